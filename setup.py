@@ -58,6 +58,8 @@ setup(
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (f"share/{NAME}", ["package.xml", "CITATION.cff"]),
+        # colcon.pkg names it: the commands are on PATH in a sourced workspace, as with pip.
+        (f"share/{NAME}/hook", ["resource/path.dsv"]),
         (f"share/{NAME}/bags", sorted(glob("bags/*.mcap") + glob("bags/*.md"))),
         (f"share/{NAME}/config", sorted(glob("config/*.yaml"))),
         (f"share/{NAME}/config/drives", sorted(glob("config/drives/*.yaml"))),

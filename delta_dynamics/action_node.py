@@ -10,7 +10,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable, Generator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -64,6 +64,23 @@ class _Goal:
     asked: bool = False
 
 
+@dataclass
+class _Settling:
+    """A machine after a hold point: it only slows down, until it rests."""
+
+    until: float
+    """On the steady clock, s."""
+    names: list[str]
+    held: list[float]
+    """The hold point."""
+    place: list[float]
+    """The joints at the last look, at first the hold point."""
+    since: float
+    """When that was, on the steady clock, s."""
+    speed: float | None = None
+    """Of the fastest joint before that; None before the first look."""
+
+
 class EffortAction:
     """Takes goals, has their efforts computed, and is the controller's client for the rest.
 
@@ -97,8 +114,7 @@ class EffortAction:
         self._turns = 0
         self._silent = 0
         """Looks since the controller's last sign of life."""
-        self._resting: tuple[float, list[str], list[float], list[float]] | None = None
-        """After a hold point: until when, the joints, the point, the last look's positions."""
+        self._settling: _Settling | None = None
         node.create_guarded_timer(LOOK, self._look)
         self._server = ActionServer(
             node,
@@ -118,6 +134,10 @@ class EffortAction:
         for goal in list(self._goals.values()):
             if not goal.sent:
                 self._abort(goal, "the node was deactivated")
+
+    def other_motion(self) -> None:
+        """Another trajectory went to the controller: no hold point may end it."""
+        self._settling = None
 
     def farewell(self) -> None:
         """The node ends, and with it every goal: the machine is stopped where it is."""
@@ -210,7 +230,7 @@ class EffortAction:
 
     def _send(self, goal: _Goal) -> None:
         goal.sent = True
-        self._resting = None
+        self.other_motion()
         self._lives()
 
         def feedback(message: Any) -> None:
@@ -319,28 +339,33 @@ class EffortAction:
             self._lives()
             then(future.result())
 
-        self._resting = (time.monotonic() + SETTLING, list(names), positions, [])
+        now = time.monotonic()
+        self._settling = _Settling(now + SETTLING, list(names), positions, positions, now)
         goal = FollowJointTrajectory.Goal(trajectory=trajectory)
         self._client.send_goal_async(goal).add_done_callback(answered)
         return True
 
     def _look_for_rest(self) -> None:
-        """A machine that comes to rest elsewhere gets the effort of that place."""
-        if self._resting is None:
+        """A machine that comes to rest elsewhere gets the effort of that place.
+
+        One that speeds up again is moved by another client of the controller.
+        """
+        settling, self._settling = self._settling, None
+        measured, now = self._place(), time.monotonic()
+        if settling is None or measured is None or now > settling.until:
             return
-        end, names, held, before = self._resting
-        measured = self._place()
-        if time.monotonic() > end or measured is None:
-            self._resting = None
+        if not measured.keys() >= set(settling.names):
             return
-        positions = [measured[name] for name in names if name in measured]
-        self._resting = end, names, held, positions
-        if len(positions) < len(held) or not before:
-            return
-        if np.abs(np.subtract(positions, before)).max() < REST * LOOK:
-            self._resting = None
-            if np.abs(np.subtract(positions, held)).max() > APART:
-                self._send_point(names, measured, lambda _: None)
+        place = [measured[name] for name in settling.names]
+        elapsed = (now - settling.since) or LOOK
+        speed = float(np.abs(np.subtract(place, settling.place)).max()) / elapsed
+        before = settling.speed
+        # The first interval may be too short to tell rest.
+        if before is not None and speed < REST:
+            if np.abs(np.subtract(place, settling.held)).max() > APART:
+                self._send_point(settling.names, measured, lambda _: None)
+        elif before is None or speed <= before + REST:
+            self._settling = replace(settling, place=place, since=now, speed=speed)
 
     def _abort(self, goal: _Goal, text: str) -> None:
         self._node.log_throttled(NAME, f"{NAME}: {text}")

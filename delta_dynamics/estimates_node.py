@@ -24,9 +24,10 @@ from pkm_twin.messages.stamps import SECOND
 from pkm_twin.robot.robot import Robot
 from pkm_twin.ros.joints import JointPublisher
 from pkm_twin.ros.node import TwinNode
+from pkm_twin.streams.pace import Pace
 
-PAYLOAD_PERIOD = 4_000_000
-"""Between two samples that the payload is estimated from, ns: errors last longer."""
+PAYLOAD_RATE = 250.0
+"""Samples a second that the payload is estimated from: errors last longer."""
 GAP = 0.1
 """Silence after which a stream begins anew, s."""
 
@@ -45,7 +46,7 @@ class Estimates:
         self.contacts = 0
         self._place: ContactPlace | None = None
         self._last = 0
-        self._due = 0
+        self._pace = Pace(PAYLOAD_RATE)
         known = robot()
         self._payload = self._create_payload(known)
         self._contact = self._create_contact(known)
@@ -124,7 +125,8 @@ class Estimates:
 
     def reset(self) -> None:
         """A stream begins anew: the load stays, time does not."""
-        self._last = self._due = 0
+        self._last = 0
+        self._pace.reset()
         if self._contact is not None:
             self._contact.reset()
         if self._payload is not None:
@@ -148,8 +150,8 @@ class Estimates:
         self._last = torques.stamp
         if self._contact is not None:
             self._take_contact(self._contact, torques, effort)
-        if self._payload is not None and torques.stamp - self._due >= PAYLOAD_PERIOD:
-            self._due = torques.stamp
+        if self._payload is not None and self._pace.due(torques.stamp):
+            self._pace.answered(torques.stamp)
             self._take_payload(self._payload, torques, effort)
 
     @property

@@ -24,6 +24,7 @@ from pkm_twin.streams.continuity import Continuity
 from pkm_twin.streams.differentiator import Differentiator
 from pkm_twin.streams.matched import WrenchWindow
 from pkm_twin.streams.monitor import StreamMonitor
+from pkm_twin.streams.rates import RateAgreement
 from pkm_twin.streams.rest import RestWatch, fit_gain, gradient_gain, rate_doubt
 from pkm_twin.streams.wrench import counting
 
@@ -81,19 +82,16 @@ class Feedforward:
         self._last_stamp = 0
         self._last_now = 0
         self._last_good: Array | None = None
-        self._differentiator = Differentiator(s.order, s.window)
-        self._rest = _rest_watch(s)
+        self.differentiator = _differentiator(s, self.robot)
+        self._window = s.window
+        self._rest = RestWatch(_slope_gain(self.differentiator))
+        self.rates = RateAgreement(self.robot)
         self._reach = friction_reach(self.robot)
         self._rules = s.stamp_rules
         self._reader = JointReader(self.robot, extra_joints=s.extra_joints)
         self._continuity = Continuity(
             self.robot, s.singularity_warn, s.singularity_stop, self._reader.highest_velocity
         )
-
-    @property
-    def differentiator_delay(self) -> float:
-        """Delay of a stream's acceleration, in samples."""
-        return self._differentiator.delay
 
     def change_robot(self, robot: Robot) -> None:
         """Take a robot with another payload, gravity, friction or limits, between two samples."""
@@ -115,8 +113,9 @@ class Feedforward:
         if self.wrenches is not None:
             self.wrenches.change_stamps(settings.accept_zero_stamp, settings.future_tolerance)
         if (before.order, before.window) != (settings.order, settings.window):
-            self._differentiator = Differentiator(settings.order, settings.window)
-            self._rest = _rest_watch(settings)
+            self.differentiator = _differentiator(settings, self.robot)
+            self._window = settings.window
+            self._rest = RestWatch(_slope_gain(self.differentiator))
             if self.wrenches is not None:
                 self.wrenches.change_fit(settings.order, settings.window)
 
@@ -268,8 +267,9 @@ class Feedforward:
         self._continuity.reset()
 
     def _restart_fit(self) -> None:
-        self._differentiator.reset()
+        self.differentiator.reset()
         self._rest.reset()
+        self.rates.reset()
         if self.wrenches is not None:
             self.wrenches.restart()
 
@@ -299,7 +299,7 @@ class Feedforward:
             )
         if silence > self.settings.stale_after * SECOND:
             if self._last_stamp:
-                text = f"no joint state for {silence / SECOND:.3f} s by their stamps"
+                text = f"no accepted joint state for {silence / SECOND:.3f} s, by the stamps"
                 self.stream.stop("stale input", text)
             self._begin_anew()
         wrench = None if self.wrenches is None else self.wrenches.require(sample.stamp)
@@ -310,7 +310,7 @@ class Feedforward:
             self._restart_fit()
             raise
         try:
-            rates = self._differentiator.push(sample.stamp, sample.q, sample.qd)
+            rates = self._differentiated(sample)
             doubt = self._doubt(sample, rates)
             measured, external = sample.effort, None
             if self.wrenches is not None:
@@ -328,19 +328,31 @@ class Feedforward:
                 )
                 effort, saturated = _gate(self.robot, self.settings.limit_policy, solved)
         except MessageError:
-            self._differentiator.retract()
+            self.differentiator.retract()
             self._rest.retract()
             if self.wrenches is not None:
                 self.wrenches.retract()
             self._continuity.retract()
             raise
         self._last_stamp = sample.stamp
+        if sample.qd is not None:
+            self.rates.push(sample.stamp, sample.q, sample.qd)
         self.near_singular = near_singular
         self.near_singularities += near_singular
         if rates is None:
             return None
         self._last_good = sample.q
         return Torques(sample.stamp, motion, effort, measured, saturated, external, doubt)
+
+    def _differentiated(self, sample: JointSample) -> tuple[Array, Array] | None:
+        """Rates and accelerations; what else looks through the window follows its length."""
+        rates = self.differentiator.push(sample.stamp, sample.q, sample.qd)
+        if self.differentiator.window != self._window:
+            self._window = self.differentiator.window
+            self._rest.gain = _slope_gain(self.differentiator)
+            if self.wrenches is not None:
+                self.wrenches.window = self._window
+        return rates
 
     def _doubt(self, sample: JointSample, rates: tuple[Array, Array] | None) -> Array | None:
         """How far the sample's rates may be off, where that makes a difference."""
@@ -350,9 +362,15 @@ class Feedforward:
         return self._rest.push(sample.stamp, sample.q, sample.qd, rate)
 
 
-def _rest_watch(s: Settings) -> RestWatch:
-    """For the rates that the differentiator gives where the stream has none."""
-    return RestWatch(fit_gain(s.order + 1, s.window, s.window - 1))
+def _differentiator(s: Settings, robot: Robot) -> Differentiator:
+    made = Differentiator(s.order, s.window, time=s.window_time)
+    made.prepare(robot.joints_count)
+    return made
+
+
+def _slope_gain(fit: Differentiator) -> float:
+    """Of the rates that a differentiator gives where the stream has none."""
+    return fit_gain(fit.order + 1, fit.window, fit.window - 1)
 
 
 def warm_up(robot: Robot) -> None:

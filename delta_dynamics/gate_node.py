@@ -111,7 +111,7 @@ class CommandGate(TwinNode):
     def reset_stop(self) -> str:
         """Open without waiting for good torques."""
         stream = self._gate.stream
-        return f"{stream.reason}: {stream.text}" if stream.resume() else ""
+        return stream.status if stream.resume() else ""
 
     def diagnose(self) -> tuple[bytes, str, dict[str, object]]:
         """Level, message and values of the node's diagnostic status."""
@@ -121,7 +121,7 @@ class CommandGate(TwinNode):
             level, message = health.WARN, f"last reject: {self._gate.last_reject}"
         if stream.stopped:
             late = self._promised_too_late()
-            level, message = health.ERROR, f"closed: {late or f'{stream.reason}: {stream.text}'}"
+            level, message = health.ERROR, f"closed: {late or stream.status}"
         values: dict[str, object] = {
             "robot": self._gate.robot.name,
             "open": not stream.stopped,
@@ -200,7 +200,7 @@ class CommandGate(TwinNode):
             return
         self._closed = stream.stopped
         if stream.stopped:
-            self.get_logger().warning(f"closed: {stream.reason}: {stream.text}")
+            self.get_logger().warning(f"closed: {stream.status}")
         else:
             self.get_logger().info("open: torques are forwarded")
 

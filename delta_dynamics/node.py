@@ -33,6 +33,7 @@ from pkm_twin.ros.run import run
 from pkm_twin.ros.turns import Task
 from pkm_twin.ros.wrench import declare_mounts
 from pkm_twin.streams.matched import WrenchWindow
+from pkm_twin.streams.pace import Pace
 from pkm_twin.streams.settings import SECONDS, changeable, with_parameters
 from pkm_twin.streams.wrench import WrenchReader, WrenchSettings
 
@@ -92,9 +93,9 @@ class DeltaDynamics(TwinNode):
             self._prepare,
             self._take,
         )
-        self._last_heard = 0
-        self._measured: Any = None
-        """The newest joint state that was taken."""
+        self._told_window = 0
+        self._accepted: tuple[int, Any] | None = None
+        """The last accepted joint state, and when it came by the steady clock, ns."""
         self._watchdog: Any = None
         self._watch_every(stale_after)
         # A step after which no stamp that was good before is good now.
@@ -109,6 +110,7 @@ class DeltaDynamics(TwinNode):
         """No torque across the seam: the stream starts anew."""
         self._feedforward.reset()
         self._estimates.reset()
+        self._reactions_pace.reset()
 
     def time_jumped_forward(self) -> None:
         """What was fresh is stale now: a running stream stops."""
@@ -122,15 +124,14 @@ class DeltaDynamics(TwinNode):
 
     def activated(self) -> None:
         """A stream begins anew."""
-        self._feedforward.reset()
-        self._estimates.reset()
-        self._last_heard = 0
+        self.time_jumped_backward()
+        self._accepted = None
 
     def deactivated(self) -> None:
         """A stream that ran is stopped; goals that wait are ended."""
         if self._action is not None:
             self._action.deactivated()
-        if self._last_heard:
+        if self._accepted is not None:
             self._stop("inactive", "the node was deactivated")
 
     def farewell(self) -> None:
@@ -149,7 +150,7 @@ class DeltaDynamics(TwinNode):
     def reset_stop(self) -> str:
         """End a stop without waiting for good samples."""
         stream = self._feedforward.stream
-        return f"{stream.reason}: {stream.text}" if stream.resume() else ""
+        return stream.status if stream.resume() else ""
 
     def diagnose(self) -> tuple[bytes, str, dict[str, object]]:
         """Level, message and values of the node's diagnostic status."""
@@ -161,10 +162,13 @@ class DeltaDynamics(TwinNode):
             message = "an effort exceeded its limit"
         if core.last_reject:
             message = f"last reject: {core.last_reject}"
+        if core.rates.fault:
+            level, message = health.WARN, core.rates.fault
+            self.log_throttled("rates", core.rates.fault)
         if core.near_singular:
             message = f"close to a singularity or the edge of the workspace: index {measure:.3g}"
         if core.stream.stopped:
-            level, message = health.ERROR, f"stopped: {core.stream.reason}: {core.stream.text}"
+            level, message = health.ERROR, f"stopped: {core.stream.status}"
         values: dict[str, object] = {
             "robot": core.robot.name,
             "payload mass": core.robot.payload.mass,
@@ -174,7 +178,8 @@ class DeltaDynamics(TwinNode):
             "older stamps dropped": core.dropped,
             "close to a singularity": core.near_singularities,
             "singularity index": "" if measure is None else f"{measure:.4f}",
-            "acceleration delay (samples)": core.differentiator_delay,
+            "acceleration delay (samples)": core.differentiator.delay,
+            "acceleration window": self._window_text(),
         }
         values |= {f"joint states rejected: {k}": v for k, v in core.stream.rejected.items()}
         values |= {f"trajectories rejected: {k}": v for k, v in core.trajectories.rejected.items()}
@@ -192,6 +197,21 @@ class DeltaDynamics(TwinNode):
             if level == health.OK and core.wrenches.last_reject:
                 level, message = health.WARN, f"last reject: {core.wrenches.last_reject}"
         return level, message, values
+
+    def _window_text(self) -> str:
+        """How long the differentiator's window is and what it costs; a new length is logged."""
+        fit = self._feedforward.differentiator
+        if fit.period == 0.0:
+            return ""
+        length, error = fit.period * (fit.window - 1), 100.0 * fit.sine_error(1.0)
+        text = (
+            f"{fit.window} samples, {1e3 * length:.3g} ms: error for a sine of 1 Hz {error:.2g} % "
+            "of the peak acceleration"
+        )
+        if fit.window != self._told_window:
+            self._told_window = fit.window
+            self.get_logger().info(f"joint states at {1.0 / fit.period:.4g} Hz, window {text}")
+        return text
 
     def _create_action(self) -> Any:
         """The action ``~/follow_joint_trajectory``, where a controller is named."""
@@ -228,11 +248,16 @@ class DeltaDynamics(TwinNode):
 
     def _place(self) -> dict[str, float] | None:
         """Where the joints are, by the controller's names and numbers; None where not measured."""
-        silent = (time.monotonic_ns() - self._last_heard) / SECOND
-        state = self._measured
-        if state is None or silent > self._feedforward.settings.stale_after:
+        if self._accepted is None or self._silence() > self._feedforward.settings.stale_after:
             return None
+        state = self._accepted[1]
         return dict(zip(state.name, map(float, state.position), strict=True))
+
+    def _silence(self) -> float:
+        """Since the last accepted joint state, by the steady clock, s; 0 before the first."""
+        if self._accepted is None:
+            return 0.0
+        return (time.monotonic_ns() - self._accepted[0]) / SECOND
 
     def _create_wrenches(self, settings: Settings) -> WrenchWindow | None:
         """The measured wrench, where the parameter asks for it."""
@@ -291,8 +316,7 @@ class DeltaDynamics(TwinNode):
             high=1e4,
             read_only=True,
         )
-        self._reactions_period = round(SECOND / rate)
-        self._reactions_due = 0
+        self._reactions_pace = Pace(rate)
         if not wanted:
             return {}
         rest = np.zeros((2, len(robot.joint_names)))
@@ -337,10 +361,11 @@ class DeltaDynamics(TwinNode):
                 break
         yield
         self._trajectory.publish(raw.with_effort(efforts))
+        if self._action is not None:
+            self._action.other_motion()
 
     def _on_joint_state(self, data: bytes) -> None:
-        core = self._feedforward
-        self._last_heard = time.monotonic_ns()
+        core, came = self._feedforward, time.monotonic_ns()
         running = not core.stream.stopped
         try:
             try:
@@ -349,11 +374,13 @@ class DeltaDynamics(TwinNode):
                 core.refuse_joint_state(error)
                 raise
             torques = core.joint_state(message, self.now())
-            self._measured = message
+            if torques is not None:
+                # The process may have stood still since.
+                core.check_age(torques, self.now())
+            # A rejected message, such as another machine's, is no sign of life of this one.
+            self._accepted = came, message
             if torques is None:
                 return
-            # The process may have stood still since.
-            core.check_age(torques, self.now())
         finally:
             if running and core.stream.stopped:
                 self._send_stop()
@@ -373,8 +400,8 @@ class DeltaDynamics(TwinNode):
 
     def _tell_reactions(self, torques: Torques) -> None:
         """At a rate of their own: a dense solve a sample is too much for the stream's."""
-        if self._reactions and abs(torques.stamp - self._reactions_due) >= self._reactions_period:
-            self._reactions_due = torques.stamp
+        if self._reactions and self._reactions_pace.due(torques.stamp):
+            self._reactions_pace.answered(torques.stamp)
             self._publish_reactions(Time(nanoseconds=torques.stamp).to_msg(), torques)
 
     def _publish_reactions(self, stamp: Any, torques: Torques) -> None:
@@ -397,10 +424,9 @@ class DeltaDynamics(TwinNode):
 
     def _watch(self) -> None:
         """Stop a stream that has gone silent; runs on the steady clock."""
-        core = self._feedforward
-        silent = (time.monotonic_ns() - self._last_heard) / 1e9
-        if self._last_heard and not core.stream.stopped and silent > core.settings.stale_after:
-            self._stop("stale input", f"no joint state for {silent:.3f} s")
+        core, silent = self._feedforward, self._silence()
+        if not core.stream.stopped and silent > core.settings.stale_after:
+            self._stop("stale input", f"no accepted joint state for {silent:.3f} s")
 
     def _stop(self, reason: str, text: str) -> None:
         with self._telling_stop():
@@ -409,7 +435,7 @@ class DeltaDynamics(TwinNode):
 
     def _send_stop(self) -> None:
         core = self._feedforward
-        self.log_throttled("stop", f"stopped: {core.stream.reason}: {core.stream.text}")
+        self.log_throttled("stop", f"stopped: {core.stream.status}")
         model = core.stop_effort()
         if model is None:
             return

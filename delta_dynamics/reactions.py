@@ -240,7 +240,8 @@ def _loads(t: Traced) -> Program:
     motion, graph = t.motion, t.graph
     forces = Forces(motion)
     # Rods stand for themselves here.
-    forces.inertia(bodies, np.zeros(len(graph.rods), dtype=object))
+    for name, ten in zip(t.tree.links, bodies, strict=True):
+        forces.body(name, ten)
     forces.passive(passive)
     forces.wrench(t.tape.inputs("wrench", 6))
     body_rows: list[Any] = []

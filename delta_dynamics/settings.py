@@ -28,7 +28,12 @@ class Settings:
         2, "polynomial degree of the velocity", name="differentiator.order", low=1, high=4
     )
     window: int = setting(
-        25, "samples in the window", name="differentiator.window", low=3, high=1000
+        25,
+        "samples in the window; a slow stream has fewer: those of 24 ms, or of as many ms as "
+        "there are samples, and at least 5",
+        name="differentiator.window",
+        low=3,
+        high=1000,
     )
     limit_policy: LimitPolicy = setting(
         "warn", "efforts beyond effort_limits: warn publishes, reject rejects, clamp limits them",
@@ -68,6 +73,11 @@ class Settings:
             raise ParameterError(
                 "differentiator.window", self.window, f"at least order + 2, {self.order + 2}"
             )
+
+    @property
+    def window_time(self) -> float:
+        """Longest window, s."""
+        return 1e-3 * max(self.window - 1, 24)
 
     @property
     def stamp_rules(self) -> StampRules:

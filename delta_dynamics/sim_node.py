@@ -28,7 +28,7 @@ from delta_dynamics.simulation import (
 )
 from delta_dynamics.topics import SIMULATION
 from pkm_twin.bags.definitions import message_definition
-from pkm_twin.errors import MessageError, ParameterError
+from pkm_twin.errors import MessageError, ParameterError, short
 from pkm_twin.messages.intake import DoublesTemplate, RawTrajectory
 from pkm_twin.messages.stamps import SECOND
 from pkm_twin.robot.robot import Robot
@@ -74,6 +74,7 @@ class MachineSim(TwinNode):
         settings = self._declare_settings(robot)
         begin = BEGIN if self._simulated else self.now()
         self._simulation = Simulation(self._variation.robot, settings, begin)
+        self._check_control()
         self._skipped = 0
         # Compiled before there is a topic to be found by.
         warm_up(self._variation.robot)
@@ -216,6 +217,28 @@ class MachineSim(TwinNode):
             ),
         )  # fmt: skip
 
+    def _check_control(self) -> None:
+        """Efforts alone need no position control: a default that is too fast only warns.
+
+        :raises ParameterError: gains that were given are unstable at the period.
+        """
+        sim = self._simulation
+        if sim.stable_share == 1.0:
+            return
+        bandwidth = sim.stable_share * self.get_parameter("bandwidth").value
+        for name, right in (
+            ("bandwidth", f"at most {bandwidth:.2g} Hz"),
+            ("stiffness", f"gains of {sim.stable_share:.2g} times their bandwidth"),
+            ("damping", f"gains of {sim.stable_share:.2g} times their bandwidth"),
+        ):
+            if name in self.given:
+                value = self.get_parameter(name).value
+                period = sim.settings.period
+                raise ParameterError(name, value, f"{right}, stable at period {period:g} s")
+        text = f"trajectories are rejected: {sim.control_fault()}"
+        self.health.limitations.append(text)
+        self.get_logger().warning(text)
+
     def _declare_payloads(self, robot: Robot) -> tuple[PayloadEvent, ...]:
         """Events as three lists; by default the robot's own payload from the start."""
         own = robot.payload
@@ -246,7 +269,7 @@ class MachineSim(TwinNode):
         for event in events:
             if not 0.0 <= event.time < np.inf:
                 raise ParameterError("payload.times", event.time, "0 or more, finite")
-            robot.changed(payload={"mass": event.mass, "com": list(event.com)})
+            robot.changed(payload=event.load)
         return events
 
     def _row(
@@ -361,7 +384,7 @@ class MachineSim(TwinNode):
     def _publish_drawn(self) -> None:
         """What was drawn: into the log, and kept on a topic for who comes late."""
         drawn = self._variation.drawn
-        values = [KeyValue(key=name, value=f"{value!r}") for name, value in drawn.items()]
+        values = [KeyValue(key=name, value=short(value)) for name, value in drawn.items()]
         status = DiagnosticStatus(name=self.get_fully_qualified_name(), values=values)
         status.message = f"{len(drawn)} parameters drawn"
         status.hardware_id = self._simulation.robot.name

@@ -7,8 +7,10 @@ alone moves. Pure: messages are read by their attributes.
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any, Final, Literal
 
 import numpy as np
@@ -21,6 +23,7 @@ from pkm_twin.messages.reading import MAX_RATE, JointReader, as_message_error
 from pkm_twin.messages.stamps import SECOND, StampRules
 from pkm_twin.messages.wrenches import read_wrench
 from pkm_twin.robot.robot import Robot
+from pkm_twin.robot.workspace import random_joints
 from pkm_twin.streams.continuity import Continuity
 from pkm_twin.streams.path import JointPath
 from pkm_twin.streams.settings import setting
@@ -30,6 +33,14 @@ OnSilence = Literal["zeros", "hold"]
 
 SINGULAR: Final = 1e-3
 """Singularity measure below which a machine has left what rigid bodies describe."""
+POSES: Final = 64
+"""Random poses among which the one with the fastest position control is sought."""
+MARGIN: Final = 1.5
+"""Factor of all gains with which the position control has to be stable, too."""
+DELAYS: Final = 20
+"""Periods of a delay that are followed one by one; a longer one is divided into as many."""
+GROWTH: Final = 1e-6
+"""Growth of an error in a period that is none: rounding's, where no gain moves a joint back."""
 
 
 @dataclass(frozen=True)
@@ -39,6 +50,11 @@ class PayloadEvent:
     time: float
     mass: float
     com: tuple[float, ...] = (0.0, 0.0, 0.0)
+
+    @property
+    def load(self) -> dict[str, Any]:
+        """The payload as a robot's file has it."""
+        return {"mass": self.mass, "com": list(self.com)}
 
 
 @dataclass(frozen=True)
@@ -106,6 +122,65 @@ def tuned(robot: Robot, bandwidth: float) -> tuple[Array, Array]:
     inertia = np.diag(mass_matrix(robot, robot.inverse(robot.home())))
     turn = 2.0 * np.pi * bandwidth
     return inertia * turn**2, 2.0 * inertia * turn
+
+
+def stable_share(robot: Robot, settings: MachineSettings) -> float:
+    """Share of the position control's bandwidth that is stable at its period, 1 at most.
+
+    Stable: in the discrete loop of the sampled control and the machine's masses, linear about rest,
+    no error grows, at the start and in the pose where the loop is fastest, with every payload, and
+    with gains that are higher by :data:`MARGIN`. The bandwidth is that of :func:`tuned`:
+    stiffness goes by its square, damping by itself.
+    """
+    q = np.vstack([settings.start, random_joints(robot, np.random.default_rng(0), POSES)])
+    inertias = []
+    for event in settings.payloads or (None,):
+        loaded = robot if event is None else robot.changed(payload=event.load)
+        inertia = mass_matrix(loaded, q)
+        gains = settings.damping + 0.5 * settings.period * settings.stiffness
+        speeds = np.abs(np.linalg.eigvals(np.linalg.solve(inertia, np.diag(gains)))).max(-1)
+        inertias += [inertia[0], inertia[int(speeds.argmax())]]
+
+    def stable(share: float) -> bool:
+        return all(
+            error_growth(inertia, settings, gain * share**2, gain * share) <= 1.0 + GROWTH
+            for inertia in inertias
+            for gain in (1.0, MARGIN)
+        )
+
+    if stable(1.0):
+        return 1.0
+    low, high = 0.0, 1.0
+    for _ in range(12):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if stable(middle) else (low, middle)
+    return low
+
+
+def error_growth(
+    inertia: Array, settings: MachineSettings, stiffness: float = 1.0, damping: float = 1.0
+) -> float:
+    """Factor by which an error of the position control grows in a period, at most.
+
+    The spectral radius of the loop that :meth:`Simulation.advance` closes: positions, rates, the
+    positions a period before (rates of an encoder with steps are differences) and the efforts on
+    their way. The mass matrix is constant, and efforts are constant in a period.
+
+    :param inertia: mass matrix, shape (n, n).
+    :param stiffness: factor of the settings' stiffness, ``damping``: of their damping.
+    """
+    n, s = len(inertia), settings
+    delay = math.ceil(s.delay / s.period)
+    period = s.period if delay <= DELAYS else s.delay / DELAYS
+    # Every row block of the unit matrix is one quantity, in terms of the state.
+    unit = np.eye(n * (3 + min(delay, DELAYS)))
+    q, qd, before, *waiting = unit.reshape(-1, n, len(unit))
+    rates = np.where(s.resolution[:, None] > 0.0, (q - before) / period, qd)
+    effort = -stiffness * s.stiffness[:, None] * q - damping * s.damping[:, None] * rates
+    waiting.append(effort)
+    qdd = np.linalg.solve(inertia, waiting.pop(0))
+    after = [q + period * qd + 0.5 * period**2 * qdd, qd + period * qdd, q, *waiting]
+    return float(np.abs(np.linalg.eigvals(np.concatenate(after))).max())
 
 
 @dataclass(frozen=True)
@@ -204,11 +279,25 @@ class Simulation:
         """
         try:
             t = self._reader.trajectory(message, self.now)
+            if self.stable_share < 1.0:
+                raise MessageError("unstable control", self.control_fault())
         except MessageError as error:
             self.refuse_trajectory(error)
             raise
         self.trajectories.accept()
         self._path = (t.stamp or self.now, JointPath(t).from_here(self._seen))
+
+    @cached_property
+    def stable_share(self) -> float:
+        """As :func:`stable_share` of this machine."""
+        return stable_share(self.robot, self.settings)
+
+    def control_fault(self) -> str:
+        """Why no trajectory is followed where :attr:`stable_share` is below 1."""
+        return (
+            f"the position control is unstable at period {self.settings.period:g} s with the "
+            f"machine's inertia; {self.stable_share:.2g} times its bandwidth is stable"
+        )
 
     def refuse_trajectory(self, error: MessageError) -> None:
         """Count a trajectory that is refused."""
@@ -316,8 +405,7 @@ class Simulation:
     def _load(self) -> None:
         """Take what payload is due."""
         while self._payloads and self._payloads[0].time <= self.time:
-            event = self._payloads.popleft()
-            load = {"mass": event.mass, "com": list(event.com)}
+            load = self._payloads.popleft().load
             self.plant.change_robot(self.robot.changed(payload=load))
 
     def _wrench(self) -> Array:

@@ -163,23 +163,45 @@ class Forces:
         self.moment[body] = self.moment[body] + cross(self.motion.arm(body, point), force)
 
     def inertia(self, bodies: Objects, rods: Objects) -> None:
-        """Newton's and Euler's laws, for the accelerations that the motion has (less gravity)."""
-        m = self.motion
-        for name, ten in zip(m.tree.links, bodies, strict=True):
-            self.body(name, ten)
-        for mass, rod in zip(rods, m.graph.rods.values(), strict=True):
+        """Newton's and Euler's laws, for the accelerations that the motion has (less gravity).
+
+        Couples of bodies that share a rotation act on the first of them: generalised efforts are
+        the same. For reactions take :meth:`body` of each.
+        """
+        for name, ten in zip(self.motion.tree.links, bodies, strict=True):
+            self._linear(name, ten)
+        for name, matrix in self._couples(bodies):
+            self._euler(name, matrix)
+        for mass, rod in zip(rods, self.motion.graph.rods.values(), strict=True):
             self.rod(rod, mass)
 
     def body(self, name: str, ten: Objects) -> None:
         """What the acceleration of one body needs."""
+        self._linear(name, ten)
+        self._euler(name, _matrix(ten))
+
+    def _linear(self, name: str, ten: Objects) -> None:
+        m = self.motion
+        first = m.rotation[name] @ ten[1:4]
+        self.force[name] = self.force[name] + m.change[name] * ten[0] + m.spin(name) @ first
+        self.moment[name] = self.moment[name] + cross(first, m.change[name])
+
+    def _euler(self, name: str, matrix: Objects) -> None:
         m = self.motion
         turned = m.rotation[name]
-        first = turned @ ten[1:4]
-        matrix = _matrix(ten)
         w, al = turned.T @ m.omega[name], turned.T @ m.alpha[name]
-        self.force[name] = self.force[name] + m.change[name] * ten[0] + m.spin(name) @ first
         euler = turned @ (matrix @ al + cross(w, matrix @ w))
-        self.moment[name] = self.moment[name] + cross(first, m.change[name]) + euler
+        self.moment[name] = self.moment[name] + euler
+
+    def _couples(self, bodies: Objects) -> list[tuple[str, Objects]]:
+        """Moments of inertia about the origins, summed over bodies that share a rotation."""
+        first: dict[int, str] = {}
+        found: dict[str, Objects] = {}
+        for name, ten in zip(self.motion.tree.links, bodies, strict=True):
+            lead = first.setdefault(id(self.motion.rotation[name]), name)
+            matrix = _matrix(ten)
+            found[lead] = found[lead] + matrix if lead in found else matrix
+        return list(found.items())
 
     def rod(self, rod: Rod, mass: Any) -> None:
         """What the acceleration of a thin even rod needs.
@@ -200,12 +222,14 @@ class Forces:
         """The same linear part alone: momenta of the velocities that the motion has."""
         m = self.motion
         for name, ten in zip(m.tree.links, bodies, strict=True):
-            turned = m.rotation[name]
-            first = turned @ ten[1:4]
+            first = m.rotation[name] @ ten[1:4]
             w, v = m.omega[name], m.speed[name]
             self.force[name] = self.force[name] + v * ten[0] + cross(w, first)
-            spin = turned @ (_matrix(ten) @ (turned.T @ w))
-            self.moment[name] = self.moment[name] + cross(first, v) + spin
+            self.moment[name] = self.moment[name] + cross(first, v)
+        for name, matrix in self._couples(bodies):
+            turned = m.rotation[name]
+            spin = turned @ (matrix @ (turned.T @ m.omega[name]))
+            self.moment[name] = self.moment[name] + spin
         for mass, rod in zip(rods, m.graph.rods.values(), strict=True):
             self._shared(rod, mass, m.velocity)
 

@@ -13,6 +13,7 @@ from launch.launch_context import LaunchContext
 from launch.launch_description_sources import PythonLaunchDescriptionSource
 
 from launch import LaunchDescription
+from pkm_twin.ros.arguments import check_launch_arguments
 
 TWIN = str(Path(__file__).with_name("twin.launch.py"))
 
@@ -44,6 +45,7 @@ def generate_launch_description() -> LaunchDescription:
 
 def machines(context: LaunchContext) -> list[GroupAction]:
     """A twin a machine, once the arguments have their values."""
+    check_launch_arguments(__file__, context.argv, ARGUMENTS)
     given = {name: context.launch_configurations[name] for name in ARGUMENTS}
     pairs = [pair.strip().partition("=") for pair in given.pop("machines").split(",")]
     for namespace, sign, robot in pairs:

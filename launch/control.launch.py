@@ -10,6 +10,7 @@ that ``pkm-twin export ros2-control`` has written, and takes the trajectories it
 
 import subprocess
 import tempfile
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +29,7 @@ from launch.actions import (
     RegisterEventHandler,
     Shutdown,
 )
-from launch.event_handlers import OnShutdown
+from launch.event_handlers import OnProcessExit, OnShutdown
 from launch.launch_context import LaunchContext
 from launch.launch_description_entity import LaunchDescriptionEntity
 from launch.launch_description_sources import PythonLaunchDescriptionSource
@@ -39,7 +40,8 @@ from launch import LaunchDescription
 from pkm_twin import Robot, load
 from pkm_twin.errors import PkmTwinError
 from pkm_twin.export.ros2_control import CONTROLLER as FEEDFORWARD
-from pkm_twin.export.ros2_control import TRAJECTORIES, package_name
+from pkm_twin.export.ros2_control import GRAVITY, TRAJECTORIES, package_name
+from pkm_twin.ros.arguments import check_launch_arguments
 from pkm_twin.ros.signals import leave_interrupts_to_launch
 
 HERE = Path(__file__).parent
@@ -81,6 +83,7 @@ def generate_launch_description() -> LaunchDescription:
 def control(context: LaunchContext) -> list[LaunchDescriptionEntity]:
     """Everything, once the arguments have their values."""
     leave_interrupts_to_launch()
+    check_launch_arguments(__file__, context.argv, ARGUMENTS)
     given = {name: context.launch_configurations[name] for name in ARGUMENTS}
     namespace = given["namespace"]
     gate = given["command_gate"].lower()
@@ -112,6 +115,18 @@ def control(context: LaunchContext) -> list[LaunchDescriptionEntity]:
         f"{holding} has no gain for {', '.join(loose)}: the machine is carried and not held in "
         "place; see bandwidth:=HZ"
     )
+    known = sections.get(f"{space}/controller_manager", {}).get("ros__parameters", {})
+    # A controller is not activated before what it falls back to is configured.
+    spawners = [
+        *([_spawner(space, file, GRAVITY, "--inactive")] if plugin and GRAVITY in known else []),
+        _spawner(
+            space,
+            file,
+            "joint_state_broadcaster",
+            *([FEEDFORWARD] if plugin else []),
+            controller,
+        ),
+    ]
     return [
         *([LogInfo(msg=warning)] if loose and holding != EFFORTS else []),
         RegisterEventHandler(OnShutdown(on_shutdown=lambda *_: folder.cleanup())),
@@ -124,21 +139,28 @@ def control(context: LaunchContext) -> list[LaunchDescriptionEntity]:
             output="screen",
             on_exit=Shutdown(reason="ros2_control_node has ended"),
         ),
-        Node(
-            package="controller_manager",
-            executable="spawner",
-            namespace=namespace,
-            arguments=[
-                "joint_state_broadcaster",
-                *([FEEDFORWARD] if plugin else []),
-                controller,
-                *("--param-file", str(file)),
-                *("--controller-manager", f"{space}/controller_manager"),
-            ],
-            output="screen",
+        *(
+            RegisterEventHandler(OnProcessExit(target_action=one, on_exit=[after]))
+            for one, after in pairwise(spawners)
         ),
+        spawners[0],
         *([] if plugin else [_twin(given, controller)]),
     ]
+
+
+def _spawner(space: str, file: Path, *arguments: str) -> Node:
+    """Loads, configures and activates controllers of the manager in a namespace."""
+    return Node(
+        package="controller_manager",
+        executable="spawner",
+        namespace=space.removeprefix("/"),
+        arguments=[
+            *arguments,
+            *("--param-file", str(file)),
+            *("--controller-manager", f"{space}/controller_manager"),
+        ],
+        output="screen",
+    )
 
 
 def _twin(given: dict[str, str], controller: str) -> LaunchDescriptionEntity:
@@ -190,7 +212,10 @@ def _controllers(given: dict[str, str], space: str) -> dict[str, dict[str, dict[
     except (PkmTwinError, ValueError) as error:
         raise RuntimeError(f"robot {given['robot']}, bandwidth: {error}") from None
     path = Path(given["controllers"] or _settings_file(given, robot))
-    sections = yaml.safe_load(path.read_text(encoding="utf-8"))
+    sections = {
+        name.removeprefix("/**/"): section
+        for name, section in yaml.safe_load(path.read_text(encoding="utf-8")).items()
+    }
     joints = list(robot.controller.names)
     # Efforts of the controller's numbers per the controller's numbers.
     scale = robot.controller.factors**2
@@ -200,7 +225,7 @@ def _controllers(given: dict[str, str], space: str) -> dict[str, dict[str, dict[
     }
     for name, section in sections.items():
         parameters = section["ros__parameters"]
-        if name not in ("controller_manager", "joint_state_broadcaster", FEEDFORWARD):
+        if name not in ("controller_manager", "joint_state_broadcaster", FEEDFORWARD, GRAVITY):
             parameters.setdefault("joints", list(joints))
         gains = parameters.get("gains", {})
         if "each" in gains:

@@ -30,6 +30,7 @@ from delta_dynamics.settings import Settings
 from launch import LaunchDescription
 from pkm_twin import load
 from pkm_twin.errors import PkmTwinError
+from pkm_twin.ros.arguments import check_launch_arguments
 from pkm_twin.ros.signals import leave_interrupts_to_launch
 
 ROBOT = "delta_cu"
@@ -104,6 +105,7 @@ def generate_launch_description() -> LaunchDescription:
 def nodes(context: LaunchContext) -> list[Node]:
     """The chosen nodes, once the arguments have their values."""
     leave_interrupts_to_launch()
+    check_launch_arguments(__file__, context.argv, ARGUMENTS)
     given = {name: context.launch_configurations[name] for name in ARGUMENTS}
     file = given["params_file"]
     if file and not Path(file).is_file():

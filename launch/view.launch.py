@@ -18,6 +18,7 @@ from launch_ros.actions import Node
 from launch import LaunchDescription
 from pkm_twin import load
 from pkm_twin.robot.robot_urdf import robot_urdf
+from pkm_twin.ros.arguments import check_launch_arguments
 from pkm_twin.ros.signals import leave_interrupts_to_launch
 
 HERE = Path(__file__).parent
@@ -51,6 +52,7 @@ def generate_launch_description() -> LaunchDescription:
 def view(context: LaunchContext) -> list[LaunchDescriptionEntity]:
     """The nodes, once the arguments have their values."""
     leave_interrupts_to_launch()
+    check_launch_arguments(__file__, context.argv, ARGUMENTS)
     given = {name: context.launch_configurations[name] for name in ARGUMENTS}
     namespace = given["namespace"].strip("/")
     prefix = f"{namespace}/" if namespace else ""

@@ -45,7 +45,7 @@ class FileError(ParameterError):
         self.args = (one_line(f"{path}: {text}", 2000),)
 
 
-NOUNS: Final = ("robot", "mechanism", "map")
+NOUNS: Final = ("robot", "mechanism", "map", "launch argument")
 """Fields whose value is a name of this kind of thing."""
 
 
@@ -228,9 +228,20 @@ def one_line(text: str, limit: int = 400) -> str:
 
 
 def short(value: object, limit: int = 80) -> str:
-    """A value for an error message, its end cut."""
-    text = repr(value)
+    """A value for an error message, its end cut; numbers of numpy as plain ones."""
+    text = repr(_plain(value))
     return text if len(text) <= limit else text[: limit - 3] + "..."
+
+
+def _plain(value: Any) -> Any:
+    """The value without numpy's types, whose representation names them."""
+    if type(value).__module__ == "numpy" and hasattr(value, "tolist"):
+        return value.tolist()
+    if type(value) in (list, tuple):
+        return type(value)(map(_plain, value))
+    if type(value) is dict:
+        return {_plain(key): _plain(one) for key, one in value.items()}
+    return value
 
 
 def install(extra: str) -> str:

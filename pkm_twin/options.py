@@ -3,8 +3,10 @@
 
 from __future__ import annotations
 
+import functools
 import inspect
 from collections.abc import Callable, Iterable
+from contextvars import ContextVar
 from pathlib import Path
 from typing import Any, Optional, TypeVar, get_type_hints
 
@@ -43,8 +45,42 @@ def take_options(command: Callable[..., Any], options: Iterable[inspect.Paramete
     command.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
 
 
+def shared_options(
+    declared: Callable[..., None], context: ContextVar[Any], make: Callable[..., Any]
+) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """A decorator that gives a command more options, for what it calls to look up.
+
+    :param declared: a function whose parameters are the options.
+    :param context: is what ``make`` makes of their values while the command runs.
+    """
+    names = options_of(declared)
+
+    def give(command: Callable[..., None]) -> Callable[..., None]:
+        @functools.wraps(command)
+        def wrapped(**given: Any) -> None:
+            token = context.set(make(*(given.pop(name) for name in names)))
+            try:
+                command(**given)
+            finally:
+                context.reset(token)
+
+        take_options(wrapped, [*options_of(command).values(), *options_of(declared).values()])
+        return wrapped
+
+    return give
+
+
 class Commands(typer.Typer):
-    """Commands as typer of Ubuntu 24.04 needs them: it evaluates no annotations and shows None."""
+    """Commands as typer of Ubuntu 24.04 needs them: it evaluates no annotations and shows None.
+
+    Help is plain text, and errors are this package's own.
+    """
+
+    def __init__(self, *, add_completion: bool = False, **settings: Any) -> None:
+        super().__init__(
+            add_completion=add_completion, pretty_exceptions_enable=False, rich_markup_mode=None,
+            **settings,
+        )  # fmt: skip
 
     def command(self, *names: Any, **settings: Any) -> Callable[[Command], Command]:
         """As typer's."""

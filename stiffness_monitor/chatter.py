@@ -40,8 +40,16 @@ DEEPEST: Final = 25.0
 """Last depth by default, likewise."""
 BATCH: Final = 5
 """Depths that are tried at once."""
-CLOSE: Final = 2e-3
+CLOSE: Final = 2e-4
 """Relative width of the bracket that a limit is found in."""
+STEEP: Final = 1.25
+"""Ratio of two neighbouring limits between which another speed is computed."""
+FLAT: Final = 1.001
+"""The same beside a minimum: it is known where both neighbours are as deep."""
+FINE: Final = 5e-4
+"""Relative distance of speeds below which none is computed between, as at a cliff."""
+MARGIN: Final = 0.01
+"""How far a spindle's speed may be off, part of it."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +74,10 @@ class Milling:
     def __post_init__(self) -> None:
         bounds = {
             "teeth": (1 <= self.teeth <= 100, "1 to 100"),
-            "tangential": (0.0 < self.tangential < 1e13, "above 0, N/m2"),
+            "tangential": (
+                1e6 <= self.tangential <= 1e11,
+                "1e6 to 1e11 N/m2, as 600e6 for 600 MPa",
+            ),
             "radial": (-10.0 <= self.radial <= 10.0, "-10 to 10, a ratio"),
             "immersion": (0.0 < self.immersion <= 1.0, "above 0 to 1"),
             "feed": (abs(self.feed) < 1e3, "an angle, rad"),
@@ -123,6 +134,27 @@ class Lobes:
         """Index of the speed with the greatest depth, of equal ones the fastest."""
         return int(np.flatnonzero(self.depths == self.depths.max())[-1])
 
+    def steady(self, margin: float = MARGIN) -> tuple[float, float, bool]:
+        """The best speed (rpm) that may be off, its stable depth (m), whether that is open.
+
+        The depth is that of all speeds within the margin, and of the next ones beyond on both
+        sides. Speeds have to rise. Of a range that is narrower, its middle with all of it.
+
+        :param margin: part of the speed.
+        """
+        last = len(self.speeds) - 1
+        low = np.searchsorted(self.speeds, self.speeds * (1.0 - margin), "right") - 1
+        high = np.searchsorted(self.speeds, self.speeds * (1.0 + margin), "left")
+        inside = np.flatnonzero((low >= 0) & (high <= last))
+        if not len(inside):
+            middle = 0.5 * float(self.speeds[0] + self.speeds[-1])
+            return middle, float(self.depths.min()), bool(self.open.all())
+        least = np.array([self.depths[low[k] : high[k] + 1].min() for k in inside])
+        k = int(np.flatnonzero(least == least.max())[-1])
+        at = int(inside[k])
+        whole = bool(self.open[low[at] : high[at] + 1].all())
+        return float(self.speeds[at]), float(least[k]), whole
+
 
 @dataclass(frozen=True, eq=False)
 class _Plane:
@@ -153,6 +185,29 @@ class _Plane:
         real = np.linalg.eigvals(milling.mean() @ response).real.min(1)
         k = int(real.argmin())
         return (-0.5 / float(real[k]) if real[k] < 0.0 else np.inf), float(at[k, 0])
+
+    def lobes(self, milling: Milling, low: float, high: float) -> Array:
+        """Speeds in a range at which lobes are lowest by the zero-order approximation, rpm, (k,).
+
+        Of every mode near its worst frequency, where from tooth to tooth there is a whole number of
+        vibrations and the phase of the lobe; and half a vibration more, where every second tooth
+        cuts deeper.
+        """
+        found: list[float] = []
+        for w, z in zip(self.turn, self.damping, strict=True):
+            at = w * (1.0 + z * np.linspace(-3.0, 3.0, 61))
+            gain = 1.0 / (
+                self.turn**2 - at[:, None] ** 2 + 2j * self.damping * self.turn * at[:, None]
+            )
+            response = np.einsum("km,mi,mj->kij", gain, self.shapes, self.shapes)
+            values = np.linalg.eigvals(milling.mean() @ response)
+            k, i = np.unravel_index(int(values.real.argmin()), values.shape)
+            phase = np.pi - 2.0 * float(np.angle(-1.0 / values[k, i]))
+            for turn, extra in ((float(at[k]), phase), (w * (1.0 + z), np.pi)):
+                teeth = 60.0 * turn / (2.0 * np.pi * milling.teeth)
+                whole = np.arange(-1.0, np.ceil(teeth / low) + 1.0) + extra / (2.0 * np.pi)
+                found += [teeth / n for n in whole.tolist() if n > 0.0 and low < teeth / n < high]
+        return np.array(found)
 
     def step(self, h: float) -> tuple[Array, Array, Array]:
         """Of time h: the modes' map (m, 2, 2), what forces at its begin and end add, (m, 2)."""
@@ -262,6 +317,56 @@ def lobes_of(
     """The same of modes at the tool point, also measured ones; as :func:`stability_lobes`."""
     plane = _Plane.of(modes, milling)
     at = np.atleast_1d(np.asarray(speeds, np.float64))
+    last, safe = _bounds(plane, milling, at, deepest)
+    return _limits(plane, milling, at, last, safe)
+
+
+def lobes_between(
+    modes: ToolModes,
+    milling: Milling,
+    low: float,
+    high: float,
+    points: int,
+    deepest: float | None = None,
+) -> Lobes:
+    """Limit depths over a range of speeds, with no minimum or cliff left between the speeds.
+
+    Evenly spaced speeds, those where the zero-order approximation has its lobes, and further ones
+    until both neighbours of every minimum are within 0.1 % of its depth, and until depths that
+    differ by more than a quarter are 0.05 % of the speed apart.
+
+    :param low, high: rpm. ``points``: number of evenly spaced speeds. Others, and errors, as
+        :func:`lobes_of`.
+    """
+    plane = _Plane.of(modes, milling)
+    even = np.linspace(low, high, points)
+    last, safe = _bounds(plane, milling, even, deepest)
+    new = np.union1d(even, plane.lobes(milling, low, high))
+    found = _limits(plane, milling, new, last, safe)
+    while True:
+        n, depth = found.speeds, found.depths
+        ratio = np.maximum(depth[1:], depth[:-1]) / np.minimum(depth[1:], depth[:-1])
+        before, after = np.append(1.0, ratio), np.append(ratio, 1.0)
+        falls = np.append(True, np.diff(depth) <= 0.0)
+        lowest = falls & np.append(np.diff(depth) >= 0.0, True)
+        unsure = lowest & (np.maximum(before, after) > FLAT)
+        split = (ratio > STEEP) | unsure[1:] | unsure[:-1]
+        split &= np.diff(n) > FINE * n[1:]
+        if not split.any():
+            return found
+        more = _limits(plane, milling, 0.5 * (n[1:] + n[:-1])[split], last, safe)
+        order = np.argsort(np.concatenate([n, more.speeds]))
+        found = Lobes(
+            np.concatenate([n, more.speeds])[order],
+            np.concatenate([depth, more.depths])[order],
+            np.concatenate([found.open, more.open])[order], safe,
+        )  # fmt: skip
+
+
+def _bounds(
+    plane: _Plane, milling: Milling, at: Array, deepest: float | None
+) -> tuple[float, float]:
+    """The deepest depth to look at, and the zero-order one, m; errors as :func:`lobes_of`."""
     least = 60.0 * float(plane.turn.max()) / (2.0 * np.pi * WAVES * milling.teeth)
     if at.ndim != 1 or not (np.isfinite(at).all() and (at >= least).all()):
         bound = f"{least:.4g} rpm or more: process damping governs at lower speeds"
@@ -272,6 +377,10 @@ def lobes_of(
     last = DEEPEST * safe if deepest is None else float(deepest)
     if not 0.0 < last < np.inf:
         raise ParameterError("deepest", deepest, "a depth above 0, m")
+    return last, safe
+
+
+def _limits(plane: _Plane, milling: Milling, at: Array, last: float, safe: float) -> Lobes:
     low = min(LOWEST * safe, 0.5 * last)
     found = np.array([plane.limit(milling, float(speed), low, last) for speed in at])
     return Lobes(at, np.minimum(found, last), found > last, safe)
@@ -285,9 +394,10 @@ def stable_depth(
     damping: ArrayLike | None = None,
     tool: ArrayLike = (0.0, 0.0, 0.0),
 ) -> float:
-    """The axial depth that is stable at every spindle speed, zero-order approximation, m.
+    """The axial depth that is stable at every spindle speed in the zero-order approximation, m.
 
-    Infinite where no depth is unstable. Parameters and errors as :func:`stability_lobes`.
+    Teeth that cut by turns can chatter at less at some speeds, see :func:`lobes_between`. Infinite
+    where no depth is unstable. Parameters and errors as :func:`stability_lobes`.
     """
     return stable_depth_of(tool_modes(robot, pose, damping=damping, tool=tool), milling)[0]
 

@@ -22,6 +22,7 @@ import numpy as np
 
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.codegen.lu import independent_rows, is_zero
+from pkm_twin.errors import ParameterError
 from pkm_twin.machine.graph import BASE
 from stiffness_monitor.structure import (
     FREE,
@@ -123,7 +124,7 @@ class Frame:
     """
 
     def __init__(self, model: StructuralModel, *, static: bool = False) -> None:
-        self.size, self.static = PLATFORM, static
+        self.size, self.static, self.rigid_chain = PLATFORM, static, model.rigid_chain
         self.nodes: dict[tuple[str, int], Node] = {
             (BASE, 0): Node((), np.zeros((6, 0)), np.zeros(3)),
             (model.platform, 0): Node(range(PLATFORM), np.eye(6), model.origin),
@@ -223,14 +224,17 @@ class Frame:
         Dependent equations, of an overconstrained machine, count once.
 
         :param tables: in some poses, shape (k, rows, size).
-        :raises ValueError: they hold the platform itself.
+        :raises ParameterError: they hold the platform itself.
         """
         rows = independent_rows(tables[..., PLATFORM:])
         if len(independent_rows(tables)) > len(rows):
-            raise ValueError(
-                "the platform's compliance is not positive: closures constrain the platform "
-                "directly"
-            )
+            chain = self.rigid_chain
+            raise ParameterError(
+                f"joints.{chain[0]}.compliance" if chain else "joints", None,
+                "a compliance of this joint: a chain of rigid bodies connects the base and the "
+                f"platform ({', '.join(chain) or 'closures'}), so the platform has directions "
+                "without compliance",
+            )  # fmt: skip
         # First what closures let through, which is in one equation or two alone.
         weight = np.where(np.arange(PLATFORM, self.size) < self.last, 1.0, 10.0)
         chosen = independent_rows((tables[:, rows, PLATFORM:] * weight).swapaxes(-1, -2))

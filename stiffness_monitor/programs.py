@@ -71,7 +71,7 @@ class Elastic:
     def followers(self) -> Followers | None:
         """Chosen by what closures hold at home and near it; None without closures.
 
-        :raises ValueError: they hold the platform itself.
+        :raises ParameterError: they hold the platform itself.
         """
         if not self.plan.closures:
             return None

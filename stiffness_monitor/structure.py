@@ -171,6 +171,19 @@ class StructuralModel:
             found += [part.support] if isinstance(part, Carried) else [part.inner, part.outer]
         return tuple(s for s in (*found, *(c.support for c in self.closures)) if s is not None)
 
+    @property
+    def rigid_chain(self) -> tuple[str, ...]:
+        """Joints between the base and the platform with rigid bodies alone; empty without one."""
+        edges = [(p.support.body, p.name, p.support) for p in self.parts if isinstance(p, Carried)]
+        edges += [(c.inner[0], c.support.body, c.support) for c in self.closures]
+        chains: dict[str, tuple[str, ...]] = {BASE: ()}
+        for _ in edges:
+            for one, other, support in edges:
+                for near, far in ((one, other), (other, one)):
+                    if near in chains:
+                        chains.setdefault(far, (*chains[near], support.joint))
+        return chains.get(self.platform, ())
+
 
 def structural_model(robot: Robot, q: ArrayLike) -> StructuralModel:
     """The model at joint positions, shape (n,), on numbers.

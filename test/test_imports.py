@@ -8,6 +8,7 @@ from graphlib import TopologicalSorter
 
 import pytest
 
+from pkm_twin.apps.groups import TASKS
 from test.support.sources import ROOT, arrows, imports, room, sources, within
 
 OWN = {"pkm_twin.errors", "pkm_twin.files", "pkm_twin.threads"}
@@ -95,12 +96,24 @@ def test_only_nodes_and_the_ros_package_import_ros():
                 assert not ROS.fullmatch(name.split(".")[0]), f"{module} imports {name}"
 
 
+def loaded_by(code):
+    code += "; import sys; print(*sorted(sys.modules))"
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, check=True)
+    return set(done.stdout.decode().split())
+
+
 def test_a_command_and_a_node_start_without_what_they_may_never_need():
     """Parts of scipy take longer to load than all the rest of a command."""
-    code = (
-        "import pkm_twin.apps.cli, delta_dynamics, stiffness_monitor, pkm_twin.state, sys;"
-        "print(*sorted(sys.modules))"
+    commands = {
+        f"pkm_twin.apps.{entry.place.partition(':')[0]}"
+        for entries in TASKS.values()
+        for entry in entries.values()
+    }
+    loaded = loaded_by(
+        f"import {', '.join(commands)}, delta_dynamics, stiffness_monitor, pkm_twin.state"
     )
-    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, check=True)
     parts = ("linalg", "optimize", "signal", "special", "stats")
-    assert not {f"scipy.{part}" for part in parts} & set(done.stdout.decode().split())
+    assert not {f"scipy.{part}" for part in parts} & loaded
+    # A command is loaded when it is asked for.
+    assert not commands & loaded_by("import pkm_twin.apps.cli")
+    assert "numpy" not in loaded_by("import pkm_twin.apps.cli")

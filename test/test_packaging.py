@@ -58,10 +58,10 @@ def run(*command, cwd, **environment):
 
 @pytest.fixture(scope="module")
 def copy(tmp_path_factory):
-    """A clean copy of the tree, without tests."""
+    """A clean copy of the tree, with this file of its tests."""
     target = tmp_path_factory.mktemp("workspace") / "src/pkm_twin"
     for name in tracked():
-        if name.parts[0] != "test":
+        if name.parts[0] != "test" or name.name == Path(__file__).name:
             (target / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copy2(REPOSITORY / name, target / name)
     return target
@@ -226,7 +226,8 @@ class TestColcon:
         workspace = copy.parents[1]
         # The build's Python is this one, as an unactivated venv needs to be told.
         path = os.pathsep.join((str(COLCON.parent), os.environ["PATH"]))
-        run(COLCON, "build", cwd=workspace, PATH=path)
+        run(COLCON, "build", cwd=workspace, PATH=path, PYTHONDONTWRITEBYTECODE="")
+        assert not (workspace / "log/latest_build/pkm_twin/stderr.log").read_text()
         prefix = workspace / "install/pkm_twin"
         assert {file.name for file in (prefix / "lib/pkm_twin").iterdir()} == EXECUTABLES
         share = prefix / "share/pkm_twin"
@@ -244,6 +245,9 @@ class TestColcon:
         check_installation(site, tmp_path)
 
         start = prefix / "lib/pkm_twin/pkm-twin"
+        sourced = "COLCON_CURRENT_PREFIX=$PWD/install . install/local_setup.sh"
+        found = run("sh", "-c", f"{sourced}; command -v pkm-twin", cwd=workspace, PATH=path)
+        assert found.strip() == str(start)
         listed = run(sys.executable, start, "robots", cwd=tmp_path, PYTHONPATH=str(site))
         assert {line.split()[0] for line in listed.splitlines()} == robots()
         if find_spec("rclpy"):

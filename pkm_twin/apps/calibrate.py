@@ -16,7 +16,7 @@ from rich.text import Text
 
 from pkm_twin.apps.limits import beyond_limits as find_beyond
 from pkm_twin.apps.limits import refuse_beyond
-from pkm_twin.apps.options import Accept, BeyondLimits, Json, RobotName
+from pkm_twin.apps.options import Accept, BeyondLimits, Json, Platform, RobotName
 from pkm_twin.apps.partial_report import (
     WIDTH,
     outlier_texts,
@@ -106,7 +106,7 @@ def calibrate_command(
         ),
     ] = [],  # noqa: B006  typer copies it
     unit: Annotated[
-        str, typer.Option(help="of x, y and z where their headers have none: m, cm, mm or um")
+        str, typer.Option(help="of x, y and z where their headers have none: m, cm, mm or µm (um)")
     ] = "m",
     measure: Annotated[
         list[str],
@@ -137,6 +137,7 @@ def calibrate_command(
         OptionalText,
         typer.Option(help="where a plan measures: x=-0.1:0.1,z=0 (m, rad); default: everywhere"),
     ] = None,
+    platform: Platform = None,
     beyond_limits: BeyondLimits = False,
     accept: Accept = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="replace the file")] = False,
@@ -165,7 +166,7 @@ def calibrate_command(
     if plan is not None and plan.suffix != ".csv":
         raise ParameterError("plan", str(plan), "a name that ends in .csv")
     refuse_existing(plan or out, overwrite, poses)
-    machine = load(robot)
+    machine = load(robot, platform=platform)
     kinds = kinds_of(measure or (["position"] if plan else []))
     known, named = parse_noise(noise), parse_columns(columns)
     measured: Poses | Partial | None = None

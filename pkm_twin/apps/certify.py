@@ -22,7 +22,13 @@ from pkm_twin.apps.certificate.description import UnfitError
 from pkm_twin.apps.certificate.maximal import Maximal
 from pkm_twin.apps.certificate.states import States, random_states
 from pkm_twin.console import finite
-from pkm_twin.errors import ParameterError, PkmTwinError, install
+from pkm_twin.errors import (
+    ParameterError,
+    PkmTwinError,
+    SingularityError,
+    UnreachableError,
+    install,
+)
 from pkm_twin.robot.robot import Robot
 from pkm_twin.robot.robot_urdf import robot_description
 from pkm_twin.robot.variation import KINDS, varied
@@ -94,6 +100,7 @@ class Certificate:
     seed: int
     states: int
     drawn: int
+    skipped: int
     mobility: int
     rank: int
     rows: int
@@ -119,6 +126,7 @@ class Certificate:
             "states": self.states,
             "variants": self.variants,
             "drawn": self.drawn,
+            "skipped": self.skipped,
             "mobility": self.mobility,
             "rank": self.rank,
             "constraints": self.rows,
@@ -158,9 +166,17 @@ def certify(
     :param progress: is told how many of ``states`` are done.
     :raises PkmTwinError: a machine that no judge can compute, or no state that all can reach.
     """
+
+    def reaches(q: Array) -> bool:
+        try:
+            robot.forward(q)
+        except (SingularityError, UnreachableError):
+            return False
+        return True
+
     try:
         first = Maximal(description)
-        drawn = random_states(first, np.random.default_rng(seed), states)
+        drawn = random_states(first, np.random.default_rng(seed), states, reaches)
     except UnfitError as error:
         raise PkmTwinError(f"{robot.name} cannot be cross-checked: {error}") from None
     judges: dict[str, Judge] = {}
@@ -187,6 +203,7 @@ def certify(
         seed,
         states,
         drawn.drawn,
+        drawn.skipped,
         first.home.mobility,
         first.home.rank,
         first.home.rows,
@@ -231,7 +248,10 @@ def certify_variants(
     ]  # fmt: skip
     missing = {name: reason for one in found for name, reason in one.missing.items()}
     states = sum(one.drawn for one in found)
-    return replace(found[0], items=items, missing=missing, drawn=states, variants=count)
+    skipped = sum(one.skipped for one in found)
+    return replace(
+        found[0], items=items, missing=missing, drawn=states, skipped=skipped, variants=count
+    )
 
 
 def drawn(robot: Robot, seed: int) -> Robot:

@@ -9,7 +9,7 @@ import typer
 from rich.table import Table
 from rich.text import Text
 
-from pkm_twin.apps.options import REFUSED, Json, RobotName
+from pkm_twin.apps.options import REFUSED, Json, Platform, RobotName
 from pkm_twin.console import print_json, progress, table_console
 
 
@@ -26,6 +26,7 @@ def certify(
             min=0, max=10000, help="also check this many machines with other lengths and masses"
         ),
     ] = 0,
+    platform: Platform = None,
     as_json: Json = False,
 ) -> None:
     """Cross-check a robot with independent engines.
@@ -35,6 +36,7 @@ def certify(
     loop constraints each; `pip install '.[certificate]'`). The command compares torques with
     wrench, payload and friction, the platform's pose and Jacobian, and the mass matrix, at random
     states inside the limits. It also checks the round trip from joint positions to pose and back.
+    States beyond a singularity on pkm_twin's way from home are skipped and counted.
 
     --variants N repeats this for N machines whose masses, inertias, friction and lengths are drawn
     at random, with a relative standard deviation of 2 %. If a machine
@@ -51,7 +53,7 @@ def certify(
         raise typer.BadParameter(f"no engine {unknown[0]!r}; there are {', '.join(ENGINES)}")
     with progress("states", states * (variants + 1)) as update:
         result = certify_variants(
-            load(robot), variants, seed=seed, progress=update,
+            load(robot, platform=platform), variants, seed=seed, progress=update,
             states=states, engines=engine or tuple(ENGINES),
         )  # fmt: skip
     if as_json:
@@ -70,6 +72,11 @@ def certify(
             values = (f"{value:.1e}" for value in (item.worst, item.median, item.bound))
             table.add_row(item.engine, item.what.replace("_", " "), *values, verdict)
         table_console().print(table)
+        if result.skipped:
+            typer.echo(
+                f"{result.skipped} of {result.drawn} states drawn were skipped: pkm_twin meets a "
+                "singularity on the way from home"
+            )
         for name, reason in result.missing.items():
             typer.echo(f"{name} was not used: {reason}")
         typer.echo("good" if result.good else "bad")

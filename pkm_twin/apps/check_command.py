@@ -20,10 +20,11 @@ from pkm_twin.apps.options import (
     LoadTimes,
     OptionalRobot,
     Payload,
+    Platform,
     load_of,
 )
 from pkm_twin.console import print_json, progress, table_console, tell
-from pkm_twin.errors import PkmTwinError, one_line
+from pkm_twin.errors import ParameterError, PkmTwinError, one_line
 from pkm_twin.options import OptionalPath, OptionalText
 from pkm_twin.threads import one_blas_thread_for_children
 
@@ -45,6 +46,7 @@ class Request:
     carried: Load | None
     history: Path | None
     machine: str | None
+    platform: str | None = None
 
 
 def bags_of(folder: Path) -> list[Path]:
@@ -62,15 +64,21 @@ def is_collection(path: Path) -> bool:
     return bool(bags_of(path)) and not any(path.glob("*.db3"))
 
 
-def check_one(path: Path, request: Request, update: Any = None) -> CheckReport:
+def check_one(
+    path: Path, request: Request, update: Any = None, thorough: bool = True
+) -> CheckReport:
     """Judge a recording, and append it to the history; errors as ``read_recording``."""
+    from pkm_twin import load
     from pkm_twin.apps.check import Bounds, judged
     from pkm_twin.apps.recorded import read_recording
 
-    recording = read_recording(
-        path, request.robot, update, topics=request.topics, carried=request.carried
-    )
-    report = judged(recording, Bounds(residual=request.residual))
+    robot: Any = request.robot
+    if request.platform is not None:
+        if robot is None:
+            raise ParameterError("--robot", None, "a file, for the platform that --platform names")
+        robot = load(robot, platform=request.platform)
+    recording = read_recording(path, robot, update, topics=request.topics, carried=request.carried)
+    report = judged(recording, Bounds(residual=request.residual), thorough)
     if request.history is not None:
         from pkm_twin.apps.history import append, measure, recorded_at
 
@@ -84,7 +92,7 @@ def check_one(path: Path, request: Request, update: Any = None) -> CheckReport:
 def _facts(path: Path, request: Request) -> dict[str, Any]:
     """One recording of many, as plain data; a damaged one too."""
     try:
-        return check_one(path, request).as_json()
+        return check_one(path, request, thorough=False).as_json()
     except (PkmTwinError, OSError) as error:
         return {"bag": str(path), "good": False, "error": one_line(str(error))}
 
@@ -118,10 +126,13 @@ def _check_folder(folder: Path, request: Request, jobs: int, as_json: bool) -> b
         return good
     for result in results:
         bad = [item["what"] for item in result.get("items", ()) if item["verdict"] == "bad"]
-        why = result.get("error") or ("bad: " + ", ".join(bad) if bad else "good")
+        found = ", ".join(bad) or result.get("not_judged")
+        why = result.get("error") or f"{result['answer']}{f': {found}' if found else ''}"
         typer.echo(f"{result['bag']}: {why}")
     count = sum(not result["good"] for result in results)
-    typer.echo(f"{len(results)} recordings, {count} bad" if count else f"{len(results)} good")
+    open_ = sum(result.get("answer") == "not judged" for result in results)
+    counts = f", {count - open_} bad" + (f", {open_} not judged" if open_ else "")
+    typer.echo(f"{len(results)} recordings{counts}" if count else f"{len(results)} good")
     return good
 
 
@@ -152,6 +163,7 @@ def check(
     machine: Annotated[
         OptionalText, typer.Option(help="name in the history; default: the robot's")
     ] = None,
+    platform: Platform = None,
     jobs: Annotated[int, typer.Option(help="processes for a folder of bags", min=1)] = 1,
     as_json: Json = False,
 ) -> None:
@@ -170,7 +182,7 @@ def check(
     from pkm_twin.bags.reader import DamagedBagError
 
     carried = load_of(payload, load_times)
-    request = Request(robot, residual, tuple(topic), carried, history, machine)
+    request = Request(robot, residual, tuple(topic), carried, history, machine, platform)
     if is_collection(bag):
         if not _check_folder(bag, request, jobs, as_json):
             raise typer.Exit(REFUSED)
@@ -193,8 +205,10 @@ def check(
         if not report.unsure:
             typer.echo("uncertainty: none in the robot file, so the model has no uncertainty band")
         table_console().print(items_table(f"{report.bag}: {report.robot}", "limit", report.items))
+        for cause in report.causes:
+            typer.echo(f"explanation: {cause}")
         bad, unknown = report.named(Verdict.BAD), report.named(Verdict.UNKNOWN)
-        text = f"bad: {', '.join(bad)}" if bad else "good"
+        text = f"{report.answer}: {', '.join(bad) or report.unjudged}".removesuffix(": ")
         typer.echo(text + (f"; not judged: {', '.join(unknown)}" if unknown else ""))
     if not report.good:
         raise typer.Exit(REFUSED)

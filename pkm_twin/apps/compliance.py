@@ -8,7 +8,8 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from pkm_twin.apps.options import BeyondLimits, Json, RobotName
+from pkm_twin.apps import export, maps  # noqa: F401  maps adds its commands to atlas
+from pkm_twin.apps.options import BeyondLimits, Json, Platform, RobotName
 from pkm_twin.console import numbers, print_json
 from pkm_twin.errors import PkmTwinError
 
@@ -26,6 +27,7 @@ def compliance(
             "axes"
         ),
     ] = "0,0,1,0,0,0",
+    platform: Platform = None,
     beyond_limits: BeyondLimits = False,
     as_json: Json = False,
 ) -> None:
@@ -42,7 +44,7 @@ def compliance(
     from pkm_twin.apps.limits import refuse_beyond
     from stiffness_monitor import compliance_deviation, deflection_deviation, strain_energy
 
-    machine = load(robot)
+    machine = load(robot, platform=platform)
     names = ", ".join(
         f"{name} ({unit})"
         for name, unit in zip(machine.pose_names, machine.pose_units, strict=True)
@@ -98,7 +100,7 @@ def compliance(
         for name, v in zip(axes, energy.deflection, strict=True)
     )
     typer.echo(f"\nunder the wrench {wrench} (N, N m)")
-    typer.echo(f"deflection (um, urad): {', '.join(moved)}")
+    typer.echo(f"deflection (µm, µrad): {', '.join(moved)}")
     shares = sorted(zip(energy.factors, energy.elements, strict=True), key=lambda pair: -pair[0])
     dominant = (
         f"dominant elements, with equal shares: {', '.join(tied)}"

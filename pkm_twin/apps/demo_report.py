@@ -16,8 +16,8 @@ from rich.table import Table
 
 from delta_dynamics import inverse_dynamics
 from pkm_twin import load
-from pkm_twin.apps.check import motion
 from pkm_twin.apps.recorded import Recording, read_recording
+from pkm_twin.apps.recorded_motion import motion
 from pkm_twin.bags.reader import inspect, read_messages
 from pkm_twin.messages.stamps import stamp_of
 from pkm_twin.robot.robot import Robot
@@ -236,7 +236,7 @@ def report_stiffness(
         )
     )
     largest = np.linalg.norm(fixed, axis=1).max()
-    findings.append(Finding(prefix, "largest deflection", f"{1e6 * largest:.2f} um"))
+    findings.append(Finding(prefix, "largest deflection", f"{1e6 * largest:.2f} µm"))
     findings.append(share(prefix, "deflections with ground truth", len(judged), len(truth)))
     if judged:
         place = np.searchsorted(common, judged)
@@ -248,7 +248,7 @@ def report_stiffness(
             Finding(
                 prefix,
                 "RMS difference to the frame's deflection",
-                f"{100 * error:.1f} % (frame's largest {greatest:.2f} um)",
+                f"{100 * error:.1f} % (frame's largest {greatest:.2f} µm)",
                 f"below {100 * MAX_DEFLECTION_ERROR:g} %",
                 bool(error < MAX_DEFLECTION_ERROR),
             )

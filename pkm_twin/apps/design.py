@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import math
 from functools import partial
 from typing import Annotated, Final
 
@@ -47,9 +46,14 @@ def design_command(
     tolerance: Annotated[
         list[str],
         typer.Option(
-            help="PATH=SIGMA: the standard deviation of a value; prints the pose error budget"
+            help="PATH=SIGMA: the standard deviation of a part's error, e.g. "
+            "rods.left_1.length=2e-5; prints the pose error budget"
         ),
     ] = [],  # noqa: B006
+    monte_carlo: Annotated[
+        int,
+        typer.Option(help="of --tolerance: machines to draw and assemble exactly as well", min=0),
+    ] = 0,
     sweep: Annotated[
         OptionalText,
         typer.Option(help="grid or sobol: compute machines within the bounds into --out FILE.nc"),
@@ -99,10 +103,13 @@ def design_command(
 
     --sweep writes all quantities of machines within the bounds to a NetCDF file, with --scheduler
     computed by a Dask cluster. --tolerance prints
-    the standard deviations of the platform's position and rotation, with the share of each value,
-    on the path or, without --path, over the workspace.
+    the standard deviations of the platform's position and rotation, with the share of each part,
+    on the path or, without --path, over the workspace. The actuated joints keep their positions.
+    Parts are rods.NAME.length, bodies.NAME.length, joints.NAME.at[0..2], joints.NAME.axis[0..1] and
+    joints.NAME.offset; with limbs. in front all copies are alike.
     """
     from pkm_twin.apps import design_report as report
+    from pkm_twin.apps.tolerances import budget, parse_tolerances
     from pkm_twin.design import design as find
     from pkm_twin.design import sweep as sweep_box
     from pkm_twin.design.optimise import searches
@@ -113,16 +120,22 @@ def design_command(
     for target in (out, picture):
         if target is not None:
             refuse_existing(target, overwrite, path)
-    machine, _ = loaded(robot, platform, payload)
+    machine, carried = loaded(robot, platform, payload)
     load_on = None if wrench is None else numbers(wrench, 6, "fx,fy,fz,mx,my,mz")
     if tolerance:
         if vary or minimise or sweep or subject_to or out or picture:
-            raise typer.BadParameter("--tolerance can only be combined with --path and --json")
-        answer(*report.budget(machine, _sigmas(tolerance), path), as_json)
+            raise typer.BadParameter(
+                "--tolerance can only be combined with --path, --wrench, --monte-carlo, --seed and "
+                "--json"
+            )
+        sigma = parse_tolerances(tolerance)
+        answer(*budget(machine, sigma, path, load_on, monte_carlo, seed), as_json)
         return
+    if monte_carlo:
+        raise typer.BadParameter("--monte-carlo needs --tolerance")
     if path is None:
         raise typer.BadParameter("give the motion with --path, see `pkm-twin path`")
-    machine, way = report.read_path(path, machine, load_on)
+    machine, way = report.read_path(path, machine, load_on, carried)
     box = parse_vary(vary)
     if sweep is not None:
         if sweep not in SWEEPS:
@@ -159,17 +172,3 @@ def design_command(
     if picture is not None:
         report.draw(machine, result, way, picture)
     answer(*report.told(machine, box, result, way, out, picture), as_json)
-
-
-def _sigmas(texts: list[str]) -> dict[str, float]:
-    found = {}
-    for text in texts:
-        path, _, value = text.rpartition("=")
-        try:
-            sigma = float(value)
-        except ValueError:
-            sigma = math.nan
-        if not path or not sigma >= 0.0:
-            raise ParameterError("tolerance", text, "PATH=SIGMA, a standard deviation of 0 or more")
-        found[path] = sigma
-    return found

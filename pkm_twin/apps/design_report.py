@@ -11,13 +11,14 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from pkm_twin.apps.loads import Load
+from pkm_twin.apps.sizes import compared
 from pkm_twin.apps.torques import motion_of
 from pkm_twin.console import finite
-from pkm_twin.design import QUANTITIES, Design, DesignPoint, PosePath, Sweep, pose_errors
+from pkm_twin.design import QUANTITIES, Design, DesignPoint, PosePath, Sweep
 from pkm_twin.design.pose_path import Followed
-from pkm_twin.design.tolerance import workspace_states
 from pkm_twin.design.variants import Variants
-from pkm_twin.errors import ParameterError
+from pkm_twin.errors import ParameterError, warn
 from pkm_twin.maps import plots
 from pkm_twin.maps.extras import require
 from pkm_twin.maps.store import writing
@@ -27,25 +28,29 @@ from pkm_twin.robot.robot import Robot
 
 Array = NDArray[np.float64]
 
-STATES: Final = 2000
-"""Joint states that stand for the workspace in an error budget."""
 FILE_DIGITS: Final = 12
 """Significant digits of a number that is written."""
 
 
-def read_path(path: Path, robot: Robot, wrench: Sequence[float] | None) -> tuple[Robot, PosePath]:
+def read_path(
+    path: Path, robot: Robot, wrench: Sequence[float] | None, carried: Load | None
+) -> tuple[Robot, PosePath]:
     """The robot with the motion's payload, and the platform's path.
 
+    :param carried: in place of the motion's payload.
     :raises ParameterError: a table that is no motion, or a payload that is held part of the time.
     :raises BagError: a bag without a motion.
     """
-    motion = motion_of(path, robot)
+    motion = motion_of(path, robot, (), carried)
     if motion.load is not None:
-        if motion.load.times:
+        held = motion.load.held(motion.time)
+        if not held.all():
             raise ParameterError(
                 f"{path}: payload", str(motion.load), "one that is held throughout"
             )
         robot = motion.load.on(robot)
+    if robot.has_masses and (unlike := compared(motion, "file").unlike):
+        warn(path, unlike)
     load = motion.wrench + (np.zeros(6) if wrench is None else np.asarray(wrench))
     way = PosePath.of_joints(robot, motion.time, motion.q, motion.qd, motion.qdd, load)
     return robot, way
@@ -241,56 +246,3 @@ def write_sweep(
     result = {"robot": robot.name, "machines": count, "rejected": lost, "out": str(out)}
     text = f"{robot.name}: {count} machines, {lost} cannot follow the path\n{out}"
     return result, text
-
-
-def budget(robot: Robot, sigma: Mapping[str, float], path: Path | None) -> tuple[Any, str]:
-    """The pose error budget of tolerances as plain data and as text."""
-    if path is None:
-        q, where = workspace_states(robot, STATES), "the workspace"
-    else:
-        q, where = robot.inverse(read_path(path, robot, None)[1].pose), path.name
-    found = pose_errors(robot, q, sigma)
-    units = {name: entries(robot).get(name, (0.0, ""))[1] for name in sigma}
-    order = sorted(sigma, key=lambda name: -found.share(name))
-
-    def rms(values: Array) -> float:
-        return float(np.sqrt((values**2).mean()))
-
-    rows: dict[str, Any] = {}
-    for name in order:
-        moves = np.linalg.norm(found.parts[name][:, :3], axis=-1)
-        turns = np.linalg.norm(found.parts[name][:, 3:], axis=-1)
-        rows[name] = {
-            "sigma": sigma[name], "unit": units[name], "rms_position_m": rms(moves),
-            "greatest_position_m": float(moves.max()), "rms_angle_rad": rms(turns),
-            "greatest_angle_rad": float(turns.max()), "share": found.share(name),
-        }  # fmt: skip
-    worst = int(found.position.argmax())
-    data: dict[str, Any] = {
-        "robot": robot.name, "states": len(q), "path": None if path is None else str(path),
-        "contributions": rows, "rms_position_m": rms(found.position),
-        "greatest_position_m": float(found.position.max()), "rms_angle_rad": rms(found.angle),
-        "greatest_angle_rad": float(found.angle.max()),
-        "worst_pose": robot.forward(q[worst]).tolist(),
-    }  # fmt: skip
-    lines = [
-        f"{robot.name}: standard deviation of the platform's position (mm) and rotation (mrad) "
-        f"over {where}, {len(q)} states",
-        f"{'value':34}{'sigma':>12} {'unit':8}{'RMS mm':>10}{'max mm':>10}{'RMS mrad':>10}"
-        f"{'share':>8}",
-    ]
-    for name, row in rows.items():
-        lines.append(
-            f"{name:34}{row['sigma']:12.4g} {row['unit']:8}{1e3 * row['rms_position_m']:10.4g}"
-            f"{1e3 * row['greatest_position_m']:10.4g}{1e3 * row['rms_angle_rad']:10.4g}"
-            f"{100 * row['share']:7.3g}%"
-        )
-    lines.append(
-        f"{'all':34}{'':21}{1e3 * data['rms_position_m']:10.4g}"
-        f"{1e3 * data['greatest_position_m']:10.4g}{1e3 * data['rms_angle_rad']:10.4g}"
-    )
-    pose = zip(robot.pose_names, data["worst_pose"], strict=True)
-    lines.append(
-        "largest position deviation at " + ", ".join(f"{name} {value:.4g}" for name, value in pose)
-    )
-    return data, "\n".join(lines)

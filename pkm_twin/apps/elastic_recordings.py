@@ -5,29 +5,30 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pkm_twin.apps.columns import read_columns, times_of
-from pkm_twin.apps.recorded import (
-    BASE_FRAME,
-    WRENCH_AXES,
-    Recording,
-    read_recording,
-    recorded_wrench,
-)
-from pkm_twin.apps.topics import TRANSFORM, require_definition
+from pkm_twin.apps.recorded import WRENCH_AXES, read_recording
+from pkm_twin.apps.topics import TRANSFORM, is_truth, require_definition
+from pkm_twin.apps.wrench_frames import FRAMES
 from pkm_twin.bags.reader import Bag, open_bag
 from pkm_twin.bags.storage import is_bag
 from pkm_twin.errors import BagError, MessageError, ParameterError, UnknownNameError, one_line
 from pkm_twin.identification.elastic_fit import AXES, Deflected
 from pkm_twin.messages.reading import TINY
 from pkm_twin.messages.stamps import SECOND, StampRules
-from pkm_twin.messages.wrenches import MAX_FORCE, MAX_MOMENT
+from pkm_twin.messages.wrenches import MAX_FORCE, MAX_MOMENT, WrenchSample
 from pkm_twin.robot.robot import Robot
-from pkm_twin.streams.deflection import MAX_SHIFT, MAX_TURN, in_base_axes, read_deflection
+from pkm_twin.streams.deflection import (
+    MAX_SHIFT,
+    MAX_TURN,
+    DeflectionSample,
+    in_base_axes,
+    read_deflection,
+)
 
 Array = NDArray[np.float64]
 Stamps = NDArray[np.int64]
@@ -117,39 +118,24 @@ def _of_bag(path: Path, robot: Robot, topics: Sequence[str]) -> Deflected:
     for what, found in ((r.topics.wrench, wrenches), (chosen, deflections)):
         if not found:
             raise BagError(f"no usable message on {what}", path=path, reason="no messages")
-    stamps = np.array([stamp for stamp, _, _ in deflections], np.int64)
-    times = np.array([stamp for stamp, _, _ in wrenches], np.int64)
+    stamps = np.array([one.stamp for one in deflections], np.int64)
+    times = np.array([one.stamp for one in wrenches], np.int64)
     near = (_apart(stamps, times) <= APART) & (_apart(stamps, r.stamps) <= APART)
     if not near.any():
         raise BagError(
             f"no deflection on {chosen} has a wrench and a joint state within {APART:g} s",
             path=path, reason="no pairs",
         )  # fmt: skip
-    values = np.array([value for _, _, value in deflections])[near]
-    frames = np.array([frame for _, frame, _ in deflections])[near]
-    return _paired(one_line(path.name, 100), r, stamps[near], (times, wrenches), (frames, values))
-
-
-def _paired(
-    name: str, r: Recording, stamps: Stamps, wrenches: tuple[Stamps, Any], deflections: Any
-) -> Deflected:
-    """Joints and wrench at the deflections' stamps, all in base axes."""
-    times, messages = wrenches
-    frames, values = deflections
-    q = _between(stamps, r.stamps, r.q)
+    values = np.array([one.values for one in deflections])[near]
+    in_base = np.array([one.frame == FRAMES.get().base_frame for one in deflections])[near]
+    q = _between(stamps[near], r.stamps, r.q)
     rotation = r.robot.platform(q)[1]
-    loads = _between(stamps, times, np.array([value for _, _, value in messages]))
-    # All frames but the base's turn with the platform; between two frames there is no middle.
-    found = sorted({frame for _, frame, _ in messages})
-    if len(found) > 1:
-        raise BagError(
-            f"wrenches in several frames, {', '.join(found[:3])}", path=name, reason="frames"
-        )
-    if found != [BASE_FRAME]:
+    loads = _between(stamps[near], times, np.array([one.wrench for one in wrenches]))
+    if r.topics.frame != FRAMES.get().base_frame:
         loads = in_base_axes(loads, rotation)
-    turned = in_base_axes(values, rotation)
-    deflection = np.where((frames == BASE_FRAME)[:, None], values, turned)
-    return Deflected(name, (stamps - stamps[0]) / SECOND, q, loads, deflection)
+    deflection = np.where(in_base[:, None], values, in_base_axes(values, rotation))
+    time = (stamps[near] - stamps[near][0]) / SECOND
+    return Deflected(one_line(path.name, 100), time, q, loads, deflection)
 
 
 def _deflection_topic(bag: Bag, wanted: Sequence[str]) -> str:
@@ -161,7 +147,10 @@ def _deflection_topic(bag: Bag, wanted: Sequence[str]) -> str:
     fit = list(wanted) or [
         name
         for name, info in topics.items()
-        if info.type == TRANSFORM and info.count and name.split("/")[-2:] != OWN
+        if info.type == TRANSFORM
+        and info.count
+        and name.split("/")[-2:] != OWN
+        and not is_truth(name)
     ]
     usual = [name for name in fit if name.split("/")[-1] == MEASURED]
     if not fit:
@@ -180,21 +169,27 @@ def _deflection_topic(bag: Bag, wanted: Sequence[str]) -> str:
     return chosen
 
 
-def _messages(bag: Bag, wrench: str, deflection: str) -> tuple[list[Any], list[Any]]:
-    """Stamps (ns), frames and values of both, in the order of their stamps; bad ones left out."""
+def _messages(
+    bag: Bag, wrench: str, deflection: str
+) -> tuple[list[WrenchSample], list[DeflectionSample]]:
+    """Samples of both in the order of their stamps; bad ones left out."""
+    read_one = FRAMES.get().reader()
     rules = StampRules(future_tolerance=2**62)
-    wrenches: dict[int, Any] = {}
-    deflections: dict[int, Any] = {}
+    wrenches: dict[int, WrenchSample] = {}
+    deflections: dict[int, DeflectionSample] = {}
     for message in bag.messages([wrench, deflection]):
         try:
             if message.topic == wrench:
-                one = recorded_wrench(message.message, message.log_time, rules)
-                wrenches[one[0]] = one
+                one = read_one(message.message, message.log_time)
+                wrenches[one.stamp] = one
             else:
                 sample = read_deflection(message.message, message.log_time, rules)
                 deflections[sample.stamp] = sample
-        except MessageError:
-            continue
+        except MessageError as error:
+            # Between wrenches of two frames there is no middle.
+            if error.reason == "frame" and message.topic == wrench:
+                text = f"{wrench}: {error}"
+                raise BagError(text, path=bag.report.path, reason="frames") from None
     return [wrenches[k] for k in sorted(wrenches)], [deflections[k] for k in sorted(deflections)]
 
 

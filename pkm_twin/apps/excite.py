@@ -10,7 +10,7 @@ import numpy as np
 import typer
 from numpy.typing import NDArray
 
-from pkm_twin.apps.options import Json, OverwriteBoth, RobotName
+from pkm_twin.apps.options import Json, OverwriteBoth, Platform, RobotName
 from pkm_twin.console import print_json, progress, refuse_existing, writing
 from pkm_twin.errors import BagError, ParameterError
 from pkm_twin.options import OptionalFloat, OptionalPath, file_name
@@ -54,6 +54,7 @@ def excite(
     ] = 0.1,
     trials: Annotated[int, typer.Option(help="number of trajectories to try", min=10)] = 300,
     seed: Annotated[int, typer.Option(help="seed of the trials", min=0)] = 0,
+    platform: Platform = None,
     overwrite: OverwriteBoth = False,
     json_output: Json = False,
 ) -> None:
@@ -74,7 +75,7 @@ def excite(
     from pkm_twin.identification.file_parameters import file_parameters
 
     table = checked_outputs(out, overwrite)
-    machine = load(robot)
+    machine = load(robot, platform=platform)
     judge = Judge.of(machine, file_parameters(machine, kinds_of(what)))
     other = None if beside is None else _condition_of(beside, judge)
     bounds = Bounds(share, acceleration, singularity, rate)

@@ -10,7 +10,8 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from pkm_twin.apps.options import RobotName
+from pkm_twin.apps.options import Platform, RobotName
+from pkm_twin.apps.printer import export_printer
 from pkm_twin.console import refuse_existing
 from pkm_twin.errors import ParameterError, UnknownNameError
 from pkm_twin.files import replace_file
@@ -30,6 +31,7 @@ def moveit(
     kinematics_plugin: Annotated[
         str, typer.Option(help="MoveIt's plugin for the inverse kinematics", metavar="NAME")
     ] = "",
+    platform: Platform = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="replace its files")] = False,
 ) -> None:
     """Write a MoveIt configuration: URDF, SRDF, limits, controllers, kinematics and a launch file.
@@ -40,7 +42,7 @@ def moveit(
     from pkm_twin import load
     from pkm_twin.export.moveit import moveit_package
 
-    loaded = load(robot)
+    loaded = load(robot, platform=platform)
     _write(out, moveit_package(loaded, _accelerations(loaded), kinematics_plugin), overwrite)
 
 
@@ -48,6 +50,7 @@ def moveit(
 def c(
     robot: RobotName,
     out: Annotated[Path, typer.Option(help="folder of the new package")],
+    platform: Platform = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="replace its files")] = False,
 ) -> None:
     """Write kinematics, dynamics and elasticity as C99 that needs only math.h.
@@ -59,7 +62,7 @@ def c(
     from pkm_twin import load
     from pkm_twin.export.c_package import c_package
 
-    _write(out, c_package(load(robot)), overwrite)
+    _write(out, c_package(load(robot, platform=platform)), overwrite)
 
 
 @app.command("ros2-control")
@@ -72,18 +75,19 @@ def ros2_control(
             help="bandwidth for the gains, from the masses at home; 0: no gains", metavar="HZ"
         ),
     ] = 0.0,
+    platform: Platform = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="replace its files")] = False,
 ) -> None:
     """Write a package of C++ plugins for ros2_control.
 
-    A chainable feedforward controller (inverse dynamics plus PD), a kinematics_interface and an
-    inverse_dynamics_solver use the robot's exported C. Build the package with colcon; it builds
-    and runs without pkm_twin.
+    A chainable feedforward controller (inverse dynamics plus PD), a gravity controller to fall back
+    to, a kinematics_interface and an inverse_dynamics_solver use the robot's exported C. Build the
+    package with colcon; it builds and runs without pkm_twin.
     """
     from pkm_twin import load
     from pkm_twin.export.ros2_control import ros2_control_package
 
-    _write(out, ros2_control_package(load(robot), bandwidth), overwrite)
+    _write(out, ros2_control_package(load(robot, platform=platform), bandwidth), overwrite)
 
 
 @app.command()
@@ -94,6 +98,7 @@ def fmu(
     kind: Annotated[
         str, typer.Option(help="dynamics: motion under efforts; torques: efforts of a motion")
     ] = "dynamics",
+    platform: Platform = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="replace the file")] = False,
 ) -> None:
     """Write a Functional Mock-up Unit, for model exchange and co-simulation.
@@ -111,7 +116,7 @@ def fmu(
     compiler = units.found_compiler()
     if compiler is None:
         typer.echo("warning: no C compiler found: the FMU has sources and no binary", err=True)
-    replace_file(out, units.Fmu(load(robot), fmi, kind).archive(compiler))
+    replace_file(out, units.Fmu(load(robot, platform=platform), fmi, kind).archive(compiler))
     typer.echo(out)
 
 
@@ -119,6 +124,7 @@ def fmu(
 def mjcf(
     robot: RobotName,
     out: Annotated[Path, typer.Option(help="the file to write", metavar="FILE.xml")],
+    platform: Platform = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="replace the file")] = False,
 ) -> None:
     """Write an MJCF for MuJoCo: bodies, loops as constraints, motors, a keyframe at home."""
@@ -126,7 +132,7 @@ def mjcf(
     from pkm_twin import load
     from pkm_twin.robot.robot_urdf import robot_mjcf
 
-    loaded = load(robot)
+    loaded = load(robot, platform=platform)
     home = loaded.massive().graph.home
     efforts = inverse_dynamics(loaded, home, 0.0 * home, 0.0 * home) - loaded.friction.offset
     refuse_existing(out, overwrite)
@@ -138,6 +144,7 @@ def mjcf(
 def sdf(
     robot: RobotName,
     out: Annotated[Path, typer.Option(help="the file to write", metavar="FILE.sdf")],
+    platform: Platform = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="replace the file")] = False,
 ) -> None:
     """Write an SDF model: links and all joints, also those that close the loops."""
@@ -145,7 +152,7 @@ def sdf(
     from pkm_twin.robot.robot_urdf import robot_sdf
 
     refuse_existing(out, overwrite)
-    replace_file(out, robot_sdf(load(robot)).encode())
+    replace_file(out, robot_sdf(load(robot, platform=platform)).encode())
     typer.echo(out)
 
 
@@ -174,3 +181,6 @@ def _accelerations(robot: Robot) -> list[float]:
     inertia = np.diag(mass_matrix(robot, q))
     with np.errstate(divide="ignore"):
         return list(SHARE * np.maximum(limits - weight, 0.0) / inertia)
+
+
+app.command("printer")(export_printer)

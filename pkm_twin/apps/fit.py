@@ -14,7 +14,16 @@ from numpy.typing import NDArray
 
 from pkm_twin.apps.limits import beyond_limits as find_beyond
 from pkm_twin.apps.limits import refuse_beyond
-from pkm_twin.apps.options import Accept, BagTopics, BeyondLimits, Json, LoadTimes, Payload, load_of
+from pkm_twin.apps.options import (
+    Accept,
+    BagTopics,
+    BeyondLimits,
+    Json,
+    LoadTimes,
+    Payload,
+    Platform,
+    load_of,
+)
 from pkm_twin.console import print_json, progress, refuse_existing, writing
 from pkm_twin.errors import BagError, ParameterError, PkmTwinError, UnknownNameError, one_line
 from pkm_twin.files import replace_file
@@ -31,8 +40,6 @@ RobotFile = Annotated[
     str,
     typer.Argument(help="a robot's name (see `pkm-twin robots`) or file: the values to start from"),
 ]
-NEAR: Final = 0.5
-"""Around a pick or release the payload is neither held nor gone, s."""
 COMPLIANCE: Final = "compliance"
 """What is fitted to deflections, not to efforts."""
 
@@ -74,6 +81,7 @@ def fit(
     topic: BagTopics = [],  # noqa: B006  typer copies it
     payload: Payload = None,
     load_times: LoadTimes = None,
+    platform: Platform = None,
     beyond_limits: BeyondLimits = False,
     accept: Accept = False,
     overwrite: Annotated[
@@ -124,7 +132,7 @@ def fit(
                 "what", what, "no --per-copy, --payload or --load-times, which are for efforts"
             )
         _fit_compliance(
-            robot, recordings, what, topic, out, page, json_output, beyond_limits, accept
+            robot, platform, recordings, what, topic, out, page, json_output, beyond_limits, accept
         )
         return
     from pkm_twin.apps.fit_files import robot_text
@@ -132,7 +140,7 @@ def fit(
     from pkm_twin.identification.friction_laws import laws_of
 
     kinds, laws = kinds_of(what), laws_of(friction)
-    text, machine = robot_text(robot, per_copy=per_copy)
+    text, machine = robot_text(robot, platform=platform, per_copy=per_copy)
     carried = load_of(payload, load_times)
     with progress("fit", 2 * len(recordings)) as update:
         result, beyond, choices = fit_recordings(
@@ -217,8 +225,9 @@ def _beyond(machine: Any, recordings: Sequence[tuple[str, Array]], limited: bool
 
 
 def _fit_compliance(
-    robot: str, recordings: Sequence[Path], what: str, topics: Sequence[str], out: Path,
-    page: Path | None, json_output: bool, beyond_limits: bool, accept: bool,
+    robot: str, platform: str | None, recordings: Sequence[Path], what: str,
+    topics: Sequence[str], out: Path, page: Path | None, json_output: bool,
+    beyond_limits: bool, accept: bool,
 ) -> None:  # fmt: skip
     """The fit of elastic elements, its files and what it says."""
     from pkm_twin.apps.elastic_recordings import read_deflected
@@ -230,7 +239,7 @@ def _fit_compliance(
         raise ParameterError(
             "what", what, "only compliance, because it is fitted to other recordings"
         )
-    text, machine = robot_text(robot)
+    text, machine = robot_text(robot, platform=platform)
     _ = machine.elastic
     with progress("fit", 2 * len(recordings)) as update:
         read = []
@@ -267,32 +276,36 @@ def fit_recordings(
         and the friction laws that were tried.
     :raises PkmTwinError: a recording without efforts, too short, or that shows nothing.
     """
-    from pkm_twin.bags.storage import is_bag
+    from pkm_twin.apps.check_efforts import recorded_of
+    from pkm_twin.apps.check_motion import step_fault
+    from pkm_twin.identification.fit import refuse_faults
     from pkm_twin.identification.friction_laws import fit_with_laws
 
-    pairs = [
-        _of_bag(path, machine, topics, carried)
-        if is_bag(path)
-        else (_of_csv(path, machine, "effort" if constant is None else "current"), carried)
-        for path in recordings
+    efforts = ("measured", "effort") if constant is None else ("current", "measured", "effort")
+    read = [_read(path, machine, topics, carried, efforts) for path in recordings]
+    beyond = _beyond(
+        machine,
+        [(one_line(p.name, 100), r.q) for p, r in zip(recordings, read, strict=True)],
+        limited,
+    )
+    faults = [
+        f"{one_line(path.name, 100)}: position steps that are no motion: {fault}"
+        for path, r in zip(recordings, read, strict=True)
+        if (fault := step_fault(r))
     ]
-    beyond = _beyond(machine, [(r.name, r.q) for r, _ in pairs], limited)
+    refuse_faults(faults, accept)
+    beyond = [*beyond, *(f"accepted by --accept: {fault}" for fault in faults)]
     base = machine
     if "payload" in kinds:
-        loads = [load for _, load in pairs if load is not None]
+        loads = [r.load for r in read if r.load is not None]
         # Two payloads are not one section of a file.
         if len({(load.mass, load.com) for load in loads}) > 1:
             masses = ", ".join(f"{load.mass:g}" for load in loads)
             raise PkmTwinError(f"recordings with payloads of {masses} kg: fit one at a time")
         base = loads[0].on(machine) if loads else machine
-    made = []
-    for recorded, load in pairs:
-        held = None if load is None else load.held(recorded.time).astype(np.float64)
-        known = None if load is None or "payload" in kinds else load.on(machine)
-        if load is not None:
-            recorded = _away_from_changes(recorded, load)
-            held = load.held(recorded.time).astype(np.float64)
-        made.append(dataclasses.replace(recorded, held=held, carried=known))
+    made = [recorded_of(r) for r in read]
+    if "payload" in kinds:
+        made = [dataclasses.replace(one, carried=None) for one in made]
     if constant is not None:
         made, told = _with_efforts(base, made, constant, kinds)
         beyond = [*told, *beyond]
@@ -317,15 +330,6 @@ def _with_efforts(
     return [found.applied(one) for one in recordings], found.lines(machine)
 
 
-def _away_from_changes(recorded: Any, load: Any) -> Any:
-    """Without the samples around a pick or release: a gap, which divides the recording."""
-    keep = ~load.near_change(recorded.time, NEAR)
-    cut = {k: getattr(recorded, k) for k in ("time", "q", "effort", "wrench")}
-    return dataclasses.replace(
-        recorded, **{k: None if v is None else v[keep] for k, v in cut.items()}
-    )
-
-
 def kinds_of(what: str) -> tuple[Any, ...]:
     """The kinds of numbers in words with commas between.
 
@@ -340,44 +344,34 @@ def kinds_of(what: str) -> tuple[Any, ...]:
     return tuple(kind for kind in KINDS if kind in words)
 
 
-def _of_bag(path: Path, machine: Any, topics: Sequence[str], carried: Any) -> tuple[Any, Any]:
-    from pkm_twin.apps.recorded import read_recording
-    from pkm_twin.identification.fit_rows import Recorded
+def _read(
+    path: Path, machine: Any, topics: Sequence[str], carried: Any, efforts: Sequence[str]
+) -> Any:
+    """A recording with efforts.
 
+    :raises PkmTwinError: there are none, or no wrench is accepted.
+    """
+    from pkm_twin.apps.recorded import read_recording, recorded_table
+    from pkm_twin.bags.storage import is_bag
+
+    if not is_bag(path):
+        r = recorded_table(path, machine, carried, efforts)
+        if r.effort is None:
+            joint = machine.joint_names[0]
+            raise ParameterError(
+                str(path), "no efforts", f"columns {joint}.effort ... of the drives, or "
+                f"{joint}.current ... with --torque-constant"
+            )  # fmt: skip
+        return r
     r = read_recording(path, robot=machine, topics=topics, carried=carried, limited=False)
     if r.effort is None:
         raise BagError(
             f"no efforts on {r.topics.joint_states}: a fit needs the efforts of the drives",
             path=path, reason="no efforts",
         )  # fmt: skip
-    return Recorded(one_line(path.name, 100), r.time, r.q, r.effort, r.wrench), r.load
-
-
-def _of_csv(path: Path, machine: Any, drive: str = "effort") -> Any:
-    from pkm_twin.apps.columns import read_columns, times_of
-    from pkm_twin.apps.recorded import WRENCH_AXES
-    from pkm_twin.identification.fit_rows import Recorded
-
-    columns = read_columns(path, machine)
-    if drive != "effort" and not any(f"{j}.{drive}" in columns for j in machine.joint_names):
-        drive = "effort"
-    for what in ("position", drive):
-        missing = [j for j in machine.joint_names if f"{j}.{what}" not in columns]
-        if missing and what == drive and len(missing) == len(machine.joint_names):
-            raise ParameterError(
-                str(path), "no efforts", f"columns {missing[0]}.effort ... of the drives, or "
-                f"{missing[0]}.current ... with --torque-constant"
-            )  # fmt: skip
-        if missing:
-            raise ParameterError(str(path), ", ".join(columns), f"a column {missing[0]}.{what}")
-    if "time" not in columns:
-        raise ParameterError(str(path), ", ".join(columns), "a column time")
-    time = times_of(path, columns["time"])
-    q, effort = (
-        np.stack([columns[f"{joint}.{what}"] for joint in machine.joint_names], -1)
-        for what in ("position", drive)
-    )
-    wrench = None
-    if any(axis in columns for axis in WRENCH_AXES):
-        wrench = np.stack([columns.get(a, np.zeros(len(time))) for a in WRENCH_AXES], -1)
-    return Recorded(one_line(path.name, 100), time, q, effort, wrench)
+    if r.topics.wrench is not None and r.wrench is None:
+        raise BagError(
+            f"no wrench on {r.topics.wrench} is accepted: {r.first_reject}", path=path,
+            reason="frames",
+        )  # fmt: skip
+    return r

@@ -25,13 +25,15 @@ class Fitted(Protocol):
         """Before and after."""
 
 
-def robot_text(name: str, *, per_copy: bool = False) -> tuple[str, Robot]:
+def robot_text(
+    name: str, *, platform: str | None = None, per_copy: bool = False
+) -> tuple[str, Robot]:
     """A robot and the text of its file; of a URDF, or with ``per_copy``, as a machine's YAML.
 
     :raises ParameterError: the file is refused; or it is to be written out, and would lose what it
         says of elasticity.
     """
-    robot = load(name)
+    robot = load(name, platform=platform)
     if per_copy and not robot.elastic_entries() and _elastic(robot):
         raise ParameterError(
             "--per-copy",
@@ -40,10 +42,13 @@ def robot_text(name: str, *, per_copy: bool = False) -> tuple[str, Robot]:
             "a file without them, or fit without --per-copy",
         )
     path = robot_path(name)
-    if per_copy or path.suffix in TREES:
-        data = read_urdf(path) if path.suffix in TREES else robot_description(robot)
-        return describe_machine_yaml(data), robot_of_data(data, path.stem)
-    return path.read_text(encoding="utf-8"), robot
+    if path.suffix in TREES:
+        data = read_urdf(path, platform=platform)
+    elif per_copy:
+        data = robot_description(robot)
+    else:
+        return path.read_text(encoding="utf-8"), robot
+    return describe_machine_yaml(data), robot_of_data(data, path.stem)
 
 
 def _elastic(robot: Robot) -> bool:

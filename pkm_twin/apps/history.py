@@ -16,10 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from delta_dynamics import inverse_dynamics
-from pkm_twin.apps.check import modelled
+from pkm_twin.apps.check_efforts import compared_of, idle_of
 from pkm_twin.apps.describe import why_no_torques
 from pkm_twin.apps.recorded import Recording
 from pkm_twin.errors import FileError, PkmTwinError
+from pkm_twin.identification.compare import by_held
 from pkm_twin.robot.robot import Robot
 
 Array = NDArray[np.float64]
@@ -101,31 +102,46 @@ def _one_kilogram(robot: Robot, q: Array, qd: Array, qdd: Array, wrench: Array) 
 def _efforts(r: Recording) -> list[Measured]:
     if r.effort is None or why_no_torques(r.robot):
         return []
-    (expected, mass), used, still, qd = modelled(r, inverse_dynamics, _one_kilogram)
-    rows = used[:, None] & ~still
+    c = compared_of(r, idle_of(r))
     n, units = len(r.robot.joint_names), r.robot.effort_units
-    if rows.sum() < 20 * (3 * n + 1):
+    if c is None:
         return []
-    residual = r.effort - expected
-    table = np.zeros((*residual.shape, 3 * n + 1))
+    carried = None if r.load is None else r.load.on(r.robot)
+    moves = [track.moves(c.how) for track in c.tracks]
+    columns = [
+        np.concatenate(
+            [track.qd * moving, np.sign(track.qd) * moving, moving,
+             by_held(r.robot, carried, track, _one_kilogram)], 1,
+        )
+        for track, moving in zip(c.tracks, moves, strict=True)
+    ]  # fmt: skip
+    rate, sign, moving, mass = np.split(c.filtered(columns), 4, 1)
+    # Where standing still is in the filter's reach, friction's sign is not known.
+    rows = moving > 0.8
+    if rows.sum() < 20 * (3 * n + 2):
+        return []
+    # How late the efforts are is fitted with the others.
+    residual = c.residual - c.late * c.change
+    table = np.zeros((*residual.shape, 3 * n + 2))
     for k in range(n):
-        table[:, k, 3 * k] = qd[:, k]
-        table[:, k, 3 * k + 1] = np.sign(qd[:, k])
+        table[:, k, 3 * k] = rate[:, k]
+        table[:, k, 3 * k + 1] = sign[:, k]
         table[:, k, 3 * k + 2] = 1.0
-    table[..., -1] = mass
-    block = np.broadcast_to(np.arange(len(residual))[:, None] * BLOCKS // len(residual), rows.shape)
+    table[..., -2], table[..., -1] = mass, c.change
+    count = len(residual)
+    block = np.broadcast_to(np.arange(count)[:, None] * BLOCKS // count, rows.shape)
     values, deviations = _fitted(table[rows], residual[rows], block[rows])
     found = []
     for k, name in enumerate(r.robot.joint_names):
-        own = residual[rows[:, k], k]
+        own = c.residual[rows[:, k], k]
         rms = float(np.sqrt(np.mean(own**2))) if len(own) else np.nan
         found.append(Measured("residual", name, rms, np.nan, units[k]))
-        rate = f"{units[k]} s/{r.robot.joint_units[k]}"
-        for j, (what, unit) in enumerate((("viscous", rate), ("coulomb", units[k]))):
+        viscous = f"{units[k]} s/{r.robot.joint_units[k]}"
+        for j, (what, unit) in enumerate((("viscous", viscous), ("coulomb", units[k]))):
             value = values[3 * k + j] + float(getattr(r.robot.friction, what)[k])
             found.append(Measured(f"friction {what}", name, value, deviations[3 * k + j], unit))
-    payload = values[-1] + r.robot.payload.mass * (r.load is None)
-    found.append(Measured("payload beyond the load", "platform", payload, deviations[-1], "kg"))
+    payload = values[-2] + r.robot.payload.mass * (r.load is None)
+    found.append(Measured("payload beyond the load", "platform", payload, deviations[-2], "kg"))
     return [number for number in found if np.isfinite(number.value)]
 
 

@@ -19,7 +19,16 @@ from numpy.typing import NDArray
 
 from delta_dynamics.elastic_reactions import elastic_reactions
 from pkm_twin.apps.loads import by_load
-from pkm_twin.apps.options import BagTopics, Json, LoadTimes, Payload, Platform, RobotName, load_of
+from pkm_twin.apps.options import (
+    BagTopics,
+    Follow,
+    Json,
+    LoadTimes,
+    Payload,
+    Platform,
+    RobotName,
+    load_of,
+)
 from pkm_twin.apps.torques import Motion, motion_of
 from pkm_twin.console import answer, finite, refuse_existing, writing
 from pkm_twin.errors import ParameterError
@@ -304,6 +313,7 @@ def loads(
     exponent: Annotated[
         float, typer.Option(help="Woehler exponent of the equivalent load range", min=1.0, max=50.0)
     ] = 5.0,
+    follow: Follow = None,
     payload: Payload = None,
     load_times: LoadTimes = None,
     platform: Platform = None,
@@ -335,7 +345,7 @@ def loads(
         if target is not None:
             refuse_existing(target, overwrite, motion)
     machine = load(robot, platform=platform)
-    taken = motion_of(motion, machine, topic, load_of(payload, load_times))
+    taken = motion_of(motion, machine, topic, load_of(payload, load_times), follow)
     if len(taken.time) < 2:
         raise ParameterError(str(motion), f"{len(taken.time)} samples", "2 or more")
     found = joint_loads(taken)

@@ -7,6 +7,7 @@ import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -20,12 +21,15 @@ from pkm_twin.robot.robot import Robot
 Array = NDArray[np.float64]
 
 
+SOURCES = {"bag": "recording", "table": "table"}
+
+
 @dataclass(frozen=True)
 class Load:
     """A payload that is no part of the robot's file, and when it is on the platform.
 
     mass in kg, com in m from the platform's reference point; times in s since the first joint
-    state, empty where it is there all the time. ``source`` says who tells: ``bag`` or ``option``.
+    state, empty where it is there all the time. ``source``: ``bag``, ``table`` or ``option``.
     """
 
     mass: float
@@ -70,8 +74,44 @@ class Load:
     def __str__(self) -> str:
         at = "" if self.com is None else " at " + ", ".join(f"{v:g}" for v in self.com) + " m"
         spans = ", ".join(f"{begin:g} to {end:g} s" for begin, end in self.times) or "throughout"
-        told = "from the recording" if self.source == "bag" else "from --payload"
+        told = "from --payload" if self.source == "option" else f"from the {SOURCES[self.source]}"
         return f"{self.mass:g} kg{at}, {spans}, {told}"
+
+
+COLUMNS = ("payload.mass", "payload.x", "payload.y", "payload.z")
+"""Of a table: mass (kg) and centre (m)."""
+
+
+def payload_columns(carried: Load | None, time: Array) -> dict[str, Array]:
+    """A table's columns of its payload; none without one."""
+    if carried is None:
+        return {}
+    values = (carried.mass, *(carried.com or ()))
+    held = carried.held(time)
+    return {name: np.where(held, v, 0.0) for name, v in zip(COLUMNS, values, strict=False)}
+
+
+def load_of_columns(path: Path, time: Array, columns: Mapping[str, Array]) -> Load | None:
+    """The payload of a table's columns, None where there is none.
+
+    :raises ParameterError: a negative mass, several payloads, or a part of a centre.
+    """
+    mass = columns.get(COLUMNS[0])
+    if mass is None or not mass.any():
+        return None
+    held = mass > 0.0
+    there = [name for name in COLUMNS if name in columns]
+    values = np.stack([columns[name][held] for name in there], -1)
+    if (mass < 0.0).any() or np.ptp(values, axis=0).any() or len(there) not in (1, 4):
+        raise ParameterError(
+            f"{path}: payload", f"columns {', '.join(there)}, {mass.min():g} to {mass.max():g} kg",
+            f"one payload of 0 kg or more, in {COLUMNS[0]} or in all of {', '.join(COLUMNS)}",
+        )  # fmt: skip
+    edges = [0, *(np.flatnonzero(np.diff(held)) + 1).tolist(), len(held)]
+    spans = [(float(time[b]), float(time[e - 1])) for b, e in pairwise(edges) if held[b]]
+    row = values[0].tolist()
+    com = (row[1], row[2], row[3]) if len(row) == 4 else None
+    return Load(row[0], com, () if held.all() else tuple(spans), "table")
 
 
 def told_load(bag: Bag) -> Load | None:
@@ -88,7 +128,13 @@ def told_load(bag: Bag) -> Load | None:
         raise metadata_error(bag, names[0], facts[names[0]], "0 or more")
     if released < picked:
         raise metadata_error(bag, names[2], facts[names[2]], f"{names[1]}, {picked:g}, or later")
-    return Load(mass, None, ((picked, released),), "bag")
+    com = None
+    if "payload_com_m" in facts:
+        try:
+            com = parse_payload(",".join([repr(mass), *facts["payload_com_m"].split()]))[1]
+        except ParameterError:
+            raise metadata_error(bag, "payload_com_m", facts["payload_com_m"], "x y z") from None
+    return Load(mass, com, ((picked, released),), "bag")
 
 
 def _fact(bag: Bag, facts: Mapping[str, str], name: str) -> float:

@@ -78,9 +78,6 @@ class _Kinds(TyperGroup):
 app = Commands(
     cls=_Kinds,
     no_args_is_help=True,
-    add_completion=False,
-    pretty_exceptions_enable=False,
-    rich_markup_mode=None,
     subcommand_metavar="KIND [OPTIONS]",
 )
 

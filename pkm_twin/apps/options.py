@@ -18,7 +18,8 @@ REFUSED, SALVAGED = 1, 3
 """Exit codes: rejected; damaged, with messages that `recover` saves."""
 
 RobotName = Annotated[
-    str, typer.Argument(help="a robot's name (see `pkm-twin robots`), a YAML file or a URDF")
+    str,
+    typer.Argument(help="a robot's name (see `pkm-twin robots`), or its YAML, URDF, MJCF, SDF"),
 ]
 Json = Annotated[bool, typer.Option("--json", help="machine-readable output")]
 OptionalRobot = Annotated[
@@ -47,6 +48,13 @@ LoadTimes = Annotated[
         "default: always"
     ),
 ]
+Follow = Annotated[
+    OptionalText,
+    typer.Option(
+        help="which columns of a table with joint positions and pose are the motion: joints, or "
+        "pose, which plans it again for this robot; default: both, which have to agree"
+    ),
+]
 BeyondLimits = Annotated[
     bool,
     typer.Option(
@@ -60,7 +68,9 @@ Accept = Annotated[
         help="also use data that this machine cannot have produced, and mark the results",
     ),
 ]
-Platform = Annotated[OptionalText, typer.Option(help="for a URDF: the link that carries the tool")]
+Platform = Annotated[
+    OptionalText, typer.Option(help="for a URDF, MJCF or SDF: the link that carries the tool")
+]
 OverwriteBoth = Annotated[bool, typer.Option("--overwrite", help="replace both files")]
 LimitShare = Annotated[
     float, typer.Option(help="fraction of the file's effort and velocity limits to use")

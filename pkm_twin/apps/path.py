@@ -218,7 +218,9 @@ def path_command(
     which limit binds when, and the largest fraction of each limit that the motion uses.
 
     The CSV that it writes has the columns time, JOINT.position, JOINT.velocity, JOINT.acceleration,
-    JOINT.effort and the pose's coordinates. `pkm-twin torques` and `pkm-twin size` read it.
+    JOINT.effort, the pose's coordinates with their velocity and acceleration, and the payload
+    (payload.mass, and payload.x, .y, .z where given). `pkm-twin torques`, `size`, `loads` and
+    `design` read it.
     """
     from pkm_twin.apps.path_report import draw_limits, report, write
     from pkm_twin.paths import timed

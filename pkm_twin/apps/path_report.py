@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pkm_twin.apps.loads import Load
+from pkm_twin.apps.loads import Load, payload_columns
 from pkm_twin.paths import Samples, ShapedPath, TimedPath
 
 Array = NDArray[np.float64]
@@ -19,7 +19,7 @@ SHOWN = 0.3
 
 
 def columns_of(motion: TimedPath, samples: Samples) -> dict[str, Array]:
-    """Columns of the table: time, the joints' motion and efforts, the pose."""
+    """Columns of the table: time, the joints' motion and efforts, the pose and its rates."""
     columns = {"time": samples.time}
     words = {"position": samples.q, "velocity": samples.qd, "acceleration": samples.qdd}
     if samples.effort is not None:
@@ -27,8 +27,12 @@ def columns_of(motion: TimedPath, samples: Samples) -> dict[str, Array]:
     for i, joint in enumerate(motion.robot.joint_names):
         for word, values in words.items():
             columns[f"{joint}.{word}"] = values[:, i]
-    for i, name in enumerate(motion.robot.pose_names):
-        columns[name] = samples.pose[:, i]
+    robot = motion.robot
+    rate = (robot.jacobian(samples.q) @ samples.qd[..., None])[..., 0]
+    change = robot.pose_acceleration(samples.q, samples.qd, samples.qdd)
+    for word, values in (("", samples.pose), (".velocity", rate), (".acceleration", change)):
+        for i, name in enumerate(robot.pose_names):
+            columns.setdefault(f"{name}{word}", values[:, i])
     return columns
 
 
@@ -39,18 +43,20 @@ def write(
     if out.suffix != ".mcap":
         from pkm_twin.apps.torques import write_table
 
-        write_table(columns_of(motion, samples), out)
+        write_table(columns_of(motion, samples) | payload_columns(carried, samples.time), out)
         return
     from pkm_twin.apps.trajectories import write_trajectory
 
     facts: dict[str, Any] = {
         "robot": motion.robot.name, "source": "pkm-twin path", "law": motion.law,
     }  # fmt: skip
-    if carried is not None and carried.com is None:
+    if carried is not None:
         facts |= {
             "payload_mass_kg": carried.mass, "payload_picked_s": 0.0,
             "payload_released_s": motion.duration + 1.0,
         }  # fmt: skip
+        if carried.com is not None:
+            facts["payload_com_m"] = " ".join(map(repr, carried.com))
     own = (samples.q, samples.qd, samples.qdd)
     write_trajectory(out, motion.robot, samples.time, own, samples.effort, facts, overwrite)
 

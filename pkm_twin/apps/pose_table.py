@@ -24,10 +24,10 @@ ANGLES: Final = ("roll", "pitch", "yaw")
 QUATERNION: Final = ("qx", "qy", "qz", "qw")
 FARTHEST: Final = 1e4
 """No instrument stands farther from what it measures, m."""
-LENGTHS: Final = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6}
+LENGTHS: Final = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "µm": 1e-6, "um": 1e-6}
 TURNS: Final = {"rad": 1.0, "mrad": 1e-3, "deg": np.pi / 180.0}
 UNITS: Final = {**LENGTHS, **TURNS}
-_UNIT: Final = re.compile(r"^(.*?)(?:\s*[\[(]\s*(\w+)\s*[\])]|_(mm|cm|um|deg|mrad))$")
+_UNIT: Final = re.compile(r"^(.*?)(?:\s*[\[(]\s*(\w+)\s*[\])]|_(mm|cm|[uµ]m|deg|mrad))$")
 _PLACE: Final = re.compile(r"(?:\w*_)?(?:pos|position|translation|point)_([xyz])")
 _TURN: Final = re.compile(r"(?:\w*_)?(?:ori|orientation|quat|quaternion|rotation|rot)_([xyzw])")
 _MEASURED: Final = re.compile(r"meas\w*_|actual_|mocap_")

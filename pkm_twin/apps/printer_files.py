@@ -30,7 +30,8 @@ FULL_STEPS: Final = 200.0
 _NUMBER: Final = r"[-+]?\d*\.?\d+"
 _POINT: Final = re.compile(r"\b" + r"[,\s]+".join(rf"{a}[:=]?\s*({_NUMBER})" for a in "XYZ"))
 _G33: Final = re.compile(rf"\b(c|xy|yz|zx|x|y|z)\s*:\s*({_NUMBER})")
-_G30: Final = re.compile(rf"^\s*G30\s+P\d+\s+X({_NUMBER})\s*Y({_NUMBER})", re.M)
+# Never across lines: what begins at each of many lines would be looked for in all that follow.
+_G30: Final = re.compile(rf"^[ \t]*G30\s+P\d+\s+X({_NUMBER})\s*Y({_NUMBER})", re.M)
 
 
 class Firmware(StrEnum):
@@ -118,7 +119,7 @@ def printer_of(robot: Robot) -> Printer:
 def written(printer: Printer, firmware: Firmware) -> str:
     """The lines of a firmware's configuration."""
     radius, arms = printer.radius, printer.arms
-    above = printer.ends - np.sqrt(arms**2 - radius**2)
+    above = printer.ends - _rise(arms, radius, "geometry.arm_lengths")
     if firmware is Firmware.KLIPPER:
         lines = ["[printer]", f"delta_radius: {radius:.6f}"]
         for k, limb in enumerate("abc"):
@@ -167,7 +168,7 @@ def read_printer(text: str, firmware: Firmware | None, probe_radius: float | Non
     if firmware is Firmware.MARLIN:
         arms = arms + [m665.get(axis, [0.0])[0] for axis in "ABC"]
     sign = 1.0 if firmware is Firmware.REPRAPFIRMWARE else -1.0
-    ends = height + np.sqrt(arms**2 - radius**2) + sign * trims
+    ends = height + _rise(arms, radius, "M665 L") + sign * trims
     points = _points(text, firmware, probe_radius or m665.get("B", [0.0])[0])
     turned = np.radians(angles)
     towers = radius * np.stack([np.cos(turned), np.sin(turned)], -1)
@@ -179,10 +180,24 @@ def read_printer(text: str, firmware: Firmware | None, probe_radius: float | Non
     return Printer(radius, angles, arms, ends, heights, np.zeros((0, 7)))
 
 
+def _rise(arms: Array, radius: float, where: str) -> Array:
+    """Height of the carriages over the nozzle in the middle, mm, shape (3,).
+
+    :raises ParameterError: an arm that does not reach the middle.
+    """
+    if not 0.0 < radius < arms.min():
+        raise ParameterError(
+            where,
+            float(arms.min()),
+            f"arms longer than the radius, {radius:g} mm (above 0)",
+        )
+    return np.sqrt(arms**2 - radius**2)
+
+
 def _firmware(text: str) -> Firmware:
-    if re.search(r"^\W*\[(printer|delta_calibrate|stepper_a)\]", text, re.M):
+    if re.search(r"^[^\w\n]*\[(printer|delta_calibrate|stepper_a)\]", text, re.M):
         return Firmware.KLIPPER
-    if re.search(r"bed probe heights|height map|^\s*G30\s+P\d", text, re.M | re.I):
+    if re.search(r"bed probe heights|height map|^[ \t]*G30\s+P\d", text, re.M | re.I):
         return Firmware.REPRAPFIRMWARE
     if re.search(r"G33|M666 X-?[\d.]+ Y", text) and _G33.search(text):
         return Firmware.MARLIN
@@ -218,6 +233,8 @@ def _points(text: str, firmware: Firmware, radius: float) -> Array:
             turn = np.radians(G33.get(name, 0))
             away = 0.0 if name == "c" else radius
             found.append((away * np.cos(turn), away * np.sin(turn), float(value)))
+    elif firmware is Firmware.MARLIN and "G33" in text:
+        raise ParameterError("G33", "no table of points", "a log of `G33 V3`, which prints one")
     elif heights:
         places, values = _G30.findall(text), heights[0].split()
         if len(places) < len(values):
@@ -287,6 +304,9 @@ def _klipper(text: str) -> Printer:
             raise ParameterError(f"[stepper_{'abc'[stepper]}] {key}", None, "a value")
         return default if value is None else _number(value, key)  # type: ignore[return-value]
 
+    kind = sections.get("printer", {}).get("kinematics", "delta")
+    if kind != "delta":
+        raise ParameterError("[printer] kinematics", kind, "delta, a linear Delta printer")
     if "delta_radius" not in sections.get("printer", {}):
         raise ParameterError("[printer] delta_radius", None, "a linear Delta's radius, mm")
     radius = _number(sections["printer"]["delta_radius"], "delta_radius")
@@ -296,7 +316,7 @@ def _klipper(text: str) -> Printer:
          for s, a in zip(steppers, ANGLES, strict=True)]
     )  # fmt: skip
     ends = np.array([number(k, "position_endstop") for k in range(3)])
-    ends = ends + np.sqrt(arms**2 - radius**2)
+    ends = ends + _rise(arms, radius, "arm_length")
     steps = np.array([_step(number, steppers, k) for k in range(3)])
     stored = sections.get("delta_calibrate", {})
 

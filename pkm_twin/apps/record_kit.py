@@ -13,8 +13,7 @@ from typing import Annotated, Any, Final
 import typer
 
 from pkm_twin.apps.excite import write_motion
-from pkm_twin.apps.options import Json
-from pkm_twin.apps.recorded import BASE_FRAME, PLATFORM_FRAME
+from pkm_twin.apps.options import Json, Platform
 from pkm_twin.apps.topics import DEFINITIONS, JOINT_STATE, TRAJECTORY, WRENCH, is_output
 from pkm_twin.apps.trajectories import SECOND
 from pkm_twin.bags.reader import Bag, BagWriter, open_bag
@@ -22,6 +21,7 @@ from pkm_twin.console import print_json, refuse_existing, writing
 from pkm_twin.errors import BagError, ParameterError
 from pkm_twin.options import OptionalPath, OptionalText
 from pkm_twin.robot.robot import Robot
+from pkm_twin.streams.wrench import PLATFORM, WrenchSettings
 
 KEPT: Final = {
     JOINT_STATE: "/joint_states", WRENCH: "/wrench", TRAJECTORY: "/joint_trajectory",
@@ -33,7 +33,7 @@ ONE_CLOCK: Final = 60 * SECOND
 """Stamps and log times that begin further apart are of two clocks, ns."""
 DAY: Final = 86_400 * SECOND
 """Times further apart are of two clocks, ns."""
-FRAMES: Final = ("", BASE_FRAME, PLATFORM_FRAME)
+FRAMES: Final = ("", WrenchSettings.base_frame, PLATFORM)
 """Frames that keep their names: readers depend on them."""
 
 
@@ -65,6 +65,7 @@ def record_kit(
         float, typer.Option(help="fraction of all limits to use", min=0.05, max=1.0)
     ] = 0.9,
     trials: Annotated[int, typer.Option(help="number of motions to try", min=10)] = 300,
+    platform: Platform = None,
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="replace files that exist")
     ] = False,
@@ -81,7 +82,7 @@ def record_kit(
     metadata, definitions and QoS are written by pkm-twin. Topics that are left out are listed.
     """
     if anonymise is not None:
-        _anonymise(anonymise, out, robot, keep_names, overwrite, json_output)
+        _anonymise(anonymise, out, robot, platform, keep_names, overwrite, json_output)
         return
     if robot is None:
         raise typer.BadParameter("a robot is missing; give one, or --anonymise BAG")
@@ -91,10 +92,10 @@ def record_kit(
     from pkm_twin.identification.excitation import Bounds, Judge
     from pkm_twin.identification.file_parameters import file_parameters
 
-    machine = load(robot)
+    machine = load(robot, platform=platform)
     judge, bounds = Judge.of(machine, file_parameters(machine)), Bounds(share)
     motions = {"excitation": (False, duration), "friction": (True, friction_duration)}
-    texts = {"README.md": readme(machine, robot), "NOTES.md": notes(machine)}
+    texts = {"README.md": readme(machine, robot, platform), "NOTES.md": notes(machine)}
     names = [*texts, *(f"{name}.{ending}" for name in motions for ending in ("mcap", "csv"))]
     with writing(out):
         out.mkdir(parents=True, exist_ok=True)
@@ -117,7 +118,13 @@ def record_kit(
 
 
 def _anonymise(
-    source: Path, out: Path, robot: str | None, keep_names: bool, overwrite: bool, as_json: bool
+    source: Path,
+    out: Path,
+    robot: str | None,
+    platform: str | None,
+    keep_names: bool,
+    overwrite: bool,
+    as_json: bool,
 ) -> None:
     from pkm_twin import load, robot_names
 
@@ -125,7 +132,7 @@ def _anonymise(
         raise ParameterError("out", str(out), "a name that ends in .mcap")
     if out.resolve().is_relative_to(source.resolve()):
         raise ParameterError("out", str(out), "another file than the recording's")
-    machine = None if robot is None else load(robot)
+    machine = None if robot is None else load(robot, platform=platform)
     metadata = {"anonymised": "names and dates removed by pkm-twin record-kit"}
     if keep_names and machine is not None and robot in robot_names():
         metadata["robot"] = machine.name
@@ -293,10 +300,11 @@ def _shifted(stamp: Any, begin: _Beginnings) -> dict[str, int]:
     return {"sec": time // SECOND, "nanosec": time % SECOND}
 
 
-def readme(machine: Robot, robot: str) -> str:
+def readme(machine: Robot, robot: str, platform: str | None = None) -> str:
     """The commands, for this robot."""
+    words = [robot] if platform is None else [robot, "--platform", platform]
     return README.format(
-        robot=shlex.quote(robot), name=machine.name, joints=", ".join(machine.controller.names),
+        robot=shlex.join(words), name=machine.name, joints=", ".join(machine.controller.names),
         units=", ".join(dict.fromkeys(machine.effort_units)),
     )  # fmt: skip
 

@@ -5,30 +5,30 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pkm_twin import load, robot_names
 from pkm_twin.apps.columns import check_motion_times, read_columns, times_of
-from pkm_twin.apps.loads import Load, metadata_error, told_load
+from pkm_twin.apps.loads import Load, load_of_columns, metadata_error, told_load
 from pkm_twin.apps.topics import JOINT_STATE, Topics, choose_topics
+from pkm_twin.apps.wrench_frames import FRAMES
 from pkm_twin.bags.reader import Bag, open_bag
 from pkm_twin.bags.storage import is_bag
 from pkm_twin.errors import BagError, MessageError, ParameterError, one_line
 from pkm_twin.messages.reading import JointReader, JointSample
-from pkm_twin.messages.stamps import StampRules, stamp_of
-from pkm_twin.messages.wrenches import read_wrench
+from pkm_twin.messages.stamps import StampRules
+from pkm_twin.messages.wrenches import WrenchSample
 from pkm_twin.robot.robot import Robot
+from pkm_twin.streams.deflection import in_base_axes
 
 Array = NDArray[np.float64]
 
 WRENCH_AXES: Final = ("fx", "fy", "fz", "mx", "my", "mz")
-BASE_FRAME: Final = "base_link"
-PLATFORM_FRAME: Final = "platform"
 
 
 @dataclass(frozen=True)
@@ -115,7 +115,8 @@ def read_recording(
     carried = carried or told_load(bag)
     reader, rules = JointReader(machine, limited=limited), StampRules(future_tolerance=2**62)
     samples: list[JointSample] = []
-    wrenches: list[tuple[int, str, Array]] = []
+    wrenches: list[WrenchSample] = []
+    read_one = FRAMES.get().reader()
     rejected: Counter[str] = Counter()
     first = ""
     names = [name for name in (chosen.joint_states, chosen.wrench) if name is not None]
@@ -129,7 +130,7 @@ def read_recording(
                     raise MessageError("stamp order", f"stamp {sample.stamp} is not after the last")
                 samples.append(sample)
             else:
-                wrenches.append(recorded_wrench(message.message, message.log_time, rules))
+                wrenches.append(read_one(message.message, message.log_time))
         except MessageError as error:
             rejected[error.reason] += 1
             first = first or one_line(f"{message.topic}: {error}")
@@ -143,7 +144,7 @@ def read_recording(
     return Recording(
         robot=machine,
         bag=bag,
-        topics=chosen,
+        topics=replace(chosen, frame=wrenches[0].frame if wrenches else ""),
         load=carried,
         stamps=stamps,
         time=(stamps - stamps[0]) / 1e9,
@@ -157,11 +158,15 @@ def read_recording(
     )
 
 
-def recorded_table(path: Path, robot: str | Robot | None, carried: Load | None) -> Recording:
+def recorded_table(
+    path: Path, robot: str | Robot | None, carried: Load | None,
+    efforts: Sequence[str] = ("measured", "effort"),
+) -> Recording:  # fmt: skip
     """A recording as a CSV with columns ``time`` and ``JOINT.position``.
 
-    Optionally ``JOINT.velocity`` and ``.acceleration``, ``JOINT.measured`` or else
-    ``JOINT.effort``, and the wrench ``fx fy fz mx my mz``; other columns are left alone.
+    Optionally ``JOINT.velocity`` and ``.acceleration``, the wrench ``fx fy fz mx my mz``, the
+    payload as in ``motion_of_csv``, and of the columns of ``efforts``, ``JOINT.measured`` or else
+    ``JOINT.effort``, the first that are there; other columns are left alone.
 
     :raises ParameterError: no robot is given, a column is missing, or a value is no finite number.
     """
@@ -181,28 +186,19 @@ def recorded_table(path: Path, robot: str | Robot | None, carried: Load | None) 
     if q is None or "time" not in columns:
         needed = ", ".join(f"{joint}.position" for joint in machine.joint_names)
         raise ParameterError(str(path), ", ".join(columns), f"columns time, {needed}")
-    time, qd, measured = times_of(path, columns["time"]), stack("velocity"), stack("measured")
+    time, qd = times_of(path, columns["time"]), stack("velocity")
+    found = (values for what in efforts if (values := stack(what)) is not None)
     check_motion_times(path, time, q, qd)
     wrench = None
     if any(axis in columns for axis in WRENCH_AXES):
         wrench = np.stack([columns.get(axis, np.zeros(len(time))) for axis in WRENCH_AXES], -1)
     return Recording(
-        robot=machine, bag=None, topics=Topics("columns of the table"), load=carried,
+        robot=machine, bag=None, topics=Topics("columns of the table"),
+        load=carried or load_of_columns(path, time, columns),
         stamps=np.round(time * 1e9).astype(np.int64), time=time, q=q, qd=qd,
-        effort=stack("effort") if measured is None else measured, wrench=wrench,
+        effort=next(found, None), wrench=wrench,
         rejected=Counter(), first_reject="", source=str(path), qdd=stack("acceleration"),
     )  # fmt: skip
-
-
-def recorded_wrench(message: Any, now: int, rules: StampRules) -> tuple[int, str, Array]:
-    """Stamp (ns), frame and values (6,) of a geometry_msgs/WrenchStamped.
-
-    :raises MessageError: it is refused.
-    """
-    # Any frame that has a name: all but the base frame turn with the platform.
-    frame = message.header.frame_id or PLATFORM_FRAME
-    sample = read_wrench(message, now, rules, frame, accept_empty=False)
-    return stamp_of(message.header), sample.frame, sample.wrench
 
 
 def _stacked(values: list[Array | None]) -> Array | None:
@@ -211,21 +207,19 @@ def _stacked(values: list[Array | None]) -> Array | None:
 
 
 def _fixed(
-    robot: Robot, stamps: NDArray[np.int64], samples: list[JointSample], wrenches: list[Any]
-) -> Array | None:
+    robot: Robot, stamps: NDArray[np.int64], samples: list[JointSample],
+    wrenches: list[WrenchSample],
+) -> Array | None:  # fmt: skip
     """The wrench nearest to each joint state, rotated into fixed axes, shape (samples, 6)."""
     if not wrenches:
         return None
-    wrenches.sort(key=lambda wrench: wrench[0])
-    at = np.array([w[0] for w in wrenches], np.int64)
+    wrenches.sort(key=lambda wrench: wrench.stamp)
+    at = np.array([w.stamp for w in wrenches], np.int64)
     right = np.clip(np.searchsorted(at, stamps), 1, max(1, len(at) - 1))
     right = np.minimum(right, len(at) - 1)
     left = np.maximum(right - 1, 0)
     nearest = np.where(np.abs(at[left] - stamps) <= np.abs(at[right] - stamps), left, right)
-    values = np.array([w[2] for w in wrenches])[nearest]
-    rotation = robot.rotation(robot.forward(np.array([s.q for s in samples])))
-    moving = np.array([w[1] != BASE_FRAME for w in wrenches])[nearest]
-    rotation = np.where(moving[:, None, None], rotation, np.eye(3))
-    return np.concatenate(
-        [np.einsum("nij,nj->ni", rotation, values[:, k : k + 3]) for k in (0, 3)], axis=1
-    )
+    values = np.array([w.wrench for w in wrenches])[nearest]
+    if wrenches[0].frame == FRAMES.get().base_frame:
+        return values
+    return in_base_axes(values, robot.rotation(robot.forward(np.array([s.q for s in samples]))))

@@ -7,7 +7,16 @@ from typing import Annotated
 
 import typer
 
-from pkm_twin.apps.options import BagTopics, Json, LoadTimes, Payload, Platform, RobotName, load_of
+from pkm_twin.apps.options import (
+    BagTopics,
+    Follow,
+    Json,
+    LoadTimes,
+    Payload,
+    Platform,
+    RobotName,
+    load_of,
+)
 from pkm_twin.console import answer, numbers, refuse_existing, writing
 from pkm_twin.errors import ParameterError
 from pkm_twin.options import OptionalFloat, OptionalPath, OptionalText, file_name
@@ -62,6 +71,7 @@ def size(
     efforts: Annotated[
         str, typer.Option(help="efforts to use: those of the motion's file if it has any, or model")
     ] = "file",
+    follow: Follow = None,
     payload: Payload = None,
     load_times: LoadTimes = None,
     platform: Platform = None,
@@ -90,6 +100,7 @@ def size(
     """
     from pkm_twin import load
     from pkm_twin.apps import sizes
+    from pkm_twin.apps.torques import motion_of
     from pkm_twin.paths.sizing import Gear
 
     if efforts not in ("file", "model"):
@@ -118,7 +129,7 @@ def size(
         data, text = sizes.worst_report(machine, speed, change, singularity)
     else:
         assert motion is not None  # noqa: S101  one of the two is given
-        taken = sizes.read_motion(motion, machine, topic, carried, efforts)
+        taken = sizes.compared(motion_of(motion, machine, topic, carried, follow), efforts)
         result = sizes.duties(taken, motors, gear)
         data, text = sizes.report(taken, result)
         if picture is not None:

@@ -15,8 +15,8 @@ import yaml
 from numpy.typing import NDArray
 
 from delta_dynamics import inverse_dynamics
-from pkm_twin.apps.loads import Load, by_load
-from pkm_twin.apps.torques import Motion, motion_of
+from pkm_twin.apps.loads import by_load
+from pkm_twin.apps.torques import Motion
 from pkm_twin.errors import FileError, ParameterError, UnknownNameError
 from pkm_twin.machine import schema
 from pkm_twin.paths.sizing import DriveDuty, Fit, Gear, Motor, size_drives
@@ -50,16 +50,24 @@ class Taken:
         squares = ((self.effort - self.model) ** 2).mean(0)
         return np.asarray(np.sqrt(squares / np.maximum((self.model**2).mean(0), 1e-24)))
 
+    @property
+    def unlike(self) -> str:
+        """Says of which joint the file's efforts are not the model's; empty where they are."""
+        worst = int(self.difference.argmax())
+        if not self.difference[worst] > UNLIKE:
+            return ""
+        return (
+            f"the file's efforts of {self.motion.robot.joint_names[worst]} differ from the model's "
+            f"by {100 * self.difference[worst]:.3g} % RMS: the file may be of another robot, "
+            "payload or rotor"
+        )
 
-def read_motion(
-    path: Path, robot: Robot, topics: Sequence[str], carried: Load | None, efforts: str
-) -> Taken:
-    """A recording or a path, with the file's efforts where it has them and they are asked for.
 
-    :raises ParameterError: a table that is no motion.
-    :raises BagError: a bag without joint states or a trajectory.
+def compared(motion: Motion, efforts: str) -> Taken:
+    """A motion with the file's efforts where it has them and they are asked for, else the model's.
+
+    :raises ParameterError: a robot without masses.
     """
-    motion = motion_of(path, robot, topics, carried)
     model = np.empty_like(motion.q)
     for machine, part in by_load(motion.robot, motion.load, motion.time, 4096):
         model[part] = inverse_dynamics(
@@ -179,13 +187,8 @@ def report(taken: Taken, result: Sequence[DriveDuty]) -> tuple[dict[str, Any], s
         f"mean power {data['mean_power_W']:.4g} W"
     )
     lines += list(m.notes)
-    if taken.difference.max() > UNLIKE:
-        worst = int(taken.difference.argmax())
-        lines.append(
-            f"the file's efforts of {m.robot.joint_names[worst]} differ from the model's by "
-            f"{100 * taken.difference[worst]:.3g} % RMS: the file may be of another robot, "
-            "load or rotor; --efforts model uses the model's"
-        )
+    if taken.unlike:
+        lines.append(f"{taken.unlike}; --efforts model uses the model's")
     return data, "\n".join(lines)
 
 

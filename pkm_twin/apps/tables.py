@@ -7,20 +7,19 @@ What a file's header row makes certain is found by itself, and reported; the res
 from __future__ import annotations
 
 import csv
-import functools
 import itertools
 import math
 from collections.abc import Callable, Iterator, Mapping
 from contextvars import ContextVar
 from dataclasses import dataclass, field
-from typing import Annotated, Any, Final
+from typing import Annotated, Final
 
 import numpy as np
 import typer
 from numpy.typing import NDArray
 
 from pkm_twin.errors import ParameterError, UnknownNameError
-from pkm_twin.options import OptionalText, options_of, take_options
+from pkm_twin.options import OptionalText, shared_options
 from pkm_twin.robot.robot import Robot
 
 Array = NDArray[np.float64]
@@ -92,9 +91,11 @@ def in_si(columns: Mapping[str, Array], robot: Robot | None) -> dict[str, Array]
     if robot is None:
         raise ParameterError("units", ", ".join(units), "none for this table")
     kinds = {"time": "time"}
-    pairs = [(f"{n}.{what}", u) for n, u in zip(robot.joint_names, robot.joint_units, strict=True)
-             for what in RATES]  # fmt: skip
-    for name, unit in [*pairs, *zip(robot.pose_names, robot.pose_units, strict=True)]:
+    of_joints = zip(robot.joint_names, robot.joint_units, strict=True)
+    of_pose = zip(robot.pose_names, robot.pose_units, strict=True)
+    for name, unit in (*of_joints, *of_pose):
+        kinds |= dict.fromkeys((f"{name}.{what}" for what in RATES), UNITS[unit][0])
+    for name, unit in zip(robot.pose_names, robot.pose_units, strict=True):
         kinds[name] = UNITS[unit][0]
     for name, kind in kinds.items():
         if name in result and kind in units:
@@ -149,17 +150,5 @@ def _options(
     del separator, decimal, columns, units, time
 
 
-def tables(command: Callable[..., None]) -> Callable[..., None]:
-    """Give a command that reads tables the options of their dialect."""
-    names = options_of(_options)
-
-    @functools.wraps(command)
-    def wrapped(**given: Any) -> None:
-        token = CHOSEN.set(_dialect(*(given.pop(name) for name in names)))
-        try:
-            command(**given)
-        finally:
-            CHOSEN.reset(token)
-
-    take_options(wrapped, [*options_of(command).values(), *options_of(_options).values()])
-    return wrapped
+tables = shared_options(_options, CHOSEN, _dialect)
+"""Gives a command that reads tables the options of their dialect."""

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from pkm_twin.bags.definitions import SEPARATOR, parse_definition
-from pkm_twin.bags.reader import Bag
+from pkm_twin.bags.reader import Bag, TopicInfo
 from pkm_twin.errors import BagError, one_line
 from pkm_twin.robot.robot import Robot
 
@@ -28,6 +28,8 @@ TWIN_OUTPUTS: Final = (
     "natural_frequencies_stamped",
 )
 """Last names of the twin's own topics of these two types, or a name before the last."""
+TRUTHS: Final = ("ground_truth", "groundtruth")
+"""Names in topics that a simulation publishes and no sensor does."""
 
 _FIELDS: Final = {
     "std_msgs/Header": ("builtin_interfaces/Time stamp", "string frame_id"),
@@ -76,9 +78,12 @@ class Topics:
     joint_states: str
     wrench: str | None = None
     left_out: Mapping[str, str] = field(default_factory=dict)
+    frame: str = ""
+    """Of the accepted wrenches."""
 
     def __str__(self) -> str:
         text = f"joint states {self.joint_states}, wrench {self.wrench or 'none'}"
+        text += f" (frame {self.frame})" if self.frame else ""
         if self.left_out:
             text += "; left out: " + ", ".join(f"{k} ({v})" for k, v in self.left_out.items())
         return one_line(text, 1000)
@@ -87,8 +92,9 @@ class Topics:
 def choose_topics(bag: Bag, robot: Robot, wanted: Sequence[str] = ()) -> Topics:
     """The joint-state topic that carries the robot's joints, and the wrench topic.
 
-    The twin's own outputs are left out. Of several that fit, ``/joint_states`` and ``/wrench`` are
-    taken; ``wanted`` names them otherwise.
+    The twin's own outputs, and what no sensor publishes, are left out. Of several that fit,
+    ``/joint_states`` and ``/wrench`` are taken. ``wanted`` names them otherwise: then a wrench is
+    read only if it is named.
 
     :raises BagError: a wanted topic is missing or of another type, no topic has the joints, or
         several fit.
@@ -96,11 +102,11 @@ def choose_topics(bag: Bag, robot: Robot, wanted: Sequence[str] = ()) -> Topics:
     kinds: dict[str, list[str]] = {JOINT_STATE: [], WRENCH: []}
     for name in wanted:
         info = bag.report.topics.get(name)
-        if info is None or info.type not in kinds:
-            fit = [n for n, i in bag.report.topics.items() if i.type in kinds]
+        if info is None or type_of(info) not in kinds:
+            fit = [n for n, i in bag.report.topics.items() if type_of(i) in kinds]
             is_a = "is not in the bag" if info is None else f"is a {info.type}"
             raise _choice_error(bag, f"topic {name} {is_a}; topics that fit: {', '.join(fit)}")
-        kinds[info.type].append(name)
+        kinds[type_of(info)].append(name)
     for kind, names in kinds.items():
         if len(set(names)) > 1:
             raise _choice_error(
@@ -118,8 +124,11 @@ def _choose_joints(bag: Bag, robot: Robot, wanted: list[str], left_out: dict[str
     named = _candidates(bag, JOINT_STATE, wanted, left_out)
     filled = [name for name in named if bag.report.topics[name].count]
     if not filled:
-        aside = "".join(f"; {name}: {why}" for name, why in left_out.items())
-        raise _choice_error(bag, f"no joint states in the bag{aside}", "no joint states")
+        aside = "; ".join(f"{name} is there, but {why}" for name, why in left_out.items())
+        text = (
+            f"no joint states that can be read: {aside}" if aside else "no joint states in the bag"
+        )
+        raise _choice_error(bag, text, "no joint states")
     for name in filled:
         require_definition(bag, name)
     # As the controller calls them, which recorded them.
@@ -147,8 +156,8 @@ def _choose_wrench(
     fit = _candidates(bag, WRENCH, wanted, left_out)
     if not fit:
         return None
-    if chosen and not wanted and len(fit) > 1:
-        # Who names the joint states alone, and there is no telling which wrench, wants none.
+    if chosen and not wanted:
+        # Who names the joint states alone wants no wrench.
         left_out.update({name: "not chosen" for name in fit})
         return None
     return _only(bag, "wrenches", fit, "wrench", left_out)
@@ -159,12 +168,29 @@ def is_output(topic: str) -> bool:
     return any(part in TWIN_OUTPUTS for part in topic.split("/")[-2:])
 
 
+def is_truth(topic: str) -> bool:
+    """Whether the name is one that a simulation publishes and no sensor does."""
+    return any(part in TRUTHS for part in topic.split("/"))
+
+
+def type_of(info: TopicInfo) -> str:
+    """A topic's type as ROS 2 writes it; libraries for other encodings leave the ``msg`` out."""
+    package, _, name = info.type.partition("/")
+    return info.type if "/" in name or not name else f"{package}/msg/{name}"
+
+
 def _candidates(bag: Bag, kind: str, wanted: list[str], left_out: dict[str, str]) -> list[str]:
-    """Topics of a type: the wanted ones, else all but the twin's own."""
+    """Topics of a type: the wanted ones, else all but the twin's own and a simulation's truths."""
     fit = []
-    for name in (name for name, info in bag.report.topics.items() if info.type == kind):
-        if wanted and name not in wanted:
+    for name, info in bag.report.topics.items():
+        if type_of(info) != kind:
+            continue
+        if info.encoding != "cdr":
+            left_out[name] = f"its encoding is {info.encoding}; expected cdr"
+        elif wanted and name not in wanted:
             left_out[name] = "not chosen"
+        elif not wanted and is_truth(name):
+            left_out[name] = "no sensor's; --topic uses it"
         elif not wanted and is_output(name):
             left_out[name] = "published by pkm_twin"
         else:
@@ -206,7 +232,7 @@ def require_definition(bag: Bag, topic: str) -> None:
     :raises BagError: naming the field.
     """
     info = bag.report.topics[topic]
-    if info.encoding != "cdr" or info.schema_encoding != "ros2msg":
+    if info.schema_encoding != "ros2msg":
         return  # the first message's decoding tells
     try:
         recorded = parse_definition(info.type, info.definition)

@@ -6,7 +6,7 @@ from __future__ import annotations
 import csv
 import importlib.util
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 
@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 from delta_dynamics import dynamics_terms, inverse_dynamics, reactions, torque_deviation
 from delta_dynamics.rest import friction_reach, moving_rates
 from pkm_twin import load
-from pkm_twin.apps.check import at_rest, motion
 from pkm_twin.apps.columns import check_motion_times, read_columns, times_of
 from pkm_twin.apps.limits import beyond_limits
-from pkm_twin.apps.loads import Load, by_load, told_load
+from pkm_twin.apps.loads import Load, by_load, load_of_columns, payload_columns, told_load
 from pkm_twin.apps.recorded import WRENCH_AXES, read_recording, robot_of
+from pkm_twin.apps.recorded_motion import at_rest, motion
 from pkm_twin.apps.topics import JOINT_STATE
 from pkm_twin.apps.trajectories import read_trajectory
 from pkm_twin.bags.reader import open_bag
@@ -34,6 +34,7 @@ from pkm_twin.errors import (
     UnreachableError,
 )
 from pkm_twin.files import STANDARD, replacing
+from pkm_twin.paths.joint_path import joint_rates
 from pkm_twin.robot.robot import Robot
 from pkm_twin.streams.rest import gradient_gain, rate_doubt
 
@@ -41,6 +42,9 @@ Array = NDArray[np.float64]
 BLOCK = 4096
 """Samples computed at a time, so that memory stays flat."""
 ENDINGS = (".csv", ".parquet", ".mat")
+FOLLOW = ("joints", "pose")
+POSE_MISS = 1e-3
+"""Difference between a table's pose and that of its joint positions, of the robot's size."""
 INPUTS = ("position", "velocity", "acceleration")
 BEYOND_LIMITS = "beyond_limits"
 MAPPED = "tables use the model's joint values; joint_map applies to messages and bags only"
@@ -72,12 +76,15 @@ class Motion:
 
 
 def motion_of(
-    path: Path, robot: str | Robot, topics: Sequence[str] = (), carried: Load | None = None
-) -> Motion:
+    path: Path, robot: str | Robot, topics: Sequence[str] = (), carried: Load | None = None,
+    follow: str | None = None,
+) -> Motion:  # fmt: skip
     """The motion of a bag or a table; errors as of the two functions below."""
-    if is_bag(path):
-        return motion_of_bag(path, robot, topics, carried)
-    return motion_of_csv(path, robot, carried)
+    if not is_bag(path):
+        return motion_of_csv(path, robot, carried, follow)
+    if follow is not None:
+        raise ParameterError("follow", follow, "no --follow: a bag has no pose columns")
+    return motion_of_bag(path, robot, topics, carried)
 
 
 def motion_of_bag(
@@ -130,44 +137,36 @@ def motion_of_bag(
     )
 
 
-def motion_of_csv(path: Path, robot: str | Robot, carried: Load | None = None) -> Motion:
+def motion_of_csv(
+    path: Path, robot: str | Robot, carried: Load | None = None, follow: str | None = None
+) -> Motion:
     """A motion from a CSV with a header row.
 
     Columns, in any order: ``time``; for every joint NAME ``NAME.position``, or in their place all
     coordinates of the pose (m, rad); optionally ``NAME.velocity`` and ``NAME.acceleration`` (of all
-    joints or of none), and the wrench ``fx fy fz mx my mz``. Absent rates are differentiated by
-    second-order differences; below what these can tell dry friction has no direction and is zero.
-    Absent parts of the wrench are zero. Other columns are left alone, but not those that begin with
-    a joint's name and are none of these or of :func:`table`'s: they are misspelt.
+    joints or of none; of the coordinates where the joints follow the pose), and the wrench ``fx fy
+    fz mx my mz``. Absent rates are differentiated by second-order differences; below what these can
+    tell dry friction has no direction and is zero. Absent parts of the wrench are zero. Columns
+    ``payload.mass`` (kg) and ``payload.x``, ``.y`` and ``.z`` (m) are the payload, unless one is
+    given. Other columns are left alone, but not those that begin with a joint's name and are none
+    of these or of :func:`table`'s: they are misspelt.
 
-    :raises ParameterError: a column is missing or misspelt, or a value is no finite number.
+    :param follow: ``joints`` or ``pose``: which columns of a table that has both are the motion;
+        None: both, which have to agree.
+    :raises ParameterError: a column is missing or misspelt, a value is no finite number, or joint
+        positions and pose are those of different machines.
     """
+    if follow not in (None, *FOLLOW):
+        raise UnknownNameError("follow", str(follow), FOLLOW)
     machine = robot if isinstance(robot, Robot) else load(robot)
     columns = read_columns(path, machine)
-    known = [f"{joint}.{what}" for joint in machine.joint_names for what in INPUTS]
-    for name in columns:
-        joint, dot, what = name.rpartition(".")
-        computed = what in ("effort", "measured") or what.startswith("effort_")
-        if dot and joint in machine.joint_names and name not in known and not computed:
-            raise UnknownNameError(f"{path}: column", name, known)
-
-    def stack(what: str) -> Array | None:
-        names = [f"{joint}.{what}" for joint in machine.joint_names]
-        present = [name in columns for name in names]
-        if not any(present):
-            return None
-        missing = [n for n, there in zip(names, present, strict=True) if not there]
-        if missing:
-            raise ParameterError(
-                str(path), None, f"a column {missing[0]!r} as for the other joints"
-            )
-        return np.stack([columns[name] for name in names], -1)
-
-    q = stack("position")
-    posed = q is None and all(name in columns for name in machine.pose_names)
-    if posed:
-        q = machine.inverse(np.stack([columns[name] for name in machine.pose_names], -1))
-    if q is None or "time" not in columns:
+    _check_names(path, machine, columns)
+    q = _stacked(path, columns, machine.joint_names, "position")
+    pose = None
+    if all(name in columns for name in machine.pose_names):
+        pose = np.stack([columns[name] for name in machine.pose_names], -1)
+    posed = q is None or follow == "pose"
+    if (pose is None and posed) or "time" not in columns:
         needed = ", ".join(f"{joint}.position" for joint in machine.joint_names)
         or_pose = ", ".join(machine.pose_names)
         raise ParameterError(
@@ -175,32 +174,102 @@ def motion_of_csv(path: Path, robot: str | Robot, carried: Load | None = None) -
         )
     time = columns["time"]
     times_of(path, time)
-    qd, qdd = stack("velocity"), stack("acceleration")
+    notes = []
+    efforts: Array | None = None
+    if q is None or (pose is not None and posed):
+        assert pose is not None  # noqa: S101  one of the two is there
+        q, qd, qdd = _of_pose(path, machine, columns, pose)
+        how = "" if qd is not None else "; velocities and accelerations differentiated"
+        notes.append(f"joints computed from the pose, {', '.join(machine.pose_names)}{how}")
+    else:
+        if pose is not None and follow is None:
+            _check_pose(path, machine, q, pose)
+        qd, qdd = (_stacked(path, columns, machine.joint_names, what) for what in INPUTS[1:])
+        if all(f"{joint}.effort" in columns for joint in machine.joint_names):
+            efforts = _stacked(path, columns, machine.joint_names, "effort")
     check_motion_times(path, time, q, qd)
     if (qd is None or qdd is None) and len(time) < 3:
         raise ParameterError(str(path), f"{len(time)} rows", "3 or more, to differentiate")
     rates = _differentiated(q, time) if qd is None else qd
-    wrench = [columns.get(name, np.zeros(len(time))) for name in WRENCH_AXES]
-    still = None if qd is not None else np.abs(rates) <= rate_doubt(time, q, gradient_gain(time))
-    names = [f"{joint}.effort" for joint in machine.joint_names]
-    efforts = None
-    if all(name in columns for name in names):
-        efforts = np.stack([columns[name] for name in names], -1)
-    notes = [] if carried is None else [f"payload: {carried}"]
-    if posed:
-        notes.append(f"joint positions computed from the pose, {', '.join(machine.pose_names)}")
+    carried = carried or load_of_columns(path, time, columns)
     return Motion(
         machine,
         time,
         q,
         rates,
         _differentiated(rates, time) if qdd is None else qdd,
-        np.stack(wrench, -1),
+        np.stack([columns.get(name, np.zeros(len(time))) for name in WRENCH_AXES], -1),
         load=carried,
-        notes=tuple(notes if machine.controller.plain else [*notes, MAPPED]),
-        still=still,
+        notes=(
+            *([] if carried is None else [f"payload: {carried}"]),
+            *notes,
+            *([] if machine.controller.plain else [MAPPED]),
+        ),
+        still=None if qd is not None else np.abs(rates) <= rate_doubt(time, q, gradient_gain(time)),
         planned=efforts,
     )
+
+
+def _check_names(path: Path, robot: Robot, columns: Mapping[str, Array]) -> None:
+    """Reject columns that begin with a joint's name and are misspelt."""
+    known = [f"{joint}.{what}" for joint in robot.joint_names for what in INPUTS]
+    for name in columns:
+        joint, dot, what = name.rpartition(".")
+        computed = what in ("effort", "measured") or what.startswith("effort_")
+        if dot and joint in robot.joint_names and name not in known and not computed:
+            raise UnknownNameError(f"{path}: column", name, known)
+
+
+def _stacked(
+    path: Path, columns: Mapping[str, Array], names: Sequence[str], what: str
+) -> Array | None:
+    """Columns ``NAME.what``, shape (samples, names), of all names or of none.
+
+    :raises ParameterError: of some.
+    """
+    wanted = [f"{name}.{what}" for name in names]
+    missing = [name for name in wanted if name not in columns]
+    if len(missing) == len(wanted):
+        return None
+    if missing:
+        raise ParameterError(str(path), None, f"a column {missing[0]!r} as for the others")
+    return np.stack([columns[name] for name in wanted], -1)
+
+
+def _of_pose(
+    path: Path, robot: Robot, columns: Mapping[str, Array], pose: Array
+) -> tuple[Array, Array | None, Array | None]:
+    """Joint positions of a pose, and their rates where the table has those of the pose."""
+    q = robot.inverse(pose)
+    # Joint rates in the table are those of the machine whose joint positions it has.
+    rates = [_stacked(path, columns, robot.pose_names, what) for what in INPUTS[1:]]
+    if set(robot.joint_names) & set(robot.pose_names) or rates[0] is None or rates[1] is None:
+        return q, None, None
+    return q, *joint_rates(robot, q, rates[0], rates[1])
+
+
+def _check_pose(path: Path, robot: Robot, q: Array, pose: Array) -> None:
+    """Reject a table whose joint positions and pose are not those of one machine.
+
+    :raises ParameterError: by the sample that is farthest off.
+    """
+    for begin in range(0, len(q), BLOCK):
+        rows = slice(begin, begin + BLOCK)
+        found, good = robot.try_forward(q[rows])
+        off = found - pose[rows]
+        turns = [i for i, unit in enumerate(robot.pose_units) if unit != "m"]
+        off[:, turns] = (off[:, turns] + np.pi) % (2.0 * np.pi) - np.pi
+        # What has no pose is rejected with its own reason later.
+        size = np.where(good, np.linalg.norm(off * robot.pose_scales, axis=1), 0.0)
+        worst = int(size.argmax())
+        if size[worst] > POSE_MISS * robot.size:
+            names = ", ".join(robot.pose_names)
+            raise ParameterError(
+                f"{path}: {names}, sample {begin + worst}",
+                f"{1e3 * size[worst]:.4g} mm from the pose of the joint positions on {robot.name}",
+                "a table of this machine; --follow pose plans its pose again, --follow joints "
+                "ignores it",
+            )  # fmt: skip
 
 
 def _differentiated(values: Array, time: Array) -> Array:
@@ -265,7 +334,8 @@ def table(m: Motion, progress: Callable[[int], None] | None = None) -> dict[str,
                 put(f"{name}.{axis}", react.wrenches[:, k, i])
         if progress is not None:
             progress(part.stop)
-    return {name: np.concatenate(parts) for name, parts in columns.items()}
+    whole = {name: np.concatenate(parts) for name, parts in columns.items()}
+    return whole | payload_columns(m.load, m.time)
 
 
 def check_target(path: Path) -> None:

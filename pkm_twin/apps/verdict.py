@@ -29,6 +29,11 @@ class Item:
     verdict: Verdict
 
 
+def judged_item(what: str, value: str, bound: str, good: bool) -> Item:
+    """A property that is good or bad."""
+    return Item(what, value, bound, Verdict.GOOD if good else Verdict.BAD)
+
+
 def items_table(title: str, bound: str, items: Iterable[Item]) -> Table:
     """Judged properties as a table; ``bound`` is the heading of their bounds."""
     table = Table(title=Text(title))

@@ -55,7 +55,9 @@ Out = Annotated[
 ]
 Picture = Annotated[bool, typer.Option(help="plot the result as a PNG next to the table")]
 Teeth = Annotated[int, typer.Option(help="teeth of the tool")]
-Tangential = Annotated[float, typer.Option(help="tangential cutting coefficient Kt, N/m2")]
+Tangential = Annotated[
+    float, typer.Option(help="tangential cutting coefficient Kt, N/m2, e.g. 600e6 for 600 MPa")
+]
 Radial = Annotated[float, typer.Option(help="ratio of radial to tangential cutting force, Kr")]
 Immersion = Annotated[
     float, typer.Option(help="radial depth of cut over tool diameter, 1 is a slot")
@@ -250,7 +252,10 @@ def lobes(
     at: At = None,
     tool: Tool = "0,0,0",
     damping: Damping = None,
-    points: Annotated[int, typer.Option(help="spindle speeds to compute", min=2, max=10**5)] = 181,
+    points: Annotated[
+        int,
+        typer.Option(help="even spindle speeds; more are added at lobes", min=2, max=10**5),
+    ] = 181,
     deepest: Annotated[
         OptionalFloat,
         typer.Option(
@@ -272,14 +277,16 @@ def lobes(
     --speeds 3000,20000 --tool 0,0,-0.1`.
 
     The tool turns about the platform's z axis, clockwise from above. The command prints the
-    spindle speed with the largest stable axial depth of cut, and the smallest limit in the range.
-    The machine's modes count, not the flexibility of spindle, holder and tool.
+    smallest limit in the range of speeds, and the spindle speed with the largest stable axial depth
+    of cut if the speed may be off by 1 %. Speeds are added at minima and steep flanks of the limit
+    until these numbers no longer change. The machine's modes count, not the flexibility of spindle,
+    holder and tool.
 
     The table has the columns speed (rpm), depth (m) and open: 1 where the cut is stable up to the
     largest depth that was computed.
     """
     from pkm_twin.apps.torques import write_table
-    from stiffness_monitor.chatter import lobes_of
+    from stiffness_monitor.chatter import MARGIN, lobes_between
     from stiffness_monitor.vibration import tool_modes
 
     low, high = numbers(speeds, 2, "LOW,HIGH")
@@ -290,22 +297,23 @@ def lobes(
         robot, platform, payload, at, out, picture, overwrite, beyond_limits
     )
     modes = tool_modes(machine, pose, damping=process.damping, tool=process.tool)
-    found = lobes_of(modes, process.milling, np.linspace(low, high, points), deepest)
-    best, least = found.best, int(found.depths.argmin())
+    found = lobes_between(modes, process.milling, low, high, points, deepest)
+    best, least = found.steady(), int(found.depths.argmin())
     data = _common(machine, pose, modes) | {
-        "best": _place(found, best),
-        "least": _place(found, least),
+        "best": _place(*best) | {"speed_margin": MARGIN},
+        "least": _place(found.speeds[least], found.depths[least], found.open[least]),
         "zero_order_depth_m": found.safe if math.isfinite(found.safe) else None,
         "speeds_rpm": found.speeds.tolist(),
         "depths_m": found.depths.tolist(),
         "out": None if out is None else str(out),
         "picture": None if drawing is None else str(drawing),
     }
-    more = "more than " if found.open[best] else ""
+    more = "more than " if found.open[least] else ""
     title = (
-        f"{machine.name}: stable up to {more}{1e3 * found.depths[best]:.3g} mm at "
-        f"{found.speeds[best]:.0f} rpm, to {1e3 * found.depths[least]:.3g} mm at every speed from "
-        f"{low:g} to {high:g} rpm"
+        f"{machine.name}: stable up to {more}{1e3 * found.depths[least]:.3g} mm at every speed "
+        f"from {low:g} to {high:g} rpm (least at {found.speeds[least]:.0f} rpm); up to "
+        f"{'more than ' if best[2] else ''}{1e3 * best[1]:.3g} mm at {best[0]:.0f} rpm "
+        f"± {100 * MARGIN:g} %"
     )
     if out is not None:
         columns = {"speed": found.speeds, "depth": found.depths, "open": found.open.astype(float)}
@@ -315,11 +323,8 @@ def lobes(
     _print(data, [title], as_json, out)
 
 
-def _place(found: Lobes, k: int) -> dict[str, Any]:
-    return {
-        "speed_rpm": float(found.speeds[k]), "depth_m": float(found.depths[k]),
-        "open": bool(found.open[k]),
-    }  # fmt: skip
+def _place(speed: float, depth: float, is_open: bool) -> dict[str, Any]:
+    return {"speed_rpm": float(speed), "depth_m": float(depth), "open": bool(is_open)}
 
 
 def _draw_lobes(found: Lobes, milling: Milling, title: str, path: Path) -> None:
@@ -330,9 +335,10 @@ def _draw_lobes(found: Lobes, milling: Milling, title: str, path: Path) -> None:
     depth = 1e3 * found.depths
     ax.plot(found.speeds, depth, color="black", lw=1.2)
     ax.fill_between(found.speeds, depth, 1.05 * depth.max(), color=plots.COLOURS[1], alpha=0.3)
-    ax.plot(found.speeds[found.best], depth[found.best], "*", color="red", mec="white", ms=13)
+    speed, safe, _ = found.steady()
+    ax.plot(speed, 1e3 * safe, "*", color="red", mec="white", ms=13)
     way = "slot" if milling.immersion == 1.0 else "up-milling" if milling.up else "down-milling"
-    head = f"{title}\n{milling.teeth} teeth, {way}; chatter above the line"
+    head = f"{title.replace('; ', chr(10))}\n{milling.teeth} teeth, {way}; chatter above the line"
     plots.label(ax, "spindle speed (rpm)", "axial depth of cut (mm)", head, 10)
     ax.set_ylim(0.0, 1.05 * depth.max())
     ax.margins(x=0.0)

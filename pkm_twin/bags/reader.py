@@ -301,10 +301,16 @@ def _joined(path: Path, reports: list[BagReport], storage: Storage) -> BagReport
     filled = [report for report in reports if report.message_count]
     count = sum(report.message_count for report in reports)
     warnings = list(dict.fromkeys(text for report in reports for text in report.warnings))
-    if storage.message_count is not None and storage.message_count != count:
-        warnings.append(
-            f"{METADATA_FILE} states {storage.message_count} messages, there are {count}"
-        )
+    stated = {"": storage.message_count} if storage.message_count is not None else {}
+    stated |= {f" on {name}": number for name, number in storage.by_topic.items()}
+    stated |= {f" in {name}": number for name, number in storage.by_file.items()}
+    counts = {"": count} | {f" on {name}": info.count for name, info in topics.items()}
+    counts |= {f" in {report.path.name}": report.message_count for report in reports}
+    miscounts = tuple(
+        f"{METADATA_FILE} states {said} messages{where}, there are {counts.get(where, 0)}"
+        for where, said in stated.items()
+        if said != counts.get(where, 0)
+    )
     return BagReport(
         path=path,
         profile=reports[0].profile,
@@ -316,7 +322,8 @@ def _joined(path: Path, reports: list[BagReport], storage: Storage) -> BagReport
         has_crc=all(report.has_crc for report in reports),
         has_index=all(report.has_index for report in reports),
         has_summary=all(report.has_summary for report in reports),
-        warnings=tuple(warnings),
+        warnings=(*warnings, *miscounts),
+        miscounts=miscounts,
         out_of_order=sum(report.out_of_order for report in reports),
         metadata={name: entries for r in reports for name, entries in r.metadata.items()},
     )

@@ -50,6 +50,8 @@ class BagReport:
     out_of_order: int
     """Messages whose log time is before that of one earlier in the file."""
     metadata: Mapping[str, Mapping[str, str]]
+    miscounts: tuple[str, ...] = ()
+    """Message counts of the bag's folder that its files contradict; they are warnings too."""
 
     @property
     def duration(self) -> float:

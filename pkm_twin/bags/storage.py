@@ -14,7 +14,7 @@ import shlex
 import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import IO, Any, Final
@@ -123,10 +123,15 @@ class _Positional(io.RawIOBase):
 
 @dataclass(frozen=True)
 class Storage:
-    """The files of a bag in order, and the message count that its folder states, if any."""
+    """The files of a bag in order, and the message counts that its folder states.
+
+    ``message_count``: of all, None where it is not stated; ``by_topic`` and ``by_file``: by name.
+    """
 
     files: tuple[BagFile, ...]
     message_count: int | None = None
+    by_topic: Mapping[str, int] = field(default_factory=dict)
+    by_file: Mapping[str, int] = field(default_factory=dict)
 
 
 def is_bag(path: Path) -> bool:
@@ -212,7 +217,9 @@ class _Field:
             raise self.error("a text")
         return default if self.value is None else self.value
 
-    def items(self) -> list[_Field]:
+    def items(self, optional: bool = False) -> list[_Field]:
+        if optional and self.value is None:
+            return []
         if not isinstance(self.value, list):
             raise self.error("a list")
         return [_Field(self._path, f"{self.name}[{i}]", v) for i, v in enumerate(self.value)]
@@ -248,7 +255,22 @@ def _described(folder: Path, root: _Field) -> Storage:
         files.append(BagFile(folder / name))
     if not files:
         raise facts.get("relative_file_paths").error("the names of the bag's files")
-    return Storage(tuple(files), facts.get("message_count").count())
+    topics = {
+        entry.get("topic_metadata").get("name").text(): entry.get("message_count").count()
+        for entry in facts.get("topics_with_message_count").items(optional=True)
+    }
+    # Of a file that is packed as a whole rosbag2 states the name before the packing.
+    names = {file.path.name.removesuffix(".zstd"): file.path.name for file in files}
+    parts = {
+        names.get(name.removesuffix(".zstd"), name): entry.get("message_count").count()
+        for entry in facts.get("files").items(optional=True)
+        for name in (entry.get("path").text(),)
+    }
+    return Storage(
+        tuple(files), facts.get("message_count").count(),
+        {name: count for name, count in topics.items() if count is not None},
+        {name: count for name, count in parts.items() if count is not None},
+    )  # fmt: skip
 
 
 def _load(path: Path) -> object:

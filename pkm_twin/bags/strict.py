@@ -99,6 +99,7 @@ class Check:
         self._offsets: list[tuple[int, int, int]] = []
         self._statistics: tuple[tuple[int, ...], dict[int, int]] | None = None
         self._in_data: tuple[int, int] = (0, 0)
+        self._notes: list[str] = []
 
     def run(self) -> None:
         """Read the file from its first byte to its last."""
@@ -384,8 +385,6 @@ class Check:
             ("attachment count", places[0], len(self._attachment_places)),
             ("metadata count", places[1], len(self._metadata_places)),
             ("chunk count", places[2], len(self._chunks)),
-            ("first log time", start, self._total.start),
-            ("last log time", end, self._total.end),
             ("counts by channel", stated, {n: span.count for n, span in self._spans.items()}),
         ]
         for what, said, found in pairs:
@@ -393,6 +392,15 @@ class Check:
                 raise FormatError(
                     f"the {what} is {found}; the statistics say {said}", None, "statistics"
                 )
+        # Some writers take a log time of 0 for none. The messages themselves are all there.
+        self._notes += [
+            f"the {what} is {found}; the statistics say {said}"
+            for what, said, found in (
+                ("first log time", start, self._total.start),
+                ("last log time", end, self._total.end),
+            )
+            if said != found
+        ]
         # Writers differ in whether a schema or channel that is only in the summary counts.
         ranges = [
             ("schema", schemas, self._in_data[0], len(self.records.schemas)),
@@ -443,6 +451,7 @@ class Check:
             yield "there is no summary: read by a scan, the message count is unproven"
         elif self._statistics is None:
             yield "the summary has no statistics: the message count is unproven"
+        yield from self._notes
         if self._out_of_order:
             yield f"{self._out_of_order} messages are out of order by log time"
         if self._unknown:

@@ -1,18 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Compiled programs on disk, named by their content. An optimisation: without it all works."""
+"""Compiled programs on disk, named by digests. An optimisation: without it all works."""
 
 from __future__ import annotations
 
+import fcntl
 import hashlib
 import json
 import logging
 import os
+import re
 import stat
 import struct
 import sys
 import tempfile
-from collections.abc import Mapping
-from contextlib import suppress
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, Final
 
@@ -24,6 +27,10 @@ _ELF: Final = struct.Struct("<4s36xQ10xHH2x")
 _LARGEST: Final = 64 * 1024 * 1024
 MOST: Final = 512 * 1024 * 1024
 """Bytes of all programs above which those that were not used for the longest time are deleted."""
+LOCK_TIMEOUT: Final = 60.0
+"""Seconds to wait for another process that compiles the same program; it may be suspended."""
+_LOCK_PERIOD: Final = 0.01
+_NAME: Final = re.compile("[0-9a-f]{32,64}")
 _LOG: Final = logging.getLogger("pkm_twin")
 
 
@@ -70,7 +77,7 @@ def read(name: str) -> tuple[dict[str, Any], bytes] | None:
     It must be this user's own, whole, and sealed under this very name.
     """
     place = folder()
-    if place is None:
+    if place is None or not _NAME.fullmatch(name):
         return None
     try:
         # A FIFO in its place would wait for a writer, a device never end.
@@ -139,6 +146,34 @@ def write(name: str, header: Mapping[str, Any], code: bytes) -> None:
         if temporary is not None:
             with suppress(OSError):
                 os.unlink(temporary)
+
+
+@contextmanager
+def alone(name: str) -> Iterator[None]:
+    """Keep other processes from compiling the same program meanwhile.
+
+    Where no lock can be had, or another process holds it for :data:`LOCK_TIMEOUT`, go on without.
+    """
+    place = folder()
+    handle = None
+    if place is not None:
+        with suppress(OSError):
+            path = place / f"{name}.lock"
+            handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+            end = time.monotonic() + LOCK_TIMEOUT
+            while time.monotonic() < end:
+                with suppress(BlockingIOError):
+                    fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                    break
+                time.sleep(_LOCK_PERIOD)
+    try:
+        yield
+    finally:
+        if handle is not None:
+            # A process that waits for the deleted file finds the stored program, as any later one.
+            with suppress(OSError):
+                os.unlink(path)
+            os.close(handle)
 
 
 def _shrink(place: Path) -> None:

@@ -20,7 +20,8 @@ class SparseCholesky:
     """L D L' without pivoting, which a positive matrix does not need, in the order of least degree.
 
     Row and column k of the factors are those of ``order[k]`` of the matrix. ``factors``: L below
-    its diagonal; ``below``: by column the rows where it is not zero; ``pivots``: D.
+    its diagonal; ``below``: by column the rows where it is not zero; ``pivots``: D; ``inverses``:
+    their reciprocals.
 
     :param matrix: lower triangle with its whole diagonal; what is left out is zero.
     :param scale: what pivots are compared with, of the matrix' diagonal.
@@ -37,11 +38,13 @@ class SparseCholesky:
             left[max(i, j), min(i, j)] = value
         self.factors: Entries = {}
         self.pivots: list[Any] = []
+        self.inverses: list[Any] = []
         self.below: list[list[int]] = []
         for j, index in enumerate(self.order):
             self.pivots.append(maximum(left[j, j], FLOOR * scale[index]))
             column = [i for i in range(j + 1, n) if (i, j) in left]
             inverse = 1.0 / self.pivots[j]
+            self.inverses.append(inverse)
             for i in column:
                 self.factors[i, j] = left[i, j] * inverse
             for i in column:
@@ -50,14 +53,19 @@ class SparseCholesky:
                         left[i, k] = left.get((i, k), 0.0) - self.factors[i, j] * left[k, j]
             self.below.append(column)
 
-    def solve(self, right: Sequence[Any]) -> list[Any]:
-        """X of A x = right, shape (n,)."""
+    def forward(self, right: Sequence[Any]) -> list[Any]:
+        """Y of L y = right, shape (n,), in the order of the factors."""
         b = [right[index] for index in self.order]
         for j, rows in enumerate(self.below):
             for i in rows:
                 b[i] = b[i] - self.factors[i, j] * b[j]
+        return b
+
+    def solve(self, right: Sequence[Any]) -> list[Any]:
+        """X of A x = right, shape (n,)."""
+        b = self.forward(right)
         for j in reversed(range(len(b))):
-            b[j] = b[j] / self.pivots[j]
+            b[j] = b[j] * self.inverses[j]
             for i in self.below[j]:
                 b[j] = b[j] - self.factors[i, j] * b[i]
         return [b[self.place[index]] for index in range(len(b))]
@@ -111,7 +119,7 @@ def traces_over(numerators: Sequence[Objects], matrix: Objects) -> list[Any]:
             for k in below[j]:
                 total = total - entry(i, k) * factors[k, j]
             inverse[i, j] = total
-        diagonal = 1.0 / whole.pivots[j]
+        diagonal = whole.inverses[j]
         for k in below[j]:
             diagonal = diagonal - factors[k, j] * inverse[k, j]
         inverse[j, j] = diagonal

@@ -96,18 +96,33 @@ class Code:
                 return _header(self.program, 1), plain.prepare, plain, None
             from pkm_twin.codegen import native
 
-            name = self.key.digest(llvm.IDENTITY)
-            stored = cache.read(name)
-            if stored and _sound(stored[0]) and cache.is_object(stored[1], native.SYMBOL):
-                header, code = stored
-            else:
-                header = _header(self.program, llvm.LANES)
-                level = native.QUICK if self.program.quick else native.OPTIMISATION
-                code = native.compile_object(llvm.emit(self.program), level)
-                cache.write(name, header, code)
+            header, code = self._compiled(llvm, native)
             prepare, address = native.load_object(code)
             prepare = native.LOCKED(prepare)
             return header, prepare, native.PROTOTYPE(address), native.LOCKED(address)
+
+    def _compiled(self, llvm: ModuleType, native: ModuleType) -> tuple[dict[str, Any], bytes]:
+        """Sizes and object code: stored under the emitted text, which is stored under the key.
+
+        So a change of a source that changes no emitted text compiles nothing.
+        """
+        source = self.key.digest(llvm.IDENTITY)
+        match cache.read(source):
+            case ({"program": str(name), **more}, b"") if not more:
+                stored = _stored(name, native.SYMBOL)
+                if stored is not None:
+                    return stored
+        header = _header(self.program, llvm.LANES)
+        level = native.QUICK if self.program.quick else native.OPTIMISATION
+        text = llvm.emit(self.program)
+        name = cache.digest(text, repr(header), str(level), llvm.IDENTITY)
+        with cache.alone(name):
+            stored = _stored(name, native.SYMBOL)
+            if stored is None:
+                stored = header, native.compile_object(text, level)
+                cache.write(name, *stored)
+        cache.write(source, {"program": name}, b"")
+        return stored
 
     @cached_property
     def sizes(self) -> tuple[tuple[int, ...], tuple[int, ...]]:
@@ -389,6 +404,13 @@ def _header(program: Program, lanes: int) -> dict[str, Any]:
         "prepared": lanes * (len(program.prepared) + 1),
         "stepped": program.equations is not None,
     }
+
+
+def _stored(name: str, symbol: str) -> tuple[dict[str, Any], bytes] | None:
+    """A stored program's sizes and object code; None where there is none that can run."""
+    stored = cache.read(name)
+    good = stored is not None and _sound(stored[0]) and cache.is_object(stored[1], symbol)
+    return stored if good else None
 
 
 def _sound(header: dict[str, Any]) -> bool:

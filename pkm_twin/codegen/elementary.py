@@ -15,6 +15,8 @@ COSINE: Final = (
     -1.13585365213876817300e-11, 2.08757008419747316778e-9, -2.75573141792967388112e-7,
     2.48015872888517045348e-5, -1.38888888888730564116e-3, 4.16666666666665929218e-2,
 )  # fmt: skip
+MAX_ANGLE: Final = 1e6
+"""Sines and cosines of larger angles, rad, are NaN: the reduction by quarter turns loses digits."""
 QUARTER: Final = (1.5707963267341256e00, 6.0771005065061922e-11, 2.0222662487959506e-21)
 # Arctangent up to 0.66 as x + x z P(z) / Q(z), z = x^2 (Cephes).
 ATAN_P: Final = (

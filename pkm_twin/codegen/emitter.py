@@ -21,7 +21,7 @@ from pkm_twin.codegen.assembly import (
     vector,
     whole,
 )
-from pkm_twin.codegen.elementary import ATAN_P, ATAN_Q, COSINE, MORE, QUARTER, SINE
+from pkm_twin.codegen.elementary import ATAN_P, ATAN_Q, COSINE, MAX_ANGLE, MORE, QUARTER, SINE
 from pkm_twin.codegen.expressions import SAMPLE, Expression, ordered
 from pkm_twin.codegen.native import FUSED
 
@@ -110,7 +110,7 @@ class Emitter:
             return self._turned[number]
         b, n = self.b, self.number
         quarters = self.call("rint", b.fmul(x, n(2 / math.pi)))
-        y = x
+        y = b.select(b.fcmp("olt", self.call("fabs", x), n(MAX_ANGLE)), x, n(math.nan))
         for part in QUARTER:
             y = self.fused(quarters, n(-part), y)
         z = b.fmul(y, y)

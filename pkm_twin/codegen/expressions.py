@@ -269,9 +269,37 @@ def _binary(op: str, plain: Callable[[Any, Any], Any]) -> Callable[[Any, Any], A
     return apply
 
 
+def _circle(e: Expression) -> tuple[Any, Any] | None:
+    """Cosine and sine of an arctangent, or of a sum of arctangents, without computing an angle."""
+    if e.op == "atan2":
+        over = 1.0 / sqrt(e.b * e.b + e.a * e.a)
+        return e.b * over, e.a * over
+    if e.op == "neg":
+        inner = _circle(e.a)
+        return inner and (inner[0], -inner[1])
+    if e.op not in ("add", "sub"):
+        return None
+    first, second = _circle(e.a), _circle(e.b)
+    if first is None or second is None:
+        return None
+    (c, s), (d, t) = first, second
+    t = t if e.op == "add" else -t
+    return c * d - s * t, s * d + c * t
+
+
+def _of_circle(op: str, plain: Callable[[Any], Any], index: int) -> Callable[[Any], Any]:
+    compute = _unary(op, plain)
+
+    def apply(x: Any) -> Any:
+        circle = _circle(x) if isinstance(x, Expression) else None
+        return compute(x) if circle is None else circle[index]
+
+    return apply
+
+
 sqrt: Final = _unary("sqrt", np.sqrt)
-sin: Final = _unary("sin", np.sin)
-cos: Final = _unary("cos", np.cos)
+sin: Final = _of_circle("sin", np.sin, 1)
+cos: Final = _of_circle("cos", np.cos, 0)
 absolute: Final = _unary("abs", np.abs)
 sign: Final = _unary("sign", np.sign)
 """-1, 0 or 1."""

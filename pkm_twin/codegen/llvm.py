@@ -33,6 +33,7 @@ from pkm_twin.codegen.program import (
     CHANGE,
     CLOSED,
     CONTRACTION,
+    LARGE,
     RESIDUAL,
     STEPPED,
     TURNS,
@@ -243,8 +244,8 @@ class _Writer:
         # Inputs that no output hangs on have to be numbers, too.
         for name in program.inputs:
             for value in values[name]:
-                total = b.fadd(total, b.fmul(value, out.number(0.0)))
-        finite = b.fcmp("olt", total, out.number(math.inf))
+                total = b.fadd(total, out.call("fabs", value))
+        finite = b.fcmp("olt", total, out.number(LARGE))
         code = b.select(good, b.select(finite, out.number(0.0), out.number(2.0)), out.number(1.0))
         good = b.and_(good, finite)
         nothing = out.number(math.nan)

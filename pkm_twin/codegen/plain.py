@@ -14,11 +14,13 @@ from typing import Any, Final
 import numpy as np
 
 from pkm_twin.codegen.arrays import Array, Mask
+from pkm_twin.codegen.elementary import MAX_ANGLE
 from pkm_twin.codegen.expressions import GEOMETRY, OPERATIONS, PARAMETERS, Expression, ordered, uses
 from pkm_twin.codegen.program import (
     CHANGE,
     CLOSED,
     CONTRACTION,
+    LARGE,
     RESIDUAL,
     STEPPED,
     TURNS,
@@ -36,12 +38,20 @@ def _sign(value: float) -> float:
     return (value > 0.0) - (value < 0.0)
 
 
+def _one(function: Callable[[float], float]) -> Callable[[float], float]:
+    return lambda x: function(x) if abs(x) < MAX_ANGLE else math.nan
+
+
+def _many(function: Callable[[Array], Array]) -> Callable[[Array], Array]:
+    return lambda x: function(np.where(np.abs(x) < MAX_ANGLE, x, np.nan))
+
+
 _ONE: Final = {
-    "sqrt": math.sqrt, "sin": math.sin, "cos": math.cos, "fabs": abs, "sign": _sign,
+    "sqrt": math.sqrt, "sin": _one(math.sin), "cos": _one(math.cos), "fabs": abs, "sign": _sign,
     "atan2": math.atan2, "fmin": min, "fmax": max, "inf": math.inf, "nan": math.nan,
 }  # fmt: skip
 _MANY: Final = {
-    "sqrt": np.sqrt, "sin": np.sin, "cos": np.cos, "fabs": np.abs, "sign": np.sign,
+    "sqrt": np.sqrt, "sin": _many(np.sin), "cos": _many(np.cos), "fabs": np.abs, "sign": np.sign,
     "atan2": np.arctan2, "fmin": np.minimum, "fmax": np.maximum, "inf": math.inf, "nan": math.nan,
 }  # fmt: skip
 
@@ -182,7 +192,7 @@ class PlainCode:
             values, (residual, *branch) = values[:at], values[at:]
             if not (residual <= RESIDUAL**2 and all(value > 0.0 for value in branch)):
                 return nothing, (1.0, reached)
-        if not all(map(math.isfinite, [*values, *(v for row in inputs for v in row)])):
+        if not sum(map(abs, [*values, *(v for row in inputs for v in row)])) < LARGE:
             return nothing, (2.0, reached)
         return self._split(values), (0.0, reached)
 
@@ -231,11 +241,10 @@ class PlainCode:
             good = good & (residual <= RESIDUAL**2)
             for value in branch:
                 good = good & (value > 0.0)
-        finite = np.ones(count, bool)
-        for row in inputs:
-            finite &= np.isfinite(row).all(-1)
-        for value in values:
-            finite &= np.isfinite(value)
+        total = np.zeros(count)
+        for value in [*values, *(column for row in inputs for column in row.T)]:
+            total = total + np.abs(value)
+        finite = total < LARGE
         code = np.where(good, np.where(finite, 0.0, 2.0), 1.0)
         outputs = [
             np.where((good & finite)[:, None], _table(row, count).T, np.nan)

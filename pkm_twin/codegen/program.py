@@ -37,6 +37,8 @@ DIRECT: Final = 1e-3
 """Least determinant, over the one at home, of a state that is reached in one step from home."""
 STEPPED: Final = 1e-8
 """The same with more steps: no correction can step over a singularity then."""
+LARGE: Final = 1e300
+"""Sum of the sizes of inputs and results from which on they count as infinite."""
 RESIDUAL: Final = 1e-10
 """Largest residual of all equations, those that were not solved too, lengths over the size."""
 

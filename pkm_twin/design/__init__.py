@@ -6,16 +6,17 @@ from pkm_twin.design.pose_path import PosePath
 from pkm_twin.design.quantities import QUANTITIES
 from pkm_twin.design.search import DesignPoint
 from pkm_twin.design.sweep import Sweep, sweep
-from pkm_twin.design.tolerance import Budget, pose_errors
+from pkm_twin.design.tolerance import Tolerances, drawn, tolerances
 
 __all__ = [
     "QUANTITIES",
-    "Budget",
     "Design",
     "DesignPoint",
     "PosePath",
     "Sweep",
+    "Tolerances",
     "design",
-    "pose_errors",
+    "drawn",
     "sweep",
+    "tolerances",
 ]

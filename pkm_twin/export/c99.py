@@ -21,6 +21,7 @@ from pkm_twin.codegen.program import (
     CHANGE,
     CLOSED,
     CONTRACTION,
+    LARGE,
     RESIDUAL,
     STEPPED,
     TURNS,
@@ -33,7 +34,6 @@ LADDER: Final = (1, *STEPS)
 """Steps of Newton's method, one attempt after the other."""
 CORRECTIONS: Final = TURNS * sum(LADDER)
 """Most corrections of a call."""
-_LARGE: Final = 1e300
 _OPERATIONS: Final[Mapping[str, Callable[..., Any]]] = {
     "add": operator.add, "sub": operator.sub, "mul": operator.mul, "neg": operator.neg,
     "inv": lambda x: 1.0 / x, "sqrt": expressions.sqrt, "sin": expressions.sin,
@@ -108,7 +108,7 @@ static int @_finite(const double *values, int count)
     for (i = 0; i < count; i++) {{
         total += fabs(values[i]);
     }}
-    return (total < HUGE_VAL) ? 1 : 0;
+    return (total < {LARGE!r}) ? 1 : 0;
 }}
 
 /* Status of results r, behind which stand the square of the closures' residual, and numbers that
@@ -216,7 +216,7 @@ static const int @_steps[{len(LADDER)}] = {{{steps}}};
         if q.start is not None:
             begin = self.function(f"{name}_start", q.start, known, aim) % "x"
             start = f"\n        if (steps == 1) {{\n            {begin};\n        }}"
-        least, size = _choice(q.least, STEPPED), _choice(q.before, _LARGE)
+        least, size = _choice(q.least, STEPPED), _choice(q.before, LARGE)
         self.add(table(f"@_{name}_home", [e.a for e in q.home]))
         self.add(table(f"@_{name}_origin", [e.a for e in q.origin]))
         self.add(f"""\

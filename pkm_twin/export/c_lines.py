@@ -7,14 +7,12 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Final
 
-from pkm_twin.codegen.elementary import COSINE, QUARTER, SINE
+from pkm_twin.codegen.elementary import COSINE, MAX_ANGLE, QUARTER, SINE
 from pkm_twin.codegen.expressions import Expression, ordered, uses
 
 LONGEST: Final = 44
 """Characters of an expression that is written into another one."""
-FAR: Final = 1e5
-"""Angle from which on the reduction below loses digits; the library's is slower."""
-QUARTERS: Final = 65536
+QUARTERS: Final = 1048576
 """More quarter turns than that angle has: what is above zero is truncated downwards."""
 
 
@@ -64,12 +62,13 @@ HEAD: Final = """\
 """
 HELPERS: Final = {
     "sin": f"""\
-/* Sines and cosines: polynomials after Cody and Waite's reduction by quarter turns. */
+/* Sines and cosines: polynomials after Cody and Waite's reduction by quarter turns. NaN where
+   the angle is so large that the reduction loses digits. */
 static void @_turn(const double *x, double *s, double *c, int count)
 {{
     int i;
     for (i = 0; i < count; i++) {{
-        const double angle = (fabs(x[i]) < {FAR!r}) ? x[i] : 0.0;
+        const double angle = (fabs(x[i]) < {MAX_ANGLE!r}) ? x[i] : 0.0;
         const int k = (int)((angle * {number(2.0 / math.pi)}) + {QUARTERS}.5) - {QUARTERS};
         const double n = -(double)k;
         const double y = PKM_FMA(n, {number(QUARTER[2])},
@@ -85,9 +84,8 @@ static void @_turn(const double *x, double *s, double *c, int count)
         c[i] = PKM_FMA(u, cosine, -(v * sine));
     }}
     for (i = 0; i < count; i++) {{
-        if (!(fabs(x[i]) < {FAR!r})) {{
-            s[i] = sin(x[i]);
-            c[i] = cos(x[i]);
+        if (!(fabs(x[i]) < {MAX_ANGLE!r})) {{
+            s[i] = c[i] = (double)NAN;
         }}
     }}
 }}

@@ -29,6 +29,7 @@ from pkm_twin.export.c_templates import (
     README,
 )
 from pkm_twin.machine.inertia import Layout
+from pkm_twin.machine.sections import MAX_LENGTH, MAX_MASS, payload_margins
 from pkm_twin.robot.robot import SAME_POSE, SINGULARITY_BOUND, Robot
 from stiffness_monitor.compliance import HELD
 from stiffness_monitor.programs import Elastic, elastic_of
@@ -278,11 +279,14 @@ class Package:
 
     def _write_parameters(self) -> None:
         unit, size = self.unit, len(self.parameters)
-        call = unit.function("prepare", self.parameters, {})
+        mass, com, inertia = self.payload[0], self.payload[1:4], self.payload[4:].reshape(3, 3)
+        margins = [self.fold.tape.lift(m) for m in payload_margins(mass, com, inertia)]
+        results = [*self.parameters, *margins]
+        call = unit.function("prepare", results, {})
         unit.add(f"""\
 int @_parameters(double mass, const double *com, const double *inertia, double *out)
 {{
-    double p[13], r[{size}];
+    double p[13], r[{len(results)}];
     int i, status;
     p[0] = mass;
     for (i = 0; i < 3; i++) {{
@@ -292,7 +296,12 @@ int @_parameters(double mass, const double *com, const double *inertia, double *
         p[4 + i] = inertia[i];
     }}
     {call % "r"};
-    status = ((mass >= 0.0) && (@_finite(p, 13) != 0) && (@_finite(r, {size}) != 0)) ? 0 : 2;
+    status = ((@_finite(p, 13) != 0) && (@_finite(r, {size}) != 0)) ? 0 : 2;
+    for (i = {size}; i < {len(results)}; i++) {{
+        if (!(r[i] >= 0.0)) {{
+            status = 2;
+        }}
+    }}
     @_give(status, r, out, {size});
     return status;
 }}
@@ -340,7 +349,7 @@ int @_parameters(double mass, const double *com, const double *inertia, double *
                 + f"{self.unit.signature(routine, given=True)};\n"
             )
         if self.massive:
-            what = _comment(PARAMETERS_OF.format(size=size))
+            what = _comment(PARAMETERS_OF.format(size=size, mass=MAX_MASS, reach=MAX_LENGTH))
             parts.append(
                 f"{what}\nint @_parameters(double mass, const double *com, "
                 "const double *inertia, double *out);\n"

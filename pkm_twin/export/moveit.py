@@ -13,6 +13,7 @@ from __future__ import annotations
 import re
 import xml.etree.ElementTree as ET
 from collections.abc import Sequence
+from itertools import combinations
 from typing import Any, Final
 
 import numpy as np
@@ -21,8 +22,9 @@ from numpy.typing import NDArray
 
 from pkm_twin.errors import ParameterError
 from pkm_twin.machine.urdf_write import GROUND, PLATFORM
+from pkm_twin.robot.clearance import distance
 from pkm_twin.robot.robot import Robot
-from pkm_twin.robot.robot_urdf import robot_urdf
+from pkm_twin.robot.robot_urdf import robot_tree, robot_urdf
 
 Array = NDArray[np.float64]
 
@@ -88,8 +90,9 @@ def srdf(robot: Robot, urdf: str) -> str:
     )
     for joint in robot.passive_joints:
         ET.SubElement(root, "passive_joint", name=joint)
-    for first, second in _touching(tree):
-        ET.SubElement(root, "disable_collisions", link1=first, link2=second, reason="Adjacent")
+    touching = dict.fromkeys(_touching(robot), "Default") | dict.fromkeys(_held(tree), "Adjacent")
+    for (first, second), reason in touching.items():
+        ET.SubElement(root, "disable_collisions", link1=first, link2=second, reason=reason)
     ET.indent(root)
     return '<?xml version="1.0"?>\n' + ET.tostring(root, encoding="unicode") + "\n"
 
@@ -104,10 +107,30 @@ def _drives_of_chain(tree: ET.Element, actuated: Sequence[str]) -> list[str]:
     return found
 
 
-def _touching(tree: ET.Element) -> list[tuple[str, str]]:
-    """Pairs of links that a joint, or a loop that the tree cuts, holds together."""
-    held = [_ends(element) for tag in ("joint", "constraint") for element in tree.findall(tag)]
-    return list(dict.fromkeys((min(pair), max(pair)) for pair in held))
+def _held(tree: ET.Element) -> list[tuple[str, str]]:
+    """Pairs of links that joints, or a loop that the tree cuts, hold together.
+
+    A link without mass and shape stands between the axes of one joint: it joins its neighbours.
+    """
+    pairs = [_ends(element) for tag in ("joint", "constraint") for element in tree.findall(tag)]
+    for link in tree.findall("link"):
+        mass = link.find("inertial/mass")
+        empty = mass is not None and float(mass.get("value", "0")) == 0.0
+        if empty and link.find("collision") is None:
+            own = link.get("name", "")
+            near = {name for pair in pairs if own in pair for name in pair} - {own}
+            pairs += combinations(sorted(near), 2)
+    return list(dict.fromkeys((min(pair), max(pair)) for pair in pairs))
+
+
+def _touching(robot: Robot) -> list[tuple[str, str]]:
+    """Pairs of links whose shapes intersect at home: bars that meet in one point of a body."""
+    pairs = []
+    for one, other in combinations(robot_tree(robot).capsules, 2):
+        gap = distance(one.start, one.end - one.start, other.start, other.end - other.start)
+        if one.body != other.body and not gap > one.radius + other.radius:
+            pairs.append((min(one.body, other.body), max(one.body, other.body)))
+    return list(dict.fromkeys(pairs))
 
 
 def _ends(element: ET.Element) -> tuple[str, str]:

@@ -24,12 +24,16 @@ from delta_dynamics.simulation import tuned
 from pkm_twin.errors import ParameterError
 from pkm_twin.export.c_package import c_package, identifier
 from pkm_twin.machine.graph import POSE
+from pkm_twin.machine.sections import MAX_LENGTH, MAX_MASS
 from pkm_twin.robot.robot import Robot
 
 Array = NDArray[np.float64]
 
 CONTROLLER: Final = "feedforward_controller"
+GRAVITY: Final = "gravity_controller"
 TRAJECTORIES: Final = "joint_trajectory_controller"
+STOP: Final = 0.1
+"""Time constant, s, of the damping of the gravity controller, by the masses at home."""
 CLEAR: Final = 0.05
 """Least singularity index of the motions that the package's own test makes."""
 
@@ -92,6 +96,9 @@ def _words(robot: Robot, package: str) -> dict[str, str]:
         + ", ".join([_number(load.mass), _row(load.com), _row(np.ravel(load.inertia))])
         + "}",
         "DRIVES": _drives(robot),
+        "STOP": f"{STOP:g}",
+        "MAXMASS": _number(MAX_MASS),
+        "MAXLENGTH": _number(MAX_LENGTH),
         "START": _row(controller.controller_positions(home)),
         "RANGE": _row(steps),
     }
@@ -124,13 +131,21 @@ def _drives(robot: Robot) -> str:
     effort = np.full(n, np.inf) if limits.effort is None else np.asarray(limits.effort)
     columns = (
         controller.factors, controller.offsets, ends[:, 0], ends[:, 1],
-        effort / np.abs(controller.factors), friction.viscous, friction.coulomb,
+        effort / np.abs(controller.factors), friction.viscous, friction.coulomb, _damping(robot),
     )  # fmt: skip
     lines = [
         f"  {{{_string(name)}, {', '.join(_number(column[k]) for column in columns)}}},"
         for k, name in enumerate(controller.names)
     ]
     return "\n".join(lines)
+
+
+def _damping(robot: Robot) -> Array:
+    """Damping of the gravity controller in the controller's numbers, shape (n,)."""
+    # Critical damping of a bandwidth f is 4 pi f times the mass.
+    _, damping = tuned(robot, 1.0 / (4.0 * np.pi * STOP))
+    # Digits that other arithmetic does not change.
+    return np.array([float(f"{d:.6g}") for d in damping / robot.controller.factors**2])
 
 
 def _start(robot: Robot) -> Array:
@@ -175,10 +190,19 @@ def _controllers(robot: Robot, package: str, bandwidth: float) -> str:
         "controller_manager": {
             "update_rate": 500,
             "joint_state_broadcaster": {"type": "joint_state_broadcaster/JointStateBroadcaster"},
-            CONTROLLER: {"type": f"{package}/FeedforwardController"},
+            CONTROLLER: {
+                "type": f"{package}/FeedforwardController",
+                "fallback_controllers": [GRAVITY],
+            },
+            GRAVITY: {"type": f"{package}/GravityController"},
             TRAJECTORIES: {"type": "joint_trajectory_controller/JointTrajectoryController"},
         },
         CONTROLLER: own,
+        GRAVITY: {
+            "gains": {
+                name: {"d": float(d)} for name, d in zip(joints, _damping(robot), strict=True)
+            },
+        },
         TRAJECTORIES: {
             "joints": joints,
             "command_joints": [f"{CONTROLLER}/{joint}" for joint in joints],
@@ -187,7 +211,8 @@ def _controllers(robot: Robot, package: str, bandwidth: float) -> str:
             "allow_nonzero_velocity_at_trajectory_end": False,
         },
     }
-    sections = {name: {"ros__parameters": section} for name, section in settings.items()}
+    # In every namespace.
+    sections = {f"/**/{name}": {"ros__parameters": part} for name, part in settings.items()}
     head = "# Written by pkm-twin export ros2-control. Effort per controller's unit and its rate.\n"
     return head + yaml.safe_dump(sections, sort_keys=False)
 

@@ -27,13 +27,12 @@ from delta_dynamics.regressor import (
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.machine.schema import frozen
 from pkm_twin.robot.robot import Robot
+from pkm_twin.robot.workspace import random_joints
 
 RANK: Final = 1e-8
 """Least pivot, of columns of norm one, that counts."""
 ABSENT: Final = 1e-10
 """Part of the largest column's norm below which a column is zero, all of them of unit kg."""
-CLEAR: Final = 0.05
-"""Least singularity measure of the random states."""
 SMALL: Final = 1e-7
 """Coefficients below are zero: rounding's."""
 
@@ -92,28 +91,6 @@ def random_states(robot: Robot, count: int, seed: int) -> tuple[Array, Array, Ar
     unit = np.where(slides, size, 1.0)
     g = 9.81 / size
     return q, unit * np.sqrt(g) * rng.normal(size=q.shape), unit * g * rng.normal(size=q.shape)
-
-
-def random_joints(robot: Robot, rng: np.random.Generator, count: int) -> Array:
-    """Joint positions clear of singularities, within limits where there are some, (count, n)."""
-    home, size = robot.graph.home, robot.engine.tree.size
-    half = np.array([0.15 * size if unit == "m" else 0.3 for unit in robot.joint_units])
-    low, high = home - half, home + half
-    if robot.limits.position is not None:
-        given = np.isfinite(robot.limits.position)
-        low = np.where(given[:, 0], robot.limits.position[:, 0], low)
-        high = np.where(given[:, 1], robot.limits.position[:, 1], high)
-    kept, share = np.empty((0, len(home))), 1.0
-    middle, reach = (low + high) / 2, (high - low) / 2
-    while len(kept) < count:
-        drawn = rng.uniform(middle - share * reach, middle + share * reach, (2 * count, len(home)))
-        measure, good = robot.try_singularity(drawn)
-        good = good & (measure > CLEAR)
-        kept = np.concatenate([kept, drawn[good]])
-        if good.mean() < 0.05:
-            # Few joint positions together make an assembly: nearer to home more of them do.
-            middle, share = (middle + home) / 2, 0.7 * share
-    return kept[:count]
 
 
 def _preference(name: str) -> float:

@@ -8,6 +8,7 @@ fit leaves is taken for noise.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
@@ -82,7 +83,9 @@ def elastic_verdict(
 
     prior = found.values - before, found.prior, np.sqrt(np.diag(found.covariance))
     names = [name for name, good in zip(directions, measured.tolist(), strict=True) if good]
-    return judge(names, suspects, cases, prior, respond)
+    told = judge(names, suspects, cases, prior, respond)
+    # Factors are not corrected: what the suspects probably changed is uncertain.
+    return replace(told, unseen=np.concatenate([told.unseen, told.shift[None]]))
 
 
 def _ends(left: Sequence[Array], samples: int) -> list[int]:

@@ -121,7 +121,7 @@ def estimate(
     fitted = start + scales * z
     bound = not possible(fitted, cones)
     if bound:
-        fitted = _nearest(z, factor, start, scales, cones)
+        fitted = nearest(z, factor, start, scales, cones)
         # The bound is exact, but how far it moves the numbers beside it is an estimate.
         moved = (fitted - start) / scales - z
         spread = spread + np.outer(moved, moved)
@@ -209,7 +209,7 @@ def _equilibrated(block: Array) -> Array:
     return scale[:, None] * block * scale
 
 
-def _nearest(z: Array, factor: Array, start: Array, scales: Array, cones: Cones) -> Array:
+def nearest(z: Array, factor: Array, start: Array, scales: Array, cones: Cones) -> Array:
     """The possible parameters nearest to a solution, in its standard deviations.
 
     :param factor: of the scaled parameters' covariance, shape (k, k).

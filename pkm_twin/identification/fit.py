@@ -17,7 +17,7 @@ import numpy as np
 
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import PkmTwinError, SingularityError, UnreachableError
-from pkm_twin.identification.estimation import Estimate
+from pkm_twin.identification.estimation import Estimate, nearest, possible
 from pkm_twin.identification.file_parameters import FileParameters, file_parameters
 from pkm_twin.identification.fit_plausible import recording_fault
 from pkm_twin.identification.fit_rows import Recorded, Rows, next_window, rows_of
@@ -77,8 +77,9 @@ class Number:
 class Judged:
     """Held-out efforts of a recording: ``time`` (k,), s; measured, before and after (k, n).
 
-    ``deviation``: of those after, by what is not known of the parameters, shape (k, n). ``noise``:
-    of a sample as if samples were independent, shape (n,).
+    ``least``: by least squares, before the numbers are corrected, (k, n). ``deviation``: of those
+    after, by what is not known of the parameters, (k, n). ``noise``: of a sample as if samples were
+    independent, (n,).
     """
 
     name: str
@@ -88,6 +89,7 @@ class Judged:
     after: Array
     deviation: Array
     noise: Array = field(default_factory=lambda: np.ones(1))
+    least: Array = field(default_factory=lambda: np.zeros((0, 1)))
 
     def rms(self, which: Array) -> Array:
         """Of measured less predicted, shape (n,)."""
@@ -96,7 +98,10 @@ class Judged:
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """What recordings say of a robot's file."""
+    """What recordings say of a robot's file.
+
+    ``estimate``: of least squares; ``numbers``: corrected by what the verdict's suspects change.
+    """
 
     robot: Robot
     parameters: FileParameters
@@ -126,7 +131,7 @@ def fit(
     accept: bool = False,
     progress: Callable[[int], None] | None = None,
     trial: Verdict | None = None,
-    possible: bool = False,
+    accepted: Sequence[str] | None = None,
 ) -> Fit:
     """Fit some kinds of numbers of a robot's file.
 
@@ -134,7 +139,8 @@ def fit(
     :param accept: fit recordings that this machine cannot have made, too.
     :param progress: called with the number of recordings that are worked on, twice each.
     :param trial: the verdict of a fit before: this fit only predicts and is not judged again.
-    :param possible: a fit before has found that the machine can have made the recordings.
+    :param accepted: what a fit before found of the recordings; None: ask whether this machine can
+        have made them.
     :raises PkmTwinError: recordings that are too short, that show nothing, or that this machine
         cannot have made.
     """
@@ -158,8 +164,8 @@ def fit(
             rows_of(robot, everything, recording, how.window)[0]
             for recording, how in zip(recordings, filtering, strict=True)
         ]
-    faults = []
-    for recording, made in () if possible else zip(recordings, whole, strict=True):
+    faults = [*(accepted or ())]
+    for recording, made in zip(recordings, whole, strict=True) if accepted is None else ():
         fault = recording_fault(robot, everything, recording, made)
         if fault is not None:
             faults.append(f"{recording.name}: {fault}")
@@ -176,26 +182,32 @@ def fit(
         again = solve(parameters, [made.only(chosen, everything.values) for made in other])
         result = _less_sure(result, again.estimate.values - result.values)
     verdict = trial or verdict_of(robot, recordings, everything, chosen, whole, solved)
-    numbers = _numbers(parameters, result, verdict) if trial is None else ()
-    if trial is None:
-        result = replace(result, covariance=verdict.widened(result.covariance))
+    if faults:
+        verdict = replace(verdict, answer="does not explain")
+    best = result if trial else _corrected(parameters, result, verdict)
+    numbers = () if trial else _numbers(parameters, best, verdict)
     if not result.directions or (numbers and all(n.status == "not excited" for n in numbers)):
         raise PkmTwinError(
             f"no excitation: the motion does not identify {', '.join(what)}; pkm-twin excite "
             "designs a motion that does"
         )
+    wide = best.covariance if trial else verdict.widened(best.covariance)
     judged = []
     for recording, made in zip(recordings, rows, strict=True):
         end = made.part(slice(held_from(made), None))
-        before, after = (end.rest + end.table @ v for v in (parameters.values, result.values))
-        spread = np.sqrt(np.sum((end.table @ result.covariance) * end.table, -1).clip(0.0))
+        before, after, least = (
+            end.rest + end.table @ v for v in (parameters.values, best.values, result.values)
+        )
+        spread = np.sqrt(np.sum((end.table @ wide) * end.table, -1).clip(0.0))
         measured = end.target + end.rest
         floor = np.maximum(end.signals.noise, EXACT * np.sqrt(np.mean(measured**2, 0)))
-        judged.append(Judged(recording.name, end.time, measured, before, after, spread, floor))
+        judged.append(
+            Judged(recording.name, end.time, measured, before, after, spread, floor, least)
+        )
     return Fit(
-        robot, parameters, result, numbers, tuple(judged), tuple(filtering),
-        sum(made.outliers for made in rows), sum(held_from(made) for made in rows), delays,
-        verdict, tuple(faults),
+        robot, parameters, replace(result, bound=best.bound), numbers, tuple(judged),
+        tuple(filtering), sum(made.outliers for made in rows),
+        sum(held_from(made) for made in rows), delays, verdict, tuple(faults),
     )  # fmt: skip
 
 
@@ -206,6 +218,26 @@ def refuse_faults(faults: Sequence[str], accept: bool) -> None:
     """
     if faults and not accept:
         raise PkmTwinError(f"{faults[0]}; --accept fits it nevertheless")
+
+
+def _corrected(parameters: FileParameters, result: Estimate, verdict: Verdict) -> Estimate:
+    """Without what the suspects probably changed, or the nearest possible machine to that.
+
+    Of recordings that the model does not explain nothing is known of what they changed.
+    """
+    if verdict.answer == "does not explain":
+        return result
+    aim, cones = result.values - verdict.shift, parameters.cones
+    if possible(aim, cones):
+        return replace(result, values=aim)
+    covariance = verdict.widened(result.covariance) / np.outer(result.prior, result.prior)
+    sizes, vectors = np.linalg.eigh(covariance)
+    factor = vectors * np.sqrt(np.maximum(sizes, 1e-12 * sizes.max()))
+    start = parameters.values
+    near = nearest((aim - start) / result.prior, factor, start, result.prior, cones)
+    # How far a bound moves the numbers next to it is an estimate.
+    moved = result.covariance + np.outer(near - aim, near - aim)
+    return replace(result, values=near, bound=True, covariance=moved)
 
 
 def _less_sure(result: Estimate, change: Array) -> Estimate:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -28,12 +29,10 @@ from pkm_twin.identification.samples import (
     Track,
     by_blocks,
     low_pass,
-    rate_noise,
     tracks,
 )
 from pkm_twin.machine.friction import linear_keys
 from pkm_twin.robot.robot import Robot
-from pkm_twin.streams.rest import SIGMAS
 
 BLOCK: Final = 2048
 OUTLIER: Final = 8.0
@@ -123,8 +122,7 @@ def rows_of(
     pieces, how = tracks(r.time, r.q, r.effort, r.wrench, r.held, window)
     if not pieces:
         raise PkmTwinError(f"{r.name}: too short to fit, no {LEAST // 2} samples without a gap")
-    slow = SIGMAS * rate_noise(how, pieces[0].period)
-    parts = [_piece(robot, parameters, r.carried, track, slow) for track in pieces]
+    parts = [_piece(robot, parameters, r.carried, track, how) for track in pieces]
     if all(not part.moves.any() for part in parts):
         raise PkmTwinError(f"{r.name}: no excitation, the joints stand still")
     first, outliers = _drop_outliers(parts, parameters, how.keep_every)
@@ -136,7 +134,12 @@ def rows_of(
     rubs = _of_drives(robot, parameters)
     rub = [part.table[..., rubs] @ first[rubs] for part in parts]
     left = [part.target - part.table @ first for part in parts]
-    shaken = _shaken(robot, parameters, r, (max(pieces, key=lambda t: len(t.time)), how), first)
+
+    def efforts(track: Track) -> Array:
+        part = _piece(robot, parameters, r.carried, track, how)
+        return np.asarray(part.rest + part.table @ first, np.float64)
+
+    shaken = shaken_efforts(r, max(pieces, key=lambda t: len(t.time)), how, efforts)
     noise = noise_of(left, shaken, pieces[0].period, how)
     rings = resonances_of(left, pieces[0].period, how)
     signals = signals_of(pieces, told, rub, how, noise, rings)
@@ -174,12 +177,13 @@ def calm_table(
     return by_blocks(len(signals.held), BLOCK, block)
 
 
-def _shaken(
-    robot: Robot, parameters: FileParameters, r: Recorded, signals: tuple[Track, Filtering],
-    values: Array,
-) -> Array:  # fmt: skip
-    """What noise of the positions, as large as theirs, changes in the efforts, (samples, n)."""
-    track, how = signals
+def shaken_efforts(
+    r: Recorded, track: Track, how: Filtering, efforts: Callable[[Track], Array]
+) -> Array:
+    """What noise of the positions, as large as theirs, changes in the efforts, (samples, n).
+
+    :param efforts: of a motion, shape (samples, n).
+    """
     noise, rng = np.array(how.position_noise), np.random.default_rng(0)
     edge = (how.window // 2 + 0.5) * track.period
     inside = (r.time > track.time[0] - edge) & (r.time < track.time[-1] + edge)
@@ -188,8 +192,7 @@ def _shaken(
     told = []
     for shake in (np.zeros_like(q), noise * rng.normal(size=q.shape)):
         pieces, _ = tracks(time, q + shake, np.zeros_like(q), window=how.window)
-        parts = [_piece(robot, parameters, r.carried, t, np.zeros(len(noise))) for t in pieces]
-        told.append(np.concatenate([part.rest + part.table @ values for part in parts]))
+        told.append(np.concatenate([efforts(t) for t in pieces]))
     return np.asarray(told[1] - told[0], np.float64)
 
 
@@ -265,7 +268,7 @@ def _of_drives(robot: Robot, parameters: FileParameters) -> Mask:
 
 
 def _piece(
-    robot: Robot, parameters: FileParameters, carried: Robot | None, track: Track, slow: Array
+    robot: Robot, parameters: FileParameters, carried: Robot | None, track: Track, how: Filtering
 ) -> _Piece:
     def block(rows: slice) -> Array:
         motion = track.q[rows], track.qd[rows], track.qdd[rows], track.wrench[rows]
@@ -274,15 +277,7 @@ def _piece(
 
     both = by_blocks(len(track.q), BLOCK, block)
     table, rest = both[..., :-1], both[..., -1]
-    rough = SIGMAS * np.abs(track.qd - np.asarray(_smooth(track.qd))).mean(0)
-    moves = np.abs(track.qd) > np.maximum(np.maximum(rough, slow), 1e-9)
-    return _Piece(table, track.effort - rest, rest, moves.astype(np.float64))
-
-
-def _smooth(values: Array) -> Array:
-    """A running mean of three."""
-    inner = (values[:-2] + values[1:-1] + values[2:]) / 3.0
-    return np.concatenate([values[:1], inner, values[-1:]])
+    return _Piece(table, track.effort - rest, rest, track.moves(how).astype(np.float64))
 
 
 def _drop_outliers(

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -35,8 +35,10 @@ HIGHEST: Final = 0.48
 """Part of the samples' rate up to which the noise is looked at."""
 STEP: Final = 1e-4
 """Of difference quotients by an offset or a give, rad or machine sizes."""
-MOTION: Final = 0.25
+MOTION: Final = 0.4
 """Part of the filter's cut-off in which nearly all of the motion is."""
+SMOOTH: Final = 5
+"""Degree of the splines that have the motion below it."""
 SEGMENT: Final = 256
 """Samples of a spectrum."""
 RESOLVED: Final = 1024
@@ -51,11 +53,11 @@ LIKELY: Final = -16.0
 """Logarithm of the probability by chance below which it is."""
 RESONANCE: Final = "drive resonance"
 INTERFERENCE: Final = "interference at one frequency"
-STENCILS: Final = {
-    1: (-1 / 60, 3 / 20, -3 / 4, 0.0, 3 / 4, -3 / 20, 1 / 60),
-    2: (1 / 90, -3 / 20, 3 / 2, -49 / 18, 3 / 2, -3 / 20, 1 / 90),
-}
-"""Central differences of sixth order, by the order of the derivative."""
+CENTRAL: Final = (7, 6)
+"""Samples and degree of the polynomial whose derivatives in its middle are central differences of
+sixth order."""
+ENDS: Final = (9, 4)
+"""And of the one that is differentiated at the ends of a piece: there are no samples beyond."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,26 +140,43 @@ def _calm(track: Track, load: Array, how: Filtering) -> list[Array]:
     and its derivatives. Noise in both of two columns would look like something in common.
     """
     cutoff = None if how.cutoff is None else MOTION * how.cutoff
-    calm = replace(how, cutoff=cutoff, keep_every=0)
-    q, force = (low_pass(v, track.period, calm) for v in (track.q, load))
-    motion, missed = [q], []
-    inner = slice(how.window // 2 + 3, len(q) - how.window // 2 - 3)
+    motion, force = (calm(values, track.period, cutoff) for values in (track.q, load))
+    missed = []
+    inner = slice(how.window // 2 + 3, len(load) - how.window // 2 - 3)
     for order in (1, 2):
-        fine = _derivative(q, order, track.period)
-        rough = scipy.signal.savgol_filter(q, how.window, DEGREE, order, track.period, axis=0)
-        apart = np.zeros_like(q)
-        apart[inner] = (rough - fine)[inner]
-        motion.append(fine)
+        rough = scipy.signal.savgol_filter(
+            motion[0], how.window, DEGREE, order, track.period, axis=0
+        )
+        apart = np.zeros_like(rough)
+        apart[inner] = (rough - motion[order])[inner]
         missed.append(apart)
-    return [*motion, *missed, force, *(_derivative(force, k, track.period) for k in (1, 2))]
+    return [*motion, *missed, *force]
 
 
-def _derivative(values: Array, order: int, period: float) -> Array:
-    """By central differences of sixth order, along the first axis."""
-    stencil = np.array(STENCILS[order])
-    return np.asarray(
-        scipy.ndimage.correlate1d(values, stencil, axis=0, mode="nearest") / period**order
+def calm(values: Array, period: float, cutoff: float | None) -> list[Array]:
+    """Signals (samples, n) below a frequency, Hz, with their first and second derivative.
+
+    A least-squares spline with two knots a period: unlike a filter's, its ends take nothing for
+    granted of what is beyond them, so that derivatives hold there too. None: as they are.
+    """
+    if cutoff is None:
+        return [values, *(derivative(values, order, period) for order in (1, 2))]
+    last = (len(values) - 1) * period
+    places = np.linspace(0.0, last, 1 + max(1, round(2.0 * cutoff * last)))
+    knots = np.concatenate([np.zeros(SMOOTH), places, np.full(SMOOTH, last)])
+    time = np.linspace(0.0, last, len(values))
+    spline = scipy.interpolate.make_lsq_spline(time, values, knots, SMOOTH)
+    return [np.asarray(spline(time, order), np.float64) for order in range(3)]
+
+
+def derivative(values: Array, order: int, period: float) -> Array:
+    """Along the first axis: central differences of sixth order, polynomials at the ends."""
+    inner, ends = (
+        scipy.signal.savgol_filter(values, points, degree, order, period, axis=0, mode="interp")
+        for points, degree in (CENTRAL, ENDS)
     )
+    beside = CENTRAL[0] // 2
+    return np.concatenate([ends[:beside], inner[beside:-beside], ends[-beside:]])
 
 
 def noise_of(residual: Sequence[Array], shaken: Array, period: float, how: Filtering) -> Array:
@@ -173,9 +192,12 @@ def noise_of(residual: Sequence[Array], shaken: Array, period: float, how: Filte
     rate = 1.0 / period
     begin = UNFILTERED * rate if how.cutoff is None else how.cutoff
     loudest = np.zeros(shaken.shape[1])
-    spectra = [_spectrum(piece, rate) for piece in residual]
-    density = np.mean([own for _, own in spectra], 0)
-    frequency, passed = _spectrum(shaken, rate)
+    # Half of the samples are in pieces of a segment or more, so that all pieces have one grid.
+    lengths = np.sort([len(piece) for piece in residual])
+    half = int(np.searchsorted(np.cumsum(lengths), 0.5 * lengths.sum()))
+    segment = min(SEGMENT, int(lengths[half]), len(shaken))
+    frequency, density = _spectrum(residual, rate, segment)
+    _, passed = _spectrum([shaken], rate, segment)
     while begin < 0.9 * HIGHEST * rate:
         inside = (frequency >= begin) & (frequency < min(2.0 * begin, HIGHEST * rate))
         if np.count_nonzero(inside) > 2:
@@ -198,7 +220,7 @@ def resonances_of(
     segment = min(RESOLVED, len(whole) // 4)
     if segment < 64:
         return ()
-    frequency, density = _spectrum(whole, rate, segment)
+    frequency, density = _spectrum([whole], rate, segment)
     # Segments overlap by half, with a Hann window: so many independent ones.
     freedoms = 2.0 * 0.95 * max(1.0, 2.0 * len(whole) / segment - 1.0)
     begin = UNFILTERED * rate if how.cutoff is None else PASSED * how.cutoff
@@ -231,11 +253,17 @@ def resonances_of(
     return tuple(found)
 
 
-def _spectrum(values: Array, rate: float, segment: int = SEGMENT) -> tuple[Array, Array]:
-    """Frequencies, and two-sided spectral densities by channel (Welch), (frequencies, n)."""
-    size = min(segment, len(values))
-    frequency, density = scipy.signal.welch(values, rate, nperseg=size, axis=0, detrend="linear")
-    return np.asarray(frequency, np.float64), np.asarray(0.5 * density, np.float64)
+def _spectrum(pieces: Sequence[Array], rate: float, segment: int) -> tuple[Array, Array]:
+    """Frequencies, and two-sided spectral densities by channel (Welch), (frequencies, n).
+
+    Of the pieces that are as long as a segment, each by its length.
+    """
+    used = [piece for piece in pieces if len(piece) >= segment]
+    both = [
+        scipy.signal.welch(piece, rate, nperseg=segment, axis=0, detrend="linear") for piece in used
+    ]
+    density = np.average([own for _, own in both], 0, [len(piece) for piece in used])
+    return np.asarray(both[0][0], np.float64), np.asarray(0.5 * density, np.float64)
 
 
 def suspects_of(robot: Robot) -> list[Suspect]:

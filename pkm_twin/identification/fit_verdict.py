@@ -109,7 +109,7 @@ def _simpler(verdict: Verdict, frozen: Verdict) -> Verdict:
     findings = tuple(replace(one, others=(*one.others, other)) for one in frozen.findings)
     return replace(
         verdict, answer="explains partly", findings=findings,
-        shifts=np.concatenate([verdict.shifts, frozen.shifts]),
+        unseen=np.concatenate([verdict.unseen, frozen.shift[None] - verdict.shift]),
     )  # fmt: skip
 
 

@@ -116,7 +116,9 @@ def fit_with_laws(
         for name in names:
             try:
                 found, opened = _opened(best, recordings, what, name)
-                one = fit(opened, recordings, what, **options, trial=best.verdict, possible=True)
+                one = fit(
+                    opened, recordings, what, **options, trial=best.verdict, accepted=best.accepted
+                )
             except PkmTwinError:
                 if asked:
                     raise
@@ -131,8 +133,7 @@ def fit_with_laws(
         choices.append(choice)
         if not choice.taken:
             break
-        result = fit(opened, recordings, what, **options, possible=True)
-        result = replace(result, accepted=best.accepted)
+        result = fit(opened, recordings, what, **options, accepted=best.accepted)
         more += _searched(best.robot, result, choice.law, found)
         wider |= _widened(result, found)
         own = (
@@ -159,7 +160,7 @@ def _compared(name: str, before: Fit, after: Fit) -> Choice:
     sums = np.zeros(5)
     band = np.array([max(channel.noise, 1e-300) for channel in before.verdict.channels])
     for one, other in zip(before.judged, after.judged, strict=True):
-        old, change = one.measured - one.after, other.after - one.after
+        old, change = one.measured - one.least, other.least - one.least
         sums += (
             np.sum((old / band) ** 2), np.sum(((old - change) / band) ** 2), old.size,
             np.sum(old * change / one.noise**2), np.sum((change / one.noise) ** 2),

@@ -7,19 +7,20 @@ offset, an elastic drive, another friction law, another geometry) adds its own s
 residual; the derivatives of the measurements by these errors, the suspects, are regressed on it one
 by one, after what the fitted numbers and the differentiation can explain has been taken out. A
 suspect that explains more than noise does is a finding (forward selection by the score test of a
-restricted model: Rao, 1948). What a finding would have changed in the fitted numbers widens their
-standard deviations.
+restricted model: Rao, 1948).
 
 Errors of usual size that the residual would not show may be there all the same, and lengths that
-hide behind each other. All of them together have the residual's posterior distribution, with their
-usual sizes as the prior's standard deviations; its second moments widen the standard deviations
-too (consider parameters: Schmidt, 1966).
+hide behind each other. All suspects together have a posterior distribution, given the residual,
+with their usual sizes as the prior's standard deviations. The fitted numbers are corrected by the
+mean of what they change, and its covariance widens the standard deviations (consider parameters:
+Schmidt, 1966).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 from typing import Final
 
 import numpy as np
@@ -51,6 +52,8 @@ MOST: Final = 0.2
 """Part of a channel's measured variation that may stay unexplained."""
 ABSURD: Final = 10.0
 """Times its usual size from which an error is another model's."""
+MAYBE: Final = 4
+"""Findings without a usual size that may be none; the others are taken for certain."""
 HARM: Final = 3.0
 """Standard deviations of a fitted number by which an unseen error is worth a word."""
 UNSEEN: Final = 3
@@ -130,7 +133,7 @@ def judge(
     basis = _basis(base)
     y, left = y - basis @ (basis.T @ y), left - basis @ (basis.T @ left)
     prior_sizes = np.array([one.usual or 0.0 if one.known else np.inf for one in suspects])
-    chosen, after, rest = _select(y, left, seen, _least(few), prior_sizes)
+    chosen, after = _select(y, left, seen, _least(few), prior_sizes)
     sizes = _sizes(y, left, prior_sizes, [one.index for one in chosen])
     found = [_finding(suspects, one, pair) for one, pair in zip(chosen, sizes, strict=True)]
     clear = [one for one in found if one.sigmas >= SIGMAS]
@@ -146,19 +149,12 @@ def judge(
         answer = "does not explain"
     elif clear or loud or any(channel.held_out > LOUD for channel in told):
         answer = "explains partly"
-    shifts = [
-        response([case.suspects[..., k, None] * size for case in cases])[:, 0]
-        for one, (size, _) in zip(chosen, sizes, strict=True)
-        for k, size in ((one.index, size), *zip(one.near, one.sizes, strict=True))
-    ]
     inflation = float(max([1.0, *loud]) ** 2)
-    blind, unseen = _unseen(
-        suspects, cases, (after, rest, np.linalg.norm(left, axis=0), seen), inflation, prior[2],
-        response, {o.index for o in chosen},
-    )  # fmt: skip
+    shift, unseen = _posterior(suspects, cases, (y, left), inflation, response, chosen)
+    blind = _blind(suspects, cases, (np.linalg.norm(left, axis=0), seen), prior[2], response)
     return Verdict(
         answer, told, tuple(clear), tuple(one for one in found if one.sigmas < SIGMAS), blind,
-        np.reshape(shifts, (-1, len(prior[2]))), inflation, unseen,
+        shift, inflation, unseen,
     )  # fmt: skip
 
 
@@ -201,12 +197,11 @@ def _basis(table: Array) -> Array:
 
 @dataclass(frozen=True)
 class _Chosen:
-    """A suspect by its place, and those near it with the sizes that they would have alone."""
+    """A suspect by its place, and those near it."""
 
     index: int
     sigmas: float
     near: tuple[int, ...]
-    sizes: tuple[float, ...]
 
 
 def _least(cases: Sequence[Evidence]) -> Array:
@@ -222,8 +217,8 @@ def _least(cases: Sequence[Evidence]) -> Array:
 
 def _select(
     y: Array, table: Array, seen: Array, least: Array, prior: Array
-) -> tuple[list[_Chosen], Array, Array]:
-    """Suspects that the residual shows, the last perhaps not clearly; what stays of it and of them.
+) -> tuple[list[_Chosen], Array]:
+    """Suspects that the residual shows, the last perhaps not clearly; what stays of it.
 
     :param seen: norms of the suspects before the fitted numbers were taken out, (s,).
     :param least: sizes from which they count, (s,).
@@ -251,14 +246,13 @@ def _select(
             break
         order = np.argsort(-np.abs(scores))
         near = [int(k) for k in order if k != best and abs(scores[k]) > NEAR * sigmas][:CHOICES]
-        own = tuple(float(np.sqrt(share[k]) * scores[k] / norms[k]) for k in near)
-        chosen.append(_Chosen(best, sigmas, tuple(near), own))
+        chosen.append(_Chosen(best, sigmas, tuple(near)))
         if sigmas < SIGMAS:
             break
         unit = left[:, best] / norms[best]
         rest = rest - unit * (unit @ rest)
         left = left - np.outer(unit, unit @ left)
-    return chosen, rest, left
+    return chosen, rest
 
 
 def _sizes(
@@ -272,45 +266,79 @@ def _sizes(
     return list(zip(sizes.tolist(), deviations.tolist(), strict=True))
 
 
-def _unseen(
-    suspects: Sequence[Suspect], cases: Sequence[Evidence],
-    tables: tuple[Array, Array, Array, Array], inflation: float, deviations: Array,
-    response: Callable[[Sequence[Array]], Array], chosen: set[int],
-) -> tuple[tuple[Blind, ...], Array]:  # fmt: skip
+def _posterior(
+    suspects: Sequence[Suspect], cases: Sequence[Evidence], tables: tuple[Array, Array],
+    inflation: float, response: Callable[[Sequence[Array]], Array], chosen: Sequence[_Chosen],
+) -> tuple[Array, Array]:  # fmt: skip
+    """What all suspects together change in the fitted parameters: mean, (f,), and factor, (r, f).
+
+    One linear Gaussian model, averaged over which kinds of errors there are (Hoeting et al., 1999).
+    Lengths are always in it, as none are exact. An error without a usual size is in it where the
+    residual shows it, with a prior as wide as one row determines it.
+
+    :param tables: the residual and the suspects without what the fitted parameters explain.
+    :returns: the covariance is the factor's transpose times the factor.
+    """
+    y, left = tables
+    kinds: dict[str, list[int]] = {}
+    sizes = np.array([one.usual or 0.0 for one in suspects])
+    always = [k for k, one in enumerate(suspects) if one.usual and one.known]
+    for k, one in enumerate(suspects):
+        if one.usual and not one.known:
+            kinds.setdefault(one.kind, []).append(k)
+    for place, finding in enumerate(chosen):
+        for k in (finding.index, *finding.near):
+            norm = float(np.linalg.norm(left[:, k]))
+            if not sizes[k] and norm > 0.0:
+                sizes[k] = np.sqrt(len(y)) / norm
+                own = kinds.setdefault(f"{place}", []) if place < MAYBE else always
+                own.append(k)
+    used = np.flatnonzero(sizes)
+    scaled = left[:, used] * sizes[used]
+    moved = response([case.suspects[..., used] * sizes[used] for case in cases])
+    gram, side = scaled.T @ scaled / inflation, scaled.T @ y / inflation
+    logs, parts = [], []
+    for which in product((False, True), repeat=len(kinds)):
+        inside = [k for own, good in zip(kinds.values(), which, strict=True) if good for k in own]
+        rows = np.searchsorted(used, sorted([*always, *inside]))
+        root = np.linalg.cholesky(np.eye(len(rows)) + gram[np.ix_(rows, rows)])
+        half = np.linalg.solve(root, np.column_stack([side[rows], moved[:, rows].T]))
+        logs.append(0.5 * half[:, 0] @ half[:, 0] - np.log(np.diag(root)).sum())
+        parts.append((half[:, 1:].T @ half[:, 0], half[:, 1:]))
+    weights = np.exp(np.array(logs) - max(logs))
+    weights /= weights.sum()
+    mean = np.einsum("w,wf->f", weights, np.stack([middle for middle, _ in parts]))
+    factors = [
+        np.sqrt(weight) * np.concatenate([half, (middle - mean)[None]])
+        for weight, (middle, half) in zip(weights, parts, strict=True)
+    ]
+    return mean, np.asarray(np.linalg.qr(np.concatenate(factors), mode="r"), np.float64)
+
+
+def _blind(
+    suspects: Sequence[Suspect], cases: Sequence[Evidence], norms: tuple[Array, Array],
+    deviations: Array, response: Callable[[Sequence[Array]], Array],
+) -> tuple[Blind, ...]:  # fmt: skip
     """Suspects of usual size that do not show, by what they would do, one of each kind.
 
-    And what these, and all whose size is known beforehand, change in the fitted parameters, as far
-    as the residual leaves them open: rows whose squares sum to second moments, (rows, parameters).
-
-    :param tables: the residual and the suspects that stay after the findings; the suspects' norms
-        after and before the fitted numbers were taken out.
-    :param inflation: of the noise's variance.
+    :param norms: the suspects' after and before the fitted numbers were taken out.
     """
-    rest, left, norms, seen = tables
-    hides = [
-        norms[k] * (one.usual or 0.0) < SIGMAS or norms[k] <= SEEN * seen[k]
-        for k, one in enumerate(suspects)
-    ]
-    # One that would show by itself is a finding where it is, but many lengths hide together.
+    after, seen = norms
     some = [
         k for k, one in enumerate(suspects)
-        if one.usual and k not in chosen and (hides[k] or one.known)
+        if one.usual and (after[k] * one.usual < SIGMAS or after[k] <= SEEN * seen[k])
     ]  # fmt: skip
     if not some:
-        return (), np.zeros((0, len(deviations)))
+        return ()
     usual = np.array([suspects[k].usual for k in some])
     moved = response([case.suspects[..., some] * usual for case in cases])
-    ratio = np.abs(moved) / np.maximum(deviations, 1e-300)[:, None] * np.array(hides)[some]
+    ratio = np.abs(moved) / np.maximum(deviations, 1e-300)[:, None]
     found: dict[str, Blind] = {}
     for place in np.argsort(-ratio.max(0)):
         one, index = suspects[some[place]], int(np.argmax(ratio[:, place]))
         if ratio[index, place] > HARM and one.kind not in found and len(found) < UNSEEN:
             found[one.kind] = Blind(one, index, float(moved[index, place]))
-    scaled = left[:, some] * usual
-    values, vectors = np.linalg.eigh(scaled.T @ scaled / inflation)
-    open_ = vectors / np.sqrt(1.0 + np.maximum(values, 0.0))
-    middle = open_ @ (open_.T @ (scaled.T @ rest)) / inflation
-    return tuple(found.values()), np.concatenate([open_, middle[:, None]], 1).T @ moved.T
+    return tuple(found.values())
 
 
 def _channel(

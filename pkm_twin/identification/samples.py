@@ -20,7 +20,8 @@ from typing import Final
 import numpy as np
 import scipy  # type: ignore[import-untyped]  # its parts come when they are asked for
 
-from pkm_twin.codegen.arrays import Array
+from pkm_twin.codegen.arrays import Array, Mask
+from pkm_twin.streams.rest import SIGMAS
 
 DEGREE: Final = 4
 """Of the local polynomial."""
@@ -54,6 +55,13 @@ class Track:
     wrench: Array
     held: Array
     period: float
+
+    def moves(self, how: Filtering) -> Mask:
+        """Where a joint moves, clear of what noise makes of its rates, shape (k, n)."""
+        slow = SIGMAS * rate_noise(how, self.period)
+        mean = (self.qd[:-2] + self.qd[1:-1] + self.qd[2:]) / 3.0
+        rough = SIGMAS * np.abs(self.qd[1:-1] - mean).sum(0) / len(self.qd)
+        return np.asarray(np.abs(self.qd) > np.maximum(np.maximum(rough, slow), 1e-9))
 
 
 @dataclass(frozen=True)
@@ -132,27 +140,32 @@ def even_pieces(time: Array, columns: list[Array]) -> list[tuple[Array, list[Arr
 
 def tracks(
     time: Array, q: Array, effort: Array, wrench: Array | None = None, held: Array | None = None,
-    window: int | None = None,
+    window: int | None = None, rates: tuple[Array, Array] | None = None,
 ) -> tuple[list[Track], Filtering]:  # fmt: skip
     """A recording as evenly sampled motion, the ends of each piece left out.
 
     :param wrench: (k, 6), none by default; ``held``: (k,), throughout by default.
     :param window: of the polynomial, samples; None chooses it.
+    :param rates: velocities and accelerations (k, n) that are known, to be used as they are.
     """
     wrench = np.zeros((len(time), 6)) if wrench is None else wrench
     held = np.ones(len(time)) if held is None else held
     period = float(np.median(np.diff(time)))
-    pieces = even_pieces(time, [q, effort, wrench, held])
+    pieces = even_pieces(time, [q, effort, wrench, held, *(rates or ())])
     if not pieces:
         return [], Filtering(0, (), None, 1)
     positions = [own[0] for _, own in pieces]
     noise = position_noise(positions)
     width = window or choose_window(positions, period, noise)
     result = []
-    for t, (place, force, load, carried) in pieces:
+    for t, (place, force, load, carried, *known) in pieces:
         smooth, rate, second = (
-            np.asarray(scipy.signal.savgol_filter(place, width, DEGREE, k, period, axis=0))
-            for k in range(3)
+            (place, *known)
+            if known
+            else (
+                np.asarray(scipy.signal.savgol_filter(place, width, DEGREE, k, period, axis=0))
+                for k in range(3)
+            )
         )
         cut = slice(width // 2, len(t) - width // 2)
         motion = (t[cut], smooth[cut], rate[cut], second[cut])

@@ -96,11 +96,10 @@ class Verdict:
     """Whether a model explains its recordings, by channel and by finding.
 
     ``hints``: suspects that the residual does not show clearly, but does not clear either.
-    ``blind``: what the recordings would not show. ``shifts``: what findings and hints changed in
-    the fitted parameters, shape (shifts, p). ``inflation``: factor on the covariance for what
-    stays unexplained. ``unseen``: what errors of usual size change in the fitted parameters, as far
-    as the residual leaves them open: rows whose squares sum to a covariance, (rows, p). ``slow``:
-    the motion is too slow to show any inertia.
+    ``blind``: what the recordings would not show. ``shift``: what the suspects
+    probably change in the fitted parameters, (p,), and ``unseen``: a factor of its covariance, rows
+    whose squares sum to it, (rows, p). ``inflation``: factor on the covariance for what stays
+    unexplained. ``slow``: the motion is too slow to show any inertia.
     """
 
     answer: Answer
@@ -108,25 +107,21 @@ class Verdict:
     findings: tuple[Finding, ...]
     hints: tuple[Finding, ...]
     blind: tuple[Blind, ...]
-    shifts: Array
+    shift: Array
     inflation: float
     unseen: Array
     slow: bool = False
 
     def widened(self, covariance: Array) -> Array:
-        """A covariance of the fitted parameters (p, p) with what the model does not explain.
-
-        And with errors of usual size that nobody would see.
-        """
-        moved = np.concatenate([self.shifts, self.unseen])
-        return np.asarray(self.inflation * covariance + moved.T @ moved, np.float64)
+        """A covariance of corrected parameters (p, p), with what the model does not explain."""
+        return np.asarray(self.inflation * covariance + self.unseen.T @ self.unseen, np.float64)
 
     @property
     def deviations(self) -> Deviations:
         """What becomes of the standard deviations."""
         if self.answer == "does not explain":
             return "withheld"
-        return "widened" if len(self.shifts) or self.inflation > 1.0 else "as estimated"
+        return "widened" if self.findings or self.hints or self.inflation > 1.0 else "as estimated"
 
     def lines(self, units: tuple[str, ...]) -> list[str]:
         """The verdict in plain sentences.

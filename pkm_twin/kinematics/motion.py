@@ -103,8 +103,11 @@ class Motion:
                 if step.turns:
                     own = turned if (step.before == UNITS).all() else turned @ step.before
                     self.axis[id(step)] = own[:, 2]
-                    angle = self._value(step, x, q, origin, step.offset)
-                    s, c = sin(angle), cos(angle)
+                    if step.circle:
+                        c, s = x[step.position], step.sign * x[step.position + 1]
+                    else:
+                        angle = self._value(step, x, q, origin, step.offset)
+                        s, c = sin(angle), cos(angle)
                     turned = np.array(
                         [own[:, 0] * c + own[:, 1] * s, own[:, 1] * c - own[:, 0] * s, own[:, 2]],
                         dtype=object,
@@ -364,6 +367,11 @@ class Motion:
             for step in link.steps:
                 k, r = step.position, step.rate
                 if step.actuated:
+                    continue
+                if step.circle:
+                    c, s = x[k] - x[k + 1] * du[r], x[k + 1] + x[k] * du[r]
+                    length = 1.0 / sqrt(c * c + s * s)
+                    new[k], new[k + 1] = c * length, s * length
                     continue
                 if not (step.ball or step.free):
                     new[k] = x[k] + du[r]

@@ -152,6 +152,8 @@ def _values(t: Traced) -> list[Any]:
         home = tree.graph.joints[steps[0].joint].home if len(steps) == 1 else 0.0
         for step in steps:
             value = t.q[step.position] - home if step.actuated else t.x[step.position]
+            if step.circle:
+                value = atan2(t.x[step.position + 1], value)
             values += [] if step.actuated else [value + home]
             values += [step.slide * value] if step.turns and step.slide else []
     for rod in t.graph.rods.values():

@@ -32,7 +32,7 @@ from typing import Any
 import numpy as np
 
 from pkm_twin.codegen.arrays import Array
-from pkm_twin.codegen.cholesky import traces_over
+from pkm_twin.codegen.cholesky import SparseCholesky, traces_over
 from pkm_twin.codegen.expressions import Objects, maximum, minimum, norm, plain, sqrt
 from pkm_twin.codegen.kernels import Kernel
 from pkm_twin.codegen.program import Program
@@ -178,20 +178,85 @@ def _held(t: Traced | _AtHome) -> Any:
 
 def _moved(t: Traced | _AtHome) -> Any:
     n, graph = t.joints, t.graph
-    table: dict[str, list[Columns]] = {name: [{} for _ in range(6)] for name in graph.bodies}
-    for j, u in enumerate(t.rate_columns()):
-        t.motion.set_rates(u, np.eye(n)[j])
-        for name, rows in table.items():
-            middle, reach = graph.frame(name)
-            parts = [*t.motion.velocity(name, middle), *(reach * t.motion.omega[name])]
-            for row, part in zip(rows, parts, strict=True):
-                row["u", j] = part
-    grams = {name: _gram(rows, n) for name, rows in table.items()}
-    responses = traces_over(list(grams.values()), grams[graph.platform])
+    rates = _Rates(t)
+    twist = rates.motion_of(graph.platform)
+    table = _gram([{("u", j): v for j, v in enumerate(row)} for row in twist], n)
+    lower = {(a, b): table[a, b] for a in range(n) for b in range(a + 1)}
+    # Pivots stay above zero where the platform stands still while a joint moves.
+    size = t.motion.tree.size
+    lengths = [1.0 if graph.joints[name].slides else size * size for name in graph.actuated]
+    root = SparseCholesky(lower, [table[k, k] + length for k, length in enumerate(lengths)])
     farthest: Any = float(n)
-    for response in responses:
-        farthest = maximum(farthest, response)
+    for name in graph.bodies:
+        if name != graph.platform:
+            farthest = maximum(farthest, rates.response(name, root))
     return sqrt(n / farthest)
+
+
+class _Rates:
+    """Motion of bodies by the joint rates: D = S U, S by the rates on a body's way from the base,
+    U these by the joint rates.
+    """
+
+    def __init__(self, t: Traced | _AtHome) -> None:
+        self.motion, self.graph, self.n = t.motion, t.graph, t.joints
+        columns, own = t.rate_columns(), np.eye(t.joints)
+        unknown = t.motion.tree.unknown_rates
+        self._by_joints: dict[tuple[str, int], Any] = {("q", k): own[k] for k in range(t.joints)}
+        for k in range(unknown):
+            self._by_joints["u", k] = [column[k] for column in columns]
+        self._halves: dict[tuple[str, int], list[Any]] = {}
+        self._products: dict[tuple[tuple[str, int], tuple[str, int]], Any] = {}
+
+    def columns(self, name: str) -> dict[tuple[str, int], list[Any]]:
+        """S: by rate the velocity of a body's middle, and its angular velocity times its reach."""
+        middle, reach = self.graph.frame(name)
+        linear = self.motion.point_columns(name, self.motion.point(name, middle))
+        turning = self.motion.turn_columns(name)
+        still = [0.0] * 3
+        return {
+            k: [*linear.get(k, still), *(reach * v for v in turning.get(k, still))]
+            for k in dict.fromkeys([*linear, *turning])
+        }
+
+    def motion_of(self, name: str) -> list[list[Any]]:
+        """D, six rows of the joints."""
+        rows: list[list[Any]] = [[0.0] * self.n for _ in range(6)]
+        for key, six in self.columns(name).items():
+            for row, value in zip(rows, six, strict=True):
+                for j, rate in enumerate(self._by_joints[key]):
+                    row[j] = row[j] + value * rate
+        return rows
+
+    def response(self, name: str, root: SparseCholesky) -> Any:
+        """tr((T'T)^-1 D'D), T'T = L E L': of D's rows, or of S'S and U (T'T)^-1 U', the shorter."""
+        columns = list(self.columns(name).items())
+        total: Any = 0.0
+        if len(columns) > self.n:
+            for row in self.motion_of(name):
+                half = root.forward(row)
+                total = total + sum(
+                    (v * v * e for v, e in zip(half, root.inverses, strict=True)), 0.0
+                )
+            return total
+        for k, (key, six) in enumerate(columns):
+            for other, others in columns[: k + 1]:
+                entry: Any = sum((a * b for a, b in zip(six, others, strict=True)), 0.0)
+                part = entry * self._product(key, other, root)
+                total = total + (part if key == other else 2.0 * part)
+        return total
+
+    def _product(self, a: tuple[str, int], b: tuple[str, int], root: SparseCholesky) -> Any:
+        """An entry of U (T'T)^-1 U'."""
+        pair = (min(a, b), max(a, b))
+        if pair not in self._products:
+            for key in pair:
+                if key not in self._halves:
+                    self._halves[key] = root.forward(self._by_joints[key])
+            left, right = (self._halves[key] for key in pair)
+            parts = zip(left, root.inverses, right, strict=True)
+            self._products[pair] = sum((x * e * y for x, e, y in parts), 0.0)
+        return self._products[pair]
 
 
 def _gram(rows: list[Columns], size: int) -> Objects:

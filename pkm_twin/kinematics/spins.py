@@ -17,7 +17,7 @@ from pkm_twin.codegen.arrays import Array
 from pkm_twin.kinematics.conditions import merged
 from pkm_twin.kinematics.linkage import Linkage
 from pkm_twin.kinematics.motion import Motion
-from pkm_twin.machine.graph import BASE, Graph, Joint, array
+from pkm_twin.machine.graph import BASE, Body, Graph, Joint, array
 from pkm_twin.machine.joints import across, unit
 from pkm_twin.machine.tree import Tree
 
@@ -29,8 +29,11 @@ _NONE: Final = 1e-6
 """Part of a spin below which a joint has none in it."""
 
 
-def without_spins(graph: Graph) -> tuple[Graph, list[str]]:
+def without_spins(graph: Graph) -> tuple[Graph, dict[str, float]]:
     """The graph with every spin of a part held, and the joints that hold them.
+
+    Of each joint the greatest mass times distance of its centre from the spin's axis, kg m: where
+    it is not zero, efforts depend on the angle at which the part is held.
 
     With the actuated joints at rest such a spin moves no platform and hardly a centre of mass. One
     of its hinges becomes fixed, or one of its ball joints a universal joint across its axis: as
@@ -50,15 +53,24 @@ def without_spins(graph: Graph) -> tuple[Graph, list[str]]:
         ),
     ):  # fmt: skip
         spins = spins @ null(twist(motion, body, point)[rows] @ spins, most, absolute=True)
-    joints, held = dict(graph.joints), []
+    joints, held = dict(graph.joints), dict[str, float]()
     while spins.shape[1]:
         found = _hinge(linkage, spins) or _ball(linkage, motion, spins)
         if found is None:
             break
-        name, axes, spins = found
+        name, axes, spins, way = found
         joints[name] = _held(joints[name], axes)
-        held.append(name)
+        held[name] = max(
+            (_imbalance(motion, body, way) for body in graph.bodies.values()), default=0.0
+        )
     return replace(graph, joints=joints), held
+
+
+def _imbalance(motion: Motion, body: Body, way: Array) -> float:
+    """Mass times the distance of a body's centre from the axis of a motion, kg m."""
+    rates = twist(motion, body.name, body.com) @ way
+    turn = float(np.linalg.norm(rates[3:]))
+    return body.mass * float(np.linalg.norm(rates[:3])) / turn if turn > _NONE else 0.0
 
 
 def _looped(tree: Tree) -> set[str]:
@@ -136,8 +148,8 @@ def null(matrix: Array, bound: float, absolute: bool = False) -> Array:
     return np.asarray(rows[rank:].T, np.float64)
 
 
-_Found = tuple[str, Array, Array]
-"""A joint, its new axes, and the spins that are left."""
+_Found = tuple[str, Array, Array, Array]
+"""A joint, its new axes, the spins that are left, and the one that it held."""
 
 
 def _hinge(linkage: Linkage, spins: Array) -> _Found | None:
@@ -152,7 +164,7 @@ def _hinge(linkage: Linkage, spins: Array) -> _Found | None:
     if not parts[at] > _NONE:
         return None
     left = spins @ null(spins[at][None], RANK)
-    return owners[at], np.zeros((0, 3)), left
+    return owners[at], np.zeros((0, 3)), left, spins @ spins[at]
 
 
 def _ball(linkage: Linkage, motion: Motion, spins: Array) -> _Found | None:
@@ -162,5 +174,5 @@ def _ball(linkage: Linkage, motion: Motion, spins: Array) -> _Found | None:
         for joint in graph.joints.values():
             if joint.kind == "spherical" and {joint.inner, joint.outer} & set(bodies):
                 left = spins @ null(way[None], RANK)
-                return joint.name, np.array(across(axis)), left
+                return joint.name, np.array(across(axis)), left, spins @ way
     return None

@@ -11,7 +11,16 @@ import numpy as np
 
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.codegen.derivatives import adjoints
-from pkm_twin.codegen.expressions import GEOMETRY, Expression, Numbers, Objects, Tape, snapped_all
+from pkm_twin.codegen.expressions import (
+    GEOMETRY,
+    Expression,
+    Numbers,
+    Objects,
+    Tape,
+    cos,
+    sin,
+    snapped_all,
+)
 from pkm_twin.codegen.lu import SparseLU
 from pkm_twin.codegen.program import UNKNOWNS, Equations
 from pkm_twin.kinematics.motion import Motion, cross, matrices
@@ -105,7 +114,11 @@ class Traced:
                 given = list(values[str(link.joint)])
                 given = given if steps[0].sign > 0.0 else given[::-1]
                 for step, value in zip(steps, given, strict=True):
-                    result[step.position] = value
+                    k = step.position
+                    if step.circle:
+                        result[k : k + 2] = [cos(value), sin(value)]
+                    else:
+                        result[k] = value
         return result
 
     def lift(self, values: Numbers) -> list[Expression]:
@@ -140,6 +153,9 @@ class Traced:
             for step in link.steps:
                 k, r = step.position, step.rate
                 if step.actuated:
+                    continue
+                if step.circle:
+                    result[r] = self.x[k] * by_x[k + 1] - self.x[k + 1] * by_x[k]
                     continue
                 if not (step.ball or step.free):
                     result[r] = by_x[k]

@@ -15,9 +15,8 @@ import numpy as np
 from pkm_twin.codegen.arrays import Array, Mask
 from pkm_twin.errors import ParameterError
 from pkm_twin.machine.joints import TYPES
+from pkm_twin.machine.loop_tree import Closure, Joint, LoopTree, ordered
 from pkm_twin.machine.rotations import skew
-from pkm_twin.machine.urdf_file import Joint, Urdf
-from pkm_twin.machine.urdf_loops import Closure
 from pkm_twin.machine.urdf_xml import Pose
 
 ROUNDS: Final = 100
@@ -45,23 +44,25 @@ class Assembly:
     turn. ``size``: of the drawing, m.
     """
 
-    def __init__(self, urdf: Urdf) -> None:
+    def __init__(self, urdf: LoopTree) -> None:
         self.urdf = urdf
         least, most = CLOSED
         self.closed = min(most, max(least, ROUNDED * urdf.accuracy))
         """A loop that misses by more is open, m or rad."""
-        self.order = _order(urdf)
+        self.order = ordered(urdf.root, urdf.joints.values())
         self.steps: list[str] = []
-        self._kinds: list[str] = []
+        turns: list[bool] = []
+        slides: list[float] = []
         self._axes: list[Array] = []
         self._first: dict[str, int] = {}
         self._count: dict[str, int] = {}
         self._moved: dict[str, list[int]] = {urdf.root: []}
         for joint in self.order:
             self._first[joint.name] = len(self.steps)
-            for kind, axis in _steps(joint):
+            for turning, slide, axis in _steps(joint):
                 self.steps.append(joint.name)
-                self._kinds.append(kind)
+                turns.append(turning)
+                slides.append(slide)
                 self._axes.append(axis)
             self._count[joint.name] = len(self.steps) - self._first[joint.name]
             own = list(range(self._first[joint.name], len(self.steps)))
@@ -69,7 +70,7 @@ class Assembly:
             self._moved[joint.child] = before + own if own else before
         skews = [skew(axis) for axis in self._axes]
         self._turning = [(first, first @ first) for first in skews]
-        self.turns = np.array([kind == "R" for kind in self._kinds], bool)
+        self.turns, self._slides = np.array(turns, bool), np.array(slides)
         self.links: dict[str, Pose] = {}
         self.axes = np.zeros((0, 3))
         """The steps' axes at the placed values, root axes, unit vectors, shape (count, 3)."""
@@ -90,13 +91,14 @@ class Assembly:
                 axis = self._axes[i]
                 axes.append(pose.rotation @ axis)
                 points.append(pose.position)
-                if self._kinds[i] == "R":
+                turned, position = pose.rotation, pose.position
+                if self._slides[i]:
+                    position = position + axes[-1] * (values[i] * self._slides[i])
+                if self.turns[i]:
                     first, second = self._turning[i]
-                    turned = pose.rotation + pose.rotation @ (sines[i] * first + lacks[i] * second)
-                    pose = Pose(turned, pose.position)
-                else:
-                    pose = Pose(pose.rotation, pose.position + axes[-1] * values[i])
-            self.links[joint.child] = pose
+                    turned = turned + turned @ (sines[i] * first + lacks[i] * second)
+                pose = Pose(turned, position)
+            self.links[joint.child] = pose @ joint.beyond
         self.axes, self._points = np.reshape(axes, (-1, 3)), np.reshape(points, (-1, 3))
 
     def frame(self, closure: Closure, end: int) -> Pose:
@@ -109,7 +111,7 @@ class Assembly:
         moved = self._moved[link]
         axes, turns = self.axes[moved].T, self.turns[moved]
         arms = np.cross(self.axes[moved], point - self._points[moved]).T
-        linear[:, moved] = np.where(turns, arms, axes)
+        linear[:, moved] = np.where(turns, arms, 0.0) + axes * self._slides[moved]
         angular[:, moved] = np.where(turns, axes, 0.0)
         return linear, angular
 
@@ -205,8 +207,8 @@ class Assembly:
         """How far the loops are open at the placed values, m or rad."""
         return float(np.abs(self.residuals(rates=False)[0]).max(initial=0.0))
 
-    def nearest(self) -> tuple[Array, float]:
-        """The closed values nearest to zero, shape (count,), and how far they still miss.
+    def anywhere(self) -> tuple[Array, float]:
+        """Values that close the loops, the nearest to zero that are found at once, and their miss.
 
         :raises ParameterError: a loop that does not close, by how much.
         """
@@ -223,22 +225,32 @@ class Assembly:
         self.place(values)
         if miss > self.closed:
             raise self._open()
+        return values, miss
+
+    def relaxed(self, values: Array, held: Mask | None = None) -> Array:
+        """The values nearest to zero to which closed loops can move from these, and place them.
+
+        :param held: steps that keep their values, shape (count,); by default none does.
+        """
+        free = np.ones(len(self.steps), bool) if held is None else ~held
+        self.place(values)
+        miss = max(self.miss(), 1e-12)
         for _ in range(ROUNDS):
-            _, rates = self.residuals()
-            slope = values - np.linalg.lstsq(rates, rates @ values, rcond=RANKS[0])[0]
+            rates, own = self.residuals()[1] * free, values * free
+            slope = own - np.linalg.lstsq(rates, rates @ own, rcond=RANKS[0])[0]
             if float(np.abs(slope).max(initial=0.0)) < 1e-12:
                 break
             size = float(values @ values)
             for share in (1.0, 0.5, 0.25, 0.1, 0.01):
-                other, less = self.close(values - share * slope)
-                if less <= max(miss, 1e-12) and float(other @ other) < size * (1.0 - 1e-14):
+                other, less = self.close(values - share * slope, held)
+                if less <= miss and float(other @ other) < size * (1.0 - 1e-14):
                     values = other
                     break
             else:
                 break
             self.place(values)
         self.place(values)
-        return values, self.miss()
+        return values
 
     def _open(self) -> ParameterError:
         """The error of loops that do not close, with the one that misses the most."""
@@ -262,27 +274,14 @@ class Assembly:
         return extent if extent > 1e-6 else 1.0
 
 
-def _order(urdf: Urdf) -> list[Joint]:
-    """The joints from the root outwards, each level in the file's order."""
-    hanging: dict[str, list[Joint]] = {}
-    for joint in urdf.joints.values():
-        hanging.setdefault(joint.parent, []).append(joint)
-    order: list[Joint] = []
-    level = [urdf.root]
-    while level:
-        found = [joint for link in level for joint in hanging.get(link, [])]
-        order += found
-        level = [joint.child for joint in found]
-    return order
-
-
-def _steps(joint: Joint) -> list[tuple[str, Array]]:
+def _steps(joint: Joint) -> list[tuple[bool, float, Array]]:
+    """Single steps: whether each turns, how far it slides per unit, and its axis."""
     if joint.type == "spherical":
-        return [("R", axis) for axis in np.eye(3)]
+        return [(True, 0.0, axis) for axis in np.eye(3)]
     if joint.type == "free":
-        return [(kind, axis) for kind in "PR" for axis in np.eye(3)]
-    kind = "P" if joint.type == "prismatic" else "R"
-    return [(kind, axis) for axis in joint.axes]
+        return [(turns, float(not turns), axis) for turns in (False, True) for axis in np.eye(3)]
+    slide = 1.0 if joint.type == "prismatic" else joint.pitch
+    return [(joint.type != "prismatic", slide, axis) for axis in joint.axes]
 
 
 def _between(first: Array, second: Array) -> Array:

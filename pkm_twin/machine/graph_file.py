@@ -375,27 +375,28 @@ def _turned(entry: Any, azimuth: Any, own: set[str], number: int) -> Any:
     return dataclasses.replace(entry, **new)
 
 
-def numbered_entry(
-    entry: T, keys: tuple[str | int, ...], value: Any, azimuth: float, path: str
-) -> T:
-    """An entry with another number or expression; nothing is checked.
+def numbered_entry(entry: T, values: Mapping[Key, Any], azimuth: float, path: str) -> T:
+    """An entry with other numbers or expressions; nothing is checked.
 
-    :param keys: of the number in the entry; ``azimuth``: the limb's own, by which it is turned on.
-    :param azimuth: the entry's vectors are turned by this: the number is that before the turn.
+    :param values: by keys of the number in the entry; ``azimuth`` alone: the limb's own, by which
+        it is turned on.
+    :param azimuth: the entry's vectors are turned by this: the numbers are those before the turn.
+    :param path: of the entry, for the error.
     """
-    if keys == ("azimuth",):
-        turned: T = _turned(entry, value - azimuth, set(), 0)
+    if ("azimuth",) in values:
+        turned: T = _turned(entry, values["azimuth",] - azimuth, set(), 0)
         return turned
-    if keys == ("home",) and isinstance(entry, JointSpec) and entry.home is None:
+    if ("home",) in values and isinstance(entry, JointSpec) and entry.home is None:
         entry = dataclasses.replace(entry, home=0.0)
-    if not (azimuth and keys[0] in (*_TURNED, "inertia", "member")):
-        made = placed(entry, {keys: value}, path)
+    if azimuth:
+        made = placed(_turned(entry, -azimuth, set(), 0), values, path)
+        back, whole = _turned(made, azimuth, set(), 0), copy.copy(entry)
+        for key in {str(key) for key, *_ in values}:
+            vars(whole)[key] = getattr(back, key)
+        made = whole
     else:
-        whole = placed(_turned(entry, -azimuth, set(), 0), {keys: value}, path)
-        back = _turned(whole, azimuth, set(), 0)
-        made = copy.copy(entry)
-        vars(made)[str(keys[0])] = getattr(back, str(keys[0]))
-    if keys == ("rotor_inertia",):
+        made = placed(entry, values, path)
+    if ("rotor_inertia",) in values:
         vars(made)["drive"] = None
     return made
 

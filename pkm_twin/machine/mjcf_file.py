@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 import re
 import xml.etree.ElementTree as ET
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
@@ -19,9 +20,8 @@ import numpy as np
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError, install, warn
 from pkm_twin.machine import urdf_xml
+from pkm_twin.machine.loop_tree import Closure, Joint, Link, LoopTree
 from pkm_twin.machine.rotations import about, from_quaternion
-from pkm_twin.machine.urdf_file import Joint, Link, Urdf
-from pkm_twin.machine.urdf_loops import Closure
 from pkm_twin.machine.urdf_xml import Pose
 
 _ENDLESS: Final = re.compile(
@@ -31,12 +31,23 @@ WORLD: Final = "world"
 """The root's name."""
 MAX_INCLUDES: Final = 8
 """How deep files may include others."""
+IGNORED: Final = (
+    ("the spring (stiffness, springref)", "JOINT", ("jnt_stiffness", "jnt_stiffnesspoly")),
+    ("damping that is not linear", "DOF", ("dof_dampingpoly",)),
+    ("gravity compensation (gravcomp)", "BODY", ("body_gravcomp",)),
+    ("the spring (stiffness)", "TENDON", ("tendon_stiffness", "tendon_stiffnesspoly")),
+    ("damping", "TENDON", ("tendon_damping", "tendon_dampingpoly")),
+    ("frictionloss", "TENDON", ("tendon_frictionloss",)),
+    ("armature", "TENDON", ("tendon_armature",)),
+    ("damping that is not linear", "ACTUATOR", ("actuator_dampingpoly",)),
+)
+"""What is read of no part but acts in MuJoCo: in words, of what, and the model's arrays."""
 REPEATED: Final = ("count", "nrow", "ncol", "width", "height")
 MAX_PARTS: Final = 100_000
 """Most of anything that a file asks for by a number: elements, copies, pixels along a side."""
 
 
-def read(path: Path) -> Urdf:
+def read(path: Path, top: ET.Element) -> LoopTree:
     """Read an MJCF file with its closures.
 
     :raises ParameterError: no mujoco package, a model that it does not compile, or a part of it
@@ -48,21 +59,42 @@ def read(path: Path) -> Urdf:
         raise ParameterError(
             str(path), "an MJCF file without the mujoco package", install("mjcf")
         ) from None
-    _require_bounded(path)
+    _require_bounded(path, top, path.parent)
     try:
         model = mujoco.MjModel.from_xml_path(str(path))
     except ValueError as error:
         text = " ".join(str(error).split())
-        raise ParameterError(str(path), text, "a model that MuJoCo compiles") from None
+        model = _without_meshes(mujoco, path)
+        if model is None:
+            raise ParameterError(str(path), text, "a model that MuJoCo compiles") from None
+        warn(path, f"read without its meshes, as its bodies have inertias: {text}")
     return _Reader(mujoco, model, path).urdf()
 
 
-def _require_bounded(path: Path, depth: int = 0) -> None:
+def _without_meshes(mujoco: Any, path: Path) -> Any:
+    """The model without meshes, textures and height fields; None where they are needed."""
+    try:
+        spec = mujoco.MjSpec.from_file(str(path))
+        derived = spec.compiler.inertiafromgeom == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
+        for geom in list(spec.geoms):
+            geom.material = ""
+            if geom.meshname or geom.hfieldname:
+                if derived or not geom.parent.explicitinertial:
+                    return None
+                spec.delete(geom)
+        for part in [*spec.meshes, *spec.hfields, *spec.materials, *spec.textures]:
+            spec.delete(part)
+        return spec.compile()
+    except (ValueError, AttributeError):
+        return None
+
+
+def _require_bounded(path: Path, top: ET.Element, folder: Path, depth: int = 0) -> None:
     """Look at a file, and at what it includes, before MuJoCo does, which waits and counts for ever.
 
+    :param folder: of the model; what is included is below it.
     :raises ParameterError: something is named that is no regular file, or asked for too often.
     """
-    top = urdf_xml.elements(path)
     if depth > MAX_INCLUDES:
         raise ParameterError(str(path), "nested includes", f"a nesting of at most {MAX_INCLUDES}")
     names = {element.get("name") for element in top.iter()}
@@ -79,8 +111,13 @@ def _require_bounded(path: Path, depth: int = 0) -> None:
         for place in places:
             if place.exists() and not place.is_file():
                 raise ParameterError(f"{element.tag}.{key}", text, "a regular file")
-        if element.tag == "include" and key == "file" and places[0].exists():
-            _require_bounded(places[0], depth + 1)
+        if element.tag == "include" and key == "file":
+            # MuJoCo looks beside the model, then beside the file that includes.
+            for included in dict.fromkeys((folder / text, path.parent / text)):
+                if not included.resolve().is_relative_to(folder.resolve()):
+                    raise ParameterError("include.file", text, f"a file below {folder}")
+                if included.exists():
+                    _require_bounded(included, urdf_xml.elements(included), folder, depth + 1)
         if key in REPEATED and math.prod(map(_whole, text.split())) > MAX_PARTS:
             raise ParameterError(f"{element.tag}.{key}", text, f"at most {MAX_PARTS}")
     if _copies(top) > MAX_PARTS:
@@ -113,8 +150,9 @@ class _Reader:
             int(kinds.mjJNT_HINGE): "revolute",
         }
 
-    def urdf(self) -> Urdf:
+    def urdf(self) -> LoopTree:
         locks = self._locks()
+        self._warn(locks)
         for body in range(1, self.model.nbody):
             self._body(body, locks)
         for site in range(self.model.nsite):
@@ -125,7 +163,7 @@ class _Reader:
             place = Pose(_rotation(self.model.site_quat[site]), self.model.site_pos[site])
             owner = self._body_name(self.model.site_bodyid[site])
             self._joint(f"{name}_frame", "fixed", owner, name, place)
-        return Urdf(
+        return LoopTree(
             self.path.stem,
             WORLD,
             self.links,
@@ -160,47 +198,116 @@ class _Reader:
         inertia = turn @ np.diag(m.body_inertia[body]) @ turn.T
         parent = self._body_name(m.body_parentid[body])
         place = Pose(_rotation(m.body_quat[body]), m.body_pos[body].copy())
-        back = np.zeros(3)
-        first = m.body_jntadr[body]
-        for k in range(m.body_jntnum[body]):
-            joint = first + k
-            own = self._name("JOINT", joint)
+        own = Link(name, float(m.body_mass[body]), m.body_ipos[body].copy(), inertia)
+        count = int(m.body_jntnum[body])
+        if not count:
+            self._joint(f"{name}_body", "fixed", parent, name, place)
+        for k in range(count):
+            joint, last = int(m.body_jntadr[body]) + k, k == count - 1
+            label, link = self._name("JOINT", joint), name
+            if not last:
+                link = f"{label}_link"
+                self._link(link)
             kind, axis = self.types[int(m.jnt_type[joint])], m.jnt_axis[joint].copy()
             at = np.zeros(3) if kind == "free" else m.jnt_pos[joint].copy()
-            origin, link = place @ Pose(position=at - back), f"{own}_link"
-            place, back = Pose(), at
+            # Every link has the body's frame; a joint's is at its point.
+            origin, beyond = place @ Pose(position=at), Pose(position=-at)
+            place = Pose()
             if kind in ("revolute", "prismatic"):
                 # The file's frames are those at ``ref``; a joint's origin is where its value is 0.
                 origin @= _moved(kind, axis, -self._start(joint))
-            self._link(link)
+            more: dict[str, Any] = self._resistance(joint)
             if joint in locks:
-                self._joint(own, "fixed", parent, link, origin @ _moved(kind, axis, locks[joint]))
-            elif kind in ("free", "spherical"):
-                self._joint(own, kind, parent, link, origin)
-            else:
-                self._joint(own, kind, parent, link, origin, **self._single(joint, own, axis))
+                kind, origin, more = "fixed", origin @ _moved(kind, axis, locks[joint]), {}
+            elif kind in ("revolute", "prismatic"):
+                more |= {"axes": axis[None], "limits": self._limits(joint)}
+            self._joint(label, kind, parent, link, origin, beyond=beyond, **more)
             parent = link
-        self.links[name] = Link(name, float(m.body_mass[body]), m.body_ipos[body].copy(), inertia)
-        self._joint(f"{name}_body", "fixed", parent, name, place @ Pose(position=-back))
+        self.links[name] = own
 
-    def _single(self, joint: int, name: str, axis: Array) -> dict[str, Any]:
-        """Axis, limits, friction and drive of a hinge or a slide."""
+    def _limits(self, joint: int) -> dict[str, Any]:
+        """Of a hinge or a slide: its range, and the effort that its actuators can apply."""
         m = self.model
         limits: dict[str, Any] = {}
         if m.jnt_limited[joint]:
             limits["position"] = m.jnt_range[joint].tolist()
+        most = math.inf
         if m.jnt_actfrclimited[joint]:
-            limits["effort"] = float(np.abs(m.jnt_actfrcrange[joint]).max())
-        if m.jnt_stiffness[joint]:
-            warn(self.path, f"the spring of joint {name} is ignored")
+            most = float(np.abs(m.jnt_actfrcrange[joint]).max())
+        drives = self._drives(joint)
+        if drives:
+            most = min(most, sum(abs(m.actuator_gear[i][0]) * self._strength(i) for i in drives))
+        if most < math.inf:
+            limits["effort"] = most
+        return limits
+
+    def _drives(self, joint: int) -> list[int]:
+        """The actuators of a joint."""
+        m, kinds = self.model, self.mj.mjtTrn
+        own = int(kinds.mjTRN_JOINT), int(kinds.mjTRN_JOINTINPARENT)
+        return [
+            i for i in range(m.nu)
+            if int(m.actuator_trntype[i]) in own
+            and m.actuator_trnid[i][0] == joint
+        ]  # fmt: skip
+
+    def _strength(self, i: int) -> float:
+        """The greatest force of an actuator; infinite without limits."""
+        m, mj = self.model, self.mj
+        most = math.inf
+        if m.actuator_forcelimited[i]:
+            most = float(np.abs(m.actuator_forcerange[i]).max())
+        motor = (
+            int(m.actuator_gaintype[i]) == int(mj.mjtGain.mjGAIN_FIXED)
+            and int(m.actuator_biastype[i]) == int(mj.mjtBias.mjBIAS_NONE)
+            and int(m.actuator_dyntype[i]) == int(mj.mjtDyn.mjDYN_NONE)
+        )
+        if motor and m.actuator_ctrllimited[i]:
+            control = float(np.abs(m.actuator_ctrlrange[i]).max())
+            most = min(most, abs(float(m.actuator_gainprm[i][0])) * control)
+        return most
+
+    def _resistance(self, joint: int) -> dict[str, Any]:
+        """Friction and rotor of a joint, with its actuators' as the joint has them."""
+        m = self.model
         dof = m.jnt_dofadr[joint]
-        return {
-            "axes": axis[None],
-            "limits": limits,
-            "viscous": float(m.dof_damping[dof]),
-            "coulomb": float(m.dof_frictionloss[dof]),
-            "rotor_inertia": float(m.dof_armature[dof]),
+        dofs = slice(dof, dof + (6, 3, 1, 1)[int(m.jnt_type[joint])])
+        found = {
+            "viscous": float(m.dof_damping[dofs].max()),
+            "coulomb": float(m.dof_frictionloss[dofs].max()),
+            "rotor_inertia": float(m.dof_armature[dofs].max()),
         }
+        for key, own in (("viscous", "actuator_damping"), ("rotor_inertia", "actuator_armature")):
+            values = getattr(m, own, None)
+            if values is not None:
+                gears = {i: float(m.actuator_gear[i][0]) for i in self._drives(joint)}
+                found[key] += sum(float(values[i]) * gear**2 for i, gear in gears.items())
+        return found
+
+    def _warn(self, locks: Mapping[int, float]) -> None:
+        """Of what acts in MuJoCo and not here."""
+        held = {("JOINT", joint) for joint in locks}
+        for what, kind, arrays in IGNORED:
+            values = [np.abs(array) for name in arrays
+                      if (array := getattr(self.model, name, None)) is not None]  # fmt: skip
+            names = [
+                self._name(kind, i)
+                for i in range(len(values[0]) if values else 0)
+                if any(np.any(array[i]) for array in values) and (kind, i) not in held
+            ]
+            if names:
+                warn(self.path, f"{what} of {kind.lower()} {', '.join(names)} is ignored")
+        geared = [
+            f"{self._name('ACTUATOR', i)} ({self.model.actuator_gear[i][0]:g})"
+            for i in range(self.model.nu) if self.model.actuator_gear[i][0] != 1.0
+        ]  # fmt: skip
+        if geared:
+            warn(
+                self.path, f"efforts are at the joints, not before the gear of {', '.join(geared)}"
+            )
+        option = self.model.opt
+        if option.density or option.viscosity:
+            warn(self.path, "the fluid of density and viscosity is ignored")
 
     def _start(self, joint: int) -> float:
         """Value of a hinge or a slide as the file draws it."""
@@ -250,6 +357,8 @@ class _Reader:
                     Pose(position=data[:3].copy()),
                 )
                 closure = "fixed"
+                if data[10] == 0.0:
+                    raise ParameterError(f"equality.{name}.torquescale", 0, "a <connect>")
             else:
                 raise ParameterError(f"equality.{name}", kind, "connect, weld or joint")
             if sites:
@@ -262,9 +371,9 @@ class _Reader:
         names: list[str] = []
         for i in range(self.model.nu):
             name = self._name("ACTUATOR", i)
-            if int(self.model.actuator_trntype[i]) != int(self.mj.mjtTrn.mjTRN_JOINT):
-                raise ParameterError(f"actuator.{name}", name, "an actuator of a joint")
             joint = int(self.model.actuator_trnid[i][0])
+            if i not in self._drives(joint):
+                raise ParameterError(f"actuator.{name}", name, "an actuator of a joint")
             own = self._name("JOINT", joint)
             if joint in locks or self.joints[own].type not in ("revolute", "prismatic"):
                 raise ParameterError(

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+import difflib
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, Final, TypeVar
@@ -93,7 +94,7 @@ def placed(section: T, changes: Mapping[tuple[Key, ...], Any], path: str = "") -
             old = None
         leaf = () in deeper
         if isinstance(old, bool | str | None) or leaf != np.isscalar(old):
-            raise ParameterError(here, None, "a number of the robot's file, see `pkm-twin info`")
+            raise unknown_number(here, [])
         result[name] = deeper[()] if leaf else placed(old, deeper, here)
     if whole:
         made = object.__new__(type(section))
@@ -143,14 +144,30 @@ def number_in(data: Any, keys: Iterable[Key], path: str) -> float:
 
     :raises ParameterError: there is none.
     """
-    try:
-        for key in keys:
-            data = data[key]
-    except (KeyError, IndexError, TypeError):
-        data = None
-    if isinstance(data, bool) or not isinstance(data, int | float):
-        raise ParameterError(path, None, "a number of the robot's file, see `pkm-twin info`")
-    return float(data)
+    keys, there = list(keys), data
+    for i, key in enumerate(keys):
+        try:
+            there = there[key]
+        except (KeyError, IndexError, TypeError):
+            whole = keys_of(path)
+            before = whole[: len(whole) - len(keys) + i]
+            names = list(there) if isinstance(there, Mapping) else _places(there)
+            near = [path_of([*before, name, *keys[i + 1 :]]) for name in names]
+            raise unknown_number(path, near) from None
+    if isinstance(there, bool) or not isinstance(there, int | float):
+        raise unknown_number(path, [])
+    return float(there)
+
+
+def _places(values: Any) -> list[int]:
+    return list(range(len(values))) if isinstance(values, list | tuple) else []
+
+
+def unknown_number(path: str, names: Iterable[str]) -> ParameterError:
+    """The error of a path where the file has no number, with the closest of some paths."""
+    close = difflib.get_close_matches(path, list(names), 1)
+    hint = f"did you mean {close[0]!r}? see" if close else "see"
+    return ParameterError(path, None, f"a number of the robot's file; {hint} `pkm-twin info`")
 
 
 def has_entry(data: Any, path: str) -> bool:

@@ -12,15 +12,21 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable, ItemsView, Mapping, Sequence
+from functools import reduce
 from typing import Any, Final, TypeVar
 
 import numpy as np
 
 from pkm_twin.codegen.arrays import Array
+from pkm_twin.codegen.expressions import absolute, maximum, minimum
 from pkm_twin.errors import ParameterError, UnknownNameError
 
 MAX_SIZE: Final = 1e18
 """Beyond every quantity of a machine in SI units; products of such numbers stay finite."""
+MAX_INERTIA: Final = 1e12
+"""Largest entry of an inertia matrix, kg m2."""
+_SLACK: Final = 1e-9
+"""Error that an inertia matrix may have, relative to its largest entry."""
 
 Check = Callable[[str, Any], Any]
 T = TypeVar("T")
@@ -214,16 +220,17 @@ def inertia(*, positive: bool, default: Any = dataclasses.MISSING) -> Any:
             matrix = np.diag([_number(f"{field}[{i}]", v) for i, v in enumerate(rows)])
         else:
             matrix = np.array(_table(field, rows, 3))
-        scale = float(np.abs(matrix).max())
-        if scale > 1e12:
-            raise ParameterError(field, value, "at most 1e12 kg m2")
-        if float(np.abs(matrix - matrix.T).max()) > 1e-9 * scale:
+        with np.errstate(all="ignore"):
+            size, symmetry, moments, triangle = inertia_margins(matrix.tolist())
+        if not size >= 0.0:
+            raise ParameterError(field, value, f"at most {MAX_INERTIA:g} kg m2")
+        if not symmetry >= 0.0:
             raise ParameterError(field, value, "a symmetric matrix")
         a, b, c = np.linalg.eigvalsh(matrix)
-        if a < -1e-9 * scale or (positive and not a > 1e-12 * scale):
+        if not moments >= 0.0 or (positive and not a > 1e-12 * float(np.abs(matrix).max())):
             bound = "above zero" if positive else "zero or more"
             raise ParameterError(field, value, f"principal moments {bound}; the least is {a:.6g}")
-        if c > (a + b) * (1 + 1e-9):
+        if not triangle >= 0.0:
             raise ParameterError(
                 field, value, f"triangle rule: {c:.6g} at most {a:.6g} + {b:.6g} (principal)"
             )
@@ -232,6 +239,39 @@ def inertia(*, positive: bool, default: Any = dataclasses.MISSING) -> Any:
     least = "above zero" if positive else "zero or more"
     bound = f"3 numbers or 3x3, symmetric, principal moments {least}, triangle rule"
     return _field(check, default, bound, "kg m2")
+
+
+def inertia_margins(matrix: Sequence[Sequence[Any]]) -> tuple[Any, Any, Any, Any]:
+    """What a body's inertia matrix, kg m2, keeps to its bounds; each at least zero if it is valid.
+
+    Of its size, its symmetry, its principal moments (at least zero) and the triangle rule (each at
+    most the sum of the others). Of expressions, expressions: exported code has the same rule.
+    """
+    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = matrix
+    entries = [absolute(value) for row in matrix for value in row]
+    differences = [absolute(xy - yx), absolute(xz - zx), absolute(yz - zy)]
+    scale = reduce(maximum, entries)
+    slack = _SLACK * scale
+    products = (0.5 * (xy + yx), 0.5 * (xz + zx), 0.5 * (yz + zy))
+    # The largest principal moment is at most (1 + slack) / (2 + slack) of the trace.
+    most = (1.0 + _SLACK) / (2.0 + _SLACK) * (xx + yy + zz)
+    return (
+        MAX_INERTIA - scale,
+        slack - reduce(maximum, differences),
+        _least_pivot((xx + slack, yy + slack, zz + slack), products),
+        _least_pivot((most - xx, most - yy, most - zz), [-value for value in products]),
+    )
+
+
+def _least_pivot(diagonal: Sequence[Any], products: Sequence[Any]) -> Any:
+    """Of a symmetric matrix; negative or NaN where it is not positive semidefinite."""
+    (xx, yy, zz), (xy, xz, yz) = diagonal, products
+    tiny = 1e-300
+    first = 1.0 / maximum(xx, tiny)
+    middle = yy - xy * xy * first
+    rest = yz - xy * xz * first
+    last = zz - xz * xz * first - rest * rest / maximum(middle, tiny)
+    return minimum(minimum(xx, middle), last)
 
 
 def names(size: int, *, default: Any = dataclasses.MISSING) -> Any:

@@ -32,6 +32,10 @@ SMALL: Final = 1e-6
 body's. SDF takes no zeros, and simulators nothing much smaller."""
 ENDLESS: Final = 1e16
 """A limit that is none."""
+MOTOR: Final = {
+    "filename": "gz-sim-apply-joint-force-system", "name": "gz::sim::systems::ApplyJointForce"
+}  # fmt: skip
+"""The plugin that lets a joint be driven, and marks it as actuated."""
 ONE: Final = {"revolute": "revolute", "prismatic": "prismatic"}
 
 
@@ -118,6 +122,9 @@ class _Writer:
         ET.SubElement(hold, "child").text = self.names[GROUND]
         for joint in self.joints:
             self._joint(*joint)
+        for name in self.tree.actuated:
+            motor = ET.SubElement(self.model, "plugin", MOTOR)
+            ET.SubElement(motor, "joint_name").text = name
         ET.indent(self.top)
         text = ET.tostring(self.top, encoding="unicode")
         return f'<?xml version="1.0"?>\n{text}\n'

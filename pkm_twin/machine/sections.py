@@ -11,6 +11,7 @@ from functools import cache as remembered
 from typing import Any, Final, Protocol
 
 from pkm_twin.codegen.arrays import Array
+from pkm_twin.codegen.expressions import absolute
 from pkm_twin.errors import ParameterError
 from pkm_twin.machine import schema
 from pkm_twin.machine.friction import BASIC, all_keys, check_laws
@@ -55,8 +56,23 @@ class Payload:
     """A body fixed to the platform: com from its reference point, inertia about the com."""
 
     mass: float = mass(default=0.0)
-    com: Array = schema.vector(3, unit="m", default=[0, 0, 0])
+    com: Array = schema.vector(
+        3, at_least=-MAX_LENGTH, at_most=MAX_LENGTH, unit="m", default=[0, 0, 0]
+    )
     inertia: Array = schema.inertia(positive=False, default=[0, 0, 0])
+
+
+def payload_margins(mass: Any, com: Any, inertia: Any) -> list[Any]:
+    """What a payload's numbers keep to the bounds of :class:`Payload`; valid: each at least zero.
+
+    :param com: shape (3,), m; ``inertia``: shape (3, 3), kg m2. Numbers or expressions.
+    """
+    return [
+        mass,
+        MAX_MASS - mass,
+        *(MAX_LENGTH - absolute(value) for value in com),
+        *schema.inertia_margins(inertia),
+    ]
 
 
 def check_angles(angle: float, path: str) -> None:

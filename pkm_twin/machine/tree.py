@@ -2,7 +2,8 @@
 """The spanning tree of a graph, and the coordinates of its joints.
 
 Actuated joints come first, then those of fewest freedoms, so that there are fewest unknowns; a body
-that only rods hold hangs free on the base. Revolute and prismatic joints have one number a step;
+that only rods hold hangs free on the base. A driven turn or slide, and a passive slide, is one
+number; a passive turn is its cosine and sine, so nothing that iterates computes an angle;
 a spherical joint's body and a free one have a unit quaternion of their absolute orientation, with
 the angular velocity in base axes as its rate: no chart, and nothing of the parents' turning.
 """
@@ -25,6 +26,8 @@ from pkm_twin.machine.joints import Freedom, across, unit
 BALL: Final = (1.0, 0.0, 0.0, 0.0)
 FREE: Final = (*BALL, 0.0, 0.0, 0.0)
 """Unknowns at home of a ball, and of a body that hangs free: a quaternion, and a place."""
+CIRCLE: Final = (1.0, 0.0)
+"""Unknowns at home of a passive turn."""
 PARALLEL: Final = 1e-6
 """Sine of an angle, or part of the machine's size, that counts as zero for a choice of axes."""
 
@@ -68,6 +71,8 @@ class Step:
     offset: float = 0.0
     ball: bool = False
     free: bool = False
+    circle: bool = False
+    """A passive turn: its cosine and sine are unknowns, from 1 and 0 at home; its rate is one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -198,15 +203,16 @@ class Tree:
                 if actuated and hint is None:
                     offset = self._tilt(body, turned, at)
                 before, frame = snapped_all(frame.T @ turned), turned @ rotation_about_z(offset)
+            circle = freedom.turns and not freedom.slide and not actuated
             if actuated:
                 position = rate = graph.actuated.index(str(name))
             else:
-                position, rate = self._claim((0.0,), str(name), 1)
+                position, rate = self._claim(CIRCLE if circle else (0.0,), str(name), 1)
                 self.scales.append(1.0 if freedom.turns else 1.0 / graph.size)
             steps.append(
                 Step(
                     axis, freedom.turns, freedom.slide, actuated, position, rate, sign, before,
-                    local, str(name), freedom.outer != backwards, offset,
+                    local, str(name), freedom.outer != backwards, offset, circle=circle,
                 )
             )  # fmt: skip
         self.axes[body], self.at[body] = frame, at

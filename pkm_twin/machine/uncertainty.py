@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 from pkm_twin.errors import ParameterError
 from pkm_twin.machine import schema
+from pkm_twin.machine.places import unknown_number
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +52,7 @@ def numbers_below(
     below = {path: v for path, (v, _) in numbers.items() if path == name or path.startswith(parts)}
     field = f"uncertainty.{name}"
     if not below:
-        raise ParameterError(field, None, "the path of numbers that the file gives")
+        raise unknown_number(field, (f"uncertainty.{path}" for path in numbers))
     if entry.deviation is not None and len(below) > 1:
         raise ParameterError(
             field, entry.deviation, "relative, because the path names several numbers"

@@ -5,8 +5,8 @@ from __future__ import annotations
 
 import math
 import xml.etree.ElementTree as ET
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -14,71 +14,19 @@ import numpy as np
 
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError, UnknownNameError, warn
-from pkm_twin.machine import urdf_loops, urdf_xml
-from pkm_twin.machine.strict_yaml import read_yaml
-from pkm_twin.machine.urdf_loops import Closure
-from pkm_twin.machine.urdf_xml import UNLIMITED, Pose
+from pkm_twin.machine import sdf_file, urdf_loops, urdf_xml
+from pkm_twin.machine.loop_tree import Closure, Joint, Link, LoopTree, drawn
+from pkm_twin.machine.motors import actuated_joints, read_beside
+from pkm_twin.machine.urdf_xml import Pose
 
 _PLACES: Final = ("axis", "parent_axis", "child_axis")
 LARGE: Final = 10.0
 """Offsets beyond this, m, look like millimetres."""
 
-MOST_MOVING: Final = 1000
-"""Most joints that are not fixed: assembling takes the cube of their number."""
 JOINTS: Final = ("revolute", "continuous", "prismatic", "fixed", "spherical")
 
 
-@dataclass(frozen=True, eq=False)
-class Link:
-    """A link: ``mass`` (kg), ``com`` (3,) m and ``inertia`` (3, 3) about it, link axes."""
-
-    name: str
-    mass: float
-    com: Array
-    inertia: Array
-
-
-@dataclass(frozen=True, eq=False)
-class Joint:
-    """A joint of the tree; ``axes``: unit vectors, shape (count, 3), joint frame.
-
-    ``type``: also ``free``, of a body that closures alone hold. ``limits``: those of position,
-    velocity and effort that the file states. ``rotor_inertia``: kg m2 or kg.
-    """
-
-    name: str
-    type: str
-    parent: str
-    child: str
-    origin: Pose
-    axes: Array
-    limits: dict[str, Any]
-    viscous: float
-    coulomb: float
-    rotor_inertia: float = 0.0
-    offset: float = 0.0
-
-
-@dataclass(frozen=True, eq=False)
-class Urdf:
-    """A file's content; ``root``: the link that has no parent; ``gravity``: m/s2, if it tells.
-
-    ``initial``: values that ``<ros2_control>`` begins with, of the joints for which it has them.
-    ``accuracy``: half of the last digit of its places and directions, m or rad.
-    """
-
-    name: str
-    root: str
-    links: dict[str, Link]
-    joints: dict[str, Joint]
-    closures: tuple[Closure, ...]
-    actuated: tuple[str, ...]
-    gravity: list[float] | None = None
-    initial: Mapping[str, float] = field(default_factory=dict)
-    accuracy: float = 0.0
-
-
-def read(path: Path, robot: ET.Element) -> Urdf:
+def read(path: Path, robot: ET.Element) -> LoopTree:
     """The links, joints and closures of a URDF file.
 
     :param robot: the file's top element; the path is for what stands beside the file.
@@ -103,23 +51,19 @@ def read(path: Path, robot: ET.Element) -> Urdf:
         raise ParameterError(
             f"coupling.{element.get('name')}", "a gear", "a machine without coupled joints"
         )
-    beside = _beside(path)
+    beside = read_beside(path)
     joints = _retyped(joints, beside)
-    moving = sum(joint.type != "fixed" for joint in joints.values())
-    if moving > MOST_MOVING:
-        raise ParameterError(str(path), f"{moving} joints that move", f"at most {MOST_MOVING}")
     closures = urdf_loops.closures(
         robot, beside, links, {name: joint.child for name, joint in joints.items()}
     )
+    for closure in _of_gazebo(path, robot, joints, root):
+        if closure.name in joints or closure.name in closures:
+            raise ParameterError("gazebo", closure.name, "a unique name")
+        closures[closure.name] = closure
     _warn_of_units(path, robot, joints, closures)
-    actuated = _actuated(path, robot, beside, joints)
-    idle = [j.name for j in joints.values() if j.type != "fixed" and j.name not in actuated]
-    if not closures and idle:
-        raise ParameterError(
-            str(path),
-            f"no loop closure, and passive joints: {', '.join(idle)}",
-            "<constraint> or <loop> elements, or closed_loop in a YAML file next to it",
-        )
+    actuated = actuated_joints(
+        path, robot, beside, {name: joint.type for name, joint in joints.items()}
+    )
     name = robot.get("name") or path.stem
     initial = _parameters(robot, actuated, "initial_value")
     rotors = _parameters(robot, actuated, "rotor_inertia")
@@ -130,10 +74,39 @@ def read(path: Path, robot: ET.Element) -> Urdf:
             rotor_inertia=rotors.get(joint.name, 0.0),
             offset=offsets.get(joint.name, 0.0),
         )
-    return Urdf(
+    return LoopTree(
         name, root, links, joints, tuple(closures.values()), actuated, initial=initial,
-        accuracy=_accuracy(robot),
+        accuracy=urdf_xml.accuracy(
+            word for e in robot.iter() if e.tag in _PLACES or "origin" in e.tag
+            for key in ("xyz", "rpy") for word in e.get(key, "").split()
+        ),
     )  # fmt: skip
+
+
+def _of_gazebo(
+    path: Path, robot: ET.Element, joints: Mapping[str, Joint], root: str
+) -> Iterator[Closure]:
+    """Joints of SDF inside ``<gazebo>``, and links that its plugins hold together."""
+    places = drawn(root, joints)
+
+    def turn(frame: str) -> Array:
+        return places[frame].rotation if frame in places else np.eye(3)
+
+    for element in robot.findall("gazebo/joint"):
+        name = urdf_xml.name(element, joints)
+        where = f"gazebo.joint.{name}"
+        first, second = (
+            urdf_xml.known_link(f"{where}.{end}", (element.findtext(end) or "").strip(), places)
+            for end in ("parent", "child")
+        )
+        stated = urdf_xml.single(element, "pose", where)
+        start = second if stated is None else stated.get("relative_to") or second
+        start = urdf_xml.known_link(f"{where}.pose", start, places)
+        place = places[start] @ sdf_file.pose(stated, f"{where}.pose")
+        edge = sdf_file.joint_edge(path, element, name, (first, second), place, turn)
+        yield edge.closure(places)
+    for edge in sdf_file.welds(path, robot, robot.get("name", ""), places):
+        yield edge.closure(places)
 
 
 def _link(element: ET.Element, name: str) -> Link:
@@ -178,39 +151,12 @@ def _joint(element: ET.Element, name: str, links: dict[str, Link]) -> Joint:
     limits: dict[str, Any] = {}
     limit = urdf_xml.single(element, "limit", where)
     if limit is not None and kind in ("revolute", "continuous", "prismatic"):
-        limits = _limits(limit, where, kind)
+        limits = urdf_xml.limits(limit.attrib, where, kind)
     viscous, coulomb = urdf_xml.friction(element, where)
     kind = "revolute" if kind == "continuous" else kind
     return Joint(
         name, kind, parent, child, origin, np.reshape(axes, (-1, 3)), limits, viscous, coulomb
     )
-
-
-def _limits(limit: ET.Element, where: str, kind: str) -> dict[str, Any]:
-    """What is stated; no width and zero are empty entries, what is far off is no limit either."""
-    limits: dict[str, Any] = {}
-    if kind in UNLIMITED and (limit.get("lower") or limit.get("upper")):
-        low, high = (
-            _bound(limit.get(end, "0"), f"{where}.limit.{end}") for end in ("lower", "upper")
-        )
-        if low > high:
-            raise ParameterError(f"{where}.limit", [low, high], "lower below upper")
-        far = UNLIMITED[kind]
-        if low < high and (low > -far or high < far):
-            limits["position"] = [max(low, -far), min(high, far)]
-    for key in ("velocity", "effort"):
-        value = _bound(limit.get(key, "0"), f"{where}.limit.{key}")
-        if value < 0.0:
-            raise ParameterError(f"{where}.limit.{key}", value, "zero or more")
-        if 0.0 < value < UNLIMITED[key]:
-            limits[key] = value
-    return limits
-
-
-def _bound(text: str, where: str) -> float:
-    """A limit, which alone of all numbers may be infinite."""
-    endless = text.strip().lower().lstrip("+-") in ("inf", "infinity")
-    return float(text) if endless else urdf_xml.number(text, where)
 
 
 def _root(links: dict[str, Link], joints: dict[str, Joint]) -> str:
@@ -243,23 +189,6 @@ def _root(links: dict[str, Link], joints: dict[str, Joint]) -> str:
     return roots[0]
 
 
-def _beside(path: Path) -> dict[str, Any]:
-    """The YAML file of the same name, if it speaks of closures or motors, else nothing."""
-    for suffix in (".yaml", ".yml"):
-        other = path.with_suffix(suffix)
-        # An empty one is the target of a conversion that reads this very URDF.
-        if not other.is_file() or other.stat().st_size == 0:
-            continue
-        data = read_yaml(other)
-        if not any(key in data for key in urdf_loops.BESIDE):
-            continue
-        for key in urdf_loops.BESIDE:
-            if not isinstance(data.get(key, []), list):
-                raise ParameterError(f"{other}: {key}", data[key], "a list")
-        return {key: data[key] for key in urdf_loops.BESIDE if data.get(key)}
-    return {}
-
-
 def _retyped(joints: dict[str, Joint], beside: dict[str, Any]) -> dict[str, Joint]:
     """Joints that the YAML file calls spherical, universal or fixed."""
     names, kinds = beside.get("joint_name", []), beside.get("joint_type", [])
@@ -277,57 +206,9 @@ def _retyped(joints: dict[str, Joint], beside: dict[str, Any]) -> dict[str, Join
             changed, axes = str(kind).lower(), []
         else:
             raise UnknownNameError("joint_type", kind, ["SPHERICAL", "FIXED", *universal])
-        old = joints[name]
-        joints[name] = Joint(
-            name,
-            changed,
-            old.parent,
-            old.child,
-            old.origin,
-            np.reshape(axes, (-1, 3)),
-            {},
-            old.viscous,
-            old.coulomb,
-        )
+        rows = np.reshape(axes, (-1, 3))
+        joints[name] = replace(joints[name], type=changed, axes=rows, limits={})
     return joints
-
-
-def _actuated(
-    path: Path, robot: ET.Element, beside: dict[str, Any], joints: dict[str, Joint]
-) -> tuple[str, ...]:
-    """name_mot of the YAML file, else joints with command interfaces, else independent ones."""
-    names, source = [str(name) for name in beside.get("name_mot", [])], "name_mot"
-    if not names:
-        source = "ros2_control"
-        names = [
-            str(joint.get("name"))
-            for system in robot.findall("ros2_control")
-            for joint in system.findall("joint")
-            if joint.find("command_interface") is not None
-        ]
-    if not names:
-        source = "independent"
-        names = [
-            str(joint.get("name"))
-            for joint in robot.findall("joint")
-            if joint.get("independent") == "true"
-        ]
-    if not names:
-        raise ParameterError(
-            str(path),
-            "no actuated joint",
-            "command interfaces in a <ros2_control> element, or name_mot in a YAML file next to it",
-        )
-    if len(set(names)) != len(names):
-        raise ParameterError(source, names, "each joint once")
-    for name in names:
-        if name not in joints:
-            raise UnknownNameError(source, name, joints)
-        if joints[name].type not in ("revolute", "prismatic"):
-            raise ParameterError(
-                f"{source}.{name}", joints[name].type, "a revolute or prismatic joint"
-            )
-    return tuple(names)
 
 
 def _parameters(robot: ET.Element, actuated: tuple[str, ...], key: str) -> dict[str, float]:
@@ -343,25 +224,6 @@ def _parameters(robot: ET.Element, actuated: tuple[str, ...], key: str) -> dict[
                 if key == "rotor_inertia" and found[name] < 0.0:
                     raise ParameterError(where, found[name], "zero or more")
     return found
-
-
-def _accuracy(robot: ET.Element) -> float:
-    """Half of the last digit of the file's longest numbers, m or rad; of whole ones nothing."""
-    words = [
-        word
-        for element in robot.iter() if element.tag in _PLACES or "origin" in element.tag
-        for key in ("xyz", "rpy") for word in element.get(key, "").split()
-    ]  # fmt: skip
-    digits = [_decimals(word) for word in words]
-    longest = max(digits, default=0)
-    return 0.5 * 10.0**-longest if longest else 0.0
-
-
-def _decimals(word: str) -> int:
-    """How many digits stand behind the point."""
-    mantissa, _, exponent = word.lower().partition("e")
-    places = len(mantissa.partition(".")[2]) - int(exponent or 0)
-    return min(max(places, 0), 18)
 
 
 def _warn_of_units(

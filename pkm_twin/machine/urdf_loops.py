@@ -12,13 +12,14 @@ import math
 import xml.etree.ElementTree as ET
 from collections import ChainMap
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, Final
 
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError, UnknownNameError
 from pkm_twin.machine import urdf_xml
 from pkm_twin.machine.joints import TYPES
+from pkm_twin.machine.loop_tree import Closure
 from pkm_twin.machine.urdf_xml import Pose
 
 CONSTRAINTS: Final = {
@@ -39,26 +40,6 @@ LOOPS: Final = {
     name: CONSTRAINTS[name]
     for name in ("revolute", "continuous", "prismatic", "fixed", "spherical")
 }
-BESIDE: Final = ("closed_loop", "type", "name_mot", "joint_name", "joint_type")
-"""What a YAML file beside a URDF can say."""
-
-
-@dataclass(frozen=True, eq=False)
-class Closure:
-    """A joint that closes a loop: a frame on either link, an axis in either frame (or none).
-
-    ``viscous``, ``coulomb``: friction of a joint of one freedom. ``cosine``: of the angle between
-    the axes of a universal joint.
-    """
-
-    name: str
-    type: str
-    links: tuple[str, str]
-    frames: tuple[Pose, Pose]
-    axes: tuple[Array, Array] | None
-    viscous: float = 0.0
-    coulomb: float = 0.0
-    cosine: float = 0.0
 
 
 def closures(

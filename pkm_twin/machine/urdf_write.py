@@ -20,6 +20,7 @@ import numpy as np
 
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.machine import rotations
+from pkm_twin.machine.urdf_control import Control, add_drives
 from pkm_twin.machine.urdf_xml import UNLIMITED
 
 GROUND: Final = "base_link"
@@ -122,23 +123,27 @@ class UrdfTree:
     screws: tuple[tuple[str, str, float], ...] = ()
 
 
-def write_urdf(tree: UrdfTree, hardware: str = MOCK, prefix: str = "") -> str:
+def write_urdf(
+    tree: UrdfTree, hardware: str = MOCK, prefix: str = "", controls: Iterable[Control] = ()
+) -> str:
     """The URDF of a tree.
 
     The root is ``base_link``; ``platform`` is a link without mass on the reference point, fixed
     to the platform's body.
 
     :param hardware: plugin of the ``<ros2_control>`` element, empty: no such element.
+    :param controls: what a controller calls the actuated joints, for the ``<ros2_control>``
+        element, see :mod:`pkm_twin.machine.urdf_control`.
     :param prefix: of the names of all links, joints and closures, for several machines in one file.
     """
     robot = ET.Element("robot", name=tree.name)
     places = {GROUND: np.zeros(3)} | {joint.child: joint.point for joint in tree.joints}
     ground = ET.SubElement(robot, "link", name=GROUND)
-    _visuals(ground, places[GROUND], (c for c in tree.capsules if c.body == GROUND))
+    _shapes(ground, places[GROUND], (c for c in tree.capsules if c.body == GROUND))
     for body in tree.bodies:
         link = ET.SubElement(robot, "link", name=body.name)
         _inertial(link, body, places[body.name])
-        _visuals(link, places[body.name], (c for c in tree.capsules if c.body == body.name))
+        _shapes(link, places[body.name], (c for c in tree.capsules if c.body == body.name))
     ET.SubElement(robot, "link", name=PLATFORM)
     for joint in tree.joints:
         _joint(robot, joint, places)
@@ -150,10 +155,11 @@ def write_urdf(tree: UrdfTree, hardware: str = MOCK, prefix: str = "") -> str:
         _closure(robot, closure, places)
     if hardware:
         _control(robot, tree, hardware)
+        add_drives(robot, controls)
     if prefix:
         for element in robot.iter():
-            for key in ("name", "link"):
-                if key in element.attrib and (key == "link" or element.tag in NAMED):
+            for key in ("name", "link", "joint"):
+                if key in element.attrib and (key != "name" or element.tag in NAMED):
                     element.set(key, prefix + element.attrib[key])
     ET.indent(robot)
     return '<?xml version="1.0"?>\n' + ET.tostring(robot, encoding="unicode") + "\n"
@@ -172,7 +178,8 @@ def _inertial(link: ET.Element, body: UrdfBody, place: Array) -> None:
     ET.SubElement(inertial, "inertia", values)
 
 
-def _visuals(link: ET.Element, place: Array, capsules: Iterable[UrdfCapsule]) -> None:
+def _shapes(link: ET.Element, place: Array, capsules: Iterable[UrdfCapsule]) -> None:
+    """Bars to look at, which are also what must not collide."""
     round_ends: list[Array] = []
     for capsule in capsules:
         along = capsule.end - capsule.start
@@ -187,13 +194,13 @@ def _visuals(link: ET.Element, place: Array, capsules: Iterable[UrdfCapsule]) ->
                 continue
             if shape == "sphere":
                 round_ends.append(centre)
-            visual = ET.SubElement(link, "visual")
-            ET.SubElement(visual, "origin", xyz=number_text(centre - place), rpy=rpy)
-            geometry = ET.SubElement(visual, "geometry")
             size = {"radius": radius}
             if shape == "cylinder":
                 size["length"] = number_text([length])
-            ET.SubElement(geometry, shape, size)
+            for purpose in ("visual", "collision"):
+                element = ET.SubElement(link, purpose)
+                ET.SubElement(element, "origin", xyz=number_text(centre - place), rpy=rpy)
+                ET.SubElement(ET.SubElement(element, "geometry"), shape, size)
 
 
 def rpy_along(direction: Array) -> str:

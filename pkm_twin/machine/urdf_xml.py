@@ -8,10 +8,10 @@ import math
 import re
 import stat
 import xml.etree.ElementTree as ET
-from collections.abc import Collection, Container
+from collections.abc import Collection, Container, Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 from xml.parsers import expat
 
 import numpy as np
@@ -20,7 +20,7 @@ from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import FileError, ParameterError, UnknownNameError
 from pkm_twin.files import decimal
 from pkm_twin.machine import schema
-from pkm_twin.machine.rotations import from_rpy
+from pkm_twin.machine.rotations import from_quaternion, from_rpy
 
 MAX_FILE_SIZE: Final = 4 * 1024 * 1024
 """Largest URDF that is read, bytes."""
@@ -175,17 +175,19 @@ def origin(element: ET.Element | None, where: str) -> Pose:
     if element is None:
         return Pose()
     position = vector(element.get("xyz", "0 0 0"), f"{where}.xyz", 3)
-    quaternion = element.get("quat_xyzw")
-    if quaternion is not None:
-        x, y, z, w = vector(quaternion, f"{where}.quat_xyzw", 4)
-        size = math.sqrt(x * x + y * y + z * z + w * w)
-        if not size > 1e-9:
-            raise ParameterError(f"{where}.quat_xyzw", quaternion, "a quaternion that is not zero")
-        x, y, z, w = x / size, y / size, z / size, w / size
-        skew = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-        return Pose(np.eye(3) + 2.0 * w * skew + 2.0 * skew @ skew, position)
+    turned = element.get("quat_xyzw")
+    if turned is not None:
+        return Pose(quaternion(vector(turned, f"{where}.quat_xyzw", 4), where), position)
     angles = vector(element.get("rpy", "0 0 0"), f"{where}.rpy", 3)
     return Pose(from_rpy(angles), position)
+
+
+def quaternion(values: Array, where: str) -> Array:
+    """The rotation of a quaternion x, y, z, w of any length but zero, shape (3, 3)."""
+    size = float(np.linalg.norm(values))
+    if not size > 1e-9:
+        raise ParameterError(f"{where}.quat_xyzw", values.tolist(), "a quaternion that is not zero")
+    return from_quaternion(*(values / size).tolist())
 
 
 def vector(text: str | None, where: str, size: int) -> Array:
@@ -225,3 +227,51 @@ def friction(element: ET.Element, where: str) -> tuple[float, float]:
                 positive(dynamics.get("friction", "0"), f"{where}.{tag}.friction"),
             )
     return 0.0, 0.0
+
+
+def boolean(text: str, where: str) -> bool:
+    """A truth value, in the spellings of XML schemas and of Python."""
+    value = {"true": True, "1": True, "false": False, "0": False}.get(text.strip().lower())
+    if value is None:
+        raise ParameterError(where, text, "true or false")
+    return value
+
+
+def limits(limit: Mapping[str, str], where: str, kind: str) -> dict[str, Any]:
+    """What is stated; no width and zero are empty entries, what is far off is no limit either."""
+    found: dict[str, Any] = {}
+    if kind in UNLIMITED and (limit.get("lower") or limit.get("upper")):
+        low, high = (
+            _bound(limit.get(end, "0"), f"{where}.limit.{end}") for end in ("lower", "upper")
+        )
+        if low > high:
+            raise ParameterError(f"{where}.limit", [low, high], "lower below upper")
+        far = UNLIMITED[kind]
+        if low < high and (low > -far or high < far):
+            found["position"] = [max(low, -far), min(high, far)]
+    for key in ("velocity", "effort"):
+        value = _bound(limit.get(key, "0"), f"{where}.limit.{key}")
+        if value < 0.0:
+            raise ParameterError(f"{where}.limit.{key}", value, "zero or more")
+        if 0.0 < value < UNLIMITED[key]:
+            found[key] = value
+    return found
+
+
+def _bound(text: str, where: str) -> float:
+    """A limit, which alone of all numbers may be infinite."""
+    endless = text.strip().lower().lstrip("+-") in ("inf", "infinity")
+    return float(text) if endless else number(text, where)
+
+
+def accuracy(words: Iterable[str]) -> float:
+    """Half of the last digit of the longest of a file's numbers, m or rad; of whole ones none."""
+    longest = max(map(_decimals, words), default=0)
+    return 0.5 * 10.0**-longest if longest else 0.0
+
+
+def _decimals(word: str) -> int:
+    """How many digits stand behind the point."""
+    mantissa, _, exponent = word.lower().partition("e")
+    places = len(mantissa.partition(".")[2]) - int(exponent or 0)
+    return min(max(places, 0), 18)

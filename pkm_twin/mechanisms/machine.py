@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Final, TypeVar
@@ -47,7 +47,14 @@ from pkm_twin.machine.graph_file import (
 from pkm_twin.machine.joint_map import JointMapEntry
 from pkm_twin.machine.joints import unit
 from pkm_twin.machine.members import Beam, Structure
-from pkm_twin.machine.places import check_number, full_keys, given, number_in, placed
+from pkm_twin.machine.places import (
+    check_number,
+    full_keys,
+    given,
+    number_in,
+    path_of,
+    placed,
+)
 from pkm_twin.machine.reach import PassiveLimit
 from pkm_twin.machine.sections import DriveSpec, Payload
 from pkm_twin.machine.shared import (
@@ -167,15 +174,21 @@ class Machine(Robot):
         """
         specs = {kind: dict(entries) for kind, entries in self.specs.items()}
         rest, origin = {}, self.described.origin
+        # Of an entry: numbers of its limb, then its azimuth, then the copy's own, each at once.
+        changes: dict[tuple[str, str, int, str, float], dict[Key, Any]] = {}
         for path, value in values.items():
             keys = full_keys(path)
-            found = list(self._named(keys))
+            found = list(self.named(keys))
             for kind, name, where, azimuth in found:
-                specs[kind][name] = numbered_entry(specs[kind][name], where, value, azimuth, path)
+                order = 2 if keys[0] == kind else 1 if where == ("azimuth",) else 0
+                place = path_of(keys[: len(keys) - len(where)])
+                changes.setdefault((kind, name, order, place, azimuth), {})[where] = value
             if not found and keys[0] == "origin":
                 origin = placed({"origin": origin}, {tuple(keys): value})["origin"]
             elif not found:
                 rest[path] = value
+        for (kind, name, _, place, azimuth), new in sorted(changes.items(), key=lambda c: c[0][2]):
+            specs[kind][name] = numbered_entry(specs[kind][name], new, azimuth, place)
         described = dataclasses.replace(
             graph_of_entries({"platform": self.described.platform}, specs), origin=origin
         )
@@ -185,7 +198,7 @@ class Machine(Robot):
     def check_number(self, path: str) -> None:
         """As a file's, in each of the entries that have it."""
         keys = full_keys(path)
-        named = list(self._named(keys))
+        named = list(self.named(keys))
         for kind, name, where, _ in named:
             if where != ("azimuth",):
                 check_number(self.specs[kind][name], where, path)
@@ -197,12 +210,13 @@ class Machine(Robot):
         keys = full_keys(path)
         if keys[0] == "origin":
             return number_in(self.described.origin.tolist(), keys[1:], path)
-        for kind, name, where, azimuth in self._named(keys):
+        for kind, name, where, azimuth in self.named(keys):
             return number_of_entry(self.specs[kind][name], where, azimuth, path)
         return super().number(path)
 
-    def _named(self, keys: list[str | int]) -> Iterator[tuple[str, str, Key, float]]:
-        """The entries that a path is about: kind, name, keys in it, and the limb's azimuth."""
+    def named(self, keys: Sequence[str | int]) -> Iterator[tuple[str, str, Key, float]]:
+        """As of every robot; of a limb's entry all copies; keys ``azimuth`` for a limb's own."""
+        keys = list(keys)
         for (kind, name), source in self.sources.items():
             if keys[:2] == [kind, name]:
                 yield kind, name, tuple(keys[2:]), 0.0
@@ -253,6 +267,11 @@ class Machine(Robot):
     def without_home(self) -> frozenset[str]:
         """Joints of which the file does not say where they count from."""
         return frozenset(n for n, joint in self.specs["joints"].items() if joint.home is None)
+
+    @property
+    def without_point(self) -> frozenset[str]:
+        """Joints without ``at``."""
+        return frozenset(n for n, joint in self.specs["joints"].items() if joint.at is None)
 
     @property
     def drives(self) -> tuple[DriveSpec | None, ...]:

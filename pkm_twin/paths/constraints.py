@@ -18,13 +18,23 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from delta_dynamics import inverse_dynamics
-from pkm_twin.codegen.arrays import Array
+from pkm_twin.codegen.arrays import Array, Mask
 from pkm_twin.errors import ParameterError
 from pkm_twin.paths.joint_path import JointPath, place_at
 from pkm_twin.robot.robot import Robot
 
 NOTHING: Final = 1e-12
 """Part of the greatest rate below which a joint does not move."""
+
+
+LEAST, MOST = 1e-9, 1e12
+"""Least and greatest limit that is a machine's, in any unit."""
+PLAUSIBLE: Final = f"from {LEAST:g} to {MOST:g}"
+
+
+def _plausible(values: Array) -> Mask:
+    """Which limits can be a machine's; infinite is none."""
+    return ((values >= LEAST) & (values <= MOST)) | np.isposinf(values)
 
 
 @dataclass(frozen=True)
@@ -56,7 +66,7 @@ class Limits:
         """The limits of a robot's file, or those given here; one number stands for all joints.
 
         :param share: part of the file's efforts and velocities that a motion may use.
-        :raises ParameterError: a limit that is not above 0, or too many numbers.
+        :raises ParameterError: a limit that no machine has, or too many numbers.
         """
         n = robot.joints_count
         own = robot.limits
@@ -67,13 +77,13 @@ class Limits:
             if given is None:
                 return np.full(n, np.inf) if file is None else share * np.asarray(file, float)
             values = np.asarray(given, float)
-            if values.shape not in ((), (1,), (n,)) or not (values > 0.0).all():
-                raise ParameterError(name, values.tolist(), f"one number above 0, or {n}")
+            if values.shape not in ((), (1,), (n,)) or not _plausible(values).all():
+                raise ParameterError(name, values.tolist(), f"one number, or {n}, {PLAUSIBLE}")
             return np.broadcast_to(values, (n,)).astype(float)
 
         most = np.inf if speed is None else float(speed)
-        if not most > 0.0:
-            raise ParameterError("speed", speed, "above 0, m/s")
+        if not _plausible(np.asarray(most)).all():
+            raise ParameterError("speed", speed, f"a number {PLAUSIBLE}, m/s")
         return cls(
             of("effort", effort, own.effort), of("velocity", velocity, own.velocity),
             of("acceleration", acceleration, None), of("jerk", jerk, None), most,
@@ -219,10 +229,10 @@ def names_of(robot: Robot) -> list[str]:
 def shares(
     limits: Limits, effort: Array | None, qd: Array, qdd: Array, qddd: Array, speed: Array
 ) -> Array:
-    """Each limit's used part, shape (k, 4 n + 1), 1 at the limit; 0 where there is none."""
+    """Each limit's used part with its sign, (k, 4 n + 1), 1 at the limit; 0 where there is none."""
     zero = np.zeros_like(qd)
     parts = [
-        np.abs(values) / bound
+        values / bound
         for values, bound in (
             (zero if effort is None else effort, limits.effort), (qd, limits.velocity),
             (qdd, limits.acceleration), (qddd, limits.jerk),
@@ -231,7 +241,7 @@ def shares(
     return np.concatenate([*parts, (np.asarray(speed) / limits.speed)[:, None]], 1)
 
 
-def check_rest(robot: Robot, part: JointPath, rows: Rows, limits: Limits, begin: float) -> None:
+def check_rest(robot: Robot, part: JointPath, rows: Rows, limits: Limits) -> None:
     """Reject a path on which the drives cannot hold the machine or creep.
 
     :raises ParameterError: by the place and joint.
@@ -240,7 +250,7 @@ def check_rest(robot: Robot, part: JointPath, rows: Rows, limits: Limits, begin:
     if not size.size or (size < 1.0).all():
         return
     row, column = np.unravel_index(int(size.argmax()), size.shape)
-    where = place_at(robot, part.q[row], begin + float(part.s[row]))
+    where = place_at(robot, part.q[row], part.curve.begin + float(part.s[row]))
     bounded = np.flatnonzero(np.isfinite(limits.effort))
     name = robot.joint_names[bounded[column]]
     raise ParameterError(

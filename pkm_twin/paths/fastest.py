@@ -9,15 +9,14 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from delta_dynamics import inverse_dynamics
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError, UnknownNameError
-from pkm_twin.paths.constraints import Forces, Limits, Rows, check_rest, shares
+from pkm_twin.paths.constraints import Forces, Limits, Rows, check_rest
 from pkm_twin.paths.geometry import Path, through
-from pkm_twin.paths.jerk import smooth_profile, smooth_run
+from pkm_twin.paths.jerk import PROGRAMS, smooth_profile, smooth_run
 from pkm_twin.paths.joint_path import JointPath, Slowdown, joint_paths
 from pkm_twin.paths.laws import LAWS, Law, quintic, shortest
-from pkm_twin.paths.motion import Run, Timed, TimedPath, needs_forces
+from pkm_twin.paths.motion import Run, Timed, TimedPath, needs_forces, run_peaks
 from pkm_twin.paths.profile import fastest_profile
 from pkm_twin.robot.robot import Robot
 
@@ -29,13 +28,27 @@ SINGULARITY: Final = 0.01
 """Least singularity index of a path, by default the nodes' ``singularity_stop``."""
 KEPT: Final = 1e-4
 """Part of each limit that the points of a path leave to what is between them."""
-LOOKED: Final = np.array([1e-6, 0.25, 0.5, 0.75, 1.0 - 1e-6])
-"""Parts of each interval of time at which limits are checked."""
 SMALL: Final = 3e-4
 """Part of a limit passed between the points that slowing the whole down makes good."""
-ROUNDING: Final = 1e-12
+COARSE: Final = 1e-3
+"""Part of a limit passed from which on intervals are divided, and of the duration, with limits of
+jerk, that is worth another program."""
+LITTLE: Final = 1e-5
+"""By what part more than is needed a motion is slowed down; each time four times as much."""
+SLOWER: Final = 12
+"""How often a motion that passes a limit is slowed down."""
 ROUNDS: Final = 4
 """How often limits are tightened where they are passed between the points."""
+DIVISIONS: Final = 5
+"""How often intervals in which they are passed are divided before that."""
+MOST_PARTS: Final = 8
+"""Most parts of an interval each time."""
+JERK_DIVISIONS: Final = 4
+"""How often intervals are divided where jerks are limited."""
+STEEP: Final = 2.0
+"""Ratio of squared speeds at the ends of an interval from which on it is divided then."""
+ENDS: Final = 8
+"""Intervals next to a stop that are not divided: their points are set closer already."""
 
 
 def fastest(
@@ -55,8 +68,9 @@ def fastest(
 ) -> TimedPath:
     """The shortest motion along a path, at rest at its ends, by the exact inverse dynamics.
 
-    The points of the path keep limits that are smaller by :data:`KEPT`, so that the limits
-    themselves hold between the points too, which is checked with the inverse dynamics.
+    The limits hold at all times: between the points of the path the inverse dynamics checks them
+    as closely as needed (:func:`~pkm_twin.paths.motion.peaks`). Where one is passed, the path gets
+    more points, then smaller limits; what is left slows the whole motion down.
 
     :param robot: with the payload that it carries, ``robot.changed(payload=...)``.
     :param path: of ``paths.through``, ``lines``, ``cycle`` or ``circle``; or poses (k, m), through
@@ -85,14 +99,11 @@ def fastest(
     )  # fmt: skip
     limits.check()
     load = None if wrench is None else np.asarray(wrench, float)
+    plan = _run
     if np.isfinite(limits.jerk).any():
-        points = min(points, JERK_POINTS)
-    runs, begin = [], 0.0
-    for part, stretch in zip(
-        joint_paths(robot, made, points, singularity, slowdown), made.stretches, strict=True
-    ):
-        runs.append(_run(robot, part, limits, load, begin))
-        begin += stretch.length
+        plan, points = _smooth, min(points, JERK_POINTS)
+    parts = joint_paths(robot, made, points, singularity, slowdown)
+    runs = [plan(robot, part, limits, load) for part in parts]
     rests = (made.wait, *(stretch.dwell for stretch in made.stretches))
     return TimedPath(robot, made, limits, tuple(runs), rests, "fastest", load)
 
@@ -138,35 +149,103 @@ def timed(
         raise ParameterError("duration", duration, f"{least:.6g} s or more, within the limits")
     factor = (duration - sum(result.rests)) / moving
     slower = tuple(run.slower(factor) for run in result.runs)
-    return TimedPath(robot, made, result.limits, slower, result.rests, law, result.wrench)
+    result = TimedPath(robot, made, result.limits, slower, result.rests, law, result.wrench)
+    over = max(result.worst.values(), default=0.0)
+    if over > 1.0 + KEPT:
+        # Speed can carry a load that the drives alone do not hold.
+        raise ParameterError("duration", duration, f"a motion within limits, not {over:.4g} of one")
+    return result
 
 
-def _run(
-    robot: Robot, part: JointPath, limits: Limits, wrench: Array | None, begin: float
-) -> Timed:
-    """One stretch, its limits kept between the points too."""
+def _run(robot: Robot, part: JointPath, limits: Limits, wrench: Array | None) -> Timed:
+    """One stretch, its limits kept between the points too.
+
+    Intervals within which a limit is passed are divided, and at last use less of the limits.
+    """
+    share = np.ones(len(part.left))
+    rows = _rows(robot, part, limits, wrench)
+    x: Array | None = None
+    for count in range(DIVISIONS + ROUNDS):
+        x = fastest_profile(rows, part.left, part.steps, share, x)
+        run = Run(part, x)
+        _check_moves(run)
+        used = run_peaks(robot, run, limits, wrench)
+        over = used.max(1)
+        bad = over > 1.0 + SMALL
+        if not bad.any():
+            break
+        parts = np.ones(len(bad), np.int64)
+        if count < DIVISIONS:
+            # What a limit is passed by between two points goes by the square of their distance.
+            wanted = np.ceil(np.sqrt(np.maximum(over - 1.0, 0.0) / SMALL))
+            most = np.minimum(part.steps / part.curve.least_step, MOST_PARTS)
+            coarse = over > 1.0 + COARSE
+            parts[coarse] = np.maximum(np.minimum(wanted, most)[coarse], 1.0)
+        tight = bad & (parts == 1)
+        share[tight] /= over[tight]
+        if (parts > 1).any():
+            ends, part, share = part.ends, part.refined(parts), np.repeat(share, parts)
+            rows = _rows(robot, part, limits, wrench)
+            x = np.interp(part.ends, ends, x)
+    return kept(robot, run, limits, wrench, used.max(0))
+
+
+def _smooth(robot: Robot, part: JointPath, limits: Limits, wrench: Array | None) -> Timed:
+    """The same with limits of jerk: the best of several profiles, or a quintic."""
+    rows = _rows(robot, part, limits, wrench)
+    slow = shortest(robot, part, quintic, limits, wrench)
+    best: Timed = slow
+    least = needed(run_peaks(robot, slow, limits, wrench).max(0)) * slow.duration
+    x = slow.profile() * (1.0 - KEPT)
+    share, jerks = np.ones((2, len(part.left)))
+    n = robot.joints_count
+    programs, improved = PROGRAMS, 0
+    for count in range(JERK_DIVISIONS + ROUNDS):
+        found = smooth_profile(part, rows, limits, x, share, jerks, programs)
+        if found is None:
+            break
+        x = found
+        run = smooth_run(part, x)
+        used = run_peaks(robot, run, limits, wrench)
+        factor = needed(used.max(0))
+        if factor * run.duration < (1.0 - COARSE) * least:
+            improved = count
+        if factor * run.duration < least:
+            best, least = run, factor * run.duration
+        if factor <= 1.0 + COARSE or count >= improved + 2:
+            break
+        over = np.ones((2, len(share)))
+        interval = run.at(0.5 * (run.times[1:] + run.times[:-1]))[0]
+        np.maximum.at(over[0], interval, np.delete(used, np.s_[3 * n : 4 * n], 1).max(1))
+        np.maximum.at(over[1], interval, used[:, 3 * n : 4 * n].max(1))
+        # Where the speed changes by much within an interval, the programs say little of it.
+        parts = np.ones(len(share), np.int64)
+        if count < JERK_DIVISIONS:
+            steep = np.maximum(x[1:], x[:-1]) > STEEP * np.minimum(x[1:], x[:-1])
+            steep[:ENDS] = steep[-ENDS:] = False
+            long = part.steps > MOST_PARTS * part.curve.least_step
+            parts[steep & long & (over.max(0) > 1.0 + COARSE)] = MOST_PARTS
+        divided = bool((parts > 1).any())
+        share, jerks = (
+            np.repeat(np.where(parts > 1, 1.0, old / own), parts)
+            for old, own in zip((share, jerks), over, strict=True)
+        )
+        programs = PROGRAMS if divided else 1
+        if divided:
+            ends, part = part.ends, part.refined(parts)
+            rows = _rows(robot, part, limits, wrench)
+            x = np.interp(part.ends, ends, x**0.75) ** (4 / 3)
+    return kept(robot, best, limits, wrench)
+
+
+def _rows(robot: Robot, part: JointPath, limits: Limits, wrench: Array | None) -> Rows:
+    """The limits at the points of a stretch, smaller by :data:`KEPT`."""
     forces = None
     if needs_forces(robot, limits):
         forces = Forces.of(robot, part.q, part.first, part.second, wrench)
     rows = Rows.of(part, forces, limits.part(1.0 - KEPT))
-    check_rest(robot, part, rows, limits, begin)
-    if np.isfinite(limits.jerk).any():
-        slow = shortest(robot, part, quintic, limits, wrench)
-        start = slow.profile() * (1.0 - KEPT)
-        smooth = smooth_run(part, smooth_profile(part, rows, limits, start))
-        return kept(robot, smooth, limits, wrench)
-    share = np.ones(len(part.left))
-    x: Array | None = None
-    for _ in range(ROUNDS):
-        x = fastest_profile(rows, part.left, part.steps, share, x)
-        run = Run(part, x)
-        _check_moves(run, begin)
-        over = passed(robot, run, limits, wrench)
-        bad = over > 1.0 + SMALL
-        if not bad.any():
-            break
-        share[bad] /= over[bad]
-    return kept(robot, run, limits, wrench, float(over.max()))
+    check_rest(robot, part, rows, limits)
+    return rows
 
 
 def _lawful(
@@ -177,64 +256,42 @@ def _lawful(
     return kept(robot, min(runs, key=lambda run: run.duration), limits, wrench)
 
 
-def _check_moves(run: Run, begin: float) -> None:
+def _check_moves(run: Run) -> None:
     """Reject a profile that stands still on its way."""
     slow = (run.x[:-1] + run.x[1:]) <= 0.0
     if slow.any():
-        way = begin + float(run.part.s[run.part.left[int(slow.argmax())]])
+        way = run.part.curve.begin + float(run.part.s[run.part.left[int(slow.argmax())]])
         raise ParameterError(
             "path", f"no motion after {way:.4g} m", "limits that let the machine pass"
         )
 
 
-def passed(robot: Robot, run: Timed, limits: Limits, wrench: Array | None) -> Array:
-    """Greatest used part of a limit between neighbouring times of a run, shape (i,); 1 is it.
+def needed(used: Array) -> float:
+    """By what a motion has to be slowed down, about, from its used parts of limits (4 n + 1,).
 
-    At :data:`LOOKED` of each interval of time, jerks over the time between them.
+    Rates go by the speed, accelerations by its square, jerks by its cube. What moves of an effort
+    goes by the square too; what rests of it does not change.
     """
-    count = len(run.times) - 1
-    begin, span = run.times[:-1], np.diff(run.times)
-    time = (begin[:, None] + span[:, None] * LOOKED).ravel()
-    interval, at, v, u = run.at(time)
-    part = run.part
-    q, qd, qdd = part.motion(interval, at, v, u)
-    effort = None
-    if needs_forces(robot, limits):
-        effort = inverse_dynamics(robot, q, qd, qdd, wrench)
-    jerk = np.zeros_like(qd)
-    if np.isfinite(limits.jerk).any():
-        inner = np.arange(len(time)).reshape(count, -1)[:, 1:-1]
-        jerk[inner] = np.gradient(qdd[inner.ravel()], time[inner.ravel()], axis=0).reshape(
-            *inner.shape, robot.joints_count
-        )
-    used = shares(limits, effort, qd, qdd, jerk, part.speed(part.felt, interval, at, v))
-    return np.asarray(used.max(1).reshape(count, len(LOOKED)).max(1), np.float64)
+    n = len(used) // 4
+    powers = np.append(np.repeat([2.0, 1.0, 2.0, 3.0], n), 1.0)
+    return float((used ** (1.0 / powers)).max())
 
 
 def kept(
-    robot: Robot, run: Timed, limits: Limits, wrench: Array | None, over: float = 0.0
+    robot: Robot, run: Timed, limits: Limits, wrench: Array | None, used: Array | None = None
 ) -> Timed:
     """A run, slower by as much as its limits need.
 
-    :param over: greatest used part of a limit, where it is known.
-
+    :param used: greatest used part of each limit, where it is known, shape (4 n + 1,).
     :raises ParameterError: no speed keeps them.
     """
-    over = over or float(passed(robot, run, limits, wrench).max())
-    slower = run
-    for _ in range(ROUNDS):
-        if over <= 1.0:
+    factor = 1.0
+    for more in LITTLE * 4.0 ** np.arange(SLOWER):
+        slower = run if factor == 1.0 else run.slower(factor)
+        if used is None:
+            used = run_peaks(robot, slower, limits, wrench).max(0)
+        if used.max() <= 1.0:
             return slower
-        # What moves goes by the speed or its square; what rests does not.
-        slower = slower.slower(over * (1.0 + ROUNDING))
-        over = float(passed(robot, slower, limits, wrench).max())
-    low, high = 1.0, 1.0 + 10.0 * KEPT
-    while passed(robot, run.slower(high), limits, wrench).max() > 1.0:
-        low, high = high, 1.0 + 2.0 * (high - 1.0)
-        if high > 1e3:
-            raise ParameterError("path", "any speed", "limits that a slow motion meets")
-    while high - low > KEPT:
-        middle = 0.5 * (low + high)
-        good = passed(robot, run.slower(middle), limits, wrench).max() <= 1.0
-        low, high = (low, middle) if good else (middle, high)
-    return run.slower(high)
+        factor *= max(needed(used), 1.0) + more
+        used = None
+    raise ParameterError("path", "any speed", "limits that a slow motion meets")

@@ -19,7 +19,6 @@ import scipy  # type: ignore[import-untyped]  # its parts come when they are ask
 from numpy.typing import NDArray
 
 from pkm_twin.codegen.arrays import Array
-from pkm_twin.errors import ParameterError
 from pkm_twin.paths.constraints import Limits, Rows
 from pkm_twin.paths.joint_path import JointPath
 
@@ -29,17 +28,23 @@ PROGRAMS: Final = 20
 """Most linear programs."""
 SETTLED: Final = 1e-4
 """Relative change of the duration that ends them."""
+LEAST: Final = 1e-9
+"""Part of the greatest x below which a machine does not slow down on its way."""
+SLOWER: Final = 6
+"""How often a start is slowed down until a program has a solution."""
+HALVINGS: Final = 50
+"""Steps of the search for the time of a place."""
 
 
 @dataclass(frozen=True)
 class SmoothRun:
     """One stretch of a path in time, its acceleration linear between times.
 
-    ``times`` (k,), s; way, speed and acceleration along the path there, shape (k,).
+    ``knots``: those times, shape (k,), s; way, speed and acceleration along the path there, (k,).
     """
 
     part: JointPath
-    times: Array
+    knots: Array
     way: Array
     v: Array
     u: Array
@@ -47,29 +52,42 @@ class SmoothRun:
     @property
     def duration(self) -> float:
         """From rest to rest, s."""
-        return float(self.times[-1])
+        return float(self.knots[-1])
 
     def slower(self, factor: float) -> SmoothRun:
         """The same with ``factor`` times the duration."""
         return SmoothRun(
-            self.part, factor * self.times, self.way, self.v / factor, self.u / factor**2
+            self.part, factor * self.knots, self.way, self.v / factor, self.u / factor**2
         )
 
     @cached_property
-    def _ends(self) -> Array:
-        return np.append(self.part.s[self.part.left], self.part.s[-1])
+    def times(self) -> Array:
+        """Times at which the jerk along the path or a derivative of the path jumps, (i + 1,), s."""
+        way = self.part.ends[1:-1]
+        k = np.clip(np.searchsorted(self.way, way, side="right") - 1, 0, len(self.knots) - 2)
+        low, high = self.knots[k], self.knots[k + 1]
+        for _ in range(HALVINGS):
+            middle = 0.5 * (low + high)
+            before = self._moved(k, middle)[0] < way
+            low, high = np.where(before, middle, low), np.where(before, high, middle)
+        return np.unique(np.concatenate([self.knots, high]))
+
+    def _moved(self, k: Index, time: Array) -> tuple[Array, Array, Array]:
+        """Way, v and u at times after knots k."""
+        span = self.knots[k + 1] - self.knots[k]
+        t = np.clip(time - self.knots[k], 0.0, span)
+        u, v = self.u[k], self.v[k]
+        jerk = (self.u[k + 1] - u) / span
+        way = self.way[k] + t * (v + t * (u / 2 + t * jerk / 6))
+        return way, np.maximum(v + t * (u + t * jerk / 2), 0.0), u + t * jerk
 
     def at(self, time: Array) -> tuple[Index, Array, Array, Array]:
         """Interval, part of it, v and u at times (k,)."""
-        k = np.clip(np.searchsorted(self.times, time, side="right") - 1, 0, len(self.times) - 2)
-        t = np.clip(time - self.times[k], 0.0, self.times[k + 1] - self.times[k])
-        u, v = self.u[k], self.v[k]
-        jerk = (self.u[k + 1] - u) / (self.times[k + 1] - self.times[k])
-        way = self.way[k] + t * (v + t * (u / 2 + t * jerk / 6))
-        s = self._ends
+        k = np.clip(np.searchsorted(self.knots, time, side="right") - 1, 0, len(self.knots) - 2)
+        way, v, u = self._moved(k, time)
+        s = self.part.ends
         j = np.clip(np.searchsorted(s, way, side="right") - 1, 0, len(s) - 2)
-        part = np.clip((way - s[j]) / (s[j + 1] - s[j]), 0.0, 1.0)
-        return j, part, np.maximum(v + t * (u + t * jerk / 2), 0.0), u + t * jerk
+        return j, np.clip((way - s[j]) / (s[j + 1] - s[j]), 0.0, 1.0), v, u
 
 
 def _sides(part: JointPath) -> tuple[Array, Array, tuple[Array, Array]]:
@@ -84,59 +102,77 @@ def _sides(part: JointPath) -> tuple[Array, Array, tuple[Array, Array]]:
     return part.first[at], second, (third[:-1], third[1:])
 
 
-def smooth_profile(part: JointPath, rows: Rows, limits: Limits, start: Array) -> Array:
+def smooth_profile(
+    part: JointPath, rows: Rows, limits: Limits, start: Array, share: Array, jerks: Array,
+    programs: int = PROGRAMS,
+) -> Array | None:  # fmt: skip
     """The greatest x at the intervals' ends, (i + 1,), with the joints' jerks within limits.
 
+    None where no program has a solution.
+
     :param start: a profile that keeps the limits, shape (i + 1,).
-    :raises ParameterError: the first program has no solution.
+    :param share: part of each interval's limits that is used, shape (i,); ``jerks``: of jerks.
+    :param programs: most linear programs that improve it.
     """
+    # In units of time in which the start has the greatest speed 1.
+    unit = float(start.max())
+    jerk = limits.jerk / unit**1.5
+    rows = Rows(
+        rows.alpha * unit, rows.beta * unit, rows.drag * np.sqrt(unit), rows.fixed, rows.dry,
+        rows.most / unit,
+    )  # fmt: skip
     h = part.steps
-    fixed, bound = _rows(part, rows, h)
-    best, x = np.inf, start
-    for count in range(PROGRAMS):
-        more, top = _jerk_rows(part, limits, h, x)
+    fixed, bound = _rows(part, rows, h, share)
+    most = _most(part, rows, jerk, share)
+    best, x = np.inf, start / unit
+    count = slower = 0
+    while count < programs:
+        more, top = _jerk_rows(part, jerk, h, x, jerks)
         drag, rest = _drag_rows(rows, part, x)
         v = np.sqrt(np.maximum(x, 1e-12 * x.max()))
         weight = np.zeros(len(x))
-        share = h / (v[:-1] + v[1:]) ** 2
-        weight[:-1] += share / v[:-1]
-        weight[1:] += share / v[1:]
-        most = _most(part, rows, limits)
+        way = h / (v[:-1] + v[1:]) ** 2
+        weight[:-1] += way / v[:-1]
+        weight[1:] += way / v[1:]
         answer = scipy.optimize.linprog(
             -weight / weight[1:-1].max(),
             A_ub=scipy.sparse.vstack([fixed + drag, more]).tocsr(),
             b_ub=np.concatenate([bound - rest, top]),
             bounds=np.stack([np.zeros(len(x)), most], 1), method="highs",
         )  # fmt: skip
-        if answer.status != 0:
-            if count == 0:
-                raise ParameterError("jerk", "no profile", f"a solution: {answer.message}")
-            break
-        new = np.maximum(answer.x, 0.0)
+        if answer.status != 0 and count == 0 and slower < SLOWER:
+            # A slower motion has smaller jerks, so that the bounds' tangents there leave room.
+            x, slower = 0.25 * x, slower + 1
+            continue
+        if answer.status != 0 and count == 0:
+            return None
+        new = np.maximum(answer.x, 0.0) if answer.status == 0 else x
         v = np.sqrt(new)
         duration = float(np.sum(2.0 * h / np.maximum(v[:-1] + v[1:], 1e-300)))
-        if duration < best:
-            settled = duration > best * (1.0 - SETTLED)
-            best, x = duration, new
-            if settled:
-                break
-        else:
+        if not duration < best:
             break
-    return x
+        settled = duration > best * (1.0 - SETTLED)
+        best, x, count = duration, new, count + 1
+        if settled:
+            break
+    x[1:-1] = np.maximum(x[1:-1], LEAST * x.max())
+    return unit * x
 
 
-def _most(part: JointPath, rows: Rows, limits: Limits) -> Array:
+def _most(part: JointPath, rows: Rows, jerk: Array, share: Array) -> Array:
     """Greatest x at the intervals' ends: by speeds, and at the first by the jerk from rest."""
     left = part.left
     most = np.append(rows.most[left], rows.most[left[-1] + 1])
     most[1:] = np.minimum(most[1:], rows.most[left + 1])
+    most[1:] *= share**2
+    most[:-1] *= share**2
     most[0] = most[-1] = 0.0
     for k, step, at in ((1, part.steps[0], 0), (-2, part.steps[-1], -1)):
         rates = np.abs(part.first[at])
-        jerk = float((limits.jerk / np.maximum(rates, 1e-300)).min())
-        if np.isfinite(jerk):
+        least = float((jerk / np.maximum(rates, 1e-300)).min())
+        if np.isfinite(least):
             # From rest s = jerk t^3 / 6 and v = jerk t^2 / 2.
-            most[k] = min(most[k], 0.25 * jerk**2 * (6.0 * step / jerk) ** (4 / 3))
+            most[k] = min(most[k], 0.25 * least ** (2 / 3) * (6.0 * step) ** (4 / 3))
     return most
 
 
@@ -145,7 +181,9 @@ def _triplets(rows: list[tuple[Any, Any, Any]], shape: tuple[int, int]) -> scipy
     return scipy.sparse.coo_matrix((values, (row, column)), shape=shape).tocsr()
 
 
-def _rows(part: JointPath, rows: Rows, h: Array) -> tuple[scipy.sparse.csr_matrix, Array]:
+def _rows(
+    part: JointPath, rows: Rows, h: Array, share: Array
+) -> tuple[scipy.sparse.csr_matrix, Array]:
     """Efforts and accelerations at both ends of all intervals, without viscous friction."""
     count, width = len(h), rows.alpha.shape[1]
     made: list[tuple[Any, Any, Any]] = []
@@ -159,7 +197,7 @@ def _rows(part: JointPath, rows: Rows, h: Array) -> tuple[scipy.sparse.csr_matri
             number = at + np.arange(count * width)
             made.append((sign * (-lever + (beta if own == 0 else 0.0)), number, column))
             made.append((sign * (lever + (beta if own == 1 else 0.0)), number, column + 1))
-            bounds.append(np.ravel(np.maximum(1.0 - sign * fixed, 0.0)))
+            bounds.append(np.ravel(np.maximum(share[:, None] - sign * fixed, 0.0)))
             at += count * width
     return _triplets(made, (at, count + 1)), np.concatenate(bounds)
 
@@ -183,13 +221,14 @@ def _drag_rows(rows: Rows, part: JointPath, x: Array) -> tuple[scipy.sparse.csr_
 
 
 def _jerk_rows(
-    part: JointPath, limits: Limits, h: Array, x: Array
+    part: JointPath, jerk: Array, h: Array, x: Array, share: Array
 ) -> tuple[scipy.sparse.csr_matrix, Array]:
     """Jerks at the points between two intervals, their bound's tangent at a profile."""
-    used = np.isfinite(limits.jerk)
+    used = np.isfinite(jerk)
     first, second, sides = _sides(part)
-    first, second = first[:, used], second[:, used]
-    most = limits.jerk[used]
+    # As fractions of the limits.
+    first, second = first[:, used] / jerk[used], second[:, used] / jerk[used]
+    most = np.minimum(share[1:], share[:-1])[:, None]
     count, width = first.shape
     before, behind = h[:-1][:, None], h[1:][:, None]
     middle = 0.5 * (before + behind)
@@ -210,7 +249,7 @@ def _jerk_rows(
     for sign, third in product((1.0, -1.0), sides):
         number = at + np.arange(count * width)
         made.append((sign * front, number, point))
-        made.append((sign * (here + third[:, used]) + tangent, number, point + 1))
+        made.append((sign * (here + third[:, used] / jerk[used]) + tangent, number, point + 1))
         made.append((sign * after, number, point + 2))
         at += count * width
     bound = np.ravel(np.broadcast_to(top, (count, width)))

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Final
 
 import numpy as np
@@ -13,61 +14,136 @@ from numpy.typing import NDArray
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError, SingularityError, UnreachableError
 from pkm_twin.paths.geometry import Path, Stretch
-from pkm_twin.paths.pieces import Piece, Smooth
 from pkm_twin.robot.robot import Robot
 
 Index = NDArray[np.int64]
 
 LEAST_POINTS: Final = 16
 """Intervals of the shortest piece."""
-PER_KNOT: Final = 1
-"""Least intervals between two waypoints of a smooth curve."""
+LEAST_STEP: Final = 1e-5
+"""Shortest interval, as a fraction of the robot's size: the second derivatives of a quintic over a
+shorter one are rounding errors."""
 GRADE: Final = 1.5
 """Power of the distance from a stop by which points are set: speeds go by its root."""
 ROUNDING: Final = 1e-9
 """A position this far beyond its limit, of unit one, is on it."""
+Slowdown = Callable[[Array, Array], Array]
+"""Of joint positions (p, n) and the way that the reference point goes (p, 3): factors (p,)."""
+
+
+@dataclass(frozen=True)
+class Curve:
+    """A stretch of a path of a robot, of which any points can be computed.
+
+    ``begin``: way up to the stretch, m. ``singularity``: least singularity index on it, 0 to 1.
+    """
+
+    robot: Robot
+    path: Path
+    stretch: Stretch
+    begin: float
+    singularity: float
+    slowdown: Slowdown | None = None
+
+    @property
+    def least_step(self) -> float:
+        """Shortest interval, m."""
+        return LEAST_STEP * self.robot.size
+
+    def grid(self, points: int) -> list[Array]:
+        """About so many points, of each piece: half by the pieces' lengths, half alike for all."""
+        pieces, result = self.stretch.pieces, []
+        for k, piece in enumerate(pieces):
+            share = piece.length / self.stretch.length + 1.0 / len(pieces)
+            count = max(LEAST_POINTS, len(piece.knots), round(0.5 * points * share))
+            even = _graded(count, begins=k == 0, ends=k == len(pieces) - 1)
+            result.append(_with_knots(piece.length * even, piece.knots, self.least_step))
+        return result
+
+    def at(self, grid: list[Array]) -> JointPath:
+        """The joint positions at points of each piece.
+
+        :raises ParameterError: by the place, a pose that the machine does not reach, a joint beyond
+            its limits, or a singularity.
+        :raises UnreachableError: joint positions without an assembly.
+        :raises SingularityError: joint positions beyond a singularity.
+        """
+        robot, pieces = self.robot, self.stretch.pieces
+        parts = [p.at(s) for p, s in zip(pieces, grid, strict=True)]
+        begins = np.concatenate([[0.0], np.cumsum([p.length for p in pieces])])
+        s = np.concatenate([b + x for b, x in zip(begins, grid, strict=False)])
+        place, slope, bend = (np.concatenate([part[k] for part in parts]) for k in range(3))
+        if self.path.space == "joint":
+            q, first, second = place, slope, bend
+            robot.forward(q)
+        else:
+            q = _joints(robot, place, self.begin + s)
+            first, second = joint_rates(robot, q, slope, bend)
+        check_positions(robot, s, q, self.begin, self.singularity)
+        twist = velocity_of(robot, q, first)
+        travel = np.linalg.norm(twist, axis=1)
+        slower = np.ones(len(s))
+        if self.slowdown is not None:
+            way = twist / np.maximum(travel, 1e-300)[:, None]
+            slower = np.asarray(self.slowdown(q, way), np.float64)
+        ends = np.cumsum([len(own) for own in grid])
+        left = np.delete(np.arange(len(s)), ends - 1)
+        return JointPath(self, tuple(grid), s, q, first, second, travel * slower, slower, left)
 
 
 @dataclass(frozen=True)
 class JointPath:
     """A stretch of a path in joint coordinates, from rest to rest.
 
-    ``s``: points, shape (p,), m; where two pieces meet there are two points of one s.
-    ``q``, ``first``, ``second``: joint positions and derivatives by s, shape (p, n).
-    ``travel``: the reference point's way by s, shape (p,); ``left``: first point of each interval,
-    whose other end is the next point. ``felt``: travel times what multiplies the speed for its
-    limit, shape (p,).
+    ``grid``: points of each piece of ``curve``. ``s``: all of them, shape (p,), m; where two pieces
+    meet there are two points of one s. ``q``, ``first``, ``second``: joint positions and
+    derivatives by s, shape (p, n). ``felt``: the reference point's way by s times ``slower``, what
+    multiplies its speed for the limit, shape (p,). ``left``: first point of each interval, whose
+    other end is the next point.
     """
 
+    curve: Curve
+    grid: tuple[Array, ...]
     s: Array
     q: Array
     first: Array
     second: Array
-    travel: Array
-    left: Index
     felt: Array
+    slower: Array
+    left: Index
 
     @property
     def steps(self) -> Array:
         """Length of each interval, shape (intervals,), m."""
         return self.s[self.left + 1] - self.s[self.left]
 
-    def between(self, interval: Index, part: Array) -> tuple[Array, Array, Array]:
-        """Positions and derivatives by s at a part (0 to 1) of intervals, shape (k, n) each.
+    @property
+    def ends(self) -> Array:
+        """The intervals' ends, shape (intervals + 1,), m."""
+        return np.append(self.s[self.left], self.s[-1])
 
-        A quintic in each interval with the values and both derivatives of its ends.
+    @cached_property
+    def _quintics(self) -> Array:
+        """Coefficients by the part of an interval, shape (6, intervals, n).
+
+        A quintic in each interval has the values and both derivatives of its ends.
         """
-        a = self.left[interval]
-        b, h = a + 1, self.steps[interval][:, None]
-        t = part[:, None]
+        a = self.left
+        b, h = a + 1, self.steps[:, None]
         d = self.q[b] - self.q[a]
         u, v = self.first[a] * h, self.first[b] * h
         x, y = self.second[a] * h**2, self.second[b] * h**2
-        c2, c3 = 0.5 * x, 10.0 * d - 6.0 * u - 4.0 * v - 1.5 * x + 0.5 * y
+        c3 = 10.0 * d - 6.0 * u - 4.0 * v - 1.5 * x + 0.5 * y
         c4 = -15.0 * d + 8.0 * u + 7.0 * v + 1.5 * x - y
         c5 = 6.0 * d - 3.0 * (u + v) - 0.5 * (x - y)
-        q = self.q[a] + t * (u + t * (c2 + t * (c3 + t * (c4 + t * c5))))
-        first = u + t * (2 * c2 + t * (3 * c3 + t * (4 * c4 + t * 5 * c5)))
+        return np.stack([self.q[a], u, 0.5 * x, c3, c4, c5])
+
+    def between(self, interval: Index, part: Array) -> tuple[Array, Array, Array]:
+        """Positions and derivatives by s at a part (0 to 1) of intervals, shape (k, n) each."""
+        c0, c1, c2, c3, c4, c5 = self._quintics[:, interval]
+        h, t = self.steps[interval][:, None], part[:, None]
+        q = c0 + t * (c1 + t * (c2 + t * (c3 + t * (c4 + t * c5))))
+        first = c1 + t * (2 * c2 + t * (3 * c3 + t * (4 * c4 + t * 5 * c5)))
         second = 2 * c2 + t * (6 * c3 + t * (12 * c4 + t * 20 * c5))
         return q, first / h, second / h**2
 
@@ -76,10 +152,39 @@ class JointPath:
         q, first, second = self.between(interval, part)
         return q, first * v[:, None], first * u[:, None] + second * (v**2)[:, None]
 
-    def speed(self, slopes: Array, interval: Index, part: Array, v: Array) -> Array:
-        """There at v along the path, (k,), by ways per s as ``travel`` and ``felt``, (p,)."""
+    def slowed(self, interval: Index, part: Array) -> Array:
+        """What multiplies the reference point's speed for its limit there, shape (k,)."""
         left = self.left[interval]
-        return v * ((1.0 - part) * slopes[left] + part * slopes[left + 1])
+        return (1.0 - part) * self.slower[left] + part * self.slower[left + 1]
+
+    def refined(self, parts: Index) -> JointPath:
+        """The same with each interval in so many parts.
+
+        :param parts: shape (intervals,).
+        :raises ParameterError: as of :meth:`Curve.at`.
+        """
+        grid, begin = [], 0
+        for own in self.grid:
+            count = parts[begin : begin + len(own) - 1]
+            begin += len(own) - 1
+            at = np.repeat(np.arange(len(count)), count)
+            part = (np.arange(len(at)) - np.repeat(np.cumsum(count) - count, count)) / count[at]
+            grid.append(np.append(own[at] + part * np.diff(own)[at], own[-1]))
+        return self.curve.at(grid)
+
+
+def joint_rates(robot: Robot, q: Array, rate: Array, change: Array) -> tuple[Array, Array]:
+    """First and second derivatives of joints (k, n) by those of the pose, shape (k, m) each."""
+    jacobian = robot.jacobian(q)
+    first = np.asarray(np.linalg.solve(jacobian, rate[..., None])[..., 0], np.float64)
+    own = robot.pose_acceleration(q, first, np.zeros_like(first))
+    second = np.linalg.solve(jacobian, (change - own)[..., None])[..., 0]
+    return first, np.asarray(second, np.float64)
+
+
+def velocity_of(robot: Robot, q: Array, qd: Array) -> Array:
+    """Velocity of the reference point, base axes, shape (k, 3), m/s, of joint rates (k, n)."""
+    return np.asarray((robot.platform_jacobian(q)[:, :3] @ qd[..., None])[..., 0], np.float64)
 
 
 def _joints(robot: Robot, places: Array, way: Array) -> Array:
@@ -101,63 +206,20 @@ def _joints(robot: Robot, places: Array, way: Array) -> Array:
     return robot.inverse(places)
 
 
-Slowdown = Callable[[Array, Array], Array]
-"""Of joint positions (p, n) and the way that the reference point goes (p, 3): factors (p,)."""
-
-
-def joint_path(
-    robot: Robot,
-    path: Path,
-    stretch: Stretch,
-    points: int,
-    begin: float = 0.0,
-    slowdown: Slowdown | None = None,
-) -> JointPath:
-    """A stretch of a path as joint positions.
-
-    :param begin: way up to the stretch, m.
-    :param points: about how many; half by the pieces' lengths, half alike for all pieces.
-    :raises ParameterError: by the place, a pose that the machine does not reach.
-    :raises UnreachableError: joint positions without an assembly.
-    :raises SingularityError: joint positions beyond a singularity.
-    """
-    pieces = stretch.pieces
-    counts = [
-        max(_least(p), round(0.5 * points * (p.length / stretch.length + 1.0 / len(pieces))))
-        for p in pieces
-    ]
-    last = len(pieces) - 1
-    locals_ = [
-        p.length * _graded(n, begins=k == 0, ends=k == last)
-        for k, (p, n) in enumerate(zip(pieces, counts, strict=True))
-    ]
-    parts = [p.at(s) for p, s in zip(pieces, locals_, strict=True)]
-    begins = np.concatenate([[0.0], np.cumsum([p.length for p in pieces])])
-    s = np.concatenate([b + x for b, x in zip(begins, locals_, strict=False)])
-    place, slope, bend = (np.concatenate([part[k] for part in parts]) for k in range(3))
-    ends = np.cumsum([n + 1 for n in counts])
-    left = np.delete(np.arange(len(s)), ends - 1)
-    if path.space == "joint":
-        q, first, second = place, slope, bend
-        robot.forward(q)
-    else:
-        q = _joints(robot, place, begin + s)
-        jacobian = robot.jacobian(q)
-        first = np.linalg.solve(jacobian, slope[..., None])[..., 0]
-        own = robot.pose_acceleration(q, first, np.zeros_like(q))
-        second = np.linalg.solve(jacobian, (bend - own)[..., None])[..., 0]
-    twist = np.einsum("kij,kj->ki", robot.platform_jacobian(q)[:, :3], first)
-    travel = np.linalg.norm(twist, axis=1)
-    felt = travel
-    if slowdown is not None:
-        felt = travel * slowdown(q, twist / np.maximum(travel, 1e-300)[:, None])
-    return JointPath(s, q, first, second, travel, left, felt)
-
-
-def _least(piece: Piece) -> int:
-    """Intervals that a piece needs for its own bends."""
-    bends = PER_KNOT * (len(piece.spline.x) - 1) if isinstance(piece, Smooth) else 0
-    return max(LEAST_POINTS, bends)
+def _with_knots(s: Array, knots: Array, least: float) -> Array:
+    """Points of a piece, those next to a knot moved there; no two closer than ``least``."""
+    inner: list[float] = []
+    for knot in knots.tolist():
+        if min(knot, s[-1] - knot) > least and not (inner and knot - inner[-1] < least):
+            inner.append(knot)
+    if not inner:
+        return s
+    at = np.array(inner)
+    # Of the even points those stay that keep a quarter of their own distance to the knots.
+    away = np.abs(s[:, None] - at).min(1)
+    free = away > np.maximum(0.25 * np.gradient(s), least)
+    free[[0, -1]] = True
+    return np.sort(np.concatenate([s[free], at]))
 
 
 def _graded(count: int, *, begins: bool, ends: bool) -> Array:
@@ -192,46 +254,45 @@ def place_at(robot: Robot, q: Array, way: float) -> Place:
     return Place(way, pose, robot.pose_names)
 
 
-def check_positions(robot: Robot, part: JointPath, begin: float, singularity: float) -> float:
-    """A path that keeps joint limits, passive joints' angles and away from singularities.
+def check_positions(robot: Robot, s: Array, q: Array, begin: float, singularity: float) -> None:
+    """Check that a path keeps joint limits, passive joints' angles and away from singularities.
 
+    :param s: way within the stretch, shape (p,), m; ``q``: joint positions there, (p, n).
     :param begin: way up to the stretch, m.
     :param singularity: least singularity index, 0 to 1.
-    :returns: the least singularity index on the path.
     :raises ParameterError: by the first joint and place.
     """
     limits = robot.limits.position
     if limits is not None:
-        excess = np.maximum(part.q - limits[:, 1], limits[:, 0] - part.q)
-        bad = excess > ROUNDING * np.maximum(1.0, np.abs(part.q))
+        excess = np.maximum(q - limits[:, 1], limits[:, 0] - q)
+        bad = excess > ROUNDING * np.maximum(1.0, np.abs(q))
         if bad.any():
             row = int(bad.any(1).argmax())
             joint = int(excess[row].argmax())
             unit, name = robot.joint_units[joint], robot.joint_names[joint]
             low, high = limits[joint]
-            where = place_at(robot, part.q[row], begin + float(part.s[row]))
+            where = place_at(robot, q[row], begin + float(s[row]))
             raise ParameterError(
-                f"path: {name} {where}", round(float(part.q[row, joint]), 6),
+                f"path: {name} {where}", round(float(q[row, joint]), 6),
                 f"{low:g} to {high:g} {unit}",
             )  # fmt: skip
     most = getattr(robot.limits, "joint_angle", None)
-    angles = None if most is None else robot.limit_angles(robot.forward(part.q))
+    angles = None if most is None else robot.limit_angles(robot.forward(q))
     if angles is not None and most is not None:
         over = np.abs(angles).max(1) > most + ROUNDING
         if over.any():
             row = int(over.argmax())
-            where = place_at(robot, part.q[row], begin + float(part.s[row]))
+            where = place_at(robot, q[row], begin + float(s[row]))
             value = float(np.abs(angles[row]).max())
             raise ParameterError(f"path: joint angle {where}", round(value, 6), f"to {most:g} rad")
-    index = robot.singularity(part.q)
+    index = robot.singularity(q)
     row = int(index.argmin())
     if index[row] < singularity:
-        where = place_at(robot, part.q[row], begin + float(part.s[row]))
+        where = place_at(robot, q[row], begin + float(s[row]))
         raise ParameterError(
             f"path: singularity index {where}", round(float(index[row]), 6),
             f"{singularity:g} or more",
         )  # fmt: skip
-    return float(index[row])
 
 
 def joint_paths(
@@ -245,11 +306,10 @@ def joint_paths(
     begin = 0.0
     for stretch in path.stretches:
         share = max(2 * LEAST_POINTS, round(points * stretch.length / path.length))
+        curve = Curve(robot, path, stretch, begin, singularity, slowdown)
         try:
-            part = joint_path(robot, path, stretch, share, begin, slowdown)
+            result.append(curve.at(curve.grid(share)))
         except (UnreachableError, SingularityError) as error:
             raise ParameterError("path", str(error), "joints that can be assembled") from None
-        check_positions(robot, part, begin, singularity)
         begin += stretch.length
-        result.append(part)
     return result

@@ -15,7 +15,7 @@ from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError
 from pkm_twin.paths.constraints import Forces, Limits
 from pkm_twin.paths.joint_path import JointPath
-from pkm_twin.paths.motion import needs_forces
+from pkm_twin.paths.motion import moving, needs_forces
 from pkm_twin.robot.robot import Robot
 
 Index = NDArray[np.int64]
@@ -57,6 +57,8 @@ def s_curve(cruise: float, smooth: float) -> Law:
     return law
 
 
+HALVINGS: Final = 60
+"""Steps of the search for the time of a place."""
 SHORTEST: Final = 1e-6
 """Duration of a stretch that nothing limits, s."""
 LAWS: Final[Mapping[str, Sequence[Law]]] = {
@@ -80,15 +82,20 @@ class LawRun:
 
     @cached_property
     def times(self) -> Array:
-        """As many times as the path has points, shape (i + 1,), s."""
-        return np.linspace(0.0, self.duration, len(self.part.left) + 1)
+        """Times of the intervals' ends, shape (i + 1,), s."""
+        way = self.part.ends / self.part.ends[-1]
+        low, high = np.zeros(len(way)), np.ones(len(way))
+        for _ in range(HALVINGS):
+            middle = 0.5 * (low + high)
+            before = self.law(middle)[0] < way
+            low, high = np.where(before, middle, low), np.where(before, high, middle)
+        high[0], high[-1] = 0.0, 1.0
+        return self.duration * high
 
     def profile(self) -> Array:
         """v^2 at the intervals' ends, shape (i + 1,)."""
-        s = np.append(self.part.s[self.part.left], self.part.s[-1])
-        t = np.linspace(0.0, 1.0, 20 * len(s))
-        way, rate, _ = self.law(t)
-        return np.asarray((np.interp(s, s[-1] * way, s[-1] * rate) / self.duration) ** 2)
+        rate = self.law(self.times / self.duration)[1]
+        return np.asarray((self.part.ends[-1] * rate / self.duration) ** 2)
 
     def slower(self, factor: float) -> LawRun:
         """The same with ``factor`` times the duration."""
@@ -96,12 +103,11 @@ class LawRun:
 
     def at(self, time: Array) -> tuple[Index, Array, Array, Array]:
         """Interval, part of it, v and u at times (k,)."""
-        begins = self.part.s[self.part.left]
-        length = float(self.part.s[-1])
+        ends, length = self.part.ends, float(self.part.ends[-1])
         way, rate, change = self.law(np.clip(time / self.duration, 0.0, 1.0))
         s = length * way
-        k = np.clip(np.searchsorted(begins, s, side="right") - 1, 0, len(begins) - 1)
-        part = np.clip((s - begins[k]) / self.part.steps[k], 0.0, 1.0)
+        k = np.clip(np.searchsorted(ends, s, side="right") - 1, 0, len(ends) - 2)
+        part = np.clip((s - ends[k]) / self.part.steps[k], 0.0, 1.0)
         return k, part, length * rate / self.duration, length * change / self.duration**2
 
 
@@ -113,7 +119,7 @@ def shortest(
     interval, share, v, u = run.at(run.times)
     _, qd, qdd = part.motion(interval, share, v, u)
     jerk = np.gradient(qdd, run.times, axis=0)
-    travel = part.speed(part.felt, interval, share, v)
+    travel = moving(robot, run, run.times)[4]
     duration = max(
         float((np.abs(qd) / limits.velocity).max()),
         float((travel / limits.speed).max()),

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
@@ -13,10 +13,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from delta_dynamics import inverse_dynamics
-from pkm_twin.codegen.arrays import Array
+from pkm_twin.codegen.arrays import Array, Mask
+from pkm_twin.errors import ParameterError
 from pkm_twin.paths.constraints import Limits, names_of, shares
 from pkm_twin.paths.geometry import Path
-from pkm_twin.paths.joint_path import JointPath
+from pkm_twin.paths.joint_path import JointPath, velocity_of
 from pkm_twin.robot.robot import Robot
 
 Index = NDArray[np.int64]
@@ -24,7 +25,15 @@ Index = NDArray[np.int64]
 BINDS: Final = 0.98
 """Used part of a limit from which on it binds."""
 CREEP: Final = 1e-9
-"""Least speed along the path of a machine that moves, m/s."""
+"""Least speed along the path of a machine that moves, of its mean speed."""
+MOST_SAMPLES: Final = 10_000_000
+"""Of a motion at a rate."""
+CELLS: Final = (4, 16, 64, 256)
+"""Parts of an interval at whose ends limits are checked, more where it is needed."""
+INSET: Final = 1e-6
+"""Part of an interval that its first and last samples stay away from jumps at its ends."""
+RESOLVED: Final = 2e-5
+"""Part of a limit between samples that is added to them; above it, they are closer."""
 BRIEF: Final = 0.01
 """Part of the duration: a stretch shorter than it joins the one before it."""
 
@@ -57,7 +66,7 @@ class Timed(Protocol):
 
     @property
     def times(self) -> Array:
-        """Times of the motion's points, from 0 to its duration, s."""
+        """From 0 to its duration, s; between two neighbours the motion is smooth."""
 
     @property
     def duration(self) -> float:
@@ -156,30 +165,33 @@ class TimedPath:
     def sample(self, times: ArrayLike) -> Samples:
         """The motion at times (k,), s from its beginning; it rests before and behind it."""
         t = np.asarray(times, np.float64)
-        n = self.robot.joints_count
+        robot, n = self.robot, self.robot.joints_count
         q, qd, qdd = (np.zeros((len(t), n)) for _ in range(3))
         travel, felt = np.zeros(len(t)), np.zeros(len(t))
         run_of = np.clip(np.searchsorted(self.begins, t, side="right") - 1, 0, None)
         for k, (begin, run) in enumerate(zip(self.begins, self.runs, strict=True)):
             mine = np.flatnonzero(run_of == k)
-            if not len(mine):
-                continue
-            interval, part, v, u = run.at(t[mine] - begin)
-            # At its end the machine rests; at its beginning it has its friction already.
-            passed = (t[mine] >= begin) & (t[mine] - begin < run.duration * (1.0 - 1e-12))
-            v, u = np.where(passed, np.maximum(v, CREEP), 0.0), np.where(passed, u, 0.0)
-            q[mine], qd[mine], qdd[mine] = run.part.motion(interval, part, v, u)
-            for speeds, slopes in ((travel, run.part.travel), (felt, run.part.felt)):
-                speeds[mine] = run.part.speed(slopes, interval, part, v)
+            if len(mine):
+                # At its end the machine rests; at its beginning it has its friction already.
+                moves = (t[mine] >= begin) & (t[mine] - begin < run.duration * (1.0 - 1e-12))
+                own = moving(robot, run, t[mine] - begin, moves)
+                q[mine], qd[mine], qdd[mine], travel[mine], felt[mine] = own
         effort = None
-        if self.robot.has_masses:
-            effort = inverse_dynamics(self.robot, q, qd, qdd, self.wrench)
-        return Samples(t, q, qd, qdd, effort, self.robot.forward(q), travel, felt)
+        if robot.has_masses:
+            effort = inverse_dynamics(robot, q, qd, qdd, self.wrench)
+        return Samples(t, q, qd, qdd, effort, robot.forward(q), travel, felt)
 
     def uniform(self, rate: float) -> Samples:
         """The motion at ``rate`` samples a second; the last is its end, half to three halves of a
         period after the one before.
+
+        :raises ParameterError: more than :data:`MOST_SAMPLES`.
         """
+        if not self.duration * rate <= MOST_SAMPLES:
+            raise ParameterError(
+                "rate", rate, f"{MOST_SAMPLES / self.duration:.4g} or less, for "
+                f"{MOST_SAMPLES} samples of a motion of {self.duration:.4g} s",
+            )  # fmt: skip
         count = max(1, round(self.duration * rate))
         return self.sample(np.append(np.arange(count) / rate, self.duration))
 
@@ -230,20 +242,28 @@ class TimedPath:
         jerk = np.zeros_like(s.q)
         if np.isfinite(self.limits.jerk).any() and len(s.time) > 2:
             jerk = np.gradient(s.qdd, s.time, axis=0)
-        return shares(self.limits, s.effort, s.qd, s.qdd, jerk, s.felt)
+        return np.abs(shares(self.limits, s.effort, s.qd, s.qdd, jerk, s.felt))
 
     @cached_property
     def bounds(self) -> list[Bound]:
         """Which limit binds when, in order."""
         return merged(self.fine.time, binding(self.used), names_of(self.robot), self.used)
 
+    @cached_property
+    def _peaks(self) -> Array:
+        """Greatest used part of each limit at all times, shape (4 n + 1,)."""
+        moved = [run_peaks(self.robot, run, self.limits, self.wrench).max(0) for run in self.runs]
+        rests = self.sample(np.append(np.nextafter(self.begins, -1.0), self.duration))
+        zero = np.zeros_like(rests.q)
+        held = shares(self.limits, rests.effort, zero, zero, zero, rests.felt)
+        return np.asarray(np.abs(np.concatenate([held, moved])).max(0), np.float64)
+
     @property
     def worst(self) -> dict[str, float]:
-        """Greatest used part of each limit that there is, 1 is the limit."""
-        finite = self.used.max(0)
+        """Greatest used part of each limit that there is, between points too; 1 is the limit."""
         return {
             name: float(value)
-            for name, value in zip(names_of(self.robot), finite, strict=True)
+            for name, value in zip(names_of(self.robot), self._peaks, strict=True)
             if value > 0.0
         }
 
@@ -264,6 +284,67 @@ class Samples:
     pose: Array
     speed: Array
     felt: Array
+
+
+def moving(robot: Robot, run: Timed, time: Array, moves: Mask | bool = True) -> tuple[Array, ...]:
+    """A run at times (k,): q, qd, qdd, the reference point's speed, and what its limit is for.
+
+    :param moves: at which times the machine moves; it rests at the others.
+    """
+    interval, part, v, u = run.at(time)
+    creep = CREEP * run.part.ends[-1] / run.duration
+    v, u = np.where(moves, np.maximum(v, creep), 0.0), np.where(moves, u, 0.0)
+    q, qd, qdd = run.part.motion(interval, part, v, u)
+    speed = np.linalg.norm(velocity_of(robot, q, qd), axis=1)
+    return q, qd, qdd, speed, speed * run.part.slowed(interval, part)
+
+
+Moments = tuple[Array | None, Array, Array, Array]
+"""Efforts, joint rates and accelerations, (k, n), and what the speed's limit is for, (k,)."""
+
+
+def peaks(limits: Limits, times: Array, sample: Callable[[Array], Moments]) -> Array:
+    """Greatest used part of each limit between neighbouring times, (i, 4 n + 1).
+
+    Each interval is sampled, and a parabola through three samples says how much more there can be
+    between them. Where that is more than :data:`RESOLVED` and could pass a limit or what is the
+    greatest so far, the interval is sampled more closely.
+
+    :param times: the motion is smooth between two of them, shape (i + 1,), s.
+    """
+    jerks = np.isfinite(limits.jerk).any()
+    spans = np.diff(times)
+    n = len(limits.jerk)
+    result = np.zeros((len(spans), 4 * n + 1))
+    todo = np.arange(len(spans))
+    for cells in CELLS:
+        parts = INSET + (1.0 - 2.0 * INSET) * np.linspace(0.0, 1.0, cells + 1)
+        effort, qd, qdd, felt = sample((times[todo, None] + spans[todo, None] * parts).ravel())
+        jerk = np.zeros_like(qd)
+        if jerks:
+            own = qdd.reshape(len(todo), cells + 1, n)
+            changes = np.gradient(own, parts, axis=1, edge_order=2)
+            jerk = (changes / spans[todo, None, None]).reshape(jerk.shape)
+        used = shares(limits, effort, qd, qdd, jerk, felt).reshape(len(todo), cells + 1, -1)
+        more = np.abs(np.diff(used, 2, axis=1)).max(1) / 8.0
+        top = np.abs(used).max(1)
+        result[todo] = top + np.minimum(more, RESOLVED)
+        matters = (more > RESOLVED) & (top + 4.0 * more > np.minimum(1.0, result.max(0)))
+        todo = todo[matters.any(1)]
+        if not len(todo):
+            break
+    return result
+
+
+def run_peaks(robot: Robot, run: Timed, limits: Limits, wrench: Array | None) -> Array:
+    """Greatest used part of each limit between neighbouring times of a run, (i, 4 n + 1)."""
+    needs = needs_forces(robot, limits)
+
+    def sample(time: Array) -> Moments:
+        q, qd, qdd, _, felt = moving(robot, run, time)
+        return inverse_dynamics(robot, q, qd, qdd, wrench) if needs else None, qd, qdd, felt
+
+    return peaks(limits, run.times, sample)
 
 
 def binding(used: Array) -> list[int]:

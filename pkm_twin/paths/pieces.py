@@ -5,13 +5,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Final, Protocol
 
 import numpy as np
 import scipy  # type: ignore[import-untyped]  # its parts come when they are asked for
 
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError
+
+NONE: Final = np.empty(0)
 
 
 class Piece(Protocol):
@@ -20,6 +22,10 @@ class Piece(Protocol):
     @property
     def length(self) -> float:
         """Range of s."""
+
+    @property
+    def knots(self) -> Array:
+        """Where within it a derivative jumps, rising."""
 
     def at(self, s: Array) -> tuple[Array, Array, Array]:
         """Coordinates and their first two derivatives by s, shape (k, m) each."""
@@ -32,6 +38,7 @@ class Line:
     begin: Array
     slope: Array
     length: float
+    knots = NONE
 
     def at(self, s: Array) -> tuple[Array, Array, Array]:
         """See :class:`Piece`."""
@@ -52,6 +59,7 @@ class Corner:
     before: Array
     behind: Array
     radius: float
+    knots = NONE
 
     @property
     def length(self) -> float:
@@ -83,6 +91,7 @@ class Arc:
     rest: Array
     radius: float
     angle: float
+    knots = NONE
 
     @property
     def length(self) -> float:
@@ -109,6 +118,11 @@ class Smooth:
     def length(self) -> float:
         """Range of s."""
         return float(self.spline.x[-1])
+
+    @property
+    def knots(self) -> Array:
+        """Where the third derivative jumps."""
+        return np.asarray(self.spline.x[1:-1], np.float64)
 
     def at(self, s: Array) -> tuple[Array, Array, Array]:
         """See :class:`Piece`."""

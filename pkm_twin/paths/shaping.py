@@ -21,8 +21,8 @@ from numpy.typing import ArrayLike
 from delta_dynamics import inverse_dynamics
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError, UnknownNameError
-from pkm_twin.paths.joint_path import JointPath, check_positions
-from pkm_twin.paths.motion import Samples, TimedPath
+from pkm_twin.paths.joint_path import check_positions, joint_rates, velocity_of
+from pkm_twin.paths.motion import Moments, Samples, TimedPath, peaks
 
 DELAYS: Final = {"zv": 1, "zvd": 2}
 """Half vibrations that each shaper takes."""
@@ -94,6 +94,25 @@ class ShapedPath(TimedPath):
     def _points(self) -> Array:
         return np.linspace(0.0, self.duration, POINTS)
 
+    @cached_property
+    def _peaks(self) -> Array:
+        """Greatest used part of each limit at all times, shape (4 n + 1,)."""
+        assert self.phase is not None  # noqa: S101  shaped() gives it
+        plain = np.concatenate(
+            [begin + run.times for begin, run in zip(self.begins, self.runs, strict=True)]
+        )
+        # Each part of the split motion jumps where the plain one does, later.
+        late = [self.phase.before(plain, -k * np.pi)[0] for k in range(len(self.amplitudes))]
+        even = np.linspace(0.0, self.duration, KNOTS)
+        times = np.unique(np.clip(np.concatenate([even, *late]), 0.0, self.duration))
+        times = times[np.diff(times, prepend=-1.0) > CLOSEST]
+
+        def sample(time: Array) -> Moments:
+            s = self.sample(time)
+            return s.effort, s.qd, s.qdd, s.felt
+
+        return np.asarray(peaks(self.limits, times, sample).max(0), np.float64)
+
     def sample(self, times: ArrayLike) -> Samples:
         """The shaped motion at times (k,), s from its beginning."""
         t = np.asarray(times, np.float64)
@@ -110,15 +129,11 @@ class ShapedPath(TimedPath):
             rate += amplitude * own_rate * first[:, None]
             change += amplitude * (own_change * (first**2)[:, None] + own_rate * second[:, None])
         q = robot.inverse(pose)
-        jacobian = robot.jacobian(q)
-        qd = np.asarray(np.linalg.solve(jacobian, rate[..., None])[..., 0], np.float64)
-        rest = robot.pose_acceleration(q, qd, np.zeros_like(qd))
-        qdd = np.asarray(np.linalg.solve(jacobian, (change - rest)[..., None])[..., 0], np.float64)
+        qd, qdd = joint_rates(robot, q, rate, change)
         effort = None
         if robot.has_masses:
             effort = inverse_dynamics(robot, q, qd, qdd, self.wrench)
-        moved = (robot.platform_jacobian(q)[:, :3] @ qd[..., None])[..., 0]
-        speed = np.linalg.norm(moved, axis=1)
+        speed = np.linalg.norm(velocity_of(robot, q, qd), axis=1)
         return Samples(t, q, qd, qdd, effort, pose, speed, speed)
 
 
@@ -188,9 +203,7 @@ def shaped(
         if over <= 1.0 + ROUNDING:
             fine = result.fine
             way = np.cumsum(fine.speed * np.diff(fine.time, prepend=0.0))
-            none = np.empty_like(fine.q)
-            part = JointPath(way, fine.q, none, none, way, np.empty(0, np.int64), way)
-            check_positions(motion.robot, part, 0.0, singularity)
+            check_positions(motion.robot, way, fine.q, 0.0, singularity)
             return result
         plain = replace(plain, runs=tuple(run.slower(over) for run in plain.runs))
     raise ParameterError("shaper", shaper, "limits that the shaped motion meets")

@@ -23,7 +23,7 @@ CATALOGUE: Final = {
     "upr_rpu": "pkm_twin.mechanisms.upr_rpu:UprRpu",
 }
 """Mechanism name to class: one line a mechanism."""
-TREES: Final = (".urdf", ".xml", ".mjcf")
+TREES: Final = (".urdf", ".xml", ".mjcf", ".sdf", ".world")
 """Endings of files that give a tree of links and its loop closures."""
 
 
@@ -65,8 +65,8 @@ def load(robot: str | Path, *, platform: str | None = None) -> Robot:
     Changes that the import made to a user's file, and implausible numbers in it, give warnings
     (:class:`pkm_twin.errors.RobotWarning`), each once.
 
-    :param robot: a name such as ``"delta_cu"``, or a path to a YAML, URDF or MJCF file.
-    :param platform: of a URDF the link that carries the tool; default by its name.
+    :param robot: a name such as ``"delta_cu"``, or a path to a YAML, URDF, MJCF or SDF file.
+    :param platform: of a URDF, MJCF or SDF the link that carries the tool; default by its name.
     :raises UnknownNameError: no such name; the closest one is named.
     :raises ParameterError: an invalid file, key, type or value, with its dotted name.
     """

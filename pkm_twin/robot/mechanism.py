@@ -8,7 +8,7 @@ forms of the start and of the inverse with the branch rules.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, ClassVar, TypeVar
@@ -28,6 +28,7 @@ from pkm_twin.machine.inertia import Coefficients
 from pkm_twin.machine.joint_map import JointMap, JointMapEntry
 from pkm_twin.machine.members import Beam, Structure
 from pkm_twin.machine.places import (
+    Key,
     check_number,
     full_keys,
     given,
@@ -35,6 +36,7 @@ from pkm_twin.machine.places import (
     number_in,
     numbers_of,
     placed,
+    unknown_number,
 )
 from pkm_twin.machine.pose_grid import PoseGrid
 from pkm_twin.machine.reach import PassiveLimit, position_box
@@ -209,6 +211,20 @@ class Mechanism:
         return frozenset()
 
     @property
+    def without_point(self) -> frozenset[str]:
+        """Joints that have no point of their own in the file."""
+        return frozenset()
+
+    def named(self, keys: Sequence[Key]) -> Iterator[tuple[str, str, tuple[Key, ...], float]]:
+        """Entries of the graph that a path's keys are about: kind, name, keys in it, azimuth.
+
+        The azimuth is a limb's, by which the entry's vectors are turned about base z.
+        """
+        kind, name, *where = [*keys, "", ""][: max(2, len(keys))]
+        if kind in ("bodies", "joints", "rods") and name in getattr(self.graph, str(kind)):
+            yield str(kind), str(name), tuple(where), 0.0
+
+    @property
     def drives(self) -> tuple[DriveSpec | None, ...]:
         """Rotor and gear of each actuated joint, None where the file does not give them."""
         return (self.drive,) * self.joints_count
@@ -375,10 +391,10 @@ class Mechanism:
         """
         keys = full_keys(path)
         sections = {f.name for f in dataclasses.fields(self) if "check" in f.metadata}
-        known = keys and keys[0] in sections
-        return number_in(
-            schema.plain(getattr(self, str(keys[0]))) if known else None, keys[1:], path
-        )
+        if not keys or keys[0] not in sections:
+            numbers = numbers_of(self.parameter_sections(), self.parameter_units())
+            raise unknown_number(path, numbers)
+        return number_in(schema.plain(getattr(self, str(keys[0]))), keys[1:], path)
 
     def check_number(self, path: str) -> None:
         """Judge a number of :meth:`numbered` as a file's is.

@@ -425,7 +425,10 @@ class Robot(Mechanism):
         return passive_names(self.engine)
 
     def passive(self, q: ArrayLike) -> Array:
-        """Values of the passive joints, shape (..., k), rad or m, in a URDF's convention."""
+        """Values of the passive joints, shape (..., k), rad or m, in a URDF's convention.
+
+        Angles are within half a turn of their value at home.
+        """
         return self.evaluate(self.engine.kernel("passive", passive_program), _NONE, q)[0]
 
     def passive_rates(self, q: ArrayLike, qd: ArrayLike) -> Array:

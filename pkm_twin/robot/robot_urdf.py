@@ -18,6 +18,7 @@ from pkm_twin.machine.graph_description import graph_description
 from pkm_twin.machine.mjcf_write import write_mjcf
 from pkm_twin.machine.places import has_entry
 from pkm_twin.machine.sdf_write import write_sdf
+from pkm_twin.machine.urdf_control import Control, tree_names
 from pkm_twin.machine.urdf_write import MOCK, UrdfBody, UrdfDrive, UrdfTree, write_urdf
 from pkm_twin.robot.robot import Robot
 from pkm_twin.robot.urdf_tree import urdf_tree
@@ -32,11 +33,28 @@ def robot_urdf(robot: Robot, hardware: str = MOCK, prefix: str = "") -> str:
     that it cuts stands in ``<constraint>``; rotors in passive joints are left out.
 
     :param hardware: ros2_control's plugin, by default mock hardware; empty: no ``<ros2_control>``
-        element, as for a description that a controller_manager must not make hardware of.
+        element, as for a description that a controller_manager must not make hardware of. With it
+        drives have the names and numbers of the robot's ``joint_map``, and the joints of the tree
+        follow them, see :mod:`pkm_twin.machine.urdf_control`.
     :param prefix: of the names of all links and joints.
+    :raises ParameterError: hardware, and a ``joint_map`` with a ratio that changes with travel.
     """
     _warn_of_laws(robot, "URDF")
-    return write_urdf(robot_tree(robot), hardware, prefix)
+    if hardware:
+        robot.controller.check_even()
+    return write_urdf(robot_tree(robot), hardware, prefix, _controls(robot))
+
+
+def joint_names(robot: Robot, hardware: str) -> tuple[str, ...]:
+    """What :func:`robot_urdf` calls the actuated and the passive joints of the tree."""
+    names = (*robot.joint_names, *robot.passive_joints)
+    return tuple(tree_names(names, _controls(robot) if hardware else ()).values())
+
+
+def _controls(robot: Robot) -> list[Control]:
+    controller = robot.controller
+    factors, offsets = controller.factors.tolist(), controller.offsets.tolist()
+    return list(map(Control, controller.names, robot.joint_names, factors, offsets))
 
 
 def robot_mjcf(robot: Robot, efforts: Sequence[float] | None = None) -> str:

@@ -9,7 +9,7 @@ one as drawn is taken, else the best conditioned; where there is none, the best 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -41,6 +41,8 @@ TRIES: Final = 6
 """Random starts within each."""
 ROUNDED: Final = (1e-8, 1e-7, 1e-6, 1e-5, 1e-4)
 """Deviations of axes and points that may be a file's rounding, rad and parts of the size."""
+TURNING: Final = 8
+"""Steps in which a part that only spins is turned back to zero."""
 WORDS: Final = {
     "drawn": "as drawn, the actuated joints at {place}",
     "wanted": "the actuated joints at {place}, not as drawn",
@@ -54,7 +56,8 @@ class Home:
     """An assembly: the steps' ``values``, and how far the loops ``miss`` (m or rad).
 
     ``how``: of WORDS; ``place``: where the actuated joints were wanted. ``graph``: idealised, with
-    spins held by the joints ``held``; None where its mobility is not right. ``rounding``: the
+    spins held by the joints ``held`` (each with the greatest mass times offset of what it holds,
+    kg m); None where its mobility is not right. ``rounding``: the
     largest deviation that was removed, rad or parts of the size. ``index``: the singularity index.
     """
 
@@ -63,7 +66,7 @@ class Home:
     how: str
     place: str
     graph: Graph | None
-    held: tuple[str, ...]
+    held: Mapping[str, float]
     rounding: float
     index: float
 
@@ -99,17 +102,43 @@ class HomeSearch:
             self.wanted[outside] = (self.low[outside] + self.high[outside]) / 2
             self.place = "zero or amid their limits"
 
-        self._hinges: tuple[str, ...] | None = None
+        self._hinges: dict[str, float] | None = None
         """The joints that hold the spins of an assembly, which hold those of others too."""
 
     def home(self) -> Home:
-        """The home.
+        """The home, with the parts that only spin at the file's zero where they can be.
 
         :raises ParameterError: the loops close nowhere, by how much they are open.
         """
+        return self._unspun(self._best())
+
+    def _unspun(self, home: Home) -> Home:
+        """The same, with parts that only spin turned back towards zero.
+
+        Where they stand is left to chance by the search, and where their masses are off the axis it
+        counts.
+        """
+        if not home.held or home.graph is None:
+            return home
+        values = self.assembly.relaxed(home.values, self.held)
+        steps = list(self.assembly.steps)
+        zero = np.array([name in home.held and steps.count(name) == 1 for name in steps], bool)
+        for left in range(TURNING, 0, -1):
+            values = np.where(zero, values * (left - 1) / left, values)
+            values, miss = self.assembly.close(values, self.held | zero)
+        if miss > max(home.miss, EXACT):
+            return home
+        turned = self._home(self._wrapped(values), miss, home.how)
+        return turned if turned.index >= SINGULAR else home
+
+    def _best(self) -> Home:
+        """The home as it is found."""
         drawn = self._drawn()
         if drawn is not None and drawn.how == "drawn" and drawn.index >= SMALL:
             return drawn
+        if drawn is None:
+            # What closes nowhere is rejected before much is tried.
+            closed = self.assembly.anywhere()[0]
         found = [] if drawn is None else [drawn]
         found += self._others(found)
         chosen = self._chosen(found)
@@ -121,8 +150,8 @@ class HomeSearch:
         if chosen is not None:
             return chosen
         # No assembly is sound: the reason is the machine's, and told where it is looked at whole.
-        values, miss = self.assembly.nearest()
-        return self._home(values, miss, "near")
+        values = self.assembly.relaxed(closed)
+        return self._home(values, self.assembly.miss(), "near")
 
     def _drawn(self) -> Home | None:
         """The assembly that the drawing leads to, with the actuated joints where they should be."""
@@ -216,14 +245,14 @@ class HomeSearch:
         except (ParameterError, SingularityError, np.linalg.LinAlgError):
             # The description is looked at again by whoever makes a robot of it.
             settled, index = None, 0.0
-        sound, held, rounding = settled or (None, (), 0.0)
+        sound, held, rounding = settled or (None, {}, 0.0)
         return Home(values, miss, how, self.place, sound, held, rounding, index)
 
-    def _settle(self, graph: Graph, most: float) -> tuple[Graph, tuple[str, ...], float] | None:
+    def _settle(self, graph: Graph, most: float) -> tuple[Graph, dict[str, float], float] | None:
         """The graph without spins and without a file's rounding, as little of it as will do."""
         fallback = None
         if self._hinges is not None:
-            sound = hold(graph, self._hinges)
+            sound = hold(graph, list(self._hinges))
             if is_right(sound) and is_clear(sound):
                 return sound, self._hinges, 0.0
         most = min(most, ROUNDED[-1])
@@ -238,7 +267,7 @@ class HomeSearch:
                 continue
             sound, held = without_spins(ideal)
             if is_right(sound):
-                result = sound, tuple(held), rounding
+                result = sound, held, rounding
                 if is_clear(sound):
                     if not tolerance and all(sound.joints[n].kind == "fixed" for n in held):
                         self._hinges = result[1]

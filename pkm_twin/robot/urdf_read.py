@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A URDF or MJCF with its loop closures as plain data of a ``mechanism: machine`` description."""
+"""URDF, MJCF and SDF with loop closures as plain data of a ``mechanism: machine`` description."""
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -11,11 +12,12 @@ import numpy as np
 
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError, warn
-from pkm_twin.machine import mjcf_file, urdf_file, urdf_xml
+from pkm_twin.machine import mjcf_file, sdf_file, urdf_file, urdf_xml
 from pkm_twin.machine.assembly import EXACT, Assembly
-from pkm_twin.machine.graph import Graph
-from pkm_twin.machine.urdf_file import Joint, Link, Urdf
-from pkm_twin.machine.urdf_loops import Closure
+from pkm_twin.machine.graph import Graph, groups
+from pkm_twin.machine.joints import TURN, TYPES
+from pkm_twin.machine.loop_tree import Closure, Joint, Link, LoopTree
+from pkm_twin.machine.urdf_control import take_drives
 from pkm_twin.machine.urdf_visuals import Visual, visuals
 from pkm_twin.machine.urdf_xml import Pose
 from pkm_twin.robot.urdf_home import Home, HomeSearch
@@ -23,7 +25,9 @@ from pkm_twin.robot.urdf_home import Home, HomeSearch
 PLATFORMS: Final = (
     "platform",
     "moving_platform",
+    "platform_link",
     "end_effector",
+    "endeffector",
     "effector",
     "end_effector_link",
     "ee_link",
@@ -35,6 +39,12 @@ PLATFORMS: Final = (
     "tcp",
 )
 """Names of links that are taken for the platform, the first that is there."""
+SINGLE: Final = tuple(name for name, kind in TYPES.items() if len(kind.steps) == 1)
+"""Joint types of one degree of freedom."""
+MOST_MOVING: Final = 1000
+"""Most joints that are not fixed: assembling takes the cube of their number."""
+BALANCED: Final = 1e-6
+"""Mass times distance from the axis of a part that is balanced, kg m."""
 GROUND: Final = "base"
 """The ground's name in a description."""
 
@@ -71,7 +81,8 @@ def read_tree(
 ) -> UrdfReading:
     """A URDF file as a description of ``mechanism: machine``, every vector in base axes at home.
 
-    A file whose top element is ``<mujoco>`` is read as MJCF, with the mujoco package.
+    A file whose top element is ``<mujoco>`` is read as MJCF, with the mujoco package, and one of
+    ``<sdf>`` as SDF.
 
     Links that fixed joints hold together are one body. Home: see :mod:`pkm_twin.robot.urdf_home`;
     ``home`` of a joint is its value there, so that joint values are the URDF's. Parts that only
@@ -84,16 +95,20 @@ def read_tree(
     """
     path = Path(path)
     top = urdf_xml.elements(path)
-    urdf = mjcf_file.read(path) if top.tag == "mujoco" else urdf_file.read(path, top)
+    controller = take_drives(top)
+    readers = {"mujoco": mjcf_file.read, "sdf": sdf_file.read}
+    urdf = readers.get(top.tag, urdf_file.read)(path, top)
+    _require_closed(path, urdf)
     tool = _platform(urdf, platform)
     ground = urdf.root if base is None else base
     ground = urdf_xml.known_link("base", ground, urdf.links)
     assembly = Assembly(urdf)
     bodies = _bodies(urdf, assembly.order, tool, ground)
+    _require_moving(urdf, bodies, tool)
     home = HomeSearch(assembly, lambda: _description(assembly, bodies, tool, ground)).home()
     assembly.place(home.values)
     data = _description(assembly, bodies, tool, ground, home.values)
-    notes = []
+    notes = _left_out(urdf)
     if home.miss > EXACT:
         notes.append(f"the loops close within {home.miss:.1g} only (m or rad)")
     if home.graph is not None:
@@ -105,10 +120,84 @@ def read_tree(
             )
         if home.held:
             notes.append(f"held, as they only let a part spin about itself: {', '.join(home.held)}")
+        heavy = {name: value for name, value in home.held.items() if value > BALANCED}
+        if heavy:
+            notes.append(
+                "efforts depend on the angle at which parts with their mass off the axis are held: "
+                + ", ".join(f"{name} ({value:.3g} kg m)" for name, value in heavy.items())
+            )
+    if controller:
+        data["joint_map"] = controller
     view = assembly.links[ground].inverse()
     places = {name: view @ pose for name, pose in assembly.links.items()}
-    shown = () if top.tag == "mujoco" else visuals(path, top, places, bodies)
+    shown = () if top.tag in readers else visuals(path, top, places, bodies)
     return UrdfReading(data, home.text, tuple(notes), tuple(shown))
+
+
+def _require_closed(path: Path, tree: LoopTree) -> None:
+    """Reject what is too large to be assembled, and passive joints that no closure holds.
+
+    :raises ParameterError: by their number, or by name.
+    """
+    moving = [joint.name for joint in tree.joints.values() if joint.type != "fixed"]
+    if len(moving) > MOST_MOVING:
+        raise ParameterError(str(path), f"{len(moving)} joints that move", f"at most {MOST_MOVING}")
+    idle = [name for name in moving if name not in tree.actuated]
+    if idle and not tree.closures:
+        raise ParameterError(
+            str(path),
+            f"no loop closure, and passive joints: {', '.join(idle)}",
+            "<constraint> or <loop> elements, or closed_loop in a YAML file next to it",
+        )
+
+
+def _require_moving(tree: LoopTree, bodies: dict[str, str], tool: str) -> None:
+    """Reject actuated joints that do not move the platform, before a home is looked for.
+
+    A joint moves it where joints and closures make a circle through it, the platform and the
+    ground: then no body stands between them, whose absence would part them.
+
+    :raises ParameterError: such joints, with the joints at which they can be cut out.
+    """
+    joints = [joint for joint in tree.joints.values() if joint.type != "free"]
+    ends = {joint.name: (joint.parent, joint.child) for joint in joints}
+    ends |= {closure.name: closure.links for closure in tree.closures}
+    pairs = {name: (bodies[a], bodies[b]) for name, (a, b) in ends.items()}
+    pairs = {name: pair for name, pair in pairs.items() if pair[0] != pair[1]}
+    target = {GROUND, bodies[tool]}
+    every = [*pairs.values(), (GROUND, bodies[tool])]
+    degree = Counter(body for pair in every for body in pair)
+    moving = set(pairs)
+    for gone in [body for body, count in degree.items() if count > 2]:
+        parts = groups([body for body in degree if body != gone], every)
+        own = next(part for part in parts if target - {gone} <= set(part))
+        moving = {name for name in moving if set(pairs[name]) - {gone} <= set(own)}
+    apart = [name for name in tree.actuated if name not in moving]
+    if not apart:
+        return
+    whole = {end for name in moving for end in pairs[name]} | target
+    cuts = [name for name, pair in pairs.items() if name not in moving and whole & set(pair)]
+    raise ParameterError(
+        "actuated", f"{', '.join(apart)}", f"joints that move the platform {tool!r}: close a "
+        f"missing loop, or cut out the other parts at {', '.join(cuts)}, with their motors"
+    )  # fmt: skip
+
+
+def _left_out(tree: LoopTree) -> list[str]:
+    """Of friction and rotors in joints that the engine has none for."""
+    found = []
+    parts: list[Joint | Closure] = [*tree.joints.values(), *tree.closures]
+    for part in parts:
+        values = {
+            "damping": part.viscous,
+            "friction": part.coulomb,
+            "rotor inertia": getattr(part, "rotor_inertia", 0.0),
+        }
+        if part.type not in (*SINGLE, "fixed"):
+            found += [f"{key} {value:g} of {part.name}" for key, value in values.items() if value]
+    if not found:
+        return []
+    return [f"ignored, because the joint has several degrees of freedom: {', '.join(found)}"]
 
 
 def _description(
@@ -139,7 +228,9 @@ def _description(
             if closure.axes is not None and closure.type == "universal":
                 second = view @ assembly.frame(closure, 1)
                 joints[closure.name]["axes"][1] = _snapped(second.rotation @ closure.axes[1])
-    gravity = {} if urdf.gravity is None else {"gravity": urdf.gravity}
+    gravity = {}
+    if urdf.gravity is not None:
+        gravity = {"gravity": _snapped(view.rotation @ urdf.gravity)}
     return {
         "mechanism": "machine",
         **gravity,
@@ -168,7 +259,7 @@ def _take(data: dict[str, Any], home: Home, graph: Graph) -> None:
                 joint["axis"] = axes[0]
 
 
-def _platform(urdf: Urdf, asked: str | None) -> str:
+def _platform(urdf: LoopTree, asked: str | None) -> str:
     if asked is not None:
         return urdf_xml.known_link("platform", asked, urdf.links)
     lower = {name.lower(): name for name in urdf.links}
@@ -180,7 +271,7 @@ def _platform(urdf: Urdf, asked: str | None) -> str:
     )
 
 
-def _bodies(urdf: Urdf, order: list[Joint], tool: str, ground: str) -> dict[str, str]:
+def _bodies(urdf: LoopTree, order: list[Joint], tool: str, ground: str) -> dict[str, str]:
     """Each link's body, named by its link nearest to the root; the tool's is named by the tool.
 
     :raises ParameterError: the tool is fixed to the ground.
@@ -219,6 +310,8 @@ def _joint(
         data["axes"] = [_snapped(axis) for axis in axes]
     elif joint.type != "spherical":
         data["axis"] = _snapped(axes[0])
+        if joint.pitch:
+            data["lead"] = joint.pitch * TURN
         if actuated:
             data["actuated"] = True
         value = round(home, 14) + 0.0
@@ -237,8 +330,7 @@ def _joint(
 
 def _friction(part: Joint | Closure, data: dict[str, Any]) -> dict[str, Any]:
     """The entry of a joint of one freedom that has friction."""
-    single = data["type"] in ("revolute", "prismatic")
-    if single and (part.viscous > 0.0 or part.coulomb > 0.0):
+    if data["type"] in SINGLE and (part.viscous > 0.0 or part.coulomb > 0.0):
         return {"friction": {"viscous": part.viscous, "coulomb": part.coulomb}}
     return {}
 
@@ -259,7 +351,7 @@ def _closure(closure: Closure, bodies: dict[str, str], place: Pose) -> dict[str,
 
 
 def _masses(
-    urdf: Urdf, bodies: dict[str, str], places: dict[str, Pose]
+    urdf: LoopTree, bodies: dict[str, str], places: dict[str, Pose]
 ) -> dict[str, dict[str, Any]]:
     """Masses, centres (m) and inertias about them of all bodies but the ground, base axes."""
     result: dict[str, dict[str, Any]] = {}

@@ -25,6 +25,8 @@ AT_ONCE: Final = 2**16
 """Poses, about, that are tried at a time."""
 CLEAR: Final = 0.01
 """Singularity measure (0 in one, 1 at best) that regular workspaces stay above."""
+INSIDE: Final = 0.05
+"""The same of random joint positions."""
 
 
 def try_inverse(robot: Robot, pose: ArrayLike) -> tuple[Array, Mask]:
@@ -269,3 +271,25 @@ def causes(
     ranked = sorted(shares.items(), key=lambda item: -item[1])
     texts = [f"{what} in {share:.3g} %" for what, share in ranked if share >= 0.1]
     return f"{', '.join(texts)} of the joint states tried"
+
+
+def random_joints(robot: Robot, rng: np.random.Generator, count: int) -> Array:
+    """Joint positions clear of singularities, within limits where there are some, (count, n)."""
+    home, size = robot.graph.home, robot.engine.tree.size
+    half = np.array([0.15 * size if unit == "m" else 0.3 for unit in robot.joint_units])
+    low, high = home - half, home + half
+    if robot.limits.position is not None:
+        given = np.isfinite(robot.limits.position)
+        low = np.where(given[:, 0], robot.limits.position[:, 0], low)
+        high = np.where(given[:, 1], robot.limits.position[:, 1], high)
+    kept, share = np.empty((0, len(home))), 1.0
+    middle, reach = (low + high) / 2, (high - low) / 2
+    while len(kept) < count:
+        drawn = rng.uniform(middle - share * reach, middle + share * reach, (2 * count, len(home)))
+        measure, good = robot.try_singularity(drawn)
+        good = good & (measure > INSIDE)
+        kept = np.concatenate([kept, drawn[good]])
+        if good.mean() < 0.05:
+            # Few joint positions together make an assembly: nearer to home more of them do.
+            middle, share = (middle + home) / 2, 0.7 * share
+    return kept[:count]

@@ -1,10 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a node's command line may hold beside ROS arguments."""
+"""What the command lines of nodes and launch files may hold."""
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from itertools import pairwise
+from pathlib import Path
+
+from pkm_twin.errors import UnknownNameError
 
 USAGE = """usage: {words} [--help] [--version] [--ros-args -p PARAMETER:=VALUE -r FROM:=TO ...]
 
@@ -36,6 +40,26 @@ def answer(name: str, summary: str, arguments: Sequence[str], others: str = "") 
         file=sys.stderr,
     )
     raise SystemExit(2)
+
+
+def check_launch_arguments(file: str, given: Iterable[str], declared: Iterable[str]) -> None:
+    """Reject arguments of ``ros2 launch`` that the launch file on its command line lacks.
+
+    A file that includes it has arguments of its own, which launch does not tell apart.
+
+    :param file: path of the launch file; ``given``: words ``NAME:=VALUE``.
+    :raises UnknownNameError: one is not declared.
+    """
+    own = Path(file)
+    named = any(
+        own.resolve() == Path(word).resolve() or (before, word) == ("pkm_twin", own.name)
+        for before, word in pairwise(sys.argv)
+    )
+    known = set(declared)
+    for word in given if named else ():
+        name = word.partition(":=")[0]
+        if name not in known:
+            raise UnknownNameError("launch argument", name, known)
 
 
 def _version() -> str:

@@ -8,19 +8,26 @@ caught, counted and told.
 from __future__ import annotations
 
 import os
+import threading
 import time
-from typing import Any
+import weakref
+from typing import Any, Final
 
-from diagnostic_msgs.msg import DiagnosticArray
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.clock import ClockChange, JumpThreshold
 from rclpy.duration import Duration
 from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
 from std_srvs.srv import Trigger
 
 from pkm_twin.ros.guarded import GuardedNode
+from pkm_twin.ros.health import WARN
 from pkm_twin.ros.qos import output_qos
 from pkm_twin.ros.requests import guarded_service
 from pkm_twin.ros.turns import SELDOM_PERIOD, Task, Tasks
+
+COMPILING: Final = "compiling the robot's programs; no message is answered yet"
+COMPILING_PERIOD: Final = 1.0
+"""How often a node that is not ready says so, s."""
 
 
 class TwinNode(GuardedNode):
@@ -35,6 +42,11 @@ class TwinNode(GuardedNode):
         super().__init__(name)
         self._tasks = Tasks(self.failed)
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", output_qos())
+        self._made = threading.Event()
+        # A node that cannot be made has to go: the thread does not hold it.
+        told = weakref.ref(self), self._made
+        self._maker = threading.Thread(target=_tell_compiling, args=told, daemon=True)
+        self._maker.start()
 
     def start(self, leap: float | None = None) -> None:
         """Refuse unknown parameters, begin the diagnostics, and say where the node listens.
@@ -64,6 +76,10 @@ class TwinNode(GuardedNode):
         domain = os.environ.get("ROS_DOMAIN_ID", "0")
         reach = os.environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "SUBNET")
         self.get_logger().info(f"{self.summary()}; domain {domain}, discovery {reach}")
+
+    def begin(self) -> None:
+        """All nodes of the process are made and the executor is about to run: answer."""
+        self._end_compiling()
         if self.autostart:
             self.trigger_configure()
             self.trigger_activate()
@@ -83,8 +99,20 @@ class TwinNode(GuardedNode):
         """The ROS clock went forward by more than a stream's messages may be apart."""
         self.time_jumped_backward()
 
+    def publish_compiling(self) -> None:
+        """A node that can be seen says why it does not answer."""
+        name = self.get_fully_qualified_name()
+        array = DiagnosticArray(status=[DiagnosticStatus(level=WARN, name=name, message=COMPILING)])
+        array.header.stamp = self.get_clock().now().to_msg()
+        self._diagnostics.publish(array)
+
+    def _end_compiling(self) -> None:
+        self._made.set()
+        self._maker.join()
+
     def farewell(self) -> None:
         """The end: nothing is answered from here on, while the topics are still there."""
+        self._end_compiling()
         self._quit()
 
     @property
@@ -163,3 +191,16 @@ class TwinNode(GuardedNode):
     def _publish_diagnostics(self) -> None:
         level, message, values = self.diagnose()
         self._diagnostics.publish(self.health.report(level, message, values, active=self.active))
+
+
+def _tell_compiling(node: weakref.ref[TwinNode], made: threading.Event) -> None:
+    """Until the executor runs, while the process compiles."""
+    while not made.wait(COMPILING_PERIOD):
+        told = node()
+        if told is None:
+            return
+        try:
+            told.publish_compiling()
+        except Exception:
+            return  # The middleware has ended.
+        del told

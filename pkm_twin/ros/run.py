@@ -101,6 +101,8 @@ def run(*factories: Callable[[], TwinNode], arguments: Sequence[str] | None = No
             with plain_warnings():
                 for factory in factories:
                     nodes.append(factory())
+            for node in nodes:
+                node.begin()
             one_blas_thread()
             _prioritise(nodes)
             # What is loaded by now stays: the collector need not look at it again.

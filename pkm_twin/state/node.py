@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import sys
 
+import numpy as np
 from geometry_msgs.msg import WrenchStamped
 from rclpy.duration import Duration
 from rclpy.time import Time
@@ -14,9 +15,8 @@ from pkm_twin.bags.definitions import message_definition
 from pkm_twin.errors import MessageError, ParameterError, PkmTwinError
 from pkm_twin.machine import rotations
 from pkm_twin.messages.intake import JointStateDecoder
-from pkm_twin.messages.stamps import SECOND
 from pkm_twin.robot.robot import Robot
-from pkm_twin.robot.robot_urdf import robot_urdf
+from pkm_twin.robot.robot_urdf import joint_names, robot_urdf
 from pkm_twin.ros import health, outputs
 from pkm_twin.ros.changes import follow_changes
 from pkm_twin.ros.node import TwinNode
@@ -71,7 +71,7 @@ class MachineStateNode(TwinNode):
         )  # fmt: skip
         self._scene = Scene(robot, self.declare_settings(Scales, fixed=True))
         self._elastic = _is_elastic(robot)
-        _warm_up(robot)
+        _warm_up(robot, self._elastic)
         self._decode = JointStateDecoder(message_definition("sensor_msgs/msg/JointState"))
         self._joints = self.create_guarded_publisher("~/joint_states")
         self._pose = self.create_guarded_publisher("~/pose")
@@ -84,8 +84,8 @@ class MachineStateNode(TwinNode):
             "empty: no such element", read_only=True,
         )  # fmt: skip
         self._urdf = robot_urdf(robot, hardware)
+        self._names = joint_names(robot, hardware)
         self._transforms = self._create_transforms()
-        self._transforms_due = 0
         self._drawn = 0
         """Stamp of the state that was drawn last."""
         self._create_markers()
@@ -114,7 +114,8 @@ class MachineStateNode(TwinNode):
     def time_jumped_backward(self) -> None:
         """No state across the seam."""
         self._core.reset()
-        self._transforms_due = self._drawn = 0
+        self._transforms_pace.reset()
+        self._drawn = 0
 
     def activated(self) -> None:
         """What does not change is told once; nothing from before is."""
@@ -161,7 +162,7 @@ class MachineStateNode(TwinNode):
             "platform", unit="Hz", low=0.1, high=1e4,
             read_only=True,
         )  # fmt: skip
-        self._transforms_period = round(SECOND / rate)
+        self._transforms_pace = Pace(rate)
         if wanted == "none":
             return None
         try:
@@ -196,15 +197,14 @@ class MachineStateNode(TwinNode):
         stamp = Time(nanoseconds=state.stamp).to_msg()
         base = self._core.settings.base_frame
         quaternion = rotations.to_quaternion(state.rotation)
-        names = self._core.joint_names
-        self._joints.publish(outputs.joint_state(stamp, names, state.joints, state.rates))
+        self._joints.publish(outputs.joint_state(stamp, self._names, state.joints, state.rates))
         self._pose.publish(outputs.pose(stamp, base, state.position, quaternion))
         if state.twist is not None:
             self._twist.publish(outputs.twist(stamp, base, state.twist))
         if self._transforms is None or not self._transforms.platform:
             return
-        if abs(state.stamp - self._transforms_due) >= self._transforms_period:
-            self._transforms_due = state.stamp
+        if self._transforms_pace.due(state.stamp):
+            self._transforms_pace.answered(state.stamp)
             self._transforms.send_platform(stamp, state.position, quaternion)
 
     def _on_wrench(self, message: WrenchStamped) -> None:
@@ -254,11 +254,14 @@ def _is_elastic(robot: Robot) -> bool:
     return True
 
 
-def _warm_up(robot: Robot) -> None:
-    """Compile, or load, what a sample needs before there is a topic to be found by."""
+def _warm_up(robot: Robot, elastic: bool) -> None:
+    """Compile, or load, what samples and markers call, before there is a topic to be found by."""
     for kernel in (state_kernel(robot), moving_state_kernel(robot)):
         kernel.warm_up()
-    robot.placements(robot.inverse(robot.home()))
+    home = robot.inverse(robot.home())
+    robot.placements(home)
+    if elastic:
+        member_deflections(robot, home, np.zeros(6))
 
 
 NODE = MachineStateNode

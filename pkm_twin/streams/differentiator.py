@@ -13,6 +13,7 @@ procedures, Analytical Chemistry 36 (1964), doi:10.1021/ac60214a047.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cache
 from typing import Any, Final
@@ -32,25 +33,32 @@ LEAST_PIVOT: Final = 1e-4
 """Least diagonal entry of the normal equations' Cholesky factor; even stamps stay above 1e-2."""
 BLOCK: Final = 32
 """Samples that one call of a program sums up: those of the default window, and some."""
+LEAST: Final = 5
+"""Samples that a window has in any case."""
+JITTER: Final = 1.1
+"""Length of a window over what it should be that is no slow stream."""
 _NONE: Final = np.zeros(0)
 
 
 @dataclass
 class Differentiator:
-    """``order``: degree of the velocity's polynomial; ``window``: samples fitted.
+    """``order``: degree of the velocity's polynomial; ``window``: samples fitted, at most.
 
-    ``middle``: read the polynomial off at the window's middle sample instead of its newest. That
-    is less noisy and half a window late: for recordings, not for control.
+    ``time``: length of the window, s, at most; a slow stream has fewer samples in it, but at least
+    :data:`LEAST`. ``middle``: read the polynomial off at the window's middle sample instead of its
+    newest. That is less noisy and half a window late: for recordings, not for control.
     """
 
     order: int = 2
     window: int = 25
     middle: bool = False
+    time: float = math.inf
     _carries_velocity: bool | None = None
 
     def __post_init__(self) -> None:
         # One place more than whole blocks have, so that the newest sample can be taken back; every
         # sample stands twice, so that each window is one piece, oldest first.
+        self._most = self.window
         self._held = -(-self.window // BLOCK) * BLOCK
         self._places = self._held + 1
         # Since the first sample, ns: whole numbers, exact for a hundred days.
@@ -59,6 +67,7 @@ class Differentiator:
         self._values = np.zeros(0)
         self._fit: _Fit | None = None
         self._count = 0
+        self._span = 0.0
 
     @property
     def delay(self) -> float:
@@ -67,13 +76,60 @@ class Differentiator:
             return (self.window - 1) / 2
         return float(self.window - 1 - self.window // 2) if self.middle else 0.0
 
+    def prepare(self, joints: int) -> None:
+        """Compile, or load, what samples of so many joints call, with rates and without."""
+        for degree in (self.order, self.order + 1):
+            _Fit(degree, self.window, joints)
+
     def reset(self) -> None:
         """Forget all samples."""
         self._count = 0
+        self._fit_samples(self._most)
 
     def retract(self) -> None:
         """Take the newest sample back, as if it had not been pushed; once after a push."""
         self._count = max(0, self._count - 1)
+
+    @property
+    def degree(self) -> int:
+        """Of the polynomial that is fitted."""
+        return self.order + (not self._carries_velocity)
+
+    @property
+    def period(self) -> float:
+        """Mean time between the samples of a full window, s; 0 before."""
+        if self._count < self.window:
+            return 0.0
+        return self._span / (self.window - 1) / SECOND
+
+    def sine_error(self, frequency: float) -> float:
+        """Greatest error of the acceleration of a sine, part of its peak, at the stream's period.
+
+        :param frequency: Hz.
+        """
+        turns = 2.0 * np.pi * frequency * self.period
+        back = np.arange(self.window) - (self.window - 1.0)
+        powers = np.vander(back, self.degree + 1, increasing=True)
+        derivative = 1 if self._carries_velocity else 2
+        weights = derivative * np.linalg.pinv(powers)[derivative]
+        return float(abs(weights @ np.exp(1j * turns * back) / (1j * turns) ** derivative - 1.0))
+
+    def _keep_time(self, end: int) -> None:
+        """Fit fewer samples where the window, while it fills or later, is too long in time."""
+        held = min(self._count, self.window)
+        self._span = self._stamps.item(end - 1) - self._stamps.item(end - held)
+        least, time = max(LEAST, self.degree + 2), self.time * SECOND
+        # Later it may be too long for once, of lost samples.
+        filling = self._count <= self.window == self._most
+        if held > least and self._span > (JITTER if filling else 2.0) * time:
+            self._fit_samples(max(1 + round(time * (held - 1) / self._span), least))
+
+    def _fit_samples(self, window: int) -> None:
+        if window == self.window:
+            return
+        self.window = window
+        if self._fit is not None:
+            self._fit = _Fit(self.degree, window, self._fit.joints)
 
     def push(self, stamp: int, q: Array, qd: Array | None) -> tuple[Array, Array] | None:
         """Add a sample with a later stamp (ns); rates and accelerations once the window is full.
@@ -90,7 +146,7 @@ class Differentiator:
             self.reset()
             self._carries_velocity = carries
             self._values = np.zeros(2 * self._places * n)
-            self._fit = _Fit(self.order + (not carries), self.window, n)
+            self._fit = _Fit(self.degree, self.window, n)
         if self._count == 0:
             self._begin = stamp
         slot = self._count % self._places
@@ -98,10 +154,11 @@ class Differentiator:
         self._stamps[slot] = self._stamps[twin] = stamp - self._begin
         self._values[slot * n : slot * n + n] = self._values[twin * n : twin * n + n] = values
         self._count += 1
-        if self._count < self.window:
-            return None
         # The blocks end at the newest sample's second place, or at its first.
         end = (slot if slot + 1 >= self._held else twin) + 1
+        self._keep_time(end)
+        if self._count < self.window:
+            return None
         at = end - 1 - (self.window - 1 - self.window // 2 if self.middle else 0)
         first, second = self._fit.derivatives(self._stamps, self._values, end, at)
         if qd is None:
@@ -124,6 +181,8 @@ class _Fit:
         size = degree + 1
         self._nothing = np.zeros(2 * degree + 1 + size * joints)
         self._blocks = -(-window // BLOCK)
+        if self._blocks > 1:
+            self._sums.warm_up()
         self._all = np.ones(BLOCK)
         # Of the oldest block, those of the window alone.
         self._oldest = np.zeros(BLOCK)

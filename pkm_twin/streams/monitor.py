@@ -28,13 +28,17 @@ class StreamMonitor:
     reason: str = ""
     text: str = ""
     """Of the stop that holds; without one, of the last reject."""
+    _since: tuple[int, str, str] = (0, "", "")
+    """Rejects since the stop: how many, and reason and text of the last."""
     _bad: int = 0
     _good: int = 0
 
     def reject(self, reason: str, text: str) -> bool:
         """Count a rejected sample; True where it stops the stream now."""
         self.rejected[reason] += 1
-        if not self.stopped:
+        if self.stopped:
+            self._since = self._since[0] + 1, reason, text
+        else:
             self.reason, self.text = reason, text
         self._good = 0
         self._bad += 1
@@ -47,8 +51,18 @@ class StreamMonitor:
             return False
         self.stopped = True
         self.reason, self.text = reason, text
+        self._since = 0, "", ""
         self.stops[reason] += 1
         return True
+
+    @property
+    def status(self) -> str:
+        """Why the stream is stopped, and why messages are rejected since then."""
+        status, (count, reason, text) = f"{self.reason}: {self.text}", self._since
+        if count:
+            status += f"; rejected since then: {count}"
+            status += "" if reason == self.reason else f", the last: {reason}: {text}"
+        return status
 
     def accept(self) -> bool:
         """Count a good sample; True where it may be answered."""

@@ -119,7 +119,7 @@ class RestWatch:
     """
 
     def __init__(self, gain: float) -> None:
-        self._gain = gain
+        self.gain = gain
         self.reset()
 
     def reset(self) -> None:
@@ -174,7 +174,7 @@ class RestWatch:
             # The fit lags where a motion begins or ends, the last three positions do not.
             apart = abs(given - sum(map(mul, slope, column[-3:])))
             late = apart if apart > slack * size else 0.0
-            doubt.append(SIGMAS * size * self._gain / period + late)
+            doubt.append(SIGMAS * size * self.gain / period + late)
         return np.array(doubt)
 
 

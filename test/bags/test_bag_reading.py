@@ -417,6 +417,18 @@ def test_lying_statistics(tmp_path: Path) -> None:
     assert caught.value.reason == "statistics"
 
 
+def test_a_first_log_time_of_zero_is_noted(tmp_path: Path) -> None:
+    """Some writers take it for none: their statistics begin with the next one."""
+    path = foreign_bag(tmp_path / "f.mcap", [0, 2, 3], enable_crcs=False)
+    data = path.read_bytes()
+    at = data.rindex(struct.pack("<IIIQQ", 0, 0, 1, 0, 3)) + 12
+    path.write_bytes(data[:at] + struct.pack("<QQ", 2, 3) + data[at + 16 :])
+    report = inspect(path)
+    assert (report.message_count, report.start_time) == (3, 0)
+    assert any("statistics" in text for text in report.warnings)
+    assert [m.log_time for m in read_messages(path)] == [0, 2, 3]
+
+
 def test_attachments_are_checked(tmp_path: Path) -> None:
     stream = io.BytesIO()
     writer = Writer(stream)

@@ -177,7 +177,22 @@ def test_a_message_count_that_differs_is_told(bag: Path, tmp_path: Path) -> None
     folder = make_folder(tmp_path / "rec", bag)
     names = [path.name for path in sorted(folder.glob("*.mcap"))]
     describe(folder, names, 73)
-    assert any("states 73 messages, there are 72" in text for text in inspect(folder).warnings)
+    (text,) = inspect(folder).miscounts
+    assert "73" in text and "72" in text
+    counts = {path.name: inspect(path).message_count for path in folder.glob("*.mcap")}
+    topics = {name: info.count for name, info in inspect(folder).topics.items()}
+
+    def stated(files: dict[str, int], by_topic: dict[str, int]) -> tuple[str, ...]:
+        rows = [{"topic_metadata": {"name": k}, "message_count": v} for k, v in by_topic.items()]
+        parts = [{"path": name, "message_count": count} for name, count in files.items()]
+        describe(folder, names, 72, topics_with_message_count=rows, files=parts)
+        return inspect(folder).miscounts
+
+    assert stated(counts, topics) == ()
+    (text,) = stated(counts | {names[1]: 99}, topics)
+    assert names[1] in text and "99" in text
+    (text,) = stated(counts, topics | {"/lost": 5})
+    assert "/lost" in text and "5" in text
 
 
 @pytest.mark.parametrize("mode", MODES)

@@ -96,7 +96,7 @@ def measure():
         parts = {
             "checks of the message": (core._reader, "joint_state"),
             "pose, rates, singularity, jump": (core._continuity, "step"),
-            "differentiator": (core._differentiator, "push"),
+            "differentiator": (core.differentiator, "push"),
             "inverse dynamics": (feedforward, "inverse_dynamics"),
         }
 

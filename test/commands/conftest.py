@@ -15,6 +15,7 @@ from test.support.command import Result
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 DELTA = REPOSITORY / "bags/delta_cu_pick_and_place.mcap"
+COLLISION = REPOSITORY / "bags/delta_cu_collision.mcap"
 MILLING = REPOSITORY / "bags/prru_milling.mcap"
 STIFFNESS = REPOSITORY / "bags/upr_rpu_milling.mcap"
 JOINTS = "/joint_states"

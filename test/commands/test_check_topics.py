@@ -4,11 +4,15 @@
 import json
 
 import numpy as np
+import pytest
+from mcap.writer import Writer
 
 from pkm_twin.apps.columns import read_columns
+from pkm_twin.apps.recorded import read_recording
 from pkm_twin.apps.topics import JOINT_STATE, WRENCH
 from pkm_twin.bags.reader import BagWriter, open_bag
-from test.commands.conftest import DELTA, JOINTS, MILLING, rewrite
+from pkm_twin.errors import BagError
+from test.commands.conftest import COLLISION, DELTA, JOINTS, MILLING, rewrite
 from test.support.mapped import sides
 
 
@@ -139,3 +143,69 @@ class TestTopics:
         data = json.loads(twin("check", path, "--json").out)
         assert data["topics"]["wrench"] == "/wrench"
         assert set(data["topics"]["left_out"]) == {own}
+
+
+def framed(tmp_path, name):
+    """The milling with its wrenches in another frame, all of them or by a function of time."""
+
+    def change(topic, message, time):
+        if topic == "/wrench":
+            message.header.frame_id = name(time) if callable(name) else name
+        return message
+
+    return rewrite(MILLING, tmp_path / f"{id(change)}.mcap", change, begin=3.0, seconds=0.4)
+
+
+class TestFrames:
+    """Wrenches of one frame are accepted: the platform or base frame, others on request."""
+
+    @pytest.mark.parametrize(
+        ("name", "options", "rejected"),
+        [
+            ("platform", (), 0),
+            ("base_link", (), 0),
+            ("world", (), 200),
+            ("world", ("--base-frame", "world"), 0),
+            ("tool", ("--wrench-frame", "tool"), 0),
+            ("platform", ("--wrench-frame", "tool"), 200),
+            (lambda time: "platform" if time < 3.2 else "base_link", (), 100),
+        ],
+    )
+    def test_what_a_node_rejects_is_rejected(self, twin, tmp_path, name, options, rejected):
+        data = json.loads(twin("check", framed(tmp_path, name), *options, "--json").out)
+        (item,) = [one for one in data["items"] if one["what"] == "messages that a node rejects"]
+        assert item["value"].startswith(f"{rejected} of 600")
+        assert item["verdict"] == ("bad" if rejected else "good")
+        accepted = "platform" if callable(name) else "" if rejected else name
+        assert data["topics"]["frame"] == accepted
+
+    def test_axes_are_those_of_the_frame(self, tmp_path):
+        turned = read_recording(framed(tmp_path, "platform"))
+        fixed = read_recording(framed(tmp_path, "base_link"))
+        rotation = turned.robot.platform(turned.q)[1]
+        force = np.einsum("kij,kj->ki", rotation, fixed.wrench[:, :3])
+        np.testing.assert_allclose(turned.wrench[:, :3], force, atol=1e-9)
+
+
+def test_what_no_sensor_publishes_is_read_on_request(twin):
+    bag = COLLISION
+    chosen = read_recording(bag)
+    assert chosen.wrench is None and "/ground_truth/wrench" in chosen.topics.left_out
+    truth = read_recording(bag, topics=["/ground_truth/wrench"])
+    assert (truth.topics.wrench, truth.topics.frame) == ("/ground_truth/wrench", "base_link")
+    assert np.abs(truth.wrench).max() > 10.0
+    assert read_recording(MILLING, topics=[JOINTS]).wrench is None
+
+
+@pytest.mark.parametrize("kind", ["sensor_msgs/JointState", JOINT_STATE])
+def test_another_encoding_is_named(tmp_path, kind):
+    path = tmp_path / "j.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        schema = writer.register_schema(kind, "jsonschema", b"{}")
+        channel = writer.register_channel(JOINTS, "json", schema)
+        writer.add_message(channel, 1, b"{}", 1)
+        writer.finish()
+    with pytest.raises(BagError, match="encoding is json"):
+        read_recording(path, "delta")

@@ -10,6 +10,7 @@ from pkm_twin.robot.catalogue import load
 
 VARY = ("--vary", "geometry.arm_length=0.15:0.3", "--vary", "geometry.forearm_length=0.3:0.6")
 TOLERANCES = ("--tolerance", "geometry.arm_length=1e-4", "--tolerance", "geometry.base_radius=5e-5")
+PARTS = ("--tolerance", "bodies.arm I.length=1e-4", "--tolerance", "joints.arm_2.offset=1e-4")
 
 
 def good(result):
@@ -54,12 +55,20 @@ def test_a_sweep_is_a_file_with_the_variables_as_axes(twin, pick, tmp_path):
 
 
 def test_a_budget_names_each_contribution(twin, pick):
-    for where in ((), ("--path", pick)):
-        data = json.loads(good(twin("design", "delta", *TOLERANCES, *where, "--json")).out)
+    for errors, where in (
+        (TOLERANCES, ()),
+        (PARTS, ("--path", pick, "--monte-carlo", "400")),
+    ):
+        line = ("design", "delta", *errors, *where, "--json")
+        data = json.loads(good(twin(*line)).out)
         parts = data["contributions"].values()
         assert sum(part["share"] for part in parts) == pytest.approx(1.0)
         squares = sum(part["rms_position_m"] ** 2 for part in parts)
         assert data["rms_position_m"] == pytest.approx(np.sqrt(squares))
+    machines = data["monte_carlo"]
+    assert machines["rms_position_m"] == pytest.approx(
+        machines["first_order_rms_position_m"], rel=0.15
+    )
 
 
 @pytest.mark.parametrize(
@@ -75,6 +84,9 @@ def test_a_budget_names_each_contribution(twin, pick):
         (*VARY, "--sweep", "circle", "--out", "no.nc"),
         (*VARY, "--sweep", "grid"),
         (*VARY,),
+        ("--tolerance", "geometry.arm_length"),
+        (*TOLERANCES, "--tolerance", "joints.arm_1.axis[0]=1e-4", "--monte-carlo", "5"),
+        (*VARY, "--minimise", "mass", "--monte-carlo", "5"),
     ],
 )
 def test_what_cannot_be_asked_is_rejected_in_a_line(twin, pick, line):

@@ -10,11 +10,12 @@ from pkm_twin.apps.cli import app
 from pkm_twin.apps.groups import TASKS, WIDE
 from test.support.command import typed_line
 
+ENTRIES = {name: entry for entries in TASKS.values() for name, entry in entries.items()}
+
 
 def test_every_command_has_one_task():
-    shown = [name for name, one in get_command(app).commands.items() if not one.hidden]
-    listed = [name for names in TASKS.values() for name in names]
-    assert sorted(listed) == sorted(shown)
+    assert sum(map(len, TASKS.values())) == len(ENTRIES)
+    assert list(get_command(app).commands) == list(ENTRIES)
 
 
 def test_help_lists_every_purpose_whole(twin):
@@ -23,6 +24,23 @@ def test_help_lists_every_purpose_whole(twin):
         if not command.hidden:
             assert f" {name} {command.get_short_help_str(WIDE)}" in words
     assert "..." not in words.split("Robots:")[1]
+
+
+def leaves(command, words=()):
+    inner = getattr(command, "commands", {})
+    for name, one in inner.items():
+        yield from leaves(one, (*words, name))
+    if not inner:
+        yield words, {parameter.name for parameter in command.params}
+
+
+def test_every_command_that_takes_a_robot_takes_the_platform_of_a_urdf():
+    """But for printers, which are no URDFs."""
+    lacking = {
+        words[-1] for words, names in leaves(get_command(app))
+        if "robot" in names and "platform" not in names
+    }  # fmt: skip
+    assert lacking == {"printer"}
 
 
 def test_each_line_of_the_greeting_is_a_command_that_runs(twin, tmp_path, monkeypatch):
@@ -52,7 +70,10 @@ def test_options_are_read_by_the_oldest_typer():
         for inner in group.registered_groups:
             yield from functions(inner.typer_instance)
 
-    for one in functions(app):
+    every = [app, *(entry.app(name) for name, entry in ENTRIES.items())]
+    found = [one for each in every for one in functions(each)]
+    assert len(found) > len(ENTRIES)
+    for one in found:
         for option in inspect.signature(one.callback).parameters.values() if one else ():
             assert not isinstance(option.annotation, str), (one.callback, option)
             if option.default in (None, option.empty):

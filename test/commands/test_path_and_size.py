@@ -12,7 +12,7 @@ from scipy.integrate import trapezoid
 from delta_dynamics import inverse_dynamics, mass_matrix
 from pkm_twin.bags.reader import read_messages
 from pkm_twin.machine.sections import DriveSpec
-from pkm_twin.paths import cycle, fastest
+from pkm_twin.paths import cycle, fastest, timed
 from test.support.robots import load, parameters_of
 
 CYCLE = ("path", "delta", "--cycle", "25,305,25", "--fastest")
@@ -59,7 +59,8 @@ def test_a_cycle_as_a_table_that_torques_reads(twin, tmp_path):
     columns = table(out)
     words = ("position", "velocity", "acceleration", "effort")
     joints = [f"{joint}.{word}" for joint in robot.joint_names for word in words]
-    assert list(columns) == ["time", *joints, "x", "y", "z"]
+    pose = [f"{name}{word}" for word in ("", ".velocity", ".acceleration") for name in "xyz"]
+    assert list(columns) == ["time", *joints, *pose]
     q, qd, qdd, effort = (of_joints(columns, robot, word) for word in words)
     assert (np.abs(effort) <= robot.limits.effort).all()
     np.testing.assert_allclose(robot.inverse(np.stack([columns[n] for n in "xyz"], -1)), q)
@@ -77,6 +78,55 @@ def test_a_planned_table_is_checked_and_one_with_other_efforts_is_bad(twin, tmp_
     result = twin("check", out)
     assert result.code == 1
     result.one_line_error()
+
+
+def test_the_table_of_another_machine_is_rejected_or_its_pose_planned_again(twin, tmp_path):
+    """A table's pose and its joint positions have to be those of the machine."""
+    motion, out = tmp_path / "motion.csv", tmp_path / "torques.csv"
+    line = ("--cycle", "25,200,25", "--duration", "0.8", "--rate", "200", "--payload", "0.3")
+    good(twin("path", "delta", *line, "--no-picture", "--out", motion))
+    other = tmp_path / "other.yaml"
+    data = parameters_of("delta")
+    data["geometry"]["arm_length"] += 0.002
+    other.write_text(yaml.safe_dump(data))
+    for command in ("torques", "size", "loads"):
+        result = twin(command, other, motion)
+        assert result.code == 1
+        assert "mm" in result.one_line_error()
+    good(twin("torques", other, motion, "--follow", "pose", "--out", out, "--no-picture"))
+    # The same path of the platform, each machine by its own inverse kinematics.
+    planned = timed(
+        load(other).changed(payload={"mass": 0.3}),
+        cycle(load("delta"), 0.025, 0.2, 0.025),
+        "quintic",
+        duration=0.8,
+    ).uniform(200)
+    columns, robot = table(out), load(other)
+    np.testing.assert_allclose(of_joints(columns, robot, "position"), planned.q, atol=1e-9)
+    scale = np.abs(planned.effort).max()
+    np.testing.assert_allclose(
+        of_joints(columns, robot, "effort"), planned.effort, atol=1e-3 * scale
+    )
+    # The payload is that of the table.
+    np.testing.assert_allclose(columns["payload.mass"], 0.3)
+    other_joints = good(twin("size", other, motion, "--follow", "joints", "--json"))
+    assert json.loads(other_joints.out)["payload"]["mass_kg"] == 0.3
+
+
+@pytest.mark.parametrize("payload", ["0.7", "0.7,0.01,0.0,-0.02"])
+@pytest.mark.parametrize("ending", ["csv", "mcap"])
+def test_a_planned_payload_is_read_again(twin, tmp_path, ending, payload):
+    out = tmp_path / f"heavy.{ending}"
+    line = ("path", "delta", "--circle", "0.04", "--duration", "1", "--rate", "100")
+    good(twin(*line, "--no-picture", "--payload", payload, "--out", out))
+    data = json.loads(good(twin("size", "delta", out, "--json")).out)
+    assert max(data["difference_from_model"]) < 1e-6
+    peak = max(drive["joint"]["peak_effort_N_m"] for drive in data["drives"].values())
+    line = ("design", "delta", "--vary", "geometry.arm_length=0.18:0.2", "--path", out)
+    found = json.loads(
+        good(twin(*line, "--minimise", "peak-effort", "--starts", "2", "--json")).out
+    )
+    assert found["quantities"]["peak-effort"]["before"] == pytest.approx(peak)
 
 
 def test_torques_takes_the_pose_in_place_of_the_joints(twin, tmp_path):

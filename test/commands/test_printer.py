@@ -13,6 +13,8 @@ import pytest
 from typer.testing import CliRunner
 
 from pkm_twin.apps.cli import app
+from pkm_twin.apps.printer_files import read_printer
+from pkm_twin.errors import ParameterError
 from test.identification.partial_cases import Towers
 from test.support.robots import partly_long
 
@@ -253,3 +255,26 @@ def test_a_plan_is_a_table_to_fill_in(tmp_path: Path) -> None:
     run("calibrate", robot, "--measure", "distance", "--plan", tmp_path / "d.csv", code=1)
     run("calibrate", robot, "--measure", "length", "--plan", tmp_path / "d.csv", code=1)
     run("calibrate", robot, code=1)
+
+
+NAMED = {
+    "[printer]\nkinematics: rotary_delta\n[stepper_a]\nupper_arm_length: 170": "kinematics",
+    "M665 L278 R145\nM666 X0 Y0 Z0\n> G33 Auto Calibrate\n.Height:295 Ex:+0.0\nstd dev:2.6": "G33",
+    "M665 L100 R145\nM666 X0 Y0 Z0\nG33\nc:0.1 x:0.1 y:0.2 z:0.1": "M665 L",
+    "[printer]\nkinematics: delta\ndelta_radius: 200\n[stepper_a]\narm_length: 150\n"
+    "position_endstop: 250": "arm_length",
+}
+
+
+@pytest.mark.parametrize("text", NAMED)
+def test_what_is_no_linear_delta_s_is_named(text: str) -> None:
+    with pytest.raises(ParameterError) as error:
+        read_printer(text, None, 85.0)
+    assert error.value.field.endswith(NAMED[text])
+
+
+@pytest.mark.parametrize("line", ["[", "", "G30", " \t["])
+def test_many_lines_are_read_in_linear_time(line: str) -> None:
+    """Else this takes minutes."""
+    with pytest.raises(ParameterError):
+        read_printer(f"{line}\n" * 100_000, None, 85.0)

@@ -142,7 +142,7 @@ class TestCompliance:
         result = twin("compliance", "upr_rpu", *POSE)
         assert (result.code, result.err) == (0, "")
         assert "m and rad, per N and N m" in result.out
-        assert "deflection (um, urad)" in result.out
+        assert "deflection (µm, µrad)" in result.out
         dominant = result.out.split("dominant element ")[1].split()[0]
         assert f"shares: {dominant} " in result.out
 

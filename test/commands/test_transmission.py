@@ -165,6 +165,15 @@ def test_tables_are_read_as_recordings_have_them(tmp_path: Path, how: str) -> No
     assert poses.rotation == pytest.approx(turn.as_matrix())
 
 
+@pytest.mark.parametrize("header", ["{} [µm]", "{} (um)", "{}_µm", "{}_um"])
+def test_micrometres_have_two_spellings(tmp_path: Path, header: str) -> None:
+    robot = load("five_bar")
+    names = [*(f"{name}.position" for name in robot.joint_names), *map(header.format, "xyz")]
+    path = tmp_path / "poses.csv"
+    path.write_text(",".join(names) + "\n" + "0,0,1000,2000,3000\n" * 3)
+    np.testing.assert_allclose(read_poses(path, robot).position, [[1e-3, 2e-3, 3e-3]] * 3)
+
+
 @pytest.mark.parametrize(
     "columns", [["x"], ["x=nothing"], ["w=meas_pos_x"], ["x=meas_pos_x [deg]"]]
 )

@@ -8,7 +8,7 @@ import pytest
 import yaml
 
 from delta_dynamics import inverse_dynamics, torque_deviation
-from pkm_twin.apps.check import DEVIATIONS, motion, residuals
+from pkm_twin.apps.check_efforts import DEVIATIONS, compared_of
 from pkm_twin.apps.recorded import read_recording
 from test.commands.conftest import DELTA, rewrite
 from test.support.command import command
@@ -37,10 +37,11 @@ def test_check_counts_the_residuals_inside_the_model_s_band(capsys, unsure, part
     assert done.code == 0, done.err
     data = json.loads(done.out)
     recording = read_recording(part, str(unsure))
-    residual, used = residuals(recording)
-    qd, qdd, _ = motion(recording)
-    spread = torque_deviation(recording.robot, recording.q[used], qd[used], qdd[used])
-    share = {k: np.mean(np.abs(residual[used]) <= k * spread, 0) for k in DEVIATIONS}
+    compared = compared_of(recording, np.zeros(len(recording.time), bool))
+    (track,) = compared.tracks
+    rows = np.isin(track.time, compared.time)
+    spread = torque_deviation(recording.robot, track.q, track.qd, track.qdd)[rows]
+    share = {k: np.mean(np.abs(compared.residual) <= k * spread, 0) for k in DEVIATIONS}
     assert 0.0 < share[1].min() < share[3].max() <= 1.0
     for i, joint in enumerate(recording.robot.joint_names):
         band = data["uncertainty"][joint]

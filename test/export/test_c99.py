@@ -13,6 +13,7 @@ import pytest
 
 from pkm_twin import robot_names
 from pkm_twin.apps.cli import main
+from pkm_twin.errors import ParameterError
 from pkm_twin.export.c_package import c_package, identifier
 from test.machine.random_machines import FILES
 from test.support.robots import (
@@ -123,6 +124,20 @@ def test_verdicts_are_those_of_python(exported, count, rng):
         if name not in ("inverse", "compliance", "strain_energy", "accelerations"):
             status, _ = package.run(program, name, *rows)
             np.testing.assert_array_equal(status == 0.0, good, err_msg=name)
+
+
+def test_joint_values_far_beyond_every_machine_are_judged_as_in_python(exported, rng):
+    """Also those whose sine a library still knows: up to the largest double."""
+    robot, package = exported
+    n = robot.joints_count
+    values = 10.0 ** np.concatenate([np.arange(3.0, 308.1, 2.5), rng.uniform(4.0, 20.0, 30)])
+    values = np.concatenate([values, -values, [1e308, np.nextafter(1e6, 0.0), 1e6]])
+    q = np.tile(robot.graph.home, (n * len(values), 1))
+    q[np.arange(len(q)), np.tile(np.arange(n), len(values))] = np.repeat(values, n)
+    status, _ = package.run(package.build(*PLAIN), "forward", q)
+    np.testing.assert_array_equal(status == 0.0, robot.try_forward(q)[1])
+    turned = np.array([unit == "rad" for unit in robot.joint_units])
+    assert status[(np.abs(q[:, turned]) >= 1e6).any(1)].all()
 
 
 @pytest.mark.parametrize("count", often(300, 10_000))
@@ -258,6 +273,68 @@ def test_another_payload_by_parameters(name, tmp_path, rng):
         np.testing.assert_allclose(
             found, right, 0.0, CLOSE.get(name, 1e-12) * np.abs(right).max(), err_msg=name
         )
+
+
+def drawn_payloads(rng, count):
+    """Rows of mass, com and inertia, of real bodies and of others, some at the rule's edge."""
+    rows = np.zeros((count, 13))
+    for k, row in enumerate(rows):
+        row[0] = rng.choice(
+            [0.0, 1.0, 1e5, -1e-9, 100_001.0, 1e300, np.nan], p=[0.2, 0.4] + [0.08] * 5
+        )
+        row[1:4] = rng.normal(size=3) * rng.choice(
+            [0.0, 1.0, 40.0, 1e300, np.inf], p=[0.3, 0.4] + [0.1] * 3
+        )
+        one, other = np.abs(rng.normal(size=2))
+        edge = 1.0 + rng.choice([0.0, 1e-10, 1e-8, -1e-8, 1e-3])
+        moments = [
+            rng.normal(size=3), 2.0 + np.abs(rng.normal(size=3)), [0.0, one, one * edge],
+            [one, other, (one + other) * edge], np.zeros(3), [0.0, 0.0, one],
+        ][k % 6]  # fmt: skip
+        axes = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+        inertia = axes @ np.diag(moments) @ axes.T * 10.0 ** rng.integers(-12, 15)
+        inertia = (inertia + inertia.T) / 2.0
+        inertia[0, 1] *= 1.0 + rng.choice([0.0, 1e-12, 1e-3], p=[0.8, 0.1, 0.1])
+        row[4:] = inertia.ravel()
+    return rows
+
+
+@pytest.mark.parametrize("count", often(600, 20_000))
+def test_payloads_are_accepted_as_in_python(small, tmp_path, count, rng):
+    robot, package = small
+    size = int(re.search(r"_PARAMETERS (\d+)", package.header).group(1))
+    (tmp_path / "judge.c").write_text(f"""
+#include <stdio.h>
+#include "{package.prefix}.h"
+int main(void)
+{{
+    double load[13], out[{size}];
+    while (fread(load, sizeof(double), 13, stdin) == 13) {{
+        putchar('0' + {package.prefix}_parameters(load[0], load + 1, load + 4, out));
+    }}
+    return 0;
+}}
+""")
+    command = [
+        COMPILERS[0], "-std=c99", *PLAIN, f"-I{package.folder}", "judge.c",
+        package.folder / f"{package.prefix}.c", "-o", "judge", "-lm",
+    ]  # fmt: skip
+    subprocess.run(command, cwd=tmp_path, check=True)
+    rows = drawn_payloads(rng, count)
+    done = subprocess.run(
+        [tmp_path / "judge"], input=rows.tobytes(), capture_output=True, check=True
+    )
+    right = []
+    for mass, *rest in rows.tolist():
+        try:
+            robot.changed(
+                payload={"mass": mass, "com": rest[:3], "inertia": np.reshape(rest[3:], (3, 3))}
+            )
+            right.append("0")
+        except ParameterError:
+            right.append("2")
+    assert done.stdout.decode() == "".join(right)
+    assert min(right.count("0"), right.count("2")) > count / 20
 
 
 def test_the_command_s_example_agrees_with_python(tmp_path, small):

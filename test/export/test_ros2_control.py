@@ -189,6 +189,25 @@ class TestCore:
         brake = clipped(core, weight - 1e-3 * both.rates(qd[0]))
         np.testing.assert_allclose(effort[1:-2], np.tile(brake, (30, 1)), 0.0, 10 * scale)
 
+    def test_at_rest_where_it_is_measured_the_machine_is_carried_and_damped(self, mapped):
+        """As the gravity controller asks; without a position the last weight is given."""
+        both, core = mapped
+        model = loaded(both.plain.name)
+        q, qd, _, _ = random_motion(model, np.random.default_rng(4), 30)
+        still = np.zeros_like(q)
+        rows = np.hstack([both.positions(q), still, still, both.positions(q), both.rates(qd)])
+        lost = np.array(rows[-1:])
+        lost[:, : core.n] = lost[:, 3 * core.n :] = np.nan
+        d = 0.07
+        sound, names, effort, _ = core.run(
+            np.concatenate([rows, lost]), both.positions(q[0]), d=d, hold=0.5, bounded=False
+        )
+        weight = both.efforts(inverse_dynamics(model, q, still, still))
+        right = np.concatenate([weight - d * both.rates(qd), weight[-1:]])
+        scale = 1e-9 * np.abs(right).max()
+        np.testing.assert_allclose(effort, clipped(core, right), 0.0, scale)
+        assert sound.all() and names == ["NONE"] * 30 + ["NOT_FINITE"]
+
     def test_each_reason_to_reject(self, mapped):
         both, core = mapped
         home = core.robot.graph.home
@@ -251,6 +270,7 @@ def test_files_are_complete_and_well_formed(files, tmp_path):
             assert name in cmake or re.search(plugin, cmake), name
     for name, base in (
         ("feedforward_controller", "controller_interface"),
+        ("gravity_controller", "controller_interface"),
         ("kinematics", "kinematics_interface"),
         ("inverse_dynamics_solver", "inverse_dynamics_solver"),
     ):
@@ -280,7 +300,7 @@ def test_the_package_file_is_valid(files, tmp_path):
 def test_settings_name_the_joints_and_have_the_gains_of_the_masses(files):
     robot = load("five_bar")
     sections = {
-        name: section["ros__parameters"]
+        name.removeprefix("/**/"): section["ros__parameters"]
         for name, section in yaml.safe_load(files["config/controllers.yaml"]).items()
     }
     manager = sections["controller_manager"]
@@ -290,7 +310,11 @@ def test_settings_name_the_joints_and_have_the_gains_of_the_masses(files):
     assert trajectories["command_joints"] == [
         f"feedforward_controller/{name}" for name in robot.joint_names
     ]
+    (fallback,) = manager["feedforward_controller"]["fallback_controllers"]
+    assert manager[fallback]["type"] in files["gravity_controller.xml"]
     inertia = np.diag(mass_matrix(robot, robot.graph.home))
+    damping = [sections[fallback]["gains"][name]["d"] for name in robot.joint_names]
+    np.testing.assert_allclose(damping, inertia / 0.1, 1e-5)
     turn = 2 * np.pi * 5.0
     gains = sections["feedforward_controller"]["gains"]
     found = [[gains[name][k] for name in robot.joint_names] for k in "pd"]

@@ -16,7 +16,7 @@ from delta_dynamics.plant import Plant
 from pkm_twin import robot_names
 from pkm_twin.apps.cli import main
 from pkm_twin.mechanisms.machine import Machine
-from pkm_twin.robot.robot_urdf import robot_mjcf, robot_sdf, robot_urdf
+from pkm_twin.robot.robot_urdf import robot_description, robot_mjcf, robot_sdf, robot_urdf
 from test.machine.random_machines import variant
 from test.support.robots import load, loaded, partly_long, random_motion
 
@@ -55,6 +55,29 @@ def test_a_robot_there_and_back_has_its_torques(name, kind, tmp_path):
         own = getattr(robot.limits, limits)
         if own is not None:
             np.testing.assert_allclose(getattr(back.limits, limits), own, 1e-12, 1e-12)
+
+
+@pytest.mark.parametrize("name", partly_long(NAMES, "delta_cu"))
+def test_an_sdf_there_and_back_has_the_torques(name, tmp_path):
+    """Joints count from home there; rotors have no place, and what has no mass gets a little."""
+    data = robot_description(robot_of(name)) | {"gravity": [0.0, 0.0, -9.81]}
+    for joint in data["joints"].values():
+        for key in ("rotor_inertia", "drive"):
+            joint.pop(key, None)
+        for key in set(joint.get("friction", {})) - {"viscous", "coulomb"}:
+            del joint["friction"][key]
+    robot = Machine.from_data(data, name)
+    path = tmp_path / "robot.sdf"
+    path.write_text(robot_sdf(robot))
+    back = load(path)
+    assert back.joint_names == robot.joint_names
+    q, *rates = random_motion(robot, np.random.default_rng(0), 20)
+    right = inverse_dynamics(robot, q, *rates)
+    found = inverse_dynamics(back, q - robot.graph.home, *rates)
+    assert np.abs(found - right).max() <= 1e-4 * np.abs(right).max()
+    if robot.limits.position is not None:
+        own = robot.limits.position - robot.graph.home[:, None]
+        np.testing.assert_allclose(back.limits.position, own, 0.0, 1e-12)
 
 
 @pytest.mark.parametrize("name", partly_long(NAMES, "five_bar"))

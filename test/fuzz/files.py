@@ -27,6 +27,7 @@ from pkm_twin.robot.robot_urdf import robot_urdf
 from test.bags.folders import make_folder
 from test.fuzz.bags import small_bag
 from test.fuzz.tally import Kind, damaged, refusal
+from test.support.mapped import sides
 
 MACHINES = Path(__file__).resolve().parents[1] / "machine" / "machines"
 NUMBERS = (
@@ -173,6 +174,7 @@ class Urdf(Machines):
         small = [
             (MACHINES.parent / "five_bar.urdf").read_text(),
             robot_urdf(load("five_bar")),
+            robot_urdf(sides("five_bar").mapped),
             robot_urdf(load(MACHINES / "four_bar.yaml")),
         ]
         self.sources = [*3 * small, robot_urdf(load("linear_delta"))]

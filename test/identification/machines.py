@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from delta_dynamics import inverse_dynamics
 from pkm_twin import Robot
 from pkm_twin.errors import PkmTwinError
+from pkm_twin.identification.fit_lengths import Lengths
 from pkm_twin.identification.fit_rows import Recorded
 from pkm_twin.robot.entries import entries, with_entries
 from test.laws.recordings import smooth_motion
@@ -63,6 +64,27 @@ def machine(
         },
     )  # fmt: skip
     return Drawn(robot, truth, time, q, qd, qdd, inverse_dynamics(truth, q, qd, qdd))
+
+
+def of_prior(robot: Robot, rng: np.random.Generator) -> Drawn:
+    """A drawn machine whose lengths are off by what is usual; its payload is light or heavy."""
+    m = machine(robot, rng, 8.0)
+    lengths = Lengths.of(robot)
+    usual = np.array([one.usual for one in lengths.suspects])
+    platform, radius = robot.graph.bodies[robot.graph.platform].mass, robot.size
+    mass = platform * np.exp(rng.uniform(np.log(0.1), np.log(1.5)))
+    moment = mass * (0.3 * radius) ** 2
+    off = lengths.mixing @ (usual * rng.normal(size=len(usual)))
+    truth = m.truth.changed(
+        payload={
+            "mass": mass, "com": (radius * rng.uniform(-0.2, 0.2, 3)).tolist(),
+            "inertia": [moment, 1.2 * moment, 1.3 * moment],
+        }
+    )  # fmt: skip
+    truth = truth.numbered(
+        {p: truth.number(p) + by for p, by in zip(lengths.paths, off, strict=True)}
+    )
+    return replace(m, truth=truth, efforts=inverse_dynamics(truth, m.q, m.qd, m.qdd))
 
 
 def noisy(

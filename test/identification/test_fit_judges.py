@@ -79,6 +79,20 @@ def test_a_sound_recording_is_explained(name: str) -> None:
     assert worst(result, drawn(name, 3)) < 3.0
 
 
+def test_a_recording_with_gaps_is_fitted_like_the_whole_one() -> None:
+    """Pieces of 100 samples to some hundreds, and some that are too short."""
+    m, rng = drawn("delta_cu", 3), np.random.default_rng(12)
+    whole = noisy(m.recorded(), rng)
+    keep = np.ones(len(whole.time), bool)
+    for begin in np.cumsum([110, 30, 180, 340]):
+        keep[begin : begin + 8] = False
+    cut = replace(whole, time=whole.time[keep], q=whole.q[keep], effort=whole.effort[keep])
+    one, other = (fit(m.robot, [record], KINDS) for record in (whole, cut))
+    assert other.verdict.answer == "explains" and worst(other, m) < 4.0
+    for n, k in zip(one.numbers, other.numbers, strict=True):
+        assert k.deviation < 4.0 * n.deviation or n.status != "fitted"
+
+
 @pytest.mark.parametrize(
     "what",
     partly_long(COMMON, "one_joint_negated", "time_reversed", "milliseconds", "efforts_late"),

@@ -53,7 +53,7 @@ def test_what_errors_of_usual_size_do_is_within_the_widened_deviations(scale: fl
     for seed in range(60):
         verdict, covariance, off = drawn(np.random.default_rng([seed, 3]), scale)
         wide = verdict.widened(covariance)
-        errors.append(np.abs(off) / np.sqrt(np.diag(wide)))
+        errors.append(np.abs(off - verdict.shift) / np.sqrt(np.diag(wide)))
         plain.append(np.abs(off) / np.sqrt(np.diag(covariance)))
     assert np.mean(np.array(errors) < 3.0) > 0.98
     # And not wider than they have to be.

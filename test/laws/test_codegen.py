@@ -84,7 +84,7 @@ def test_equal_expressions_are_one_and_constants_fold():
 
 @compiled
 def test_constants_keep_their_bits():
-    values = np.tile([0.0, -0.0, 5e-324, 1.7e308, 1 / 3, -1 / 3], (5, 1))
+    values = np.tile([0.0, -0.0, 5e-324, 1.7e299, 1 / 3, -1 / 3], (5, 1))
     for found in both(lambda x: values[0].tolist(), np.zeros((5, 1)), "test constants"):
         assert found.tobytes() == values.tobytes()
 
@@ -103,6 +103,12 @@ def test_sine_cosine_and_arctangent_over_large_ranges(rng):
     assert (np.abs(fast[:, 1] - np.cos(a[:, 0])) <= bound).all()
     small = np.abs(a[:, 0]) < 1e-3
     np.testing.assert_allclose(fast[small, 0], np.sin(a[small, 0]), rtol=4e-16)
+    # Beyond, the reduction would lose digits.
+    far = np.array([1e6, -1e6, 1e9, 1e16, 1e300, -1e308])[:, None]
+    tape = program(lambda x: [ex.sin(x[0]), ex.cos(x[0])], 1)
+    (fast,), _ = Kernel(Code(lambda: tape, ProgramKey("test sincos")))(NONE, far)
+    (slow,), _ = PlainKernel(tape).run([far])
+    assert np.isnan(fast).all() and np.isnan(slow).all()
     pairs = 10.0 ** rng.uniform(-100, 100, (4000, 2)) * rng.choice([-1.0, 1.0], (4000, 2))
     pairs[:2000] = rng.normal(size=(2000, 2))
     special = [[0.0, 1.0], [0.0, -1.0], [1.0, 0.0], [-1.0, 0.0], [0.0, 0.0], [1.0, 1.0]]
@@ -223,11 +229,20 @@ print(robot.forward([0.1, 0.2, 0.3]).tolist(), robot.jacobian([0.1, 0.2, 0.3]).t
 """
 
 
-def start(folder):
+COUNTED = """
+import atexit
+from pkm_twin.codegen import native
+compile_object, calls = native.compile_object, []
+native.compile_object = lambda *a: (calls.append(0), compile_object(*a))[1]
+atexit.register(lambda: print(len(calls)))
+"""
+
+
+def start(folder, program=PROGRAM):
     environment = {k: v for k, v in os.environ.items() if k != "_ROS_WHEELS_BOOTSTRAP_COMPLETE"}
     environment |= {"PKM_TWIN_CACHE": str(folder), "PYTHONPATH": os.pathsep.join(sys.path)}
     return subprocess.Popen(
-        [sys.executable, "-c", PROGRAM], env=environment, text=True,
+        [sys.executable, "-c", program], env=environment, text=True,
         stdout=subprocess.PIPE, stderr=subprocess.PIPE,
     )  # fmt: skip
 
@@ -245,7 +260,8 @@ def test_the_cache_is_an_optimisation(tmp_path):
     first, second = [finished(p) for p in [start(folder), start(folder)]]
     assert first == second and not first[1]
     stored = sorted(folder.iterdir())
-    assert len(stored) == 2
+    # Two programs and two names of what their sources emit; no lock.
+    assert len(stored) == 4
     whole = [path.read_bytes() for path in stored]
     stored[0].write_bytes(whole[0][:-1] + b"\1")
     assert finished(start(folder)) == first
@@ -261,6 +277,59 @@ def test_the_cache_is_an_optimisation(tmp_path):
     out, lines = finished(start(blocked))
     assert out == first[0]
     assert len(lines) == 1 and "compiled programs are not kept" in lines[0]
+
+
+@compiled
+def test_sources_that_emit_the_same_text_share_a_program(tmp_path, monkeypatch):
+    """A changed source is traced again; only another text is compiled."""
+    from pkm_twin.codegen import native
+
+    monkeypatch.setenv("PKM_TWIN_CACHE", str(tmp_path))
+    compiled_texts = []
+    compile_object = native.compile_object
+
+    def counted(text, level):
+        compiled_texts.append(text)
+        return compile_object(text, level)
+
+    monkeypatch.setattr(native, "compile_object", counted)
+
+    def result(key, factor):
+        built = []
+
+        def build():
+            built.append(key)
+            return program(lambda x: [factor * x[0]], 1)
+
+        return Kernel(Code(build, ProgramKey(key)))(NONE, [1.0])[0][0][0], len(built)
+
+    assert result("before", 2.0) == (2.0, 1)
+    assert result("before", 2.0) == (2.0, 0)
+    assert result("an edit of a comment", 2.0) == (2.0, 1)
+    assert result("an edit of a comment", 2.0) == (2.0, 0)
+    assert len(compiled_texts) == 1
+    assert result("an edit of a factor", 3.0) == (3.0, 1)
+    assert len(compiled_texts) == 2
+
+
+@compiled
+def test_processes_that_start_cold_compile_each_program_once(tmp_path):
+    counted = COUNTED + PROGRAM
+    outputs = [finished(p)[0].splitlines() for p in [start(tmp_path, counted) for _ in range(4)]]
+    assert len({tuple(lines[:-1]) for lines in outputs}) == 1
+    assert sum(int(lines[-1]) for lines in outputs) == len(list(tmp_path.iterdir())) // 2 == 2
+
+
+def test_a_lock_that_is_not_released_delays_and_does_not_block(tmp_path, monkeypatch):
+    monkeypatch.setenv("PKM_TWIN_CACHE", str(tmp_path))
+    monkeypatch.setattr(cache, "LOCK_TIMEOUT", 0.05)
+    entered = []
+    with cache.alone("0" * 32), cache.alone("0" * 32):
+        entered.append("both")
+    (tmp_path / f"{'1' * 32}.lock").mkdir()
+    with cache.alone("1" * 32):
+        entered.append("without")
+    assert entered == ["both", "without"]
 
 
 @compiled
@@ -339,25 +408,27 @@ HARM = [
     with_code(lambda code: b""),
     with_code(lambda code: b"kernel" * 1000),
     with_code(lambda code: code[: len(code) // 2]),
-    with_code(lambda code: code[:64] + bytes(len(code) - 64)),
+    with_code(lambda code: code[:64] + bytes(max(len(code) - 64, 0))),
     with_code(lambda code: code.replace(b"kernel", b"colonel"[:6])),
 ]
 
 
 @compiled
+@pytest.mark.parametrize("level", ["name", "program"])
 @pytest.mark.parametrize("harm", HARM)
-def test_a_stored_program_that_must_not_run_is_rebuilt(tmp_path, monkeypatch, harm):
+def test_a_stored_program_that_must_not_run_is_rebuilt(tmp_path, monkeypatch, harm, level):
     monkeypatch.setenv("PKM_TWIN_CACHE", str(tmp_path))
     made = [program(lambda x, k=k: [k * x[0]], 1) for k in (2.0, 3.0)]
 
     def outputs():
-        codes = [Code(lambda m=m: m, ProgramKey(f"times {id(m)}")) for m in made]
+        codes = [Code(lambda m=m: m, ProgramKey(f"times {k}")) for k, m in enumerate(made)]
         return [Kernel(code)(NONE, [1.0])[0][0][0] for code in codes]
 
     assert outputs() == [2.0, 3.0]
-    paths = sorted(tmp_path.iterdir())
+    paths = sorted(tmp_path.iterdir(), key=lambda path: (path.stat().st_size, path.name))
     whole = [path.read_bytes() for path in paths]
-    harm(*paths)
+    # The names of what sources emit, then the programs.
+    harm(*(paths[:2] if level == "name" else paths[2:]))
     assert outputs() == [2.0, 3.0]
     assert [path.read_bytes() for path in paths] == whole
     assert {(path.stat().st_mode & 0o777, path.stat().st_uid) for path in paths} == {

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from delta_dynamics import Contact, ContactMonitor, inverse_dynamics
 from pkm_twin import Robot
-from pkm_twin.apps.check import motion
 from pkm_twin.apps.recorded import Recording, read_recording
+from pkm_twin.apps.recorded_motion import motion
 from pkm_twin.bags.reader import open_bag
 from pkm_twin.machine.places import given
 from pkm_twin.robot.catalogue import robot_of_data

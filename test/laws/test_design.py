@@ -8,10 +8,9 @@ import pytest
 
 from delta_dynamics import inverse_dynamics
 from pkm_twin import variants
-from pkm_twin.design import PosePath, design, pose_errors, sweep
+from pkm_twin.design import PosePath, design, sweep
 from pkm_twin.design.pose_path import Followed
 from pkm_twin.design.quantities import QUANTITIES
-from pkm_twin.design.tolerance import workspace_states
 from pkm_twin.errors import ParameterError, PkmTwinError, UnknownNameError
 from pkm_twin.paths import cycle, timed
 from test.laws.test_derivatives import POINTS, WEIGHTS
@@ -168,20 +167,3 @@ def test_what_cannot_be_designed_is_rejected(picking, vary, aim, bounds, error):
     robot, path = picking
     with pytest.raises(error):
         design(robot, vary, path, aim, bounds, starts=4)
-
-
-def test_an_error_budget_is_that_of_drawn_machines():
-    robot = load("delta_cu")
-    sigma = {
-        "geometry.arm_length": 2e-5,
-        "geometry.base_radius": 1e-5,
-        "geometry.platform_radius": 3e-5,
-    }
-    q = workspace_states(robot, 20)
-    found = pose_errors(robot, q, sigma)
-    rng, count = np.random.default_rng(0), 4000
-    drawn = {path: robot.number(path) + s * rng.normal(size=count) for path, s in sigma.items()}
-    position, _ = variants(robot, drawn).platform(np.broadcast_to(q, (count, *q.shape)))
-    apart = position - robot.platform(q)[0]
-    np.testing.assert_allclose(found.position, np.sqrt((apart**2).mean(0).sum(-1)), rtol=0.05)
-    assert sum(found.share(path) for path in sigma) == pytest.approx(1.0)

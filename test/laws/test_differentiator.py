@@ -200,3 +200,50 @@ def test_a_sample_that_is_taken_back_was_never_there(rng, carries):
         assert (expected is None) == (found is None)
         if found is not None:
             assert np.array(found).tobytes() == np.array(expected).tobytes()
+
+
+@pytest.mark.parametrize("rate", [1500.0, 1000.0, 800.0, 430.0, 200.0, 100.0, 40.0])
+@pytest.mark.parametrize("carries", [True, False])
+def test_a_window_of_a_time_has_the_error_for_a_sine_that_it_says(rate, carries):
+    """Whatever the rate, and after a slower or faster stream before."""
+    time = 0.024
+    differentiator = Differentiator(2, 25, time=time)
+    errors, turn = [], 2.0 * np.pi
+    for before in (120.0, 900.0):
+        for i in range(60):
+            differentiator.push(round(i * SECOND / before), np.zeros(3), np.zeros(3))
+        differentiator.reset()
+    for i in range(round(2 * rate) + 25):
+        t = i / rate
+        q, qd, qdd = np.sin(turn * t) * np.array([1.0, 1.0, -(turn**2)])
+        qd = turn * np.cos(turn * t)
+        result = differentiator.push(
+            round(t * SECOND), np.full(2, q), np.full(2, qd) if carries else None
+        )
+        if result is not None:
+            errors.append(abs(result[1][0] - qdd) / turn**2)
+    span = (differentiator.window - 1) / rate
+    assert differentiator.window == 5 or 0.8 * time < span < 1.11 * time or rate > 1000.0
+    assert differentiator.window <= 25
+    assert differentiator.period == pytest.approx(1.0 / rate)
+    assert max(errors) == pytest.approx(differentiator.sine_error(1.0), rel=0.02, abs=1e-6)
+    assert max(errors) < 0.005 or rate < 150.0
+
+
+def test_lost_samples_and_jitter_leave_the_window_as_long(rng):
+    stamps = np.array(stamps_of(rng, 400, 0.8))[rng.uniform(size=400) > 0.05].tolist()
+    differentiator = Differentiator(2, 25, time=0.024)
+    for k, stamp in enumerate(stamps):
+        assert (differentiator.push(stamp, np.zeros(3), np.zeros(3)) is None) == (
+            k < differentiator.window - 1
+        )
+    assert 22 <= differentiator.window <= 25
+
+
+def test_a_stream_that_slows_down_gets_a_shorter_window(rng):
+    differentiator = Differentiator(2, 25, time=0.024)
+    stamp = 0
+    for i in range(200):
+        stamp += STEP if i < 100 else 5 * STEP
+        assert (differentiator.push(stamp, np.zeros(3), np.zeros(3)) is None) == (i < 24)
+    assert differentiator.window <= 10

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from delta_dynamics import PayloadEstimator, inverse_dynamics
 from pkm_twin import Robot
-from pkm_twin.apps.check import motion
 from pkm_twin.apps.recorded import read_recording
+from pkm_twin.apps.recorded_motion import motion
 from test.support.robots import joint_range, load
 
 Array = NDArray[np.float64]

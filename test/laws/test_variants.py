@@ -14,6 +14,7 @@ from pkm_twin.apps.certificate.description import expand
 from pkm_twin.codegen.lu import pivot_order
 from pkm_twin.errors import ParameterError, PkmTwinError
 from pkm_twin.kinematics.motion import Motion
+from pkm_twin.machine.places import keys_of
 from pkm_twin.robot.catalogue import robot_of_data
 from pkm_twin.robot.entries import entries, with_entries
 from stiffness_monitor import compliance
@@ -142,6 +143,31 @@ def test_a_limbs_number_is_that_of_all_its_copies(name, rng):
         assert judge(robot, {key: value + np.array([0.0, 0.01])}, rng) > 0
     mass = next(iter(p for p in numbers_of(robot) if p.endswith(".mass")))
     assert judge(robot, {mass: [0.5, 1.5], "payload.mass": [0.0, 0.7]}, rng) == 2
+
+
+def test_numbers_of_one_limb_s_entry_vary_together(rng):
+    """In the order limb, azimuth, copy, whatever the order they are given in."""
+    data = plain("stewart")
+    robot = robot_of_data(data, "stewart")
+    foot = data["limbs"]["joints"]["foot_a"]
+    own = {
+        **{f"limbs.joints.foot_a.at[{k}]": foot["at"][k] for k in range(3)},
+        **{f"limbs.joints.foot_a.axes[1][{k}]": foot["axes"][1][k] for k in range(2)},
+        "limbs.azimuths[1]": data["limbs"]["azimuths"][1],
+    }
+    values = {path: value + rng.uniform(-0.02, 0.02, 2) for path, value in own.items()}
+    paths = rng.permutation(list(own)).tolist()
+    many = variants(robot, {path: values[path] for path in paths})
+    q, *_ = motion(robot, rng, 3)
+    for k, pose in enumerate(many.forward(q)):
+        made = plain("stewart")
+        for path, value in values.items():
+            *way, last = keys_of(path)
+            holder = made
+            for key in way:
+                holder = holder[key]
+            holder[last] = float(value[k])
+        np.testing.assert_allclose(pose, robot_of_data(made, "made").forward(q), rtol=0, atol=1e-12)
 
 
 def test_each_machine_has_its_own_samples(rng):

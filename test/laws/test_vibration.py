@@ -13,7 +13,7 @@ from scipy.linalg import expm
 
 from pkm_twin.errors import ParameterError
 from stiffness_monitor import compliance, frequency_response, stability_lobes, stable_depth
-from stiffness_monitor.chatter import Milling, lobes_of, stable_depth_of
+from stiffness_monitor.chatter import Milling, lobes_between, lobes_of, stable_depth_of
 from stiffness_monitor.modes import natural_frequencies
 from stiffness_monitor.vibration import ToolModes, tool_modes
 from test.support.command import command
@@ -168,6 +168,32 @@ def test_lobes_follow_the_laws_of_scale():
         lobes_of(ONE, slot, [50.0])
     with pytest.raises(ParameterError, match="immersion"):
         Milling(2, KT, 0.3, 1.2)
+    for other_unit in (600.0, 0.6, 6e14):
+        with pytest.raises(ParameterError, match="tangential"):
+            Milling(2, other_unit, 0.3)
+
+
+@pytest.mark.parametrize("seed", partly_long(range(6), 0))
+def test_no_speed_of_a_range_is_worse_than_its_least_depth(seed):
+    """Nor any within the margin of the best speed; speeds that nobody chose."""
+    rng = np.random.default_rng(seed)
+    count = int(rng.integers(1, 4))
+    modes = modes_of(
+        rng.uniform(40.0, 250.0, count), rng.uniform(0.01, 0.04, count),
+        0.3 * rng.normal(size=(count, 2)),
+    )  # fmt: skip
+    milling = Milling(int(rng.integers(1, 4)), KT, 0.3, rng.choice([0.1, 0.5, 1.0]))
+    high = 60.0 * modes.frequencies.max() / milling.teeth * rng.uniform(0.5, 1.5)
+    low = 0.6 * high
+    found = lobes_between(modes, milling, low, high, 12)
+    tried = lobes_of(modes, milling, rng.uniform(low, high, 30))
+    assert tried.depths.min() > (1.0 - 2e-3) * found.depths.min()
+    speed, depth, _ = found.steady()
+    near = lobes_of(modes, milling, speed * (1.0 + 0.01 * rng.uniform(-1.0, 1.0, 8)))
+    assert near.depths.min() > (1.0 - 2e-3) * depth
+    # A range without speeds between: cliffs and minima are found from its ends.
+    again = lobes_between(modes, milling, low, high, 5)
+    assert again.depths.min() == pytest.approx(found.depths.min(), rel=2e-3)
 
 
 def test_commands_write_what_the_functions_give(capsys, tmp_path):
@@ -190,9 +216,11 @@ def test_commands_write_what_the_functions_give(capsys, tmp_path):
     told = json.loads(command(capsys, "lobes", "upr_rpu", *process, *speeds, *shared).out)
     milling = Milling(2, 600e6, 0.3, 0.5)
     given = {"damping": 0.03, "tool": [0, 0, -0.1]}
-    lobes = stability_lobes(robot, robot.home(), milling, [8000.0, 12000.0], **given)
+    lobes = stability_lobes(robot, robot.home(), milling, told["speeds_rpm"], **given)
     assert told["depths_m"] == lobes.depths.tolist()
     assert loadmat(mat)["depth"][:, 0].tolist() == lobes.depths.tolist()
+    assert told["least"]["depth_m"] == lobes.depths.min()
     assert told["zero_order_depth_m"] == stable_depth(robot, robot.home(), milling, **given)
-    assert told["best"]["speed_rpm"] == lobes.speeds[lobes.best]
+    best = told["best"]
+    assert (best["speed_rpm"], best["depth_m"], best["open"]) == lobes.steady()
     assert table.with_suffix(".png").exists() and mat.with_suffix(".png").exists()

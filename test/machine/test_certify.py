@@ -16,7 +16,7 @@ from pkm_twin import load
 from pkm_twin.apps import certify as certification
 from pkm_twin.apps.certify import ENGINES, Certificate, certify, certify_variants, drawn
 from pkm_twin.codegen.code import Code
-from pkm_twin.errors import PkmTwinError
+from pkm_twin.errors import PkmTwinError, SingularityError
 from pkm_twin.kinematics import engine
 from test.machine.random_machines import FILES, plain
 from test.support.robots import partly_long
@@ -180,3 +180,20 @@ def test_variants_are_certified_with_the_robot():
     result = certify_variants(robot, 3, seed=1, states=2, engines=["maximal"], progress=seen.append)
     assert result.good and result.variants == 3 and seen == list(range(1, 9))
     assert result.drawn >= 8
+
+
+def test_a_state_that_the_twin_does_not_reach_is_skipped_and_counted(echoes, monkeypatch):
+    robot = Echo(plain("rps3"))
+    reached, real = [], robot.forward
+
+    def forward(q):
+        if np.ndim(q) == 1:
+            reached.append(q)
+            if len(reached) % 2:
+                raise SingularityError("joint state", (), 0.0, 1e-6)
+        return real(q)
+
+    robot.forward = forward
+    result = certify(robot, robot.description_data, states=4, engines=("maximal",))
+    assert result.skipped == 4 and result.drawn >= 8 and result.good
+    assert result.as_json()["skipped"] == 4

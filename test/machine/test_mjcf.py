@@ -140,29 +140,6 @@ def test_a_body_on_a_free_joint_is_held_by_closures_alone(tmp_path):
     assert {data["joints"][n]["type"] for n in held} == {"spherical"}
 
 
-def test_it_is_a_machine_of_the_engine(tmp_path):
-    robot = Machine.from_data(read_urdf(save(tmp_path, hexapod()), platform="tool"), "hexapod")
-    assert robot.mobility == "6: x, y, z, roll, pitch, yaw"
-    weight = inverse_dynamics(robot, robot.inverse(robot.home()), np.zeros(6), np.zeros(6))
-    np.testing.assert_allclose(robot.forward(robot.inverse(robot.home())), robot.home(), atol=1e-12)
-    # Virtual work: the rate at which gravity's work grows with each slide.
-    step = 1e-6
-    for k in range(6):
-        q = robot.inverse(robot.home())
-        up, down = (total_height(robot, q + s * step * np.eye(6)[k]) for s in (1, -1))
-        assert weight[k] == pytest.approx(9.81 * (up - down) / (2 * step), abs=1e-5)
-
-
-def total_height(robot, q):
-    """Sum of mass times height, kg m."""
-    rotations, origins = robot.placements(q)
-    total = 0.0
-    for name, body in robot.graph.bodies.items():
-        arm = body.com - robot.engine.tree.at[name]
-        total += body.mass * (origins[name] + rotations[name] @ arm)[2]
-    return total
-
-
 def test_a_weld_and_a_lock_hold(tmp_path):
     weld = '<weld name="tip" body1="fore_1" body2="fore_2" relpose="0.3 0 0 0.6 0 0 0.8"/>'
     # Two bars that are welded at an angle of their own: one motor must go.
@@ -240,3 +217,192 @@ def test_a_part_may_be_called_like_such_a_number(tmp_path):
     path = five_bar(tmp_path)
     path.write_text(path.read_text().replace('"m1"', '"nan"'))
     assert "nan" in read_urdf(path)["joints"]
+
+
+class Judge:
+    """MuJoCo's inverse dynamics of the open tree, projected by the Jacobian of its equalities."""
+
+    def __init__(self, path, names):
+        self.model = mujoco.MjModel.from_xml_path(str(path))
+        self.model.opt.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
+        self.data = mujoco.MjData(self.model)
+        self.names = names
+        self.own = [int(self.model.joint(name).dofadr[0]) for name in names]
+        self.rest = np.setdiff1d(np.arange(self.model.nv), self.own)
+
+    def rows(self):
+        """What the equalities miss, and its Jacobian; no other constraint is asked."""
+        mujoco.mj_forward(self.model, self.data)
+        count = int(self.data.ne)
+        table = np.reshape(self.data.efc_J, (-1, self.model.nv))[:count]
+        return self.data.efc_pos[:count].copy(), table.copy()
+
+    def close(self, q):
+        for name, value in zip(self.names, q, strict=True):
+            self.data.joint(name).qpos[0] = value
+        for _ in range(50):
+            miss, table = self.rows()
+            step = np.zeros(self.model.nv)
+            step[self.rest] = -np.linalg.lstsq(table[:, self.rest], miss, rcond=1e-9)[0]
+            mujoco.mj_integratePos(self.model, self.data.qpos, step, 1.0)
+        assert np.abs(self.rows()[0]).max() < 1e-10
+
+    def efforts(self, q, qd, qdd):
+        self.close(q)
+        place, (_, table) = self.data.qpos.copy(), self.rows()
+        motion = np.zeros((self.model.nv, len(q)))
+        motion[self.own] = np.eye(len(q))
+        passive = table[:, self.rest]
+        motion[self.rest] = -np.linalg.lstsq(passive, table[:, self.own], rcond=1e-9)[0]
+        speed, step = motion @ qd, 1e-6
+        tables = []
+        for way in (step, -step):
+            self.data.qpos[:] = place
+            mujoco.mj_integratePos(self.model, self.data.qpos, speed, way)
+            tables.append(self.rows()[1])
+        drift = (tables[0] - tables[1]) @ speed / (2 * step)
+        change = motion @ qdd
+        change[self.rest] -= np.linalg.lstsq(passive, drift, rcond=1e-9)[0]
+        self.data.qpos[:], self.data.qvel[:], self.data.qacc[:] = place, speed, change
+        flags = self.model.opt.disableflags
+        self.model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
+        mujoco.mj_inverse(self.model, self.data)
+        self.model.opt.disableflags = flags
+        self.data.qvel[:] = 0.0
+        # Dry friction is a constraint in MuJoCo.
+        dry = self.model.dof_frictionloss * np.sign(speed)
+        return motion.T @ (self.data.qfrc_inverse + dry)
+
+
+ROD = """<mujoco><compiler angle="radian"/><option gravity="0 -9.81 -2"/><worldbody>
+  <body name="crank"><joint name="m" axis="0 0 1"/>
+    <geom type="capsule" fromto="0 0 0 0.1 0.02 0" size="0.01" mass="0.5"/>
+    <body name="rod" pos="0.1 0.02 0"><joint name="ball" type="ball"/>
+      <geom type="capsule" fromto="0 0 0 0.3 -0.02 0" size="0.01" mass="0.3"/></body></body>
+  <body name="slider" pos="0.4 0 0"><joint name="s" type="slide" axis="1 0 0.2"/>
+    <geom type="sphere" size="0.02" mass="0.7"/><site name="tool"/></body>
+  </worldbody>
+  <tendon><fixed name="cord"><joint joint="s" coef="1"/></fixed></tendon>
+  <equality><connect name="pin" body1="rod" body2="slider" anchor="0.3 -0.02 0"/></equality>
+  <actuator><motor name="a" joint="m"/></actuator></mujoco>"""
+ATTRIBUTES = {
+    # What is read: the torques are MuJoCo's.
+    "nothing": ("", "", "read"),
+    "damping of a hinge": ('name="m"', 'name="m" damping="0.3"', "read"),
+    "damping of a slide": ('name="s"', 'name="s" damping="3"', "read"),
+    "frictionloss": ('name="m"', 'name="m" frictionloss="0.2"', "read"),
+    "frictionloss of a passive joint": ('name="s"', 'name="s" frictionloss="2"', "read"),
+    "armature": ('name="m"', 'name="m" armature="0.05"', "read"),
+    "armature of a passive joint": ('name="s"', 'name="s" armature="0.5"', "read"),
+    "armature of an actuator": ('joint="m"', 'joint="m" armature="0.002" gear="3"', "read"),
+    "damping of an actuator": ('joint="m"', 'joint="m" damping="0.02" gear="-3"', "read"),
+    "gravity": ("0 -9.81 -2", "3 -9.81 1", "read"),
+    "ref": ('name="m"', 'name="m" ref="0.2"', "read"),
+    "pos": ('name="ball"', 'name="ball" pos="0.01 0 0"', "read"),
+    # Without effect on what moves exactly along its joints.
+    "solref": ('name="pin"', 'name="pin" solref="0.01 0.5"', "read"),
+    "solimp": ('name="pin"', 'name="pin" solimp="0.5 0.6 0.01"', "read"),
+    "margin": ('name="m"', 'name="m" margin="0.1" range="-3 3"', "read"),
+    "springref alone": ('name="m"', 'name="m" springref="0.3"', "read"),
+    # What is left out is said by name.
+    "damping of a ball": ('name="ball"', 'name="ball" damping="0.1"', "damping 0.1 of ball"),
+    "frictionloss of a ball": ('name="ball"', 'name="ball" frictionloss="1"', "friction 1 of ball"),
+    "armature of a ball": ('name="ball"', 'name="ball" armature="1"', "inertia 1 of ball"),
+    "stiffness": ('name="m"', 'name="m" stiffness="2"', r"spring .* of joint m "),
+    "stiffness of a ball": ('name="ball"', 'name="ball" stiffness="2"', "spring .* of joint ball "),
+    "polynomial damping": ('name="m"', 'name="m" damping="0.1 0.2"', "not linear of dof"),
+    "gravcomp": ('name="rod"', 'name="rod" gravcomp="1"', "gravcomp.* of body rod "),
+    "gear": ('joint="m"/></act', 'joint="m" gear="2"/></act', r"gear of a \(2\)"),
+    "stiffness of a tendon": ('name="cord"', 'name="cord" stiffness="2"', "of tendon cord "),
+    "damping of a tendon": ('name="cord"', 'name="cord" damping="2"', "damping of tendon cord "),
+    "frictionloss of a tendon": ('name="cord"', 'name="cord" frictionloss="2"', "of tendon cord "),
+    "armature of a tendon": ('name="cord"', 'name="cord" armature="2"', "of tendon cord "),
+    "fluid": ("<option", '<option density="1000"', "fluid"),
+    # What would be another machine is rejected.
+    "coupled joints": (
+        "<equality>", '<equality><joint name="c" joint1="m" joint2="s"/>', ParameterError
+    ),
+    "coupled tendons": (
+        "<equality>", '<equality><tendon name="c" tendon1="cord"/>', ParameterError
+    ),
+    "actuated tendon": ('joint="m"/></act', 'tendon="cord"/></act', ParameterError),
+    "actuated ball": ('joint="m"/></act', 'joint="ball"/></act', ParameterError),
+    "torquescale": (
+        '<connect name="pin" body1="rod" body2="slider" anchor="0.3 -0.02 0"/>',
+        '<weld body1="rod" body2="slider" torquescale="0"/>', ParameterError,
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("attribute", ATTRIBUTES)
+def test_every_attribute_is_read_or_warned_of_or_rejected(attribute, tmp_path):
+    old, new, kind = ATTRIBUTES[attribute]
+    assert old in ROD
+    path = save(tmp_path, ROD.replace(old, new, 1) if old else ROD)
+    if kind is ParameterError:
+        with pytest.raises(ParameterError, match=r"equality\.|actuator\."):
+            read_urdf(path)
+        return
+    if kind != "read":
+        with pytest.warns(UserWarning, match=kind):
+            data = read_urdf(path, platform="tool")
+        # And the rest is as it is without the attribute.
+        joint = data["joints"]["m"]
+        assert "rotor_inertia" not in joint
+        return
+    robot = Machine.from_data(read_urdf(path, platform="tool"), "rod")
+    judge = Judge(path, robot.joint_names)
+    rng = np.random.default_rng(6)
+    for q in robot.graph.home + rng.uniform(-0.3, 0.3, (3, 1)):
+        qd, qdd = rng.normal(size=(2, 1))
+        right = judge.efforts(q, qd, qdd)
+        np.testing.assert_allclose(inverse_dynamics(robot, q, qd, qdd), right, 1e-6, 1e-7)
+
+
+@pytest.mark.parametrize("name", ["five_bar", "hexapod"])
+def test_torques_are_mujoco_s_projected(name, tmp_path):
+    content = FIVE_BAR.replace("CLOSURE", CONNECT) if name == "five_bar" else hexapod()
+    path = save(tmp_path, content)
+    robot = Machine.from_data(read_urdf(path, platform="tool"), name)
+    judge = Judge(path, robot.joint_names)
+    rng, count = np.random.default_rng(7), len(robot.joint_names)
+    for _ in range(3):
+        q = robot.graph.home + rng.uniform(-0.05, 0.05, count)
+        qd, qdd = rng.normal(size=(2, count))
+        right = judge.efforts(q, qd, qdd)
+        error = np.abs(inverse_dynamics(robot, q, qd, qdd) - right).max()
+        assert error < 1e-6 * np.abs(right).max()
+
+
+def test_effort_limits_are_those_of_joint_and_actuators_together(tmp_path):
+    for limits, right in {
+        'forcerange="-2 3" gear="4"': 12.0,
+        'ctrlrange="-2 1" gear="5"': 10.0,
+        'ctrlrange="-2 1" forcerange="-1 1" gear="-5"': 5.0,
+    }.items():
+        path = save(tmp_path, ROD.replace('joint="m"/></act', f'joint="m" {limits}/></act'))
+        assert read_urdf(path)["joints"]["m"]["limits"]["effort"] == right
+
+
+def test_meshes_that_are_missing_are_not_needed_where_inertias_are_given(tmp_path):
+    mesh = '<asset><mesh name="shell" file="none.stl"/></asset><worldbody>'
+    old = '<joint name="m" axis="0 0 1"/>'
+    inertial = '<inertial pos="0.05 0.01 0" mass="0.5" diaginertia="1e-4 1e-3 1e-3"/>'
+    geom = '<geom type="mesh" mesh="shell"/>'
+    text = ROD.replace("<worldbody>", mesh)
+    right = read_urdf(save(tmp_path, ROD.replace(old, old + inertial)))
+    with pytest.warns(UserWarning, match="without its meshes"):
+        assert read_urdf(save(tmp_path, text.replace(old, old + inertial + geom))) == right
+    with pytest.raises(ParameterError, match=r"none\.stl"):
+        read_urdf(save(tmp_path, text.replace(old, old + geom)))
+
+
+@pytest.mark.parametrize("file", ["/etc/passwd", "../outside.xml", "link.xml"])
+def test_only_files_below_the_model_are_included(file, tmp_path):
+    (tmp_path / "outside.xml").write_text("<mujoco/>")
+    folder = tmp_path / "model"
+    folder.mkdir()
+    (folder / "link.xml").symlink_to(tmp_path / "outside.xml")
+    with pytest.raises(ParameterError) as error:
+        read_urdf(save(folder, f'<mujoco><include file="{file}"/></mujoco>'))
+    assert error.value.field == "include.file"

@@ -53,6 +53,45 @@ def test_every_name_of_the_srdf_is_in_the_urdf(exported):
     assert srdf.find("virtual_joint").get("child_link") in links
 
 
+def test_bars_collide_as_they_are_seen_and_neighbours_are_left_out(exported):
+    """Of Pinocchio's collision library: nothing at home, and what crosses in a drawn posture."""
+    pin = pytest.importorskip("pinocchio")
+    robot, folder = exported
+    urdf = (folder / f"config/{robot.name}.urdf").read_text()
+    model = pin.buildModelFromXML(urdf)
+    kinds = (pin.VISUAL, pin.COLLISION)
+    seen, solid = (pin.buildGeomFromUrdfString(model, urdf, kind) for kind in kinds)
+    shapes = [
+        [(g.parentFrame, str(g.placement), type(g.geometry)) for g in one.geometryObjects]
+        for one in (seen, solid)
+    ]
+    assert shapes[0] == shapes[1] and shapes[0]
+    solid.addAllCollisionPairs()
+    everything = len(solid.collisionPairs)
+    pin.removeCollisionPairsFromXML(
+        model, solid, (folder / f"config/{robot.name}.srdf").read_text(), False
+    )
+    assert len(solid.collisionPairs) < everything
+    data, pairs = model.createData(), solid.createData()
+
+    joints = dict(zip(list(model.names)[1:], list(model.joints)[1:], strict=True))
+
+    def collides(q, turned=0.0):
+        states = dict(zip(robot.joint_names, q, strict=True))
+        states |= dict(zip(robot.passive_joints, robot.passive(q), strict=True))
+        at = np.zeros(model.nq)
+        for name, joint in joints.items():
+            turns = joint.shortname().startswith("JointModelR")
+            at[joint.idx_q] = states[name] + rng.uniform(-turned, turned) * turns
+        return pin.computeCollisions(model, data, solid, pairs, at, True)
+
+    home, rng = robot.inverse(robot.home()), np.random.default_rng(3)
+    assert not collides(home)
+    assert not any(collides(home + rng.uniform(-0.02, 0.02, len(home))) for _ in range(5))
+    # Without its loops the tree can cross its limbs.
+    assert any(collides(home, 2.0) for _ in range(100))
+
+
 def test_a_numeric_solver_is_offered_where_its_chain_has_a_drive(exported):
     robot, folder = exported
     urdf = ET.parse(folder / f"config/{robot.name}.urdf").getroot()

@@ -274,3 +274,18 @@ def test_copies_of_two_sections_of_one_name_are_told_apart():
         Machine.from_data(data, "x")
     assert (error.value.field, error.value.value) == ("limbs[1].bodies.crank", "crank_1")
     assert "limbs[0].bodies.crank" in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("value", "shown"),
+    [
+        (np.float64(3.0), "3.0"),
+        (np.int64(3), "3"),
+        (np.bool_(True), "True"),
+        (np.array([1.0, 2.0]), "[1.0, 2.0]"),
+        ([np.float64(1.5), (np.float32(0.5),)], "[1.5, (0.5,)]"),
+        ({np.str_("a"): np.float64(2.0)}, "{'a': 2.0}"),
+    ],
+)
+def test_numbers_of_numpy_are_plain_in_an_error(value, shown):
+    assert str(ParameterError("x", value, "y")) == f"x: {shown}; expected y"

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import re
 from xml.etree import ElementTree as ET
 
@@ -11,12 +12,15 @@ import pytest
 
 from delta_dynamics import inverse_dynamics
 from pkm_twin import robot_names
+from pkm_twin.errors import ParameterError
 from pkm_twin.machine import urdf_file, urdf_xml
 from pkm_twin.mechanisms.machine import Machine
 from pkm_twin.robot import urdf_tree
-from pkm_twin.robot.robot_urdf import robot_description, robot_urdf
+from pkm_twin.robot.catalogue import robot_of_data
+from pkm_twin.robot.robot_urdf import joint_names, robot_description, robot_urdf
 from pkm_twin.robot.urdf_read import read_urdf
-from test.support.robots import load, partly_long
+from test.support.mapped import sides
+from test.support.robots import load, partly_long, random_joints
 
 pytest.importorskip("pinocchio")
 
@@ -25,6 +29,22 @@ import pinocchio as pin
 from .sketches import closure_rows
 
 STATES = 50
+
+
+CELLS = ("delta_cu", "five_bar", "linear_delta", "rps3", "upr_rpu")
+
+
+@pytest.fixture(params=partly_long(CELLS, *CELLS[:3]), scope="module")
+def cell(request):
+    """A robot on both sides of a joint map: some joints have the controller's name of another."""
+    both = sides(request.param)
+    joint_map = dict(both.data["joint_map"])
+    first, second, *_ = both.plain.joint_names
+    joint_map[first] = joint_map[first] | {"name": second}
+    joint_map[second] = {k: v for k, v in joint_map[second].items() if k != "name"}
+    joint_map[second] |= {"name": both.plain.passive_joints[0]}
+    mapped = robot_of_data(both.data | {"joint_map": joint_map}, "cell")
+    return dataclasses.replace(both, mapped=mapped, names=list(mapped.controller.names))
 
 
 @pytest.fixture(
@@ -94,6 +114,83 @@ def test_mock_hardware_begins_inside_the_limits(robot):
     if limits is not None:
         assert (limits[:, 0] <= start).all()
         assert (start <= limits[:, 1]).all()
+
+
+def numbers(element, *names):
+    return [float(element.get(name)) for name in names]
+
+
+def test_a_cell_s_drives_have_the_controller_s_names_and_numbers(cell):
+    robot, tree = cell.mapped, ET.fromstring(robot_urdf(cell.mapped))
+    joints = {joint.get("name"): joint for joint in tree.findall("joint")}
+    controlled = tree.findall("ros2_control/joint")
+    assert [joint.get("name") for joint in controlled] == cell.names
+    start = np.array([float(j.find("state_interface/param").text) for j in controlled])
+    np.testing.assert_allclose(start, cell.positions(robot.graph.home), rtol=1e-12)
+    limits, effort = robot.limits, robot.limits.effort
+    for k, name in enumerate(cell.names):
+        low, high, most = numbers(joints[name].find("limit"), "lower", "upper", "effort")
+        assert low <= start[k] <= high
+        if limits.position is not None:
+            ends = cell.offsets[k] + cell.factors[k] * limits.position[k]
+            np.testing.assert_allclose([low, high], np.sort(ends), rtol=1e-12)
+        if effort is not None:
+            assert most == pytest.approx(effort[k] / abs(cell.factors[k]), rel=1e-12)
+
+
+def test_a_cell_s_links_follow_the_controller_s_numbers(cell):
+    """As robot_state_publisher has it, which knows the joint states of the broadcaster alone."""
+    robot, text = cell.mapped, robot_urdf(cell.mapped)
+    follows = {
+        joint.get("name"): (mimic.get("joint"), *numbers(mimic, "multiplier", "offset"))
+        for joint in ET.fromstring(text).findall("joint")
+        if (mimic := joint.find("mimic")) is not None
+    }
+    model = pin.buildModelFromXML(text)
+    names = joint_names(robot, "some/Hardware")
+    data, n = model.createData(), robot.joints_count
+    q = random_joints(robot, np.random.default_rng(5), 20)
+    for given, passive, at, turned in zip(
+        cell.positions(q), robot.passive(q), *robot.platform(q), strict=True
+    ):
+        states = dict(zip(cell.names, given, strict=True))
+        states |= dict(zip(names[n:], passive, strict=True))
+        for name, (drive, factor, offset) in follows.items():
+            states[name] = offset + factor * states[drive]
+        found = np.array([states[name] for name in list(model.names)[1:]])
+        order = np.argsort([joint.idx_q for joint in list(model.joints)[1:]])
+        pin.framesForwardKinematics(model, data, found[order])
+        platform = data.oMf[model.getFrameId("platform", pin.BODY)]
+        np.testing.assert_allclose(platform.translation, at, atol=1e-9)
+        np.testing.assert_allclose(platform.rotation, turned, atol=1e-9)
+
+
+def test_a_cell_s_description_is_read_back_with_its_joint_map(cell, tmp_path):
+    path = tmp_path / "cell.urdf"
+    path.write_text(robot_urdf(cell.mapped))
+    again = Machine.from_data(read_urdf(path), "again")
+    assert again.joint_names == cell.mapped.joint_names
+    assert list(again.controller.names) == cell.names
+    np.testing.assert_allclose(again.controller.factors, cell.factors, 1e-14)
+    np.testing.assert_allclose(again.controller.offsets, cell.offsets, 1e-13)
+    q = random_joints(cell.mapped, np.random.default_rng(6), 5)
+    expected = inverse_dynamics(cell.mapped, q, 0.0 * q, 1.0 + 0.0 * q)
+    found = inverse_dynamics(again, q, 0.0 * q, 1.0 + 0.0 * q)
+    np.testing.assert_allclose(found, expected, 0.0, 1e-9 * np.abs(expected).max())
+    # Without hardware the description is the model's.
+    model, plain = (ET.fromstring(robot_urdf(r, hardware="")) for r in (cell.mapped, cell.plain))
+    assert [ET.tostring(e) for e in model] == [ET.tostring(e) for e in plain]
+
+
+def test_a_ratio_that_changes_with_travel_has_no_description_for_a_controller():
+    robot = robot_of_data(
+        sides("linear_delta").data
+        | {"joint_map": {"rail_1": {"ratio": 40.0, "ratio_change": 0.1}}},
+        "winch",
+    )
+    with pytest.raises(ParameterError, match="ratio_change"):
+        robot_urdf(robot)
+    assert robot_urdf(robot, hardware="")
 
 
 def test_links_need_no_quoting_and_their_old_names_are_found(robot, tmp_path):

@@ -3,10 +3,14 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 
 from pkm_twin.errors import ParameterError
+from pkm_twin.machine import urdf_file, urdf_xml
+from pkm_twin.machine.loop_tree import drawn
 from pkm_twin.robot.urdf_read import read_urdf
 
 pytest.importorskip("pinocchio")
@@ -147,3 +151,83 @@ def test_a_quaternion_serves_as_well_as_angles(tmp_path):
 
 def test_a_tree_whose_joints_are_all_driven_needs_no_closure(tmp_path):
     assert np.allclose(read_urdf(small(tmp_path))["joints"]["motor"]["axis"], Z)
+
+
+MARKS = {
+    "transmission": (
+        '<transmission name="t"><type>transmission_interface/SimpleTransmission</type>'
+        '<joint name="motor"/><actuator name="a"/></transmission>'
+    ),
+    "plugin": (
+        '<gazebo><plugin name="gz::sim::systems::JointPositionController">'
+        "<joint_name>motor</joint_name></plugin></gazebo>"
+    ),
+}
+
+
+@pytest.mark.parametrize("mark", [*MARKS, "true", "True", "1", "TRUE", " true "])
+def test_what_marks_a_motor(mark, tmp_path):
+    path = small(tmp_path)
+    head, _, _ = path.read_text().partition("<ros2_control")
+    path.write_text(head + MARKS.get(mark, "") + "</robot>")
+    if mark not in MARKS:
+        old = '<joint name="motor" type="revolute"'
+        path.write_text(path.read_text().replace(old, f'{old} independent="{mark}"'))
+    assert read_urdf(path)["joints"]["motor"]["actuated"]
+
+
+@pytest.mark.parametrize("value", ["yes", "", "2", "truee"])
+def test_a_truth_value_that_is_none_is_named(value, tmp_path):
+    old = '<joint name="motor" type="revolute"'
+    path = small(tmp_path, old, f'{old} independent="{value}"')
+    head, _, _ = path.read_text().partition("<ros2_control")
+    path.write_text(head + "</robot>")
+    with pytest.raises(ParameterError) as error:
+        read_urdf(path)
+    assert error.value.field == "joint.motor.independent"
+
+
+CLOSURES = {
+    "plugin": (
+        '<plugin name="gz::sim::systems::DetachableJoint"><parent_link>fore_1</parent_link>'
+        "<child_model>ROBOT</child_model><child_link>pin</child_link></plugin>"
+    ),
+    "joint": '<joint name="weld" type="fixed"><parent>fore_1</parent><child>pin</child></joint>',
+}
+
+
+@pytest.mark.parametrize("kind", sorted(CLOSURES))
+def test_gazebo_s_ways_to_close_a_loop(kind, tmp_path):
+    """A pin on the second forearm that is welded to the first, as it is drawn."""
+    path = five_bar().save(tmp_path)
+    text = path.read_text()
+    tree, _, rest = text.partition("<constraint")
+    constraint, _, rest = rest.partition("</constraint>")
+    origin = re.search(r"<child_origin ([^>]*)/>", constraint)[1]
+    axis = re.search(r'<(?:child|parent)_axis xyz="([^"]*)"', constraint)[1]
+    pin = (
+        '<link name="pin"/><joint name="tip" type="continuous"><parent link="platform"/>'
+        f'<child link="pin"/><origin {origin}/><axis xyz="{axis}"/></joint>'
+    )
+    closure = CLOSURES[kind].replace("ROBOT", re.search(r'<robot name="([^"]*)"', text)[1])
+    path.write_text(f"{tree}{pin}<gazebo>{closure}</gazebo>{rest}")
+    tree = urdf_file.read(path, urdf_xml.elements(path))
+    places = drawn(tree.root, tree.joints)
+    (weld,) = tree.closures
+    assert weld.type == "fixed"
+    first, second = (
+        places[link] @ frame for link, frame in zip(weld.links, weld.frames, strict=True)
+    )
+    np.testing.assert_allclose(first.position, second.position, atol=1e-14)
+    np.testing.assert_allclose(first.rotation, second.rotation, atol=1e-14)
+    data = read_urdf(path, platform="platform")
+    assert sum(joint.get("actuated", False) for joint in data["joints"].values()) == 2
+
+
+def test_a_plugin_that_holds_another_model_is_left_out(tmp_path):
+    other = (
+        '<gazebo><plugin name="gz::sim::systems::DetachableJoint"><parent_link>tool</parent_link>'
+        "<child_model>cube</child_model><child_link>link</child_link></plugin></gazebo></robot>"
+    )
+    with pytest.warns(UserWarning, match="cube"):
+        assert read_urdf(small(tmp_path, "</robot>", other)) == read_urdf(small(tmp_path))

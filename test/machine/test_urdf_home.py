@@ -10,6 +10,7 @@ import yaml
 
 from delta_dynamics import inverse_dynamics
 from pkm_twin.errors import ParameterError
+from pkm_twin.machine.assembly import Assembly
 from pkm_twin.mechanisms.machine import Machine
 from pkm_twin.robot.urdf_read import read_tree
 from test.support.robots import often, partly_long, random_joints
@@ -266,11 +267,77 @@ def test_bars_between_two_balls_are_kept_from_spinning(tmp_path):
         np.testing.assert_allclose(found, wanted, atol=1e-9)
 
 
-def test_an_open_loop_is_named_with_its_gap(tmp_path):
+def test_what_moves_another_part_than_the_platform_is_named(tmp_path):
+    """A second leg at the ground, and a motor on the arm that moves a flap."""
+    path = five_bar().save(tmp_path)
+    inertial = '<inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1"/></inertial>'
+    for parent, at in (("ground", "flap"), ("arm_1", "flap"), ("platform", "flap")):
+        more = (
+            f'<link name="{at}">{inertial}</link><joint name="hinge" type="continuous">'
+            f'<parent link="{parent}"/><child link="{at}"/></joint><ros2_control name="x">'
+            '<joint name="hinge"><command_interface name="effort"/></joint></ros2_control></robot>'
+        )
+        other = path.with_name(f"{parent}.urdf")
+        other.write_text(path.read_text().replace("</robot>", more))
+        with pytest.raises(ParameterError) as error:
+            read_tree(other)
+        assert error.value.field == "actuated"
+        assert error.value.value == "hinge" and "at hinge" in error.value.bound
+
+
+def test_an_open_loop_is_named_with_its_gap(tmp_path, monkeypatch):
+    tries, real = [], Assembly.close
+    monkeypatch.setattr(
+        Assembly, "close", lambda self, *given: tries.append(given) or real(self, *given)
+    )
     path = five_bar().save(tmp_path)
     path.write_text(path.read_text().replace('<child_origin xyz="', '<child_origin xyz="5'))
     with warnings.catch_warnings(), pytest.raises(ParameterError) as error:
         warnings.simplefilter("ignore")
         read_tree(path)
     assert error.value.field == "tip"
+    # A second look at every start of the search would be of no use.
+    assert len(tries) <= 2 * 11
     assert re.search(r"open by \d[\d.e+]* mm", str(error.value))
+
+
+SPUN = """<robot name="crank"><link name="base"/>
+<link name="arm"><inertial><origin xyz="0.05 0 0"/><mass value="0.5"/>
+  <inertia ixx="1e-3" iyy="1e-3" izz="1e-3"/></inertial></link>
+<link name="yaw"/><link name="pitch"/>
+<link name="rod"><inertial><origin xyz="0.15 {offset} 0"/><mass value="1.5"/>
+  <inertia ixx="1e-3" iyy="5e-3" izz="5e-3"/></inertial></link>
+<link name="tool"><inertial><mass value="0.7"/>
+  <inertia ixx="1e-3" iyy="1e-3" izz="1e-3"/></inertial></link>
+<joint name="m" type="continuous"><parent link="base"/><child link="arm"/>
+  <axis xyz="0 0.3 1"/></joint>
+<joint name="a" type="continuous"><parent link="arm"/><child link="yaw"/>
+  <origin xyz="0.1 0 0"/><axis xyz="0 0 1"/></joint>
+<joint name="b" type="continuous"><parent link="yaw"/><child link="pitch"/>
+  <axis xyz="0 1 0"/></joint>
+<joint name="c" type="continuous"><parent link="pitch"/><child link="rod"/>
+  <axis xyz="1 0 0"/></joint>
+<joint name="s" type="prismatic"><parent link="base"/><child link="tool"/>
+  <origin xyz="0.6 0.05 -0.1"/><axis xyz="1 0 0"/><limit lower="-2" upper="2"/></joint>
+<constraint name="pin" type="spherical"><parent link="rod"/><parent_origin xyz="0.3 0 0"/>
+  <child link="tool"/></constraint>
+<ros2_control name="c" type="system"><joint name="m"><command_interface name="effort"/>
+  <state_interface name="position"><param name="initial_value">{start}</param></state_interface>
+</joint></ros2_control></robot>"""
+
+
+@pytest.mark.parametrize("start", [0.3, 1.3, -2.0])
+def test_a_part_that_only_spins_is_held_at_zero_and_its_imbalance_is_said(start, tmp_path):
+    path = tmp_path / "crank.urdf"
+    path.write_text(SPUN.format(offset=0.02, start=start))
+    reading = read_tree(path)
+    data = reading.description
+    assert data["joints"]["c"]["type"] == "fixed"
+    # At zero, the centre is off the rod's axis along the pitch joint's, and nowhere else.
+    ends = [np.array(data["joints"][name]["at"]) for name in ("a", "pin")]
+    along = (ends[1] - ends[0]) / 0.3
+    off = np.array(data["bodies"]["rod"]["com"]) - ends[0] - 0.15 * along
+    np.testing.assert_allclose(off, 0.02 * np.array(data["joints"]["b"]["axis"]), atol=1e-9)
+    assert any("c (0.03 kg m)" in note for note in reading.notes)
+    path.write_text(SPUN.format(offset=0.0, start=start))
+    assert not any("kg m" in note for note in read_tree(path).notes)

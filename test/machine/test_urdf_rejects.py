@@ -24,7 +24,7 @@ pytestmark = pytest.mark.usefixtures("quickly_compiled")
 REFUSED = {
     "no XML": ("</robot>", "", "well-formed XML"),
     "entities": ("<robot", '<!DOCTYPE r [<!ENTITY a "b">]><robot', "without a document type"),
-    "other root": ("robot", "sdf", "a <robot> element"),
+    "other root": ("robot", "world", "a <robot> element"),
     "xacro": ('<link name="tool"/>', '<link name="tool"/><xacro:x/>', "run xacro"),
     "two roots": ('<link name="tool"/>', '<link name="tool"/><link name="x"/>', "one root link"),
     "circle": ('<parent link="stand"/>', '<parent link="tool"/>', "circle"),

@@ -443,7 +443,8 @@ def values_of(array):
 def silence_of(array):
     """How long there was no joint state, s, by the status of a stream that it stopped."""
     text = array.status[0].message
-    return float(re.fullmatch(r"stopped: stale input: no joint state for ([\d.]+) s.*", text)[1])
+    found = re.fullmatch(r"stopped: stale input: no accepted joint state for ([\d.]+) s.*", text)
+    return float(found[1])
 
 
 def text_of(array):

@@ -316,6 +316,31 @@ def test_a_machine_that_rests_elsewhere_gets_the_weight_of_that_place(action):
     assert len(action.holds) == 2
 
 
+@pytest.mark.parametrize("rested", [True, False])
+def test_another_client_s_motion_is_not_ended_by_a_hold_point(action, rested):
+    """It starts from rest or takes the machine over, and it dwells."""
+    goal = action.accept(Goal(1))
+    action.controller.take()
+    action.cancel(goal)
+    places = [0.1, 0.2, 0.3] if rested else [0.15, 0.16, 0.2, 0.3]
+    for k, place in enumerate([*places, *[places[-1]] * 5, 0.5, 0.5]):
+        action.now += (0.02 if k == 0 else 0.1) * bool(rested)
+        action.place = {"a": place, "b": 0.2}
+        action.node.look(1)
+    assert len(action.holds) == 1
+
+
+def test_a_trajectory_that_was_forwarded_is_not_ended_by_a_hold_point(action):
+    goal = action.accept(Goal(1))
+    action.controller.take()
+    action.cancel(goal)
+    action.served.other_motion()
+    for place in (0.15, 0.18, 0.19, 0.19, 0.19):
+        action.place = {"a": place, "b": 0.2}
+        action.node.look(1)
+    assert len(action.holds) == 1
+
+
 def test_goals_end_and_the_machine_is_held_when_the_node_ends(action):
     moving = action.accept(Goal(1))
     handle = action.controller.take()

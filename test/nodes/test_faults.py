@@ -94,6 +94,31 @@ class TestSilence:
             # A stop carries the time at which it is sent.
             assert stamp_of(torques[-1]) - stamp_of(last) > QUICK * SECOND
 
+    def test_joint_states_of_another_machine_do_not_keep_a_stream_alive(self, fleet):
+        """And while it is stopped, the status has the reason of the stop and of the rejects."""
+        twin = running(fleet["strict"])
+        assert twin.set(stale_after=0.3, trip_count=1000).successful
+
+        def foreign():
+            twin.send_state(MAKE.joint_state(("a", "b", "c"), Q, Q, stamp=twin.stamp()))
+
+        try:
+            twin.peer.clear_topic("/diagnostics")
+            (status,) = twin.peer.until(
+                lambda: [
+                    array.status[0]
+                    for array in twin.peer.told("/strict")[-1:]
+                    if "rejected since then" in array.status[0].message
+                ],
+                repeat=foreign,
+                every=0.02,
+            )
+            assert status.level == b"\x02"
+            assert status.message.startswith("stopped: stale input")
+            assert "missing joint: joint 'arm_1' is missing" in status.message
+        finally:
+            assert twin.set(stale_after=1.0, trip_count=5).successful
+
 
 class TestLoad:
     def test_a_burst_leaves_nothing_old_and_every_loss_is_counted(self, quick):

@@ -198,6 +198,7 @@ class TestRefusedSamples:
         reject(twin.joint_state, *sample(make, 14, names=("a", "b", "c")))
         twin.time_jumped_forward()
         assert (twin.stream.reason, twin.stream.text) == before
+        assert "missing joint" in twin.stream.status
         assert twin.stream.stops == {"not finite": 1}
 
     def test_a_stop_that_is_ended_by_hand_answers_at_once(self, make):

@@ -10,7 +10,9 @@ import contextlib
 import os
 import re
 import signal
+import sys
 from importlib.util import find_spec
+from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
@@ -19,9 +21,12 @@ import yaml
 
 from delta_dynamics import inverse_dynamics
 from pkm_twin import robot_names
+from pkm_twin.errors import UnknownNameError
 from pkm_twin.machine import rotations
 from pkm_twin.robot.robot_urdf import robot_urdf
+from pkm_twin.ros.arguments import check_launch_arguments
 from test.nodes.harness import REPOSITORY, Command, Maker, Ros
+from test.support.mapped import sides
 from test.support.robots import load
 
 LAUNCH = REPOSITORY / "launch"
@@ -78,6 +83,28 @@ class TestText:
             assert all(re.search(rf"\b{name}\b", source) for name in names)
             assert set(names) <= set(arguments)
 
+    @pytest.mark.parametrize("name", FILES)
+    def test_an_argument_that_a_file_lacks_is_rejected_where_the_command_line_names_it(
+        self, monkeypatch, name
+    ):
+        """A user's own file, which includes it, has arguments of its own."""
+        file, declared = str(LAUNCH / f"{name}.launch.py"), literal(name, "ARGUMENTS")
+        for words in (["pkm_twin", f"{name}.launch.py"], [file]):
+            monkeypatch.setattr(sys, "argv", ["ros2", "launch", *words])
+            check_launch_arguments(file, [f"{key}:=x" for key in declared], declared)
+            for key in declared:
+                with pytest.raises(UnknownNameError) as error:
+                    check_launch_arguments(file, [f"{key}:=x", f"{key}x:=y"], declared)
+                assert error.value.closest == key
+        monkeypatch.setattr(sys, "argv", ["ros2", "launch", "cell", f"{name}.launch.py"])
+        check_launch_arguments(file, ["speed:=x"], declared)
+        calls = [
+            node.func.id
+            for node in ast.walk(ast.parse(Path(file).read_text(encoding="utf-8")))
+            if isinstance(node, ast.Call) and isinstance(node.func, ast.Name)
+        ]
+        assert "check_launch_arguments" in calls
+
     def test_what_a_cell_passes_on_a_twin_takes(self):
         assert set(literal("cell", "ARGUMENTS")) - {"machines"} <= set(literal("twin", "ARGUMENTS"))
 
@@ -106,27 +133,6 @@ def installed(package):
     except PackageNotFoundError:
         return False
     return True
-
-
-def mock_hardware(names, positions):
-    """A URDF with these joints side by side, under mock hardware that stands where told."""
-    limit = '<limit lower="-3" upper="3" velocity="20" effort="50"/>'
-    links = "".join(
-        f'<link name="l{i}"/><joint name="{name}" type="revolute"><parent link="base_link"/>'
-        f'<child link="l{i}"/><axis xyz="0 1 0"/>{limit}</joint>'
-        for i, name in enumerate(names)
-    )
-    joints = "".join(
-        f'<joint name="{name}"><command_interface name="effort"/><state_interface name="position">'
-        f'<param name="initial_value">{position}</param></state_interface>'
-        '<state_interface name="velocity"/><state_interface name="effort"/></joint>'
-        for name, position in zip(names, positions, strict=True)
-    )
-    return (
-        f'<robot name="mock"><link name="base_link"/>{links}<ros2_control name="mock" '
-        'type="system"><hardware><plugin>mock_components/GenericSystem</plugin></hardware>'
-        f"{joints}</ros2_control></robot>"
-    )
 
 
 class Launched(Command):
@@ -327,9 +333,12 @@ class TestRunning:
         listener.unregister()
 
     @pytest.mark.skipif(not installed("controller_manager"), reason="ros2_control is not installed")
-    @pytest.mark.parametrize("space", ["", "left"])
-    def test_a_controller_gets_the_efforts_of_a_goal(self, launched, peer, tmp_path, space):
-        """Through the twin's action to joint_trajectory_controller on mock hardware."""
+    @pytest.mark.parametrize(("space", "mapped"), [("", False), ("left", True)])
+    def test_a_controller_gets_the_efforts_of_a_goal(self, launched, peer, tmp_path, space, mapped):
+        """Through the twin's action to joint_trajectory_controller on mock hardware.
+
+        ``mapped``: names, signs, ratios and offsets of the controller are its own.
+        """
         from action_msgs.msg import GoalStatus
         from control_msgs.action import FollowJointTrajectory
         from control_msgs.msg import JointTrajectoryControllerState
@@ -337,12 +346,13 @@ class TestRunning:
         from rclpy.qos import DurabilityPolicy, QoSProfile
         from std_msgs.msg import String
 
-        from test.nodes.twin import NAMES, ROBOT, Q, trajectory
+        from test.nodes.twin import ROBOT, trajectory
 
         prefix = f"/{space}".rstrip("/")
-        description = mock_hardware(NAMES, Q)
-        file = tmp_path / "robot.urdf"
-        file.write_text(description)
+        both = sides(ROBOT.name)
+        robot = both.mapped if mapped else ROBOT
+        given = both.write(tmp_path) if mapped else ROBOT.name
+        description = robot_urdf(robot)
         latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         publisher = peer.node.create_publisher(String, f"{prefix}/robot_description", latched)
         publisher.publish(String(data=description))
@@ -351,9 +361,7 @@ class TestRunning:
         action = f"{prefix}/delta_dynamics/follow_joint_trajectory"
         client = ActionClient(peer.node, FollowJointTrajectory, action)
         chosen = [f"namespace:={space}"] if space else []
-        process = launched(
-            "control", f"description:={file}", "robot_state_publisher:=false", *chosen
-        )
+        process = launched("control", f"robot:={given}", "robot_state_publisher:=false", *chosen)
 
         def ready():
             assert process.alive(), process.output
@@ -364,7 +372,15 @@ class TestRunning:
             peer.received(state).clear()
             sent = trajectory(count=5)
             # The controller takes none that does not end at rest.
-            sent.points[-1].velocities = [0.0] * len(NAMES)
+            sent.points[-1].velocities = [0.0] * robot.joints_count
+            rows = [(p.positions, p.velocities, p.accelerations) for p in sent.points]
+            q, qd, qdd = (np.array(values) for values in zip(*rows, strict=True))
+            controller = robot.controller
+            sent.joint_names = list(controller.names)
+            for point, row in zip(sent.points, zip(q, qd, qdd, strict=True), strict=True):
+                point.positions = controller.controller_positions(row[0]).tolist()
+                point.velocities = controller.controller_rates(row[1]).tolist()
+                point.accelerations = controller.controller_rates(row[2]).tolist()
 
             def answer():
                 goal = client.send_goal_async(FollowJointTrajectory.Goal(trajectory=sent))
@@ -378,17 +394,17 @@ class TestRunning:
             while last.result.error_string.startswith("no action server"):
                 last = answer()
             assert last.status == GoalStatus.STATUS_SUCCEEDED, last.result.error_string
-            rows = [(p.positions, p.velocities, p.accelerations) for p in sent.points]
-            q, qd, qdd = (np.array(values) for values in zip(*rows, strict=True))
             efforts = inverse_dynamics(ROBOT, q, qd, qdd)
             least = 1e-4 * np.abs(efforts).max()
 
             def outputs():
-                return np.array([m.output.effort for m in peer.received(state)])
+                found = np.array([m.output.effort for m in peer.received(state)])
+                return found * both.factors if mapped else found
 
             # The controller runs over the points. The last one accelerates: what bears the weight
             # where the mock hardware stands takes its place.
-            weight = inverse_dynamics(ROBOT, Q, 0 * qd[0], 0 * qd[0])
+            home = ROBOT.graph.home
+            weight = inverse_dynamics(ROBOT, home, 0 * home, 0 * home)
             peer.until(lambda: np.abs(outputs()[-1] - weight).max() < least)
             efforts = np.vstack((efforts, weight))
             moving = outputs()[np.abs(outputs()).max(1) > 0.0]
@@ -408,6 +424,7 @@ class TestRunning:
             ("twin", "respawn:=maybe", "respawn: 'maybe' is neither true nor false"),
             ("cell", "machines:=a", "machines: 'a' is not NAMESPACE=ROBOT"),
             ("cell", "machines:=a=delta,a=prru", "two share a namespace"),
+            *((name, "robto:=delta", "unknown launch argument 'robto'") for name in FILES),
         ],
     )
     def test_a_bad_argument_is_refused_by_name(self, launched, name, argument, said):

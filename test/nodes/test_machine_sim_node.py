@@ -176,6 +176,7 @@ def test_it_ends_on_a_signal(peer, machine):
         (("start:=[0.0, 2.0, 0.0]",), "start, arm_2: 2.0; expected -0.9 to 1.3"),
         (("use_sim_time:=true",), "use_sim_time: True; expected false"),
         (("payload.masses:=[1.0, 2.0]",), "payload.masses"),
+        (("bandwidth:=10.0", "period:=0.01"), "bandwidth: 10.0; expected at most 2.9 Hz"),
     ],
 )
 def test_a_bad_parameter_is_refused_in_one_line(refused, parameters, word):

@@ -102,6 +102,49 @@ def test_no_node_starts_with_a_parameter_whose_change_nothing_follows(launch):
     assert line == "cannot start: nothing follows a change of volume"
 
 
+COMPILING = """
+import time
+from functools import cached_property
+from pathlib import Path
+import delta_dynamics.node as node
+from pkm_twin.codegen.code import Code
+warm, begin, load = node.warm_up, node.DeltaDynamics.begin, Code.__dict__["_loaded"].func
+def slow(robot):
+    while not Path({path!r}).exists():
+        time.sleep(0.05)
+    warm(robot)
+def late(code):
+    print("loaded late:", code.key, flush=True)
+    return load(code)
+def begun(made):
+    Code._loaded = cached_property(late)
+    Code._loaded.__set_name__(Code, "_loaded")
+    begin(made)
+node.warm_up, node.DeltaDynamics.begin = slow, begun
+node.main()
+"""
+
+
+def test_a_node_that_compiles_says_so_and_compiles_nothing_later(peer, launch, tmp_path):
+    done = tmp_path / "done"
+    peer.hear(DiagnosticArray, "/diagnostics")
+    remap = ("-r", "__node:=slow", "-r", "joint_states:=/slow/states")
+    options = ("acceleration:=differentiate", "stale_after:=30.0", "observe_wrench:=true")
+    process = launch(
+        MODULE, *COMMON, *options, arguments=remap, code=COMPILING.format(path=str(done))
+    )
+    array = peer.diagnostics("/slow")
+    assert array.status[0].message.startswith("compiling")
+    assert array.status[0].level == b"\x01"
+    assert not peer.node.count_subscribers("/slow/states")
+    done.touch()
+    twin = Twin(peer, process, "slow").ready()
+    for velocity in ((), (0.0, 0.0, 0.0)):
+        twin.since(twin.stream(WINDOW + 2, velocity=velocity, effort=(0.1, 0.2, 0.3)))
+    assert not twin.diagnostics().status[0].message.startswith("compiling")
+    assert "loaded late" not in process.output
+
+
 class TestRequests:
     @pytest.mark.parametrize("kind", STRANGE)
     def test_a_parameter_of_no_type_is_refused_and_the_next_one_is_set(self, twin, kind):

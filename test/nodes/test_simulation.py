@@ -7,12 +7,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from delta_dynamics import inverse_dynamics
+from delta_dynamics import inverse_dynamics, mass_matrix
 from delta_dynamics.simulation import (
     MachineSettings,
     PayloadEvent,
     Simulation,
     WrenchSignal,
+    error_growth,
     tuned,
 )
 from pkm_twin.errors import MessageError, ParameterError
@@ -230,3 +231,81 @@ def test_where_the_model_ends_the_machine_stands_until_it_is_put_back():
 def test_a_start_beyond_the_limits_is_refused():
     with pytest.raises(ParameterError, match="start, arm_2"):
         simulation(start=np.array([0.0, 2.0, 0.0]))
+
+
+def home_of(robot):
+    return robot.inverse(robot.home())
+
+
+def controlled(robot, bandwidth, **changes):
+    """A machine whose drives have no limits, under position control."""
+    free = np.full(robot.joints_count, np.inf)
+    settings = MachineSettings(home_of(robot), free, *tuned(robot, bandwidth), **changes)
+    return Simulation(robot, settings, BEGIN)
+
+
+def growth_in_time(robot, machine):
+    """Factor by which a small error grows in a period, simulated."""
+    rng = np.random.default_rng(2)
+    q, n = machine.settings.start, robot.joints_count
+    point = SimpleNamespace(
+        positions=q, velocities=0 * q, accelerations=0 * q, effort=0 * q,
+        time_from_start=SimpleNamespace(sec=0, nanosec=0),
+    )  # fmt: skip
+    machine.__dict__["stable_share"] = 1.0
+    machine.trajectory(
+        SimpleNamespace(
+            header=SimpleNamespace(stamp=SimpleNamespace(sec=0, nanosec=0)),
+            joint_names=robot.joint_names, points=[point],
+        )
+    )  # fmt: skip
+    machine.plant.qd = 1e-9 * rng.normal(size=n)
+    sizes = [0.0]
+    while len(sizes) < 60 and sizes[-1] < 1e-4:
+        machine.advance()
+        sizes.append(np.linalg.norm(machine.plant.qd) + np.linalg.norm(machine.plant.q - q))
+    half = len(sizes) // 2
+    return (sizes[-1] / sizes[half]) ** (1.0 / (len(sizes) - 1 - half))
+
+
+@pytest.mark.parametrize("name", ["delta_cu", "prru"])
+@pytest.mark.parametrize("changes", [{}, {"delay": 0.02}])
+@pytest.mark.parametrize("bandwidth", [2.0, 20.0])
+def test_errors_of_the_position_control_grow_by_the_spectral_radius(name, changes, bandwidth):
+    """Of the linear loop, against the simulated machine; friction and weight left out."""
+    robot = load(name).changed(friction={"viscous": 0.0, "coulomb": 0.0}, gravity=[0.0, 0.0, 0.0])
+    machine = controlled(robot, bandwidth, period=0.01, **changes)
+    want = error_growth(mass_matrix(robot, machine.settings.start), machine.settings)
+    assert growth_in_time(robot, machine) == pytest.approx(want, rel=0.1)
+
+
+@pytest.mark.parametrize("name", ["delta_cu", "five_bar", "prru"])
+def test_every_pair_of_period_and_bandwidth_follows_a_trajectory_or_rejects_it(make, name):
+    """And a bandwidth that is stable is not rejected by far."""
+    robot = load(name)
+    home, turn = home_of(robot), np.array([1.0, -1.0, 1.0])[: robot.joints_count]
+    x = np.linspace(0.0, 1.0, 41)
+    way = np.array([6.0, -15.0, 10.0, 0.0, 0.0, 0.0])
+    reach = 0.05 * np.where(np.array(robot.joint_units) == "m", robot.size, 1.0) * turn
+    followed = 0
+    for period in (1e-3, 1e-2, 4e-2):
+        seconds = 20.0 * period
+        rows = [np.outer(np.polyval(np.polyder(way, k), x) / seconds**k, reach) for k in range(3)]
+        q, qd, qdd = home + rows[0], rows[1], rows[2]
+        times = [round(t * SECOND) for t in x * seconds]
+        message = make.trajectory(robot.joint_names, times, q, qd, qdd)
+        for point, effort in zip(message.points, inverse_dynamics(robot, q, qd, qdd), strict=True):
+            point.effort = effort.tolist()
+        for turns in (0.003, 0.03, 0.3, 3.0):
+            machine = controlled(robot, turns / period / (2.0 * np.pi), period=period)
+            try:
+                machine.trajectory(message)
+            except MessageError as error:
+                assert error.reason == "unstable control"
+                assert machine.trajectories.rejected[error.reason] == 1
+                assert machine.stable_share * turns < 1.0
+                continue
+            followed += 1
+            rates = np.array([np.abs(s.qd) for s in go(machine, 40)]).max(0)
+            assert (rates < 1.5 * np.abs(qd).max(0)).all(), (period, turns)
+    assert followed >= 6

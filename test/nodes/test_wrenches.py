@@ -274,6 +274,33 @@ class TestTorques:
             self.answer(core, 0)
 
 
+@pytest.mark.parametrize("carries", [True, False])
+def test_a_stream_has_the_torques_of_its_motion_at_any_rate(make, carries):
+    """A sine of 1 Hz by the default window, under a load; each rate after another in one core."""
+    settings = Settings(differentiate=True, stale_after=0.5, recovery_count=1)
+    window = WrenchWindow(WrenchReader(WrenchSettings()), SECOND, "stop", 2, settings.window)
+    robot, now, push = load("delta_cu"), NOW, np.array([3.0, -2.0, 5.0, 0, 0, 0])
+    core = Feedforward(robot, settings, window)
+    turn, reach = 2.0 * np.pi, np.array([0.2, -0.15, 0.1])
+    for rate in (200, 1000, 100):
+        now += SECOND
+        results = []
+        for i in range(rate):
+            stamp = now + i * SECOND // rate
+            q, qd = 0.2 + reach * np.sin(turn * i / rate), reach * turn * np.cos(turn * i / rate)
+            pushed = push * np.sin(turn * i / rate)
+            core.wrenches.take(make.wrench(pushed, stamp=stamp), stamp)
+            message = make.joint_state(robot.joint_names, q, qd if carries else (), qd, stamp=stamp)
+            answer = core.joint_state(message, stamp)
+            if answer is not None:
+                exact = inverse_dynamics(robot, q, qd, turn**2 * (0.2 - q), answer.wrench)
+                results.append(np.concatenate([answer.effort - exact, answer.wrench - pushed]))
+        now += SECOND
+        assert len(results) >= rate - 25
+        assert np.abs(results)[:, :3].max() < 0.01 * np.abs(exact).max()
+        assert np.abs(results)[:, 3:].max() < 0.01 * push.max()
+
+
 def test_a_cut_is_no_residual():
     """Of the milling bag's first seconds."""
     bag = REPOSITORY / "bags" / "prru_milling.mcap"

@@ -4,8 +4,8 @@
 import numpy as np
 import pytest
 
-from pkm_twin.apps.check import residuals
 from pkm_twin.apps.recorded import read_recording
+from pkm_twin.apps.recorded_motion import predicted
 from pkm_twin.apps.view import texts
 from pkm_twin.apps.view.live import SPAN, Live
 from pkm_twin.apps.view.timeline import POINTS, Timeline
@@ -30,9 +30,10 @@ def milling(tmp_path_factory):
     return read_recording(rewrite(MILLING, path, seconds=0.4))
 
 
-def test_the_time_line_has_what_check_judges(recording):
+def test_the_time_line_has_a_node_s_residual(recording):
     line = Timeline.of(recording)
-    residual, used = residuals(recording)
+    efforts, used = predicted(recording)
+    residual = recording.effort - efforts
     assert line.end == recording.time[-1]
     for k in np.flatnonzero(used)[:: len(used) // 7]:
         at = line.at(line.time[k] + 1e-5)

@@ -7,7 +7,7 @@
 in tools/cell_trial/topic_hardware. Of both, the references that the controller has followed go to a
 running delta_dynamics as a JointTrajectory, and its efforts are compared with the controller's.
 ``beyond``: mock hardware, and a trajectory through a position limit: the controller holds, and
-after its hold_time the chain is deactivated.
+after its hold_time the chain is deactivated and the gravity controller carries the machine.
 
 Needs a sourced Jazzy workspace with pkm_twin, ros2_control, joint_trajectory_controller and the
 package that ``pkm-twin export ros2-control ROBOT`` wrote; for ``sim`` also pkm_topic_hardware.
@@ -33,7 +33,7 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from delta_dynamics import inverse_dynamics
 from pkm_twin import Robot, load
-from pkm_twin.export.ros2_control import CONTROLLER, TRAJECTORIES, package_name
+from pkm_twin.export.ros2_control import CONTROLLER, GRAVITY, TRAJECTORIES, package_name
 
 MOCK = "mock_components/GenericSystem"
 HARDWARE = {"mock": MOCK, "sim": "pkm_topic_hardware/TopicSystem", "beyond": MOCK}
@@ -89,6 +89,9 @@ class Chain:
         self.states = other.hear(
             JointTrajectoryControllerState, f"/{CONTROLLER}/controller_state", 50000
         )
+        self.fallen = other.hear(
+            JointTrajectoryControllerState, f"/{GRAVITY}/controller_state", 50000
+        )
         self.counts = other.hear(DiagnosticArray, "/diagnostics", 1000)
         self.send = other.node.create_publisher(
             JointTrajectory, f"/{TRAJECTORIES}/joint_trajectory", QoSProfile(depth=10)
@@ -106,10 +109,10 @@ class Chain:
         """
         share = Path(get_package_share_directory(package_name(self.robot)))
         sections = yaml.safe_load((share / "config" / "controllers.yaml").read_text())
-        sections["joint_state_broadcaster"] = {"ros__parameters": {}}
+        sections["/**/joint_state_broadcaster"] = {"ros__parameters": {}}
         for section in sections.values():
             section["ros__parameters"]["use_sim_time"] = True
-        sections["controller_manager"]["ros__parameters"]["update_rate"] = 200
+        sections["/**/controller_manager"]["ros__parameters"]["update_rate"] = 200
         file = Path(tempfile.mkdtemp()) / "controllers.yaml"
         file.write_text(yaml.safe_dump(sections))
         return file
@@ -157,8 +160,17 @@ class Chain:
             f"beyond: held {robot.limits.position[0, 1] - held[0]:.1e} before the limit, "
             f"effort less that of the weight {np.abs(found - weight).max():.1e}"
         )
+        self.fallen.clear()
         self.other.spin(3.0)
         self.report()
+        state = self.fallen[-1]
+        at = robot.controller.positions(np.array(state.feedback.positions))
+        weight = inverse_dynamics(robot, at, 0.0 * at, 0.0 * at)
+        carried = robot.controller.efforts(np.array(state.output.effort))
+        print(
+            f"beyond: {GRAVITY} gives the weight at the measured position, peak "
+            f"{np.abs(weight).max():.4g}, difference {np.abs(carried - weight).max():.1e}"
+        )
         print(_output("ros2", "control", "list_controllers"))
 
     def report(self) -> None:

@@ -291,7 +291,7 @@ the diagonal with solids whose end sections are rigid and therefore cannot contr
 
 def _paper_rows(rows: PaperRows, links: dict[str, Links], judge: Judge) -> str:
     lines = []
-    names = ("dx, um", "dy, um", "dz, um", "rx, urad", "ry, urad", "rz, urad")
+    names = ("dx, µm", "dy, µm", "dz, µm", "rx, µrad", "ry, µrad", "rz, µrad")
     for k, name in enumerate(names):
         cells = []
         for c in range(2):

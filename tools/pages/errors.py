@@ -99,6 +99,10 @@ REASONS = {
     "too short": ("too few points to differentiate", "send at least 3 points"),
     "transform": ("no transform for the sensor", "publish it, or use `sensor.xyz`, `sensor.rpy`"),
     "uneven stamps": ("stamps are too uneven to differentiate", "check the sender's timing"),
+    "unstable control": (
+        "the position control of `machine_sim` is unstable at its period",
+        "set `bandwidth` as the message says, or a shorter `period`",
+    ),
     "unknown joint": ("a trajectory has a joint that the robot lacks", "see `extra_joints`"),
     "unreachable": ("the joint positions cannot be assembled", "check the robot file and offsets"),
     "zero stamp": ("the stamp is zero", "stamp the message, or set `accept_zero_stamp`"),

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
@@ -30,6 +31,8 @@ class States:
     wrench: Array
     drawn: int
     """How many positions were drawn; the others are out of reach, near a singularity or folded."""
+    skipped: int
+    """How many of these only the twin does not reach: on its way from home is a singularity."""
 
 
 def ranges(judge: Maximal) -> Array:
@@ -55,16 +58,22 @@ def extent(judge: Maximal) -> float:
     return float(np.linalg.norm(np.ptp(np.array(points), axis=0)) / 2) or 1.0
 
 
-def random_states(judge: Maximal, rng: np.random.Generator, count: int) -> States:
+def random_states(
+    judge: Maximal,
+    rng: np.random.Generator,
+    count: int,
+    reaches: Callable[[Array], bool] = lambda _: True,
+) -> States:
     """States inside the limits, connected to home, clear of singularities.
 
     Rates of the order of the range in a second, wrenches of the order of the machine's weight.
 
+    :param reaches: whether the twin reaches joint positions, shape (n,).
     :raises UnfitError: fewer than ``count`` in twenty times as many draws.
     """
     low, high = ranges(judge).T
     found: list[Array] = []
-    drawn = 0
+    drawn = skipped = 0
     while len(found) < count:
         if drawn == 20 * count:
             raise UnfitError(f"only {len(found)} of {drawn} positions in the limits can be judged")
@@ -72,14 +81,16 @@ def random_states(judge: Maximal, rng: np.random.Generator, count: int) -> State
         q = rng.uniform(low, high)
         try:
             state = judge.assemble(q)
-            if min(state.least, state.pose) >= CLEAR:
-                found.append(q)
         except UnfitError:
             continue
+        if min(state.least, state.pose) >= CLEAR:
+            good = reaches(q)
+            skipped += not good
+            found += [q] if good else []
     machine, n = judge.machine, len(low)
     span = high - low
     weight = 1.0 + 9.81 * sum(body.mass for body in machine.bodies.values())
     wrench = rng.normal(size=(count, 6)) * weight
     wrench[:, 3:] *= extent(judge)
     qd, qdd = (rng.normal(size=(count, n)) * span * factor for factor in (2.0, 10.0))
-    return States(np.array(found), qd, qdd, wrench, drawn)
+    return States(np.array(found), qd, qdd, wrench, drawn, skipped)

@@ -81,8 +81,8 @@ def load(numbers: Numbers) -> str:
         rows.append(
             _row(
                 axis,
-                _value(f"deflection_{k}", float(moved[k]), "um"),
-                _value(f"deflection_{k + 3}", float(moved[k + 3]), "urad"),
+                _value(f"deflection_{k}", float(moved[k]), "µm"),
+                _value(f"deflection_{k + 3}", float(moved[k + 3]), "µrad"),
             )
         )
     tie = " (tie)" if energy.tie else ""

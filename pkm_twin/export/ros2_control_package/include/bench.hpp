@@ -3,6 +3,7 @@
 #ifndef @GUARD@__BENCH_HPP_
 #define @GUARD@__BENCH_HPP_
 
+#include <functional>
 #include <memory>
 #include <stdexcept>
 #include <string>
@@ -10,6 +11,7 @@
 #include <vector>
 
 #include "controller_interface/chainable_controller_interface.hpp"
+#include "controller_interface/controller_interface.hpp"
 #include "hardware_interface/loaned_command_interface.hpp"
 #include "hardware_interface/loaned_state_interface.hpp"
 #include "lifecycle_msgs/msg/state.hpp"
@@ -24,17 +26,27 @@ namespace @PACKAGE@
 constexpr Vector START{@START@};
 constexpr Vector RANGE{@RANGE@};
 
-/// The controller plugin between joints and references that the caller sets: what a controller
+/// A controller plugin between joints and references that the caller sets: what a controller
 /// manager does, without one.
+///
+/// prepare: called before the configuration.
 class Bench
 {
 public:
-  explicit Bench(std::vector<rclcpp::Parameter> parameters = {})
-  : loader_("controller_interface", "controller_interface::ChainableControllerInterface"),
-    controller_(loader_.createSharedInstance("@PACKAGE@/FeedforwardController"))
+  using Prepare = std::function<void(rclcpp_lifecycle::LifecycleNode &)>;
+
+  explicit Bench(
+    std::vector<rclcpp::Parameter> parameters = {},
+    const std::string & name = "FeedforwardController", const Prepare & prepare = {})
   {
     using hardware_interface::CommandInterface;
     using hardware_interface::StateInterface;
+    const std::string plugin = "@PACKAGE@/" + name;
+    if (chained_.isClassAvailable(plugin)) {
+      controller_ = chained_.createSharedInstance(plugin);
+    } else {
+      controller_ = single_.createSharedInstance(plugin);
+    }
     controller_interface::ControllerInterfaceParams params;
     params.controller_name = "feedforward_controller";
     params.update_rate = params.controller_manager_update_rate = 1000;
@@ -43,11 +55,16 @@ public:
     if (controller_->init(params) != controller_interface::return_type::OK) {
       throw std::runtime_error("init");
     }
+    if (prepare) {
+      prepare(*node());
+    }
     using State = lifecycle_msgs::msg::State;
     if (controller_->configure().id() != State::PRIMARY_STATE_INACTIVE) {
       throw std::runtime_error("configure");
     }
-    references_ = controller_->export_reference_interfaces();
+    if (controller_->is_chainable()) {
+      references_ = controller_->export_reference_interfaces();
+    }
     std::vector<hardware_interface::LoanedCommandInterface> commands;
     std::vector<hardware_interface::LoanedStateInterface> states;
     for (const char * kind : {"position", "velocity"}) {
@@ -74,7 +91,7 @@ public:
   bool activate(bool chained)
   {
     using State = lifecycle_msgs::msg::State;
-    return controller_->set_chained_mode(chained) &&
+    return (!controller_->is_chainable() || controller_->set_chained_mode(chained)) &&
            controller_->get_node()->activate().id() == State::PRIMARY_STATE_ACTIVE;
   }
   void deactivate() {controller_->get_node()->deactivate();}
@@ -102,8 +119,11 @@ public:
   rclcpp_lifecycle::LifecycleNode::SharedPtr node() const {return controller_->get_node();}
 
 private:
-  pluginlib::ClassLoader<controller_interface::ChainableControllerInterface> loader_;
-  std::shared_ptr<controller_interface::ChainableControllerInterface> controller_;
+  pluginlib::ClassLoader<controller_interface::ChainableControllerInterface> chained_{
+    "controller_interface", "controller_interface::ChainableControllerInterface"};
+  pluginlib::ClassLoader<controller_interface::ControllerInterface> single_{
+    "controller_interface", "controller_interface::ControllerInterface"};
+  std::shared_ptr<controller_interface::ControllerInterfaceBase> controller_;
   std::vector<hardware_interface::CommandInterface::SharedPtr> references_, commands_;
   std::vector<std::shared_ptr<hardware_interface::StateInterface>> states_;
 };

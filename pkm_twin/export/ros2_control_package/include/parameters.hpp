@@ -6,7 +6,6 @@
 #include <algorithm>
 #include <cmath>
 #include <limits>
-#include <set>
 #include <stdexcept>
 #include <string>
 #include <vector>
@@ -16,10 +15,17 @@
 
 #include "@PACKAGE@/feedforward.hpp"
 
-/// Parameters of the controller. What is wrong throws, with the parameter's name and what is right.
+/// Parameters of the controllers. What is wrong throws, with the parameter's name and what is right.
 namespace @PACKAGE@
 {
 using Node = rclcpp_lifecycle::LifecycleNode;
+
+/// What a controller does, and which parameters it has.
+enum class Role
+{
+  FOLLOWS,  // a reference
+  CARRIES,  // the weight at the measured position
+};
 
 inline double number(const rclcpp::Parameter & parameter)
 {
@@ -66,7 +72,7 @@ inline double within(const std::string & name, double value, double least, doubl
 }
 
 /// Declare all with the robot's numbers; the joints' names.
-inline std::vector<std::string> declare_parameters(Node & node)
+inline std::vector<std::string> declare_parameters(Node & node, Role role)
 {
   // Whole numbers are taken for floats.
   rcl_interfaces::msg::ParameterDescriptor any;
@@ -85,43 +91,63 @@ inline std::vector<std::string> declare_parameters(Node & node)
   if (joints.size() != JOINTS) {
     throw std::invalid_argument("joints: expected " + std::to_string(JOINTS) + " names");
   }
+  const bool follows = role == Role::FOLLOWS;
   for (std::size_t i = 0; i < JOINTS; ++i) {
-    add("gains." + joints[i] + ".p", 0.0);
-    add("gains." + joints[i] + ".d", 0.0);
-    add("limits." + joints[i] + ".lower", DRIVES[i].lower);
-    add("limits." + joints[i] + ".upper", DRIVES[i].upper);
-    add("limits." + joints[i] + ".effort", DRIVES[i].effort);
+    const std::string gains = "gains." + joints[i], limits = "limits." + joints[i];
+    add(gains + ".d", follows ? 0.0 : DRIVES[i].damping);
+    add(limits + ".effort", DRIVES[i].effort);
+    if (follows) {
+      add(gains + ".p", 0.0);
+      add(limits + ".lower", DRIVES[i].lower);
+      add(limits + ".upper", DRIVES[i].upper);
+    }
   }
   add("payload.mass", PAYLOAD.mass);
   add("payload.com", std::vector<double>(PAYLOAD.com.begin(), PAYLOAD.com.end()));
   add("payload.inertia", std::vector<double>(PAYLOAD.inertia.begin(), PAYLOAD.inertia.end()));
-  add("singularity_stop", Settings().singularity_stop);
+  // Near a singularity the weight still has its effort, up to the limits.
+  add("singularity_stop", follows ? Settings().singularity_stop : 0.0);
   add("hold_time", Settings().hold_time);
-  add("reference_timeout", 0.1);
   add("state_publish_rate", 50.0);
+  if (follows) {
+    add("reference_timeout", 0.1);
+  }
   return joints;
 }
 
 /// A misspelt joint would else keep its gain of zero without a word.
 inline void check_names(Node & node, const std::vector<std::string> & joints)
 {
-  std::set<std::string> known{"payload.mass", "payload.com", "payload.inertia"};
-  for (const std::string & joint : joints) {
-    for (const char * leaf : {"p", "d"}) {
-      known.insert("gains." + joint + "." + leaf);
-    }
-    for (const char * leaf : {"lower", "upper", "effort"}) {
-      known.insert("limits." + joint + "." + leaf);
-    }
-  }
   const auto & given = node.get_node_parameters_interface()->get_parameter_overrides();
   for (const auto & [name, value] : given) {
     const std::string group = name.substr(0, name.find('.'));
     const bool ours = group == "gains" || group == "limits" || group == "payload";
-    if (ours && known.count(name) == 0) {
+    if (ours && !node.has_parameter(name)) {
       throw std::invalid_argument(name + ": unknown parameter; the first joint is " + joints[0]);
     }
   }
+}
+
+/// Parameters of a payload, by the rule of the robot's file.
+inline Parameters read_payload(
+  double mass, const std::array<double, 3> & com, const std::array<double, 9> & inertia)
+{
+  Parameters result;
+  if (payload_parameters(mass, {}, {}, result) != 0) {
+    throw std::invalid_argument(
+            "payload.mass: " + std::to_string(mass) + ", expected 0 to " +
+            std::to_string(MAX_MASS) + " kg");
+  }
+  if (payload_parameters(mass, com, {}, result) != 0) {
+    throw std::invalid_argument(
+            "payload.com: expected numbers up to " + std::to_string(MAX_LENGTH) + " m");
+  }
+  if (payload_parameters(mass, com, inertia, result) != 0) {
+    throw std::invalid_argument(
+            "payload.inertia: expected a symmetric matrix whose principal moments are at least "
+            "zero, each at most the sum of the others");
+  }
+  return result;
 }
 
 /// The settings, with changes that are not made yet.
@@ -141,22 +167,23 @@ inline Settings read_settings(
       return within(name, number(get(name)), least, most);
     };
   Settings result;
+  result.lower.fill(-UNLIMITED);
+  result.upper.fill(UNLIMITED);
   for (std::size_t i = 0; i < JOINTS; ++i) {
-    result.p[i] = bounded("gains." + joints[i] + ".p", 0.0, MOST);
-    result.d[i] = bounded("gains." + joints[i] + ".d", 0.0, MOST);
-    const std::string limits = "limits." + joints[i];
-    result.lower[i] = bounded(limits + ".lower", -UNLIMITED, UNLIMITED);
-    result.upper[i] = bounded(limits + ".upper", result.lower[i], UNLIMITED);
+    const std::string gains = "gains." + joints[i], limits = "limits." + joints[i];
+    result.d[i] = bounded(gains + ".d", 0.0, MOST);
     result.effort[i] = bounded(limits + ".effort", 0.0, UNLIMITED);
+    if (node.has_parameter(gains + ".p")) {
+      result.p[i] = bounded(gains + ".p", 0.0, MOST);
+      result.lower[i] = bounded(limits + ".lower", -UNLIMITED, UNLIMITED);
+      result.upper[i] = bounded(limits + ".upper", result.lower[i], UNLIMITED);
+    }
   }
   result.singularity_stop = bounded("singularity_stop", 0.0, 1.0);
   result.hold_time = bounded("hold_time", 0.0, UNLIMITED);
-  const double mass = bounded("payload.mass", 0.0, MOST);
-  const auto com = numbers<3>(get("payload.com"));
-  const auto inertia = numbers<9>(get("payload.inertia"));
-  if (payload_parameters(mass, com, inertia, result.parameters) != 0) {
-    throw std::invalid_argument("payload: expected finite numbers");
-  }
+  result.parameters = read_payload(
+    number(get("payload.mass")), numbers<3>(get("payload.com")),
+    numbers<9>(get("payload.inertia")));
   return result;
 }
 }  // namespace @PACKAGE@

@@ -18,13 +18,15 @@ using Parameters = std::array<double, @MACRO@_PARAMETERS>;
 constexpr double UNLIMITED = std::numeric_limits<double>::infinity();
 
 /// An actuated joint. The controller's position is offset + factor * the model's.
-/// Limits are in the controller's numbers, friction is in the model's.
+/// Limits are in the controller's numbers, friction is in the model's. damping, in the controller's
+/// numbers, stops the drive's mass at home with a time constant of @STOP@ s.
 struct Drive
 {
   const char * name;
   double factor, offset;
   double lower, upper, effort;
   double viscous, coulomb;
+  double damping;
 };
 
 constexpr std::array<Drive, JOINTS> DRIVES{{
@@ -40,6 +42,9 @@ struct Payload
   std::array<double, 3> com;
   std::array<double, 9> inertia;
 };
+
+/// Bounds of a payload, kg and m, of its mass and the coordinates of its centre.
+constexpr double MAX_MASS = @MAXMASS@, MAX_LENGTH = @MAXLENGTH@;
 
 /// That of the robot's file.
 constexpr Payload PAYLOAD@PAYLOAD@;

@@ -40,7 +40,7 @@ public:
       read(*parameters, prefix + "inertia", load.inertia);
     }
     if (payload_parameters(load.mass, load.com, load.inertia, parameters_) != 0) {
-      throw std::invalid_argument("payload: expected finite numbers and a mass of at least 0");
+      throw std::invalid_argument(prefix + "*: expected the payload of a real body");
     }
     initialized_ = true;
   }

@@ -198,6 +198,99 @@ TEST_F(Plugins, parameters_change_while_it_runs_or_are_rejected)
   EXPECT_NEAR(bench.effort(0), before, CLOSE * (1e-3 + std::fabs(before)));
 }
 
+TEST_F(Plugins, a_payload_that_no_body_has_is_rejected)
+{
+  Bench bench;
+  const auto rejects = [&](const char * name, const auto & value) {
+      return !bench.node()->set_parameter({name, value}).successful;
+    };
+  EXPECT_TRUE(rejects("payload.mass", 1e300));
+  EXPECT_TRUE(rejects("payload.com", std::vector<double>{0.0, 1e300, 0.0}));
+  for (const double moment : {-1.0, 1e300, NaN}) {
+    EXPECT_TRUE(
+      rejects("payload.inertia", std::vector<double>{moment, 0, 0, 0, moment, 0, 0, 0, moment}));
+  }
+  EXPECT_TRUE(rejects("payload.inertia", std::vector<double>{1, 0, 0, 0, 1, 0, 0, 0, 3}));
+  EXPECT_TRUE(rejects("payload.inertia", std::vector<double>{1, 0, 0, 0.1, 1, 0, 0, 0, 1}));
+  EXPECT_FALSE(rejects("payload.inertia", std::vector<double>{1, 0, 0, 0, 1, 0, 0, 0, 2}));
+}
+
+TEST_F(Plugins, a_set_that_another_callback_rejects_has_no_effect)
+{
+  // Callbacks are asked from the last one added to the first one.
+  rclcpp::node_interfaces::OnSetParametersCallbackHandle::SharedPtr kept;
+  Bench bench(
+    {}, "FeedforwardController", [&](rclcpp_lifecycle::LifecycleNode & node) {
+      kept = node.add_on_set_parameters_callback(
+        [](const std::vector<rclcpp::Parameter> &) {
+          rcl_interfaces::msg::SetParametersResult result;
+          result.successful = false;
+          return result;
+        });
+    });
+  ASSERT_TRUE(bench.activate(true));
+  give(bench, motion(2));
+  EXPECT_FALSE(bench.node()->set_parameter({"payload.mass", PAYLOAD.mass + 1.0}).successful);
+  ASSERT_TRUE(bench.update(0.0, 1e-3));
+  const Vector wanted = efforts_of(motion(2));
+  expect_effort(bench, wanted, largest(wanted));
+}
+
+TEST_F(Plugins, gravity_is_that_of_the_measured_position_with_damping)
+{
+  for (const bool damped : {false, true}) {
+    const double d = 0.25;
+    std::vector<rclcpp::Parameter> gains{{"hold_time", 0.1}};
+    for (const Drive & drive : DRIVES) {
+      gains.emplace_back(std::string("gains.") + drive.name + ".d", damped ? d : 0.0);
+    }
+    Bench bench(gains, "GravityController");
+    ASSERT_TRUE(bench.activate(false));
+    expect_effort(bench, weight_at(START), largest(weight_at(START)));
+    Vector wanted;
+    for (int k = 0; k < 20; ++k) {
+      const Motion m = motion(k);
+      const Vector weight = weight_at(m.position);
+      for (std::size_t i = 0; i < JOINTS; ++i) {
+        bench.measure(i, m.position[i], m.velocity[i]);
+        wanted[i] = weight[i] - (damped ? d * m.velocity[i] : 0.0);
+      }
+      ASSERT_TRUE(bench.update(1e-3 * k, 1e-3));
+      expect_effort(bench, wanted, largest(wanted));
+    }
+    // Without a state the last weight is given for a while.
+    for (std::size_t i = 0; i < JOINTS; ++i) {
+      bench.measure(i, NaN, NaN);
+    }
+    const Vector last = weight_at(motion(19).position);
+    int good = 0;
+    while (good < 200 && bench.update(0.0, 1e-3)) {
+      ++good;
+      expect_effort(bench, last, largest(last));
+    }
+    EXPECT_NEAR(good, 100, 1);
+    bench.deactivate();
+    for (std::size_t i = 0; i < JOINTS; ++i) {
+      EXPECT_EQ(bench.effort(i), 0.0);
+    }
+  }
+}
+
+TEST_F(Plugins, gravity_is_damped_without_settings)
+{
+  Bench bench({}, "GravityController");
+  ASSERT_TRUE(bench.activate(false));
+  const Vector weight = weight_at(START);
+  Vector wanted;
+  for (std::size_t i = 0; i < JOINTS; ++i) {
+    bench.measure(i, START[i], RANGE[i]);
+    wanted[i] = weight[i] - DRIVES[i].damping * RANGE[i];
+    EXPECT_GT(DRIVES[i].damping, 0.0);
+  }
+  ASSERT_TRUE(bench.update(0.0, 1e-3));
+  expect_effort(bench, wanted, largest(wanted));
+}
+
 TEST_F(Plugins, what_cannot_be_assembled_is_not_activated)
 {
   Bench bench;

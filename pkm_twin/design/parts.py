@@ -1,0 +1,441 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Errors of a machine's parts, and where they take the bodies while the actuated joints are held.
+
+A part's error moves a joint's frame on one of its two bodies, or changes a length. Every body has
+six coordinates of its own; joints, rods and held drives are rows between two bodies:
+
+    A V + C e = 0
+
+with V the bodies' twists and e the errors, to first order; and Newton's method on the rows
+themselves for errors of any size. Where no V fulfils all rows, rigid parts cannot be assembled.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Container, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+
+from pkm_twin.codegen.arrays import Array
+from pkm_twin.errors import ParameterError, PkmTwinError, SingularityError, UnknownNameError
+from pkm_twin.machine.graph import BASE, Joint, rotation_about_z
+from pkm_twin.machine.joints import across, unit
+from pkm_twin.machine.places import full_keys
+from pkm_twin.robot.robot import SINGULARITY_BOUND, Robot
+
+CONSISTENT: Final = 1e-6
+"""Largest part of an error's rows that may stay open where the parts can be assembled."""
+CLOSED: Final = 1e-12
+"""Last correction of an assembly, of unit one."""
+CORRECTIONS: Final = 30
+POINTS: Final = 1e-3 * np.array([-2.0, -1.0, 1.0, 2.0])
+WEIGHTS: Final = np.array([1.0, -8.0, 8.0, -1.0]) / 12e-3
+"""Differences of fourth order: errors of a rigid part change its rows smoothly."""
+
+Effect = tuple[str, str]
+"""What moves, and of what: ``inner`` or ``outer`` (a joint's centre on that body), ``tilt`` (its
+frame on the inner body), ``start`` or ``end`` (of a rod), ``length``, ``offset``, ``origin``."""
+
+
+@dataclass(frozen=True)
+class Part:
+    """An error of a part, or of several parts alike.
+
+    ``effects``: by what moves, per unit of the error, base axes at home, shape (3,); of a length or
+    an offset (1,). ``text``: what the error is, in words. ``unit``: rad or m.
+    """
+
+    effects: Mapping[Effect, Array]
+    text: str
+    unit: str
+
+
+def part_of(robot: Robot, path: str) -> Part | None:
+    """The part that a path names; None where it names a number of the file.
+
+    :raises ParameterError: an entry of the machine without such an error.
+    """
+    keys = full_keys(path)
+    if keys[0] not in ("bodies", "joints", "rods", "limbs"):
+        return None
+    effects: dict[Effect, Array] = {}
+    texts, unit_ = [], ""
+    for kind, name, where, azimuth in robot.named(keys):
+        found = _effects(robot, kind, name, where, rotation_about_z(azimuth), path)
+        if found is None:
+            break
+        effects |= found[0]
+        texts.append(found[1])
+        unit_ = found[2]
+    if not effects and len(keys) > 1 and keys[0] != "limbs":
+        known = getattr(robot.graph, str(keys[0]))
+        if keys[1] not in known:
+            raise UnknownNameError(f"tolerance {path}", str(keys[1]), known)
+    if not effects:
+        raise ParameterError(
+            path, None, "a part: rods.NAME.length, bodies.NAME.length, joints.NAME.at[0..2], "
+            "joints.NAME.axis[0..1] or joints.NAME.offset, of all copies with limbs. before"
+        )  # fmt: skip
+    alike = ", and its copies alike" if len(texts) > 1 else ""
+    return Part(effects, texts[0] + alike, unit_)
+
+
+def _effects(
+    robot: Robot, kind: str, name: str, where: Sequence[str | int], turn: Array, path: str
+) -> tuple[dict[Effect, Array], str, str] | None:
+    """What one entry's error moves, in words, and its unit; None where it has none of that name."""
+    graph = robot.graph
+    match kind, *where:
+        case "rods", "length":
+            return {("length", name): np.ones(1)}, f"{name} longer", "m"
+        case "bodies", "length":
+            return _longer(robot, name, path), f"{name} longer", "m"
+        case "joints", "offset":
+            joint = graph.joints[name]
+            if not joint.actuated:
+                raise ParameterError(path, name, "an actuated joint")
+            return (
+                {("offset", name): np.ones(1)}, f"zero of {name}", "m" if joint.slides else "rad"
+            )  # fmt: skip
+        case "joints", ("at" | "axis") as what, int(k) if k < (3 if what == "at" else 2):
+            joint = graph.joints[name]
+            if joint.given:
+                raise ParameterError(path, name, "a joint that does not stand for others")
+            if what == "at":
+                moved = np.asarray(turn @ np.eye(3)[k])
+                return {("inner", name): moved}, f"centre of {name} on {joint.inner}", "m"
+            if not len(joint.axes):
+                raise ParameterError(path, joint.kind, "a joint with an axis")
+            if name in robot.without_point:
+                raise ParameterError(f"joints.{name}.at", None, "the point about which it tilts")
+            about = np.asarray(turn @ across(unit(turn.T @ joint.axes[0]))[k])
+            return {("tilt", name): about}, f"axis of {name} on {joint.inner}", "rad"
+    return None
+
+
+def _longer(robot: Robot, body: str, path: str) -> dict[Effect, Array]:
+    """All points of a body but its joint towards the base, along the line to their mean."""
+    graph = robot.graph
+    joints = [j for j in graph.joints.values() if not j.given]
+    far, ring = {BASE: 0}, [BASE]
+    for near in ring:
+        for joint in joints:
+            for one, other in ((joint.inner, joint.outer), (joint.outer, joint.inner)):
+                if one == near and other not in far:
+                    far[other] = far[near] + 1
+                    ring.append(other)
+    own = [j for j in joints if body in (j.inner, j.outer)]
+    towards = [j for j in own if min(far.get(b, 0) for b in (j.inner, j.outer)) < far.get(body, 0)]
+    if len(towards) != 1:
+        raise ParameterError(
+            path, ", ".join(j.name for j in towards) or None,
+            "a body with one joint towards the base; move the joints of others by joints.NAME.at",
+        )  # fmt: skip
+    start = towards[0]
+    if start.name in robot.without_point:
+        raise ParameterError(f"joints.{start.name}.at", None, f"the point where {body} begins")
+    moved: dict[Effect, Array] = {}
+    for joint in own:
+        if joint is not start:
+            moved["inner" if joint.inner == body else "outer", joint.name] = joint.at
+    for rod in graph.rods.values():
+        for side, end, on in zip(("start", "end"), rod.ends, (rod.inner, rod.outer), strict=True):
+            if on == body:
+                moved[side, rod.name] = end
+    if body == graph.platform:
+        moved["origin", body] = graph.origin
+    line = np.mean(list(moved.values()), 0) - start.at if moved else np.zeros(3)
+    if not float(np.linalg.norm(line)) > CONSISTENT * graph.size:
+        raise ParameterError(path, start.name, "a body with points apart from that joint")
+    return dict.fromkeys(moved, unit(line))
+
+
+class Row(NamedTuple):
+    """A scalar equation between two bodies, of unit one; arrays lead with the batch axes.
+
+    A unit of its multiplier is a force and a moment at ``point`` on ``outer``, the opposite on
+    ``inner``. ``part``: the joint or rod.
+    """
+
+    part: str
+    value: Array
+    inner: str
+    outer: str
+    point: Array
+    force: Array
+    moment: Array
+
+
+@dataclass(frozen=True)
+class Placed:
+    """Where bodies are: rotation from home (..., 3, 3) and place of the origin (..., 3) by name."""
+
+    rotation: dict[str, Array]
+    origin: dict[str, Array]
+
+    def moved(self, twists: Mapping[str, Array]) -> Placed:
+        """After displacements of the origin and small turns, shape (..., 6) each."""
+        rotation = {n: turned(v[..., 3:]) @ self.rotation[n] for n, v in twists.items()}
+        return Placed(rotation, {n: self.origin[n] + v[..., :3] for n, v in twists.items()})
+
+
+def turned(vector: Array) -> Array:
+    """Rotation by a vector's length about it, shape (..., 3, 3)."""
+    angle = np.linalg.norm(vector, axis=-1)[..., None, None]
+    x, y, z = np.moveaxis(vector, -1, 0)
+    o = np.zeros_like(x)
+    skew = np.moveaxis(np.array([[o, -z, y], [z, o, -x], [-y, x, o]]), (0, 1), (-2, -1))
+    half = np.sinc(angle / (2.0 * np.pi))
+    return np.asarray(np.eye(3) + np.sinc(angle / np.pi) * skew + 0.5 * half**2 * skew @ skew)
+
+
+def rotation_vector(rotation: Array) -> Array:
+    """The vector of :func:`turned`, of less than half a turn, shape (..., 3)."""
+    r = rotation
+    twice = np.stack(
+        [r[..., 2, 1] - r[..., 1, 2], r[..., 0, 2] - r[..., 2, 0], r[..., 1, 0] - r[..., 0, 1]], -1
+    )
+    sine = 0.5 * np.linalg.norm(twice, axis=-1)
+    angle = np.arctan2(sine, 0.5 * (np.trace(r, axis1=-2, axis2=-1) - 1.0))
+    return np.asarray(twice * 0.5 / np.sinc(angle / np.pi)[..., None], np.float64)
+
+
+class Assembly:
+    """A machine's bodies and rows at joint positions, with errors of its parts.
+
+    :param q: joint positions, shape (..., n). Errors as of :meth:`Robot.forward`.
+    """
+
+    def __init__(self, robot: Robot, q: Array) -> None:
+        self.robot, self.graph = robot, robot.graph
+        self.at, self.size = robot.engine.tree.at, float(robot.graph.size)
+        self.bodies = list(self.graph.bodies)
+        self.q, self.placed = q, Placed(*robot.placements(q))
+
+    # Rows, on bodies anywhere and errors of any size.
+
+    def rows(
+        self, placed: Placed, q: Array, errors: Mapping[Effect, Array],
+        only: Container[str] | None = None,
+    ) -> list[Row]:  # fmt: skip
+        """What joints, rods and drives hold.
+
+        :param errors: by what moves, shape (..., 3) or (..., 1); what is not there has none.
+        :param only: names of joints and rods; None is all.
+        """
+        found: list[Row] = []
+        names = list(self.graph.actuated)
+        for joint in self.graph.joints.values():
+            if joint.given or (only is not None and joint.name not in only):
+                continue
+            value = q[..., names.index(joint.name)] if joint.actuated else None
+            found += self._joint(joint, placed, value, errors)
+        for rod in self.graph.rods.values():
+            if only is not None and rod.name not in only:
+                continue
+            start, end = (
+                self._point(placed, body, at, errors.get((side, rod.name)))
+                for side, body, at in zip(
+                    ("start", "end"), (rod.inner, rod.outer), rod.ends, strict=True
+                )
+            )
+            apart = end - start
+            far = np.linalg.norm(apart, axis=-1)
+            longer = errors.get(("length", rod.name), np.zeros(1))[..., 0]
+            long = float(np.linalg.norm(rod.ends[1] - rod.ends[0])) + longer
+            along = apart / far[..., None]
+            found.append(
+                Row(
+                    rod.name, (far - long) / self.size, rod.inner, rod.outer, end,
+                    along / self.size, np.zeros(3),
+                )
+            )  # fmt: skip
+            if rod.pair is not None:
+                # Two rods as long as each other: their middle stands across the difference of the
+                # directions in which they are side by side on both bodies.
+                first, second = (
+                    np.asarray((np.eye(3) if body == BASE else placed.rotation[body]) @ rod.pair)
+                    for body in (rod.inner, rod.outer)
+                )
+                value = (along * (second - first)).sum(-1)
+                found.append(
+                    Row(
+                        rod.name, value, rod.inner, rod.outer, end, np.zeros(3),
+                        np.cross(second, along),
+                    )
+                )  # fmt: skip
+        return found
+
+    def _point(self, placed: Placed, body: str, at: Array, error: Array | None) -> Array:
+        local = at if error is None else at + error
+        if body == BASE:
+            return np.asarray(local)
+        arm = (placed.rotation[body] @ (local - self.at[body])[..., None])[..., 0]
+        return np.asarray(placed.origin[body] + arm)
+
+    def _joint(
+        self, joint: Joint, placed: Placed, value: Array | None, errors: Mapping[Effect, Array]
+    ) -> list[Row]:
+        a, b = joint.inner, joint.outer
+        first = self._point(placed, a, joint.at, errors.get(("inner", joint.name)))
+        point = self._point(placed, b, joint.at, errors.get(("outer", joint.name)))
+        apart, none = point - first, np.zeros(3)
+        inner, outer = (np.eye(3) if n == BASE else placed.rotation[n] for n in (a, b))
+        if ("tilt", joint.name) in errors:
+            inner = inner @ turned(errors["tilt", joint.name])
+        rows: list[Row] = []
+
+        def add(value: Array, force: Array, moment: Array, scale: float) -> None:
+            rows.append(Row(joint.name, value * scale, a, b, point, force * scale, moment * scale))
+
+        def angle(one: Array, other: Array, known: float = 0.0) -> None:
+            """A vector of the inner frame and one of the outer frame keep their cosine."""
+            e, u = (inner @ one[..., None])[..., 0], outer @ other
+            add((e * u).sum(-1) - known, none, np.cross(u, e), 1.0)
+
+        scale = 1.0 / self.size
+        for held in joint.constraints:
+            e = inner @ held.inner
+            if held.kind == "point":
+                for k in range(3):
+                    add(apart[..., k], np.eye(3)[k], none, scale)
+            elif held.kind == "plane":
+                add((e * apart).sum(-1), e, none, scale)
+            elif held.kind == "angle":
+                angle(held.inner, held.outer, float(held.inner @ held.outer))
+            else:
+                way = (e * apart).sum(-1)
+                x, y = (
+                    ((inner @ one)[..., None, :] @ (outer @ held.outer)[..., None])[..., 0, 0]
+                    for one in (held.outer, np.cross(held.inner, held.outer))
+                )
+                turn = np.arctan2(y, x)
+                turn = turn + 2.0 * np.pi * np.round((way / held.slide - turn) / (2.0 * np.pi))
+                add(way - held.slide * turn, e, -held.slide * e, scale)
+        if value is not None:
+            (freedom,) = joint.freedoms
+            goal = value - joint.home + errors.get(("offset", joint.name), np.zeros(1))[..., 0]
+            if freedom.turns:
+                mark = across(joint.axes[0])
+                s, c = np.sin(goal)[..., None], np.cos(goal)[..., None]
+                angle(c * mark[1] - s * mark[0], mark[0])
+            else:
+                e = inner @ joint.axes[0]
+                add((e * apart).sum(-1) - goal, e, none, scale)
+        return rows
+
+    # To first order.
+
+    def _matrix(self, rows: Sequence[Row]) -> Array:
+        """Derivatives of the rows by the bodies' twists of unit one, (..., rows, 6 bodies)."""
+        table = np.zeros((*self.q.shape[:-1], len(rows), 6 * len(self.bodies)))
+        for i, row in enumerate(rows):
+            for body, side in ((row.outer, 1.0), (row.inner, -1.0)):
+                if body != BASE:
+                    k = 6 * self.bodies.index(body)
+                    arm = row.point - self.placed.origin[body]
+                    table[..., i, k : k + 3] += side * self.size * row.force
+                    table[..., i, k + 3 : k + 6] += side * (np.cross(arm, row.force) + row.moment)
+        return table
+
+    @cached_property
+    def _rows(self) -> list[Row]:
+        """Without errors."""
+        return self.rows(self.placed, self.q, {})
+
+    @cached_property
+    def _factors(self) -> tuple[Array, Array]:
+        """Of the matrix: orthonormal columns and a triangle.
+
+        :raises SingularityError: the rows do not determine the bodies.
+        """
+        q, r = np.linalg.qr(self._matrix(self._rows))
+        sizes = np.abs(np.diagonal(r, axis1=-2, axis2=-1))
+        measure = sizes.min(-1) / sizes.max(-1)
+        if not (measure > SINGULARITY_BOUND).all():
+            k = int(np.argmin(measure))
+            state = np.round(self.q.reshape(-1, self.q.shape[-1])[k], 6).tolist()
+            bound = SINGULARITY_BOUND
+            raise SingularityError(f"the joint state {state}", (), float(np.min(measure)), bound)
+        return q, r
+
+    def _solved(self, values: Array) -> Array:
+        """Twists, of unit one, that take rows (..., rows, k) to zero in the least squares."""
+        q, r = self._factors
+        return np.asarray(-np.linalg.solve(r, q.swapaxes(-1, -2) @ values), np.float64)
+
+    def _slope(self, part: Part) -> Array:
+        """Derivatives of the rows by an error, shape (..., rows, 1), by differences."""
+        scale = self.size if part.unit == "m" else 1.0
+        moving, shape = {name for _, name in part.effects}, self.q.shape[:-1]
+        total: Any = 0.0
+        for point, weight in zip(POINTS, WEIGHTS, strict=True):
+            errors = {what: scale * point * vector for what, vector in part.effects.items()}
+            moved = iter(self.rows(self.placed, self.q, errors, moving))
+            values = [
+                np.broadcast_to(next(moved).value if row.part in moving else 0.0, shape)
+                for row in self._rows
+            ]
+            total = total + weight / scale * np.stack(values, -1)
+        return np.asarray(total[..., None], np.float64)
+
+    def platform(self, parts: Sequence[Part]) -> tuple[Array, Array]:
+        """How errors move the platform, and how much of each the bodies cannot follow, 0 to 1.
+
+        :returns: displacement of the reference point and small turn per unit of each error, base
+            axes, shape (..., 6, parts); greatest part of its rows that stays open, shape (parts,).
+        """
+        columns = np.concatenate([self._slope(part) for part in parts], -1)
+        found = self._solved(columns)
+        left = columns - self._factors[0] @ (self._factors[0].swapaxes(-1, -2) @ columns)
+        whole = np.maximum(np.linalg.norm(columns, axis=-2), np.finfo(float).tiny)
+        missed = (np.linalg.norm(left, axis=-2) / whole).reshape(-1, len(parts)).max(0)
+        name = self.graph.platform
+        k, rotation = 6 * self.bodies.index(name), self.placed.rotation[name]
+        arm = self._point(self.placed, name, self.graph.origin, None) - self.placed.origin[name]
+        moved, turn = self.size * found[..., k : k + 3, :], found[..., k + 3 : k + 6, :]
+        moved = moved + np.cross(turn, arm[..., None], axis=-2)
+        for column, part in enumerate(parts):
+            if ("origin", name) in part.effects:
+                moved[..., column] += rotation @ part.effects["origin", name]
+        return np.concatenate([moved, turn], -2), np.asarray(missed, np.float64)
+
+    # Of any size.
+
+    def displaced(self, errors: Mapping[Effect, Array]) -> Array:
+        """How far errors take the platform, by Newton's method on all rows.
+
+        :param errors: by what moves, shape (count, 3) or (count, 1). The state is a single one.
+        :returns: displacement of the reference point and rotation vector, base axes, (count, 6).
+        :raises PkmTwinError: parts with these errors cannot be assembled.
+        """
+        count = len(next(iter(errors.values())))
+        placed = Placed(
+            {n: np.tile(r, (count, 1, 1)) for n, r in self.placed.rotation.items()},
+            {n: np.tile(o, (count, 1)) for n, o in self.placed.origin.items()},
+        )
+        for _ in range(CORRECTIONS):
+            rows = self.rows(placed, self.q, errors)
+            values = np.stack([np.broadcast_to(row.value, (count,)) for row in rows])
+            step = self._solved(values)
+            twists = step.T.reshape(count, -1, 6) * ([self.size] * 3 + [1.0] * 3)
+            placed = placed.moved(dict(zip(self.bodies, np.moveaxis(twists, 1, 0), strict=True)))
+            last = float(np.abs(step).max())
+            if not last < 1.0:
+                break
+            if last < CLOSED:
+                left = float(np.abs(values).max())
+                if left > CONSISTENT:
+                    break
+                name, origin = self.graph.platform, self.graph.origin
+                there = self._point(placed, name, origin, errors.get(("origin", name)))
+                turn = placed.rotation[name] @ self.placed.rotation[name].T
+                moved = there - self._point(self.placed, name, origin, None)
+                return np.concatenate([moved, rotation_vector(turn)], -1)
+        raise PkmTwinError(
+            f"{self.robot.name}: rigid parts with errors of this size cannot be assembled at "
+            f"{np.round(self.q, 6).tolist()}"
+        )

@@ -1,0 +1,206 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Measured efforts against the model's, by the derivative, filter and noise of a fit.
+
+Nothing is fitted but how late the efforts are against the positions, as in a fit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Final
+
+import numpy as np
+
+from delta_dynamics.rest import beyond_friction, friction_reach, moving_rates
+from delta_dynamics.virtual_work import inverse_dynamics
+from pkm_twin.codegen.arrays import Array, Mask
+from pkm_twin.identification.fit_rows import BLOCK, Recorded, shaken_efforts
+from pkm_twin.identification.fit_signals import NOISE_BAND, SEGMENT, noise_of
+from pkm_twin.identification.judge import LOUD
+from pkm_twin.identification.plausible import LATEST
+from pkm_twin.identification.samples import Filtering, Track, by_blocks, low_pass, tracks
+from pkm_twin.robot.robot import Robot
+
+TURNS: Final = 5
+"""Robust passes for how late the efforts are."""
+HUBER: Final = 1.5
+"""Robust deviations up to which a residual counts with its square."""
+LOCAL: Final = 0.25
+"""Time over which a residual is judged by itself, s: a collision is shorter than a recording."""
+MORE: Final = 3.0
+"""And how many times the bound of the whole recording it may be there."""
+LIGHT: Final = 0.05
+"""Part of the greatest peak effort of its unit that a joint's peak is taken for at least."""
+
+
+@dataclass(frozen=True, eq=False)
+class Compared:
+    """Efforts of a recording in the band of its motion, k rows, n joints.
+
+    ``time``: (k,), s; ``measured``, ``expected``, ``residual``: (k, n), N m or N; ``raw``: the
+    residual before the filter; ``change``: of the efforts in time. ``noise``: standard deviation in
+    the band, ``peak``: of the model's efforts, (n,). ``late``: of the efforts against the
+    positions, taken out, s. ``starts``: the first rows of the pieces. ``tracks``: their motion
+    before the filter, and ``inner``, which part of it has rows.
+    """
+
+    time: Array
+    measured: Array
+    expected: Array
+    residual: Array
+    raw: Array
+    change: Array
+    noise: Array
+    peak: Array
+    late: float
+    period: float
+    starts: tuple[int, ...]
+    tracks: tuple[Track, ...]
+    inner: tuple[slice, ...]
+    how: Filtering
+
+    def filtered(self, columns: Sequence[Array]) -> Array:
+        """Signals of the tracks, (samples, m) each, filtered as the efforts are, shape (k, m)."""
+        one_by_one = replace(self.how, keep_every=1)
+        parts = [low_pass(column, self.period, one_by_one) for column in columns]
+        return np.concatenate(parts)
+
+    @property
+    def edge(self) -> float:
+        """How far the filter spreads a step in time, s."""
+        return 0.0 if self.how.cutoff is None else 1.0 / self.how.cutoff
+
+    @property
+    def rms(self) -> Array:
+        """Of the residual, shape (n,)."""
+        return np.asarray(np.sqrt(np.mean(self.residual**2, 0)), np.float64)
+
+    def limit(self, bound: float) -> Array:
+        """Largest good residual, RMS, shape (n,): a part of the peak, and not below the noise.
+
+        What is as large as the noise in the band explains the recording, as the verdict of a fit
+        has it.
+        """
+        return np.maximum(bound * self.peak, LOUD * self.noise)
+
+    def local(self) -> tuple[Array, Array]:
+        """The largest RMS over a short time, and the time of its middle, s, shape (n,) each."""
+        n = self.residual.shape[1]
+        worst, at = np.zeros(n), np.full(n, self.time[0])
+        width = max(1, round(LOCAL / self.period))
+        for begin, end in zip(self.starts, (*self.starts[1:], len(self.time)), strict=True):
+            some = min(width, end - begin)
+            total = np.cumsum(self.residual[begin:end] ** 2, 0)
+            total = np.concatenate([np.zeros((1, n)), total])
+            found = np.sqrt(np.maximum(total[some:] - total[:-some], 0.0) / some)
+            place = found.argmax(0)
+            more = found.max(0) > worst
+            worst = np.where(more, found.max(0), worst)
+            at = np.where(more, self.time[begin + place + some // 2], at)
+        return worst, at
+
+    def begins(self, limit: Array) -> float | None:
+        """When the residual first leaves the local bound of any joint, s; None: never.
+
+        Before the filter, which spreads a step in time.
+        """
+        away = np.abs(self.raw)
+        usual = 1.4826 * np.median(away, axis=0)
+        beyond = (away > MORE * limit + 4.0 * np.minimum(usual, limit)).any(1)
+        # Two in a row: one is noise's.
+        rows = np.flatnonzero(beyond[1:] & beyond[:-1])
+        return float(self.time[rows[0]]) if len(rows) else None
+
+    def good(self, bound: float) -> Mask:
+        """Which joints' efforts agree with the model, shape (n,)."""
+        limit = self.limit(bound)
+        return np.asarray((self.rms <= limit) & (self.local()[0] <= MORE * limit))
+
+
+def by_held(
+    robot: Robot, carried: Robot | None, track: Track, function: Callable[..., Array],
+    rates: Array | None = None,
+) -> Array:  # fmt: skip
+    """A function of robot, motion and wrench along a track, with the payload while it is held."""
+    qd = track.qd if rates is None else rates
+
+    def rows(machine: Robot, some: Mask) -> Array:
+        def block(part: slice) -> Array:
+            cut = [one[some][part] for one in (track.q, qd, track.qdd, track.wrench)]
+            return function(machine, *cut)
+
+        return by_blocks(int(some.sum()), BLOCK, block)
+
+    held = (track.held > 0.5) & (carried is not None)
+    made = np.zeros_like(track.q)
+    for machine, some in ((robot, ~held), (carried, held)):
+        if machine is not None and some.any():
+            made[some] = rows(machine, some)
+    return made
+
+
+def compare(
+    robot: Robot, recorded: Recorded, rates: tuple[Array, Array] | None = None
+) -> Compared | None:
+    """Compare a recording with the model; None where no piece of it is long enough.
+
+    :param recorded: ``carried`` and ``held`` tell of a payload.
+    :param rates: velocities and accelerations (k, n) that are known, to be used as they are.
+    """
+    r, reach = recorded, friction_reach(robot)
+    held = None if r.carried is None else r.held
+    pieces, how = tracks(r.time, r.q, r.effort, r.wrench, held, rates=rates)
+    if not pieces:
+        return None
+
+    def efforts(track: Track) -> Array:
+        qd = moving_rates(track.qd, ~track.moves(how), reach)
+        return by_held(robot, r.carried, track, inverse_dynamics, qd)
+
+    period, made, raw, inside = pieces[0].period, [], [], []
+    one_by_one: Any = replace(how, keep_every=1)
+    for track in pieces:
+        expected = efforts(track)
+        left = beyond_friction(track.effort - expected, ~track.moves(how), reach)
+        change = np.gradient(expected, period, axis=0)
+        smooth = low_pass(np.concatenate([expected, left, change], 1), period, one_by_one)
+        n, edge = left.shape[1], (len(left) - len(smooth)) // 2
+        inner = slice(edge, edge + len(smooth))
+        parts = [smooth[:, k * n : (k + 1) * n] for k in range(3)]
+        made.append([track.time[inner], *parts, left[inner], change[inner]])
+        raw.append(left)
+        inside.append(inner)
+    starts = np.cumsum([0, *(len(one[0]) for one in made[:-1])]).tolist()
+    time, expected, left, change, sharp, turn = (
+        np.concatenate(one) for one in zip(*made, strict=True)
+    )
+    late = _late(left, change)
+    longest = max(pieces, key=lambda track: len(track.time))
+    long = [one for one in raw if len(one) >= SEGMENT] or [max(raw, key=len)]
+    shaken = np.zeros_like(r.q) if rates is not None else shaken_efforts(r, longest, how, efforts)
+    density = noise_of(long, shaken, period, how)
+    passed = 1.0 if how.cutoff is None else min(1.0, 2.0 * NOISE_BAND * how.cutoff * period)
+    size = np.abs(expected).max(0)
+    units = np.array(robot.effort_units)
+    greatest = np.array([size[units == unit].max() for unit in units])
+    residual = left + late * change
+    return Compared(
+        time, expected + residual, expected, residual, sharp + late * turn, change,
+        density * np.sqrt(passed / period), np.maximum(size, LIGHT * greatest), late, period,
+        tuple(starts), tuple(pieces), tuple(inside), how,
+    )  # fmt: skip
+
+
+def _late(left: Array, change: Array) -> float:
+    """How late the efforts are, s, by residuals and the efforts' change (k, n) each."""
+    late, size = 0.0, np.maximum(np.sqrt(np.mean(change**2, 0)), 1e-300)
+    for _ in range(TURNS):
+        away = np.abs(left + late * change)
+        usual = np.maximum(1.4826 * np.median(away, axis=0), 1e-12 * size)
+        weight = np.minimum(1.0, HUBER * usual / np.maximum(away, 1e-300)) / usual**2
+        total = float(np.sum(weight * change**2))
+        if not total > 0.0:
+            return 0.0
+        late = float(np.clip(-np.sum(weight * left * change) / total, -LATEST, LATEST))
+    return late

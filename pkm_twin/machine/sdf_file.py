@@ -1,0 +1,550 @@
+# SPDX-License-Identifier: Apache-2.0
+"""An SDF model as links, joints and loop closures, as the SDFormat specification reads it.
+
+Versions 1.4 to 1.12: poses relative to frames, nested models, axes in any frame. The model stands
+as drawn where all joints are at zero. SDF has a graph of joints: a spanning tree is chosen, with
+fixed and actuated joints first, and the other joints close loops.
+"""
+
+from __future__ import annotations
+
+import re
+import xml.etree.ElementTree as ET
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from pkm_twin.codegen.arrays import Array
+from pkm_twin.errors import ParameterError, UnknownNameError, warn
+from pkm_twin.machine import urdf_xml
+from pkm_twin.machine.joints import TURN, TYPES
+from pkm_twin.machine.loop_tree import Closure, Joint, Link, LoopTree
+from pkm_twin.machine.motors import actuated_joints, read_beside
+from pkm_twin.machine.rotations import from_rpy
+from pkm_twin.machine.urdf_xml import Pose
+
+WORLD: Final = "world"
+"""The root's name."""
+MODEL: Final = "__model__"
+NEWEST: Final = (1, 12)
+OLDEST: Final = (1, 4)
+NEAR: Final = 1e-6
+"""Distance of two points that are one, m."""
+KINDS: Final = {
+    "fixed": "fixed", "revolute": "revolute", "continuous": "revolute", "prismatic": "prismatic",
+    "screw": "helical", "universal": "universal", "revolute2": "universal", "ball": "spherical",
+}  # fmt: skip
+"""SDF's joint types and ours."""
+FOREIGN: Final = re.compile(r"drake:.*(joint|constraint|bushing).*")
+"""Drake's own elements that make another machine."""
+WELDS: Final = {
+    "DetachableJoint": ("parent_link", "child_link"), "AttachLinks": ("parent", "child")
+}  # fmt: skip
+"""Gazebo's plugins that hold two links together as they are drawn, and where they name them."""
+
+
+@dataclass(frozen=True, eq=False)
+class Edge:
+    """A joint between two links, with its frame as drawn, in the world; axes in that frame."""
+
+    name: str
+    type: str
+    links: tuple[str, str]
+    place: Pose
+    axes: Array = field(default_factory=lambda: np.zeros((0, 3)))
+    limits: dict[str, Any] = field(default_factory=dict)
+    viscous: float = 0.0
+    coulomb: float = 0.0
+    pitch: float = 0.0
+
+    def joint(self, places: Mapping[str, Pose], parent: str) -> Joint:
+        """As a joint of the tree, outwards from one of its links."""
+        forward = parent == self.links[0]
+        child = self.links[1] if forward else self.links[0]
+        # The inner link against the outer one: the same number about the opposite axes.
+        axes = self.axes if forward else -self.axes[::-1]
+        return Joint(
+            self.name, self.type, parent, child, places[parent].inverse() @ self.place, axes,
+            self.limits, self.viscous, self.coulomb,
+            beyond=self.place.inverse() @ places[child], pitch=self.pitch,
+        )  # fmt: skip
+
+    def closure(self, places: Mapping[str, Pose]) -> Closure:
+        """As a joint that closes a loop.
+
+        :raises ParameterError: a screw.
+        """
+        kind = TYPES[self.type]
+        if kind.threaded():
+            raise ParameterError(f"joint.{self.name}.type", "screw", "a loop with other joints too")
+        first, second = (places[link].inverse() @ self.place for link in self.links)
+        axes = (self.axes[0], self.axes[-1]) if kind.count else None
+        cosine = float(self.axes[0] @ self.axes[1]) if kind.count == 2 else 0.0
+        return Closure(
+            self.name, self.type, self.links, (first, second), axes, self.viscous, self.coulomb,
+            cosine,
+        )  # fmt: skip
+
+
+def read(path: Path, top: ET.Element) -> LoopTree:
+    """Read an SDF file.
+
+    :param top: the file's top element; the path is for what stands beside the file.
+    :raises ParameterError: an element that is not supported, or is wrong, by name.
+    """
+    if any(str(part.tag).startswith("xacro:") for part in top.iter()):
+        raise ParameterError(str(path), "xacro elements", "an SDF: run xacro on this file first")
+    version = _version(top)
+    element, gravity = _model(path, top)
+    model = Model(element, version)
+    links = {WORLD: Link(WORLD, 0.0, np.zeros(3), np.zeros((3, 3)))}
+    links |= {name: _link(path, part, name) for name, part in model.all("link")}
+    places = {name: model.place(name) for name in links}
+    edges: dict[str, Edge] = {}
+    welded = welds(path, top, element.get("name", ""), places)
+    for edge in (*model.edges(path), *welded):
+        if edge.name in edges:
+            raise ParameterError(f"joint.{edge.name}", edge.name, "a unique name")
+        edges[edge.name] = edge
+    for name, _ in model.all("frame"):
+        owner = model.link(name)
+        if owner in links and name not in links:
+            links[name] = Link(name, 0.0, np.zeros(3), np.zeros((3, 3)))
+            places[name] = model.place(name)
+            own = f"{name}_frame"
+            edges[own] = Edge(own, "fixed", (owner, name), places[name])
+    if not any(WORLD in edge.links for edge in edges.values()):
+        held = model.link(MODEL)
+        warn(path, f"no joint holds the model in the world: link {held} is taken for the ground")
+        edges["world_fixed"] = Edge("world_fixed", "fixed", (WORLD, held), places[held])
+    types = {name: edge.type for name, edge in edges.items()}
+    actuated = actuated_joints(path, top, read_beside(path), types, effort_limited(edges))
+    joints, closures = spanned(edges, actuated, places)
+    for name in dict.fromkeys(links).keys() - {WORLD, *(joint.child for joint in joints)}:
+        raise ParameterError(f"link.{name}", None, "a joint that connects it")
+    return LoopTree(
+        element.get("name") or path.stem, WORLD, links, {joint.name: joint for joint in joints},
+        tuple(edge.closure(places) for edge in closures), actuated,
+        _gravity(path, model, gravity, edges), accuracy=urdf_xml.accuracy(
+            word for part in element.iter() if part.tag in ("pose", "xyz")
+            for word in (part.text or "").split()
+        ),
+    )  # fmt: skip
+
+
+def _version(top: ET.Element) -> tuple[int, int]:
+    text = top.get("version", "")
+    found = re.fullmatch(r"1\.(\d+)", text)
+    if not found or not OLDEST <= (1, int(found[1])) <= NEWEST:
+        raise ParameterError("sdf.version", text or None, "1.4 to 1.12")
+    return 1, int(found[1])
+
+
+def _model(path: Path, top: ET.Element) -> tuple[ET.Element, list[float] | None]:
+    """The only model that can move, and the world's gravity if the file has a world."""
+    worlds = top.findall("world")
+    gravity = None
+    for world in worlds:
+        stated = urdf_xml.single(world, "gravity", "world")
+        if stated is not None:
+            gravity = urdf_xml.vector(stated.text, "world.gravity", 3).tolist()
+    models = [one for root in (top, *worlds) for one in root.findall("model")]
+    moving = [one for one in models if not _flag(one, "static", False)]
+    if not moving:
+        for included in top.iter("include"):
+            raise _of_include(included)
+    if len(moving) != 1:
+        names = [one.get("name") for one in moving]
+        raise ParameterError(str(path), names, "one model that is not static")
+    return moving[0], gravity
+
+
+def _of_include(element: ET.Element) -> ParameterError:
+    uri = (element.findtext("uri") or "").strip()
+    return ParameterError("include", uri, "one file: `gz sdf -p FILE` writes includes out")
+
+
+def _gravity(
+    path: Path, model: Model, stated: list[float] | None, edges: Mapping[str, Edge]
+) -> list[float] | None:
+    """The world's gravity, or none where no link that can move has weight.
+
+    :raises ParameterError: only some have.
+    """
+    held = {WORLD}
+    bolts = [edge.links for edge in edges.values() if edge.type == "fixed"]
+    while reached := {end for pair in bolts if held & set(pair) for end in pair} - held:
+        held |= reached
+    weight = {name: _flag(part, "gravity", True) for name, part in model.all("link")}
+    moving = [name for name in weight if name not in held]
+    off = [name for name in moving if not weight[name]]
+    if off and len(off) < len(moving):
+        raise ParameterError(f"link.{off[0]}.gravity", "false", "all moving links alike")
+    if not off:
+        return stated
+    warn(path, "gravity is switched off on every link that can move")
+    return [0.0, 0.0, 0.0]
+
+
+def _flag(element: ET.Element, tag: str, default: bool) -> bool:
+    text = element.findtext(tag)
+    return default if text is None else urdf_xml.boolean(text, f"{element.get('name')}.{tag}")
+
+
+class Model:
+    """A model's frames by name, each relative to the model's own; ``::`` leads into nested ones."""
+
+    def __init__(self, element: ET.Element, version: tuple[int, int], outer: Model | None = None):
+        self.element, self.version, self.outer = element, version, outer
+        own = element.get("name", "")
+        self.prefix: str = "" if outer is None else f"{outer.prefix}{own}::"
+        self.parts: dict[str, ET.Element] = {}
+        for part in sorted(element, key=lambda part: part.tag == "joint"):
+            if part.tag in ("link", "joint", "frame", "model"):
+                # Until 1.6 a joint and a link could have one name; it meant the link.
+                name = urdf_xml.name(part, self.parts if version >= (1, 7) else ())
+                self.parts.setdefault(name, part)
+        nested = element.findall("model")
+        self.models = {str(one.get("name")): Model(one, version, self) for one in nested}
+        for one in element.findall("include"):
+            raise _of_include(one)
+        self._known: dict[str, Pose | None] = {}
+
+    def all(self, tag: str) -> Iterator[tuple[str, ET.Element]]:
+        """Elements of that kind, nested models' too, with their names."""
+        for part in self.element.findall(tag):
+            yield self.prefix + str(part.get("name")), part
+        for one in self.models.values():
+            yield from one.all(tag)
+
+    def _in(self, name: str, where: str) -> tuple[Model, str]:
+        """The nested model that a scoped name leads to, and the rest of the name."""
+        first, _, rest = name.partition("::")
+        if rest and first in self.models:
+            return self.models[first]._in(rest, where)
+        if name not in (MODEL, WORLD) and name not in self.parts:
+            raise UnknownNameError(where, name, [MODEL, WORLD, *self.parts])
+        return self, name
+
+    def place(self, name: str, where: str = "relative_to") -> Pose:
+        """A frame as drawn, in this model's; of the outermost model in the world.
+
+        :raises ParameterError: no such frame, or one that leads back to itself.
+        """
+        if self.outer is None:
+            return self.pose() @ self.local(name, where)
+        return self.local(name, where)
+
+    def pose(self) -> Pose:
+        """The model's frame in the outer model's, or in the world."""
+        found = self._posed(self.element, WORLD if self.outer is None else MODEL, self.outer)
+        placed = self.element.get("placement_frame")
+        return found @ self.local(placed, "placement_frame").inverse() if placed else found
+
+    def local(self, name: str, where: str) -> Pose:
+        """A frame in this model's."""
+        if name not in self._known:
+            self._known[name] = None
+            self._known[name] = self._local(name, where)
+        found = self._known[name]
+        if found is None:
+            raise ParameterError(
+                f"{self.prefix}{name}.pose", where, "frames that do not lead back to themselves"
+            )
+        return found
+
+    def _local(self, name: str, where: str) -> Pose:
+        model, own = self._in(name, where)
+        if model is not self:
+            scope, found = model, model.local(own, where)
+            while scope is not self and scope.outer is not None:
+                found, scope = scope.pose() @ found, scope.outer
+            return found
+        if name == MODEL:
+            return Pose()
+        if name == WORLD:
+            outside = Pose() if self.outer is None else self.outer.local(WORLD, where)
+            return self.pose().inverse() @ outside
+        part = self.parts[name]
+        if part.tag == "model":
+            return self.models[name].pose()
+        default = MODEL
+        if part.tag == "joint":
+            default = _end(part, "child")
+        elif part.tag == "frame":
+            default = part.get("attached_to") or MODEL
+        return self._posed(part, default, self)
+
+    def _posed(self, part: ET.Element, default: str, scope: Model | None) -> Pose:
+        where = f"{part.tag}.{part.get('name')}.pose"
+        stated = urdf_xml.single(part, "pose", where)
+        # ``frame`` is what ``relative_to`` was called until 1.6.
+        name = default
+        if stated is not None:
+            name = stated.get("relative_to") or stated.get("frame") or default
+        return (Pose() if scope is None else scope.local(name, where)) @ pose(stated, where)
+
+    def link(self, name: str, where: str = "attached_to") -> str:
+        """The link that a frame is attached to.
+
+        :raises ParameterError: none is found.
+        """
+        for _ in range(urdf_xml.MAX_DEPTH):
+            model, own = self._in(name, where)
+            if own == WORLD:
+                return WORLD
+            part = model.element if own == MODEL else model.parts[own]
+            if part.tag == "link":
+                return model.prefix + own
+            if part.tag == "model":
+                held = model if own == MODEL else model.models[own]
+                first = next((key for key, _ in held.all("link")), None)
+                named = part.get("canonical_link")
+                if named is None and first is None:
+                    raise ParameterError(f"model.{part.get('name')}", "no link", "a model of links")
+                return str(first) if named is None else held.link(named, "canonical_link")
+            nested = _end(part, "child") if part.tag == "joint" else part.get("attached_to", MODEL)
+            name = model.prefix.removeprefix(self.prefix) + (nested or MODEL)
+        raise ParameterError(where, name, "frames that do not lead back to themselves")
+
+    def edges(self, path: Path) -> Iterator[Edge]:
+        """The joints, nested models' too; the path is for warnings."""
+        for part in self.element.findall("joint"):
+            yield _edge(path, part, self)
+        for part in self.element:
+            if FOREIGN.fullmatch(part.tag):
+                raise ParameterError(part.tag, part.get("name"), "joints and closures of SDF alone")
+        for one in self.models.values():
+            yield from one.edges(path)
+
+
+def _end(joint: ET.Element, tag: str) -> str:
+    text = (joint.findtext(tag) or "").strip()
+    if not text:
+        raise ParameterError(f"joint.{joint.get('name')}.{tag}", None, "the name of a link")
+    return text
+
+
+def pose(element: ET.Element | None, where: str) -> Pose:
+    """What a ``<pose>`` says; an empty one is the identity."""
+    text = "" if element is None else (element.text or "").strip()
+    if element is None or not text:
+        return Pose()
+    turn = element.get("rotation_format", "euler_rpy")
+    if turn not in ("euler_rpy", "quat_xyzw"):
+        raise UnknownNameError(f"{where}.rotation_format", turn, ["euler_rpy", "quat_xyzw"])
+    values = urdf_xml.vector(text, where, 7 if turn == "quat_xyzw" else 6)
+    if turn == "quat_xyzw":
+        return Pose(urdf_xml.quaternion(values[3:], where), values[:3])
+    degrees = urdf_xml.boolean(element.get("degrees", "false"), f"{where}.degrees")
+    return Pose(from_rpy(np.radians(values[3:]) if degrees else values[3:]), values[:3])
+
+
+def _text(element: ET.Element | None, tag: str, where: str, default: float) -> float:
+    """A number that stands in an element of its own."""
+    stated = None if element is None else urdf_xml.single(element, tag, where)
+    if stated is None:
+        return default
+    return urdf_xml.number((stated.text or "").strip(), f"{where}.{tag}")
+
+
+def _link(path: Path, element: ET.Element, name: str) -> Link:
+    """Mass and inertia; what the file leaves out is 1 kg and 1 kg m2, as the format has it."""
+    where = f"link.{name}.inertial"
+    inertial = urdf_xml.single(element, "inertial", f"link.{name}")
+    if inertial is not None and urdf_xml.boolean(inertial.get("auto", "false"), f"{where}.auto"):
+        raise ParameterError(f"{where}.auto", "true", "a mass and an inertia as numbers")
+    if inertial is not None and inertial.find("fluid_added_mass") is not None:
+        raise ParameterError(f"{where}.fluid_added_mass", "given", "a machine in air")
+    mass = _text(inertial, "mass", where, 1.0)
+    if mass < 0.0:
+        raise ParameterError(f"{where}.mass", mass, "zero or more, kg")
+    moments = None if inertial is None else urdf_xml.single(inertial, "inertia", where)
+    missing = [key for key, part in (("mass", inertial), ("inertia", moments)) if part is None]
+    if missing:
+        warn(path, f"link {name} has no {' and no '.join(missing)}: SDF then has 1 kg and 1 kg m2")
+    xx, xy, xz, yy, yz, zz = (
+        _text(moments, key, f"{where}.inertia", float(key[1] == key[2]))
+        for key in ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+    )
+    at = pose(None if inertial is None else urdf_xml.single(inertial, "pose", where), where)
+    matrix = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+    return Link(name, mass, at.position, at.rotation @ matrix @ at.rotation.T)
+
+
+def _edge(path: Path, part: ET.Element, model: Model) -> Edge:
+    """A joint with its frame in the world."""
+    name = model.prefix + urdf_xml.name(part, ())
+    where = f"joint.{name}"
+    outer = model
+    while outer.outer is not None:
+        outer = outer.outer
+
+    def place(frame: str) -> Pose:
+        return outer.place(model.prefix + frame, where)
+
+    ends = [_end(part, tag) for tag in ("parent", "child")]
+    links = model.link(ends[0], f"{where}.parent"), model.link(ends[1], f"{where}.child")
+    if links[0] == links[1]:
+        raise ParameterError(where, links[0], "a joint between two links")
+    stated = urdf_xml.single(part, "pose", where)
+    named = None if stated is None else stated.get("relative_to") or stated.get("frame")
+    at = place(named or ends[1]) @ pose(stated, f"{where}.pose")
+    frame = model.parts.get(ends[0])
+    if frame is not None and frame.tag == "frame":
+        far = float(np.linalg.norm(place(ends[0]).position - at.position))
+        if far > NEAR:
+            warn(path, f"{where}: the frame {ends[0]} is drawn {far:.3g} m from the joint; "
+                 "a joint of SDF holds its links as they are drawn")  # fmt: skip
+    return joint_edge(path, part, name, links, at, lambda frame: place(frame).rotation,
+                      model.version)  # fmt: skip
+
+
+def joint_edge(
+    path: Path,
+    part: ET.Element,
+    name: str,
+    links: tuple[str, str],
+    place: Pose,
+    turn: Callable[[str], Array],
+    version: tuple[int, int] = NEWEST,
+) -> Edge:
+    """A ``<joint>`` whose frame is known.
+
+    :param turn: gives the rotation of a frame in the world by its name.
+    :raises ParameterError: what is not supported, by name.
+    """
+    where = f"joint.{name}"
+    if part.get("type") not in KINDS:
+        raise UnknownNameError(f"{where}.type", part.get("type"), KINDS)
+    kind = KINDS[str(part.get("type"))]
+    axes: list[Array] = []
+    found: dict[str, Any] = {"limits": {}}
+    tags = ("axis", "axis2")[: 0 if kind == "spherical" else TYPES[kind].count]
+    for tag in ("gearbox_ratio", "mimic"):
+        if part.find(f".//{tag}") is not None:
+            raise ParameterError(f"{where}.{tag}", f"<{tag}>", "joints without coupling")
+    viscous: list[float] = []
+    coulomb: list[float] = []
+    for tag in ("axis", "axis2"):
+        element = urdf_xml.single(part, tag, where)
+        if tag in tags:
+            axes.append(_axis(element, f"{where}.{tag}", place, turn, version))
+        dynamics = None if element is None else urdf_xml.single(element, "dynamics", where)
+        for values, key in ((viscous, "damping"), (coulomb, "friction")):
+            values.append(_text(dynamics, key, f"{where}.{tag}.dynamics", 0.0))
+            if values[-1] < 0.0:
+                raise ParameterError(f"{where}.{tag}.{key}", values[-1], "zero or more")
+        if _text(dynamics, "spring_stiffness", where, 0.0):
+            warn(path, f"the spring of joint {name} is ignored")
+        limit = None if element is None else urdf_xml.single(element, "limit", where)
+        if limit is not None and tag == "axis" and kind in ("revolute", "prismatic", "helical"):
+            stated = {child.tag: (child.text or "").strip() for child in limit}
+            # -1 is no limit.
+            stated = {k: v for k, v in stated.items() if k in ("lower", "upper") or v[:1] != "-"}
+            turns = "revolute" if kind == "helical" else kind
+            found["limits"] = urdf_xml.limits(stated, where, turns)
+    pitch = _pitch(part, where) if kind == "helical" else 0.0
+    return Edge(
+        name, kind, links, place, np.reshape(axes, (-1, 3)), viscous=max(viscous),
+        coulomb=max(coulomb), pitch=pitch, **found,
+    )  # fmt: skip
+
+
+def _pitch(part: ET.Element, where: str) -> float:
+    """Of a screw, m a rad: ``thread_pitch`` is rad/m of a left-handed one, its successor m/turn."""
+    if part.find("screw_thread_pitch") is not None or part.find("thread_pitch") is None:
+        return _text(part, "screw_thread_pitch", where, 1.0) / TURN
+    pitch = _text(part, "thread_pitch", where, 1.0)
+    if pitch == 0.0:
+        raise ParameterError(f"{where}.thread_pitch", pitch, "rad/m, not zero")
+    return -1.0 / pitch
+
+
+def _axis(
+    element: ET.Element | None,
+    where: str,
+    place: Pose,
+    turn: Callable[[str], Array],
+    version: tuple[int, int],
+) -> Array:
+    """A unit vector in the joint's frame."""
+    stated = None if element is None else urdf_xml.single(element, "xyz", where)
+    text = "0 0 1" if stated is None else stated.text
+    value = urdf_xml.vector(text, f"{where}.xyz", 3)
+    size = float(np.linalg.norm(value))
+    if not size > 1e-9:
+        raise ParameterError(f"{where}.xyz", value.tolist(), "a vector that is not zero")
+    frame = "" if stated is None else stated.get("expressed_in", "")
+    old = None if element is None else element.findtext("use_parent_model_frame")
+    if version <= OLDEST or (old and urdf_xml.boolean(old, f"{where}.use_parent_model_frame")):
+        frame = frame or MODEL
+    if frame:
+        return np.asarray(place.rotation.T @ turn(frame) @ value / size)
+    return value / size
+
+
+def welds(path: Path, top: ET.Element, model: str, places: Mapping[str, Pose]) -> Iterator[Edge]:
+    """What Gazebo's plugins hold together: two links of this model, as they are drawn.
+
+    :raises UnknownNameError: a parent link that is not there.
+    """
+    for plugin in top.iter("plugin"):
+        kind = (plugin.get("name") or "").rpartition("::")[2]
+        if kind not in WELDS:
+            continue
+        ends = [(plugin.findtext(tag) or "").strip() for tag in WELDS[kind]]
+        other = (plugin.findtext("child_model") or model).strip()
+        if other not in (model, MODEL):
+            warn(path, f"{kind} plugin: {ends[1]!r} of model {other!r} is not part of this machine")
+            continue
+        for tag, end in zip(WELDS[kind], ends, strict=True):
+            if end not in places:
+                raise UnknownNameError(f"plugin.{kind}.{tag}", end, places)
+        yield Edge("_".join(ends), "fixed", (ends[0], ends[1]), places[ends[1]])
+
+
+def effort_limited(edges: Mapping[str, Edge]) -> list[str]:
+    """Joints with an effort limit; where only some have one, these are motors."""
+    return [name for name, edge in edges.items() if "effort" in edge.limits]
+
+
+def spanned(
+    edges: Mapping[str, Edge], actuated: Sequence[str], places: Mapping[str, Pose]
+) -> tuple[list[Joint], list[Edge]]:
+    """A tree of joints from the world outwards, and the joints that close loops."""
+    group = {name: name for name in places}
+
+    def root(name: str) -> str:
+        while group[name] != name:
+            name = group[name]
+        return name
+
+    def rank(edge: Edge) -> tuple[bool, bool, int]:
+        return edge.type != "fixed", edge.name not in actuated, TYPES[edge.type].cost
+
+    hanging: dict[str, list[Edge]] = {name: [] for name in places}
+    closures = []
+    for edge in sorted(edges.values(), key=rank):
+        first, second = map(root, edge.links)
+        if first == second:
+            closures.append(edge)
+            continue
+        group[first] = second
+        for link in edge.links:
+            hanging[link].append(edge)
+    joints: list[Joint] = []
+    reached, level = {WORLD}, [WORLD]
+    while level:
+        for link in level:
+            for edge in hanging[link]:
+                if not reached.issuperset(edge.links):
+                    joints.append(edge.joint(places, link))
+                    reached |= set(edge.links)
+        level = [joint.child for joint in joints if joint.parent in level]
+    order = list(edges)
+    joints.sort(key=lambda joint: order.index(joint.name))
+    return joints, sorted(closures, key=lambda edge: order.index(edge.name))

@@ -1,0 +1,204 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Whether joints can have moved as their positions say: jumps, two publishers, missing samples.
+
+From one sample to the next a joint moves by its rate times the period. What it moves farther than
+its rates on both sides allow is a jump: a wrong sample of an encoder, or another publisher's. Where
+no rates are measured they are those of the steps around.
+
+Pure.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+
+from pkm_twin.codegen.arrays import Array, Mask
+from pkm_twin.streams.rest import ROBUST, SIGMAS
+
+SLACK: Final = 5e-3
+"""By how much stamps may be off, s: at the highest rate a joint may be so far from where it should
+be."""
+SHORT: Final = 0.01
+"""Longest time between samples over which the rates at its ends bound the move, s."""
+LATE: Final = 0.01
+"""By how much measured rates may be late, s."""
+AROUND: Final = 5
+"""Steps whose median is a rate, where none is measured."""
+GAP: Final = 3.5
+"""Periods between two samples whose move only the limits bound."""
+OFTEN: Final = 0.02
+"""Part of the steps that jump from which there may be two publishers."""
+PUBLISHER: Final = 0.05
+"""Part of the samples that is one publisher's at least."""
+BEFORE: Final = 4
+"""Samples before, of which one is of the same publisher."""
+FEW: Final = 0.9
+"""Part of the samples of which the largest rate is the motion's, not that of jumps."""
+QUINTILE: Final = 0.2533 * 6.0**0.5
+"""Of the sizes of second differences, over the noise's standard deviation."""
+APART: Final = 0.25
+"""By how much of a period a gap may miss a whole number of periods, where samples are missing."""
+
+
+def excess(move: float, low: float, high: float) -> float:
+    """How much farther a joint moved than bounds of its move allow, of the same unit."""
+    return max(move - high, low - move, 0.0)
+
+
+@dataclass(frozen=True)
+class Steps:
+    """Steps between the samples of a recording that are no motion of the machine.
+
+    ``jumps``: shape (k - 1, n). ``sizes``: how much farther each moved than its rates allow.
+    ``publishers``: how many samples each of two interleaved publishers sent; empty for one.
+    """
+
+    jumps: Mask
+    sizes: Array
+    publishers: tuple[int, ...]
+
+    @property
+    def first(self) -> list[tuple[int, int]]:
+        """Step and joint of each jump, the first of every run of steps."""
+        rows = np.flatnonzero(self.jumps.any(1))
+        return [(int(k), int(np.argmax(self.jumps[k] * self.sizes[k]))) for k in rows]
+
+
+def steps_of(time: Array, q: Array, qd: Array | None, limit: Sequence[float] | None) -> Steps:
+    """Judge the steps of a recording.
+
+    :param time: rising, shape (k,), s; q and qd, where it is measured, shape (k, n).
+    :param limit: largest rates, (n,), where they are known.
+    """
+    k, n = q.shape
+    if k < 2:
+        return Steps(np.zeros((0, n), np.bool_), np.zeros((0, n)), ())
+    span, move = np.diff(time)[:, None], np.diff(q, axis=0)
+    period = float(np.median(span))
+    rates = move / span
+    low, high = _bracket(qd, rates, period)
+    steps = np.abs(move)
+    tick = np.where(steps > 0.0, steps, np.inf).min(0)
+    tick = np.where(np.isfinite(tick), tick, 0.0)
+    speed = np.quantile(_nearest(q), FEW, axis=0) / period
+    if qd is not None:
+        speed = np.maximum(speed, np.quantile(np.abs(qd), FEW, axis=0))
+    floor = 2.0 * SIGMAS * _noise(q) + 2.0 * tick
+    off = SIGMAS * ROBUST * float(np.median(np.abs(span - period)))
+    slack = min(SLACK, max(period, off)) * speed + floor
+    near = span[:, 0] <= GAP * period
+    sizes = np.maximum(np.maximum(move - high * span, low * span - move), 0.0)
+    if qd is None:
+        # Rates of steps miss what happens within a few steps.
+        slack = slack + SIGMAS * np.quantile(sizes, FEW, axis=0)
+    sizes = np.where(near[:, None] & (sizes > slack), sizes, 0.0)
+    if limit is not None:
+        bound = 2.0 * np.asarray(limit)
+        beyond = np.maximum(steps - bound * span, 0.0)
+        sizes = np.maximum(sizes, np.where(beyond > SLACK * np.asarray(limit), beyond, 0.0))
+    jumps = sizes > 0.0
+    publishers: tuple[int, ...] = ()
+    if np.mean(jumps.any(1)) > OFTEN or (qd is None and _alternates(move, slack)):
+        publishers = _publishers(q, floor + BEFORE * period * speed)
+    return Steps(jumps, sizes, publishers)
+
+
+def _nearest(q: Array) -> Array:
+    """By how much each sample is apart from the nearest of those before, shape (k - 1, n).
+
+    Of two publishers one of them is the same one's.
+    """
+    lags = [np.abs(q[lag:] - q[:-lag]) for lag in range(1, min(BEFORE, len(q) - 1) + 1)]
+    least = lags[0].copy()
+    for lag, apart in enumerate(lags[1:], 1):
+        least[lag:] = np.minimum(least[lag:], apart)
+    return least
+
+
+def _noise(q: Array) -> Array:
+    """Standard deviation of the positions' noise, (n,), of one publisher or of each of two."""
+    found = np.full(q.shape[1], np.inf)
+    for lag in (1, 2):
+        if len(q) > 2 * lag:
+            bent = np.abs(q[2 * lag :] - 2.0 * q[lag:-lag] + q[: -2 * lag])
+            found = np.minimum(found, np.quantile(bent, 0.2, axis=0) / QUINTILE)
+    return np.where(np.isfinite(found), found, 0.0)
+
+
+def _bracket(qd: Array | None, rates: Array, period: float) -> tuple[Array, Array]:
+    """Least and greatest rates around each step, shape (k - 1, n) each."""
+    if qd is None:
+        # Of the steps before and of those after, so that one that jumps is in neither.
+        wide = np.pad(rates, ((AROUND, AROUND), (0, 0)), mode="edge")
+        around = np.median(sliding_window_view(wide, AROUND, axis=0), -1)
+        before, after = around[: len(rates)], around[AROUND + 1 :]
+        return np.minimum(before, after), np.maximum(before, after)
+    reach = min(max(1, round(LATE / period)), len(qd) - 1)
+    wide = np.pad(qd, ((reach - 1, reach - 1), (0, 0)), mode="edge")
+    windows = sliding_window_view(wide, 2 * reach, axis=0)
+    return windows.min(-1), windows.max(-1)
+
+
+def _alternates(move: Array, slack: Array) -> bool:
+    """Whether steps there and back are many: medians of them say nothing."""
+    back = np.abs(move[1:] + move[:-1]) < 0.1 * np.abs(move[1:])
+    return bool(np.mean((back & (np.abs(move[1:]) > 4.0 * slack)).any(1)) > OFTEN)
+
+
+def _publishers(q: Array, slack: Array) -> tuple[int, ...]:
+    """Samples of two tracks that are each smooth, where the samples are from two; else nothing."""
+    scale = 1.0 / np.maximum(slack, 1e-300)
+    rows = (q * scale).tolist()
+    last, counts, seen, jumps = [rows[0]], [1], [0], 0
+    for k, row in enumerate(rows[1:], 1):
+        far = [max(abs(a - b) for a, b in zip(row, other, strict=True)) for other in last]
+        nearest = far.index(min(far))
+        if far[nearest] > max(1.0, (k - seen[nearest]) / BEFORE):
+            if len(last) == 1:
+                last.append(row)
+                counts.append(1)
+                seen.append(k)
+                continue
+            jumps += 1
+        last[nearest], seen[nearest] = row, k
+        counts[nearest] += 1
+    if len(counts) < 2 or min(counts) < PUBLISHER * len(rows) or jumps > OFTEN * len(rows):
+        return ()
+    return tuple(counts)
+
+
+@dataclass(frozen=True)
+class Sampling:
+    """Period of a recording, s, and how many samples are missing of how many that there should be.
+
+    ``missing`` is None where the samples have no common period.
+    """
+
+    period: float
+    expected: int
+    missing: int | None
+
+
+def sampling_of(time: Array) -> Sampling:
+    """The period of the samples and how many are missing.
+
+    :param time: rising, shape (k,), k 2 or more, s.
+    """
+    spans = np.diff(time)
+    short = spans[spans <= 1.5 * np.quantile(spans, 0.1)]
+    period = float(np.median(short))
+    for _ in range(3):
+        whole = np.maximum(np.round(spans / period), 1.0)
+        period = float(spans.sum() / whole.sum())
+    long = spans / period
+    long = long[long > 1.5]
+    odd = np.abs(long - np.round(long)) > APART
+    if len(long) > 0.1 * len(spans) and odd.mean() > APART:
+        return Sampling(float(np.median(spans)), len(time), None)
+    expected = int(whole.sum()) + 1
+    return Sampling(period, expected, expected - len(time))

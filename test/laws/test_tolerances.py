@@ -1,0 +1,377 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Errors of parts: each is an added drive of the same machine, in maximal coordinates."""
+
+from __future__ import annotations
+
+import copy
+
+import numpy as np
+import pytest
+
+from pkm_twin.apps.certificate.description import across
+from pkm_twin.apps.certificate.maximal import Maximal, rotation_of
+from pkm_twin.design import drawn, tolerances
+from pkm_twin.design.parts import Assembly, part_of
+from pkm_twin.design.tolerance import workspace_states
+from pkm_twin.errors import ParameterError
+from pkm_twin.robot.catalogue import robot_of_data
+from stiffness_monitor import platform_response
+from test.machine.random_machines import NAMES, variant
+from test.machine.test_helical import driven, slide
+from test.machine.test_planar import puck
+from test.support.robots import load, partly_long
+
+PATHS = 6
+"""Errors of a machine that are tried, of all that it may have."""
+CARRIER = {"mass": 0.0, "com": [0.0, 0.0, 0.0], "inertia": [0.0, 0.0, 0.0]}
+
+
+def paths_of(data):
+    """Every error that a part of a machine may have, by kind."""
+    for name, joint in data["joints"].items():
+        if "at" in joint:
+            yield from (f"joints.{name}.at[{k}]" for k in range(3))
+        if ("axis" in joint or "axes" in joint) and "at" in joint:
+            yield from (f"joints.{name}.axis[{k}]" for k in range(2))
+        if joint.get("actuated"):
+            yield f"joints.{name}.offset"
+    yield from (f"rods.{name}.length" for name in data["rods"])
+    yield from (f"bodies.{name}.length" for name in data["bodies"])
+
+
+def towards(data, body):
+    """The joints of a body that are nearest to the base."""
+    far = {"base": 0}
+    for steps in range(len(data["bodies"])):
+        for joint in data["joints"].values():
+            ends = joint["between"]
+            for one, other in (ends, ends[::-1]):
+                if far.get(one) == steps:
+                    far.setdefault(other, steps + 1)
+    return [
+        name for name, joint in data["joints"].items()
+        if body in joint["between"] and min(map(far.get, joint["between"])) < far[body]
+    ]  # fmt: skip
+
+
+def with_drives(data, path):
+    """The same machine with drives that make a part's error; they stand at zero, added last.
+
+    None of a body without one joint that has a place towards the base, or without length.
+    """
+    made = copy.deepcopy(data)
+    kind, name, what = path.split(".")
+    entry = made[kind][name]
+    count = len(made["joints"])
+
+    def drive(body, type_, at, axis):
+        """A carrier on a body, that a drive moves."""
+        new = f"carrier {len(made['joints'])}"
+        made["bodies"][new] = CARRIER
+        made["joints"][f"error {len(made['joints']) - count}"] = {
+            "type": type_, "between": [body, new], "at": list(at), "axis": list(axis),
+            "actuated": True,
+        }  # fmt: skip
+        return new
+
+    if what == "offset":
+        return made
+    if kind == "joints":
+        inner, k = entry["between"][0], int(what[-2])
+        if what.startswith("at"):
+            carrier = drive(inner, "prismatic", entry["at"], np.eye(3)[k])
+        else:
+            first = np.array(entry["axis"] if "axis" in entry else entry["axes"][0], float)
+            axis = first / np.linalg.norm(first)
+            least = np.eye(3)[int(np.argmin(np.round(np.abs(axis), 9)))]
+            one = np.cross(axis, least) / np.linalg.norm(np.cross(axis, least))
+            carrier = drive(inner, "revolute", entry["at"], (one, np.cross(axis, one))[k])
+        entry["between"] = [carrier, entry["between"][1]]
+    elif kind == "rods":
+        a, b = np.array(entry["ends"], float)
+        del made["rods"][name]
+        along = (b - a) / np.linalg.norm(b - a)
+        made["bodies"]["half"] = CARRIER
+        carrier = drive("half", "prismatic", a, along)
+        inner, outer = entry["between"]
+        made["joints"]["rod foot"] = {
+            "type": "universal", "between": [inner, "half"], "at": a, "axes": across(along)
+        }  # fmt: skip
+        made["joints"]["rod head"] = {"type": "spherical", "between": [carrier, outer], "at": b}
+    else:
+        start, *others = towards(data, name)
+        points = [j["at"] for n, j in data["joints"].items() if name in j["between"] and n != start]
+        for rod in data["rods"].values():
+            points += [e for e, on in zip(rod["ends"], rod["between"], strict=True) if on == name]
+        points += [data["origin"]] if data["platform"] == name else []
+        line = np.mean(points, 0) - data["joints"][start].get("at", np.mean(points, 0))
+        if others or np.linalg.norm(line) < 1e-9:
+            return None
+        for other, joint in list(made["joints"].items()):
+            if name in joint["between"] and other != start:
+                carrier = drive(name, "prismatic", joint["at"], line)
+                joint["between"] = [carrier if n == name else n for n in joint["between"]]
+        for rod in made["rods"].values():
+            for k in range(2):
+                if rod["between"][k] == name:
+                    rod["between"] = list(rod["between"])
+                    rod["between"][k] = drive(name, "prismatic", rod["ends"][k], line)
+        if data["platform"] == name:
+            made["platform"] = drive(name, "prismatic", data["origin"], line)
+    return made
+
+
+def judged(data, path, q):
+    """A machine with drives that make an error, the state q, and which of its drives move."""
+    if path.endswith("offset"):
+        actuated = [name for name, joint in data["joints"].items() if joint.get("actuated")]
+        return Maximal(data), q, np.array([path.split(".")[1] == name for name in actuated], float)
+    judge = Maximal(with_drives(data, path))
+    state = np.append(q, np.zeros(len(judge.machine.actuated) - len(q)))
+    return judge, state, np.arange(len(state)) >= len(q)
+
+
+def slope_of(data, path, q):
+    """Twist of the platform per unit of the error; None where rigid parts do not fit."""
+    judge, state, way = judged(data, path, q)
+    judge.assemble(state)
+    closures = judge.closures().columns
+    table = np.vstack([closures, judge.drives().columns])
+    goal = np.append(np.zeros(len(closures)), way)
+    found = np.linalg.lstsq(table, goal, rcond=1e-9)[0]
+    return judge.twist_columns() @ found if np.abs(table @ found - goal).max() < 1e-7 else None
+
+
+def states_of(robot, rng, count):
+    """Joint states near home."""
+    units = np.array([robot.graph.size if u == "m" else 1.0 for u in robot.joint_units])
+    return robot.graph.home + 0.05 * units * rng.uniform(-1.0, 1.0, (count, robot.joints_count))
+
+
+@pytest.mark.parametrize(
+    "name",
+    partly_long(NAMES, "rrr3_planar", "rsur"),
+)
+def test_an_error_of_a_part_is_a_drive_that_makes_it(name, rng):
+    data = variant(name, rng)
+    data.setdefault("platform", "platform")
+    data.setdefault("origin", data["bodies"][data["platform"]]["com"])
+    for k, joint in enumerate(data["joints"].values()):
+        if not joint.get("actuated") and k % 2:
+            # The same joint, seen from its other body.
+            joint["between"] = joint["between"][::-1]
+            if "home" in joint:
+                joint["home"] *= -1.0
+            if "axes" in joint:
+                joint["axes"] = joint["axes"][::-1]
+    robot = robot_of_data(data, name)
+    q, fitting = states_of(robot, rng, 2), 0
+    paths = rng.permutation(list(paths_of(data))).tolist()
+    lengths = [path for path in paths if path.endswith("length")]
+    zeros = [path for path in paths if path.endswith("offset")]
+    for path in dict.fromkeys([*paths[:PATHS], *lengths[:5], zeros[0]]):
+        made = with_drives(data, path)
+        expected = [None if made is None else slope_of(data, path, one) for one in q]
+        if any(row is None for row in expected):
+            with pytest.raises(ParameterError):
+                tolerances(robot, {path: 1e-4}, q)
+            continue
+        fitting += 1
+        found = tolerances(robot, {path: 1e-4}, q).sensitivity[path]
+        scale = max(1.0, np.abs(expected).max())
+        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-8 * scale, err_msg=path)
+        exact = Assembly(robot, q[0]).displaced(
+            {what: 3e-3 * vector[None] for what, vector in part_of(robot, path).effects.items()}
+        )[0]
+        judge, state, way = judged(data, path, q[0])
+        place, turn = judge.platform(state + 3e-3 * way)
+        before, from_ = judge.platform(state)
+        np.testing.assert_allclose(exact[:3], place - before, atol=1e-9)
+        np.testing.assert_allclose(rotation_of(exact[3:]), turn @ from_.T, atol=1e-9)
+    assert fitting
+
+
+@pytest.mark.parametrize("name", partly_long(["linear_delta", "stewart", "five_bar"], "stewart"))
+def test_copies_of_a_limb_vary_alike(name, rng):
+    """An error of all copies is the sum of their own, each in its copy's axes."""
+    robot = load(name)
+    q = states_of(robot, rng, 3)
+    for (kind, entry), source in robot.sources.items():
+        if source.path[0] != "limbs" or source.copy:
+            continue
+        copies = [n for (k, n), s in robot.sources.items() if s.path == source.path and k == kind]
+        azimuths = [robot.sources[kind, n].azimuth for n in copies]
+        shared = ".".join(map(str, source.path))
+        if kind == "joints" and entry not in robot.without_point:
+            alike = tolerances(robot, {f"{shared}.at[0]": 1e-4}, q).sensitivity[f"{shared}.at[0]"]
+            total = np.zeros_like(alike)
+            for copy_, azimuth in zip(copies, azimuths, strict=True):
+                own = [f"joints.{copy_}.at[{k}]" for k in range(2)]
+                found = tolerances(robot, dict.fromkeys(own, 1e-4), q).sensitivity
+                total += np.cos(azimuth) * found[own[0]] + np.sin(azimuth) * found[own[1]]
+        elif kind == "rods":
+            own = [f"rods.{copy_}.length" for copy_ in copies]
+            alike = tolerances(robot, {f"{shared}.length": 1e-4}, q).sensitivity[f"{shared}.length"]
+            total = sum(tolerances(robot, dict.fromkeys(own, 1e-4), q).sensitivity.values())
+        else:
+            continue
+        np.testing.assert_allclose(alike, total, rtol=0, atol=1e-9 * max(1.0, abs(total).max()))
+
+
+def test_drawn_machines_have_the_standard_deviations():
+    robot = load("linear_delta")
+    sigma = {
+        "rods.left_1.length": 4e-5, "limbs.rods.right.length": 2e-5, "joints.rail_2.offset": 3e-5,
+        "joints.rail_3.axis[0]": 1e-4, "joints.rail_3.at[1]": 5e-5,
+    }  # fmt: skip
+    q = robot.graph.home + np.array([[0.0, 0.0, 0.0], [0.03, -0.05, 0.02]])
+    found, errors = tolerances(robot, sigma, q), drawn(robot, sigma, q, 4000)
+    np.testing.assert_allclose(np.sqrt((errors**2).mean(0)), found.deviation, rtol=0.05)
+    np.testing.assert_allclose(sum(found.share.values()), 1.0)
+    again = drawn(robot, sigma, q, 50)
+    small = drawn(robot, {path: 0.1 * value for path, value in sigma.items()}, q, 50)
+    # Beyond the first order there is little, and it falls with the square.
+    np.testing.assert_allclose(again, 10.0 * small, atol=5e-3 * abs(again).max())
+
+
+def test_numbers_of_a_file_without_parts_vary_as_the_file_says():
+    robot = load("delta_cu")
+    sigma = {
+        "geometry.arm_length": 2e-5, "geometry.base_radius": 1e-5,
+        "geometry.platform_radius": 3e-5,
+    }  # fmt: skip
+    q = workspace_states(robot, 20)
+    found, errors = tolerances(robot, sigma, q), drawn(robot, sigma, q, 4000)
+    np.testing.assert_allclose(
+        np.sqrt((errors[..., :3] ** 2).mean(0)), found.deviation[:, :3], rtol=0.06
+    )
+    arms = [f"bodies.arm {n}.length" for n in ("I", "II", "III")]
+    each = tolerances(robot, dict.fromkeys(arms, 2e-5), q).sensitivity
+    np.testing.assert_allclose(
+        sum(each.values()), found.sensitivity["geometry.arm_length"], atol=1e-9
+    )
+
+
+def test_one_arm_of_a_delta_moves_its_platform_at_home():
+    """A Delta of 0.35 m arms on 0.2 m, 0.8 m forearms: 0.1 mm of one arm are 0.072 mm."""
+    data = {
+        "mechanism": "machine", "origin": [0, 0, -0.6205], "pose": ["x", "y", "z"],
+        "bodies": {"platform": {"mass": 0.35, "com": [0, 0, -0.6205], "inertia": [4e-4] * 3}},
+        "limbs": {
+            "azimuths": [0.0, 2.0943951, 4.1887902],
+            "bodies": {"arm": {"mass": 0.6, "com": [0.34, 0, 0], "inertia": [7e-3] * 3}},
+            "joints": {
+                "motor": {
+                    "type": "revolute", "between": ["base", "arm"], "at": [0.2, 0, 0],
+                    "axis": [0, 1, 0], "actuated": True,
+                }
+            },
+            "rods": {
+                side: {
+                    "between": ["arm", "platform"], "mass": 0.1,
+                    "ends": [[0.55, y, 0], [0.045, y, -0.62047562]],
+                }
+                for side, y in (("left", 0.05), ("right", -0.05))
+            },
+        },
+    }  # fmt: skip
+    robot = robot_of_data(data, "irb")
+    one = tolerances(robot, {"bodies.arm_1.length": 1e-4}, robot.graph.home)
+    assert np.linalg.norm(one.deviation[:3]) == pytest.approx(7.2e-5, rel=1e-2)
+    # By hand: along the forearm in its limb's plane, against a platform that two others hold.
+    rod = np.array([0.505, 0.0, 0.62047562])
+    turn = 2.0943951
+    table = np.array(
+        [[rod[0] * np.cos(a), rod[0] * np.sin(a), rod[2]] for a in (0.0, turn, 2.0 * turn)]
+    )
+    moved = np.linalg.solve(table, [rod[0], 0.0, 0.0])
+    np.testing.assert_allclose(one.sensitivity["bodies.arm_1.length"][:3], moved, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("name", "path"),
+    [
+        ("five_bar", "joints.elbow_left.at[1]"),
+        ("five_bar", "joints.tip.axis[0]"),
+        ("five_bar", "joints.elbow_left.offset"),
+        ("five_bar", "joints.elbow_left.at[3]"),
+        ("five_bar", "joints.elbow.at[0]"),
+        ("five_bar", "bodies.forearm_left.mass"),
+        ("five_bar", "bodies.base.length"),
+        ("stewart", "bodies.platform.length"),
+        ("stewart", "joints.ball_a_1.axis[0]"),
+        ("stewart", "payload.mass"),
+        ("delta", "joints.translation.at[0]"),
+        ("delta", "inertia.arm_mass"),
+        ("delta", "geometry.arm"),
+    ],
+)
+def test_what_is_no_part_or_does_not_fit_is_rejected(name, path):
+    robot = load(name)
+    with pytest.raises(ParameterError, match=path.split(".")[0]):
+        tolerances(robot, {path: 1e-4}, robot.graph.home)
+    with pytest.raises(ParameterError):
+        tolerances(robot, {"joints.left.offset": -1e-4}, robot.graph.home)
+
+
+def test_a_wrench_adds_the_deflection_of_the_machine_itself():
+    robot, load_on = load("delta"), [0.0, 0.0, -100.0, 0.0, 0.0, 0.0]
+    q = robot.graph.home
+    found = tolerances(robot, {"joints.arm_1.offset": 1e-5}, q, load_on)
+    expected = platform_response(robot, q, load_on).deflection
+    np.testing.assert_array_equal(found.deflection, expected)
+    assert tolerances(robot, {"joints.arm_1.offset": 1e-5}, q).deflection is None
+
+
+def test_parallelograms_are_their_two_rods():
+    """A tilted arm turns the platform, which the file's machine itself cannot."""
+    robot = load("delta")
+    graph = robot.graph
+    data = {
+        "mechanism": "machine", "platform": graph.platform, "origin": graph.origin.tolist(),
+        "pose": ["x", "y", "z"],
+        "bodies": {n: CARRIER | {"mass": 1.0, "inertia": [0.01] * 3} for n in graph.bodies},
+        "joints": {
+            name: {
+                "type": joint.kind, "between": [joint.inner, joint.outer], "at": joint.at.tolist(),
+                "axis": joint.axes[0].tolist(), "actuated": True, "home": joint.home,
+            }
+            for name, joint in graph.joints.items() if joint.actuated
+        },
+        "rods": {
+            f"{name} {side}": {
+                "between": [rod.inner, rod.outer], "mass": 0.1,
+                "ends": (rod.ends + side * 0.5 * rod.width * rod.pair).tolist(),
+            }
+            for name, rod in graph.rods.items() for side in (-1, 1)
+        },
+    }  # fmt: skip
+    other = robot_of_data(data, "rods")
+    q = graph.home + np.array([0.1, -0.2, 0.05])
+    same = [f"joints.arm_2.{what}" for what in ("at[0]", "at[1]", "axis[0]", "axis[1]", "offset")]
+    one = tolerances(robot, dict.fromkeys([*same, "rods.forearm I.length"], 1e-4), q).sensitivity
+    pair = ["rods.forearm I -1.length", "rods.forearm I 1.length"]
+    two = tolerances(other, dict.fromkeys([*same, *pair], 1e-4), q).sensitivity
+    for path in same:
+        np.testing.assert_allclose(one[path], two[path], rtol=0, atol=1e-9)
+    np.testing.assert_allclose(
+        one["rods.forearm I.length"], two[pair[0]] + two[pair[1]], rtol=0, atol=1e-9
+    )
+    assert np.abs(one["joints.arm_2.axis[1]"][3:]).max() > 0.1
+
+
+def test_a_zero_moves_the_platform_as_the_drive_does():
+    """Of joint types that the judge does not know, screws over several turns too."""
+    for robot, turns in ((slide(0.008), 7.0), (driven(-0.005, [0.0, 0.1, 0.0]), 3.0), (puck(1), 0)):
+        q = robot.graph.home + 0.05 + 2.0 * np.pi * turns
+        columns = robot.platform_jacobian(q)
+        for k, name in enumerate(robot.joint_names):
+            path = f"joints.{name}.offset"
+            found = tolerances(robot, {path: 1e-4}, q).sensitivity[path]
+            np.testing.assert_allclose(found, columns[:, k], rtol=0, atol=1e-9)
+            exact = drawn(robot, {path: 1e-4}, q, 3)[:, 0]
+            assert np.abs(exact).max() > 0.0
+            np.testing.assert_allclose(
+                exact / exact[:, [np.abs(exact).max(0).argmax()]],
+                np.tile(found / found[np.abs(exact).max(0).argmax()], (3, 1)), atol=1e-3,
+            )  # fmt: skip
