@@ -111,10 +111,11 @@ def test_it_parses_as_it_stands(tree, page, line):
     if words[0].startswith("-"):
         assert words[0] in {name for option in tree.params for name in option.opts}
         return
-    assert words[0] in tree.commands
+    command = tree.get_command(None, words[0])
+    assert command is not None
     # A command's name alone, in running text, is only named.
     if "--help" not in words and (commands()[page, line] or len(words) > 1):
-        tree.commands[words[0]].make_context(words[0], words[1:])
+        command.make_context(words[0], words[1:])
 
 
 @pytest.fixture(scope="module")
