@@ -97,7 +97,7 @@ def page() -> str:
         load_1, load_5, _ = psutil.getloadavg()
     speed = rates["strain-energy", "upr_rpu"]
     core_seconds = 1e9 / speed
-    gigabytes = size * 100 / 1e3
+    gigabytes = size * 1e6 / points
     disk = 3 * gigabytes / 0.5 / 60
     template = (Path(__file__).parent / "scale.md").read_text(encoding="utf-8")
     return template.format(
