@@ -71,7 +71,8 @@ class Kind:
     computed at once; ``samples``, ``population`` and ``rounds``: size of the search for the worst
     pose. ``screen``: of a quantity that takes long, a fast one that is bad in the same poses.
     ``least``: default singularity index below which a pose does not count. ``together``: all cases
-    share the worst pose of the first. ``page_help``: explains the further figure of the page.
+    share the worst pose of the first. ``signed``: values may be negative. ``page_help``:
+    explains the further figure of the page.
     """
 
     name: ClassVar[str]
@@ -84,6 +85,7 @@ class Kind:
     has_shares: ClassVar[bool] = False
     takes_wrench: ClassVar[bool] = False
     together: ClassVar[bool] = False
+    signed: ClassVar[bool] = False
     least: ClassVar[float] = 0.05
     points: ClassVar[int] = 50_000
     chunk: ClassVar[int] = 16384
@@ -281,7 +283,12 @@ def unit_motions(robot: Robot, q: Array) -> tuple[Array, Array]:
     """Joint rates of unit rates of the platform, shape (k, n, d), and their directions, (d, 3).
 
     Of the position in the pose, its angles at rest; of a pose of angles alone about the base axes.
+
+    :raises ParameterError: more drives than freedoms, whose rates depend on each other.
     """
+    if len(robot.joint_names) != len(robot.pose_names):
+        what = "as many actuated joints as pose coordinates"
+        raise ParameterError("joints", len(robot.joint_names), what)
     places = [k for k, name in enumerate(robot.pose_names) if name in "xyz"]
     if not places:
         turned = np.linalg.pinv(robot.platform_jacobian(q)[..., 3:, :])

@@ -115,7 +115,7 @@ class Map(Space):
         axes, elements = self.kind.axes(self.robot), self.elements
         turn = {"units": "1", "valid_min": -1.0, "valid_max": 1.0}
         names = {"valid_min": -1, "valid_max": len(elements) - 1}
-        value = about(self.kind.name, "", POSITIVE if self.kind.name != "workspace" else {})
+        value = about(self.kind.name, "", {} if self.kind.signed else POSITIVE)
         blame = about(f"index of the {self.kind.element}", "", names)
         grid, plane = (*self.dims, "case"), ("plane", "row", "column", "case")
         fields = {"value": Field(grid, value)}

@@ -97,8 +97,12 @@ def page() -> str:
         load_1, load_5, _ = psutil.getloadavg()
     speed = rates["strain-energy", "upr_rpu"]
     core_seconds = 1e9 / speed
-    gigabytes = size * 100 / 1e3
-    disk = 3 * gigabytes / 0.5 / 60
+    gigabytes = size * 1e6 / points
+    sweep = map_of(load("upr_rpu"), KINDS["strain-energy"](), 10**6)
+    chunk = sweep.chunks()[0]
+    # Bytes of a pose are gigabytes of a billion.
+    parts = sum(v.nbytes for v in sweep.evaluate(chunk).values()) / sweep.count(chunk)
+    disk = (2 * parts + gigabytes) / 0.5 / 60
     template = (Path(__file__).parent / "scale.md").read_text(encoding="utf-8")
     return template.format(
         date=datetime.date.today().isoformat(),
@@ -112,12 +116,13 @@ def page() -> str:
         speed=power(speed),
         core_seconds=f"{core_seconds:.0f}",
         gigabytes=f"{gigabytes:.0f}",
-        twice=f"{2 * gigabytes:.0f}",
+        parts=f"{parts:.0f}",
+        both=f"{parts + gigabytes:.0f}",
         two=f"{core_seconds / 2 / 60:.0f}",
         sixteen=f"{core_seconds / 16:.0f}",
         disk=f"{disk:.0f}",
-        fast=f"{gigabytes * 8 / 10 / 60:.0f}",
-        slow=f"{gigabytes * 8 / 60:.0f}",
+        fast=f"{parts * 8 / 10 / 60:.0f}",
+        slow=f"{parts * 8 / 60:.0f}",
     )
 
 

@@ -44,6 +44,7 @@ class Workspace(Kind):
     name = "workspace"
     question = "where does it reach?"
     least = 0.0
+    signed = True
     points = 200_000
 
     def cases(self, robot: Robot) -> tuple[Case, ...]:
