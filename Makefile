@@ -88,14 +88,14 @@ faults: $(VENV)/test.stamp
 	$(BIN)/python -m test.faults
 
 soak: $(VENV)/test.stamp
-	SOAK_MINUTES=$(MINUTES) SOAK_OUT=$(CURDIR)/out $(BIN)/python -m pytest -m long test/atlas/test_run.py test/nodes/test_soak.py
+	SOAK_MINUTES=$(MINUTES) SOAK_OUT=$(CURDIR)/out $(BIN)/python -m pytest -m long test/maps/test_run.py test/nodes/test_soak.py
 	$(BIN)/python -m test.nodes.soak out
 
 audit: $(VENV)/audit.stamp
 	$(BIN)/pip-audit --skip-editable
 
 scale: $(VENV)/test.stamp
-	OMP_NUM_THREADS=1 $(BIN)/python -m test.atlas.scale docs/scale.md
+	OMP_NUM_THREADS=1 $(BIN)/python -m test.maps.scale docs/scale.md
 
 reality: $(VENV)/test.stamp
 	$(BIN)/python -m tools.reality docs/reality.md

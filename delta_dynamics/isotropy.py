@@ -18,7 +18,7 @@ import itertools
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from delta_dynamics.least_form import MOST, largest, least_direction
 from delta_dynamics.terms import frictionless
@@ -164,13 +164,37 @@ def max_driving_force_range(
     """
     if len(robot.pose_names) > MOST:
         raise ParameterError("pose", len(robot.pose_names), f"at most {MOST} pose coordinates")
+    back, forms = _driving_forms(robot, pose, energy, acceleration)
+    greatest, high, _ = _peak(forms)
+    flat = forms.reshape(-1, *forms.shape[-3:])
+    low = np.array([least_direction(form) for form in flat]).reshape(high.shape)
+    least = largest(forms, low)
+    y = np.stack([low, high], -2)
+    return Extremes(least, greatest, _directions(np.einsum("...ij,...kj->...ki", back, y)))
+
+
+def driving_force_peak(
+    robot: Robot, pose: ArrayLike, energy: float = ENERGY, acceleration: ArrayLike = 0.0
+) -> tuple[Array, Array, NDArray[np.int64]]:
+    """Greatest F_max over all directions, its direction (..., m), and the index of its actuator.
+
+    Arguments as of :func:`max_driving_force_range`; any number of pose coordinates.
+    """
+    back, forms = _driving_forms(robot, pose, energy, acceleration)
+    greatest, y, joint = _peak(forms)
+    return greatest, _directions(np.einsum("...ij,...j->...i", back, y)), joint
+
+
+def _driving_forms(
+    robot: Robot, pose: ArrayLike, energy: float, acceleration: ArrayLike
+) -> tuple[Array, Array]:
+    """Pose rates of unit vectors y, (..., m, m), and F_d of y as forms, (..., actuators, m, m)."""
     where = doubles(pose, "poses")
     platform, _ = energy_matrices(robot, where)
     back = np.sqrt(2 * _energy(energy)) * _inverse_root(robot, platform)
     size = where.shape[-1]
     start = joint_motion(robot, where, np.zeros(size), acceleration)
     constant = frictionless(robot, *start)
-    count = constant.shape[-1]
     pairs = list(itertools.combinations(range(size), 2))
     units = np.eye(size)
     mixed = np.array([units[j] + units[k] for j, k in pairs]).reshape(-1, size)
@@ -184,19 +208,18 @@ def max_driving_force_range(
         both = (moved[..., probe, :] - moved[..., j, :] - moved[..., k, :]) / 2
         forms[..., j, k] = forms[..., k, j] = both
     forms += constant[..., None, None] * np.eye(size)
+    return back, forms
 
+
+def _peak(forms: Array) -> tuple[Array, Array, NDArray[np.int64]]:
+    """Greatest absolute value of forms on the unit sphere, where, and of which."""
     values, vectors = np.linalg.eigh(forms)
-    batch = constant.shape[:-1]
-    ends = np.abs(values[..., [0, -1]]).reshape(*batch, 2 * count)
-    best = ends.argmax(-1)[..., None]
-    candidates = vectors[..., [0, -1]].swapaxes(-1, -2).reshape(*batch, 2 * count, size)
-    high = np.take_along_axis(candidates, best[..., None], -2)[..., 0, :]
-    greatest = np.take_along_axis(ends, best, -1)[..., 0]
-    flat = forms.reshape(-1, count, size, size)
-    low = np.array([least_direction(form) for form in flat]).reshape(high.shape)
-    least = largest(forms, low)
-    y = np.stack([low, high], -2)
-    return Extremes(least, greatest, _directions(np.einsum("...ij,...kj->...ki", back, y)))
+    ends = np.abs(values[..., [0, -1]])
+    flat = ends.reshape(*ends.shape[:-2], -1)
+    best = flat.argmax(-1)[..., None]
+    sides = vectors[..., [0, -1]].swapaxes(-1, -2)
+    y = np.take_along_axis(sides.reshape(*flat.shape, forms.shape[-1]), best[..., None], -2)
+    return np.take_along_axis(flat, best, -1)[..., 0], y[..., 0, :], best[..., 0] // 2
 
 
 def spread(values: ArrayLike) -> Array:

@@ -44,10 +44,10 @@ MAY = {
     "delta_dynamics.node": NODE | {"delta_dynamics"},
     "stiffness_monitor.node": NODE | {"stiffness_monitor"},
     "pkm_twin.state.node": NODE | {"pkm_twin.state", "stiffness_monitor"},
-    "pkm_twin.atlas": NODE | TWINS | {"pkm_twin.console", "pkm_twin.options"},
+    "pkm_twin.maps": NODE | TWINS | {"pkm_twin.console", "pkm_twin.options"},
     "pkm_twin.apps": NODE
     | TWINS
-    | {"pkm_twin.console", "pkm_twin.atlas", "pkm_twin.export", "pkm_twin.identification"}
+    | {"pkm_twin.console", "pkm_twin.maps", "pkm_twin.export", "pkm_twin.identification"}
     | {"pkm_twin.paths", "pkm_twin.design", "pkm_twin.options"},
 }
 """Rooms that each may import, beside itself and :data:`OWN`; so nobody imports apps or a node."""

@@ -11,7 +11,7 @@ import numpy as np
 
 from pkm_twin.apps.demo_report import DynamicsSeries, StiffnessSeries
 from pkm_twin.apps.tracking_report import TrackingSeries
-from pkm_twin.atlas import figures, plots
+from pkm_twin.maps import figures, plots
 
 
 def draw(

@@ -11,6 +11,7 @@ import numpy as np
 
 from delta_dynamics import reactions
 from pkm_twin.errors import ParameterError
+from pkm_twin.robot.clearance import clearance, has_clearance
 from pkm_twin.robot.plausibility import Finding, findings
 from pkm_twin.robot.robot import Robot
 
@@ -57,6 +58,7 @@ def describe(robot: Robot) -> dict[str, Any]:
         "assumed_joints": [joint.name for joint in robot.graph.joints.values() if joint.given],
         "home_choice": robot.home_choice or None,
         "singularity_at_home": float(robot.singularity(q)),
+        "clearance_at_home": float(clearance(robot, home)) if has_clearance(robot) else None,
         "plausibility": [dataclasses.asdict(finding) for finding in findings(robot)],
         "parameters": robot.parameter_sections(),
         "parameter_units": robot.parameter_units(),
@@ -131,6 +133,9 @@ def lines(data: dict[str, Any]) -> list[tuple[str, str]]:
         ("home joints", _pairs(data["home_joints"], joint_units)),
         ("singularity index at home", f"{data['singularity_at_home']:.3f} (0 singular, 1 best)"),
     ]
+    if (gap := data["clearance_at_home"]) is not None:
+        text = f"{1e3 * gap:.3g} mm"
+        rows.append(("clearance at home", text if gap > 0.0 else f"{text}: limbs interfere"))
     if data["home_choice"]:
         rows.append(("home", data["home_choice"]))
     grouped = grouped_reactions(data["overconstrained"])

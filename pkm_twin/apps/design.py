@@ -110,12 +110,12 @@ def design_command(
     """
     from pkm_twin.apps import design_report as report
     from pkm_twin.apps.tolerances import budget, parse_tolerances
-    from pkm_twin.atlas.run import on_cluster
     from pkm_twin.design import design as find
     from pkm_twin.design import sweep as sweep_box
     from pkm_twin.design.optimise import searches
     from pkm_twin.design.sweep import here
     from pkm_twin.design.variables import parse_vary
+    from pkm_twin.maps.run import on_cluster
 
     for target in (out, picture):
         if target is not None:

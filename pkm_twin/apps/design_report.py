@@ -14,14 +14,14 @@ from numpy.typing import NDArray
 from pkm_twin.apps.loads import Load
 from pkm_twin.apps.sizes import compared
 from pkm_twin.apps.torques import motion_of
-from pkm_twin.atlas import plots
-from pkm_twin.atlas.extras import require
-from pkm_twin.atlas.store import writing
 from pkm_twin.console import finite
 from pkm_twin.design import QUANTITIES, Design, DesignPoint, PosePath, Sweep
 from pkm_twin.design.pose_path import Followed
 from pkm_twin.design.variants import Variants
 from pkm_twin.errors import ParameterError, warn
+from pkm_twin.maps import plots
+from pkm_twin.maps.extras import require
+from pkm_twin.maps.store import writing
 from pkm_twin.robot.edited import Chosen, edited_yaml, write_edited
 from pkm_twin.robot.entries import entries
 from pkm_twin.robot.robot import Robot
@@ -178,7 +178,7 @@ def write_robot(robot: Robot, source: str, result: Design, path: Path, out: Path
 def draw(robot: Robot, result: Design, path: PosePath, picture: Path) -> None:
     """Draw the Pareto front, or the efforts before and after.
 
-    :raises AtlasError: not writable.
+    :raises MapError: not writable.
     """
     if result.front:
         figure, ((ax,),) = plots.columns(1, 1)
@@ -217,7 +217,7 @@ def write_sweep(
     """Write a sweep as NetCDF and tell what is in it.
 
     :raises MissingExtraError: h5netcdf or xarray is not installed.
-    :raises AtlasError: not writable.
+    :raises MapError: not writable.
     """
     require("h5netcdf", "atlas")
     xarray = require("xarray", "atlas")

@@ -72,8 +72,7 @@ TASKS: Final[Mapping[str, Mapping[str, Entry]]] = {
             "compliance:compliance",
             settings={"context_settings": {"ignore_unknown_options": True}},
         ),
-        "atlas": Entry("maps:app"),
-        "show": Entry("maps:show"),
+        "map": Entry("maps:app"),
         "frf": Entry("vibration:frf"),
         "lobes": Entry("vibration:lobes"),
     },
@@ -102,6 +101,8 @@ TASKS: Final[Mapping[str, Mapping[str, Entry]]] = {
     },
 }
 """Commands in the order in which tasks need them."""
+OLDER: Final = {"atlas": "map"}
+"""Older names of commands, which help does not list."""
 GREETING: Final = """pkm-twin: torques, stiffness and recordings of parallel robots. Try
 
   pkm-twin view delta_cu                       look at a robot in the browser
@@ -142,6 +143,10 @@ class Tasks(TyperGroup):
     def __init__(self, **settings: Any) -> None:
         super().__init__(**settings)
         self.commands: Any = _Loaded()
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        """A command, by its name or an older one."""
+        return super().get_command(ctx, OLDER.get(cmd_name, cmd_name))
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
         """A section for each task."""

@@ -132,7 +132,7 @@ def report(
 
 def draw_limits(motion: TimedPath, path: Path) -> None:
     """Draw how much of each limit is used when, coloured by the one that binds."""
-    from pkm_twin.atlas import plots
+    from pkm_twin.maps import plots
     from pkm_twin.paths.constraints import names_of
 
     figure, axes = plots.columns(1, 2)

@@ -61,8 +61,8 @@ def torques(
     from pkm_twin.apps.limits import beyond_limits as find_beyond
     from pkm_twin.apps.limits import refuse_beyond
     from pkm_twin.apps.torques import check_target, motion_of, table, write_table
-    from pkm_twin.atlas import plots
     from pkm_twin.bags.storage import is_bag
+    from pkm_twin.maps import plots
 
     check_target(out)
     drawing, piped = out.with_suffix(".png"), str(out) == STANDARD

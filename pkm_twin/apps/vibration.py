@@ -27,7 +27,7 @@ from pkm_twin.files import STANDARD
 from pkm_twin.options import OptionalFloat, OptionalPath, OptionalText, file_name
 
 if TYPE_CHECKING:
-    from pkm_twin.atlas.maps.milling import Process
+    from pkm_twin.maps.kinds.cutting_depth import CuttingDepth
     from pkm_twin.robot.robot import Robot
     from stiffness_monitor.chatter import Lobes, Milling
     from stiffness_monitor.vibration import ToolModes
@@ -85,16 +85,16 @@ def parse_damping(text: str | None) -> list[float] | None:
 def process_of(
     teeth: int, tangential: float, radial: float, immersion: float, up: bool, feed: float,
     tool: str, damping: str | None,
-) -> Process:  # fmt: skip
+) -> CuttingDepth:  # fmt: skip
     """The milling process of a command line.
 
     :raises ParameterError: a number out of range.
     """
-    from pkm_twin.atlas.maps.milling import Process
+    from pkm_twin.maps.kinds.cutting_depth import CuttingDepth
     from stiffness_monitor.chatter import Milling
 
     ratios = parse_damping(damping)
-    return Process(
+    return CuttingDepth(
         Milling(teeth, tangential, radial, immersion, up, math.radians(feed)),
         None if ratios is None else tuple(ratios),
         tuple(numbers(tool, 3, "a tool point: x,y,z")),
@@ -223,7 +223,7 @@ def _print(data: dict[str, Any], text: list[str], as_json: bool, out: Path | Non
 
 
 def _draw_response(grid: Array, response: Any, modes: ToolModes, title: str, path: Path) -> None:
-    from pkm_twin.atlas import plots
+    from pkm_twin.maps import plots
 
     figure, axes = plots.columns(1, 2)
     size, phase = axes[0]
@@ -328,7 +328,7 @@ def _place(speed: float, depth: float, is_open: bool) -> dict[str, Any]:
 
 
 def _draw_lobes(found: Lobes, milling: Milling, title: str, path: Path) -> None:
-    from pkm_twin.atlas import plots
+    from pkm_twin.maps import plots
 
     figure, axes = plots.columns(1, 1)
     ax = axes[0][0]

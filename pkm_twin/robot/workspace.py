@@ -239,6 +239,40 @@ def _first_rungs(
     return rung, left
 
 
+def causes(
+    robot: Robot, q: Array, pose: Array, known: Mask, least: float, least_clearance: float
+) -> str:
+    """What keeps joint positions (k, n) from counting in a workspace, most frequent first, as text.
+
+    Each is counted for the first of these that it fails: assembly, actuator limits, limits of
+    passive joints, singularity index, clearance.
+
+    :param pose: of the joint positions, shape (k, m); ``known``: where there is one, shape (k,).
+    :param least: singularity index, and ``least_clearance``: clearance (m), that are too little.
+    """
+    left, found = np.array(known), {"no assembly": ~known}
+
+    def judged(what: str, kept: Mask) -> None:
+        nonlocal left
+        found[what] = left & ~kept
+        left = left & kept
+
+    judged("an actuator beyond its limits", within_limits(robot, q))
+    judged("a passive joint beyond its limits", keeps_limits(robot, q, pose, -math.inf, left))
+    judged(f"a singularity index below {least:g}", robot.try_singularity(q)[0] >= least)
+    if has_clearance(robot):
+        gap = joint_clearance(robot, q, refuse=False)
+        home = float(joint_clearance(robot, robot.graph.home))
+        what = (
+            "limbs interfere" if least_clearance == 0.0 else f"limbs within {least_clearance:g} m"
+        )
+        judged(f"{what} (clearance {home:.3g} m at home)", np.asarray(gap > least_clearance))
+    shares = {what: 100.0 * float(out.mean()) for what, out in found.items()}
+    ranked = sorted(shares.items(), key=lambda item: -item[1])
+    texts = [f"{what} in {share:.3g} %" for what, share in ranked if share >= 0.1]
+    return f"{', '.join(texts)} of the joint states tried"
+
+
 def random_joints(robot: Robot, rng: np.random.Generator, count: int) -> Array:
     """Joint positions clear of singularities, within limits where there are some, (count, n)."""
     home, size = robot.graph.home, robot.engine.tree.size

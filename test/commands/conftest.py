@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from pkm_twin.apps import drawing, fit_report
-from pkm_twin.atlas import plots
 from pkm_twin.bags.reader import BagWriter, open_bag
+from pkm_twin.maps import plots
 from test.support.command import Result
 
 REPOSITORY = Path(__file__).resolve().parents[2]

@@ -40,7 +40,7 @@ def commands(deflections, target):
         ".csv": (*EXCITE, "--out", f"{stem}.mcap"),
         ".png": ("info", "five_bar", "--picture", f"{stem}.png"),
         ".bag": ("recover", SOFT, f"{stem}.bag"),
-        ".nc": ("atlas", "five_bar", "workspace", "--points", 1000, "--out", f"{stem}.nc"),
+        ".nc": ("map", "five_bar", "workspace", "--points", 1000, "--out", f"{stem}.nc"),
     }
 
 
@@ -78,7 +78,7 @@ def test_a_folder_or_nothing_is_no_files_name(twin, tmp_path, monkeypatch, defle
         option = line[where - 1] if str(line[where - 1]).startswith("--") else "out"
         assert done.one_line_error().startswith(f"pkm-twin: {option}: ")
         tried += 1
-    for line in (("torques", "five_bar", "none.csv", "--out"), ("show", "none.nc", "--out")):
+    for line in (("torques", "five_bar", "none.csv", "--out"), ("map", "show", "none.nc", "--out")):
         assert twin(*line, name).one_line_error().startswith("pkm-twin: --out: ")
     assert tried == 8
     assert [p.name for p in tmp_path.iterdir()] == [deflections.name]
@@ -195,7 +195,7 @@ def test_names_of_anything_in_titles_and_comments(tmp_path, deflections):
         ("info", five.name, "--picture", f"{ODD}.png"),
         (*EXCITE, "--out", "motion.mcap"),
         ("torques", five.name, "motion.csv", "--out", f"torques {ODD}.csv"),
-        ("atlas", five.name, "workspace", "--points", 1000, "--out", f"{ODD}.nc", "--html"),
+        ("map", five.name, "workspace", "--points", 1000, "--out", f"{ODD}.nc", "--html"),
         ("urdf", robot.name),
         ("info", robot.name, "--json"),
     ):

@@ -13,8 +13,8 @@ import yaml
 from scipy.optimize import lsq_linear
 
 from delta_dynamics.isotropy import tilted_pose
-from pkm_twin.atlas.workspace.sweep import workspace_sweep
 from pkm_twin.errors import ParameterError, SingularityError, UnreachableError
+from pkm_twin.maps.box import workspace_box
 from pkm_twin.robot.clearance import clearance, distance, has_clearance
 from pkm_twin.robot.workspace import reachable, regular_workspace
 from stiffness_monitor.structure import structural_model
@@ -227,8 +227,7 @@ def test_thicker_members_leave_that_much_less(variant, rng):
 
 def box(robot, count=25):
     """Poses around all that a robot reaches, shape (..., m)."""
-    axes = workspace_sweep(robot).axes
-    ticks = [np.linspace(a[0], a[-1], count) for a in axes]
+    ticks = [np.linspace(low, high, count) for low, high in workspace_box(robot)]
     return np.stack(np.meshgrid(*ticks, indexing="ij"), -1)
 
 

@@ -362,7 +362,7 @@ def test_prru_indices_repeat_after_a_third_of_a_turn(head, rng):
 
 
 def test_prru_poses_60_180_and_300_degrees_have_the_same_sphere(head):
-    """The paper's atlas at a tilt of 45 degrees: eta exactly, F_max nearly (its Xddot = 0 is
+    """The paper's maps at a tilt of 45 degrees: eta exactly, F_max nearly (its Xddot = 0 is
     meant in alpha and beta, which a turn does not keep: 0.6 % between 60 and 180 degrees)."""
     poses = tilted_pose(0.9, np.radians([60, 180, 300]), np.radians(45))
     eta = energy_transfer_range(head, poses)

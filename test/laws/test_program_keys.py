@@ -55,7 +55,7 @@ def test_a_key_has_no_node_and_no_command():
     for kernel in kernels(load("delta_cu")).values():
         rooms = {room(at[path]) for path in kernel.code.key.sources}
         assert {"pkm_twin.codegen", "pkm_twin.kinematics", "pkm_twin.machine"} <= rooms
-        assert not {name for name in rooms if name.endswith(("node", ".ros", ".apps", ".atlas"))}
+        assert not {name for name in rooms if name.endswith(("node", ".ros", ".apps", ".maps"))}
 
 
 @pytest.fixture

@@ -18,8 +18,8 @@ import pytest
 from pkm_twin.apps.view.door import listen
 from pkm_twin.apps.view.texts import number
 from stiffness_monitor import strain_energy
-from test.atlas.browser import Browser, find_browser
 from test.commands.conftest import DELTA, REPOSITORY
+from test.maps.browser import Browser, find_browser
 from test.nodes.harness import end_with_parent
 from test.support.robots import load
 

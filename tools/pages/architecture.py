@@ -15,7 +15,7 @@ PLACES = {
     "delta_dynamics.node": (0.0, 4.2),
     "stiffness_monitor.node": (4.0, 4.2),
     "state.node": (6.6, 4.2),
-    "atlas": (2.0, 4.2),
+    "maps": (2.0, 4.2),
     "export": (-1.2, 4.9),
     "design": (4.0, 4.7),
     "identification": (5.6, 4.9),

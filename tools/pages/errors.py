@@ -44,7 +44,7 @@ ERRORS = {
     ),
     errors.UnreachableError: (
         errors.UnreachableError("pose", "limb 2", (3,), 0.0125),
-        "choose a pose inside the workspace (`pkm-twin atlas ROBOT workspace`)",
+        "choose a pose inside the workspace (`pkm-twin map ROBOT workspace`)",
     ),
     errors.SingularityError: (
         errors.SingularityError("joint state", (), 2e-9, 1e-6),

@@ -20,7 +20,7 @@ from pkm_twin.apps.view.model import Model
 from pkm_twin.apps.view.page import Page, serving
 from pkm_twin.apps.view.panels import BagPanel
 from pkm_twin.apps.view.timeline import Timeline
-from test.atlas.browser import Browser, find_browser
+from test.maps.browser import Browser, find_browser
 
 SIZE = (1100, 900)
 CLOSE = "document.querySelectorAll('[class*=Notification] button').forEach(b => b.click())"

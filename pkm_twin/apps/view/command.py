@@ -50,7 +50,7 @@ def view(
     Runs until Ctrl-C, and is reachable from this machine only, unless --host and --token are given.
     """
     from pkm_twin.apps.view.door import Door, listen
-    from pkm_twin.atlas.extras import require
+    from pkm_twin.maps.extras import require
 
     carried = load_of(payload, load_times)
     if bag is None and (topic or carried is not None):

@@ -1,0 +1,301 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Pictures of stored maps: planes through the worst pose, the answer in the title."""
+
+from __future__ import annotations
+
+import math
+import re
+import textwrap
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pkm_twin.errors import UnknownNameError
+from pkm_twin.maps import plots
+from pkm_twin.maps.kind import Kind
+from pkm_twin.maps.kinds import KINDS
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+    from xarray import Dataset
+
+Array = NDArray[np.float64]
+
+MAP: Final = "viridis"
+LINES: Final = tuple(colour for colour in plots.COLOURS if colour != "#F0E442")
+"""Colours of lines on white, where yellow is hard to see."""
+PREFIXES: Final = {-12: "p", -9: "n", -6: "µ", -3: "m", 0: "", 3: "k", 6: "M"}
+PANELS: Final = 3
+"""Most planes in a picture."""
+WIDE: Final = 9.0
+"""Of a picture, inches."""
+LETTERS: Final = 105
+"""In a line of a picture's title."""
+FINE: Final = 200
+"""Dots per inch."""
+
+
+def subplots(*shape: int, **options: Any) -> tuple[Figure, Any]:
+    """A new figure and its axes, as ``pyplot.subplots`` has them."""
+    figure, axes = plots.pyplot().subplots(*shape, **options)
+    return figure, axes
+
+
+def scale_of(greatest: float, unit: str) -> tuple[float, str]:
+    """Factor and unit with a prefix that leave values up to a greatest below 1000.
+
+    Angles are in degrees. Prefixes stand where they exist: kg has g and t, and what starts with
+    another power or an angle has none.
+    """
+    if unit == "rad":
+        return 180.0 / math.pi, "deg"
+    power = 3 * math.floor(math.log10(abs(greatest) or 1.0) / 3) if math.isfinite(greatest) else 0
+    if unit == "kg":
+        power = min(max(power, -3), 3)
+        return 10.0**-power, {-3: "g", 0: "kg", 3: "t"}[power]
+    if not re.match(r"(m|N|J|Hz|Pa)(?!\w)", unit):
+        return 1.0, unit
+    power = min(max(power, min(PREFIXES)), 0 if unit[0] == "m" else max(PREFIXES))
+    return 10.0**-power, PREFIXES[power] + unit
+
+
+def shown(value: float, unit: str, digits: int = 4) -> str:
+    """A value with its unit, as text."""
+    scale, prefixed = scale_of(value, unit)
+    return f"{scale * value + 0.0:.{digits}g} {prefixed}".strip()
+
+
+def kind_of(data: Dataset) -> type[Kind]:
+    """The kind of a stored map.
+
+    :raises UnknownNameError: a kind that this version does not know.
+    """
+    name = str(data.attrs["kind"])
+    if name not in KINDS:
+        raise UnknownNameError("map", name, tuple(KINDS))
+    return KINDS[name]
+
+
+def answers(data: Dataset) -> list[dict[str, Any]]:
+    """The worst of each case as plain data: case, value, unit, pose, direction, element."""
+    names = [str(name) for name in data.coordinate.values]
+    found = []
+    for k, case in enumerate(data.case.values):
+        part = data.isel(case=k)
+        if not math.isfinite(float(part.worst_value)):
+            continue
+        answer = {
+            "case": str(case),
+            "what": str(part.case_what.values),
+            "answer": str(part.case_answer.values),
+            "value": float(part.worst_value),
+            "unit": str(part.case_unit.values),
+            "pose": dict(zip(names, part.worst_pose.values.tolist(), strict=True)),
+        }
+        if "worst_direction" in data:
+            answer["direction"] = part.worst_direction.values.tolist()
+            answer["axes"] = [str(name) for name in data.axis.values]
+        if "worst_element" in data and int(part.worst_element) >= 0:
+            answer["element"] = str(data.element.values[int(part.worst_element)])
+        found.append(answer)
+    return found
+
+
+def sentence(answer: dict[str, Any], units: dict[str, str]) -> str:
+    """The worst of a case in words: "softest: 32.8 µm/N along y at (0, -0.16, -0.35), arm III".
+
+    :param units: of the pose coordinates.
+    """
+    pose = ", ".join(
+        f"{round(math.degrees(v), 2) + 0.0:g}°" if units[k] == "rad" else f"{_plain(v):.4g}"
+        for k, v in answer["pose"].items()
+    )
+    text = f"{answer['answer']}: {shown(answer['value'], answer['unit'])}"
+    way = np.array(answer.get("direction", []))
+    if len(way) and np.isfinite(way).all() and way.any():
+        axis = int(np.abs(way).argmax())
+        alone = abs(way[axis]) > 0.9995
+        words = ", ".join(f"{_plain(v):.3g}" for v in way)
+        text += f" along {answer['axes'][axis] if alone else f'({words})'}"
+    return f"{text} at ({pose})" + (f", {answer['element']}" if "element" in answer else "")
+
+
+def _plain(value: float) -> float:
+    """Without what is zero but for rounding."""
+    return round(value, 6) + 0.0
+
+
+def units_of(data: Dataset) -> dict[str, str]:
+    """Units of the pose coordinates."""
+    return {str(k): str(u) for k, u in zip(data.coordinate.values, data.unit.values, strict=True)}
+
+
+def lines(data: Dataset) -> list[str]:
+    """What a map answers: a line for each case, then what its kind says of the workspace."""
+    found, units = answers(data), units_of(data)
+    alone = len(found) == 1
+    texts = [("" if alone else f"{a['case']}: ") + sentence(a, units) for a in found]
+    facts = kind_of(data).facts(data)
+    searched = bool(np.isfinite(data.worst_value.values[0]))
+    return [*texts, *facts] if searched else [*facts, *texts]
+
+
+def title(data: Dataset, case: int) -> list[str]:
+    """Question and answer of a case."""
+    name = str(data.case.values[case])
+    units = units_of(data)
+    own = [sentence(a, units) for a in answers(data) if a["case"] == name]
+    label = "" if len(data.case) == 1 else f", {name.replace('-', ' ')}"
+    head = f"{data.attrs['robot']}{label}: {data.attrs['question']}"
+    return [head, *(own or ["; ".join(kind_of(data).facts(data))])]
+
+
+def draw(data: Dataset) -> dict[str, Figure]:
+    """All pictures of a stored map: one for each case, and those of its kind; by name."""
+    names = [str(name) for name in data.case.values]
+    pictures = {n if len(names) > 1 else "": planes(data, k) for k, n in enumerate(names)}
+    return pictures | kind_of(data).figures(data)
+
+
+def limits(values: Array, worst: float) -> tuple[float, float]:
+    """First and last value of a scale: from 0, or from least to most where these are near."""
+    known = values[np.isfinite(values)]
+    every = np.append(known, worst) if math.isfinite(worst) else known
+    low, high = (float(every.min()), float(every.max())) if len(every) else (0.0, 1.0)
+    if 0.0 <= low <= 0.5 * high:
+        low = 0.0
+    return low, high if high > low else low + (abs(low) or 1.0)
+
+
+def plane_of(data: Dataset, case: int, plane: int) -> dict[str, Any]:
+    """A plane for drawing: names, units and ticks of its sides, values; angles in degrees.
+
+    ``star``: where the worst pose is in it; None where it is not. ``held``: the other coordinates.
+    """
+    part, units = data.isel(case=case, plane=plane), units_of(data)
+    names = tuple(n for n in (str(part.row_name.values), str(part.column_name.values)) if n)
+    scales = [scale_of(1.0, units[n]) if units[n] == "rad" else (1.0, units[n]) for n in names]
+    sides = [part.row_value.values, part.column_value.values]
+    pose, through = part.worst_pose.values, part.through.values
+    every = [str(name) for name in data.coordinate.values]
+    at = {n: through[every.index(n)] for n in every}
+    held = [
+        f"{n} = {round(math.degrees(at[n]), 2) + 0.0:g} deg" if units[n] == "rad"
+        else f"{n} = {_plain(at[n]):.4g} {units[n]}"
+        for n in every if n not in names
+    ]  # fmt: skip
+    star = None
+    if np.isfinite(pose).all() and np.allclose(pose, through, rtol=0.0, atol=1e-12):
+        star = [s * at[n] for n, (s, _) in zip(names, scales, strict=True)]
+    return {
+        "names": names,
+        "units": [unit for _, unit in scales],
+        "ticks": [s * side for side, (s, _) in zip(sides, scales, strict=False)],
+        "values": part.plane_value.values,
+        "reach": part.plane_reach.values,
+        "star": star,
+        "held": ", ".join(held),
+    }
+
+
+def full_planes(data: Dataset, case: int) -> list[int]:
+    """Planes of a case, by index, in which more than their pose counts, the fullest first."""
+    known = np.isfinite(data.plane_value.isel(case=case).values).sum((1, 2))
+    order = np.argsort(-known, kind="stable")
+    return [int(k) for k in order if known[k] > 1] or [int(order[0])]
+
+
+def planes(data: Dataset, case: int) -> Figure:
+    """Up to three planes of a case through its worst pose, on one scale of colours."""
+    kind, part = kind_of(data), data.isel(case=case)
+    drawn = [plane_of(data, case, k) for k in sorted(full_planes(data, case)[:PANELS])]
+    count = len(drawn)
+    worst = float(part.worst_value)
+    values = np.concatenate([one["values"].ravel() for one in drawn])
+    low, high = limits(values, worst)
+    scale, unit = scale_of(max(abs(low), abs(high)), str(part.case_unit.values))
+    label = f"{part.case_what.values} ({unit or 'dimensionless'})"
+    words = [row for text in title(data, case) for row in textwrap.wrap(text, LETTERS)]
+    with plots.pyplot().rc_context({"font.size": 9}):
+        high_of = 0.5 * WIDE if count < PANELS else WIDE / PANELS + 0.9
+        figure, axes = subplots(
+            1, count, figsize=(WIDE, high_of + 0.2 * len(words)), layout="constrained",
+            squeeze=False, gridspec_kw={"width_ratios": _widths(drawn)},
+        )  # fmt: skip
+        for one, ax in zip(drawn, axes[0], strict=True):
+            if len(one["names"]) == 1:
+                _line(one, ax, scale, label)
+                continue
+            mesh = _panel(one, ax, scale, scale * low, scale * high)
+            kind.overlay(data, one["names"], ax)
+        if len(drawn[0]["names"]) > 1:
+            bar = figure.colorbar(mesh, ax=list(axes[0]), aspect=25, pad=0.01)
+            bar.set_label(label)
+        figure.suptitle("\n".join(words), fontsize=10)
+        figure.supxlabel(_caption(data, drawn), fontsize=8.5, color="0.3")
+    return figure
+
+
+def _widths(drawn: list[dict[str, Any]]) -> list[float]:
+    """Widths of panels: of equal scale where all coordinates have one unit."""
+    if len({unit for one in drawn for unit in one["units"]}) > 1 or len(drawn) == 1:
+        return [1.0] * len(drawn)
+    widths = np.array([np.ptp(one["ticks"][0]) for one in drawn])
+    return list(np.clip(widths / widths.max(), 0.5, 1.0).tolist())
+
+
+def _caption(data: Dataset, drawn: list[dict[str, Any]]) -> str:
+    star = "star: worst pose; " if any(one["star"] for one in drawn) else ""
+    return f"{star}outline: all joint limits are kept; white: does not count"
+
+
+def _line(one: dict[str, Any], ax: Axes, scale: float, label: str) -> None:
+    ax.plot(one["ticks"][0], scale * one["values"][:, 0], color=plots.COLOURS[0])
+    plots.label(ax, f"{one['names'][0]} ({one['units'][0]})", label)
+    if one["star"]:
+        k = int(np.abs(one["ticks"][0] - one["star"][0]).argmin())
+        ax.plot(one["star"][0], scale * one["values"][k, 0], "*", color="red", ms=12)
+
+
+def _panel(one: dict[str, Any], ax: Axes, scale: float, low: float, high: float) -> Any:
+    x, y = one["ticks"]
+    values = scale * one["values"].T
+    mesh = ax.pcolormesh(
+        x, y, np.ma.masked_invalid(values), shading="nearest", cmap=MAP, vmin=low, vmax=high,
+        rasterized=True,
+    )  # fmt: skip
+    if one["reach"].any() and not one["reach"].all():
+        ax.contour(x, y, one["reach"].T, [0.5], colors="0.2", linewidths=1.2)
+    known = values[np.isfinite(values)]
+    if len(known) > values.size // 6 and np.ptp(known) > 0.02 * (high - low):
+        levels = np.unique([float(f"{v:.2g}") for v in np.quantile(known, (0.25, 0.6, 0.9))])
+        contours = ax.contour(x, y, values, levels, colors="white", linewidths=0.7)
+        for text in ax.clabel(contours, fmt="%.3g", fontsize=8.5):
+            text.set_bbox({"facecolor": "0.25", "edgecolor": "none", "alpha": 0.55, "pad": 0.6})
+    if one["star"]:
+        # In the colour of its cell, which it covers.
+        at = [
+            int(np.abs(side - place).argmin())
+            for side, place in zip((x, y), one["star"], strict=True)
+        ]
+        face = mesh.to_rgba(values[at[1], at[0]])
+        ax.plot(*one["star"], "*", color=face, mec="red", mew=1.2, ms=14, zorder=5)
+    ax.set_xlabel(f"{one['names'][0]} ({one['units'][0]})")
+    ax.set_ylabel(f"{one['names'][1]} ({one['units'][1]})")
+    if one["held"].count("=") == 1:
+        ax.set_title(one["held"], fontsize=9)
+    if one["units"][0] == one["units"][1]:
+        ax.set_aspect("equal")
+    return mesh
+
+
+def save_all(data: Dataset, out: Path) -> list[Path]:
+    """Write all pictures as PNG beside a path, ``<stem>.png`` or ``<stem>_<name>.png``."""
+    saved = []
+    for name, figure in draw(data).items():
+        ending = "".join(f"_{re.sub(r'[^A-Za-z0-9_.-]+', '_', part)}" for part in [name] if part)
+        saved.append(plots.save(figure, out.with_name(f"{out.stem}{ending}.png"), FINE))
+    return saved

@@ -1,0 +1,331 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a kind of map states: a quantity of a pose, its unit, and which value is worst.
+
+Grid, search of the worst pose, storage, pictures, pages and commands are the same for all kinds.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pkm_twin.errors import ParameterError, PkmTwinError
+from pkm_twin.robot.robot import Robot
+from pkm_twin.robot.workspace import keeps_limits
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+    from xarray import Dataset
+
+    from pkm_twin.maps.variables import Variable
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+
+class Found(NamedTuple):
+    """A quantity in k poses: ``value`` (k,), its ``direction`` (k, axes), its ``element`` (k,).
+
+    ``element``: index of the name that is to blame. ``shares``: parts of the elements, shape
+    (k, elements). A kind without directions, elements or shares leaves them out.
+    """
+
+    value: Array
+    direction: Array | None = None
+    element: NDArray[np.int64] | None = None
+    shares: Array | None = None
+
+
+@dataclass(frozen=True)
+class Case:
+    """One quantity of a map; several load cases or several modes are several cases.
+
+    ``what`` and ``unit``: of the value. ``answer``: what the worst pose is, as "softest".
+    ``largest``: is the largest value the worst? ``wrench``: force (N) and moment (N m) that the
+    surroundings apply to the platform at its reference point, base axes. ``searched``: whether the
+    worst pose is searched; otherwise the planes go through home. ``interfering``: whether poses
+    count in which limbs interfere.
+    """
+
+    name: str
+    what: str
+    unit: str
+    answer: str
+    largest: bool = True
+    wrench: tuple[float, ...] | None = None
+    searched: bool = True
+    interfering: bool = False
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A kind of map; its fields are the options of its command.
+
+    ``question``: what its picture answers. ``points``: of the grid; ``chunk``: poses that are
+    computed at once; ``samples``, ``population`` and ``rounds``: size of the search for the worst
+    pose. ``screen``: of a quantity that takes long, a fast one that is bad in the same poses.
+    ``least``: default singularity index below which a pose does not count. ``together``: all cases
+    share the worst pose of the first. ``signed``: values may be negative. ``page_help``:
+    explains the further figure of the page.
+    """
+
+    name: ClassVar[str]
+    question: ClassVar[str]
+    answer: ClassVar[str]
+    what: ClassVar[str]
+    unit: ClassVar[str] = ""
+    largest: ClassVar[bool] = True
+    element: ClassVar[str] = "element"
+    has_shares: ClassVar[bool] = False
+    takes_wrench: ClassVar[bool] = False
+    together: ClassVar[bool] = False
+    signed: ClassVar[bool] = False
+    least: ClassVar[float] = 0.05
+    points: ClassVar[int] = 50_000
+    chunk: ClassVar[int] = 16384
+    samples: ClassVar[int] = 8192
+    population: ClassVar[int] = 256
+    rounds: ClassVar[int] = 200
+    screen: ClassVar[Kind | None] = None
+    page_help: ClassVar[str] = ""
+
+    def found(self, robot: Robot, q: Array, case: Case) -> Found:
+        """The quantity at joint positions (k, n), k above zero.
+
+        :raises ParameterError: the robot's file lacks what the quantity needs.
+        """
+        raise NotImplementedError
+
+    def each(self, robot: Robot, q: Array, cases: Sequence[Case]) -> list[Found]:
+        """The same for several cases."""
+        return [self.found(robot, q, case) for case in cases]
+
+    def cases(self, robot: Robot) -> tuple[Case, ...]:
+        """The cases of a map without given loads."""
+        return (Case(self.name, self.what, self.unit, self.answer, self.largest),)
+
+    def loaded(self, robot: Robot, name: str, wrench: Sequence[float]) -> Case:
+        """A load case of a name.
+
+        :raises ParameterError: other than six finite numbers, or a kind without loads.
+        """
+        if not self.takes_wrench:
+            raise ParameterError("wrench", name, f"no wrench for the map {self.name}")
+        if len(wrench) != 6 or not np.isfinite(wrench).all() or not np.any(wrench):
+            raise ParameterError("wrench", list(wrench), "six finite numbers, not all zero")
+        return replace(self.cases(robot)[0], name=name, wrench=tuple(map(float, wrench)))
+
+    def elements(self, robot: Robot) -> tuple[str, ...]:
+        """Names that ``element`` counts."""
+        return ()
+
+    def axes(self, robot: Robot) -> tuple[str, ...]:
+        """Names of the components of a direction."""
+        return ("x", "y", "z")
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """The kind's own options, for a file."""
+        return asdict(self)
+
+    def summaries(self, space: Space, counted: int, apart: int) -> dict[str, Variable]:
+        """Results over the whole workspace.
+
+        :param counted: poses of the grid that keep all bounds but the one on the clearance;
+            ``apart``: of these, poses in which no limbs interfere.
+        """
+        return {}
+
+    @classmethod
+    def facts(cls, data: Dataset) -> list[str]:
+        """Sentences about a stored map, besides those on worst poses."""
+        return []
+
+    @classmethod
+    def overlay(cls, data: Dataset, names: tuple[str, ...], ax: Axes) -> None:
+        """What is drawn over a plane of two pose coordinates."""
+
+    @classmethod
+    def figures(cls, data: Dataset) -> dict[str, Figure]:
+        """Further pictures of a stored map, by name."""
+        return {}
+
+    @classmethod
+    def page(cls, data: Dataset) -> Any:
+        """A further plotly figure of a stored map for its page; None for none."""
+        return None
+
+
+@dataclass(frozen=True, eq=False)
+class Worst:
+    """A worst pose (m,), its joint positions (n,), and what was found there."""
+
+    pose: Array
+    q: Array
+    found: Found
+
+
+@dataclass(frozen=True, eq=False)
+class Space:
+    """The poses of a map, and which of them count.
+
+    ``bounds``: of the pose coordinates, shape (m, 2). ``ticks``: of a grid of up to three of them;
+    otherwise empty, and ``samples`` joint positions are drawn. ``side``: poses along a side of a
+    plane. ``least``: singularity index, and ``least_clearance``: distance of the limbs, m, below
+    which a pose does not count. ``at``: the pose (m,) that planes go through, instead of the worst.
+    ``worst``: of each case, once they are known; None where none is searched.
+    """
+
+    robot: Robot
+    kind: Kind
+    cases: tuple[Case, ...]
+    bounds: Array
+    ticks: tuple[Array, ...]
+    samples: int
+    side: int
+    least: float
+    least_clearance: float
+    at: Array | None = None
+    worst: tuple[Worst | None, ...] = ()
+
+    @property
+    def by_joints(self) -> bool:
+        """Whether finite limits bound the joint positions."""
+        limits = self.robot.limits.position
+        return limits is not None and bool(np.isfinite(limits).all())
+
+    @property
+    def box(self) -> Array:
+        """Where worst poses are searched: limits of joints (n, 2), or bounds of poses."""
+        limits = self.robot.limits.position
+        return limits if self.by_joints and limits is not None else self.bounds
+
+    def state(self, x: Array) -> tuple[Array, Array, Mask]:
+        """Joint positions, poses, and which are known, of places (k, n) in the box."""
+        if not self.by_joints:
+            return self.of_poses(x)
+        pose, known = self.robot.try_forward(x)
+        return x, np.where(known[:, None], pose, self.robot.home()), known
+
+    def of_poses(self, poses: Array) -> tuple[Array, Array, Mask]:
+        """Joint positions, the poses (k, m), and which of them are known."""
+        q, known = self.robot.try_inverse(poses)
+        return np.where(known[:, None], q, self.robot.graph.home), poses, known
+
+    def counts(self, q: Array, pose: Array, known: Mask, case: Case) -> Mask:
+        """Which joint positions (k, n) and poses (k, m) count, of those that are known."""
+        bound = -math.inf if case.interfering else self.least_clearance
+        return counts(self.robot, q, pose, known, self.least, bound)
+
+    def through(self, case: int) -> Array:
+        """The pose that the planes of a case go through, shape (m,)."""
+        worst = self.worst[0 if self.kind.together else case]
+        if self.at is not None or worst is None:
+            return self.robot.home() if self.at is None else self.at
+        return worst.pose
+
+
+def counts(
+    robot: Robot, q: Array, pose: Array, known: Mask, least: float, least_clearance: float
+) -> Mask:
+    """Which joint positions (k, n) and poses (k, m) count, of those that are known, shape (k,)."""
+    inside = keeps_limits(robot, q, pose, least_clearance, known)
+    inside[inside] = robot.try_singularity(q[inside])[0] >= least
+    return inside
+
+
+def found_of(kind: Kind, robot: Robot, q: Array, cases: Sequence[Case]) -> list[Found]:
+    """A kind's cases at joint positions (k, n); NaN in single poses that have no value."""
+    ways = len(kind.axes(robot))
+
+    def without(k: int) -> Found:
+        shares = np.full((k, len(kind.elements(robot))), np.nan) if kind.has_shares else None
+        return Found(np.full(k, np.nan), np.full((k, ways), np.nan), np.full(k, -1), shares)
+
+    if not len(q):
+        return [without(0) for _ in cases]
+    try:
+        return kind.each(robot, q, cases)
+    except ParameterError:
+        raise
+    except PkmTwinError:
+        if len(q) == 1:
+            return [without(1) for _ in cases]
+        halves = [found_of(kind, robot, part, cases) for part in np.array_split(q, 2)]
+        return [_joined(*pair) for pair in zip(*halves, strict=True)]
+
+
+def _joined(one: Found, other: Found) -> Found:
+    def both(a: NDArray[Any] | None, b: NDArray[Any] | None) -> Any:
+        return None if a is None or b is None else np.concatenate([a, b])
+
+    return Found(*map(both, one, other))
+
+
+def limits_of(robot: Robot, name: str) -> Array:
+    """Limits of the drives by name, ``effort`` or ``velocity``, shape (n,); SI units.
+
+    :raises ParameterError: the robot's file has none.
+    """
+    limits = getattr(robot.limits, name)
+    if limits is None or not np.isfinite(limits).any():
+        raise ParameterError(f"limits.{name}", None, f"the drives' {name} limits")
+    return np.asarray(limits, np.float64)
+
+
+def unit_motions(robot: Robot, q: Array) -> tuple[Array, Array]:
+    """Joint rates of unit rates of the platform, shape (k, n, d), and their directions, (d, 3).
+
+    Of the position in the pose, its angles at rest; of a pose of angles alone about the base axes.
+
+    :raises ParameterError: more drives than freedoms, whose rates depend on each other.
+    """
+    if len(robot.joint_names) != len(robot.pose_names):
+        what = "as many actuated joints as pose coordinates"
+        raise ParameterError("joints", len(robot.joint_names), what)
+    places = [k for k, name in enumerate(robot.pose_names) if name in "xyz"]
+    if not places:
+        turned = np.linalg.pinv(robot.platform_jacobian(q)[..., 3:, :])
+        return np.asarray(turned, np.float64), np.eye(3)
+    ways = np.eye(3)[["xyz".index(robot.pose_names[k]) for k in places]]
+    return np.asarray(np.linalg.pinv(robot.jacobian(q))[..., places], np.float64), ways
+
+
+def unit_of_motion(robot: Robot) -> str:
+    """Unit of what :func:`unit_motions` moves: ``m`` or ``rad``."""
+    return "m" if set("xyz") & set(robot.pose_names) else "rad"
+
+
+def least_room(room: Array, rows: Array) -> tuple[Array, Array, NDArray[np.int64]]:
+    """The least of each pose, the unit vector of its row, and its index: what limits a motion.
+
+    :param room: shape (k, n); ``rows``: shape (k, n, 3).
+    """
+    joint = room.argmin(-1)
+    value = np.take_along_axis(room, joint[..., None], -1)[..., 0]
+    row = np.take_along_axis(rows, joint[..., None, None], -2)[..., 0, :]
+    return value, size_and_direction(row)[1], joint
+
+
+def largest_axis(matrices: Array) -> tuple[Array, Array]:
+    """Largest eigenvalue (k,) and its direction (k, 3) of symmetric matrices (k, 3, 3).
+
+    The direction's largest entry is positive.
+    """
+    values, vectors = np.linalg.eigh(matrices)
+    direction = vectors[..., -1]
+    index = np.abs(direction).argmax(-1)[..., None]
+    sign = np.sign(np.take_along_axis(direction, index, -1))
+    return values[..., -1], direction * sign
+
+
+def size_and_direction(vectors: Array) -> tuple[Array, Array]:
+    """Lengths (k,) and unit vectors (k, 3); zero where a vector is."""
+    size = np.linalg.norm(vectors, axis=-1)
+    return size, vectors / np.where(size > 0.0, size, 1.0)[..., None]

@@ -1,0 +1,59 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The acceleration from rest that the drives reach in every direction."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from delta_dynamics import inverse_dynamics
+from pkm_twin.maps.kind import (
+    Array,
+    Case,
+    Found,
+    Kind,
+    least_room,
+    limits_of,
+    unit_motions,
+    unit_of_motion,
+)
+from pkm_twin.robot.robot import Robot
+
+
+class Acceleration(Kind):
+    """The acceleration from rest that the drives reach in every direction."""
+
+    name = "acceleration"
+    question = "how hard can it accelerate?"
+    answer = "accelerates least"
+    what = "acceleration in the worst direction"
+    largest = False
+    element = "drive"
+    takes_wrench = True
+
+    def cases(self, robot: Robot) -> tuple[Case, ...]:
+        """Of a pose of angles alone the angular acceleration."""
+        return (replace(super().cases(robot)[0], unit=f"{unit_of_motion(robot)}/s2"),)
+
+    def elements(self, robot: Robot) -> tuple[str, ...]:
+        """The drives."""
+        return robot.joint_names
+
+    def found(self, robot: Robot, q: Array, case: Case) -> Found:
+        """Least over directions of what the first drive at its limit leaves; its angles at rest.
+
+        0 where the drives do not hold the machine.
+        """
+        limits, still = limits_of(robot, "effort"), np.zeros_like(q)
+        back, axes = unit_motions(robot, q)
+        held = inverse_dynamics(robot, q, still, still, case.wrench)
+        columns = [inverse_dynamics(robot, q, still, c, case.wrench) - held
+                   for c in np.moveaxis(back, -1, 0)]  # fmt: skip
+        each = np.stack(columns, -1)
+        size = np.linalg.norm(each, axis=-1)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            room = np.where(size > 0.0, (limits - np.abs(held)) / size, np.inf)
+        sign = np.where(held < 0.0, -1.0, 1.0)[..., None]
+        value, direction, drive = least_room(room, sign * (each @ axes))
+        return Found(np.maximum(value, 0.0), direction, drive)

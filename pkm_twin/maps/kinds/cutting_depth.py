@@ -1,0 +1,48 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The axial depth of cut that mills without chatter at every spindle speed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from pkm_twin.maps.kind import Array, Found, size_and_direction
+from pkm_twin.maps.kinds.frequency import Frequency
+from pkm_twin.robot.robot import Robot
+from stiffness_monitor.chatter import Milling, stable_depth_of
+from stiffness_monitor.vibration import COUNT, tool_modes
+
+
+@dataclass(frozen=True)
+class CuttingDepth(Frequency):
+    """The axial depth of cut that mills without chatter at every spindle speed (zero-order).
+
+    ``damping`` and ``tool`` as of :func:`~stiffness_monitor.vibration.tool_modes`.
+    """
+
+    milling: Milling
+    damping: tuple[float, ...] | None = None
+    tool: tuple[float, ...] = (0.0, 0.0, 0.0)
+
+    name = "cutting-depth"
+    question = "how deep does it mill without chatter?"
+    answer = "chatters first"
+    what = "axial depth of cut without chatter"
+    unit = "m"
+    element = "mode"
+    together = False
+
+    def elements(self, robot: Robot) -> tuple[str, ...]:
+        """Modes of the tool point, lowest first."""
+        return tuple(f"mode {k}" for k in range(1, COUNT + 1))
+
+    def each(self, robot: Robot, q: Array, cases: object) -> list[Found]:
+        """The zero-order depth, how the tool point swings in the mode that chatters, and which."""
+        poses = robot.forward(q)
+        found = [tool_modes(robot, p, damping=self.damping, tool=self.tool) for p in poses]
+        depths = [stable_depth_of(modes, self.milling) for modes in found]
+        moved = [modes.shapes[k, :3] for modes, (_, k) in zip(found, depths, strict=True)]
+        value, mode = np.array(depths).reshape(-1, 2).T
+        direction = size_and_direction(np.array(moved))[1]
+        return [Found(value, direction, mode.astype(np.int64))]

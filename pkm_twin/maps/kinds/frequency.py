@@ -1,0 +1,41 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The first natural frequency, actuators locked."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from pkm_twin.maps.kind import Array, Case, Found, Kind, size_and_direction
+from pkm_twin.maps.kinds.compliance import Compliance
+from pkm_twin.robot.robot import Robot
+from stiffness_monitor.modes import modes
+
+
+class Frequency(Kind):
+    """The first natural frequency, actuators locked."""
+
+    name = "frequency"
+    question = "where does it ring lowest?"
+    answer = "rings lowest"
+    what = "first natural frequency"
+    unit = "Hz"
+    largest = False
+    together = True
+    points = 1000
+    chunk = 256
+    samples = 256
+    population = 24
+    rounds = 40
+    screen = Compliance()
+
+    def elements(self, robot: Robot) -> tuple[str, ...]:
+        """Bodies, and joints with elasticity."""
+        return modes(robot, robot.home(), 1).energies.elements
+
+    def each(self, robot: Robot, q: Array, cases: Sequence[Case]) -> list[Found]:
+        """Frequencies, the way that the platform swings, and the parts with most strain energy."""
+        found = modes(robot, robot.forward(q), len(cases))
+        _, direction = size_and_direction(found.shapes[..., 0, :3])
+        strain = found.energies.strain.argmax(-1)
+        return [Found(found.frequencies[:, k], direction[:, k], strain[:, k])
+                for k in range(len(cases))]  # fmt: skip

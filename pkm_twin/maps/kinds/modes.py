@@ -1,0 +1,271 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The six lowest natural frequencies, actuators locked, and the shapes of their modes."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pkm_twin.machine.graph import BASE
+from pkm_twin.maps import plots
+from pkm_twin.maps.extras import require
+from pkm_twin.maps.kind import Array, Case, Space
+from pkm_twin.maps.kinds.frequency import Frequency
+from pkm_twin.maps.variables import POSITIVE, SHARE, Variable, about
+from pkm_twin.robot.robot import Robot
+from stiffness_monitor.modes import modes
+from stiffness_monitor.structure import StructuralModel, structural_model
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+    from xarray import Dataset
+
+COUNT: Final = 6
+DRAWN: Final = 3
+"""Modes in the picture of shapes."""
+ENLARGED: Final = 0.13
+"""Largest displacement of a drawn mode shape over the size of the machine."""
+PHASES: Final = 16
+"""Pictures in one swing of a mode."""
+
+
+class Modes(Frequency):
+    """The six lowest natural frequencies and their mode shapes."""
+
+    name = "modes"
+    question = "how does it vibrate?"
+    page_help = (
+        "Below: the frame at rest (grey) and in a mode, magnified, at the pose that rings lowest; "
+        "the button animates it."
+    )
+
+    def cases(self, robot: Robot) -> tuple[Case, ...]:
+        """The modes, lowest first."""
+        (first,) = super().cases(robot)
+        numbers = range(1, COUNT + 1)
+        return tuple(replace(first, name=f"mode {k}", what=f"frequency of mode {k}",
+                             answer="rings lowest" if k == 1 else "rings there")
+                     for k in numbers)  # fmt: skip
+
+    def summaries(self, space: Space, counted: int, apart: int) -> dict[str, Variable]:
+        """The shapes of the modes at the planes' pose, where their energy is, and lines to draw."""
+        pose, node, part = space.through(0), ("mode", "node", "space"), ("mode", "element")
+        found = modes(space.robot, pose, len(space.cases))
+        edges = structure_edges(
+            structural_model(space.robot, space.robot.inverse(pose)), found.nodes
+        )
+        ends = {"valid_min": 0, "valid_max": len(found.nodes) - 1}
+        what = "displacement of the nodes in a mode of unit generalised mass"
+        share = {kind: about(f"part of the mode's {kind} energy", "", SHARE)
+                 for kind in ("strain", "kinetic")}  # fmt: skip
+        return {
+            "node": Variable(("node",), np.array(found.nodes, "U"), {}),
+            "line": Variable(("edge", "end"), edges, about("nodes that it joins", "", ends)),
+            "position": Variable(("node", "space"), found.positions, about("node at rest", "m")),
+            "displacement": Variable(node, found.shapes[..., :3], about(what, "1/sqrt(kg)")),
+            "shape_frequency": Variable(
+                ("mode",), found.frequencies, about("of the shape", "Hz", POSITIVE)
+            ),
+            "strain_share": Variable(part, found.energies.strain, share["strain"]),
+            "kinetic_share": Variable(part, found.energies.kinetic, share["kinetic"]),
+        }
+
+    @classmethod
+    def figures(cls, data: Dataset) -> dict[str, Figure]:
+        """The shapes of the lowest modes, in colours of how far each point moves."""
+        from mpl_toolkits.mplot3d.art3d import Line3DCollection  # type: ignore[import-untyped]
+
+        figure, axes = plots.pyplot().subplots(
+            1, DRAWN, figsize=(9, 4.6), layout="constrained", subplot_kw={"projection": "3d"}
+        )
+        rest, edges = data.position.values, data.line.values
+        low, high = _ends(rest)
+        for mode, ax in enumerate(axes):
+            moved, far = deformed(data, mode)
+            ax.add_collection3d(Line3DCollection(rest[edges], colors="0.7", linewidths=1.0))
+            drawn = Line3DCollection(moved[edges], cmap="viridis", linewidths=2.2)
+            drawn.set_array(far[edges].mean(1))
+            drawn.set_clim(0.0, 1.0)
+            ax.add_collection3d(drawn)
+            ax.scatter(*rest[grounded(data)].T, marker="s", s=14, color="0.3", depthshade=False)
+            ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
+            ax.set_box_aspect(high - low, zoom=0.95)
+            ax.view_init(elev=18, azim=-58)
+            ax.set_axis_off()
+            ax.set_title("\n".join(_head(data, mode)), fontsize=9)
+        figure.colorbar(drawn, ax=axes.tolist(), aspect=25, pad=0.01).set_label(
+            "displacement over the mode's largest (dimensionless)", fontsize=9
+        )
+        figure.suptitle(
+            f"{data.attrs['robot']}: lowest modes where it rings lowest, actuators locked\n"
+            "grey: at rest; coloured: deformed, magnified; below: the parts with most energy",
+            fontsize=10,
+        )
+        return {"shapes": figure}
+
+    @classmethod
+    def page(cls, data: Dataset) -> Any:
+        """The frame at rest and in a mode that a menu chooses and buttons swing and hold."""
+        graph = require("plotly.graph_objects", "atlas")
+        from pkm_twin.maps.pages import CAMERA, MARGIN, MENU, button, narrow
+
+        rest, path = data.position.values, _path(data.line.values)
+        low, high = _ends(rest)
+        still: dict[str, Any] = {"hoverinfo": "skip", "showlegend": False}
+        figure = graph.Figure()
+        grey, square = {"color": "#b0b0b0"}, {"symbol": "square", "size": 4, "color": "#444"}
+        ground = _points(rest, grounded(data))
+        figure.add_scatter3d(**_points(rest, path), mode="lines", line=grey, **still)
+        figure.add_scatter3d(**ground, mode="markers", marker=square, **still)
+        names = ["" if k < 0 else str(data.node.values[k]) for k in path.tolist()]
+        figure.add_scatter3d(mode="lines", text=names, hovertemplate="%{text}<extra></extra>",
+                             showlegend=False)  # fmt: skip
+        buttons, frames = [], []
+        for mode in range(data.sizes["mode"]):
+            moved, far = deformed(data, mode)
+            line = {"color": _picked(far, path, 0.0), "coloraxis": "coloraxis", "width": 7}
+            for n in range(PHASES):
+                place = rest + math.cos(2 * math.pi * n / PHASES) * (moved - rest)
+                shape = graph.Scatter3d(**_points(place, path), line=line)
+                frames.append(graph.Frame(name=f"{mode}/{n}", data=[shape], traces=[2]))
+            head = _head(data, mode)
+            change = {axis: [values] for axis, values in _points(moved, path).items()}
+            change["line"] = [line]
+            layout = {"title.text": "; ".join(head), "updatemenus[1].buttons": _players(mode)}
+            buttons.append(button(head[0], change, layout, [2]))
+        figure.frames = frames
+        first, layout = buttons[0]["args"][:2]
+        figure.data[2].update({name: values[0] for name, values in first.items()})
+        bar = {"title": {"text": "displacement over<br>the mode's largest"}, "len": 0.7}
+        figure.update_layout(
+            title={"y": 1.0, "yanchor": "top", "pad": {"t": 36}, "text": layout["title.text"]},
+            coloraxis={"colorscale": "Viridis", "cmin": 0.0, "cmax": 1.0, "colorbar": bar},
+            scene={
+                "aspectmode": "manual",
+                "aspectratio": dict(zip("xyz", (1.3 * (high - low) / (high - low).max()).tolist(),
+                                        strict=True)),
+                "camera": {**CAMERA, "projection": {"type": "orthographic"}},
+                **{f"{axis}axis": {"title": f"{axis} (m)", "range": [a, b], "nticks": 6}
+                   for axis, a, b in zip("xyz", low.tolist(), high.tolist(), strict=True)},
+            },
+            margin=MARGIN, meta=narrow(), uirevision="modes",
+            updatemenus=[
+                {"buttons": buttons, **MENU},
+                {"type": "buttons", "direction": "left", "showactive": False,
+                 "buttons": _players(0), **MENU, "x": 1.0, "xanchor": "right"},
+            ],
+        )  # fmt: skip
+        return figure
+
+
+def deformed(data: Dataset, mode: int) -> tuple[Array, Array]:
+    """Nodes of a mode shape, enlarged, and how far each moves; (nodes, 3), m, and (nodes,).
+
+    The second is over the largest of all nodes.
+
+    :param mode: by index, 0 is the lowest.
+    """
+    rest, moved = data.position.values, data.displacement.values[mode]
+    far = np.linalg.norm(moved, axis=1)
+    scale = ENLARGED * float(np.linalg.norm(np.ptp(rest, axis=0))) / far.max()
+    return rest + scale * moved, far / far.max()
+
+
+def grounded(data: Dataset) -> NDArray[np.int64]:
+    """Nodes on the ground, by index: the ends that one line alone meets."""
+    nodes, count = np.unique(data.line.values, return_counts=True)
+    return np.asarray(nodes[count == 1], np.int64)
+
+
+def _head(data: Dataset, mode: int) -> list[str]:
+    """A mode's number, its frequency, and the parts that hold most of its energy."""
+    lines = [f"mode {mode + 1}: {float(data.shape_frequency[mode]):.4g} Hz"]
+    for kind in ("strain", "kinetic"):
+        shares = data[f"{kind}_share"].values[mode]
+        order = np.argsort(-shares, kind="stable")[:3]
+        parts = [f"{data.element.values[k]} {100 * shares[k]:.0f} %" for k in order
+                 if shares[k] >= 0.005]  # fmt: skip
+        lines.append(f"{kind}: {', '.join(parts)}")
+    return lines
+
+
+def _ends(rest: Array) -> tuple[Array, Array]:
+    """Bounds of a scene that are the same for all modes, with room for the shapes."""
+    margin = 0.6 * ENLARGED * float(np.linalg.norm(np.ptp(rest, axis=0)))
+    return rest.min(0) - margin, rest.max(0) + margin
+
+
+def _path(edges: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Nodes of all lines in one go; -1 between lines that do not meet."""
+    path: list[int] = []
+    for start, end in edges.tolist():
+        if not path or path[-1] != start:
+            path += [start] if not path else [-1, start]
+        path.append(end)
+    return np.array(path)
+
+
+def _picked(values: Array, path: NDArray[np.int64], gap: float | None = None) -> list[Any]:
+    """Values (nodes,) along a path; a plain list, as only that can have None in its gaps."""
+    return [gap if k < 0 else round(float(values[k]), 5) for k in path.tolist()]
+
+
+def _points(nodes: Array, path: NDArray[np.int64]) -> dict[str, Any]:
+    """Coordinates of nodes (n, 3) along a path."""
+    return {axis: _picked(nodes[:, k], path) for k, axis in enumerate("xyz")}
+
+
+def _players(mode: int) -> list[dict[str, Any]]:
+    """Buttons that swing a mode ten times and hold it; plotly cannot repeat without end."""
+    names = [f"{mode}/{n % PHASES}" for n in range(10 * PHASES + 1)]
+    timing = {"mode": "immediate", "transition": {"duration": 0}}
+    swing = {**timing, "frame": {"duration": 60, "redraw": True}}
+    hold = {**timing, "frame": {"duration": 0, "redraw": False}}
+    return [
+        {"label": "swing", "method": "animate", "args": [names, swing]},
+        {"label": "hold", "method": "animate", "args": [[None], hold]},
+    ]
+
+
+def structure_edges(model: StructuralModel, nodes: tuple[str, ...]) -> NDArray[np.int64]:
+    """Pairs of nodes to draw lines between, shape (edges, 2).
+
+    Along the members; from a member's end to those that stand on it; the platform as spokes from
+    its origin and the outline of the points where members meet it.
+
+    :param nodes: names as :func:`stiffness_monitor.modes.modes` gives them: the platform's origin,
+        then ``<member> <k>/<elements>``.
+    """
+    members = model.members
+    of: dict[str, list[int]] = {member.name: [] for member in members}
+    for index, name in enumerate(nodes[1:], start=1):
+        of[name.rpartition(" ")[0]].append(index)
+    lines: list[tuple[int, int]] = []
+    corners: list[tuple[int, Array]] = []
+    for member in members:
+        own = of[member.name]
+        lines += pairwise(own)
+        for support, node, point in (
+            (member.inner, own[0], member.start),
+            (member.outer, own[-1], member.end),
+        ):
+            if support is None or support.body == BASE:
+                continue
+            if support.body == model.platform:
+                corners.append((node, point))
+            elif support.body in of:
+                lines.append((of[support.body][-1], node))
+    # Around the platform by angle, in the plane of its points.
+    arms = np.array([point - model.origin for _, point in corners])
+    across = np.linalg.svd(arms - arms.mean(0))[2][:2]
+    turn = np.arctan2(*((arms - arms.mean(0)) @ across.T).T)
+    around = [corners[k][0] for k in np.argsort(turn)]
+    lines += [(0, node) for node in around]
+    if len(around) > 2:
+        lines += pairwise([*around, around[0]])
+    return np.array(lines, np.int64)

@@ -1,0 +1,49 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The largest mass that the drives hold at rest."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from delta_dynamics import inverse_dynamics
+from pkm_twin.maps.kind import Array, Case, Found, Kind, limits_of
+from pkm_twin.robot.robot import Robot
+
+
+class Payload(Kind):
+    """The largest mass that the drives hold at rest, weight included."""
+
+    name = "payload"
+    question = "how much can it carry?"
+    answer = "carries least"
+    what = "largest payload"
+    unit = "kg"
+    largest = False
+    element = "drive"
+    takes_wrench = True
+
+    def elements(self, robot: Robot) -> tuple[str, ...]:
+        """The drives."""
+        return robot.joint_names
+
+    def axes(self, robot: Robot) -> tuple[str, ...]:
+        """None: weight acts along gravity."""
+        return ()
+
+    def found(self, robot: Robot, q: Array, case: Case) -> Found:
+        """The mass with the centre of the file's payload, which is taken away.
+
+        0 where the drives do not hold the machine without it; infinite where no drive feels the
+        mass. The element is the drive at its limit.
+        """
+        limits, still = limits_of(robot, "effort"), np.zeros_like(q)
+        none = {"mass": 0.0, "inertia": np.zeros((3, 3)).tolist()}
+        bare, loaded = (robot.changed(payload=none | {"mass": mass}) for mass in (0.0, 1.0))
+        held = inverse_dynamics(bare, q, still, still, case.wrench)
+        each = inverse_dynamics(loaded, q, still, still, case.wrench) - held
+        with np.errstate(divide="ignore", invalid="ignore"):
+            room = np.where(each == 0.0, np.inf, (np.copysign(limits, each) - held) / each)
+        over = np.abs(held) / limits
+        fails = over.max(-1) > 1.0
+        joint = np.where(fails, over.argmax(-1), room.argmin(-1))
+        return Found(np.where(fails, 0.0, room.min(-1)), None, joint)

@@ -1,0 +1,54 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The standard deviation of the platform's position, from the file's `uncertainty`."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pkm_twin.errors import ParameterError
+from pkm_twin.maps.kind import Array, Case, Found, Kind, largest_axis
+from pkm_twin.robot.derivatives import position_effects
+from pkm_twin.robot.robot import Robot
+
+
+class PoseError(Kind):
+    """The standard deviation of the position, from the file's `uncertainty`."""
+
+    name = "pose-error"
+    question = "where is it least accurate?"
+    answer = "least accurate"
+    what = "standard deviation of the position"
+    unit = "m"
+    element = "cause"
+    points = 20_000
+    chunk = 4096
+    samples = 1024
+    population = 64
+    rounds = 100
+
+    def elements(self, robot: Robot) -> tuple[str, ...]:
+        """The numbers of the geometry whose errors move the platform."""
+        return tuple(list(robot.causes)[k] for k in _moving(robot))
+
+    def found(self, robot: Robot, q: Array, case: Case) -> Found:
+        """In the worst direction, joints at their set points; to first order, independent causes.
+
+        The element is the cause with the greatest part in that direction.
+        """
+        effects = position_effects(robot, q)[..., _moving(robot)].swapaxes(-1, -2)
+        value, direction = largest_axis(effects.swapaxes(-1, -2) @ effects)
+        along = np.abs((effects * direction[..., None, :]).sum(-1))
+        return Found(np.sqrt(np.maximum(value, 0.0)), direction, along.argmax(-1))
+
+
+def _moving(robot: Robot) -> NDArray[np.intp]:
+    """Places of the causes that move the platform at home.
+
+    :raises ParameterError: a file without standard deviations of the geometry.
+    """
+    found = np.flatnonzero(position_effects(robot, robot.graph.home).any(0))
+    if not len(found):
+        what = "the standard deviation of a length or angle that moves the platform"
+        raise ParameterError("uncertainty", None, what)
+    return found

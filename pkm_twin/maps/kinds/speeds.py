@@ -1,0 +1,40 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The speed that the drives reach in every direction."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from pkm_twin.maps.kind import (
+    Array,
+    Case,
+    Found,
+    Kind,
+    least_room,
+    limits_of,
+    unit_motions,
+    unit_of_motion,
+)
+from pkm_twin.robot.robot import Robot
+
+
+class Speeds(Kind):
+    """The speed that the drives reach in every direction."""
+
+    name, what, answer = "speeds", "speed in the slowest direction", "slowest"
+    question, element, largest = "how fast can it move?", "drive", False
+
+    def cases(self, robot: Robot) -> tuple[Case, ...]:
+        """Of a pose of angles alone the angular velocity."""
+        return (replace(super().cases(robot)[0], unit=f"{unit_of_motion(robot)}/s"),)
+
+    def elements(self, robot: Robot) -> tuple[str, ...]:
+        """The drives."""
+        return robot.joint_names
+
+    def found(self, robot: Robot, q: Array, case: Case) -> Found:
+        """Velocity limits over the joint rates of unit motions; the element is at its limit."""
+        back, axes = unit_motions(robot, q)
+        with np.errstate(divide="ignore"):
+            room = limits_of(robot, "velocity") / np.linalg.norm(back, axis=-1)
+        return Found(*least_room(room, back @ axes))

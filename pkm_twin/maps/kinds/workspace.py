@@ -1,0 +1,188 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Reach, singularities, limb interference, and the largest cylinder in the workspace."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from pkm_twin.maps.kind import Array, Case, Found, Kind, Space
+from pkm_twin.maps.variables import POSITIVE, SHARE, Variable, about, number
+from pkm_twin.robot.clearance import has_clearance, joint_clearance
+from pkm_twin.robot.robot import Robot
+from pkm_twin.robot.workspace import (
+    CLEAR,
+    circle_radii,
+    distance_unit,
+    has_joint_angles,
+    joint_angle_at,
+)
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from xarray import Dataset
+
+SINGULARITY: Final = Case(
+    "singularity", "singularity index", "", "nearest to a singularity", False, searched=False
+)
+CLEARANCE: Final = Case(
+    "clearance", "clearance of the limbs", "m", "limbs nearest", False, interfering=True
+)
+ANGLE: Final = Case("joint-angle", "largest passive joint angle", "rad", "bends most")
+LAYERS: Final = 101
+"""Heights of the circles."""
+
+
+class Workspace(Kind):
+    """Reach, singularities, limb interference, largest inscribed cylinder."""
+
+    name = "workspace"
+    question = "where does it reach?"
+    least = 0.0
+    signed = True
+    points = 200_000
+
+    def cases(self, robot: Robot) -> tuple[Case, ...]:
+        """The singularity index; clearance and passive angle where the file gives them."""
+        known = (True, has_clearance(robot), has_joint_angles(robot))
+        cases = (SINGULARITY, CLEARANCE, ANGLE)
+        return tuple(case for case, there in zip(cases, known, strict=True) if there)
+
+    def axes(self, robot: Robot) -> tuple[str, ...]:
+        """None: distances and angles have no direction."""
+        return ()
+
+    def found(self, robot: Robot, q: Array, case: Case) -> Found:
+        """One number a pose, without direction or element."""
+        if case == SINGULARITY:
+            return Found(robot.try_singularity(q)[0])
+        if case == CLEARANCE:
+            return Found(joint_clearance(robot, q, refuse=False))
+        return Found(joint_angle_at(robot, robot.forward(q)))
+
+    def summaries(self, space: Space, counted: int, apart: int) -> dict[str, Variable]:
+        """Volume, what interference takes away, and of poses about an axis circles and cylinder."""
+        robot, result = space.robot, {}
+        if 1 < len(space.ticks) == len(robot.pose_names):
+            cell = math.prod(float(ticks[1] - ticks[0]) for ticks in space.ticks)
+            what = "volume of the reachable poses"
+            result["volume"] = number(apart * cell, what, _product(robot.pose_units), POSITIVE)
+        if has_clearance(robot):
+            share = (counted - apart) / counted if counted else math.nan
+            what = "share of otherwise reachable poses in which limbs interfere"
+            result["interference"] = number(share, what, "", SHARE)
+        if space.ticks and robot.grid().kind == "cylinder":
+            low, high = space.ticks[robot.pose_names.index(robot.grid().height)][[0, -1]]
+            heights = np.linspace(low, high, LAYERS)
+            result |= regular(robot, heights, space.least, space.least_clearance)
+        return result
+
+    @classmethod
+    def facts(cls, data: Dataset) -> list[str]:
+        """How much is reachable, and the cylinder."""
+        facts = []
+        if "volume" in data:
+            facts.append(f"reaches {float(data.volume):.4g} {data.volume.attrs['units']}")
+        else:
+            of = "joint states within limits" if "sample" in data.sizes else "the poses tried"
+            facts.append(f"reaches {100 * float(data.valid):.3g} % of {of}")
+        if "interference" in data and (lost := float(data.interference)) > 0.0:
+            facts.append(f"limbs interfere in {100 * lost:.3g} % of otherwise reachable poses")
+        if "cylinder_radius" in data and (radius := float(data.cylinder_radius)) > 0.0:
+            angle = data.cylinder_radius.attrs["units"] == "rad"
+            wide = f"{math.degrees(radius):.1f} deg" if angle else f"{radius:.3f} m"
+            low, high = float(data.cylinder_low), float(data.cylinder_high)
+            name = data.attrs["height"]
+            facts.append(f"largest cylinder: {name} {low:.3f} to {high:.3f} m, radius {wide}")
+        return facts
+
+    @classmethod
+    def overlay(cls, data: Dataset, names: tuple[str, ...], ax: Axes) -> None:
+        """The circles about the axis and the cylinder, in planes that they lie in."""
+        if "circle" not in data or len(names) != 2:
+            return
+        scale = 180 / math.pi if data.circle.attrs["units"] == "rad" else 1.0
+        radius, height = scale * float(data.cylinder_radius), data.attrs["height"]
+        if height not in names:
+            turn = np.linspace(0.0, 2 * np.pi, 181)
+            ax.plot(radius * np.cos(turn), radius * np.sin(turn), "--", color="white", lw=1.2)
+            return
+        low, high = float(data.cylinder_low), float(data.cylinder_high)
+        outline = [radius, radius, -radius, -radius, radius], [low, high, high, low, low]
+        circle = scale * np.where(data.circle.values > 0.0, data.circle.values, np.nan)
+        sides = np.concatenate([circle, [np.nan], -circle])
+        heights = np.concatenate([data.height.values, [np.nan], data.height.values])
+        for style, (x, y) in (("-", (sides, heights)), ("--", outline)):
+            ax.plot(*((x, y) if names[1] == height else (y, x)), style, color="white", lw=1.2)
+
+
+def regular(
+    robot: Robot, heights: Array, least: float, least_clearance: float
+) -> dict[str, Variable]:
+    """The largest circles about the axis at heights (n,), m, and the cylinder, for a file."""
+    radius = circles(robot, heights, least=least, least_clearance=least_clearance)
+    best, unit = largest_cylinder(heights, radius), distance_unit(robot)
+    return {
+        "height": Variable(("height",), heights, about("height of the circles", "m")),
+        "circle": Variable(("height",), radius, about("largest circle, radius", unit, POSITIVE)),
+        "cylinder_low": number(best.low, "largest cylinder, low", "m"),
+        "cylinder_high": number(best.high, "largest cylinder, high", "m"),
+        "cylinder_radius": number(best.radius, "largest cylinder, radius", unit),
+    }
+
+
+def circles(
+    robot: Robot,
+    heights: ArrayLike,
+    steps: int = 340,
+    least: float = 0.0,
+    least_clearance: float = 0.0,
+) -> Array:
+    """Radii of the largest reachable circles about the axis with all their inside, (n,), m or rad.
+
+    0 where the axis itself is out of reach.
+
+    :param heights: shape (n,), m.
+    :param steps: first search along each of 360 rays; a bisection refines it.
+    :param least: singularity index below which a pose counts as out of reach; ``CLEAR`` at least.
+    :param least_clearance: what the limbs' clearance has to be above, m.
+    """
+    z = np.atleast_1d(np.asarray(heights, np.float64))
+    lateral = [robot.pose_names.index(name) for name in robot.grid().lateral]
+    step = float(np.abs(robot.search_box()[lateral]).max()) / steps
+    return circle_radii(
+        robot, z, step, steps, least=max(least, CLEAR), least_clearance=least_clearance
+    )
+
+
+@dataclass(frozen=True)
+class Cylinder:
+    """The largest upright cylinder about the axis in a stack of circles, m (radius m or rad)."""
+
+    low: float
+    high: float
+    radius: float
+
+
+def largest_cylinder(heights: Array, radius: Array) -> Cylinder:
+    """The cylinder of greatest radius squared times height between two of the heights (n,)."""
+    best, volume = Cylinder(math.nan, math.nan, 0.0), 0.0
+    for i in range(len(heights)):
+        thin = np.minimum.accumulate(radius[i:])
+        volumes: NDArray[np.float64] = thin**2 * (heights[i:] - heights[i])
+        j = int(volumes.argmax())
+        if volumes[j] > volume:
+            volume = float(volumes[j])
+            best = Cylinder(float(heights[i]), float(heights[i + j]), float(thin[j]))
+    return best
+
+
+def _product(units: Iterable[str]) -> str:
+    """Unit of a volume: "m3", "m rad2"."""
+    counts = {unit: list(units).count(unit) for unit in sorted(set(units))}
+    return " ".join(f"{unit}{power if power > 1 else ''}" for unit, power in counts.items())

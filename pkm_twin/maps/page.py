@@ -1,0 +1,208 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Pages of stored maps: one HTML file that needs no network, with the picture's star and value."""
+
+from __future__ import annotations
+
+import html
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pkm_twin.files import replace_file
+from pkm_twin.maps import figures
+from pkm_twin.maps.extras import require
+from pkm_twin.maps.pages import (
+    CAMERA,
+    CONFIG,
+    FIT,
+    LEAST,
+    LIT,
+    MARGIN,
+    MENU,
+    SHELL,
+    TITLE,
+    button,
+    few,
+    narrow,
+    short,
+    slider,
+    span,
+    triangles,
+)
+from pkm_twin.maps.store import reading, source, writing
+
+if TYPE_CHECKING:
+    from xarray import Dataset
+
+Array = NDArray[np.float64]
+
+MOST: Final = (15, 61)
+"""Layers, and samples along the sides of a layer."""
+STAR: Final = {"color": "red", "line": {"color": "white", "width": 1}}
+HELP: Final = (
+    "Coloured poses count: joints within limits, limbs apart, clear of singularities. The \
+menu chooses the case and plane, a slider one layer alone."
+)
+
+
+def write_page(data: Dataset, path: Path) -> Path:
+    """Write a stored map as one HTML file: plotly's script is inside.
+
+    :raises MissingExtraError: plotly is not installed.
+    """
+    require("plotly", "atlas")
+    kind = figures.kind_of(data)
+    with reading(source(data)):
+        drawn = page(data).update_layout(title=TITLE)
+        more = kind.page(data)
+    parts = [drawn, *([] if more is None else [more])]
+    plots = [
+        one.to_html(
+            include_plotlyjs=k == 0, full_html=False, config=CONFIG, default_width="100%",
+            default_height="100%", auto_play=False, post_script=FIT,
+        )
+        for k, one in enumerate(parts)
+    ]  # fmt: skip
+    text = SHELL.format(
+        title=html.escape(str(data.attrs["title"])),
+        plot="".join(f"<div>{plot}</div>" for plot in plots),
+        help=html.escape(" ".join([HELP, kind.page_help]).strip()),
+        width=LEAST,
+    )
+    with writing(path):
+        replace_file(path, text.encode())
+    return path
+
+
+def page(data: Dataset) -> Any:
+    """Three coordinates as layers, others as planes through the worst pose, of every case."""
+    return _layers(data) if len(data.coordinate) == 3 else _planes(data)
+
+
+def _case(data: Dataset, case: int, values: Array) -> tuple[float, str, dict[str, Any]]:
+    """Scale, unit, and layout of a case: its title, and one scale of colours with the worst."""
+    part = data.isel(case=case)
+    low, high = figures.limits(values, float(part.worst_value))
+    scale, unit = figures.scale_of(max(abs(low), abs(high)), str(part.case_unit.values))
+    label = f"{part.case_what.values} ({unit})" if unit else str(part.case_what.values)
+    layout = {
+        "coloraxis.cmin": float(few(np.array(scale * low))),
+        "coloraxis.cmax": float(few(np.array(scale * high))),
+        "coloraxis.colorbar.title.text": label,
+        "title.text": " ".join(figures.title(data, case)),
+    }
+    return scale, unit, layout
+
+
+def _layers(data: Dataset) -> Any:
+    graph = require("plotly.graph_objects", "atlas")
+    units = figures.units_of(data)
+    dims = list(units)
+    upwards = data.attrs["height"] or dims[2]
+    flat = [name for name in dims if name != upwards]
+    steps = {n: math.ceil(data.sizes[n] / (MOST[0] if n == upwards else MOST[1])) for n in dims}
+    part = data.value.isel({n: slice(None, None, step) for n, step in steps.items()})
+    values = part.transpose("case", upwards, *flat).values
+    turns = {n: figures.scale_of(1.0, u) if u == "rad" else (1.0, u) for n, u in units.items()}
+    x, y, heights = (turns[n][0] * part[n].values for n in (*flat, upwards))
+    names = [f"{name} ({turns[name][1]})" for name in (*flat, upwards)]
+    x, y = np.meshgrid(x, y, indexing="ij")
+    kept = np.isfinite(values).any(0)
+    figure = graph.Figure()
+    for z, seen in zip(heights.tolist(), kept, strict=True):
+        figure.add_mesh3d(
+            x=short(x[seen]), y=short(y[seen]), z=short(np.full(seen.sum(), z)),
+            **triangles(seen), coloraxis="coloraxis", flatshading=True, lighting=LIT,
+        )  # fmt: skip
+    figure.add_scatter3d(mode="markers", marker=STAR | {"size": 7, "symbol": "diamond"})
+    where = "".join(f"{n} %{{{axis}:.4~f}}<br>" for n, axis in zip(names, "xyz", strict=True))
+    buttons = []
+    for k, case in enumerate(data.case.values):
+        scale, unit, layout = _case(data, k, values[k])
+        name = str(data.case_what.values[k])
+        said = f"{where}{name} %{{intensity:.4~g}} {unit}<extra></extra>"
+        pose = dict(zip(units, data.worst_pose.values[k].tolist(), strict=True))
+        known = math.isfinite(float(data.worst_value[k]))
+        star = [few(np.array([turns[n][0] * pose[n]] * known)).tolist() for n in (*flat, upwards)]
+        worst = figures.shown(float(data.worst_value[k]), str(data.case_unit.values[k]))
+        change = {
+            "intensity": [*(few(scale * v[s]) for v, s in zip(values[k], kept, strict=True)), None],
+            "hovertemplate": [*[said] * len(kept), f"{where}worst {worst}<extra></extra>"],
+            **{axis: [*(t[axis] for t in figure.data[:-1]), place]
+               for axis, place in zip("xyz", star, strict=True)},
+        }  # fmt: skip
+        buttons.append(button(str(case), change, layout))
+    count = len(kept)
+    every = {"label": "all", "method": "restyle", "args": [{"visible": [True] * (count + 1)}]}
+    slices = [
+        {"label": f"{z:.3f}", "method": "restyle",
+         "args": [{"visible": [*(n == k for n in range(count)), True]}]}
+        for k, z in enumerate(heights.tolist())
+    ]  # fmt: skip
+    figure.update_layout(
+        scene={
+            **{f"{axis}axis": {"title": name, "range": span(ends)}
+               for axis, name, ends in zip("xyz", names, (x, y, heights), strict=True)},
+            "aspectmode": "cube", "camera": CAMERA,
+        },
+        margin=MARGIN, meta=narrow(farther=1.8),
+        sliders=[slider([every, *slices], f"{names[2]}: ")],
+    )  # fmt: skip
+    return _chosen(figure, buttons)
+
+
+def _planes(data: Dataset) -> Any:
+    graph = require("plotly.graph_objects", "atlas")
+    figure, buttons = graph.Figure(), []
+    every = [(k, p) for k in range(len(data.case)) for p in figures.full_planes(data, k)]
+    for k, p in every:
+        scale, unit, layout = _case(data, k, data.plane_value.isel(case=k).values)
+        one = figures.plane_of(data, k, p)
+        what, (x, *y) = str(data.case_what.values[k]), one["names"]
+        values, axes = scale * one["values"], [few(ticks) for ticks in one["ticks"]]
+        named = [f"{n} ({u})" for n, u in zip(one["names"], one["units"], strict=True)]
+        where = "".join(f"{n} %{{{a}:.4~f}}<br>" for n, a in zip(named, "xy", strict=False))
+        said = f"{where}{what} %{{{'z' if y else 'y'}:.4~g}} {unit}<extra></extra>"
+        if y:
+            figure.add_heatmap(
+                x=axes[0], y=axes[1], z=few(values.T), coloraxis="coloraxis", hoverongaps=False,
+                hovertemplate=said,
+            )  # fmt: skip
+        else:
+            figure.add_scatter(x=axes[0], y=few(values[:, 0]), hovertemplate=said)
+        star = one["star"] if one["star"] and y else [None, None]
+        worst = figures.shown(float(data.worst_value[k]), str(data.case_unit.values[k]))
+        figure.add_scatter(
+            x=star[:1], y=star[1:2], mode="markers", showlegend=False,
+            marker=STAR | {"symbol": "star", "size": 16},
+            hovertemplate=f"worst {worst}<extra></extra>",
+        )  # fmt: skip
+        layout |= {"xaxis.title.text": named[0], "yaxis.title.text": named[1] if y else what}
+        text = ", ".join([x, *y]) + ("" if len(data.case) == 1 else f": {data.case.values[k]}")
+        buttons.append((text, layout))
+    visible = [[n // 2 == k for n in range(len(figure.data))] for k in range(len(buttons))]
+    for trace, seen in zip(figure.data, visible[0], strict=True):
+        trace.visible = seen
+    figure.update_layout(margin={**MARGIN, "l": 70, "b": 60}, meta=narrow())
+    return _chosen(figure, [
+        button(text, {"visible": seen}, layout)
+        for (text, layout), seen in zip(buttons, visible, strict=True)
+    ])  # fmt: skip
+
+
+def _chosen(figure: Any, buttons: list[dict[str, Any]]) -> Any:
+    """A figure as its menu's first entry shows it."""
+    figure.update_layout(
+        coloraxis={"colorscale": "Viridis", "colorbar": {"len": 0.8, "title.side": "right"}},
+        updatemenus=[{"buttons": buttons, **MENU}],
+    )
+    first, layout = buttons[0]["args"]
+    for name, values in first.items():
+        for trace, value in zip(figure.data, values, strict=True):
+            if value is not None:
+                trace[name] = value
+    figure.update_layout(layout)
+    return figure

@@ -1,0 +1,106 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Pictures. matplotlib is imported on first use; every function draws on axes that it is given."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pkm_twin.files import replace_file
+from pkm_twin.maps.store import writing
+
+# Okabe and Ito's colours, told apart by colour-blind readers too.
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#F0E442", "#000000")
+
+
+def pyplot() -> Any:
+    """Matplotlib's pyplot, drawing into files only."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    return pyplot
+
+
+def columns(count: int, rows: int) -> tuple[Any, list[Any]]:
+    """A figure of ``count`` columns with ``rows`` axes each."""
+    figure, axes = pyplot().subplots(
+        rows, count, figsize=(8 * count, 3 * rows), squeeze=False, layout="constrained"
+    )
+    return figure, list(axes.T)
+
+
+def label(ax: Any, x: str, y: str, title: str = "", size: float | None = None) -> None:
+    """Name the axes, and draw a grid; ``size``: of the title's letters."""
+    ax.set_xlabel(x)
+    ax.set_ylabel(y)
+    if title:
+        ax.set_title(title, **({} if size is None else {"fontsize": size}))
+    ax.grid(alpha=0.3)
+
+
+def rendered(figure: Any, dpi: int, form: str = "png") -> bytes:
+    """A figure as an image; it is closed.
+
+    Names of files and joints may have a dollar in them: no text that is set here is a formula.
+    """
+    texts = [] if figure._suptitle is None else [figure._suptitle]
+    for ax in figure.axes:
+        legend = ax.get_legend()
+        texts += [ax.title, ax.xaxis.label, ax.yaxis.label, *ax.texts]
+        texts += [] if legend is None else legend.get_texts()
+    for text in texts:
+        text.set_parse_math(False)
+    data = io.BytesIO()
+    figure.savefig(data, dpi=dpi, format=form)
+    pyplot().close(figure)
+    return data.getvalue()
+
+
+def save(figure: Any, path: Path, dpi: int = 110) -> Path:
+    """Write a figure as PNG, whole or not at all, and close it.
+
+    :raises MapError: the file cannot be written.
+    """
+    data = rendered(figure, dpi)
+    with writing(path):
+        replace_file(path, data)
+    return path
+
+
+def torques(motion: Any, table: Mapping[str, Any]) -> Any:
+    """Efforts and their terms, an axes for each actuated joint; grey where beyond the limits."""
+    robot = motion.robot
+    figure, axes = columns(1, len(robot.joint_names))
+    terms = ("gravity", "inertia", "velocity", "payload", "friction", "external")
+    for ax, joint, unit in zip(axes[0], robot.joint_names, robot.effort_units, strict=True):
+        if motion.measured is not None:
+            ax.plot(table["time"], table[f"{joint}.measured"], color="0.7", lw=2, label="measured")
+        ax.plot(table["time"], table[f"{joint}.effort"], color="black", lw=1, label="sum")
+        if f"{joint}.effort_deviation" in table:
+            band = 2.0 * table[f"{joint}.effort_deviation"]
+            low, high = (table[f"{joint}.effort"] + sign * band for sign in (-1.0, 1.0))
+            style: dict[str, Any] = {"color": "0.3", "alpha": 0.25, "lw": 0}
+            ax.fill_between(table["time"], low, high, label="two deviations", **style)
+        for colour, term in zip(COLOURS, terms, strict=False):
+            values = table[f"{joint}.effort_{term}"]
+            if np.any(values != 0.0):
+                ax.plot(table["time"], values, color=colour, lw=0.8, label=term)
+        if "beyond_limits" in table:
+            ax.fill_between(
+                table["time"],
+                *(0, 1),
+                where=np.asarray(table["beyond_limits"]) > 0,
+                transform=ax.get_xaxis_transform(),
+                color="0.85",
+                zorder=0,
+                label="beyond limits",
+            )
+        label(ax, "time (s)", f"effort ({unit})", f"{robot.name}: effort of {joint}")
+        ax.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=8)
+    return figure

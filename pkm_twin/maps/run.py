@@ -1,0 +1,302 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Computing a sweep: here in one process or on all cores, or on a Dask cluster.
+
+Chunks are independent, so the results are the same bit for bit wherever and in whatever order they
+are computed. Few chunks are in flight at a time, and each goes to disk when it is done: memory
+does not grow with the sweep.
+"""
+
+from __future__ import annotations
+
+import functools
+import logging
+import multiprocessing
+import os
+import pickle
+import signal
+from asyncio import CancelledError
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures import CancelledError as FutureCancelled
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, Final, Protocol
+
+import pkm_twin
+from pkm_twin.errors import ParameterError, PkmTwinError
+from pkm_twin.maps.extras import require
+from pkm_twin.maps.store import MapError, Parts, join, save_part, writing
+from pkm_twin.maps.sweep import Chunk, Map
+from pkm_twin.maps.variables import Values
+from pkm_twin.threads import one_blas_thread_for_children
+
+Progress = Callable[[int], None]
+Work = Sequence[tuple[int, Any]]
+"""Numbered parts of a task."""
+
+ATTEMPTS: Final = 3
+"""How often workers may die at one chunk before the sweep is given up."""
+FEW: Final = 3
+"""Chunks that are not worth starting processes for."""
+CONNECT: Final = "10s"
+"""How long a scheduler may take to answer."""
+IN_FLIGHT: Final = 2
+"""Chunks a worker that are handed out at a time."""
+
+
+class Task(Protocol):
+    """Work that workers get whole with each of its parts, as :class:`Map` with its chunks."""
+
+    @property
+    def fingerprint(self) -> str:
+        """Of this task alone."""
+
+    def evaluate(self, chunk: Any, /) -> Values:
+        """Results of one part."""
+
+
+class ClusterError(PkmTwinError):
+    """A Dask scheduler that does not answer, or a cluster that keeps losing its workers."""
+
+
+def run(
+    sweep: Map,
+    out: Path,
+    *,
+    workers: int | None = None,
+    scheduler: str | None = None,
+    overwrite: bool = False,
+    progress: Progress | None = None,
+) -> Path:
+    """Compute a sweep into a NetCDF file; chunks that an earlier, stopped run finished are kept.
+
+    :param workers: processes on this machine; default one a core, 1 is this process alone.
+    :param scheduler: address of a Dask scheduler, which then does the work.
+    :param overwrite: replace the target, and chunks of another sweep.
+    :param progress: called with the number of points done.
+    :raises MapError: the target exists, another process works on it, the kept chunks belong to
+        another sweep, or the system refuses to write.
+    :raises ClusterError: no scheduler, or workers that keep dying.
+    :raises MissingExtraError: a package that is not installed.
+    """
+    # Before hours of work.
+    require("h5netcdf", "atlas")
+    if workers is not None and workers < 1:
+        raise PkmTwinError(f"workers is {workers}; it has to be 1 or more")
+    with writing(out):
+        if out.exists() and not overwrite:
+            raise MapError(out, "exists; give --overwrite to replace it")
+        if out.exists() and not out.is_file():
+            raise MapError(out, "is not a regular file, so it is not replaced")
+        parts = Parts(out, sweep)
+        parts.open(overwrite)
+        try:
+            tell = progress or (lambda _: None)
+            _fill(sweep, parts, False, workers, scheduler, tell)
+            # Deterministic, so that a run that is resumed has the same planes.
+            try:
+                sweep = sweep.searched(parts.grid())
+            except ParameterError:
+                # Nothing to continue from: no pose counts.
+                parts.drop()
+                raise
+            _fill(sweep, parts, True, workers, scheduler, tell)
+            join(sweep, parts, out)
+            parts.drop()
+        finally:
+            parts.close()
+    return out
+
+
+def _fill(
+    sweep: Map,
+    parts: Parts,
+    planes: bool,
+    workers: int | None,
+    scheduler: str | None,
+    tell: Progress,
+) -> None:
+    """Compute the chunks of the grid or of the planes that are not there yet."""
+    chunks = sweep.chunks()
+    pending = parts.pending()
+    done = sum(map(sweep.count, chunks)) - sum(sweep.count(chunks[i]) for i in pending)
+    tell(done)
+    work = [(i, chunks[i]) for i in pending if (chunks[i].plane is not None) == planes]
+    results: Iterator[tuple[int, Values | None]]
+    if scheduler is not None and work:
+        results = on_cluster(sweep, work, scheduler)
+    else:
+        count = workers or os.cpu_count() or 1
+        alone = count == 1 or len(work) <= FEW
+        results = here(sweep, work) if alone else on_cores(sweep, work, count, parts.folder)
+    for index, values in results:
+        if values is not None:
+            parts.save(index, values)
+        done += sweep.count(chunks[index])
+        tell(done)
+
+
+def here(sweep: Map, work: Work) -> Iterator[tuple[int, Values]]:
+    """Chunks one after the other in this process."""
+    for index, chunk in work:
+        yield index, sweep.evaluate(chunk)
+
+
+def on_cores(
+    sweep: Map, work: Work, workers: int, folder: Path
+) -> Iterator[tuple[int, Values | None]]:
+    """Chunks on processes of this machine, in the order in which they are done.
+
+    The processes keep their chunks in the folder themselves (None here): only a number goes
+    through the pipe, which a process that is killed in the middle of a long message would block.
+    A killed process costs its chunk's time.
+    """
+    # The first chunk compiles what the others load; processes that all compile would waste it.
+    first = next((k for k, (_, chunk) in enumerate(work) if sweep.count(chunk)), 0)
+    yield from here(sweep, [work[first]])
+    rest = dict([*work[:first], *work[first + 1 :]])
+    broken = 0
+    while rest:
+        try:
+            for index in _pool(sweep, list(rest.items()), min(workers, len(rest)), folder):
+                del rest[index]
+                yield index, None
+        except BrokenProcessPool:
+            broken += 1
+            if broken == ATTEMPTS:
+                raise ClusterError(f"processes died {ATTEMPTS} times in this sweep") from None
+
+
+def _pool(sweep: Map, work: Work, workers: int, folder: Path) -> Iterator[int]:
+    # Not forked: the parent has threads (the progress bar's).
+    context = multiprocessing.get_context("spawn")
+    # Once, and here: a pool that cannot pass its work on waits for ever.
+    packed = pickle.dumps(sweep)
+    pool = ProcessPoolExecutor(workers, mp_context=context)
+    queue = iter(work)
+    flying: set[Future[int]] = set()
+    try:
+        while True:
+            for index, chunk in queue:
+                with _without_interrupts(), one_blas_thread_for_children():
+                    flying.add(pool.submit(_keep, packed, chunk, folder, index))
+                if len(flying) >= IN_FLIGHT * workers:
+                    break
+            if not flying:
+                break
+            finished, flying = wait(flying, return_when=FIRST_COMPLETED)
+            for future in finished:
+                yield future.result()
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def on_cluster(sweep: Task, work: Work, scheduler: str) -> Iterator[tuple[int, Values]]:
+    """Chunks on a Dask cluster, in the order in which they are done.
+
+    The scheduler gives the chunks of a lost worker to another one.
+
+    :raises ClusterError: no scheduler answers, it has no workers, or chunks keep losing theirs.
+    """
+    distributed = require("distributed", "cluster")
+    # Its own log tells at length what one line of ours says.
+    logging.getLogger("distributed").setLevel(logging.CRITICAL)
+    arguments = distributed.Security().get_connection_args("client")
+    if scheduler.startswith("tls:") and arguments.get("ssl_context") is None:
+        # A client that is made without one fails at once, and again at its end.
+        raise ClusterError(f"{scheduler} asks for TLS, and Dask is configured with no certificate")
+    try:
+        client = distributed.Client(scheduler, timeout=CONNECT, set_as_default=False)
+    except (OSError, TimeoutError, ValueError, RuntimeError) as error:
+        raise ClusterError(f"no Dask scheduler answers at {scheduler}: {error}") from None
+    with client:
+        threads = sum(client.nthreads().values())
+        if not threads:
+            raise ClusterError(f"the Dask scheduler at {scheduler} has no workers")
+        try:
+            yield from _from_workers(sweep, work, distributed, client, threads)
+        except distributed.KilledWorker as error:
+            raise ClusterError(f"workers kept dying: {error}") from None
+        except (CancelledError, FutureCancelled, distributed.comm.CommClosedError):
+            raise ClusterError(f"the Dask scheduler at {scheduler} went away") from None
+        except PkmTwinError:
+            raise
+        except OSError as error:
+            raise ClusterError(f"the Dask scheduler at {scheduler}: {error}") from None
+
+
+def _from_workers(
+    sweep: Task, work: Work, distributed: Any, client: Any, threads: int
+) -> Iterator[tuple[int, Values]]:
+    queue = iter(work)
+
+    def submit() -> list[Any]:
+        return [
+            client.submit(
+                compute,
+                sweep,
+                chunk,
+                pkm_twin.__version__,
+                key=f"map-{sweep.fingerprint[:16]}-{index}",
+                pure=False,
+            )
+            for index, chunk in _some(queue, 1)
+        ]
+
+    flying: list[Any] = []
+    for _ in range(IN_FLIGHT * threads):
+        flying += submit()
+    finished = distributed.as_completed(flying, loop=client.loop)
+    del flying
+    for future in finished:
+        values = future.result()
+        index = int(future.key.rpartition("-")[2])
+        del future
+        yield index, values
+        for following in submit():
+            finished.add(following)
+
+
+def compute(sweep: Task, chunk: Any, version: str) -> Values:
+    """One chunk, in a worker.
+
+    :raises PkmTwinError: what the chunk raises, in a form that passes between processes; or a
+        worker with another version of this package.
+    """
+    if pkm_twin.__version__ != version:
+        raise PkmTwinError(f"a worker has pkm_twin {pkm_twin.__version__}, not {version}")
+    try:
+        return sweep.evaluate(chunk)
+    except PkmTwinError as error:
+        raise PkmTwinError(str(error)) from None
+
+
+def _keep(packed: bytes, chunk: Chunk, folder: Path, index: int) -> int:
+    save_part(folder, index, compute(_unpacked(packed), chunk, pkm_twin.__version__))
+    return index
+
+
+@functools.lru_cache(1)
+def _unpacked(packed: bytes) -> Map:
+    # Once a process: what the robot derives for its first chunk serves all.
+    sweep: Map = pickle.loads(packed)  # noqa: S301  from the parent
+    return sweep
+
+
+def _some(queue: Iterator[tuple[int, Any]], count: int) -> Iterator[tuple[int, Any]]:
+    for _, item in zip(range(count), queue, strict=False):
+        yield item
+
+
+@contextmanager
+def _without_interrupts() -> Iterator[None]:
+    """A process started here never sees Ctrl-C: the parent decides what it means.
+
+    A terminal sends it to all its processes; one that had to be told would be hit at its imports.
+    """
+    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})

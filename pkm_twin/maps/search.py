@@ -1,0 +1,129 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The worst pose of a quantity over the whole workspace."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pkm_twin.errors import ParameterError
+from pkm_twin.maps.kind import Array, Case, Kind, Space, Worst, found_of
+from pkm_twin.robot.workspace import causes
+
+HALVINGS: Final = 12
+"""Of the way to a place that does not count, to find where it still does."""
+INSIDE: Final = 1e-9
+"""Part of a joint's range that the search stays away from its ends."""
+
+
+def worst_of(space: Space, case: Case, starts: Array) -> Worst:
+    """The worst pose of the workspace.
+
+    Over joint positions between finite limits, otherwise over poses in the map's box.
+
+    :param starts: poses that count, shape (k, m).
+    :raises ParameterError: no pose counts; the error names what removes most of them.
+    """
+    robot, kind = space.robot, space.kind
+    low, high = space.box.T
+    by_joints = space.by_joints
+    rng = np.random.default_rng(0)
+    first = robot.inverse(starts) if by_joints and len(starts) else starts
+    if by_joints:
+        low, high = low + INSIDE * (high - low), high - INSIDE * (high - low)
+
+    def inside(x: Array) -> NDArray[np.bool_]:
+        return space.counts(*space.state(x), case)
+
+    def score(x: Array, what: Kind = kind) -> Array:
+        q = space.state(x)[0]
+        counted = inside(x)
+        one = case if what is kind else what.cases(robot)[0]
+        result = np.full(len(x), -np.inf)
+        (found,) = found_of(what, robot, q[counted], [one])
+        result[counted] = badness(found.value, one.largest)
+        return result
+
+    def drawn(count: int) -> Array:
+        # Extremes are often where joints are at their limits.
+        ends = rng.integers(0, 3, (count // 2, len(low))) / 2.0
+        inner = rng.random((count - len(ends), len(low)))
+        return np.asarray(low + np.concatenate([ends, inner]) * (high - low))
+
+    tried = np.concatenate([first.reshape(-1, len(low)), drawn(kind.samples)])
+    if kind.screen is not None:
+        more = drawn(kind.screen.samples)
+        order = np.argsort(-score(more, kind.screen), kind="stable")
+        tried = np.concatenate([tried, more[order[: kind.samples]]])
+    kept = inside if kind.screen is not None else None
+    x, best = evolved(score, np.clip(tried, low, high), low, high, kind, rng, kept)
+    if not np.isfinite(best):
+        why = "" if inside(tried).any() else causes(
+            robot, *space.state(tried), space.least, space.least_clearance
+        )  # fmt: skip
+        bound = "a workspace in which some pose counts"
+        raise ParameterError("robot", robot.name, f"{bound}: {why}" if why else bound)
+    q, pose, _ = space.state(x[None])
+    return Worst(pose[0], q[0], found_of(kind, robot, q, [case])[0])
+
+
+def badness(value: Array, largest: bool) -> Array:
+    """How bad values are; minus infinity where there is none."""
+    return np.where(np.isfinite(value), value if largest else -value, -np.inf)
+
+
+def evolved(
+    score: Callable[[Array], Array],
+    tried: Array,
+    low: Array,
+    high: Array,
+    kind: Kind,
+    rng: np.random.Generator,
+    inside: Callable[[Array], NDArray[np.bool_]] | None = None,
+) -> tuple[Array, float]:
+    """The place (n,) of the highest score in a box, and it, from the best of the places tried.
+
+    Each place of a population climbs for itself, so that many hills are climbed: by steps along one
+    coordinate or all, whose size follows their success, and by differences of two others
+    (differential evolution, Storn and Price 1997); some go towards the best.
+
+    :param inside: which places (k, n) count; a step to where none does ends at the border between.
+    """
+    scores = np.concatenate([score(part) for part in np.array_split(tried, 1 + len(tried) // 4096)])
+    order = np.argsort(-scores, kind="stable")[: kind.population]
+    x, f = tried[order], scores[order]
+    count, n = x.shape
+    step = np.full(count, 0.1)
+    for _ in range(kind.rounds):
+        a, b = (x[rng.integers(0, count, count)] for _ in range(2))
+        alone = np.equal.outer(rng.integers(0, n, count), np.arange(n))
+        along = alone | (rng.random((count, 1)) < 0.5)
+        near = along * rng.normal(size=(count, n)) * step[:, None] * (high - low)
+        pull = np.where(rng.random((count, 1)) < 0.1, x[f.argmax()] - x, 0.0)
+        crossed = rng.random((count, n)) < 0.8
+        far = rng.uniform(0.4, 0.9, (count, 1)) * (a - b + pull) * crossed
+        local = np.asarray(rng.random(count) < 0.7)
+        moved = np.clip(x + np.where(local[:, None], near, far), low, high)
+        if inside is not None:
+            moved = _bordered(x, moved, inside)
+        reached = score(moved)
+        better = reached > f
+        step = np.clip(np.where(local, step * np.where(better, 1.5, 0.9), step), 1e-6, 0.3)
+        x, f = np.where(better[:, None], moved, x), np.where(better, reached, f)
+    return x[f.argmax()], float(f.max())
+
+
+def _bordered(x: Array, moved: Array, inside: Callable[[Array], NDArray[np.bool_]]) -> Array:
+    """Places moved (k, n), those outside drawn back towards x as far as they have to, by halving.
+
+    Extremes are often where a pose just counts: at a limit or the least singularity index.
+    """
+    share = inside(moved).astype(float)
+    step = np.where(share < 1.0, 0.5, 0.0)
+    for _ in range(HALVINGS):
+        good = inside(x + (share + step)[:, None] * (moved - x))
+        share, step = share + np.where(good, step, 0.0), 0.5 * step
+    return np.asarray(x + share[:, None] * (moved - x))

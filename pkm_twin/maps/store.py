@@ -1,0 +1,412 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Finished chunks in a folder beside the target, joined into one NetCDF file at the end.
+
+Everything is written under another name and renamed, so a stop at any time leaves whole files
+only. One run at a time works in a folder: it holds a lock there that names its owner, and that the
+system takes away with the process. Nothing is removed but what a run wrote.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import gc
+import io
+import json
+import os
+import re
+import socket
+import sys
+import zipfile
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, BinaryIO, Final
+
+import numpy as np
+
+from pkm_twin.errors import PkmTwinError
+from pkm_twin.files import replace_file
+from pkm_twin.maps.extras import require
+from pkm_twin.maps.soundness import SEALED, nonsense, seal, seal_holds
+from pkm_twin.maps.variables import FORMAT, Values
+
+if TYPE_CHECKING:
+    from xarray import Dataset
+
+    from pkm_twin.maps.sweep import Chunk, Map
+
+_MARK: Final = "sweep.json"
+_LOCK: Final = "lock"
+_JOINED: Final = "joined.tmp"
+_STORED: Final = {"compression": "gzip", "compression_opts": 1, "shuffle": True, "fletcher32": True}
+"""How fields are stored; level 1, as numbers with all their digits gain little by more."""
+_OWN: Final = re.compile(r"sweep\.json|lock|\d{8}\.npz|[\w.]+\.tmp")
+"""Names of what a run writes into its folder."""
+
+
+class MapError(PkmTwinError):
+    """A map, or the chunks of one, that cannot be read or written as asked."""
+
+    def __init__(self, path: Path, what: str) -> None:
+        super().__init__(f"{_short(path)}: {what}")
+        self.path = path
+
+
+def _short(path: Path) -> str:
+    text = str(path)
+    return text if len(text) <= 200 else f"{text[:120]}...{text[-60:]}"
+
+
+def source(data: Dataset) -> Path:
+    """The file that a map came from, for errors."""
+    return Path(str(data.encoding.get("source", "map")))
+
+
+@contextmanager
+def writing(path: Path) -> Iterator[None]:
+    """What the system refuses (a full disk, a folder that is none) as an error with its path.
+
+    :param path: named where the system names none.
+    :raises MapError: instead of any ``OSError``.
+    """
+    try:
+        yield
+    except OSError as error:
+        where = Path(os.fsdecode(error.filename)) if error.filename else path
+        raise MapError(where, error.strerror or str(error) or type(error).__name__) from None
+
+
+@contextmanager
+def reading(path: Path) -> Iterator[None]:
+    """Whatever a damaged file makes of its readers as one error.
+
+    :raises MapError: the file is not what a map is.
+    """
+    try:
+        yield
+    except PkmTwinError:
+        raise
+    except Exception as error:
+        raise MapError(path, _damage(error)) from None
+
+
+class Parts:
+    """The finished chunks of one sweep, in ``<target>.parts``."""
+
+    def __init__(self, out: Path, sweep: Map) -> None:
+        self.folder = out.with_name(out.name + ".parts")
+        self._sweep = sweep
+        self._chunks = sweep.chunks()
+        self._lock = -1
+
+    def open(self, overwrite: bool = False) -> None:
+        """Make the folder, or take up the one that is there, and lock it.
+
+        :param overwrite: drop what is there if it belongs to another sweep.
+        :raises MapError: another process works there, or the folder holds what is not this
+            sweep's; what no run wrote is never dropped.
+        """
+        if self.folder.exists() and not self.folder.is_dir():
+            raise MapError(self.folder, "is not a folder; the chunks need a folder of this name")
+        while self._lock < 0:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            self._refuse_foreign()
+            self._lock = self._locked()
+        mark = self.folder / _MARK
+        try:
+            found = json.loads(mark.read_text())["fingerprint"]
+        except (OSError, ValueError, KeyError, TypeError):
+            found = None
+        if found != self._sweep.fingerprint:
+            chunks = [name for name in self._names() if name != _LOCK]
+            if chunks and not overwrite:
+                self.close()
+                raise MapError(self.folder, "holds chunks of another sweep; --overwrite drops them")
+            for name in chunks:
+                (self.folder / name).unlink()
+            about = {"fingerprint": self._sweep.fingerprint, **self._sweep.attributes}
+            replace_file(mark, json.dumps(about, indent=2).encode())
+        # Of runs that were killed.
+        for path in self.folder.glob("*.tmp"):
+            path.unlink(missing_ok=True)
+
+    def _names(self) -> list[str]:
+        return [path.name for path in self.folder.iterdir()]
+
+    def _refuse_foreign(self) -> None:
+        foreign = [name for name in self._names() if not _OWN.fullmatch(name)]
+        if foreign:
+            raise MapError(
+                self.folder, f"holds {foreign[0]!r}, which no map wrote; move it elsewhere"
+            )
+
+    def _locked(self) -> int:
+        """The lock's file descriptor; below 0 if the folder went away meanwhile.
+
+        :raises MapError: another process has it.
+        """
+        path = self.folder / _LOCK
+        try:
+            lock = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
+        except FileNotFoundError:
+            return -1
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            owner = os.read(lock, 200).decode(errors="replace").strip() or "another process"
+            os.close(lock)
+            raise MapError(self.folder, f"{owner} works on this map") from None
+        with suppress(FileNotFoundError):
+            if os.path.samestat(os.fstat(lock), os.stat(path)):
+                os.ftruncate(lock, 0)
+                os.write(lock, f"process {os.getpid()} on {socket.gethostname()}\n".encode())
+                return lock
+        os.close(lock)
+        return -1
+
+    def close(self) -> None:
+        """Let go of the folder; the chunks stay."""
+        if self._lock >= 0:
+            os.close(self._lock)
+            self._lock = -1
+
+    def pending(self) -> list[int]:
+        """Indices of chunks that are not there yet."""
+        here = set(self._names())
+        return [i for i in range(len(self._chunks)) if self._path(i).name not in here]
+
+    def save(self, index: int, values: Values) -> None:
+        """Keep a finished chunk."""
+        save_part(self.folder, index, values)
+
+    def grid(self) -> list[Values]:
+        """What the chunks of the grid say besides their fields, in the order of the grid."""
+        chunks = [k for k, chunk in enumerate(self._chunks) if chunk.plane is None]
+        return [self._read(index, ("starts", "counts")) for index in chunks]
+
+    def __iter__(self) -> Iterator[tuple[Chunk, Values]]:
+        """All chunks with their values, in order."""
+        for index, chunk in enumerate(self._chunks):
+            yield chunk, self._read(index)
+
+    def _read(self, index: int, names: Sequence[str] = ()) -> Values:
+        try:
+            with np.load(self._path(index), allow_pickle=False) as data:
+                return {name: data[name] for name in names or data.files}
+        except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile) as error:
+            raise MapError(self._path(index), f"damaged ({error}); remove it") from None
+
+    def drop(self) -> None:
+        """Remove what runs wrote, and the folder if it is empty then."""
+        for name in self._names():
+            if _OWN.fullmatch(name):
+                (self.folder / name).unlink(missing_ok=True)
+        self.close()
+        with suppress(OSError):
+            self.folder.rmdir()
+
+    def _path(self, index: int) -> Path:
+        return _part(self.folder, index)
+
+
+def save_part(folder: Path, index: int, values: Values) -> None:
+    """Keep a finished chunk in a folder."""
+    path = _part(folder, index)
+    # Of a run that was killed a worker may still be at it.
+    hidden = path.with_suffix(f".{os.getpid()}.tmp")
+    with writing(path):
+        try:
+            with hidden.open("wb") as file:
+                np.savez(file, **values)  # type: ignore[arg-type]
+                file.flush()
+                os.fsync(file.fileno())
+            os.replace(hidden, path)
+        except BaseException:
+            hidden.unlink(missing_ok=True)
+            raise
+
+
+def _part(folder: Path, index: int) -> Path:
+    return folder / f"{index:08}.npz"
+
+
+class _Sink(io.RawIOBase):
+    """A file for the HDF5 library that remembers the first refusal of the system.
+
+    After it writes go nowhere: the library does not survive errors while it closes a file.
+    """
+
+    def __init__(self, file: BinaryIO) -> None:
+        super().__init__()
+        self._file = file
+        self.error: OSError | None = None
+
+    def readinto(self, buffer: Any) -> int:
+        view = memoryview(buffer)
+        got = self._file.readinto(view) if self.error is None else 0  # type: ignore[attr-defined]
+        view[got:] = bytes(len(view) - got)
+        return len(view)
+
+    def write(self, data: Any) -> int:
+        view = memoryview(data).cast("B")
+        done = 0
+        while self.error is None and done < len(view):
+            try:
+                done += self._file.write(view[done:])
+            except OSError as error:
+                self.error = error
+        return len(view)
+
+    def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
+        return self._file.seek(offset, whence)
+
+    def tell(self) -> int:
+        return self._file.tell()
+
+    def truncate(self, size: int | None = None) -> int:
+        if self.error is None:
+            try:
+                return self._file.truncate(size)
+            except OSError as error:
+                self.error = error
+        return size or 0
+
+
+def join(sweep: Map, parts: Parts, out: Path) -> None:
+    """Write the NetCDF file of a finished sweep, chunk by chunk.
+
+    :raises MapError: a damaged chunk.
+    :raises OSError: the disk is full, or the target cannot be written.
+    """
+    hidden = parts.folder / _JOINED
+    try:
+        with hidden.open("w+b", buffering=0) as file:
+            sink = _Sink(file)
+            try:
+                _join(sweep, parts, sink)
+            except Exception:
+                # What the library makes of a disk that is full.
+                if sink.error is None:
+                    raise
+            if sink.error is not None:
+                raise sink.error
+            seal(file)
+            os.fsync(file.fileno())
+        os.replace(hidden, out)
+    finally:
+        hidden.unlink(missing_ok=True)
+
+
+def _join(sweep: Map, parts: Parts, sink: _Sink) -> None:
+    h5netcdf = require("h5netcdf", "atlas")
+    summaries = sweep.summaries(parts.grid())
+    with h5netcdf.File(sink, "w") as file:
+        file.dimensions = sweep.sizes | {
+            dim: size
+            for variable in summaries.values()
+            for dim, size in zip(variable.dims, variable.values.shape, strict=True)
+        }
+        for key, value in (sweep.attributes | SEALED).items():
+            file.attrs[key] = value
+        for name, coordinate in (sweep.coordinates | summaries).items():
+            _write(file, name, coordinate.dims, coordinate.values, coordinate.attrs)
+        sizes = sweep.sizes
+        fields = sweep.fields
+        for name, field in fields.items():
+            fill = np.nan if np.dtype(field.dtype).kind == "f" else None
+            shape = [sizes[dim] for dim in field.dims]
+            # As large as what is written at once.
+            rows = (1, *shape[1:3], 1) if field.dims[0] == "plane" else (sweep.rows, *shape[1:])
+            chunks = tuple(min(sides) for sides in zip(rows, shape, strict=True))
+            target = file.create_variable(
+                name, field.dims, field.dtype, fillvalue=fill, chunks=chunks, **_STORED
+            )
+            target.attrs.update(_typed(field.attrs, field.dtype))
+        for chunk, values in parts:
+            if sink.error is not None:
+                raise sink.error
+            for name in values.keys() & fields.keys():
+                file[name][chunk.place(fields[name].dims)] = values[name]
+
+
+def _write(file: Any, name: str, dims: tuple[str, ...], values: Any, attrs: Any) -> None:
+    array = np.asarray(values)
+    if array.dtype.kind == "U":
+        h5py = require("h5py", "atlas")
+        variable = file.create_variable(name, dims, h5py.string_dtype())
+        for index in np.ndindex(array.shape):
+            variable[index] = str(array[index])
+    else:
+        filters = {"fletcher32": True} if array.size and array.ndim else {}
+        variable = file.create_variable(name, dims, array.dtype, **filters)
+        variable[...] = array
+    variable.attrs.update(_typed(attrs, array.dtype))
+
+
+def _typed(attrs: Mapping[str, Any], dtype: Any) -> dict[str, Any]:
+    """Attributes, bounds in the type of their variable, as the CF conventions want them."""
+    return {
+        key: np.asarray(value, dtype)[()] if key.startswith("valid_") else value
+        for key, value in attrs.items()
+    }
+
+
+def _opened(xarray: Any, path: Path) -> Dataset:
+    """The data set of a file.
+
+    What the library leaves half made of a damaged file complains when it goes: here, unheard.
+    """
+    hook, sys.unraisablehook = sys.unraisablehook, lambda _: None
+    try:
+        try:
+            data: Dataset = xarray.open_dataset(path, engine="h5netcdf")
+        except Exception as error:
+            what = _damage(error)
+        else:
+            return data
+        gc.collect()
+        raise MapError(path, what)
+    finally:
+        sys.unraisablehook = hook
+
+
+def _damage(error: Exception) -> str:
+    what = " ".join(str(error).split())[:200]
+    return f"no map of `pkm-twin map`, or damaged: {what}"
+
+
+def open_map(path: Path) -> Dataset:
+    """A stored map, its checksum and the ranges of its numbers checked.
+
+    Large fields are read part by part for it, and again when they are used.
+
+    :raises MapError: no map, a damaged one, or one with numbers that cannot be.
+    """
+    xarray = require("xarray", "atlas")
+    require("h5netcdf", "atlas")
+    with writing(path):
+        if not path.exists():
+            raise MapError(path, "no such file")
+        if not path.is_file():
+            raise MapError(path, "no regular file")
+        # Before HDF5 sees the file: damage may end the process there.
+        whole = seal_holds(path)
+    if whole is False:
+        raise MapError(path, "damaged, or changed by another program: its checksum differs")
+    data = _opened(xarray, path)
+    try:
+        if data.attrs.get("format") != FORMAT:
+            older = "kind" in data.attrs and "robot" in data.attrs
+            what = "made by an earlier version: build it again" if older else "no map"
+            raise MapError(path, what)
+        if whole is None and SEALED.keys() <= data.attrs.keys():
+            what = "damaged, or written by another program: its checksum is missing"
+            raise MapError(path, what)
+        with reading(path):
+            wrong = nonsense(data)
+        if wrong:
+            raise MapError(path, f"no map of `pkm-twin map`, or damaged: {wrong}")
+    except MapError:
+        data.close()
+        raise
+    return data

@@ -1,0 +1,491 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A map: a kind's cases over all poses, the worst pose of each, and planes through it.
+
+Poses count where actuators and passive joints keep their limits, limbs stay apart, and the
+singularity index is not below a bound. Of up to three pose coordinates there is a grid of poses, of
+more a sample of joint positions. The worst pose is searched in the whole workspace, from the worst
+of these poses. Then come planes of every two coordinates that go exactly through it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+import json
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, Final
+
+import numpy as np
+
+import pkm_twin
+from pkm_twin.errors import ParameterError
+from pkm_twin.maps.box import FULL, workspace_box
+from pkm_twin.maps.kind import Array, Case, Found, Kind, Mask, Space, Worst, found_of
+from pkm_twin.maps.search import badness, worst_of
+from pkm_twin.maps.variables import (
+    FLAG,
+    FORMAT,
+    POSITIVE,
+    SHARE,
+    Field,
+    Values,
+    Variable,
+    about,
+    number,
+    texts,
+)
+from pkm_twin.robot.clearance import has_clearance, joint_clearance
+from pkm_twin.robot.robot import Robot
+from pkm_twin.robot.workspace import keeps_limits
+
+LONGEST: Final = 2001
+"""Most poses along one coordinate."""
+KEPT: Final = 16
+"""Worst poses of a chunk that the search may begin at."""
+ZOOMS: Final = 3
+"""How often the part of a plane that is reachable is looked for, each time finer."""
+LEAST_VIEW: Final = 0.1
+"""Part of a coordinate's range that a plane shows at least on each side of its pose."""
+COARSE: Final = 61
+"""Poses along a side of a plane for that."""
+SIDES: Final = (11, 151)
+"""Fewest and most poses along a side of a plane."""
+
+
+@dataclass(frozen=True)
+class Chunk:
+    """Rows ``start`` to ``stop`` of the grid, or of a plane; ``case``: of which, None all."""
+
+    start: int
+    stop: int
+    plane: int | None = None
+    case: int | None = None
+
+    @property
+    def before(self) -> str:
+        """What names of its fields begin with."""
+        return "" if self.plane is None else "plane_"
+
+    def place(self, dims: Sequence[str]) -> tuple[Any, ...]:
+        """Where its values stand in a field."""
+        rows = slice(self.start, self.stop)
+        if self.plane is None:
+            return (rows,)
+        cases = slice(None) if self.case is None else slice(self.case, self.case + 1)
+        return (self.plane, rows, slice(None), cases)[: len(dims)]
+
+
+@dataclass(frozen=True, eq=False)
+class Map(Space):
+    """One map to be computed. Frozen and small: workers get it whole with every chunk.
+
+    ``extents``: of the planes of each case, shape (planes, 2, 2), once the worst poses are known.
+    """
+
+    extents: tuple[Array, ...] = ()
+
+    @property
+    def dims(self) -> tuple[str, ...]:
+        """Dimensions of the grid."""
+        return self.robot.pose_names if self.ticks else ("sample",)
+
+    @property
+    def planes(self) -> list[tuple[int, ...]]:
+        """Pose coordinates of the planes, by index, those of places first; or the only one."""
+        angles = [unit == "rad" for unit in self.robot.pose_units]
+        pairs = itertools.combinations(range(len(angles)), 2)
+        return sorted(pairs, key=lambda pair: sum(angles[k] for k in pair)) or [(0,)]
+
+    @cached_property
+    def elements(self) -> tuple[str, ...]:
+        """Names that ``dominant`` counts."""
+        return self.kind.elements(self.robot)
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Of the grid."""
+        return tuple(map(len, self.ticks)) or (self.samples,)
+
+    @cached_property
+    def fields(self) -> dict[str, Field]:
+        """Fields of the grid and of the planes; NaN and -1 where a pose does not count."""
+        axes, elements = self.kind.axes(self.robot), self.elements
+        turn = {"units": "1", "valid_min": -1.0, "valid_max": 1.0}
+        names = {"valid_min": -1, "valid_max": len(elements) - 1}
+        value = about(self.kind.name, "", {} if self.kind.signed else POSITIVE)
+        blame = about(f"index of the {self.kind.element}", "", names)
+        grid, plane = (*self.dims, "case"), ("plane", "row", "column", "case")
+        fields = {"value": Field(grid, value)}
+        if axes:
+            fields["direction"] = Field((*grid, "axis"), about("of the value", "", turn))
+        if elements:
+            fields["dominant"] = Field(grid, blame, "i2")
+        if self.kind.has_shares:
+            fields["factor"] = Field((*grid, "element"), about("share of an element", "", SHARE))
+        if not self.ticks:
+            fields["pose"] = Field(("sample", "coordinate"), about("pose of a sample, m and rad"))
+        fields["plane_value"] = Field(plane, value)
+        if elements:
+            fields["plane_dominant"] = Field(plane, blame, "i2")
+        reach = about("1 where all limits are kept", "", FLAG)
+        return fields | {"plane_reach": Field(plane, reach, "i1")}
+
+    @property
+    def coordinates(self) -> dict[str, Variable]:
+        """The grid's axes, the planes, and the cases with their units and words."""
+        robot, cases = self.robot, self.cases
+        named = list(zip(robot.pose_names, robot.pose_units, strict=True))
+        result = {
+            name: Variable((name,), ticks, about(f"pose coordinate {name}", unit))
+            for (name, unit), ticks in zip(named, self.ticks, strict=False)
+        }
+        result |= {"coordinate": texts("coordinate", robot.pose_names),
+                   "unit": texts("coordinate", robot.pose_units),
+                   "case": texts("case", [case.name for case in cases])}  # fmt: skip
+        for word in ("what", "unit", "answer"):
+            result[f"case_{word}"] = texts("case", [getattr(case, word) for case in cases])
+        for k, dim in enumerate(("row", "column")):
+            shown = [robot.pose_names[p[k]] if k < len(p) else "" for p in self.planes]
+            result[f"{dim}_name"] = texts("plane", shown)
+        if axes := self.kind.axes(robot):
+            result["axis"] = texts("axis", axes)
+        if self.elements:
+            result["element"] = texts("element", self.elements)
+        return result
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """What made this map besides the robot, as plain values."""
+        return {
+            "points": math.prod(self.shape),
+            "least_singularity": self.least,
+            "least_clearance": self.least_clearance,
+            "at": None if self.at is None else self.at.tolist(),
+            "wrenches": {case.name: case.wrench for case in self.cases},
+            "options": self.kind.options,
+        }
+
+    @property
+    def attributes(self) -> dict[str, str]:
+        """Global attributes of the file: everything that made it."""
+        grid = self.robot.grid()
+        return {
+            "title": f"{self.kind.name} of {self.robot.name}",
+            "Conventions": "CF-1.10",
+            "format": FORMAT,
+            "kind": self.kind.name,
+            "question": self.kind.question,
+            "element": self.kind.element,
+            "robot": self.robot.name,
+            "mechanism": self.robot.mechanism,
+            "height": grid.height,
+            "robot_parameters": json.dumps(self.robot.parameter_sections(), sort_keys=True),
+            "settings": json.dumps(self.settings, sort_keys=True),
+            "pkm_twin_version": pkm_twin.__version__,
+        }
+
+    @property
+    def fingerprint(self) -> str:
+        """Equal for two maps exactly if their results are."""
+        digest = hashlib.sha256(json.dumps(self.attributes, sort_keys=True).encode())
+        digest.update(self.robot.graph.key.encode() + self.robot.own_inertial.tobytes())
+        digest.update(f"{self.rows} {self.side} {self.bounds.tolist()}".encode())
+        for name, variable in self.coordinates.items():
+            digest.update(name.encode() + np.ascontiguousarray(variable.values).tobytes())
+        return digest.hexdigest()
+
+    @property
+    def sizes(self) -> dict[str, int]:
+        """Length of every dimension."""
+        columns = self.side if len(self.bounds) > 1 else 1
+        sizes = dict(zip(self.dims, self.shape, strict=True))
+        sizes |= {"plane": len(self.planes), "row": self.side, "column": columns}
+        for variable in self.coordinates.values():
+            sizes |= dict(zip(variable.dims, variable.values.shape, strict=True))
+        return sizes
+
+    @property
+    def rows(self) -> int:
+        """Rows of the grid in one chunk."""
+        return max(1, self.kind.chunk // math.prod(self.shape[1:]))
+
+    def chunks(self) -> list[Chunk]:
+        """All chunks: those of the grid, then those of the planes."""
+        chunks = _parted(self.shape[0], self.rows)
+        rows = max(1, self.kind.chunk // self.sizes["column"])
+        cases = (None,) if self.kind.together else range(len(self.cases))
+        for plane, case in itertools.product(range(len(self.planes)), cases):
+            chunks += [replace(c, plane=plane, case=case) for c in _parted(self.side, rows)]
+        return chunks
+
+    def count(self, chunk: Chunk) -> int:
+        """Poses of one chunk."""
+        across = math.prod(self.shape[1:]) if chunk.plane is None else self.sizes["column"]
+        return (chunk.stop - chunk.start) * across
+
+    @property
+    def points(self) -> int:
+        """Poses to compute; the unit of progress."""
+        return sum(self.count(chunk) for chunk in self.chunks())
+
+    def plane_ticks(self, plane: int, case: int) -> list[Array]:
+        """Coordinates along a plane's sides; its pose is among them."""
+        sides = zip(self.planes[plane], self.extents[case][plane], strict=False)
+        return [_ticks(ends, self.through(case)[k], self.side) for k, ends in sides]
+
+    def _extent(self, plane: int, case: int) -> Array:
+        """Ends of a plane's sides (2, 2), around what is reachable in it and its pose."""
+        shown, pose = list(self.planes[plane]), self.through(case)
+        box = self.bounds[shown]
+        for _ in range(ZOOMS):
+            ticks = [_ticks(ends, pose[k], COARSE) for k, ends in zip(shown, box, strict=True)]
+            poses = self._plane_poses(plane, case, ticks)
+            q, _, known = self.of_poses(poses)
+            reach = keeps_limits(self.robot, q, poses, -math.inf, known)
+            seen = np.concatenate([poses[reach], pose[None]])[:, shown]
+            margin = 0.75 * np.array([np.diff(side).max() for side in ticks])
+            around = np.maximum(margin, LEAST_VIEW * np.ptp(self.bounds[shown], axis=1))
+            low = np.minimum(seen.min(0) - margin, pose[shown] - around)
+            high = np.maximum(seen.max(0) + margin, pose[shown] + around)
+            least, most = np.minimum(box[:, 0], pose[shown]), np.maximum(box[:, 1], pose[shown])
+            box = np.stack([np.maximum(low, least), np.minimum(high, most)], -1)
+        return np.concatenate([box, np.zeros((2 - len(box), 2))])
+
+    def _plane_poses(self, plane: int, case: int, ticks: Sequence[Array]) -> Array:
+        """Poses of a plane, shape (k, m)."""
+        grid = np.meshgrid(*ticks, indexing="ij")
+        poses = np.broadcast_to(self.through(case), (*grid[0].shape, len(self.bounds))).copy()
+        for k, values in zip(self.planes[plane], grid, strict=True):
+            poses[..., k] = values
+        return poses.reshape(-1, len(self.bounds))
+
+    def _states(self, chunk: Chunk) -> tuple[Array, Array, Mask]:
+        """Joint positions, poses, and which are known, of a chunk."""
+        rows = slice(chunk.start, chunk.stop)
+        if chunk.plane is not None:
+            case = chunk.case or 0
+            first, *rest = self.plane_ticks(chunk.plane, case)
+            return self.of_poses(self._plane_poses(chunk.plane, case, [first[rows], *rest]))
+        if self.ticks:
+            grid = np.meshgrid(self.ticks[0][rows], *self.ticks[1:], indexing="ij")
+            return self.of_poses(np.stack(grid, -1).reshape(-1, len(self.bounds)))
+        rng = np.random.default_rng(chunk.start)
+        low, high = self.box.T
+        return self.state(rng.uniform(low, high, (chunk.stop - chunk.start, len(low))))
+
+    def evaluate(self, chunk: Chunk) -> Values:
+        """The cases on a chunk, and of the grid its worst poses and how many count."""
+        states = self._states(chunk)
+        parts = 1 + len(states[0]) // self.kind.chunk
+        cases = self.cases if chunk.case is None else (self.cases[chunk.case],)
+        batches = zip(*(np.array_split(array, parts) for array in states), strict=True)
+        done = [self._values(q, pose, known, cases) for q, pose, known in batches]
+        joined = {name: np.concatenate([one[name] for one in done]) for name in done[0]}
+        total, starts = joined.pop("counts").sum(0), joined.pop("starts")
+        if chunk.plane is None:
+            shape = (chunk.stop - chunk.start, *self.shape[1:])
+            values = {"counts": total, "starts": starts} | joined
+        else:
+            shape = (chunk.stop - chunk.start, self.sizes["column"])
+            self._put_worst(joined, states[1], chunk.case)
+            values = {chunk.before + name: array for name, array in joined.items()}
+        fields = self.fields
+        return {
+            name: array.reshape(*shape, *array.shape[1:]) if name in fields else array
+            for name, array in values.items()
+            if name in fields or name in ("counts", "starts")
+        }
+
+    def _put_worst(self, values: Values, poses: Array, case: int | None) -> None:
+        """Write the worst where its pose is: by inverse kinematics it may be out by rounding."""
+        cases = range(len(self.cases)) if case is None else [case]
+        for column, k in enumerate(cases):
+            worst = self.worst[k]
+            if worst is not None:
+                kept = (poses == worst.pose).all(-1)
+                _put(values, column, kept, worst.found)
+                values["reach"][kept, column] = 1
+
+    def _values(self, q: Array, pose: Array, known: Mask, cases: Sequence[Case]) -> Values:
+        robot, count = self.robot, len(q)
+        reach = keeps_limits(robot, q, pose, -math.inf, known)
+        inside = reach.copy()
+        inside[inside] = robot.try_singularity(q[inside])[0] >= self.least
+        apart = inside.copy()
+        if has_clearance(robot):
+            gap = joint_clearance(robot, q[inside], refuse=False)
+            apart[inside] = gap > self.least_clearance
+        size, ways = len(self.elements), len(self.kind.axes(robot))
+        values: Values = {
+            "value": np.full((count, len(cases)), np.nan),
+            "direction": np.full((count, len(cases), ways), np.nan),
+            "dominant": np.full((count, len(cases)), -1, np.int16),
+            "factor": np.full((count, len(cases), size), np.nan),
+            "reach": np.repeat(reach[:, None], len(cases), 1).astype(np.int8),
+            "pose": np.where(known[:, None], pose, np.nan),
+            "counts": np.array([[inside.sum(), apart.sum(), count]]),
+            "starts": np.full((1, len(cases), KEPT, pose.shape[-1]), np.nan),
+        }
+        for interfering, kept in ((False, apart), (True, inside)):
+            own = [k for k, case in enumerate(cases) if case.interfering == interfering]
+            if not own:
+                continue
+            each = found_of(self.kind, robot, q[kept], [cases[k] for k in own])
+            for k, found in zip(own, each, strict=True):
+                _put(values, k, kept, found)
+                best = np.argsort(-badness(found.value, cases[k].largest))[:KEPT]
+                values["starts"][0, k, : len(best)] = pose[kept][best]
+        return values
+
+    def searched(self, grid: Iterable[Values]) -> Map:
+        """With the worst pose of each case.
+
+        :param grid: results of all chunks of the grid.
+        :raises ParameterError: no pose counts.
+        """
+        starts = np.concatenate([values["starts"] for values in grid])
+
+        def worst(k: int) -> Worst | None:
+            first = starts[:, k].reshape(-1, starts.shape[-1])
+            first = first[np.isfinite(first[:, 0])]
+            return worst_of(self, self.cases[k], first) if self.cases[k].searched else None
+
+        count = range(len(self.cases))
+        if self.kind.together and (one := worst(0)) is not None:
+            every = found_of(self.kind, self.robot, one.q[None], self.cases)
+            found = replace(self, worst=tuple(replace(one, found=value) for value in every))
+        else:
+            found = replace(self, worst=tuple(map(worst, count)))
+        planes = range(len(self.planes))
+        extents = tuple(np.array([found._extent(p, k) for p in planes]) for k in count)
+        return replace(found, extents=extents)
+
+    def summaries(self, grid: Iterable[Values]) -> dict[str, Variable]:
+        """The worst of each case, the planes' axes, and what the kind says of the workspace."""
+        counted, apart, every = np.sum([values["counts"] for values in grid], axis=0).tolist()
+        result = {"valid": number(apart / every, "part of the grid that counts", "", SHARE)}
+        for k, dim in enumerate(("row", "column")):
+            sides = [
+                [[*self.plane_ticks(p, c), np.zeros(1)][k] for p in range(len(self.planes))]
+                for c in range(len(self.cases))
+            ]
+            what = about(f"pose coordinate along the {dim}s")
+            result[f"{dim}_value"] = Variable(("case", "plane", dim), np.array(sides), what)
+        poses = np.array([self.through(k) for k in range(len(self.cases))])
+        what = about("pose that the planes go through, m and rad")
+        result["through"] = Variable(("case", "coordinate"), poses, what)
+        return result | self._worst() | self.kind.summaries(self, counted, apart)
+
+    def _worst(self) -> dict[str, Variable]:
+        """Value, pose, direction and element of the worst poses; NaN where none was searched."""
+        none = Worst(np.full(len(self.bounds), np.nan), np.empty(0), Found(np.full(1, np.nan)))
+        worst = [one or none for one in self.worst]
+        value = [one.found.value[0] for one in worst]
+        what = "the worst value"
+        result = {
+            "worst_value": Variable(("case",), np.array(value), about(what)),
+            "worst_pose": Variable(
+                ("case", "coordinate"), np.array([one.pose for one in worst]), about(f"of {what}")
+            ),
+        }
+        if self.kind.axes(self.robot):
+            none_of = np.full((1, len(self.kind.axes(self.robot))), np.nan)
+            ways = [none_of if (d := one.found.direction) is None else d for one in worst]
+            result["worst_direction"] = Variable(
+                ("case", "axis"), np.concatenate(ways), about(f"of {what}")
+            )
+        if self.elements:
+            names = about(f"index of the {self.kind.element}", "", {"valid_min": -1})
+            blame = np.array([-1 if (e := one.found.element) is None else e[0] for one in worst])
+            result["worst_element"] = Variable(("case",), blame, names)
+        return result
+
+
+def _put(values: Values, case: int, kept: Mask, found: Found) -> None:
+    """Write what was found in the poses kept."""
+    finite = np.isfinite(found.value)
+    values["value"][kept, case] = np.where(finite, found.value, np.nan)
+    if found.direction is not None:
+        values["direction"][kept, case] = np.where(finite[:, None], found.direction, np.nan)
+    if found.element is not None:
+        values["dominant"][kept, case] = np.where(finite, found.element, -1)
+    if found.shares is not None:
+        values["factor"][kept, case] = found.shares
+
+
+def _ticks(ends: Array, value: float, count: int) -> Array:
+    """Numbers between ends (2,), evenly but for one that is a value; wider where it is outside."""
+    ticks = np.linspace(min(ends[0], value), max(ends[1], value), count)
+    ticks[np.abs(ticks - value).argmin()] = value
+    return np.asarray(ticks, np.float64)
+
+
+def _parted(count: int, rows: int) -> list[Chunk]:
+    return [Chunk(start, min(start + rows, count)) for start in range(0, count, rows)]
+
+
+def map_of(
+    robot: Robot,
+    kind: Kind,
+    points: int | None = None,
+    *,
+    cases: Sequence[Case] = (),
+    at: Sequence[float] | None = None,
+    least_singularity: float | None = None,
+    least_clearance: float = 0.0,
+) -> Map:
+    """The map of a kind over a robot's workspace.
+
+    :param points: poses of the grid, about; default by the kind.
+    :param cases: load cases (:meth:`Kind.loaded`); default the kind's own.
+    :param at: the pose that the planes go through; default the worst.
+    :param least_singularity: singularity index below which a pose does not count; default by kind.
+    :param least_clearance: distance of the limbs, m, that is too little.
+    :raises ParameterError: the robot's file lacks what the kind needs; no limits where the
+        workspace has no end without; a bound on a clearance that is not known.
+    :raises UnreachableError: ``at`` is none of the robot's poses.
+    """
+    cases = tuple(cases) or kind.cases(robot)
+    check(robot, kind, cases)
+    total = kind.points if points is None else points
+    least = kind.least if least_singularity is None else least_singularity
+    if total < 50:
+        raise ParameterError("points", total, "50 or more")
+    if not 0.0 <= least < 1.0:
+        raise ParameterError("singularity", least, "0 to below 1")
+    if not 0.0 <= least_clearance < math.inf:
+        raise ParameterError("least_clearance", least_clearance, "0 or more, m")
+    if least_clearance > 0.0 and not has_clearance(robot):
+        what = "0: the file does not give the members' diameters"
+        raise ParameterError("least_clearance", least_clearance, what)
+    if at is not None:
+        robot.inverse(at)
+    bounds = workspace_box(robot)
+    count = len(bounds)
+    ticks: tuple[Array, ...] = ()
+    if count <= FULL:
+        length = max(5, min(round(total ** (1 / count)), LONGEST))
+        # Odd across an axis, so that the axis is on the grid.
+        odd = length + 1 - length % 2
+        lateral = robot.grid().lateral
+        ticks = tuple(
+            np.linspace(low, high, odd if name in lateral else length)
+            for (low, high), name in zip(bounds, robot.pose_names, strict=True)
+        )
+    side = round(math.sqrt(total / (3 if count > 2 else 1))) if count > 1 else total
+    return Map(
+        robot, kind, cases, bounds, ticks, total, min(max(side, SIDES[0]), SIDES[1]), least,
+        least_clearance, None if at is None else np.array(at, np.float64),
+    )  # fmt: skip
+
+
+def check(robot: Robot, kind: Kind, cases: Sequence[Case]) -> None:
+    """Compute a kind once, at home, for what it says the robot's file lacks.
+
+    :raises ParameterError: by the section.
+    """
+    kind.elements(robot)
+    found_of(kind, robot, robot.graph.home[None], cases)

@@ -1,0 +1,137 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The default map of every robot holds all that it reaches, whatever its pose coordinates are."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pkm_twin import robot_names
+from pkm_twin.errors import ParameterError
+from pkm_twin.maps import figures
+from pkm_twin.maps.box import workspace_box
+from pkm_twin.maps.kinds.workspace import Workspace
+from pkm_twin.maps.page import write_page
+from pkm_twin.maps.run import run
+from pkm_twin.maps.store import open_map
+from pkm_twin.maps.sweep import map_of
+from pkm_twin.robot.workspace import reachable, singularity_at, try_forward
+from test.support.robots import SHIPPED, load, partly_long
+
+COUNTS = partly_long([20_000, 100_000], 20_000)
+"""Random joint states."""
+
+
+def reached(robot, rng, count):
+    """Reachable poses of random joint states between the limits."""
+    low, high = robot.limits.position.T
+    poses, good = try_forward(robot, rng.uniform(low, high, (count, len(low))))
+    poses = poses[good]
+    poses = poses[reachable(robot, poses)]
+    assert len(poses) > count / 10
+    return poses
+
+
+@pytest.mark.parametrize("count", COUNTS)
+@pytest.mark.parametrize("name", partly_long(robot_names(), "delta_cu", "five_bar", "upr_rpu"))
+def test_the_default_map_holds_all_that_is_reachable(name, count, rng):
+    robot = load(name)
+    poses = reached(robot, rng, count)
+    bounds = workspace_box(robot)
+    assert len(bounds) == len(robot.pose_names)
+    for k, (low, high) in enumerate(bounds):
+        assert low <= poses[:, k].min()
+        assert poses[:, k].max() <= high
+        # And little else: the grid is not spent on what is empty.
+        assert np.ptp(poses[:, k]) > 0.4 * (high - low)
+    box = robot.search_box()
+    assert ((box[:, 0] <= poses) & (poses <= box[:, 1])).all()
+
+
+# A box of two and of three coordinates, and one about an axis.
+VOLUMES = partly_long(
+    [n for n, robot in SHIPPED.items() if len(robot.pose_names) in (2, 3)], "five_bar", "delta_cu"
+)
+
+
+@pytest.mark.parametrize("count", partly_long([40_000, 200_000], 40_000))
+@pytest.mark.parametrize("name", VOLUMES)
+def test_the_volume_is_that_of_random_poses(name, count, rng, tmp_path):
+    """By Monte Carlo in the search box, which the map's own box has no part in."""
+    robot = load(name)
+    low, high = robot.search_box().T
+    share = reachable(robot, rng.uniform(low, high, (count, len(low)))).mean()
+    sweep = map_of(robot, Workspace(), 40 ** len(low))
+    with open_map(run(sweep, tmp_path / "a.nc", workers=1)) as data:
+        expected = share * np.prod(high - low)
+        assert float(data.volume) == pytest.approx(expected, rel=0.06)
+
+
+@pytest.mark.parametrize("count", COUNTS)
+@pytest.mark.parametrize("name", robot_names())
+def test_a_cylinder_of_poses_holds_all_that_is_reachable(name, count, rng):
+    robot = load(name)
+    grid = robot.grid()
+    if grid.kind == "box":
+        with pytest.raises(ValueError, match="no height"):
+            grid.polar_pose(0.0, 0.0, 0.0)
+        return
+    poses = dict(zip(robot.pose_names, reached(robot, rng, count).T, strict=True))
+    box = dict(zip(robot.pose_names, robot.search_box(), strict=True))
+    assert box[grid.height][0] <= poses[grid.height].min()
+    assert poses[grid.height].max() <= box[grid.height][1]
+    for coordinate in grid.lateral:
+        assert np.abs(poses[coordinate]).max() <= np.abs(box[coordinate]).max()
+    # On the axis the azimuth means nothing, and the coordinates stand where the names say.
+    on_axis = grid.polar_pose(0.1, 0.0, [0.0, 2.0])
+    assert on_axis == pytest.approx(np.array([[0.1 * (n == grid.height) for n in grid.names]] * 2))
+
+
+@pytest.mark.parametrize(
+    "name",
+    partly_long(
+        [n for n, robot in SHIPPED.items() if robot.grid().kind == "box"], "five_bar", "stewart"
+    ),
+)
+def test_planes_of_every_number_of_coordinates(name, tmp_path):
+    """Through home of the singularity index: values are those of the poses that planes have."""
+    from matplotlib import pyplot
+
+    robot = load(name)
+    size = len(robot.pose_names)
+    with open_map(run(map_of(robot, Workspace(), 3000), tmp_path / "a.nc", workers=1)) as data:
+        data.load()
+        assert "circle" not in data
+        assert data.sizes["plane"] == max(1, size * (size - 1) // 2)
+        for figure in figures.draw(data).values():
+            assert 1 <= sum(bool(ax.get_xlabel()) for ax in figure.axes) <= figures.PANELS
+            pyplot.close(figure)
+        pytest.importorskip("plotly")
+        assert "Plotly.newPlot" in write_page(data, tmp_path / "a.html").read_text()
+    names = list(robot.pose_names)
+    assert (data.through.values[0] == robot.home()).all()
+    for k in range(data.sizes["plane"]):
+        part = data.isel(plane=k, case=0)
+        grid = np.tile(robot.home(), (part.sizes["row"], part.sizes["column"], 1))
+        grid[..., names.index(str(part.row_name.values))] = part.row_value.values[:, None]
+        if size > 1:
+            grid[..., names.index(str(part.column_name.values))] = part.column_value.values
+        inside = reachable(robot, grid)
+        assert inside.any()
+        assert (np.isfinite(part.plane_value.values) == inside).all()
+        expected = singularity_at(robot, grid[inside])
+        assert part.plane_value.values[inside] == pytest.approx(expected, abs=1e-9)
+    if size > 3:
+        kept = np.isfinite(data.value.values[:, 0])
+        at = singularity_at(robot, data.pose.values[kept])
+        assert data.value.values[kept, 0] == pytest.approx(at, abs=1e-9)
+
+
+@pytest.mark.parametrize(("name", "key"), [("prru", "position"), ("upr_rpu", "limb_length")])
+def test_a_workspace_without_end_is_refused(name, key):
+    robot = load(name)
+    endless = replace(robot, limits=replace(robot.limits, **{key: None}))
+    with pytest.raises(ParameterError, match=rf"limits\.{key}"):
+        map_of(endless, Workspace())
