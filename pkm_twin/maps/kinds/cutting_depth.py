@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The axial depth of cut that mills without chatter at every spindle speed."""
+"""The least axial depth of cut of the stability lobes, in the zero-order approximation."""
 
 from __future__ import annotations
 
@@ -16,7 +16,9 @@ from stiffness_monitor.vibration import COUNT, tool_modes
 
 @dataclass(frozen=True)
 class CuttingDepth(Frequency):
-    """The axial depth of cut that mills without chatter at every spindle speed (zero-order).
+    """The least axial depth of cut of the stability lobes, in the zero-order approximation.
+
+    At small immersions single speeds chatter below it: `lobes` is exact at one pose.
 
     ``damping`` and ``tool`` as of :func:`~stiffness_monitor.vibration.tool_modes`.
     """
@@ -28,7 +30,7 @@ class CuttingDepth(Frequency):
     name = "cutting-depth"
     question = "how deep does it mill without chatter?"
     answer = "chatters first"
-    what = "axial depth of cut without chatter"
+    what = "axial depth of cut, zero-order"
     unit = "m"
     element = "mode"
     together = False
