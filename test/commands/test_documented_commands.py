@@ -16,7 +16,6 @@ from test.support.command import SHELL, typed_line
 
 NOT_RUN = {
     r"pkm-twin .*\b(my_delta|converted)\..*": "of a file that the page writes: test/docs runs them",
-    r"pkm-twin monitor-torques.*": "needs ROS and a running node: test/nodes has one",
     r"pkm-twin view .*": "serves until a signal: test/view runs it in a browser",
     r"pkm-twin play .*": "needs ROS: test_player runs it over the real middleware",
     r"pkm-twin map .* --scheduler .*": "needs a Dask cluster: test/maps/test_run.py has one",
