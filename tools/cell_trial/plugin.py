@@ -32,6 +32,7 @@ from cell import Peer, Process, closing, node, peer
 from control_msgs.msg import JointTrajectoryControllerState
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.qos import QoSProfile
+from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from delta_dynamics import inverse_dynamics
@@ -102,6 +103,7 @@ class Chain:
         self.fallen = other.hear(
             JointTrajectoryControllerState, f"/{GRAVITY}/controller_state", 50000
         )
+        self.hardware = other.hear(JointState, "/joint_states", 50000)
         self.counts = other.hear(DiagnosticArray, "/diagnostics", 1000)
         self.send = other.node.create_publisher(
             JointTrajectory, f"/{target}/joint_trajectory", QoSProfile(depth=10)
@@ -199,6 +201,8 @@ class Chain:
             f"feedforward less that of the weight {np.abs(found - weight).max():.1e}"
         )
         self.fallen.clear()
+        self.hardware.clear()
+        self.other.until(lambda: self.fallen, GRAVITY)
         self.other.spin(3.0)
         self.report()
         share = Path(get_package_share_directory(package_name(robot)))
@@ -216,6 +220,8 @@ class Chain:
             f"{np.abs(at - at[0]).max():.1e}, fastest {np.abs(columns[1]).max():.1e}, at the end "
             f"{np.abs(columns[1][-1]).max():.1e}"
         )
+        idle = [m for m in self.hardware if not any(m.effort)]
+        print(f"{self.part}: {len(idle)} of {len(self.hardware)} joint states have no effort")
         print(_output("ros2", "control", "list_controllers"))
 
     def report(self) -> None:
