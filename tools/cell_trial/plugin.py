@@ -1,16 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
 """The exported controller under joint_trajectory_controller: its efforts compared with the twin's.
 
-    python3 tools/cell_trial/plugin.py [--robot delta_cu] [--bandwidth 2] [mock] [sim] [beyond]
+    python3 tools/cell_trial/plugin.py [--robot delta_cu] [--bandwidth 2] [PART ...]
 
 ``mock``: mock hardware, which does not move. ``sim``: machine_sim in lockstep, through the hardware
 in tools/cell_trial/topic_hardware. Of both, the references that the controller has followed go to a
 running delta_dynamics as a JointTrajectory, and its efforts are compared with the controller's.
 ``beyond``: mock hardware, and a trajectory through a position limit: the controller holds, and
 after its hold_time the chain is deactivated and the gravity controller carries the machine.
+``fall``: the same with machine_sim, which moves. ``twin``: without the plugin, the trajectory goes
+through delta_dynamics, and the controller's effort is compared with the model's along it.
 
 Needs a sourced Jazzy workspace with pkm_twin, ros2_control, joint_trajectory_controller and the
-package that ``pkm-twin export ros2-control ROBOT`` wrote; for ``sim`` also pkm_topic_hardware.
+package that ``pkm-twin export ros2-control ROBOT`` wrote; for ``sim`` and ``fall`` also
+pkm_topic_hardware.
 """
 
 from __future__ import annotations
@@ -29,6 +32,7 @@ from cell import Peer, Process, closing, node, peer
 from control_msgs.msg import JointTrajectoryControllerState
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.qos import QoSProfile
+from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from delta_dynamics import inverse_dynamics
@@ -36,7 +40,9 @@ from pkm_twin import Robot, load
 from pkm_twin.export.ros2_control import CONTROLLER, GRAVITY, TRAJECTORIES, package_name
 
 MOCK = "mock_components/GenericSystem"
-HARDWARE = {"mock": MOCK, "sim": "pkm_topic_hardware/TopicSystem", "beyond": MOCK}
+TOPICS = "pkm_topic_hardware/TopicSystem"
+KINDS = ("positions", "velocities", "accelerations")
+HARDWARE = {"mock": MOCK, "sim": TOPICS, "beyond": MOCK, "fall": TOPICS, "twin": MOCK}
 
 
 def stamped(seconds: float) -> Duration:
@@ -86,19 +92,26 @@ class Chain:
 
     def __init__(self, other: Peer, given: str, part: str, bandwidth: float) -> None:
         self.other, self.robot, self.part = other, load(given), part
+        use, source, target = (
+            ("twin", TRAJECTORIES, "delta_dynamics")
+            if part == "twin"
+            else ("plugin", CONTROLLER, TRAJECTORIES)
+        )
         self.states = other.hear(
-            JointTrajectoryControllerState, f"/{CONTROLLER}/controller_state", 50000
+            JointTrajectoryControllerState, f"/{source}/controller_state", 50000
         )
         self.fallen = other.hear(
             JointTrajectoryControllerState, f"/{GRAVITY}/controller_state", 50000
         )
+        self.hardware = other.hear(JointState, "/joint_states", 50000)
         self.counts = other.hear(DiagnosticArray, "/diagnostics", 1000)
         self.send = other.node.create_publisher(
-            JointTrajectory, f"/{TRAJECTORIES}/joint_trajectory", QoSProfile(depth=10)
+            JointTrajectory, f"/{target}/joint_trajectory", QoSProfile(depth=10)
         )
-        settings = [f"controllers:={self._by_its_clock()}"] if part == "sim" else []
+        simulated = HARDWARE[part] == TOPICS
+        settings = [f"controllers:={self._by_its_clock()}"] if simulated else []
         self.process = Process(
-            "ros2", "launch", "pkm_twin", "control.launch.py", f"robot:={given}", "use:=plugin",
+            "ros2", "launch", "pkm_twin", "control.launch.py", f"robot:={given}", f"use:={use}",
             f"hardware_plugin:={HARDWARE[part]}", f"bandwidth:={bandwidth}", *settings,
         )  # fmt: skip
 
@@ -120,10 +133,13 @@ class Chain:
     def start(self) -> Any:
         """Wait for both controllers; the model's joint positions."""
         self.other.until(lambda: self.states, lambda: f"the controller\n{self.process.output}")
-        self.other.until(self.send.get_subscription_count, TRAJECTORIES)
+        self.other.until(self.send.get_subscription_count, "who takes trajectories")
         # They become active one after the other.
         self.other.spin(5.0)
-        return self.robot.controller.positions(np.array(self.states[-1].feedback.positions))
+        found, home = np.array(self.last.feedback.positions), self.robot.graph.home
+        miss = np.abs(found - self.robot.controller.controller_positions(home)).max()
+        print(f"{self.part}: starts at {found.round(6).tolist()}, {miss:.1e} from home")
+        return self.robot.controller.positions(found)
 
     def go(self, motion: JointTrajectory) -> None:
         """Send a trajectory and wait until it begins."""
@@ -145,6 +161,30 @@ class Chain:
         self.report()
         return [s for s in self.states if any(s.reference.velocities)]
 
+    def through_the_twin(self) -> None:
+        """A motion there and back through delta_dynamics."""
+        robot = self.robot
+        motion = there_and_back(robot, self.start(), 4.0)
+        self.go(motion)
+        self.other.spin(5.0)
+        found = np.array([s.output.effort for s in self.states if any(s.reference.velocities)])
+        columns = [np.array([getattr(p, name) for p in motion.points]) for name in KINDS]
+        rates = robot.controller.rates
+        model = inverse_dynamics(
+            robot, robot.controller.positions(columns[0]), *map(rates, columns[1:])
+        )
+        right = robot.controller.controller_efforts(model)
+        # The controller interpolates efforts between points.
+        a, d = right[:-1], np.diff(right, axis=0)
+        away = found[:, None] - a
+        share = np.clip((away * d).sum(-1) / np.maximum((d * d).sum(-1), 1e-300), 0.0, 1.0)
+        error = np.linalg.norm(away - share[..., None] * d, axis=-1).min(1).max()
+        print(
+            f"twin: {len(found)} states of the motion, effort less that of the model {error:.2e} "
+            f"at most, {error / np.abs(right).max():.1e} of the peak; efforts at their peaks "
+            f"{[right[k, j].round(5).item() for j, k in enumerate(np.abs(right).argmax(0))]}"
+        )
+
     def beyond(self) -> None:
         """A trajectory through the position limit of the first joint."""
         robot, start = self.robot, self.start()
@@ -155,22 +195,33 @@ class Chain:
         self.other.until(lambda: not any(self.last.reference.velocities), "the hold")
         held = robot.controller.positions(np.array(self.last.reference.positions))
         weight = inverse_dynamics(robot, held, 0.0 * held, 0.0 * held)
-        found = robot.controller.efforts(np.array(self.last.output.effort))
+        found = robot.controller.efforts(np.array(self.last.reference.effort))
         print(
-            f"beyond: held {robot.limits.position[0, 1] - held[0]:.1e} before the limit, "
-            f"effort less that of the weight {np.abs(found - weight).max():.1e}"
+            f"{self.part}: held {robot.limits.position[0, 1] - held[0]:.1e} before the limit, "
+            f"feedforward less that of the weight {np.abs(found - weight).max():.1e}"
         )
         self.fallen.clear()
+        self.hardware.clear()
+        self.other.until(lambda: self.fallen, GRAVITY)
         self.other.spin(3.0)
         self.report()
-        state = self.fallen[-1]
-        at = robot.controller.positions(np.array(state.feedback.positions))
-        weight = inverse_dynamics(robot, at, 0.0 * at, 0.0 * at)
-        carried = robot.controller.efforts(np.array(state.output.effort))
+        share = Path(get_package_share_directory(package_name(robot)))
+        sections = yaml.safe_load((share / "config" / "controllers.yaml").read_text())
+        gains = sections[f"/**/{GRAVITY}"]["ros__parameters"]["gains"]
+        d = np.array([gains[name]["d"] for name in robot.controller.names])
+        columns = [np.array([getattr(s.feedback, k) for s in self.fallen]) for k in KINDS[:2]]
+        at, still = robot.controller.positions(columns[0]), np.zeros_like(columns[0])
+        weight = robot.controller.controller_efforts(inverse_dynamics(robot, at, still, still))
+        carried = np.array([s.output.effort for s in self.fallen])
+        error = np.abs(carried - (weight - d * columns[1])).max()
         print(
-            f"beyond: {GRAVITY} gives the weight at the measured position, peak "
-            f"{np.abs(weight).max():.4g}, difference {np.abs(carried - weight).max():.1e}"
+            f"{self.part}: {GRAVITY}, {len(carried)} states: effort {carried[-1].tolist()}, less "
+            f"weight and damping at what is measured {error:.1e} at most; moved "
+            f"{np.abs(at - at[0]).max():.1e}, fastest {np.abs(columns[1]).max():.1e}, at the end "
+            f"{np.abs(columns[1][-1]).max():.1e}"
         )
+        idle = [m for m in self.hardware if not any(m.effort)]
+        print(f"{self.part}: {len(idle)} of {len(self.hardware)} joint states have no effort")
         print(_output("ros2", "control", "list_controllers"))
 
     def report(self) -> None:
@@ -194,10 +245,7 @@ def twin_s_efforts(other: Peer, robot: Robot, given: str, states: list[Any]) -> 
         JointTrajectory, "/delta_dynamics/joint_trajectory", QoSProfile(depth=10)
     )
     references = [s.reference for s in states]
-    columns = [
-        np.array([getattr(r, name) for r in references])
-        for name in ("positions", "velocities", "accelerations")
-    ]
+    columns = [np.array([getattr(r, name) for r in references]) for name in KINDS]
     # Times only have to rise: efforts are those of each point.
     message = trajectory(
         list(robot.controller.names), 1e-3 * np.arange(1, len(states) + 1), *columns
@@ -213,7 +261,8 @@ def twin_s_efforts(other: Peer, robot: Robot, given: str, states: list[Any]) -> 
 def show(other: Peer, given: str, part: str, bandwidth: float) -> None:
     """One part."""
     robot, simulated = load(given), []
-    if part == "sim":
+    moves = HARDWARE[part] == TOPICS
+    if moves:
         simulated.append(
             node(
                 "machine_sim",
@@ -223,9 +272,12 @@ def show(other: Peer, given: str, part: str, bandwidth: float) -> None:
         )
     with closing(*simulated):
         # Mock hardware does not follow: gains would push against it.
-        chain = Chain(other, given, part, bandwidth if part == "sim" else 0.0)
+        chain = Chain(other, given, part, bandwidth if moves else 0.0)
         with closing(chain.process):
-            if part == "beyond":
+            if part == "twin":
+                chain.through_the_twin()
+                return
+            if part in ("beyond", "fall"):
                 chain.beyond()
                 return
             states = chain.followed()
