@@ -455,7 +455,7 @@ def joint_edge(
             # -1 is no limit, and one end of a range may stand alone.
             stated = {k: v for k, v in stated.items() if k in ("lower", "upper") or v[:1] != "-"}
             stated = {"lower": "-inf", "upper": "inf", **stated}
-            turns = "revolute" if kind == "helical" else str(part.get("type"))
+            turns = "revolute" if kind == "helical" else kind
             found["limits"] = urdf_xml.limits(stated, where, turns)
     pitch = _pitch(part, where) if kind == "helical" else 0.0
     return Edge(
