@@ -12,6 +12,7 @@ import re
 import xml.etree.ElementTree as ET
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -99,8 +100,8 @@ def read(path: Path, top: ET.Element) -> LoopTree:
         raise ParameterError(str(path), "xacro elements", "an SDF: run xacro on this file first")
     version = _version(top)
     outside, element, gravity = _model(path, top)
-    name, world = urdf_xml.name(element, ()), Model(outside, version)
-    model = world.models[name]
+    title, world = urdf_xml.name(element, ()), Model(outside, version)
+    model = world.models[title]
     links = {WORLD: Link(WORLD, 0.0, np.zeros(3), np.zeros((3, 3)))}
     links |= {name: _link(path, part, name) for name, part in model.all("link")}
     places = {name: model.place(name) for name in links}
@@ -110,7 +111,7 @@ def read(path: Path, top: ET.Element) -> LoopTree:
             raise ParameterError(f"joint.{edge.name}", edge.name, "a unique name")
         edges[edge.name] = edge
     taken = set(edges)
-    welded = welds(path, top, name, places, taken)
+    welded = welds(path, top, title, places, taken)
     edges |= {edge.name: edge for edge in welded}
     for name, _ in model.all("frame"):
         owner = model.link(name)
@@ -130,7 +131,7 @@ def read(path: Path, top: ET.Element) -> LoopTree:
     for name in dict.fromkeys(links).keys() - {WORLD, *(joint.child for joint in joints)}:
         raise ParameterError(f"link.{name}", None, "a joint that connects it")
     return LoopTree(
-        name, WORLD, links, {joint.name: joint for joint in joints},
+        title, WORLD, links, {joint.name: joint for joint in joints},
         tuple(edge.closure(places) for edge in closures), actuated,
         _gravity(path, model, gravity, edges), accuracy=urdf_xml.accuracy(
             word for part in element.iter() if part.tag in ("pose", "xyz")
@@ -391,10 +392,7 @@ def _edge(path: Path, part: ET.Element, model: Model) -> Edge:
     """A joint with its frame in the world."""
     name = model.prefix + urdf_xml.name(part, ())
     where = f"joint.{name}"
-
-    def place(frame: str) -> Pose:
-        return model.place(frame, where)
-
+    place = partial(model.place, where=where)
     ends = [_end(part, tag) for tag in ("parent", "child")]
     links = model.link(ends[0], f"{where}.parent"), model.link(ends[1], f"{where}.child")
     if links[0] == links[1]:
