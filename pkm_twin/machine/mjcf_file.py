@@ -142,6 +142,10 @@ class _Reader:
         self.mj, self.model, self.path = mujoco, model, path
         self.links = {WORLD: Link(WORLD, 0.0, np.zeros(3), np.zeros((3, 3)))}
         self.joints: dict[str, Joint] = {}
+        self.names: dict[tuple[str, int], str] = {}
+        # The names of the file, and those that are made up beside them.
+        self.link_names = self._named(SITE=model.nsite, BODY=model.nbody)
+        self.joint_names = self._named(JOINT=model.njnt, EQUALITY=model.neq)
         kinds = mujoco.mjtJoint
         self.types = {
             int(kinds.mjJNT_FREE): "free",
@@ -156,13 +160,12 @@ class _Reader:
         for body in range(1, self.model.nbody):
             self._body(body, locks)
         for site in range(self.model.nsite):
-            name = self._name("SITE", site)
-            if name in self.links:
-                continue
-            self._link(name)
+            name = self._link(self._name("SITE", site))
             place = Pose(_rotation(self.model.site_quat[site]), self.model.site_pos[site])
-            owner = self._body_name(self.model.site_bodyid[site])
-            self._joint(f"{name}_frame", "fixed", owner, name, place)
+            owner = self._name("BODY", self.model.site_bodyid[site])
+            self._joint(
+                urdf_xml.free_name(f"{name}_frame", self.joint_names), "fixed", owner, name, place
+            )
         return LoopTree(
             self.path.stem,
             WORLD,
@@ -174,15 +177,40 @@ class _Reader:
             {name: self._start(self.model.joint(name).id) for name in actuated},
         )
 
-    def _name(self, kind: str, index: int) -> str:
+    def _named(self, **counts: int) -> set[str]:
+        """Name the parts of several kinds; MuJoCo's names are unique within one kind only.
+
+        A name that parts share is the first kind's, and the world's before all others.
+        """
+        parts = [(kind, i) for kind, count in counts.items() for i in range(count)]
+        given = {part: name for part in parts if (name := self._given(*part))}
+        owners = {name: part for part, name in reversed(given.items())}
+        if "BODY" in counts:
+            owners[WORLD] = "BODY", 0
+        taken = set(owners)
+        for kind, i in parts:
+            name = given.get((kind, i))
+            if name is None:
+                self.names[kind, i] = urdf_xml.free_name(f"{kind.lower()}_{i}", taken)
+            elif owners[name] == (kind, i):
+                self.names[kind, i] = name
+            else:
+                other = self.names[kind, i] = urdf_xml.free_name(f"{name}_{kind.lower()}", taken)
+                first = owners[name][0].lower()
+                warn(self.path, f"{kind.lower()} {name} is read as {other}: a {first} is {name}")
+        return taken
+
+    def _given(self, kind: str, index: int) -> str | None:
         name = self.mj.mj_id2name(self.model, getattr(self.mj.mjtObj, f"mjOBJ_{kind}"), index)
-        return str(name) if name else f"{kind.lower()}_{index}"
+        return str(name) if name else None
 
-    def _body_name(self, body: int) -> str:
-        return self._name("BODY", body) if body else WORLD
+    def _name(self, kind: str, index: int) -> str:
+        own = self.names.get((kind, int(index))) or self._given(kind, index)
+        return own or f"{kind.lower()}_{index}"
 
-    def _link(self, name: str) -> None:
+    def _link(self, name: str) -> str:
         self.links[name] = Link(name, 0.0, np.zeros(3), np.zeros((3, 3)))
+        return name
 
     def _joint(
         self, name: str, kind: str, parent: str, child: str, origin: Pose, **more: Any
@@ -193,21 +221,21 @@ class _Reader:
 
     def _body(self, body: int, locks: dict[int, float]) -> None:
         """A body on its joints, one after another, each in the body's frame."""
-        m, name = self.model, self._body_name(body)
+        m, name = self.model, self._name("BODY", body)
         turn = _rotation(m.body_iquat[body])
         inertia = turn @ np.diag(m.body_inertia[body]) @ turn.T
-        parent = self._body_name(m.body_parentid[body])
+        parent = self._name("BODY", m.body_parentid[body])
         place = Pose(_rotation(m.body_quat[body]), m.body_pos[body].copy())
         own = Link(name, float(m.body_mass[body]), m.body_ipos[body].copy(), inertia)
         count = int(m.body_jntnum[body])
         if not count:
-            self._joint(f"{name}_body", "fixed", parent, name, place)
+            label = urdf_xml.free_name(f"{name}_body", self.joint_names)
+            self._joint(label, "fixed", parent, name, place)
         for k in range(count):
             joint, last = int(m.body_jntadr[body]) + k, k == count - 1
             label, link = self._name("JOINT", joint), name
             if not last:
-                link = f"{label}_link"
-                self._link(link)
+                link = self._link(urdf_xml.free_name(f"{label}_link", self.link_names))
             kind, axis = self.types[int(m.jnt_type[joint])], m.jnt_axis[joint].copy()
             at = np.zeros(3) if kind == "free" else m.jnt_pos[joint].copy()
             # Every link has the body's frame; a joint's is at its point.
@@ -338,32 +366,30 @@ class _Reader:
                 raise ParameterError(
                     f"equality.{name}", self._name("JOINT", joint), "joints without coupling"
                 )
-            locks[joint] = float(data[0])
+            locks[joint] = self._start(joint) + float(data[0])
         return locks
 
     def _closures(self) -> list[Closure]:
         kinds = self.mj.mjtEq
+        weld = int(kinds.mjEQ_WELD)
         closures = []
         for name, kind, data, ids, sites in self._equalities():
             if kind == int(kinds.mjEQ_JOINT):
                 continue
-            if kind == int(kinds.mjEQ_CONNECT):
-                frames = Pose(position=data[:3].copy()), Pose(position=data[3:6].copy())
-                closure = "spherical"
-            elif kind == int(kinds.mjEQ_WELD):
-                # The weld's point and orientation in the first body, the point in the second.
-                frames = (
-                    Pose(_rotation(data[6:10]), data[3:6].copy()),
-                    Pose(position=data[:3].copy()),
-                )
-                closure = "fixed"
-                if data[10] == 0.0:
-                    raise ParameterError(f"equality.{name}.torquescale", 0, "a <connect>")
-            else:
+            if kind not in (int(kinds.mjEQ_CONNECT), weld):
                 raise ParameterError(f"equality.{name}", kind, "connect, weld or joint")
+            if kind == weld and data[10] == 0.0:
+                raise ParameterError(f"equality.{name}.torquescale", 0, "a <connect>")
+            closure = "fixed" if kind == weld else "spherical"
             if sites:
                 frames = Pose(), Pose()
-            ends = [self._name("SITE", i) if sites else self._body_name(i) for i in ids]
+            elif kind == weld:
+                # The weld's point and orientation in the first body, the point in the second.
+                first = Pose(_rotation(data[6:10]), data[3:6].copy())
+                frames = first, Pose(position=data[:3].copy())
+            else:
+                frames = Pose(position=data[:3].copy()), Pose(position=data[3:6].copy())
+            ends = [self._name("SITE" if sites else "BODY", i) for i in ids]
             closures.append(Closure(name, closure, (ends[0], ends[1]), frames, None))
         return closures
 

@@ -42,7 +42,7 @@ def read_beside(path: Path) -> dict[str, Any]:
 
 def _commanded(top: ET.Element) -> list[str]:
     return [
-        str(joint.get("name"))
+        urdf_xml.name(joint, ())
         for system in top.iter("ros2_control")
         for joint in system.findall("joint")
         if joint.find("command_interface") is not None
@@ -51,12 +51,12 @@ def _commanded(top: ET.Element) -> list[str]:
 
 def _transmitted(top: ET.Element) -> list[str]:
     joints = [joint for one in top.iter("transmission") for joint in one.findall("joint")]
-    return list(dict.fromkeys(str(joint.get("name")) for joint in joints))
+    return list(dict.fromkeys(urdf_xml.name(joint, ()) for joint in joints))
 
 
 def _independent(top: ET.Element) -> list[str]:
     return [
-        str(joint.get("name"))
+        urdf_xml.name(joint, ())
         for joint in top.findall("joint")
         if urdf_xml.boolean(
             joint.get("independent", "false"), f"joint.{joint.get('name')}.independent"

@@ -12,6 +12,7 @@ import re
 import xml.etree.ElementTree as ET
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -98,35 +99,39 @@ def read(path: Path, top: ET.Element) -> LoopTree:
     if any(str(part.tag).startswith("xacro:") for part in top.iter()):
         raise ParameterError(str(path), "xacro elements", "an SDF: run xacro on this file first")
     version = _version(top)
-    element, gravity = _model(path, top)
-    model = Model(element, version)
+    outside, element, gravity = _model(path, top)
+    title, world = urdf_xml.name(element, ()), Model(outside, version)
+    model = world.models[title]
     links = {WORLD: Link(WORLD, 0.0, np.zeros(3), np.zeros((3, 3)))}
     links |= {name: _link(path, part, name) for name, part in model.all("link")}
     places = {name: model.place(name) for name in links}
     edges: dict[str, Edge] = {}
-    welded = welds(path, top, element.get("name", ""), places)
-    for edge in (*model.edges(path), *welded):
+    for edge in world.edges(path):
         if edge.name in edges:
             raise ParameterError(f"joint.{edge.name}", edge.name, "a unique name")
         edges[edge.name] = edge
+    taken = set(edges)
+    welded = welds(path, top, title, places, taken)
+    edges |= {edge.name: edge for edge in welded}
     for name, _ in model.all("frame"):
         owner = model.link(name)
         if owner in links and name not in links:
             links[name] = Link(name, 0.0, np.zeros(3), np.zeros((3, 3)))
             places[name] = model.place(name)
-            own = f"{name}_frame"
+            own = urdf_xml.free_name(f"{name}_frame", taken)
             edges[own] = Edge(own, "fixed", (owner, name), places[name])
     if not any(WORLD in edge.links for edge in edges.values()):
         held = model.link(MODEL)
         warn(path, f"no joint holds the model in the world: link {held} is taken for the ground")
-        edges["world_fixed"] = Edge("world_fixed", "fixed", (WORLD, held), places[held])
+        own = urdf_xml.free_name("world_fixed", taken)
+        edges[own] = Edge(own, "fixed", (WORLD, held), places[held])
     types = {name: edge.type for name, edge in edges.items()}
     actuated = actuated_joints(path, top, read_beside(path), types, effort_limited(edges))
     joints, closures = spanned(edges, actuated, places)
     for name in dict.fromkeys(links).keys() - {WORLD, *(joint.child for joint in joints)}:
         raise ParameterError(f"link.{name}", None, "a joint that connects it")
     return LoopTree(
-        element.get("name") or path.stem, WORLD, links, {joint.name: joint for joint in joints},
+        title, WORLD, links, {joint.name: joint for joint in joints},
         tuple(edge.closure(places) for edge in closures), actuated,
         _gravity(path, model, gravity, edges), accuracy=urdf_xml.accuracy(
             word for part in element.iter() if part.tag in ("pose", "xyz")
@@ -143,23 +148,23 @@ def _version(top: ET.Element) -> tuple[int, int]:
     return 1, int(found[1])
 
 
-def _model(path: Path, top: ET.Element) -> tuple[ET.Element, list[float] | None]:
-    """The only model that can move, and the world's gravity if the file has a world."""
+def _model(path: Path, top: ET.Element) -> tuple[ET.Element, ET.Element, list[float] | None]:
+    """The only model that can move, after what it stands in, and a world's gravity if stated."""
     worlds = top.findall("world")
     gravity = None
     for world in worlds:
         stated = urdf_xml.single(world, "gravity", "world")
         if stated is not None:
             gravity = urdf_xml.vector(stated.text, "world.gravity", 3).tolist()
-    models = [one for root in (top, *worlds) for one in root.findall("model")]
-    moving = [one for one in models if not _flag(one, "static", False)]
+    models = [(root, one) for root in (top, *worlds) for one in root.findall("model")]
+    moving = [(root, one) for root, one in models if not _flag(one, "static", False)]
     if not moving:
         for included in top.iter("include"):
             raise _of_include(included)
     if len(moving) != 1:
-        names = [one.get("name") for one in moving]
-        raise ParameterError(str(path), names, "one model that is not static")
-    return moving[0], gravity
+        names = ", ".join(str(one.get("name")) for _, one in moving)
+        raise ParameterError(str(path), names or "no <model>", "one <model> that is not static")
+    return *moving[0], gravity
 
 
 def _of_include(element: ET.Element) -> ParameterError:
@@ -195,21 +200,28 @@ def _flag(element: ET.Element, tag: str, default: bool) -> bool:
 
 
 class Model:
-    """A model's frames by name, each relative to the model's own; ``::`` leads into nested ones."""
+    """A model's frames by name, each relative to the model's own; ``::`` leads into nested ones.
+
+    The outermost one is the world. Names of parts are those in the model that it holds.
+    """
 
     def __init__(self, element: ET.Element, version: tuple[int, int], outer: Model | None = None):
         self.element, self.version, self.outer = element, version, outer
         own = element.get("name", "")
-        self.prefix: str = "" if outer is None else f"{outer.prefix}{own}::"
+        self.prefix: str = f"{outer.prefix}{own}::" if outer and outer.outer else ""
+        self.static: bool = outer is not None and (
+            outer.static or (outer.outer is None and _flag(element, "static", False))
+        )
         self.parts: dict[str, ET.Element] = {}
         for part in sorted(element, key=lambda part: part.tag == "joint"):
             if part.tag in ("link", "joint", "frame", "model"):
                 # Until 1.6 a joint and a link could have one name; it meant the link.
                 name = urdf_xml.name(part, self.parts if version >= (1, 7) else ())
                 self.parts.setdefault(name, part)
-        nested = element.findall("model")
-        self.models = {str(one.get("name")): Model(one, version, self) for one in nested}
-        for one in element.findall("include"):
+        self.models: dict[str, Model] = {}
+        for one in element.findall("model"):
+            self.models[urdf_xml.name(one, self.models)] = Model(one, version, self)
+        for one in element.findall("include") if outer and not self.static else ():
             raise _of_include(one)
         self._known: dict[str, Pose | None] = {}
 
@@ -230,17 +242,18 @@ class Model:
         return self, name
 
     def place(self, name: str, where: str = "relative_to") -> Pose:
-        """A frame as drawn, in this model's; of the outermost model in the world.
+        """A frame as drawn, in the world.
 
         :raises ParameterError: no such frame, or one that leads back to itself.
         """
-        if self.outer is None:
-            return self.pose() @ self.local(name, where)
-        return self.local(name, where)
+        found, scope = self.local(name, where), self
+        while scope.outer is not None:
+            found, scope = scope.pose() @ found, scope.outer
+        return found
 
     def pose(self) -> Pose:
-        """The model's frame in the outer model's, or in the world."""
-        found = self._posed(self.element, WORLD if self.outer is None else MODEL, self.outer)
+        """The model's frame in the outer model's."""
+        found = self._posed(self.element, MODEL, self.outer)
         placed = self.element.get("placement_frame")
         return found @ self.local(placed, "placement_frame").inverse() if placed else found
 
@@ -263,11 +276,10 @@ class Model:
             while scope is not self and scope.outer is not None:
                 found, scope = scope.pose() @ found, scope.outer
             return found
-        if name == MODEL:
+        if name == WORLD and self.outer is not None:
+            return self.pose().inverse() @ self.outer.local(WORLD, where)
+        if name in (MODEL, WORLD):
             return Pose()
-        if name == WORLD:
-            outside = Pose() if self.outer is None else self.outer.local(WORLD, where)
-            return self.pose().inverse() @ outside
         part = self.parts[name]
         if part.tag == "model":
             return self.models[name].pose()
@@ -292,22 +304,23 @@ class Model:
 
         :raises ParameterError: none is found.
         """
+        model, own = self, name
         for _ in range(urdf_xml.MAX_DEPTH):
-            model, own = self._in(name, where)
-            if own == WORLD:
+            model, own = model._in(own, where)
+            held = model.models.get(own, model)
+            if own == WORLD or held.static or (held.outer is None and own == MODEL):
                 return WORLD
-            part = model.element if own == MODEL else model.parts[own]
+            part = held.element if own == MODEL else model.parts[own]
             if part.tag == "link":
                 return model.prefix + own
             if part.tag == "model":
-                held = model if own == MODEL else model.models[own]
                 first = next((key for key, _ in held.all("link")), None)
                 named = part.get("canonical_link")
                 if named is None and first is None:
                     raise ParameterError(f"model.{part.get('name')}", "no link", "a model of links")
                 return str(first) if named is None else held.link(named, "canonical_link")
-            nested = _end(part, "child") if part.tag == "joint" else part.get("attached_to", MODEL)
-            name = model.prefix.removeprefix(self.prefix) + (nested or MODEL)
+            end = _end(part, "child") if part.tag == "joint" else part.get("attached_to")
+            own = end or MODEL
         raise ParameterError(where, name, "frames that do not lead back to themselves")
 
     def edges(self, path: Path) -> Iterator[Edge]:
@@ -318,7 +331,7 @@ class Model:
             if FOREIGN.fullmatch(part.tag):
                 raise ParameterError(part.tag, part.get("name"), "joints and closures of SDF alone")
         for one in self.models.values():
-            yield from one.edges(path)
+            yield from () if one.static else one.edges(path)
 
 
 def _end(joint: ET.Element, tag: str) -> str:
@@ -359,13 +372,13 @@ def _link(path: Path, element: ET.Element, name: str) -> Link:
         raise ParameterError(f"{where}.auto", "true", "a mass and an inertia as numbers")
     if inertial is not None and inertial.find("fluid_added_mass") is not None:
         raise ParameterError(f"{where}.fluid_added_mass", "given", "a machine in air")
+    stated = set() if inertial is None else {part.tag for part in inertial.iter()}
+    if missing := [key for key in ("mass", "ixx", "iyy", "izz") if key not in stated]:
+        warn(path, f"link {name} has no {', '.join(missing)}: SDF then has 1 kg and 1 kg m2")
     mass = _text(inertial, "mass", where, 1.0)
     if mass < 0.0:
         raise ParameterError(f"{where}.mass", mass, "zero or more, kg")
     moments = None if inertial is None else urdf_xml.single(inertial, "inertia", where)
-    missing = [key for key, part in (("mass", inertial), ("inertia", moments)) if part is None]
-    if missing:
-        warn(path, f"link {name} has no {' and no '.join(missing)}: SDF then has 1 kg and 1 kg m2")
     xx, xy, xz, yy, yz, zz = (
         _text(moments, key, f"{where}.inertia", float(key[1] == key[2]))
         for key in ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
@@ -379,13 +392,7 @@ def _edge(path: Path, part: ET.Element, model: Model) -> Edge:
     """A joint with its frame in the world."""
     name = model.prefix + urdf_xml.name(part, ())
     where = f"joint.{name}"
-    outer = model
-    while outer.outer is not None:
-        outer = outer.outer
-
-    def place(frame: str) -> Pose:
-        return outer.place(model.prefix + frame, where)
-
+    place = partial(model.place, where=where)
     ends = [_end(part, tag) for tag in ("parent", "child")]
     links = model.link(ends[0], f"{where}.parent"), model.link(ends[1], f"{where}.child")
     if links[0] == links[1]:
@@ -443,8 +450,9 @@ def joint_edge(
         limit = None if element is None else urdf_xml.single(element, "limit", where)
         if limit is not None and tag == "axis" and kind in ("revolute", "prismatic", "helical"):
             stated = {child.tag: (child.text or "").strip() for child in limit}
-            # -1 is no limit.
+            # -1 is no limit, and one end of a range may stand alone.
             stated = {k: v for k, v in stated.items() if k in ("lower", "upper") or v[:1] != "-"}
+            stated = {"lower": "-inf", "upper": "inf", **stated}
             turns = "revolute" if kind == "helical" else kind
             found["limits"] = urdf_xml.limits(stated, where, turns)
     pitch = _pitch(part, where) if kind == "helical" else 0.0
@@ -487,9 +495,12 @@ def _axis(
     return value / size
 
 
-def welds(path: Path, top: ET.Element, model: str, places: Mapping[str, Pose]) -> Iterator[Edge]:
+def welds(
+    path: Path, top: ET.Element, model: str, places: Mapping[str, Pose], taken: set[str]
+) -> Iterator[Edge]:
     """What Gazebo's plugins hold together: two links of this model, as they are drawn.
 
+    :param taken: names of joints and closures; the welds' own are added.
     :raises UnknownNameError: a parent link that is not there.
     """
     for plugin in top.iter("plugin"):
@@ -504,7 +515,8 @@ def welds(path: Path, top: ET.Element, model: str, places: Mapping[str, Pose]) -
         for tag, end in zip(WELDS[kind], ends, strict=True):
             if end not in places:
                 raise UnknownNameError(f"plugin.{kind}.{tag}", end, places)
-        yield Edge("_".join(ends), "fixed", (ends[0], ends[1]), places[ends[1]])
+        name = urdf_xml.free_name("_".join(ends), taken)
+        yield Edge(name, "fixed", (ends[0], ends[1]), places[ends[1]])
 
 
 def effort_limited(edges: Mapping[str, Edge]) -> list[str]:

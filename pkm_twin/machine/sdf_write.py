@@ -14,6 +14,7 @@ from typing import Final
 import numpy as np
 
 from pkm_twin.codegen.arrays import Array
+from pkm_twin.machine import urdf_xml
 from pkm_twin.machine.simulated import hang, row_of
 from pkm_twin.machine.urdf_write import (
     GROUND,
@@ -72,13 +73,7 @@ class _Writer:
             else:
                 self._chain(*ends, row_of(closure, *ends), places, closure.name)
         taken = {name for name, *_ in self.joints} | {PLATFORM}
-        self.names: dict[str, str] = {}
-        for name in self.bodies:
-            link = name
-            while link in taken:
-                link += "_link"
-            self.names[name] = link
-            taken.add(link)
+        self.names = {name: urdf_xml.free_name(name, taken, "_link") for name in self.bodies}
         self.places = places
 
     def _empty(self, name: str, place: Array) -> UrdfBody:

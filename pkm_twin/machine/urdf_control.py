@@ -54,7 +54,10 @@ def tree_names(joints: Iterable[str], controls: Iterable[Control]) -> dict[str, 
     names = list(joints)
     drives = {control.name for control in controls if not control.same}
     taken = drives.union(names)
-    return {name: _free(name + MODEL, taken, MODEL) if name in drives else name for name in names}
+    return {
+        name: urdf_xml.free_name(name + MODEL, taken, MODEL) if name in drives else name
+        for name in names
+    }
 
 
 def add_drives(robot: ET.Element, controls: Iterable[Control]) -> None:
@@ -70,8 +73,7 @@ def add_drives(robot: ET.Element, controls: Iterable[Control]) -> None:
         joints[name].set("name", own)
     for name, control in changed.items():
         joint = joints[name]
-        link = _free(control.name + DRIVE, links, "_")
-        links.add(link)
+        link = urdf_xml.free_name(control.name + DRIVE, links)
         drive = ET.SubElement(robot, "joint", name=control.name, type=_kind(joint, control))
         parts = {child.tag: copy.deepcopy(child) for child in joint}
         drive.extend(parts[tag] for tag in ("origin", "parent"))
@@ -154,12 +156,6 @@ def _kind(joint: ET.Element, control: Control) -> str:
     """A motor that turns, or a slide where the controller counts the metres of one."""
     slides = joint.get("type") == "prismatic" and abs(control.factor) == 1.0
     return "prismatic" if slides else "revolute"
-
-
-def _free(name: str, taken: set[str], more: str) -> str:
-    while name in taken:
-        name += more
-    return name
 
 
 def _rename(robot: ET.Element, name_of: Callable[[str], str]) -> None:

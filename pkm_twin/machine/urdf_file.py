@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 import xml.etree.ElementTree as ET
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
@@ -56,10 +56,7 @@ def read(path: Path, robot: ET.Element) -> LoopTree:
     closures = urdf_loops.closures(
         robot, beside, links, {name: joint.child for name, joint in joints.items()}
     )
-    for closure in _of_gazebo(path, robot, joints, root):
-        if closure.name in joints or closure.name in closures:
-            raise ParameterError("gazebo", closure.name, "a unique name")
-        closures[closure.name] = closure
+    closures |= _of_gazebo(path, robot, joints, root, {*joints, *closures})
     _warn_of_units(path, robot, joints, closures)
     actuated = actuated_joints(
         path, robot, beside, {name: joint.type for name, joint in joints.items()}
@@ -84,16 +81,20 @@ def read(path: Path, robot: ET.Element) -> LoopTree:
 
 
 def _of_gazebo(
-    path: Path, robot: ET.Element, joints: Mapping[str, Joint], root: str
-) -> Iterator[Closure]:
-    """Joints of SDF inside ``<gazebo>``, and links that its plugins hold together."""
+    path: Path, robot: ET.Element, joints: Mapping[str, Joint], root: str, taken: set[str]
+) -> dict[str, Closure]:
+    """Joints of SDF inside ``<gazebo>``, and links that its plugins hold together, by name.
+
+    :param taken: names of joints and closures; those of these are added.
+    """
     places = drawn(root, joints)
 
     def turn(frame: str) -> Array:
         return places[frame].rotation if frame in places else np.eye(3)
 
+    edges: list[sdf_file.Edge] = []
     for element in robot.findall("gazebo/joint"):
-        name = urdf_xml.name(element, joints)
+        taken.add(name := urdf_xml.name(element, taken))
         where = f"gazebo.joint.{name}"
         first, second = (
             urdf_xml.known_link(f"{where}.{end}", (element.findtext(end) or "").strip(), places)
@@ -104,9 +105,9 @@ def _of_gazebo(
         start = urdf_xml.known_link(f"{where}.pose", start, places)
         place = places[start] @ sdf_file.pose(stated, f"{where}.pose")
         edge = sdf_file.joint_edge(path, element, name, (first, second), place, turn)
-        yield edge.closure(places)
-    for edge in sdf_file.welds(path, robot, robot.get("name", ""), places):
-        yield edge.closure(places)
+        edges.append(edge)
+    edges += sdf_file.welds(path, robot, robot.get("name", ""), places, taken)
+    return {edge.name: edge.closure(places) for edge in edges}
 
 
 def _link(element: ET.Element, name: str) -> Link:

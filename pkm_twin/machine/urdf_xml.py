@@ -112,6 +112,14 @@ def name(element: ET.Element, taken: Container[str]) -> str:
     return own
 
 
+def free_name(name: str, taken: set[str], more: str = "_") -> str:
+    """A name for a part that the file does not name: a free one, which is taken from now on."""
+    while name in taken:
+        name += more
+    taken.add(name)
+    return name
+
+
 def only(element: ET.Element | None, where: str, tags: Collection[str]) -> None:
     """No child element but these; a misspelt one would be taken for a missing one.
 

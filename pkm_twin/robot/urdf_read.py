@@ -286,10 +286,7 @@ def _bodies(urdf: LoopTree, order: list[Joint], tool: str, ground: str) -> dict[
     for first, wanted in ((group[tool], tool), *((first, first) for first in group.values())):
         if first in names:
             continue
-        while wanted in taken:
-            wanted += "_"
-        names[first] = wanted
-        taken.add(wanted)
+        names[first] = urdf_xml.free_name(wanted, taken)
     return {link: names[first] for link, first in group.items()}
 
 

@@ -359,9 +359,37 @@ def test_every_attribute_is_read_or_warned_of_or_rejected(attribute, tmp_path):
         np.testing.assert_allclose(inverse_dynamics(robot, q, qd, qdd), right, 1e-6, 1e-7)
 
 
-@pytest.mark.parametrize("name", ["five_bar", "hexapod"])
+SLIDE = '<joint name="e1" axis="0 0 1"/><joint name="x" type="slide" axis="1 0 0" ref="0.02"/>'
+BOX = '<body name="tool" pos="0.1 0.02 0"><geom type="sphere" size="0.02" mass="0.1"/></body>'
+END = '<site name="end" pos="0.3 0 0"/>'
+HAND = """<body name="hand" pos="0.3 0 0" euler="0 0 -86"><joint name="h" axis="0 0 1"/>
+  <geom type="sphere" pos="0.02 0 0" size="0.02" mass="0.1"/><site name="end"/></body>"""
+VARIANTS = {
+    "five_bar": {},
+    "locked at a ref": {
+        '<joint name="e1" axis="0 0 1"/>': SLIDE,
+        CONNECT: CONNECT + '<joint joint1="x" polycoef="0.05 0 0 0 0"/>',
+    },
+    "sites with names of bodies": {
+        END: BOX + '<site name="fore_2" pos="0.3 0 0"/>', 'site2="end"': 'site2="fore_2"',
+    },
+    "names as this reader makes them": {
+        '<joint name="e1" axis="0 0 1"/>': SLIDE.replace('"x"', '"tool_frame"'),
+        '"fore_2"': '"e1_link"', END: BOX.replace('"tool"', '"box"') + "<site/>" + END,
+        '"end"': '"site_1"', '"e2"': '"box_body"', '"tip"': '"m1"',
+        CONNECT: CONNECT + '<joint joint1="tool_frame"/>',
+    },
+    "weld of sites": {END: HAND, "<connect": "<weld"},
+}  # fmt: skip
+
+
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+@pytest.mark.parametrize("name", [*VARIANTS, "hexapod"])
 def test_torques_are_mujoco_s_projected(name, tmp_path):
-    content = FIVE_BAR.replace("CLOSURE", CONNECT) if name == "five_bar" else hexapod()
+    content = hexapod() if name == "hexapod" else FIVE_BAR.replace("CLOSURE", CONNECT)
+    for old, new in sorted(VARIANTS.get(name, {}).items(), key=lambda pair: -len(pair[0])):
+        assert old in content
+        content = content.replace(old, new)
     path = save(tmp_path, content)
     robot = Machine.from_data(read_urdf(path, platform="tool"), name)
     judge = Judge(path, robot.joint_names)
@@ -372,6 +400,9 @@ def test_torques_are_mujoco_s_projected(name, tmp_path):
         right = judge.efforts(q, qd, qdd)
         error = np.abs(inverse_dynamics(robot, q, qd, qdd) - right).max()
         assert error < 1e-6 * np.abs(right).max()
+        judge.close(q)
+        place = judge.data.site("tool").xpos
+        np.testing.assert_allclose(robot.platform(q)[0], place, atol=1e-9)
 
 
 def test_effort_limits_are_those_of_joint_and_actuators_together(tmp_path):

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from delta_dynamics import inverse_dynamics
 from pkm_twin.errors import ParameterError
+from pkm_twin.machine.urdf_xml import UNLIMITED
 from pkm_twin.mechanisms.machine import Machine
 from pkm_twin.robot.robot_urdf import robot_sdf
 from pkm_twin.robot.urdf_read import read_urdf
@@ -21,6 +22,7 @@ from test.support.robots import load, random_motion
 
 pytestmark = pytest.mark.usefixtures("quickly_compiled")
 
+TURN = UNLIMITED["revolute"]
 FIVE_BAR = """<sdf version="1.9"><world name="w"><gravity>0 -9.81 0</gravity>
 <model name="ground"><static>1</static></model>
 <model name="five_bar">
@@ -287,16 +289,84 @@ def test_a_model_without_motors_is_rejected(tmp_path):
         read_urdf(five_bar(tmp_path, motors=""))
 
 
-def test_what_is_left_out_is_a_kilogram_and_said(tmp_path):
-    with pytest.warns(UserWarning, match="fore_2 has no mass and no inertia"):
+LEFT_OUT = {
+    "inertial": (r"<inertial>.*?</inertial>", "mass, ixx, iyy, izz", 1.0, [1.0, 1.0, 1.0]),
+    "mass": (r"<mass>.*?</mass>", "mass:", 1.0, [1e-4, 2e-3, 2e-3]),
+    "misspelt": (r"mass>", "mass:", 1.0, [1e-4, 2e-3, 2e-3]),
+    "inertia": (r"<inertia>.*?</inertia>", "ixx, iyy, izz", 0.4, [1.0, 1.0, 1.0]),
+    "ixx": (r"<ixx>.*?</ixx>", "ixx:", 0.4, [1.0, 2e-3, 2e-3]),
+}
+
+
+@pytest.mark.parametrize("part", LEFT_OUT)
+def test_what_is_left_out_is_a_kilogram_and_said(part, tmp_path):
+    pattern, words, mass, inertia = LEFT_OUT[part]
+    path = five_bar(tmp_path)
+    head, link, tail = path.read_text().partition('<link name="fore_2">')
+    left, end, tail = tail.partition("</link>")
+    left = re.sub(pattern, "mas>" if part == "misspelt" else "", left, flags=re.DOTALL)
+    path.write_text(head + link + left + end + tail)
+    with pytest.warns(UserWarning, match=f"fore_2 .*{words}"):
+        body = read_urdf(path)["bodies"]["fore_2"]
+    assert body["mass"] == mass
+    matrix = np.array(body["inertia"])
+    found = np.linalg.eigvalsh(np.diag(matrix) if matrix.ndim == 1 else matrix)
+    np.testing.assert_allclose(found, sorted(inertia), rtol=1e-9)
+
+
+MODEL = '<model name="five_bar">'
+FRAME = """<frame name="F"><pose>1 0 0 0.4 0 0</pose></frame>
+<frame name="G" attached_to="F"><pose>0 2 0 0 0.3 0</pose></frame>"""
+M1 = """<joint name="m1" type="revolute"><parent>world</parent><child>arm_1</child>
+ <axis><xyz>0 0 1</xyz></axis></joint>"""
+SAME = {
+    "a frame of the world": (
+        {MODEL: f'{FRAME}{MODEL}<pose relative_to="G">0 0 3 0 0 0.2</pose>'},
+        {MODEL: f"{MODEL}<pose>{{}}</pose>"},
+    ),
+    "a joint of the world": (
+        {
+            M1: "",
+            "<static>1</static>": '<static>1</static><link name="g"/>',
+            MODEL: M1.replace("world", "ground::g").replace(">arm_1", ">five_bar::arm_1") + MODEL,
+        },
+        {},
+    ),
+    "names as this reader makes them": ({'"e1"': '"tool_frame"', '"e2"': '"world_fixed"'}, {}),
+}
+
+
+@pytest.mark.parametrize("way", SAME)
+def test_what_stands_in_the_world_is_the_same_machine(way, tmp_path):
+    frames = Rotation.from_euler("xyz", [0.4, 0, 0]), Rotation.from_euler("xyz", [0, 0.3, 0])
+    turn = frames[0] * frames[1]
+    at = frames[0].apply([0, 2, 0]) + turn.apply([0, 0, 3])
+    angles = (turn * Rotation.from_euler("xyz", [0, 0, 0.2])).as_euler("xyz")
+    robots = []
+    for changes in SAME[way]:
         path = five_bar(tmp_path)
         text = path.read_text()
-        at = text.index("<inertial>", text.index('name="fore_2"'))
-        end = text.index("</inertial>", at) + len("</inertial>")
-        path.write_text(text[:at] + text[end:])
-        data = read_urdf(path)
-    body = next(body for body in data["bodies"].values() if body["mass"] == 1.0)
-    assert np.allclose(body["inertia"], 1.0)
+        for old, new in changes.items():
+            assert old in text
+            text = text.replace(old, new.format(text_of([at[0] + 1, *at[1:], *angles])))
+        path.write_text(text)
+        robots.append(load(path, platform="tool"))
+    found, right = robots
+    motion = random_motion(right, np.random.default_rng(8), 5)
+    np.testing.assert_allclose(found.platform(motion[0])[0], right.platform(motion[0])[0], 1e-9)
+    np.testing.assert_allclose(
+        inverse_dynamics(found, *motion), inverse_dynamics(right, *motion), 1e-8, 1e-10
+    )
+
+
+@pytest.mark.parametrize(("limit", "right"), [
+    ("<lower>-1</lower>", [-1.0, TURN]), ("<upper>1</upper>", [-TURN, 1.0]),
+    ("<lower>-1</lower><upper>2</upper>", [-1.0, 2.0]), ("<effort>3</effort>", None),
+])  # fmt: skip
+def test_a_range_may_have_one_end(limit, right, tmp_path):
+    axis = "<xyz>0 0 1</xyz></axis>"
+    path = five_bar(tmp_path, axis, axis.replace("</axis>", f"<limit>{limit}</limit></axis>"))
+    assert read_urdf(path)["joints"]["m1"]["limits"].get("position") == right
 
 
 REJECTED = {
@@ -318,6 +388,10 @@ REJECTED = {
     "motor": ("<joint_name>m2</joint_name>", "<joint_name>m3</joint_name>", "plugin"),
     "mimic": ("<xyz>0 0 1</xyz></axis>", '<xyz>0 0 1</xyz><mimic joint="m1"/></axis>',
               "joint.m1.mimic"),
+    "frame of the world": (MODEL, f'{MODEL}<pose relative_to="none"/>', "model.five_bar.pose"),
+    "joint of the world": (MODEL, M1.replace("m1", "j").replace("arm_1", "five_bar::none") + MODEL,
+                           "joint.j.child"),
+    "no model": (MODEL, f"{MODEL}<static>1</static>", "five_bar.sdf"),
     "xacro": ("<static>1</static>", "<xacro:include/>", "five_bar.sdf"),
 }  # fmt: skip
 
@@ -328,3 +402,4 @@ def test_what_is_rejected_is_named(case, tmp_path):
     with pytest.raises(ParameterError) as error:
         read_urdf(five_bar(tmp_path, old, new))
     assert error.value.field.endswith(field)
+    assert error.value.value not in ("None", [])

@@ -206,7 +206,7 @@ def test_gazebo_s_ways_to_close_a_loop(kind, tmp_path):
     origin = re.search(r"<child_origin ([^>]*)/>", constraint)[1]
     axis = re.search(r'<(?:child|parent)_axis xyz="([^"]*)"', constraint)[1]
     pin = (
-        '<link name="pin"/><joint name="tip" type="continuous"><parent link="platform"/>'
+        '<link name="pin"/><joint name="fore_1_pin" type="continuous"><parent link="platform"/>'
         f'<child link="pin"/><origin {origin}/><axis xyz="{axis}"/></joint>'
     )
     closure = CLOSURES[kind].replace("ROBOT", re.search(r'<robot name="([^"]*)"', text)[1])

@@ -70,6 +70,12 @@ REFUSED = {
     "negative effort": ('effort="3"', 'effort="-3"', "joint.motor.limit.effort"),
     "nobody drives": ('<command_interface name="effort"/>', "", "no actuated joint"),
     "unknown motor": ('<joint name="motor">', '<joint name="moto">', "did you mean 'motor'"),
+    "unnamed motor": ('<joint name="motor">', "<joint>", "joint: .*with a name"),
+    "unnamed transmission": (
+        '<command_interface name="effort"/></joint></ros2_control>',
+        "</joint></ros2_control><transmission><joint/></transmission>",
+        "joint: missing",
+    ),
     "driven weld": ('<joint name="motor">', '<joint name="weld">', "ros2_control.weld: 'fixed'"),
     "no closure": (
         'name="weld" type="fixed"',
