@@ -206,6 +206,8 @@ def _smooth(robot: Robot, part: JointPath, limits: Limits, wrench: Array | None)
             break
         x = found
         run = smooth_run(part, x)
+        if run is None:
+            break
         used = run_peaks(robot, run, limits, wrench)
         factor = needed(used.max(0))
         if factor * run.duration < (1.0 - COARSE) * least:

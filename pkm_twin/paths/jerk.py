@@ -32,6 +32,10 @@ LEAST: Final = 1e-9
 """Part of the greatest x below which a machine does not slow down on its way."""
 SLOWER: Final = 6
 """How often a start is slowed down until a program has a solution."""
+RAISED: Final = 20
+"""How often a profile is raised where it would go back."""
+ROUNDED: Final = 1e-12
+"""Part of the greatest speed below rest that is rounding."""
 HALVINGS: Final = 50
 """Steps of the search for the time of a place."""
 
@@ -79,7 +83,17 @@ class SmoothRun:
         u, v = self.u[k], self.v[k]
         jerk = (self.u[k + 1] - u) / span
         way = self.way[k] + t * (v + t * (u / 2 + t * jerk / 6))
-        return way, np.maximum(v + t * (u + t * jerk / 2), 0.0), u + t * jerk
+        return way, v + t * (u + t * jerk / 2), u + t * jerk
+
+    @property
+    def least(self) -> Array:
+        """Least speed along the path between two knots, where it turns too, (k - 1,), m/s."""
+        u, span = self.u[:-1], np.diff(self.knots)
+        change = np.diff(self.u)
+        rises = (u < 0.0) & (self.u[1:] > 0.0)
+        # From there to the turn the acceleration goes to zero.
+        dip = np.where(rises, 0.5 * u * span * -u / np.where(rises, change, 1.0), 0.0)
+        return np.minimum(np.minimum(self.v[:-1], self.v[1:]), self.v[:-1] + dip)
 
     def at(self, time: Array) -> tuple[Index, Array, Array, Array]:
         """Interval, part of it, v and u at times (k,)."""
@@ -256,7 +270,26 @@ def _jerk_rows(
     return _triplets(made, (at, len(x))), np.tile(bound, 4)
 
 
-def smooth_run(part: JointPath, x: Array) -> SmoothRun:
+def smooth_run(part: JointPath, x: Array) -> SmoothRun | None:
+    """A profile in time that never goes back along the path; None where none is found.
+
+    Where a machine nearly stops on its way, lines between the accelerations may go below rest: the
+    profile is raised there.
+    """
+    x = x.copy()
+    for count in range(RAISED):
+        run = _joined(part, x)
+        below = -run.least
+        # Between two middles of intervals lies the point of their common end.
+        low = np.flatnonzero(below > ROUNDED * run.v.max())
+        if not len(low):
+            return run
+        at = np.clip(low, 1, len(x) - 2)
+        np.maximum.at(x, at, (np.sqrt(x[at]) + 1.5**count * below[low]) ** 2)
+    return None
+
+
+def _joined(part: JointPath, x: Array) -> SmoothRun:
     """A profile in time: its mean accelerations, joined by lines in time.
 
     Between points y = x^(3/4) is linear in s, as it is from rest with even jerk. What the lines

@@ -7,6 +7,8 @@ import pytest
 from delta_dynamics import inverse_dynamics
 from pkm_twin.errors import ParameterError
 from pkm_twin.paths import circle, cycle, fastest, lines, through, timed
+from pkm_twin.paths.jerk import smooth_run
+from pkm_twin.paths.joint_path import joint_paths
 from pkm_twin.paths.laws import LAWS
 from pkm_twin.paths.pieces import Arc, Corner, arc_through
 from test.support.robots import FREE, load, partly_long
@@ -246,6 +248,43 @@ def test_jerks_are_kept_and_cost_time(name):
     assert 0.98 < used_at_most(motion) <= 1.0001
 
 
+def missed_by_the_rates(motion):
+    """Greatest difference between positions and the rates' integral, between the rates' jumps."""
+    node, weight = np.polynomial.legendre.leggauss(8)
+    ends = motion.runs[0].times
+    half = 0.5 * np.diff(ends)[:, None]
+    times = ends[:-1, None] + half * (1.0 + node)
+    qd = motion.sample(times.ravel()).qd.reshape(*times.shape, -1)
+    q = motion.sample(ends).q
+    return np.abs(np.diff(q, axis=0) - np.einsum("kg,kgn->kn", half * weight, qd)).sum(0).max()
+
+
+def test_rates_with_limits_of_jerk_are_those_of_the_positions():
+    """Two of the points are 10 micrometres apart; there the machine nearly stops."""
+    robot = load("delta_cu").changed(payload={"mass": 0.3})
+    millimetres = [
+        [-2.3463, 9.4973, -353.3997], [0.4832, -6.3215, -366.7954], [-0.2985, 8.0417, -354.1937],
+        [8.2979, -4.5807, -360.5465], [8.2993, -4.5709, -360.5432], [-7.0692, 0.6709, -358.6772],
+        [-3.6767, -8.8975, -362.2181], [-2.1533, -4.2661, -361.0709],
+    ]  # fmt: skip
+    motion = fastest(robot, 1e-3 * np.array(millimetres), jerk=4000.0, points=300)
+    assert missed_by_the_rates(motion) < 1e-9
+    assert max(motion.worst.values()) <= 1.0
+
+
+def test_a_motion_never_goes_back_along_its_path():
+    """Of any profile, with places where the machine nearly stops."""
+    rng, robot = np.random.default_rng(2), load("five_bar")
+    [part] = joint_paths(robot, through(robot, points_of(robot)), 120, 1e-6)
+    s = part.ends / part.ends[-1]
+    for dip in 10.0 ** rng.uniform(-9.0, 0.0, 20):
+        x = np.sin(np.pi * s) ** (4 / 3) * (1.0 - (1.0 - dip) * (rng.random(len(s)) < 0.05))
+        run = smooth_run(part, x)
+        assert run is not None
+        v = run.at(np.linspace(0.0, run.duration, 50_000))[2]
+        assert v.min() >= -1e-9 * v.max()
+
+
 def test_jerks_are_kept_on_paths_with_corners_and_close_points():
     """Third derivatives of the path jump where its pieces meet."""
     for name, jerk in (("delta", 2e5), ("stewart", 200.0)):
@@ -257,6 +296,7 @@ def test_jerks_are_kept_on_paths_with_corners_and_close_points():
     robot = load("delta")
     motion = fastest(robot, close_pair(robot, 0), jerk=2e5)
     assert used_at_most(motion) <= 1.0001
+    assert missed_by_the_rates(motion) < 1e-9
 
 
 @pytest.mark.parametrize("name", ["effort", "velocity", "acceleration", "jerk", "speed"])
