@@ -10,7 +10,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from pkm_twin.apps.check_causes import causes_of
+from pkm_twin.apps.check_causes import Causes, causes_of
 from pkm_twin.apps.check_efforts import ModelBand, judged_efforts
 from pkm_twin.apps.check_motion import OF_MOTION, Bounds, motion_items
 from pkm_twin.apps.limits import ranges
@@ -48,7 +48,9 @@ class CheckReport:
     unjudged: str = ""
     """Why there is no verdict; empty where there is one."""
     causes: tuple[str, ...] = ()
-    """What explains efforts that contradict the model."""
+    """What explains efforts that contradict the model: with it they agree."""
+    findings: tuple[str, ...] = ()
+    """What `fit` says of them, where nothing explains them."""
 
     @property
     def answer(self) -> str:
@@ -86,6 +88,7 @@ class CheckReport:
             "answer": self.answer,
             "not_judged": self.unjudged or None,
             "causes": list(self.causes),
+            "findings": list(self.findings),
             "good": self.good,
         }
 
@@ -106,10 +109,10 @@ def judged(
     items += efforts.items
     r = recording
     # Of positions that are none the efforts say nothing.
-    causes = causes_of(r, efforts, bounds.residual, thorough) if moved else []
+    causes = causes_of(r, efforts, bounds.residual, thorough) if moved else Causes()
     return CheckReport(
         str(path), r.robot.name, tuple(items), r.topics, r.load, bool(r.robot.uncertainty),
-        efforts.bands, efforts.unjudged, tuple(causes),
+        efforts.bands, efforts.unjudged, causes.explained, causes.findings,
     )  # fmt: skip
 
 

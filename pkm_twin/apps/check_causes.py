@@ -3,8 +3,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import replace
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any, Final
 
@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from delta_dynamics import inverse_dynamics
-from pkm_twin.apps.check_efforts import Efforts, compared_of, recorded_of
+from pkm_twin.apps.check_efforts import MEASURED, NEAR, Efforts, compared_of, recorded_of
 from pkm_twin.apps.loads import Load
 from pkm_twin.apps.recorded import Recording
 from pkm_twin.apps.wrench_frames import FRAMES
@@ -36,38 +36,71 @@ BEFORE: Final = 0.2
 MOVED: Final = 0.5
 """and part of the peak efforts that are seen in it."""
 FULL: Final = 0.01
-"""Part of the samples whose effort is at its greatest where a sensor is saturated."""
+"""Part of the samples whose effort is at its greatest where a sensor is saturated,"""
+TENS: Final = 30
+"""and how many they are at least."""
 FOUND: Final = 2
 """Findings of a fit that are named."""
 
 
-def causes_of(r: Recording, efforts: Efforts, bound: float, thorough: bool = True) -> list[str]:
-    """The likely cause of a bad residual, the first that explains it; empty where none does.
+@dataclass(frozen=True)
+class Causes:
+    """Why efforts contradict the model.
+
+    ``explained``: the first cause that makes them agree, on the same samples; empty where none
+    does. ``findings``: what `fit` says of them besides.
+    """
+
+    explained: tuple[str, ...] = ()
+    findings: tuple[str, ...] = ()
+
+
+def causes_of(r: Recording, efforts: Efforts, bound: float, thorough: bool = True) -> Causes:
+    """The likely cause of a bad residual.
 
     :param bound: on the residual, as for :meth:`Compared.good`.
     :param thorough: also ask what `fit` finds, which takes some seconds.
     """
     c, leave_out = efforts.compared, efforts.left_out
-    if c is None or c.good(bound).all():
-        return []
+    measured = all(item.what != MEASURED for item in efforts.items)
+    if c is None or c.good(bound).all() or not measured:
+        return Causes()
 
-    def explained(other: Recording, without: Mask | None = None) -> bool:
+    def good(other: Recording, without: Mask) -> bool:
         try:
-            found = compared_of(other, leave_out if without is None else leave_out | without)
+            found = compared_of(other, without)
         except (PkmTwinError, ValueError):
             return False
         return found is not None and bool(found.good(bound).all())
 
-    for text, other in (*_wrenches(r), *_payloads(r, c, bound)):
+    def explained(other: Recording) -> bool:
+        """Whether it makes the efforts agree on samples on which they do not as recorded."""
+        changes = other.load is not r.load and other.load is not None and bool(other.load.times)
+        if not changes or other.load is None:
+            return good(other, leave_out)
+        without = leave_out | other.load.near_change(r.time, NEAR)
+        return good(other, without) and not good(r, without)
+
+    for text, other in (*_signs(r, c, bound), *_wrenches(r), *_payloads(r, c, bound)):
         if explained(other):
-            return [text]
+            return Causes((text,))
     found = _saturated(r, c, bound)
     if found:
-        return found
+        return Causes(tuple(found))
     for text, without in _contacts(r, c, bound):
-        if explained(r, without):
-            return [text]
-    return _of_fit(r, leave_out) if thorough else []
+        if good(r, leave_out | without):
+            return Causes((text,))
+    return _of_fit(r, leave_out, explained) if thorough else Causes()
+
+
+def _signs(r: Recording, c: Compared, bound: float) -> Iterator[tuple[str, Recording]]:
+    """Efforts of the other sign."""
+    assert r.effort is not None  # noqa: S101
+    turned = ~c.good(bound) & (np.sum(c.measured * c.expected, 0) < 0.0)
+    if turned.any():
+        names = ", ".join(np.array(r.robot.joint_names)[turned].tolist())
+        effort = r.effort * np.where(turned, -1.0, 1.0)
+        yield f"efforts of {names} have the opposite sign", replace(r, effort=effort)
 
 
 def _contacts(r: Recording, c: Compared, bound: float) -> Iterator[tuple[str, Mask]]:
@@ -167,6 +200,7 @@ def _saturated(r: Recording, c: Compared, bound: float) -> list[str]:
         usual = 1.4826 * float(np.median(np.abs(less))) if len(less) else 0.0
         enough = (
             full.mean() > FULL
+            and full.sum() >= TENS
             and (np.abs(expected[full, j]) > most - limit[j] - 4.0 * usual).mean() > 1.0 - FULL
         )
         if not enough or (len(less) and np.sqrt(np.mean(less**2)) > limit[j] + 4.0 * usual):
@@ -178,12 +212,13 @@ def _saturated(r: Recording, c: Compared, bound: float) -> list[str]:
     return found
 
 
-def _of_fit(r: Recording, leave_out: Mask) -> list[str]:
-    """What `fit` says of the recording: a fault of the recording, or its findings."""
+def _of_fit(r: Recording, leave_out: Mask, explained: Callable[[Recording], bool]) -> Causes:
+    """What `fit` says of the recording: its friction where that explains it, or its findings."""
     from pkm_twin.identification.file_parameters import file_parameters
     from pkm_twin.identification.fit import fit
     from pkm_twin.identification.fit_plausible import recording_fault
     from pkm_twin.identification.fit_rows import rows_of
+    from pkm_twin.identification.fit_signals import ELASTIC
 
     recorded: Any = recorded_of(r, leave_out)
     try:
@@ -191,12 +226,21 @@ def _of_fit(r: Recording, leave_out: Mask) -> list[str]:
         rows, _ = rows_of(r.robot, everything, recorded, None)
         fault = recording_fault(r.robot, everything, recorded, rows)
         if fault is not None:
-            return [fault]
-        verdict = fit(r.robot, [recorded], ("friction",), accept=True).verdict
+            return Causes((), (fault,))
+        result = fit(r.robot, [recorded], ("friction",), accept=True)
+        friction: dict[str, list[float]] = {}
+        for name, value in zip(result.parameters.names, result.estimate.values, strict=True):
+            joint, _, law = name.rpartition(".")
+            values = friction.setdefault(law, getattr(r.robot.friction, law).tolist())
+            values[r.robot.joint_names.index(joint)] = float(value)
+        fitted = r.robot.changed(friction=friction)
     except (PkmTwinError, ValueError, np.linalg.LinAlgError):
-        return []
-    if verdict.answer == "does not explain":
-        return []
-    if verdict.answer == "explains":
-        return ["friction other than the file's explains the efforts: `pkm-twin fit`"]
-    return [str(finding) for finding in verdict.findings[:FOUND]]
+        return Causes()
+    if explained(replace(r, robot=fitted)):
+        text = "friction other than the file's explains the efforts: `pkm-twin fit`"
+        return Causes((text,))
+    # A compliance below zero is no drive's.
+    findings = [
+        str(one) for one in result.verdict.findings if one.suspect.kind != ELASTIC or one.size > 0.0
+    ]
+    return Causes((), tuple(findings[:FOUND]))

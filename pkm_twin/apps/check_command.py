@@ -209,6 +209,8 @@ def check(
         table_console().print(items_table(f"{report.bag}: {report.robot}", "limit", report.items))
         for cause in report.causes:
             typer.echo(f"explanation: {cause}")
+        for finding in report.findings:
+            typer.echo(f"no explanation; `fit` finds: {finding}")
         bad, unknown = report.named(Verdict.BAD), report.named(Verdict.UNKNOWN)
         text = f"{report.answer}: {', '.join(bad) or report.unjudged}".removesuffix(": ")
         typer.echo(text + (f"; not judged: {', '.join(unknown)}" if unknown else ""))

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from delta_dynamics import inverse_dynamics, torque_deviation
-from pkm_twin.apps.check_motion import Bounds, near_jumps
+from pkm_twin.apps.check_motion import STANDS, STUCK, TICKS, Bounds, near_jumps, runs_of
 from pkm_twin.apps.describe import why_no_torques
 from pkm_twin.apps.loads import by_load
 from pkm_twin.apps.recorded import Recording
@@ -20,12 +20,13 @@ from pkm_twin.apps.verdict import Item, Verdict, judged_item
 from pkm_twin.errors import SingularityError, UnreachableError, one_line
 from pkm_twin.identification.compare import Compared, by_held, compare
 from pkm_twin.identification.fit_rows import Recorded
-from pkm_twin.streams.drives import idle_samples
+from pkm_twin.streams.drives import COUNT, SAME, idle_samples
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 RESIDUAL: Final = "torque residual"
+MEASURED: Final = "measured efforts"
 NEAR: Final = 0.5
 """Around a pick or release the payload is neither held nor gone, s."""
 DEVIATIONS: Final = (1, 2, 3)
@@ -89,6 +90,9 @@ def judged_efforts(r: Recording, bounds: Bounds) -> Efforts:
         return Efforts([Item(RESIDUAL, str(error), bound, Verdict.BAD)], {}, nothing)
     items, unjudged = _shares(r, idle, compared, bounds)
     if compared is not None and not unjudged:
+        stuck = _stuck(r, r.effort, compared, bounds)
+        if stuck:
+            items.append(Item(MEASURED, stuck, "change as the model's", Verdict.BAD))
         items += _residuals(r, compared, bands, bounds, bound)
     return Efforts(items, bands, left_out, compared, unjudged)
 
@@ -153,6 +157,38 @@ def _shares(
     if enough:
         return items, ""
     return items, f"efforts can be compared in {text}, {bound} needed for a verdict"
+
+
+def _stuck(r: Recording, effort: Array, c: Compared, bounds: Bounds) -> str:
+    """Efforts that stay at one number while the model's change, by joint; empty for none.
+
+    At its greatest, an effort is saturated.
+    """
+    texts, good = [], c.good(bounds.residual)
+    for j, (joint, unit) in enumerate(zip(r.robot.joint_names, r.robot.effort_units, strict=True)):
+        values = effort[:, j]
+        most = float(np.abs(values).max())
+        if np.ptp(values) <= SAME * most:
+            if not good[j]:
+                text = f"{values[0] + 0.0:.4g} {unit} throughout: nothing was measured"
+                texts.append(f"the effort of {joint} is {text}")
+            continue
+        steps = np.abs(np.diff(values))
+        tick, size = steps[steps > 0.0].min(), STANDS * np.ptp(c.expected[:, j])
+        for begin, end in runs_of(steps == 0.0):
+            long = end - begin >= COUNT and r.time[end] - r.time[begin] > STUCK
+            if not long or abs(values[begin]) >= most * (1.0 - SAME):
+                continue
+            some = slice(*np.searchsorted(c.time, r.time[[begin, end]]))
+            change = float(np.ptp(c.expected[some, j])) if some.stop > some.start else 0.0
+            if change > max(TICKS * tick, size):
+                texts.append(
+                    f"the effort of {joint} stays at {values[begin]:.4g} {unit} from "
+                    f"{r.time[begin]:.3f} s to {r.time[end]:.3f} s while the model's changes by "
+                    f"{change:.3g} {unit} (sensor?)"
+                )
+                break
+    return "; ".join(texts)
 
 
 def _residuals(

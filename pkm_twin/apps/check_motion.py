@@ -182,6 +182,12 @@ def _velocities(r: Recording, qd: Array, steps: Steps, bounds: Bounds) -> list[I
     return [judged_item(VELOCITIES, f"RMS difference {', '.join(texts)}", bound, False)]
 
 
+def runs_of(same: NDArray[np.bool_]) -> list[tuple[int, int]]:
+    """First and last sample of each run of steps that are ``same``, shape (samples - 1,)."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], same, [0]]))).tolist()
+    return list(zip(edges[::2], edges[1::2], strict=True))
+
+
 def _stuck(r: Recording, qd: Array) -> str:
     """Positions that stay at one number while their velocity moves the joint; else empty."""
     span = np.diff(r.time)
@@ -189,8 +195,7 @@ def _stuck(r: Recording, qd: Array) -> str:
         moves = np.diff(r.q[:, j])
         tick = np.abs(moves[moves != 0.0]).min(initial=np.inf)
         told = np.concatenate([[0.0], np.cumsum(0.5 * (qd[1:, j] + qd[:-1, j]) * span)])
-        edges = np.flatnonzero(np.diff(np.concatenate([[0], moves == 0.0, [0]])))
-        for begin, end in zip(edges[::2], edges[1::2], strict=True):
+        for begin, end in runs_of(moves == 0.0):
             long = r.time[end] - r.time[begin] > STUCK
             if long and abs(told[end] - told[begin]) > max(TICKS * tick, STANDS * np.ptp(told)):
                 return (

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from pkm_twin.codegen.arrays import Array, Mask
-from pkm_twin.streams.rest import ROBUST, SIGMAS
+from pkm_twin.streams.rest import ROBUST, SIGMAS, noise
 
 SLACK: Final = 5e-3
 """By how much stamps may be off, s: at the highest rate a joint may be so far from where it should
@@ -45,6 +45,10 @@ LEAST: Final = 0.1
 """Part of the second differences that are of one publisher's samples and no jump of its own,"""
 OF_NOISE: Final = 0.1257 * 6.0**0.5
 """and their quantile of it, over the noise's standard deviation."""
+TURNS: Final = 16
+"""Samples in a row that alternate between two publishers,"""
+MOST: Final = 0.75
+"""and part of them that must."""
 APART: Final = 0.25
 """By how much of a period a gap may miss a whole number of periods, where samples are missing."""
 
@@ -95,8 +99,7 @@ def steps_of(
     rates = move / span
     low, high = _bracket(qd, rates, period)
     steps = np.abs(move)
-    tick = np.where(steps > 0.0, steps, np.inf).min(0)
-    tick = np.where(np.isfinite(tick), tick, 0.0)
+    tick = _tick(steps)
     speed = np.quantile(_nearest(q), FEW, axis=0) / period
     if qd is not None:
         speed = np.maximum(speed, np.quantile(np.abs(qd), FEW, axis=0))
@@ -114,9 +117,21 @@ def steps_of(
         sizes = np.where(steps > bound, np.maximum(sizes, steps), sizes)
     jumps = sizes > 0.0
     publishers: tuple[int, ...] = ()
-    if np.mean(jumps.any(1)) > OFTEN or (qd is None and _alternates(move, slack)):
+    if np.mean(jumps.any(1)) > OFTEN:
         publishers = _publishers(q, floor + BEFORE * period * speed)
+    if not publishers:
+        apart = _alternating(time, q)
+        rows = apart.any(1)
+        if np.mean(rows) > 2.0 * PUBLISHER:
+            sizes = np.maximum(sizes, apart[1:])
+            jumps, publishers = sizes > 0.0, (k - k // 2, k // 2)
     return Steps(jumps, sizes, publishers)
+
+
+def _tick(steps: Array) -> Array:
+    """The least step of each column that is one, (n,); zero where there is none."""
+    least = np.where(steps > 0.0, steps, np.inf).min(0)
+    return np.where(np.isfinite(least), least, 0.0)
 
 
 def _nearest(q: Array) -> Array:
@@ -155,10 +170,30 @@ def _bracket(qd: Array | None, rates: Array, period: float) -> tuple[Array, Arra
     return windows.min(-1), windows.max(-1)
 
 
-def _alternates(move: Array, slack: Array) -> bool:
-    """Whether steps there and back are many: medians of them say nothing."""
-    back = np.abs(move[1:] + move[:-1]) < 0.1 * np.abs(move[1:])
-    return bool(np.mean((back & (np.abs(move[1:]) > 4.0 * slack)).any(1)) > OFTEN)
+def _alternating(time: Array, q: Array) -> Array:
+    """How far apart two tracks are between which the samples alternate, shape (k, n); else zero.
+
+    Of the difference of each sample from its neighbours' line, with its sign turned at every other
+    sample, a motion and its noise leave nothing that lasts. A track that is sampled half as often
+    leaves half of its move over two samples.
+    """
+    found = np.zeros_like(q)
+    blocks = (len(q) - 2) // TURNS
+    if blocks < 1:
+        return found
+    size = np.maximum(noise(time[::2], q[::2]), noise(time[1::2], q[1::2]))
+    span = np.diff(time)[:, None]
+    line = (q[:-2] * span[1:] + q[2:] * span[:-1]) / (span[1:] + span[:-1])
+    signs = np.where(np.arange(len(line)) % 2, -1.0, 1.0)[:, None]
+    shape = (blocks, TURNS, q.shape[1])
+    bent = (signs * (q[1:-1] - line))[: blocks * TURNS].reshape(shape)
+    twice = np.abs(q[2:] - q[:-2])
+    moved = twice[: blocks * TURNS].reshape(shape).mean(1)
+    bent *= np.sign(bent.sum(1, keepdims=True))
+    clear = bent > np.maximum(moved + SIGMAS * size, 2.0 * _tick(twice))[:, None]
+    apart = np.where(clear.mean(1) > MOST, bent.mean(1), 0.0)
+    found[1 : blocks * TURNS + 1] = np.repeat(apart, TURNS, 0)
+    return found
 
 
 def _publishers(q: Array, slack: Array) -> tuple[int, ...]:

@@ -12,6 +12,7 @@ from mcap.writer import CompressionType, Writer
 
 from delta_dynamics import inverse_dynamics
 from pkm_twin.apps.check import judged
+from pkm_twin.apps.check_efforts import MEASURED
 from pkm_twin.apps.recorded import Recording
 from pkm_twin.apps.topics import JOINT_STATE, Topics
 from pkm_twin.bags.reader import inspect, read_messages
@@ -459,6 +460,63 @@ class TestCauses:
         made.effort[:, 1] = np.clip(made.effort[:, 1], -most, most)
         (text,) = self.cause(made)
         assert robot.joint_names[1] in text and f"{most:.4g}" in text
+
+    def test_efforts_of_the_other_sign(self, rng):
+        robot = load("delta")
+        m = machine(robot, rng, 6.0, 250.0)
+        made = recording_of(robot, m, inverse_dynamics(robot, m.q, m.qd, m.qdd))
+        made.effort[:, 2] *= -1.0
+        (text,) = self.cause(made)
+        assert [name in text for name in robot.joint_names] == [False, False, True]
+
+    @pytest.mark.parametrize("joints", [[1], [0, 1, 2]])
+    def test_efforts_that_are_stuck_are_named(self, rng, joints):
+        """No payload of that time is: it would leave the stuck samples out."""
+        robot = load("delta")
+        m = machine(robot, rng, 8.0, 500.0)
+        made = recording_of(robot, m, inverse_dynamics(robot, m.q, m.qd, m.qdd))
+        assert judged(made, thorough=False).answer == "good"
+        begin = 1500
+        while np.any(np.abs(made.effort[begin]) >= np.abs(made.effort).max(0)):
+            begin += 1
+        made.effort[begin : begin + 500, joints] = made.effort[begin, joints]
+        report = judged(made, thorough=False)
+        assert report.answer == "bad" and report.causes == ()
+        (found,) = (item.value for item in report.items if item.what == MEASURED)
+        named = [name in found for name in robot.joint_names]
+        assert named == [k in joints for k in range(3)]
+        assert f"{m.time[begin] - m.time[0]:.3f} s to" in found
+
+    @pytest.mark.parametrize("level", [0.0, 0.3])
+    def test_efforts_that_never_change_were_not_measured(self, rng, level):
+        robot = load("delta")
+        m = machine(robot, rng, 4.0, 250.0)
+        made = recording_of(robot, m, inverse_dynamics(robot, m.q, m.qd, m.qdd))
+        made.effort[:, 1] = level
+        report = judged(made, thorough=False)
+        assert report.answer == "bad" and report.causes == ()
+        (found,) = (item.value for item in report.items if item.what == MEASURED)
+        assert robot.joint_names[1] in found and "nothing was measured" in found
+
+    def test_a_payload_that_only_leaves_bad_samples_out_explains_nothing(self, rng):
+        robot = load("delta")
+        m = machine(robot, rng, 8.0, 500.0)
+        efforts = inverse_dynamics(robot, m.q, m.qd, m.qdd)
+        short = (m.time > 4.0) & (m.time < 4.3)
+        efforts = efforts + 0.3 * short[:, None] * np.abs(efforts).max(0)
+        assert not any("payload" in text for text in self.cause(recording_of(robot, m, efforts)))
+
+    @pytest.mark.long
+    def test_what_fit_finds_is_no_explanation_where_the_efforts_do_not_agree(self, rng):
+        robot = load("delta")
+        m = machine(robot, rng, 8.0, 200.0)
+        efforts = inverse_dynamics(robot, m.q, m.qd, m.qdd)
+        noise = np.abs(efforts).max() * rng.normal(size=efforts.shape)
+        spike = efforts + 10.0 * np.abs(efforts).max() * (np.arange(len(efforts)) == 700)[:, None]
+        for wrong in (noise, spike):
+            report = judged(recording_of(robot, m, wrong))
+            assert report.answer == "bad" and report.causes == ()
+            assert not any("-0." in text.partition("elastic")[2][:9] for text in report.findings)
 
     @pytest.mark.long
     def test_friction_that_the_file_has_not(self, rng):

@@ -78,6 +78,24 @@ def test_two_publishers_are_told_apart(rng, measured, share, regular, still):
     assert min(found.publishers) == pytest.approx(min(own.sum(), (~own).sum()), rel=0.02)
 
 
+@pytest.mark.parametrize("measured", [True, False])
+@pytest.mark.parametrize("late", [0.01, 0.05, 0.3])
+def test_two_publishers_of_one_motion_are_told_apart(rng, measured, late):
+    """One is late, or a little off; what is published twice, or trembles, is one publisher's."""
+    for rate in (200.0, 500.0, 1000.0):
+        time, q, qd = drawn(rng, rate)
+        noisy = q + 1e-4 * rng.normal(size=q.shape)
+        odd = np.arange(len(time))[:, None] % 2 == 1
+        lag = max(5, round(late * rate))
+        for other in (np.roll(noisy, lag, 0), 1.01 * noisy + 20.0 / rate):
+            mixed = np.where(odd, other, noisy)[lag:]
+            found = steps_of(time[lag:], mixed, qd[lag:] if measured else None, LIMIT)
+            assert sum(found.publishers) == len(mixed) and found.jumps.mean() > 0.1
+        twice = np.repeat(q[::2], 2, 0)[: len(q)]
+        found = steps_of(time, twice, qd if measured else None, LIMIT)
+        assert found.publishers == ()
+
+
 def test_wrong_bits_are_no_second_publisher(rng):
     time, q, qd = drawn(rng)
     bad = rng.random(q.shape) < 0.02
