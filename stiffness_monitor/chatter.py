@@ -397,7 +397,7 @@ def _bounds(
     """The deepest depth to look at, and the zero-order one, m; errors as :func:`lobes_of`."""
     if at.ndim != 1:
         raise ParameterError("speeds", at.shape, "one speed after another")
-    for speed in at:
+    for speed in (at.min(), at.max()) if at.size else ():
         check_limit("speeds", float(speed), "rpm", 1e-3, FASTEST)
     waves = plane.waves(milling, at)
     if len(at) and waves.max() > WAVES * (1.0 + 1e-12):
