@@ -98,13 +98,15 @@ MOST_LIMIT: Final = 1e12
 """Least and greatest limit that a machine can have, in any unit."""
 
 
-def check_limit(field: str, value: float, unit: str = "") -> None:
-    """Reject a limit that no machine has: zero, a negative one, NaN, or one out of range.
+def check_limit(
+    field: str, value: float, unit: str = "", least: float = LEAST_LIMIT, most: float = MOST_LIMIT
+) -> None:
+    """Reject a value that no machine has: NaN, or one out of range; by default zero and below too.
 
     :raises ParameterError: by the field.
     """
-    if not LEAST_LIMIT <= value <= MOST_LIMIT:
-        raise ParameterError(field, value, f"{LEAST_LIMIT:g} to {MOST_LIMIT:g} {unit}".strip())
+    if not least <= value <= most:
+        raise ParameterError(field, value, f"{least:g} to {most:g} {unit}".strip())
 
 
 def warn(path: str | Path, text: str) -> None:

@@ -19,7 +19,7 @@ import scipy  # type: ignore[import-untyped]  # its parts come when they are ask
 from numpy.typing import ArrayLike
 
 from pkm_twin.codegen.arrays import Array, Mask
-from pkm_twin.errors import ParameterError
+from pkm_twin.errors import ParameterError, check_limit
 from pkm_twin.robot.robot import Robot
 from stiffness_monitor.vibration import ToolModes, tool_modes
 
@@ -48,6 +48,14 @@ FLAT: Final = 1.001
 """The same beside a minimum: it is known where both neighbours are as deep."""
 FINE: Final = 5e-4
 """Relative distance of speeds below which none is computed between, as at a cliff."""
+SPACING: Final = 0.1
+"""Most vibrations from tooth to tooth between speeds: one lobe is a vibration of a mode wide."""
+DENSE: Final = 1e-3
+"""Largest relative distance of speeds within the margin of the best one."""
+FASTEST: Final = 1e6
+"""Speed of a spindle at most, rpm."""
+DEPTHS: Final = (1e-6, 10.0)
+"""Depths of cut that may be given, m."""
 MARGIN: Final = 0.01
 """How far a spindle's speed may be off, part of it."""
 
@@ -58,7 +66,7 @@ class Milling:
 
     ``teeth``: number, evenly spaced, without helix. ``tangential``: cutting coefficient Kt, N/m2.
     ``radial``: force across over tangential force, Kr. ``immersion``: radial depth of cut over tool
-    diameter, above 0 to 1. ``up``: up-milling instead of down-milling. ``feed``: direction of the
+    diameter, 0.001 to 1. ``up``: up-milling instead of down-milling. ``feed``: direction of the
     feed in the platform's xy plane from x towards y, rad.
 
     :raises ParameterError: a number out of range.
@@ -79,7 +87,7 @@ class Milling:
                 "1e6 to 1e11 N/m2, as 600e6 for 600 MPa",
             ),
             "radial": (-10.0 <= self.radial <= 10.0, "-10 to 10, a ratio"),
-            "immersion": (0.0 < self.immersion <= 1.0, "above 0 to 1"),
+            "immersion": (1e-3 <= self.immersion <= 1.0, "0.001 to 1, a ratio"),
             "feed": (abs(self.feed) < 1e3, "an angle, rad"),
         }
         for field in fields(self):
@@ -155,6 +163,25 @@ class Lobes:
         whole = bool(self.open[low[at] : high[at] + 1].all())
         return float(self.speeds[at]), float(least[k]), whole
 
+    def gaps(self, waves: Array) -> Mask:
+        """Which neighbouring speeds may have another limit between them, shape (k - 1,).
+
+        :param waves: vibrations of the fastest mode from tooth to tooth, by speed, shape (k,).
+        """
+        n, depth = self.speeds, self.depths
+        ratio = np.maximum(depth[1:], depth[:-1]) / np.minimum(depth[1:], depth[:-1])
+        before, after = np.append(1.0, ratio), np.append(ratio, 1.0)
+        falls = np.append(True, np.diff(depth) <= 0.0)
+        lowest = falls & np.append(np.diff(depth) >= 0.0, True)
+        unsure = lowest & (np.maximum(before, after) > FLAT)
+        split = (ratio > STEEP) | unsure[1:] | unsure[:-1]
+        split = (split & (np.diff(n) > FINE * n[1:])) | (waves[:-1] - waves[1:] > SPACING)
+        if not split.any():
+            best = self.steady()[0]
+            near = (n[1:] > (1.0 - MARGIN) * best) & (n[:-1] < (1.0 + MARGIN) * best)
+            split = near & (np.diff(n) > DENSE * n[1:])
+        return np.asarray(split)
+
 
 @dataclass(frozen=True, eq=False)
 class _Plane:
@@ -190,8 +217,8 @@ class _Plane:
         """Speeds in a range at which lobes are lowest by the zero-order approximation, rpm, (k,).
 
         Of every mode near its worst frequency, where from tooth to tooth there is a whole number of
-        vibrations and the phase of the lobe; and half a vibration more, where every second tooth
-        cuts deeper.
+        vibrations and the phase of the lobe; and about its own frequency half a vibration more,
+        where every second tooth cuts deeper.
         """
         found: list[float] = []
         for w, z in zip(self.turn, self.damping, strict=True):
@@ -203,11 +230,16 @@ class _Plane:
             values = np.linalg.eigvals(milling.mean() @ response)
             k, i = np.unravel_index(int(values.real.argmin()), values.shape)
             phase = np.pi - 2.0 * float(np.angle(-1.0 / values[k, i]))
-            for turn, extra in ((float(at[k]), phase), (w * (1.0 + z), np.pi)):
+            flips = [(w * (1.0 + part * z), np.pi) for part in (-1.0, 0.0, 1.0)]
+            for turn, extra in ((float(at[k]), phase), *flips):
                 teeth = 60.0 * turn / (2.0 * np.pi * milling.teeth)
                 whole = np.arange(-1.0, np.ceil(teeth / low) + 1.0) + extra / (2.0 * np.pi)
                 found += [teeth / n for n in whole.tolist() if n > 0.0 and low < teeth / n < high]
         return np.array(found)
+
+    def waves(self, milling: Milling, speeds: Array) -> Array:
+        """Vibrations of the fastest mode from tooth to tooth at speeds, rpm."""
+        return np.asarray(60.0 * self.turn.max() / (2.0 * np.pi * milling.teeth) / speeds)
 
     def step(self, h: float) -> tuple[Array, Array, Array]:
         """Of time h: the modes' map (m, 2, 2), what forces at its begin and end add, (m, 2)."""
@@ -225,7 +257,7 @@ class _Plane:
     def growth(self, milling: Milling, speed: float, depths: Array) -> Array:
         """Largest size of an eigenvalue from tooth to tooth, of depths (k,), m, at a speed, rpm."""
         period = 60.0 / (speed * milling.teeth)
-        waves = float(self.turn.max()) * period / (2.0 * np.pi)
+        waves = float(self.waves(milling, np.array(speed)))
         count = max(2 * STEPS, int(np.ceil(STEPS * waves)))
         force = milling.steps(count)
         free, begin, end = self.step(period / count)
@@ -329,11 +361,13 @@ def lobes_between(
     points: int,
     deepest: float | None = None,
 ) -> Lobes:
-    """Limit depths over a range of speeds, with no minimum or cliff left between the speeds.
+    """Limit depths over a range of speeds, close enough for its least depth and its best speed.
 
-    Evenly spaced speeds, those where the zero-order approximation has its lobes, and further ones
-    until both neighbours of every minimum are within 0.1 % of its depth, and until depths that
-    differ by more than a quarter are 0.05 % of the speed apart.
+    Evenly spaced speeds, those where the zero-order approximation has its lobes, and further ones:
+    ten for each vibration of the fastest mode from tooth to tooth; until both neighbours of every
+    minimum are within 0.1 % of its depth; until depths that differ by more than a quarter are
+    0.05 % of the speed apart; and until speeds within the margin of :meth:`Lobes.steady` are
+    0.1 % apart.
 
     :param low, high: rpm. ``points``: number of evenly spaced speeds. Others, and errors, as
         :func:`lobes_of`.
@@ -345,13 +379,7 @@ def lobes_between(
     found = _limits(plane, milling, new, last, safe)
     while True:
         n, depth = found.speeds, found.depths
-        ratio = np.maximum(depth[1:], depth[:-1]) / np.minimum(depth[1:], depth[:-1])
-        before, after = np.append(1.0, ratio), np.append(ratio, 1.0)
-        falls = np.append(True, np.diff(depth) <= 0.0)
-        lowest = falls & np.append(np.diff(depth) >= 0.0, True)
-        unsure = lowest & (np.maximum(before, after) > FLAT)
-        split = (ratio > STEEP) | unsure[1:] | unsure[:-1]
-        split &= np.diff(n) > FINE * n[1:]
+        split = found.gaps(plane.waves(milling, n))
         if not split.any():
             return found
         more = _limits(plane, milling, 0.5 * (n[1:] + n[:-1])[split], last, safe)
@@ -367,17 +395,21 @@ def _bounds(
     plane: _Plane, milling: Milling, at: Array, deepest: float | None
 ) -> tuple[float, float]:
     """The deepest depth to look at, and the zero-order one, m; errors as :func:`lobes_of`."""
-    least = 60.0 * float(plane.turn.max()) / (2.0 * np.pi * WAVES * milling.teeth)
-    if at.ndim != 1 or not (np.isfinite(at).all() and (at >= least).all()):
-        bound = f"{least:.4g} rpm or more: process damping governs at lower speeds"
-        raise ParameterError("speeds", at.min() if at.ndim == 1 else at.shape, bound)
+    if at.ndim != 1:
+        raise ParameterError("speeds", at.shape, "one speed after another")
+    for speed in (at.min(), at.max()) if at.size else ():
+        check_limit("speeds", float(speed), "rpm", 1e-3, FASTEST)
+    waves = plane.waves(milling, at)
+    if len(at) and waves.max() > WAVES * (1.0 + 1e-12):
+        bound = f"{at.min() * waves.max() / WAVES:.4g} rpm or more: process damping governs below"
+        raise ParameterError("speeds", at.min(), bound)
     safe, _ = plane.stable_depth(milling)
     if deepest is None and not np.isfinite(safe):
         raise ParameterError("deepest", None, "a depth, m, as no depth is unstable in theory")
-    last = DEEPEST * safe if deepest is None else float(deepest)
-    if not 0.0 < last < np.inf:
-        raise ParameterError("deepest", deepest, "a depth above 0, m")
-    return last, safe
+    if deepest is None:
+        return DEEPEST * safe, safe
+    check_limit("deepest", deepest, "m", *DEPTHS)
+    return float(deepest), safe
 
 
 def _limits(plane: _Plane, milling: Milling, at: Array, last: float, safe: float) -> Lobes:

@@ -14,8 +14,8 @@ import numpy as np
 import scipy  # type: ignore[import-untyped]  # its parts come when they are asked for
 from numpy.typing import ArrayLike, NDArray
 
-from pkm_twin.codegen.arrays import Array, one_vector
-from pkm_twin.errors import ParameterError
+from pkm_twin.codegen.arrays import Array, doubles, one_vector
+from pkm_twin.errors import ParameterError, check_limit
 from pkm_twin.robot.robot import Robot
 from stiffness_monitor.frame import rigid_offset
 from stiffness_monitor.modes import ELEMENTS, frame_system, solve_modes, stiffness_root
@@ -24,6 +24,12 @@ Complex = NDArray[np.complex128]
 
 COUNT: Final = 24
 """Modes that respond dynamically."""
+FASTEST: Final = 1e6
+"""Frequency at most that is asked for, Hz."""
+LONGEST: Final = 10.0
+"""Distance of a tool point along an axis at most, in parts of the machine's extent."""
+DAMPING: Final = (1e-5, 0.99)
+"""Damping ratios of modes that may be given."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +49,12 @@ class ToolModes:
 
     def receptance(self, frequencies: ArrayLike) -> Complex:
         """Displacement per force at frequencies (k,), Hz; shape (k, 6, 6), m and rad per N, N m."""
-        turn = 2.0 * np.pi * np.asarray(frequencies, np.float64)[:, None]
+        at = doubles(frequencies, "frequencies")
+        if at.ndim != 1:
+            raise ParameterError("frequencies", at.shape, "one frequency after another")
+        for frequency in (at.min(), at.max()) if at.size else ():
+            check_limit("frequencies", float(frequency), "Hz", 0.0, FASTEST)
+        turn = 2.0 * np.pi * at[:, None]
         own = 2.0 * np.pi * self.frequencies
         gain = 1.0 / (own**2 - turn**2 + 2j * self.damping * own * turn)
         return np.asarray(np.einsum("km,mi,mj->kij", gain, self.shapes, self.shapes) + self.rest)
@@ -63,7 +74,8 @@ def tool_modes(
     :param damping: ratio of all modes, or of each from the lowest on, the last one of all further
         modes; default the robot file's ``modal_damping``.
     :param tool: from the platform's reference point, platform axes, m.
-    :raises ParameterError: no damping is given, or a ratio that is not between 0 and 1.
+    :raises ParameterError: no damping is given, a ratio beyond :data:`DAMPING`, or a tool point
+        farther off than :data:`LONGEST` times the machine's extent.
     """
     q = robot.inverse(one_vector(pose, len(robot.pose_names), "the pose"))
     system = frame_system(robot, q, elements)
@@ -71,7 +83,11 @@ def tool_modes(
     ratios = damping_ratios(robot, damping, count)
     frequencies, vectors = solve_modes(system, count, (), vectors=True)
     rotation = robot.platform(q)[1]
-    moved = rigid_offset(rotation @ one_vector(tool, 3, "the tool point"))
+    point = one_vector(tool, 3, "the tool point")
+    far = LONGEST * robot.graph.size
+    for value in point.tolist():
+        check_limit("tool", value, "m", -far, far)
+    moved = rigid_offset(rotation @ point)
     shapes = (moved @ vectors[:6]).T
     loads = np.zeros((len(system.mass), 6))
     loads[:6] = moved.T
@@ -98,9 +114,7 @@ def frequency_response(
     Other parameters and errors as :func:`tool_modes`.
     """
     poses = np.asarray(pose, np.float64)
-    at = np.atleast_1d(np.asarray(frequencies, np.float64))
-    if at.ndim != 1 or not (np.isfinite(at).all() and (at >= 0.0).all()):
-        raise ValueError("frequencies: expected finite numbers, 0 Hz or more, shape (k,)")
+    at = np.atleast_1d(doubles(frequencies, "frequencies"))
     found = [
         tool_modes(robot, one, damping=damping, tool=tool).receptance(at)
         for one in poses.reshape(-1, poses.shape[-1])
@@ -111,11 +125,13 @@ def frequency_response(
 def damping_ratios(robot: Robot, given: ArrayLike | None, count: int) -> Array:
     """Damping ratios of modes, shape (count,); parameters and errors as :func:`tool_modes`."""
     field = "modal_damping" if given is None else "damping"
-    values = np.atleast_1d(np.asarray(robot.modal_damping if given is None else given, np.float64))
+    values = np.atleast_1d(doubles(robot.modal_damping if given is None else given, field))
     if not values.size:
         raise ParameterError(
             field, None, "damping ratios of the modes, in the robot's file or given"
         )
-    if values.ndim != 1 or not ((values > 0.0) & (values < 1.0)).all():
-        raise ParameterError(field, values.tolist(), "damping ratios above 0 and below 1")
+    if values.ndim != 1:
+        raise ParameterError(field, values.shape, "one damping ratio after another")
+    for value in values.tolist():
+        check_limit(field, value, "", *DAMPING)
     return values[np.minimum(np.arange(count), len(values) - 1)]

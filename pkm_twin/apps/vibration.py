@@ -278,9 +278,9 @@ def lobes(
 
     The tool turns about the platform's z axis, clockwise from above. The command prints the
     smallest limit in the range of speeds, and the spindle speed with the largest stable axial depth
-    of cut if the speed may be off by 1 %. Speeds are added at minima and steep flanks of the limit
-    until these numbers no longer change. The machine's modes count, not the flexibility of spindle,
-    holder and tool.
+    of cut if the speed may be off by 1 %. Speeds are added at lobes, minima and steep flanks of the
+    limit, and every 0.1 % within this 1 %. The machine's modes count, not the flexibility of
+    spindle, holder and tool.
 
     The table has the columns speed (rpm), depth (m) and open: 1 where the cut is stable up to the
     largest depth that was computed.

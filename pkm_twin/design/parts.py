@@ -23,7 +23,7 @@ from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError, PkmTwinError, SingularityError, UnknownNameError
 from pkm_twin.machine.graph import BASE, Joint, rotation_about_z
 from pkm_twin.machine.joints import across, unit
-from pkm_twin.machine.places import full_keys
+from pkm_twin.machine.places import full_keys, keys_of, path_of
 from pkm_twin.robot.robot import SINGULARITY_BOUND, Robot
 
 CONSISTENT: Final = 1e-6
@@ -34,6 +34,12 @@ CORRECTIONS: Final = 30
 POINTS: Final = 1e-3 * np.array([-2.0, -1.0, 1.0, 2.0])
 WEIGHTS: Final = np.array([1.0, -8.0, 8.0, -1.0]) / 12e-3
 """Differences of fourth order: errors of a rigid part change its rows smoothly."""
+
+ENDS: Final = {
+    "bodies": ["length"], "rods": ["length"],
+    "joints": ["at[0]", "at[1]", "at[2]", "axis[0]", "axis[1]", "offset"],
+}  # fmt: skip
+"""How paths of errors end, by the kind of the part."""
 
 Effect = tuple[str, str]
 """What moves, and of what: ``inner`` or ``outer`` (a joint's centre on that body), ``tilt`` (its
@@ -70,17 +76,28 @@ def part_of(robot: Robot, path: str) -> Part | None:
         effects |= found[0]
         texts.append(found[1])
         unit_ = found[2]
-    if not effects and len(keys) > 1 and keys[0] != "limbs":
-        known = getattr(robot.graph, str(keys[0]))
-        if keys[1] not in known:
-            raise UnknownNameError(f"tolerance {path}", str(keys[1]), known)
     if not effects:
-        raise ParameterError(
-            path, None, "a part: rods.NAME.length, bodies.NAME.length, joints.NAME.at[0..2], "
-            "joints.NAME.axis[0..1] or joints.NAME.offset, of all copies with limbs. before"
-        )  # fmt: skip
+        raise _unknown(robot, keys, path)
     alike = ", and its copies alike" if len(texts) > 1 else ""
     return Part(effects, texts[0] + alike, unit_)
+
+
+def _unknown(robot: Robot, keys: Sequence[str | int], path: str) -> ParameterError:
+    """The error of a path without a part: by its first word that there is not."""
+    places: dict[tuple[str | int, ...], str] = {}
+    for kind in ENDS:
+        places |= {(kind, name): kind for name in getattr(robot.graph, kind)}
+    for (kind, _), source in getattr(robot, "sources", {}).items():
+        places[source.path] = kind
+    known = [[*place, *keys_of(end)] for place, kind in places.items() for end in ENDS[kind]]
+    for k in range(len(keys) + 1):
+        words = {str(one[k]) for one in known if one[:k] == keys[:k] and len(one) > k}
+        if k < len(keys) and words and str(keys[k]) not in words:
+            return UnknownNameError(path, keys[k], words)
+        if not words or k == len(keys):
+            rest = f"one of {', '.join(sorted(words))} behind it" if words else "no more keys"
+            return ParameterError(path, path_of(keys[k:]) or None, rest)
+    raise AssertionError(path)
 
 
 def _effects(
@@ -392,7 +409,7 @@ class Assembly:
         found = self._solved(columns)
         left = columns - self._factors[0] @ (self._factors[0].swapaxes(-1, -2) @ columns)
         whole = np.maximum(np.linalg.norm(columns, axis=-2), np.finfo(float).tiny)
-        missed = (np.linalg.norm(left, axis=-2) / whole).reshape(-1, len(parts)).max(0)
+        missed = (np.linalg.norm(left, axis=-2) / whole).reshape(-1, len(parts)).max(0, initial=0.0)
         name = self.graph.platform
         k, rotation = 6 * self.bodies.index(name), self.placed.rotation[name]
         arm = self._point(self.placed, name, self.graph.origin, None) - self.placed.origin[name]

@@ -16,6 +16,7 @@ from pkm_twin.codegen.arrays import Array, vectors
 from pkm_twin.design.parts import CONSISTENT, Assembly, Effect, part_of, rotation_vector
 from pkm_twin.design.variants import variants
 from pkm_twin.errors import ParameterError, PkmTwinError
+from pkm_twin.machine import schema
 from pkm_twin.robot.derivatives import platform_derivatives
 from pkm_twin.robot.entries import entries
 from pkm_twin.robot.robot import Robot
@@ -23,6 +24,8 @@ from stiffness_monitor.compliance import platform_response
 
 REGULAR: Final = 0.05
 """Least singularity index of joint states that stand for the workspace."""
+LARGEST: Final = 0.02
+"""Standard deviation at most, rad, or part of the machine's extent: more is a wrong unit."""
 STATES: Final = 256
 """States whose bodies are solved for at a time: large tables for each."""
 
@@ -76,12 +79,13 @@ def tolerances(
     - ``joints.NAME.axis[0]``, ``[1]``: the joint's frame on its inner body turns about its centre
       and two axes across the joint's (first) axis;
     - ``joints.NAME.offset``: an actuated joint stands by this beyond its position;
-    - ``limbs.`` in front, or ``limbs[0].``: all copies of a limb alike, in the axes of azimuth 0.
+    - ``limbs.`` in front, or ``limbs[0].`` where ``limbs`` is a list: all copies of a limb alike,
+      in the axes of azimuth 0.
 
     Any other number of the file that moves the platform may be given too, such as
     ``geometry.arm_length``: then the file's number changes, with all that follows from it.
 
-    :param sigma: standard deviation by path, m or rad.
+    :param sigma: standard deviation by path, m or rad, at most :data:`LARGEST`.
     :param q: joint positions, shape (..., n), rad or m.
     :param wrench: on the platform, shape (6,) or (..., 6), N and N m, for ``deflection``.
     :raises ParameterError: a path that there is not, a standard deviation that is none, a number
@@ -91,26 +95,32 @@ def tolerances(
         ``forward``.
     """
     states = vectors(q, robot.joints_count, "q")
-    parts = {path: part_of(robot, path) for path in sigma}
-    for path, value in sigma.items():
-        if not (math.isfinite(value) and value >= 0.0):
-            raise ParameterError(f"tolerance {path}", value, "a standard deviation, 0 or more")
     if not sigma:
         raise ParameterError("tolerance", None, "at least one PATH with its standard deviation")
+    parts = {path: part_of(robot, path) for path in sigma}
     known = {path: part for path, part in parts.items() if part is not None}
     numbers = [path for path in sigma if path not in known]
     slopes = dict(platform_derivatives(robot, states, numbers).by)
-    units = entries(robot) if numbers else {}
+    given = entries(robot) if numbers else {}
+    units = {
+        path: (given[path][1] if path in given else "") if part is None else part.unit
+        for path, part in parts.items()
+    }
+    for path, value in sigma.items():
+        most = {"m": LARGEST * robot.graph.size, "rad": LARGEST}.get(units[path], math.inf)
+        size = schema.number(at_least=0.0, at_most=most, unit=units[path])
+        schema.checked(size, f"tolerance {path}", value)
     for path in numbers:
-        if not slopes[path].any():
+        if states.size and not slopes[path].any():
             raise ParameterError(f"tolerance {path}", robot.number(path), "a length or an angle")
     if known:
         rows = states.reshape(-1, robot.joints_count)
         found = [
             Assembly(robot, rows[start : start + STATES]).platform(list(known.values()))
-            for start in range(0, len(rows), STATES)
+            for start in range(0, max(1, len(rows)), STATES)
         ]
-        table = np.concatenate([twist for twist, _ in found]).reshape(*states.shape[:-1], 6, -1)
+        table = np.concatenate([twist for twist, _ in found])
+        table = table.reshape(*states.shape[:-1], 6, len(known))
         for k, (path, part) in enumerate(known.items()):
             slopes[path] = np.ascontiguousarray(table[..., k])
             missed = max(float(part_missed[k]) for _, part_missed in found)
@@ -123,7 +133,7 @@ def tolerances(
     return Tolerances(
         dict(sigma), {path: slopes[path] for path in sigma},
         {path: "number of the file" if part is None else part.text for path, part in parts.items()},
-        {path: units[path][1] if part is None else part.unit for path, part in parts.items()},
+        units,
         None if wrench is None else _deflection(robot, states, wrench),
     )  # fmt: skip
 

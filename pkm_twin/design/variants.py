@@ -26,6 +26,7 @@ from pkm_twin.codegen.kernels import MISSED, Kernel
 from pkm_twin.design import programs
 from pkm_twin.errors import ParameterError, PkmTwinError
 from pkm_twin.machine.geometry import pattern_of
+from pkm_twin.machine.places import keys_of
 from pkm_twin.machine.tree import Tree
 from pkm_twin.robot.derivatives import twist_rows
 from pkm_twin.robot.entries import with_entries
@@ -60,10 +61,15 @@ class Variants:
     def __init__(self, robot: Robot, numbers: Mapping[str, ArrayLike]) -> None:
         self.robot = robot
         self.paths = tuple(numbers)
-        arrays = [np.asarray(value, np.float64) for value in numbers.values()]
-        for path, array in zip(self.paths, arrays, strict=True):
-            if array.ndim > 1:
-                raise ParameterError(path, list(array.shape), "a number, or one per machine")
+        arrays = []
+        for path, value in numbers.items():
+            _ = keys_of(path)
+            try:
+                arrays.append(doubles(value, path))
+            except ValueError:
+                raise ParameterError(path, value, "a number, or one per machine") from None
+            if arrays[-1].ndim > 1:
+                raise ParameterError(path, arrays[-1].shape, "a number, or one per machine")
         try:
             rows = np.broadcast_arrays(*arrays) if arrays else [np.zeros(1)]
         except ValueError:
@@ -107,8 +113,8 @@ class Variants:
         steps = np.linspace(-1.0, 1.0, len(home)) + 0.3
         away = NEAR * np.array([0.0 * steps, steps, -steps]) * reach
         (poses, *_), good = self.run(programs.forward, (home + away)[None])
-        sound = good.reshape(len(self), -1) & np.isfinite(poses).reshape(len(self), 3, -1).all(-1)
-        return np.asarray(sound.all(1))
+        sound = good[..., 0] & np.isfinite(poses).all(-1)
+        return np.asarray(sound.reshape(len(self), 3).all(1))
 
     def reason(self, index: int) -> str:
         """Why a machine is not valid; empty for one that is."""
@@ -137,7 +143,7 @@ class Variants:
         """
         load = np.zeros(6) if wrench is None else wrench
         loads, good = self.run(programs.loads, q, qd, qdd, load)
-        rows, at = [part.reshape(good.size, -1) for part in loads], np.flatnonzero(good)
+        rows, at = [part.reshape(good.size, part.shape[-1]) for part in loads], np.flatnonzero(good)
         parts = []
         for start in range(0, max(1, len(at)), BALANCES):
             taken = [row[at[start : start + BALANCES]] for row in rows]
@@ -181,7 +187,7 @@ class Variants:
     def jacobian(self, q: ArrayLike) -> Array:
         """Pose rates per joint rate, shape (k, ..., m, n), see :meth:`Robot.jacobian`."""
         flat, n = self.run(programs.jacobian, q)[0][0], self.robot.joints_count
-        return flat.reshape(*flat.shape[:-1], -1, n)
+        return flat.reshape(*flat.shape[:-1], len(self.robot.pose_names), n)
 
     def platform_jacobian(self, q: ArrayLike) -> Array:
         """Platform twist per joint rate, shape (k, ..., 6, n)."""
@@ -313,7 +319,9 @@ class Variants:
         code = kernel.code
         found = self._prepared.get(id(code))
         if found is None:
-            found = self._prepared[id(code)] = code, code.prepare(numbers(self))
+            rows = numbers(self)
+            prepared = code.prepare(rows) if len(rows) else np.zeros((0, 1))
+            found = self._prepared[id(code)] = code, prepared
         return found
 
     def run(self, ask: programs.Ask, *inputs: ArrayLike) -> tuple[list[Array], Mask]:

@@ -12,7 +12,7 @@ from typing import Any, Final, TypeVar
 
 import numpy as np
 
-from pkm_twin.codegen.expressions import plain
+from pkm_twin.codegen.expressions import Expression, plain
 from pkm_twin.errors import ParameterError
 from pkm_twin.machine import schema
 
@@ -22,8 +22,15 @@ Key = str | int
 
 
 def keys_of(path: str) -> list[Key]:
-    """The keys and places of a dotted path: ``joints.arm.at[2]`` has four."""
-    return [name or int(place) for name, place in _PART.findall(path)]
+    """The keys and places of a dotted path: ``joints.arm.at[2]`` has four.
+
+    :raises ParameterError: no text, or one without a key.
+    """
+    text = path if isinstance(path, str) else ""
+    keys = [name or int(place) for name, place in _PART.findall(text)]
+    if not keys:
+        raise ParameterError("path", path, "a dotted path of a number of the robot's file")
+    return keys
 
 
 def path_of(keys: Iterable[Key]) -> str:
@@ -93,7 +100,8 @@ def placed(section: T, changes: Mapping[tuple[Key, ...], Any], path: str = "") -
         except (KeyError, IndexError, TypeError):
             old = None
         leaf = () in deeper
-        if isinstance(old, bool | str | None) or leaf != np.isscalar(old):
+        single = np.isscalar(old) or isinstance(old, Expression)
+        if isinstance(old, bool | str | None) or leaf != single:
             raise unknown_number(here, [])
         result[name] = deeper[()] if leaf else placed(old, deeper, here)
     if whole:

@@ -13,7 +13,7 @@ from pkm_twin.apps.certificate.maximal import Maximal, rotation_of
 from pkm_twin.design import drawn, tolerances
 from pkm_twin.design.parts import Assembly, part_of
 from pkm_twin.design.tolerance import workspace_states
-from pkm_twin.errors import ParameterError
+from pkm_twin.errors import ParameterError, UnknownNameError
 from pkm_twin.robot.catalogue import robot_of_data
 from stiffness_monitor import platform_response
 from test.machine.random_machines import NAMES, variant
@@ -312,6 +312,33 @@ def test_what_is_no_part_or_does_not_fit_is_rejected(name, path):
         tolerances(robot, {path: 1e-4}, robot.graph.home)
     with pytest.raises(ParameterError):
         tolerances(robot, {"joints.left.offset": -1e-4}, robot.graph.home)
+
+
+@pytest.mark.parametrize("sigma", ["a", None, True, [1e-4], np.nan, -1e-4, 0.1, 1e300])
+@pytest.mark.parametrize("path", ["joints.left.offset", "bodies.arm_left.length"])
+def test_a_size_that_no_part_s_error_has_is_rejected(path, sigma):
+    robot = load("five_bar")
+    with pytest.raises(ParameterError) as caught:
+        tolerances(robot, {path: sigma}, robot.graph.home)
+    assert path in caught.value.field
+    if sigma == 0.1:
+        assert str(caught.value).endswith("rad" if "offset" in path else "m")
+    assert tolerances(robot, {path: 1e-4}, np.zeros((0, 2))).deviation.shape == (0, 6)
+
+
+def test_the_first_wrong_word_of_a_path_is_named():
+    robot = load("linear_delta")
+    for path, word, near in (
+        ("rods.left_1.lenght", "lenght", "length"), ("rods.leftt_1.length", "leftt_1", "left_1"),
+        ("limbs.joints.rial.at[0]", "rial", "rail"), ("limbs[0].rods.left.length", 0, None),
+        ("joints.rail_1.at[3]", 3, None),
+    ):  # fmt: skip
+        with pytest.raises(UnknownNameError) as caught:
+            tolerances(robot, {path: 1e-4}, robot.graph.home)
+        assert (caught.value.value, caught.value.closest) == (word, near)
+    for path in ("", 5, "joints.rail_1.at", "rods.left_1.length[0]"):
+        with pytest.raises(ParameterError):
+            tolerances(robot, {path: 1e-4}, robot.graph.home)
 
 
 def test_a_wrench_adds_the_deflection_of_the_machine_itself():

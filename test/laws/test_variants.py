@@ -221,6 +221,34 @@ def test_what_was_changed_stays_when_another_number_changes(name, rng):
         assert (np.asarray(robot.limits.velocity) == 7.0).all()
 
 
+@pytest.mark.parametrize(
+    "numbers",
+    [{"": 0.2}, {5: 0.2}, {None: 0.2}, *({"payload.mass": v} for v in ("a", None, True, [[1.0]]))],
+)
+def test_what_is_no_number_or_path_is_rejected(numbers):
+    with pytest.raises(ParameterError):
+        variants(load("delta"), numbers)
+
+
+def test_no_machines_have_empty_answers():
+    robot = load("five_bar")
+    many, q = variants(robot, {"payload.mass": []}), robot.graph.home
+    assert len(many) == 0 and many.valid.shape == (0,)
+    assert many.inverse_dynamics(q, q, q).shape == many.inverse(many.forward(q)).shape == (0, 2)
+    assert many.jacobian(q).shape == many.mass_matrix(q).shape == (0, 2, 2)
+    assert many.reactions(q, q, q).wrenches.shape[0] == 0
+
+
+def test_a_limb_s_number_and_that_of_one_copy_vary_together(rng):
+    """The copy's own stands after that of all copies."""
+    robot = load("linear_delta")
+    one = next(n for n, s in robot.sources.items() if n[0] == "joints" and s.copy == 1)
+    alike, own = ".".join(map(str, robot.sources[one].path)), ".".join(one)
+    numbers = {f"{alike}.at[0]": 0.01, f"{own}.at[0]": -0.02}
+    numbers = {p: robot.number(p) + step * np.array([1.0, 0.5]) for p, step in numbers.items()}
+    assert judge(robot, numbers, rng) == 2
+
+
 def test_columns_of_several_lengths_are_rejected():
     with pytest.raises(ParameterError):
         variants(

@@ -196,6 +196,47 @@ def test_no_speed_of_a_range_is_worse_than_its_least_depth(seed):
     assert again.depths.min() == pytest.approx(found.depths.min(), rel=2e-3)
 
 
+COARSE = {"an island at half a mode's period": (4, 3, 0.1, False), "a window": (28, 4, 0.05, True)}
+
+
+@pytest.mark.parametrize("case", partly_long(COARSE, "a window"))
+def test_the_ends_of_a_range_are_enough_to_find_what_holds_in_it(case):
+    """Of lightly damped machines and narrow cuts, whose limits change within 1 % of the speed."""
+    seed, count, immersion, up = COARSE[case]
+    rng = np.random.default_rng(seed)
+    if up:
+        frequencies = np.sort(rng.uniform(30.0, 600.0, count))
+        damping, size = rng.choice([0.005, 0.01, 0.02], count), 0.1
+    else:
+        frequencies = np.sort(rng.uniform(40.0, 250.0, count))
+        damping, size = rng.uniform(0.005, 0.03, count), 0.3
+    modes = modes_of(frequencies, damping, size * rng.normal(size=(count, 2)))
+    milling = Milling(1, KT, 0.3, immersion, up)
+    low, high = 60.0 * frequencies[-1] * np.array([0.62, 0.87] if up else [1.1, 1.3])
+    found = lobes_between(modes, milling, low, high, 2)
+    speed, depth, _ = found.steady()
+    near = lobes_of(modes, milling, speed * (1.0 + np.linspace(-0.01, 0.01, 9)))
+    assert near.depths.min() > (1.0 - 5e-3) * depth
+    tried = lobes_of(modes, milling, np.linspace(low, high, 17))
+    assert tried.depths.min() > (1.0 - 5e-3) * found.depths.min()
+
+
+def test_what_no_machine_has_is_rejected_by_name():
+    robot = load("upr_rpu")
+    pose, milling = robot.home(), Milling(2, KT, 0.3)
+    for name, call in {
+        "tool": lambda: tool_modes(robot, pose, damping=0.02, tool=[0.0, 0.0, 1e300]),
+        "damping": lambda: tool_modes(robot, pose, damping=1e-9),
+        "frequencies": lambda: frequency_response(robot, pose, [0.0, 1e300], damping=0.02),
+        "immersion": lambda: Milling(2, KT, 0.3, 1e-12),
+        "speeds": lambda: lobes_between(ONE, milling, 3000.0, 1e300, 181),
+        "deepest": lambda: lobes_of(ONE, milling, [5000.0], deepest=1e-12),
+    }.items():
+        with pytest.raises(ParameterError) as caught:
+            call()
+        assert caught.value.field == name
+
+
 def test_commands_write_what_the_functions_give(capsys, tmp_path):
     robot = load("upr_rpu")
     table, mat = tmp_path / "frf.csv", tmp_path / "lobes.mat"

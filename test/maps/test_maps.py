@@ -151,6 +151,19 @@ def test_errors_of_the_pose_follow_from_those_of_lengths(rng):
     np.testing.assert_allclose(across, error.value**2, rtol=1e-6)
 
 
+@pytest.mark.parametrize("cause", ["joints.elbow_left.at[0]", "joints"])
+def test_errors_of_places_that_parts_share_are_no_errors_of_the_pose(cause, rng):
+    """Home closes whatever they are; the reference point itself is one on the platform."""
+    data = parameters_of("five_bar")
+    origin = {"origin[0]": {"deviation": 1e-4}, "origin[2]": {"deviation": 1e-4}}
+    sure = robot_of_data(data | {"uncertainty": origin}, "origin")
+    np.testing.assert_allclose(found(sure, "pose-error", states(sure, rng, 5)).value, 1e-4)
+    unsure = robot_of_data(data | {"uncertainty": {**origin, cause: {"relative": 1e-3}}}, "places")
+    with pytest.raises(ParameterError) as caught:
+        map_of(unsure, KINDS["pose-error"]())
+    assert caught.value.field == f"uncertainty.{cause}"
+
+
 MAPS = [f"{name} compliance" for name in SHIPPED]
 MAPS += [f"{name} {kind}" for name in DRIVEN for kind in ("payload", "acceleration")]
 WORST = ("delta compliance", "five_bar acceleration")

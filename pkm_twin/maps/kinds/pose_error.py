@@ -3,13 +3,19 @@
 
 from __future__ import annotations
 
+from typing import Final
+
 import numpy as np
 from numpy.typing import NDArray
 
 from pkm_twin.errors import ParameterError
+from pkm_twin.machine.places import keys_of
 from pkm_twin.maps.kind import Array, Case, Found, Kind, largest_axis
 from pkm_twin.robot.derivatives import position_effects
 from pkm_twin.robot.robot import Robot
+
+SHARED: Final = {"at", "axis", "axes", "ends"}
+"""Keys of a machine's points and axes at home."""
 
 
 class PoseError(Kind):
@@ -45,8 +51,17 @@ class PoseError(Kind):
 def _moving(robot: Robot) -> NDArray[np.intp]:
     """Places of the causes that move the platform at home.
 
-    :raises ParameterError: a file without standard deviations of the geometry.
+    :raises ParameterError: a file without standard deviations of the geometry, or with those of
+        points or axes at home: all parts that meet there move along, and home closes as before.
     """
+    for name, steps in robot.causes.items() if robot.mechanism == "machine" else ():
+        shared = [path for path, step in steps.items() if step and SHARED & {*keys_of(path)[2:3]}]
+        if shared:
+            raise ParameterError(
+                f"uncertainty.{name}", shared[0],
+                "numbers that move the platform at home, where this one is a place that parts "
+                "share; errors of single parts: pkm-twin design --tolerance",
+            )  # fmt: skip
     found = np.flatnonzero(position_effects(robot, robot.graph.home).any(0))
     if not len(found):
         what = "the standard deviation of a length or angle that moves the platform"
