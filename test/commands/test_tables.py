@@ -13,6 +13,9 @@ import numpy as np
 import pytest
 from scipy.io import loadmat
 
+from pkm_twin.apps.recorded import recorded_table
+from pkm_twin.apps.torques import motion_of_csv
+from pkm_twin.errors import ParameterError
 from test.support.command import command
 from test.support.robots import load
 
@@ -114,6 +117,24 @@ def test_an_ambiguous_table_is_refused(motion, capsys):
     header = ["time", *(f"{j}.position" for j in robot.joint_names)]
     Path("a.csv").write_text(written(header, [time, *q.T], ",", ","))
     assert command(capsys, "size", "five_bar", "a.csv").code == 1
+
+
+@pytest.mark.parametrize("name", ["five_bar", "delta"])
+def test_a_pose_has_to_be_that_of_the_joints(name, tmp_path, rng):
+    """Of a recording as of a planned motion: a table of another machine is none of this one."""
+    robot = load(name)
+    time = np.linspace(0.0, 0.4, 21)
+    q = robot.graph.home + 0.1 * np.sin(np.outer(time, rng.uniform(2.0, 8.0, robot.joints_count)))
+    pose, path = robot.forward(q), tmp_path / "a.csv"
+    header = ["time", *(f"{j}.position" for j in robot.joint_names), *robot.pose_names]
+    for read in (motion_of_csv, lambda path, robot: recorded_table(path, robot, None)):
+        path.write_text(written(header, [time, *q.T, *pose.T]))
+        assert read(path, robot).q == pytest.approx(q)
+        wrong = pose.copy()
+        wrong[7, 0] += 0.01 * robot.size
+        path.write_text(written(header, [time, *q.T, *wrong.T]))
+        with pytest.raises(ParameterError, match="sample 7"):
+            read(path, robot)
 
 
 def test_matlab_files_have_the_columns(motion, capsys):
