@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pkm_twin import load, robot_names
-from pkm_twin.apps.columns import check_motion_times, read_columns, times_of
+from pkm_twin.apps.columns import check_units, read_columns, times_of
 from pkm_twin.apps.loads import Load, load_of_columns, metadata_error, told_load
 from pkm_twin.apps.topics import JOINT_STATE, Topics, choose_topics
 from pkm_twin.apps.wrench_frames import FRAMES
@@ -198,7 +198,7 @@ def recorded_table(
         raise ParameterError(str(path), ", ".join(columns), f"columns time, {needed}")
     time, qd = times_of(path, columns["time"]), stack("velocity")
     found = (values for what in efforts if (values := stack(what)) is not None)
-    check_motion_times(path, time, q, qd)
+    check_units(path, machine, time, q, qd)
     pose = pose_of(machine, columns)
     if pose is not None:
         check_pose(path, machine, q, pose)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from delta_dynamics import dynamics_terms, inverse_dynamics, reactions, torque_deviation
 from delta_dynamics.rest import friction_reach, moving_rates
 from pkm_twin import load
-from pkm_twin.apps.columns import check_motion_times, read_columns, times_of
+from pkm_twin.apps.columns import check_units, read_columns, times_of
 from pkm_twin.apps.limits import beyond_limits
 from pkm_twin.apps.loads import Load, by_load, load_of_columns, payload_columns, told_load
 from pkm_twin.apps.recorded import (
@@ -202,7 +202,7 @@ def motion_of_csv(
         qd, qdd = (_stacked(path, columns, machine.joint_names, what) for what in INPUTS[1:])
         if all(f"{joint}.effort" in columns for joint in machine.joint_names):
             efforts = _stacked(path, columns, machine.joint_names, "effort")
-    check_motion_times(path, time, q, qd)
+    check_units(path, machine, time, q, qd)
     if (qd is None or qdd is None) and len(time) < 3:
         raise ParameterError(str(path), f"{len(time)} rows", "3 or more, to differentiate")
     rates = _differentiated(q, time) if qd is None else qd
