@@ -16,7 +16,8 @@ from typing import TextIO
 import numpy as np
 from numpy.typing import NDArray
 
-from pkm_twin.apps.tables import cells, in_si
+from pkm_twin.apps.limits import beyond_limits
+from pkm_twin.apps.tables import CHOSEN, UNITS, cells, in_si
 from pkm_twin.errors import FileError, ParameterError, warn
 from pkm_twin.files import STANDARD, decimal, open_regular
 from pkm_twin.robot.robot import Robot
@@ -30,6 +31,8 @@ SHORTEST_STEP = 1e-9
 """Between two times, s: what a bag's stamps resolve."""
 LONGEST = 1e6
 """From the first time to the last, s; of a trajectory it is the same."""
+SOME = 500
+"""Samples of a motion by which its units are judged."""
 MAX_CSV_LINE = 1024**2
 """Longest line of it, characters."""
 
@@ -79,12 +82,17 @@ def times_of(path: Path, values: Array) -> Array:
     return time
 
 
-def check_motion_times(path: Path, time: Array, q: Array, qd: Array | None) -> None:
-    """Times of a motion are in seconds: its steps are short, its velocities those of its positions.
+def check_units(path: Path, robot: Robot, time: Array, q: Array, qd: Array | None) -> None:
+    """Units of a motion: the steps of its times are short, its velocities those of its positions.
+
+    A warning tells of positions that may be in degrees.
 
     :param time: shape (samples,); q and qd, shape (samples, n), qd where the file tells it.
     :raises ParameterError: velocities are a thousand times those of the positions.
     """
+    if _in_degrees(robot, q):
+        most = float(np.abs(q).max())
+        warn(path, f"positions up to {most:.4g}; expected rad; are these degrees? --units deg")
     step = float(np.median(np.diff(time))) if len(time) > 1 else 0.0
     if qd is not None and len(time) > 2:
         with np.errstate(all="ignore"):
@@ -98,6 +106,22 @@ def check_motion_times(path: Path, time: Array, q: Array, qd: Array | None) -> N
             )  # fmt: skip
     if step > LONGEST_STEP:
         warn(path, f"time: steps of {step:g} s; expected seconds; are these milliseconds?")
+
+
+def _in_degrees(robot: Robot, q: Array) -> bool:
+    """Whether most joint states are none of the robot, and all are if they are in degrees."""
+    turns = np.array([unit == "rad" for unit in robot.joint_units])
+    if "angle" in CHOSEN.get().units or not turns.any():
+        return False
+    some = q[:: max(1, len(q) // SOME)]
+
+    def possible(states: Array) -> NDArray[np.bool_]:
+        outside, _ = beyond_limits(robot, states)
+        return np.asarray(robot.try_forward(states)[1] & ~outside, np.bool_)
+
+    if np.mean(possible(some)) > 0.5:
+        return False
+    return bool(possible(np.where(turns, some * UNITS["deg"][1], some)).all())
 
 
 def _rows(text: TextIO, path: Path) -> Iterator[list[str]]:
@@ -114,6 +138,19 @@ def _lines(text: TextIO, path: Path) -> Iterator[str]:
         yield line
 
 
+def _number(cell: str, blank: bool) -> float:
+    """A cell's number; NaN of an empty one.
+
+    :raises ValueError: no finite number.
+    """
+    if blank and not cell.strip():
+        return math.nan
+    value = decimal(cell)
+    if not math.isfinite(value):
+        raise ValueError(f"{cell!r} is not finite")
+    return value
+
+
 def _parse_columns(path: Path, rows: Iterator[list[str]], blank: bool) -> dict[str, Array]:
     first, above = next(rows, []), 0
     while first and first[0].startswith("#"):
@@ -126,15 +163,12 @@ def _parse_columns(path: Path, rows: Iterator[list[str]], blank: bool) -> dict[s
     for number, row in enumerate(rows, 2 + above):
         if len(row) != len(header):
             raise ParameterError(f"{path}: line {number}", len(row), f"{len(header)} values")
-        try:
-            values = [math.nan if blank and not c.strip() else decimal(c) for c in row]
-        except ValueError as error:
-            raise ParameterError(f"{path}: line {number}", str(error), "numbers") from None
-        if not all(
-            math.isfinite(v) or (blank and not c.strip()) for v, c in zip(values, row, strict=True)
-        ):
-            raise ParameterError(f"{path}: line {number}", row, "finite numbers")
-        data.extend(values)
+        for name, cell in zip(header, row, strict=True):
+            try:
+                data.append(_number(cell, blank))
+            except ValueError:
+                where = f"{path}: line {number}, column {name}"
+                raise ParameterError(where, cell, "a finite number") from None
     if not data:
         raise ParameterError(str(path), f"{number if header else 0} lines", "a header row and rows")
     table = np.frombuffer(data, np.float64).reshape(-1, len(header))

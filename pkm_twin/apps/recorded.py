@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pkm_twin import load, robot_names
-from pkm_twin.apps.columns import check_motion_times, read_columns, times_of
+from pkm_twin.apps.columns import check_units, read_columns, times_of
 from pkm_twin.apps.loads import Load, load_of_columns, metadata_error, told_load
 from pkm_twin.apps.topics import JOINT_STATE, Topics, choose_topics
 from pkm_twin.apps.wrench_frames import FRAMES
@@ -30,6 +30,10 @@ Array = NDArray[np.float64]
 
 WRENCH_AXES: Final = ("fx", "fy", "fz", "mx", "my", "mz")
 
+POSE_MISS: Final = 1e-3
+"""Difference between a table's pose and that of its joint positions, of the robot's size."""
+BLOCK: Final = 4096
+"""Samples computed at a time, so that memory stays flat."""
 RECORDING: Final = "an MCAP file, a rosbag2 folder, or a CSV with columns time, JOINT.position ..."
 """What is a recording."""
 
@@ -169,9 +173,11 @@ def recorded_table(
 
     Optionally ``JOINT.velocity`` and ``.acceleration``, the wrench ``fx fy fz mx my mz``, the
     payload as in ``motion_of_csv``, and of the columns of ``efforts``, ``JOINT.measured`` or else
-    ``JOINT.effort``, the first that are there; other columns are left alone.
+    ``JOINT.effort``, the first that are there; a pose has to be that of the joints, and other
+    columns are left alone.
 
-    :raises ParameterError: no robot is given, a column is missing, or a value is no finite number.
+    :raises ParameterError: no robot is given, a column is missing, a value is no finite number, or
+        joint positions and pose are those of different machines.
     """
     if robot is None:
         _require_table(path)
@@ -192,7 +198,10 @@ def recorded_table(
         raise ParameterError(str(path), ", ".join(columns), f"columns time, {needed}")
     time, qd = times_of(path, columns["time"]), stack("velocity")
     found = (values for what in efforts if (values := stack(what)) is not None)
-    check_motion_times(path, time, q, qd)
+    check_units(path, machine, time, q, qd)
+    pose = pose_of(machine, columns)
+    if pose is not None:
+        check_pose(path, machine, q, pose)
     wrench = None
     if any(axis in columns for axis in WRENCH_AXES):
         wrench = np.stack([columns.get(axis, np.zeros(len(time))) for axis in WRENCH_AXES], -1)
@@ -203,6 +212,37 @@ def recorded_table(
         effort=next(found, None), wrench=wrench,
         rejected=Counter(), first_reject="", source=str(path), qdd=stack("acceleration"),
     )  # fmt: skip
+
+
+def pose_of(robot: Robot, columns: Mapping[str, Array]) -> Array | None:
+    """A table's pose columns, shape (samples, m); None where one is missing."""
+    if not all(name in columns for name in robot.pose_names):
+        return None
+    return np.stack([columns[name] for name in robot.pose_names], -1)
+
+
+def check_pose(path: Path, robot: Robot, q: Array, pose: Array, how: str = "") -> None:
+    """Reject a table whose joint positions and pose are not those of one machine.
+
+    :param how: what else the table may be read as.
+    :raises ParameterError: by the sample that is farthest off.
+    """
+    for begin in range(0, len(q), BLOCK):
+        rows = slice(begin, begin + BLOCK)
+        found, good = robot.try_forward(q[rows])
+        off = found - pose[rows]
+        turns = [i for i, unit in enumerate(robot.pose_units) if unit != "m"]
+        off[:, turns] = (off[:, turns] + np.pi) % (2.0 * np.pi) - np.pi
+        # What has no pose is rejected with its own reason later.
+        size = np.where(good, np.linalg.norm(off * robot.pose_scales, axis=1), 0.0)
+        worst = int(size.argmax())
+        if size[worst] > POSE_MISS * robot.size:
+            names = ", ".join(robot.pose_names)
+            raise ParameterError(
+                f"{path}: {names}, sample {begin + worst}",
+                f"{1e3 * size[worst]:.4g} mm from the pose of the joint positions on {robot.name}",
+                f"a table of this machine{how}",
+            )  # fmt: skip
 
 
 def _require_table(path: Path) -> None:

@@ -16,10 +16,16 @@ from numpy.typing import NDArray
 from delta_dynamics import dynamics_terms, inverse_dynamics, reactions, torque_deviation
 from delta_dynamics.rest import friction_reach, moving_rates
 from pkm_twin import load
-from pkm_twin.apps.columns import check_motion_times, read_columns, times_of
+from pkm_twin.apps.columns import check_units, read_columns, times_of
 from pkm_twin.apps.limits import beyond_limits
 from pkm_twin.apps.loads import Load, by_load, load_of_columns, payload_columns, told_load
-from pkm_twin.apps.recorded import WRENCH_AXES, read_recording, robot_of
+from pkm_twin.apps.recorded import (
+    WRENCH_AXES,
+    check_pose,
+    pose_of,
+    read_recording,
+    robot_of,
+)
 from pkm_twin.apps.recorded_motion import at_rest, motion
 from pkm_twin.apps.topics import JOINT_STATE
 from pkm_twin.apps.trajectories import read_trajectory
@@ -45,8 +51,6 @@ ENDINGS = (".csv", ".parquet", ".mat")
 FOLLOW = ("joints", "pose")
 MOST_EFFORT = 1e9
 """Greatest effort or wrench of a file that can be a machine's, N m or N."""
-POSE_MISS = 1e-3
-"""Difference between a table's pose and that of its joint positions, of the robot's size."""
 INPUTS = ("position", "velocity", "acceleration")
 BEYOND_LIMITS = "beyond_limits"
 MAPPED = "tables use the model's joint values; joint_map applies to messages and bags only"
@@ -174,9 +178,7 @@ def motion_of_csv(
     columns = read_columns(path, machine)
     _check_names(path, machine, columns)
     q = _stacked(path, columns, machine.joint_names, "position")
-    pose = None
-    if all(name in columns for name in machine.pose_names):
-        pose = np.stack([columns[name] for name in machine.pose_names], -1)
+    pose = pose_of(machine, columns)
     posed = q is None or follow == "pose"
     if (pose is None and posed) or "time" not in columns:
         needed = ", ".join(f"{joint}.position" for joint in machine.joint_names)
@@ -195,11 +197,12 @@ def motion_of_csv(
         notes.append(f"joints computed from the pose, {', '.join(machine.pose_names)}{how}")
     else:
         if pose is not None and follow is None:
-            _check_pose(path, machine, q, pose)
+            how = "; --follow pose plans its pose again, --follow joints ignores it"
+            check_pose(path, machine, q, pose, how)
         qd, qdd = (_stacked(path, columns, machine.joint_names, what) for what in INPUTS[1:])
         if all(f"{joint}.effort" in columns for joint in machine.joint_names):
             efforts = _stacked(path, columns, machine.joint_names, "effort")
-    check_motion_times(path, time, q, qd)
+    check_units(path, machine, time, q, qd)
     if (qd is None or qdd is None) and len(time) < 3:
         raise ParameterError(str(path), f"{len(time)} rows", "3 or more, to differentiate")
     rates = _differentiated(q, time) if qd is None else qd
@@ -258,30 +261,6 @@ def _of_pose(
     if set(robot.joint_names) & set(robot.pose_names) or rates[0] is None or rates[1] is None:
         return q, None, None
     return q, *joint_rates(robot, q, rates[0], rates[1])
-
-
-def _check_pose(path: Path, robot: Robot, q: Array, pose: Array) -> None:
-    """Reject a table whose joint positions and pose are not those of one machine.
-
-    :raises ParameterError: by the sample that is farthest off.
-    """
-    for begin in range(0, len(q), BLOCK):
-        rows = slice(begin, begin + BLOCK)
-        found, good = robot.try_forward(q[rows])
-        off = found - pose[rows]
-        turns = [i for i, unit in enumerate(robot.pose_units) if unit != "m"]
-        off[:, turns] = (off[:, turns] + np.pi) % (2.0 * np.pi) - np.pi
-        # What has no pose is rejected with its own reason later.
-        size = np.where(good, np.linalg.norm(off * robot.pose_scales, axis=1), 0.0)
-        worst = int(size.argmax())
-        if size[worst] > POSE_MISS * robot.size:
-            names = ", ".join(robot.pose_names)
-            raise ParameterError(
-                f"{path}: {names}, sample {begin + worst}",
-                f"{1e3 * size[worst]:.4g} mm from the pose of the joint positions on {robot.name}",
-                "a table of this machine; --follow pose plans its pose again, --follow joints "
-                "ignores it",
-            )  # fmt: skip
 
 
 def _differentiated(values: Array, time: Array) -> Array:

@@ -7,12 +7,16 @@ import os
 import re
 import subprocess
 import sys
+import warnings
 from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.io import loadmat
 
+from pkm_twin.apps.recorded import recorded_table
+from pkm_twin.apps.torques import motion_of_csv
+from pkm_twin.errors import ParameterError
 from test.support.command import command
 from test.support.robots import load
 
@@ -114,6 +118,55 @@ def test_an_ambiguous_table_is_refused(motion, capsys):
     header = ["time", *(f"{j}.position" for j in robot.joint_names)]
     Path("a.csv").write_text(written(header, [time, *q.T], ",", ","))
     assert command(capsys, "size", "five_bar", "a.csv").code == 1
+
+
+@pytest.mark.parametrize("cell", ["nan", "-inf", "1_0", "x", ""])
+def test_a_cell_without_a_number_is_named(cell, motion, rng):
+    robot, time, q = motion
+    header = ["time", *(f"{j}.position" for j in robot.joint_names)]
+    row, column = int(rng.integers(len(time))), int(rng.integers(len(header)))
+    lines = [line.split(",") for line in plain(robot, time, q).splitlines()]
+    lines[1 + row][column] = cell
+    Path("a.csv").write_text("\n".join(map(",".join, lines)))
+    with pytest.raises(ParameterError) as error:
+        recorded_table(Path("a.csv"), robot, None)
+    assert f"line {2 + row}, column {header[column]}" in str(error.value)
+
+
+@pytest.mark.parametrize("name", ["five_bar", "delta", "linear_delta"])
+def test_positions_in_degrees_are_noticed(name, tmp_path, rng):
+    """Where all of a motion is possible in degrees, and most of it not in radians."""
+    robot = load(name)
+    time = np.linspace(0.0, 2.0, 201)
+    wave = np.sin(np.outer(time, rng.uniform(2.0, 8.0, robot.joints_count)))
+    q, path = robot.graph.home + 0.05 * robot.size * wave, tmp_path / "a.csv"
+    header = ["time", *(f"{j}.position" for j in robot.joint_names)]
+    glitch = q.copy()
+    glitch[60, 0] += 60.0
+    for values, noticed in ((q, 0), (glitch, 0), (np.degrees(q), robot.joint_units[0] == "rad")):
+        path.write_text(written(header, [time, *values.T]))
+        with warnings.catch_warnings(record=True) as told:
+            warnings.simplefilter("always")
+            recorded_table(path, robot, None)
+        assert sum("--units deg" in str(one.message) for one in told) == noticed
+
+
+@pytest.mark.parametrize("name", ["five_bar", "delta"])
+def test_a_pose_has_to_be_that_of_the_joints(name, tmp_path, rng):
+    """Of a recording as of a planned motion: a table of another machine is none of this one."""
+    robot = load(name)
+    time = np.linspace(0.0, 0.4, 21)
+    q = robot.graph.home + 0.1 * np.sin(np.outer(time, rng.uniform(2.0, 8.0, robot.joints_count)))
+    pose, path = robot.forward(q), tmp_path / "a.csv"
+    header = ["time", *(f"{j}.position" for j in robot.joint_names), *robot.pose_names]
+    for read in (motion_of_csv, lambda path, robot: recorded_table(path, robot, None)):
+        path.write_text(written(header, [time, *q.T, *pose.T]))
+        assert read(path, robot).q == pytest.approx(q)
+        wrong = pose.copy()
+        wrong[7, 0] += 0.01 * robot.size
+        path.write_text(written(header, [time, *q.T, *wrong.T]))
+        with pytest.raises(ParameterError, match="sample 7"):
+            read(path, robot)
 
 
 def test_matlab_files_have_the_columns(motion, capsys):
