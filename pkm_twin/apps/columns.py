@@ -42,6 +42,8 @@ def read_columns(
 ) -> dict[str, Array]:
     """Columns of a CSV with a header row, by name, shape (rows,) each, in SI units.
 
+    A column without any number is left out: `torques` writes such reactions.
+
     :param path: ``-`` is stdin. ``robot``: whose joints and pose the columns may be of. ``blank``:
         whether cells may be empty, which are NaN.
 
@@ -138,12 +140,12 @@ def _lines(text: TextIO, path: Path) -> Iterator[str]:
         yield line
 
 
-def _number(cell: str, blank: bool) -> float:
+def _number(cell: str) -> float:
     """A cell's number; NaN of an empty one.
 
     :raises ValueError: no finite number.
     """
-    if blank and not cell.strip():
+    if not cell.strip():
         return math.nan
     value = decimal(cell)
     if not math.isfinite(value):
@@ -165,11 +167,21 @@ def _parse_columns(path: Path, rows: Iterator[list[str]], blank: bool) -> dict[s
             raise ParameterError(f"{path}: line {number}", len(row), f"{len(header)} values")
         for name, cell in zip(header, row, strict=True):
             try:
-                data.append(_number(cell, blank))
+                data.append(_number(cell))
             except ValueError:
                 where = f"{path}: line {number}, column {name}"
                 raise ParameterError(where, cell, "a finite number") from None
     if not data:
         raise ParameterError(str(path), f"{number if header else 0} lines", "a header row and rows")
     table = np.frombuffer(data, np.float64).reshape(-1, len(header))
-    return dict(zip(header, np.ascontiguousarray(table.T), strict=True))
+    columns = dict(zip(header, np.ascontiguousarray(table.T), strict=True))
+    if blank:
+        return columns
+    for name, values in list(columns.items()):
+        empty = np.isnan(values)
+        if empty.all():
+            del columns[name]
+        elif empty.any():
+            where = f"{path}: line {2 + above + int(empty.argmax())}, column {name}"
+            raise ParameterError(where, "empty", "a finite number")
+    return columns

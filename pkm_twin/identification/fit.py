@@ -238,8 +238,8 @@ def _enough(rows: Sequence[Rows], result: Estimate, what: Sequence[Kind]) -> Non
     if values < FEW * result.directions:
         raise PkmTwinError(
             f"too few samples: {values:.0f} independent efforts for {result.directions} numbers of "
-            f"{', '.join(what)}, {FEW * result.directions:.0f} or more are needed; record a longer "
-            "motion, or fit less with --what"
+            f"{', '.join(what)}, {FEW * result.directions:.0f} or more are needed; record a "
+            "motion with more changes of speed (`pkm-twin excite`), or fit less with --what"
         )
 
 

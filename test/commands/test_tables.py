@@ -133,6 +133,20 @@ def test_a_cell_without_a_number_is_named(cell, motion, rng):
     assert f"line {2 + row}, column {header[column]}" in str(error.value)
 
 
+def test_columns_without_any_number_are_not_there(motion):
+    """`torques` writes reactions that rigid bodies do not determine as empty cells."""
+    robot, time, q = motion
+    header = ["time", *(f"{name}.position" for name in robot.joint_names)]
+    lines = written(header, [time, *q.T]).splitlines()
+    table = "\n".join([f"{lines[0]},elbow.fx", *(f"{line}," for line in lines[1:])]) + "\n"
+    Path("empty.csv").write_text(table)
+    assert motion_of_csv(Path("empty.csv"), robot).q == pytest.approx(q, abs=1e-12)
+    # A cell that is empty in one row alone is an error.
+    Path("empty.csv").write_text(table.rstrip("\n") + "1.0\n")
+    with pytest.raises(ParameterError, match=r"line 2, column elbow\.fx"):
+        motion_of_csv(Path("empty.csv"), robot)
+
+
 @pytest.mark.parametrize("name", ["five_bar", "delta", "linear_delta"])
 def test_positions_in_degrees_are_noticed(name, tmp_path, rng):
     """Where all of a motion is possible in degrees, and most of it not in radians."""
