@@ -111,7 +111,10 @@ def check_units(path: Path, robot: Robot, time: Array, q: Array, qd: Array | Non
 
 
 def _in_degrees(robot: Robot, q: Array) -> bool:
-    """Whether most joint states are none of the robot, and all are if they are in degrees."""
+    """Whether most joint states are none of the robot, and all are if they are in degrees.
+
+    What is beyond a limit by a little is in rad: most have a joint more than half a turn from zero.
+    """
     turns = np.array([unit == "rad" for unit in robot.joint_units])
     if "angle" in CHOSEN.get().units or not turns.any():
         return False
@@ -121,7 +124,8 @@ def _in_degrees(robot: Robot, q: Array) -> bool:
         outside, _ = beyond_limits(robot, states)
         return np.asarray(robot.try_forward(states)[1] & ~outside, np.bool_)
 
-    if np.mean(possible(some)) > 0.5:
+    far = np.abs(some[:, turns]).max(1) > np.pi
+    if np.mean(far & ~possible(some)) <= 0.5:
         return False
     return bool(possible(np.where(turns, some * UNITS["deg"][1], some)).all())
 

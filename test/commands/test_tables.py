@@ -157,7 +157,13 @@ def test_positions_in_degrees_are_noticed(name, tmp_path, rng):
     header = ["time", *(f"{j}.position" for j in robot.joint_names)]
     glitch = q.copy()
     glitch[60, 0] += 60.0
-    for values, noticed in ((q, 0), (glitch, 0), (np.degrees(q), robot.joint_units[0] == "rad")):
+    beyond = q + 1.0
+    for values, noticed in (
+        (q, 0),
+        (glitch, 0),
+        (beyond, 0),
+        (np.degrees(q), robot.joint_units[0] == "rad"),
+    ):
         path.write_text(written(header, [time, *values.T]))
         with warnings.catch_warnings(record=True) as told:
             warnings.simplefilter("always")
