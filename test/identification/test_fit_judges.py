@@ -119,6 +119,16 @@ def test_a_payload_that_is_on_the_platform_for_a_while_is_named(name: str) -> No
     assert fault is not None and fault.startswith("an unknown payload ")
 
 
+def test_a_known_payload_that_the_efforts_do_not_show_is_rejected() -> None:
+    """Also where time in another unit would ask for efforts beyond any number."""
+    m, record = drawn("delta_cu", 3), recorded("sound", "delta_cu", 3)
+    loaded, held = m.robot.changed(payload={"mass": 20.0}), np.ones(len(m.time))
+    record = replace(record, carried=loaded, held=held)
+    everything = file_parameters(m.robot)
+    rows, _ = rows_of(m.robot, everything, record, None)
+    assert recording_fault(m.robot, everything, record, rows) is not None
+
+
 def test_half_its_speed_is_rejected_though_weight_makes_up_the_efforts() -> None:
     assert rejected("half_speed", "prru", 5)
 
