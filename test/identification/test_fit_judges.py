@@ -263,6 +263,19 @@ def test_an_elastic_drive_is_one_explanation_of_a_delay(name: str, late: bool) -
     assert ("elastic drive" in named) != late
 
 
+def test_a_drive_of_negative_compliance_is_no_explanation() -> None:
+    m = drawn("delta_cu", 2)
+    give = 5e-3 / np.abs(m.efforts).max(0)
+    record = noisy(m.recorded(q=m.q - give * m.efforts), np.random.default_rng(3))
+    verdict = fit(m.robot, [record], KINDS, accept=True).verdict
+    named = {
+        one.kind
+        for finding in (*verdict.findings, *verdict.hints)
+        for one in (finding.suspect, *finding.others)
+    }
+    assert verdict.answer != "explains" and "elastic drive" not in named
+
+
 @pytest.mark.long
 @pytest.mark.parametrize("name", ["delta", "five_bar", "linear_delta", "prru", "upr_rpu"])
 @pytest.mark.parametrize("what", WRONG)
