@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from pkm_twin.bags.reader import Bag
 from pkm_twin.console import parse_numbers
 from pkm_twin.errors import BagError, ParameterError
+from pkm_twin.robot.plausibility import payload_findings
 from pkm_twin.robot.robot import Robot
 
 Array = NDArray[np.float64]
@@ -55,12 +56,18 @@ class Load:
     def on(self, robot: Robot) -> Robot:
         """The robot with this payload.
 
-        :raises ParameterError: the robot takes none, or not such a one.
+        :raises ParameterError: the robot takes none, or not such a one; a mass that is many times
+            that of all that moves.
         """
         changes: dict[str, Any] = {"mass": self.mass}
         if self.com is not None:
             changes["com"] = list(self.com)
-        return robot.changed(payload=changes)
+        loaded = robot.changed(payload=changes)
+        for finding in payload_findings(loaded):
+            raise ParameterError(
+                finding.field, finding.value, f"{finding.bound:.4g} kg or less: {finding.likely}"
+            )
+        return loaded
 
     def as_json(self) -> dict[str, Any]:
         """Plain data, units in the keys; no times where it is held all the time."""

@@ -13,7 +13,7 @@ import numpy as np
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import PkmTwinError
 from pkm_twin.identification.file_parameters import FileParameters
-from pkm_twin.identification.fit_rows import Recorded, Rows, calm_table, rows_of
+from pkm_twin.identification.fit_rows import LARGEST, Recorded, Rows, calm_table, rows_of
 from pkm_twin.identification.plausible import Problem, Retold, fault_of
 from pkm_twin.machine.friction import turning_keys
 from pkm_twin.machine.inertia import ten_numbers
@@ -67,6 +67,9 @@ def recording_fault(
                 some = Recorded(r.name, **few, carried=r.carried)
                 made, _ = rows_of(robot, everything, some, None)
             except (PkmTwinError, ValueError, np.linalg.LinAlgError):
+                return None
+            needs = made.rest + made.table @ everything.values
+            if not np.abs(needs).max() < LARGEST:
                 return None
             return problem_of(robot, everything, made)
 

@@ -289,7 +289,7 @@ def suspects_of(robot: Robot) -> list[Suspect]:
         for name, unit, length in zip(names, units, lengths, strict=True)
     ]
     found += [
-        Suspect(ELASTIC, name, f"{u}/({e})" if " " in e else f"{u}/{e}")
+        Suspect(ELASTIC, name, f"{u}/({e})" if " " in e else f"{u}/{e}", positive=True)
         for name, u, e in zip(names, units, efforts, strict=True)
     ]
     found += [

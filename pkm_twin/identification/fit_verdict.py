@@ -224,12 +224,13 @@ class _Court:
         sizes = ", ".join(
             f"{self.suspects[k].where} {give:.2g} {self.suspects[k].unit}"
             for k, give in zip(which, gives.tolist(), strict=True)
+            if give > 0.0
         )
         finding = Finding(
             Suspect(LATE, "all joints", "s"), float(delays[place]), error, float(clear),
             (Suspect(ELASTIC, sizes),),
         )  # fmt: skip
-        signals = [case.suspects[..., which] @ gives[:, None] for case in cases]
+        signals = [case.suspects[..., which] @ gives.clip(0.0)[:, None] for case in cases]
         return finding, self.solved.response(signals)[:, 0]
 
     def inertia_shown(self) -> bool:

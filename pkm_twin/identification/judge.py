@@ -25,7 +25,7 @@ from typing import Final
 
 import numpy as np
 
-from pkm_twin.codegen.arrays import Array
+from pkm_twin.codegen.arrays import Array, Mask
 from pkm_twin.identification.estimation import WIDEN
 from pkm_twin.identification.verdict import Answer, Blind, Channel, Finding, Suspect, Verdict
 
@@ -63,6 +63,10 @@ UNSEEN: Final = 3
 """Most unseen errors that are told."""
 VALUES: Final = 30000
 """Values of the residual that are judged; of more, every so many rows."""
+
+
+UNKNOWN: Final = "no known error"
+"""What is named where a suspect fits that has no such size."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,7 +140,8 @@ def judge(
     basis = basis_of(base)
     y, left = y - basis @ (basis.T @ y), left - basis @ (basis.T @ left)
     prior_sizes = np.array([one.usual or 0.0 if one.known else np.inf for one in suspects])
-    chosen, after = _select(y, left, seen, _least(few), prior_sizes)
+    positive = np.array([one.positive for one in suspects])
+    chosen, after = _select(y, left, seen, _least(few), prior_sizes, positive)
     sizes = _sizes(y, left, prior_sizes, [one.index for one in chosen])
     found = [_finding(suspects, one, pair) for one, pair in zip(chosen, sizes, strict=True)]
     clear = [one for one in found if one.sigmas >= SIGMAS]
@@ -166,6 +171,9 @@ def judge(
 
 def _finding(suspects: Sequence[Suspect], one: _Chosen, size: tuple[float, float]) -> Finding:
     own = suspects[one.index]
+    if own.positive and size[0] < 0.0:
+        # The residual is there, but this cannot be its cause.
+        own = replace(own, kind=UNKNOWN)
     others = dict.fromkeys(suspects[k] for k in one.near)
     others.pop(own, None)
     return Finding(own, *size, one.sigmas, tuple(others))
@@ -222,13 +230,14 @@ def _least(cases: Sequence[Evidence]) -> Array:
 
 
 def _select(
-    y: Array, table: Array, seen: Array, least: Array, prior: Array
+    y: Array, table: Array, seen: Array, least: Array, prior: Array, positive: Mask
 ) -> tuple[list[_Chosen], Array]:
     """Suspects that the residual shows, the last perhaps not clearly; what stays of it.
 
     :param seen: norms of the suspects before the fitted numbers were taken out, (s,).
     :param least: sizes from which they count, (s,).
     :param prior: standard deviations that are known of their sizes, else infinite, (s,).
+    :param positive: which sizes cannot be below zero, (s,).
     """
     chosen: list[_Chosen] = []
     left, rest = table.copy(), y
@@ -251,6 +260,7 @@ def _select(
         if sigmas < HINT:
             break
         order = np.argsort(-np.abs(scores))
+        scores = np.where(positive, np.maximum(scores, 0.0), scores)
         near = [int(k) for k in order if k != best and abs(scores[k]) > NEAR * sigmas][:CHOICES]
         chosen.append(_Chosen(best, sigmas, tuple(near)))
         if sigmas < SIGMAS:

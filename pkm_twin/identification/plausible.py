@@ -4,8 +4,8 @@
 The efforts are fitted by a machine as far from its file as one may be: friction, rotors, a payload,
 masses within a factor of two, current sensors off by a part of the load, all of them physically
 possible. What such a machine leaves unexplained is compared with what it leaves of the recording
-put right: signs turned, columns exchanged, another unit, another time. A recording that is
-explained much better by one of these has that fault.
+put right: signs turned, columns exchanged, another unit, another time. A recording that one of
+these explains as well as a sound one has that fault; of others no cause is named.
 """
 
 from __future__ import annotations
@@ -37,11 +37,16 @@ NAMED: Final = 0.8
 FAR: Final = 0.1
 """What is left from which other positions and times are tried, which costs more."""
 BESIDE_NOISE: Final = 0.03
-"""The same, above noise, where the efforts have a fault: positions or times may be its cause."""
+"""What a recording leaves beside noise once its fault is put right: of more the cause is unknown.
+"""
+HELD: Final = 0.15
+"""The same of a payload that is held for a while, whose times are estimated from the efforts."""
 RANGE: Final = 2.0
 """How many times as heavy as its file a machine may be, and the inverse."""
 LATEST: Final = 0.05
-"""Efforts that are later or earlier are another recording's, s."""
+"""Efforts that are late, or early, by no more can be this recording's, s."""
+SHORT: Final = 0.01
+"""A delay that is no fault, s."""
 SEARCHED: Final = 1.5
 """How far efforts are looked for in time, s."""
 SLOWEST: Final = 1.0
@@ -236,13 +241,14 @@ def fault_of(
         return None
     best, cause = told, ""
     others = [*_efforts(problem, joints), ("time runs backwards", problem.backwards(), RARE)]
-    if problem.payload.any():
-        others.append((*problem.loaded_in_part(), UNIT))
+    loaded = (problem.loaded_in_part(),) if problem.payload.any() else ()
+    others += [(*one, UNIT) for one in loaded]
     for text, other, price in others:
         found = other.judged()
         if found.cost + price < best.cost:
             best, cause = Judged(found.left, found.cost + price), text
-    unclear = bool(cause) and best.left**2 > BESIDE_NOISE**2 + problem.noisy**2
+    known = min(float(np.hypot(BESIDE_NOISE, problem.noisy)), 2.0 * POOR)
+    unclear = bool(cause) and best.left > known
     here = some() if unclear or best.left > FAR else None
     if here is not None:
         # All of them by the same samples: how much better than as recorded?
@@ -253,17 +259,19 @@ def fault_of(
             if own.cost - found.cost - RARE > gain:
                 gain, told, cause = own.cost - found.cost - RARE, own, text
                 best = found
-    if cause and best.left < min(NAMED * told.left, 2.0 * POOR):
-        return (
-            f"{cause}: put right, a machine like the file's leaves {100 * best.left:.2g} % of the "
-            f"efforts' variation unexplained, as recorded {100 * told.left:.2g} %"
-        )
-    if cause and best.left < 2.0 * POOR:
+    known = max(known, HELD) if cause in dict(loaded) else known
+    if cause and best.left <= known:
+        if best.left < NAMED * told.left:
+            return (
+                f"{cause}: put right, a machine like the file's leaves {100 * best.left:.2g} % of "
+                f"the efforts' variation unexplained, as recorded {100 * told.left:.2g} %"
+            )
         return f"{cause}: as recorded, masses and payload would be far from the file's"
     if cause or told.left**2 > POOR**2 + problem.noisy**2:
         return (
-            f"no machine like the file's explains the efforts: {100 * told.left:.2g} % of their "
-            "variation is left (another machine, another motion, or noise?)"
+            "no machine like the file's explains the efforts, and no single mistake does: "
+            f"{100 * told.left:.2g} % of their variation is left (another machine, another motion, "
+            "an unknown load, or noise?)"
         )
     return None
 
@@ -324,9 +332,8 @@ def _delays(problem: Problem, joints: Sequence[str]) -> Iterator[tuple[str, Prob
     """Efforts, of all joints or of one, that belong to another time."""
     k, n = problem.effort.shape
     most = min(int(SEARCHED / problem.period), k // 4)
-    least = int(np.ceil(LATEST / problem.period))
-    steps = [s for s in range(-most, most + 1) if abs(s) >= least]
-    if not steps:
+    steps = range(-most, most + 1)
+    if most * problem.period < SHORT:
         return
     inner = slice(most, k - most)
     missed = np.empty((len(steps), n))
@@ -342,6 +349,8 @@ def _delays(problem: Problem, joints: Sequence[str]) -> Iterator[tuple[str, Prob
     choices += [((j,), int(np.argmin(missed[:, j]))) for j in range(n)] if n > 1 else []
     for which, place in choices:
         step = steps[place]
+        if abs(step) * problem.period < SHORT:
+            continue
         names = _listed([joints[j] for j in which], n)
         late = step * problem.period
         text = f"efforts of {names} are {abs(late):.2g} s {'late' if late > 0 else 'early'}"

@@ -27,7 +27,8 @@ class Suspect:
 
     ``kind``: in words; ``where``: a joint, a direction, or a number of the file; ``unit``: of its
     size, empty for a ratio; ``usual``: a size that is common, None where there is none; ``known``:
-    it is the standard deviation, and much larger sizes explain nothing.
+    it is the standard deviation, and much larger sizes explain nothing. ``positive``: no size below
+    zero is possible.
     """
 
     kind: str
@@ -35,6 +36,7 @@ class Suspect:
     unit: str = ""
     usual: float | None = None
     known: bool = False
+    positive: bool = False
 
     def __str__(self) -> str:
         return f"{self.kind} ({self.where})"

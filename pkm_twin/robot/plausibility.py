@@ -135,16 +135,17 @@ def _masses(robot: Robot, graph: Graph) -> Iterator[Finding]:
             "kg",
             "left out? then torques lack its weight and inertia",
         )
-    load = robot.payload
-    if load.mass > LOADED * total:
+    yield from payload_findings(robot)
+
+
+def payload_findings(robot: Robot) -> Iterator[Finding]:
+    """A payload that is too heavy for the machine that moves it."""
+    total, mass = _total(robot.graph), robot.payload.mass
+    if 0.0 < LOADED * total < mass:
         yield Finding(
-            "payload.mass",
-            "payload",
-            load.mass,
-            LOADED * total,
-            "kg",
+            "payload.mass", "payload", mass, LOADED * total, "kg",
             f"{total:.4g} kg move it; a mass in grams?",
-        )
+        )  # fmt: skip
 
 
 def _bodies(robot: Robot, graph: Graph) -> Iterator[Finding]:

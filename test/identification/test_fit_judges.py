@@ -119,6 +119,44 @@ def test_a_payload_that_is_on_the_platform_for_a_while_is_named(name: str) -> No
     assert fault is not None and fault.startswith("an unknown payload ")
 
 
+def test_a_known_payload_that_the_efforts_do_not_show_is_rejected() -> None:
+    """Also where time in another unit would ask for efforts beyond any number."""
+    m, record = drawn("delta_cu", 3), recorded("sound", "delta_cu", 3)
+    loaded, held = m.robot.changed(payload={"mass": 20.0}), np.ones(len(m.time))
+    record = replace(record, carried=loaded, held=held)
+    everything = file_parameters(m.robot)
+    rows, _ = rows_of(m.robot, everything, record, None)
+    assert recording_fault(m.robot, everything, record, rows) is not None
+
+
+@pytest.mark.parametrize("who", [[0, 1, 2], [0]])
+def test_a_short_delay_is_named_by_its_length(who: list[int]) -> None:
+    m = drawn("delta_cu", 4)
+    efforts = m.efforts.copy()
+    efforts[:, who] = shifted(m.efforts, m.time, 0.04)[:, who]
+    record = noisy(m.recorded(effort=efforts), np.random.default_rng(7))
+    everything = file_parameters(m.robot)
+    rows, _ = rows_of(m.robot, everything, record, None)
+    fault = recording_fault(m.robot, everything, record, rows)
+    names = "all joints" if len(who) > 1 else m.robot.joint_names[0]
+    assert fault is not None and fault.startswith(f"efforts of {names} are 0.04 s late")
+
+
+def test_a_cause_that_does_not_explain_the_efforts_is_not_named() -> None:
+    """A force on the platform that was not recorded looks like a payload that comes and goes."""
+    m = drawn("delta_cu", 4)
+    force = np.zeros((len(m.time), 6))
+    force[:, 2] = -5.0 * np.sin(2.0 * np.pi * 0.7 * m.time)
+    efforts = inverse_dynamics(m.truth, m.q, m.qd, m.qdd, force)
+    everything = file_parameters(m.robot)
+    for wrench in (None, -force):
+        made = replace(m.recorded(effort=efforts), wrench=wrench)
+        record = noisy(made, np.random.default_rng(7))
+        rows, _ = rows_of(m.robot, everything, record, None)
+        fault = recording_fault(m.robot, everything, record, rows)
+        assert fault is not None and fault.startswith("no machine like the file's ")
+
+
 def test_half_its_speed_is_rejected_though_weight_makes_up_the_efforts() -> None:
     assert rejected("half_speed", "prru", 5)
 
@@ -223,6 +261,19 @@ def test_an_elastic_drive_is_one_explanation_of_a_delay(name: str, late: bool) -
         for one in (finding.suspect, *finding.others)
     }
     assert ("elastic drive" in named) != late
+
+
+def test_a_drive_of_negative_compliance_is_no_explanation() -> None:
+    m = drawn("delta_cu", 2)
+    give = 5e-3 / np.abs(m.efforts).max(0)
+    record = noisy(m.recorded(q=m.q - give * m.efforts), np.random.default_rng(3))
+    verdict = fit(m.robot, [record], KINDS, accept=True).verdict
+    named = {
+        one.kind
+        for finding in (*verdict.findings, *verdict.hints)
+        for one in (finding.suspect, *finding.others)
+    }
+    assert verdict.answer != "explains" and "elastic drive" not in named
 
 
 @pytest.mark.long

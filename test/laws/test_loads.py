@@ -2,8 +2,11 @@
 """When a payload is held, and what is too near to a pick or release to be judged."""
 
 import numpy as np
+import pytest
 
 from pkm_twin.apps.loads import Load
+from pkm_twin.errors import ParameterError
+from test.support.robots import load as robot_of
 
 TIME = np.array([0.4, 0.6, 1.0, 1.4, 1.6, 2.0, 2.4, 2.6])
 
@@ -20,3 +23,15 @@ def test_what_is_near_a_change_is_within_the_span_of_either_edge():
     assert near.tolist() == [False, True, True, True, True, True, True, False]
     assert load.near_change(TIME, 0.1).tolist() == [t in (1.0, 2.0) for t in TIME]
     assert not Load(0.2).near_change(TIME, 0.5).any()
+
+
+@pytest.mark.parametrize("name", ["delta_cu", "five_bar"])
+def test_a_mass_in_grams_is_no_payload(name):
+    """Of a tenth of all that moves, in kg and in g."""
+    robot = robot_of(name)
+    graph = robot.graph
+    moving = sum(b.mass for b in graph.bodies.values()) + sum(r.mass for r in graph.rods.values())
+    assert Load(0.1 * moving).on(robot).payload.mass == 0.1 * moving
+    with pytest.raises(ParameterError) as caught:
+        Load(100.0 * moving).on(robot)
+    assert (caught.value.field, caught.value.value) == ("payload.mass", 100.0 * moving)
