@@ -143,7 +143,8 @@ def rows_of(
 
     shaken = shaken_efforts(r, max(pieces, key=lambda t: len(t.time)), how, efforts)
     noise = noise_of(left, shaken, pieces[0].period, how)
-    rings = resonances_of(left, pieces[0].period, how)
+    size = np.sqrt(np.mean(np.concatenate([part.target + part.rest for part in parts]) ** 2, 0))
+    rings = resonances_of(left, pieces[0].period, how, size)
     signals = signals_of(pieces, told, rub, how, noise, rings)
     period = pieces[0].period
     return Rows(time, table, target, rest, counts, change, outliers, period, signals), how

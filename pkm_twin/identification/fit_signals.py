@@ -11,6 +11,7 @@ import numpy as np
 import scipy  # type: ignore[import-untyped]  # its parts come when they are asked for
 
 from pkm_twin.codegen.arrays import Array
+from pkm_twin.identification.judge import EXACT
 from pkm_twin.identification.samples import DEGREE, Filtering, Track, low_pass
 from pkm_twin.identification.verdict import Suspect
 from pkm_twin.robot.robot import Robot
@@ -210,11 +211,12 @@ def noise_of(residual: Sequence[Array], shaken: Array, period: float, how: Filte
 
 
 def resonances_of(
-    residual: Sequence[Array], period: float, how: Filtering
+    residual: Sequence[Array], period: float, how: Filtering, size: Array
 ) -> tuple[Resonance, ...]:
     """The lowest clear peak above the motion's band of each joint's residual, where there is one.
 
-    :param residual: measured less fitted, every sample, (samples, n) by piece.
+    :param residual: measured less fitted, every sample, (samples, n) by piece. ``size``: RMS of
+        the measured efforts, (n,): a peak below :data:`.judge.EXACT` of it is rounding.
     """
     whole, rate = max(residual, key=len), 1.0 / period
     segment = min(RESOLVED, len(whole) // 4)
@@ -249,6 +251,8 @@ def resonances_of(
         width = 0.5 * step * (wide[-1] - wide[0] + 1)
         sigmas = float(scipy.stats.norm.isf(np.exp(max(chance[peak], -700.0))))
         rms = float(np.sqrt(2.0 * step * np.sum(above)))
+        if not rms > EXACT * size[j]:
+            continue
         found.append(Resonance(j, centre, float(width), rms, sigmas, bool(width < 1.25 * step)))
     return tuple(found)
 

@@ -97,7 +97,7 @@ def test_a_resonance_is_found_with_its_frequency_and_no_other(rng):
     count = 12000
     for _ in range(20):
         noise = rng.normal(size=(count, 2)) * [0.1, 0.02]
-        assert resonances_of([noise], period, how) == ()
+        assert resonances_of([noise], period, how, np.ones(2)) == ()
     damping = 0.02
     for frequency in (62.0, 140.0):
         # A lightly damped oscillator that noise excites.
@@ -107,11 +107,13 @@ def test_a_resonance_is_found_with_its_frequency_and_no_other(rng):
         ring[:, 1] = lfilter([1.0], poles, rng.normal(size=count))
         ring *= 0.02 / ring[:, 1].std()
         noise = rng.normal(size=(count, 2)) * [0.1, 0.02]
-        (found,) = resonances_of([noise + ring], period, how)
+        (found,) = resonances_of([noise + ring], period, how, np.ones(2))
         assert found.joint == 1
         assert abs(found.frequency - frequency) < 3.0
         assert found.rms == pytest.approx(0.02, rel=0.4)
         assert not found.line
+        # What is nothing beside the efforts is rounding.
+        assert resonances_of([noise + ring], period, how, np.full(2, 100.0)) == ()
 
 
 @pytest.mark.parametrize("name", ["five_bar", "delta_cu"])
