@@ -162,7 +162,7 @@ class UprRpu(Robot):
         z, beta, gamma = pose
         cosine = cos(beta)
         low = maximum(absolute(beta) - 0.5 * math.pi, z)
-        rho = z / maximum(cosine, 1e-300)
+        rho = z / maximum(cosine, 1e-100)
         q = []
         for i in range(3):
             along, up = self._limb(i, rho, beta, gamma)

@@ -225,7 +225,7 @@ class TestInertia:
             ([[1, 0, 0], [0, 1, 0], [0, 0]], "list of 3"),
             ([1, [0, 1, 0], 1], "list of 3"),
             ([1, 1, math.nan], "finite"),
-            ([1e13, 1e13, 1e13], "1e12"),
+            ([1e13, 1e13, 1e13], "1e+12"),
         ],
     )
     def test_only_a_real_bodys_matrix_is_taken(self, load_data, value, bound):
