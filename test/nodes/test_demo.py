@@ -75,17 +75,17 @@ def test_a_node_that_waits_for_its_turn_answers_everything(
 
     @contextmanager
     def process(command):
-        """As the demonstration's, and once it publishes stopped for a while again and again.
+        """As the demonstration's, and once it answers stopped for a while again and again.
 
-        Before, it can hold what every new process on this machine needs.
+        Before, it can hold what every new process on this machine needs, or miss its discovery.
         """
         with demo_recorder.process(command) as child:
             ended = threading.Event()
 
             def starve():
-                while not (node.count_publishers(topic) or ended.wait(0.1)):
+                while not (recorder.newest or ended.wait(0.01)):
                     pass
-                while not ended.wait(0.4):
+                while not ended.wait(0.2):
                     os.kill(child.pid, signal.SIGSTOP)
                     time.sleep(0.4)
                     os.kill(child.pid, signal.SIGCONT)
