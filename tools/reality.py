@@ -221,7 +221,7 @@ The owner also reports that the holding current of a leg at one pose differs by 
 direction from which the pose was approached. Gravity needs 0.2 to 0.7 A there. Coulomb friction
 (0.88 to 1.22 A over 105 strokes) supports any load between its two limits at standstill, so the
 current depends on the motion before. No static model of pose and velocity can predict it:
-feedforward of gravity removes the mean, and what is left is for the feedback controller. Compare a
+feedforward of gravity removes the mean, and the feedback controller compensates the rest. Compare a
 model with currents of slow motion in both directions, not with holding currents.
 
 ## Send a recording

@@ -87,7 +87,7 @@ def times_of(path: Path, values: Array) -> Array:
 def check_units(path: Path, robot: Robot, time: Array, q: Array, qd: Array | None) -> None:
     """Units of a motion: the steps of its times are short, its velocities those of its positions.
 
-    A warning tells of positions that may be in degrees.
+    Positions that may be in degrees give a warning.
 
     :param time: shape (samples,); q and qd, shape (samples, n), qd where the file tells it.
     :raises ParameterError: velocities are a thousand times those of the positions.

@@ -68,7 +68,7 @@ def tolerances(
 ) -> Tolerances:
     """Errors of the platform by independent errors of single parts, to first order.
 
-    A part's error changes one part: loops close anew by the passive joints while the actuated
+    A part's error changes one part: the passive joints close the loops again while the actuated
     joints keep their positions. Paths, in base axes at home:
 
     - ``rods.NAME.length``;
@@ -152,7 +152,7 @@ def drawn(
 ) -> Array:
     """Errors of the platform of machines with normally distributed errors, on exact geometry.
 
-    Every machine is assembled anew in every state, without a linear step: what
+    Every machine is assembled in every state, without a linear step: what
     :func:`tolerances` gives to first order.
 
     :param q: joint positions, shape (k, n). Other parameters and errors as there; paths are those
