@@ -17,13 +17,13 @@ help:
 	@echo "make test         lint, types and tests"
 	@echo "make long         the same tests with more robots, states and points"
 	@echo "make bags         record the bags again (Pinocchio, PyNite)"
-	@echo "make bench        measure times, into docs/benchmarks.md and docs/latency.md"
+	@echo "make bench        measure times, into docs/benchmarks.md"
 	@echo "make certificate  cross-check torques and compliance, into docs/certificate.md"
 	@echo "make fuzz         random bags, messages, files and command lines (SECONDS, SEED)"
 	@echo "make faults       run the tests of every row of docs/faults.md"
 	@echo "make soak         ten million poses, and all nodes under load, with constant memory (MINUTES)"
 	@echo "make audit        known vulnerabilities of the installed packages"
-	@echo "make scale        measure the cost of workspace maps, into docs/scale.md"
+	@echo "make scale        measure the cost of workspace maps, into docs/benchmarks.md"
 	@echo "make reality      compare recordings of real machines with the models, into docs/reality.md"
 	@echo "make contact-table  simulate 1,000 contacts, into docs/contact.md (an hour)"
 	@echo "make pages        write the generated pages and pictures of docs/"
@@ -70,7 +70,7 @@ bench: $(VENV)/bench.stamp
 	mkdir -p out
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest test/benchmarks -m benchmark_run --benchmark-disable-gc --benchmark-json=out/benchmarks.json
 	$(BIN)/python -m test.benchmarks.report out/benchmarks.json docs/benchmarks.md
-	OMP_NUM_THREADS=1 $(BIN)/python -m test.benchmarks.latency docs/latency.md
+	OMP_NUM_THREADS=1 $(BIN)/python -m test.benchmarks.latency docs/benchmarks.md
 	OMP_NUM_THREADS=1 $(BIN)/python -m test.benchmarks.pinocchio_c docs/export_c.md
 
 certificate: $(VENV)/certificate.stamp
@@ -95,7 +95,7 @@ audit: $(VENV)/audit.stamp
 	$(BIN)/pip-audit --skip-editable
 
 scale: $(VENV)/test.stamp
-	OMP_NUM_THREADS=1 $(BIN)/python -m test.maps.scale docs/scale.md
+	OMP_NUM_THREADS=1 $(BIN)/python -m test.maps.scale docs/benchmarks.md
 
 reality: $(VENV)/test.stamp
 	$(BIN)/python -m tools.reality docs/reality.md

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from test.nodes.harness import SECOND, Domain, Maker, Ros
+from test.support.pages import write_section
 
 SAMPLES, WARM = 4000, 500
 POINTS = 100_000
@@ -155,30 +156,22 @@ def table(rows, unit):
 def main(target):
     stream, long = measure()
     lines = [
-        "# Latency",
-        "",
-        "Written by `python -m test.benchmarks.latency`: processor time of one thread of the node "
-        "`delta_dynamics` with `delta_cu`, medians, no subscriber. [The round trip](benchmarks.md) "
-        "includes the time of the middleware.",
+        "Processor time of one thread of the node `delta_dynamics` with `delta_cu`, medians, no "
+        "subscriber. The round trip above includes the middleware.",
         "",
         "The node decodes a joint state from its bytes and encodes the answer to bytes, without "
         "rclpy's conversion, which takes a large part of the time of a bare echo. Three compiled "
         "programs do the computation: pose, rates, jump and singularity index; the fit over the "
         "window; and the torques. The rest is Python. At 1 kHz the caches are cold, and a call "
-        "takes "
-        "about twice as long as here.",
-        "",
-        "## A joint state",
+        "takes about twice as long as here.",
         "",
         *table(stream, "us"),
         "",
-        f"## A trajectory of {POINTS} points",
-        "",
-        "Computed in slices between the samples of the stream.",
+        f"A trajectory of {POINTS} points, computed in slices between the samples of the stream:",
         "",
         *table(long, "ms"),
     ]
-    Path(target).write_text("\n".join(lines) + "\n", encoding="utf-8")
+    write_section("latency", "\n".join(lines), Path(target))
 
 
 if __name__ == "__main__":

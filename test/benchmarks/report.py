@@ -1,19 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""pytest-benchmark's JSON as docs/benchmarks.md: ``python -m test.benchmarks.report IN OUT``."""
+"""pytest-benchmark's JSON in docs/benchmarks.md: ``python -m test.benchmarks.report IN PAGE``."""
 
 import json
 import statistics
 import sys
 from pathlib import Path
 
-TARGETS = """
-Targets: one torque sample at most 2 us, 0.15 us per sample in a batch; one platform response at
-most 30 us, 6 us per sample in a batch; round trip p50 at most 1.10 of the echo's, p99 and processor
-time at most 1.2, and p50 with `events` below the single-threaded echo's; a minute without a lost
-message; 2 s to the first answer.
+from test.support.pages import write_section
 
-The exported C, alone and next to Pinocchio in C++: [export_c.md](export_c.md).
-"""
 BOUNDS = (1.10, 1.2, 1.2)
 """Most that p50, p99 and processor time may be of the echo's."""
 
@@ -22,8 +16,6 @@ def main(source, target):
     data = json.loads(Path(source).read_text())
     cpu = data["machine_info"]["cpu"]
     lines = [
-        "# Benchmarks",
-        "",
         f"Made by `make bench` on {data['datetime'][:10]}: {cpu.get('brand_raw', 'unknown CPU')}, "
         f"{cpu['count']} cores shared with other work, Python "
         f"{data['machine_info']['python_version']}, one thread. Times are medians; they depend on "
@@ -58,7 +50,7 @@ def main(source, target):
             f"{max(seconds):.2f})."
         )
     lines += [design(one) for one in told.get("design", [])]
-    Path(target).write_text("\n".join(lines) + "\n" + TARGETS)
+    write_section("calls", "\n".join(lines), Path(target))
 
 
 def design(one):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What docs/errata.md says of the papers is so, computed from their numbers and equations."""
+"""What docs/validation.md says of the papers is so, computed from their numbers and equations."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from test.validation import test_delta_cu_paper as delta_cu
 from test.validation import test_upr_rpu_paper as upr_rpu
 from test.validation.test_prru_paper import paper, turn
 
-PAGE = "docs/errata.md"
+PAGE = "docs/validation.md"
 
 
 class TestDeltaCu:

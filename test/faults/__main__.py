@@ -17,7 +17,7 @@ from typing import Any
 import pytest
 
 from test.faults.catalogue import TESTS, Row, rows
-from test.faults.page import write_section
+from test.support.pages import FAULTS, write_section
 
 RESULTS = Path("out/faults.json")
 """Of every row, by its number, how many cases ran and what came of them."""
@@ -83,7 +83,7 @@ def main() -> int:
     results |= {str(row.number): result(row, outcomes) for row in asked}
     RESULTS.parent.mkdir(exist_ok=True)
     RESULTS.write_text(json.dumps(results, indent=1) + "\n")
-    write_section("catalogue", section(results))
+    write_section("catalogue", section(results), FAULTS)
     return int(any(how != PASS for _, how in results.values()))
 
 

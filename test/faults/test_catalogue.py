@@ -6,7 +6,7 @@ import re
 import pytest
 
 from test.faults.catalogue import TESTS, names_in, rows
-from test.faults.page import PAGE, write_section
+from test.support.pages import FAULTS, write_section
 
 ROWS = rows()
 
@@ -26,7 +26,7 @@ def test_numbers_are_given_once():
 
 def test_the_page_has_the_rows_of_the_catalogue():
     """Whether each passes say its tests; `make faults` prints it."""
-    text = PAGE.read_text(encoding="utf-8")
+    text = FAULTS.read_text(encoding="utf-8")
     found = re.findall(r"^\| (\d+) \| (.*) \| (.*) \| \d+ \| [^|]+ \|$", text, re.MULTILINE)
     assert found == [(str(row.number), row.fault, row.answer) for row in ROWS]
 

@@ -15,13 +15,13 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from test.faults.page import read_section, write_section
 from test.fuzz.bags import DamagedBags, DamagedSplits, NonsenseBags
 from test.fuzz.commands import EACH, Commands
 from test.fuzz.definitions import Cdr
 from test.fuzz.files import COMPILED, Csv, Metadata, Urdf, Yaml
 from test.fuzz.messages import Messages
 from test.fuzz.tally import Kind, run
+from test.support.pages import FAULTS, read_section, write_section
 
 KINDS: tuple[type[Kind], ...] = (
     Messages, DamagedBags, DamagedSplits, NonsenseBags, Cdr, Metadata, Yaml, Urdf, Csv, Commands,
@@ -101,7 +101,7 @@ def main() -> int:
         nodes = options.out / NODES
         figures = [json.loads(path.read_text()) for path in files if path.exists()]
         found = json.loads(nodes.read_text()) if nodes.exists() else None
-        write_section("fuzz", section(figures, found, read_section("fuzz")))
+        write_section("fuzz", section(figures, found, read_section("fuzz", FAULTS)), FAULTS)
         return 0
     asked = options.only.split(",")
     kinds = [kind for kind in KINDS if any(word in kind.name for word in asked)]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What sweeps cost, written into docs/scale.md: ``python -m test.maps.scale OUT``."""
+"""What sweeps cost, in docs/benchmarks.md: ``python -m test.maps.scale PAGE``."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ import psutil
 from pkm_twin import load
 from pkm_twin.maps.kinds import KINDS
 from pkm_twin.maps.sweep import map_of
+from test.support.pages import write_section
 
 MEASURED = (
     ("strain-energy", "upr_rpu", 10**6, "strain energy (total, nine shares, direction)"),
@@ -77,54 +78,43 @@ def power(value: float) -> str:
     return f"{digits}e{int(exponent)}"
 
 
-def page() -> str:
-    """docs/scale.md."""
-    rates = {(kind, robot): rate(kind, robot, points) for kind, robot, points, _ in MEASURED}
-    first = "\n".join(
-        f"| {what} | {robot} | {power(rates[kind, robot])} |" for kind, robot, _, what in MEASURED
-    )
-    second = []
+def section() -> str:
+    """Rates and runs."""
+    lines = [
+        f"On {datetime.date.today().isoformat()}: {psutil.cpu_count()} cores of a shared machine, "
+        f"Python {platform.python_version()}, llvmlite {llvmlite.__version__}, kernels already "
+        "compiled. The rates count the processor time of the chunks alone.",
+        "",
+        "| map | robot | samples per second and core |",
+        "|---|---|---|",
+    ]
+    for kind, robot, points, what in MEASURED:
+        lines.append(f"| {what} | {robot} | {power(rate(kind, robot, points))} |")
+    rows = []
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "a.nc"
         for points, processes in RUNS:
             seconds, peak = command(points, processes, out)
             who = f"{processes} and the parent" if processes > 1 else "1"
             size = out.stat().st_size / 1e6
-            second.append(
+            rows.append(
                 f"| {power(points)} | {who} | {seconds:.0f} s | {peak / 2**20:.0f} MiB | "
                 f"{size:.0f} MB |"
             )
-        load_1, load_5, _ = psutil.getloadavg()
-    speed = rates["strain-energy", "upr_rpu"]
-    core_seconds = 1e9 / speed
-    gigabytes = size * 1e6 / points
-    sweep = map_of(load("upr_rpu"), KINDS["strain-energy"](), 10**6)
-    chunk = sweep.chunks()[0]
-    # Bytes of a pose are gigabytes of a billion.
-    parts = sum(v.nbytes for v in sweep.evaluate(chunk).values()) / sweep.count(chunk)
-    disk = (2 * parts + gigabytes) / 0.5 / 60
-    template = (Path(__file__).parent / "scale.md").read_text(encoding="utf-8")
-    return template.format(
-        date=datetime.date.today().isoformat(),
-        python=platform.python_version(),
-        llvmlite=llvmlite.__version__,
-        cores=psutil.cpu_count(),
-        load_1=f"{load_1:.1f}",
-        load_5=f"{load_5:.1f}",
-        first=first,
-        second="\n".join(second),
-        speed=power(speed),
-        core_seconds=f"{core_seconds:.0f}",
-        gigabytes=f"{gigabytes:.0f}",
-        parts=f"{parts:.0f}",
-        both=f"{parts + gigabytes:.0f}",
-        two=f"{core_seconds / 2 / 60:.0f}",
-        sixteen=f"{core_seconds / 16:.0f}",
-        disk=f"{disk:.0f}",
-        fast=f"{parts * 8 / 10 / 60:.0f}",
-        slow=f"{parts * 8 / 60:.0f}",
-    )
+    load = psutil.getloadavg()
+    lines += [
+        "",
+        "The whole command `pkm-twin map upr_rpu strain-energy --points N --no-picture`, from "
+        "start to the closed file. Memory is the peak of the proportional set sizes, summed over "
+        f"all processes. The load average was {load[0]:.1f} over the last minute and {load[1]:.1f} "
+        "over the last five, including the program itself.",
+        "",
+        "| poses | processes | time | peak memory | file |",
+        "|---|---|---|---|---|",
+        *rows,
+    ]
+    return "\n".join(lines)
 
 
 if __name__ == "__main__":
-    Path(sys.argv[1]).write_text(page(), encoding="utf-8")
+    write_section("scale", section(), Path(sys.argv[1]))

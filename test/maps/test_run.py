@@ -223,7 +223,7 @@ def test_typed_errors(tmp_path, strain, monkeypatch):
 
 @pytest.mark.long
 def test_memory_is_flat(tmp_path):
-    """docs/scale.md: from a million poses to ten, all processes together."""
+    """docs/benchmarks.md: from a million poses to ten, all processes together."""
     (_, small), (_, large) = (command(points, 2, tmp_path / "a.nc") for points in (10**6, 10**7))
     assert large < 1.2 * small
     assert large < 2e9

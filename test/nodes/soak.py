@@ -16,8 +16,8 @@ from pathlib import Path
 import numpy as np
 
 from pkm_twin import load
-from test.faults.page import PAGE, write_section
 from test.nodes.harness import REPOSITORY, SECOND, Maker, Ros
+from test.support.pages import FAULTS, write_section
 
 MAKE = Maker(Ros())
 RATES = np.array([6.0, 5.0, 4.0])
@@ -356,8 +356,8 @@ def main():
     """Copy the picture of a run into the docs and its figures into the page on faults."""
     folder = Path(sys.argv[1])
     summary = json.loads((folder / "soak.json").read_text())
-    shutil.copy(folder / "soak.png", PAGE.with_name("soak.png"))
-    write_section("soak", section(summary))
+    shutil.copy(folder / "soak.png", FAULTS.with_name("soak.png"))
+    write_section("soak", section(summary), FAULTS)
 
 
 if __name__ == "__main__":

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Numbers that stand in running text of the repository's pages, to be compared with today's."""
+"""The repository's pages: numbers in running text, and parts that programs write."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).resolve().parents[2]
+FAULTS = ROOT / "docs" / "faults.md"
 
 
 def text_of(page: str) -> str:
@@ -32,3 +33,30 @@ def _texts(page: str, pattern: str) -> tuple[str, ...]:
     match = re.search(pattern, text_of(page))
     assert match, f"{page} has no {pattern!r}"
     return match.groups()
+
+
+def read_section(name: str, page: Path) -> str:
+    """What stands between the marks of a part.
+
+    :raises ValueError: the page has no such part.
+    """
+    return _parts(name, page)[1].strip()
+
+
+def write_section(name: str, text: str, page: Path) -> None:
+    """Replace what stands between the marks of a part.
+
+    :raises ValueError: the page has no such part.
+    """
+    before, _, after = _parts(name, page)
+    page.write_text(f"{before}\n{text.strip()}\n{after}", encoding="utf-8")
+
+
+def _parts(name: str, page: Path) -> tuple[str, str, str]:
+    """The page before, between and after a part's marks, which stay outside."""
+    begin, end = (f"<!-- {name}: {what} -->" for what in ("begin", "end"))
+    before, found, rest = page.read_text(encoding="utf-8").partition(begin)
+    text, closed, after = rest.partition(end)
+    if not (found and closed):
+        raise ValueError(f"{page.name} has no part {name!r}")
+    return before + begin, text, end + after

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Tables 2 to 6 of the Delta-CU paper, decoded, within their printing accuracy.
 
-Digits of the source that are wrong: docs/errata.md.
+Digits of the source that are wrong: docs/validation.md.
 Two numbers of the worked example are not in the paper and were inferred by a fit to its tables: the
 home angle 0.22 rad and a platform load of 25 N along z, away from the base. The paper writes
 the rod closure for all three limbs; z points towards the platform, so z and the load turn round.
@@ -24,7 +24,7 @@ VELOCITY = [
     [0, 0, 0],
     [-79.2, 43.2, 92.3],
     [-209, 122, 49.5],
-    [-181, 105, -110.8],  # the source has -10.80, a digit lost (docs/errata.md)
+    [-181, 105, -110.8],  # the source has -10.80, a digit lost (docs/validation.md)
     [-69.7, 37.8, -86.7],
     [0, 0, 0],
 ]  # table 2, mm/s

@@ -15,11 +15,10 @@ from pathlib import Path
 from typing import Any
 
 BRIEF = {
-    "benchmarks", "certificate", "commands", "engine", "faults", "identification", "latency",
-    "parameters", "scale",
+    "benchmarks", "certificate", "commands", "engine", "faults", "identification", "parameters",
 }  # fmt: skip
 """Pages of long tables and lists: a section's first paragraph and its names are indexed."""
-REFERENCE = {"api", "certificate", "commands", "errors", "parameters", "scale"}
+REFERENCE = {"api", "certificate", "commands", "errors", "parameters"}
 """Pages that rank below those that explain."""
 ROLE = re.compile(r":(?:attr|class|data|func|meth|mod):<code>(~?)([\w.]+)</code>")
 """A reference of a docstring, which Markdown does not know."""
