@@ -9,5 +9,5 @@
 :mod:`~pkm_twin.identification.excitation` designs motions that identify.
 :mod:`~pkm_twin.identification.verdict` judges a fit by its residual,
 :mod:`~pkm_twin.identification.plausible` judges a recording before it is fitted,
-:mod:`~pkm_twin.identification.robust` weighs measured poses.
+:mod:`~pkm_twin.identification.noise` has noise and robust weights.
 """

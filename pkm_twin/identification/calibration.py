@@ -48,7 +48,7 @@ from pkm_twin.identification.calibration_state import (
     place_frame,
     start_of,
 )
-from pkm_twin.identification.robust import Weighed
+from pkm_twin.identification.noise import Weighed
 from pkm_twin.identification.transmission import Transmission, numbers
 from pkm_twin.identification.undetermined import undetermined
 from pkm_twin.machine.joint_map import JointMap

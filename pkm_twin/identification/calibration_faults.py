@@ -12,7 +12,7 @@ import numpy as np
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError, one_line
 from pkm_twin.identification.calibration_state import FRAME, TARGET
-from pkm_twin.identification.robust import OUTLIER, Weighed, distances
+from pkm_twin.identification.noise import OUTLIER, Weighed, distances
 
 WRONG: Final = 0.02
 """Part of the machine's size that no fit may leave over: such poses are not its own."""

@@ -20,7 +20,7 @@ from pkm_twin.identification.calibration_state import (
     moved,
     value_of,
 )
-from pkm_twin.identification.robust import Weighed, weighed
+from pkm_twin.identification.noise import Weighed, weighed
 from pkm_twin.identification.transmission import by_map
 from pkm_twin.machine.rotations import skew
 from pkm_twin.robot.robot import Robot
@@ -85,7 +85,7 @@ class Measured(Posed, Protocol):
     def weighed(
         self, parts: list[Array], slopes: list[Array], prior: Array, drives: Array | None = None
     ) -> Any:
-        """Noise and weights, as :class:`pkm_twin.identification.robust.Weighed`.
+        """Noise and weights, as :class:`pkm_twin.identification.noise.Weighed`.
 
         :param drives: derivatives by the drives' errors, (k, sum of a, n).
         """

@@ -16,8 +16,8 @@ from delta_dynamics.rest import beyond_friction, friction_reach, moving_rates
 from delta_dynamics.virtual_work import inverse_dynamics
 from pkm_twin.codegen.arrays import Array, Mask
 from pkm_twin.identification.fit_rows import BLOCK, Recorded, shaken_efforts
-from pkm_twin.identification.fit_signals import NOISE_BAND, SEGMENT, noise_of
 from pkm_twin.identification.judge import LOUD
+from pkm_twin.identification.noise import SEGMENT, huber, noise_of, passed_band, usual_size
 from pkm_twin.identification.plausible import LATEST
 from pkm_twin.identification.samples import Filtering, Track, by_blocks, low_pass, tracks
 from pkm_twin.robot.robot import Robot
@@ -26,8 +26,6 @@ LEAST: Final = 40
 """Samples that a piece needs: fewer than for a fit, as nothing is fitted."""
 TURNS: Final = 5
 """Robust passes for how late the efforts are."""
-HUBER: Final = 1.5
-"""Robust deviations up to which a residual counts with its square."""
 LOCAL: Final = 0.25
 """Time over which a residual is judged by itself, s: a collision is shorter than a recording."""
 MORE: Final = 3.0
@@ -108,7 +106,7 @@ class Compared:
         Before the filter, which spreads a step in time.
         """
         away = np.abs(self.raw)
-        usual = 1.4826 * np.median(away, axis=0)
+        usual = usual_size(self.raw)
         far = away > MORE * limit + 4.0 * np.minimum(usual, limit)
         beyond: Mask = np.asarray(far.any(1), np.bool_)
         # Two in a row: one is noise's.
@@ -185,14 +183,14 @@ def compare(
     long = [one for one in raw if len(one) >= SEGMENT] or [max(raw, key=len)]
     shaken = np.zeros_like(r.q) if rates is not None else shaken_efforts(r, longest, how, efforts)
     density = noise_of(long, shaken, period, how)
-    passed = 1.0 if how.cutoff is None else min(1.0, 2.0 * NOISE_BAND * how.cutoff * period)
     size = np.abs(expected).max(0)
     units = np.array(robot.effort_units)
     greatest = np.array([size[units == unit].max() for unit in units])
     residual = left + late * change
     return Compared(
         time, expected + residual, expected, residual, sharp + late * turn, change,
-        density * np.sqrt(passed / period), np.maximum(size, LIGHT * greatest), late, period,
+        density * np.sqrt(passed_band(how, 1.0 / period) / period),
+        np.maximum(size, LIGHT * greatest), late, period,
         tuple(starts), tuple(pieces), tuple(inside), how,
     )  # fmt: skip
 
@@ -201,9 +199,9 @@ def _late(left: Array, change: Array) -> float:
     """How late the efforts are, s, by residuals and the efforts' change (k, n) each."""
     late, size = 0.0, np.maximum(np.sqrt(np.mean(change**2, 0)), 1e-300)
     for _ in range(TURNS):
-        away = np.abs(left + late * change)
-        usual = np.maximum(1.4826 * np.median(away, axis=0), 1e-12 * size)
-        weight = np.minimum(1.0, HUBER * usual / np.maximum(away, 1e-300)) / usual**2
+        away = left + late * change
+        usual = np.maximum(usual_size(away), 1e-12 * size)
+        weight = huber(np.abs(away) / usual) / usual**2
         total = float(np.sum(weight * change**2))
         if not total > 0.0:
             return 0.0

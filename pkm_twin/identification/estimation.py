@@ -18,11 +18,10 @@ import numpy as np
 
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import PkmTwinError, install
+from pkm_twin.identification.noise import huber
 
 Cones = Sequence[tuple[slice, Array]]
 
-HUBER: Final = 1.5
-"""Robust deviations up to which a residual counts with its square."""
 TURNS: Final = 15
 TOLD: Final = 5.0
 """A direction is the data's where they tell it by this much better than the prior."""
@@ -110,7 +109,7 @@ def estimate(
         new = np.array([_robust(residual[used[:, j], j], floor) for j in range(n)])
         settled = np.abs(scaled @ (z - before) / noise).max(initial=0.0) < 1e-3
         noise = new
-        weights = counts * np.minimum(1.0, HUBER / np.maximum(np.abs(residual) / noise, 1e-12))
+        weights = counts * huber(np.abs(residual) / noise)
         if settled:
             break
     z, values, vectors, kept = told

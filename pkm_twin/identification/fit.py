@@ -23,7 +23,7 @@ from pkm_twin.identification.fit_plausible import recording_fault
 from pkm_twin.identification.fit_rows import Recorded, Rows, next_window, rows_of
 from pkm_twin.identification.fit_solved import held_from, solve
 from pkm_twin.identification.fit_verdict import verdict_of
-from pkm_twin.identification.judge import EXACT
+from pkm_twin.identification.noise import EXACT
 from pkm_twin.identification.samples import Filtering
 from pkm_twin.identification.verdict import Verdict
 from pkm_twin.machine.friction import LAWS, FrictionLaw

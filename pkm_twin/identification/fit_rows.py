@@ -18,10 +18,9 @@ from pkm_twin.identification.file_parameters import FileParameters
 from pkm_twin.identification.fit_signals import (
     Efforts,
     Signals,
-    noise_of,
-    resonances_of,
     signals_of,
 )
+from pkm_twin.identification.noise import noise_of, resonances_of, usual_size
 from pkm_twin.identification.samples import (
     LEAST,
     WINDOWS,
@@ -305,7 +304,7 @@ def _drop_outliers(
     for part in parts:
         told = part.table @ first
         away = np.abs(part.target - told)
-        bound = OUTLIER * 1.4826 * np.median(away, axis=0)
+        bound = OUTLIER * usual_size(part.target - told)
         # Where friction turns over, an effort that is some samples late is no outlier.
         near = scipy.ndimage.maximum_filter1d(
             np.abs(np.diff(told, axis=0, prepend=told[:1])), 7, axis=0

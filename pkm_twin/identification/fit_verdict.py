@@ -20,7 +20,6 @@ from pkm_twin.identification.fit_signals import (
     LATE,
     RESONANCE,
     SPEED,
-    Resonance,
     columns_of,
     suspects_of,
 )
@@ -34,6 +33,7 @@ from pkm_twin.identification.judge import (
     basis_of,
     judge,
 )
+from pkm_twin.identification.noise import Resonance
 from pkm_twin.identification.verdict import Finding, Suspect, Verdict
 from pkm_twin.machine.friction import turning_keys
 from pkm_twin.robot.robot import Robot

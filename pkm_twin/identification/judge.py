@@ -27,6 +27,7 @@ import numpy as np
 
 from pkm_twin.codegen.arrays import Array, Mask
 from pkm_twin.identification.estimation import WIDEN
+from pkm_twin.identification.noise import EXACT
 from pkm_twin.identification.verdict import Answer, Blind, Channel, Finding, Suspect, Verdict
 
 SIGMAS: Final = 4.5
@@ -39,8 +40,6 @@ CHOICES: Final = 3
 """Most suspects that are named in the place of a finding."""
 FINDINGS: Final = 12
 """Most findings that are looked for."""
-EXACT: Final = 1e-3
-"""Noise, as part of the measured rms, below which no recording is judged more strictly."""
 SEEN: Final = 1e-3
 """Part of its norm that a suspect keeps beside the fitted numbers, or it cannot be seen."""
 RANK: Final = 1e-7

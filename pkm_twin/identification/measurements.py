@@ -14,7 +14,7 @@ from pkm_twin.codegen.arrays import Array, Indices
 from pkm_twin.errors import ParameterError, UnknownNameError
 from pkm_twin.identification.calibration_fit import derivatives
 from pkm_twin.identification.calibration_state import State
-from pkm_twin.identification.robust import CLEAR, FINEST
+from pkm_twin.identification.noise import CLEAR, FINEST, huber
 from pkm_twin.robot.robot import Robot
 
 BELIEVED: Final = 4.0
@@ -322,7 +322,7 @@ class Partial:
         weights = [np.ones(len(part)) for part in parts]
         for _ in range(TURNS):
             away = [np.abs(part[:, 0]) / s for part, s in zip(parts, noise, strict=True)]
-            weights = [np.minimum(1.0, CLEAR / np.maximum(one, CLEAR)) for one in away]
+            weights = [huber(one, CLEAR) for one in away]
             left = left_over(slopes, noise, prior)
             for k, one in enumerate(self.readings):
                 good = away[k] < CLEAR

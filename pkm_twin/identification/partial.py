@@ -25,7 +25,7 @@ from pkm_twin.identification.calibration_state import (
     start_of,
 )
 from pkm_twin.identification.measurements import Partial, left_over, spans_of
-from pkm_twin.identification.robust import OUTLIER, Weighed
+from pkm_twin.identification.noise import OUTLIER, Weighed
 from pkm_twin.identification.transmission import Transmission
 from pkm_twin.robot.entries import with_entries
 from pkm_twin.robot.robot import Robot

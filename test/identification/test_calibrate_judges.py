@@ -19,7 +19,7 @@ from pkm_twin.apps.cli import app
 from pkm_twin.errors import PkmTwinError
 from pkm_twin.identification.calibration import calibrate, geometric
 from pkm_twin.identification.calibration_state import Poses
-from pkm_twin.identification.robust import weighed
+from pkm_twin.identification.noise import weighed
 from pkm_twin.identification.undetermined import LINES, undetermined
 from pkm_twin.robot.entries import data_of, entries, with_entries
 from test.support.robots import load, random_joints
