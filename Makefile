@@ -109,7 +109,7 @@ pages: $(VENV)/test.stamp
 	$(BIN)/python -m tools.pages.errors docs/errors.md
 	$(BIN)/python -m tools.pages.nodes docs/nodes.md docs/security/policy.xml
 	$(BIN)/python -m tools.pages.engine docs/engine.md
-	$(BIN)/python -m tools.pages.trend docs/trend.md
+	$(BIN)/python -m tools.pages.trend docs/recordings.md
 	$(BIN)/python -m tools.pages.architecture docs/architecture.png
 	$(BIN)/python -m tools.pages.robots docs/gallery
 	$(BIN)/python -m tools.pages.view docs/gallery

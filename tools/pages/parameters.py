@@ -57,7 +57,7 @@ other bodies are shared."""
 
 FRICTION = """Friction of the actuated joints, opposite to the rate: viscous friction is
 proportional to the rate, Coulomb friction depends on its sign. `offset` is a constant effort.
-The other keys belong to further friction laws, see [friction.md](friction.md)."""
+The other keys belong to further friction laws, see [friction](fit.md#friction-of-drives)."""
 LIMITS = "Nodes and commands reject values beyond these limits, or warn. The default is no limit."
 UNCERTAINTY = """The uncertainty of a number, by its dotted path in this file (`inertia.arm_mass`),
 or of all numbers below a name together (`joints_compliance`). Each entry is an independent cause;

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 BRIEF = {
-    "benchmarks", "certificate", "commands", "engine", "faults", "identification", "parameters",
+    "benchmarks", "certificate", "commands", "engine", "faults", "parameters",
 }  # fmt: skip
 """Pages of long tables and lists: a section's first paragraph and its names are indexed."""
 REFERENCE = {"api", "certificate", "commands", "errors", "parameters"}

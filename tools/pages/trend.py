@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Output and picture of docs/trend.md: ``python -m tools.pages.trend docs/trend.md``."""
+"""A trend in docs/recordings.md and its picture: ``python -m tools.pages.trend PAGE``."""
 
 from __future__ import annotations
 
@@ -37,10 +37,12 @@ def rewritten(text, picture):
         record(history)
         lines = printed(history, picture)
     block = "\n".join(["```text", *lines[:SHOWN], "...", lines[-1], "```"])
-    return re.sub(r"```text\n.*?```", lambda _: block, text, count=1, flags=re.DOTALL)
+    before, trend, after = text.partition("## Find a trend over nights")
+    after = re.sub(r"```text\n.*?```", lambda _: block, after, count=1, flags=re.DOTALL)
+    return before + trend + after
 
 
 if __name__ == "__main__":
     page = Path(sys.argv[1])
-    text = rewritten(page.read_text(encoding="utf-8"), page.with_suffix(".png"))
+    text = rewritten(page.read_text(encoding="utf-8"), page.with_name("trend.png"))
     page.write_text(text, encoding="utf-8")
