@@ -81,7 +81,7 @@ def expected(robot, judge, q):
     exact = [judge.drives().columns]
     wrong = [judge.rod_rows(rod).columns / rod.length for rod in judge.machine.rods]
     for joint in judge.machine.joints:
-        rows = stacked(judge._joint_rows(joint), judge.size).columns
+        rows = stacked(judge.joint_rows(joint), judge.size).columns
         if joint.name not in placed.tree.cut:
             exact.append(rows)
             continue
@@ -95,7 +95,7 @@ def expected(robot, judge, q):
         a = np.vstack(wrong) @ free
         response = np.linalg.norm(bodies @ free @ np.linalg.pinv(a))
         held = 0.5 * a.shape[1] / np.sqrt(len(a)) / response
-    tangent = judge._tangent()
+    tangent = judge.tangent()
     k = list(graph.bodies).index(graph.platform)
     inverse = np.linalg.pinv(bodies[6 * k : 6 * k + 6] @ tangent)
     farthest = max(

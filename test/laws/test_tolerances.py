@@ -388,7 +388,7 @@ def test_parallelograms_are_their_two_rods():
 
 
 def test_a_zero_moves_the_platform_as_the_drive_does():
-    """Of joint types that the judge does not know, screws over several turns too."""
+    """Of screws over several turns too, and of a table."""
     for robot, turns in ((slide(0.008), 7.0), (driven(-0.005, [0.0, 0.1, 0.0]), 3.0), (puck(1), 0)):
         q = robot.graph.home + 0.05 + 2.0 * np.pi * turns
         columns = robot.platform_jacobian(q)

@@ -1,16 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The judges beside each other: two engines that share a description and nothing else."""
+"""The judges beside each other: engines that share a description and what joints hold."""
 
 import importlib
 
 import numpy as np
 import pytest
 
-from pkm_twin.apps.certificate.description import AXES, expand, read
+from pkm_twin.apps.certificate.description import expand, read
 from pkm_twin.apps.certificate.maximal import Maximal
 from pkm_twin.apps.certificate.states import random_states
-from pkm_twin.apps.certify import ENGINES, effort_differences, relative
+from pkm_twin.apps.certify import ENGINES, certificate_of, effort_differences, relative
+from pkm_twin.machine.joints import TYPES
 from test.machine.random_machines import FREE, NAMES, plain, variant
+from test.machine.test_helical import driven, slide
+from test.machine.test_planar import puck
 from test.support.robots import partly_long
 
 BOUNDS = {"pinocchio": 1e-11, "mujoco": 1e-8}
@@ -84,9 +87,16 @@ def test_jacobian_is_the_places_slope(name):
         assert np.abs(twist - jacobian[:, k]).max() < 1e-7 * max(1.0, np.abs(jacobian).max())
 
 
+def test_screws_and_tables_are_certified_by_all():
+    robots = slide(0.02), slide(-0.3), driven(0.5, [0.2, 0.05, 0.0]), puck(table=True)
+    for robot in robots:
+        result = certificate_of(robot, states=2)
+        assert not result.missing and result.good, [i for i in result.items if not i.good]
+
+
 def test_every_joint_type_is_there_and_every_machine_varies():
-    kinds = {joint.kind for name in NAMES for joint in read(plain(name)).joints}
-    assert kinds == set(AXES)
+    kinds = {joint.type.name for name in NAMES for joint in read(plain(name)).joints}
+    assert kinds | {"helical", "planar"} == set(TYPES)
     assert set(FREE) == set(NAMES)
 
 

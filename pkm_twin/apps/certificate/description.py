@@ -1,5 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A machine's plain description, limbs written out, every vector in base axes at home."""
+"""A machine's plain description, limbs written out, every vector in base axes at home.
+
+Of the twin it takes what a joint type is called, lets move and holds; what that means in equations
+each judge says for itself.
+"""
 
 from __future__ import annotations
 
@@ -11,20 +15,12 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from pkm_twin.machine.joints import TYPES, JointType
+
 Array = NDArray[np.float64]
 Description = Mapping[str, Any]
 
 BASE: Final = "base"
-AXES: Final = {
-    "revolute": 1,
-    "prismatic": 1,
-    "cylindrical": 1,
-    "universal": 2,
-    "spherical": 0,
-    "fixed": 0,
-    "translation": 0,
-}
-"""Joint types and how many axes each names."""
 STANDARD_GRAVITY: Final = (0.0, 0.0, -9.81)
 """Gravity where the description names none, m/s2."""
 POSE_NAMES: Final = ("x", "y", "z", "roll", "pitch", "yaw")
@@ -51,7 +47,7 @@ class Joint:
     """A joint at home; its value is ``home`` there."""
 
     name: str
-    kind: str
+    type: type[JointType]
     inner: str
     outer: str
     at: Array
@@ -68,6 +64,25 @@ class Joint:
     rotor_inertia: float
     friction: Mapping[str, Any]
     """As the file has it."""
+    pitch: float
+    """Of a screw, m a rad."""
+
+    @property
+    def slides(self) -> bool:
+        """Whether its value is a length."""
+        return self.type.steps == ("slide",)
+
+    @property
+    def steps(self) -> list[tuple[bool, Array]]:
+        """Single freedoms from the inner body to the outer: whether it turns, and the axis.
+
+        A screw is a slide and a turn that a further equation ties together.
+        """
+        found = []
+        for freedom in self.type.freedoms(self.axes, self.pitch):
+            axis = np.asarray(freedom.axis, dtype=float)
+            found += [(False, axis)] * bool(freedom.slide) + [(True, axis)] * freedom.turns
+        return found
 
 
 @dataclass(frozen=True)
@@ -99,8 +114,6 @@ class Machine:
     bodies: Mapping[str, Body]
     joints: tuple[Joint, ...]
     rods: tuple[Rod, ...]
-    payload: Body | None
-    """At home, base axes; rides on the platform."""
     actuated: tuple[Joint, ...] = field(init=False)
     """In the order of appearance."""
 
@@ -214,14 +227,11 @@ def read(description: Description) -> Machine:
         raise UnfitError(f"no body is named {platform!r}, the platform")
     origin = vector(data.get("origin", bodies[platform].com))
     load = data.get("payload") or {}
-    payload = None
     if load.get("mass"):
         # The payload's centre is told from the reference point.
-        payload = Body(
-            float(load["mass"]),
-            origin + vector(load.get("com", (0, 0, 0))),
-            tensor(load.get("inertia", (0, 0, 0))),
-        )
+        at = origin + vector(load.get("com", (0, 0, 0)))
+        payload = Body(float(load["mass"]), at, tensor(load.get("inertia", (0, 0, 0))))
+        bodies[platform] = joined(bodies[platform], payload)
     return Machine(
         vector(data.get("gravity", STANDARD_GRAVITY)),
         platform,
@@ -231,8 +241,18 @@ def read(description: Description) -> Machine:
         bodies,
         joints,
         rods,
-        payload,
     )
+
+
+def joined(one: Body, other: Body) -> Body:
+    """Two rigid bodies as one; the other has mass."""
+    mass = one.mass + other.mass
+    com = (one.mass * one.com + other.mass * other.com) / mass
+    inertia = np.zeros((3, 3))
+    for body in (one, other):
+        arm = body.com - com
+        inertia += body.inertia + body.mass * (arm @ arm * np.eye(3) - np.outer(arm, arm))
+    return Body(mass, com, inertia)
 
 
 def _body(entry: Mapping[str, Any]) -> Body:
@@ -253,18 +273,19 @@ def _ends(name: str, entry: Mapping[str, Any], known: set[str]) -> tuple[str, st
 
 def _joint(name: str, entry: Mapping[str, Any], known: set[str]) -> Joint:
     kind = entry["type"]
-    if kind not in AXES:
+    if kind not in TYPES:
         raise UnfitError(f"joints.{name}: no joint type {kind!r}")
+    count = TYPES[kind].count
     inner, outer = _ends(f"joints.{name}", entry, known)
     axes: Sequence[Any] = entry.get("axes") or ([entry["axis"]] if "axis" in entry else [])
-    if len(axes) != AXES[kind]:
-        raise UnfitError(f"joints.{name}: {len(axes)} axes, a {kind} joint has {AXES[kind]}")
+    if len(axes) != count:
+        raise UnfitError(f"joints.{name}: {len(axes)} axes, a {kind} joint has {count}")
     units = [vector(axis) / np.linalg.norm(vector(axis)) for axis in axes]
     friction, limits = entry.get("friction") or {}, entry.get("limits") or {}
     low, high = limits.get("position", (-math.inf, math.inf))
     return Joint(
         name,
-        kind,
+        TYPES[kind],
         inner,
         outer,
         vector(entry.get("at", (0, 0, 0))),
@@ -277,6 +298,7 @@ def _joint(name: str, entry: Mapping[str, Any], known: set[str]) -> Joint:
         float(friction.get("offset", 0.0)),
         _rotor(entry),
         friction,
+        float(entry.get("lead", 0.0)) / (2.0 * math.pi),
     )
 
 

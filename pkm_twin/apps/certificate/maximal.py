@@ -1,14 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Inverse dynamics in maximal coordinates: six for each body, every joint its rows.
 
-All bodies are free; a joint is equations between two of them, see ``rows``:
-
-    A V = 0,  B V = q',   A V' = -a,  B V' = q'' - b,   T = [A; B]^+ [0; 1]
-    tau = T' (M V' + gyroscopic - weight - wrench) + friction + rotors
-
-by least squares over all rows, redundant ones too. Positions come from home by continuation along
-the straight line in joint space: a step of second order, then Newton's method on all rows, with
-the step's length held so that Newton has little to do. No tree, no spanning, no symbolic algebra.
+All bodies are free; every joint is equations between two of them, see ``rows``. Positions come
+from home by continuation along the straight line in joint space: a step of second order, then
+Newton's method on all rows, with the step's length held so that Newton has little to do. No tree,
+no spanning, no symbolic algebra.
 """
 
 from __future__ import annotations
@@ -20,19 +16,15 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from pkm_twin.apps.certificate.description import (
-    BASE,
     POSE_NAMES,
     Array,
-    Body,
     Description,
-    Joint,
     UnfitError,
     angles,
     cross,
     read,
-    with_laws,
 )
-from pkm_twin.apps.certificate.rows import Jet, Moving
+from pkm_twin.apps.certificate.rows import SINGULAR, Frame, Moving, skewed
 
 FIRST_STEP: Final = 1.0 / 16.0
 """Part of the way home to goal that the first step goes."""
@@ -41,8 +33,6 @@ FAR: Final = 0.02
 """Longest first correction of a good step, relative to the motion's own size."""
 KEPT: Final = 64
 """Assemblies that are kept: the way from home takes far longer than what is asked for there."""
-SINGULAR: Final = 1e-9
-"""Least singular value over the greatest: below it the rows do not determine the motion."""
 
 
 @dataclass(frozen=True)
@@ -87,11 +77,6 @@ def rotation_of(turn: Array) -> Array:
     return result
 
 
-def skewed(v: Array) -> Array:
-    """The matrix of v x, shape (3, 3)."""
-    return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
-
-
 class Maximal(Moving):
     """A machine in maximal coordinates.
 
@@ -105,6 +90,7 @@ class Maximal(Moving):
         self.names = list(self.machine.bodies)
         self.size = 6 * len(self.names)
         self._coms = np.array([body.com for body in self.machine.bodies.values()])
+        self._columns = np.split(np.eye(self.size), len(self.names))
         self._start = State(
             np.tile(np.eye(3), (len(self.names), 1, 1)),
             self._coms.copy(),
@@ -114,42 +100,13 @@ class Maximal(Moving):
         self._assembled: dict[bytes, State] = {}
         self.home: Final = self._analyse()
 
-    # Motion of points and directions
-
-    def point(self, body: str, at: Array) -> Jet:
-        """A point fixed in a body, by its place at home (m)."""
-        if body == BASE:
-            return self.still(at)
-        k = self.names.index(body)
-        state = self._state
-        arm = state.rotation[k] @ (at - self._coms[k])
-        columns = np.zeros((3, self.size))
-        columns[:, 6 * k : 6 * k + 3] = np.eye(3)
-        columns[:, 6 * k + 3 : 6 * k + 6] = -skewed(arm)
-        v, w = state.velocity[k, :3], state.velocity[k, 3:]
-        swing = cross(w, arm)
-        return Jet(state.com[k] + arm, columns, v + swing, cross(w, swing))
-
-    def direction(self, body: str, axis: Array) -> Jet:
-        """A direction fixed in a body, by its components at home."""
-        if body == BASE:
-            return self.still(axis)
-        k = self.names.index(body)
-        value = self._state.rotation[k] @ axis
-        columns = np.zeros((3, self.size))
-        columns[:, 6 * k + 3 : 6 * k + 6] = -skewed(value)
-        w = self._state.velocity[k, 3:]
-        swing = cross(w, value)
-        return Jet(value, columns, swing, cross(w, swing))
-
-    def spin(self, body: str) -> Jet:
-        """A body's angular velocity; as a vector it is nothing, its value is zero."""
-        columns = np.zeros((3, self.size))
-        if body == BASE:
-            return self.still(np.zeros(3))
-        k = self.names.index(body)
-        columns[:, 6 * k + 3 : 6 * k + 6] = np.eye(3)
-        return Jet(np.zeros(3), columns, self._state.velocity[k, 3:], np.zeros(3))
+    def frame(self, body: str) -> Frame:
+        """A body's frame in its centre of mass."""
+        k, state = self.names.index(body), self._state
+        columns = self._columns[k]
+        return Frame(
+            self._coms[k], state.com[k], state.rotation[k], columns, state.velocity[k], np.zeros(6)
+        )
 
     def _analyse(self) -> Home:
         closures = self.closures()
@@ -183,13 +140,13 @@ class Maximal(Moving):
         while gone < 1.0:
             step = min(step, 1.0 - gone)
             self._state = state
-            tangent = self._tangent()
+            tangent = self.tangent()
             folds.append(self._fold(tangent))
             state = replace(state, velocity=(tangent @ way).reshape(-1, 6))
             self._state = state
-            change = self._changes_of(np.zeros(len(way)))
+            change = self.solve(-self.closures().bias, -self.drives().bias)
             size = float(np.abs(state.velocity).max())
-            guess = self._moved(state, (step * state.velocity + step**2 / 2 * change).ravel())
+            guess = self._moved(state, step * state.velocity.ravel() + step**2 / 2 * change)
             goal = 1.0 if step >= 1.0 - gone else gone + step
             trial, condition = self._close(guess, goal * way, FAR * max(size * step, 1e-9))
             if trial is None:
@@ -200,7 +157,7 @@ class Maximal(Moving):
             state, gone, step = trial, goal, 1.5 * step
             least = min(least, condition / self.home.condition)
         self._state = state
-        folds.append(self._fold(self._tangent()))
+        folds.append(self._fold(self.tangent()))
         pose = min(fold / folds[0] for fold in folds) if folds[0] else 0.0
         return replace(state, velocity=np.zeros_like(state.velocity), least=least, pose=pose)
 
@@ -210,7 +167,7 @@ class Maximal(Moving):
         if len(machine.pose) != len(machine.actuated):
             return 1.0
         twist = self.twist_columns() @ tangent
-        _, rotation = self._place()
+        _, rotation = self._placed()
         _, pitch, yaw = angles(rotation)
         c, s = math.cos(yaw), math.sin(yaw)
         # Angular velocity by the rates of roll, pitch and yaw.
@@ -250,86 +207,16 @@ class Maximal(Moving):
                 break
         return (state if last < 1e-13 else None), condition
 
-    # Rates
+    # Rates and forces
 
-    def _solve(self, closed: Array, driven: Array) -> Array:
-        columns = np.vstack([self.closures().columns, self.drives().columns])
-        result: Array = np.linalg.lstsq(columns, np.concatenate([closed, driven]), rcond=SINGULAR)[
-            0
-        ]
-        return result
-
-    def _rates_of(self, qd: Array) -> Array:
-        none = np.zeros(self.home.rows)
-        return self._solve(none, qd).reshape(-1, 6)
-
-    def _changes_of(self, qdd: Array) -> Array:
-        closures, drives = self.closures(), self.drives()
-        return self._solve(-closures.bias, qdd - drives.bias).reshape(-1, 6)
-
-    # What is asked for
-
-    def platform(self, q: Array) -> tuple[Array, Array]:
-        """Position of the reference point, shape (3,), m, and rotation from home, (3, 3)."""
-        self.assemble(q)
-        return self._place()
-
-    def _place(self) -> tuple[Array, Array]:
-        machine = self.machine
-        rotation = self._state.rotation[self.names.index(machine.platform)]
-        return self.point(machine.platform, machine.origin).value, rotation
+    def move(self, rates: Array) -> None:
+        """Let the bodies have velocities, shape (6 bodies,)."""
+        self._state = replace(self._state, velocity=rates.reshape(-1, 6))
 
     def pose(self, q: Array) -> Array:
         """Pose coordinates, shape (m,), m and rad."""
         position, rotation = self.platform(q)
         return self.machine.of(rotation, position)
-
-    def jacobian(self, q: Array) -> Array:
-        """The platform's twist at its reference point per joint rate, shape (6, n)."""
-        self.assemble(q)
-        return self.twist_columns() @ self._tangent()
-
-    def _tangent(self) -> Array:
-        n = len(self.machine.actuated)
-        return self._solve(np.zeros((self.home.rows, n)), np.eye(n))
-
-    def inverse_dynamics(
-        self, q: Array, qd: Array, qdd: Array, wrench: Array | None = None
-    ) -> Array:
-        """Efforts of the actuated joints, shape (n,), N m or N.
-
-        :param q: positions, shape (n,), rad or m; ``qd``, ``qdd`` their derivatives.
-        :param wrench: force (N) and moment (N m) of the surroundings on the platform, shape (6,).
-        """
-        state = self.assemble(q)
-        qd, qdd = np.asarray(qd, dtype=float), np.asarray(qdd, dtype=float)
-        self._state = state = replace(state, velocity=self._rates_of(qd))
-        change = self._changes_of(qdd)
-        tangent = self._tangent()
-        force = self._mass() @ change.ravel() + self._bias()
-        if wrench is not None:
-            force -= self.twist_columns().T @ np.asarray(wrench, dtype=float)
-        for joint in self.machine.joints:
-            if joint.actuated:
-                continue
-            if joint.viscous or joint.coulomb:
-                columns = self.rates(joint).columns
-                force += columns.T @ drag(joint, columns @ state.velocity.ravel())
-            if joint.rotor_inertia:
-                row = self.rates(joint)
-                own = row.columns @ change.ravel() + row.bias
-                force += joint.rotor_inertia * row.columns.T @ own
-        tau: Array = tangent.T @ force
-        for k, joint in enumerate(self.machine.actuated):
-            tau[k] += joint.rotor_inertia * qdd[k] + drag(joint, qd[k : k + 1])[0]
-        return with_laws(self.machine.actuated, q, qd, tau)
-
-    def mass_matrix(self, q: Array) -> Array:
-        """Inertia felt at the actuated joints, shape (n, n), kg m2, kg or kg m."""
-        self.assemble(q)
-        tangent = self._tangent()
-        result: Array = tangent.T @ self._mass() @ tangent + self.rotors(tangent)
-        return result
 
     def energy(self, q: Array, qd: Array) -> tuple[float, float]:
         """Kinetic and potential energy, J; the potential one is zero at base height."""
@@ -337,7 +224,7 @@ class Maximal(Moving):
         kinetic = float(qd @ self.mass_matrix(q) @ qd / 2)
         weights = [
             body.mass * self.point(name, body.com).value @ self.machine.gravity
-            for name, body in self._solids()
+            for name, body in self.machine.bodies.items()
         ]
         for rod in self.machine.rods:
             ends = (
@@ -346,45 +233,20 @@ class Maximal(Moving):
             weights.append(rod.mass * ends @ self.machine.gravity / 2)
         return kinetic, -float(sum(weights))
 
-    def _solids(self) -> list[tuple[str, Body]]:
-        """All that has mass, with the body that it moves with."""
-        solids = list(self.machine.bodies.items())
-        if self.machine.payload is not None:
-            solids.append((self.machine.platform, self.machine.payload))
-        return solids
-
-    def _mass(self) -> Array:
-        total = np.zeros((self.size, self.size))
-        for name, body in self._solids():
-            point, spin = self.point(name, body.com), self.spin(name).columns
-            rotation = self._state.rotation[self.names.index(name)]
-            total += body.mass * point.columns.T @ point.columns
-            total += spin.T @ (rotation @ body.inertia @ rotation.T) @ spin
-        for rod in self.machine.rods:
-            a = self.point(rod.inner, rod.ends[0]).columns
-            b = self.point(rod.outer, rod.ends[1]).columns
-            total += rod.mass / 6 * (2 * a.T @ a + a.T @ b + b.T @ a + 2 * b.T @ b)
-        return total
-
-    def _bias(self) -> Array:
-        """Forces of the rates and the weight, shape (6 bodies,)."""
+    def forces(self, change: Array) -> Array:
+        """Of inertia, gyroscopic ones and the weight's, shape (6 bodies,)."""
         gravity = self.machine.gravity
         total = np.zeros(self.size)
-        for name, body in self._solids():
+        for name, body in self.machine.bodies.items():
             point, spin = self.point(name, body.com), self.spin(name)
             rotation = self._state.rotation[self.names.index(name)]
-            total += body.mass * point.columns.T @ (point.bias - gravity)
-            turning = rotation @ body.inertia @ rotation.T @ spin.rate
-            total += spin.columns.T @ cross(spin.rate, turning)
+            inertia = rotation @ body.inertia @ rotation.T
+            pull = body.mass * (point.columns @ change + point.bias - gravity)
+            turning = inertia @ (spin.columns @ change) + cross(spin.rate, inertia @ spin.rate)
+            total += point.columns.T @ pull + spin.columns.T @ turning
         for rod in self.machine.rods:
             a, b = self.point(rod.inner, rod.ends[0]), self.point(rod.outer, rod.ends[1])
-            one, other = a.bias - gravity, b.bias - gravity
+            one, other = (end.columns @ change + end.bias - gravity for end in (a, b))
             total += rod.mass / 6 * a.columns.T @ (2 * one + other)
             total += rod.mass / 6 * b.columns.T @ (one + 2 * other)
         return total
-
-
-def drag(joint: Joint, rates: Array) -> Array:
-    """Friction's share of the effort at these rates, one a rate, N m or N."""
-    result: Array = joint.viscous * rates + joint.coulomb * np.sign(rates) + joint.offset
-    return result

@@ -40,7 +40,7 @@ def ranges(judge: Maximal) -> Array:
     machine, size = judge.machine, extent(judge)
     result = []
     for joint in machine.actuated:
-        reach = NARROW if joint.kind == "revolute" else NARROW * size / 2
+        reach = NARROW * size / 2 if joint.slides else NARROW
         low, high = joint.position
         low = low if np.isfinite(low) else joint.home - reach
         high = high if np.isfinite(high) else joint.home + reach
