@@ -3,11 +3,18 @@
 
 from __future__ import annotations
 
+import importlib
+import io
+import os
 import struct
 import zlib
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import IO
+from enum import IntEnum
+from functools import cache
+from itertools import chain
+from typing import IO, Any, NamedTuple
 
 MAX_RECORD_BYTES = 256 * 1024**2
 """Largest record that is loaded; attachments and unknown records are passed through in blocks."""
@@ -19,25 +26,46 @@ FREE_TOTAL_BYTES = 128 * 1024**2
 """Every file may unpack to so much."""
 RECORD_COST = 64
 """Bytes that a record in a chunk counts for beside its own: the time that it takes."""
+MAX_CHUNK_BYTES = 64 * 1024**2
+"""Largest unpacked chunk."""
+MAX_RATIO = 1000
+"""Largest ratio of unpacked to packed size, for chunks that unpack to more than FREE_BYTES."""
+FREE_BYTES = 8 * 1024**2
+"""A chunk up to this size may have any ratio: a black image packs ten thousand to one."""
+ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 MAGIC = b"\x89MCAP0\r\n"
 _BLOCK_BYTES = 1024**2
 METADATA_CRC = "crc32"
 
-HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, CHUNK_INDEX = range(1, 9)
-ATTACHMENT, ATTACHMENT_INDEX, STATISTICS, METADATA, METADATA_INDEX = range(9, 14)
-SUMMARY_OFFSET, DATA_END = 14, 15
-FIRST_UNKNOWN = 16
-_NAMES = (
-    "zero", "header", "footer", "schema", "channel", "message", "chunk", "message index",
-    "chunk index", "attachment", "attachment index", "statistics", "metadata", "metadata index",
-    "summary offset", "data end",
-)  # fmt: skip
 
+class Op(IntEnum):
+    """The kinds of records."""
+
+    HEADER = 1
+    FOOTER = 2
+    SCHEMA = 3
+    CHANNEL = 4
+    MESSAGE = 5
+    CHUNK = 6
+    MESSAGE_INDEX = 7
+    CHUNK_INDEX = 8
+    ATTACHMENT = 9
+    ATTACHMENT_INDEX = 10
+    STATISTICS = 11
+    METADATA = 12
+    METADATA_INDEX = 13
+    SUMMARY_OFFSET = 14
+    DATA_END = 15
+
+
+FIRST_UNKNOWN = 16
 FRAME = struct.Struct("<BQ")
 MESSAGE_HEAD = struct.Struct("<HIQQ")
 INDEX_ENTRY = struct.Struct("<QQ")
 FOOTER_BODY = struct.Struct("<QQI")
 CRC = struct.Struct("<I")
+CHUNK_HEAD = struct.Struct("<QQQI")
+STATISTICS_HEAD = struct.Struct("<QHIIIIQQ")
 
 TOTAL_CAP = "total_cap"
 """Reason of a file that is refused whole for what it would cost."""
@@ -56,6 +84,21 @@ class FormatError(Exception):
         self.text = text
         self.offset = offset
         self.reason = reason
+
+
+@dataclass(slots=True)
+class Span:
+    """How many messages, and from when to when by their log times."""
+
+    count: int = 0
+    start: int = 0
+    end: int = 0
+
+    def add(self, log_time: int) -> None:
+        """Count a message."""
+        self.start = min(self.start, log_time) if self.count else log_time
+        self.end = max(self.end, log_time) if self.count else log_time
+        self.count += 1
 
 
 class Budget:
@@ -84,16 +127,15 @@ class Budget:
 class RecordReader:
     """A file read forward, with its position and the CRC of all that was read."""
 
-    def __init__(self, file: IO[bytes], size: int, budget: Budget | None = None) -> None:
-        self._file = file
-        self.size = size
-        self.budget = budget or Budget(size)
+    def __init__(self, file: IO[bytes], budget: Budget | None = None) -> None:
+        self._descriptor = file.fileno()
+        self.size = os.fstat(self._descriptor).st_size
+        self.budget = budget or Budget(self.size)
         self.position = 0
         self.crc = 0
 
     def seek(self, position: int) -> None:
         """Go to a byte; the CRC is then no longer that of the file from its start."""
-        self._file.seek(position)
         self.position = position
 
     def read(self, count: int, what: str) -> bytes:
@@ -106,7 +148,8 @@ class RecordReader:
                 "truncated",
             )
         self.budget.spend(count, self.position)
-        data = self._file.read(count)
+        # Others may read the same open file, each at a position of its own.
+        data = os.pread(self._descriptor, count, self.position)
         if len(data) != count:
             raise FormatError("the file shrank while it was read", self.position, "truncated")
         self.position += count
@@ -138,19 +181,21 @@ class RecordReader:
             )
         return self.read(length, f"{opcode_name(opcode)} record")
 
-    def skip(self, length: int) -> int:
-        """Pass over ``length`` bytes in blocks; return their CRC."""
-        crc = 0
+    def skip(self, length: int, what: str, crc: int = 0) -> int:
+        """Pass over ``length`` bytes in blocks; return the CRC continued over them."""
         while length:
-            block = self.read(min(length, _BLOCK_BYTES), "record")
+            block = self.read(min(length, _BLOCK_BYTES), what)
             crc = zlib.crc32(block, crc)
             length -= len(block)
         return crc
 
 
+@cache
 def opcode_name(opcode: int) -> str:
     """Return the name of a kind of record, for error texts."""
-    return _NAMES[opcode] if opcode < FIRST_UNKNOWN else f"unknown (0x{opcode:02x})"
+    if opcode >= FIRST_UNKNOWN:
+        return f"unknown (0x{opcode:02x})"
+    return Op(opcode).name.lower().replace("_", " ")
 
 
 def utf8(raw: bytes, what: str, offset: int | None) -> str:
@@ -249,14 +294,13 @@ def iterate_records(
         yield opcode, start, position
 
 
-def message_head(data: bytes, start: int, end: int, offset: int) -> tuple[int, int, int, int]:
-    """Return channel, sequence, log time and publish time of the message record."""
-    if end - start < MESSAGE_HEAD.size:
-        raise FormatError(
-            f"a message record has {end - start} bytes; at least {MESSAGE_HEAD.size}", offset
-        )
-    number, sequence, log_time, publish_time = MESSAGE_HEAD.unpack_from(data, start)
-    return number, sequence, log_time, publish_time
+class Head(NamedTuple):
+    """The fields of a message record; times in ns."""
+
+    channel: int
+    sequence: int
+    log_time: int
+    publish_time: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -285,12 +329,34 @@ class Records:
         self.schemas: dict[int, Schema] = {}
         self.channels: dict[int, Channel] = {}
         self.types: dict[int, str] = {}
+        self.passed_over: Counter[int] = Counter()
+
+    def messages(
+        self, data: bytes, offset: int, budget: Budget | None = None
+    ) -> Iterator[tuple[Head, int, int]]:
+        """Walk the records in a chunk's data: yield head, start and end of each message.
+
+        Schemas and channels are taken in; other records are counted in ``passed_over``.
+        """
+        for opcode, start, end in iterate_records(data, offset, budget):
+            if opcode == Op.MESSAGE:
+                if end - start < MESSAGE_HEAD.size:
+                    text = f"a message record has {end - start} bytes"
+                    raise FormatError(f"{text}; at least {MESSAGE_HEAD.size}", offset)
+                head = Head(*MESSAGE_HEAD.unpack_from(data, start))
+                if head.channel not in self.channels:
+                    raise FormatError(f"a message has the unknown channel {head.channel}", offset)
+                yield head, start, end
+            elif opcode in (Op.SCHEMA, Op.CHANNEL):
+                self.add(opcode, data[start:end], offset)
+            else:
+                self.passed_over[opcode] += 1
 
     def add(self, opcode: int, body: bytes, offset: int) -> None:
         """Take in a schema or channel record."""
         fields = Fields(body, opcode_name(opcode), offset)
         number = fields.number("H")
-        if opcode == SCHEMA:
+        if opcode == Op.SCHEMA:
             self._add_schema(number, fields, offset)
         else:
             self._add_channel(number, fields, offset)
@@ -329,9 +395,13 @@ def metadata(body: bytes, offset: int) -> tuple[str, dict[str, str], bool]:
 
 def metadata_crc(name: str, entries: Mapping[str, str]) -> str:
     """CRC over a metadata record; MCAP has none there, and recovery needs one."""
-    texts = [name, *(text for item in sorted(entries.items()) for text in item)]
-    packed = b"".join(struct.pack("<I", len(text.encode())) + text.encode() for text in texts)
-    return f"{zlib.crc32(packed):08x}"
+    return f"{zlib.crc32(packed_texts(name, *chain(*sorted(entries.items())))):08x}"
+
+
+def packed_texts(*texts: str | bytes) -> bytes:
+    """Return length-prefixed texts, as records have them."""
+    raw = [text.encode() if isinstance(text, str) else text for text in texts]
+    return b"".join(struct.pack("<I", len(text)) + text for text in raw)
 
 
 def read_magic(reader: RecordReader) -> None:
@@ -356,8 +426,8 @@ def read_magic(reader: RecordReader) -> None:
         raise FormatError("the file contains only the MCAP signature", 0, "truncated")
 
 
-def read_attachment(reader: RecordReader, at: int, length: int) -> tuple[bytes, tuple[object, ...]]:
-    """Pass over an attachment in blocks; return its head and what its index must say."""
+def read_attachment(reader: RecordReader, at: int, length: int) -> tuple[object, ...]:
+    """Pass over an attachment in blocks; return what its index must say."""
     end = reader.position + length
     if length < 16 + 4 + 4 + 8 + CRC.size:
         raise FormatError(f"the attachment record has {length} bytes, too few for its fields", at)
@@ -368,7 +438,7 @@ def read_attachment(reader: RecordReader, at: int, length: int) -> tuple[bytes, 
         (count,) = struct.unpack("<I", prefix)
         if count > end - reader.position:
             raise FormatError("a field of the attachment record reaches past its end", at)
-        texts.append(reader.body(ATTACHMENT, count))
+        texts.append(reader.body(Op.ATTACHMENT, count))
         head += prefix + texts[-1]
     prefix = reader.read(8, "attachment")
     (size,) = struct.unpack("<Q", prefix)
@@ -376,16 +446,109 @@ def read_attachment(reader: RecordReader, at: int, length: int) -> tuple[bytes, 
         raise FormatError(f"the attachment says {size} bytes of data; its record differs", at)
     head += prefix
     log_time, create_time = struct.unpack("<QQ", head[:16])
-    crc = zlib.crc32(head)
-    left = size
-    while left:
-        block = reader.read(min(left, _BLOCK_BYTES), "attachment")
-        crc = zlib.crc32(block, crc)
-        left -= len(block)
+    crc = reader.skip(size, "attachment", zlib.crc32(head))
     (stated,) = CRC.unpack(reader.read(CRC.size, "attachment"))
     if stated and stated != crc:
         raise FormatError(
             f"the attachment's CRC is {crc:08x}; the file says {stated:08x}", at, "crc"
         )
     name, media = (utf8(text, "attachment", at) for text in texts)
-    return head, (at, FRAME.size + length, log_time, create_time, size, name, media)
+    return (at, FRAME.size + length, log_time, create_time, size, name, media)
+
+
+@dataclass(frozen=True, slots=True)
+class Chunk:
+    """A chunk record's fields, its data unpacked and checked."""
+
+    start: int
+    end: int
+    compression: str
+    packed_size: int
+    data: bytes
+    has_crc: bool
+
+
+def read_chunk(body: bytes, offset: int, budget: Budget) -> Chunk:
+    """Unpack the chunk record at ``offset`` and compare its CRC, if it has one."""
+    fields = Fields(body, "chunk", offset)
+    start, end, size, crc = CHUNK_HEAD.unpack(fields.take(CHUNK_HEAD.size))
+    compression = fields.text()
+    packed = fields.blob("Q")
+    fields.done()
+    data = _unpack(compression, packed, size, offset, budget)
+    if crc and zlib.crc32(data) != crc:
+        raise FormatError(
+            f"the chunk's CRC is {zlib.crc32(data):08x}; the file says {crc:08x}", offset, "crc"
+        )
+    return Chunk(start, end, compression, len(packed), data, crc != 0)
+
+
+def _unpack(compression: str, packed: bytes, size: int, offset: int, budget: Budget) -> bytes:
+    """Unpack a chunk to exactly ``size`` bytes, having checked the size first."""
+    if compression not in ("", "zstd", "lz4"):
+        raise FormatError(
+            f"unknown compression {compression!r}; known: zstd, lz4, none", offset, "compression"
+        )
+    _check_size("chunk", len(packed), size, offset)
+    if not compression:
+        if len(packed) != size:
+            raise FormatError(f"the chunk has {len(packed)} bytes; the file says {size}", offset)
+        return packed
+    budget.spend(size, offset)
+    # One byte more than declared is let out, to tell a longer content from an exact one.
+    data = _decompress(compression, packed, size + 1, offset)
+    if len(data) != size:
+        more = "more" if len(data) > size else str(len(data))
+        raise FormatError(f"the chunk unpacks to {more} bytes; the file says {size}", offset)
+    return data
+
+
+def _check_size(what: str, packed: int, size: int, offset: int) -> None:
+    if size > MAX_CHUNK_BYTES:
+        raise FormatError(
+            f"the {what} unpacks to {size} bytes; at most {MAX_CHUNK_BYTES}", offset, "size_cap"
+        )
+    if size > FREE_BYTES and size > MAX_RATIO * packed:
+        raise FormatError(
+            f"the {what} unpacks from {packed} to {size} bytes; at most {MAX_RATIO} to 1",
+            offset,
+            "size_cap",
+        )
+
+
+def _decompress(compression: str, packed: bytes, limit: int, offset: int) -> bytes:
+    """Unpack at most ``limit`` bytes."""
+    name = "zstandard" if compression == "zstd" else "lz4.frame"
+    try:
+        library: Any = importlib.import_module(name)
+    except ImportError:
+        text = f"the data are packed with {compression}; the Python package {name} is missing"
+        raise FormatError(text, offset, "compression") from None
+    failures = (library.ZstdError,) if compression == "zstd" else (RuntimeError, EOFError)
+    try:
+        if compression == "lz4":
+            unpacked: bytes = library.LZ4FrameDecompressor().decompress(packed, max_length=limit)
+            return unpacked
+        window = library.ZstdDecompressor(max_window_size=2 * MAX_CHUNK_BYTES)
+        with window.stream_reader(io.BytesIO(packed)) as reader:
+            return bytes(reader.read(limit))
+    except failures as error:
+        raise FormatError(f"the data do not unpack: {error}", offset) from None
+
+
+def message_data(
+    data: bytes, start: int, end: int, encoding: str, offset: int, budget: Budget
+) -> bytes:
+    """Return a message record's payload, unpacked where rosbag2 has packed each message.
+
+    No plain CDR begins as a zstd frame does, so the bytes tell; rosbag2 says it only beside them.
+    """
+    start += MESSAGE_HEAD.size
+    if data[start : start + len(ZSTD_MAGIC)] != ZSTD_MAGIC or encoding != "cdr":
+        return data[start:end]
+    packed = data[start:end]
+    limit = min(MAX_CHUNK_BYTES, max(FREE_BYTES, MAX_RATIO * len(packed)))
+    unpacked = _decompress("zstd", packed, limit + 1, offset)
+    budget.spend(len(unpacked), offset)
+    _check_size("message", len(packed), len(unpacked), offset)
+    return unpacked

@@ -7,7 +7,8 @@ import re
 from dataclasses import dataclass
 from typing import Any, Final
 
-from pkm_twin.bags.plain_yaml import load_plain
+import yaml
+
 from pkm_twin.errors import BagError
 
 MAX_QOS_CHARACTERS: Final = 100_000
@@ -16,6 +17,10 @@ MAX_DEPTH: Final = 100_000
 """Largest queue that a recorded offer may ask for."""
 MAX_TOPIC_CHARACTERS: Final = 247
 """Longest topic name that ROS takes: 255 of DDS less its own prefix."""
+
+MAX_NESTING: Final = 50
+"""Deepest nesting; rosbag2 writes eight."""
+_LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 _TOPIC = re.compile(r"(?:/[A-Za-z_][A-Za-z0-9_]*)+")
 # rosbag2 writes names since Jazzy, numbers before.
@@ -33,6 +38,27 @@ class OfferedQos:
     transient_local: bool = False
     depth: int = 0
     """Samples kept, 0 where the recording does not say."""
+
+
+def load_plain(text: str) -> object:
+    """Read YAML that others wrote in bounded time: no tags, no aliases, not deep.
+
+    :raises ValueError: it is none, in one line why.
+    """
+    depth = 0
+    try:
+        # Events come before anything is built: a few aliases may stand for gigabytes.
+        for event in yaml.parse(text, Loader=_LOADER):
+            depth += isinstance(event, yaml.CollectionStartEvent)
+            depth -= isinstance(event, yaml.CollectionEndEvent)
+            line = event.start_mark.line + 1 if event.start_mark else 0
+            if isinstance(event, yaml.AliasEvent):
+                raise ValueError(f"an alias in line {line}")
+            if depth > MAX_NESTING:
+                raise ValueError(f"nested deeper than {MAX_NESTING} in line {line}")
+        return yaml.load(text, Loader=_LOADER)  # noqa: S506  a safe loader
+    except (yaml.YAMLError, OverflowError, RecursionError) as error:
+        raise ValueError(" ".join(str(error).split()) or type(error).__name__) from None
 
 
 def parse_qos(topic: str, text: str) -> OfferedQos:

@@ -16,29 +16,25 @@ import heapq
 from collections.abc import Callable, Container, Iterable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, lru_cache, partial
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Any, Literal
 
 from pkm_twin.bags.cdr import MessageCodec
-from pkm_twin.bags.chunks import message_data
 from pkm_twin.bags.definitions import message_definition
 from pkm_twin.bags.format import (
-    MESSAGE,
     TOTAL_CAP,
-    Budget,
     Channel,
     FormatError,
     RecordReader,
     Schema,
-    iterate_records,
-    message_head,
+    message_data,
     utf8,
 )
 from pkm_twin.bags.recover import RecoverResult, count_salvageable, recover
-from pkm_twin.bags.report import BagReport, Segment, TopicInfo, join_topic
+from pkm_twin.bags.report import BagReport, TopicInfo, join_topic
 from pkm_twin.bags.storage import METADATA_FILE, BagFile, Storage, find_storage
-from pkm_twin.bags.strict import Check
+from pkm_twin.bags.strict import Check, Segment
 from pkm_twin.bags.writer import BagWriter
 from pkm_twin.errors import BagError
 
@@ -145,50 +141,37 @@ class _Part:
     def __init__(self, file: BagFile, check: Check) -> None:
         self.file = file
         self.segments = check.segments
-        self.channels = check.records.channels
-        self.types = check.records.types
+        self.records = check.records
         self.report = check.report(file.path)
-        # Channels of one type share its codec, which may be long in the making.
-        schemas = check.records.schemas
-        codecs = {number: _Codec(schemas.get(number)) for number in (0, *schemas)}
-        self.decoders = {
-            number: _decoder(channel, codecs[channel.schema_id])
-            for number, channel in self.channels.items()
+        self._decoders = {
+            number: partial(_decode, channel, check.records.schemas.get(channel.schema_id))
+            for number, channel in check.records.channels.items()
         }
 
-    def numbered(self, topics: Container[str]) -> set[int]:
-        """The channels of these topics."""
-        return {number for number, channel in self.channels.items() if channel.topic in topics}
-
-    def parse(self, segment: Segment, reader: RecordReader, wanted: set[int]) -> list[BagMessage]:
-        """The messages of the wanted channels in a segment, in the order of the file."""
+    def parse(
+        self, segment: Segment, reader: RecordReader, topics: Container[str]
+    ) -> list[BagMessage]:
+        """The messages of the topics in a segment, in the order of the file."""
         try:
             data = segment.read(reader)
-            return list(self._messages(data, segment.offset, reader.budget, wanted))
+            return [
+                BagMessage(
+                    channel.topic,
+                    self.records.types[head.channel],
+                    head.log_time,
+                    head.publish_time,
+                    head.sequence,
+                    message_data(data, start, end, channel.encoding, segment.offset, reader.budget),
+                    self._decoders[head.channel],
+                )
+                for head, start, end in self.records.messages(data, segment.offset)
+                if (channel := self.records.channels[head.channel]).topic in topics
+            ]
         except FormatError as error:
             text = f"changed since it was checked: {error.text}"
             raise BagError(
                 text, path=self.file.path, reason="changed", offset=error.offset
             ) from None
-
-    def _messages(
-        self, data: bytes, offset: int, budget: Budget, wanted: set[int]
-    ) -> Iterator[BagMessage]:
-        for opcode, start, end in iterate_records(data, offset):
-            if opcode != MESSAGE:
-                continue
-            number, sequence, log_time, publish_time = message_head(data, start, end, offset)
-            if number in wanted:
-                channel = self.channels[number]
-                yield BagMessage(
-                    channel.topic,
-                    self.types[number],
-                    log_time,
-                    publish_time,
-                    sequence,
-                    message_data(data, start, end, channel.encoding, offset, budget),
-                    self.decoders[number],
-                )
 
 
 class Bag:
@@ -216,44 +199,45 @@ class Bag:
         """
         if order not in ("log_time", "file"):
             raise ValueError(f"order is {order!r}; expected 'log_time' or 'file'")
-        wanted = self._wanted(topics)
-        return self._ordered(wanted) if order == "log_time" else self._in_file(wanted)
-
-    def _wanted(self, topics: Iterable[str] | None) -> list[set[int]]:
-        """The channels of ``topics``, a set for each part."""
         known = self.report.topics
-        names = (
-            known.keys() if topics is None else {topics} if isinstance(topics, str) else set(topics)
+        wanted = (
+            set(known) if topics is None else {topics} if isinstance(topics, str) else set(topics)
         )
-        unknown = sorted(names - known.keys())
+        unknown = sorted(wanted - known.keys())
         if unknown:
             raise BagError(
                 f"no topic {', '.join(unknown)}; topics: {', '.join(sorted(known))}",
                 path=self._path,
                 reason="no_topic",
             )
-        return [part.numbered(names) for part in self._parts]
+        return self._ordered(wanted) if order == "log_time" else self._in_file(wanted)
 
-    def _in_file(self, wanted: list[set[int]]) -> Iterator[BagMessage]:
-        for part, numbers in zip(self._parts, wanted, strict=True):
+    def _in_file(self, wanted: set[str]) -> Iterator[BagMessage]:
+        for part in self._parts:
             with part.file.open() as reader:
                 for segment in part.segments:
-                    yield from part.parse(segment, reader, numbers)
+                    yield from part.parse(segment, reader, wanted)
 
-    def _ordered(self, wanted: list[set[int]]) -> Iterator[BagMessage]:
+    def _ordered(self, wanted: set[str]) -> Iterator[BagMessage]:
         waiting: list[tuple[int, int, int, int, BagMessage]] = []
         held = 0
         places = [(n, segment) for n, part in enumerate(self._parts) for segment in part.segments]
         places.sort(key=lambda place: (place[1].start, place[0], place[1].offset))
-        with _Readers(self._parts) as readers:
+        # Splits follow each other in time, so one is open at once.
+        current = -1
+        with ExitStack() as opened:
             for number, segment in places:
+                if number != current:
+                    opened.close()
+                    reader = opened.enter_context(self._parts[number].file.open())
+                    current = number
                 # Nothing from here on is earlier than this segment's start. A message of exactly
                 # that time stays, since the segment may stand before it in the file.
                 while waiting and waiting[0][0] < segment.start:
                     message = heapq.heappop(waiting)[-1]
                     held -= len(message.data) + _MESSAGE_COST
                     yield message
-                found = self._parts[number].parse(segment, readers.get(number), wanted[number])
+                found = self._parts[number].parse(segment, reader, wanted)
                 for index, message in enumerate(found):
                     entry = (message.log_time, number, segment.offset, index, message)
                     heapq.heappush(waiting, entry)
@@ -268,28 +252,6 @@ class Bag:
                     )
             while waiting:
                 yield heapq.heappop(waiting)[-1]
-
-
-class _Readers:
-    """The file that is being read; splits follow each other, so one is open at a time."""
-
-    def __init__(self, parts: list[_Part]) -> None:
-        self._parts = parts
-        self._open = ExitStack()
-        self._current: tuple[int, RecordReader] | None = None
-
-    def get(self, number: int) -> RecordReader:
-        if self._current is None or self._current[0] != number:
-            self._open.close()
-            reader = self._open.enter_context(self._parts[number].file.open())
-            self._current = (number, reader)
-        return self._current[1]
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self._open.close()
 
 
 def _joined(path: Path, reports: list[BagReport], storage: Storage) -> BagReport:
@@ -329,46 +291,26 @@ def _joined(path: Path, reports: list[BagReport], storage: Storage) -> BagReport
     )
 
 
-class _Codec:
-    """A type's codec, made at its first message."""
-
-    def __init__(self, schema: Schema | None) -> None:
-        self._schema = schema
-
-    def get(self, channel: Channel) -> MessageCodec:
-        _require_encoding(channel, self._schema)
-        return self._made
-
-    @cached_property
-    def _made(self) -> MessageCodec:
-        assert self._schema is not None  # noqa: S101  asked for with the encoding
-        return MessageCodec(self._schema.name, utf8(self._schema.data, "schema", None))
+@lru_cache(maxsize=256)
+def _codec(schema: Schema) -> MessageCodec:
+    """A type's codec, which may be long in the making."""
+    return MessageCodec(schema.name, utf8(schema.data, "schema", None))
 
 
-def _decoder(channel: Channel, codec: _Codec) -> Callable[[bytes], Any]:
-    """Return a function that decodes the channel's messages."""
-
-    def decode(data: bytes) -> Any:
-        try:
-            return codec.get(channel).decode(data)
-        except (BagError, FormatError) as error:
-            raise BagError(f"topic {channel.topic}: {error}", reason=error.reason) from error
-
-    return decode
-
-
-def _require_encoding(channel: Channel, schema: Schema | None) -> None:
-    name = schema.name if schema else "no schema"
-    if channel.encoding != "cdr":
-        raise BagError(
-            f"type {name} has the message encoding {channel.encoding!r}; expected 'cdr'",
-            reason="encoding",
-        )
-    if schema is None or schema.encoding != "ros2msg":
-        found = repr(schema.encoding) if schema else "none"
-        raise BagError(
-            f"type {name} has the schema encoding {found}; expected 'ros2msg'", reason="encoding"
-        )
+def _decode(channel: Channel, schema: Schema | None, data: bytes) -> Any:
+    """Decode a message of the channel."""
+    try:
+        kind = f"type {schema.name if schema else 'no schema'}"
+        if channel.encoding != "cdr":
+            text = f"{kind} has the message encoding {channel.encoding!r}; expected 'cdr'"
+            raise BagError(text, reason="encoding")
+        if schema is None or schema.encoding != "ros2msg":
+            found = repr(schema.encoding) if schema else "none"
+            text = f"{kind} has the schema encoding {found}; expected 'ros2msg'"
+            raise BagError(text, reason="encoding")
+        return _codec(schema).decode(data)
+    except (BagError, FormatError) as error:
+        raise BagError(f"topic {channel.topic}: {error}", reason=error.reason) from error
 
 
 def _bag_error(error: FormatError, file: BagFile, storage: Storage) -> BagError:

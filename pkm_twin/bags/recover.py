@@ -3,54 +3,35 @@
 
 from __future__ import annotations
 
-import io
 import os
 import zlib
 from bisect import bisect_right
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, Self
+from typing import Self
 
-from pkm_twin.bags.chunks import message_data, read_chunk
 from pkm_twin.bags.format import (
-    ATTACHMENT,
-    CHANNEL,
-    CHUNK,
-    CHUNK_INDEX,
     CRC,
-    DATA_END,
-    FIRST_UNKNOWN,
-    FOOTER,
     FOOTER_BODY,
     FRAME,
-    HEADER,
     MAGIC,
     MAX_RECORD_BYTES,
-    MESSAGE,
-    MESSAGE_INDEX,
-    METADATA,
-    METADATA_CRC,
-    SCHEMA,
     TOTAL_CAP,
-    Channel,
+    Chunk,
     Fields,
     FormatError,
+    Op,
     RecordReader,
-    Records,
-    Schema,
     iterate_records,
-    message_head,
-    metadata,
-    metadata_crc,
+    message_data,
     opcode_name,
 )
 from pkm_twin.bags.storage import BagFile, files_by_name, find_storage
-from pkm_twin.bags.strict import Check
-from pkm_twin.bags.writer import LIBRARY, Sink, mcap_writer, refuse_existing, write_error
+from pkm_twin.bags.strict import Check, Walker
+from pkm_twin.bags.writer import McapWriter, refuse_existing, write_error
 from pkm_twin.errors import BagError
 from pkm_twin.files import replacing
 
@@ -80,7 +61,7 @@ ROSBAG2 = "rosbag2"
 """Name of the record in which rosbag2 repeats its ``metadata.yaml``."""
 
 
-class Salvage:
+class Salvage(Walker):
     """A forward scan that keeps what is whole and goes on behind what is not.
 
     Where the summary is there and its CRC holds, its channels stand in for lost ones, and its list
@@ -88,23 +69,25 @@ class Salvage:
     """
 
     def __init__(self, reader: RecordReader) -> None:
-        self._reader = reader
-        self._records = Records()
+        super().__init__(reader)
+        self._profile = "ros2"
         # Length of each chunk record by its offset, and the end of the data, as the summary says.
         self._known: dict[int, int] = {}
         self._offsets: list[int] = []
         self._data_end = reader.size
         self._chunked = False
-        self._target: _Target | None = None
+        self._writer: McapWriter | None = None
+        # The new numbers of the channels.
+        self._numbers: dict[int, int] = {}
         self.reason = ""
         self.messages = self.unverified = self.chunks_lost = self.bytes_lost = 0
 
-    def run(self, target: _Target | None) -> Self:
-        """Scan the file; hand what is whole to ``target``, or only count where that is None.
+    def run(self, writer: McapWriter | None) -> Self:
+        """Scan the file; hand what is whole to ``writer``, or only count where that is None.
 
         :raises FormatError: the scan costs more than such a file may cost.
         """
-        self._target = target
+        self._writer = writer
         with suppress(FormatError):
             self._read_trusted_summary()
         self._reader.seek(min(len(MAGIC), self._reader.size))
@@ -115,16 +98,18 @@ class Salvage:
             try:
                 opcode, length = self._reader.frame()
                 end = self._reader.position + length
-                if at in self._known and opcode != CHUNK:
+                if at in self._known and opcode != Op.CHUNK:
                     raise FormatError("a chunk's record is damaged", at)
-                if (opcode, length) in ((DATA_END, CRC.size), (FOOTER, FOOTER_BODY.size)):
+                if (opcode, length) in ((Op.DATA_END, CRC.size), (Op.FOOTER, FOOTER_BODY.size)):
                     break
-                self._keep(at, opcode, length)
+                if writer and opcode != Op.HEADER:
+                    writer.start(self._profile)
+                self._walk(at, opcode, length)
             except FormatError as error:
                 if error.reason == TOTAL_CAP:
                     raise
                 self.reason = self.reason or error.text
-                self.chunks_lost += opcode == CHUNK or at in self._known
+                self.chunks_lost += opcode == Op.CHUNK or at in self._known
                 end = self._resume(at, end)
                 self.bytes_lost += end - at
             self._reader.seek(end)
@@ -139,75 +124,50 @@ class Salvage:
         later = self._offsets[place] if place < len(self._offsets) else self._data_end
         return later if end is None or end > later else end
 
-    def _keep(self, at: int, opcode: int, length: int) -> None:
-        if opcode in (ATTACHMENT, *range(FIRST_UNKNOWN, 256)):
-            raise FormatError(f"{opcode_name(opcode)} records are not carried over", at)
-        body = self._reader.body(opcode, length)
-        if opcode == CHUNK:
-            self._chunked = True
-            self._keep_chunk(at, body)
-        elif opcode == MESSAGE:
-            # What looks like one beside chunks is a damaged record of another kind.
-            if self._chunked:
-                raise FormatError("a message record stands outside the chunks", at)
-            self._deliver(body, 0, len(body), at, verified=False)
-        elif opcode in (SCHEMA, CHANNEL):
-            self._records.add(opcode, body, at)
-        elif opcode == METADATA:
-            name, entries, verified = metadata(body, at)
-            # rosbag2's record of its own files is not true of the new one.
-            if self._target and name != ROSBAG2:
-                self._target.add_metadata(name, entries, verified)
-        elif opcode in (HEADER, MESSAGE_INDEX):
-            self._pass_over(opcode, body, at)
-        else:
-            raise FormatError(f"a {opcode_name(opcode)} record stands in the data section", at)
+    def _pass_over(self, at: int, opcode: int, length: int) -> None:
+        raise FormatError(f"{opcode_name(opcode)} records are not carried over", at)
 
-    def _pass_over(self, opcode: int, body: bytes, at: int) -> None:
-        """Read a record that is not kept, to find out whether it is what it says it is."""
-        fields = Fields(body, opcode_name(opcode), at)
-        if opcode == HEADER:
-            profile, _ = fields.text(), fields.text()
-            if self._target:
-                self._target.profile = profile
-        else:
-            fields.number("H")
-            fields.blob("I")
-        fields.done()
+    def _take_message(self, at: int, record: bytes) -> None:
+        # What looks like one beside chunks is a damaged record of another kind.
+        if self._chunked:
+            raise FormatError("a message record stands outside the chunks", at)
+        self._deliver(record, at, verified=False)
 
-    def _keep_chunk(self, at: int, body: bytes) -> None:
-        chunk = read_chunk(body, at, self._reader.budget)
+    def _take_metadata(
+        self, at: int, length: int, name: str, entries: dict[str, str], verified: bool
+    ) -> None:
+        # rosbag2's record of its own files is not true of the new one.
+        if self._writer and name != ROSBAG2:
+            # Where it had no CRC of its own it gets none: doubt is not made proof.
+            self._writer.add_metadata(name, entries, verified)
+
+    def _take_chunk(self, at: int, chunk: Chunk, length: int) -> None:
+        self._chunked = True
         # All of the chunk is looked at before any of it is handed on.
-        for opcode, start, end in iterate_records(chunk.data, at, self._reader.budget):
-            if opcode == MESSAGE:
-                self._require_channel(message_head(chunk.data, start, end, at)[0], at)
-            elif opcode in (SCHEMA, CHANNEL):
-                self._records.add(opcode, chunk.data[start:end], at)
-        for opcode, start, end in iterate_records(chunk.data, at):
-            if opcode == MESSAGE:
-                self._deliver(chunk.data, start, end, at, verified=chunk.has_crc)
+        for _ in self.records.messages(chunk.data, at, self._reader.budget):
+            pass
+        self._deliver(chunk.data, at, verified=chunk.has_crc)
 
-    def _require_channel(self, number: int, at: int) -> None:
-        if number not in self._records.channels:
-            raise FormatError(f"messages of the channel {number}, whose record is lost", at)
-
-    def _deliver(self, data: bytes, start: int, end: int, at: int, *, verified: bool) -> None:
-        """Hand on one message, unpacked: the new bag has no metadata to say that it is packed."""
-        head = message_head(data, start, end, at)
-        self._require_channel(head[0], at)
-        encoding = self._records.channels[head[0]].encoding
-        try:
-            content = message_data(data, start, end, encoding, at, self._reader.budget)
-        except FormatError as error:
-            if error.reason == TOTAL_CAP:
-                raise
-            self.reason = self.reason or error.text
-            self.bytes_lost += end - start
-            return
-        self.messages += 1
-        self.unverified += not verified
-        if self._target:
-            self._target.add_message(self._records, head, content)
+    def _deliver(self, data: bytes, at: int, *, verified: bool) -> None:
+        """Hand on messages, unpacked: the new bag has no metadata to say that they are packed."""
+        for head, start, end in self.records.messages(data, at):
+            channel = self.records.channels[head.channel]
+            try:
+                content = message_data(data, start, end, channel.encoding, at, self._reader.budget)
+            except FormatError as error:
+                if error.reason == TOTAL_CAP:
+                    raise
+                self.reason = self.reason or error.text
+                self.bytes_lost += end - start
+                continue
+            self.messages += 1
+            self.unverified += not verified
+            if self._writer:
+                if head.channel not in self._numbers:
+                    schema = self.records.schemas.get(channel.schema_id)
+                    self._numbers[head.channel] = self._writer.channel(schema, channel)
+                head = head._replace(channel=self._numbers[head.channel])
+                self._writer.add_message(head, content)
 
     def _read_trusted_summary(self) -> None:
         size = FRAME.size + FOOTER_BODY.size + len(MAGIC)
@@ -218,7 +178,7 @@ class Salvage:
         tail = self._reader.read(size, "footer")
         opcode, length = FRAME.unpack_from(tail)
         start, _, crc = FOOTER_BODY.unpack_from(tail, FRAME.size)
-        if (opcode, length) != (FOOTER, FOOTER_BODY.size) or not crc:
+        if (opcode, length) != (Op.FOOTER, FOOTER_BODY.size) or not crc:
             return
         if not len(MAGIC) < start <= at or at - start > MAX_RECORD_BYTES:
             return
@@ -228,9 +188,9 @@ class Salvage:
         if zlib.crc32(summary + tail[: -len(MAGIC) - CRC.size]) != crc:
             return
         for opcode, begin, end in iterate_records(summary, start):
-            if opcode in (SCHEMA, CHANNEL):
-                self._records.add(opcode, summary[begin:end], start)
-            elif opcode == CHUNK_INDEX:
+            if opcode in (Op.SCHEMA, Op.CHANNEL):
+                self.records.add(opcode, summary[begin:end], start)
+            elif opcode == Op.CHUNK_INDEX:
                 fields = Fields(summary[begin:end], opcode_name(opcode), start)
                 _, _, offset, length = fields.numbers("QQQQ")
                 if FRAME.size < length <= start - offset:
@@ -241,68 +201,6 @@ class Salvage:
         if any(one + self._known[one] > other for one, other in pairwise(self._offsets)):
             # Chunks do not overlap: a list in which they do is of no help.
             self._known, self._offsets = {}, []
-
-
-class _Target:
-    """The bag that recovery writes: the kept channels, messages and metadata as they were."""
-
-    def __init__(self, sink: Sink) -> None:
-        self.profile = "ros2"
-        self._open_writer = mcap_writer(sink, 256 * 1024)
-        self._schemas: dict[Schema, int] = {}
-        self._channels: dict[tuple[object, ...], int] = {}
-        # The new numbers of the channels of the file that is being read.
-        self._numbers: dict[int, int] = {}
-        self._metadata: set[tuple[object, ...]] = set()
-
-    def begin(self) -> None:
-        """Begin with another file, whose numbers are its own."""
-        self._numbers = {}
-
-    @cached_property
-    def _writer(self) -> Any:
-        """The writer, its header written at the first use, when the profile is known."""
-        self._open_writer.start(profile=self.profile, library=LIBRARY)
-        return self._open_writer
-
-    def add_metadata(self, name: str, entries: Mapping[str, str], verified: bool) -> None:
-        """Write metadata; a CRC of its own only where it had one, so doubt is not made proof."""
-        crc = {METADATA_CRC: metadata_crc(name, entries)} if verified else {}
-        # Every file of a bag may repeat it.
-        key = (name, *sorted(entries.items()))
-        if key not in self._metadata:
-            self._metadata.add(key)
-            self._writer.add_metadata(name, {**entries, **crc})
-
-    def add_message(self, records: Records, head: tuple[int, int, int, int], data: bytes) -> None:
-        """Write a message, before the first of a channel also what describes it."""
-        number, sequence, log_time, publish_time = head
-        if number not in self._numbers:
-            self._numbers[number] = self._channel(records, records.channels[number])
-        self._writer.add_message(
-            self._numbers[number], log_time, data, publish_time, sequence=sequence
-        )
-
-    def _channel(self, records: Records, channel: Channel) -> int:
-        schema = records.schemas.get(channel.schema_id)
-        schema_number = 0 if schema is None else self._schema(schema)
-        metadata = tuple(sorted(channel.metadata.items()))
-        key = (schema_number, channel.topic, channel.encoding, metadata)
-        if key not in self._channels:
-            self._channels[key] = self._writer.register_channel(
-                channel.topic, channel.encoding, schema_number, dict(channel.metadata)
-            )
-        return self._channels[key]
-
-    def _schema(self, schema: Schema) -> int:
-        if schema not in self._schemas:
-            self._schemas[schema] = self._writer.register_schema(
-                schema.name, schema.encoding, schema.data
-            )
-        return self._schemas[schema]
-
-    def finish(self) -> None:
-        self._writer.finish()
 
 
 def count_salvageable(files: Iterable[BagFile]) -> int:
@@ -389,29 +287,15 @@ def _first_error(file: BagFile) -> str:
     return ""
 
 
-class _TargetSink(Sink):
-    """What the system refuses here is the target's: a source is being read around it."""
-
-    def __init__(self, file: io.FileIO, target: Path) -> None:
-        super().__init__(file)
-        self._target = target
-
-    def write(self, data: bytes) -> int:
-        try:
-            return super().write(data)
-        except OSError as error:
-            raise write_error(error, self._target) from error
-
-
 def _write_salvage(files: Sequence[BagFile], path: Path, named: Path) -> RecoverResult:
     with path.open("xb", buffering=0) as output:
-        target = _Target(_TargetSink(output, named))
+        # What the system refuses here is the target's: a source is being read around it.
+        writer = McapWriter(output, named, 256 * 1024)
         found = []
         for file in files:
-            target.begin()
             with file.open() as reader:
-                found.append(Salvage(reader).run(target))
-        target.finish()
+                found.append(Salvage(reader).run(writer))
+        writer.finish()
         os.fsync(output.fileno())
     return RecoverResult(
         sum(salvage.messages for salvage in found),

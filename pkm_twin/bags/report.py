@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a strict pass over a bag found: its topics, and where its messages are."""
+"""What a strict pass over a bag found."""
 
 from __future__ import annotations
 
@@ -7,9 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from pkm_twin.bags.chunks import read_chunk
 from pkm_twin.bags.definitions import parse_definition
-from pkm_twin.bags.format import FRAME, RecordReader
 from pkm_twin.errors import BagError
 
 
@@ -57,25 +55,6 @@ class BagReport:
     def duration(self) -> float:
         """Time from the first message to the last, s."""
         return (self.end_time - self.start_time) * 1e-9
-
-
-@dataclass(frozen=True, slots=True)
-class Segment:
-    """Part of the file that is loaded at once: a chunk record, or a run of message records."""
-
-    offset: int
-    length: int
-    start: int
-    end: int
-    is_chunk: bool
-
-    def read(self, reader: RecordReader) -> bytes:
-        """Return the segment's records, checked once more."""
-        reader.seek(self.offset)
-        data = reader.read(self.length, "segment")
-        if not self.is_chunk:
-            return data
-        return read_chunk(data[FRAME.size :], self.offset, reader.budget).data
 
 
 def join_topic(topics: dict[str, TopicInfo], name: str, info: TopicInfo, path: Path) -> None:

@@ -7,8 +7,6 @@ may have packed with zstd as a whole (``.mcap.zstd``).
 
 from __future__ import annotations
 
-import errno
-import io
 import os
 import shlex
 import tempfile
@@ -17,11 +15,10 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import IO, Any, Final
+from typing import IO, Final
 
-from pkm_twin.bags.chunks import ZSTD_MAGIC
-from pkm_twin.bags.format import Budget, FormatError, RecordReader
-from pkm_twin.bags.plain_yaml import load_plain
+from pkm_twin.bags.format import ZSTD_MAGIC, Budget, FormatError, RecordReader
+from pkm_twin.bags.qos import load_plain
 from pkm_twin.errors import BagError
 from pkm_twin.files import STANDARD, open_regular
 
@@ -52,13 +49,10 @@ class BagFile:
                         reason="not_mcap",
                     )
                 if not head.startswith(ZSTD_MAGIC):
-                    yield RecordReader(file, size)
+                    yield RecordReader(file)
                     return
-            unpacked = self._unpacked
-            with io.BufferedReader(_Positional(unpacked.fileno())) as content:
-                # The budget is that of the bytes on the disk.
-                budget = Budget(size)
-                yield RecordReader(content, os.fstat(unpacked.fileno()).st_size, budget)
+            # The budget is that of the bytes on the disk.
+            yield RecordReader(self._unpacked, Budget(size))
         except FileNotFoundError as error:
             raise BagError("no such file", path=self.path, reason="not_found") from error
         except OSError as error:
@@ -91,34 +85,6 @@ class BagFile:
                     raise BagError(error.text, path=self.path, reason=error.reason) from None
         target.flush()
         return target
-
-
-class _Positional(io.RawIOBase):
-    """Reads a file that others read too, each from a position of its own."""
-
-    def __init__(self, descriptor: int) -> None:
-        self._descriptor = descriptor
-        self._position = 0
-
-    def readable(self) -> bool:
-        return True
-
-    def seekable(self) -> bool:
-        return True
-
-    def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
-        if whence != os.SEEK_SET:
-            raise OSError(errno.EINVAL, "only absolute positions")
-        self._position = offset
-        return offset
-
-    def tell(self) -> int:
-        return self._position
-
-    def readinto(self, buffer: Any) -> int:
-        count = os.preadv(self._descriptor, [buffer], self._position)
-        self._position += count
-        return count
 
 
 @dataclass(frozen=True)

@@ -12,72 +12,114 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from pkm_twin.bags.chunks import ZSTD_MAGIC, message_data, read_chunk
 from pkm_twin.bags.format import (
-    ATTACHMENT,
-    ATTACHMENT_INDEX,
-    CHANNEL,
-    CHUNK,
-    CHUNK_INDEX,
     CRC,
-    DATA_END,
     FIRST_UNKNOWN,
-    FOOTER,
     FOOTER_BODY,
     FRAME,
-    HEADER,
     INDEX_ENTRY,
     MAGIC,
-    MESSAGE,
     MESSAGE_HEAD,
-    MESSAGE_INDEX,
-    METADATA,
-    METADATA_INDEX,
-    SCHEMA,
-    STATISTICS,
-    SUMMARY_OFFSET,
+    ZSTD_MAGIC,
+    Chunk,
     Fields,
     FormatError,
+    Op,
     RecordReader,
     Records,
-    iterate_records,
-    message_head,
+    Span,
+    message_data,
     metadata,
     opcode_name,
     read_attachment,
+    read_chunk,
     read_magic,
 )
-from pkm_twin.bags.report import BagReport, Segment, TopicInfo, join_topic
+from pkm_twin.bags.report import BagReport, TopicInfo, join_topic
 
 # Messages outside chunks are read back in runs of about this size.
 _RUN_BYTES = 1024**2
 
 
-@dataclass(slots=True)
-class _Span:
-    """How many messages, and from when to when."""
+@dataclass(frozen=True, slots=True)
+class Segment:
+    """Part of the file that is loaded at once: a chunk record, or a run of message records."""
 
-    count: int = 0
-    start: int = 0
-    end: int = 0
+    offset: int
+    length: int
+    start: int
+    end: int
+    is_chunk: bool
 
-    def add(self, log_time: int) -> None:
-        self.start = min(self.start, log_time) if self.count else log_time
-        self.end = max(self.end, log_time) if self.count else log_time
-        self.count += 1
+    def read(self, reader: RecordReader) -> bytes:
+        """Return the segment's records, checked once more."""
+        reader.seek(self.offset)
+        data = reader.read(self.length, "segment")
+        if not self.is_chunk:
+            return data
+        return read_chunk(data[FRAME.size :], self.offset, reader.budget).data
 
 
-class Check:
-    """One pass over a file, in which every statement that it makes about itself is checked."""
+class Walker:
+    """Reads the records of a file's data section; what each is worth, a subclass decides."""
 
     def __init__(self, reader: RecordReader) -> None:
         self._reader = reader
         self.records = Records()
-        self.segments: list[Segment] = []
-        self._spans: dict[int, _Span] = {}
-        self._total = _Span()
-        self._out_of_order = 0
         self._profile = self._library = ""
+
+    def _walk(self, at: int, opcode: int, length: int) -> None:
+        """Read the record at ``at``, whose frame has been read."""
+        if opcode == Op.ATTACHMENT or opcode >= FIRST_UNKNOWN:
+            self._pass_over(at, opcode, length)
+            return
+        body = self._reader.body(opcode, length)
+        fields = Fields(body, opcode_name(opcode), at)
+        if opcode == Op.CHUNK:
+            self._take_chunk(at, read_chunk(body, at, self._reader.budget), FRAME.size + length)
+        elif opcode == Op.MESSAGE:
+            self._take_message(at, FRAME.pack(opcode, length) + body)
+        elif opcode in (Op.SCHEMA, Op.CHANNEL):
+            self.records.add(opcode, body, at)
+        elif opcode == Op.METADATA:
+            self._take_metadata(at, FRAME.size + length, *metadata(body, at))
+        elif opcode == Op.MESSAGE_INDEX:
+            number, entries = fields.number("H"), fields.blob("I")
+            fields.done()
+            self._take_index(at, number, entries)
+        elif opcode == Op.HEADER and at == len(MAGIC):
+            self._profile, self._library = fields.text(), fields.text()
+            fields.done()
+        else:
+            raise FormatError(f"a {opcode_name(opcode)} record stands in the data section", at)
+
+    def _pass_over(self, at: int, opcode: int, length: int) -> None:
+        raise NotImplementedError
+
+    def _take_chunk(self, at: int, chunk: Chunk, length: int) -> None:
+        raise NotImplementedError
+
+    def _take_message(self, at: int, record: bytes) -> None:
+        raise NotImplementedError
+
+    def _take_metadata(
+        self, at: int, length: int, name: str, entries: dict[str, str], verified: bool
+    ) -> None:
+        raise NotImplementedError
+
+    def _take_index(self, at: int, number: int, entries: bytes) -> None:
+        """Use a message index, which repeats what is in the chunk before it."""
+
+
+class Check(Walker):
+    """One pass over a file, in which every statement that it makes about itself is checked."""
+
+    def __init__(self, reader: RecordReader) -> None:
+        super().__init__(reader)
+        self.segments: list[Segment] = []
+        self._spans: dict[int, Span] = {}
+        self._total = Span()
+        self._out_of_order = 0
         self._metadata: dict[str, dict[str, str]] = {}
         self._summary_without_crc = False
         # Of the last chunk: log times and positions by channel, packed as its index must have them,
@@ -92,7 +134,6 @@ class Check:
         self._indexed: set[int] = set()
         self._metadata_places: set[tuple[int, int, str]] = set()
         self._attachment_places: set[tuple[object, ...]] = set()
-        self._unknown = 0
         self._has_data_crc = False
         self._has_summary = False
         self._groups: dict[int, list[int]] = {}
@@ -104,53 +145,34 @@ class Check:
     def run(self) -> None:
         """Read the file from its first byte to its last."""
         read_magic(self._reader)
-        self._read_header()
         self._read_data()
         self._read_summary()
         self._read_end()
         self._compare_counts()
 
-    def _read_header(self) -> None:
-        at = self._reader.position
-        opcode, length = self._reader.frame()
-        if opcode != HEADER:
-            raise FormatError(f"the first record is {opcode_name(opcode)}, not the header", at)
-        fields = Fields(self._reader.body(opcode, length), "header", at)
-        self._profile, self._library = fields.text(), fields.text()
-        fields.done()
-
     def _read_data(self) -> None:
-        readers: dict[int, Callable[[int, bytes], None]] = {
-            SCHEMA: lambda at, body: self.records.add(SCHEMA, body, at),
-            CHANNEL: lambda at, body: self.records.add(CHANNEL, body, at),
-            MESSAGE: self._read_message,
-            CHUNK: self._read_chunk,
-            MESSAGE_INDEX: self._read_message_index,
-            METADATA: self._read_metadata,
-        }
         while True:
             at, crc = self._reader.position, self._reader.crc
             opcode, length = self._reader.frame()
-            if opcode != MESSAGE_INDEX:
+            if at == len(MAGIC) and opcode != Op.HEADER:
+                raise FormatError(f"the first record is {opcode_name(opcode)}, not the header", at)
+            if opcode != Op.MESSAGE_INDEX:
                 self._close_chunk(at)
-            if opcode == DATA_END:
+            if opcode == Op.DATA_END:
                 self._read_data_end(at, length, crc)
                 return
-            if opcode == ATTACHMENT:
-                self._read_attachment(at, length)
-            elif opcode >= FIRST_UNKNOWN:
-                self._unknown += 1
-                self._reader.skip(length)
-            elif opcode in readers:
-                readers[opcode](at, self._reader.body(opcode, length))
-            else:
-                raise FormatError(f"a {opcode_name(opcode)} record stands in the data section", at)
+            self._walk(at, opcode, length)
 
-    def _read_message(self, at: int, body: bytes) -> None:
-        number, _, log_time, _ = message_head(body, 0, len(body), at)
-        self._count(number, log_time, at)
-        self._prove(number, body, 0, len(body), at)
-        length = FRAME.size + len(body)
+    def _pass_over(self, at: int, opcode: int, length: int) -> None:
+        if opcode == Op.ATTACHMENT:
+            self._attachment_places.add(read_attachment(self._reader, at, length))
+        else:
+            self.records.passed_over[opcode] += 1
+            self._reader.skip(length, "record")
+
+    def _take_message(self, at: int, record: bytes) -> None:
+        span, _ = self._messages(record, at)
+        length = len(record)
         last = self.segments[-1] if self.segments else None
         if (
             last
@@ -158,41 +180,33 @@ class Check:
             and last.offset + last.length == at
             and last.length + length <= _RUN_BYTES
         ):
-            start, end = min(last.start, log_time), max(last.end, log_time)
+            start, end = min(last.start, span.start), max(last.end, span.end)
             self.segments[-1] = Segment(last.offset, last.length + length, start, end, False)
             return
-        self.segments.append(Segment(at, length, log_time, log_time, False))
+        self.segments.append(Segment(at, length, span.start, span.end, False))
 
-    def _count(self, number: int, log_time: int, at: int) -> None:
-        if number not in self.records.channels:
-            raise FormatError(f"a message has the unknown channel {number}", at)
-        self._out_of_order += self._total.count > 0 and log_time < self._total.end
-        self._total.add(log_time)
-        self._spans.setdefault(number, _Span()).add(log_time)
+    def _messages(self, data: bytes, at: int) -> tuple[Span, dict[int, bytearray]]:
+        """Count the messages in ``data``; return their span and what their index must say."""
+        span = Span()
+        entries: dict[int, bytearray] = {}
+        for head, start, end in self.records.messages(data, at, self._reader.budget):
+            number, time = head.channel, head.log_time
+            self._out_of_order += self._total.count > 0 and time < self._total.end
+            for each in (self._total, span, self._spans.setdefault(number, Span())):
+                each.add(time)
+            # A message that is packed by itself must unpack.
+            if data.startswith(ZSTD_MAGIC, start + MESSAGE_HEAD.size):
+                encoding = self.records.channels[number].encoding
+                message_data(data, start, end, encoding, at, self._reader.budget)
+            entry = INDEX_ENTRY.pack(time, start - FRAME.size)
+            entries.setdefault(number, bytearray()).extend(entry)
+        return span, entries
 
-    def _prove(self, number: int, data: bytes, start: int, end: int, at: int) -> None:
-        """See that a message which is packed by itself can be unpacked."""
-        if data.startswith(ZSTD_MAGIC, start + MESSAGE_HEAD.size):
-            encoding = self.records.channels[number].encoding
-            message_data(data, start, end, encoding, at, self._reader.budget)
-
-    def _read_chunk(self, at: int, body: bytes) -> None:
-        chunk = read_chunk(body, at, self._reader.budget)
-        span = _Span()
-        for opcode, start, end in iterate_records(chunk.data, at, self._reader.budget):
-            if opcode == MESSAGE:
-                number, _, log_time, _ = message_head(chunk.data, start, end, at)
-                self._count(number, log_time, at)
-                self._prove(number, chunk.data, start, end, at)
-                span.add(log_time)
-                entry = INDEX_ENTRY.pack(log_time, start - FRAME.size)
-                self._entries.setdefault(number, bytearray()).extend(entry)
-            elif opcode in (SCHEMA, CHANNEL):
-                self.records.add(opcode, chunk.data[start:end], at)
-            elif opcode < FIRST_UNKNOWN:
+    def _take_chunk(self, at: int, chunk: Chunk, length: int) -> None:
+        span, self._entries = self._messages(chunk.data, at)
+        for opcode in self.records.passed_over:
+            if opcode < FIRST_UNKNOWN:
                 raise FormatError(f"a {opcode_name(opcode)} record stands in a chunk", at)
-            else:
-                self._unknown += 1
         if (chunk.start, chunk.end) != (span.start, span.end):
             raise FormatError(
                 f"the chunk's messages span {span.start} to {span.end} ns; "
@@ -200,18 +214,13 @@ class Check:
                 at,
             )
         self._chunks_without_crc += not chunk.has_crc
-        length = FRAME.size + len(body)
         self.segments.append(Segment(at, length, span.start, span.end, True))
         self._index_start = self._reader.position
         facts = (chunk.start, chunk.end, length)
         sizes = (chunk.compression, chunk.packed_size, len(chunk.data))
         self._last_chunk = (at, (facts, sizes))
 
-    def _read_message_index(self, at: int, body: bytes) -> None:
-        fields = Fields(body, "message index", at)
-        number = fields.number("H")
-        raw = fields.blob("I")
-        fields.done()
+    def _take_index(self, at: int, number: int, raw: bytes) -> None:
         if self._last_chunk is None or number in self._index_offsets:
             raise FormatError(f"a message index of channel {number} belongs to no chunk", at)
         if len(raw) % INDEX_ENTRY.size:
@@ -238,17 +247,15 @@ class Check:
         self._entries = {}
         self._index_offsets = {}
 
-    def _read_metadata(self, at: int, body: bytes) -> None:
-        name, entries, _ = metadata(body, at)
+    def _take_metadata(
+        self, at: int, length: int, name: str, entries: dict[str, str], verified: bool
+    ) -> None:
         # rosbag2 writes its record anew when it closes a bag: the last one holds.
         self._metadata[name] = entries
-        self._metadata_places.add((at, FRAME.size + len(body), name))
-
-    def _read_attachment(self, at: int, length: int) -> None:
-        self._attachment_places.add(read_attachment(self._reader, at, length)[1])
+        self._metadata_places.add((at, length, name))
 
     def _read_data_end(self, at: int, length: int, crc: int) -> None:
-        fields = Fields(self._reader.body(DATA_END, length), "data end", at)
+        fields = Fields(self._reader.body(Op.DATA_END, length), "data end", at)
         stated = fields.number("I")
         fields.done()
         if stated and stated != crc:
@@ -263,12 +270,11 @@ class Check:
             at, crc = self._reader.position, self._reader.crc
             opcode, length = self._reader.frame()
             body = b"" if opcode >= FIRST_UNKNOWN else self._reader.body(opcode, length)
-            if opcode == FOOTER:
+            if opcode == Op.FOOTER:
                 self._read_footer(begin, at, body, crc)
                 return
             if opcode >= FIRST_UNKNOWN:
-                self._unknown += 1
-                self._reader.skip(length)
+                self._pass_over(at, opcode, length)
             else:
                 self._read_summary_record(opcode, at, body)
             group = self._groups.setdefault(opcode, [at, at])
@@ -279,19 +285,19 @@ class Check:
             group[1] = self._reader.position
 
     def _read_summary_record(self, opcode: int, at: int, body: bytes) -> None:
-        if opcode in (SCHEMA, CHANNEL):
+        if opcode in (Op.SCHEMA, Op.CHANNEL):
             self.records.add(opcode, body, at)
             return
         readers: dict[int, Callable[[Fields, int], None]] = {
-            STATISTICS: self._read_statistics,
-            CHUNK_INDEX: self._read_chunk_index,
-            METADATA_INDEX: self._read_metadata_index,
-            ATTACHMENT_INDEX: self._read_attachment_index,
-            SUMMARY_OFFSET: self._read_summary_offset,
+            Op.STATISTICS: self._read_statistics,
+            Op.CHUNK_INDEX: self._read_chunk_index,
+            Op.METADATA_INDEX: self._read_metadata_index,
+            Op.ATTACHMENT_INDEX: self._read_attachment_index,
+            Op.SUMMARY_OFFSET: self._read_summary_offset,
         }
         if opcode not in readers:
             raise FormatError(f"a {opcode_name(opcode)} record stands in the summary", at)
-        if SUMMARY_OFFSET in self._groups and opcode != SUMMARY_OFFSET:
+        if Op.SUMMARY_OFFSET in self._groups and opcode != Op.SUMMARY_OFFSET:
             raise FormatError(
                 f"a {opcode_name(opcode)} record stands among the summary offsets", at
             )
@@ -352,12 +358,12 @@ class Check:
         self._has_summary = at > begin
         if start != (begin if self._has_summary else 0) and (start, at) != (begin, begin):
             raise FormatError(f"the footer puts the summary at {start}; it is at {begin}", at)
-        found = self._groups.get(SUMMARY_OFFSET, [0])[0]
+        found = self._groups.get(Op.SUMMARY_OFFSET, [0])[0]
         if offset_start not in (found, found or at):
             raise FormatError(
                 f"the footer puts the summary offsets at {offset_start}, not {found}", at
             )
-        actual = zlib.crc32(FRAME.pack(FOOTER, len(body)) + body[: -CRC.size], crc)
+        actual = zlib.crc32(FRAME.pack(Op.FOOTER, len(body)) + body[: -CRC.size], crc)
         if stated and stated != actual:
             raise FormatError(
                 f"the summary's CRC is {actual:08x}; the file says {stated:08x}", at, "crc"
@@ -454,8 +460,8 @@ class Check:
         yield from self._notes
         if self._out_of_order:
             yield f"{self._out_of_order} messages are out of order by log time"
-        if self._unknown:
-            yield f"{self._unknown} records of unknown kinds were passed over"
+        if unknown := self.records.passed_over.total():
+            yield f"{unknown} records of unknown kinds were passed over"
 
     def _topics(self, path: Path) -> dict[str, TopicInfo]:
         topics: dict[str, TopicInfo] = {}
@@ -467,7 +473,7 @@ class Check:
         for number, channel in self.records.channels.items():
             kind = self.records.types[number]
             schema = self.records.schemas.get(channel.schema_id)
-            span = self._spans.get(number, _Span())
+            span = self._spans.get(number, Span())
             qos = channel.metadata.get("offered_qos_profiles", "")
             info = TopicInfo(
                 type=kind,

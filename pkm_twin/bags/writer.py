@@ -8,22 +8,48 @@ import io
 import operator
 import os
 import queue
+import struct
 import threading
 import time
-from collections.abc import Callable, Mapping
+import zlib
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
+from itertools import chain
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-from mcap.writer import CompressionType, Writer
-
 from pkm_twin.bags.cdr import MessageCodec
-from pkm_twin.bags.chunks import FREE_BYTES, MAX_CHUNK_BYTES
 from pkm_twin.bags.definitions import live_type_name, message_definition
-from pkm_twin.bags.format import METADATA_CRC, metadata_crc
+from pkm_twin.bags.format import (
+    CHUNK_HEAD,
+    CRC,
+    FOOTER_BODY,
+    FRAME,
+    FREE_BYTES,
+    INDEX_ENTRY,
+    MAGIC,
+    MAX_CHUNK_BYTES,
+    MESSAGE_HEAD,
+    METADATA_CRC,
+    STATISTICS_HEAD,
+    Channel,
+    Head,
+    Op,
+    Schema,
+    Span,
+    metadata_crc,
+    packed_texts,
+)
 from pkm_twin.errors import BagError
 from pkm_twin.files import require_replaceable
+
+zstandard: Any
+try:
+    import zstandard
+except ImportError:
+    zstandard = None
 
 LIBRARY = "pkm_twin"
 """What the header of our own bags says wrote them."""
@@ -32,41 +58,6 @@ FLUSH_PERIOD = 0.05
 
 # What the writer may hold in memory before it slows its caller down.
 _QUEUE_LIMIT = 20_000
-
-
-class Sink:
-    """An unbuffered file for the MCAP writer: what it has written, the system has."""
-
-    def __init__(self, file: io.FileIO) -> None:
-        self._file = file
-        self._position = 0
-
-    def write(self, data: bytes) -> int:
-        """Write all of ``data``; the system may take it in parts."""
-        view = memoryview(data)
-        while view:
-            view = view[self._file.write(view) :]
-        self._position += len(data)
-        return len(data)
-
-    def tell(self) -> int:
-        """Return the position, counted since the start."""
-        return self._position
-
-    def flush(self) -> None:
-        """Nothing is held back."""
-
-
-def mcap_writer(sink: Sink, chunk_size: int) -> Any:
-    """Return an MCAP writer of which every byte is covered by a CRC."""
-    output: Any = sink
-    return Writer(
-        output,
-        chunk_size=chunk_size,
-        compression=CompressionType.ZSTD,
-        enable_crcs=True,
-        enable_data_crcs=True,
-    )
 
 
 def refuse_existing(path: Path, overwrite: bool) -> None:
@@ -110,6 +101,153 @@ def offered_qos(reliability: str, durability: str, depth: int) -> str:
         f"  liveliness: automatic\n  liveliness_lease_duration:{infinite}\n"
         "  avoid_ros_namespace_conventions: false"
     )
+
+
+class McapWriter:
+    """Writes the records of one MCAP file so that a CRC covers every byte.
+
+    Messages are gathered into chunks of ``chunk_size`` bytes. ``file`` is unbuffered: what has been
+    written, the system has. Without the package zstandard chunks are not packed.
+
+    :raises BagError: by each method, where the system refuses to write ``path``.
+    """
+
+    def __init__(self, file: io.FileIO, path: Path, chunk_size: int) -> None:
+        self._file = file
+        self._path = path
+        self._chunk_size = chunk_size
+        self._position = self._crc = 0
+        self._numbers: dict[Op, dict[bytes, int]] = {Op.SCHEMA: {}, Op.CHANNEL: {}}
+        self._metadata: set[bytes] = set()
+        self._counts: Counter[int] = Counter()
+        self._total, self._span = Span(), Span()
+        self._chunk = bytearray()
+        self._entries: dict[int, bytearray] = {}
+        self._indexes: dict[Op, list[bytes]] = {Op.CHUNK_INDEX: [], Op.METADATA_INDEX: []}
+
+    def start(self, profile: str) -> None:
+        """Write the opening mark and the header, unless they are there."""
+        if not self._position:
+            self._write(MAGIC + _record(Op.HEADER, packed_texts(profile, LIBRARY)))
+
+    def add_metadata(self, name: str, entries: Mapping[str, str], verified: bool = True) -> None:
+        """Write texts by name, once, with a CRC of their own where they are ``verified``."""
+        crc = {METADATA_CRC: metadata_crc(name, entries)} if verified else {}
+        record = _record(Op.METADATA, packed_texts(name), _map({**entries, **crc}))
+        if record in self._metadata:
+            return
+        self._metadata.add(record)
+        place = struct.pack("<QQ", self._position, len(record))
+        self._indexes[Op.METADATA_INDEX].append(
+            _record(Op.METADATA_INDEX, place, packed_texts(name))
+        )
+        self._write(record)
+
+    def channel(self, schema: Schema | None, channel: Channel) -> int:
+        """Return the number of a channel, whose own ``schema_id`` does not count."""
+        number = 0
+        if schema is not None:
+            texts = packed_texts(schema.name, schema.encoding, schema.data)
+            number = self._number(Op.SCHEMA, texts)
+        texts = packed_texts(channel.topic, channel.encoding) + _map(channel.metadata)
+        return self._number(Op.CHANNEL, struct.pack("<H", number) + texts)
+
+    def _number(self, kind: Op, body: bytes) -> int:
+        """The number of a schema or channel, which is written when it is first asked for."""
+        numbers = self._numbers[kind]
+        if body not in numbers:
+            numbers[body] = len(numbers) + 1
+            self._gather(_numbered(kind, numbers[body], body))
+        return numbers[body]
+
+    def add_message(self, head: Head, data: bytes) -> None:
+        """Write a message of a channel that :meth:`channel` has numbered."""
+        entry = INDEX_ENTRY.pack(head.log_time, len(self._chunk))
+        self._entries.setdefault(head.channel, bytearray()).extend(entry)
+        for span in (self._total, self._span):
+            span.add(head.log_time)
+        self._counts[head.channel] += 1
+        self._gather(_record(Op.MESSAGE, MESSAGE_HEAD.pack(*head), data))
+
+    def _gather(self, record: bytes) -> None:
+        self._chunk += record
+        if len(self._chunk) > self._chunk_size:
+            self.flush()
+
+    def flush(self) -> None:
+        """Write what has been gathered as a chunk with its index, once it has a message."""
+        if not self._entries:
+            return
+        data, at = bytes(self._chunk), self._position
+        compression, packed = ("zstd", zstandard.compress(data)) if zstandard else ("", data)
+        times = self._span.start, self._span.end
+        head = CHUNK_HEAD.pack(*times, len(data), zlib.crc32(data)) + packed_texts(compression)
+        self._write(_record(Op.CHUNK, head, struct.pack("<Q", len(packed)), packed))
+        begin, places, indexes = self._position, b"", b""
+        for number, entries in self._entries.items():
+            places += struct.pack("<HQ", number, begin + len(indexes))
+            indexes += _numbered(Op.MESSAGE_INDEX, number, packed_texts(bytes(entries)))
+        self._write(indexes)
+        self._indexes[Op.CHUNK_INDEX].append(
+            _record(
+                Op.CHUNK_INDEX,
+                struct.pack("<QQQQ", *times, at, begin - at),
+                packed_texts(places),
+                struct.pack("<Q", len(indexes)),
+                packed_texts(compression),
+                struct.pack("<QQ", len(packed), len(data)),
+            )
+        )
+        self._chunk, self._entries, self._span = bytearray(), {}, Span()
+
+    def finish(self) -> None:
+        """Write what is left, the summary and the closing mark."""
+        self.flush()
+        self._write(_record(Op.DATA_END, CRC.pack(self._crc)))
+        start, summary, offsets = self._position, b"", b""
+        for kind, records in self._summary():
+            group = b"".join(records)
+            place = struct.pack("<BQQ", kind, start + len(summary), len(group))
+            offsets += _record(Op.SUMMARY_OFFSET, place)
+            summary += group
+        footer = FRAME.pack(Op.FOOTER, FOOTER_BODY.size)
+        end = summary + offsets + footer + struct.pack("<QQ", start, start + len(summary))
+        self._write(end + CRC.pack(zlib.crc32(end)) + MAGIC)
+
+    def _summary(self) -> Iterator[tuple[Op, list[bytes]]]:
+        for kind, numbers in self._numbers.items():
+            yield kind, [_numbered(kind, number, body) for body, number in numbers.items()]
+        places = [len(self._indexes[kind]) for kind in (Op.METADATA_INDEX, Op.CHUNK_INDEX)]
+        kinds = [len(self._numbers[kind]) for kind in (Op.SCHEMA, Op.CHANNEL)]
+        times = self._total.start, self._total.end
+        facts = STATISTICS_HEAD.pack(self._total.count, *kinds, 0, *places, *times)
+        counts = b"".join(struct.pack("<HQ", *item) for item in self._counts.items())
+        yield Op.STATISTICS, [_record(Op.STATISTICS, facts, packed_texts(counts))]
+        yield Op.CHUNK_INDEX, self._indexes[Op.CHUNK_INDEX]
+        yield Op.ATTACHMENT_INDEX, []
+        yield Op.METADATA_INDEX, self._indexes[Op.METADATA_INDEX]
+
+    def _write(self, data: bytes) -> None:
+        view = memoryview(data)
+        try:
+            while view:
+                view = view[self._file.write(view) :]
+        except OSError as error:
+            raise write_error(error, self._path) from error
+        self._crc = zlib.crc32(data, self._crc)
+        self._position += len(data)
+
+
+def _record(kind: Op, *parts: bytes) -> bytes:
+    return b"".join((FRAME.pack(kind, sum(map(len, parts))), *parts))
+
+
+def _numbered(kind: Op, number: int, body: bytes) -> bytes:
+    return _record(kind, struct.pack("<H", number), body)
+
+
+def _map(entries: Mapping[str, str]) -> bytes:
+    return packed_texts(packed_texts(*chain(*entries.items())))
 
 
 class BagWriter:
@@ -156,8 +294,7 @@ class BagWriter:
         self._queue: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
         self._error: BagError | None = None
         self._closed = False
-        self._schema_numbers: dict[tuple[str, str], int] = {}
-        self._channel_numbers: dict[str, int] = {}
+        self._numbers: dict[str, int] = {}
         refuse_existing(self._path, overwrite)
         try:
             if overwrite:
@@ -168,15 +305,14 @@ class BagWriter:
             self._file = self._path.open("xb", buffering=0)
         except OSError as error:
             raise write_error(error, self._path) from error
+        self._writer = McapWriter(self._file, self._path, chunk_size)
         try:
-            self._writer = mcap_writer(Sink(self._file), chunk_size)
-            self._writer.start(profile="ros2", library=LIBRARY)
+            self._writer.start("ros2")
             for name, entries in (metadata or {}).items():
-                crc = metadata_crc(name, entries)
-                self._writer.add_metadata(name, {**entries, METADATA_CRC: crc})
-        except OSError as error:
+                self._writer.add_metadata(name, entries)
+        except BagError:
             self._file.close()
-            raise write_error(error, self._path) from error
+            raise
         self._thread = threading.Thread(target=self._work, name="bag writer", daemon=True)
         self._thread.start()
 
@@ -285,24 +421,19 @@ class BagWriter:
     # From here on: the writer's thread.
 
     def _register(self, topic: str, type_name: str, text: str, qos: str) -> None:
-        key = (type_name, text)
-        if key not in self._schema_numbers:
-            number = self._writer.register_schema(type_name, "ros2msg", text.encode())
-            self._schema_numbers[key] = number
-        self._channel_numbers[topic] = self._writer.register_channel(
-            topic, "cdr", self._schema_numbers[key], {"offered_qos_profiles": qos}
-        )
+        schema = Schema(type_name, "ros2msg", text.encode())
+        channel = Channel(0, topic, "cdr", {"offered_qos_profiles": qos})
+        self._numbers[topic] = self._writer.channel(schema, channel)
 
     def _add(self, topic: str, log_time: int, data: bytes, published: int, sequence: int) -> None:
-        number = self._channel_numbers[topic]
-        self._writer.add_message(number, log_time, data, published, sequence=sequence)
+        self._writer.add_message(Head(self._numbers[topic], sequence, log_time, published), data)
 
     def _work(self) -> None:
         try:
             self._take_in()
             self._writer.finish()
-        except OSError as error:
-            self._error = write_error(error, self._path)
+        except BagError as error:
+            self._error = error
         except Exception as error:
             # The caller is in another thread: without this it would record into nothing.
             self._error = BagError(f"cannot be written: {error}", path=self._path, reason="io")

@@ -6,6 +6,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import pytest
+
+pytest.importorskip("mcap")
+pytest.importorskip("zstandard")
 import yaml
 import zstandard
 from mcap.writer import CompressionType, Writer

@@ -15,10 +15,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+
+pytest.importorskip("mcap")
+pytest.importorskip("zstandard")
 import zstandard
 from mcap.writer import CompressionType, IndexType, Writer
 
-from pkm_twin.bags import chunks
 from pkm_twin.bags import format as mcap_format
 from pkm_twin.bags.reader import (
     BagMessage,
@@ -304,8 +306,8 @@ def test_decompression_bomb(tmp_path: Path, declared: int) -> None:
 def test_each_cap_holds_alone(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cap: str, text: str
 ) -> None:
-    monkeypatch.setattr(chunks, cap, 100)
-    monkeypatch.setattr(chunks, "FREE_BYTES", 1000 if cap == "MAX_RATIO" else 10**6)
+    monkeypatch.setattr(mcap_format, cap, 100)
+    monkeypatch.setattr(mcap_format, "FREE_BYTES", 1000 if cap == "MAX_RATIO" else 10**6)
     packed = zstandard.compress(bytes(5000))
     path = raw_bag(tmp_path / "p.mcap", chunk_record(packed, size=5000))
     with pytest.raises(DamagedBagError, match=text) as caught:

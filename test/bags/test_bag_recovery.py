@@ -11,6 +11,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+
+pytest.importorskip("mcap")
 from mcap.writer import CompressionType, Writer
 
 from pkm_twin.bags.reader import inspect, read_messages

@@ -16,6 +16,7 @@ from pathlib import Path
 import pytest
 import yaml
 
+from pkm_twin.bags import writer as writer_module
 from pkm_twin.bags.reader import BagWriter, inspect, read_messages
 from pkm_twin.bags.recover import recover
 from pkm_twin.errors import BagError
@@ -266,3 +267,33 @@ def test_no_threads_or_descriptors_are_left(tmp_path: Path) -> None:
     # Of Python's threads: libraries start and end some of their own when they like.
     after = held()
     assert after[0] <= before[0] and after[1] <= before[1]
+
+
+@pytest.mark.parametrize("packed", [True, False])
+def test_a_bag_has_the_bytes_of_the_format_s_own_library(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, make_bag: Callable[..., Path], packed: bool
+) -> None:
+    """Also without zstandard, when nothing is packed."""
+    mcap = pytest.importorskip("mcap.writer")
+    if not packed:
+        monkeypatch.setattr(writer_module, "zstandard", None)
+    path = make_bag(tmp_path / "own.mcap")
+    kind = mcap.CompressionType.ZSTD if packed else mcap.CompressionType.NONE
+    report = inspect(path)
+    assert not report.warnings and report.has_crc and report.has_index
+    with (tmp_path / "other.mcap").open("wb") as file:
+        writer = mcap.Writer(file, chunk_size=1024, compression=kind, enable_data_crcs=True)
+        writer.start(profile="ros2", library="pkm_twin")
+        (entries,) = report.metadata.values()
+        crc = writer_module.metadata_crc("pkm_twin", entries)
+        writer.add_metadata("pkm_twin", {**entries, "crc32": crc})
+        numbers = {}
+        for topic, info in report.topics.items():
+            schema = writer.register_schema(info.type, "ros2msg", info.definition.encode())
+            qos = {"offered_qos_profiles": info.offered_qos}
+            numbers[topic] = writer.register_channel(topic, "cdr", schema, qos)
+        for m in read_messages(path, order="file"):
+            number = numbers[m.topic]
+            writer.add_message(number, m.log_time, m.data, m.publish_time, m.sequence)
+        writer.finish()
+    assert path.read_bytes() == (tmp_path / "other.mcap").read_bytes()

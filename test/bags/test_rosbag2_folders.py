@@ -10,6 +10,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+
+pytest.importorskip("mcap")
+pytest.importorskip("zstandard")
 import zstandard
 from mcap.writer import CompressionType
 

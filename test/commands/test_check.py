@@ -8,6 +8,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+
+pytest.importorskip("mcap")
 from mcap.writer import CompressionType, Writer
 
 from delta_dynamics import inverse_dynamics

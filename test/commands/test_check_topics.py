@@ -5,6 +5,8 @@ import json
 
 import numpy as np
 import pytest
+
+pytest.importorskip("mcap")
 from mcap.writer import Writer
 
 from pkm_twin.apps.columns import read_columns

@@ -4,6 +4,8 @@
 import os
 
 import pytest
+
+pytest.importorskip("mcap")
 from mcap.writer import Writer
 
 from pkm_twin.bags.reader import inspect
