@@ -75,7 +75,6 @@ setup(
     install_requires=[
         "matplotlib>=3.6",
         "lz4",
-        "mcap>=1.6",
         "llvmlite>=0.41",
         "numpy>=1.26",
         "PyYAML>=6",
@@ -109,6 +108,7 @@ setup(
             "h5netcdf",
             "h5py",
             "hypothesis",
+            "mcap>=1.6",
             "mcap-ros2-support",
             "mpmath",
             "mujoco",

@@ -302,7 +302,6 @@ class TestManifest:
 DECLARED = {
     "hypothesis", "matplotlib", "numpy", "pkm_twin", "delta_dynamics", "stiffness_monitor",
     "pytest", "rich", "scipy", "setuptools", "support", "test", "tools", "bags", "typer", "yaml",
-    "zstandard", "lz4", "mcap",
 }  # fmt: skip
 """What package.xml's dependencies bring, and this package."""
 
