@@ -19,8 +19,8 @@ from pkm_twin.machine.joint_map import ControllerNumbers
 from pkm_twin.messages.reading import JointReader
 from pkm_twin.messages.stamps import SECOND, StampRules
 from pkm_twin.robot.robot import Robot
+from pkm_twin.settings import COUNT, FUTURE, LATE, SECONDS, setting
 from pkm_twin.streams.monitor import StreamMonitor
-from pkm_twin.streams.settings import COUNT, FUTURE, LATE, SECONDS, setting
 from pkm_twin.streams.wrench import counting
 
 OnStop = Literal["zeros", "gravity"]

@@ -32,9 +32,9 @@ from pkm_twin.ros.node import TwinNode
 from pkm_twin.ros.run import run
 from pkm_twin.ros.turns import Task
 from pkm_twin.ros.wrench import declare_mounts
+from pkm_twin.settings import SECONDS, changeable, with_parameters
 from pkm_twin.streams.matched import WrenchWindow
 from pkm_twin.streams.pace import Pace
-from pkm_twin.streams.settings import SECONDS, changeable, with_parameters
 from pkm_twin.streams.wrench import WrenchReader, WrenchSettings
 
 LAST_WORD: Final = 0.5

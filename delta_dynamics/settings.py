@@ -9,7 +9,7 @@ from typing import Literal
 from pkm_twin.errors import ParameterError
 from pkm_twin.messages.reading import ExtraJoints
 from pkm_twin.messages.stamps import SECOND, StampRules
-from pkm_twin.streams.settings import COUNT, FUTURE, LATE, SECONDS, SHARE, ZERO_STAMP, setting
+from pkm_twin.settings import COUNT, FUTURE, LATE, SECONDS, SHARE, ZERO_STAMP, setting
 
 LimitPolicy = Literal["warn", "reject", "clamp"]
 OnStop = Literal["nothing", "zeros", "gravity"]

@@ -24,9 +24,9 @@ from pkm_twin.messages.stamps import SECOND, StampRules
 from pkm_twin.messages.wrenches import read_wrench
 from pkm_twin.robot.robot import Robot
 from pkm_twin.robot.workspace import random_joints
+from pkm_twin.settings import setting
 from pkm_twin.streams.continuity import Continuity
 from pkm_twin.streams.path import JointPath
-from pkm_twin.streams.settings import setting
 from pkm_twin.streams.wrench import counting
 
 OnSilence = Literal["zeros", "hold"]

@@ -23,7 +23,7 @@ import numpy as np
 from pkm_twin.codegen.arrays import Array, Indices, one_vector
 from pkm_twin.errors import PkmTwinError
 from pkm_twin.robot.robot import Robot
-from pkm_twin.streams.settings import setting
+from pkm_twin.settings import setting
 from stiffness_monitor.compliance import strain_energy
 from stiffness_monitor.derivatives import compliance_effects, energy_effects
 from stiffness_monitor.response import element_response

@@ -20,7 +20,7 @@ from pkm_twin.robot.robot import Robot
 from pkm_twin.ros import health
 from pkm_twin.ros.node import TwinNode
 from pkm_twin.ros.turns import Task
-from pkm_twin.streams.settings import SECONDS
+from pkm_twin.settings import SECONDS
 from stiffness_monitor.alarm import AlarmSettings, Departure
 from stiffness_monitor.monitor import Answer
 from stiffness_monitor.watch import StiffnessWatch

@@ -28,8 +28,8 @@ from pkm_twin.ros.changes import follow_changes
 from pkm_twin.ros.node import TwinNode
 from pkm_twin.ros.run import run
 from pkm_twin.ros.wrench import declare_mounts
+from pkm_twin.settings import changeable, with_parameters
 from pkm_twin.streams.pace import Pace
-from pkm_twin.streams.settings import changeable, with_parameters
 from pkm_twin.streams.wrench import PLATFORM
 from stiffness_monitor.alarm_node import StiffnessAlarmTopics
 from stiffness_monitor.compliance import kernels

@@ -8,10 +8,10 @@ from graphlib import TopologicalSorter
 
 import pytest
 
-from pkm_twin.apps.groups import TASKS
+from pkm_twin.apps.groups import commands
 from test.support.sources import ROOT, arrows, imports, room, sources, within
 
-OWN = {"pkm_twin.errors", "pkm_twin.files", "pkm_twin.threads"}
+OWN = {"pkm_twin.errors", "pkm_twin.files", "pkm_twin.threads", "pkm_twin.settings"}
 """Modules without a folder that all may import."""
 GRAPH = {"pkm_twin.codegen", "pkm_twin.machine", "pkm_twin.kinematics"}
 CORE = GRAPH | {"pkm_twin.robot"}
@@ -23,8 +23,10 @@ MAY = {
     "pkm_twin.errors": set(),
     "pkm_twin.files": set(),
     "pkm_twin.threads": set(),
+    "pkm_twin.settings": set(),
     "pkm_twin.console": set(),
     "pkm_twin.options": set(),
+    "pkm_twin.report": {"pkm_twin.console"},
     "pkm_twin.codegen": set(),
     "pkm_twin.bags": set(),
     "pkm_twin.machine": {"pkm_twin.codegen"},
@@ -44,11 +46,11 @@ MAY = {
     "delta_dynamics.node": NODE | {"delta_dynamics"},
     "stiffness_monitor.node": NODE | {"stiffness_monitor"},
     "pkm_twin.state.node": NODE | {"pkm_twin.state", "stiffness_monitor"},
-    "pkm_twin.maps": NODE | TWINS | {"pkm_twin.console", "pkm_twin.options"},
+    "pkm_twin.maps": NODE | TWINS | {"pkm_twin.console", "pkm_twin.options", "pkm_twin.report"},
     "pkm_twin.apps": NODE
     | TWINS
     | {"pkm_twin.console", "pkm_twin.maps", "pkm_twin.export", "pkm_twin.identification"}
-    | {"pkm_twin.paths", "pkm_twin.design", "pkm_twin.options"},
+    | {"pkm_twin.paths", "pkm_twin.design", "pkm_twin.options", "pkm_twin.report"},
 }
 """Rooms that each may import, beside itself and :data:`OWN`; so nobody imports apps or a node."""
 ROS = re.compile(r"rclpy|\w+_msgs|\w+_interfaces")
@@ -104,16 +106,12 @@ def loaded_by(code):
 
 def test_a_command_and_a_node_start_without_what_they_may_never_need():
     """Parts of scipy take longer to load than all the rest of a command."""
-    commands = {
-        f"pkm_twin.apps.{entry.place.partition(':')[0]}"
-        for entries in TASKS.values()
-        for entry in entries.values()
-    }
+    modules = set(commands().places())
     loaded = loaded_by(
-        f"import {', '.join(commands)}, delta_dynamics, stiffness_monitor, pkm_twin.state"
+        f"import {', '.join(modules)}, delta_dynamics, stiffness_monitor, pkm_twin.state"
     )
     parts = ("linalg", "optimize", "signal", "special", "stats")
     assert not {f"scipy.{part}" for part in parts} & loaded
     # A command is loaded when it is asked for.
-    assert not commands & loaded_by("import pkm_twin.apps.cli")
+    assert not modules & loaded_by("import pkm_twin.apps.cli")
     assert "numpy" not in loaded_by("import pkm_twin.apps.cli")

@@ -11,7 +11,8 @@ import numpy as np
 
 from pkm_twin.apps.demo_report import DynamicsSeries, StiffnessSeries
 from pkm_twin.apps.tracking_report import TrackingSeries
-from pkm_twin.maps import figures, plots
+from pkm_twin.maps import figures
+from pkm_twin.report import plots
 
 
 def draw(

@@ -19,9 +19,9 @@ from pkm_twin.design import QUANTITIES, Design, DesignPoint, PosePath, Sweep
 from pkm_twin.design.pose_path import Followed
 from pkm_twin.design.variants import Variants
 from pkm_twin.errors import ParameterError, warn
-from pkm_twin.maps import plots
 from pkm_twin.maps.extras import require
 from pkm_twin.maps.store import writing
+from pkm_twin.report import plots
 from pkm_twin.robot.edited import Chosen, edited_yaml, write_edited
 from pkm_twin.robot.entries import entries
 from pkm_twin.robot.robot import Robot

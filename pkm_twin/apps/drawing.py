@@ -14,7 +14,7 @@ from pkm_twin.apps.view.scene import GROUND, PLATFORM, Scene
 from pkm_twin.apps.view.stage import LOOK
 from pkm_twin.errors import ParameterError, PkmTwinError
 from pkm_twin.files import replace_file
-from pkm_twin.maps.plots import pyplot, rendered
+from pkm_twin.report.plots import pyplot, rendered
 from pkm_twin.robot.robot import Robot
 
 Array = NDArray[np.float64]

@@ -131,7 +131,7 @@ def _report(
         f"constant feed within the tolerance is {1e3 * even:.4g} mm/s"
     )
     if drawing is not None:
-        from pkm_twin.maps import plots
+        from pkm_twin.report import plots
 
         figure, axes = plots.columns(1, 2)
         curves = ((1e3 * s.speed, "feed (mm/s)", speed), (1e6 * bend * s.speed, "deflection (µm)",

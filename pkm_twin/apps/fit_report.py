@@ -15,7 +15,7 @@ from rich.table import Table
 
 from pkm_twin.console import finite, table_console
 from pkm_twin.identification.fit import Fit, Number
-from pkm_twin.maps.plots import COLOURS, columns, label, rendered
+from pkm_twin.report.plots import COLOURS, columns, label, rendered
 from pkm_twin.robot.robot import Robot
 
 HEAD_OF_PAGE: Final = """<!DOCTYPE html>

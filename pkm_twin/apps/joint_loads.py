@@ -303,7 +303,8 @@ def spectra(loads: Sequence[Summary]) -> str:
 
 def draw(motion: Motion, loads: Sequence[Summary], path: Path) -> None:
     """Forces of the joints with the largest ones over time, and their rainflow spectra."""
-    from pkm_twin.maps import figures, plots
+    from pkm_twin.maps import figures
+    from pkm_twin.report import plots
 
     shown = sorted((load for load in loads if load.known), key=lambda load: -load.peaks[0])[:SHOWN]
     figure, axes = figures.subplots(1, 2, figsize=(9, 4.6), layout="constrained")

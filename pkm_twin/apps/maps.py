@@ -406,7 +406,8 @@ def _draw(
     cases: Sequence[Case], found: Sequence[Found], elements: Sequence[str],
 ) -> None:  # fmt: skip
     """The values of each case over time, in the colours of the elements to blame."""
-    from pkm_twin.maps import figures, plots
+    from pkm_twin.maps import figures
+    from pkm_twin.report import plots
 
     count = len(found)
     indices = [one.element for one in found if one.element is not None and elements]

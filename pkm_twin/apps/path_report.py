@@ -132,8 +132,8 @@ def report(
 
 def draw_limits(motion: TimedPath, path: Path) -> None:
     """Draw how much of each limit is used when, coloured by the one that binds."""
-    from pkm_twin.maps import plots
     from pkm_twin.paths.constraints import names_of
+    from pkm_twin.report import plots
 
     figure, axes = plots.columns(1, 2)
     used, time = motion.used, motion.fine.time

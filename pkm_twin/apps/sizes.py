@@ -269,7 +269,7 @@ def near(duty: DriveDuty) -> list[Fit]:
 
 def draw(taken: Taken, result: Sequence[DriveDuty], path: Path) -> None:
     """Torque against speed, an axes for each drive, with the curves of motors."""
-    from pkm_twin.maps import plots
+    from pkm_twin.report import plots
 
     shown = list(result)[:4]
     figure, axes = plots.columns(1, len(shown))

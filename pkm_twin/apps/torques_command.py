@@ -62,7 +62,7 @@ def torques(
     from pkm_twin.apps.limits import refuse_beyond
     from pkm_twin.apps.torques import check_target, motion_of, table, write_table
     from pkm_twin.bags.storage import is_bag
-    from pkm_twin.maps import plots
+    from pkm_twin.report import plots
 
     check_target(out)
     drawing, piped = out.with_suffix(".png"), str(out) == STANDARD

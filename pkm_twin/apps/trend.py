@@ -197,7 +197,8 @@ def _line(one: Judged) -> str:
 
 def draw(results: Sequence[Judged], path: Path) -> None:
     """Series with their control limits, those that drift first."""
-    from pkm_twin.maps import figures, plots
+    from pkm_twin.maps import figures
+    from pkm_twin.report import plots
 
     order = sorted(results, key=lambda one: (not one.drifts, -len(one.series.value)))[:SHOWN]
     drifting = sum(one.drifts for one in results)

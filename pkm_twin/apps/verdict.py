@@ -5,18 +5,11 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from enum import StrEnum
 
 from rich.table import Table
 from rich.text import Text
 
-
-class Verdict(StrEnum):
-    """Not enough evidence is a verdict of its own."""
-
-    GOOD = "good"
-    BAD = "bad"
-    UNKNOWN = "unknown"
+from pkm_twin.report import Verdict as Verdict
 
 
 @dataclass(frozen=True)

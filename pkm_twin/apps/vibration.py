@@ -223,7 +223,7 @@ def _print(data: dict[str, Any], text: list[str], as_json: bool, out: Path | Non
 
 
 def _draw_response(grid: Array, response: Any, modes: ToolModes, title: str, path: Path) -> None:
-    from pkm_twin.maps import plots
+    from pkm_twin.report import plots
 
     figure, axes = plots.columns(1, 2)
     size, phase = axes[0]
@@ -328,7 +328,7 @@ def _place(speed: float, depth: float, is_open: bool) -> dict[str, Any]:
 
 
 def _draw_lobes(found: Lobes, milling: Milling, title: str, path: Path) -> None:
-    from pkm_twin.maps import plots
+    from pkm_twin.report import plots
 
     figure, axes = plots.columns(1, 1)
     ax = axes[0][0]

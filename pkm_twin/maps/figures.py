@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pkm_twin.errors import UnknownNameError
-from pkm_twin.maps import plots
 from pkm_twin.maps.kind import Kind
 from pkm_twin.maps.kinds import KINDS
+from pkm_twin.report import plots
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

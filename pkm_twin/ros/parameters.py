@@ -22,7 +22,7 @@ from rclpy.parameter import Parameter
 from pkm_twin.errors import ParameterError, PkmTwinError, UnknownNameError
 from pkm_twin.robot.catalogue import load
 from pkm_twin.robot.robot import Robot
-from pkm_twin.streams.settings import Setting, settings_of
+from pkm_twin.settings import Setting, settings_of
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance

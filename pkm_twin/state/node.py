@@ -22,11 +22,11 @@ from pkm_twin.ros.changes import follow_changes
 from pkm_twin.ros.node import TwinNode
 from pkm_twin.ros.run import run
 from pkm_twin.ros.wrench import declare_mounts, triple
+from pkm_twin.settings import changeable, with_parameters
 from pkm_twin.state.scene import Load, Scales, Scene
 from pkm_twin.state.state import MachineState, State, moving_state_kernel, state_kernel
 from pkm_twin.state.topics import STATE
 from pkm_twin.streams.pace import Pace
-from pkm_twin.streams.settings import changeable, with_parameters
 from pkm_twin.streams.wrench import PLATFORM, Mount, WrenchSettings
 from stiffness_monitor.compliance import kernels, member_deflections, platform_response
 

@@ -17,8 +17,8 @@ from pkm_twin.machine import rotations
 from pkm_twin.machine.members import Place
 from pkm_twin.robot.outline import Posture, robot_bars
 from pkm_twin.robot.robot import Robot
+from pkm_twin.settings import LARGE, setting
 from pkm_twin.state.state import State
-from pkm_twin.streams.settings import LARGE, setting
 
 Array = NDArray[np.float64]
 Kind = Literal["cylinder", "sphere", "arrow", "line", "text"]

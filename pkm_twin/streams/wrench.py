@@ -19,8 +19,8 @@ from pkm_twin.errors import MessageError, ParameterError
 from pkm_twin.machine import rotations
 from pkm_twin.messages.stamps import SECOND, StampRules
 from pkm_twin.messages.wrenches import WrenchSample, read_wrench
+from pkm_twin.settings import FUTURE, SECONDS, ZERO_STAMP, setting
 from pkm_twin.streams.monitor import StreamMonitor
-from pkm_twin.streams.settings import FUTURE, SECONDS, ZERO_STAMP, setting
 
 Triple = tuple[float, float, float]
 V = TypeVar("V")

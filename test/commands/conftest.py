@@ -10,7 +10,7 @@ import pytest
 
 from pkm_twin.apps import drawing, fit_report
 from pkm_twin.bags.reader import BagWriter, open_bag
-from pkm_twin.maps import plots
+from pkm_twin.report import plots
 from test.support.command import Result
 
 REPOSITORY = Path(__file__).resolve().parents[2]

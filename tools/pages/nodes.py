@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from pkm_twin.apps.nodes import MODULES
-from pkm_twin.streams.settings import Setting
+from pkm_twin.settings import Setting
 from pkm_twin.streams.topics import Topic
 
 COMMON: Final = ("autostart", "executor", "queue_depth", "thread_priority")

@@ -12,11 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pkm_twin.machine.graph import BASE
-from pkm_twin.maps import plots
 from pkm_twin.maps.extras import require
 from pkm_twin.maps.kind import Array, Case, Space
 from pkm_twin.maps.kinds.frequency import Frequency
 from pkm_twin.maps.variables import POSITIVE, SHARE, Variable, about
+from pkm_twin.report import plots
 from pkm_twin.robot.robot import Robot
 from stiffness_monitor.modes import modes
 from stiffness_monitor.structure import StructuralModel, structural_model

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Settings of a node as fields of a class: what declares, changes and documents its parameters."""
+"""Settings as fields of a class: they declare a node's parameters and a command's options."""
 
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass, field
+from dataclasses import MISSING, dataclass, field
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 if TYPE_CHECKING:
@@ -16,11 +16,14 @@ S = TypeVar("S", bound="DataclassInstance")
 
 @dataclass(frozen=True)
 class Setting:
-    """The parameter of a field.
+    """The parameter or option of a field.
 
     ``name``: of the parameter, by default the field's. ``choices``: the words that are allowed, or
-    the field's value for each. ``fixed``: not changeable while the node runs. ``usual``: words for
-    a default that depends on the robot.
+    the field's value for each. Of nodes alone: ``fixed``, not changeable while the node runs;
+    ``usual``, words for a default that depends on the robot. Of commands alone: ``argument``, given
+    by its place; ``count``, this many numbers with commas between, 0 for any count; ``writes``, a
+    file that the command writes, whose name ends in one of ``endings`` where there are any;
+    ``older``, spellings that help does not list; ``metavar``, the value's name in help.
     """
 
     text: str
@@ -31,6 +34,12 @@ class Setting:
     choices: Collection[str] | Mapping[str, Any] = ()
     fixed: bool = False
     usual: str = ""
+    argument: bool = False
+    count: int | None = None
+    writes: bool = False
+    endings: tuple[str, ...] = ()
+    older: tuple[str, ...] = ()
+    metavar: str | None = None
 
     def value(self, given: Any) -> Any:
         """The field's value for a parameter's."""
@@ -56,7 +65,13 @@ ZERO_STAMP: Final = "accept a zero stamp, as the arrival time"
 
 
 def setting(default: Any, text: str, **more: Any) -> Any:
-    """A field that is a parameter; ``more``: further attributes of :class:`Setting`."""
+    """A field that is a parameter or an option.
+
+    :param default: ``...`` for none: it has to be given.
+    :param more: further attributes of :class:`Setting`.
+    """
+    if default is ...:
+        default = MISSING
     return field(default=default, metadata={"setting": Setting(text, **more)})
 
 

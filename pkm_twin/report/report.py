@@ -1,0 +1,185 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The parts of a report, and the report as plain data."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from enum import StrEnum
+from pathlib import Path
+from typing import Any
+
+
+class Verdict(StrEnum):
+    """Not enough evidence is a verdict of its own."""
+
+    GOOD = "good"
+    BAD = "bad"
+    UNKNOWN = "unknown"
+
+
+@dataclass(frozen=True)
+class Fact:
+    """A named value.
+
+    ``name``: its key in JSON; empty where JSON has the value elsewhere. ``value``: a number, word,
+    list or mapping, in SI units. ``text``: its label in the terminal; None where it is in JSON
+    alone. ``shown``: the value in words, by default its number. ``bound`` and ``verdict``: of a
+    judged property.
+    """
+
+    name: str
+    value: Any
+    unit: str = ""
+    text: str | None = None
+    shown: str = ""
+    bound: Any = None
+    verdict: Verdict | None = None
+
+    @property
+    def words(self) -> str:
+        """The value as the terminal shows it, with its unit."""
+        return self.shown or f"{number(self.value)} {self.unit}".strip()
+
+
+def judged(what: str, value: str, bound: str, good: bool | None) -> Fact:
+    """A property in words against its bound; ``good``: None where nothing can be told."""
+    verdict = Verdict.UNKNOWN if good is None else Verdict.GOOD if good else Verdict.BAD
+    return Fact("", value, text=what, bound=bound, verdict=verdict)
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column of a table.
+
+    ``name``: its key in JSON; empty where it is only shown. ``text``: its heading, by default the
+    name, a blank for none; None where it is in JSON alone. ``scale``: what the terminal multiplies
+    a number by, so that it is in ``shown``, by default in ``unit``. ``form``: of numbers.
+    """
+
+    name: str
+    unit: str = ""
+    text: str | None = ""
+    scale: float = 1.0
+    shown: str = ""
+    form: str = ".4g"
+
+    @property
+    def heading(self) -> str:
+        """What the terminal prints above it."""
+        unit = self.shown or self.unit
+        return f"{self.text or self.name}{f' ({unit})' if unit else ''}"
+
+    def cell(self, value: Any) -> str:
+        """A value as the terminal shows it."""
+        scales = self.scale != 1.0 and isinstance(value, int | float)
+        return number(value * self.scale if scales else value, self.form)
+
+
+@dataclass(frozen=True)
+class Table:
+    """Rows by name, each with a value per column; JSON has ``{name: {row: {column: value}}}``.
+
+    ``name``: empty for a table of the terminal alone. ``head``: what the rows are. ``title``: the
+    line above it.
+    """
+
+    name: str
+    columns: Sequence[Column]
+    rows: Mapping[str, Sequence[Any]]
+    title: str = ""
+    head: str = ""
+
+    @property
+    def data(self) -> dict[str, dict[str, Any]]:
+        """As JSON has it."""
+        return {
+            row: {c.name: v for c, v in zip(self.columns, values, strict=True) if c.name}
+            for row, values in self.rows.items()
+        }
+
+
+@dataclass(frozen=True)
+class Report:
+    """What a command found.
+
+    ``answer``: one sentence with units, the first line of the output. ``files``: written ones by
+    their keys in JSON, None where none was. ``figures``: by what is added to the picture's name,
+    functions that draw one each with matplotlib. ``verdict``: bad ends the command with code 1;
+    ``code``: another one. ``error``: a line on stderr. ``raw``: what the command prints as it is,
+    in place of the rest.
+    """
+
+    answer: str = ""
+    facts: Sequence[Fact] = ()
+    tables: Sequence[Table] = ()
+    figures: Mapping[str, Callable[[], Any]] = field(default_factory=dict)
+    notes: Sequence[str] = ()
+    files: Mapping[str, Path | None] = field(default_factory=dict)
+    verdict: Verdict | None = None
+    code: int = 0
+    error: str = ""
+    raw: str = ""
+
+    @property
+    def exit_code(self) -> int:
+        """Of the command: 0 good, 1 bad."""
+        return self.code or int(self.verdict is Verdict.BAD)
+
+    @property
+    def data(self) -> dict[str, Any]:
+        """Facts and tables as JSON has them, in SI units; what is not finite is None.
+
+        ``units`` has the units of facts, and of columns as TABLE.COLUMN; ``items`` the judged ones.
+        """
+        found = {fact.name: fact.value for fact in self.facts if fact.name}
+        items = [
+            {"what": f.text, "value": f.value, "bound": f.bound, "verdict": f.verdict}
+            for f in self.facts
+            if f.verdict is not None
+        ]
+        found |= {"items": items} if items else {}
+        found |= {table.name: table.data for table in self.tables if table.name}
+        found |= {name: None if path is None else str(path) for name, path in self.files.items()}
+        units = {fact.name: fact.unit for fact in self.facts if fact.name and fact.unit}
+        for table in filter(lambda one: one.name, self.tables):
+            units |= {f"{table.name}.{c.name}": c.unit for c in table.columns if c.name and c.unit}
+        found |= {"units": units} if units and "units" not in found else {}
+        found |= {"verdict": self.verdict} if self.verdict is not None else {}
+        found |= {"error": self.error} if self.error else {}
+        return dict(plain(found))
+
+    def and_files(self, **files: Path | None) -> Report:
+        """With more files."""
+        return dataclasses.replace(self, files={**self.files, **files})
+
+
+def plain(value: Any) -> Any:
+    """Data that JSON can have: arrays are lists, and what is not finite is None."""
+    if hasattr(value, "tolist"):
+        value = value.tolist()
+    if isinstance(value, Mapping):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    return str(value) if isinstance(value, Path | StrEnum) else value
+
+
+def number(value: Any, form: str = ".4g") -> str:
+    """A value in words: what is not known is a dash."""
+    value = value.tolist() if hasattr(value, "tolist") else value
+    if value is None or value != value:
+        return "-"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, float):
+        return f"{value + 0.0:{form}}"
+    if isinstance(value, list | tuple):
+        return ", ".join(number(item, form) for item in value)
+    if isinstance(value, Mapping):
+        return ", ".join(f"{key} {number(item, form)}" for key, item in value.items())
+    return str(value)

@@ -1,0 +1,89 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A report as text: the answer first, then facts, tables, notes and files."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Final
+
+import typer
+
+from pkm_twin.console import print_json, tell
+from pkm_twin.report.report import Fact, Report, Table, Verdict
+
+COLOURS: Final = {Verdict.GOOD: "green", Verdict.BAD: "red", Verdict.UNKNOWN: "yellow"}
+
+
+def present(report: Report, as_json: bool, *, piped: bool = False) -> None:
+    """Print a report.
+
+    :param piped: stdout carries the file that the command writes; the text goes to stderr.
+    """
+    if as_json:
+        print_json(report.data)
+    elif report.raw:
+        typer.echo(report.raw, nl=False)
+    else:
+        text = text_of(report)
+        if text:
+            typer.echo(text, err=piped)
+    if report.error:
+        tell(report.error)
+
+
+def text_of(report: Report) -> str:
+    """What the terminal shows, lines with newlines between."""
+    found = [report.answer] if report.answer else []
+    for fact in report.facts:
+        if fact.text is not None and fact.verdict is None:
+            found.append(f"{fact.text}: {fact.words}" if fact.text else fact.words)
+    found += _judged([fact for fact in report.facts if fact.verdict is not None])
+    for table in report.tables:
+        found += ["", *table_lines(table)] if found else table_lines(table)
+    if report.tables and (report.notes or any(report.files.values())):
+        found.append("")
+    found += [*report.notes, *(str(path) for path in report.files.values() if path is not None)]
+    return "\n".join(found)
+
+
+def _judged(facts: Sequence[Fact]) -> Iterator[str]:
+    """Judged properties as a table."""
+    if not facts:
+        return
+    rows = [(f.text or f.name, f.words, _words(f.bound), f.verdict or "") for f in facts]
+    lines = aligned([("", "value", "limit", "verdict"), *rows], "<<<<")
+    yield next(lines)
+    for fact, line in zip(facts, lines, strict=True):
+        word = str(fact.verdict)
+        end = line.rstrip()[: -len(word)]
+        yield end + typer.style(word, fg=COLOURS[fact.verdict or Verdict.UNKNOWN])
+
+
+def _words(bound: object) -> str:
+    return "" if bound is None else str(bound)
+
+
+def table_lines(table: Table) -> list[str]:
+    """A table's title, headings and rows; columns of numbers end at the right."""
+    shown = [k for k, column in enumerate(table.columns) if column.text is not None]
+    columns = [table.columns[k] for k in shown]
+    head = (table.head, *(column.heading for column in columns))
+    rows = [
+        (name, *(column.cell(values[k]) for k, column in zip(shown, columns, strict=True)))
+        for name, values in table.rows.items()
+    ]
+    words = [any(isinstance(row[k], str) for row in table.rows.values()) for k in shown]
+    sides = "<" + "".join("<" if word else ">" for word in words)
+    titled = [table.title] if table.title else []
+    lines = aligned([head, *rows] if any(cell.strip() for cell in head) else rows, sides)
+    return [*titled, *lines]
+
+
+def aligned(rows: Sequence[Sequence[str]], sides: str) -> Iterator[str]:
+    """Lines with their cells below each other; ``sides`` has < or > for each column."""
+    if not any(row[0] for row in rows):
+        rows, sides = [row[1:] for row in rows], sides[1:]
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    for row in rows:
+        cells = (f"{c:{s}{w}}" for c, s, w in zip(row, sides, widths, strict=True))
+        yield "  ".join(cells).rstrip()
