@@ -68,14 +68,14 @@ def parse_numbers(text: str) -> list[float]:
 
 
 def numbers(text: str, count: int, expected: str = "") -> list[float]:
-    """``count`` finite numbers of a command line, with commas between.
+    """``count`` finite numbers of a command line, with commas between; any count for 0.
 
     :param expected: what is right, in words; by default that count of numbers.
     """
     values = parse_numbers(text)
-    if len(values) != count:
-        expected = expected or f"{count} numbers separated by commas"
-        raise typer.BadParameter(f"{text!r} is not {expected}")
+    if len(values) != (count or max(len(values), 1)):
+        expected = expected or f"{count or ''} numbers separated by commas".strip()
+        raise typer.BadParameter(f"{text.strip()!r} is not {expected}")
     return values
 
 

@@ -45,7 +45,7 @@ class FileError(ParameterError):
         self.args = (one_line(f"{path}: {text}", 2000),)
 
 
-NOUNS: Final = ("robot", "mechanism", "map", "launch argument")
+NOUNS: Final = ("robot", "mechanism", "map", "launch argument", "command")
 """Fields whose value is a name of this kind of thing."""
 
 

@@ -15,6 +15,8 @@ import typer
 from pkm_twin.errors import PkmTwinError
 
 Command = TypeVar("Command", bound=Callable[..., Any])
+UsageError: Any = typer.BadParameter.__mro__[1]
+"""Of the click that this typer has."""
 
 # typer of Ubuntu 24.04 reads no unions.
 OptionalInt = Optional[int]  # noqa: UP045

@@ -1,18 +1,24 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The table of commands by task: where each is, loaded when it is asked for."""
+"""The commands: one file each in ``pkm_twin.apps.commands``, loaded when it is asked for."""
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from functools import cache
 from importlib import import_module
+from pathlib import Path
 from typing import Any, Final
 
 import typer
 from typer.core import TyperGroup
 from typer.main import get_command
 
-from pkm_twin.options import Commands
+from pkm_twin.apps.options import USAGE
+from pkm_twin.console import tell
+from pkm_twin.errors import UnknownNameError
+from pkm_twin.options import Commands, UsageError
 
 WIDE: Final = 200
 """Characters of a command's purpose, never cut."""
@@ -52,7 +58,6 @@ class Entry:
 
 TASKS: Final[Mapping[str, Mapping[str, Entry]]] = {
     "Robots": {
-        "robots": Entry("robots:robots"),
         "info": Entry("robots:info"),
         "view": Entry("view.command:view"),
         "certify": Entry("certify_command:certify"),
@@ -67,11 +72,6 @@ TASKS: Final[Mapping[str, Mapping[str, Entry]]] = {
         "loads": Entry("joint_loads:loads", tables=True, wrenches=True),
     },
     "Stiffness, workspace and vibration": {
-        # A negative number is no option.
-        "compliance": Entry(
-            "compliance:compliance",
-            settings={"context_settings": {"ignore_unknown_options": True}},
-        ),
         "map": Entry("maps:app"),
         "frf": Entry("vibration:frf"),
         "lobes": Entry("vibration:lobes"),
@@ -82,10 +82,6 @@ TASKS: Final[Mapping[str, Mapping[str, Entry]]] = {
         "recover": Entry("replay:recover"),
         "play": Entry("replay:play"),
         "monitor-torques": Entry("guard_check:guard_check"),
-        "guard-check": Entry(
-            "guard_check:guard_check",
-            settings={"hidden": True, "help": "The older name of `monitor-torques`."},
-        ),
     },
     "Identification and calibration": {
         "record-kit": Entry("record_kit:record_kit"),
@@ -100,9 +96,11 @@ TASKS: Final[Mapping[str, Mapping[str, Entry]]] = {
         "export": Entry("export:app"),
     },
 }
-"""Commands in the order in which tasks need them."""
-OLDER: Final = {"atlas": "map"}
-"""Older names of commands, which help does not list."""
+"""Commands that are not in the folder yet, in the order in which tasks need them."""
+OLDER: Final[Mapping[str, tuple[str, ...]]] = {
+    "atlas": ("map",), "guard-check": ("monitor-torques",),
+}  # fmt: skip
+"""Older names of commands, which help does not list, with the words in their place."""
 GREETING: Final = """pkm-twin: torques, stiffness and recordings of parallel robots. Try
 
   pkm-twin view delta_cu                       look at a robot in the browser
@@ -114,27 +112,61 @@ GREETING: Final = """pkm-twin: torques, stiffness and recordings of parallel rob
 pkm-twin --help lists all commands."""
 
 
-class _Loaded(Mapping[str, Any]):
-    """The table's commands, each built when it is first taken."""
+class Loaded(Mapping[str, Any]):
+    """Every command by its name, each built when it is first taken."""
 
     def __init__(self) -> None:
-        self._entries = {name: e for names in TASKS.values() for name, e in names.items()}
+        folder = Path(__file__).parent / "commands"
+        self.files = sorted(path.stem.replace("_", "-") for path in folder.glob("[a-z]*.py"))
+        self.older = {name: e for names in TASKS.values() for name, e in names.items()}
         self._built: dict[str, Any] = {}
 
     def __getitem__(self, name: str) -> Any:
         if name not in self._built:
-            self._built[name] = get_command(self._entries[name].app(name))
+            self._built[name] = get_command(self.declared(name).app(name))
             self._built[name].name = name
         return self._built[name]
 
     def __contains__(self, name: object) -> bool:
-        return name in self._entries
+        return name in self.files or name in self.older
 
     def __iter__(self) -> Iterator[str]:
-        return iter(self._entries)
+        return iter([*self.files, *self.older])
 
     def __len__(self) -> int:
-        return len(self._entries)
+        return len(self.files) + len(self.older)
+
+    def places(self) -> list[str]:
+        """The modules of all commands."""
+        older = {f"pkm_twin.apps.{e.place.partition(':')[0]}" for e in self.older.values()}
+        return [*map(_module, self.files), *older]
+
+    def declared(self, name: str) -> Any:
+        """What the file of a command declares; its ``app`` is the command as a program."""
+        if name in self.older:
+            return self.older[name]
+        if name not in self.files:
+            raise KeyError(name)
+        return import_module(_module(name)).COMMAND
+
+    def tasks(self) -> dict[str, list[str]]:
+        """Names by task; this loads every command."""
+        found: dict[str, list[str]] = {title: [] for title in TASKS}
+        for name in self.files:
+            found[self.declared(name).task].append(name)
+        for title, entries in TASKS.items():
+            found[title] += entries
+        return found
+
+
+@cache
+def commands() -> Loaded:
+    """All commands of ``pkm-twin``."""
+    return Loaded()
+
+
+def _module(name: str) -> str:
+    return f"pkm_twin.apps.commands.{name.replace('-', '_')}"
 
 
 class Tasks(TyperGroup):
@@ -142,21 +174,41 @@ class Tasks(TyperGroup):
 
     def __init__(self, **settings: Any) -> None:
         super().__init__(**settings)
-        self.commands: Any = _Loaded()
+        self.commands: Any = commands()
 
-    def get_command(self, ctx: Any, cmd_name: str) -> Any:
+    def main(self, *args: Any, **extra: Any) -> Any:
+        """As typer's for a program; what is wrong is one line."""
+        try:
+            code = super().main(*args, **{**extra, "standalone_mode": False})
+        except UsageError as error:
+            text = error.format_message().rstrip(".").removeprefix("Invalid value: ")
+            context = getattr(error, "ctx", None)
+            where = f"; see {context.command_path} --help" if context is not None else ""
+            tell(f"{text}{where}")
+            sys.exit(USAGE)
+        sys.exit(code if isinstance(code, int) else 0)
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """A command, by its name or an older one."""
-        return super().get_command(ctx, OLDER.get(cmd_name, cmd_name))
+        if args and args[0] in OLDER:
+            args = [*OLDER[args[0]], *args[1:]]
+        return super().parse_args(ctx, args)
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        """As click's; a name that is none comes with the closest one."""
+        if args[0] not in self.commands and not args[0].startswith("-"):
+            names = (*self.commands, *OLDER)
+            raise UsageError(str(UnknownNameError("command", args[0], names)), ctx)
+        return super().resolve_command(ctx, args)
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
         """A section for each task."""
         longest = max(len(name) for name in self.commands)
-        for title, names in TASKS.items():
-            found = [(name, self.commands[name]) for name in names]
+        for title, names in self.commands.tasks().items():
             rows = [
-                (f"{name:{longest}}", command.get_short_help_str(WIDE))
-                for name, command in found
-                if not command.hidden
+                (f"{name:{longest}}", self.commands[name].get_short_help_str(WIDE))
+                for name in names
+                if not self.commands[name].hidden
             ]
             with formatter.section(title):
                 formatter.write_dl(rows)
@@ -166,4 +218,4 @@ def greet(ctx: typer.Context) -> None:
     """Three things to try, where no command is given: wrong usage, as scripts see it."""
     if ctx.invoked_subcommand is None:
         typer.echo(GREETING)
-        raise typer.Exit(2)
+        raise typer.Exit(USAGE)

@@ -4,18 +4,257 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from pkm_twin.console import refuse_existing
+from pkm_twin.console import numbers, refuse_existing
 from pkm_twin.errors import ParameterError
 from pkm_twin.files import STANDARD
 from pkm_twin.options import OptionalPath, OptionalText, file_name
+from pkm_twin.settings import setting
 
-REFUSED, SALVAGED = 1, 3
-"""Exit codes: rejected; damaged, with messages that `recover` saves."""
+if TYPE_CHECKING:
+    from pkm_twin.apps.tables import Dialect
+    from pkm_twin.apps.wrench_frames import WrenchFrames
+    from pkm_twin.robot.robot import Robot
+
+REFUSED, USAGE, SALVAGED = 1, 2, 3
+"""Exit codes: rejected; wrong usage; damaged, with messages that `recover` saves."""
+
+PICTURES = (".png", ".svg", ".pdf")
+"""What a picture's name may end in."""
+ROBOT_HELP = "a robot's name (see `pkm-twin robots`), or its YAML, URDF, MJCF, SDF"
+
+
+@dataclass(frozen=True, kw_only=True)
+class OfPlatform:
+    """The platform of a description that names none."""
+
+    platform: str | None = setting(None, "for a URDF, MJCF or SDF: the link that carries the tool")
+
+
+@dataclass(frozen=True, kw_only=True)
+class OfRobot(OfPlatform):
+    """A command on a robot."""
+
+    robot: str = setting(..., ROBOT_HELP, argument=True)
+
+    def machine(self) -> Robot:
+        """The robot, with the payload where the command has one.
+
+        :raises PkmTwinError: it cannot be read.
+        """
+        from pkm_twin import load
+
+        return load(self.robot, platform=self.platform)
+
+
+@dataclass(frozen=True, kw_only=True)
+class OfRecordedRobot(OfPlatform):
+    """A command on recordings, which may name their robot."""
+
+    robot: str | None = setting(
+        None, "a robot's name or file; default: the robot that the recording names"
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Carries(OfRobot):
+    """A payload on the platform."""
+
+    payload: str | None = setting(
+        None,
+        "payload on the platform: MASS[,x,y,z], kg, m from the platform's reference point; "
+        "default: that of the recording or the robot file",
+    )
+
+    @property
+    def load(self) -> Any:
+        """The payload, None where none is given."""
+        return load_of(self.payload, getattr(self, "load_times", None))
+
+    def machine(self) -> Robot:
+        """The robot with its payload."""
+        machine, carried = super().machine(), self.load
+        return machine if carried is None else carried.on(machine)
+
+
+@dataclass(frozen=True, kw_only=True)
+class CarriesAtTimes(Carries):
+    """A payload that is held in intervals."""
+
+    load_times: str | None = setting(
+        None,
+        "intervals in which --payload is held: FROM,TO[,FROM,TO...], s from the start; "
+        "default: always",
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReadsTables:
+    """How tables are written."""
+
+    separator: str | None = setting(None, "of a table's columns: , ; or tab; default: found")
+    decimal: str | None = setting(None, "of a table's numbers: . or ,")
+    columns: str | None = setting(
+        None, "names of a table's columns, OURS=THEIRS,...: time=t,arm_1.position=q1"
+    )
+    units: str | None = setting(None, "of a table: of rad, deg, m, mm, s, ms, us; default SI")
+    time: str | None = setting(None, "name of a table's column of times")
+
+    @property
+    def dialect(self) -> Dialect:
+        """As the readers of tables take it.
+
+        :raises ParameterError: an option that is none.
+        """
+        from pkm_twin.apps.tables import dialect_of
+
+        return dialect_of(self.separator, self.decimal, self.columns, self.units, self.time)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReadsWrenches:
+    """The frame of a recording's wrenches."""
+
+    wrench_frame: str | None = setting(
+        None,
+        "accepted frame of a bag's wrenches, which turns with the platform; default: platform or "
+        "--base-frame, whichever comes first",
+    )
+    base_frame: str = setting("base_link", "frame of a bag's wrenches with base axes")
+
+    @property
+    def frames(self) -> WrenchFrames:
+        """As the readers of bags take them."""
+        from pkm_twin.apps.wrench_frames import WrenchFrames
+
+        return WrenchFrames(self.wrench_frame, self.base_frame)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReadsRecordings(ReadsTables, ReadsWrenches):
+    """Which topics of a recording are read, and how its tables are written."""
+
+    topic: tuple[str, ...] = setting(
+        (), "topic of joint states or wrenches; default: found by the robot's joint names"
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReadsMotions(ReadsRecordings):
+    """A recording or a path as a motion."""
+
+    follow: str | None = setting(
+        None,
+        "which columns of a table with joint positions and pose are the motion: joints, or pose, "
+        "which plans it again for this robot; default: both, which have to agree",
+        choices=("joints", "pose"),
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class AtPose(Carries):
+    """A pose of the platform."""
+
+    at: str | None = setting(None, "the pose's coordinates, separated by commas; default: home")
+
+    def pose(self, machine: Robot) -> list[float]:
+        """The pose, shape (m,)."""
+        names = machine.pose_names
+        if self.at is None:
+            home: list[float] = machine.home().tolist()
+            return home
+        return numbers(self.at, len(names), f"a pose: {', '.join(names)}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class BeyondLimitsToo:
+    """Work outside the joint limits."""
+
+    beyond_limits: bool = setting(
+        False, "also compute outside the joint limits, and mark these results"
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Accepts:
+    """Data that the machine cannot have produced."""
+
+    accept: bool = setting(
+        False, "also use data that this machine cannot have produced, and mark the results"
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Overwrites:
+    """Files that are there may be replaced."""
+
+    overwrite: bool = setting(False, "replace files that exist")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Writes(Overwrites):
+    """A file to write; a command says which by its own field ``out``."""
+
+    out: Path | None = setting(None, "file to write", writes=True)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Draws(Overwrites):
+    """A picture of the result: asked for, or beside ``--out``."""
+
+    picture: str | None = setting(
+        None, "draw the result: .png, .svg or .pdf; default: beside --out", metavar="[FILE]"
+    )
+    no_picture: bool = setting(False, "draw nothing beside --out")
+
+    def drawing(self, command: str) -> Path | None:
+        """The picture's file, None for none.
+
+        :raises ParameterError: another ending.
+        """
+        out = getattr(self, "out", None)
+        beside = None if out is None or str(out) == STANDARD else out.with_suffix(".png")
+        if self.no_picture or (self.picture is None and beside is None):
+            return None
+        if not self.picture:
+            robot = getattr(self, "robot", None) or "recording"
+            return beside or Path(f"{command}_{Path(robot).stem}.png")
+        if Path(self.picture).suffix not in PICTURES:
+            raise ParameterError(
+                "--picture", self.picture, f"a name that ends in {', '.join(PICTURES)}"
+            )
+        return Path(self.picture)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Parallel:
+    """Processes that work at the same time."""
+
+    jobs: int | None = setting(
+        None, "processes on this computer; default: one per core", low=1, high=10**4
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Seeded:
+    """Random numbers."""
+
+    seed: int = setting(0, "of the random numbers", low=0, high=2**32 - 1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class AwayFromSingular:
+    """The singularity index below which a pose does not count."""
+
+    singularity: float = setting(
+        0.05, "least singularity index of a pose, 0 to 1", low=0.0, high=1.0
+    )
+
 
 RobotName = Annotated[
     str,

@@ -18,15 +18,6 @@ from pkm_twin.errors import ParameterError
 from pkm_twin.options import OptionalPath, file_name
 
 
-def robots() -> None:
-    """List the robots that ship with pkm_twin."""
-    from pkm_twin import load, robot_names
-    from pkm_twin.apps.describe import summary
-
-    for name in robot_names():
-        typer.echo(f"{name:12} {summary(load(name))}")
-
-
 def info(
     robot: RobotName,
     platform: Platform = None,

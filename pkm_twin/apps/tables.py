@@ -103,10 +103,14 @@ def in_si(columns: Mapping[str, Array], robot: Robot | None) -> dict[str, Array]
     return result
 
 
-def _dialect(
+def dialect_of(
     separator: str | None, decimal: str | None, columns: str | None, units: str | None,
     time: str | None,
 ) -> Dialect:  # fmt: skip
+    """The dialect of a command line.
+
+    :raises ParameterError: an option that is none.
+    """
     if separator is not None and separator not in SEPARATORS:
         raise ParameterError("--separator", separator, "one of , ; tab")
     if decimal is not None and decimal not in (".", ","):
@@ -150,5 +154,5 @@ def _options(
     del separator, decimal, columns, units, time
 
 
-tables = shared_options(_options, CHOSEN, _dialect)
+tables = shared_options(_options, CHOSEN, dialect_of)
 """Gives a command that reads tables the options of their dialect."""

@@ -7,15 +7,15 @@ import re
 from typer.main import get_command
 
 from pkm_twin.apps.cli import app
-from pkm_twin.apps.groups import TASKS, WIDE
+from pkm_twin.apps.groups import WIDE, commands
 from test.support.command import typed_line
 
-ENTRIES = {name: entry for entries in TASKS.values() for name, entry in entries.items()}
+ALL = commands()
 
 
 def test_every_command_has_one_task():
-    assert sum(map(len, TASKS.values())) == len(ENTRIES)
-    assert list(get_command(app).commands) == list(ENTRIES)
+    named = [name for names in ALL.tasks().values() for name in names]
+    assert sorted(named) == sorted(ALL)
 
 
 def test_help_lists_every_purpose_whole(twin):
@@ -70,9 +70,9 @@ def test_options_are_read_by_the_oldest_typer():
         for inner in group.registered_groups:
             yield from functions(inner.typer_instance)
 
-    every = [app, *(entry.app(name) for name, entry in ENTRIES.items())]
+    every = [app, *(ALL.declared(name).app(name) for name in ALL)]
     found = [one for each in every for one in functions(each)]
-    assert len(found) > len(ENTRIES)
+    assert len(found) > len(ALL)
     for one in found:
         for option in inspect.signature(one.callback).parameters.values() if one else ():
             assert not isinstance(option.annotation, str), (one.callback, option)

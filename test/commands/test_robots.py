@@ -187,8 +187,8 @@ class TestCompliance:
             (("upr_rpu", -1e300, 0, 0), 1, ""),
             (("upr_rpu", -0.6, 0, 0, "--wrench", "1e300,0,0,0,0,0"), 1, "finite"),
             (("upr_rpu", -0.6, 0), 2, "z (m), beta (rad), gamma (rad)"),
-            (("upr_rpu", "nan", 0, 0), 2, "z (m), beta (rad), gamma (rad)"),
-            (("upr_rpu", "z", 0, 0), 2, "pose"),
+            (("upr_rpu", "nan", 0, 0), 2, "POSE: 'nan'; expected a number"),
+            (("upr_rpu", "z", 0, 0), 2, "POSE: 'z'"),
             (("upr_rpu", -0.6, 0, 0, "--jsn"), 2, ""),
             (("upr_rpu", -0.6, 0, 0, "--wrench", "1,2,3"), 2, "6 numbers"),
             (("upr_rpu", -0.6, 0, 0, "--wrench", "nan,0,0,0,0,0"), 2, "6 numbers"),
@@ -197,7 +197,7 @@ class TestCompliance:
     def test_refusals(self, twin, arguments, code, text):
         result = twin("compliance", *arguments)
         assert (result.code, result.out) == (code, "")
-        assert text in result.err
+        assert text in result.one_line_error()
         if code == 1:
             result.one_line_error()
 

@@ -12,7 +12,7 @@ from typing import Any
 from typer.main import get_command
 
 from pkm_twin.apps.cli import app
-from pkm_twin.apps.groups import TASKS
+from pkm_twin.apps.groups import commands as loaded
 
 WIDE = 200
 
@@ -32,8 +32,7 @@ def page() -> str:
         for name, command in commands.items()
         if section.startswith(f"## `pkm-twin {name}`")
     }
-    named = {name for names in TASKS.values() for name in names}
-    tasks = TASKS | {"Others": tuple(name for name in commands if name not in named)}
+    tasks = loaded().tasks()
     listed = [
         f"**{task}**\n\n" + "".join(
             f"* [`{name}`](#pkm-twin-{name}): {commands[name].get_short_help_str(WIDE)}\n"

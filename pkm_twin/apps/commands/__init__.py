@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The commands of ``pkm-twin``: a file each, which is found by its name."""

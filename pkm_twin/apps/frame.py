@@ -1,0 +1,316 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Commands: a class of settings is their options, and a function of it gives their report."""
+
+from __future__ import annotations
+
+import dataclasses
+import inspect
+import math
+import re
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from types import UnionType
+from typing import Annotated, Any, Final, Optional, TypeVar, Union, get_args, get_origin
+from typing import get_type_hints as hints_of
+
+import typer
+from typer.core import TyperCommand
+
+from pkm_twin.apps.options import PICTURES, ReadsTables, ReadsWrenches
+from pkm_twin.console import numbers, refuse_existing
+from pkm_twin.errors import ParameterError
+from pkm_twin.files import STANDARD, decimal
+from pkm_twin.options import Commands, file_name
+from pkm_twin.report import Report, present
+from pkm_twin.settings import Setting
+
+G = TypeVar("G")
+
+MOST: Final = 1e5
+"""A bound of more is there to catch slips, and not told in the help."""
+_NEGATIVE: Final = re.compile(r"-\.?\d")
+_JSON: Final = inspect.Parameter(
+    "as_json",
+    inspect.Parameter.KEYWORD_ONLY,
+    default=False,
+    annotation=Annotated[bool, typer.Option("--json", help="print JSON")],
+)
+
+
+@dataclass(frozen=True)
+class Command:
+    """A command: a function of a class of settings.
+
+    ``given``: the class; its docstring is the help, its fields are the options. ``task``: the
+    heading in the list of commands; empty for a command of a group.
+    """
+
+    given: type[Any]
+    run: Callable[[Any], Report]
+    task: str = ""
+    hidden: bool = False
+
+    def app(self, name: str) -> typer.Typer:
+        """It alone as a program."""
+        app = Commands()
+        self.add_to(app, name)
+        return app
+
+    def add_to(self, app: typer.Typer, name: str) -> None:
+        """Make it a command of a program."""
+        fields = _fields(self.given)
+
+        def call(**values: Any) -> None:
+            as_json = values.pop("as_json")
+            settings = {
+                name: _taken(name, kind, row, values[name]) for name, kind, row, _ in fields
+            }
+            execute(self, name, self.given(**settings), as_json)
+
+        parameters = [_parameter(*field) for field in fields]
+        vars(call)["__signature__"] = inspect.Signature([*parameters, _JSON])
+        call.__annotations__ = {p.name: p.annotation for p in [*parameters, _JSON]}
+        rows = [(field, row) for field, _, row, _ in fields]
+        known = {_spelled(field, row): row.older for field, row in rows}
+        older = {old: new for new, olds in known.items() for old in olds}
+        cls = type("_Words", (_Words,), {"older": older})
+        app.command(
+            name, cls=cls, help=inspect.cleandoc(self.given.__doc__ or ""), hidden=self.hidden
+        )(call)
+
+
+def command(run: Callable[[G], Report], task: str = "", *, hidden: bool = False) -> Command:
+    """The command of a function; the class of its one parameter declares the options.
+
+    :param task: the heading in the list of commands.
+    """
+    ((_, given),) = ((k, v) for k, v in hints_of(run).items() if k != "return")
+    return Command(given, run, task, hidden)
+
+
+@dataclass(frozen=True)
+class Group:
+    """Commands under one name."""
+
+    text: str
+    commands: dict[str, Command]
+    task: str = ""
+
+    def app(self, name: str) -> typer.Typer:
+        """The group as a program."""
+        app = Commands(help=self.text, name=name)
+        for each, one in self.commands.items():
+            one.add_to(app, each)
+        return app
+
+
+def execute(command: Command, name: str, given: Any, as_json: bool) -> None:
+    """Run a command: check its targets, present its report, write its picture, set the exit code.
+
+    :raises PkmTwinError: what the command raises, or a file that may not be replaced.
+    """
+    out = getattr(given, "out", None)
+    piped = isinstance(out, Path) and str(out) == STANDARD
+    _check_targets(given)
+    drawing = given.drawing(name) if hasattr(given, "drawing") else None
+    if drawing is not None:
+        refuse_existing(drawing, given.overwrite, _source(given))
+    with _readers(given):
+        report = command.run(given)
+        if hasattr(given, "drawing"):
+            report = _drawn(report, drawing)
+    present(report, as_json, piped=piped)
+    if report.exit_code:
+        raise typer.Exit(report.exit_code)
+
+
+@contextmanager
+def _readers(given: Any) -> Iterator[None]:
+    """What readers of tables and bags look up while the command runs."""
+    with ExitStack() as stack:
+        if isinstance(given, ReadsTables):
+            from pkm_twin.apps.tables import CHOSEN
+
+            stack.callback(CHOSEN.reset, CHOSEN.set(given.dialect))
+        if isinstance(given, ReadsWrenches):
+            from pkm_twin.apps.wrench_frames import FRAMES
+
+            stack.callback(FRAMES.reset, FRAMES.set(given.frames))
+        yield
+
+
+def _drawn(report: Report, drawing: Path | None) -> Report:
+    """Write the pictures of a report; the first is its ``picture``."""
+    from pkm_twin.report import plots
+
+    written = []
+    for suffix, figure in report.figures.items() if drawing is not None else ():
+        assert drawing is not None  # noqa: S101  the loop is empty without
+        target = drawing.with_stem(f"{drawing.stem}{suffix}")
+        written.append(plots.save(figure(), target))
+    first = written[0] if written else None
+    rest = {f"picture{k + 1}": path for k, path in enumerate(written) if k}
+    return report.and_files(picture=first, **rest)
+
+
+def _check_targets(given: Any) -> None:
+    """What a command will write may be written.
+
+    :raises PkmTwinError: it may not.
+    """
+    for field, _, row, _ in _fields(type(given)):
+        target = getattr(given, field)
+        if not row.writes or target is None or str(target) == STANDARD:
+            continue
+        if row.endings and target.suffix not in row.endings:
+            raise ParameterError(
+                _spelled(field, row), str(target), f"a name that ends in {' or '.join(row.endings)}"
+            )
+        refuse_existing(target, given.overwrite, _source(given))
+
+
+def _source(given: Any) -> Path | None:
+    """The first file that a command reads, which it never replaces."""
+    for field, _, row, _ in _fields(type(given)):
+        value = getattr(given, field)
+        if isinstance(value, Path) and not row.writes:
+            return value
+    return None
+
+
+def _fields(given: type[Any]) -> list[tuple[str, Any, Setting, Any]]:
+    """Name, type, setting and default of each field, in the order of the help.
+
+    Arguments come first, those of the classes below before the class's own; of options, the
+    class's own come first.
+    """
+    hints = hints_of(given)
+    own = vars(given).get("__annotations__", {})
+    found = [
+        (f.name, hints[f.name], f.metadata["setting"], f.default)
+        for f in dataclasses.fields(given)
+        if "setting" in f.metadata
+    ]
+    return sorted(found, key=lambda row: (not row[2].argument, (row[0] in own) == row[2].argument))
+
+
+def _spelled(field: str, row: Setting) -> str:
+    return f"--{row.name or field.replace('_', '-')}"
+
+
+def _plain_type(kind: Any) -> tuple[Any, bool]:
+    """A type without None, and whether None was there."""
+    if get_origin(kind) in (Union, UnionType):
+        (rest,) = (one for one in get_args(kind) if one is not type(None))
+        return rest, True
+    return kind, False
+
+
+def _parameter(name: str, kind: Any, row: Setting, default: Any) -> inspect.Parameter:
+    """A field as a parameter of a function, as typer reads it: numbers and choices are words."""
+    bare, optional = _plain_type(kind)
+    repeated = get_origin(bare) is tuple and row.count is None
+    item = get_args(bare)[0] if repeated else bare
+    required = default is dataclasses.MISSING
+    metavar = {Path: "FILE", str: "TEXT", int: "COUNT", float: "NUMBER"}.get(item)
+    settings: dict[str, Any] = {"help": row.text, "metavar": row.metavar or metavar}
+    if row.choices:
+        words = list(row.choices)
+        settings |= {"autocompletion": lambda: words, "metavar": row.metavar or "|".join(words)}
+        default = default if required or default is None else row.parameter(default)
+    elif item in (int, float):
+        settings["help"] += _bounds(row)
+    elif row.count is not None:
+        settings["metavar"] = row.metavar or "NUMBERS"
+    if not required and default is not None and item not in (bool, str, Path):
+        default = list(map(str, default)) if repeated else _written(default)
+    word = item if item in (bool, Path) else str
+    typed: Any = list[word] if repeated else word  # type: ignore[valid-type]
+    settings["callback"] = file_name if row.writes else None
+    settings["show_default"] = not required and default not in (None, "", [])
+    if row.argument:
+        declared: Any = typer.Argument(**{**settings, "metavar": row.metavar or name.upper()})
+    else:
+        declared = typer.Option(_spelled(name, row), **settings)
+    return inspect.Parameter(
+        name,
+        inspect.Parameter.KEYWORD_ONLY,
+        default=inspect.Parameter.empty if required else list(default) if repeated else default,
+        annotation=Annotated[Optional[typed] if optional else typed, declared],  # noqa: UP045
+    )
+
+
+def _written(default: Any) -> str:
+    return ",".join(f"{v:g}" for v in default) if isinstance(default, tuple) else str(default)
+
+
+def _bounds(row: Setting) -> str:
+    """The range of a number, where the help does not have it anyway."""
+    if row.low is None or row.high is None or row.high >= MOST:
+        return ""
+    return f" [{row.low:g} to {row.high:g}]"
+
+
+def _taken(field: str, kind: Any, row: Setting, value: Any) -> Any:
+    """A field's value for the words that are given.
+
+    :raises BadParameter: they are none.
+    """
+    if value is None:
+        return None
+    bare, _ = _plain_type(kind)
+    name = field.upper() if row.argument else _spelled(field, row)
+    if get_origin(bare) is tuple and row.count is None:
+        return tuple(_one(name, get_args(bare)[0], row, word) for word in value)
+    return _one(name, bare, row, value)
+
+
+def _one(name: str, kind: Any, row: Setting, word: Any) -> Any:
+    if row.choices:
+        if word not in row.choices:
+            raise typer.BadParameter(f"{name}: {word!r}; expected {' or '.join(row.choices)}")
+        return row.value(word)
+    if row.count is not None:
+        return tuple(numbers(word, row.count, row.metavar or ""))
+    if kind not in (int, float):
+        return word
+    try:
+        value = decimal(word)
+        value = int(word) if kind is int else value
+    except ValueError:
+        value = math.nan
+    low = -math.inf if row.low is None else row.low
+    high = math.inf if row.high is None else row.high
+    if not (low <= value <= high and math.isfinite(value)):
+        what = "a whole number" if kind is int else "a number"
+        span = f", {row.low:g} or more" if row.low is not None else ""
+        span += f", at most {row.high:g}" if row.high is not None else ""
+        raise typer.BadParameter(f"{name}: {word.strip()!r}; expected {what}{span}")
+    return value
+
+
+class _Words(TyperCommand):
+    """A command that takes negative numbers, older spellings, and a picture without a name."""
+
+    older: dict[str, str]
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        return super().parse_args(ctx, list(self._plain(args)))
+
+    def _plain(self, args: Sequence[str]) -> Iterator[str]:
+        for k, word in enumerate(args):
+            if word == "--":
+                yield from args[k:]
+                return
+            name, sign, value = word.partition("=")
+            name = self.older.get(name, name)
+            following = args[k + 1] if k + 1 < len(args) else ""
+            if _NEGATIVE.match(word):
+                # A number is no option, and what reads it overlooks the blank.
+                yield f" {word}"
+            elif name == "--picture" and not sign and Path(following).suffix not in PICTURES:
+                yield "--picture="
+            else:
+                yield f"{name}{sign}{value}"

@@ -1,0 +1,115 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A class of settings as a command: its options, its targets, its report, its exit code."""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+from typer.main import get_command
+
+from pkm_twin.apps.frame import command
+from pkm_twin.apps.options import Draws, OfRobot, Writes
+from pkm_twin.report import Column, Fact, Report, Table, Verdict, judged, plots
+from pkm_twin.settings import setting
+
+
+@dataclass(frozen=True, kw_only=True)
+class Weigh(OfRobot, Writes, Draws):
+    """Weigh a robot."""
+
+    times: tuple[int, ...] = setting((), "how often", argument=True)
+    scale: float = setting(2.0, "of the balance", low=1.0, high=5.0, older=("--balance",))
+    at: tuple[float, ...] | None = setting(None, "where", count=2)
+    how: str = setting("fast", "how", choices=("fast", "slow"))
+    bad: bool = setting(False, "what it finds is bad")
+    out: Path | None = setting(None, "table", writes=True, endings=(".csv",))
+
+
+SEEN = []
+
+
+def weigh(given: Weigh) -> Report:
+    SEEN.append(given)
+    columns = [Column("mass", "kg"), Column("length", "m", "long", 1e3, "mm")]
+    return Report(
+        "2 kg",
+        [Fact("mass", 2.0, "kg", "mass"), Fact("lost", float("nan"))],
+        [Table("parts", columns, {"arm": [1.5, 0.25], "rod": [0.5, None]})],
+        {"": lambda: plots.columns(1, 1)[0]},
+        verdict=Verdict.BAD if given.bad else None,
+    )
+
+
+@pytest.fixture
+def run(capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    made = get_command(command(weigh, "Robots").app("weigh"))
+
+    def call(*words):
+        SEEN.clear()
+        code = made.main(list(words), prog_name="weigh", standalone_mode=False)
+        return code or 0, capsys.readouterr().out
+
+    return call
+
+
+def test_words_become_values(run):
+    run("cart", "-3", "--balance", "3", "--at", "-1,2e-3", "--how", "slow", "4")
+    (given,) = SEEN
+    assert given == Weigh(
+        robot="cart", times=(-3, 4), scale=3.0, at=(-1.0, 0.002), how="slow"
+    )  # fmt: skip
+    for wrong in (("--scale", "9"), ("--scale", "nan"), ("--at", "1"), ("--how", "well")):
+        with pytest.raises(Exception, match=wrong[1]):
+            run("cart", *wrong)
+        assert not SEEN
+
+
+def test_json_has_the_facts_with_units_and_the_terminal_the_answer_first(run):
+    code, out = run("cart", "--json", "--bad")
+    assert code == 1
+    assert json.loads(out) == {
+        "mass": 2.0, "lost": None, "verdict": "bad", "picture": None,
+        "parts": {"arm": {"mass": 1.5, "length": 0.25}, "rod": {"mass": 0.5, "length": None}},
+        "units": {"mass": "kg", "parts.mass": "kg", "parts.length": "m"},
+    }  # fmt: skip
+    code, out = run("cart")
+    lines = out.splitlines()
+    assert (code, lines[:2]) == (0, ["2 kg", "mass: 2 kg"])
+    assert [line.split() for line in lines[3:]] == [
+        ["mass", "(kg)", "long", "(mm)"], ["arm", "1.5", "250"], ["rod", "0.5", "-"]
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("words", "drawn"),
+    [
+        ((), None),
+        (("--picture",), "weigh_cart.png"),
+        (("--picture", "3"), "weigh_cart.png"),
+        (("--picture", "a.svg"), "a.svg"),
+        (("--out", "t.csv"), "t.png"),
+        (("--out", "t.csv", "--no-picture"), None),
+        (("--out", "t.csv", "--picture=b.pdf"), "b.pdf"),
+    ],
+)
+def test_a_picture_has_its_name_from_the_line_or_the_table(run, tmp_path, words, drawn):
+    code, out = run("cart", *words, "--json")
+    assert (code, json.loads(out)["picture"]) == (0, drawn)
+    assert [path.name for path in tmp_path.iterdir()] == ([drawn] if drawn else [])
+
+
+def test_targets_are_checked_before_the_work(run, tmp_path):
+    (tmp_path / "t.png").touch()
+    for words in (("--out", "t.csv"), ("--out", "t.txt"), ("--picture=t.gif",)):
+        with pytest.raises(Exception, match=r"t\.(png|txt|gif)"):
+            run("cart", *words)
+        assert not SEEN
+    run("cart", "--out", "t.csv", "--overwrite")
+    assert SEEN and (tmp_path / "t.png").stat().st_size
+
+
+def test_judged_facts_are_items():
+    report = Report(facts=[judged("rate", "900 Hz", "1 kHz", False), judged("gaps", "?", "", None)])
+    assert [item["verdict"] for item in report.data["items"]] == ["bad", "unknown"]
