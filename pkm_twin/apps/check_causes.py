@@ -214,29 +214,28 @@ def _saturated(r: Recording, c: Compared, bound: float) -> list[str]:
 
 def _of_fit(r: Recording, leave_out: Mask, explained: Callable[[Recording], bool]) -> Causes:
     """What `fit` says of the recording: its friction where that explains it, or its findings."""
-    from pkm_twin.identification.file_parameters import file_parameters
-    from pkm_twin.identification.fit import fit
+    from pkm_twin.identification.fit import fitted
     from pkm_twin.identification.fit_plausible import recording_fault
-    from pkm_twin.identification.fit_rows import rows_of
-    from pkm_twin.identification.fit_signals import ELASTIC
+    from pkm_twin.identification.problem import Problem
+    from pkm_twin.identification.suspects import ELASTIC
 
     recorded: Any = recorded_of(r, leave_out)
     try:
-        everything = file_parameters(r.robot)
-        rows, _ = rows_of(r.robot, everything, recorded, None)
-        fault = recording_fault(r.robot, everything, recorded, rows)
+        problem = Problem.of(r.robot, [recorded], ("friction",))
+        fault = recording_fault(problem.whole[0])
         if fault is not None:
             return Causes((), (fault,))
-        result = fit(r.robot, [recorded], ("friction",), accept=True)
+        problem.check_count()
+        result = fitted(problem, tuple(problem.worse()))
         friction: dict[str, list[float]] = {}
-        for name, value in zip(result.parameters.names, result.estimate.values, strict=True):
+        for name, value in zip(problem.parameters.names, result.estimate.values, strict=True):
             joint, _, law = name.rpartition(".")
             values = friction.setdefault(law, getattr(r.robot.friction, law).tolist())
             values[r.robot.joint_names.index(joint)] = float(value)
-        fitted = r.robot.changed(friction=friction)
+        machine = r.robot.changed(friction=friction)
     except (PkmTwinError, ValueError, np.linalg.LinAlgError):
         return Causes()
-    if explained(replace(r, robot=fitted)):
+    if explained(replace(r, robot=machine)):
         text = "friction other than the file's explains the efforts: `pkm-twin fit`"
         return Causes((text,))
     # A compliance below zero is no drive's.

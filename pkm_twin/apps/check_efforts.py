@@ -19,7 +19,7 @@ from pkm_twin.apps.recorded_motion import at_rest
 from pkm_twin.apps.verdict import Item, Verdict, judged_item
 from pkm_twin.errors import SingularityError, UnreachableError, one_line
 from pkm_twin.identification.compare import Compared, by_held, compare
-from pkm_twin.identification.fit_rows import Recorded
+from pkm_twin.identification.rows import Recorded
 from pkm_twin.streams.drives import COUNT, SAME, idle_samples
 
 Array = NDArray[np.float64]

@@ -72,7 +72,7 @@ def excite(
     from pkm_twin import load
     from pkm_twin.apps.fit import kinds_of
     from pkm_twin.identification.excitation import Bounds, Judge
-    from pkm_twin.identification.file_parameters import file_parameters
+    from pkm_twin.identification.parameters import file_parameters
 
     table = checked_outputs(out, overwrite)
     machine = load(robot, platform=platform)

@@ -8,7 +8,7 @@ from typing import Any, Protocol
 
 from pkm_twin import Robot, load
 from pkm_twin.errors import ParameterError
-from pkm_twin.identification.fit import Number
+from pkm_twin.identification.parameters import Number
 from pkm_twin.machine.machine_yaml import describe_machine_yaml
 from pkm_twin.machine.shared import Key
 from pkm_twin.machine.yaml_edit import edit_yaml

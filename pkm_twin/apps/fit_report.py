@@ -14,7 +14,8 @@ import typer
 from rich.table import Table
 
 from pkm_twin.console import finite, table_console
-from pkm_twin.identification.fit import Fit, Number
+from pkm_twin.identification.fit import Fit
+from pkm_twin.identification.parameters import Number
 from pkm_twin.report.plots import COLOURS, columns, label, rendered
 from pkm_twin.robot.robot import Robot
 
@@ -217,7 +218,7 @@ class Report:
 def effort_report(result: Fit, recordings: Sequence[str]) -> Report:
     """Of a fit to efforts."""
     joints, units = result.robot.joint_names, result.robot.effort_units
-    parameters, e = result.parameters, result.estimate
+    parameters, e = result.problem.parameters, result.estimate
     table = Table(box=None)
     table.add_column("parameter")
     for name in ("in the file", "fitted", "standard deviation"):

@@ -90,7 +90,7 @@ def record_kit(
         raise typer.BadParameter("--keep-names needs --anonymise")
     from pkm_twin import load
     from pkm_twin.identification.excitation import Bounds, Judge
-    from pkm_twin.identification.file_parameters import file_parameters
+    from pkm_twin.identification.parameters import file_parameters
 
     machine = load(robot, platform=platform)
     judge, bounds = Judge.of(machine, file_parameters(machine)), Bounds(share)

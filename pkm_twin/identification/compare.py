@@ -15,10 +15,10 @@ import numpy as np
 from delta_dynamics.rest import beyond_friction, friction_reach, moving_rates
 from delta_dynamics.virtual_work import inverse_dynamics
 from pkm_twin.codegen.arrays import Array, Mask
-from pkm_twin.identification.fit_rows import BLOCK, Recorded, shaken_efforts
 from pkm_twin.identification.judge import LOUD
 from pkm_twin.identification.noise import SEGMENT, huber, noise_of, passed_band, usual_size
 from pkm_twin.identification.plausible import LATEST
+from pkm_twin.identification.rows import BLOCK, Recorded, shaken_efforts
 from pkm_twin.identification.samples import Filtering, Track, by_blocks, low_pass, tracks
 from pkm_twin.robot.robot import Robot
 

@@ -16,16 +16,18 @@ import numpy as np
 
 from pkm_twin.codegen.arrays import Array, Mask
 from pkm_twin.errors import PkmTwinError
-from pkm_twin.identification.elastic_groups import PRIOR, Group, groups_of
 from pkm_twin.identification.elastic_verdict import elastic_verdict, put_right
 from pkm_twin.identification.estimation import Estimate, estimate
-from pkm_twin.identification.fit import SURE, Judged, Number, known, refuse_faults
-from pkm_twin.identification.fit_solved import HELD_OUT
+from pkm_twin.identification.fit import Judged, Result, refuse_faults
+from pkm_twin.identification.parameters import SURE, Group, Number, groups_of, number_of
+from pkm_twin.identification.rows import HELD_OUT
 from pkm_twin.identification.verdict import Verdict
 from pkm_twin.machine.shared import above_zero
 from pkm_twin.robot.robot import Robot
 from stiffness_monitor.response import ElementResponse, element_response
 
+PRIOR: Final = 1.0
+"""An element's compliance may be off by all of its value."""
 AXES: Final = ("dx", "dy", "dz", "rx", "ry", "rz")
 """Directions of a deflection, as the columns of a table call them: m, then rad."""
 LEAST_SAMPLES: Final = 12
@@ -75,32 +77,18 @@ class Deflected:
         return replace(self, **cut)
 
 
-@dataclass(frozen=True, eq=False)
-class ElasticFit:
-    """What recordings say of a robot's elastic elements.
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ElasticFit(Result):
+    """A fit of deflections: ``numbers`` are the factors of the file's ``element_compliance``.
 
-    ``numbers``: the factors of the file's ``element_compliance``. ``zeros``: of the instrument by
-    recording, (recordings, 6). ``measured``: which directions are, (recordings, 6).
+    ``zeros``: of the instrument by recording, (recordings, 6). ``measured``: which directions are,
+    (recordings, 6). ``told``: how many combinations of factors are known.
     """
 
-    robot: Robot
-    estimate: Estimate
-    numbers: tuple[Number, ...]
     groups: tuple[Group, ...]
-    judged: tuple[Judged, ...]
     zeros: Array
     measured: Mask
-    samples: int
     told: int
-    """How many combinations of factors are known."""
-    verdict: Verdict
-    """Whether elastic elements explain the deflections."""
-    accepted: tuple[str, ...] = ()
-    """Why this machine cannot have made the recordings, although they were fitted."""
-
-    def of(self, status: str) -> tuple[Number, ...]:
-        """The numbers of a status."""
-        return tuple(number for number in self.numbers if number.status == status)
 
 
 @dataclass(frozen=True, eq=False)
@@ -187,10 +175,11 @@ def fit_elements(
         _judged(part, factors, zero, own) for part, zero in zip(parts, zeros, strict=True)
     )
     return ElasticFit(
-        robot, found, numbers, groups_of(names, factors, plain, own), judged, zeros,
-        np.array([part.measured for part in parts]), sum(part.split for part in parts),
-        int(np.sum(np.linalg.eigvalsh(plain / PRIOR**2) < SURE**2)), verdict,
-        tuple(faults),
+        robot=robot, estimate=found, numbers=numbers, judged=judged, zeros=zeros, verdict=verdict,
+        groups=groups_of(names, factors, plain, own),
+        measured=np.array([part.measured for part in parts]),
+        samples=sum(part.split for part in parts),
+        told=int(np.sum(np.linalg.eigvalsh(plain / PRIOR**2) < SURE**2)), accepted=tuple(faults),
     )  # fmt: skip
 
 
@@ -202,17 +191,14 @@ def _numbers(
         np.sqrt(np.diag(one)[: len(names)])
         for one in (found.covariance, verdict.widened(found.covariance))
     )
+    wide = np.full_like(wide, np.nan) if verdict.deviations == "withheld" else wide
     numbers = []
-    for name, factor, plain, told in zip(names, factors, own, wide, strict=True):
+    for name, factor, *deviations in zip(names, factors, own, wide, strict=True):
         before = float(robot.element_compliance.get(name, 1.0))
-        number = known(
-            ("element_compliance", name), "", before, float(before * factor),
-            float(before * plain), PRIOR * before,
-        )  # fmt: skip
-        if number.status != "not excited":
-            withheld = verdict.deviations == "withheld"
-            number = replace(number, deviation=np.nan if withheld else float(before * told))
-        numbers.append(number)
+        plain, told = (float(before * one) for one in deviations)
+        key = "element_compliance", name
+        after = float(before * factor)
+        numbers.append(number_of(key, "", before, after, (plain, told), PRIOR * before))
     return tuple(numbers)
 
 

@@ -19,7 +19,7 @@ from delta_dynamics.virtual_work import inverse_dynamics
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import PkmTwinError, check_limit
 from pkm_twin.identification.base_parameters import independent, random_states
-from pkm_twin.identification.file_parameters import FileParameters
+from pkm_twin.identification.parameters import FileParameters
 from pkm_twin.robot.robot import Robot
 from pkm_twin.robot.workspace import reachable
 

@@ -12,12 +12,10 @@ import numpy as np
 
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import PkmTwinError
-from pkm_twin.identification.file_parameters import FileParameters
-from pkm_twin.identification.fit_rows import LARGEST, Recorded, Rows, calm_table, rows_of
 from pkm_twin.identification.plausible import Problem, Retold, fault_of
+from pkm_twin.identification.rows import LARGEST, Recorded, Rows, rows_of
 from pkm_twin.machine.friction import turning_keys
 from pkm_twin.machine.inertia import ten_numbers
-from pkm_twin.robot.robot import Robot
 
 OFFSET: Final = 0.1
 """Part of the efforts that a current sensor is off by."""
@@ -38,21 +36,17 @@ ANGLES: Final = {
 }  # fmt: skip
 
 
-def recording_fault(
-    robot: Robot, everything: FileParameters, recording: Recorded, rows: Rows
-) -> str | None:
+def recording_fault(rows: Rows) -> str | None:
     """Why this machine cannot have made a recording; None where it can.
 
-    :param everything: all parameters of the file; ``rows``: the recording's, with all of them.
+    :param rows: with all parameters of the file.
     """
-    r = recording
-    period = float(np.median(np.diff(r.time)))
-    s = rows.signals
-    still = replace(s, motion=(s.motion[0], 0.0 * s.motion[1], 0.0 * s.motion[2]))
-    both = [calm_table(robot, everything, r.carried, one) for one in (s, still)]
+    r, robot, everything = rows.recording, rows.model.robot, rows.model.parameters
+    period, motion = float(np.median(np.diff(r.time))), rows.signals.motion
+    still = replace(motion, qd=0.0 * motion.qd, qdd=0.0 * motion.qdd)
+    moving, standing = (rows.model.columns(one)[0] for one in (motion, still))
     rubs = [group.kind == "friction" for group in everything.groups for _ in group.names]
-    inertial = np.where(rubs, 0.0, both[0] - both[1])
-    problem = problem_of(robot, everything, rows, inertial)
+    problem = problem_of(rows, np.where(rubs, 0.0, moving - standing))
     first = int(np.searchsorted(r.time, _worst(problem, SOME * period)))
     first = max(0, min(first, len(r.time) - SOME))
 
@@ -65,13 +59,13 @@ def recording_fault(
             }
             try:
                 some = Recorded(r.name, **few, carried=r.carried)
-                made, _ = rows_of(robot, everything, some, None)
+                made = rows_of(robot, everything, some)
             except (PkmTwinError, ValueError, np.linalg.LinAlgError):
                 return None
             needs = made.rest + made.table @ everything.values
             if not np.abs(needs).max() < LARGEST:
                 return None
-            return problem_of(robot, everything, made)
+            return problem_of(made)
 
         return make
 
@@ -106,13 +100,12 @@ def _worst(problem: Problem, duration: float) -> float:
     return float(problem.time[np.argmax(total[ends] - total[:-1])])
 
 
-def problem_of(
-    robot: Robot, everything: FileParameters, rows: Rows, inertial: Array | None = None
-) -> Problem:
+def problem_of(rows: Rows, inertial: Array | None = None) -> Problem:
     """The machines that may have made a recording, around the robot's file.
 
     :param inertial: the part of the rows' table that grows with the square of the rate of time.
     """
+    robot, everything = rows.model.robot, rows.model.parameters
     tables = [rows.table] if inertial is None else [rows.table, inertial]
     told = rows.rest + rows.table @ everything.values
     size = np.sqrt(np.mean(told**2, 0))

@@ -3,27 +3,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pkm_twin.codegen.arrays import Array, Mask
-from pkm_twin.identification.file_parameters import FileParameters
-from pkm_twin.identification.fit_lengths import GEOMETRY, Lengths
-from pkm_twin.identification.fit_rows import Recorded, Rows, calm_table, efforts_of
-from pkm_twin.identification.fit_signals import (
-    ELASTIC,
-    INTERFERENCE,
-    LATE,
-    RESONANCE,
-    SPEED,
-    columns_of,
-    suspects_of,
-)
-from pkm_twin.identification.fit_solved import Solved
 from pkm_twin.identification.judge import (
     HINT,
     NEAR,
@@ -34,9 +19,19 @@ from pkm_twin.identification.judge import (
     judge,
 )
 from pkm_twin.identification.noise import Resonance
+from pkm_twin.identification.problem import Problem
+from pkm_twin.identification.rows import Rows
+from pkm_twin.identification.suspects import (
+    ELASTIC,
+    GEOMETRY,
+    INTERFERENCE,
+    LATE,
+    RESONANCE,
+    SPEED,
+    Lengths,
+    errors_of,
+)
 from pkm_twin.identification.verdict import Finding, Suspect, Verdict
-from pkm_twin.machine.friction import turning_keys
-from pkm_twin.robot.robot import Robot
 
 OF_THE_FILE: Final = {
     "friction": "friction other than the file's",
@@ -55,30 +50,15 @@ INERTIA: Final = 0.1
 sensors, within their priors, take up three quarters."""
 
 
-def verdict_of(
-    robot: Robot, recordings: Sequence[Recorded], everything: FileParameters,
-    chosen: Mask, rows: Sequence[Rows], solved: Solved,
-) -> Verdict:  # fmt: skip
-    """Whether the fitted model explains its recordings.
-
-    :param everything: all parameters of the file; ``chosen``: which of them were fitted.
-    :param rows: of each recording, with all parameters.
-    """
-    values = everything.values.copy()
-    values[chosen] = solved.estimate.values
-    lengths = Lengths.of(robot)
-    made = [
-        _Recording.of(robot, everything, recording, made, delay, values, lengths)
-        for recording, made, delay in zip(recordings, rows, solved.delays, strict=True)
-    ]
-    suspects = (*suspects_of(robot), *lengths.suspects)
-    court = _Court(robot, everything, chosen, values, solved, made, suspects)
+def verdict_of(problem: Problem) -> Verdict:
+    """Whether the fitted model explains its recordings."""
+    chosen, lengths = problem.chosen, Lengths.of(problem.robot)
+    court = _Court(problem, lengths)
     verdict = court.judged(chosen)
-    kinds = court.kinds
-    masses = kinds == "inertia"
+    masses = court.kinds == "inertia"
     if (chosen & masses).any():
         verdict = _simpler(verdict, court.judged(chosen & ~masses))
-    if (chosen & np.isin(kinds, OF_INERTIA)).any() and not court.inertia_shown():
+    if (chosen & np.isin(court.kinds, OF_INERTIA)).any() and not court.inertia_shown():
         answer = "explains partly" if verdict.answer == "explains" else verdict.answer
         verdict = replace(verdict, answer=answer, slow=True)
     named = {one.suspect.kind for one in verdict.findings}
@@ -87,17 +67,17 @@ def verdict_of(
         finding, change = either
         unseen = np.concatenate([verdict.unseen, change[None]])
         verdict = replace(verdict, hints=(*verdict.hints, finding), unseen=unseen)
-    rings = _resonances(robot, rows)
+    rings = _resonances(problem)
     if rings:
         answer = "explains partly" if verdict.answer == "explains" else verdict.answer
         verdict = replace(verdict, answer=answer, findings=(*verdict.findings, *rings))
     return verdict
 
 
-def _resonances(robot: Robot, rows: Sequence[Rows]) -> tuple[Finding, ...]:
+def _resonances(problem: Problem) -> tuple[Finding, ...]:
     """Of each joint the clearest of all recordings: above the band, so that no number changes."""
-    best: dict[int, Resonance] = {}
-    for one in (ring for made in rows for ring in made.signals.resonances):
+    robot, best = problem.robot, dict[int, Resonance]()
+    for one in (ring for made in problem.whole for ring in made.signals.resonances):
         if one.joint not in best or one.sigmas > best[one.joint].sigmas:
             best[one.joint] = one
     found = []
@@ -141,38 +121,23 @@ class _Recording:
     calm: Array
     """All parameters' columns, without noise."""
 
-    @classmethod
-    def of(
-        cls, robot: Robot, everything: FileParameters, recorded: Recorded, rows: Rows,
-        delay: float, values: Array, lengths: Lengths,
-    ) -> _Recording:  # fmt: skip
-        """With the signals of the errors that every robot may have, and of its lengths."""
-        smooth = _smooth(everything, values)
-        efforts = efforts_of(robot, everything, recorded.carried, smooth, rows.signals)
-        columns, missed = columns_of(robot, rows.signals, efforts)
-        calm = calm_table(robot, everything, recorded.carried, rows.signals)
-        own = lengths.columns(robot, everything, recorded.carried, values, rows.signals)
-        columns = np.concatenate([columns, own], -1)
-        return cls(rows, delay, columns, missed, calm)
 
-
-@dataclass(frozen=True, eq=False)
 class _Court:
     """All recordings of a fit, to be judged by several sets of parameters and suspects."""
 
-    robot: Robot
-    everything: FileParameters
-    chosen: Mask
-    values: Array
-    solved: Solved
-    recordings: Sequence[_Recording]
-    suspects: Sequence[Suspect]
-    """Whose columns the recordings have."""
-
-    @property
-    def kinds(self) -> NDArray[np.str_]:
-        """Of all parameters of the file."""
-        return np.array([group.kind for group in self.everything.groups for _ in group.names])
+    def __init__(self, problem: Problem, lengths: Lengths) -> None:
+        self.robot, self.everything, self.solved = problem.robot, problem.everything, problem.solved
+        self.chosen, self.values = problem.chosen, problem.values
+        self.kinds = np.array([g.kind for g in self.everything.groups for _ in g.names])
+        self.recordings: list[_Recording] = []
+        self.suspects: tuple[Suspect, ...] = ()
+        for rows, delay in zip(problem.whole, self.solved.delays, strict=True):
+            errors, missed = errors_of(rows, self.values)
+            own = np.stack([column for _, column in errors], -1)
+            columns = np.concatenate([own, lengths.columns(rows, self.values)], -1)
+            calm, _ = rows.model.columns(rows.signals.motion)
+            self.recordings.append(_Recording(rows, delay, columns, missed, calm))
+            self.suspects = (*(suspect for suspect, _ in errors), *lengths.suspects)
 
     def judged(self, free: Mask) -> Verdict:
         """With some parameters free to explain the residual, the others as the file has them."""
@@ -269,9 +234,3 @@ class _Court:
             rows.signals.noise, rows.signals.band, rows.counts, self.solved.counts[i],
             np.sqrt(np.mean(effort**2, 0)), np.std(effort, 0),
         )  # fmt: skip
-
-
-def _smooth(everything: FileParameters, values: Array) -> Array:
-    """Without dry friction: its sign has no derivative, and turns where a rate is near zero."""
-    dry = turning_keys()
-    return np.where([n.rpartition(".")[2] in dry for n in everything.names], 0.0, values)

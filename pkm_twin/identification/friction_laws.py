@@ -9,7 +9,7 @@ what it predicts there, beyond what noise does, and is smaller with it.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
@@ -17,13 +17,14 @@ import numpy as np
 
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import PkmTwinError, UnknownNameError
-from pkm_twin.identification.file_parameters import file_parameters
-from pkm_twin.identification.fit import Fit, Number, fit
-from pkm_twin.identification.fit_rows import Recorded, rows_of
-from pkm_twin.identification.fit_signals import RESONANCE
-from pkm_twin.identification.fit_solved import held_from
+from pkm_twin.identification.fit import Fit, fit, fitted
 from pkm_twin.identification.judge import SIGMAS
-from pkm_twin.identification.samples import Filtering, low_pass, tracks
+from pkm_twin.identification.noise import EXACT
+from pkm_twin.identification.parameters import Number
+from pkm_twin.identification.problem import Problem
+from pkm_twin.identification.rows import Recorded, Rows
+from pkm_twin.identification.samples import Track, low_pass
+from pkm_twin.identification.suspects import RESONANCE
 from pkm_twin.machine.friction import BASIC, LAWS, taken
 from pkm_twin.machine.shared import KINDS, Kind
 from pkm_twin.robot.robot import Robot
@@ -117,10 +118,9 @@ def fit_with_laws(
         tried = []
         for name in names:
             try:
-                found, opened = _opened(best, recordings, what, name)
-                one = fit(
-                    opened, recordings, what, **options, trial=best.verdict, accepted=best.accepted
-                )
+                found, opened = _opened(best.problem, name)
+                one = Problem.of(opened, recordings, what, passes=1)
+                one.check_count()
             except PkmTwinError:
                 if asked:
                     raise
@@ -135,7 +135,9 @@ def fit_with_laws(
         choices.append(choice)
         if not choice.taken:
             break
-        result = fit(opened, recordings, what, **options, accepted=best.accepted)
+        problem = Problem.of(opened, recordings, what)
+        problem.check_count()
+        result = fitted(problem, best.accepted)
         more += _searched(best.robot, result, choice.law, found)
         wider |= _widened(result, found)
         own = (
@@ -157,16 +159,18 @@ def _unexplained(result: Fit) -> bool:
     )
 
 
-def _compared(name: str, before: Fit, after: Fit) -> Choice:
+def _compared(name: str, before: Fit, after: Problem) -> Choice:
     """Two fits by what was held out."""
     band = np.array([max(channel.noise, 1e-300) for channel in before.verdict.channels])
     parts = []
-    for one, other in zip(before.judged, after.judged, strict=True):
-        old, change = one.measured - one.least, other.least - one.least
+    for one, other in zip(before.problem.rows, after.rows, strict=True):
+        end, least = one.held_out, (_least(before.problem, one), _least(after, other))
+        noise = np.maximum(end.signals.noise, EXACT * np.sqrt(np.mean(end.effort**2, 0)))
+        old, change = end.effort - least[0], least[1] - least[0]
         each = (old / band) ** 2, ((old - change) / band) ** 2
-        parts.append((*each, old * change / one.noise**2, (change / one.noise) ** 2))
+        parts.append((*each, old * change / noise**2, (change / noise) ** 2))
     sums = np.array([np.concatenate(each).sum(0) for each in zip(*parts, strict=True)])
-    count = sum(one.measured.size for one in before.judged)
+    count = sum(one.size for one, *_ in parts)
     before_rms, after_rms = np.sqrt(sums[:2].sum(-1) / count)
     sigmas = sums[2].sum() / np.sqrt(max(sums[3].sum(), 1e-300))
     no_joint_worse = (sums[1] <= WORSE**2 * sums[0]).all()
@@ -174,15 +178,19 @@ def _compared(name: str, before: Fit, after: Fit) -> Choice:
     return Choice(name, bool(good), float(before_rms), float(after_rms), float(sigmas))
 
 
-def _opened(
-    before: Fit, recordings: Sequence[Recorded], what: Sequence[Kind], name: str
-) -> tuple[dict[str, Searched], Robot]:
+def _least(problem: Problem, rows: Rows) -> Array:
+    """Held-out efforts by least squares alone, (k, n)."""
+    end = rows.held_out
+    return end.rest + end.table @ problem.solved.estimate.values
+
+
+def _opened(before: Problem, name: str) -> tuple[dict[str, Searched], Robot]:
     """The robot with one law more, and what was found of its parameters that are not linear.
 
     :raises PkmTwinError: the motion does not show it.
     """
     robot = before.robot
-    found = _Search(before, recordings, what, name).found()
+    found = _Search(before, name).found()
     if found:
         robot = robot.changed(friction={key: one.value.tolist() for key, one in found.items()})
     return found, replace(robot, open_laws=(*robot.open_laws, name))
@@ -234,43 +242,37 @@ def _joint_of(robot: Robot, key: tuple[str | int, ...]) -> int:
 class _Search:
     """The parameters of a law that efforts are not linear in, by the residual of a fit without."""
 
-    def __init__(
-        self, before: Fit, recordings: Sequence[Recorded], what: Sequence[Kind], name: str
-    ) -> None:
+    def __init__(self, before: Problem, name: str) -> None:
         self.robot, self.law = before.robot, LAWS[name]
-        self._name = name
-        self._pieces: list[tuple[Any, Filtering, int]] = []
-        parameters = file_parameters(self.robot, what)
-        values, left, weight = before.estimate.values, [], []
-        for recording, how, delay in zip(recordings, before.filtering, before.delays, strict=True):
-            rows, _ = rows_of(self.robot, parameters, recording, how.window)
-            end = held_from(rows)
-            left.append((rows.target - rows.table @ values + delay * rows.change)[:end])
-            weight.append((rows.counts / np.maximum(rows.signals.noise, 1e-300))[:end])
-            own, _ = tracks(recording.time, recording.q, recording.effort, window=how.window)
-            self._pieces.append((own, how, end))
+        self._name, self._rows = name, before.rows
+        values, left, weight = before.solved.estimate.values, [], []
+        for rows, delay in zip(self._rows, before.solved.delays, strict=True):
+            some = rows.fitted
+            left.append(some.target - some.table @ values + delay * some.change)
+            weight.append(some.counts / np.maximum(some.signals.noise, 1e-300))
         self._weight = np.concatenate(weight)
         self._left = np.concatenate(left) * self._weight
         rates = self._filtered(lambda t: np.stack([t.qd, np.sign(t.qd), 1.0 + 0.0 * t.qd], -1))
         basic: Array = rates * self._weight[..., None]
         self._basic = [np.linalg.qr(basic[:, j])[0] for j in range(self.robot.joints_count)]
-        pieces = [t for own, _, _ in self._pieces for t in own]
+        pieces = [t for rows in self._rows for t in rows.tracks]
         q, qd = (np.concatenate([getattr(t, word) for t in pieces]) for word in ("q", "qd"))
         self._speed, self._travel = np.sqrt(np.mean(qd**2, 0)), np.ptp(q, axis=0)
-        cutoffs = [how.cutoff for _, how, _ in self._pieces if how.cutoff is not None]
+        cutoffs = [rows.how.cutoff for rows in self._rows if rows.how.cutoff is not None]
         fastest = self._travel * min(cutoffs, default=np.inf) / np.maximum(self._speed, 1e-300)
         self._waves = np.minimum(WAVES, fastest)
 
-    def _filtered(self, columns: Any) -> Array:
+    def _filtered(self, columns: Callable[[Track], Array]) -> Array:
         """Columns of tracks, (samples, n, c), at the fitted rows."""
         made = []
-        for own, how, end in self._pieces:
+        for rows in self._rows:
             parts = []
-            for track in own:
+            for track in rows.tracks:
                 values = columns(track)
                 flat = values.reshape(len(values), -1)
-                parts.append(low_pass(flat, track.period, how).reshape(-1, *values.shape[1:]))
-            made.append(np.concatenate(parts)[:end])
+                smooth = low_pass(flat, track.period, rows.how)
+                parts.append(smooth.reshape(-1, *values.shape[1:]))
+            made.append(np.concatenate(parts)[: rows.held_from])
         return np.concatenate(made)
 
     def found(self) -> dict[str, Searched]:
@@ -329,7 +331,7 @@ class _Search:
             (word, one) for word, one in self.law.parameters.items() if one.linear
         ]  # fmt: skip
 
-        def columns(track: Any) -> Array:
+        def columns(track: Track) -> Array:
             made = []
             for values in grid:
                 for word, _ in linear:

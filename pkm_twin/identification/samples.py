@@ -40,20 +40,34 @@ LEAST: Final = 200
 
 
 @dataclass(frozen=True, eq=False)
-class Track:
-    """Evenly sampled motion of one piece of a recording: ``time`` (k,), q, qd, qdd, effort (k, n).
+class Motion:
+    """Joints' positions, rates and accelerations, (k, n) each, and what is on the platform.
 
-    ``wrench``: (k, 6). ``held``: where the payload that is looked for is on the platform, (k,),
-    0 or 1.
+    ``wrench``: (k, 6). ``held``: where the payload that is looked for is there, (k,), 0 or 1.
     """
 
-    time: Array
     q: Array
     qd: Array
     qdd: Array
-    effort: Array
     wrench: Array
     held: Array
+
+    @property
+    def joints(self) -> tuple[Array, Array, Array]:
+        """Positions, rates and accelerations."""
+        return self.q, self.qd, self.qdd
+
+    def part(self, rows: slice) -> Motion:
+        """Some of the rows."""
+        return Motion(*(one[rows] for one in (*self.joints, self.wrench, self.held)))
+
+
+@dataclass(frozen=True, eq=False)
+class Track(Motion):
+    """Evenly sampled motion of one piece of a recording: ``time`` (k,), s; effort (k, n)."""
+
+    time: Array
+    effort: Array
     period: float
 
     def moves(self, how: Filtering) -> Mask:
@@ -175,8 +189,8 @@ def tracks(
             )
         )
         cut = slice(width // 2, len(t) - width // 2)
-        motion = (t[cut], smooth[cut], rate[cut], second[cut])
-        result.append(Track(*motion, force[cut], load[cut], carried[cut], period))
+        motion = Motion(smooth, rate, second, load, carried).part(cut)
+        result.append(Track(**vars(motion), time=t[cut], effort=force[cut], period=period))
     speed = np.sqrt(np.mean(np.concatenate([p.qd for p in result]) ** 2, 0))
     change = np.sqrt(np.mean(np.concatenate([p.qdd for p in result]) ** 2, 0))
     moving = speed > 0.0

@@ -17,7 +17,7 @@ import numpy as np
 from delta_dynamics import inverse_dynamics
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError, PkmTwinError
-from pkm_twin.identification.fit_rows import Recorded, next_window
+from pkm_twin.identification.rows import Recorded, next_window
 from pkm_twin.identification.samples import low_pass, tracks
 from pkm_twin.machine.friction import all_keys
 from pkm_twin.robot.robot import Robot

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from delta_dynamics import inverse_dynamics
 from pkm_twin import Robot
 from pkm_twin.errors import PkmTwinError
-from pkm_twin.identification.fit_lengths import Lengths
-from pkm_twin.identification.fit_rows import Recorded
+from pkm_twin.identification.rows import Recorded
+from pkm_twin.identification.suspects import Lengths
 from pkm_twin.robot.entries import entries, with_entries
 from test.laws.recordings import smooth_motion
 

@@ -12,7 +12,7 @@ from pkm_twin import Robot
 from pkm_twin.errors import PkmTwinError
 from pkm_twin.identification.compare import compare
 from pkm_twin.identification.fit import Fit, fit
-from pkm_twin.identification.fit_rows import Recorded
+from pkm_twin.identification.rows import Recorded
 from pkm_twin.robot.entries import with_entries
 from test.identification.machines import IMPOSSIBLE, WRONG, machine, noisy, shifted
 from test.support.robots import load

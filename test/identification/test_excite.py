@@ -7,7 +7,7 @@ import pytest
 from delta_dynamics import inverse_dynamics
 from pkm_twin.errors import ParameterError, PkmTwinError
 from pkm_twin.identification.excitation import Bounds, Judge, excite
-from pkm_twin.identification.file_parameters import file_parameters
+from pkm_twin.identification.parameters import file_parameters
 from test.support.robots import load
 
 

@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 from delta_dynamics import inverse_dynamics, mass_matrix
 from pkm_twin.errors import PkmTwinError
 from pkm_twin.identification.estimation import estimate
-from pkm_twin.identification.file_parameters import file_parameters
 from pkm_twin.identification.fit import Fit, fit
 from pkm_twin.identification.fit_plausible import problem_of, recording_fault
-from pkm_twin.identification.fit_rows import Recorded, rows_of
 from pkm_twin.identification.friction_laws import fit_with_laws
+from pkm_twin.identification.parameters import file_parameters
+from pkm_twin.identification.rows import Recorded, rows_of
 from pkm_twin.machine.shared import above_zero
 from test.identification.machines import IMPOSSIBLE, WRONG, Drawn, machine, noisy, shifted, unit_of
 from test.laws.test_fit import truths
@@ -66,8 +66,8 @@ def rejected(what: str, name: str, seed: int) -> bool:
     robot, record = load(name), recorded(what, name, seed)
     everything = file_parameters(robot)
     try:
-        rows, _ = rows_of(robot, everything, record, None)
-        return recording_fault(robot, everything, record, rows) is not None
+        rows = rows_of(robot, everything, record)
+        return recording_fault(rows) is not None
     except PkmTwinError:
         return True
 
@@ -110,12 +110,11 @@ def test_a_payload_that_is_on_the_platform_for_a_while_is_named(name: str) -> No
     held = (m.time > 5.0) & (m.time < 9.0)
     efforts = np.where(held[:, None], m.efforts, inverse_dynamics(bare, m.q, m.qd, m.qdd))
     record = noisy(m.recorded(effort=efforts), np.random.default_rng(7))
-    everything = file_parameters(m.robot)
-    rows, _ = rows_of(m.robot, everything, record, None)
-    _, part = problem_of(m.robot, everything, rows).loaded_in_part()
+    rows = rows_of(m.robot, file_parameters(m.robot), record)
+    _, part = problem_of(rows).loaded_in_part()
     used = part.time[np.abs(part.columns[..., part.payload]).max((1, 2)) > 0.0]
     assert (used[0], used[-1]) == pytest.approx((5.0, 9.0), abs=0.2)
-    fault = recording_fault(m.robot, everything, record, rows)
+    fault = recording_fault(rows)
     assert fault is not None and fault.startswith("an unknown payload ")
 
 
@@ -124,9 +123,8 @@ def test_a_known_payload_that_the_efforts_do_not_show_is_rejected() -> None:
     m, record = drawn("delta_cu", 3), recorded("sound", "delta_cu", 3)
     loaded, held = m.robot.changed(payload={"mass": 20.0}), np.ones(len(m.time))
     record = replace(record, carried=loaded, held=held)
-    everything = file_parameters(m.robot)
-    rows, _ = rows_of(m.robot, everything, record, None)
-    assert recording_fault(m.robot, everything, record, rows) is not None
+    rows = rows_of(m.robot, file_parameters(m.robot), record)
+    assert recording_fault(rows) is not None
 
 
 @pytest.mark.parametrize("who", [[0, 1, 2], [0]])
@@ -135,9 +133,8 @@ def test_a_short_delay_is_named_by_its_length(who: list[int]) -> None:
     efforts = m.efforts.copy()
     efforts[:, who] = shifted(m.efforts, m.time, 0.04)[:, who]
     record = noisy(m.recorded(effort=efforts), np.random.default_rng(7))
-    everything = file_parameters(m.robot)
-    rows, _ = rows_of(m.robot, everything, record, None)
-    fault = recording_fault(m.robot, everything, record, rows)
+    rows = rows_of(m.robot, file_parameters(m.robot), record)
+    fault = recording_fault(rows)
     names = "all joints" if len(who) > 1 else m.robot.joint_names[0]
     assert fault is not None and fault.startswith(f"efforts of {names} are 0.04 s late")
 
@@ -152,8 +149,8 @@ def test_a_cause_that_does_not_explain_the_efforts_is_not_named() -> None:
     for wrench in (None, -force):
         made = replace(m.recorded(effort=efforts), wrench=wrench)
         record = noisy(made, np.random.default_rng(7))
-        rows, _ = rows_of(m.robot, everything, record, None)
-        fault = recording_fault(m.robot, everything, record, rows)
+        rows = rows_of(m.robot, everything, record)
+        fault = recording_fault(rows)
         assert fault is not None and fault.startswith("no machine like the file's ")
 
 
@@ -188,9 +185,9 @@ def test_a_drive_that_counts_the_wrong_way_is_named(case: tuple[str, bool, float
     middle = m.robot.graph.home[-1] if homed else q[:, -1].mean() + 0.01 * m.robot.size
     q[:, -1] = 2.0 * middle - q[:, -1]
     effort[:, -1] *= way
-    record, everything = replace(sound, q=q, effort=effort), file_parameters(m.robot)
-    rows, _ = rows_of(m.robot, everything, record, None)
-    fault = recording_fault(m.robot, everything, record, rows)
+    record = replace(sound, q=q, effort=effort)
+    rows = rows_of(m.robot, file_parameters(m.robot), record)
+    fault = recording_fault(rows)
     both = "positions and efforts of" if way < 0.0 else "positions of"
     assert fault is not None and fault.startswith(f"{both} {m.robot.joint_names[-1]} ")
 
@@ -225,9 +222,8 @@ def test_rotors_that_the_file_does_not_have_are_no_other_rate_of_time(
     home = m.robot.graph.home
     rotors = share * float(np.diag(mass_matrix(m.robot, home)).max()) * m.qdd
     record = noisy(m.recorded(effort=m.efforts + rotors), np.random.default_rng(7))
-    everything = file_parameters(m.robot)
-    rows, _ = rows_of(m.robot, everything, record, None)
-    assert recording_fault(m.robot, everything, record, rows) is None
+    rows = rows_of(m.robot, file_parameters(m.robot), record)
+    assert recording_fault(rows) is None
 
 
 @pytest.mark.parametrize(

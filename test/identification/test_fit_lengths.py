@@ -13,11 +13,10 @@ from scipy.interpolate import CubicSpline
 
 from delta_dynamics import inverse_dynamics
 from pkm_twin import Robot
-from pkm_twin.identification.file_parameters import file_parameters
 from pkm_twin.identification.fit import fit
-from pkm_twin.identification.fit_lengths import USUAL, Lengths
-from pkm_twin.identification.fit_rows import Recorded, rows_of
-from pkm_twin.identification.fit_signals import derivative
+from pkm_twin.identification.parameters import file_parameters
+from pkm_twin.identification.rows import Recorded, derivative, rows_of
+from pkm_twin.identification.suspects import USUAL, Lengths
 from pkm_twin.robot.catalogue import robot_of_data
 from pkm_twin.robot.entries import data_of, with_entries
 from test.identification.machines import machine, noisy, of_prior
@@ -54,13 +53,13 @@ def test_columns_are_differences_of_the_efforts(name: str) -> None:
     held = (m.time > 3.0).astype(float)
     record = replace(noisy(m.recorded(), np.random.default_rng(4)), held=held)
     everything = file_parameters(robot)
-    rows, _ = rows_of(robot, everything, record, None)
+    rows = rows_of(robot, everything, record)
     heavy = robot.changed(payload={"mass": 0.4})
     none = robot.changed(payload={"mass": 0.0, "inertia": [0.0, 0.0, 0.0]})
     values = file_parameters(heavy).values
     lengths = Lengths.of(robot)
-    found = lengths.columns(robot, everything, None, values, rows.signals)
-    size = np.abs(inverse_dynamics(robot, *rows.signals.motion)).max() / robot.graph.size
+    found = lengths.columns(rows, values)
+    size = np.abs(inverse_dynamics(robot, *rows.signals.motion.joints)).max() / robot.graph.size
     tried = 0
     for k in np.random.default_rng(5).permutation(len(lengths.paths))[:8]:
         (where,) = np.flatnonzero(lengths.mixing[:, k])
@@ -70,11 +69,11 @@ def test_columns_are_differences_of_the_efforts(name: str) -> None:
         try:
             for one in (heavy, none):
                 pair = [with_entries(one, {path: one.number(path) + h}) for h in (-step, step)]
-                low, high = (inverse_dynamics(other, *rows.signals.motion) for other in pair)
+                low, high = (inverse_dynamics(other, *rows.signals.motion.joints) for other in pair)
                 sides.append((high - low) / (2.0 * step))
         except ValueError:
             continue  # a closure that only this number's own value meets
-        loaded = rows.signals.held[:, None]
+        loaded = rows.signals.motion.held[:, None]
         expected = loaded * sides[0] + (1.0 - loaded) * sides[1]
         np.testing.assert_allclose(found[..., k], expected, rtol=0, atol=1e-4 * size)
         tried += 1
@@ -98,9 +97,9 @@ def test_drawn_lengths_change_the_efforts_as_their_columns_say(name: str) -> Non
     robot, rng = load(name), np.random.default_rng(8)
     m = machine(robot, rng, 4.0, 1000.0)
     everything = file_parameters(robot)
-    rows, _ = rows_of(robot, everything, noisy(m.recorded(), rng), None)
+    rows = rows_of(robot, everything, noisy(m.recorded(), rng))
     lengths = Lengths.of(robot)
-    columns = lengths.columns(robot, everything, None, everything.values, rows.signals)
+    columns = lengths.columns(rows, everything.values)
     motion = [CubicSpline(m.time, values)(rows.time) for values in (m.q, m.qd, m.qdd)]
     here = inverse_dynamics(robot, *motion)
     for _ in range(5):

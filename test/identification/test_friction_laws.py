@@ -8,9 +8,9 @@ from scipy.signal import lfilter
 from delta_dynamics import inverse_dynamics
 from pkm_twin.errors import ParameterError, PkmTwinError, UnknownNameError
 from pkm_twin.identification.excitation import Bounds, Judge
-from pkm_twin.identification.file_parameters import file_parameters
 from pkm_twin.identification.friction_laws import fit_with_laws, laws_of
 from pkm_twin.identification.noise import resonances_of
+from pkm_twin.identification.parameters import file_parameters
 from pkm_twin.identification.samples import Filtering
 from pkm_twin.identification.sweeps import sweeps
 from pkm_twin.identification.torque_constant import fitted_constants, given_constants

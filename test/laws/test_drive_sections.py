@@ -7,7 +7,7 @@ import yaml
 
 from delta_dynamics import inverse_dynamics
 from pkm_twin.errors import ParameterError
-from pkm_twin.identification.file_parameters import file_parameters
+from pkm_twin.identification.parameters import file_parameters
 from pkm_twin.robot.robot_urdf import robot_description
 from test.support.robots import load, parameters_of
 

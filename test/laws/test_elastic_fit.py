@@ -10,7 +10,7 @@ import pytest
 
 from pkm_twin.errors import PkmTwinError
 from pkm_twin.identification.elastic_fit import fit_elements
-from pkm_twin.identification.elastic_groups import groups_of
+from pkm_twin.identification.parameters import groups_of
 from stiffness_monitor.response import element_response
 from test.laws.deflections import SENSORS, frame_recording, noisy, twin_recording
 from test.support.robots import load

@@ -15,8 +15,9 @@ from delta_dynamics import inverse_dynamics, regressor
 from pkm_twin import Robot
 from pkm_twin.errors import PkmTwinError
 from pkm_twin.identification.estimation import estimate, possible
-from pkm_twin.identification.file_parameters import file_parameters
-from pkm_twin.identification.fit import Fit, Recorded, fit
+from pkm_twin.identification.fit import Fit, fit
+from pkm_twin.identification.parameters import file_parameters
+from pkm_twin.identification.rows import Recorded
 from pkm_twin.machine.inertia import ten_numbers
 from pkm_twin.machine.shared import pseudo_inertia
 from pkm_twin.robot.catalogue import robot_of_data

@@ -15,7 +15,7 @@ from delta_dynamics import inverse_dynamics
 from pkm_twin import Robot
 from pkm_twin.apps.certificate.maximal import Maximal, State
 from pkm_twin.identification.fit import fit
-from pkm_twin.identification.fit_rows import Recorded
+from pkm_twin.identification.rows import Recorded
 from pkm_twin.robot.robot_urdf import robot_description
 from test.identification.machines import machine
 from test.laws.recordings import engine_efforts

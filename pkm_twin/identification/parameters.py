@@ -1,0 +1,252 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a fit varies and how well it knows it: parameters of a file, numbers, combinations."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import pairwise
+from typing import Final, Literal
+
+import numpy as np
+
+from delta_dynamics.regressor import TEN, parameter_names
+from delta_dynamics.virtual_work import mass_matrix
+from pkm_twin.codegen.arrays import Array
+from pkm_twin.machine.inertia import transport
+from pkm_twin.machine.places import path_of
+from pkm_twin.machine.shared import KINDS, Key, Kind, Shared
+from pkm_twin.robot.robot import Robot
+
+Status = Literal["fitted", "combination", "not excited"]
+
+SURE: Final = 0.2
+"""A number that is known this much better than before is fitted."""
+OBSERVED: Final = 0.5
+"""One that is known this much better is observed: the measurements, not the prior, say most of it.
+"""
+UNSURE: Final = 0.98
+"""One that is known no better than this is not excited."""
+STAYS: Final = 1e-3
+"""Change over the standard deviation before that says nothing."""
+SHOWN: Final = 0.1
+"""Part of the greatest weight below which an element is no part of a combination."""
+
+
+@dataclass(frozen=True, eq=False)
+class FileParameters:
+    """Some of the parameters that a robot's file gives, k of them.
+
+    ``groups``: entries of the file, in order. ``mixing``: shape (p, k), the regressor's parameters
+    by these: Y mixing is the columns of these. ``loads``: values of these by which friction that
+    grows with the load is taken, shape (k,); None: the file's.
+    """
+
+    groups: tuple[Shared, ...]
+    mixing: Array
+    loads: Array | None = None
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """Names, shape (k,)."""
+        return tuple(name for group in self.groups for name in group.names)
+
+    @cached_property
+    def units(self) -> tuple[str, ...]:
+        """Units, shape (k,)."""
+        return tuple(unit for group in self.groups for unit in group.units)
+
+    @cached_property
+    def values(self) -> Array:
+        """The file's own, shape (k,)."""
+        return np.concatenate([group.values for group in self.groups])
+
+    @cached_property
+    def scales(self) -> Array:
+        """How far each may be from the file's, shape (k,); NaN where only data can tell."""
+        return np.concatenate([group.scales for group in self.groups])
+
+    @cached_property
+    def slices(self) -> tuple[slice, ...]:
+        """Where each group's parameters stand."""
+        ends = np.cumsum([0, *(len(group.names) for group in self.groups)])
+        return tuple(slice(int(a), int(b)) for a, b in pairwise(ends))
+
+    @cached_property
+    def cones(self) -> tuple[tuple[slice, Array], ...]:
+        """Where in the parameters, and the matrices whose sum has to be semidefinite."""
+        pairs = zip(self.slices, self.groups, strict=True)
+        return tuple((where, cone) for where, group in pairs for cone in group.cones)
+
+
+def _scaled(group: Shared, robot: Robot) -> Shared:
+    """A rotor may weigh as much as all that the joints move at home."""
+    if group.kind != "rotor":
+        return group
+    moved = float(np.diag(mass_matrix(robot, robot.graph.home)).max())
+    return replace(group, scales=np.array([max(moved, float(group.values[0]))]))
+
+
+def file_parameters(robot: Robot, what: Sequence[Kind] = KINDS) -> FileParameters:
+    """The parameters of some kinds.
+
+    :raises ParameterError: the robot's file gives no masses.
+    """
+    kept = [_scaled(g, robot) for g in robot.shared_parameters() if g.kind in what]
+    place = {name: k for k, name in enumerate(parameter_names(robot))}
+    tree = robot.engine.tree
+    mixing = np.zeros((len(place), sum(len(group.names) for group in kept)))
+    start = 0
+    for group in kept:
+        end = start + len(group.names)
+        for body, ten in group.bodies.items():
+            rows = [place[f"{body}.{word}"] for word in TEN]
+            mixing[rows, start:end] += transport(np.eye(3), -tree.at[body]) @ ten
+        for name, row in group.others.items():
+            mixing[place[name], start:end] += row
+        start = end
+    return FileParameters(tuple(kept), mixing)
+
+
+@dataclass(frozen=True)
+class Number:
+    """One number of the file: where it stands, before and after, and its standard deviation.
+
+    ``deviation``: NaN where it is withheld, as the model does not explain the recordings.
+    ``share``: that of the noise alone over that of before. ``status``: ``fitted``; ``combination``:
+    known only in combination; ``not excited``: the motion does not identify it, the file's value
+    stays.
+    """
+
+    key: Key
+    unit: str
+    before: float
+    after: float
+    deviation: float
+    share: float
+    status: Status
+
+    @property
+    def spread(self) -> str:
+        """The standard deviation in words."""
+        return f"{self.deviation:.2g}" if np.isfinite(self.deviation) else "withheld"
+
+    @property
+    def name(self) -> str:
+        """The key, with dots."""
+        return path_of(self.key)
+
+
+def number_of(
+    key: Key, unit: str, before: float, value: float, deviations: tuple[float, float], prior: float
+) -> Number:
+    """A number with how well it is known: by the noise alone.
+
+    :param deviations: by the noise alone, and with what the model does not explain.
+    :param prior: its standard deviation before.
+    """
+    plain, wide = deviations
+    share = plain / prior if prior > 0.0 else 1.0
+    if share > UNSURE and abs(value - before) <= STAYS * prior:
+        return Number(key, unit, before, before, plain, share, "not excited")
+    status: Status = "fitted" if share < SURE else "combination"
+    return Number(key, unit, before, value, wide, share, status)
+
+
+def numbers_of_group(
+    group: Shared, values: Array, prior: Array, covariances: tuple[Array, Array]
+) -> list[Number]:
+    """A group's numbers of the file, their standard deviations by the derivatives of its keys.
+
+    :param covariances: of the values by the noise alone, and with what the model does not explain.
+    """
+    before, after = group.keys(group.values), group.keys(values)
+    columns = []
+    for step in np.diag(1e-6 * prior):
+        high, low = group.keys(values + step), group.keys(values - step)
+        columns.append([(high[key] - low[key]) / (2.0 * step.sum()) for key in after])
+    numbers = []
+    for slope, (key, value) in zip(np.array(columns).T, after.items(), strict=True):
+        plain, wide = (float(np.sqrt(max(slope @ one @ slope, 0.0))) for one in covariances)
+        usual = float(np.linalg.norm(slope * prior))
+        unit = _unit(group, key)
+        numbers.append(number_of(key, unit, before[key], value, (plain, wide), usual))
+    return numbers
+
+
+def _unit(group: Shared, key: Key) -> str:
+    """Unit of a number of the file."""
+    words = [str(k) for k in key if isinstance(k, str)]
+    if len(group.names) == 1:
+        return group.units[0]
+    last = words[-1]
+    if last.endswith("com"):
+        return "m" if len(key) > 2 and isinstance(key[-1], int) else ""
+    return "kg" if last.endswith("mass") else "kg m2"
+
+
+@dataclass(frozen=True)
+class Combination:
+    """A weighted sum of elements' factors, of weights with squares that sum to 1."""
+
+    weights: dict[str, float]
+    value: float
+    deviation: float
+
+
+@dataclass(frozen=True)
+class Group:
+    """Elements that the loads do not distinguish, and what is known of them together."""
+
+    elements: tuple[str, ...]
+    known: tuple[Combination, ...]
+
+
+def groups_of(
+    names: Sequence[str], factors: Array, covariance: Array, wide: Array | None = None
+) -> tuple[Group, ...]:
+    """Elements that share a direction that is not known, and the directions that are.
+
+    :param factors: shape (elements,), known to 1 before. ``covariance``: of them, and of more
+        behind them, by the noise alone. ``wide``: with what the model does not explain; default
+        the same.
+    """
+    count = len(names)
+    own = covariance[:count, :count]
+    full = own if wide is None else wide[:count, :count]
+    values, vectors = np.linalg.eigh(own)
+    unknown = vectors[:, values > SURE**2]
+    shared = np.abs(unknown @ unknown.T)
+    left, groups = set(np.flatnonzero(np.diag(shared) > SHOWN**2).tolist()), []
+    while left:
+        group, edge = set(), {min(left)}
+        while edge:
+            group |= edge
+            edge = {j for i in edge for j in left - group if shared[i, j] > SHOWN}
+        left -= group
+        if len(group) > 1:
+            groups.append(_group(sorted(group), names, factors, (own, full)))
+    return tuple(groups)
+
+
+def _group(
+    members: list[int], names: Sequence[str], factors: Array, covariances: tuple[Array, Array]
+) -> Group:
+    own, wide = covariances
+    values, vectors = np.linalg.eigh(own[np.ix_(members, members)])
+    told = []
+    for value, vector in zip(values, vectors.T, strict=True):
+        if value > SURE**2:
+            continue
+        weights = vector * np.sign(vector[np.argmax(np.abs(vector))])
+        weights[np.abs(weights) < SHOWN * np.abs(weights).max()] = 0.0
+        weights /= np.linalg.norm(weights)
+        deviation = float(np.sqrt(weights @ wide[np.ix_(members, members)] @ weights))
+        told.append(
+            Combination(
+                {names[k]: float(w) for k, w in zip(members, weights, strict=True) if w},
+                float(weights @ factors[members]), deviation,
+            )
+        )  # fmt: skip
+    return Group(tuple(names[k] for k in members), tuple(told))

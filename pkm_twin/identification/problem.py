@@ -1,0 +1,203 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Recordings of a robot as one linear least-squares problem in the parameters of its file.
+
+Efforts may be late against positions, by some samples and alike in all joints: a drive that holds
+its torque for a period would else look like friction. How late is fitted too, for each recording.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Final
+
+import numpy as np
+
+from pkm_twin.codegen.arrays import Array, Mask
+from pkm_twin.errors import PkmTwinError, SingularityError, UnreachableError
+from pkm_twin.identification.estimation import Estimate, estimate
+from pkm_twin.identification.fit_plausible import recording_fault
+from pkm_twin.identification.noise import EXACT
+from pkm_twin.identification.parameters import FileParameters, file_parameters
+from pkm_twin.identification.rows import LATE, Recorded, Rows, prior_scales, rows_of
+from pkm_twin.machine.friction import LAWS, FrictionLaw
+from pkm_twin.machine.shared import Kind
+from pkm_twin.robot.robot import Robot
+
+LOADED: Final = frozenset(name for name, law in LAWS.items() if law.share is not FrictionLaw.share)
+"""Laws that grow with the load."""
+LOAD_PASSES: Final = 2
+FEW: Final = 5.0
+"""Independent measured values for each fitted number, below which there are too few."""
+WORSE: Final = 1.2
+"""Held-out residual of a joint over that of the file's values that a machine like the file's does
+not leave."""
+
+
+@dataclass(frozen=True, eq=False)
+class Solved:
+    """An estimate of the parameters, and how late the efforts of each recording are, s.
+
+    ``whole``: of parameters and delays; ``table``: their columns, (samples, n, parameters and
+    delays), the fitted rows of all recordings one after the other, ``counts`` of each.
+    """
+
+    whole: Estimate
+    table: Array
+    counts: tuple[int, ...]
+
+    @property
+    def estimate(self) -> Estimate:
+        """Of the parameters alone."""
+        e, k = self.whole, self.table.shape[-1] - len(self.counts)
+        return replace(
+            e, values=e.values[:k], covariance=e.covariance[:k, :k], prior=e.prior[:k],
+            inverse=e.inverse[:k, :k],
+        )  # fmt: skip
+
+    @property
+    def delays(self) -> tuple[float, ...]:
+        """Of the recordings, s."""
+        return tuple(self.whole.values[self.table.shape[-1] - len(self.counts) :].tolist())
+
+    def response(self, signals: Sequence[Array]) -> Array:
+        """What signals (k, n, m) added to the efforts change in the parameters, (p, m)."""
+        used = [one[:count] for one, count in zip(signals, self.counts, strict=True)]
+        moved = self.whole.response(self.table, np.concatenate(used))
+        return moved[: self.table.shape[-1] - len(self.counts)]
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """Recordings as one least-squares problem in some of the parameters of a robot's file.
+
+    ``everything``: all parameters, ``whole``: rows with all of them, by recording. ``what``: the
+    kinds that are fitted.
+    """
+
+    robot: Robot
+    what: tuple[Kind, ...]
+    everything: FileParameters
+    whole: tuple[Rows, ...]
+
+    @classmethod
+    def of(
+        cls, robot: Robot, recordings: Sequence[Recorded], what: Sequence[Kind],
+        passes: int = LOAD_PASSES, progress: Callable[[int], None] | None = None,
+    ) -> Problem:  # fmt: skip
+        """Filter recordings.
+
+        :param passes: in which friction that grows with the load is taken by the load of the
+            fitted machine, not of the file's.
+        :param progress: called with the number of recordings that are done.
+        """
+        everything, whole = file_parameters(robot), []
+        for i, recording in enumerate(recordings):
+            try:
+                whole.append(rows_of(robot, everything, recording))
+            except (UnreachableError, SingularityError) as error:
+                raise PkmTwinError(
+                    f"{recording.name}: {error} (positions of this machine, in rad and m?)"
+                ) from None
+            if progress is not None:
+                progress(i + 1)
+        problem = cls(robot, tuple(what), everything, tuple(whole))
+        for _ in range(passes if set(robot.laws) & LOADED else 0):
+            problem = replace(problem, everything=replace(everything, loads=problem.values))
+            problem = problem.again([made.how.window for made in problem.whole])
+        return problem
+
+    def again(
+        self, windows: Sequence[int], progress: Callable[[int], None] | None = None
+    ) -> Problem:
+        """The same recordings, differentiated with other windows."""
+        whole = []
+        for i, (made, window) in enumerate(zip(self.whole, windows, strict=True)):
+            whole.append(made.again(self.everything, window))
+            if progress is not None:
+                progress(len(self.whole) + i + 1)
+        return replace(self, whole=tuple(whole))
+
+    @cached_property
+    def parameters(self) -> FileParameters:
+        """Those that are fitted."""
+        return file_parameters(self.robot, self.what)
+
+    @cached_property
+    def chosen(self) -> Mask:
+        """Which of all parameters they are."""
+        groups = self.everything.groups
+        return np.array([group.kind in self.what for group in groups for _ in group.names])
+
+    @cached_property
+    def rows(self) -> tuple[Rows, ...]:
+        """With these parameters alone."""
+        return tuple(made.only(self.chosen, self.everything.values) for made in self.whole)
+
+    @cached_property
+    def solved(self) -> Solved:
+        """By least squares: the parameters, and how late the efforts of each recording are."""
+        used = [made.fitted for made in self.rows]
+        table, target, rest, counts = (
+            np.concatenate([getattr(made, name) for made in used])
+            for name in ("table", "target", "rest", "counts")
+        )
+        scales = prior_scales(self.parameters, table, target + rest)
+        # Late by a delay is less the delay times the change.
+        late = [
+            np.concatenate([-made.change * (i == j) for j, made in enumerate(used)])
+            for i in range(len(used))
+        ]
+        whole = np.concatenate([table, np.stack(late, -1)], -1)
+        found = estimate(
+            whole, target, np.append(self.parameters.values, np.zeros(len(used))),
+            np.append(scales, [LATE * made.period for made in used]), self.parameters.cones, counts,
+        )  # fmt: skip
+        return Solved(found, whole, tuple(len(made.time) for made in used))
+
+    @property
+    def values(self) -> Array:
+        """All parameters, those that are fitted as they were found."""
+        values = self.everything.values.copy()
+        values[self.chosen] = self.solved.estimate.values
+        return values
+
+    def check_count(self) -> None:
+        """Reject fewer independent values than the numbers need.
+
+        :raises PkmTwinError: with how many there are.
+        """
+        directions = self.solved.whole.directions
+        used = ((made.fitted.counts.sum(), made.signals.band) for made in self.rows)
+        values = sum(float(count) * band for count, band in used)
+        if values < FEW * directions:
+            raise PkmTwinError(
+                f"too few samples: {values:.0f} independent efforts for {directions} numbers of "
+                f"{', '.join(self.what)}, {FEW * directions:.0f} or more are needed; record a "
+                "motion with more changes of speed (`pkm-twin excite`), or fit less with --what"
+            )
+
+    def faults(self) -> list[str]:
+        """Recordings that this machine cannot have made, in words."""
+        found = ((made.recording.name, recording_fault(made)) for made in self.whole)
+        return [f"{name}: {fault}" for name, fault in found if fault is not None]
+
+    def worse(self) -> list[str]:
+        """Recordings whose held-out part the fitted values predict worse than the file's."""
+        robot, told = self.robot, []
+        for made in self.rows:
+            end, after = made.held_out, self.solved.estimate.values
+            old, new = (
+                np.sqrt(np.mean(end.counts * (end.target - end.table @ v) ** 2, 0))
+                for v in (self.parameters.values, after)
+            )
+            j = int(np.argmax(new / np.maximum(old, 1e-300)))
+            if new[j] > WORSE * old[j] and new[j] > EXACT * np.std(end.effort[:, j]):
+                told.append(
+                    f"{made.recording.name}: the fitted values leave {new[j]:.3g} "
+                    f"{robot.effort_units[j]} of the held-out efforts of {robot.joint_names[j]}, "
+                    f"the file's {old[j]:.3g} (another machine, or a motion that is too short or "
+                    "changes?)"
+                )
+        return told

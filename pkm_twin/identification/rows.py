@@ -1,0 +1,468 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A recording as rows of a least-squares problem: regressor and efforts, filtered alike.
+
+With them the signals of the same rows that a fit's residual is held against.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+import scipy  # type: ignore[import-untyped]  # its parts come when they are asked for
+
+from delta_dynamics.regressor import law_columns, law_keys, parameter_values, regressor
+from pkm_twin.codegen.arrays import Array, Mask
+from pkm_twin.errors import PkmTwinError
+from pkm_twin.identification.estimation import estimate
+from pkm_twin.identification.noise import (
+    Resonance,
+    noise_of,
+    passed_band,
+    resonances_of,
+    usual_size,
+)
+from pkm_twin.identification.parameters import FileParameters
+from pkm_twin.identification.samples import (
+    DEGREE,
+    LEAST,
+    WINDOWS,
+    Filtering,
+    Motion,
+    Track,
+    by_blocks,
+    low_pass,
+    tracks,
+)
+from pkm_twin.machine.friction import linear_keys
+from pkm_twin.robot.robot import Robot
+
+BLOCK: Final = 2048
+OUTLIER: Final = 8.0
+"""Robust deviations beyond which a measured effort is no measurement."""
+IN_A_ROW: Final = 10
+"""Samples in a row that are no outliers, but something that the model lacks."""
+LEAST_EFFORT: Final = 1e-9
+"""Efforts that change by less are no measurement, N m or N."""
+LARGEST: Final = 1e9
+"""Effort that no drive has, N m or N."""
+LATE: Final = 2.0
+"""Samples by which efforts may well be late."""
+HELD_OUT: Final = 1 / 3
+"""Part of each recording, its end, that is judged and not fitted."""
+SHAKEN: Final = 3000
+"""Samples that show what the positions' noise does."""
+
+STRIBECK: Final = (0.05, 0.1, 0.2)
+"""Speeds below which static friction shows, over the rms speed."""
+MOTION: Final = 0.4
+"""Part of the filter's cut-off in which nearly all of the motion is."""
+SMOOTH: Final = 5
+"""Degree of the splines that have the motion below it."""
+CENTRAL: Final = (7, 6)
+"""Samples and degree of the polynomial whose derivatives in its middle are central differences of
+sixth order."""
+ENDS: Final = (9, 4)
+"""And of the one that is differentiated at the ends of a piece: there are no samples beyond."""
+
+
+@dataclass(frozen=True, eq=False)
+class Recorded:
+    """A recording: ``time`` (k,), s; q and efforts (k, n); wrench (k, 6) or None.
+
+    ``held``: 1 where the payload that is looked for is on the platform, shape (k,). ``carried``:
+    a robot with the payload that is known, while it is held; None where there is none.
+    """
+
+    name: str
+    time: Array
+    q: Array
+    effort: Array
+    wrench: Array | None = None
+    held: Array | None = None
+    carried: Robot | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """A robot's efforts, linear in the parameters of its file.
+
+    ``carried``: the robot with the payload that is known, while it is held; None where there is
+    none.
+    """
+
+    robot: Robot
+    parameters: FileParameters
+    carried: Robot | None = None
+
+    @property
+    def of_drives(self) -> Mask:
+        """Which parameters are friction of the drives."""
+        keys, drives = linear_keys(self.robot.laws), set(self.robot.joint_names)
+        pairs = [name.rpartition(".")[::2] for name in self.parameters.names]
+        return np.array([joint in drives and key in keys for joint, key in pairs])
+
+    def columns(self, motion: Motion) -> tuple[Array, Array]:
+        """The parameters' columns, (k, n, p), and what the others need, (k, n)."""
+
+        def block(rows: slice) -> Array:
+            own, rest = self._columns(motion.part(rows))
+            return np.concatenate([own, rest[..., None]], -1)
+
+        both = by_blocks(len(motion.q), BLOCK, block)
+        return both[..., :-1], both[..., -1]
+
+    def efforts(self, motion: Motion, values: Array) -> Array:
+        """With values of the parameters, (k, n)."""
+        table, rest = self.columns(motion)
+        return np.asarray(rest + table @ values, np.float64)
+
+    def _columns(self, motion: Motion) -> tuple[Array, Array]:
+        robot, parameters, held = self.robot, self.parameters, motion.held
+        pi = parameter_values(robot)
+        extra = np.zeros(len(pi)) if self.carried is None else parameter_values(self.carried) - pi
+        full = regressor(robot, *motion.joints, motion.wrench)
+        own = full @ parameters.mixing
+        rest = full @ pi - own @ parameters.values + held[:, None] * (full @ extra)
+        for where, group in zip(parameters.slices, parameters.groups, strict=True):
+            if group.kind == "payload":
+                own[..., where] *= held[:, None, None]
+        if parameters.loads is not None and robot.laws:
+            rubs = self.of_drives
+            load = rest + own[..., ~rubs] @ parameters.loads[~rubs]
+            laws = law_columns(robot, motion.q, motion.qd, load)
+            names = [f"{joint}.{key}" for key in law_keys(robot) for joint in robot.joint_names]
+            for name, column in zip(names, np.moveaxis(laws, -1, 0), strict=True):
+                own[..., parameters.names.index(name)] = column
+        return own, rest
+
+
+@dataclass(frozen=True, eq=False)
+class Signals:
+    """Signals of a recording at its rows, filtered as they are; k rows, n joints.
+
+    ``motion``: without noise beyond the motion's band, and ``missed``: what the
+    differentiation misses of qd and qdd; ``load``: of the efforts without friction, with its first
+    and second derivative, (k, n) each. ``effort``: what a first fit predicts, and its derivative.
+    ``own``: friction of other laws, a unit of each, (k, n, laws). ``noise``: deviation of a row's
+    noise as if rows were independent, (n,). ``band``: the part of the rows' rate that the filter
+    passes. ``resonances``: of the residual above the band.
+    """
+
+    motion: Motion
+    missed: tuple[Array, Array]
+    load: tuple[Array, Array, Array]
+    effort: tuple[Array, Array]
+    own: Array
+    noise: Array
+    band: float
+    resonances: tuple[Resonance, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Rows:
+    """Filtered rows of one recording: time (k,), table (k, n, parameters), target (k, n).
+
+    ``rest``: what the parameters that stay need; ``counts``: what is judged; ``change``: of the
+    efforts in time, (k, n) each. ``signals``: of the same rows. ``tracks``: before the filter
+    ``how``. ``model``: of all parameters.
+    """
+
+    recording: Recorded
+    model: Model
+    how: Filtering
+    tracks: tuple[Track, ...]
+    time: Array
+    table: Array
+    target: Array
+    rest: Array
+    counts: Array
+    change: Array
+    outliers: int
+    signals: Signals
+
+    @property
+    def period(self) -> float:
+        """Of the samples, s."""
+        return self.tracks[0].period
+
+    @property
+    def effort(self) -> Array:
+        """As measured, filtered, shape (k, n)."""
+        return self.target + self.rest
+
+    @property
+    def held_from(self) -> int:
+        """The first row that is held out."""
+        return round((1.0 - HELD_OUT) * len(self.time))
+
+    @property
+    def fitted(self) -> Rows:
+        """The rows that are fitted."""
+        return self._part(slice(0, self.held_from))
+
+    @property
+    def held_out(self) -> Rows:
+        """The others, by which a fit is judged."""
+        return self._part(slice(self.held_from, None))
+
+    def _part(self, rows: slice) -> Rows:
+        cut = ("time", "table", "target", "rest", "counts", "change")
+        return replace(self, **{name: getattr(self, name)[rows] for name in cut})
+
+    def only(self, columns: Mask, values: Array) -> Rows:
+        """With some of the parameters, the others at these values, (parameters,)."""
+        stay = self.table[..., ~columns] @ values[~columns]
+        return replace(
+            self, table=self.table[..., columns], target=self.target - stay, rest=self.rest + stay
+        )
+
+    def again(self, parameters: FileParameters, window: int) -> Rows:
+        """The recording with other parameters or another window of the differentiation."""
+        return rows_of(self.model.robot, parameters, self.recording, window)
+
+
+def next_window(window: int) -> int:
+    """The window that is fitted next to it: the next shorter one, of the shortest the next."""
+    k = WINDOWS.index(window)
+    return WINDOWS[k - 1] if k else WINDOWS[1]
+
+
+def rows_of(
+    robot: Robot, parameters: FileParameters, recording: Recorded, window: int | None = None
+) -> Rows:
+    """A recording's filtered rows.
+
+    :param window: of the differentiation, samples; None chooses it.
+    :raises PkmTwinError: it is too short, its joints stand still, or its efforts are none.
+    """
+    r = recording
+    _check_efforts(robot, r)
+    if len(r.time) < LEAST:
+        raise PkmTwinError(
+            f"{r.name}: too short to fit, {len(r.time)} samples; {LEAST} or more in a row"
+        )
+    pieces, how = tracks(r.time, r.q, r.effort, r.wrench, r.held, window)
+    if not pieces:
+        raise PkmTwinError(f"{r.name}: too short to fit, no {LEAST // 2} samples without a gap")
+    model = Model(robot, parameters, r.carried)
+    parts = [_Piece.of(model, track, how) for track in pieces]
+    if all(not part.moves.any() for part in parts):
+        raise PkmTwinError(f"{r.name}: no excitation, the joints stand still")
+    first, outliers = _drop_outliers(parts, parameters, how.keep_every)
+    made = [part.filtered(first, track, how) for part, track in zip(parts, pieces, strict=True)]
+    time, table, target, rest, counts, change = (
+        np.concatenate([one[k] for one in made]) for k in range(6)
+    )
+    told = [part.rest + part.table @ first for part in parts]
+    rubs = model.of_drives
+    rub = [part.table[..., rubs] @ first[rubs] for part in parts]
+    left = [part.target - part.table @ first for part in parts]
+    longest = max(pieces, key=lambda t: len(t.time))
+    shaken = shaken_efforts(r, longest, how, lambda track: model.efforts(track, first))
+    noise = noise_of(left, shaken, longest.period, how)
+    size = np.sqrt(np.mean(np.concatenate([part.target + part.rest for part in parts]) ** 2, 0))
+    rings = resonances_of(left, longest.period, how, size)
+    return Rows(
+        r, model, how, tuple(pieces), time, table, target, rest, counts, change, outliers,
+        signals_of(pieces, told, rub, how, noise, rings),
+    )  # fmt: skip
+
+
+def shaken_efforts(
+    r: Recorded, track: Track, how: Filtering, efforts: Callable[[Track], Array]
+) -> Array:
+    """What noise of the positions, as large as theirs, changes in the efforts, (samples, n).
+
+    :param efforts: of a motion, shape (samples, n).
+    """
+    noise, rng = np.array(how.position_noise), np.random.default_rng(0)
+    edge = (how.window // 2 + 0.5) * track.period
+    inside = (r.time > track.time[0] - edge) & (r.time < track.time[-1] + edge)
+    some = np.flatnonzero(inside)[:SHAKEN]
+    time, q = r.time[some], r.q[some]
+    told = []
+    for shake in (np.zeros_like(q), noise * rng.normal(size=q.shape)):
+        pieces, _ = tracks(
+            time,
+            q + shake,
+            np.zeros_like(q),
+            window=how.window,
+            least=min(LEAST // 2, len(track.time)),
+        )
+        told.append(np.concatenate([efforts(t) for t in pieces]))
+    return np.asarray(told[1] - told[0], np.float64)
+
+
+@dataclass(frozen=True, eq=False)
+class _Piece:
+    """One even piece before the filter."""
+
+    table: Array
+    target: Array
+    rest: Array
+    moves: Array
+    """1 where a joint moves, or where standing still is no matter, shape (k, n)."""
+
+    @classmethod
+    def of(cls, model: Model, track: Track, how: Filtering) -> _Piece:
+        """Of a track."""
+        table, rest = model.columns(track)
+        return cls(table, track.effort - rest, rest, track.moves(how).astype(np.float64))
+
+    def filtered(self, first: Array, track: Track, how: Filtering) -> tuple[Array, ...]:
+        """Time, table, target, rest, what counts and the efforts' change, all filtered alike."""
+        samples = len(self.table)
+        change = np.gradient(self.rest + self.table @ first, track.period, axis=0)
+        flat = np.concatenate(
+            [self.table.reshape(samples, -1), self.target, self.rest, self.moves, change,
+             track.time[:, None]], 1,
+        )  # fmt: skip
+        smooth = low_pass(flat, track.period, how)
+        n = self.target.shape[1]
+        ends = np.cumsum([self.table[0].size, n, n, n, n])
+        table, target, rest, moves, change, time = np.split(smooth, ends, 1)
+        # Where standing still is in the filter's reach, friction's sign is not known.
+        counts = (moves > 0.8).astype(np.float64)
+        return time[:, 0], table.reshape(len(table), n, -1), target, rest, counts, change
+
+
+def _check_efforts(robot: Robot, r: Recorded) -> None:
+    for joint, effort in zip(robot.joint_names, r.effort.T, strict=True):
+        worst = float(effort[np.argmax(~(np.abs(effort) < LARGEST))])
+        if not abs(worst) < LARGEST:
+            raise PkmTwinError(
+                f"{r.name}: effort of {joint} is {worst:g}; below {LARGEST:g} is what a drive has"
+            )
+        if len(effort) and np.ptp(effort) < LEAST_EFFORT:
+            only = effort[0] + 0.0  # no minus before zero
+            raise PkmTwinError(
+                f"{r.name}: effort of {joint} is {only:g} throughout: nothing was measured"
+            )
+
+
+def _drop_outliers(
+    parts: list[_Piece], parameters: FileParameters, every: int
+) -> tuple[Array, int]:
+    """Efforts far from a first robust fit take its values, but not many of them or in a row.
+
+    :returns: that fit's parameters, and how many efforts.
+    """
+    table = np.concatenate([part.table[::every] for part in parts])
+    target = np.concatenate([part.target[::every] for part in parts])
+    rest = np.concatenate([part.rest[::every] for part in parts])
+    scales = prior_scales(parameters, table, target + rest)
+    first = estimate(table, target, parameters.values, scales).values
+    count = 0
+    for part in parts:
+        told = part.table @ first
+        away = np.abs(part.target - told)
+        bound = OUTLIER * usual_size(part.target - told)
+        # Where friction turns over, an effort that is some samples late is no outlier.
+        near = scipy.ndimage.maximum_filter1d(
+            np.abs(np.diff(told, axis=0, prepend=told[:1])), 7, axis=0
+        )
+        far = (away > bound + LATE * near) & (bound > 1e-6 * np.abs(part.target).max(0))
+        far &= ~scipy.ndimage.binary_opening(far, np.ones((IN_A_ROW, 1)))
+        if far.mean() > 0.05:
+            continue
+        part.target[far] = told[far]
+        count += int(far.sum())
+    return first, count
+
+
+def prior_scales(parameters: FileParameters, table: Array, effort: Array) -> Array:
+    """The prior's deviations; of friction and rotors what would be all of the joints' efforts."""
+    scales = parameters.scales.copy()
+    size = np.sqrt(np.mean(effort**2, 0))
+    columns = np.sqrt(np.mean(table**2, 0))
+    for k in np.flatnonzero(np.isnan(scales)):
+        joint = int(np.argmax(columns[:, k]))
+        shown = columns[joint, k]
+        scales[k] = size[joint] / shown if shown > 0.0 else 0.0
+    kinds = [name.rpartition(".")[2] for name in parameters.names]
+    for k in np.flatnonzero(scales == 0.0):
+        # As uncertain as the others of its sort, where its joint does not move.
+        alike = [s for s, kind in zip(scales, kinds, strict=True) if kind == kinds[k] and s > 0.0]
+        scales[k] = max(alike, default=1.0)
+    return scales
+
+
+def signals_of(
+    tracks: Sequence[Track], told: Sequence[Array], rub: Sequence[Array], how: Filtering,
+    noise: Array, resonances: tuple[Resonance, ...] = (),
+) -> Signals:  # fmt: skip
+    """The signals of a recording's pieces.
+
+    :param told: efforts of a first fit, every sample, (samples, n) each. ``rub``: the part of them
+        that is friction of the drives.
+        ``noise``: of :func:`.noise.noise_of`. ``resonances``: of :func:`.noise.resonances_of`.
+    """
+    speed = np.sqrt(np.mean(np.concatenate([t.qd for t in tracks]) ** 2, 0))
+    parts = []
+    for track, effort, friction in zip(tracks, told, rub, strict=True):
+        load, sign = effort - friction, np.sign(track.qd)
+        laws = [np.abs(load) * sign, track.qd * np.abs(track.qd)]
+        for share in STRIBECK:
+            laws.append(np.exp(-((track.qd / np.maximum(share * speed, 1e-300)) ** 2)) * sign)
+        change = np.gradient(effort, track.period, axis=0)
+        columns = [effort, change, *_calm(track, load, how), *laws, track.wrench]
+        whole = np.concatenate([*columns, track.held[:, None]], 1)
+        parts.append(low_pass(whole, track.period, how))
+    whole = np.concatenate(parts)
+    count = 10 + 2 + len(STRIBECK)
+    each = np.split(whole[:, : count * tracks[0].q.shape[1]], count, 1)
+    rate = 1.0 / (tracks[0].period * how.keep_every)
+    return Signals(
+        Motion(each[2], each[3], each[4], whole[:, -7:-1], whole[:, -1]), (each[5], each[6]),
+        (each[7], each[8], each[9]), (each[0], each[1]), np.stack(each[10:], -1),
+        noise * np.sqrt(rate), passed_band(how, rate), resonances,
+    )  # fmt: skip
+
+
+def _calm(track: Track, load: Array, how: Filtering) -> list[Array]:
+    """Motion and load in the motion's own band, where nearly no noise is, (samples, n) each.
+
+    Positions, rates and accelerations; what the local polynomials miss of the latter two; the load
+    and its derivatives. Noise in both of two columns would look like something in common.
+    """
+    cutoff = None if how.cutoff is None else MOTION * how.cutoff
+    motion, force = (calm(values, track.period, cutoff) for values in (track.q, load))
+    missed = []
+    inner = slice(how.window // 2 + 3, len(load) - how.window // 2 - 3)
+    for order in (1, 2):
+        rough = scipy.signal.savgol_filter(
+            motion[0], how.window, DEGREE, order, track.period, axis=0
+        )
+        apart = np.zeros_like(rough)
+        apart[inner] = (rough - motion[order])[inner]
+        missed.append(apart)
+    return [*motion, *missed, *force]
+
+
+def calm(values: Array, period: float, cutoff: float | None) -> list[Array]:
+    """Signals (samples, n) below a frequency, Hz, with their first and second derivative.
+
+    A least-squares spline with two knots a period: unlike a filter's, its ends take nothing for
+    granted of what is beyond them, so that derivatives hold there too. None: as they are.
+    """
+    if cutoff is None:
+        return [values, *(derivative(values, order, period) for order in (1, 2))]
+    last = (len(values) - 1) * period
+    places = np.linspace(0.0, last, 1 + max(1, round(2.0 * cutoff * last)))
+    knots = np.concatenate([np.zeros(SMOOTH), places, np.full(SMOOTH, last)])
+    time = np.linspace(0.0, last, len(values))
+    spline = scipy.interpolate.make_lsq_spline(time, values, knots, SMOOTH)
+    return [np.asarray(spline(time, order), np.float64) for order in range(3)]
+
+
+def derivative(values: Array, order: int, period: float) -> Array:
+    """Along the first axis: central differences of sixth order, polynomials at the ends."""
+    inner, ends = (
+        scipy.signal.savgol_filter(values, points, degree, order, period, axis=0, mode="interp")
+        for points, degree in (CENTRAL, ENDS)
+    )
+    beside = CENTRAL[0] // 2
+    return np.concatenate([ends[:beside], inner[beside:-beside], ends[-beside:]])
