@@ -14,8 +14,8 @@ from pkm_twin import Robot, load
 from pkm_twin.apps.columns import read_columns
 from pkm_twin.apps.drive_friction import GRAVITY
 from pkm_twin.apps.pose_table import read_poses
-from pkm_twin.identification.calibration import HELD_OUT, Calibration, calibrate, geometric
-from pkm_twin.identification.calibration_state import Errors, Poses, rotations
+from pkm_twin.identification.calibration import HELD_OUT, Calibration, Errors, calibrate, geometric
+from pkm_twin.identification.calibration_state import Poses, rotations
 from pkm_twin.identification.hanging_mass import drive_friction, lines
 
 Array = NDArray[np.float64]
@@ -105,7 +105,7 @@ def page() -> str:
     poses = recorded(robot)
     count = len(poses.joints)
     paths = geometric(robot, robot.controller.positions(poses.joints))
-    rows: dict[str, list[Errors]] = {"the file": [], "`calibrate`": [], ALONE: []}
+    rows: dict[str, list[list[Errors]]] = {"the file": [], "`calibrate`": [], ALONE: []}
     for k in range(HELD_OUT):
         # `calibrate` holds the last of each four out.
         part = _rolled(poses, HELD_OUT - 1 - k)
@@ -113,7 +113,8 @@ def page() -> str:
         legs, deviations = fit_a_leg(robot, part.part(~last))
         away = leg_poses(legs, part.part(last))
         found = calibrate(robot, part, paths)
-        held = (*found.held_out, Errors(_rms(away), float(away.max())))
+        held = [[a.held_out[k] for a in found.agreements] for k in range(2)]
+        held.append([Errors(_rms(away), float(away.max()))])
         for own, errors in zip(rows.values(), held, strict=True):
             own.append(errors)
     table = "\n".join(_row(name, own) for name, own in rows.items())
@@ -142,12 +143,12 @@ def _rolled(poses: Poses, by: int) -> Poses:
     return Poses(*(np.roll(one, by, 0) for one in (poses.joints, poses.position, poses.rotation)))
 
 
-def _row(name: str, errors: list[Errors]) -> str:
-    """One fit's row: each part that was held out, and all of them."""
-    each = [one.rms for one in errors]
-    angles = [one.rms_angle for one in errors if one.rms_angle is not None]
+def _row(name: str, errors: list[list[Errors]]) -> str:
+    """One fit's row: each part that was held out, and all of them; positions, perhaps rotations."""
+    each = [one[0].rms for one in errors]
+    angles = [one[1].rms for one in errors if len(one) > 1]
     cells = [f"{1e3 * rms:.2f}" for rms in (*each, _rms(np.array(each)))]
-    cells += [f"{1e3 * max(one.worst for one in errors):.2f}"]
+    cells += [f"{1e3 * max(one[0].worst for one in errors):.2f}"]
     cells += [f"{1e3 * _rms(np.array(angles)):.2f}" if angles else ""]
     return f"| {name} | " + " | ".join(cells) + " |"
 

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
 from pathlib import Path
 from textwrap import fill
 from typing import Annotated, Any
@@ -18,33 +17,29 @@ from pkm_twin.apps.limits import beyond_limits as find_beyond
 from pkm_twin.apps.limits import refuse_beyond
 from pkm_twin.apps.options import Accept, BeyondLimits, Json, Platform, RobotName
 from pkm_twin.apps.partial_report import (
+    SIZES,
     WIDTH,
-    outlier_texts,
     parse_noise,
     parse_within,
-    partial_data,
     plan_data,
     plan_table,
-    print_partial,
     print_plan,
     scale_text,
 )
-from pkm_twin.apps.pose_table import LENGTHS, parse_columns, read_partial, read_poses
+from pkm_twin.apps.pose_table import LENGTHS, parse_columns, read_measured, read_poses
 from pkm_twin.console import print_json, progress, refuse_existing, table_console
 from pkm_twin.errors import ParameterError, one_line
 from pkm_twin.files import replace_file
 from pkm_twin.identification.calibration import (
-    HELD_OUT,
+    Agreement,
     Calibration,
     Estimate,
     calibrate,
     geometric,
 )
-from pkm_twin.identification.calibration_faults import Outlier
-from pkm_twin.identification.calibration_fit import STEPS, Parameter
-from pkm_twin.identification.calibration_state import BESIDE, Errors, Poses
-from pkm_twin.identification.measurements import Partial, kinds_of
-from pkm_twin.identification.partial import PartialCalibration, calibrate_partial
+from pkm_twin.identification.calibration_fit import STEPS
+from pkm_twin.identification.calibration_state import BESIDE, Poses
+from pkm_twin.identification.measurements import Measured, kinds_of
 from pkm_twin.identification.plan import MOST
 from pkm_twin.identification.plan import plan as plan_poses
 from pkm_twin.identification.transmission import Transmission, written
@@ -169,9 +164,9 @@ def calibrate_command(
     machine = load(robot, platform=platform)
     kinds = kinds_of(measure or (["position"] if plan else []))
     known, named = parse_noise(noise), parse_columns(columns)
-    measured: Poses | Partial | None = None
+    measured: Poses | Measured | None = None
     if poses is not None and kinds:
-        measured = read_partial(poses, machine, kinds, known, named, unit)
+        measured = read_measured(poses, machine, kinds, known, named, unit)
     elif poses is not None:
         measured = read_poses(poses, machine, named, unit)
     notes = []
@@ -186,7 +181,7 @@ def calibrate_command(
         "transmission": transmission,
     }  # fmt: skip
     if plan is not None:
-        some = measured if isinstance(measured, Partial) else None
+        some = measured if isinstance(measured, Measured) else None
         chosen = plan_poses(
             machine, kinds, only, measured=some, within=parse_within(within), count=count,
             accuracy=accuracy, noise=known, **options,
@@ -202,7 +197,6 @@ def calibrate_command(
     if poses is None or measured is None:
         raise ParameterError("poses", None, "a CSV of measured poses, or --plan FILE.csv")
     paths = geometric(machine, q, only)
-    result: Calibration | PartialCalibration
     with progress("steps", 2 * STEPS) as update:
         done = 0
 
@@ -211,33 +205,24 @@ def calibrate_command(
             done += count
             update(done)
 
-        options |= {"accept": accept, "progress": step}
-        if isinstance(measured, Partial):
-            result = calibrate_partial(machine, measured, paths, **options)
-        else:
-            result = calibrate(machine, measured, paths, **options)
+        result = calibrate(machine, measured, paths, accept=accept, progress=step, **options)
     marks = [*(f"accepted anyway: {fault}" for fault in result.faults), *notes]
     source = f"calibrated with {one_line(poses.name, 100)}"
-    own = measured.own if isinstance(measured, Partial) else {}
     values = {
         p.name: Fitted(p.value, p.deviation, p.unit, source + ("" if p.observed else UNKNOWN))
         for p in result.parameters
-        if not p.name.startswith(BESIDE) and p.name not in own
+        if not p.name.startswith(BESIDE) and p.name not in result.instrument.own
     }
     mapped = {p.name: (p.value, p.deviation) for p in result.parameters}
     values |= {
         path: Fitted(*number, source)
         for path, number in written(machine, result.joint_map, mapped).items()
     }
-    head = [f"{machine.name}, {source}: {len(measured.joints)} poses."]
-    if isinstance(result, PartialCalibration):
-        head += [f"Measured: {', '.join(f'{a.rows} {a.name}' for a in result.agreements)}."]
-        if result.scale is not None:
-            head.append(f"{scale_text(result.scale)}.")
-        outliers = outlier_texts(result)
-    else:
-        outliers = [_outlier_text(one) for one in result.outliers]
-    head += [f"Outlier, with a small weight: {line}." for line in outliers]
+    counts = ", ".join(f"{a.count} {a.name}" for a in result.agreements)
+    head = [f"{machine.name}, {source}: {len(measured.joints)} poses.", f"Measured: {counts}."]
+    if result.scale is not None:
+        head.append(f"{scale_text(result.scale)}.")
+    head += [f"Outlier, with a small weight: {one}." for one in result.outliers]
     write_edited(out, [*head, *marks], edited_yaml(machine, robot, values))
     if as_json:
         about = {
@@ -252,89 +237,95 @@ def calibrate_command(
     typer.echo(f"{out}: {len(values)} numbers")
 
 
-def as_data(result: Calibration | PartialCalibration) -> dict[str, Any]:
+def as_data(result: Calibration) -> dict[str, Any]:
     """Plain numbers for a script, SI units."""
-    listed = {
+    whole = {a.unit: a for a in result.agreements if a.name in ("position", "rotation")}
+    scale = result.scale
+    data: dict[str, Any] = {
         "parameters": {
             p.name: {
-                "unit": p.unit,
-                "before": p.before,
-                "value": p.value,
-                "standard_deviation": p.deviation,
-                "observed": p.observed,
+                "unit": p.unit, "before": p.before, "value": p.value,
+                "standard_deviation": p.deviation, "observed": p.observed,
             }
             for p in result.parameters
-        }
-    }
-    if isinstance(result, PartialCalibration):
-        return {**listed, **partial_data(result)}
-    pairs = {"fitted": result.fitted, "held_out": result.held_out}
-    return {
-        **listed,
+        },
+        "measurements": {
+            a.name: {
+                "unit": a.unit, "count": a.count, "before": a.fitted[0]._asdict(),
+                "after": a.fitted[1]._asdict(), "held_out": a.held_out[1]._asdict(),
+                "noise": a.noise,
+            }
+            for a in result.agreements
+        },
         "not_observed": list(result.unobserved),
         "outliers": [
             {
-                "row": one.index + 1,
-                "line": one.line,
-                "distance_m": one.distance,
-                "distance_rad": one.angle,
-                "sigmas": one.sigmas,
+                "row": one.line - 1, "line": one.line, "kind": one.worst.kind,
+                "size": one.worst.size, "sigmas": one.worst.sigmas,
+                **{f"distance_{unit}": one.size(unit) for unit in SIZES},
             }
             for one in result.outliers
         ],
-        "condition": result.condition,
-        "noise_m": result.noise,
-        "noise_rad": result.noise_angle,
-        "steps": result.steps,
-        **{
-            name: {"before": _errors(before), "after": _errors(after)}
-            for name, (before, after) in pairs.items()
+        "scale": None if scale is None else {
+            "relative_deviation_before": scale.before, "relative_deviation": scale.after,
+            "determined": scale.determined,
         },
-    }
+        "condition": result.condition,
+        "steps": result.steps,
+    }  # fmt: skip
+    if not whole:
+        return data
+    data |= {f"noise_{unit}": whole[unit].noise if unit in whole else None for unit in SIZES}
+    for name in ("fitted", "held_out"):
+        pairs = {unit: getattr(a, name) for unit, a in whole.items()}
+        data[name] = {
+            when: {f"{key}_{unit}": v for unit, pair in pairs.items()
+                   for key, v in pair[k]._asdict().items()}
+            for k, when in enumerate(("before", "after"))
+        }  # fmt: skip
+    return data
 
 
-def _errors(errors: Errors) -> dict[str, float]:
-    names = {"rms": "rms_m", "worst": "worst_m", "rms_angle": "rms_rad", "worst_angle": "worst_rad"}
-    return {names[key]: value for key, value in asdict(errors).items() if value is not None}
-
-
-def _print(result: Calibration | PartialCalibration) -> None:
+def _print(result: Calibration) -> None:
     table = Table(title=Text("calibrated parameters"))
     for column in ("parameter", "before", "after", "standard deviation", "unit", "determined"):
         table.add_column(column)
     for p in result.parameters:
-        table.add_row(Text(p.name), *_row(p))
+        numbers = (f"{value:.6g}" for value in (p.before, p.value))
+        known = "yes" if p.observed else "no"
+        table.add_row(Text(p.name), *numbers, f"{p.deviation:.2g}", p.unit, known)
     table_console().print(table)
-    if isinstance(result, PartialCalibration):
-        print_partial(result)
-    else:
-        _print_errors(result)
+    errors = Table(title=Text("measured minus computed, RMS and worst"))
+    for column in (
+        "measurement",
+        "count",
+        "before",
+        "after",
+        "held out before",
+        "held out",
+        "unit",
+    ):
+        errors.add_column(column)
+    for a in result.agreements:
+        errors.add_row(a.name, str(a.count), *_errors(a))
+    table_console().print(errors)
+    typer.echo("held out: every fourth whole pose, or each measurement against a fit to all others")
+    noise = ", ".join(f"{a.name} {a.noise * 1e3:.4f} m{a.unit}" for a in result.agreements)
+    condition = result.condition or np.inf
+    typer.echo(f"remaining noise per axis: {noise}; condition number {condition:.3g}")
+    if result.scale is not None:
+        typer.echo(fill(scale_text(result.scale), WIDTH))
+    for one in result.outliers[:MOST_SHOWN]:
+        typer.echo(f"outlier, with a small weight: {one}")
+    if len(result.outliers) > MOST_SHOWN:
+        typer.echo(f"{len(result.outliers) - MOST_SHOWN} more outliers: see --json")
     _print_open(result)
 
 
-def _print_errors(result: Calibration) -> None:
-    errors = Table(title=Text("distance between measured and computed poses"))
-    for column in ("poses", "RMS before", "RMS after", "worst before", "worst after"):
-        errors.add_column(column)
-    for name, (before, after) in (
-        ("fitted", result.fitted),
-        (f"held out, every {HELD_OUT}th", result.held_out),
-    ):
-        lengths = (before.rms, after.rms, before.worst, after.worst)
-        errors.add_row(Text(f"{name}, mm"), *(f"{1e3 * value:.4f}" for value in lengths))
-        angles = (before.rms_angle, after.rms_angle, before.worst_angle, after.worst_angle)
-        told = [value for value in angles if value is not None]
-        if told:
-            errors.add_row(Text(f"{name}, mrad"), *(f"{1e3 * value:.4f}" for value in told))
-    table_console().print(errors)
-    noise = f"{1e3 * result.noise:.4f} mm"
-    if result.noise_angle is not None:
-        noise += f", {1e3 * result.noise_angle:.4f} mrad"
-    typer.echo(f"remaining noise per axis: {noise}; condition number {result.condition:.3g}")
-    for one in result.outliers[:MOST_SHOWN]:
-        typer.echo(f"outlier, with a small weight: {_outlier_text(one)}")
-    if len(result.outliers) > MOST_SHOWN:
-        typer.echo(f"{len(result.outliers) - MOST_SHOWN} more outliers: see --json")
+def _errors(a: Agreement) -> list[str]:
+    unit, factor = SIZES[a.unit]
+    pairs = (*a.fitted, *a.held_out)
+    return [*(f"{factor * rms:.4f}, {factor * worst:.4f}" for rms, worst in pairs), unit]
 
 
 def _print_open(result: Estimate) -> None:
@@ -346,16 +337,3 @@ def _print_open(result: Estimate) -> None:
         )
     for line in open_lines:
         typer.echo(fill(line, WIDTH, initial_indent="  ", subsequent_indent="    "))
-
-
-def _outlier_text(one: Outlier) -> str:
-    angle = "" if one.angle is None else f", {1e3 * one.angle:.3g} mrad"
-    return (
-        f"row {one.index + 1} (line {one.line}) is off by {1e3 * one.distance:.3g} mm{angle}, "
-        f"{one.sigmas:.3g} sigma"
-    )
-
-
-def _row(p: Parameter) -> tuple[str, ...]:
-    numbers = (f"{value:.6g}" for value in (p.before, p.value))
-    return (*numbers, f"{p.deviation:.2g}", p.unit, "yes" if p.observed else "no")

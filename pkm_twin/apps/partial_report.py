@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict
-from textwrap import fill
 from typing import Any, Final
 
 import numpy as np
@@ -15,8 +14,8 @@ from rich.text import Text
 
 from pkm_twin.console import table_console
 from pkm_twin.errors import ParameterError, UnknownNameError
+from pkm_twin.identification.calibration import Scale
 from pkm_twin.identification.measurements import KINDS
-from pkm_twin.identification.partial import PartialCalibration, Scale
 from pkm_twin.identification.plan import Plan
 from pkm_twin.robot.robot import Robot
 
@@ -73,59 +72,6 @@ def scale_text(scale: Scale) -> str:
         f"{100.0 * scale.before:.2g} mm before). Numbers that depend on it are marked no, and "
         "stay near the file's values. Measure distances as well (--measure height,distance)"
     )
-
-
-def outlier_texts(result: PartialCalibration) -> list[str]:
-    """Measurements that do not fit the others, a line each."""
-    found = []
-    for name, one in result.outliers:
-        size = (
-            f"{1e3 * one.distance:.3g} mm" if one.angle is None else f"{1e3 * one.angle:.3g} mrad"
-        )
-        found.append(f"line {one.line}: {name} is off by {size}, {one.sigmas:.3g} sigma")
-    return found
-
-
-def partial_data(result: PartialCalibration) -> dict[str, Any]:
-    """Plain numbers for a script, m and rad."""
-    return {
-        "measurements": {
-            a.name: {
-                "unit": a.unit, "count": a.rows, "before": {"rms": a.before},
-                "after": {"rms": a.after, "worst": a.worst}, "held_out": {"rms": a.held_out},
-                "noise": a.noise,
-            }
-            for a in result.agreements
-        },
-        "outliers": [
-            {"kind": name, "line": one.line, "size": one.angle or one.distance,
-             "sigmas": one.sigmas}
-            for name, one in result.outliers
-        ],
-        "scale": None if result.scale is None else {
-            "relative_deviation_before": result.scale.before,
-            "relative_deviation": result.scale.after, "determined": result.scale.determined,
-        },
-        "not_observed": list(result.unobserved),
-        "steps": result.steps,
-    }  # fmt: skip
-
-
-def print_partial(result: PartialCalibration) -> None:
-    """The residuals of each kind, the scale, outliers."""
-    table = Table(title=Text("measured minus computed, RMS"))
-    for column in ("measurement", "count", "before", "after", "left out", "worst", "noise", "unit"):
-        table.add_column(column)
-    for a in result.agreements:
-        unit, factor = SIZES[a.unit]
-        sizes = (a.before, a.after, a.held_out, a.worst, a.noise)
-        table.add_row(a.name, str(a.rows), *(f"{factor * size:.4f}" for size in sizes), unit)
-    table_console().print(table)
-    typer.echo("left out: each measurement, predicted by the fit to all others")
-    if result.scale is not None:
-        typer.echo(fill(scale_text(result.scale), WIDTH))
-    for line in outlier_texts(result):
-        typer.echo(f"outlier, with a small weight: {line}")
 
 
 def plan_table(robot: Robot, plan: Plan) -> list[str]:

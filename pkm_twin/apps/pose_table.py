@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from pkm_twin.apps.columns import read_columns
 from pkm_twin.errors import ParameterError, UnknownNameError
 from pkm_twin.identification.calibration_state import Poses, rotations
-from pkm_twin.identification.measurements import KINDS, Kind, Partial, partial_of
+from pkm_twin.identification.measurements import KINDS, Kind, Measured, measured_of
 from pkm_twin.robot.robot import Robot
 
 Array = NDArray[np.float64]
@@ -95,10 +95,10 @@ def read_poses(
     return Poses(q, position, rotation)
 
 
-def read_partial(
+def read_measured(
     path: Path, robot: Robot, kinds: Sequence[Kind], noise: Mapping[str, float],
     renamed: Mapping[str, str] | None = None, unit: str = "m",
-) -> Partial:  # fmt: skip
+) -> Measured:  # fmt: skip
     """Measurements of some quantities, of a CSV in which cells may be empty.
 
     Columns: ``JOINT.position`` of every joint, and one by the name of each kind. ``z`` stands for a
@@ -131,7 +131,7 @@ def read_partial(
         line = int(np.flatnonzero(~np.isfinite(q).all(1))[0]) + 2
         raise ParameterError(f"{path}: line {line}", "an empty cell", "every joint's position")
     values = {name: _stacked(path, columns, [name])[:, 0] for name in names}
-    return partial_of(q, second, values, np.arange(len(q)) + 2, noise)
+    return measured_of(q, second, values, np.arange(len(q)) + 2, noise)
 
 
 def _columns_of(

@@ -3,9 +3,9 @@
 
 :mod:`~pkm_twin.identification.fit` fits masses, friction and rotors to efforts,
 :mod:`~pkm_twin.identification.elastic_fit` compliances to deflections,
-:mod:`~pkm_twin.identification.calibration` geometry and offsets to poses,
-:mod:`~pkm_twin.identification.partial` the same to single quantities of poses, which
-:mod:`~pkm_twin.identification.plan` chooses;
+:mod:`~pkm_twin.identification.calibration` geometry and offsets to poses, or to any of the
+:mod:`~pkm_twin.identification.measurements` of them, which :mod:`~pkm_twin.identification.plan`
+chooses;
 :mod:`~pkm_twin.identification.excitation` designs motions that identify.
 :mod:`~pkm_twin.identification.verdict` judges a fit by its residual,
 :mod:`~pkm_twin.identification.plausible` judges a recording before it is fitted,

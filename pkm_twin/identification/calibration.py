@@ -1,20 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Geometry from measured platform poses: weighted least squares with the file as prior.
+"""Geometry from measurements of the platform: weighted least squares with the file as prior.
 
 Gauss and Newton's method on the machine itself, damped where it has to be: every step computes the
-platform with the new numbers and its exact derivatives, by programs that take them at run time. The
-errors before and after are those of the loaded robots.
+platform with the new numbers and its exact derivatives, by programs that take them at run time.
+Whole poses are measurements of six axes; the errors of those that are held out are those of the
+loaded robots.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
-from typing import Final
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from pkm_twin.codegen.arrays import Array, Mask
+from pkm_twin.codegen.arrays import Array, Indices
 from pkm_twin.design import programs
 from pkm_twin.design.variants import Variants
 from pkm_twin.errors import ParameterError, PkmTwinError, UnreachableError
@@ -30,25 +32,24 @@ from pkm_twin.identification.calibration_faults import (
     outliers_of,
     place_fault,
 )
-from pkm_twin.identification.calibration_fit import (
-    KNOWN,
-    Parameter,
-    UnsettledError,
-    Whole,
-    derivatives,
-    fit,
-)
+from pkm_twin.identification.calibration_fit import KNOWN, Fitted, Parameter, UnsettledError, fit
 from pkm_twin.identification.calibration_state import (
     BESIDE,
     FRAME,
     TARGET,
-    Errors,
+    Instrument,
     Poses,
     State,
     place_frame,
     start_of,
 )
-from pkm_twin.identification.noise import Weighed
+from pkm_twin.identification.measurements import (
+    PLACE,
+    Measured,
+    left_over,
+    scale_slopes,
+    whole_of,
+)
 from pkm_twin.identification.transmission import Transmission, numbers
 from pkm_twin.identification.undetermined import undetermined
 from pkm_twin.machine.joint_map import JointMap
@@ -60,7 +61,7 @@ from pkm_twin.robot.robot import Robot
 MOVES: Final = 1e-6
 """A number that moves the platform less than this, per unit, is no number of the geometry."""
 HELD_OUT: Final = 4
-"""Every so many poses one is held out."""
+"""Every so many whole poses one is held out."""
 STEP: Final = 1e-6
 """By which a number is moved to see whether the machine can be assembled with another one."""
 SAME: Final = 1e-4
@@ -68,6 +69,30 @@ SAME: Final = 1e-4
 SHOWN: Final = 0.1
 """Part of the greatest weight below which a number is not named in a combination."""
 NOT_GEOMETRY: Final = ("limits.", "gravity", "payload.", "joint_map.")
+SCALED: Final = 0.5
+"""Part of its deviation before below which a scale is known; part of a number's variance from
+which on it depends on the scale."""
+KEPT: Final = 0.1
+"""Part of its prior deviation to which a length is kept that is known worse, without a scale."""
+CURVED: Final = 1e-4
+"""Deviation of a scale below which no measured length is needed: 0.01 mm in 100 mm."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Free:
+    """What is fitted beside the numbers of a file, and how well lengths are known before.
+
+    ``offsets``: of the joints' sensors; ``frame``, ``target``: where the instrument stands, and
+    its target on the platform. ``prior``: standard deviation of lengths, m; angles have it at the
+    platform's radius. ``transmission``: which ratios of the joint map; ``auto``: those of sliding
+    joints that have one.
+    """
+
+    offsets: bool = True
+    frame: bool = False
+    target: bool = False
+    prior: float = 0.01
+    transmission: Transmission = Transmission.AUTO
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,11 +102,6 @@ class Estimate:
     robot: Robot
     parameters: tuple[Parameter, ...]
     covariance: Array
-    steps: int
-    faults: tuple[Fault, ...] = ()
-    """Why this machine was not in the poses, where they were accepted all the same."""
-    joint_map: JointMap = field(default_factory=lambda: JointMap.of((), {}))
-    """With the fitted numbers."""
 
     @property
     def _unknown(self) -> Array:
@@ -118,24 +138,62 @@ class Estimate:
         return tuple(found)
 
 
-@dataclass(frozen=True, kw_only=True)
-class Calibration(Estimate):
-    """A robot that was calibrated with poses."""
+class Errors(NamedTuple):
+    """Measured less computed: root mean square and worst, m or rad; of whole poses the distance."""
 
-    condition: float
-    """Of the poses' equations in units of the prior deviations, over what was observed."""
+    rms: float
+    worst: float
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """Errors of one kind of measurement, before and after, without the outliers.
+
+    Before, only the instrument's own numbers are fitted. ``held_out``: of whole poses those that
+    were not learnt from, else of each measurement by the fit to all others. ``noise``: standard
+    deviation an axis that the fit leaves.
+    """
+
+    name: str
+    unit: str
+    count: int
     noise: float
-    noise_angle: float | None
-    """Standard deviations of the measurement that the fit leaves, m an axis and rad an axis."""
     fitted: tuple[Errors, Errors]
     held_out: tuple[Errors, Errors]
-    """Before (frame and target of the measurement alone are fitted) and after; no outliers."""
-    outliers: tuple[Outlier, ...] = ()
-    """Poses that do not fit the others, the worst first."""
-    cost: float = 0.0
+
+
+class Scale(NamedTuple):
+    """Relative standard deviation of distances across the poses, before and after."""
+
+    before: float
+    after: float
+    determined: bool
+
+
+@dataclass(frozen=True, kw_only=True)
+class Calibration(Estimate):
+    """A robot that was calibrated."""
+
+    instrument: Instrument
+    agreements: tuple[Agreement, ...]
+    outliers: tuple[Outlier, ...]
+    """Lines of the table that do not fit the others, the worst first."""
+    scale: Scale | None
+    """None where the platform does not move from its place."""
+    condition: float | None
+    """Of the measurements' equations in units of the prior deviations, over what was observed."""
+    steps: int
+    cost: float
     """Squares of the machine's changes over their prior standard deviations, summed."""
-    placed: bool = False
-    """Whether another place of the instrument may explain the poses better."""
+    faults: tuple[Fault, ...]
+    """Why this machine was not in the poses, where they were accepted all the same."""
+    placed: bool
+    """Whether another place of the instrument may explain the measurements better."""
+
+    @property
+    def joint_map(self) -> JointMap:
+        """With the fitted numbers."""
+        return self.instrument.map
 
 
 def geometric(robot: Robot, q: Array, only: Sequence[str] = ()) -> tuple[str, ...]:
@@ -169,180 +227,223 @@ def geometric(robot: Robot, q: Array, only: Sequence[str] = ()) -> tuple[str, ..
     return tuple(found)
 
 
+def unknowns(robot: Robot, measured: Measured, paths: Sequence[str], free: Free) -> list[Parameter]:
+    """What is fitted, as it is before: the machine's numbers, the instrument's, the kinds' own."""
+    known, prior = entries(robot), free.prior
+    angle = prior / robot.size
+    # A joint's value at home and its sensor's offset are one number.
+    homes = {f"joints.{name}.home" for name in robot.joint_names} if free.offsets else set()
+    fitted = [(path, *known[path]) for path in paths if path not in homes]
+    parameters = [
+        Parameter(path, unit, value, prior if unit == "m" else angle)
+        for path, value, unit in fitted
+    ]
+    q = robot.controller.positions(measured.joints)
+    mapped = numbers(robot, q, free.transmission, free.offsets, prior, angle)
+    parameters += [Parameter(*number) for number in mapped]
+    # Where the instrument stands is not known at all.
+    far = 100.0 * robot.engine.tree.size
+    for name in [*(FRAME if free.frame else ()), *(TARGET if free.target else ())]:
+        turns = name[-2] == "r"
+        parameters.append(Parameter(name, "rad" if turns else "m", 0.0, 10.0 if turns else far))
+    return parameters + [Parameter(n, unit, 0.0, far) for n, (unit, far) in measured.own.items()]
+
+
+def placed(robot: Robot, measured: Measured, paths: Sequence[str], frame: bool = False) -> State:
+    """The machine as it is at the measured poses, with a first guess of what is beside it."""
+    state = start_of(robot, measured.joints, paths)
+    state.instrument.own = dict.fromkeys(measured.own, 0.0)
+    for one in measured.readings:
+        if frame and one.kind is PLACE:
+            place_frame(state, one.values)
+        state.instrument.own |= one.kind.begin(one.seen(state)[0], one.values[:, 0])
+    return state
+
+
 def calibrate(
     robot: Robot,
-    poses: Poses,
+    poses: Poses | Measured,
     paths: Sequence[str],
     *,
-    offsets: bool = True,
-    frame: bool = False,
-    target: bool = False,
-    prior: float = 0.01,
-    transmission: Transmission = Transmission.AUTO,
     accept: bool = False,
     progress: Callable[[int], None] = lambda _: None,
+    **options: Any,
 ) -> Calibration:
-    """Fit geometry, joint offsets and the instrument's frame and target to measured poses.
+    """Fit geometry, joint offsets and the instrument's frame and target to measurements.
 
-    Poses that do not fit the others hardly count, and are named.
+    Measurements that do not fit the others hardly count, and are named. What they do not determine
+    stays near the file's values.
 
+    :param poses: whole poses, of which every fourth is held out, or measurements of some
+        quantities, of which none is.
     :param paths: numbers of the robot's file, of :func:`geometric`.
-    :param prior: standard deviation that lengths have without the poses, m; angles have it at the
-        platform's radius.
-    :param transmission: which ratios of the joint map are fitted; ``auto``: those of sliding joints
-        that have one.
     :param accept: calibrate with poses that this machine was not in, too.
+    :param options: of :class:`Free`.
     :raises ParameterError: too few poses, poses of another machine, unit or frame, poses that tell
         no number, or a fit that does not settle.
     """
-    extra = [*(FRAME if frame else ()), *(TARGET if target else ())]
-    q = robot.controller.positions(poses.joints)
+    free, apart = Free(**options), None
+    if isinstance(poses, Measured):
+        learnt = poses
+    else:
+        held = np.arange(len(poses.joints)) % HELD_OUT == HELD_OUT - 1
+        learnt, apart = (whole_of(poses, np.flatnonzero(rows)) for rows in (~held, held))
+    fit_of = partial(_calibrated, robot, learnt, apart, paths, progress)
 
-    def listed(extra: Sequence[str]) -> list[Parameter]:
-        return parameters_of(robot, q, paths, offsets, transmission, extra, prior)
-
-    parameters = listed(extra)
-
-    def fitted(frame: bool, parameters: Sequence[Parameter]) -> tuple[Calibration, State]:
-        return _calibrated(robot, poses, parameters, frame, prior, progress)
-
-    def placed() -> tuple[Calibration, State] | None:
+    def other_place() -> Calibration | None:
         """The same with the instrument's frame; None where that is no machine either."""
-        if frame:
+        if free.frame or apart is None:
             return None
         try:
-            other = fitted(True, listed([*FRAME, *extra]))
+            other = fit_of(replace(free, frame=True))
         except PkmTwinError:
             return None
-        return None if other[0].faults else other
+        return None if other.faults else other
 
     try:
-        result, _ = fitted(frame, parameters)
+        result = fit_of(free)
     except (UnsettledError, UnreachableError) as error:
-        other = placed()
+        other = other_place()
         if other is None:
             raise
-        raise RejectedPosesError(_place(other[1])) from error
+        raise RejectedPosesError(place_fault(other.instrument)) from error
     # Ratios that are a little off look like a shift of the instrument.
-    saved = MOVED * (1 + sum(p.name.endswith(".ratio") for p in parameters))
+    saved = MOVED * (1 + sum(p.name.endswith(".ratio") for p in result.parameters))
     if result.faults or result.cost > saved or result.placed:
-        other = placed()
+        other = other_place()
         if other is not None and (
             result.faults
-            or (result.cost - other[0].cost > saved and other[0].cost < HALF * result.cost)
-            or other[0].noise < 0.5 * result.noise
+            or (result.cost - other.cost > saved and other.cost < HALF * result.cost)
+            or other.agreements[0].noise < 0.5 * result.agreements[0].noise
         ):  # fmt: skip
-            result = replace(result, faults=(_place(other[1]), *result.faults))
+            result = replace(result, faults=(place_fault(other.instrument), *result.faults))
     if result.faults and not accept:
         raise RejectedPosesError(result.faults[0])
     return result
 
 
-def _place(state: State) -> Fault:
-    tool = state.instrument
-    return place_fault(tool.place, tool.frame.as_rotvec())
+def _calibrated(
+    robot: Robot, learnt: Measured, apart: Measured | None, paths: Sequence[str],
+    progress: Callable[[int], None], free: Free,
+) -> Calibration:  # fmt: skip
+    """The fit with its faults.
+
+    :param apart: whole poses that are not learnt from.
+    """
+    parameters = unknowns(robot, learnt, paths, free)
+    if apart is not None:
+        _enough(learnt, apart, len(parameters))
+    beside = {p.name for p in parameters if p.name.startswith(BESIDE)} | learnt.own.keys()
+    machine = [p.name for p in parameters if p.name not in beside]
+    start = placed(robot, learnt, machine, free.frame)
+    first = [p for p in parameters if p.name in (*FRAME, *TARGET, *learnt.own)]
+    before = fit(robot, start, learnt, first, progress).state if first else start
+    found = fit(robot, before, learnt, parameters, progress)
+    covariance, steps = found.covariance, found.steps
+    deviations = np.sqrt(np.diag(covariance)).tolist()
+    told = [replace(p, deviation=d) for p, d in zip(parameters, deviations, strict=True)]
+    scale, told = _scaled(robot, found.state, learnt, told, covariance)
+    if scale is not None and not scale.determined:
+        near = [
+            replace(p, prior=KEPT * p.prior)
+            if p.unit == "m" and p.deviation > KEPT * p.prior and p.name in machine
+            else p
+            for p in told
+        ]
+        found = fit(robot, before, learnt, near, progress)
+        steps += found.steps
+    told = [replace(p, value=float(v)) for p, v in zip(told, found.values, strict=True)]
+    built = with_entries(robot, found.state.numbers)
+    agreements, outliers = _compared(robot, built, learnt, apart, before, found, parameters)
+    changes = [p for p in told if p.name not in (*FRAME, *TARGET, *learnt.own)]
+    count = len({k for m in (learnt, apart) if m for one in m.readings for k in one.lines.tolist()})
+    left = [(one.unit, one.noise) for one in agreements]
+    faults = faults_of(left, outliers, count, changes, free.prior, robot.engine.tree.size)
+    good = np.array([p.observed for p in told])
+    if apart is not None and not good.any() and not faults:
+        raise ParameterError(
+            "poses", count, "poses farther apart: these determine none of the numbers"
+        )
+    singular = np.linalg.svd(found.table[:, good], compute_uv=False)
+    return Calibration(
+        robot=built, parameters=tuple(told), covariance=covariance, agreements=agreements,
+        condition=float(singular[0] / singular[-1]) if good.any() else None, scale=scale,
+        outliers=outliers, steps=steps, faults=tuple(faults), cost=cost_of(changes),
+        placed=apart is not None and not free.frame and _looks_placed(robot, learnt, found, told),
+        instrument=found.state.instrument,
+    )  # fmt: skip
 
 
-def _learnt(poses: Poses) -> Mask:
-    """Which poses are learnt from."""
-    return np.asarray(np.arange(len(poses.joints)) % HELD_OUT != HELD_OUT - 1)
+def _enough(learnt: Measured, apart: Measured, count: int) -> None:
+    """Whole poses have to tell more than is fitted.
+
+    :raises ParameterError: they do not.
+    """
+    # A pose that is measured again tells no more numbers.
+    different = len(np.unique(np.round(learnt.joints / SAME), axis=0))
+    if 3 * different * len(learnt.readings) < count + 6 or not len(apart.joints):
+        raise ParameterError(
+            "poses", f"{different} different ones to learn from",
+            f"enough for {count} numbers to be fitted",
+        )  # fmt: skip
 
 
-def parameters_of(
-    robot: Robot, q: Array, paths: Sequence[str], offsets: bool, transmission: Transmission,
-    extra: Sequence[str], prior: float,
-) -> list[Parameter]:  # fmt: skip
-    """What is fitted, as it is before."""
-    known = entries(robot)
-    angle = prior / robot.size
-    # A joint's value at home and its sensor's offset are one number.
-    homes = {f"joints.{name}.home" for name in robot.joint_names} if offsets else set()
-    fitted = [path for path in paths if path not in homes]
-    parameters = [
-        Parameter(path, known[path][1], known[path][0], prior if known[path][1] == "m" else angle)
-        for path in fitted
-    ]
-    mapped = numbers(robot, q, transmission, offsets, prior, angle)
-    parameters += [Parameter(*number) for number in mapped]
-    # Where the instrument stands is not known at all.
-    far = 100.0 * robot.engine.tree.size
-    return parameters + _placing(extra, far)
+def _compared(
+    robot: Robot, built: Robot, learnt: Measured, apart: Measured | None, before: State,
+    found: Fitted, parameters: Sequence[Parameter],
+) -> tuple[tuple[Agreement, ...], tuple[Outlier, ...]]:  # fmt: skip
+    """What the measurements differ by from the machines, and what does not fit the others."""
+    noise, old, new = found.weights.noise, learnt.parts(before), learnt.parts(found.state)
+    readings, parts = learnt.readings, new
+    if apart is None:
+        slopes = learnt.slopes(robot, found.state, [p.name for p in parameters])
+        left = left_over(slopes, noise, np.array([p.prior for p in parameters]))
+        held = old, [part / one[:, None] for part, one in zip(new, left, strict=True)]
+    else:
+        pairs = (robot, before), (built, found.state)
+        first, last = (apart.parts(state.at(machine, apart.joints)) for machine, state in pairs)
+        held, readings, parts = (first, last), (*readings, *apart.readings), [*new, *last]
+    outliers = outliers_of(readings, parts, noise * (len(readings) // len(noise)))
+    bad = [one.line for one in outliers]
 
+    def errors(part: Array, lines: Indices) -> Errors:
+        sizes, sound = np.linalg.norm(part, axis=1), ~np.isin(lines, bad)
+        sizes = sizes[sound] if sound.any() else sizes
+        return Errors(float(np.sqrt(np.mean(sizes**2))), float(sizes.max()))
 
-def _placing(names: Sequence[str], far: float) -> list[Parameter]:
-    return [
-        Parameter(name, "rad" if name[-2] == "r" else "m", 0.0, 10.0 if name[-2] == "r" else far)
-        for name in names
-    ]
+    agreements = []
+    for k, one in enumerate(learnt.readings):
+        lines = one.lines if apart is None else apart.readings[k].lines
+        fitted = errors(old[k], one.lines), errors(new[k], one.lines)
+        left_out = errors(held[0][k], lines), errors(held[1][k], lines)
+        kind = one.kind
+        agreements.append(
+            Agreement(kind.name, kind.unit, len(one.lines), noise[k], fitted, left_out)
+        )
+    return tuple(agreements), outliers
 
 
 def _looks_placed(
-    robot: Robot, state: State, poses: Poses, noise: Weighed, table: Array,
-    told: Sequence[Parameter],
-) -> bool:  # fmt: skip
-    parts = state.parts(poses)
-    columns = derivatives(robot, state, FRAME)
-    halves = [columns[:, :3], columns[:, 3:]][: len(parts)]
-    asked = [(p.before - p.value) / p.prior for p in told]
-    return looks_placed(table, noise.over(halves), np.append(noise.over(parts), asked))
+    robot: Robot, measured: Measured, found: Fitted, told: Sequence[Parameter]
+) -> bool:
+    over, asked = found.weights.over, [(p.before - p.value) / p.prior for p in told]
+    columns = over(measured.slopes(robot, found.state, FRAME))
+    return looks_placed(found.table, columns, np.append(over(measured.parts(found.state)), asked))
 
 
-def _calibrated(
-    robot: Robot, poses: Poses, parameters: Sequence[Parameter], frame: bool, prior: float,
-    progress: Callable[[int], None],
-) -> tuple[Calibration, State]:  # fmt: skip
-    """The fit with its faults, and the machine at the poses that are learnt from."""
-    rows = _learnt(poses)
-    some = poses.part(rows)
-    learnt = Whole(some.joints, some.position, some.rotation)
-    # A pose that is measured again tells no more numbers.
-    different = len(np.unique(np.round(learnt.joints / SAME), axis=0))
-    equations = different * (3 if poses.rotation is None else 6)
-    if equations < len(parameters) + 6 or rows.all():
-        raise ParameterError(
-            "poses", f"{different} different ones to learn from",
-            f"enough for {len(parameters)} numbers to be fitted",
-        )  # fmt: skip
-    instrument = [p for p in parameters if p.name in (*FRAME, *TARGET)]
-    paths = [p.name for p in parameters if not p.name.startswith(BESIDE)]
-    start = start_of(robot, learnt, paths)
-    if frame:
-        place_frame(start, learnt)
-    before = fit(robot, start, learnt, instrument, progress)[0] if instrument else start
-    after, values, covariance, information, noise, steps = fit(
-        robot, before, learnt, parameters, progress
-    )
-    built = with_entries(robot, after.numbers)
-    deviations = np.sqrt(np.diag(covariance))
-    told = [
-        Parameter(p.name, p.unit, p.before, p.prior, float(v), float(d))
-        for p, v, d in zip(parameters, values, deviations, strict=True)
-    ]
-    outliers = outliers_of(after.instrument.parts(built, poses), noise.noise)
-    sound = np.ones(len(rows), bool)
-    sound[[one.index for one in outliers]] = False
-    shown = [
-        poses.part(which & sound if (which & sound).any() else which) for which in (rows, ~rows)
-    ]
-    fitted_errors, held_errors = (
-        (before.instrument.errors(robot, part), after.instrument.errors(built, part))
-        for part in shown
-    )
-    changes = [(p.name, p.unit, p.value - p.before, p.prior) for p in told]
-    faults = faults_of(noise, outliers, len(rows), changes, prior, robot.engine.tree.size)
-    good = np.array([p.observed for p in told])
-    if not good.any() and not faults:
-        raise ParameterError(
-            "poses", len(poses.joints), "poses farther apart: these determine none of the numbers"
-        )
-    singular = np.linalg.svd(information[:, good], compute_uv=False)
-    condition = float(singular[0] / singular[-1]) if good.any() else np.inf
-    result = Calibration(
-        robot=built, parameters=tuple(told), covariance=covariance, condition=condition,
-        noise=noise.noise[0], noise_angle=noise.noise[1] if len(noise.noise) > 1 else None,
-        fitted=fitted_errors, held_out=held_errors, steps=steps, outliers=outliers,
-        faults=tuple(faults), cost=cost_of(changes),
-        placed=not frame and _looks_placed(robot, after, learnt, noise, information, told),
-        joint_map=after.instrument.map,
-    )  # fmt: skip
-    return result, after
+def _scaled(
+    robot: Robot, state: State, measured: Measured, told: list[Parameter], covariance: Array
+) -> tuple[Scale | None, list[Parameter]]:
+    """How well the scale is known, and the numbers with those marked that hang on it alone."""
+    row = scale_slopes(robot, state, [p.name for p in told])
+    if row is None:
+        return None, told
+    prior = np.array([p.prior for p in told])
+    before, after = (float(np.sqrt(row @ c @ row)) for c in (np.diag(prior**2), covariance))
+    length = any(one.kind.length for one in measured.readings)
+    known = after < SCALED * before and (length or after < CURVED)
+    scale = Scale(before, after, known)
+    if known or not before > 0.0:
+        return scale, told
+    share = (covariance @ row) ** 2 / (after**2 * np.diag(covariance))
+    return scale, [replace(p, scaled=bool(s > SCALED)) for p, s in zip(told, share, strict=True)]

@@ -11,8 +11,10 @@ import numpy as np
 
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError, one_line
-from pkm_twin.identification.calibration_state import FRAME, TARGET
-from pkm_twin.identification.noise import OUTLIER, Weighed, distances
+from pkm_twin.identification.calibration_fit import Parameter
+from pkm_twin.identification.calibration_state import Instrument
+from pkm_twin.identification.measurements import Readings
+from pkm_twin.identification.noise import OUTLIER
 
 WRONG: Final = 0.02
 """Part of the machine's size that no fit may leave over: such poses are not its own."""
@@ -49,83 +51,89 @@ class RejectedPosesError(ParameterError):
         self.field, self.value, self.bound = "poses", fault.what, fault.right
 
 
-@dataclass(frozen=True)
-class Outlier:
-    """A pose that does not fit the others.
+class Away(NamedTuple):
+    """What a measurement is off by, m or rad, and over the noise."""
 
-    ``index``: among all poses, from 0. ``distance``: m; ``angle``: rad, None where no rotation was
-    measured; ``sigmas``: over the noise.
-    """
-
-    index: int
-    distance: float
-    angle: float | None
+    kind: str
+    unit: str
+    size: float
     sigmas: float
 
+
+@dataclass(frozen=True)
+class Outlier:
+    """A line of a table, from 1, whose measurements do not fit the others."""
+
+    line: int
+    away: tuple[Away, ...]
+
     @property
-    def line(self) -> int:
-        """Of a table with a header line, from 1."""
-        return self.index + 2
+    def worst(self) -> Away:
+        """Of its measurements the one that fits least."""
+        return max(self.away, key=lambda one: one.sigmas)
+
+    def size(self, unit: str) -> float | None:
+        """Greatest of one unit; None: there is none."""
+        return max((one.size for one in self.away if one.unit == unit), default=None)
+
+    def __str__(self) -> str:
+        sizes = ", ".join(f"{one.kind} by {1e3 * one.size:.3g} m{one.unit}" for one in self.away)
+        return f"line {self.line} is off: {sizes}; {self.worst.sigmas:.3g} sigma"
 
 
-def outliers_of(parts: Sequence[Array], noise: Sequence[float]) -> tuple[Outlier, ...]:
-    """Outliers among residuals (k, 3) of positions and perhaps rotations, the worst first."""
-    away = distances(parts, noise)
-    sizes = [np.linalg.norm(part, axis=1) for part in parts]
-    found = [
-        Outlier(
-            k, float(sizes[0][k]), float(sizes[1][k]) if len(sizes) > 1 else None, float(away[k])
-        )
-        for k in np.flatnonzero(away > OUTLIER).tolist()
-    ]
-    return tuple(sorted(found, key=lambda one: -one.sigmas))
+def outliers_of(
+    readings: Sequence[Readings], parts: Sequence[Array], noise: Sequence[float]
+) -> tuple[Outlier, ...]:
+    """Outliers among residuals (m, a) of readings, the worst first."""
+    lines: dict[int, list[Away]] = {}
+    for one, part, sigma in zip(readings, parts, noise, strict=True):
+        sizes = np.linalg.norm(part, axis=1)
+        for line, size in zip(one.lines.tolist(), sizes.tolist(), strict=True):
+            over = size / sigma / part.shape[1] ** 0.5
+            lines.setdefault(line, []).append(Away(one.kind.name, one.kind.unit, size, over))
+    found = [Outlier(line, tuple(away)) for line, away in lines.items()]
+    bad = [one for one in found if one.worst.sigmas > OUTLIER]
+    return tuple(sorted(bad, key=lambda one: -one.worst.sigmas))
 
 
 def faults_of(
-    weighed: Weighed, outliers: Sequence[Outlier], count: int,
-    changes: Sequence[tuple[str, str, float, float]], prior: float, size: float,
+    left: Sequence[tuple[str, float]], outliers: Sequence[Outlier], count: int,
+    changes: Sequence[Parameter], prior: float, size: float,
 ) -> list[Fault]:  # fmt: skip
     """Why a machine like the file's was not in so many poses.
 
-    :param changes: of the fitted numbers: name, unit, change and prior standard deviation.
-    :param prior: of lengths, m. ``size``: of the machine, m.
+    :param left: unit and noise an axis of each kind of measurement. ``changes``: the
+        machine's numbers. ``prior``: of lengths, m. ``size``: of the machine, m.
     """
     faults = []
-    noise = weighed.noise
-    most = max(prior, WRONG * size)
-    if noise[0] > most:
-        faults.append(
-            Fault(
-                f"RMS residual {noise[0]:.3g} m per axis after the fit",
-                f"expected at most {most:.3g} m for poses of this machine in m and rad",
-            )
-        )
-    steepest = max(prior / size, TWISTED)
-    if len(noise) > 1 and noise[1] > steepest:
-        faults.append(
-            Fault(
-                f"RMS residual {noise[1]:.3g} rad per axis after the fit",
-                f"expected at most {steepest:.3g} rad for rotations of this machine from its "
-                "home, in rad and in the order and axes of the columns",
-            )
-        )
+    bounds = {
+        "m": (max(prior, WRONG * size), "poses of this machine in m and rad"),
+        "rad": (
+            max(prior / size, TWISTED),
+            "rotations of this machine from its home, in rad and in the order and axes of the "
+            "columns",
+        ),
+    }  # fmt: skip
+    for unit, (most, right) in bounds.items():
+        noise = max((one for its, one in left if its == unit), default=0.0)
+        if noise > most:
+            what = f"RMS residual {noise:.3g} {unit} per axis after the fit"
+            faults.append(Fault(what, f"expected at most {most:.3g} {unit} for {right}"))
     if len(outliers) > MOST * count:
-        worst = outliers[0]
         faults.append(
             Fault(
-                f"{len(outliers)} of {count} do not fit the others (line {worst.line} by "
-                f"{1e3 * worst.distance:.3g} mm)",
+                f"{len(outliers)} of {count} do not fit the others ({outliers[0]})",
                 f"at most {100 * MOST:.0f} % may be outliers",
             )
         )
-    machine = [one for one in changes if one[0] not in (*FRAME, *TARGET)]
-    if machine:
-        name, unit, change, usual = max(machine, key=lambda one: abs(one[2]) / one[3])
-        if abs(change) > FAR * usual:
+    if changes:
+        worst = max(changes, key=lambda p: abs(p.value - p.before) / p.prior)
+        change = worst.value - worst.before
+        if abs(change) > FAR * worst.prior:
             faults.append(
                 Fault(
-                    f"{name} changes by {f'{change:.3g} {unit}'.rstrip()}, "
-                    f"{abs(change) / usual:.2g} times its prior standard deviation",
+                    f"{worst.name} changes by {f'{change:.3g} {worst.unit}'.rstrip()}, "
+                    f"{abs(change) / worst.prior:.2g} times its prior standard deviation",
                     f"at most {FAR:g} times is likely: are the poses in the base's axes and in "
                     "the file's units? A greater --prior allows more",
                 )
@@ -133,11 +141,9 @@ def faults_of(
     return faults
 
 
-def cost_of(changes: Sequence[tuple[str, str, float, float]]) -> float:
+def cost_of(changes: Sequence[Parameter]) -> float:
     """Squares of the machine's changes over their prior standard deviations, summed."""
-    return sum(
-        (change / usual) ** 2 for name, _, change, usual in changes if name not in (*FRAME, *TARGET)
-    )
+    return sum(((p.value - p.before) / p.prior) ** 2 for p in changes)
 
 
 def looks_placed(table: Array, columns: Array, target: Array) -> bool:
@@ -154,10 +160,11 @@ def looks_placed(table: Array, columns: Array, target: Array) -> bool:
     return float(left[1] @ left[1]) < EXPLAINED * float(left[0] @ left[0])
 
 
-def place_fault(place: Array, turn: Array) -> Fault:
-    """The poses fit where the instrument stands elsewhere: place (3,), m, and turn (3,), rad."""
+def place_fault(instrument: Instrument) -> Fault:
+    """The poses fit where the instrument stands elsewhere."""
     shift, angles = (
-        ", ".join(f"{value + 0.0:.4f}" for value in np.round(one, 4)) for one in (place, turn)
+        ", ".join(f"{value + 0.0:.4f}" for value in np.round(one, 4))
+        for one in (instrument.place, instrument.frame.as_rotvec())
     )
     return Fault(
         f"they fit in an instrument's frame at ({shift}) m, turned by ({angles}) rad, and not in "

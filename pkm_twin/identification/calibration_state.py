@@ -4,16 +4,17 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Final, Protocol
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
 from pkm_twin.codegen.arrays import Array, Mask
 from pkm_twin.design.variants import Variants
 from pkm_twin.errors import ParameterError
-from pkm_twin.identification.transmission import centred, changed
+from pkm_twin.identification.transmission import by_map, centred, changed
 from pkm_twin.machine.joint_map import JointMap
+from pkm_twin.machine.rotations import skew
 from pkm_twin.robot.robot import Robot
 
 if TYPE_CHECKING:
@@ -50,24 +51,6 @@ class Poses:
         return Poses(self.joints[rows], self.position[rows], turned)
 
 
-class Posed(Protocol):
-    """Measurements at joint positions (k, n) in the controller's numbers."""
-
-    @property
-    def joints(self) -> Array:
-        """Of the poses."""
-
-
-@dataclass(frozen=True)
-class Errors:
-    """Of poses: root mean square and greatest distance, m, and angle, rad (None: not measured)."""
-
-    rms: float
-    worst: float
-    rms_angle: float | None = None
-    worst_angle: float | None = None
-
-
 @dataclass
 class Instrument:
     """What is fitted beside the machine: its joints' sensors, where the instrument stands."""
@@ -79,41 +62,15 @@ class Instrument:
     own: dict[str, float] = field(default_factory=dict)
     """Numbers of single measurements, such as a plane's height, by name."""
 
-    def joints(self, poses: Posed) -> Array:
-        """The model's joint positions (k, n) at measured poses."""
-        return self.map.positions(poses.joints)
-
     def seen(self, position: Array, rotation: Array) -> tuple[Array, Array]:
         """What it should see of the platform: positions and rotations in its own frame."""
         turn = self.frame.as_matrix()
         return self.place + (position + rotation @ self.target) @ turn.T, turn @ rotation
 
-    def residuals(
-        self, poses: Poses, position: Array, rotation: Array
-    ) -> tuple[Array, Array | None]:
-        """Measured less seen: (k, 3), m, and rotation vectors (k, 3), rad."""
-        position, rotation = self.seen(position, rotation)
-        if poses.rotation is None:
-            return poses.position - position, None
-        apart = rotations().from_matrix(poses.rotation @ np.swapaxes(rotation, -1, -2))
-        return poses.position - position, apart.as_rotvec()
-
-    def parts(self, robot: Robot, poses: Poses) -> list[Array]:
-        """Of a loaded robot: residuals of positions and, where measured, rotations, (k, 3) each."""
-        both = self.residuals(poses, *robot.platform(self.joints(poses)))
-        return [part for part in both if part is not None]
-
-    def errors(self, robot: Robot, poses: Poses) -> Errors:
-        """Of a loaded robot."""
-        sizes = [np.linalg.norm(part, axis=1) for part in self.parts(robot, poses)]
-        pairs = [(float(np.sqrt(np.mean(size**2))), float(size.max())) for size in sizes]
-        values = [value for pair in pairs for value in pair]
-        return Errors(*values)
-
 
 @dataclass
 class State:
-    """The machine with numbers as they are now, at the poses that are learnt from.
+    """The machine with numbers as they are now, at the measured poses.
 
     ``machine``: alone among its variants. ``platform``: positions (k, 3) and rotations (k, 3, 3) of
     its reference point.
@@ -124,10 +81,10 @@ class State:
     platform: tuple[Array, Array]
     instrument: Instrument
 
-    def parts(self, poses: Poses) -> list[Array]:
-        """The instrument's residuals of the poses that are learnt from, (k, 3) each."""
-        both = self.instrument.residuals(poses, *self.platform)
-        return [part for part in both if part is not None]
+    def at(self, robot: Robot, joints: Array) -> State:
+        """The same at other measurements, of a loaded robot with these numbers."""
+        q = self.instrument.map.positions(joints)
+        return replace(self, q=q, platform=robot.platform(q))
 
     @property
     def numbers(self) -> dict[str, float]:
@@ -135,22 +92,23 @@ class State:
         return dict(zip(self.machine.paths, self.machine.values[0].tolist(), strict=False))
 
 
-def start_of(robot: Robot, poses: Posed, paths: Sequence[str]) -> State:
+def start_of(robot: Robot, joints: Array, paths: Sequence[str]) -> State:
     """The robot as it is, with numbers that may change, an instrument at its base.
 
+    :param joints: of the measurements, in the controller's numbers, (k, n).
     :raises UnreachableError: a joint state without an assembly, by limb, sample and miss.
     """
-    instrument = Instrument(centred(robot, robot.controller.positions(poses.joints)))
-    q = instrument.joints(poses)
+    instrument = Instrument(centred(robot, robot.controller.positions(joints)))
     machine = Variants(robot, {path: robot.number(path) for path in paths})
+    q = instrument.map.positions(joints)
     return State(machine, q, robot.platform(q), instrument)
 
 
-def place_frame(state: State, poses: Poses) -> None:
-    """A first guess of the instrument's frame: the best rigid motion between the point clouds."""
+def place_frame(state: State, position: Array) -> None:
+    """A first guess of the instrument's frame: the best rigid motion to measured positions."""
     tool, model = state.instrument, state.platform[0]
-    centres = poses.position.mean(0), model.mean(0)
-    tool.frame, _ = rotations().align_vectors(poses.position - centres[0], model - centres[1])
+    centres = position.mean(0), model.mean(0)
+    tool.frame, _ = rotations().align_vectors(position - centres[0], model - centres[1])
     tool.place = centres[0] - tool.frame.apply(centres[1])
 
 
@@ -165,10 +123,11 @@ def value_of(state: State, name: str, otherwise: float) -> float:
 
 
 def moved(
-    robot: Robot, state: State, poses: Posed, values: Mapping[str, float], turn: Array
+    robot: Robot, state: State, joints: Array, values: Mapping[str, float], turn: Array
 ) -> State:
     """The machine with new numbers.
 
+    :param joints: of the measurements, in the controller's numbers, (k, n).
     :param values: of all that is fitted, by name.
     :param turn: of the instrument's frame since ``state``, a rotation vector, shape (3,), rad.
     :raises ParameterError: numbers that no file may have, or no machine can be assembled with.
@@ -181,7 +140,7 @@ def moved(
         np.array([values.get(n, v) for n, v in zip(TARGET, tool.target, strict=True)]),
         {name: values.get(name, value) for name, value in tool.own.items()},
     )
-    machine, q = state.machine, new.joints(poses)
+    machine, q = state.machine, new.map.positions(joints)
     if machine.paths:
         now = state.numbers
         row = [values.get(path, now[path]) for path in machine.paths]
@@ -190,3 +149,35 @@ def moved(
     if not np.isfinite(position).all():
         raise ParameterError("geometry", None, "numbers with which the machine can be assembled")
     return State(machine, q, (position[0], rotation[0]), new)
+
+
+def derivatives(robot: Robot, state: State, names: Sequence[str]) -> Array:
+    """Of what the instrument sees of positions and rotations, by named parameters: (k, 6, p).
+
+    Zero by numbers of single measurements.
+    """
+    tool, machine = state.instrument, state.machine
+    position, rotation = state.platform
+    by_joints = machine.platform_jacobian(state.q[None])[0]
+    by_name = by_map(robot, tool.map, state.q, by_joints)
+    if any(name in machine.paths for name in names):
+        slopes = np.moveaxis(machine.platform_slopes(state.q), -1, 0)
+        by_name |= dict(zip(machine.paths, slopes, strict=True))
+    turn = tool.frame.as_matrix()
+    lever = rotation @ tool.target
+    out = np.zeros((len(state.q), 6, len(names)))
+    for k, name in enumerate(names):
+        if name in FRAME:
+            axis = np.eye(3)[FRAME.index(name) % 3]
+            if name in FRAME[:3]:
+                out[:, :3, k] = axis
+            else:
+                out[:, :3, k] = np.cross(axis, (position + lever) @ turn.T)
+                out[:, 3:, k] = axis
+        elif name in TARGET:
+            out[:, :3, k] = rotation[..., TARGET.index(name)] @ turn.T
+        elif name in by_name:
+            linear, angular = by_name[name][:, :3], by_name[name][:, 3:]
+            shifted = linear - (skew(lever) @ angular[..., None])[..., 0]
+            out[:, :3, k], out[:, 3:, k] = shifted @ turn.T, angular @ turn.T
+    return out

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What people can measure of a platform: one quantity a kind, its derivative, its own unknowns."""
+"""What people can measure of a platform: one class a kind, with its derivative and own unknowns."""
 
 from __future__ import annotations
 
@@ -12,70 +12,52 @@ import numpy as np
 
 from pkm_twin.codegen.arrays import Array, Indices
 from pkm_twin.errors import ParameterError, UnknownNameError
-from pkm_twin.identification.calibration_fit import derivatives
-from pkm_twin.identification.calibration_state import State
+from pkm_twin.identification.calibration_state import Poses, State, derivatives, rotations
 from pkm_twin.identification.noise import CLEAR, FINEST, huber
 from pkm_twin.robot.robot import Robot
 
 BELIEVED: Final = 4.0
 """Measurements that the usual noise of a kind counts for against the residuals."""
-MEDIAN: Final = 0.6745
-"""Median of the size of a normal variable of deviation one."""
+MEDIANS: Final = {1: 0.6745, 3: 0.888}
+"""Median, by the number of axes, of the root mean square of normal variables of deviation one."""
 TURNS: Final = 5
 SPANS: Final = 24
 """Poses between which distances stand for the scale."""
 SHORT: Final = 0.3
 """Part of the longest of them from which on a distance counts."""
 COORDINATES: Final = ("x", "y", "z", "roll", "pitch", "yaw")
+FAR: Final = 10.0
+"""Standard deviation of a place, m, and a slope that nothing is known of."""
 
 
 @dataclass(frozen=True)
 class Kind:
-    """A coordinate of the pose, in the instrument's frame: x y z, m; roll pitch yaw, rad.
+    """A quantity of a axes that people measure, by position and rotation in the instrument's frame.
 
-    ``name``: of its column. ``noise``: usual standard deviation. ``length``: whether it measures a
-    length across the workspace. ``own``: unit and standard deviation before of numbers that are
-    fitted with it.
+    ``name``: of its column. ``noise``: usual standard deviation, which counts for ``believed``
+    measurements. ``length``: whether it measures a length across the workspace. ``pair``: whether
+    it measures two poses, by the difference of their positions. ``own``: unit and standard
+    deviation before of numbers that are fitted with it.
     """
 
     name: str
     unit: str
     noise: float
-    axis: int = 2
+    axes: tuple[int, ...] = ()
     length: bool = False
     pair: bool = False
     own: Mapping[str, tuple[str, float]] = field(default_factory=dict)
-    lengths: Array = field(default_factory=lambda: np.zeros(0))
-    """Of a scale: distances of the pairs now."""
+    believed: float = BELIEVED
 
     def value(self, p: Array, r: Array, own: Mapping[str, float]) -> Array:
-        """At positions (m, 3), of pairs their differences, and rotations (m, 3, 3): (m,)."""
-        del own
-        if self.axis < 3:
-            return p[:, self.axis]
-        if self.axis == 4:
-            return np.asarray(-np.arcsin(np.clip(r[:, 2, 0], -1.0, 1.0)))
-        rows = (r[:, 2, 1], r[:, 2, 2]) if self.axis == 3 else (r[:, 1, 0], r[:, 0, 0])
-        return np.asarray(np.arctan2(*rows))
+        """At positions (m, 3) and rotations (m, 3, 3): (m, a); here coordinates of the position."""
+        del r, own
+        return p[:, self.axes]
 
     def slopes(self, p: Array, r: Array, own: Mapping[str, float]) -> Array:
-        """Its derivatives by the linear and the angular velocity, (m, 6)."""
-        out = np.zeros((len(p), 6))
-        if self.axis < 3:
-            out[:, self.axis] = 1.0
-            return out
-        yaw = np.arctan2(r[:, 1, 0], r[:, 0, 0])
-        zero = np.zeros(len(p))
-        axes = np.stack(
-            [
-                r[:, :, 0],
-                np.stack([-np.sin(yaw), np.cos(yaw), zero], -1),
-                np.broadcast_to([0.0, 0.0, 1.0], (len(p), 3)),
-            ],
-            -1,
-        )
-        out[:, 3:] = np.linalg.inv(axes)[:, self.axis - 3]
-        return out
+        """Its derivatives by the linear and the angular velocity, (m, a, 6)."""
+        del r, own
+        return np.broadcast_to(np.eye(6)[list(self.axes)], (len(p), len(self.axes), 6))
 
     def by_own(self, p: Array, own: Mapping[str, float]) -> dict[str, Array]:
         """Its derivatives by its own numbers, (m,) each."""
@@ -83,15 +65,45 @@ class Kind:
         return {}
 
     def begin(self, p: Array, values: Array) -> dict[str, float]:
-        """A first guess of its own numbers by positions (m, 3)."""
+        """A first guess of its own numbers by positions (m, 3) and values (m,)."""
         del p, values
         return {}
 
-    def wrapped(self, difference: Array) -> Array:
-        """Of two values."""
-        if self.unit != "rad":
-            return difference
-        return np.asarray((difference + np.pi) % (2.0 * np.pi) - np.pi)
+    def likely(self, p: Array) -> Array:
+        """Values (m, 1) at positions (m, 3) that give its own numbers a likely place."""
+        return np.zeros((len(p), 1))
+
+    def residual(self, values: Array, p: Array, r: Array, own: Mapping[str, float]) -> Array:
+        """Measured less computed, (m, a)."""
+        apart = values - self.value(p, r, own)
+        turned = np.asarray((apart + np.pi) % (2.0 * np.pi) - np.pi)
+        return turned if self.unit == "rad" else apart
+
+
+class _Rotation(Kind):
+    """A whole rotation, measured as (m, 3, 3)."""
+
+    def residual(self, values: Array, p: Array, r: Array, own: Mapping[str, float]) -> Array:
+        del p, own
+        apart = rotations().from_matrix(values @ np.swapaxes(r, -1, -2))
+        return np.asarray(apart.as_rotvec(), np.float64)
+
+
+class _Angle(Kind):
+    """Roll, pitch or yaw."""
+
+    def value(self, p: Array, r: Array, own: Mapping[str, float]) -> Array:
+        del p, own
+        pitch = -np.arcsin(np.clip(r[:, 2, 0], -1.0, 1.0))
+        roll, yaw = np.arctan2(r[:, 2, 1], r[:, 2, 2]), np.arctan2(r[:, 1, 0], r[:, 0, 0])
+        return np.stack([roll, pitch, yaw], -1)[:, self.axes]
+
+    def slopes(self, p: Array, r: Array, own: Mapping[str, float]) -> Array:
+        yaw, zero = np.arctan2(r[:, 1, 0], r[:, 0, 0]), np.zeros(len(p))
+        about = [r[:, :, 0], np.stack([-np.sin(yaw), np.cos(yaw), zero], -1)]
+        table = np.stack([*about, np.broadcast_to([0.0, 0.0, 1.0], (len(p), 3))], -1)
+        rows = np.linalg.inv(table)[:, self.axes]
+        return np.concatenate([np.zeros_like(rows), rows], -1)
 
 
 class _Plane(Kind):
@@ -101,15 +113,13 @@ class _Plane(Kind):
         return np.array([-own["plane.slope_x"], -own["plane.slope_y"], 1.0])
 
     def value(self, p: Array, r: Array, own: Mapping[str, float]) -> Array:
-        del r
         normal = self._normal(own)
-        return np.asarray((p @ normal - own["plane.z"]) / np.linalg.norm(normal))
+        return np.asarray((p @ normal - own["plane.z"]) / np.linalg.norm(normal))[:, None]
 
     def slopes(self, p: Array, r: Array, own: Mapping[str, float]) -> Array:
-        del r
         normal = self._normal(own)
         row = np.concatenate([normal / np.linalg.norm(normal), np.zeros(3)])
-        return np.broadcast_to(row, (len(p), 6))
+        return np.broadcast_to(row, (len(p), 1, 6))
 
     def by_own(self, p: Array, own: Mapping[str, float]) -> dict[str, Array]:
         size = np.linalg.norm(self._normal(own))
@@ -125,26 +135,27 @@ class _Plane(Kind):
         return dict(zip(self.own, found.tolist(), strict=True))
 
 
-def _along(ways: Array) -> Array:
-    """Derivatives of lengths of ways (m, 3) by the velocities of their ends, (m, 6)."""
-    unit = ways / np.maximum(np.linalg.norm(ways, axis=1, keepdims=True), 1e-12)
-    return np.hstack([unit, np.zeros((len(ways), 3))])
-
-
-class _Ball(Kind):
-    """Distance from a fixed centre of unknown place: a ball bar's length."""
+class _Distance(Kind):
+    """Length of ``p``: of the platform's reference point at two poses, or from a fixed centre."""
 
     def value(self, p: Array, r: Array, own: Mapping[str, float]) -> Array:
-        del r
-        return np.asarray(np.linalg.norm(p - list(own.values()), axis=1))
+        return np.asarray(np.linalg.norm(self._away(p, own), axis=1, keepdims=True))
 
     def slopes(self, p: Array, r: Array, own: Mapping[str, float]) -> Array:
-        del r
-        return _along(p - list(own.values()))
+        away = self._away(p, own)
+        unit = away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-12)
+        return np.hstack([unit, np.zeros_like(unit)])[:, None]
+
+    def _away(self, p: Array, own: Mapping[str, float]) -> Array:
+        return p - list(own.values())[:3] if own else p
+
+
+class _Ball(_Distance):
+    """Distance from a fixed centre of unknown place: a ball bar's length."""
 
     def by_own(self, p: Array, own: Mapping[str, float]) -> dict[str, Array]:
-        unit = -self.slopes(p, p, own)
-        return {name: unit[:, k] for k, name in enumerate(own)}
+        unit = -self.slopes(p, p, own)[:, 0]
+        return {name: unit[:, k] for k, name in enumerate(list(own)[:3])}
 
     def begin(self, p: Array, values: Array) -> dict[str, float]:
         """The difference of |p - c|^2 = r^2 of every two is linear in c."""
@@ -158,42 +169,26 @@ class _Ball(Kind):
             left = np.mean(values**2) - np.mean(np.sum((away - centre) ** 2, 1))
             aside = np.linalg.svd(rows)[2][-1]
             centre -= np.sqrt(max(left, 0.0)) * aside * np.sign(aside[2] or 1.0)
-        return dict(zip(self.own, (middle + centre).tolist(), strict=True))
+        return dict(zip(self.own, (middle + centre).tolist(), strict=False))
+
+    def likely(self, p: Array) -> Array:
+        """A ball below the positions."""
+        below = p.mean(0) - [0.0, 0.0, float(np.ptp(p, axis=0).max())]
+        return np.asarray(np.linalg.norm(p - below, axis=1, keepdims=True))
 
 
-class _Distance(Kind):
-    """Distance of the platform's reference point at two poses, whose difference ``p`` is."""
-
-    def value(self, p: Array, r: Array, own: Mapping[str, float]) -> Array:
-        del r, own
-        return np.asarray(np.linalg.norm(p, axis=1))
-
-    def slopes(self, p: Array, r: Array, own: Mapping[str, float]) -> Array:
-        del r, own
-        return _along(p)
-
-
-class _Scale(_Distance):
-    """Mean of the distances of pairs, each over what it is by the file."""
-
-    def value(self, p: Array, r: Array, own: Mapping[str, float]) -> Array:
-        return np.atleast_1d(np.mean(super().value(p, r, own) / self.lengths))
-
-    def slopes(self, p: Array, r: Array, own: Mapping[str, float]) -> Array:
-        return super().slopes(p, r, own) / self.lengths[:, None]
-
-
-FAR: Final = 10.0
-"""Standard deviation of a place, m, and a slope that nothing is known of."""
+PLACE: Final = Kind("position", "m", FINEST, (0, 1, 2), length=True, believed=0.0)
+TURN: Final = _Rotation("rotation", "rad", FINEST, (3, 4, 5), believed=0.0)
+"""Of whole poses."""
 KINDS: Final = {
     kind.name: kind
     for kind in (
         *(
-            Kind(name, "m", 5e-5, k, length=k < 2)
+            Kind(name, "m", 5e-5, (k,), length=k < 2)
             for k, name in enumerate(COORDINATES[:3])
         ),
-        *(Kind(name, "rad", 5e-4, 3 + k) for k, name in enumerate(COORDINATES[3:])),
-        Kind("height", "m", 3e-5),
+        *(_Angle(name, "rad", 5e-4, (k,)) for k, name in enumerate(COORDINATES[3:])),
+        Kind("height", "m", 3e-5, (2,)),
         _Plane(
             "plane", "m", 3e-5,
             own={f"plane.{name}": (unit, FAR) for name, unit in
@@ -224,7 +219,7 @@ def kinds_of(texts: Sequence[str]) -> tuple[Kind, ...]:
 
 @dataclass(frozen=True, eq=False)
 class Readings:
-    """What one kind of measurement read: values (m,) at poses ``first``, pairs with ``second``.
+    """What one kind of measurement read: values (m, a) at poses ``first``, pairs with ``second``.
 
     ``lines``: of the table, from 1.
     """
@@ -245,25 +240,36 @@ class Readings:
         """The kind's own numbers as they are now."""
         return {name: state.instrument.own[name] for name in self.kind.own}
 
+    def slopes(self, state: State, columns: Array, names: Sequence[str]) -> Array:
+        """Derivatives of what is computed, (m, a, p), by those of the poses, (k, 6, p)."""
+        (p, r), own = self.seen(state), self.own(state)
+        moved = columns[self.first]
+        if self.second is not None:
+            moved = moved - columns[self.second]
+        table = np.asarray(self.kind.slopes(p, r, own) @ moved, np.float64)
+        for name, column in self.kind.by_own(p, own).items():
+            table[:, 0, names.index(name)] = column
+        return table
+
 
 @dataclass(frozen=True, eq=False)
-class Counted:
+class Weights:
     """Noise of each kind, and square roots of the weights over it, (m,) a kind."""
 
     noise: tuple[float, ...]
     scales: tuple[Array, ...]
 
     def over(self, parts: Sequence[Array]) -> Array:
-        """Rows (m, 1, ...) of each kind over the noise, one below the other."""
+        """Rows (m, a, ...) of each kind over the noise, one below the other."""
         rows = [
-            part[:, 0] * scale.reshape(-1, *[1] * (part.ndim - 2))
+            (part * scale.reshape(-1, *[1] * (part.ndim - 1))).reshape(-1, *part.shape[2:])
             for part, scale in zip(parts, self.scales, strict=True)
         ]
         return np.asarray(np.concatenate(rows), np.float64)
 
 
 @dataclass(frozen=True, eq=False)
-class Partial:
+class Measured:
     """Measurements of some quantities at joints (k, n) in the controller's numbers.
 
     ``noise``: standard deviations that are known, by kind.
@@ -272,7 +278,6 @@ class Partial:
     joints: Array
     readings: tuple[Readings, ...]
     noise: Mapping[str, float] = field(default_factory=dict)
-    whole: bool = False
 
     @property
     def own(self) -> dict[str, tuple[str, float]]:
@@ -280,87 +285,87 @@ class Partial:
         return {name: number for one in self.readings for name, number in one.kind.own.items()}
 
     def parts(self, state: State) -> list[Array]:
-        """Measured less computed, (m, 1) a kind."""
-        found = []
-        for one in self.readings:
-            value = one.kind.value(*one.seen(state), one.own(state))
-            found.append(one.kind.wrapped(one.values - value)[:, None])
-        return found
+        """Measured less computed, (m, a) a kind."""
+        return [
+            one.kind.residual(one.values, *one.seen(state), one.own(state)) for one in self.readings
+        ]
 
     def slopes(self, robot: Robot, state: State, names: Sequence[str]) -> list[Array]:
-        """Derivatives of what is computed by named parameters, (m, 1, p) a kind."""
-        mine = [k for k, name in enumerate(names) if name not in state.instrument.own]
-        columns = np.zeros((len(state.q), 6, len(names)))
-        columns[..., mine] = derivatives(robot, state, [names[k] for k in mine])
-        found = []
-        for one in self.readings:
-            (p, r), own = one.seen(state), one.own(state)
-            moved = columns[one.first]
-            if one.second is not None:
-                moved = moved - columns[one.second]
-            table = np.einsum("ma,map->mp", one.kind.slopes(p, r, own), moved)
-            if len(one.kind.lengths):
-                table = table.mean(0, keepdims=True)
-            for name, column in one.kind.by_own(p, own).items():
-                table[:, names.index(name)] = column
-            found.append(table[:, None])
-        return found
+        """Derivatives of what is computed by named parameters, (m, a, p) a kind."""
+        columns = derivatives(robot, state, names)
+        return [one.slopes(state, columns, names) for one in self.readings]
 
-    def weighed(
-        self, parts: list[Array], slopes: list[Array], prior: Array, drives: Array | None = None
-    ) -> Counted:
-        """Noise by what a fit leaves over and by what is usual; less weight beyond ``CLEAR``.
+    def weighed(self, parts: list[Array], slopes: list[Array], prior: Array) -> Weights:
+        """Noise by what a fit leaves over and by what is usual; robust weights.
 
         Of few measurements a fit leaves little: each counts for the part that it does not decide.
         """
-        del drives
-        usual = [self.noise.get(one.kind.name, one.kind.noise) for one in self.readings]
+        kinds = [one.kind for one in self.readings]
+        usual = [self.noise.get(kind.name, kind.noise) for kind in kinds]
+        sizes = [np.sqrt(np.mean(part**2, 1)) for part in parts]
         noise = [
-            s if one.kind.name in self.noise else max(s, float(np.median(np.abs(part))) / MEDIAN)
-            for one, s, part in zip(self.readings, usual, parts, strict=True)
+            s
+            if kind.name in self.noise
+            else max(s, float(np.median(size)) / MEDIANS[part.shape[1]])
+            for kind, s, size, part in zip(kinds, usual, sizes, parts, strict=True)
         ]
         weights = [np.ones(len(part)) for part in parts]
         for _ in range(TURNS):
-            away = [np.abs(part[:, 0]) / s for part, s in zip(parts, noise, strict=True)]
-            weights = [huber(one, CLEAR) for one in away]
+            away = [size / s for size, s in zip(sizes, noise, strict=True)]
+            weights = [huber(one) for one in away]
             left = left_over(slopes, noise, prior)
-            for k, one in enumerate(self.readings):
+            for k, kind in enumerate(kinds):
                 good = away[k] < CLEAR
-                square = BELIEVED * usual[k] ** 2 + float(np.sum(parts[k][good] ** 2))
-                count = BELIEVED + float(np.sum(left[k][good]))
-                if one.kind.name not in self.noise:
-                    noise[k] = max(float(np.sqrt(square / count)), FINEST)
+                square = kind.believed * usual[k] ** 2 + float(np.sum(parts[k][good] ** 2))
+                count = kind.believed + float(np.sum(left[k][good])) * parts[k].shape[1]
+                if kind.name not in self.noise:
+                    noise[k] = max(float(np.sqrt(square / max(count, 1.0))), FINEST)
         scales = [np.sqrt(w) / s for w, s in zip(weights, noise, strict=True)]
-        return Counted(tuple(noise), tuple(scales))
-
-
-def spans_of(state: State) -> Readings | None:
-    """The scale: distances between poses as the machine has them now; None: it does not travel."""
-    some = np.unique(np.linspace(0, len(state.q) - 1, SPANS).astype(int))
-    first, second = np.array(list(combinations(some.tolist(), 2)), np.intp).reshape(-1, 2).T
-    position = state.platform[0]
-    lengths = np.linalg.norm(position[first] - position[second], axis=1)
-    far = lengths > max(SHORT * float(lengths.max(initial=0.0)), 1e-6)
-    if not far.any():
-        return None
-    kind = _Scale("scale", "", 1.0, length=True, pair=True, lengths=lengths[far])
-    return Readings(kind, first[far], second[far], np.ones(1), np.zeros(1, np.intp))
+        return Weights(tuple(noise), tuple(scales))
 
 
 def left_over(slopes: Sequence[Array], noise: Sequence[float], prior: Array) -> list[Array]:
     """Part of each measurement that the others and the priors decide, 0 to 1, (m,) a kind."""
-    rows = [table[:, 0] * prior / s for table, s in zip(slopes, noise, strict=True)]
+    rows = [
+        (table * prior / s).reshape(-1, len(prior)) for table, s in zip(slopes, noise, strict=True)
+    ]
     whole = np.concatenate(rows)
     both = np.vstack([whole, np.eye(len(prior))])
     base = np.linalg.qr(both)[0][: len(whole)]
     left = np.maximum(1.0 - np.sum(base**2, 1), 1e-9)
-    return np.split(left, np.cumsum([len(row) for row in rows])[:-1])
+    each = np.split(left, np.cumsum([len(row) for row in rows])[:-1])
+    return [part.reshape(len(table), -1).mean(1) for part, table in zip(each, slopes, strict=True)]
 
 
-def partial_of(
+def scale_slopes(robot: Robot, state: State, names: Sequence[str]) -> Array | None:
+    """Relative derivatives (p,) of the mean distance of poses; None: the platform stays there."""
+    some = np.unique(np.linspace(0, len(state.q) - 1, SPANS).astype(int))
+    first, second = np.array(list(combinations(some.tolist(), 2)), np.intp).reshape(-1, 2).T
+    position = state.instrument.seen(*state.platform)[0]
+    ways = position[first] - position[second]
+    lengths = np.linalg.norm(ways, axis=1)
+    far = lengths > max(SHORT * float(lengths.max(initial=0.0)), 1e-6)
+    if not far.any():
+        return None
+    columns = derivatives(robot, state, names)[:, :3]
+    moved = (columns[first] - columns[second])[far]
+    relative = ways[far] / lengths[far, None] ** 2
+    return np.asarray(np.einsum("ma,map->mp", relative, moved).mean(0), np.float64)
+
+
+def whole_of(poses: Poses, rows: Indices) -> Measured:
+    """Some of the whole poses, or of their positions, as measurements."""
+    every, lines = np.arange(len(rows)), rows + 2
+    readings = [Readings(PLACE, every, None, poses.position[rows], lines)]
+    if poses.rotation is not None:
+        readings.append(Readings(TURN, every, None, poses.rotation[rows], lines))
+    return Measured(poses.joints[rows], tuple(readings))
+
+
+def measured_of(
     joints: Array, second: Array | None, values: Mapping[str, Array], lines: Indices,
     noise: Mapping[str, float],
-) -> Partial:  # fmt: skip
+) -> Measured:  # fmt: skip
     """Measurements of a table: a value that is NaN was not measured.
 
     :param joints: of the rows, (k, n); ``second``: of a pair's other pose, (k, n), NaN where none.
@@ -369,7 +374,7 @@ def partial_of(
     """
     count = len(joints)
     both = joints if second is None else np.vstack([joints, second])
-    readings = []
+    found, used = [], np.zeros(len(both), bool)
     for name, column in values.items():
         rows = np.flatnonzero(np.isfinite(column))
         if not len(rows):
@@ -379,19 +384,15 @@ def partial_of(
             raise ParameterError(
                 name, "one pose", "two in each row: JOINT.position and JOINT.position_2 columns"
             )
-        readings.append(
-            Readings(KINDS[name], rows, rows + count if pair else None, column[rows], lines[rows])
-        )
-    used = np.unique(
-        np.concatenate([p for one in readings for p in (one.first, one.second) if p is not None])
-    )
-    place = np.full(len(both), -1)
-    place[used] = np.arange(len(used))
-    placed = tuple(
+        used[rows] = True
+        used[rows + count * pair] = True
+        found.append((KINDS[name], rows, rows + count if pair else None))
+    place = np.cumsum(used) - 1
+    readings = (
         Readings(
-            one.kind, place[one.first], None if one.second is None else place[one.second],
-            one.values, one.lines,
+            kind, place[first], None if other is None else place[other],
+            values[kind.name][first, None], lines[first],
         )
-        for one in readings
+        for kind, first, other in found
     )  # fmt: skip
-    return Partial(both[used], placed, noise)
+    return Measured(both[used], tuple(readings), noise)

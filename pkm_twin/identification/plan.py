@@ -11,11 +11,9 @@ import numpy as np
 
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError
-from pkm_twin.identification.calibration import Estimate, geometric
-from pkm_twin.identification.calibration_fit import derivatives
-from pkm_twin.identification.calibration_state import State
-from pkm_twin.identification.measurements import KINDS, Kind, Partial, Readings, spans_of
-from pkm_twin.identification.partial import placed, unknowns
+from pkm_twin.identification.calibration import Estimate, Free, geometric, placed, unknowns
+from pkm_twin.identification.calibration_state import derivatives
+from pkm_twin.identification.measurements import KINDS, Kind, Measured, Readings, scale_slopes
 from pkm_twin.machine.rotations import skew
 from pkm_twin.robot.robot import Robot
 from pkm_twin.robot.workspace import within_limits
@@ -58,7 +56,7 @@ def plan(
     kinds: Sequence[Kind],
     only: Sequence[str] = (),
     *,
-    measured: Partial | None = None,
+    measured: Measured | None = None,
     within: Mapping[str, tuple[float, float]] | None = None,
     count: int | None = None,
     accuracy: float | None = None,
@@ -71,7 +69,7 @@ def plan(
     :param measured: what was measured already; its poses then bound the workspace.
     :param within: least and greatest value by pose coordinate, m or rad.
     :param accuracy: of the platform's position, m: as many as it needs; ``count``: so many.
-    :param options: as of :func:`pkm_twin.identification.partial.unknowns`.
+    :param options: of :class:`~pkm_twin.identification.calibration.Free`.
     :raises ParameterError: no workspace is known, or two families of poses (pairs and single ones).
     """
     pair = {kind.pair for kind in kinds}
@@ -83,10 +81,11 @@ def plan(
     first = np.arange(len(q))
     second = np.roll(first, len(q) // 2) if pair == {True} else None
     noise = dict(noise or {})
-    all_poses = Partial(
-        joints, tuple(Readings(k, first, second, _guess(k, robot, q), first) for k in kinds), noise
+    position = robot.platform(q)[0]
+    all_poses = Measured(
+        joints, tuple(Readings(k, first, second, k.likely(position), first) for k in kinds), noise
     )
-    parameters = unknowns(robot, all_poses, paths, **options)
+    parameters = unknowns(robot, all_poses, paths, Free(**options))
     names = [p.name for p in parameters]
     prior = np.array([p.prior for p in parameters])
     fitted = [name for name in names if name in paths]
@@ -95,25 +94,20 @@ def plan(
     if measured is not None:
         there = placed(robot, measured, fitted)
         state.instrument.own |= {k: v for k, v in there.instrument.own.items() if k in names}
-        table = _rows(measured, robot, there, names, prior)
+        known = [measured.noise.get(one.kind.name, one.kind.noise) for one in measured.readings]
+        table = np.concatenate(_over(measured.slopes(robot, there, names), prior, known))
         covariance = np.asarray(np.linalg.inv(covariance + table.T @ table), np.float64)
-    rows = np.stack(
-        [
-            part[:, 0] * prior / noise.get(kind.name, kind.noise)
-            for kind, part in zip(kinds, all_poses.slopes(robot, state, names), strict=True)
-        ],
-        1,
-    )
-    mine = [k for k, name in enumerate(names) if name not in all_poses.own]
-    places = np.zeros((len(q), 3, len(names)))
-    places[..., mine] = derivatives(robot, state, [names[k] for k in mine])[:, :3] * prior[mine]
+    usual = [noise.get(kind.name, kind.noise) for kind in kinds]
+    rows = np.stack(_over(all_poses.slopes(robot, state, names), prior, usual), 1)
+    places = derivatives(robot, state, names)[:, :3] * prior
     # A motion of the whole workspace is where the instrument stands, not an error of the machine.
     rigid = np.concatenate(
         [np.broadcast_to(np.eye(3), (len(q), 3, 3)), -skew(state.platform[0])], -1
     ).reshape(-1, 6)
     flat = places.reshape(len(rigid), -1)
     places = (flat - rigid @ np.linalg.lstsq(rigid, flat, rcond=1e-9)[0]).reshape(places.shape)
-    span = _span(all_poses, robot, state, names, prior)
+    scaled = scale_slopes(robot, state, names)
+    span = np.zeros(len(names)) if scaled is None else scaled * prior
     order: list[int] = []
     told: list[tuple[float, float, Array]] = []
     most = min(count or (MOST if accuracy else USUAL), MOST, len(q))
@@ -131,22 +125,20 @@ def plan(
         order.append(best)
         taken = moved[best]
         covariance = covariance - taken.T @ np.linalg.solve(inner[best], taken)
-    position, scale, seen_all = zip(*told, strict=True)
-    quantity = {
-        kind.name: np.array(seen_all)[:, k] * noise.get(kind.name, kind.noise)
-        for k, kind in enumerate(kinds)
-    }
+    axis, scale, seen_all = zip(*told, strict=True)
+    seen_by = zip(kinds, usual, np.array(seen_all).T, strict=True)
+    quantity = {kind.name: size * seen for kind, size, seen in seen_by}
     deviations = prior * np.sqrt(np.maximum(np.diag(covariance), 0.0))
-    known = tuple(
+    numbers = tuple(
         replace(p, value=p.before, deviation=float(d))
         for p, d in zip(parameters, deviations, strict=True)
     )
     return Plan(
         joints=joints[order], second=None if second is None else joints[second[order]],
-        poses=robot.forward(q[order]), position=np.array(position), quantity=quantity,
+        poses=robot.forward(q[order]), position=np.array(axis), quantity=quantity,
         scale=np.array(scale),
         known=Estimate(
-            robot=robot, parameters=known, covariance=covariance * np.outer(prior, prior), steps=0
+            robot=robot, parameters=numbers, covariance=covariance * np.outer(prior, prior)
         ),
     )  # fmt: skip
 
@@ -155,38 +147,13 @@ def _variances(rows: Array, covariance: Array) -> Array:
     return np.asarray(np.sum((rows @ covariance) * rows, -1), np.float64)
 
 
-def _rows(
-    measured: Partial, robot: Robot, state: State, names: Sequence[str], prior: Array
-) -> Array:
-    """Derivatives of all measurements over their noise, in units of the priors."""
-    parts = zip(measured.readings, measured.slopes(robot, state, names), strict=True)
-    return np.concatenate(
-        [
-            part[:, 0] * prior / measured.noise.get(one.kind.name, one.kind.noise)
-            for one, part in parts
-        ]
-    )
-
-
-def _span(poses: Partial, robot: Robot, state: State, names: Sequence[str], prior: Array) -> Array:
-    readings = spans_of(state)
-    if readings is None:
-        return np.zeros(len(names))
-    part = replace(poses, readings=(*poses.readings, readings)).slopes(robot, state, names)[-1]
-    return np.asarray(part[0, 0] * prior, np.float64)
-
-
-def _guess(kind: Kind, robot: Robot, q: Array) -> Array:
-    """Values with which a kind's own numbers get a likely place: a ball below the poses."""
-    if kind.name != "radius":
-        return np.zeros(len(q))
-    position = robot.platform(q)[0]
-    below = position.mean(0) - [0.0, 0.0, float(np.ptp(position, axis=0).max())]
-    return np.asarray(np.linalg.norm(position - below, axis=1), np.float64)
+def _over(parts: Sequence[Array], prior: Array, noise: Sequence[float]) -> list[Array]:
+    """Derivatives (m, p) of each kind over its noise, in units of the priors."""
+    return [part[:, 0] * prior / size for part, size in zip(parts, noise, strict=True)]
 
 
 def _candidates(
-    robot: Robot, measured: Partial | None, within: dict[str, tuple[float, float]],
+    robot: Robot, measured: Measured | None, within: dict[str, tuple[float, float]],
     kinds: Sequence[Kind],
 ) -> Array:  # fmt: skip
     """Joint states (k, n) from which poses are chosen.

@@ -140,8 +140,8 @@ def crooked(seed: int, only: list[str], count: int) -> tuple[Robot, Poses]:
 def settles(seed: int, only: list[str], count: int = 60) -> None:
     robot, poses = crooked(seed, only, count)
     result = calibrate(robot, poses, geometric(robot, poses.joints, only))
-    assert result.held_out[1].rms < 2.0 * NOISE * np.sqrt(3.0)
-    assert 0.7 * NOISE < result.noise < 1.4 * NOISE
+    assert result.agreements[0].held_out[1].rms < 2.0 * NOISE * np.sqrt(3.0)
+    assert 0.7 * NOISE < result.agreements[0].noise < 1.4 * NOISE
 
 
 def test_directions_in_which_the_machine_turns_away_from_its_tangent_settle() -> None:

@@ -64,7 +64,8 @@ def test_ratios_are_found_within_their_deviations(how: str) -> None:
     changes = np.array([0.3, -0.2, 0.1]) if how == "travel" else np.zeros(3)
     poses = measured(changes, factors)
     found = calibrate(robot, poses, (), transmission=Transmission(how))
-    assert found.held_out[1].rms < 2.0 * NOISE * np.sqrt(3.0) < found.held_out[0].rms
+    away = found.agreements[0].held_out
+    assert away[1].rms < 2.0 * NOISE * np.sqrt(3.0) < away[0].rms
     by = {p.name: p for p in found.parameters}
     for k, joint in enumerate(robot.joint_names):
         path, centre = f"joint_map.{joint}", float(found.joint_map.centres[k])
@@ -106,7 +107,7 @@ def test_a_measured_hexapod_is_predicted_as_well_as_by_a_fit_of_each_leg(
     found = calibrate(robot, poses, geometric(robot, robot.controller.positions(motors)))
     legs, _ = fit_a_leg(robot, poses.part(learnt))
     away = np.sqrt(np.mean(leg_poses(legs, poses.part(~learnt)) ** 2))
-    assert found.held_out[1].rms < 1.02 * away
+    assert found.agreements[0].held_out[1].rms < 1.02 * away
     by = {p.name: p for p in found.parameters}
     for joint, factor in zip(robot.joint_names, factors, strict=True):
         ratio = by[f"joint_map.{joint}.ratio"]

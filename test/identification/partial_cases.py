@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from pkm_twin import Robot
 from pkm_twin.identification.calibration import geometric
-from pkm_twin.identification.measurements import Partial, partial_of
+from pkm_twin.identification.measurements import Measured, measured_of
 from pkm_twin.robot.catalogue import robot_of_data
 from pkm_twin.robot.entries import with_entries
 from test.support.robots import random_joints
@@ -31,7 +31,7 @@ class Case(NamedTuple):
     """A machine as drawn, what was measured of the real one, and the real one's numbers."""
 
     drawn: Robot
-    measured: Partial
+    measured: Measured
     paths: tuple[str, ...]
     truth: dict[str, float]
 
@@ -73,7 +73,7 @@ def case(drawn: Robot, kinds: Sequence[str], count: int, seed: int, flat: bool =
     }  # fmt: skip
     values = {kind: columns[kind] + rng.normal(scale=NOISE[kind], size=count) for kind in kinds}
     second = read[other] if "distance" in kinds else None
-    return Case(drawn, partial_of(read, second, values, np.arange(count) + 2, {}), paths, truth)
+    return Case(drawn, measured_of(read, second, values, np.arange(count) + 2, {}), paths, truth)
 
 
 class Towers(NamedTuple):

@@ -19,7 +19,7 @@ from pkm_twin.apps.cli import app
 from pkm_twin.errors import PkmTwinError
 from pkm_twin.identification.calibration import calibrate, geometric
 from pkm_twin.identification.calibration_state import Poses
-from pkm_twin.identification.noise import weighed
+from pkm_twin.identification.measurements import whole_of
 from pkm_twin.identification.undetermined import LINES, undetermined
 from pkm_twin.robot.entries import data_of, entries, with_entries
 from test.support.robots import load, random_joints
@@ -57,9 +57,9 @@ def test_one_wrong_pose_of_sixty_moves_nothing_and_is_named(seed: int) -> None:
         position = poses.position.copy()
         position[row] += 0.05 * Rotation.random(random_state=rng).as_matrix()[0]
         found = calibrate(robot, Poses(poses.joints, position), paths)
-        assert [one.index for one in found.outliers] == [row]
-        assert found.outliers[0].distance == pytest.approx(0.05, rel=0.01)
-        assert found.held_out[1].rms < 2.0 * NOISE * np.sqrt(3.0)
+        assert [one.line for one in found.outliers] == [row + 2]
+        assert found.outliers[0].size("m") == pytest.approx(0.05, rel=0.01)
+        assert found.agreements[0].held_out[1].rms < 2.0 * NOISE * np.sqrt(3.0)
         for one, before in zip(found.parameters, plain.parameters, strict=True):
             assert abs(one.value - before.value) < 1.5 * before.deviation, one.name
             assert one.deviation < 1.5 * before.deviation
@@ -75,7 +75,7 @@ def test_poses_in_another_frame_are_proposed_a_frame() -> None:
             calibrate(robot, Poses(poses.joints, poses.position @ turn.T), paths)
     shifted = Poses(poses.joints, poses.position @ QUARTER.T + [0.05, -0.3, 0.1])
     found = calibrate(robot, shifted, paths, frame=True)
-    assert found.held_out[1].rms < 2.0 * NOISE * np.sqrt(3.0) and not found.faults
+    assert found.agreements[0].held_out[1].rms < 2.0 * NOISE * np.sqrt(3.0) and not found.faults
 
 
 def test_an_offset_that_no_number_takes_up_is_a_frame_too() -> None:
@@ -131,10 +131,13 @@ def test_noise_is_that_of_the_good_poses() -> None:
     rng = np.random.default_rng(0)
     parts = [1e-4 * rng.normal(size=(400, 3)), 1e-3 * rng.normal(size=(400, 3))]
     parts[0][::20] += 0.1
-    found = weighed(parts, 0)
+    still = Poses(np.zeros((400, 3)), np.zeros((400, 3)), np.zeros((400, 3, 3)))
+    none = [np.zeros((400, 3, 1))] * 2
+    found = whole_of(still, np.arange(400)).weighed(parts, none, np.ones(1))
     assert found.noise == pytest.approx((1e-4, 1e-3), rel=0.15)
-    assert found.weights[::20].max() < 0.01
-    assert np.mean(found.weights[np.arange(400) % 20 != 0] == 1.0) > 0.9
+    weights = (found.noise[0] * found.scales[0]) ** 2
+    assert weights[::20].max() < 0.01
+    assert np.mean(weights[np.arange(400) % 20 != 0] > 1.0 - 1e-9) > 0.9
 
 
 @pytest.mark.parametrize(

@@ -9,10 +9,15 @@ import pytest
 from delta_dynamics import inverse_dynamics
 from delta_dynamics.regressor import parameter_values, regressor
 from pkm_twin import Robot
-from pkm_twin.identification.calibration import geometric
+from pkm_twin.identification.calibration import (
+    Free,
+    calibrate,
+    geometric,
+    placed,
+    unknowns,
+)
 from pkm_twin.identification.calibration_state import FRAME, moved
-from pkm_twin.identification.measurements import KINDS, Partial, kinds_of, partial_of
-from pkm_twin.identification.partial import calibrate_partial, placed, unknowns
+from pkm_twin.identification.measurements import KINDS, Measured, kinds_of, measured_of
 from pkm_twin.identification.plan import plan
 from pkm_twin.robot.catalogue import robot_of_data
 from pkm_twin.robot.entries import data_of
@@ -40,7 +45,7 @@ def test_derivatives_are_those_of_what_is_computed(name: str) -> None:
              ("roll", "pitch", "yaw")]  # fmt: skip
     drawn = case(robot, kinds, 5, 1)
     paths = drawn.paths[:3]
-    parameters = unknowns(robot, drawn.measured, paths, frame=True, target=True)
+    parameters = unknowns(robot, drawn.measured, paths, Free(frame=True, target=True))
     names = [p.name for p in parameters]
     state = placed(robot, drawn.measured, paths)
     state.instrument.own |= {"plane.slope_x": 0.2, "plane.slope_y": -0.3}
@@ -51,7 +56,9 @@ def test_derivatives_are_those_of_what_is_computed(name: str) -> None:
         turn = np.zeros(3)
         if name in FRAME[3:]:
             turn[FRAME.index(name) - 3] = step
-        other = moved(robot, state, drawn.measured, before | {name: before[name] + step}, turn)
+        other = moved(
+            robot, state, drawn.measured.joints, before | {name: before[name] + step}, turn
+        )
         return -np.concatenate(drawn.measured.parts(other))[:, 0]
 
     for k, name in enumerate(names):
@@ -79,7 +86,7 @@ def test_numbers_that_are_reported_are_right_and_the_rest_is_named(
         robot = printer if name == "printer" else load(name)
         names = [kind.name for kind in kinds_of([kinds])]
         one = case(robot, names, rows, seed, flat=name == "printer")
-        found = calibrate_partial(robot, one.measured, one.paths)
+        found = calibrate(robot, one.measured, one.paths)
         told = [p for p in found.parameters if p.name in one.truth and p.observed]
         wrong = [p for p in told if abs(p.value - one.truth[p.name]) > 3.0 * p.deviation]
         numbers, off = numbers + len(told), off + len(wrong)
@@ -113,7 +120,7 @@ def probed(seed: int, distances: int, lean: float = 1e-3) -> tuple[Towers, dict[
     return KIT, {"travel": travel, "first": ends[0], "second": ends[1], "lengths": lengths}
 
 
-def partial(data: dict[str, np.ndarray], rows: slice) -> Partial:
+def partial(data: dict[str, np.ndarray], rows: slice) -> Measured:
     """As a table has it, with these distances."""
     lengths = data["lengths"][rows]
     read = -1e-3 * np.vstack([data["travel"], data["first"][rows]])
@@ -123,7 +130,7 @@ def partial(data: dict[str, np.ndarray], rows: slice) -> Partial:
     height, distance = np.full(len(read), np.nan), np.full(len(read), np.nan)
     height[:count], distance[count:] = 0.0, 1e-3 * lengths
     values = {"height": height} | ({"distance": distance} if len(lengths) else {})
-    return partial_of(read, second, values, np.arange(len(read)) + 2, {})
+    return measured_of(read, second, values, np.arange(len(read)) + 2, {})
 
 
 @pytest.mark.parametrize("count", often(1, 25))
@@ -132,9 +139,9 @@ def test_heights_alone_fit_as_well_as_the_published_algorithm(count: int, printe
         start, data = probed(seed, 0)
         measured = partial(data, slice(0))
         q = printer.controller.positions(measured.joints)
-        found = calibrate_partial(printer, measured, geometric(printer, q))
+        found = calibrate(printer, measured, geometric(printer, q))
         _, rms, _ = published(start, data["travel"], None)
-        assert found.agreements[0].after <= 1e-3 * rms + 1e-7
+        assert found.agreements[0].fitted[1].rms <= 1e-3 * rms + 1e-7
         assert found.scale is not None and not found.scale.determined
         lengths = [p for p in found.parameters if "arm_lengths" in p.name]
         assert not any(p.observed for p in lengths)
@@ -149,7 +156,7 @@ def test_distances_that_were_left_out_are_predicted(count: int, printer: Robot) 
         start, data = probed(100 + seed, 12)
         measured = partial(data, slice(0, 8))
         q = printer.controller.positions(measured.joints)
-        found = calibrate_partial(printer, measured, geometric(printer, q))
+        found = calibrate(printer, measured, geometric(printer, q))
         assert found.scale is not None and found.scale.determined
         robot = found.robot
         ends = [
@@ -159,7 +166,7 @@ def test_distances_that_were_left_out_are_predicted(count: int, printer: Robot) 
         miss = 1e3 * np.linalg.norm(ends[0] - ends[1], axis=1) - data["lengths"][8:]
         pairs = tuple(data[key][:8] for key in ("first", "second", "lengths"))
         _, rms, left = published(start, data["travel"], pairs)  # type: ignore[arg-type]
-        after = {a.name: a.after for a in found.agreements}
+        after = {a.name: a.fitted[1].rms for a in found.agreements}
         assert after["height"] <= 1e-3 * rms + 2e-5
         assert after["distance"] <= 1e-3 * float(np.sqrt(np.mean(left**2))) + 2e-5
         errors.append(float(np.sqrt(np.mean(miss**2))))
@@ -197,8 +204,8 @@ def test_forces_are_linear_in_the_masses(printer: Robot) -> None:
 def test_a_wrong_probe_is_named(printer: Robot) -> None:
     one = case(printer, ["height"], 30, 5, flat=True)
     one.measured.readings[0].values[7] += 1e-3
-    found = calibrate_partial(printer, one.measured, one.paths)
-    assert [o.line for _, o in found.outliers][:1] == [9]
+    found = calibrate(printer, one.measured, one.paths)
+    assert [o.line for o in found.outliers][:1] == [9]
 
 
 def test_a_plan_keeps_its_promise(printer: Robot) -> None:
@@ -215,9 +222,9 @@ def test_a_plan_keeps_its_promise(printer: Robot) -> None:
     def deviations(first: np.ndarray, second: np.ndarray) -> float:
         ends = [printer.platform(printer.controller.positions(q))[0] for q in (first, second)]
         lengths = np.linalg.norm(ends[0] - ends[1], axis=1)
-        table = partial_of(first, second, {"distance": lengths}, np.arange(len(first)) + 2, noise)
+        table = measured_of(first, second, {"distance": lengths}, np.arange(len(first)) + 2, noise)
         q = printer.controller.positions(table.joints)
-        found = calibrate_partial(printer, table, geometric(printer, q))
+        found = calibrate(printer, table, geometric(printer, q))
         assert found.scale is not None
         if first is chosen.joints:
             pairs = zip(found.parameters, chosen.known.parameters, strict=True)
