@@ -17,7 +17,7 @@ from pkm_twin.apps.wrench_frames import FRAMES
 from pkm_twin.bags.reader import Bag, open_bag
 from pkm_twin.bags.storage import is_bag
 from pkm_twin.errors import BagError, MessageError, ParameterError, UnknownNameError, one_line
-from pkm_twin.identification.elastic_fit import AXES, Deflected
+from pkm_twin.identification.deflections import AXES, Deflected
 from pkm_twin.messages.reading import TINY
 from pkm_twin.messages.stamps import SECOND, StampRules
 from pkm_twin.messages.wrenches import MAX_FORCE, MAX_MOMENT, WrenchSample

@@ -12,7 +12,7 @@ from rich.table import Table
 
 from pkm_twin.apps.fit_report import MOST_SAMPLES, Report, note_of
 from pkm_twin.console import finite
-from pkm_twin.identification.elastic_fit import AXES, ElasticFit
+from pkm_twin.identification.deflections import AXES, ElasticFit
 from pkm_twin.identification.parameters import Combination, Group
 from pkm_twin.report.plots import COLOURS, columns, label
 

@@ -233,7 +233,7 @@ def _fit_compliance(
     from pkm_twin.apps.elastic_recordings import read_deflected
     from pkm_twin.apps.elastic_report import elastic_report
     from pkm_twin.apps.fit_files import robot_text
-    from pkm_twin.identification.elastic_fit import fit_elements
+    from pkm_twin.identification.deflections import fit_elements
 
     if what.strip() != COMPLIANCE:
         raise ParameterError(

@@ -172,7 +172,7 @@ def _fitted(table: Array, target: Array, block: NDArray[np.int64]) -> tuple[Arra
 
 def _elasticity(r: Recording) -> list[Measured]:
     from pkm_twin.apps.elastic_recordings import read_deflected
-    from pkm_twin.identification.elastic_fit import fit_elements
+    from pkm_twin.identification.deflections import fit_elements
     from stiffness_monitor.modes import has_modes, natural_frequencies
 
     if r.bag is None:

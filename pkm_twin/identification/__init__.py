@@ -2,7 +2,7 @@
 """Numbers of a machine from recordings, and whether the recordings fit the machine at all.
 
 :mod:`~pkm_twin.identification.fit` fits masses, friction and rotors to efforts,
-:mod:`~pkm_twin.identification.elastic_fit` compliances to deflections,
+:mod:`~pkm_twin.identification.deflections` compliances to deflections,
 :mod:`~pkm_twin.identification.calibration` geometry and offsets to poses, or to any of the
 :mod:`~pkm_twin.identification.measurements` of them, which :mod:`~pkm_twin.identification.plan`
 chooses;

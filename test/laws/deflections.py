@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from pkm_twin.apps.elastic_recordings import read_deflected
-from pkm_twin.identification.elastic_fit import Deflected
+from pkm_twin.identification.deflections import Deflected
 from stiffness_monitor.response import ElementResponse, element_response
 from test.support.robots import load
 

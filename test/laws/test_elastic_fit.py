@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from pkm_twin.errors import PkmTwinError
-from pkm_twin.identification.elastic_fit import fit_elements
+from pkm_twin.identification.deflections import fit_elements
 from pkm_twin.identification.parameters import groups_of
 from stiffness_monitor.response import element_response
 from test.laws.deflections import SENSORS, frame_recording, noisy, twin_recording

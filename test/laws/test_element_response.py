@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from pkm_twin.errors import ParameterError, UnknownNameError
-from pkm_twin.identification.elastic_fit import Deflected, fit_elements
+from pkm_twin.identification.deflections import Deflected, fit_elements
 from pkm_twin.robot.entries import with_entries
 from stiffness_monitor import compliance, strain_energy
 from stiffness_monitor.response import element_response

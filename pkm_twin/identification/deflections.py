@@ -4,32 +4,38 @@
 delta = C(s) w + z: s multiplies each element's compliance of the file, z is a zero of the
 instrument, one a recording and direction. C is not linear in s where limbs share a load: the fit
 goes by Gauss and Newton, with exact derivatives. The last third of every recording is held out.
+Noise is what differs between neighbours in time where loads change slowly; elsewhere all that the
+fit leaves is taken for noise.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 from typing import Final
 
 import numpy as np
 
 from pkm_twin.codegen.arrays import Array, Mask
 from pkm_twin.errors import PkmTwinError
-from pkm_twin.identification.elastic_verdict import elastic_verdict, put_right
 from pkm_twin.identification.estimation import Estimate, estimate
 from pkm_twin.identification.fit import Judged, Result, refuse_faults
+from pkm_twin.identification.judge import Evidence, judge
 from pkm_twin.identification.parameters import SURE, Group, Number, groups_of, number_of
 from pkm_twin.identification.rows import HELD_OUT
-from pkm_twin.identification.verdict import Verdict
+from pkm_twin.identification.verdict import Suspect, Verdict
 from pkm_twin.machine.shared import above_zero
 from pkm_twin.robot.robot import Robot
+from pkm_twin.streams.deflection import in_base_axes
 from stiffness_monitor.response import ElementResponse, element_response
 
 PRIOR: Final = 1.0
 """An element's compliance may be off by all of its value."""
 AXES: Final = ("dx", "dy", "dz", "rx", "ry", "rz")
-"""Directions of a deflection, as the columns of a table call them: m, then rad."""
+"""Directions of a deflection, as the columns of a table call them."""
+UNITS: Final = ("m",) * 3 + ("rad",) * 3
+WRENCH: Final = ("fx", "fy", "fz", "mx", "my", "mz")
 LEAST_SAMPLES: Final = 12
 MOST_SAMPLES: Final = 2000
 """Of a recording: of more, every so many are taken."""
@@ -54,6 +60,8 @@ UNLIKE: Final = 0.3
 """Part of it from which a fault of the recording is looked for."""
 BETTER: Final = 0.85
 """A recording has a fault if without it so much less is left."""
+SMOOTH: Final = 0.2
+"""Of neighbours' difference over the signal: below, what differs between neighbours is noise."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,17 +111,17 @@ class _Part:
     def split(self) -> int:
         return round((1.0 - HELD_OUT) * len(self.recording.time))
 
+    def moved(self, factors: Array) -> tuple[Array, Array]:
+        """Deflections by the model (k, 6), and their derivatives by the factors (k, 6, e)."""
+        return self.response.deflection(self.recording.wrench, factors)
+
     def rows(self, factors: Array) -> tuple[Array, Array, Array]:
         """Of what is fitted: derivatives (k, 6, e), target and what counts, (k, 6) each."""
-        r, end = self.recording, self.split
-        moved, slopes = self.response.deflection(r.wrench, factors)
-        target = r.deflection - moved + slopes @ factors
+        moved, slopes = (one[: self.split] for one in self.moved(factors))
+        target = self.recording.deflection[: self.split] - moved + slopes @ factors
         counts = np.isfinite(target)
-        keep = counts[:end, :, None]
-        return (
-            np.where(keep, slopes[:end], 0.0), np.where(counts, target, 0.0)[:end],
-            counts[:end].astype(float),
-        )  # fmt: skip
+        slopes = np.where(counts[..., None], slopes, 0.0)
+        return slopes, np.where(counts, target, 0.0), counts.astype(np.float64)
 
 
 def fit_elements(
@@ -147,20 +155,12 @@ def fit_elements(
     try:
         found, table = _solve(parts, len(names))
     except PkmTwinError as error:
-        cause, _ = _best_put_right(robot, parts[0], len(names), np.inf)
+        cause, _ = _best_repair(robot, parts[0], len(names), np.inf)
         raise PkmTwinError(f"{error}" + (f" ({cause}?)" if cause else "")) from None
     # What a bound holds at zero would be no compliance, and no file's.
     factors = np.maximum(found.values[: len(names)], STIFFEST)
     zeros = found.values[len(names) :].reshape(len(parts), 6)
-    left = [
-        part.recording.deflection - part.response.deflection(part.recording.wrench, factors)[0] - z
-        for part, z in zip(parts, zeros, strict=True)
-    ]
-    verdict = elastic_verdict(
-        robot, AXES, [(part.response, part.recording.q, part.recording.wrench) for part in parts],
-        left, replace(found, values=np.concatenate([factors, zeros.ravel()])), table,
-        np.concatenate([np.ones(len(names)), np.zeros(zeros.size)]),
-    )  # fmt: skip
+    verdict = _verdict(robot, parts, found, factors, zeros, table)
     if not faults:
         odd = verdict.answer == "does not explain"
         faults = _unexplained(robot, parts, factors, zeros, odd)
@@ -244,7 +244,7 @@ def _scale_faults(parts: Sequence[_Part]) -> list[str]:
     faults = []
     for part in parts:
         r = part.recording
-        moved, _ = part.response.deflection(r.wrench, np.ones(len(part.response.names)))
+        moved, _ = part.moved(np.ones(len(part.response.names)))
         seen = np.where(np.isfinite(r.deflection), moved, np.nan)[:, part.measured]
         told = r.deflection[:, part.measured]
         seen, told = (v - np.nanmean(v, 0) for v in (seen, told))
@@ -272,12 +272,12 @@ def _part_left(part: _Part, factors: Array, zero: Array) -> float:
     Over all measured directions that vary by more than their noise or would by the robot's file,
     each by its own variation; zero where none does.
     """
-    moved, _ = part.response.deflection(part.recording.wrench, factors)
+    moved, _ = part.moved(factors)
     told = (part.recording.deflection - zero)[: part.split, part.measured]
     left = told - moved[: part.split, part.measured]
     size = np.nanmean((told - np.nanmean(told, 0)) ** 2, 0)
     noise = 0.5 * np.nanmean(np.diff(told, axis=0) ** 2, 0)
-    expected, _ = part.response.deflection(part.recording.wrench, np.ones(len(factors)))
+    expected, _ = part.moved(np.ones(len(factors)))
     due = np.nanvar(expected[: part.split, part.measured], 0)
     good = (size > VARIES * noise) | (due > HIDDEN * noise)
     if not good.any():
@@ -299,7 +299,7 @@ def _unexplained(
         left = _part_left(part, factors, zero)
         if left < UNLIKE and not odd:
             continue
-        cause, best = _best_put_right(robot, part, len(factors), left)
+        cause, best = _best_repair(robot, part, len(factors), left)
         if cause and best < BETTER * left:
             faults.append(
                 f"{part.recording.name}: {cause}: put right, elastic elements leave "
@@ -313,11 +313,11 @@ def _unexplained(
     return faults
 
 
-def _best_put_right(robot: Robot, part: _Part, count: int, most: float) -> tuple[str, float]:
+def _best_repair(robot: Robot, part: _Part, count: int, most: float) -> tuple[str, float]:
     """The fault without which the least is left of a recording, and how much; at most ``most``."""
-    r, best, cause = part.recording, most, ""
-    for text, wrench, deflection in put_right(robot, r.q, r.wrench, r.deflection):
-        other = replace(part, recording=replace(r, wrench=wrench, deflection=deflection))
+    best, cause = most, ""
+    for text, recording in _repairs(robot, part.recording):
+        other = replace(part, recording=recording)
         try:
             found, _ = _solve([other], count)
         except (PkmTwinError, np.linalg.LinAlgError):
@@ -338,14 +338,13 @@ def _solve(parts: Sequence[_Part], count: int) -> tuple[Estimate, Array]:
     cones = [(slice(k, k + 1), above_zero(0, 1)) for k in range(count)]
     for _ in range(STEPS):
         rows = [part.rows(factors) for part in parts]
-        tables = []
-        for i, (slopes, _, counts) in enumerate(rows):
-            zeros = np.zeros((*slopes.shape[:2], 6 * len(parts)))
-            zeros[..., 6 * i : 6 * i + 6] = counts[..., None] * np.eye(6)
-            tables.append(np.concatenate([slopes, zeros], -1))
+        tables = [
+            np.concatenate([slopes, _zeros(i, len(parts), counts)], -1)
+            for i, (slopes, _, counts) in enumerate(rows)
+        ]
         target, judged = (np.concatenate([one[k] for one in rows]) for k in (1, 2))
         table = np.concatenate(tables)
-        begin = _noise(table * scales, target - table @ start, judged)
+        begin = _level(table * scales, target - table @ start, judged)
         found = estimate(table, target, start, scales, cones, judged, begin)
         new = np.maximum(found.values[:count], STIFFEST)
         moved = np.abs(new - factors) / np.sqrt(np.diag(found.covariance)[:count])
@@ -358,7 +357,7 @@ def _solve(parts: Sequence[_Part], count: int) -> tuple[Estimate, Array]:
     )
 
 
-def _noise(table: Array, change: Array, judged: Array) -> Array | None:
+def _level(table: Array, change: Array, judged: Array) -> Array | None:
     """What all factors and zeros together leave of a change, by direction (6,).
 
     None where there are hardly more equations than those.
@@ -386,8 +385,151 @@ def _measured(part: _Part) -> Array:
 def _judged(part: _Part, factors: Array, zero: Array, covariance: Array) -> Judged:
     """What is held out, without the instrument's zero."""
     r, end = part.recording, slice(part.split, None)
-    before, _ = part.response.deflection(r.wrench, np.ones(len(factors)))
-    after, slopes = part.response.deflection(r.wrench, factors)
+    before, _ = part.moved(np.ones(len(factors)))
+    after, slopes = part.moved(factors)
     spread = np.sqrt(np.sum((slopes @ covariance) * slopes, -1).clip(0.0))
     measured = r.deflection[end] - zero
     return Judged(r.name, r.time[end], measured, before[end], after[end], spread[end])
+
+
+def _verdict(
+    robot: Robot, parts: Sequence[_Part], found: Estimate, factors: Array, zeros: Array,
+    table: Array,
+) -> Verdict:  # fmt: skip
+    """Judge the factors and zeros (recordings, 6) of a fit.
+
+    :param table: columns of factors, then zeros, the fitted samples of all recordings one after the
+        other, (samples, 6, e).
+    """
+    measured = np.any([part.measured for part in parts], 0)
+    cases: list[Evidence] = []
+    suspects: tuple[Suspect, ...] = ()
+    for i, (part, zero) in enumerate(zip(parts, zeros, strict=True)):
+        moved, slopes = part.moved(factors)
+        left = part.recording.deflection - moved - zero
+        counts = np.isfinite(left)
+        suspects, errors = zip(*_errors(robot, part, factors), strict=True)
+        own = np.where(counts, moved, 0.0)
+        columns = np.concatenate([slopes, _zeros(i, len(parts), np.ones_like(own))], -1)
+        cases.append(
+            Evidence(
+                np.where(counts, left, 0.0)[:, measured],
+                columns[:, measured], np.zeros((*own[:, measured].shape, 0)),
+                np.zeros(int(measured.sum())), np.stack(errors, -1)[:, measured],
+                _noise(left, own, columns.shape[-1])[measured], 1.0,
+                counts[:, measured].astype(np.float64), part.split,
+                np.sqrt(np.mean(own**2, 0))[measured], np.std(own, 0)[measured],
+            )
+        )  # fmt: skip
+
+    def respond(signals: Sequence[Array]) -> Array:
+        whole = []
+        for signal, part in zip(signals, parts, strict=True):
+            full = np.zeros((part.split, 6, signal.shape[-1]))
+            full[:, measured] = signal[: part.split]
+            whole.append(full)
+        return found.response(table, np.concatenate(whole))
+
+    change = np.concatenate([factors - 1.0, zeros.ravel()])
+    prior = change, found.prior, np.sqrt(np.diag(found.covariance))
+    names = [name for name, good in zip(AXES, measured.tolist(), strict=True) if good]
+    verdict = judge(names, suspects, cases, prior, respond)
+    # Factors are not corrected: what the suspects probably changed is uncertain.
+    return replace(verdict, unseen=np.concatenate([verdict.unseen, verdict.shift[None]]))
+
+
+def _zeros(recording: int, count: int, values: Array) -> Array:
+    """Columns of the instruments' zeros of so many recordings, at one of them, (k, 6, 6 count)."""
+    columns = np.zeros((*values.shape, 6 * count))
+    columns[..., 6 * recording : 6 * recording + 6] = values[..., None] * np.eye(6)
+    return columns
+
+
+def _noise(left: Array, moved: Array, fitted: int) -> Array:
+    """Deviation of a deflection's noise by direction, shape (6,)."""
+    result = np.zeros(6)
+    for k in range(6):
+        good = np.isfinite(left[:, k])
+        values, signal = left[good, k], moved[good, k]
+        if len(values) < 4:
+            continue
+        free = max(len(values) - fitted / 6.0, 1.0)
+        result[k] = np.sqrt(np.sum((values - values.mean()) ** 2) / free)
+        # Of second differences, which are of no slope, the variance is six times the noise's.
+        apart = np.sqrt(np.mean(np.diff(signal, 2) ** 2) / 6.0)
+        if apart < SMOOTH * max(float(np.std(signal)), 1e-300):
+            rough = np.sqrt(np.mean(np.diff(values, 2) ** 2) / 6.0)
+            result[k] = min(result[k], float(rough))
+    return result
+
+
+def _errors(robot: Robot, part: _Part, factors: Array) -> Iterator[tuple[Suspect, Array]]:
+    """Errors of a machine or a recording, with the derivatives of the deflections, (k, 6)."""
+    q, wrench = part.recording.q, part.recording.wrench
+    moved, _ = part.moved(factors)
+
+    def bent(load: Array) -> Array:
+        return part.response.deflection(load, factors)[0]
+
+    def turned(values: Array, about: Array) -> Array:
+        return np.concatenate([np.cross(about, values[:, k : k + 3]) for k in (0, 3)], 1)
+
+    usual, eye = 0.05, np.eye(6)
+    for name, e in zip(AXES, eye, strict=True):
+        yield Suspect("gain of the deflection", name, usual=usual), moved * e
+    for name, e in zip(WRENCH, eye, strict=True):
+        yield Suspect("gain of the wrench", name, usual=usual), -bent(wrench * e)
+    for axis, e in zip("xyz", np.eye(3), strict=True):
+        lever = np.concatenate([0.0 * wrench[:, :3], np.cross(e, wrench[:, :3])], 1)
+        yield Suspect("the wrench's point of attack", axis, "m", usual * robot.size), bent(lever)
+        yield Suspect("axes of the wrench turned about", axis, "rad"), bent(turned(wrench, e))
+        yield Suspect("axes of the deflection turned about", axis, "rad"), turned(moved, e)
+    size = np.maximum(np.abs(moved).max(0), 1e-300)
+    rate = np.sign(np.gradient(moved, axis=0))
+    ramp = np.linspace(-0.5, 0.5, len(moved))[:, None]
+    place = q - q.mean(0)
+    place = place / np.maximum(np.abs(place).max(0), 1e-300)
+    for name, unit, e in zip(AXES, UNITS, eye, strict=True):
+        give = f"{unit}/{'N' if unit == 'm' else '(N m)'}"
+        softer = moved * np.abs(moved) / size
+        yield Suspect("stiffness that changes with the load", name), softer * e
+        yield Suspect("hysteresis", name, unit), rate * e
+        yield Suspect("drift", name, f"{unit}, from first to last"), ramp * e
+        yield Suspect("base that gives", name, give), wrench * e
+        for joint, here in zip(robot.joint_names, place.T, strict=True):
+            pose = Suspect("compliance that changes with the pose", joint)
+            yield pose, moved * here[:, None] * e
+
+
+def _repairs(robot: Robot, r: Deflected) -> Iterator[tuple[str, Deflected]]:
+    """Faults of a recording, and the recording without each."""
+    rotation = robot.rotation(robot.forward(r.q))
+    back = np.swapaxes(rotation, -1, -2)
+    base, platform = "the base's axes", "the platform's"
+
+    def loaded(wrench: Array) -> Deflected:
+        return replace(r, wrench=wrench)
+
+    def moved(deflection: Array) -> Deflected:
+        return replace(r, deflection=deflection)
+
+    own, other = (in_base_axes(r.wrench, one) for one in (rotation, back))
+    yield f"the wrench is in {platform} axes, not in {base}", loaded(own)
+    yield f"the wrench is in {base}, not in {platform}", loaded(other)
+    own = in_base_axes(r.deflection, rotation)
+    yield f"the deflection is in {platform} axes, not in {base}", moved(own)
+    for first, load, move in ((0, "forces", "shifts"), (3, "moments", "turns")):
+        for i, j in combinations(range(3), 2):
+            order = np.arange(6)
+            order[[first + i, first + j]] = first + j, first + i
+            pair = f"{'xyz'[i]} and {'xyz'[j]}"
+            yield f"{load} along {pair} are exchanged", loaded(r.wrench[:, order])
+            yield f"{move} along {pair} are exchanged", moved(r.deflection[:, order])
+    for k, (load, move) in enumerate(zip(WRENCH, AXES, strict=True)):
+        sign = np.where(np.arange(6) == k, -1.0, 1.0)
+        yield f"{load} has the wrong sign", loaded(r.wrench * sign)
+        yield f"{move} has the wrong sign", moved(r.deflection * sign)
+    mixed = np.repeat([1.0, 1e-3], 3)
+    yield "moments are in N mm, forces in N", loaded(r.wrench * mixed)
+    yield "turns are in mrad, shifts in m", moved(r.deflection * mixed)
+    yield "shifts are in mm, turns in rad", moved(r.deflection * mixed[::-1])
