@@ -107,7 +107,7 @@ def calibrate_command(
         list[str],
         typer.Option(
             help="what was measured, where not whole poses, separated by commas: height, distance "
-            "(of two poses), radius (ball bar), plane (contact), tilt (roll, pitch), or of x, y, "
+            "(of two poses), radius (ball bar), range (laser tracker), plane (contact), tilt, or of x, y, "
             "z, roll, pitch, yaw"
         ),
     ] = [],  # noqa: B006  typer copies it

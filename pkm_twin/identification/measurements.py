@@ -177,6 +177,25 @@ class _Ball(_Distance):
         return np.asarray(np.linalg.norm(p - below, axis=1, keepdims=True))
 
 
+class _Range(_Ball):
+    """Distance from a fixed place with an unknown zero: a laser tracker's or a wire's reading."""
+
+    def value(self, p: Array, r: Array, own: Mapping[str, float]) -> Array:
+        return super().value(p, r, own) + own["range.zero"]
+
+    def by_own(self, p: Array, own: Mapping[str, float]) -> dict[str, Array]:
+        return super().by_own(p, own) | {"range.zero": np.ones(len(p))}
+
+    def begin(self, p: Array, values: Array) -> dict[str, float]:
+        """Of places at many distances from the middle the one that fits best."""
+        away = np.ptp(p, axis=0).max() * 2.0 ** np.arange(-1, 6)
+        zeros = [0.0, *(values.mean() - away).tolist()]
+        found = [_Ball.begin(self, p, values - z) | {"range.zero": z} for z in zeros]
+        return min(
+            found, key=lambda own: float(np.sum((values - self.value(p, p, own)[:, 0]) ** 2))
+        )
+
+
 PLACE: Final = Kind("position", "m", FINEST, (0, 1, 2), length=True, believed=0.0)
 TURN: Final = _Rotation("rotation", "rad", FINEST, (3, 4, 5), believed=0.0)
 """Of whole poses."""
@@ -197,6 +216,10 @@ KINDS: Final = {
         _Ball(
             "radius", "m", 1e-5, length=True,
             own={f"ball.{axis}": ("m", FAR) for axis in "xyz"},
+        ),
+        _Range(
+            "range", "m", 1e-5, length=True,
+            own={f"range.{name}": ("m", FAR) for name in ("x", "y", "z", "zero")},
         ),
         _Distance("distance", "m", 6e-5, length=True, pair=True),
     )

@@ -20,9 +20,11 @@ from test.support.robots import random_joints
 
 Array = NDArray[np.float64]
 
-NOISE = {"height": 2e-5, "plane": 2e-5, "radius": 1e-5, "distance": 5e-5} | dict.fromkeys(
-    ("x", "y", "z"), 5e-5
-) | dict.fromkeys(("roll", "pitch", "yaw"), 3e-4)  # fmt: skip
+NOISE = {
+    **dict.fromkeys(("height", "plane"), 2e-5), **dict.fromkeys(("radius", "range"), 1e-5),
+    **dict.fromkeys(("x", "y", "z", "distance"), 5e-5),
+    **dict.fromkeys(("roll", "pitch", "yaw"), 3e-4),
+}  # fmt: skip
 OFF = 1e-3
 """By which a machine's lengths are not as drawn, m; angles by as much at its platform's radius."""
 
@@ -69,6 +71,7 @@ def case(drawn: Robot, kinds: Sequence[str], count: int, seed: int, flat: bool =
     columns |= {
         "height": position[:, 2], "plane": position @ normal - 0.05,
         "radius": np.linalg.norm(position - centre, axis=1),
+        "range": np.linalg.norm(position - [1.5, -2.0, 0.8], axis=1) - 2.3,
         "distance": np.linalg.norm(position - position[other], axis=1),
     }  # fmt: skip
     values = {kind: columns[kind] + rng.normal(scale=NOISE[kind], size=count) for kind in kinds}

@@ -71,7 +71,7 @@ MACHINES = [
     ("printer", "height", 30), ("printer", "height,distance", 20), ("printer", "radius", 40),
     ("delta_cu", "plane", 40), ("delta", "distance", 40), ("stewart", "tilt", 60),
     ("stewart", "x,z", 60), ("five_bar", "distance", 50), ("rps3", "height,tilt", 50),
-    ("linear_delta", "position", 30),
+    ("linear_delta", "position", 30), ("delta", "range", 50), ("stewart", "range", 80),
 ]  # fmt: skip
 
 
