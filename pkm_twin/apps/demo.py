@@ -37,7 +37,6 @@ from pkm_twin.apps.demo_recorder import (
     wait_for,
 )
 from pkm_twin.apps.demo_report import REPORTS, Finding, print_findings
-from pkm_twin.apps.tracking_report import report_tracking
 from pkm_twin.bags.reader import BagMessage, BagWriter, inspect
 from pkm_twin.errors import PkmTwinError
 from pkm_twin.ros.context import middleware_arguments
@@ -222,7 +221,7 @@ def run(bags: Path, out: Path, console: Console) -> list[Finding]:
             bags / f"{stage.bag}.mcap", recording, stage.bag
         )
         findings += found
-    found, series["machine_sim"] = report_tracking(recording, demo_tracking.SPREADS)
+    found, series["machine_sim"] = demo_tracking.report(recording)
     findings += found
     picture = draw(series, out / "demo.png")
     print_findings(console, findings)

@@ -5,14 +5,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from pkm_twin.apps.demo_report import DynamicsSeries, StiffnessSeries
-from pkm_twin.apps.tracking_report import TrackingSeries
 from pkm_twin.maps import figures
 from pkm_twin.report import plots
+
+if TYPE_CHECKING:
+    from pkm_twin.apps.demo_tracking import TrackingSeries
 
 
 def draw(

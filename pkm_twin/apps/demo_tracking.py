@@ -1,17 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The demonstration's closed loop: a path gone by PD alone, then with the twin's feedforward.
+"""The demonstration's closed loop: PD alone, then PD with feedforward, on the same path.
 
-machine_sim, whose parameters are drawn about the twin's, keeps simulated time and goes all of a
-trajectory by itself, brakes on before: so it does the same on every computer, whatever its load.
+machine_sim, whose parameters are drawn about the model's, keeps simulated time and follows a
+trajectory by itself, with the brakes on before. So the result does not depend on the computer.
 """
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import QoSProfile
 from rich.console import Console
@@ -29,9 +32,20 @@ from pkm_twin.apps.demo_recorder import (
     process,
     wait_for,
 )
-from pkm_twin.apps.tracking_report import PERIOD, ROBOT, prefix
+from pkm_twin.apps.demo_report import Finding, share
+from pkm_twin.bags.reader import read_messages
+from pkm_twin.errors import BagError
+from pkm_twin.messages.reading import JointReader
 from pkm_twin.messages.stamps import SECOND, stamp_of
+from pkm_twin.streams.path import JointPath
 
+Array = NDArray[np.float64]
+
+TIMES_BETTER: Final = 5.0
+"""How much smaller feedforward has to make the tracking error at the smallest spread."""
+ROBOT: Final = "delta_cu"
+PERIOD: Final = 2e-3
+"""Of the machine's joint states, s: what a loaded computer can still record."""
 SPREADS: Final = (0.01, 0.2)
 AMPLITUDES: Final = (0.5, -0.4, 0.6)
 """How far the joints go and come back, rad."""
@@ -143,3 +157,82 @@ def _trajectory() -> JointTrajectory:
         point.time_from_start.sec, point.time_from_start.nanosec = divmod(time, SECOND)
         message.points.append(point)
     return message
+
+
+@dataclass(frozen=True)
+class Run:
+    """One way along the path: its duration and times, s; errors (rad) and efforts (N m), (p, n)."""
+
+    duration: float
+    time: Array
+    error: Array
+    effort: Array
+
+    @property
+    def rms(self) -> float:
+        """Root mean square of the tracking error over all joints."""
+        return float(np.sqrt(np.mean(self.error**2)))
+
+
+@dataclass(frozen=True)
+class TrackingSeries:
+    """By spread the run by PD alone and the one with feedforward."""
+
+    joints: tuple[str, ...]
+    runs: Mapping[float, tuple[Run, Run]]
+
+
+def prefix(spread: float) -> str:
+    """Under what a spread's topics stand in the recording."""
+    return f"machine_sim_{100 * spread:g}_percent"
+
+
+def report(recording: Path) -> tuple[list[Finding], TrackingSeries]:
+    """Tracking error and torque of both runs of every model error."""
+    findings: list[Finding] = []
+    runs = {}
+    robot = load(ROBOT)
+    for spread in SPREADS:
+        name = prefix(spread)
+        plain, ahead = runs[spread] = _runs(recording, name)
+        there = sum(len(run.time) for run in (plain, ahead))
+        all_in_all = sum(round(run.duration / PERIOD) for run in (plain, ahead))
+        findings.append(share(name, "joint states recorded", there, all_in_all))
+        for what, way in (("PD", plain), ("PD and feedforward", ahead)):
+            peaks = ", ".join(f"{peak:.3g}" for peak in np.abs(way.effort).max(0))
+            value = f"{1e3 * way.rms:.3f} mrad RMS, {1e3 * np.abs(way.error).max():.3f} worst"
+            findings.append(Finding(name, f"tracking error, {what}", value))
+            findings.append(Finding(name, f"peak effort, {what}", f"{peaks} {robot.effort_unit}"))
+        ratio = plain.rms / ahead.rms
+        what = f"feedforward at {100 * spread:g} % parameter error"
+        bound = f"{TIMES_BETTER:g} or more" if spread == min(SPREADS) else ""
+        value = f"{ratio:.1f} times better"
+        findings.append(Finding(name, what, value, bound, ratio >= TIMES_BETTER))
+    return findings, TrackingSeries(robot.joint_names, runs)
+
+
+def _runs(recording: Path, name: str) -> tuple[Run, Run]:
+    """The two trajectories that the machine got, and the joint states while it went them."""
+    reader = JointReader(load(ROBOT), with_effort=True)
+    messages = read_messages(recording, [f"/{name}/joint_states"])
+    states = {stamp_of(m.message.header): m.message for m in messages}
+    stamps = np.array(sorted(states))
+    moving = np.array([any(states[stamp].velocity) for stamp in stamps.tolist()])
+    # A trajectory begins with the last joint state that stands still.
+    starts = stamps[:-1][~moving[:-1] & moving[1:]]
+    topic = f"/{name}/machine_sim/joint_trajectory"
+    trajectories = [reader.trajectory(m.message, 0) for m in read_messages(recording, [topic])]
+    found: dict[bool, Run] = {}
+    for trajectory, start in zip(trajectories, starts.tolist(), strict=False):
+        path = JointPath(trajectory)
+        end = start + round(path.duration * SECOND)
+        during = stamps[(stamps > start) & (stamps <= end)].tolist()
+        # In the machine's order of joints, the robot's.
+        q = np.array([states[s].position for s in during])
+        times = (np.array(during) - start) / SECOND
+        wanted = np.array([path.at(t).q for t in times.tolist()])
+        effort = np.array([states[s].effort for s in during])
+        found[trajectory.effort is not None] = Run(path.duration, times, q - wanted, effort)
+    if len(found) != 2 or len(starts) != 2:
+        raise BagError(f"{name}: {len(found)} of two runs were recorded", path=recording)
+    return found[False], found[True]
