@@ -1,52 +1,88 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``pkm-twin check``: compare a recording with the model of its machine."""
+"""Judge a recording: its file, time stamps, motion, limits, and its efforts against the model.
+
+Efforts are compared by the derivative, filter and noise of `fit`, so that both never disagree.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass, field
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pkm_twin.apps.check_causes import Causes, causes_of
-from pkm_twin.apps.check_efforts import ModelBand, judged_efforts
-from pkm_twin.apps.check_motion import OF_MOTION, Bounds, motion_items
+from delta_dynamics import inverse_dynamics, torque_deviation
+from pkm_twin.apps.describe import why_no_torques
 from pkm_twin.apps.limits import ranges
-from pkm_twin.apps.loads import Load
 from pkm_twin.apps.recorded import Recording
-from pkm_twin.apps.topics import Topics
+from pkm_twin.apps.recorded_motion import at_rest
 from pkm_twin.apps.verdict import Item, Verdict, judged_item
-from pkm_twin.errors import SingularityError, UnreachableError
+from pkm_twin.errors import SingularityError, UnreachableError, one_line
+from pkm_twin.identification.compare import Compared, by_held, compare
+from pkm_twin.identification.rows import Recorded
+from pkm_twin.streams.drives import COUNT, SAME, idle_samples
+from pkm_twin.streams.rates import BLOCK, STANDS, STEPS, RateAgreement, likely_cause, rms
+from pkm_twin.streams.rest import SIGMAS, noise
+from pkm_twin.streams.steps import GAP, Steps, sampling_of, steps_of
 
 Array = NDArray[np.float64]
-# Samples computed at a time, so that memory stays flat.
-_BLOCK = 4096
-# Of the differentiator: degree of the velocity's polynomial, samples.
-_ORDER, _WINDOW = 3, 9
+Mask = NDArray[np.bool_]
+
+POSITION_STEPS: Final = "position steps"
+VELOCITIES: Final = "velocities"
+RESIDUAL: Final = "torque residual"
+MEASURED: Final = "measured efforts"
+SHOWN: Final = 4
+"""Jumps that are listed."""
+CLEAR: Final = 4
+"""Samples on each side of a jump that are left out: a gap that divides the recording."""
+STUCK: Final = 0.05
+"""Time for which a signal stays the same before it counts as stuck, s,"""
+TICKS: Final = 10.0
+"""and by how many of its least steps it has to change meanwhile."""
+NEAR: Final = 0.5
+"""Around a pick or release the payload is neither held nor gone, s."""
 DEVIATIONS: Final = (1, 2, 3)
 """Of the model, inside which residuals are counted."""
 
 
 @dataclass(frozen=True)
-class CheckReport:
-    """All items; the whole is good where none is bad.
+class Bounds:
+    """What a good bag keeps to."""
 
-    ``bands``: by joint; empty where the robot's file has no ``uncertainty``, or torques were not
-    judged.
+    residual: float = 0.05
+    """Torque residual RMS, part of the joint's peak effort."""
+    gap: float = 5.0
+    """Longest time between joint states, in median periods."""
+    rejected: float = 0.0
+    """Messages that a node would reject, part of all."""
+    singularity: float = 1e-3
+    """Least singularity index, 0 in a singularity, 1 at best."""
+    missing: float = 0.01
+    """Joint states that are missing, part of those that there should be."""
+    rate: float = 0.15
+    """Difference of the measured velocities from the positions' rates, part of them, RMS."""
+    judged: float = 0.1
+    """Least part of the recording whose efforts are compared."""
+
+
+@dataclass(frozen=True)
+class Checked:
+    """All items of a recording; the whole is good where it was judged and none is bad.
+
+    ``bands``: by joint the residual against the standard deviation that the file's ``uncertainty``
+    gives, empty without one. ``unjudged``: why efforts have no verdict; empty where they have one.
+    ``compared``: the efforts; ``left_out``: idle samples and those near jumps, (samples,).
     """
 
-    bag: str
-    robot: str
-    items: tuple[Item, ...]
-    topics: Topics
-    load: Load | None
-    unsure: bool
-    """Whether the robot's file has an ``uncertainty``."""
-    bands: Mapping[str, ModelBand]
+    recording: Recording
+    items: list[Item]
+    bands: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     unjudged: str = ""
-    """Why there is no verdict; empty where there is one."""
+    compared: Compared | None = None
+    left_out: Mask = field(default_factory=lambda: np.zeros(0, np.bool_))
     causes: tuple[str, ...] = ()
     """What explains efforts that contradict the model: with it they agree."""
     findings: tuple[str, ...] = ()
@@ -59,61 +95,37 @@ class CheckReport:
             return "bad"
         return "not judged" if self.unjudged else "good"
 
-    @property
-    def good(self) -> bool:
-        """The recording was judged, and no item is bad."""
-        return self.answer == "good"
-
     def named(self, verdict: Verdict) -> list[str]:
         """What got this verdict."""
         return [item.what for item in self.items if item.verdict is verdict]
 
-    def as_json(self) -> dict[str, Any]:
-        """Plain data for a script."""
-        return {
-            "bag": self.bag,
-            "robot": self.robot,
-            "topics": asdict(self.topics),
-            "payload": None if self.load is None else self.load.as_json(),
-            "items": [asdict(item) for item in self.items],
-            "uncertainty": {
-                joint: {
-                    "effort_deviation_rms": band.deviation_rms,
-                    "effort_unit": band.unit,
-                    "share_within_deviations": {str(k): v for k, v in band.share_within.items()},
-                }
-                for joint, band in self.bands.items()
-            }
-            or None,
-            "answer": self.answer,
-            "not_judged": self.unjudged or None,
-            "causes": list(self.causes),
-            "findings": list(self.findings),
-            "good": self.good,
-        }
 
-
-def judged(
-    recording: Recording, bounds: Bounds | None = None, thorough: bool = True
-) -> CheckReport:
-    """Compare a recording with the model.
-
-    :param thorough: look longer for the cause of efforts that contradict the model.
-    """
-    bounds = bounds or Bounds()
-    path = recording.source
-    items = [*_file(recording, bounds), *motion_items(recording, bounds), *_limits(recording)]
-    items.append(_singularity(recording, bounds))
-    moved = all(item.verdict is not Verdict.BAD or item.what not in OF_MOTION for item in items)
-    efforts = judged_efforts(recording, bounds)
-    items += efforts.items
-    r = recording
-    # Of positions that are none the efforts say nothing.
-    causes = causes_of(r, efforts, bounds.residual, thorough) if moved else Causes()
-    return CheckReport(
-        str(path), r.robot.name, tuple(items), r.topics, r.load, bool(r.robot.uncertainty),
-        efforts.bands, efforts.unjudged, causes.explained, causes.findings,
-    )  # fmt: skip
+def checked(r: Recording, bounds: Bounds) -> Checked:
+    """Compare a recording with the model, without a look for causes."""
+    items = [*_file(r, bounds), *_motion(r, bounds), *_limits(r), _singularity(r, bounds)]
+    left_out = np.zeros(len(r.time), np.bool_)
+    bound = f"RMS below {100 * bounds.residual:g} % of peak"
+    reason = why_no_torques(r.robot)
+    if r.effort is None:
+        reason = reason or "the bag carries no efforts"
+    if reason or r.effort is None:
+        return Checked(r, [*items, Item(RESIDUAL, reason, bound, Verdict.UNKNOWN)])
+    try:
+        idle = idle_of(r)
+        left_out = idle | near_jumps(r)
+        compared = compared_of(r, left_out)
+        bands = {} if compared is None else _bands(r, compared)
+    # ValueError: numbers within bounds whose result is not finite.
+    except (UnreachableError, SingularityError, ValueError) as error:
+        return Checked(r, [*items, Item(RESIDUAL, one_line(str(error)), bound, Verdict.BAD)])
+    shares, unjudged = _shares(r, idle, compared, bounds)
+    items += shares
+    if compared is not None and not unjudged:
+        stuck = _stuck_efforts(r, compared, compared.good(bounds.residual))
+        if stuck:
+            items.append(Item(MEASURED, stuck, "change as the model's", Verdict.BAD))
+        items += _residuals(r, compared, bands, bounds, bound)
+    return Checked(r, items, bands, unjudged, compared, left_out)
 
 
 def _file(r: Recording, bounds: Bounds) -> list[Item]:
@@ -121,35 +133,143 @@ def _file(r: Recording, bounds: Bounds) -> list[Item]:
         found = f"a table of {len(r.time)} rows, all numbers finite"
         return [Item("file", found, "finite numbers", Verdict.GOOD)]
     report = r.bag.report
-    items = [
-        Item(
-            "file",
-            "; ".join(report.warnings) or "complete; checksums and counts agree",
-            "complete and consistent",
-            Verdict.BAD
-            if report.miscounts
-            else Verdict.UNKNOWN
-            if report.warnings
-            else Verdict.GOOD,
-        )
-    ]
-    refused = sum(r.rejected.values())
-    total = r.message_count
+    verdict = Verdict.UNKNOWN if report.warnings else Verdict.GOOD
+    text = "; ".join(report.warnings) or "complete; checksums and counts agree"
+    refused, total = sum(r.rejected.values()), r.message_count
     reasons = ", ".join(f"{k}: {v}" for k, v in r.rejected.items())
     value = f"{refused} of {total}" + (f" ({reasons}; first: {r.first_reject})" if refused else "")
-    items.append(
-        judged_item(
-            "messages that a node rejects",
-            value,
-            f"at most {100 * bounds.rejected:g} %",
-            refused <= bounds.rejected * total,
-        )
+    bound = f"at most {100 * bounds.rejected:g} %"
+    good = refused <= bounds.rejected * total
+    return [
+        Item("file", text, "complete and consistent", Verdict.BAD if report.miscounts else verdict),
+        judged_item("messages that a node rejects", value, bound, good),
+    ]
+
+
+def _motion(r: Recording, bounds: Bounds) -> list[Item]:
+    """The items on time stamps, steps and velocities."""
+    if len(r.time) < 3:
+        return [Item("rate", f"{len(r.time)} joint states", "3 or more", Verdict.UNKNOWN)]
+    periods = np.diff(r.time)
+    median, longest = float(np.median(periods)), float(periods.max())
+    gap = f"{1e3 * longest:.3f} ms at {r.time[int(periods.argmax())]:.3f} s"
+    sampling, most = sampling_of(r.time), f"at most {100 * bounds.missing:g} %"
+    if sampling.missing is None:
+        text = "the samples have no common period"
+        missing = Item("missing samples", text, most, Verdict.UNKNOWN)
+    else:
+        share = sampling.missing / sampling.expected
+        text = f"{sampling.missing} of {sampling.expected}"
+        text += f" ({100 * share:.3g} %)" if sampling.missing else ""
+        missing = judged_item("missing samples", text, most, share <= bounds.missing)
+    steps, within = steps_in(r), bounds.gap * median
+    fault = step_fault(r, steps)
+    items = [
+        Item("rate", f"{1 / median:.1f} Hz over {r.time[-1]:.3f} s", "", Verdict.GOOD),
+        missing,
+        judged_item("longest gap", gap, f"at most {1e3 * within:.3f} ms", longest <= within),
+        judged_item(POSITION_STEPS, fault or "no jumps", "within rates and limits", not fault),
+    ]
+    return (
+        items if r.qd is None or steps.publishers else items + _velocities(r, r.qd, steps, bounds)
     )
-    return items
+
+
+def steps_in(r: Recording) -> Steps:
+    """The steps by the measured velocities, or by the positions alone if these do not jump."""
+    limit = r.robot.limits.velocity
+    steps = steps_of(r.time, r.q, r.qd, limit)
+    if r.qd is None or not steps.jumps.any():
+        return steps
+    alone = steps_of(r.time, r.q, None, limit)
+    # What jumps by wrong velocities only is not the positions' fault.
+    return steps if alone.jumps.any() else alone
+
+
+def step_fault(r: Recording, steps: Steps | None = None) -> str:
+    """Jumps of the positions with their times; empty where there are none."""
+    steps = steps_in(r) if steps is None else steps
+    found = steps.first
+    if steps.publishers:
+        counts = " and ".join(map(str, steps.publishers))
+        jump = f"{len(found)} of {len(r.time) - 1} steps jump"
+        return f"two publishers interleaved, {counts} samples: {jump}"
+    texts = [
+        f"{r.robot.joint_names[j]} by {steps.sizes[k, j]:.3g} {r.robot.joint_units[j]} at "
+        f"{r.time[k + 1]:.3f} s"
+        for k, j in found[:SHOWN]
+    ]
+    more = f" and {len(found) - SHOWN} more" if len(found) > SHOWN else ""
+    return f"{len(found)} jumps: {', '.join(texts)}{more}" if found else ""
+
+
+def near_jumps(r: Recording) -> Mask:
+    """Samples so near to a jump that no derivative holds there, shape (samples,)."""
+    steps = steps_in(r)
+    found = np.zeros(len(r.time), np.bool_)
+    for k in np.flatnonzero(steps.jumps.any(1)):
+        found[max(k - CLEAR, 0) : k + CLEAR + 2] = True
+    return found
+
+
+def stuck_from(time: Array, values: Array, told: Array, count: int = 1) -> tuple[int, int] | None:
+    """The first and last sample between which a signal stays the same and should not; or None.
+
+    :param values: shape (k,); ``told``: what it should be but for a constant, NaN where that is not
+        known. ``count``: samples of it at least.
+    """
+    steps = np.abs(np.diff(values))
+    tick = steps[steps > 0.0].min(initial=np.inf)
+    size = max(TICKS * tick, STANDS * float(np.ptp(told[np.isfinite(told)])))
+    for begin, end in np.flatnonzero(np.diff(steps == 0.0, prepend=0, append=0)).reshape(-1, 2):
+        known = told[begin : end + 1]
+        known = known[np.isfinite(known)]
+        long = end - begin >= count and time[end] - time[begin] > STUCK
+        if long and len(known) and np.ptp(known) > size:
+            return int(begin), int(end)
+    return None
+
+
+def _velocities(r: Recording, qd: Array, steps: Steps, bounds: Bounds) -> list[Item]:
+    """How far measured velocities are from what the positions move by, over short times."""
+    names, span = r.robot.joint_names, np.diff(r.time)
+    period = float(np.median(span))
+    bound = f"RMS below {100 * bounds.rate:g} % of the positions' rate"
+    turned = np.cumsum(0.5 * (qd[1:] + qd[:-1]) * span[:, None], 0)
+    for j, told in enumerate(np.concatenate([0.0 * turned[:1], turned]).T):
+        found = stuck_from(r.time, r.q[:, j], told)
+        if found is not None:
+            begin, end = r.time[list(found)]
+            text = f"the position of {names[j]} stands still from {begin:.3f} s to {end:.3f} s"
+            text += " while its velocity does not (encoder?)"
+            return [judged_item(VELOCITIES, text, bound, False)]
+    agreement = RateAgreement(r.robot, blocks=None)
+    apart = np.concatenate([[False], (span > GAP * period) | steps.jumps.any(1)])
+    for stamp, q, rate, other in zip(r.stamps.tolist(), r.q, qd, apart.tolist(), strict=True):
+        if other:
+            agreement.skip()
+        agreement.push(stamp, q, rate)
+    moved, told = agreement.moves
+    if len(moved) < 2:
+        return []
+    # A joint that hardly moves shows noise alone.
+    units, most = np.array(r.robot.joint_units), np.maximum(rms(moved), rms(told))
+    floor = np.array([STANDS * most[units == unit].max() for unit in units])
+    size, width = rms(told - moved), max(STEPS, BLOCK / period)
+    noisy = 2.0 * noise(r.time, r.q) + np.sqrt(width) * period * noise(r.time, qd)
+    part = size / np.maximum(np.maximum(most, floor), 1e-300)
+    bad = (part > bounds.rate) & (size > SIGMAS * noisy)
+    texts = [
+        f"{names[j]} {100 * part[j]:.3g} %{likely_cause(moved[:, j], told[:, j])}"
+        for j in np.flatnonzero(bad)
+    ]
+    worst = int(np.argmax(part))
+    value = ", ".join(texts) or f"{100 * part[worst]:.2g} %, {names[worst]}"
+    return [judged_item(VELOCITIES, f"RMS difference {value}", bound, not texts)]
 
 
 def _limits(r: Recording) -> list[Item]:
-    """Effort limits; position and velocity limits are already a node's reason to refuse."""
+    """Effort limits; position and velocity limits are already a node's reason to reject."""
     effort = r.robot.limits.effort
     bounds = list(ranges(r.robot))
     if effort is not None:
@@ -179,3 +299,143 @@ def _singularity(r: Recording, bounds: Bounds) -> Item:
     worst = int(measure.argmin())
     value = f"{measure[worst]:.4f} at {r.time[worst]:.3f} s"
     return judged_item(what, value, bound, bool(measure[worst] >= bounds.singularity))
+
+
+def recorded_of(r: Recording, leave_out: Mask | None = None) -> Recorded:
+    """A recording with efforts as `fit` reads it, without samples around a pick or release.
+
+    :param leave_out: more samples that are left out, (samples,): a gap divides the recording.
+    """
+    assert r.effort is not None  # noqa: S101
+    keep = np.ones(len(r.time), np.bool_) if leave_out is None else ~leave_out
+    if r.load is not None:
+        keep &= ~r.load.near_change(r.time, NEAR)
+    wrench = None if r.wrench is None else r.wrench[keep]
+    held = None if r.load is None else r.load.held(r.time[keep]).astype(np.float64)
+    carried = None if r.load is None else r.load.on(r.robot)
+    name = one_line(r.source.rpartition("/")[2], 100)
+    return Recorded(name, r.time[keep], r.q[keep], r.effort[keep], wrench, held, carried)
+
+
+def compared_of(r: Recording, idle: Mask) -> Compared | None:
+    """The efforts in the band of the motion, without samples whose drives are idle."""
+    recorded = recorded_of(r, idle)
+    if len(recorded.time) < 3:
+        return None
+    known = None
+    if r.qd is not None and r.qdd is not None:
+        keep = np.isin(r.time, recorded.time)
+        known = r.qd[keep], r.qdd[keep]
+    return compare(r.robot, recorded, known)
+
+
+def idle_of(r: Recording) -> Mask:
+    """Samples whose efforts are zero, or constant at standstill, against the model, (samples,)."""
+    assert r.effort is not None  # noqa: S101
+    still = np.zeros_like(r.q)
+    wrench = np.zeros((len(r.time), 6)) if r.wrench is None else r.wrench
+    carried = None if r.load is None else r.load.on(r.robot)
+    held = None if r.load is None else r.load.held(r.time).astype(np.float64)
+    needed = by_held(r.robot, carried, held, inverse_dynamics, r.q, still, still, wrench)
+    rates = r.qd
+    if rates is None:
+        rates = np.gradient(r.q, r.time, axis=0) if len(r.time) > 1 else still
+    return idle_samples(r.time, at_rest(r, rates), r.effort, needed)
+
+
+def _shares(
+    r: Recording, idle: Mask, compared: Compared | None, bounds: Bounds
+) -> tuple[list[Item], str]:
+    """What is left out, and why there is no verdict, if there is none."""
+    items, total = [], max(float(r.time[-1]), 1e-9)
+    used = 0 if compared is None else sum(len(track.time) for track in compared.tracks)
+    share = used / len(r.time)
+    enough = share >= bounds.judged
+    verdict = Verdict.GOOD if enough else Verdict.UNKNOWN
+    if idle.any():
+        seconds = float(np.sum(np.gradient(r.time)[idle])) if len(r.time) > 1 else 0.0
+        text = f"{seconds:.3f} s of {total:.3f} s, left out: efforts zero or constant at standstill"
+        items.append(Item("drives off or braked", text, "some efforts measured", verdict))
+    text = f"{100 * share:.3g} % of {len(r.time)} samples"
+    bound = f"at least {100 * bounds.judged:g} %"
+    items.append(Item("compared efforts", text, bound, verdict))
+    return (
+        items,
+        "" if enough else f"efforts can be compared in {text}, {bound} needed for a verdict",
+    )
+
+
+def _stuck_efforts(r: Recording, c: Compared, good: Mask) -> str:
+    """Efforts that were not measured, or not all the time; saturated ones are no such; or empty."""
+    assert r.effort is not None  # noqa: S101
+    rows = np.searchsorted(r.time, c.time).clip(0, len(r.time) - 1)
+    texts = []
+    for j, (joint, unit) in enumerate(zip(r.robot.joint_names, r.robot.effort_units, strict=True)):
+        values = r.effort[:, j].copy()
+        most, told = np.abs(values).max(), np.full(len(values), np.nan)
+        if np.ptp(values) <= SAME * most:
+            if not good[j]:
+                text = f"{values[0] + 0.0:.4g} {unit} throughout: nothing was measured"
+                texts.append(f"the effort of {joint} is {text}")
+            continue
+        values[np.abs(values) >= most * (1.0 - SAME)] = np.nan
+        told[rows] = c.expected[:, j]
+        found = stuck_from(r.time, values, told, COUNT)
+        if found is not None:
+            begin, end = found
+            change = np.nanmax(told[begin : end + 1]) - np.nanmin(told[begin : end + 1])
+            texts.append(
+                f"the effort of {joint} stays at {values[begin]:.4g} {unit} from "
+                f"{r.time[begin]:.3f} s to {r.time[end]:.3f} s while the model's changes by "
+                f"{change:.3g} {unit} (sensor?)"
+            )
+    return "; ".join(texts)
+
+
+def _residuals(
+    r: Recording, c: Compared, bands: Mapping[str, Mapping[str, Any]], bounds: Bounds, bound: str
+) -> list[Item]:
+    good, limit, (worst, at) = c.good(bounds.residual), c.limit(bounds.residual), c.local()
+    begins = c.begins(limit)
+    items = []
+    for i, (name, unit) in enumerate(zip(r.robot.joint_names, r.robot.effort_units, strict=True)):
+        share = 100 * c.rms[i] / max(c.peak[i], 1e-12)
+        text = (
+            f"RMS {c.rms[i]:.4g} {unit}, {share:.2f} % of the model's peak {c.peak[i]:.4g}, noise "
+            f"{c.noise[i]:.2g}"
+        )
+        if name in bands:
+            inside = bands[name]["share_within_deviations"]
+            shares = ", ".join(f"{100 * part:.3g}" for part in inside.values())
+            size = f"{bands[name]['effort_deviation_rms']:.3g} {unit}"
+            text += f"; {shares} % inside {', '.join(inside)} standard deviations of the model"
+            text += f" (RMS {size})"
+        if not good[i]:
+            text += f"; largest {worst[i]:.4g} {unit} at {at[i]:.3f} s"
+            text += f", begins at {begins:.3f} s" if begins is not None else ""
+        items.append(judged_item(f"{RESIDUAL} of {name}", text, bound, bool(good[i])))
+    if good.all() and abs(c.late) > 0.1 * c.period:
+        late = f"{1e3 * abs(c.late):.3g} ms {'late' if c.late > 0.0 else 'early'}, taken out"
+        items.append(Item("efforts against positions", late, "", Verdict.GOOD))
+    return items
+
+
+def _bands(r: Recording, c: Compared) -> dict[str, dict[str, Any]]:
+    """By joint, where the robot's file has an ``uncertainty``."""
+    if not r.robot.uncertainty:
+        return {}
+    carried = None if r.load is None else r.load.on(r.robot)
+    parts = []
+    for track, rows in zip(c.tracks, c.inner, strict=True):
+        made = by_held(r.robot, carried, track.held, torque_deviation, *track.motion)
+        parts.append(made[rows])
+    spread = np.concatenate(parts)
+    inside = {str(k): np.mean(np.abs(c.residual) <= k * spread, 0) for k in DEVIATIONS}
+    return {
+        joint: {
+            "effort_deviation_rms": float(rms(spread)[i]),
+            "effort_unit": r.robot.effort_units[i],
+            "share_within_deviations": {k: float(share[i]) for k, share in inside.items()},
+        }
+        for i, joint in enumerate(r.robot.joint_names)
+    }

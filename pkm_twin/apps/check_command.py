@@ -6,7 +6,7 @@ from __future__ import annotations
 import multiprocessing
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
@@ -29,7 +29,7 @@ from pkm_twin.options import OptionalPath, OptionalText
 from pkm_twin.threads import one_blas_thread_for_children
 
 if TYPE_CHECKING:
-    from pkm_twin.apps.check import CheckReport
+    from pkm_twin.apps.check import Checked
     from pkm_twin.apps.loads import Load
 
 METADATA: Final = "metadata.yaml"
@@ -64,13 +64,11 @@ def is_collection(path: Path) -> bool:
     return bool(bags_of(path)) and not any(path.glob("*.db3"))
 
 
-def check_one(
-    path: Path, request: Request, update: Any = None, thorough: bool = True
-) -> CheckReport:
+def check_one(path: Path, request: Request, update: Any = None, thorough: bool = True) -> Checked:
     """Judge a recording, and append it to the history; errors as ``read_recording``."""
     from pkm_twin import load
-    from pkm_twin.apps.check import judged
-    from pkm_twin.apps.check_motion import Bounds
+    from pkm_twin.apps.check import Bounds
+    from pkm_twin.apps.check_causes import judged
     from pkm_twin.apps.recorded import read_recording
 
     robot: Any = request.robot
@@ -86,14 +84,28 @@ def check_one(
         name = recording.robot.name
         when = recorded_at(recording, path)
         machine = request.machine or name
-        append(request.history, machine, name, path, when, report.good, measure(recording))
+        append(
+            request.history, machine, name, path, when, report.answer == "good", measure(recording)
+        )
     return report
+
+
+def _plain(report: Checked) -> dict[str, Any]:
+    r = report.recording
+    return {
+        "bag": str(r.source), "robot": r.robot.name, "topics": asdict(r.topics),
+        "payload": None if r.load is None else r.load.as_json(),
+        "items": [asdict(item) for item in report.items], "uncertainty": report.bands or None,
+        "answer": report.answer, "not_judged": report.unjudged or None,
+        "causes": list(report.causes), "findings": list(report.findings),
+        "good": report.answer == "good",
+    }  # fmt: skip
 
 
 def _facts(path: Path, request: Request) -> dict[str, Any]:
     """One recording of many, as plain data; a damaged one too."""
     try:
-        return check_one(path, request, thorough=False).as_json()
+        return _plain(check_one(path, request, thorough=False))
     except (PkmTwinError, OSError) as error:
         return {"bag": str(path), "good": False, "error": one_line(str(error))}
 
@@ -192,6 +204,7 @@ def check(
     try:
         with progress("reading", None) as update:
             report = check_one(bag, request, update)
+            r = report.recording
     except PkmTwinError as error:
         salvageable = error.salvageable if isinstance(error, DamagedBagError) else 0
         if as_json:
@@ -200,13 +213,13 @@ def check(
         tell(str(error))
         raise typer.Exit(SALVAGED if salvageable else REFUSED) from None
     if as_json:
-        print_json(report.as_json())
+        print_json(_plain(report))
     else:
-        typer.echo(f"{report.topics}")
-        typer.echo(f"payload: {report.load or 'as in the robot file'}")
-        if not report.unsure:
+        typer.echo(f"{r.topics}")
+        typer.echo(f"payload: {r.load or 'as in the robot file'}")
+        if not r.robot.uncertainty:
             typer.echo("uncertainty: none in the robot file, so the model has no uncertainty band")
-        table_console().print(items_table(f"{report.bag}: {report.robot}", "limit", report.items))
+        table_console().print(items_table(f"{r.source}: {r.robot.name}", "limit", report.items))
         for cause in report.causes:
             typer.echo(f"explanation: {cause}")
         for finding in report.findings:
@@ -214,5 +227,5 @@ def check(
         bad, unknown = report.named(Verdict.BAD), report.named(Verdict.UNKNOWN)
         text = f"{report.answer}: {', '.join(bad) or report.unjudged}".removesuffix(": ")
         typer.echo(text + (f"; not judged: {', '.join(unknown)}" if unknown else ""))
-    if not report.good:
+    if report.answer != "good":
         raise typer.Exit(REFUSED)

@@ -276,8 +276,7 @@ def fit_recordings(
         and the friction laws that were tried.
     :raises PkmTwinError: a recording without efforts, too short, or that shows nothing.
     """
-    from pkm_twin.apps.check_efforts import recorded_of
-    from pkm_twin.apps.check_motion import step_fault
+    from pkm_twin.apps.check import recorded_of, step_fault
     from pkm_twin.identification.fit import refuse_faults
     from pkm_twin.identification.friction_laws import fit_with_laws
 

@@ -7,7 +7,7 @@ import os
 import sqlite3
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final
@@ -15,22 +15,16 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from delta_dynamics import inverse_dynamics
-from pkm_twin.apps.check_efforts import compared_of, idle_of
+from pkm_twin.apps.check import compared_of, idle_of, recorded_of
 from pkm_twin.apps.describe import why_no_torques
 from pkm_twin.apps.recorded import Recording
 from pkm_twin.errors import FileError, PkmTwinError
-from pkm_twin.identification.compare import by_held
-from pkm_twin.robot.robot import Robot
+from pkm_twin.identification.fit import fit
 
 Array = NDArray[np.float64]
 
 WAIT: Final = 60.0
 """How long a writer waits for the others, s."""
-BLOCKS: Final = 20
-"""Stretches of a recording whose errors are taken as independent of each other."""
-DISTINCT: Final = 1e-4
-"""Least singular value, of unit columns, of numbers that a motion tells apart."""
 SINCE: Final = 1e17
 """Stamps above this, ns, are since 1970; smaller ones are since a start."""
 HISTORY: Final = "a history that `pkm-twin check --history` wrote"
@@ -86,88 +80,39 @@ WORDS: Final = {
 def measure(recording: Recording) -> list[Measured]:
     """Residual, friction and payload by the efforts; stiffness and frequency by deflections.
 
-    What the recording or the robot's file lacks is left out. Friction and payload come from one
-    least squares of the residual on the velocity, its sign, an offset and a mass at the platform;
-    their deviations from how stretches of the recording differ, so that errors may be correlated.
+    Friction and payload are those that `fit` finds, with its standard deviations. What the
+    recording or the robot's file lacks, or the motion does not excite, is left out.
     """
     return [*_efforts(recording), *_elasticity(recording)]
-
-
-def _one_kilogram(robot: Robot, q: Array, qd: Array, qdd: Array, wrench: Array) -> Array:
-    load = robot.payload
-    more = robot.changed(payload={"mass": load.mass + 1.0})
-    return inverse_dynamics(more, q, qd, qdd, wrench) - inverse_dynamics(robot, q, qd, qdd, wrench)
 
 
 def _efforts(r: Recording) -> list[Measured]:
     if r.effort is None or why_no_torques(r.robot):
         return []
-    c = compared_of(r, idle_of(r))
-    n, units = len(r.robot.joint_names), r.robot.effort_units
-    if c is None:
+    idle = idle_of(r)
+    compared = compared_of(r, idle)
+    if compared is None:
         return []
-    carried = None if r.load is None else r.load.on(r.robot)
-    moves = [track.moves(c.how) for track in c.tracks]
-    columns = [
-        np.concatenate(
-            [track.qd * moving, np.sign(track.qd) * moving, moving,
-             by_held(r.robot, carried, track, _one_kilogram)], 1,
-        )
-        for track, moving in zip(c.tracks, moves, strict=True)
-    ]  # fmt: skip
-    rate, sign, moving, mass = np.split(c.filtered(columns), 4, 1)
-    # Where standing still is in the filter's reach, friction's sign is not known.
-    rows = moving > 0.8
-    if rows.sum() < 20 * (3 * n + 2):
-        return []
-    # How late the efforts are is fitted with the others.
-    residual = c.residual - c.late * c.change
-    table = np.zeros((*residual.shape, 3 * n + 2))
-    for k in range(n):
-        table[:, k, 3 * k] = rate[:, k]
-        table[:, k, 3 * k + 1] = sign[:, k]
-        table[:, k, 3 * k + 2] = 1.0
-    table[..., -2], table[..., -1] = mass, c.change
-    count = len(residual)
-    block = np.broadcast_to(np.arange(count)[:, None] * BLOCKS // count, rows.shape)
-    values, deviations = _fitted(table[rows], residual[rows], block[rows])
-    found = []
-    for k, name in enumerate(r.robot.joint_names):
-        own = c.residual[rows[:, k], k]
-        rms = float(np.sqrt(np.mean(own**2))) if len(own) else np.nan
-        found.append(Measured("residual", name, rms, np.nan, units[k]))
-        viscous = f"{units[k]} s/{r.robot.joint_units[k]}"
-        for j, (what, unit) in enumerate((("viscous", viscous), ("coulomb", units[k]))):
-            value = values[3 * k + j] + float(getattr(r.robot.friction, what)[k])
-            found.append(Measured(f"friction {what}", name, value, deviations[3 * k + j], unit))
-    payload = values[-2] + r.robot.payload.mass * (r.load is None)
-    found.append(Measured("payload beyond the load", "platform", payload, deviations[-2], "kg"))
-    return [number for number in found if np.isfinite(number.value)]
-
-
-def _fitted(table: Array, target: Array, block: NDArray[np.int64]) -> tuple[Array, Array]:
-    """Least squares, and deviations that allow errors to be correlated within a block.
-
-    NaN for columns that the rows do not tell apart from others.
-    """
-    size = np.linalg.norm(table, axis=0)
-    unit = table / np.where(size > 0.0, size, 1.0)
-    _, scale, ways = np.linalg.svd(unit, full_matrices=False)
-    # A column with a part in a direction that nothing is known of is not known.
-    unknown = (np.abs(ways[scale < DISTINCT]) > 1e-2).any(0) | (size == 0.0)
-    kept = np.flatnonzero(~unknown)
-    values, deviations = np.full((2, len(size)), np.nan)
-    if not len(kept):
-        return values, deviations
-    part = unit[:, kept]
-    found, *_ = np.linalg.lstsq(part, target, rcond=None)
-    pull = part * (target - part @ found)[:, None]
-    sums = np.array([pull[block == b].sum(0) for b in np.unique(block)])
-    inverse = np.linalg.inv(part.T @ part)
-    spread = inverse @ (sums.T @ sums) @ inverse * len(sums) / max(len(sums) - 1, 1)
-    values[kept] = found / size[kept]
-    deviations[kept] = np.sqrt(np.diag(spread)) / size[kept]
-    return values, deviations
+    names, units = r.robot.joint_names, r.robot.effort_units
+    residuals = zip(names, compared.rms.tolist(), units, strict=True)
+    found = [Measured("residual", name, rms, np.nan, unit) for name, rms, unit in residuals]
+    loaded, known = r.robot, 0.0
+    if r.load is not None:
+        loaded, known = r.load.on(r.robot), r.load.mass
+    recorded = replace(recorded_of(r, idle), carried=None)
+    try:
+        numbers = fit(loaded, [recorded], ("friction", "payload"), accept=True).of("fitted")
+    except (PkmTwinError, ValueError, np.linalg.LinAlgError):
+        return found
+    for number in numbers:
+        if number.key == ("payload", "mass"):
+            what, part, value = "payload beyond the load", "platform", number.after - known
+        elif number.key[:2] in (("friction", "viscous"), ("friction", "coulomb")):
+            what, part, value = f"friction {number.key[1]}", names[int(number.key[2])], number.after
+        else:
+            continue
+        found.append(Measured(what, part, value, number.deviation, number.unit))
+    return found
 
 
 def _elasticity(r: Recording) -> list[Measured]:

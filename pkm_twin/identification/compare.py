@@ -120,26 +120,25 @@ class Compared:
 
 
 def by_held(
-    robot: Robot, carried: Robot | None, track: Track, function: Callable[..., Array],
-    rates: Array | None = None,
+    robot: Robot, carried: Robot | None, held: Array | None, function: Callable[..., Array],
+    *motion: Array,
 ) -> Array:  # fmt: skip
-    """A function of robot, motion and wrench along a track, with the payload while it is held."""
-    qd = track.qd if rates is None else rates
+    """A function of robot and motion, with the payload while it is held, shape (k, n).
 
-    def rows(machine: Robot, some: Mask) -> Array:
-        def block(part: slice) -> Array:
-            cut = [one[some][part] for one in (track.q, qd, track.qdd, track.wrench)]
-            return function(machine, *cut)
-
-        return by_blocks(int(some.sum()), BLOCK, block)
-
-    held: Mask = np.zeros(len(track.time), np.bool_)
-    if carried is not None:
-        held |= track.held > 0.5
-    made = np.zeros_like(track.q)
-    for machine, some in ((robot, ~held), (carried, held)):
+    :param held: 1 where ``carried`` is the robot, shape (k,); ``motion``: q and others, (k, ...).
+    """
+    loaded: Mask = np.zeros(len(motion[0]), np.bool_)
+    if carried is not None and held is not None:
+        loaded = np.asarray(held > 0.5, np.bool_)
+    made = np.zeros_like(motion[0])
+    for machine, some in ((robot, ~loaded), (carried, loaded)):
         if machine is not None and some.any():
-            made[some] = rows(machine, some)
+            own = [one[some] for one in motion]
+
+            def block(part: slice, machine: Robot = machine, own: list[Array] = own) -> Array:
+                return function(machine, *(one[part] for one in own))
+
+            made[some] = by_blocks(int(some.sum()), BLOCK, block)
     return made
 
 
@@ -159,7 +158,8 @@ def compare(
 
     def efforts(track: Track) -> Array:
         qd = moving_rates(track.qd, ~track.moves(how), reach)
-        return by_held(robot, r.carried, track, inverse_dynamics, qd)
+        motion = track.q, qd, track.qdd, track.wrench
+        return by_held(robot, r.carried, track.held, inverse_dynamics, *motion)
 
     period, made, raw, inside = pieces[0].period, [], [], []
     one_by_one: Any = replace(how, keep_every=1)

@@ -63,12 +63,54 @@ TURNS: Final = 4
 """Most solutions for one recording, each with what the one before has left."""
 RATES: Final = (2.0, 0.5, 3.0, 1.0 / 3.0, 4.0, 0.25, 5.0, 0.2, 10.0, 0.1)
 """Of time steps that were taken for others'."""
-SETTLED: Final = 0.05
-"""Time on each side over which a payload is the same, s."""
+BLOCK: Final = 0.25
+"""Time over which a payload is held or is not, s,"""
+BLOCKS: Final = 400
+"""and at most so many of them in a recording."""
 SPANS: Final = 3
 """Most times that are named."""
 LIKE_A_UNIT: Final = 1.25
 """A scale that is so near to a unit's is named by it."""
+
+
+def held_payload(
+    time: Array, column: Array, residual: Array, weight: Array
+) -> tuple[float, list[tuple[float, float]], Mask]:
+    """The mass that explains most of a residual while it is held, and when that is.
+
+    The block of times that explains most gives the mass; it is held where more than half of it is
+    seen, and from the samples on, and until those, that separate both best.
+
+    :param time: rising, shape (k,), s; the others (k, n): efforts of a kilogram, the residual, and
+        the weights of its squares.
+    :returns: kg, 0 where nothing is explained; spans of time, s; the samples of these, (k,).
+    """
+    span = max(BLOCK, float(time[-1] - time[0]) / BLOCKS)
+    block = np.floor((time - time[0]) / span).astype(np.int64)
+    rows = [np.sum(weight * column * one, 1) for one in (residual, column)]
+    pull, size = (np.bincount(block, one) for one in rows)
+    sums = [np.concatenate([[0.0], np.cumsum(one)]) for one in (pull, size)]
+    ahead, below = (one[None, :] - one[:, None] for one in sums)
+    gain = np.triu(np.maximum(ahead, 0.0) ** 2 / np.where(below > 0.0, below, np.inf), 1)
+    first, last = np.unravel_index(int(np.argmax(gain)), gain.shape)
+    mass = float(ahead[first, last] / max(below[first, last], 1e-300))
+    held = np.zeros(len(time), np.bool_)
+    if not mass > 0.0:
+        return 0.0, [], held
+    own = pull > 0.5 * mass * size
+    mass = float(pull[own].sum() / size[own].sum())
+    apart = np.cumsum(mass * (rows[0] - 0.5 * mass * rows[1]))
+    spans = []
+    for edges in np.flatnonzero(np.diff(own, prepend=False, append=False)).reshape(-1, 2):
+        ends = []
+        for edge, best in zip(edges.tolist(), (np.argmin, np.argmax), strict=True):
+            near = np.searchsorted(block, [edge - 1, edge + 1])
+            inside = 0 < edge < len(own)
+            place = near[0] + best(apart[slice(*near)]) if inside else edge * len(time)
+            ends.append(min(int(place), len(time) - 1))
+        spans.append((float(time[ends[0]]), float(time[ends[1]])))
+        held[ends[0] : ends[1] + 1] = True
+    return mass, spans, held
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,26 +183,23 @@ class Problem:
     def loaded_in_part(self) -> tuple[str, Problem]:
         """The same with the payload on the platform only while the efforts ask for one; in words.
 
-        What is left as a mass by time has two values, one of them zero.
+        Of the best machine's numbers those of the payload are left out.
         """
-        mass = self.columns[..., int(np.argmax(self.payload))] / self.variation * self.counts
-        parts = np.stack([np.sum(mass * self.missed(), 1), np.sum(mass**2, 1)], -1)
-        size = 2 * round(SETTLED / self.period) + 1
-        smooth = scipy.ndimage.uniform_filter1d(parts, size, axis=0)
-        carried = smooth[:, 0] / np.maximum(smooth[:, 1], 1e-300)
-        held = carried > np.quantile(carried, (0.1, 0.9)).mean()
-        held = scipy.ndimage.median_filter(held.astype(np.uint8), 4 * size + 1, mode="nearest") > 0
+        x = self._best[1]
+        told = self.rest + self.columns @ np.where(self.payload, 0.0, x[:-1]) - x[-1] * self.late
+        weight = self.counts / self.variation**2
+        mass = self.columns[..., int(np.argmax(self.payload))]
+        _, spans, held = held_payload(self.time, mass, self.effort - told, weight)
         share = np.where(self.payload, held[:, None, None], 1.0)
         part = replace(
             self, columns=share * self.columns,
             inertial=None if self.inertial is None else share * self.inertial,
         )  # fmt: skip
-        edges = np.flatnonzero(np.diff(np.concatenate([[False], held, [False]]).astype(int)))
-        spans = edges.reshape(-1, 2)[:SPANS]
-        times = [f"{self.time[a]:.4g} to {self.time[b - 1]:.4g} s" for a, b in spans]
-        times += ["..."] if len(edges) > 2 * SPANS else []
+        times = [f"{begin:.4g} to {end:.4g} s" for begin, end in spans[:SPANS]]
+        times += ["..."] if len(spans) > SPANS else []
         kilograms = float(part._best[1][:-1][self.payload].sum())
-        text = f"an unknown payload of about {kilograms:.2g} kg at {', '.join(times)}"
+        when = f" at {', '.join(times)}" if times else ""
+        text = f"an unknown payload of about {kilograms:.2g} kg{when}"
         return f"{text} (--payload, --load-times)", part
 
     def scales(self, free: Array) -> Array:

@@ -70,6 +70,11 @@ class Track(Motion):
     effort: Array
     period: float
 
+    @property
+    def motion(self) -> tuple[Array, Array, Array, Array]:
+        """Positions, rates, accelerations and wrenches, as functions of a motion take them."""
+        return self.q, self.qd, self.qdd, self.wrench
+
     def moves(self, how: Filtering) -> Mask:
         """Where a joint moves, clear of what noise makes of its rates, shape (k, n)."""
         slow = SIGMAS * rate_noise(how, self.period)

@@ -8,9 +8,10 @@ make no difference. Pure.
 
 from __future__ import annotations
 
-import math
 from collections import deque
 from typing import Final
+
+import numpy as np
 
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.messages.stamps import SECOND
@@ -21,34 +22,71 @@ BLOCK: Final = 0.05
 STEPS: Final = 5
 """Fewest steps of a block."""
 BLOCKS: Final = 20
-"""Blocks that are judged together."""
+"""Blocks of a live stream that are judged together."""
 LEAST: Final = 0.01
-"""Root of the sum of squares of the moves in all blocks below which nothing is said, rad; of a
+"""Root of the sum of squares of the moves in all blocks below which nothing is judged, rad; of a
 sliding joint this part of the machine's size."""
 MAX_ERROR: Final = 0.4
 """Difference of both over the larger one, root of the sum of squares, that velocities which are
 late may have."""
+STANDS: Final = 0.03
+"""Part of the other's motion below which positions, or velocities, stand still."""
+LIKE: Final = 0.1
+"""Relative difference below which a scale is named as a cause."""
+
+
+def rms(values: Array) -> Array:
+    """Root mean square along the first axis, shape (n,)."""
+    return np.asarray(np.sqrt(np.mean(values**2, 0)), np.float64)
+
+
+def likely_cause(moved: Array, told: Array) -> str:
+    """Why the moves of a joint, shape (blocks,), are not those by its velocities; may be empty."""
+    by_q, by_qd = float(rms(moved)), float(rms(told))
+    scale = float(np.sum(told * moved) / max(np.sum(moved**2), 1e-300))
+    if by_q < STANDS * by_qd:
+        return " (the position stands still: encoder?)"
+    if by_qd < STANDS * by_q:
+        return " (the velocity is zero)"
+    if abs(scale + 1.0) < LIKE:
+        return " (wrong sign?)"
+    if rms(told - scale * moved) < LIKE * by_qd:
+        return f" ({scale:.3g} times the positions' rate: time stamps, ratio or unit?)"
+    return ""
 
 
 class RateAgreement:
     """Compares the positions of a stream with its velocities.
 
     ``fault``: the joint that disagrees most in the last blocks that moved, in words; else empty.
+
+    :param blocks: how many blocks are kept; None keeps all, and judges nothing by itself.
     """
 
-    def __init__(self, robot: Robot) -> None:
-        self._names, self._units = robot.joint_names, robot.joint_units
-        self._least = [LEAST * (robot.size if unit == "m" else 1.0) for unit in self._units]
+    def __init__(self, robot: Robot, blocks: int | None = BLOCKS) -> None:
+        self._names, self._count = robot.joint_names, blocks
+        sizes = [robot.size if unit == "m" else 1.0 for unit in robot.joint_units]
+        self._least = LEAST * np.array(sizes)
         self.reset()
 
     def reset(self) -> None:
         """Forget the stream."""
         self.fault = ""
-        self._blocks: deque[tuple[float, list[tuple[float, float]]]] = deque(maxlen=BLOCKS)
-        self._begin: tuple[int, list[float]] | None = None
+        self._blocks: deque[tuple[list[float], list[float]]] = deque(maxlen=self._count)
         self._last, self._steps = 0, 0
         self._rates: list[float] = []
         self._sums: list[float] = []
+        self.skip()
+
+    def skip(self) -> None:
+        """Begin another block: nothing is known of what is between two samples."""
+        self._begin: tuple[int, list[float]] | None = None
+
+    @property
+    def moves(self) -> tuple[Array, Array]:
+        """Moves of the blocks by positions and by velocities, shape (blocks, n) each."""
+        both = np.reshape(list(self._blocks), (-1, 2, len(self._names)))
+        return both[:, 0], both[:, 1]
 
     def push(self, stamp: int, q: Array, qd: Array) -> None:
         """Take a sample, shape (n,) each; the stamp, ns, is later than the last one's."""
@@ -61,11 +99,10 @@ class RateAgreement:
             self._sums = [total + half * (a + b) for total, a, b in pairs]
             self._steps += 1
             first, before = self._begin
-            span = (stamp - first) / SECOND
-            if self._steps >= STEPS and span >= BLOCK:
+            if self._steps >= STEPS and (stamp - first) / SECOND >= BLOCK:
                 moves = [now - then for now, then in zip(q.tolist(), before, strict=True)]
-                self._blocks.append((span, list(zip(moves, self._sums, strict=True))))
-                if len(self._blocks) == BLOCKS:
+                self._blocks.append((moves, self._sums))
+                if len(self._blocks) == self._count:
                     self._judge()
                 self._start(stamp, q)
         self._last, self._rates = stamp, rates
@@ -75,22 +112,17 @@ class RateAgreement:
         self._sums, self._steps = [0.0] * len(q), 0
 
     def _judge(self) -> None:
-        worst, fault, moved = MAX_ERROR, "", False
-        for j, least in enumerate(self._least):
-            pairs = [block[j] for _, block in self._blocks]
-            by_q, by_qd = (math.hypot(*column) for column in zip(*pairs, strict=True))
-            size = max(by_q, by_qd)
-            if size < least:
-                continue
-            moved = True
-            error = math.hypot(*(a - b for a, b in pairs)) / size
-            if error > worst:
-                worst, unit = error, self._units[j]
-                paths = [sum(map(abs, column)) for column in zip(*pairs, strict=True)]
-                span = sum(span for span, _ in self._blocks)
-                fault = (
-                    f"{self._names[j]} moved by {paths[0]:.3g} {unit} in {span:.2g} s, by its "
-                    f"velocities {paths[1]:.3g} {unit}: check scales and units of both"
-                )
-        if moved:
-            self.fault = fault
+        moved, told = self.moves
+        size = np.maximum(rms(moved), rms(told))
+        moves = size * np.sqrt(len(moved)) >= self._least
+        if not moves.any():
+            return
+        error = np.where(moves, rms(told - moved) / np.maximum(size, 1e-300), 0.0)
+        j = int(np.argmax(error))
+        self.fault = ""
+        if error[j] > MAX_ERROR:
+            cause = likely_cause(moved[:, j], told[:, j])
+            self.fault = (
+                f"{self._names[j]}: velocities differ from the rate of the positions by "
+                f"{100 * error[j]:.2g} %{cause}"
+            )

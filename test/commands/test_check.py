@@ -13,8 +13,8 @@ pytest.importorskip("mcap")
 from mcap.writer import CompressionType, Writer
 
 from delta_dynamics import inverse_dynamics
-from pkm_twin.apps.check import judged
-from pkm_twin.apps.check_efforts import MEASURED
+from pkm_twin.apps.check import MEASURED
+from pkm_twin.apps.check_causes import judged
 from pkm_twin.apps.recorded import Recording
 from pkm_twin.apps.topics import JOINT_STATE, Topics
 from pkm_twin.bags.reader import inspect, read_messages

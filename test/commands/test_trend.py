@@ -86,28 +86,31 @@ def test_a_recording_tells_friction_and_payload(tmp_path, rng):
             assert one.deviation < 0.02
     load_ = found["payload beyond the load", "platform"]
     assert abs(load_.value - 0.12) < 5 * load_.deviation
-    assert load_.deviation < 0.01
+    # With what errors of lengths and sensors may do to it.
+    assert load_.deviation < 0.02
 
 
 def test_nights_of_a_folder_to_a_verdict(tmp_path, capsys, monkeypatch, rng):
     monkeypatch.chdir(tmp_path)
     robot = load("delta")
-    for k in range(10):
-        path = night(tmp_path / f"{k}.csv", robot, rng, coulomb=[0.1 + 0.4 * (k >= 7), 0.1, 0.1])
+    for k in range(8):
+        path = night(tmp_path / f"{k}.csv", robot, rng, coulomb=[0.1 + 0.4 * (k >= 6), 0.1, 0.1])
         stamp = 1.7e9 + DAY * k
         os.utime(path, (stamp, stamp))
-        command(capsys, "check", path, "--robot", "delta", "--history", "nights.db")
-        done = command(capsys, "trend", "nights.db", "--json")
-        if k in (4, 6):
+        options = ("--robot", "delta", "--residual", 0.9, "--history", "nights.db")
+        command(capsys, "check", path, *options)
+        if k in (4, 5):
+            done = command(capsys, "trend", "nights.db", "--json")
             told = json.loads(done.out)
             assert done.code == 0
             assert not told["drifts"]
-            assert told["judged"] == (len(told["series"]) if k == 6 else 0)
+            assert told["judged"] == (len(told["series"]) if k == 5 else 0)
+    done = command(capsys, "trend", "nights.db", "--json")
     assert done.code == 1
     told = {(s["quantity"], s["part"]): s for s in json.loads(done.out)["series"]}
     worse = told["friction coulomb", robot.joint_names[0]]
     assert worse["drifts"]
-    assert worse["changed"].startswith("2023-11-21")
+    assert worse["changed"].startswith("2023-11-20")
     assert worse["after"] - worse["before"] == pytest.approx(0.4, abs=0.05)
     assert not told["friction coulomb", robot.joint_names[1]]["drifts"]
     done = command(capsys, "trend", "nights.db", "--picture", "trend.png")

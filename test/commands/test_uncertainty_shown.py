@@ -8,7 +8,7 @@ import pytest
 import yaml
 
 from delta_dynamics import inverse_dynamics, torque_deviation
-from pkm_twin.apps.check_efforts import DEVIATIONS, compared_of
+from pkm_twin.apps.check import DEVIATIONS, compared_of
 from pkm_twin.apps.recorded import read_recording
 from test.commands.conftest import DELTA, rewrite
 from test.support.command import command

@@ -13,7 +13,7 @@ from typing import Any
 import zstandard
 from hypothesis import strategies as st
 
-from pkm_twin.apps.check import judged
+from pkm_twin.apps.check_causes import judged
 from pkm_twin.apps.recorded import read_recording
 from pkm_twin.bags.cdr import MessageCodec
 from pkm_twin.bags.qos import parse_qos, require_topic
