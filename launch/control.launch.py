@@ -54,7 +54,10 @@ ARGUMENTS = {
         "twin: efforts of delta_dynamics; plugin: those of the robot's exported package",
     ),
     "namespace": ("", "namespace of all nodes and topics"),
-    "description": ("", "a URDF with a ros2_control element; default: what pkm-twin urdf writes"),
+    "description": (
+        "",
+        "a URDF with a ros2_control element; default: what pkm-twin export urdf writes",
+    ),
     "controllers": (
         "",
         "settings of ros2_control; default: controllers.yaml in this folder, or the package's",

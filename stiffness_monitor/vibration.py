@@ -59,6 +59,21 @@ class ToolModes:
         gain = 1.0 / (own**2 - turn**2 + 2j * self.damping * own * turn)
         return np.asarray(np.einsum("km,mi,mj->kij", gain, self.shapes, self.shapes) + self.rest)
 
+    def strongest(self, frequencies: ArrayLike) -> tuple[float, float, Array]:
+        """Where the tool point moves most per force, between the first and last frequency.
+
+        Returns the frequency, Hz, the displacement per force, m/N, and its direction (3,), base
+        axes. Peaks are looked at too: they may be narrower than the steps of the frequencies.
+        """
+        grid = doubles(frequencies, "frequencies")
+        peaks = self.frequencies * np.sqrt(np.maximum(1.0 - 2.0 * self.damping**2, 0.0))
+        tried = np.concatenate([grid, peaks[(peaks >= grid[0]) & (peaks <= grid[-1])]])
+        _, size, ways = np.linalg.svd(self.receptance(tried)[:, :3, :3])
+        k = int(size[:, 0].argmax())
+        # A complex vector is that of a straight direction up to its phase.
+        way = ways[k, 0] / np.exp(1j * np.angle(ways[k, 0][np.abs(ways[k, 0]).argmax()]))
+        return float(tried[k]), float(size[k, 0]), np.asarray(way.real)
+
 
 def tool_modes(
     robot: Robot,

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
@@ -12,9 +11,7 @@ from numpy.typing import NDArray
 
 from pkm_twin.apps.view.scene import GROUND, PLATFORM, Scene
 from pkm_twin.apps.view.stage import LOOK
-from pkm_twin.errors import ParameterError, PkmTwinError
-from pkm_twin.files import replace_file
-from pkm_twin.report.plots import pyplot, rendered
+from pkm_twin.report.plots import pyplot
 from pkm_twin.robot.robot import Robot
 
 Array = NDArray[np.float64]
@@ -198,18 +195,3 @@ def _corners(ax: Any, camera: Camera, style: dict[str, Any]) -> None:
     right, low = camera.high[0] - 25 * camera.pixel, camera.low[1] + 22 * camera.pixel
     ax.plot([right - length, right], [low, low], color="k", linewidth=2)
     ax.text(right - length / 2, low + 8 * camera.pixel, f"{length:g} m", **style)
-
-
-def picture(robot: Robot, path: Path) -> None:
-    """Draw a robot into a file.
-
-    :raises PkmTwinError: the file cannot be written, or its name ends in something else.
-    """
-    if path.suffix not in PICTURES:
-        # Another one would get an ending that nobody has asked for.
-        raise ParameterError("picture", str(path), f"a name that ends in {' or '.join(PICTURES)}")
-    data = rendered(draw(robot), DPI, path.suffix[1:])
-    try:
-        replace_file(path, data)
-    except OSError as error:
-        raise PkmTwinError(f"{path} cannot be written: {error.strerror}") from None

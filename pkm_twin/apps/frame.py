@@ -18,7 +18,7 @@ from typing import get_type_hints as hints_of
 import typer
 from typer.core import TyperCommand
 
-from pkm_twin.apps.options import PICTURES, ReadsTables, ReadsWrenches
+from pkm_twin.apps.options import BESIDE, ReadsTables, ReadsWrenches
 from pkm_twin.console import numbers, refuse_existing
 from pkm_twin.errors import ParameterError
 from pkm_twin.files import STANDARD, decimal
@@ -306,11 +306,10 @@ class _Words(TyperCommand):
                 return
             name, sign, value = word.partition("=")
             name = self.older.get(name, name)
-            following = args[k + 1] if k + 1 < len(args) else ""
             if _NEGATIVE.match(word):
                 # A number is no option, and what reads it overlooks the blank.
                 yield f" {word}"
-            elif name == "--picture" and not sign and Path(following).suffix not in PICTURES:
-                yield "--picture="
+            elif word == "--picture" and (k + 1 == len(args) or args[k + 1].startswith("-")):
+                yield f"--picture={BESIDE}"
             else:
                 yield f"{name}{sign}{value}"

@@ -58,11 +58,8 @@ class Entry:
 
 TASKS: Final[Mapping[str, Mapping[str, Entry]]] = {
     "Robots": {
-        "info": Entry("robots:info"),
         "view": Entry("view.command:view"),
         "certify": Entry("certify_command:certify"),
-        "urdf": Entry("robots:urdf"),
-        "convert": Entry("robots:convert"),
     },
     "Torques, paths and drives": {
         "torques": Entry("torques_command:torques", tables=True, wrenches=True),
@@ -73,8 +70,6 @@ TASKS: Final[Mapping[str, Mapping[str, Entry]]] = {
     },
     "Stiffness, workspace and vibration": {
         "map": Entry("maps:app"),
-        "frf": Entry("vibration:frf"),
-        "lobes": Entry("vibration:lobes"),
     },
     "Recordings": {
         "check": Entry("check_command:check", tables=True, wrenches=True),
@@ -89,16 +84,15 @@ TASKS: Final[Mapping[str, Mapping[str, Entry]]] = {
         "fit": Entry("fit:fit", tables=True, wrenches=True),
         "drive-friction": Entry("drive_friction:drive_friction_command"),
         "calibrate": Entry("calibrate:calibrate_command"),
-        "printer": Entry("printer:printer_command"),
     },
     "Design and export": {
         "design": Entry("design:design_command"),
-        "export": Entry("export:app"),
     },
 }
 """Commands that are not in the folder yet, in the order in which tasks need them."""
 OLDER: Final[Mapping[str, tuple[str, ...]]] = {
-    "atlas": ("map",), "guard-check": ("monitor-torques",),
+    "atlas": ("map",), "guard-check": ("monitor-torques",), "printer": ("convert",),
+    "urdf": ("export", "urdf"),
 }  # fmt: skip
 """Older names of commands, which help does not list, with the words in their place."""
 GREETING: Final = """pkm-twin: torques, stiffness and recordings of parallel robots. Try

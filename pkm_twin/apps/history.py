@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pkm_twin.apps.check import compared_of, idle_of, recorded_of
-from pkm_twin.apps.describe import why_no_torques
 from pkm_twin.apps.recorded import Recording
 from pkm_twin.errors import FileError, PkmTwinError
 from pkm_twin.identification.fit import fit
+from pkm_twin.robot.plausibility import why_no_torques
 
 Array = NDArray[np.float64]
 

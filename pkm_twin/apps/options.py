@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,15 +18,19 @@ from pkm_twin.options import OptionalPath, OptionalText, file_name
 from pkm_twin.settings import setting
 
 if TYPE_CHECKING:
+    from pkm_twin.apps.limits import Beyond
     from pkm_twin.apps.tables import Dialect
     from pkm_twin.apps.wrench_frames import WrenchFrames
     from pkm_twin.robot.robot import Robot
+    from stiffness_monitor.chatter import Milling
 
 REFUSED, USAGE, SALVAGED = 1, 2, 3
 """Exit codes: rejected; wrong usage; damaged, with messages that `recover` saves."""
 
 PICTURES = (".png", ".svg", ".pdf")
 """What a picture's name may end in."""
+BESIDE = "auto"
+"""The picture's name where --picture has none."""
 ROBOT_HELP = "a robot's name (see `pkm-twin robots`), or its YAML, URDF, MJCF, SDF"
 
 
@@ -157,27 +162,87 @@ class ReadsMotions(ReadsRecordings):
 
 
 @dataclass(frozen=True, kw_only=True)
-class AtPose(Carries):
-    """A pose of the platform."""
-
-    at: str | None = setting(None, "the pose's coordinates, separated by commas; default: home")
-
-    def pose(self, machine: Robot) -> list[float]:
-        """The pose, shape (m,)."""
-        names = machine.pose_names
-        if self.at is None:
-            home: list[float] = machine.home().tolist()
-            return home
-        return numbers(self.at, len(names), f"a pose: {', '.join(names)}")
-
-
-@dataclass(frozen=True, kw_only=True)
 class BeyondLimitsToo:
     """Work outside the joint limits."""
 
     beyond_limits: bool = setting(
         False, "also compute outside the joint limits, and mark these results"
     )
+
+    def admitted(self, machine: Robot, pose: Sequence[float]) -> list[Beyond]:
+        """What a pose has beyond the joint limits.
+
+        :raises ParameterError: something, and it is not allowed.
+        """
+        from pkm_twin.apps.limits import beyond_limits, refuse_beyond
+
+        _, found = beyond_limits(machine, machine.inverse(pose))
+        if not self.beyond_limits:
+            refuse_beyond(found)
+        return found
+
+
+@dataclass(frozen=True, kw_only=True)
+class AtPose(Carries, BeyondLimitsToo):
+    """A pose of the platform."""
+
+    at: str | None = setting(None, "the pose's coordinates, separated by commas; default: home")
+
+    def pose(self, machine: Robot) -> list[float]:
+        """The pose, shape (m,).
+
+        :raises ParameterError: beyond the joint limits, unless that is allowed.
+        """
+        names = machine.pose_names
+        pose: list[float] = machine.home().tolist()
+        if self.at is not None:
+            pose = numbers(self.at, len(names), f"a pose: {', '.join(names)}")
+        for joint in self.admitted(machine, pose):
+            typer.echo(f"outside the limits: {joint}", err=True)
+        return pose
+
+
+@dataclass(frozen=True, kw_only=True)
+class OfTool:
+    """The modes of the tool point."""
+
+    tool: tuple[float, ...] = setting(
+        (0.0, 0.0, 0.0), "tool point from the platform's reference point, platform axes, m",
+        count=3, metavar="x,y,z",
+    )  # fmt: skip
+    damping: tuple[float, ...] | None = setting(
+        None,
+        "damping ratio of all modes, or one per mode from the lowest on; the last one also holds "
+        "for all higher modes; default: `modal_damping` of the robot file",
+        count=0,
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class OfMilling:
+    """A milling process."""
+
+    teeth: int = setting(..., "teeth of the tool")
+    tangential: float = setting(
+        ..., "tangential cutting coefficient Kt, N/m2, e.g. 600e6 for 600 MPa"
+    )
+    radial: float = setting(..., "ratio of radial to tangential cutting force, Kr")
+    immersion: float = setting(1.0, "radial depth of cut over tool diameter, 1 is a slot")
+    up: bool = setting(False, "up-milling instead of down-milling")
+    feed: float = setting(0.0, "direction of the feed in the platform's xy plane, deg from x to y")
+
+    @property
+    def milling(self) -> Milling:
+        """The process.
+
+        :raises ParameterError: a number out of range.
+        """
+        from stiffness_monitor.chatter import Milling
+
+        return Milling(
+            self.teeth, self.tangential, self.radial, self.immersion, self.up,
+            math.radians(self.feed),
+        )  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -208,9 +273,9 @@ class Draws(Overwrites):
     """A picture of the result: asked for, or beside ``--out``."""
 
     picture: str | None = setting(
-        None, "draw the result: .png, .svg or .pdf; default: beside --out", metavar="[FILE]"
+        None, "draw the result: .png, .svg or .pdf; default: next to --out", metavar="[FILE]"
     )
-    no_picture: bool = setting(False, "draw nothing beside --out")
+    no_picture: bool = setting(False, "draw nothing next to --out")
 
     def drawing(self, command: str) -> Path | None:
         """The picture's file, None for none.
@@ -221,14 +286,14 @@ class Draws(Overwrites):
         beside = None if out is None or str(out) == STANDARD else out.with_suffix(".png")
         if self.no_picture or (self.picture is None and beside is None):
             return None
-        if not self.picture:
+        if self.picture in (None, BESIDE):
             robot = getattr(self, "robot", None) or "recording"
             return beside or Path(f"{command}_{Path(robot).stem}.png")
-        if Path(self.picture).suffix not in PICTURES:
-            raise ParameterError(
-                "--picture", self.picture, f"a name that ends in {', '.join(PICTURES)}"
-            )
-        return Path(self.picture)
+        picture = Path(str(self.picture))
+        if picture.suffix not in PICTURES:
+            bound = f"a name that ends in {', '.join(PICTURES)}"
+            raise ParameterError("--picture", self.picture, bound)
+        return picture
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -20,6 +20,7 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
+from delta_dynamics import inverse_dynamics, mass_matrix
 from pkm_twin.errors import ParameterError
 from pkm_twin.machine.urdf_write import GROUND, PLATFORM
 from pkm_twin.robot.clearance import distance
@@ -33,16 +34,15 @@ GROUP: Final = "actuated"
 LIMB: Final = "limb"
 """The chain from the ground to the platform, for the numeric solver."""
 NUMERIC: Final = "kdl_kinematics_plugin/KDLKinematicsPlugin"
+SHARE: Final = 0.5
+"""Fraction of the effort left at home after gravity that a planner may use to accelerate."""
 CONTROLLER: Final = "delta_dynamics"
 """The node whose action fills goals with effort, as MoveIt's controller."""
 
 
-def moveit_package(
-    robot: Robot, accelerations: Sequence[float], kinematics: str = ""
-) -> dict[str, str]:
+def moveit_package(robot: Robot, kinematics: str = "") -> dict[str, str]:
     """The files of a package ``ROBOT_moveit_config`` by their paths in it.
 
-    :param accelerations: greatest ones of the actuated joints, rad/s2 or m/s2, shape (n,).
     :param kinematics: plugin of the planning group's inverse kinematics; empty: none.
     :raises ParameterError: the robot has a ``joint_map``: plans are in the numbers of the URDF.
     """
@@ -57,7 +57,7 @@ def moveit_package(
     texts = {
         f"config/{name}.urdf": urdf,
         f"config/{name}.srdf": groups,
-        "config/joint_limits.yaml": _yaml(_joint_limits(robot, accelerations)),
+        "config/joint_limits.yaml": _yaml(_joint_limits(robot, accelerations(robot))),
         "config/kinematics.yaml": _yaml(_kinematics(kinematics, f'name="{LIMB}"' in groups)),
         "config/moveit_controllers.yaml": _yaml(_controllers(robot)),
         "config/ompl_planning.yaml": _yaml(PLANNING),
@@ -66,6 +66,21 @@ def moveit_package(
         "CMakeLists.txt": CMAKE.format(package=package),
     }
     return dict(sorted(texts.items()))
+
+
+def accelerations(robot: Robot) -> list[float]:
+    """What each drive can do by itself at home beside the weight, shape (n,), rad/s2 or m/s2.
+
+    Infinite without effort limits.
+    """
+    limits = robot.limits.effort
+    if limits is None:
+        return [np.inf] * len(robot.joint_names)
+    q = robot.inverse(robot.home())
+    weight = np.abs(inverse_dynamics(robot, q, 0.0 * q, 0.0 * q))
+    inertia = np.diag(mass_matrix(robot, q))
+    with np.errstate(divide="ignore"):
+        return list(SHARE * np.maximum(limits - weight, 0.0) / inertia)
 
 
 def srdf(robot: Robot, urdf: str) -> str:

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a command answers: facts, tables and figures, for the terminal, scripts and the browser."""
 
-from pkm_twin.report.report import Column, Fact, Report, Table, Verdict, judged, plain
+from pkm_twin.report.report import Column, Fact, Report, Table, Verdict, judged, number, plain
 from pkm_twin.report.terminal import present, text_of
 
 __all__ = [
-    "Column", "Fact", "Report", "Table", "Verdict", "judged", "plain", "present", "text_of",
+    "Column", "Fact", "Report", "Table", "Verdict", "judged", "number", "plain", "present",
+    "text_of",
 ]  # fmt: skip

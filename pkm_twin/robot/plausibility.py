@@ -15,7 +15,7 @@ from typing import Any, Final
 import numpy as np
 
 from pkm_twin.codegen.arrays import Array
-from pkm_twin.errors import PkmTwinError
+from pkm_twin.errors import ParameterError, PkmTwinError
 from pkm_twin.kinematics.conditions import merged
 from pkm_twin.kinematics.singularity import singularity_at_home
 from pkm_twin.machine.graph import BASE, Graph, Joint
@@ -292,3 +292,12 @@ def _leg(graph: Graph, slide: Joint) -> float:
                 if slide not in (a, b) and along > 0.99 * float(np.linalg.norm(apart)):
                     lengths.append(along)
     return max(lengths)
+
+
+def why_no_torques(robot: Robot) -> str:
+    """Why the model has no torques for this robot; empty where it has."""
+    try:
+        robot.massive()
+    except ParameterError as error:
+        return str(error)
+    return ""

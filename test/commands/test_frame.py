@@ -87,7 +87,6 @@ def test_json_has_the_facts_with_units_and_the_terminal_the_answer_first(run):
     [
         ((), None),
         (("--picture",), "weigh_cart.png"),
-        (("--picture", "3"), "weigh_cart.png"),
         (("--picture", "a.svg"), "a.svg"),
         (("--out", "t.csv"), "t.png"),
         (("--out", "t.csv", "--no-picture"), None),

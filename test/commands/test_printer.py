@@ -13,8 +13,8 @@ import pytest
 from typer.testing import CliRunner
 
 from pkm_twin.apps.cli import app
-from pkm_twin.apps.printer_files import read_printer
 from pkm_twin.errors import ParameterError
+from pkm_twin.robot.printers import read_printer
 from test.identification.partial_cases import Towers
 from test.support.robots import partly_long
 

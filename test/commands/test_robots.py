@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from pkm_twin import load, robot_names
-from pkm_twin.apps.describe import describe, lines
+from pkm_twin.apps.commands.info import Info, info
+from pkm_twin.report import text_of
 from stiffness_monitor import compliance, strain_energy
 from test.commands.conftest import REPOSITORY
 from test.support.command import forked
@@ -74,15 +75,11 @@ class TestInfo:
         pose = list(data["home_pose"].values())
         assert np.allclose(robot.inverse(pose), list(data["home_joints"].values()))
 
-    def test_table_shows_every_parameter_with_its_unit(self, twin, name):
-        result = twin("info", name)
-        assert (result.code, result.err) == (0, "")
-        rows = dict(
-            [cell.strip() for cell in line.strip("│").split("│")]
-            for line in result.out.splitlines()
-            if line.startswith("│")
-        )
-        assert "-0.0000" not in result.out
+    def test_every_parameter_is_shown_with_its_unit(self, twin, name):
+        report = info(Info(robot=name))
+        assert twin("info", name).out == text_of(report) + "\n"
+        assert "-0.0000" not in text_of(report)
+        rows = {fact.text: fact.words for fact in report.facts if fact.text}
         robot = load(name)
         units = robot.parameter_units()
 
@@ -90,11 +87,8 @@ class TestInfo:
             if isinstance(value, dict):
                 for key, item in value.items():
                     shown(f"{row}: {key}", item, unit[key])
-            elif value is None:
-                assert rows[row] == "none"
             else:
-                # A long cell goes on in the next line.
-                assert rows[row].endswith(unit) or len(rows[row]) > 40, row
+                assert rows[row] == "none" if value is None else rows[row].endswith(unit), row
 
         for section, value in robot.parameter_sections().items():
             if isinstance(value, dict):
@@ -105,16 +99,20 @@ class TestInfo:
         assert rows["pose"] and rows["actuated joints"].count("(") == len(robot.joint_names)
 
 
-def test_overconstraint_is_named(twin):
-    assert "moment along" in twin("info", "upr_rpu").out
-    assert "│ no:" in twin("info", "delta_cu").out
+def test_overconstraint_is_named():
+    rows = [
+        {fact.text: fact.words for fact in info(Info(robot=name)).facts}
+        for name in ("upr_rpu", "delta_cu")
+    ]
+    assert "moment along" in rows[0]["overconstrained"]
+    assert rows[1]["overconstrained"].startswith("no:")
 
 
 @every_robot
 def test_closures_that_are_redundant_make_a_machine_overconstrained(name):
-    """Or the table says which joint of the model repeats what the limbs hold."""
-    data = describe(load(name))
-    shown = dict(lines(data))
+    """Or it is told which joint of the model repeats what the limbs hold."""
+    report = info(Info(robot=name))
+    data, shown = report.data, {fact.text: fact.words for fact in report.facts}
     redundant, open_reactions = data["redundant_closures"], data["overconstrained"]
     repeats = f"joint {'+'.join(data['assumed_joints'])} repeats"
     assert (repeats in shown["loop constraints"]) == bool(redundant and not open_reactions)
@@ -246,9 +244,9 @@ class TestEnds:
 def test_a_picture_that_cannot_be_written_is_one_line(twin, tmp_path):
     for path, why in (
         (tmp_path / "none" / "a.png", "there is no folder"),
-        (tmp_path / "a", ".png or .svg"),
+        (tmp_path / "a", ".png, .svg"),
     ):
-        result = twin("info", "five_bar", "--picture", str(path))
+        result = twin("info", "five_bar", "--picture", path)
         assert (result.code, result.out) == (1, "")
         assert why in result.err
         assert str(path) in result.err

@@ -105,7 +105,7 @@ def test_a_numeric_solver_is_offered_where_its_chain_has_a_drive(exported):
     assert set(settings(folder, "kinematics")) == ({LIMB} if driven else set())
     srdf = ET.parse(folder / f"config/{robot.name}.srdf").getroot()
     assert (srdf.find(f"group[@name='{LIMB}']") is not None) is driven
-    files = moveit_package(robot, [1.0] * len(robot.joint_names), "mine/Kinematics")
+    files = moveit_package(robot, "mine/Kinematics")
     solver = yaml.safe_load(files["config/kinematics.yaml"])[GROUP]["kinematics_solver"]
     assert solver == "mine/Kinematics"
 
@@ -158,4 +158,4 @@ def test_a_robot_whose_controller_has_other_numbers_is_refused(tmp_path):
     path = tmp_path / "mapped.yaml"
     path.write_text(yaml.safe_dump(data))
     with pytest.raises(ParameterError, match="joint_map"):
-        moveit_package(load(path), [1.0] * 3)
+        moveit_package(load(path))

@@ -115,7 +115,7 @@ def diagnosed(other: Peer) -> dict[str, Any]:
 
 
 def urdf(_: Peer, tell: Results) -> None:
-    """Options of pkm-twin urdf."""
+    """Options of pkm-twin export urdf."""
     program = executable("pkm-twin")
     for words in (
         (),
@@ -133,7 +133,7 @@ def urdf(_: Peer, tell: Results) -> None:
         wanted = words[1] if "--hardware-plugin" in words else wanted
         tell(
             code == 0 and plugin == wanted and prefixed == ("--prefix" in words),
-            f"pkm-twin urdf {' '.join((ROBOT, *words))}: hardware plugin {plugin}, first link "
+            f"export urdf {' '.join((ROBOT, *words))}: hardware plugin {plugin}, first link "
             f"{names[0]}",
         )
 

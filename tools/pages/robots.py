@@ -7,7 +7,8 @@ import sys
 from pathlib import Path
 
 from pkm_twin import load, robot_names
-from pkm_twin.apps.drawing import picture
+from pkm_twin.apps.drawing import DPI, draw
+from pkm_twin.report import plots
 
 MACHINES = Path(__file__).parents[2] / "examples/machines"
 GALLERY = sorted(path for path in MACHINES.iterdir() if path.suffix in (".yaml", ".urdf"))
@@ -16,4 +17,5 @@ GALLERY = sorted(path for path in MACHINES.iterdir() if path.suffix in (".yaml",
 
 if __name__ == "__main__":
     for source in (*robot_names(), *GALLERY):
-        picture(load(source), Path(sys.argv[1]) / f"robot_{Path(source).stem}.png")
+        target = Path(sys.argv[1]) / f"robot_{Path(source).stem}.png"
+        plots.save(draw(load(source)), target, DPI)

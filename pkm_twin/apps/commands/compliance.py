@@ -45,7 +45,6 @@ def compliance(given: Compliance) -> Report:
     """
     import numpy as np
 
-    from pkm_twin.apps.limits import beyond_limits, refuse_beyond
     from stiffness_monitor import compliance_deviation, deflection_deviation, strain_energy
 
     machine = given.machine()
@@ -55,9 +54,7 @@ def compliance(given: Compliance) -> Report:
         shown = " ".join(f"{number:g}" for number in given.pose)
         raise typer.BadParameter(f"a pose of {machine.name} is {', '.join(units)}, not {shown}")
     try:
-        _, beyond = beyond_limits(machine, machine.inverse(given.pose))
-        if not given.beyond_limits:
-            refuse_beyond(beyond)
+        beyond = given.admitted(machine, given.pose)
         energy = strain_energy(machine, given.pose, given.wrench)
     except PkmTwinError:
         raise

@@ -100,7 +100,7 @@ def printer_of(robot: Robot) -> Printer:
     if robot.mechanism != "linear_delta":
         raise ParameterError(
             f"{robot.name}: mechanism", robot.mechanism,
-            "linear_delta, as in a file that `pkm-twin printer` writes",
+            "linear_delta, as in a file that `pkm-twin convert` writes",
         )  # fmt: skip
     g: Any = vars(robot)["geometry"]
     own = robot.controller

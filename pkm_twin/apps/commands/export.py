@@ -1,0 +1,240 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``pkm-twin export ...``: a robot as files of other software."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from pkm_twin.apps.frame import Group, command
+from pkm_twin.apps.options import OfRobot, Overwrites
+from pkm_twin.console import refuse_existing, tell
+from pkm_twin.errors import ParameterError
+from pkm_twin.files import replace_file
+from pkm_twin.report import Fact, Report
+from pkm_twin.robot.printers import Firmware, printer_of, written
+from pkm_twin.settings import setting
+
+
+@dataclass(frozen=True, kw_only=True)
+class ToFolder(OfRobot, Overwrites):
+    """A package of several files."""
+
+    out: Path = setting(..., "folder of the new package", metavar="FOLDER")
+
+    def write(self, files: Mapping[str, str]) -> Report:
+        """Write all files or, where one may not be replaced, none."""
+        paths = [self.out / name for name in files]
+        for path in paths:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            refuse_existing(path, self.overwrite)
+        for path, text in zip(paths, files.values(), strict=True):
+            replace_file(path, text.encode())
+        return Report(facts=[Fact("files", list(map(str, paths)))], notes=list(map(str, paths)))
+
+
+@dataclass(frozen=True, kw_only=True)
+class ToFile(OfRobot, Overwrites):
+    """One file."""
+
+    out: Path = setting(..., "the file to write", writes=True)
+
+    def write(self, data: bytes | str) -> Report:
+        """Write the file."""
+        replace_file(self.out, data.encode() if isinstance(data, str) else data)
+        return Report(files={"out": self.out})
+
+
+@dataclass(frozen=True, kw_only=True)
+class Printed(OfRobot, Overwrites):
+    """A text that is printed, or a file."""
+
+    out: Path | None = setting(None, "a file; default: print", writes=True)
+
+    def write(self, text: str) -> Report:
+        """Print the text, or write the file."""
+        if self.out is None:
+            return Report(facts=[Fact("text", text)], raw=text)
+        replace_file(self.out, text.encode())
+        return Report(files={"out": self.out})
+
+
+@dataclass(frozen=True, kw_only=True)
+class Moveit(ToFolder):
+    """Write a MoveIt configuration: URDF, SRDF, limits, controllers, kinematics and a launch file.
+
+    MoveIt sends its plans to delta_dynamics, which adds efforts for the controller. Goals in joint
+    space work as they are; goals of the platform's pose need a kinematics plugin.
+    """
+
+    kinematics_plugin: str = setting(
+        "", "MoveIt's plugin for the inverse kinematics", metavar="NAME"
+    )
+
+
+def moveit(given: Moveit) -> Report:
+    """A package for MoveIt."""
+    from pkm_twin.export.moveit import moveit_package
+
+    return given.write(moveit_package(given.machine(), given.kinematics_plugin))
+
+
+@dataclass(frozen=True, kw_only=True)
+class C(ToFolder):
+    """Write kinematics, dynamics and elasticity as C99 that needs only math.h.
+
+    The code is for controllers in C or C++, PLCs and Simulink. It uses no heap and no recursion,
+    its loops are bounded, and every function returns a status. Functions use the payload of the
+    robot's file; functions whose names end in _with take the payload as an argument.
+    """
+
+
+def c(given: C) -> Report:
+    """A package in C."""
+    from pkm_twin.export.c_package import c_package
+
+    return given.write(c_package(given.machine()))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Ros2Control(ToFolder):
+    """Write a package of C++ plugins for ros2_control.
+
+    A chainable feedforward controller (inverse dynamics plus PD), a gravity controller to fall back
+    to, a kinematics_interface and an inverse_dynamics_solver use the robot's exported C. Build the
+    package with colcon; it builds and runs without pkm_twin.
+    """
+
+    bandwidth: float = setting(
+        0.0, "bandwidth for the gains, from the masses at home; 0: no gains", metavar="HZ"
+    )
+
+
+def ros2_control(given: Ros2Control) -> Report:
+    """A package of controllers."""
+    from pkm_twin.export.ros2_control import ros2_control_package
+
+    return given.write(ros2_control_package(given.machine(), given.bandwidth))
+
+
+@dataclass(frozen=True, kw_only=True)
+class FunctionalMockupUnit(ToFile):
+    """Write a Functional Mock-up Unit, for model exchange and co-simulation.
+
+    It contains C sources and, if this computer has a C compiler, a binary for this platform.
+    """
+
+    fmi: int = setting(3, "FMI version", choices={"2": 2, "3": 3})
+    kind: str = setting(
+        "dynamics",
+        "dynamics: motion under efforts; torques: efforts of a motion",
+        choices=("dynamics", "torques"),
+    )
+
+
+def fmu(given: FunctionalMockupUnit) -> Report:
+    """An archive of sources, with a binary where a compiler is found."""
+    from pkm_twin.export.fmu import Fmu, found_compiler
+
+    compiler = found_compiler()
+    if compiler is None:
+        tell("warning: no C compiler found: the FMU has sources and no binary")
+    return given.write(Fmu(given.machine(), given.fmi, given.kind).archive(compiler))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Mjcf(ToFile):
+    """Write an MJCF for MuJoCo: bodies, loops as constraints, motors, a keyframe at home."""
+
+
+def mjcf(given: Mjcf) -> Report:
+    """A model whose keyframe holds its weight."""
+    from delta_dynamics import inverse_dynamics
+    from pkm_twin.robot.robot_urdf import robot_mjcf
+
+    robot = given.machine()
+    home = robot.massive().graph.home
+    efforts = inverse_dynamics(robot, home, 0.0 * home, 0.0 * home) - robot.friction.offset
+    return given.write(robot_mjcf(robot, list(efforts)))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sdf(ToFile):
+    """Write an SDF model: links and all joints, also those that close the loops."""
+
+
+def sdf(given: Sdf) -> Report:
+    """A model for Gazebo."""
+    from pkm_twin.robot.robot_urdf import robot_sdf
+
+    return given.write(robot_sdf(given.machine()))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Urdf(Printed):
+    """Print a robot as a URDF, with its loops as constraints.
+
+    The URDF is a tree with all joints, actuated and passive, and a <constraint> element for each
+    loop that was cut. Parsers that know only trees ignore these elements. The base is the link
+    base_link, the platform the link platform. The same robot always gives the same bytes.
+
+    The ros2_control element has the controller's joints: with a joint_map they have their own names
+    and numbers, and the joints of the tree follow them through <mimic>.
+    """
+
+    hardware_plugin: str = setting(
+        "mock_components/GenericSystem", "hardware plugin of ros2_control", metavar="NAME"
+    )
+    prefix: str = setting("", "prefix for the names of all links and joints")
+    no_ros2_control: bool = setting(False, "write no ros2_control element")
+
+
+def urdf(given: Urdf) -> Report:
+    """The text of a URDF.
+
+    :raises ParameterError: a prefix or a plugin that cannot be written.
+    """
+    from pkm_twin.robot.robot_urdf import robot_urdf
+
+    if re.search(r"[^\w./-]", given.prefix, re.ASCII):
+        raise ParameterError("--prefix", given.prefix, "letters, digits and . / _ -")
+    plugin = given.hardware_plugin
+    if not plugin.strip():
+        raise ParameterError("--hardware-plugin", plugin, "a plugin, or --no-ros2-control")
+    hardware = "" if given.no_ros2_control else plugin
+    return given.write(robot_urdf(given.machine(), hardware, given.prefix))
+
+
+@dataclass(frozen=True, kw_only=True)
+class ToPrinter(Printed):
+    """Write a linear Delta's geometry as a printer's configuration.
+
+    Towers are turned about z so that the third is at 90 degrees.
+    """
+
+    firmware: Firmware = setting(
+        ..., "smoothieware cannot be written", choices={one.value: one for one in Firmware}
+    )
+
+
+def printer(given: ToPrinter) -> Report:
+    """The text of a configuration."""
+    return given.write(written(printer_of(given.machine()), given.firmware))
+
+
+COMMAND = Group(
+    "Export a robot to other software.",
+    {
+        "c": command(c),
+        "ros2-control": command(ros2_control),
+        "fmu": command(fmu),
+        "urdf": command(urdf),
+        "mjcf": command(mjcf),
+        "sdf": command(sdf),
+        "moveit": command(moveit),
+        "printer": command(printer),
+    },
+    "Design and export",
+)

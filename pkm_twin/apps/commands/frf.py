@@ -1,0 +1,118 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``pkm-twin frf``: the frequency response of the tool point at a pose."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pkm_twin.apps.frame import command
+from pkm_twin.apps.options import AtPose, Draws, OfTool, Writes
+from pkm_twin.apps.torques import ENDINGS, write_table
+from pkm_twin.errors import ParameterError
+from pkm_twin.report import Fact, Report, plots
+from pkm_twin.settings import setting
+
+if TYPE_CHECKING:
+    from pkm_twin.robot.robot import Robot
+    from stiffness_monitor.vibration import ToolModes
+
+AXES = "xyz"
+
+
+@dataclass(frozen=True, kw_only=True)
+class FrequencyResponse(AtPose, OfTool, Writes, Draws):
+    """Compute the frequency response of the tool point at a pose.
+
+    The response is the displacement per harmonic force (receptance), actuators locked, of the
+    elastic frame with its masses and modal damping. The command prints natural frequencies, and the
+    frequency and direction in which the tool point responds most.
+
+    The table has the columns frequency (Hz) and, for each pair of directions in base axes,
+    real and imaginary part (m/N): xx.real, xx.imag, xy.real, ... xy is the displacement along x per
+    force along y.
+    """
+
+    frequencies: tuple[float, ...] | None = setting(
+        None, "range of the table, Hz; default: 0 to above the sixth mode",
+        count=2, metavar="LOW,HIGH",
+    )  # fmt: skip
+    points: int = setting(2001, "rows of the table", low=2, high=10**6)
+    out: Path | None = setting(
+        None, "table to write, .csv, .parquet or .mat", writes=True, endings=ENDINGS
+    )
+
+
+def frf(given: FrequencyResponse) -> Report:
+    """The modes at the tool point, and where it responds most."""
+    from stiffness_monitor.vibration import tool_modes
+
+    machine = given.machine()
+    pose = given.pose(machine)
+    modes = tool_modes(machine, pose, damping=given.damping, tool=given.tool)
+    low, high = given.frequencies or (0.0, 1.2 * float(modes.frequencies[:6][-1]))
+    if not 0.0 <= low < high:
+        raise ParameterError("frequencies", f"{low:g},{high:g}", "Hz, 0 or more, rising")
+    grid = np.linspace(low, high, given.points)
+    response = modes.receptance(grid)[:, :3, :3]
+    frequency, size, way = modes.strongest(grid)
+    static = modes.receptance([0.0])[0, :3, :3].real
+    ratio = float(size / np.linalg.eigvalsh(static).max())
+    along = ", ".join(f"{v:.3g}" for v in way.round(3) + 0.0)
+    answer = (
+        f"{machine.name}: the tool point responds most at {frequency:.4g} Hz along ({along}): "
+        f"{1e6 * size:.4g} µm/N, {ratio:.3g} times the static compliance"
+    )
+    if given.out is not None:
+        columns = {"frequency": grid}
+        for i, row in enumerate(AXES):
+            for j, column in enumerate(AXES):
+                columns[f"{row}{column}.real"] = response[:, i, j].real
+                columns[f"{row}{column}.imag"] = response[:, i, j].imag
+        write_table(columns, given.out)
+    most = {"frequency_hz": frequency, "compliance_m_per_n": size, "direction": way}
+    return Report(
+        answer,
+        [
+            *of_modes(machine, pose, modes),
+            Fact("static_compliance_m_per_n", static),
+            Fact("most", most),
+        ],
+        figures={"": lambda: draw(grid, response, modes, answer)},
+        files={"out": given.out},
+    )
+
+
+def of_modes(machine: Robot, pose: list[float], modes: ToolModes) -> list[Fact]:
+    """The robot, the pose, and its lowest modes."""
+    pairs = list(zip(modes.frequencies.tolist(), modes.damping.tolist(), strict=True))[:6]
+    shown = ", ".join(f"{f:.4g} Hz ({100 * z:.3g} %)" for f, z in pairs)
+    found = [{"frequency_hz": f, "damping": z} for f, z in pairs]
+    return [
+        Fact("robot", machine.name),
+        Fact("pose", dict(zip(machine.pose_names, pose, strict=True))),
+        Fact("modes", found, text="modes (damping)", shown=shown),
+    ]
+
+
+def draw(grid: Any, response: Any, modes: ToolModes, title: str) -> Any:
+    """Size and phase along each axis over the frequency."""
+    figure, axes = plots.columns(1, 2)
+    size, phase = axes[0]
+    for k, name in enumerate(AXES):
+        one = response[:, k, k]
+        size.semilogy(grid, 1e6 * np.abs(one), color=plots.COLOURS[k], label=f"along {name}")
+        phase.plot(grid, np.degrees(np.angle(one)), color=plots.COLOURS[k])
+    for frequency in modes.frequencies[modes.frequencies <= grid[-1]]:
+        size.axvline(frequency, color="0.8", lw=0.8, zorder=0)
+    figure.suptitle(title.replace("): ", "):\n"))
+    plots.label(size, "frequency (Hz)", "displacement per force (µm/N)")
+    plots.legend(size)
+    plots.label(phase, "frequency (Hz)", "phase (deg)")
+    return figure
+
+
+COMMAND = command(frf, "Stiffness, workspace and vibration")

@@ -1,0 +1,178 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``pkm-twin info``: what a robot is, in words and numbers."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+
+from delta_dynamics import reactions
+from pkm_twin.apps.frame import command
+from pkm_twin.apps.options import Draws, OfRobot
+from pkm_twin.report import Fact, Report, number
+from pkm_twin.robot.clearance import clearance, has_clearance
+from pkm_twin.robot.plausibility import findings, why_no_torques
+from pkm_twin.robot.robot import Robot
+
+MOST_NAMES: Final = 6
+"""Most names that a line has."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Info(OfRobot, Draws):
+    """Show a robot's parameters, with units.
+
+    Prints dimensions, masses, limits, home pose and mobility. For an overconstrained mechanism it
+    also lists the joint reactions that rigid-body equations do not determine. --picture draws the
+    robot at home.
+    """
+
+
+def info(given: Info) -> Report:
+    """Every parameter, mobility, overconstraint and the home pose."""
+    robot = given.machine()
+    home = robot.home()
+    q = robot.inverse(home)
+    engine = robot.engine.mobility
+    pose_units = dict(zip(robot.pose_names, robot.pose_units, strict=True))
+    joint_units = dict(zip(robot.joint_names, robot.joint_units, strict=True))
+    home_pose = dict(zip(robot.pose_names, home.tolist(), strict=True))
+    home_joints = dict(zip(robot.joint_names, q.tolist(), strict=True))
+    bodies = list(robot.body_names[:-1])
+    assumed = [joint.name for joint in robot.graph.joints.values() if joint.given]
+    undetermined = overconstraint(robot)
+    gap = float(clearance(robot, home)) if has_clearance(robot) else None
+    odd = findings(robot)
+    equations = f"{engine.closures} equations of rank {engine.rank}, {engine.redundant} redundant"
+    if engine.redundant and assumed and not undetermined:
+        # A joint that stands for what several limbs hold repeats what one of them holds alone.
+        equations += (
+            f" in the model only, where joint {', '.join(assumed)} repeats constraints of the limbs"
+        )
+    facts = [
+        Fact("name", robot.name),
+        Fact("mechanism", robot.mechanism),
+        Fact("description", robot.description),
+        Fact("mobility", robot.mobility, text="mobility"),
+        Fact("bodies", bodies, text="bodies and rods"),
+        Fact("joint_count", len(robot.graph.joints)),
+        Fact("closures", engine.closures, text="loop constraints", shown=equations),
+        Fact("rank", engine.rank),
+        Fact("redundant_closures", engine.redundant),
+        Fact("assumed_joints", assumed),
+        Fact("pose", pose_units, text="pose", shown=_named(pose_units)),
+        Fact("joints", list(robot.joint_names), text="actuated joints", shown=_named(joint_units)),
+        Fact("joint_unit", robot.joint_unit),
+        Fact("joint_units", list(robot.joint_units)),
+        Fact("effort_unit", None if why_no_torques(robot) else robot.effort_unit),
+        Fact("home_pose", home_pose, text="home pose", shown=_pairs(home_pose, pose_units)),
+        Fact("home_joints", home_joints, text="home joints",
+             shown=_pairs(home_joints, joint_units)),
+        Fact("singularity_at_home", value := float(robot.singularity(q)),
+             text="singularity index at home", shown=f"{value:.3f} (0 singular, 1 best)"),
+        Fact("clearance_at_home", gap, text=None if gap is None else "clearance at home",
+             shown="" if gap is None else f"{1e3 * gap:.3g} mm"
+             + ("" if gap > 0.0 else ": limbs interfere")),
+        Fact("home_choice", robot.home_choice or None, text="home" if robot.home_choice else None),
+        Fact("overconstrained", undetermined),
+        *(Fact("", text, text="overconstrained")
+          for text in grouped_reactions(undetermined)
+          or ["no: rigid-body equations determine every reaction"]),
+        Fact("plausibility", [dataclasses.asdict(finding) for finding in odd]),
+        *(Fact("", text, text="plausibility")
+          for text in [finding.text for finding in odd] or ["no implausible value"]),
+        Fact("parameters", robot.parameter_sections()),
+        Fact("parameter_units", robot.parameter_units()),
+    ]  # fmt: skip
+    for section, value in robot.parameter_sections().items():
+        listed = section == "joints" and isinstance(value, list)
+        if section not in ("mechanism", "name") and not listed:
+            facts += _parameters(section, value, robot.parameter_units().get(section, ""))
+    return Report(
+        f"{robot.name}: {robot.description}", facts, figures={"": lambda: _picture(robot)}
+    )
+
+
+def _picture(robot: Robot) -> Any:
+    from pkm_twin.apps.drawing import draw
+
+    return draw(robot)
+
+
+def overconstraint(robot: Robot) -> list[str]:
+    """What rigid-body statics cannot determine, by name; empty where it determines all."""
+    if not why_no_torques(robot):
+        zero = np.zeros(len(robot.joint_names))
+        return list(reactions(robot, robot.inverse(robot.home()), zero, zero).indeterminate)
+    mobility = robot.engine.mobility
+    if not mobility.redundant:
+        return []
+    count = f"{mobility.redundant} of {mobility.closures} closure equations"
+    return [f"{count} are redundant, among {', '.join(mobility.parts)}"]
+
+
+def grouped_reactions(names: Sequence[str]) -> list[str]:
+    """Reactions in few words: of each joint what is not determined, alike joints in one line.
+
+    :param names: as :func:`delta_dynamics.reactions` has them, "JOINT: force along DIRECTION".
+    """
+    joints: dict[str, dict[str, list[str]]] = {}
+    others = []
+    for name in names:
+        joint, colon, rest = name.rpartition(": ")
+        kind, along, direction = rest.partition(" along ")
+        if colon and along:
+            joints.setdefault(joint, {}).setdefault(kind, []).append(direction)
+        else:
+            others.append(name)
+    alike: dict[str, list[str]] = {}
+    for joint, kinds in joints.items():
+        words = [f"{kind} {_directions(directions)}".strip() for kind, directions in kinds.items()]
+        alike.setdefault(" and ".join(words), []).append(joint)
+    return [f"{what} in {_some(names)}" for what, names in alike.items()] + others
+
+
+def _directions(names: list[str]) -> str:
+    """Directions of one joint's forces or moments."""
+    if len(names) == 3:
+        return "in all directions"
+    both = {"across 1", "across 2"} <= set(names)
+    words = ["along the axis" if n == "axis" else f"along {n}" for n in names if "across" not in n]
+    if both:
+        words.append("across the axis")
+    elif any("across" in n for n in names):
+        words.append("in one direction across the axis")
+    return " and ".join(words)
+
+
+def _some(names: list[str]) -> str:
+    """Names, of many the first."""
+    if len(names) <= MOST_NAMES:
+        return ", ".join(names)
+    return f"{', '.join(names[:MOST_NAMES])} and {len(names) - MOST_NAMES} more"
+
+
+def _parameters(name: str, value: Any, unit: Any) -> Iterator[Fact]:
+    """A parameter, or a section's parameters under its name."""
+    if isinstance(value, dict):
+        for key, item in value.items():
+            yield from _parameters(f"{name}: {key}", item, unit[key])
+    else:
+        shown = "none" if value is None else f"{number(value, '.6g')} {unit}".strip()
+        yield Fact("", value, text=name, shown=shown)
+
+
+def _named(units: dict[str, str]) -> str:
+    return ", ".join(f"{name} ({unit})" for name, unit in units.items())
+
+
+def _pairs(values: dict[str, float], units: dict[str, str]) -> str:
+    # Rounded first, so that nothing reads -0.0000.
+    return ", ".join(f"{k} {round(v, 4) + 0.0:.4f} {units[k]}" for k, v in values.items())
+
+
+COMMAND = command(info, "Robots")

@@ -1,0 +1,114 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``pkm-twin lobes``: the depth of cut above which milling chatters."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pkm_twin.apps.commands.frf import of_modes
+from pkm_twin.apps.frame import command
+from pkm_twin.apps.options import AtPose, Draws, OfMilling, OfTool, Writes
+from pkm_twin.apps.torques import ENDINGS, write_table
+from pkm_twin.errors import ParameterError
+from pkm_twin.report import Fact, Report, plots
+from pkm_twin.settings import setting
+
+if TYPE_CHECKING:
+    from stiffness_monitor.chatter import Lobes as Limits
+    from stiffness_monitor.chatter import Milling
+
+
+@dataclass(frozen=True, kw_only=True)
+class Lobes(OfMilling, AtPose, OfTool, Writes, Draws):
+    """Compute the axial depth above which milling chatters, over spindle speeds.
+
+    Example: `pkm-twin lobes upr_rpu --teeth 2 --tangential 600e6 --radial 0.3 --immersion 0.5
+    --speeds 3000,20000 --tool 0,0,-0.1`.
+
+    The tool turns about the platform's z axis, clockwise from above. The command prints the
+    smallest limit in the range of speeds, and the spindle speed with the largest stable axial depth
+    of cut if the speed may be off by 1 %. Speeds are added at lobes, minima and steep flanks of the
+    limit, and every 0.1 % within this 1 %. The machine's modes count, not the flexibility of
+    spindle, holder and tool.
+
+    The table has the columns speed (rpm), depth (m) and open: 1 where the cut is stable up to the
+    largest depth that was computed.
+    """
+
+    speeds: tuple[float, ...] = setting(..., "spindle speeds, rpm", count=2, metavar="LOW,HIGH")
+    points: int = setting(181, "even spindle speeds; more are added at lobes", low=2, high=10**5)
+    deepest: float | None = setting(
+        None,
+        "largest depth to look at, m; default: 25 times the depth that is stable at every speed",
+    )
+    out: Path | None = setting(
+        None, "table to write, .csv, .parquet or .mat", writes=True, endings=ENDINGS
+    )
+
+
+def lobes(given: Lobes) -> Report:
+    """The limits of stability over the spindle's speed."""
+    from stiffness_monitor.chatter import MARGIN, lobes_between
+    from stiffness_monitor.vibration import tool_modes
+
+    low, high = given.speeds
+    if not 0.0 < low < high:
+        raise ParameterError("speeds", f"{low:g},{high:g}", "rpm, above 0, rising")
+    milling = given.milling
+    machine = given.machine()
+    pose = given.pose(machine)
+    modes = tool_modes(machine, pose, damping=given.damping, tool=given.tool)
+    found = lobes_between(modes, milling, low, high, given.points, given.deepest)
+    best, least = found.steady(), int(found.depths.argmin())
+    worst = found.speeds[least], found.depths[least], found.open[least]
+    answer = (
+        f"{machine.name}: stable up to {_depth(*worst)} at every speed from {low:g} to {high:g} "
+        f"rpm (least at {worst[0]:.0f} rpm); up to {_depth(*best)} at {best[0]:.0f} rpm "
+        f"± {100 * MARGIN:g} %"
+    )
+    if given.out is not None:
+        columns = {"speed": found.speeds, "depth": found.depths, "open": found.open.astype(float)}
+        write_table(columns, given.out)
+    return Report(
+        answer,
+        [
+            *of_modes(machine, pose, modes),
+            Fact("best", _place(*best) | {"speed_margin": MARGIN}),
+            Fact("least", _place(*worst)),
+            Fact("zero_order_depth_m", found.safe),
+            Fact("speeds_rpm", found.speeds),
+            Fact("depths_m", found.depths),
+        ],
+        figures={"": lambda: draw(found, milling, answer)},
+        files={"out": given.out},
+    )
+
+
+def _depth(_speed: float, depth: float, is_open: bool) -> str:
+    return f"{'more than ' if is_open else ''}{1e3 * depth:.3g} mm"
+
+
+def _place(speed: float, depth: float, is_open: bool) -> dict[str, Any]:
+    return {"speed_rpm": float(speed), "depth_m": float(depth), "open": bool(is_open)}
+
+
+def draw(found: Limits, milling: Milling, title: str) -> Any:
+    """The limit of the depth over the speed, with the best speed."""
+    figure, axes = plots.columns(1, 1)
+    ax = axes[0][0]
+    depth = 1e3 * found.depths
+    ax.plot(found.speeds, depth, color="black", lw=1.2)
+    ax.fill_between(found.speeds, depth, 1.05 * depth.max(), color=plots.COLOURS[1], alpha=0.3)
+    speed, safe, _ = found.steady()
+    ax.plot(speed, 1e3 * safe, "*", color="red", mec="white", ms=13)
+    way = "slot" if milling.immersion == 1.0 else "up-milling" if milling.up else "down-milling"
+    head = f"{title.replace('; ', chr(10))}\n{milling.teeth} teeth, {way}; chatter above the line"
+    plots.label(ax, "spindle speed (rpm)", "axial depth of cut (mm)", head, 10)
+    ax.set_ylim(0.0, 1.05 * depth.max())
+    ax.margins(x=0.0)
+    return figure
+
+
+COMMAND = command(lobes, "Stiffness, workspace and vibration")
