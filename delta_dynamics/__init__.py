@@ -1,9 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Rigid-body dynamics of parallel kinematic machines."""
 
-from importlib import import_module
-from typing import Any
-
+from delta_dynamics.base_parameters import BaseParameters, base_parameters
 from delta_dynamics.contact import Contact, ContactMonitor
 from delta_dynamics.derivatives import TorqueDerivatives, torque_derivatives, torque_gradient
 from delta_dynamics.elastic_reactions import elastic_reactions
@@ -17,6 +15,7 @@ from delta_dynamics.isotropy import (
     joint_motion,
     max_driving_force,
     max_driving_force_range,
+    sphere_directions,
     spread,
     tilted_pose,
 )
@@ -38,7 +37,6 @@ from delta_dynamics.virtual_work import (
     inverse_dynamics,
     mass_matrix,
 )
-from pkm_twin.kinematics.directions import sphere_directions
 
 __all__ = [
     "BaseParameters",
@@ -81,13 +79,3 @@ __all__ = [
     "torque_deviation",
     "torque_gradient",
 ]
-
-
-def __getattr__(name: str) -> Any:
-    """Names of identification, which imports this package: loaded when they are asked for."""
-    if name not in ("BaseParameters", "base_parameters"):
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    value = globals()[name] = getattr(
-        import_module("pkm_twin.identification.base_parameters"), name
-    )
-    return value

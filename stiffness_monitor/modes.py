@@ -3,11 +3,16 @@
 
 The robot is linear about the pose: elastic beams, joints with free and elastic directions, a rigid
 platform (Delta-CU paper, modal analysis). K x = (2 pi f)^2 M x.
+
+A member's inner nodes can be replaced by its lowest modes with held ends, beside the static shapes
+of its ends (Craig and Bampton 1968): statics stay exact, and a pose costs much less.
+Displacements of a node are in the order x y z rx ry rz (m, rad).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Final
 
 import numpy as np
@@ -16,9 +21,211 @@ from numpy.typing import ArrayLike
 
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError, SingularityError
+from pkm_twin.machine.members import Section
 from pkm_twin.robot.robot import SINGULARITY_BOUND, Robot
-from stiffness_monitor.beams import System, assemble
-from stiffness_monitor.structure import structural_model
+from stiffness_monitor.frame import PLANES, Frame, bent, deformations, rigid_offset
+from stiffness_monitor.structure import RigidBody, StructuralModel, structural_model
+
+
+@lru_cache(maxsize=64)
+def element_matrices(section: Section, length: float) -> tuple[Array, Array]:
+    """Stiffness and consistent mass of one beam element along its own x axis, shape (12, 12) each.
+
+    Shape functions are the exact static ones of a beam loaded at its ends (Friedman and Kosmatka
+    1993); mass of cross sections in translation and in rotation. Read-only.
+    """
+    ways = deformations(length, *section.rigidities)
+    forms = np.zeros((len(ways), 12))
+    for row, (form, _) in zip(forms, ways, strict=True):
+        row[list(form)] = list(form.values())
+    stiffness = (forms.T * [rigidity for _, rigidity in ways]) @ forms
+    turning = section.rotary_inertia * np.array([2.0, 1.0, 1.0])
+    inertia = length / 2 * np.array([*[section.mass_per_length] * 3, *turning])
+    chord = np.hstack((-np.eye(6), np.eye(6))) / length
+    mass = np.zeros((12, 12))
+    # Polynomials of the sixth degree, exactly.
+    for place, weight in zip(*np.polynomial.legendre.leggauss(4), strict=True):
+        share = (1 + place) / 2
+        shape = np.hstack(((1 - share) * np.eye(6), share * np.eye(6)))
+        across, along = bent(share, length, section.rigidities[3] / length**2)
+        for k, (move, turn, side) in enumerate(PLANES, start=1):
+            shape[turn] = side * (chord[move] + along @ forms[2 * k : 2 * k + 2])
+            shape[move] += across @ forms[2 * k : 2 * k + 2]
+        mass += weight * (shape.T * inertia) @ shape
+    for matrix in (stiffness, mass):
+        matrix.setflags(write=False)
+    return stiffness, mass
+
+
+def member_matrices(section: Section, length: float, elements: int) -> tuple[Array, Array]:
+    """Stiffness and mass of a chain of equal elements, shape (6 (elements + 1),) * 2."""
+    one, weight = element_matrices(section, length / elements)
+    size = 6 * (elements + 1)
+    stiffness, mass = np.zeros((size, size)), np.zeros((size, size))
+    for k in range(elements):
+        at = slice(6 * k, 6 * k + 12)
+        stiffness[at, at] += one
+        mass[at, at] += weight
+    return stiffness, mass
+
+
+@lru_cache(maxsize=64)
+def _member(
+    section: Section, length: float, elements: int, kept: int | None
+) -> tuple[Array, Array, Array]:
+    """Basis, stiffness and mass of a member on its own coordinates.
+
+    Coordinates: six displacements of the start, six of the end, then those inside. ``basis``,
+    shape (6 (elements + 1), coordinates), gives the nodes' displacements.
+    """
+    stiffness, mass = member_matrices(section, length, elements)
+    size = len(mass)
+    ends, inside = np.r_[0:6, size - 6 : size], np.arange(6, size - 6)
+    basis = np.zeros((size, 12))
+    basis[ends] = np.eye(12)
+    own = np.eye(len(inside))
+    if kept is not None and kept < len(inside):
+        held = stiffness[np.ix_(inside, inside)]
+        # The static shapes take no share of the modes' stiffness.
+        basis[inside] = -np.linalg.solve(held, stiffness[np.ix_(inside, ends)])
+        root = np.linalg.inv(np.linalg.cholesky(mass[np.ix_(inside, inside)]))
+        values, vectors = np.linalg.eigh(root @ held @ root.T)
+        # Equal ones stay together: one of a pair would make a round bar uneven.
+        while kept < len(values) and values[kept] < values[kept - 1] * (1 + 1e-6):
+            kept += 1
+        own = root.T @ vectors[:, :kept]
+    modal = np.zeros((size, own.shape[1]))
+    modal[inside] = own
+    basis = np.hstack((basis, modal))
+    result = basis, basis.T @ stiffness @ basis, basis.T @ mass @ basis
+    for array in result:
+        array.setflags(write=False)
+    return result
+
+
+def body_mass(body: RigidBody, at: Array) -> Array:
+    """Mass matrix of a rigid body at a point that moves with it, shape (6, 6)."""
+    about_com = np.zeros((6, 6))
+    about_com[:3, :3] = body.mass * np.eye(3)
+    about_com[3:, 3:] = body.inertia
+    offset = rigid_offset(body.at - at)
+    return np.asarray(offset.T @ about_com @ offset, np.float64)
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """One element of the energy shares: matrices on its own displacements.
+
+    ``own`` (k,) of the system's coordinates move it, by ``map``, shape (rows, k).
+    """
+
+    name: str
+    own: list[int]
+    map: Array
+    stiffness: Array
+    mass: Array
+
+
+@dataclass(frozen=True, eq=False)
+class System:
+    """An assembled frame of n coordinates.
+
+    ``stiffness``, ``mass``: shape (n, n). The platform's six displacements are the first six
+    coordinates. ``nodes``: names, at ``positions``, shape (nodes, 3), m: the platform, then
+    members' nodes in order. ``members``: index of the part, its basis, and its axes.
+    """
+
+    stiffness: Array
+    mass: Array
+    parts: tuple[Part, ...]
+    nodes: tuple[str, ...]
+    positions: Array
+    members: tuple[tuple[int, Array, Array], ...]
+
+    def displacements(self, shape: Array) -> Array:
+        """World displacements of the named nodes, shape (nodes, 6), of coordinates (n,)."""
+        rows = [shape[None, :6]]
+        for index, basis, axes in self.members:
+            part = self.parts[index]
+            own = (basis @ (part.map @ shape[part.own])).reshape(-1, 2, 3)
+            rows.append((own @ axes.T).reshape(-1, 6))
+        return np.concatenate(rows)
+
+    def energies(self, shape: Array) -> tuple[tuple[str, ...], Array, Array]:
+        """Names, then twice the strain energy and twice the kinetic one at unit rate, by part.
+
+        Parts of one name are added up.
+        """
+        strain: dict[str, float] = {}
+        kinetic: dict[str, float] = {}
+        for part in self.parts:
+            own = part.map @ shape[part.own]
+            strain[part.name] = strain.get(part.name, 0.0) + float(own @ part.stiffness @ own)
+            kinetic[part.name] = kinetic.get(part.name, 0.0) + float(own @ part.mass @ own)
+        return tuple(strain), np.array(list(strain.values())), np.array(list(kinetic.values()))
+
+
+def assemble(model: StructuralModel, elements: int, kept: int | None = None) -> System:
+    """Stiffness and mass of a structural model, each member divided into ``elements`` beams.
+
+    :param kept: modes with held ends that a member keeps; None keeps all its nodes.
+
+    :raises ValueError: a part stands on a body that hangs nowhere, or closures hold the platform.
+    """
+    frame = Frame(model)
+    names, positions = [model.platform], [model.origin[None]]
+    whole: list[Part] = []
+    for body in model.bodies:
+        node = frame.nodes[body.body, 0]
+        weight = body_mass(body, node.at)
+        whole.append(Part(body.name, list(node.own), node.map, np.zeros((6, 6)), weight))
+    members: list[tuple[int, Array, Array]] = []
+    size = frame.size
+    for member, ends in frame.bars:
+        # Rounded: poses of one robot differ by less in a member that keeps its length.
+        length = round(float(member.length), 12)
+        basis, stiffness, mass = _member(member.section, length, elements, kept)
+        # Inside, coordinates are along the member's own axes.
+        rows = len(mass)
+        own = [*dict.fromkeys([*ends[0].own, *ends[1].own]), *range(size, size + rows - 12)]
+        size += rows - 12
+        joined = np.zeros((rows, len(own)))
+        joined[12:, len(own) - rows + 12 :] = np.eye(rows - 12)
+        for first, node in zip((0, 6), ends, strict=True):
+            joined[first : first + 6, [own.index(k) for k in node.own]] = node.map
+        members.append((len(whole), basis, member.axes))
+        whole.append(Part(member.body, own, joined, stiffness, mass))
+        shares = np.arange(elements + 1)[:, None] / elements
+        positions.append(member.start + shares * (member.end - member.start))
+        names += [f"{member.name} {k}/{elements}" for k in range(elements + 1)]
+    for spring in frame.springs:
+        row = np.array([list(spring.row.values())], np.float64)
+        rigidity = np.array([[spring.rigidity]])
+        whole.append(Part(spring.element, list(spring.row), row, rigidity, np.zeros((1, 1))))
+    if frame.held:
+        basis = _null_space(frame, size)
+        size = basis.shape[1]
+        every = list(range(size))
+        whole = [Part(p.name, every, p.map @ basis[p.own], p.stiffness, p.mass) for p in whole]
+    stiffness, mass = np.zeros((size, size)), np.zeros((size, size))
+    for part in whole:
+        at = np.ix_(part.own, part.own)
+        stiffness[at] += part.map.T @ part.stiffness @ part.map
+        mass[at] += part.map.T @ part.mass @ part.map
+    where = np.concatenate(positions)
+    return System(stiffness, mass, tuple(whole), tuple(names), where, tuple(members))
+
+
+def _null_space(frame: Frame, size: int) -> Array:
+    """Coordinates that keep what closures hold, shape (size, fewer); the first six are the same."""
+    table = np.zeros((len(frame.held), size))
+    table[:, : frame.size] = frame.table()
+    rows, chosen = frame.dependents(table[None, :, : frame.size])
+    free = [k for k in range(size) if k not in chosen]
+    basis = np.eye(size)[:, free]
+    basis[chosen] = -np.linalg.solve(table[np.ix_(rows, chosen)], table[np.ix_(rows, free)])
+    return basis
+
 
 ELEMENTS: Final = 8
 """Beam elements a member: the first six frequencies of the shipped robots to 0.1 %."""

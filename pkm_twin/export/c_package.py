@@ -248,7 +248,7 @@ class Package:
             "inverse", {"pose": self.m}, {"q": outputs["q"]}, (), solver, summary
         )
         self.candidate = candidate
-        turns = [1.0 if turn else 0.0 for turn in robot._turn_mask]
+        turns = [1.0 if turn else 0.0 for turn in robot.turn_mask]
         test = "            double apart = there[i] - pose[i];\n"
         if any(turns):
             self.unit.add(table("@_full_turn", [turn * 2.0 * np.pi for turn in turns]))
@@ -256,7 +256,7 @@ class Package:
                 "            if (@_full_turn[i] > 0.0) {\n"
                 "                apart = remainder(apart, @_full_turn[i]);\n            }\n"
             )
-        self.unit.add(table("@_same", [SAME_POSE / float(unit) for unit in robot._pose_units]))
+        self.unit.add(table("@_same", [SAME_POSE / float(unit) for unit in robot.pose_scales]))
         self.unit.add(f"""\
 {self.unit.signature(self.inverse, given=True)}
 {{

@@ -1,2 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One file a mechanism."""
+"""One file a mechanism, and what all of them add to a robot."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from pkm_twin.robot.robot import ControlLoop, Robot
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class TwinRobot(Robot):
+    """A robot whose dynamics are at hand as a method."""
+
+    def torque_loop(self, samples: int = 1) -> ControlLoop:
+        """As :meth:`Robot.torque_loop`."""
+        # Here: a command that needs no torques does not load them.
+        from delta_dynamics.virtual_work import TorqueLoop
+
+        return TorqueLoop(self, samples)

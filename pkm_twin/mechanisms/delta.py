@@ -52,9 +52,9 @@ from pkm_twin.machine.members import Beam, Structure, axial, disc
 from pkm_twin.machine.pose_grid import PoseGrid
 from pkm_twin.machine.sections import shared_middle
 from pkm_twin.machine.shared import Key, Shared, above_zero, bar, point_mass, shared_number
+from pkm_twin.mechanisms import TwinRobot
 from pkm_twin.mechanisms.delta_file import Geometry, Inertia, Members
 from pkm_twin.robot.mechanism import Inverse
-from pkm_twin.robot.robot import Robot
 
 LIMBS: Final = ("I", "II", "III")
 MAX_ITERATIONS: Final = 12
@@ -63,7 +63,7 @@ EVEN: Final = 0.02
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Delta(Robot):
+class Delta(TwinRobot):
     """A Delta robot, symmetric or with one R-C-U limb (Delta-CU)."""
 
     mechanism: str = schema.choice("delta")

@@ -27,7 +27,7 @@ from pkm_twin.machine.members import disc
 from pkm_twin.machine.pose_grid import PoseGrid
 from pkm_twin.machine.sections import check_azimuths, length, mass
 from pkm_twin.machine.shared import Shared, point_mass, shared_number
-from pkm_twin.robot.robot import Robot
+from pkm_twin.mechanisms import TwinRobot
 
 LIMBS: Final = ("a", "b", "c")
 
@@ -63,7 +63,7 @@ class Inertia:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class LinearDelta(Robot):
+class LinearDelta(TwinRobot):
     """A linear Delta of a printer."""
 
     mechanism: str = schema.choice("linear_delta")

@@ -20,9 +20,8 @@ import numpy as np
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.codegen.expressions import norm, plain
 from pkm_twin.errors import ParameterError, UnknownNameError
-from pkm_twin.kinematics.masses import check_masses
 from pkm_twin.kinematics.pose import COORDINATES, Coordinate
-from pkm_twin.kinematics.scheme import choose_coordinates
+from pkm_twin.kinematics.scheme import check_masses, choose_coordinates
 from pkm_twin.machine import schema
 from pkm_twin.machine.friction import linear_keys
 from pkm_twin.machine.graph import (
@@ -67,7 +66,7 @@ from pkm_twin.machine.shared import (
     shared_number,
 )
 from pkm_twin.machine.uncertainty import UncertaintyEntry
-from pkm_twin.robot.robot import Robot
+from pkm_twin.mechanisms import TwinRobot
 from pkm_twin.robot.robot_urdf import robot_description
 
 M = TypeVar("M", bound="Machine")
@@ -89,7 +88,7 @@ _SLIDING: Final = {"joint": "m", "effort": "N", "rotor": "kg"}
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Machine(Robot):
+class Machine(TwinRobot):
     """A machine that its parameter file describes as a graph."""
 
     described: Graph

@@ -67,8 +67,9 @@ from pkm_twin.machine.shared import (
     shared_body,
     shared_number,
 )
+from pkm_twin.mechanisms import TwinRobot
 from pkm_twin.robot.mechanism import Inverse
-from pkm_twin.robot.robot import SINGULARITY_BOUND, Robot
+from pkm_twin.robot.robot import SINGULARITY_BOUND
 
 LIMBS: Final = ("I", "II", "III")
 
@@ -137,7 +138,7 @@ class Members:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Prru(Robot):
+class Prru(TwinRobot):
     """A 3-PRRU head with three vertical sliders."""
 
     mechanism: str = schema.choice("prru")

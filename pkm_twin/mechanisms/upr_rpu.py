@@ -57,9 +57,9 @@ from pkm_twin.machine.members import Beam, Section, Structure, axial, disc
 from pkm_twin.machine.pose_grid import PoseGrid
 from pkm_twin.machine.sections import shared_middle
 from pkm_twin.machine.shared import Shared, shared_body, shared_number
+from pkm_twin.mechanisms import TwinRobot
 from pkm_twin.mechanisms.upr_rpu_file import Geometry, Inertia, JointsCompliance, Limits, Members
 from pkm_twin.robot.mechanism import Inverse
-from pkm_twin.robot.robot import Robot
 
 FAR: Final = 1e5
 """Longest limb over the machine's size; beyond, rounding would lose the pose, or overflow."""
@@ -71,7 +71,7 @@ _Y: Final = array([0.0, 1.0, 0.0])
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class UprRpu(Robot):
+class UprRpu(TwinRobot):
     """A 2UPR-RPU machine with elastic bars and joints."""
 
     mechanism: str = schema.choice("upr_rpu")

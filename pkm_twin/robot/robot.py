@@ -8,7 +8,6 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from importlib import import_module
 from typing import Any, Final, Protocol
 
 import numpy as np
@@ -246,10 +245,10 @@ class Robot(Mechanism):
         # What is infinite or NaN is no pose.
         with np.errstate(invalid="ignore"):
             apart = found - np.asarray(pose, np.float64)
-            if self._turn_mask.any():
+            if self.turn_mask.any():
                 turned = np.remainder(apart + math.pi, math.tau) - math.pi
-                apart = np.where(self._turn_mask, turned, apart)
-            same = (np.abs(apart) * self._pose_units <= SAME_POSE).all(-1)
+                apart = np.where(self.turn_mask, turned, apart)
+            same = (np.abs(apart) * self.pose_scales <= SAME_POSE).all(-1)
         if codes is None:
             if same.all():
                 return q, None
@@ -259,12 +258,12 @@ class Robot(Mechanism):
         return q, codes
 
     @cached_property
-    def _turn_mask(self) -> Mask:
+    def turn_mask(self) -> Mask:
         """Which pose coordinates are turns, that a full one does not change, shape (m,)."""
         return np.array([len(c.entries) == 2 for c in self.coordinates])
 
     @cached_property
-    def _pose_units(self) -> Array:
+    def pose_scales(self) -> Array:
         """What makes pose coordinates of unit one, shape (m,)."""
         return np.array([1.0 if c.entries else 1.0 / self.graph.size for c in self.coordinates])
 
@@ -414,10 +413,9 @@ class Robot(Mechanism):
         """Inverse dynamics for a control loop, with preallocated arrays.
 
         Write ``q, qd, qdd, wrench``, call it, and read ``tau`` and the returned status; see
-        :class:`delta_dynamics.loop.TorqueLoop`.
+        :class:`delta_dynamics.virtual_work.TorqueLoop`.
         """
-        made: ControlLoop = import_module("delta_dynamics.loop").TorqueLoop(self, samples)
-        return made
+        raise NotImplementedError
 
     @cached_property
     def passive_joints(self) -> tuple[str, ...]:

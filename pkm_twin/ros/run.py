@@ -3,11 +3,14 @@
 
 from __future__ import annotations
 
+import ctypes
 import faulthandler
 import gc
+import os
 import sys
 import time
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Final
 
 import rclpy
@@ -20,9 +23,34 @@ from pkm_twin.errors import PkmTwinError, plain_warnings
 from pkm_twin.ros.context import middleware_arguments
 from pkm_twin.ros.node import TwinNode
 from pkm_twin.ros.parameters import UnknownParametersError
-from pkm_twin.ros.priority import set_priority
 from pkm_twin.ros.signals import NodeSignals, ignore_signals
 from pkm_twin.threads import one_blas_thread
+
+_MCL_CURRENT: Final = 1
+_MCL_ONFAULT: Final = 4
+
+
+def set_priority(priority: int) -> None:
+    """Schedule all threads of this process by SCHED_FIFO, and keep its pages in memory (Linux).
+
+    Threads that start later inherit it from the one that starts them.
+
+    :param priority: 1 to 99, before every thread with a lower one and every ordinary process.
+    :raises OSError: the user may not (``ulimit -r``, ``ulimit -l``), or the system has none.
+    """
+    if not hasattr(os, "sched_setscheduler"):
+        raise OSError("this system has no SCHED_FIFO")
+    parameter = os.sched_param(priority)
+    for thread in Path("/proc/self/task").iterdir():
+        try:
+            os.sched_setscheduler(int(thread.name), os.SCHED_FIFO, parameter)
+        except ProcessLookupError:
+            continue  # It has ended meanwhile.
+        except OSError as error:
+            raise OSError(f"SCHED_FIFO: {error.strerror}") from None
+    if ctypes.CDLL(None, use_errno=True).mlockall(_MCL_CURRENT | _MCL_ONFAULT):
+        raise OSError(f"locking memory: {os.strerror(ctypes.get_errno())}")
+
 
 LOOK: Final = 0.5
 """How often the events executor looks whether it has to end, s."""

@@ -4,31 +4,176 @@
 from __future__ import annotations
 
 import sys
+from array import array
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, Final
 
 import numpy as np
-from geometry_msgs.msg import WrenchStamped
+from builtin_interfaces.msg import Duration as DurationMessage
+from builtin_interfaces.msg import Time as TimeMessage
+from geometry_msgs.msg import (
+    Point,
+    PoseStamped,
+    Quaternion,
+    TransformStamped,
+    TwistStamped,
+    Vector3,
+    WrenchStamped,
+)
+from numpy.typing import NDArray
 from rclpy.duration import Duration
 from rclpy.time import Time
-from std_msgs.msg import String
+from sensor_msgs.msg import JointState
+from std_msgs.msg import ColorRGBA, String
+from visualization_msgs.msg import Marker, MarkerArray
 
 from pkm_twin.bags.definitions import message_definition
 from pkm_twin.errors import MessageError, ParameterError, PkmTwinError
 from pkm_twin.machine import rotations
 from pkm_twin.messages.intake import JointStateDecoder
+from pkm_twin.messages.stamps import SECOND
 from pkm_twin.robot.robot import Robot
 from pkm_twin.robot.robot_urdf import joint_names, robot_urdf
-from pkm_twin.ros import health, outputs
+from pkm_twin.ros import health
 from pkm_twin.ros.changes import follow_changes
 from pkm_twin.ros.node import TwinNode
 from pkm_twin.ros.run import run
 from pkm_twin.ros.wrench import declare_mounts, triple
 from pkm_twin.settings import changeable, with_parameters
-from pkm_twin.state.scene import Load, Scales, Scene
-from pkm_twin.state.state import MachineState, State, moving_state_kernel, state_kernel
-from pkm_twin.state.topics import STATE
+from pkm_twin.state.scene import Load, Scales, Scene, Shape
+from pkm_twin.state.state import STATE, MachineState, State, moving_state_kernel, state_kernel
 from pkm_twin.streams.pace import Pace
 from pkm_twin.streams.wrench import PLATFORM, Mount, WrenchSettings
 from stiffness_monitor.compliance import kernels, member_deflections, platform_response
+
+KINDS: Final = {
+    "cylinder": Marker.CYLINDER,
+    "sphere": Marker.SPHERE,
+    "arrow": Marker.ARROW,
+    "line": Marker.LINE_STRIP,
+    "text": Marker.TEXT_VIEW_FACING,
+}
+
+
+def joint_state(
+    stamp: TimeMessage,
+    names: Sequence[str],
+    values: NDArray[Any],
+    rates: NDArray[Any] | None = None,
+) -> JointState:
+    """Positions, and velocities where there are any, by name."""
+    message = JointState(name=list(names), position=array("d", values))
+    if rates is not None:
+        message.velocity = array("d", rates)
+    message.header.stamp = stamp
+    return message
+
+
+def pose(stamp: TimeMessage, frame: str, position: NDArray[Any], turn: NDArray[Any]) -> PoseStamped:
+    """A place (3,) and a quaternion x y z w."""
+    message = PoseStamped()
+    message.header.stamp, message.header.frame_id = stamp, frame
+    message.pose.position, message.pose.orientation = _point(position), _quaternion(turn)
+    return message
+
+
+def twist(stamp: TimeMessage, frame: str, values: NDArray[Any]) -> TwistStamped:
+    """Velocity and angular velocity, shape (6,)."""
+    message = TwistStamped()
+    message.header.stamp, message.header.frame_id = stamp, frame
+    message.twist.linear, message.twist.angular = _vector(values[:3]), _vector(values[3:])
+    return message
+
+
+def transform(
+    stamp: TimeMessage, frame: str, child: str, position: NDArray[Any], turn: NDArray[Any]
+) -> TransformStamped:
+    """From a frame to its child."""
+    message = TransformStamped(child_frame_id=child)
+    message.header.stamp, message.header.frame_id = stamp, frame
+    message.transform.translation = _vector(position)
+    message.transform.rotation = _quaternion(turn)
+    return message
+
+
+def markers(
+    stamp: TimeMessage, frame: str, shapes: Iterable[Shape], lifetime: DurationMessage
+) -> MarkerArray:
+    """Shapes as markers; those that do not last are drawn for ``lifetime``."""
+    array_of = MarkerArray()
+    for shape in shapes:
+        marker = Marker(ns=shape.group, id=shape.number, type=KINDS[shape.kind], text=shape.text)
+        marker.header.stamp, marker.header.frame_id = stamp, frame
+        marker.pose.position = _point(shape.position)
+        marker.pose.orientation = _quaternion(shape.quaternion)
+        marker.scale = _vector(shape.size)
+        marker.points = [_point(point) for point in shape.points]
+        r, g, b, a = shape.colour
+        marker.color = ColorRGBA(r=r, g=g, b=b, a=a)
+        if not shape.lasting:
+            marker.lifetime = lifetime
+        array_of.markers.append(marker)
+    return array_of
+
+
+class Transforms:
+    """Publishers of ``/tf`` (base to platform) and ``/tf_static`` (platform to tool).
+
+    :param frames: names of the frames ``platform`` and ``tool``; ``tool``: where it stands.
+    :param platform: whether base to platform is published here.
+    :raises ImportError: tf2_msgs is not installed.
+    """
+
+    def __init__(
+        self, node: TwinNode, base: str, frames: Mapping[str, str], tool: Mount, platform: bool
+    ) -> None:
+        from tf2_msgs.msg import TFMessage
+
+        self._message = TFMessage
+        self._base, self._frames, self._tool = base, frames, tool
+        self.platform = platform
+        self._static = node.create_guarded_publisher("/tf_static")
+        self._moving = node.create_guarded_publisher("/tf") if platform else None
+
+    def send_tool(self, now: int) -> None:
+        """Platform to tool, once and for all; ``now`` in ns."""
+        sec, nanosec = divmod(now, SECOND)
+        turn = rotations.to_quaternion(self._tool.rotation)
+        self._static.publish(
+            self._message(
+                transforms=[
+                    transform(
+                        TimeMessage(sec=sec, nanosec=nanosec),
+                        self._frames["platform"],
+                        self._frames["tool"],
+                        self._tool.position,
+                        turn,
+                    )
+                ]
+            )
+        )
+
+    def send_platform(self, stamp: TimeMessage, position: NDArray[Any], turn: NDArray[Any]) -> None:
+        """Base to platform."""
+        if self._moving is not None:
+            found = transform(stamp, self._base, self._frames["platform"], position, turn)
+            self._moving.publish(self._message(transforms=[found]))
+
+
+def _point(values: Sequence[float] | NDArray[Any]) -> Point:
+    x, y, z = map(float, values)
+    return Point(x=x, y=y, z=z)
+
+
+def _vector(values: Sequence[float] | NDArray[Any]) -> Vector3:
+    x, y, z = map(float, values)
+    return Vector3(x=x, y=y, z=z)
+
+
+def _quaternion(values: Sequence[float] | NDArray[Any]) -> Quaternion:
+    x, y, z, w = map(float, values)
+    return Quaternion(x=x, y=y, z=z, w=w)
+
 
 LIFETIME = 1.0
 """How long what a load does is drawn after the last marker, s."""
@@ -147,7 +292,7 @@ class MachineStateNode(TwinNode):
             raise ParameterError(name, frame, "a frame's name")
         return frame
 
-    def _create_transforms(self) -> outputs.Transforms | None:
+    def _create_transforms(self) -> Transforms | None:
         """Publishers of ``/tf`` and ``/tf_static``, where they are asked for and tf2 is there."""
         wanted = self.declare(
             "publish_tf",
@@ -166,7 +311,7 @@ class MachineStateNode(TwinNode):
         if wanted == "none":
             return None
         try:
-            return outputs.Transforms(
+            return Transforms(
                 self, self._core.settings.base_frame, self._frames, self._tool, wanted == "all"
             )
         except ImportError as error:
@@ -197,10 +342,10 @@ class MachineStateNode(TwinNode):
         stamp = Time(nanoseconds=state.stamp).to_msg()
         base = self._core.settings.base_frame
         quaternion = rotations.to_quaternion(state.rotation)
-        self._joints.publish(outputs.joint_state(stamp, self._names, state.joints, state.rates))
-        self._pose.publish(outputs.pose(stamp, base, state.position, quaternion))
+        self._joints.publish(joint_state(stamp, self._names, state.joints, state.rates))
+        self._pose.publish(pose(stamp, base, state.position, quaternion))
         if state.twist is not None:
-            self._twist.publish(outputs.twist(stamp, base, state.twist))
+            self._twist.publish(twist(stamp, base, state.twist))
         if self._transforms is None or not self._transforms.platform:
             return
         if self._transforms_pace.due(state.stamp):
@@ -222,7 +367,7 @@ class MachineStateNode(TwinNode):
         base = self._core.settings.base_frame
         stamp = Time(nanoseconds=state.stamp).to_msg()
         lifetime = Duration(seconds=LIFETIME).to_msg()
-        self._markers.publish(outputs.markers(stamp, base, shapes, lifetime))
+        self._markers.publish(markers(stamp, base, shapes, lifetime))
 
     def _load(self, state: State) -> Load | None:
         """What the wrench does to the machine, None where it is not known."""

@@ -13,8 +13,8 @@ from scipy.optimize import brentq
 
 from pkm_twin.machine.graph import BASE
 from pkm_twin.machine.members import Section, cowper
-from stiffness_monitor.beams import assemble, body_mass, element_matrices, member_matrices
 from stiffness_monitor.frame import Frame, rigid_offset
+from stiffness_monitor.modes import assemble, body_mass, element_matrices, member_matrices
 from stiffness_monitor.structure import (
     RIGID,
     Member,

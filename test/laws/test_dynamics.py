@@ -151,6 +151,18 @@ def test_batches_equal_single_samples(name, robot, rng, batch):
         )
 
 
+def test_a_control_loop_fills_its_arrays_with_the_torques(name, robot, rng):
+    loop = robot.torque_loop(samples=3)
+    loop.q[:], loop.qd[:], loop.qdd[:] = states(robot, rng, 3)
+    loop.wrench[:] = rng.normal(0.0, 10.0, (3, 6))
+    assert loop() == 0
+    np.testing.assert_array_equal(
+        loop.tau, inverse_dynamics(robot, loop.q, loop.qd, loop.qdd, loop.wrench)
+    )
+    loop.qd[1] = np.inf
+    assert loop() == 2 and np.isnan(loop.tau[1]).all()
+
+
 def test_broadcasts_and_takes_any_layout(name, robot, rng):
     q, qd, qdd = states(robot, rng, 6)
     full = inverse_dynamics(robot, q, np.tile(qd[0], (6, 1)), qdd)

@@ -12,8 +12,7 @@ import pytest
 from delta_dynamics import inverse_dynamics
 from pkm_twin.errors import ParameterError, SingularityError, UnreachableError
 from stiffness_monitor import compliance
-from stiffness_monitor.beams import assemble
-from stiffness_monitor.modes import modes, natural_frequencies
+from stiffness_monitor.modes import assemble, modes, natural_frequencies
 from stiffness_monitor.structure import Carried, Member, structural_model
 from test.support.robots import elastic, load, parameters_of, random_joints
 

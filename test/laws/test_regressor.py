@@ -14,8 +14,8 @@ from delta_dynamics import (
     parameter_values,
     regressor,
 )
+from delta_dynamics.base_parameters import random_states
 from pkm_twin import Robot
-from pkm_twin.identification.base_parameters import random_states
 from pkm_twin.robot.catalogue import robot_of_data
 from test.machine.random_machines import NAMES, variant
 from test.support.robots import load, loaded, massive, random_motion

@@ -11,8 +11,7 @@ from pkm_twin.robot.catalogue import robot_of_data
 from pkm_twin.robot.clearance import clearance
 from pkm_twin.robot.entries import with_entries
 from stiffness_monitor import compliance, platform_response, strain_energy
-from stiffness_monitor.beams import assemble
-from stiffness_monitor.modes import natural_frequencies
+from stiffness_monitor.modes import assemble, natural_frequencies
 from stiffness_monitor.structure import structural_model
 from test.machine.random_machines import plain
 from test.support.robots import load, rigid

@@ -23,8 +23,7 @@ from pkm_twin.maps.search import evolved, worst_of
 from pkm_twin.maps.store import open_map
 from pkm_twin.maps.sweep import map_of
 from pkm_twin.robot.catalogue import robot_of_data
-from pkm_twin.robot.passive_limits import passive_values
-from pkm_twin.robot.workspace import reachable, try_forward
+from pkm_twin.robot.workspace import passive_values, reachable, try_forward
 from stiffness_monitor import Milling, compliance, stable_depth, strain_energy
 from stiffness_monitor.modes import natural_frequencies
 from test.machine.random_machines import FILES

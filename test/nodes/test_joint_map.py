@@ -23,8 +23,7 @@ from pkm_twin.apps.view.live import Live
 from pkm_twin.errors import MessageError
 from pkm_twin.messages.reading import JointReader
 from pkm_twin.messages.stamps import StampRules
-from pkm_twin.state.state import MachineState
-from pkm_twin.state.topics import STATE
+from pkm_twin.state.state import STATE, MachineState
 from pkm_twin.streams.topics import JOINTS, NUMBERS, TRAJECTORY
 from pkm_twin.streams.wrench import WrenchSettings
 from stiffness_monitor.monitor import Monitor

@@ -24,7 +24,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray, String
 from visualization_msgs.msg import Marker, MarkerArray
 
-from pkm_twin.ros.outputs import KINDS
+from pkm_twin.state.node import KINDS
 
 MODULE = "pkm_twin.state.node"
 MAKE = Maker(Ros())

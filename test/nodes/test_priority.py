@@ -11,7 +11,7 @@ pytest.importorskip("rclpy", exc_type=ImportError)
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 
-from pkm_twin.ros import priority
+from pkm_twin.ros import run
 
 PRIORITY = 7
 
@@ -58,4 +58,4 @@ def test_a_refusal_of_the_system_is_told(monkeypatch):
 
     monkeypatch.setattr(os, "sched_setscheduler", refuse)
     with pytest.raises(OSError, match=os.strerror(errno.EPERM)):
-        priority.set_priority(PRIORITY)
+        run.set_priority(PRIORITY)

@@ -22,7 +22,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import JointState
 from tf2_msgs.msg import TFMessage
 
-from pkm_twin.ros.outputs import transform
+from pkm_twin.state.node import transform
 
 ROBOT = load("upr_rpu")
 Q = ROBOT.inverse([-0.7, 0.2, -0.15])

@@ -8,6 +8,9 @@ from functools import cache
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
+DEMO = {"pkm_twin.apps.demo", "pkm_twin.apps.demo_tracking"}
+REGISTRIES = {"pkm_twin.robot.catalogue", "pkm_twin.apps.nodes"} | DEMO
+"""Modules that name mechanisms by a file's key, and nodes that become processes."""
 PACKAGES = ("pkm_twin", "delta_dynamics", "stiffness_monitor")
 
 
@@ -25,7 +28,10 @@ def _module(path: Path) -> str:
 
 @cache
 def imports(module: str) -> frozenset[str]:
-    """What a module imports, wherever in it: modules, also where a name of one is imported."""
+    """What a module imports, wherever in it: modules, also where a name of one is imported.
+
+    A text that names a module of another room, as ``import_module`` takes it, counts as well.
+    """
     found = set()
     for node in ast.walk(ast.parse(sources()[module].read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):
@@ -34,6 +40,11 @@ def imports(module: str) -> frozenset[str]:
             assert node.level == 0 and node.module, f"{module}: a relative import"
             whole = {f"{node.module}.{alias.name}" for alias in node.names}
             found |= {name if name in sources() else node.module for name in whole}
+        elif isinstance(node, ast.Constant) and isinstance(node.value, str):
+            name = node.value.partition(":")[0]
+            named = "." in name and name in sources() and room(name) != room(module)
+            if named and module not in REGISTRIES:
+                found.add(name)
     return frozenset(found)
 
 
