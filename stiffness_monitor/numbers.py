@@ -10,7 +10,8 @@ from typing import Any, Final
 import numpy as np
 
 from pkm_twin.codegen.arrays import Array
-from pkm_twin.codegen.expressions import SNAP, Numbers, maximum, references, sign, snapped
+from pkm_twin.codegen.expressions import SNAP, Numbers, references, snapped
+from pkm_twin.codegen.operations import maximum, sign
 from pkm_twin.machine.geometry import marks
 from pkm_twin.machine.graph import Graph
 from pkm_twin.machine.members import Place, Structure

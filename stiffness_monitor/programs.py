@@ -19,9 +19,10 @@ from typing import Any, Final
 import numpy as np
 
 from pkm_twin.codegen.cholesky import SparseCholesky
-from pkm_twin.codegen.expressions import GEOMETRY, absolute, maximum, minimum, sqrt
+from pkm_twin.codegen.expressions import GEOMETRY
 from pkm_twin.codegen.kernels import Kernel
 from pkm_twin.codegen.lu import Order, SparseLU, independent_rows, pivot_order
+from pkm_twin.codegen.operations import absolute, maximum, minimum, sqrt
 from pkm_twin.codegen.program import Program
 from pkm_twin.kinematics.motion import Motion
 from pkm_twin.kinematics.traced import Traced

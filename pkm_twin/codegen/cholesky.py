@@ -6,8 +6,9 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final
 
-from pkm_twin.codegen.expressions import Objects, maximum
+from pkm_twin.codegen.expressions import Objects
 from pkm_twin.codegen.lu import is_zero
+from pkm_twin.codegen.operations import maximum
 
 FLOOR: Final = 1e-20
 """Least pivot, over what it is compared with: rounding ends far above it, so all stays finite."""

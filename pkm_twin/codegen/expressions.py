@@ -10,11 +10,26 @@ from __future__ import annotations
 
 import math
 import operator
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
+
+from pkm_twin.codegen.operations import (
+    CONSTANT,
+    PARAMETER,
+    SAMPLE,
+    Operation,
+    add,
+    cos,
+    divide,
+    mul,
+    neg,
+    sin,
+    sqrt,
+    sub,
+)
 
 Objects = NDArray[Any]
 """Array of expressions, of floats, or of both."""
@@ -22,17 +37,14 @@ Objects = NDArray[Any]
 Numbers = Sequence[Any] | NDArray[Any]
 """Some expressions or numbers in a row."""
 
-CONSTANT: Final = 0
-PARAMETER: Final = 1
-SAMPLE: Final = 2
-"""What an expression hangs on: nothing, the parameters alone, or the sample."""
-
 PARAMETERS: Final = "p"
 GEOMETRY: Final = "g"
 """Names of the inputs that are the same for all samples of a machine: those of a program's own, and
 the machine's geometry."""
 
-_COMMUTE: Final = frozenset(("add", "mul", "min", "max"))
+
+_number_of: Final = operator.attrgetter("number")
+_level_of: Final = operator.attrgetter("level")
 
 
 class Tape:
@@ -55,18 +67,19 @@ class Tape:
     def constant(self, value: float) -> Expression:
         """A number."""
         # The sign of zero counts: it is a different number to atan2.
-        key = ("const", value, math.copysign(1.0, value))
-        known = self._known.get(key)
-        return known or self._new(key, "const", float(value), None, CONSTANT, float(value))
+        key = (None, value, math.copysign(1.0, value))
+        return self._known.get(key) or self._new(key, None, (), CONSTANT, float(value))
 
     def input(self, name: str, index: int) -> Expression:
         """Entry ``index`` of the input ``name``."""
-        key = ("in", name, index)
-        level, value = SAMPLE, math.nan
-        if name in (PARAMETERS, GEOMETRY):
-            level = PARAMETER
+        key = (name, index)
+        known = self._known.get(key)
+        if known is None:
+            level = PARAMETER if name in (PARAMETERS, GEOMETRY) else SAMPLE
             value = float(self.reference[index]) if name == GEOMETRY else math.nan
-        return self._known.get(key) or self._new(key, "in", name, index, level, value)
+            known = self._new(key, None, (), level, value)
+            known.source = key
+        return known
 
     def inputs(self, name: str, size: int) -> Objects:
         """All entries of an input, shape (size,)."""
@@ -78,70 +91,85 @@ class Tape:
         """An expression as it is, a number as a constant."""
         return value if isinstance(value, Expression) else self.constant(float(value))
 
-    def make(self, op: str, a: Expression, b: Expression | None = None) -> Expression:
-        """The operation on one or two expressions, one object for equal ones."""
-        if b is not None and op in _COMMUTE and a.number > b.number:
-            a, b = b, a
-        key = (op, a.number, None if b is None else b.number)
+    def make(self, op: Operation, *args: Expression) -> Expression:
+        """The operation on expressions, one object for equal ones."""
+        if op.commutes and args[0].number > args[1].number:
+            args = args[::-1]
+        key = (op, *map(_number_of, args))
         known = self._known.get(key)
         if known is not None:
             return known
-        level = a.level if b is None else max(a.level, b.level)
-        value = math.nan
-        if level == PARAMETER:
-            value = _PLAIN[op](*((a.value,) if b is None else (a.value, b.value)))
-        return self._new(key, op, a, b, level, value)
+        level = max(map(_level_of, args))
+        value = op.one(*[x.value for x in args]) if level == PARAMETER else math.nan
+        return self._new(key, op, args, level, value)
 
     def _new(
-        self, key: tuple[Any, ...], op: str, a: Any, b: Any, level: int, value: float
+        self, key: Any, op: Operation | None, args: tuple[Expression, ...], level: int, value: float
     ) -> Expression:
-        result = self._known[key] = Expression(self, op, a, b, len(self._known), level, value)
+        result = self._known[key] = Expression(self, op, args, len(self._known), level, value)
         return result
 
 
 class Expression:
-    """One operation. ``a``, ``b``: its arguments; of a constant its value, of an input its name
-    and index. ``value``: in the tape's known case, NaN where it hangs on the sample.
+    """A constant, an input or an operation on ``args``.
+
+    ``source``: name and index of an input. ``value``: of a constant, else in the tape's known case,
+    NaN where it hangs on the sample.
     """
 
-    __slots__ = ("a", "b", "level", "number", "op", "tape", "value")
+    __slots__ = ("args", "level", "number", "op", "source", "tape", "value")
 
     def __init__(
-        self, tape: Tape, op: str, a: Any, b: Any, number: int, level: int, value: float
-    ) -> None:
-        self.tape, self.op, self.a, self.b = tape, op, a, b
+        self, tape: Tape, op: Operation | None, args: tuple[Expression, ...], number: int,
+        level: int, value: float,
+    ) -> None:  # fmt: skip
+        self.tape, self.op, self.args = tape, op, args
         self.number, self.level, self.value = number, level, value
+        self.source: tuple[str, int] | None = None
 
     def is_constant(self, value: float) -> bool:
         """Whether it is this number."""
-        return self.op == "const" and self.a == value
+        return self.level == CONSTANT and self.value == value
+
+    def _with(self, op: Operation, other: Any, *, after: bool = False) -> Any:
+        """The operation on this and another value, or, ``after``, on that and this."""
+        if other.__class__ is not Expression:
+            if isinstance(other, np.ndarray):
+                return NotImplemented
+            other = self.tape.lift(other)
+        a, b = (other, self) if after else (self, other)
+        return (
+            op.fold(a, b)
+            if a.level or b.level
+            else self.tape.constant(op.numbers(a.value, b.value))
+        )
 
     def __add__(self, other: Any) -> Any:
-        return NotImplemented if isinstance(other, np.ndarray) else _add(self, other)
+        return self._with(add, other)
 
     def __radd__(self, other: Any) -> Any:
-        return NotImplemented if isinstance(other, np.ndarray) else _add(other, self)
+        return self._with(add, other, after=True)
 
     def __sub__(self, other: Any) -> Any:
-        return NotImplemented if isinstance(other, np.ndarray) else _subtract(self, other)
+        return self._with(sub, other)
 
     def __rsub__(self, other: Any) -> Any:
-        return NotImplemented if isinstance(other, np.ndarray) else _subtract(other, self)
+        return self._with(sub, other, after=True)
 
     def __mul__(self, other: Any) -> Any:
-        return NotImplemented if isinstance(other, np.ndarray) else _multiply(self, other)
+        return self._with(mul, other)
 
     def __rmul__(self, other: Any) -> Any:
-        return NotImplemented if isinstance(other, np.ndarray) else _multiply(other, self)
+        return self._with(mul, other, after=True)
 
     def __truediv__(self, other: Any) -> Any:
-        return NotImplemented if isinstance(other, np.ndarray) else _divide(self, other)
+        return self._with(divide, other)
 
     def __rtruediv__(self, other: Any) -> Any:
-        return NotImplemented if isinstance(other, np.ndarray) else _divide(other, self)
+        return self._with(divide, other, after=True)
 
-    def __neg__(self) -> Expression:
-        return _negate(self)
+    def __neg__(self) -> Any:
+        return neg(self)
 
     def __pow__(self, power: int) -> Any:
         result: Any = self
@@ -164,157 +192,7 @@ class Expression:
         return cos(self)
 
     def __repr__(self) -> str:
-        return f"<{self.op} {self.number}>"
-
-
-def _pair(a: Any, b: Any) -> tuple[Expression, Expression]:
-    tape = a.tape if isinstance(a, Expression) else b.tape
-    return tape.lift(a), tape.lift(b)
-
-
-def _add(x: Any, y: Any) -> Expression:
-    a, b = _pair(x, y)
-    if a.op == "const" and b.op == "const":
-        return a.tape.constant(a.a + b.a)
-    if a.is_constant(0.0):
-        return b
-    if b.is_constant(0.0):
-        return a
-    if b.op == "neg":
-        return _subtract(a, b.a)
-    if a.op == "neg":
-        return _subtract(b, a.a)
-    return a.tape.make("add", a, b)
-
-
-def _subtract(x: Any, y: Any) -> Expression:
-    a, b = _pair(x, y)
-    if a.op == "const" and b.op == "const":
-        return a.tape.constant(a.a - b.a)
-    if a is b:
-        return a.tape.constant(0.0)
-    if b.is_constant(0.0):
-        return a
-    if a.is_constant(0.0):
-        return _negate(b)
-    if b.op == "neg":
-        return _add(a, b.a)
-    if a.op == "neg":
-        return _negate(_add(a.a, b))
-    return a.tape.make("sub", a, b)
-
-
-def _multiply(x: Any, y: Any) -> Expression:
-    a, b = _pair(x, y)
-    if a.op == "const" and b.op == "const":
-        return a.tape.constant(a.a * b.a)
-    for u, v in ((a, b), (b, a)):
-        if u.is_constant(0.0):
-            return u
-        if u.is_constant(1.0):
-            return v
-        if u.is_constant(-1.0):
-            return _negate(v)
-    if a.op == "neg":
-        return _multiply(a.a, b.a) if b.op == "neg" else _negate(_multiply(a.a, b))
-    if b.op == "neg":
-        return _negate(_multiply(a, b.a))
-    return a.tape.make("mul", a, b)
-
-
-def _divide(x: Any, y: Any) -> Expression:
-    a, b = _pair(x, y)
-    if a.is_constant(0.0):
-        return a
-    if b.op == "const":
-        return _multiply(a, a.tape.constant(1.0 / b.a))
-    if a.op == "neg":
-        return _negate(_divide(a.a, b))
-    if b.op == "neg":
-        return _negate(_divide(a, b.a))
-    # One reciprocal, shared.
-    inverse = a.tape.make("inv", b)
-    return inverse if a.is_constant(1.0) else _multiply(a, inverse)
-
-
-def _negate(e: Expression) -> Expression:
-    if e.op == "const":
-        return e.tape.constant(-e.a)
-    if e.op == "neg":
-        inner: Expression = e.a
-        return inner
-    if e.op == "sub":
-        return e.tape.make("sub", e.b, e.a)
-    return e.tape.make("neg", e)
-
-
-def _unary(op: str, plain: Callable[[Any], Any]) -> Callable[[Any], Any]:
-    def apply(x: Any) -> Any:
-        if not isinstance(x, Expression):
-            return plain(x)
-        return x.tape.constant(float(plain(x.a))) if x.op == "const" else x.tape.make(op, x)
-
-    return apply
-
-
-def _binary(op: str, plain: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
-    def apply(x: Any, y: Any) -> Any:
-        if not (isinstance(x, Expression) or isinstance(y, Expression)):
-            return plain(x, y)
-        a, b = _pair(x, y)
-        if a.op == "const" and b.op == "const":
-            return a.tape.constant(float(plain(a.a, b.a)))
-        return a.tape.make(op, a, b)
-
-    return apply
-
-
-def _circle(e: Expression) -> tuple[Any, Any] | None:
-    """Cosine and sine of an arctangent, or of a sum of arctangents, without computing an angle."""
-    if e.op == "atan2":
-        over = 1.0 / sqrt(e.b * e.b + e.a * e.a)
-        return e.b * over, e.a * over
-    if e.op == "neg":
-        inner = _circle(e.a)
-        return inner and (inner[0], -inner[1])
-    if e.op not in ("add", "sub"):
-        return None
-    first, second = _circle(e.a), _circle(e.b)
-    if first is None or second is None:
-        return None
-    (c, s), (d, t) = first, second
-    t = t if e.op == "add" else -t
-    return c * d - s * t, s * d + c * t
-
-
-def _of_circle(op: str, plain: Callable[[Any], Any], index: int) -> Callable[[Any], Any]:
-    compute = _unary(op, plain)
-
-    def apply(x: Any) -> Any:
-        circle = _circle(x) if isinstance(x, Expression) else None
-        return compute(x) if circle is None else circle[index]
-
-    return apply
-
-
-sqrt: Final = _unary("sqrt", np.sqrt)
-sin: Final = _of_circle("sin", np.sin, 1)
-cos: Final = _of_circle("cos", np.cos, 0)
-absolute: Final = _unary("abs", np.abs)
-sign: Final = _unary("sign", np.sign)
-"""-1, 0 or 1."""
-atan2: Final = _binary("atan2", np.arctan2)
-minimum: Final = _binary("min", np.minimum)
-maximum: Final = _binary("max", np.maximum)
-
-_PLAIN: Final[Mapping[str, Callable[..., float]]] = {
-    "add": operator.add, "sub": operator.sub, "mul": operator.mul, "neg": operator.neg,
-    "inv": lambda x: 1.0 / x if x else math.inf,
-    "sqrt": lambda x: math.sqrt(x) if x >= 0.0 else math.nan,
-    "sin": math.sin, "cos": math.cos, "abs": abs, "sign": lambda x: (x > 0.0) - (x < 0.0),
-    "atan2": math.atan2, "min": min, "max": max,
-}  # fmt: skip
-"""Every operation on two floats or one."""
+        return f"<{self.op or self.source or self.value} {self.number}>"
 
 
 SNAP: Final = 1e-14
@@ -376,28 +254,10 @@ def snapped(value: Any) -> Any:
     known = reference(value)
     for target in (0.0, 1.0, -1.0):
         if abs(known - target) < SNAP:
-            if isinstance(value, Expression) and value.op != "const":
+            if isinstance(value, Expression) and value.level != CONSTANT:
                 value.tape.assumed.append((value, target))
             return target
     return value
-
-
-OPERATIONS: Final[Mapping[str, str]] = {
-    "add": "{a} + {b}",
-    "sub": "{a} - {b}",
-    "mul": "{a} * {b}",
-    "neg": "-{a}",
-    "inv": "1.0 / {a}",
-    "sqrt": "sqrt({a})",
-    "sin": "sin({a})",
-    "cos": "cos({a})",
-    "abs": "fabs({a})",
-    "sign": "sign({a})",
-    "atan2": "atan2({a}, {b})",
-    "min": "fmin({a}, {b})",
-    "max": "fmax({a}, {b})",
-}
-"""Every operation, as the plain back end writes it."""
 
 
 def ordered(results: Iterable[Expression], known: Iterable[int] = ()) -> list[Expression]:
@@ -414,11 +274,13 @@ def ordered(results: Iterable[Expression], known: Iterable[int] = ()) -> list[Ex
             if e.number in seen:
                 continue
             seen.add(e.number)
-            stack.append((e, True))
-            if e.op not in ("const", "in"):
-                stack.append((e.a, False))
-                if e.b is not None:
-                    stack.append((e.b, False))
+            if e.args:
+                stack.append((e, True))
+                for x in e.args:
+                    if x.number not in seen:
+                        stack.append((x, False))
+            else:
+                order.append(e)
     return order
 
 
@@ -426,10 +288,8 @@ def uses(results: Sequence[Expression]) -> dict[int, int]:
     """How often each operation's value is used, by number; a result counts as used often."""
     counts: dict[int, int] = {}
     for e in ordered(results):
-        if e.op not in ("const", "in"):
-            for argument in (e.a, e.b):
-                if argument is not None:
-                    counts[argument.number] = counts.get(argument.number, 0) + 1
+        for x in e.args:
+            counts[x.number] = counts.get(x.number, 0) + 1
     for result in results:
         counts[result.number] = counts.get(result.number, 0) + 2
     return counts
@@ -437,4 +297,4 @@ def uses(results: Sequence[Expression]) -> dict[int, int]:
 
 def count(results: Iterable[Expression]) -> int:
     """Operations a sample: without inputs, constants and what hangs on parameters alone."""
-    return sum(e.level == SAMPLE and e.op != "in" for e in ordered(results))
+    return sum(e.level == SAMPLE and e.op is not None for e in ordered(results))

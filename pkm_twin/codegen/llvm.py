@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Final
+from typing import Final, NamedTuple
 
 import llvmlite
 import llvmlite.binding as binding
@@ -26,9 +26,10 @@ from pkm_twin.codegen.assembly import (
     undefined,
     whole,
 )
-from pkm_twin.codegen.emitter import LANES, MASK, TRUE, VECTOR, Emitter, Prepared
-from pkm_twin.codegen.expressions import GEOMETRY, PARAMETERS, ordered, uses
+from pkm_twin.codegen.expressions import GEOMETRY, PARAMETERS, Expression, ordered, uses
+from pkm_twin.codegen.lanes import ALIGN, LANES, MASK, TRUE, VECTOR, Lanes
 from pkm_twin.codegen.native import CPU, FEATURES, OPTIMISATION, PREPARE, QUICK, SYMBOL
+from pkm_twin.codegen.operations import CONSTANT, fused, sub
 from pkm_twin.codegen.program import (
     CHANGE,
     CLOSED,
@@ -49,6 +50,75 @@ ZERO: Final = whole(0)
 ONE: Final = whole(1)
 IDENTITY: Final = f"{llvmlite.__version__} {CPU} {FEATURES} {LANES} {OPTIMISATION} {QUICK}"
 """What machine code hangs on beside the program."""
+
+
+class Known(dict[int, Value]):
+    """Values by expression; what is prepared is loaded where it is used.
+
+    A value that is held from one end of a program to the other would only be in the way of the
+    registers' allocation.
+    """
+
+    def __init__(self, known: Mapping[int, Value], b: Function, prepared: Prepared | None) -> None:
+        super().__init__(known)
+        self._b = b
+        self.places: Mapping[int, int] = {} if prepared is None else prepared.places
+        self._base = None if prepared is None else prepared.base
+
+    def __missing__(self, number: int) -> Value:
+        if self._base is None:
+            raise KeyError(number)
+        return self._b.load(self._b.gep(self._base, whole(self.places[number])), ALIGN)
+
+
+class Prepared(NamedTuple):
+    """Where the vectors of what is prepared stand, by expression's number."""
+
+    base: Value
+    places: Mapping[int, int]
+
+
+class Emitter(Lanes):
+    """Values of expressions at one place of the code, scalar or in lanes.
+
+    :param prepared: where values that are known stand in memory.
+    """
+
+    def __init__(
+        self,
+        function: Function,
+        used: Mapping[int, int],
+        known: Mapping[int, Value],
+        *,
+        wide: bool,
+        prepared: Prepared | None = None,
+    ) -> None:
+        super().__init__(function, wide=wide)
+        self.used, self.known = used, Known(known, function, prepared)
+
+    def value(self, e: Expression, inputs: Mapping[str, Sequence[Value]]) -> Value:
+        """The instructions of one expression, its arguments known."""
+        if e.source is not None:
+            name, index = e.source
+            return inputs[name][index]
+        if e.op is None:
+            return self.number(e.value)
+        parts = fused(e, self.used, self.known.places)
+        if parts is None:
+            return e.op.lanes(self, e, *[self.known[x.number] for x in e.args])
+        first, product, rest = parts
+        x, y, z = [self.known[v.number] for v in (*product.args, rest)]
+        if e.op is sub:
+            x, z = (x, self.b.fneg(z)) if first else (self.b.fneg(x), z)
+        return self.fused(x, y, z)
+
+    def run(
+        self, results: Sequence[Expression], inputs: Mapping[str, Sequence[Value]]
+    ) -> list[Value]:
+        """Values of the results; every shared expression once."""
+        for e in ordered(results, [*self.known, *self.known.places]):
+            self.known[e.number] = self.value(e, inputs)
+        return [self.known[e.number] for e in results]
 
 
 class _Counter:
@@ -102,8 +172,9 @@ def _preparation(program: Program) -> Function:
     first = {PARAMETERS: 0, GEOMETRY: program.parameters}
     inputs: dict[str, dict[int, Value]] = {name: {} for name in first}
     for e in ordered(results):
-        if e.op == "in":
-            inputs[e.a][e.b] = b.load(b.gep(here, whole(first[e.a] + e.b)))
+        if e.source is not None:
+            name, k = e.source
+            inputs[name][k] = b.load(b.gep(here, whole(first[name] + k)))
     out = Emitter(b, uses(results), {}, wide=False)
     for k, value in enumerate(out.run(results, inputs)):  # type: ignore[arg-type]
         for lane in range(LANES):
@@ -152,8 +223,8 @@ class _Writer:
         """Constants, in all lanes."""
         wide = Emitter(self.b, self.used, {}, wide=True)
         known = [e.number for e in self.program.prepared]
-        constants = [e for e in ordered(self.program.results, known) if e.op == "const"]
-        return {e.number: wide.number(e.a) for e in constants}
+        constants = [e for e in ordered(self.program.results, known) if e.level == CONSTANT]
+        return {e.number: wide.number(e.value) for e in constants}
 
     def emitter(self) -> Emitter:
         return Emitter(self.b, self.used, self.constants, wide=True, prepared=self.prepared)

@@ -14,8 +14,8 @@ from typing import Any, Final
 import numpy as np
 
 from pkm_twin.codegen.arrays import Array, Mask
-from pkm_twin.codegen.elementary import MAX_ANGLE
-from pkm_twin.codegen.expressions import GEOMETRY, OPERATIONS, PARAMETERS, Expression, ordered, uses
+from pkm_twin.codegen.expressions import GEOMETRY, PARAMETERS, Expression, ordered, uses
+from pkm_twin.codegen.operations import OPERATIONS
 from pkm_twin.codegen.program import (
     CHANGE,
     CLOSED,
@@ -34,26 +34,9 @@ _LONGEST: Final = 200
 """Characters of an expression that is written into another one."""
 
 
-def _sign(value: float) -> float:
-    return (value > 0.0) - (value < 0.0)
-
-
-def _one(function: Callable[[float], float]) -> Callable[[float], float]:
-    return lambda x: function(x) if abs(x) < MAX_ANGLE else math.nan
-
-
-def _many(function: Callable[[Array], Array]) -> Callable[[Array], Array]:
-    return lambda x: function(np.where(np.abs(x) < MAX_ANGLE, x, np.nan))
-
-
-_ONE: Final = {
-    "sqrt": math.sqrt, "sin": _one(math.sin), "cos": _one(math.cos), "fabs": abs, "sign": _sign,
-    "atan2": math.atan2, "fmin": min, "fmax": max, "inf": math.inf, "nan": math.nan,
-}  # fmt: skip
-_MANY: Final = {
-    "sqrt": np.sqrt, "sin": _many(np.sin), "cos": _many(np.cos), "fabs": np.abs, "sign": np.sign,
-    "atan2": np.arctan2, "fmin": np.minimum, "fmax": np.maximum, "inf": math.inf, "nan": math.nan,
-}  # fmt: skip
+_NUMBERS: Final = {"inf": math.inf, "nan": math.nan}
+_ONE: Final = {op.name: op.one for op in OPERATIONS} | _NUMBERS
+_MANY: Final = {op.name: op.many for op in OPERATIONS} | _NUMBERS
 
 
 def source(
@@ -71,22 +54,20 @@ def source(
     lines = [f"def program({', '.join(inputs)}):"]
     read: dict[str, set[int]] = {}
     for e in order:
-        if e.op == "in":
-            read.setdefault(e.a, set()).add(e.b)
+        if e.source is not None:
+            read.setdefault(e.source[0], set()).add(e.source[1])
     for name, size in inputs.items():
         if read.get(name):
             lines.append(f"    {', '.join(f'{name}{k}' for k in range(size))}, = {name}")
     for e in order:
-        if e.op == "const":
-            text[e.number] = f"({e.a!r})"
-        elif e.op == "in":
-            text[e.number] = f"{e.a}{e.b}"
+        if e.source is not None:
+            text[e.number] = "{}{}".format(*e.source)
+        elif e.op is None:
+            text[e.number] = f"({e.value!r})"
         else:
-            a = text[e.a.number]
-            b = "" if e.b is None else text[e.b.number]
-            written = OPERATIONS[e.op].format(a=a, b=b)
+            written = e.op.in_python([text[x.number] for x in e.args])
             if counts[e.number] == 1 and len(written) < _LONGEST:
-                text[e.number] = f"({written})"
+                text[e.number] = written
             else:
                 text[e.number] = f"v{e.number}"
                 lines.append(f"    v{e.number} = {written}")

@@ -8,15 +8,8 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Final
 
-from pkm_twin.codegen.expressions import (
-    GEOMETRY,
-    PARAMETER,
-    PARAMETERS,
-    SAMPLE,
-    Expression,
-    Tape,
-    ordered,
-)
+from pkm_twin.codegen.expressions import GEOMETRY, PARAMETERS, Expression, Tape, count, ordered
+from pkm_twin.codegen.operations import PARAMETER, SAMPLE
 from pkm_twin.errors import PkmTwinError
 
 UNKNOWNS: Final = "x"
@@ -128,8 +121,9 @@ class Program:
         if self.equations is not None:
             known[UNKNOWNS] = len(self.equations.home)
         for e in ordered(self.results):
-            if e.op == "in" and not e.b < known.get(e.a, 0):
-                raise PkmTwinError(f"the program reads {e.a}[{e.b}], which is no input")
+            name, index = e.source or ("", -1)
+            if not index < known.get(name, 0):
+                raise PkmTwinError(f"the program reads {name}[{index}], which is no input")
 
     @property
     def geometry(self) -> int:
@@ -152,8 +146,8 @@ class Program:
         """
         edge = {e.number: e for e in self.results if e.level == PARAMETER}
         for e in ordered(self.results):
-            if e.level == SAMPLE and e.op != "in":
-                edge |= {a.number: a for a in (e.a, e.b) if a is not None and a.level == PARAMETER}
+            if e.level == SAMPLE:
+                edge |= {x.number: x for x in e.args if x.level == PARAMETER}
         return list(edge.values())
 
     @property
@@ -170,7 +164,4 @@ class Program:
         """Operations of one correction, and of the outputs."""
         newton = [] if self.equations is None else self.equations.results
         rows = [e for row in self.outputs.values() for e in row]
-        return tuple(  # type: ignore[return-value]
-            sum(e.level == SAMPLE and e.op != "in" for e in ordered(part))
-            for part in (newton, rows)
-        )
+        return count(newton), count(rows)

@@ -8,15 +8,14 @@ as the other back ends.
 
 from __future__ import annotations
 
-import operator
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from textwrap import indent
 from typing import Any, Final
 
-from pkm_twin.codegen import expressions
 from pkm_twin.codegen.code import STEPS
-from pkm_twin.codegen.expressions import PARAMETER, SAMPLE, Expression, Tape, count, ordered
+from pkm_twin.codegen.expressions import Expression, Tape, count, ordered
+from pkm_twin.codegen.operations import OPERATIONS, PARAMETER, SAMPLE, Operation, c_number
 from pkm_twin.codegen.program import (
     CHANGE,
     CLOSED,
@@ -28,18 +27,12 @@ from pkm_twin.codegen.program import (
     UNKNOWNS,
     Equations,
 )
-from pkm_twin.export.c_lines import HELPERS, Lines, bare, number, table
+from pkm_twin.export.c_lines import Lines, bare, table
 
 LADDER: Final = (1, *STEPS)
 """Steps of Newton's method, one attempt after the other."""
 CORRECTIONS: Final = TURNS * sum(LADDER)
 """Most corrections of a call."""
-_OPERATIONS: Final[Mapping[str, Callable[..., Any]]] = {
-    "add": operator.add, "sub": operator.sub, "mul": operator.mul, "neg": operator.neg,
-    "inv": lambda x: 1.0 / x, "sqrt": expressions.sqrt, "sin": expressions.sin,
-    "cos": expressions.cos, "abs": expressions.absolute, "sign": expressions.sign,
-    "atan2": expressions.atan2, "min": expressions.minimum, "max": expressions.maximum,
-}  # fmt: skip
 
 
 class Folding:
@@ -55,13 +48,12 @@ class Folding:
         results = list(results)
         made: dict[int, Expression] = {}
         for e in ordered(results):
-            value: Any
-            if e.op == "const":
-                value = e.a
-            elif e.op == "in":
-                value = given[e.a][e.b] if e.a in given else self.tape.input(e.a, e.b)
-            else:
-                value = _OPERATIONS[e.op](*(made[x.number] for x in (e.a, e.b) if x is not None))
+            value: Any = e.value
+            if e.source is not None:
+                name, k = e.source
+                value = given[name][k] if name in given else self.tape.input(name, k)
+            elif e.op is not None:
+                value = e.op(*(made[x.number] for x in e.args))
             made[e.number] = self.tape.lift(value)
         return [made[e.number] for e in results]
 
@@ -147,7 +139,7 @@ class Unit:
     def __init__(self, prefix: str, parameters: Sequence[Expression]) -> None:
         self.prefix = prefix
         self._known = {e.number: f"p[{k}]" for k, e in enumerate(parameters)}
-        self._needed: set[str] = set()
+        self._needed: set[Operation] = set()
         self._parts: list[str] = []
         self._solvers: dict[str, Equations] = {}
         self._ahead: dict[str, dict[int, str]] = {}
@@ -156,7 +148,7 @@ class Unit:
 
     def text(self) -> str:
         """Helpers and all functions."""
-        helpers = [text for op, text in HELPERS.items() if op in self._needed]
+        helpers = dict.fromkeys(op.helper for op in OPERATIONS if op in self._needed and op.helper)
         steps = ", ".join(map(str, LADDER))
         ladder = f"""\
 /* Attempts of Newton's method; fewer shorten the worst case, and reject some valid states. */
@@ -188,10 +180,10 @@ static const int @_steps[{len(LADDER)}] = {{{steps}}};
         :param called: what callers give for an argument of another name.
         """
         order = ordered(results, known)
-        below = [x for e in order for x in (e.a, e.b) if isinstance(x, Expression)]
+        below = [x for e in order for x in e.args]
         tables = {known[e.number] for e in (*results, *below) if e.number in known}
         arguments = sorted({text.partition("[")[0] for text in tables})
-        arguments += sorted({e.a for e in order if e.op == "in"})
+        arguments += sorted({e.source[0] for e in order if e.source is not None})
         made = Lines(results, known)
         self._needed |= made.needed
         lines = made.lines + [f"    r[{k}] = {bare(text)};" for k, text in enumerate(made.results)]
@@ -217,8 +209,8 @@ static const int @_steps[{len(LADDER)}] = {{{steps}}};
             begin = self.function(f"{name}_start", q.start, known, aim) % "x"
             start = f"\n        if (steps == 1) {{\n            {begin};\n        }}"
         least, size = _choice(q.least, STEPPED), _choice(q.before, LARGE)
-        self.add(table(f"@_{name}_home", [e.a for e in q.home]))
-        self.add(table(f"@_{name}_origin", [e.a for e in q.origin]))
+        self.add(table(f"@_{name}_home", [e.value for e in q.home]))
+        self.add(table(f"@_{name}_origin", [e.value for e in q.origin]))
         self.add(f"""\
 /* Newton's method from the known assembly in so many steps; 0 where it does not get there. */
 static int @_{name}(const double *{q.target}, int steps, double *h, double *x)
@@ -351,8 +343,8 @@ def edge(rows: Iterable[Sequence[Expression]]) -> list[Expression]:
     for results in rows:
         found |= {e.number: e for e in results if e.level == PARAMETER}
         for e in ordered(results):
-            if e.level == SAMPLE and e.op != "in":
-                found |= {x.number: x for x in (e.a, e.b) if x is not None and x.level == PARAMETER}
+            if e.level == SAMPLE:
+                found |= {x.number: x for x in e.args if x.level == PARAMETER}
     return list(found.values())
 
 
@@ -361,10 +353,9 @@ def _without(name: str, results: Sequence[Expression]) -> list[Expression]:
     moved: set[int] = set()
     found: dict[int, Expression] = {}
     for e in ordered(results):
-        below = [x for x in (e.a, e.b) if isinstance(x, Expression)]
-        if (e.op == "in" and e.a == name) or any(x.number in moved for x in below):
+        if (e.source or "")[:1] == (name,) or any(x.number in moved for x in e.args):
             moved.add(e.number)
-            still = (x for x in below if x.number not in moved and x.op not in ("in", "const"))
+            still = (x for x in e.args if x.number not in moved and x.op is not None)
             found |= {x.number: x for x in still}
     return list(found.values())
 
@@ -372,5 +363,5 @@ def _without(name: str, results: Sequence[Expression]) -> list[Expression]:
 def _choice(once: float, stepped: float) -> str:
     """A bound of Newton's method in one step, and in more."""
     if once == stepped:
-        return number(once)
-    return f"((steps == 1) ? {number(once)} : {number(stepped)})"
+        return c_number(once)
+    return f"((steps == 1) ? {c_number(once)} : {c_number(stepped)})"

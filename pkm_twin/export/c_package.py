@@ -219,7 +219,7 @@ class Package:
     def _write(self) -> None:
         unit = self.unit
         own = self.fold(self.parameters, {PARAMETERS: self._payload()})
-        unit.add(table("@_own", [e.a for e in own]))
+        unit.add(table("@_own", [e.value for e in own]))
         unit.solver(SOLVER, self.equations)
         if self.massive:
             self._write_parameters()

@@ -16,15 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pkm_twin.codegen.arrays import Array
-from pkm_twin.codegen.expressions import (
-    Numbers,
-    Objects,
-    cos,
-    sin,
-    snapped,
-    snapped_all,
-    sqrt,
-)
+from pkm_twin.codegen.expressions import Numbers, Objects, snapped, snapped_all
+from pkm_twin.codegen.operations import cos, sin, sqrt
 from pkm_twin.machine.graph import BASE, Direction, Joint, Rod
 from pkm_twin.machine.joints import UNITS, Constraint, across, unit
 from pkm_twin.machine.tree import Link, Step, Tree

@@ -16,7 +16,8 @@ from typing import Any
 import numpy as np
 
 from pkm_twin.codegen.arrays import Array
-from pkm_twin.codegen.expressions import Expression, Numbers, Objects, atan2, sqrt
+from pkm_twin.codegen.expressions import Expression, Numbers, Objects
+from pkm_twin.codegen.operations import atan2, sqrt
 from pkm_twin.codegen.program import Program
 from pkm_twin.kinematics.engine import Engine
 from pkm_twin.kinematics.motion import cross

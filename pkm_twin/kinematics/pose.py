@@ -11,7 +11,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
-from pkm_twin.codegen.expressions import Numbers, atan2, cos, sin, sqrt
+from pkm_twin.codegen.expressions import Numbers
+from pkm_twin.codegen.operations import atan2, cos, sin, sqrt
 from pkm_twin.kinematics.motion import Columns, Motion, cross
 
 Entry = tuple[int, int, float]

@@ -33,8 +33,9 @@ import numpy as np
 
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.codegen.cholesky import SparseCholesky, traces_over
-from pkm_twin.codegen.expressions import Objects, maximum, minimum, norm, plain, sqrt
+from pkm_twin.codegen.expressions import Objects, norm, plain
 from pkm_twin.codegen.kernels import Kernel
+from pkm_twin.codegen.operations import maximum, minimum, sqrt
 from pkm_twin.codegen.program import Program
 from pkm_twin.errors import SingularityError
 from pkm_twin.kinematics.engine import Engine

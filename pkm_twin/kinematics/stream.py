@@ -7,8 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from pkm_twin.codegen.expressions import PARAMETERS, absolute
+from pkm_twin.codegen.expressions import PARAMETERS
 from pkm_twin.codegen.kernels import Kernel
+from pkm_twin.codegen.operations import absolute
 from pkm_twin.codegen.program import Program
 from pkm_twin.kinematics import pose as poses
 from pkm_twin.kinematics.engine import Engine

@@ -15,16 +15,13 @@ from typing import Any, ClassVar, Final
 import numpy as np
 
 from pkm_twin.codegen.arrays import Array
-from pkm_twin.codegen.expressions import absolute, cos, maximum, minimum, references, sign, sin
+from pkm_twin.codegen.expressions import references
+from pkm_twin.codegen.operations import absolute, cos, exp, maximum, sign, sin
 from pkm_twin.errors import ParameterError
 
 Values = Mapping[str, Any]
 """A law's parameters by key: a number, an expression or an array."""
 
-HALVINGS: Final = 7
-"""Of the argument of :func:`decay`."""
-PADE: Final = (30240.0, 15120.0, 3360.0, 420.0, 30.0, 1.0)
-"""Of the exponential function, diagonal, order five."""
 LEAST: Final = 1e-9
 """Divisor in place of a parameter that is not given: its law's effort is zero."""
 
@@ -126,7 +123,7 @@ class Stribeck(FrictionLaw):
         """Zero or more."""
         del q
         ratio = speed / maximum(values["stribeck_speed"], LEAST)
-        return values["stribeck"] * decay(ratio * ratio)
+        return values["stribeck"] * exp(-(ratio * ratio))
 
 
 class LoadDependent(FrictionLaw):
@@ -176,21 +173,6 @@ LAWS: Final[Mapping[str, type[FrictionLaw]]] = {
     law.name: law for law in FrictionLaw.__subclasses__() if law is not BASIC
 }
 """The other laws by name."""
-
-
-def decay(x: Any) -> Any:
-    """exp(-x) for x >= 0, of numbers or expressions, to 4e-12 of itself; constant from 64 on.
-
-    Of operations that all back ends have, so that all compute the same.
-    """
-    z = minimum(x, 64.0) * (-(0.5**HALVINGS))
-    square = z * z
-    even = PADE[0] + square * (PADE[2] + square * PADE[4])
-    odd = z * (PADE[1] + square * (PADE[3] + square * PADE[5]))
-    result = (even + odd) / (even - odd)
-    for _ in range(HALVINGS):
-        result = result * result
-    return result
 
 
 def law_names(friction: Any, opened: Sequence[str] = ()) -> tuple[str, ...]:

@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from pkm_twin.codegen.arrays import Array
-from pkm_twin.codegen.expressions import cos, maximum, minimum, norm, plain, reference, sin
+from pkm_twin.codegen.expressions import norm, plain, reference
+from pkm_twin.codegen.operations import cos, maximum, minimum, sin
 from pkm_twin.errors import ParameterError
 from pkm_twin.machine.joints import TYPES, Constraint, Freedom, JointType
 

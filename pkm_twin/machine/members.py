@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 
 from pkm_twin.codegen.arrays import Array
-from pkm_twin.codegen.expressions import maximum, number, reference, sign, sqrt
+from pkm_twin.codegen.expressions import number, reference
+from pkm_twin.codegen.operations import maximum, sign, sqrt
 from pkm_twin.errors import ParameterError
 from pkm_twin.machine import schema
 

@@ -18,7 +18,7 @@ from typing import Any, Final, TypeVar
 import numpy as np
 
 from pkm_twin.codegen.arrays import Array
-from pkm_twin.codegen.expressions import absolute, maximum, minimum
+from pkm_twin.codegen.operations import absolute, maximum, minimum
 from pkm_twin.errors import ParameterError, UnknownNameError
 
 MAX_SIZE: Final = 1e18

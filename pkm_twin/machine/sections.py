@@ -11,7 +11,7 @@ from functools import cache as remembered
 from typing import Any, Final, Protocol
 
 from pkm_twin.codegen.arrays import Array
-from pkm_twin.codegen.expressions import absolute
+from pkm_twin.codegen.operations import absolute
 from pkm_twin.errors import ParameterError
 from pkm_twin.machine import schema
 from pkm_twin.machine.friction import BASIC, all_keys, check_laws

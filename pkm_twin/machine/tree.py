@@ -18,7 +18,8 @@ from typing import Any, Final
 import numpy as np
 
 from pkm_twin.codegen.arrays import Array
-from pkm_twin.codegen.expressions import atan2, norm, plain, reference, snapped, snapped_all
+from pkm_twin.codegen.expressions import norm, plain, reference, snapped, snapped_all
+from pkm_twin.codegen.operations import atan2
 from pkm_twin.errors import ParameterError
 from pkm_twin.machine.graph import BASE, Graph, rotation_about_z
 from pkm_twin.machine.joints import Freedom, across, unit

@@ -27,20 +27,8 @@ from typing import Any, ClassVar, Final
 import numpy as np
 
 from pkm_twin.codegen.arrays import Array
-from pkm_twin.codegen.expressions import (
-    Expression,
-    Numbers,
-    Objects,
-    absolute,
-    atan2,
-    cos,
-    maximum,
-    minimum,
-    plain,
-    reference,
-    sin,
-    sqrt,
-)
+from pkm_twin.codegen.expressions import Expression, Numbers, Objects, plain, reference
+from pkm_twin.codegen.operations import absolute, atan2, cos, maximum, minimum, sin, sqrt
 from pkm_twin.errors import ParameterError
 from pkm_twin.kinematics.motion import cross
 from pkm_twin.kinematics.pose import COORDINATES, Coordinate

@@ -18,7 +18,8 @@ from typing import Any, ClassVar, Final
 import numpy as np
 
 from pkm_twin.codegen.arrays import Array
-from pkm_twin.codegen.expressions import cos, plain, sin, sqrt
+from pkm_twin.codegen.expressions import plain
+from pkm_twin.codegen.operations import cos, sin, sqrt
 from pkm_twin.errors import ParameterError
 from pkm_twin.kinematics.pose import COORDINATES, Coordinate
 from pkm_twin.machine import schema

@@ -37,18 +37,8 @@ from typing import Any, ClassVar, Final
 import numpy as np
 
 from pkm_twin.codegen.arrays import Array
-from pkm_twin.codegen.expressions import (
-    Numbers,
-    Objects,
-    absolute,
-    cos,
-    maximum,
-    minimum,
-    plain,
-    sin,
-    snapped,
-    sqrt,
-)
+from pkm_twin.codegen.expressions import Numbers, Objects, plain, snapped
+from pkm_twin.codegen.operations import absolute, cos, maximum, minimum, sin, sqrt
 from pkm_twin.errors import ParameterError
 from pkm_twin.kinematics.motion import Motion
 from pkm_twin.kinematics.pose import COORDINATES, Coordinate, about_x, about_y

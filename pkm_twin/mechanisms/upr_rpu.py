@@ -34,19 +34,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from pkm_twin.codegen.arrays import Array
-from pkm_twin.codegen.expressions import (
-    Numbers,
-    Objects,
-    absolute,
-    atan2,
-    cos,
-    maximum,
-    minimum,
-    norm,
-    reference,
-    sin,
-    sqrt,
-)
+from pkm_twin.codegen.expressions import Numbers, Objects, norm, reference
+from pkm_twin.codegen.operations import absolute, atan2, cos, maximum, minimum, sin, sqrt
 from pkm_twin.errors import ParameterError
 from pkm_twin.kinematics.engine import Engine
 from pkm_twin.kinematics.pose import COORDINATES, Coordinate, about_x, about_y

@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from pkm_twin.codegen.arrays import Array
-from pkm_twin.codegen.expressions import maximum, minimum, sqrt
 from pkm_twin.codegen.kernels import Kernel
+from pkm_twin.codegen.operations import maximum, minimum, sqrt
 from pkm_twin.codegen.program import Program
 from pkm_twin.errors import ParameterError
 from pkm_twin.kinematics.motion import cross

@@ -22,9 +22,10 @@ import numpy as np
 
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.codegen.code import Code
-from pkm_twin.codegen.expressions import Objects, Tape, sqrt
+from pkm_twin.codegen.expressions import Objects, Tape
 from pkm_twin.codegen.kernels import Kernel
 from pkm_twin.codegen.key import EMPTY
+from pkm_twin.codegen.operations import sqrt
 from pkm_twin.codegen.program import Program
 from pkm_twin.errors import MessageError
 from pkm_twin.messages.stamps import SECOND

@@ -16,8 +16,10 @@ from pkm_twin import variants
 from pkm_twin.codegen import cache, parts
 from pkm_twin.codegen import code as codes
 from pkm_twin.codegen import expressions as ex
+from pkm_twin.codegen import operations as op
 from pkm_twin.codegen.cholesky import FLOOR, traces_over
 from pkm_twin.codegen.code import Code
+from pkm_twin.codegen.derivatives import tangents
 from pkm_twin.codegen.kernels import Kernel
 from pkm_twin.codegen.key import ProgramKey
 from pkm_twin.codegen.lu import SparseLU, independent_rows, pivot_order
@@ -49,11 +51,12 @@ def both(write, x, key):
 
 def formula(x):
     a, b, c, d = x
-    s = ex.sqrt(a * a + b * b + 1.0)
+    s = op.sqrt(a * a + b * b + 1.0)
     return [
-        a + b, a - b, a * b, -a, a / s, s, ex.sin(a), ex.cos(b), ex.absolute(c), ex.sign(d),
-        ex.atan2(a, b), ex.minimum(a, c), ex.maximum(b, d), (a + b) * (a - b) - c / s + 3.0 * d,
-        ex.sin(a) * ex.cos(a) - (-b) * (-c), 2.0 - (3.0 - a), (a - b) - (b - a), 0.0 * a + 1.0 * b,
+        a + b, a - b, a * b, -a, a / s, s, op.sin(a), op.cos(b), op.absolute(c), op.sign(d),
+        op.atan2(a, b), op.minimum(a, c), op.maximum(b, d), (a + b) * (a - b) - c / s + 3.0 * d,
+        op.exp(a), op.tanh(b), op.less(a, b), op.select(op.less(c, d), a, -b), op.select(c, a, d),
+        op.sin(a) * op.cos(a) - (-b) * (-c), 2.0 - (3.0 - a), (a - b) - (b - a), 0.0 * a + 1.0 * b,
     ]  # fmt: skip
 
 
@@ -72,12 +75,12 @@ def test_equal_expressions_are_one_and_constants_fold():
     tape = ex.Tape()
     a, b = tape.inputs("x", 2)
     assert a + b is b + a
-    assert ex.sin(a) is ex.sin(a)
+    assert op.sin(a) is op.sin(a)
     assert (a * 0.0).is_constant(0.0)
     assert a * 1.0 is a
     assert a - a is tape.constant(0.0)
     assert 0.0 - (-a) is a
-    assert ex.sqrt(tape.constant(4.0)).is_constant(2.0)
+    assert op.sqrt(tape.constant(4.0)).is_constant(2.0)
     # The sign of zero is another number to atan2.
     assert tape.constant(0.0) is not tape.constant(-0.0)
 
@@ -96,7 +99,7 @@ def test_sine_cosine_and_arctangent_over_large_ranges(rng):
     a = size * rng.choice([-1.0, 1.0], len(size))
     near = np.pi / 2 * rng.integers(-1000, 1000, 1000) + rng.normal(0.0, 1e-9, 1000)
     a = np.concatenate([a, near, [0.0]])[:, None]
-    fast, _ = both(lambda x: [ex.sin(x[0]), ex.cos(x[0])], a, "test sincos")
+    fast, _ = both(lambda x: [op.sin(x[0]), op.cos(x[0])], a, "test sincos")
     # The reduction has three parts of pi / 2: what they miss grows with the turns.
     bound = 4e-16 + 5e-21 * np.abs(a[:, 0])
     assert (np.abs(fast[:, 0] - np.sin(a[:, 0])) <= bound).all()
@@ -105,7 +108,7 @@ def test_sine_cosine_and_arctangent_over_large_ranges(rng):
     np.testing.assert_allclose(fast[small, 0], np.sin(a[small, 0]), rtol=4e-16)
     # Beyond, the reduction would lose digits.
     far = np.array([1e6, -1e6, 1e9, 1e16, 1e300, -1e308])[:, None]
-    tape = program(lambda x: [ex.sin(x[0]), ex.cos(x[0])], 1)
+    tape = program(lambda x: [op.sin(x[0]), op.cos(x[0])], 1)
     (fast,), _ = Kernel(Code(lambda: tape, ProgramKey("test sincos")))(NONE, far)
     (slow,), _ = PlainKernel(tape).run([far])
     assert np.isnan(fast).all() and np.isnan(slow).all()
@@ -113,8 +116,41 @@ def test_sine_cosine_and_arctangent_over_large_ranges(rng):
     pairs[:2000] = rng.normal(size=(2000, 2))
     special = [[0.0, 1.0], [0.0, -1.0], [1.0, 0.0], [-1.0, 0.0], [0.0, 0.0], [1.0, 1.0]]
     pairs = np.concatenate([pairs, special])
-    fast, _ = both(lambda x: [ex.atan2(x[0], x[1])], pairs, "test atan2")
+    fast, _ = both(lambda x: [op.atan2(x[0], x[1])], pairs, "test atan2")
     np.testing.assert_allclose(fast[:, 0], np.arctan2(*pairs.T), rtol=5e-16, atol=1e-300)
+
+
+@compiled
+def test_exponential_and_hyperbolic_tangent_over_their_whole_range(rng):
+    """Within two ulps of numpy's, to where they are zero, one or infinite."""
+    x = np.concatenate([rng.uniform(-745.0, 690.0, 4000), 10.0 ** rng.uniform(-300, 1, 1000), [0]])
+    x = np.concatenate([x, -x[4000:]])[:, None]
+    fast, slow = both(lambda x: [op.exp(x[0]), op.tanh(x[0])], x, "test exponential")
+    for found in (fast, slow):
+        np.testing.assert_allclose(found[:, 0], np.exp(x[:, 0]), rtol=5e-16, atol=1e-323)
+        np.testing.assert_allclose(found[:, 1], np.tanh(x[:, 0]), rtol=5e-16)
+    # An infinite value is refused, its reciprocal is zero.
+    far = np.array([[720.0], [1e4], [1e290]])
+    for found in both(lambda x: [1.0 / op.exp(x[0]), op.exp(-x[0])], far, "test infinite"):
+        np.testing.assert_allclose(found[:, 0], found[:, 1], rtol=1e-9, atol=1e-300)
+        assert (found[1:] == 0.0).all()
+
+
+@pytest.mark.parametrize("name", [one.name for one in op.OPERATIONS])
+def test_slopes_of_operations_are_those_of_their_values(rng, name):
+    """Central differences, away from where an operation jumps."""
+    (one,) = (one for one in op.OPERATIONS if one.name == name)
+    values = rng.uniform(0.5, 1.5, 3)
+    arguments = 3 if name == "select" else 1
+    if name in {"add", "sub", "mul", "atan2", "min", "max", "less"}:
+        arguments = 2
+    tape = ex.Tape(values.tolist())
+    given = list(tape.inputs(ex.GEOMETRY, 3))[:arguments]
+    (found,) = tangents([one(*given)], given)
+    for k, slope in enumerate(found):
+        step = 1e-6 * np.eye(3)[k]
+        high, low = (one.numbers(*(values + s)[:arguments]) for s in (step, -step))
+        assert ex.reference(slope) == pytest.approx((high - low) / 2e-6, abs=1e-8)
 
 
 @every_robot

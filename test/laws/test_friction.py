@@ -17,7 +17,7 @@ from delta_dynamics.plant import Plant
 from pkm_twin.apps.certificate.maximal import Maximal
 from pkm_twin.errors import ParameterError
 from pkm_twin.export.fmu import Fmu
-from pkm_twin.machine.friction import BASIC, LAWS, all_keys, decay
+from pkm_twin.machine.friction import BASIC, LAWS, all_keys
 from pkm_twin.robot.catalogue import robot_of_data
 from pkm_twin.robot.robot_urdf import robot_description
 from test.machine.random_machines import variant
@@ -153,12 +153,6 @@ def test_a_drive_breaks_away_at_static_friction_and_its_share_of_the_load(way, r
             plant.advance(effort, np.zeros(6), 1e-3)
         assert (way * (plant.q - q)[0] > 0.0) == moves
         assert moves or (plant.q == q).all()
-
-
-def test_the_exponential_is_that_of_the_field():
-    x = np.linspace(0.0, 60.0, 1001)
-    assert np.abs(decay(x) / np.exp(-x) - 1.0).max() < 1e-11
-    assert 0.0 <= decay(1e300) < 1e-27
 
 
 def test_files_state_the_laws_and_keep_them():
