@@ -83,7 +83,6 @@ TASKS: Final[Mapping[str, Mapping[str, Entry]]] = {
         "excite": Entry("excite:excite"),
         "fit": Entry("fit:fit", tables=True, wrenches=True),
         "drive-friction": Entry("drive_friction:drive_friction_command"),
-        "calibrate": Entry("calibrate:calibrate_command"),
     },
     "Design and export": {
         "design": Entry("design:design_command"),

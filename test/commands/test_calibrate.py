@@ -16,8 +16,8 @@ from typer.testing import CliRunner
 from bags.recording.capture import machine_parameters
 from bags.recording.record_poses import NOISE, OFFSETS, SHIFTS, TURNS, record
 from pkm_twin import Robot
-from pkm_twin.apps.calibrate import read_poses
 from pkm_twin.apps.cli import app
+from pkm_twin.apps.pose_table import read_poses
 from pkm_twin.errors import ParameterError
 from pkm_twin.identification.calibration import calibrate, geometric
 from pkm_twin.identification.calibration_state import Poses

@@ -1,0 +1,390 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``pkm-twin calibrate``: the geometry of one's own machine from measurements of its platform."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from textwrap import fill
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from pkm_twin.apps.frame import command
+from pkm_twin.apps.limits import beyond_limits, refuse_beyond
+from pkm_twin.apps.options import Accepts, BeyondLimitsToo, OfRobot, Overwrites
+from pkm_twin.apps.pose_table import LENGTHS, parse_columns, read_measured, read_poses
+from pkm_twin.console import progress, refuse_existing
+from pkm_twin.errors import ParameterError, UnknownNameError, one_line
+from pkm_twin.files import replace_file
+from pkm_twin.identification.calibration import Calibration, Estimate, Scale, geometric
+from pkm_twin.identification.calibration import calibrate as calibrated
+from pkm_twin.identification.calibration_fit import STEPS
+from pkm_twin.identification.calibration_state import BESIDE, Poses
+from pkm_twin.identification.measurements import KINDS, Measured, kinds_of
+from pkm_twin.identification.plan import MOST, Plan
+from pkm_twin.identification.plan import plan as plan_of
+from pkm_twin.identification.transmission import Transmission, written
+from pkm_twin.report import Column, Fact, Report, Table
+from pkm_twin.robot.edited import Fitted, edited_yaml, write_edited
+from pkm_twin.settings import setting
+
+if TYPE_CHECKING:
+    from pkm_twin.robot.robot import Robot
+
+WIDTH: Final = 100
+"""Columns of a line of text."""
+MOST_SHOWN: Final = 10
+"""Outliers that are printed."""
+STEPS_SHOWN: Final = (0, 1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128)
+"""Measurements of a plan after which its deviations are printed."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Calibrate(OfRobot, BeyondLimitsToo, Accepts, Overwrites):
+    """Fit a robot's geometry and joint offsets to poses that an instrument measured.
+
+    A robust least-squares fit with the machine's closures. A pose that does not fit the others gets
+    a small weight, and the report names its line. Changes of numbers that the poses do not
+    determine are listed and not made; a number in one may still change with others. The fit does
+    not use every fourth pose: the error there, before and after, is the calibration's accuracy.
+
+    Poses that this machine cannot reach are rejected with the reason, and without --frame so are
+    poses in another frame than the base's. --accept calibrates anyway and marks the file.
+
+    With --measure, parts of the poses are enough, and cells may be empty. Each measurement is then
+    compared with the fit to all others, and the report says whether the scale is determined.
+    --plan chooses the most informative poses.
+    """
+
+    poses: Path | None = setting(
+        None,
+        "CSV: JOINT.position columns, x y z (m), perhaps roll pitch yaw (rad) or qx qy qz qw; or "
+        "what --measure names",
+        argument=True,
+    )
+    out: Path | None = setting(
+        None, "the calibrated robot, a YAML; default: calibrated.yaml", writes=True,
+        endings=(".yaml", ".yml"),
+    )  # fmt: skip
+    only: tuple[str, ...] = setting(
+        (), "fit only numbers whose path begins with this; may be repeated"
+    )
+    no_offsets: bool = setting(False, "do not fit the joints' sensor offsets")
+    frame: bool = setting(False, "fit where the instrument stands: its six numbers")
+    target: bool = setting(False, "fit where the target is on the platform: three numbers")
+    prior: float = setting(
+        0.01, "how well lengths are known before, m (standard deviation)", low=1e-6, high=1.0
+    )
+    transmission: Transmission = setting(
+        Transmission.AUTO,
+        "ratios of joint_map to fit: each joint's, one factor shared by all, each and its change "
+        "with travel (a spool), or none (file); auto: each of sliding joints that have a ratio",
+        choices={str(how): how for how in Transmission},
+    )
+    columns: tuple[str, ...] = setting(
+        (),
+        "NAME=HEADER of columns with other headers, separated by commas: "
+        "'leg_*.position=motor_*, x=pos_x [mm]'; may be repeated",
+    )
+    units: str = setting(
+        "m", "of x, y and z where their headers have none", choices=tuple(LENGTHS),
+        older=("--unit",),
+    )  # fmt: skip
+    measure: tuple[str, ...] = setting(
+        (),
+        "what was measured, where not whole poses, separated by commas: height, distance (of two "
+        "poses), radius (ball bar), range (laser tracker), plane (contact), tilt (roll, pitch), or "
+        "of x, y, z, roll, pitch, yaw",
+    )
+    noise: tuple[str, ...] = setting(
+        (), "KIND=VALUE: known standard deviation of a measurement, m or rad"
+    )
+    plan: Path | None = setting(
+        None,
+        "write the poses to measure next, a CSV, and predict how well the machine will be known; "
+        "calibrate nothing",
+        writes=True,
+        endings=(".csv",),
+    )
+    count: int | None = setting(None, "poses of a plan", low=1, high=MOST)
+    accuracy: float | None = setting(
+        None, "position's standard deviation that a plan is to reach, m", low=1e-9
+    )
+    within: str | None = setting(
+        None, "where a plan measures: x=-0.1:0.1,z=0 (m, rad); default: everywhere"
+    )
+
+    @property
+    def free(self) -> dict[str, Any]:
+        """What is fitted beside the file's numbers."""
+        return {
+            "offsets": not self.no_offsets, "frame": self.frame, "target": self.target,
+            "prior": self.prior, "transmission": self.transmission,
+        }  # fmt: skip
+
+
+def calibrate(given: Calibrate) -> Report:
+    """The calibrated robot's numbers and errors, or a plan.
+
+    :raises ParameterError: poses of another machine, or too few; see
+        :func:`pkm_twin.identification.calibration.calibrate`.
+    """
+    out = given.out or Path("calibrated.yaml")
+    if given.plan is None:
+        refuse_existing(out, given.overwrite, given.poses)
+    machine = given.machine()
+    kinds = kinds_of(given.measure or (["position"] if given.plan else []))
+    known, named = parse_noise(given.noise), parse_columns(given.columns)
+    measured: Poses | Measured | None = None
+    if given.poses is None:
+        pass
+    elif kinds:
+        measured = read_measured(given.poses, machine, kinds, known, named, given.units)
+    else:
+        measured = read_poses(given.poses, machine, named, given.units)
+    notes = []
+    if measured is not None:
+        q = machine.controller.positions(measured.joints)
+        _, beyond = beyond_limits(machine, q)
+        if not given.beyond_limits:
+            refuse_beyond(beyond)
+        notes = [f"beyond limits: {item}" for item in beyond]
+    if given.plan is not None:
+        some = measured if isinstance(measured, Measured) else None
+        chosen = plan_of(
+            machine, kinds, given.only, measured=some, within=parse_within(given.within),
+            count=given.count, accuracy=given.accuracy, noise=known, **given.free,
+        )  # fmt: skip
+        replace_file(given.plan, ("\n".join([*plan_table(machine, chosen), ""])).encode())
+        return planned(machine, chosen, given.accuracy, given.plan)
+    if given.poses is None or measured is None:
+        raise ParameterError("poses", None, "a CSV of measured poses, or --plan FILE.csv")
+    paths = geometric(machine, q, given.only)
+    with progress("steps", 2 * STEPS) as update:
+        done = 0
+
+        def step(count: int) -> None:
+            nonlocal done
+            done += count
+            update(done)
+
+        result = calibrated(
+            machine, measured, paths, accept=given.accept, progress=step, **given.free
+        )
+    source = f"calibrated with {one_line(given.poses.name, 100)}"
+    marks = [*(f"accepted anyway: {fault}" for fault in result.faults), *notes]
+    values = _fitted(machine, result, source)
+    head = [f"{machine.name}, {source}: {len(measured.joints)} poses."]
+    head += [f"Measured: {', '.join(f'{a.count} {a.name}' for a in result.agreements)}."]
+    head += [f"{scale_text(result.scale)}."] if result.scale is not None else []
+    head += [f"Outlier, with a small weight: {one}." for one in result.outliers]
+    write_edited(out, [*head, *marks], edited_yaml(machine, given.robot, values))
+    return report_of(machine, source, result, notes, marks, out)
+
+
+def _fitted(machine: Robot, result: Calibration, source: str) -> dict[str, Fitted]:
+    """Numbers of the file by path."""
+    unknown = f"{source}; not determined by these measurements"
+    values = {
+        p.name: Fitted(p.value, p.deviation, p.unit, source if p.observed else unknown)
+        for p in result.parameters
+        if not p.name.startswith(BESIDE) and p.name not in result.instrument.own
+    }
+    mapped = {p.name: (p.value, p.deviation) for p in result.parameters}
+    own = written(machine, result.joint_map, mapped)
+    return values | {path: Fitted(*number, source) for path, number in own.items()}
+
+
+def report_of(
+    machine: Robot, source: str, result: Calibration, notes: Sequence[str], marks: Sequence[str],
+    out: Path | None,
+) -> Report:  # fmt: skip
+    """Parameters, errors by kind of measurement, and what stays open."""
+    first, scale = result.agreements[0], result.scale
+    whole = {a.unit: a for a in result.agreements if a.name in ("position", "rotation")}
+    before, after = (f"{1e3 * one.rms:.4f} m{first.unit}" for one in first.held_out)
+    outliers = [
+        {"row": one.line - 1, "line": one.line, "kind": one.worst.kind, "size": one.worst.size,
+         "sigmas": one.worst.sigmas, "distance_m": one.size("m"), "distance_rad": one.size("rad")}
+        for one in result.outliers
+    ]  # fmt: skip
+    facts = [
+        Fact("robot", machine.name),
+        Fact("condition", result.condition, text="condition number"),
+        Fact("steps", result.steps),
+        Fact("beyond_limits", notes),
+        Fact("accepted", [str(fault) for fault in result.faults]),
+        Fact("not_observed", result.unobserved),
+        Fact("outliers", outliers),
+        Fact("scale", None if scale is None else {
+            "relative_deviation_before": scale.before, "relative_deviation": scale.after,
+            "determined": scale.determined,
+        }),
+    ]  # fmt: skip
+    for unit in ("m", "rad") if whole else ():
+        facts.append(Fact(f"noise_{unit}", whole[unit].noise if unit in whole else None, unit))
+    for name in ("fitted", "held_out") if whole else ():
+        pairs = {unit: getattr(a, name) for unit, a in whole.items()}
+        errors = {
+            when: {f"{key}_{unit}": value for unit, pair in pairs.items()
+                   for key, value in pair[k]._asdict().items()}
+            for k, when in enumerate(("before", "after"))
+        }  # fmt: skip
+        facts.append(Fact(name, errors))
+    columns = [
+        Column("before", form=".6g"), Column("value", text="after", form=".6g"),
+        Column("standard_deviation", text="standard deviation", form=".2g"), Column("unit"),
+        Column("observed", text="determined"),
+    ]  # fmt: skip
+    rows = {p.name: [p.before, p.value, p.deviation, p.unit, p.observed] for p in result.parameters}
+    kinds = [Column("unit", text=None), Column("count")]
+    kinds += [Column(name, text=None) for name in ("before", "after", "held_out", "noise")]
+    shown = ("before", "after", "held out before", "held out", "noise an axis", "unit")
+    kinds += [Column("", text=name) for name in shown]
+    agreements = {}
+    for a in result.agreements:
+        ends = (*a.fitted, *a.held_out)
+        told = [f"{1e3 * one.rms:.4f} ({1e3 * one.worst:.4f})" for one in ends]
+        stored = [ends[0]._asdict(), ends[1]._asdict(), ends[3]._asdict(), a.noise]
+        last = f"{1e3 * a.noise:.4f}", f"m{a.unit}"
+        agreements[a.name] = [a.unit, a.count, *stored, *told, *last]
+    found = sum(p.observed for p in result.parameters)
+    lines = [] if scale is None else [fill(scale_text(scale), WIDTH)]
+    lines += [f"outlier, with a small weight: {one}" for one in result.outliers[:MOST_SHOWN]]
+    if len(result.outliers) > MOST_SHOWN:
+        lines.append(f"{len(result.outliers) - MOST_SHOWN} more outliers: see --json")
+    return Report(
+        f"{machine.name}, {source}: {first.name} off by {after} RMS where it was held out "
+        f"({before} before); {found} of {len(rows)} numbers determined",
+        facts,
+        [Table("parameters", columns, rows, "calibrated parameters"),
+         Table("measurements", kinds, agreements, "measured minus computed, RMS (worst); held out: "
+               "every fourth whole pose, else each measurement against a fit to all others")],
+        notes=[*lines, *_open(result), *marks],
+        files={"out": out},
+    )  # fmt: skip
+
+
+def _open(result: Estimate) -> list[str]:
+    """What is not determined, in lines."""
+    lines = [
+        fill(line, WIDTH, initial_indent="  ", subsequent_indent="    ")
+        for line in result.undetermined
+    ]
+    told = "the poses do not determine these changes, and the calibration makes none of them; a "
+    return [f"{told}number in one may still change with others:", *lines] if lines else []
+
+
+def scale_text(scale: Scale) -> str:
+    """How well distances are known, in a sentence."""
+    ends = f"{100.0 * scale.after:.2g} mm in 100 mm"
+    if scale.determined:
+        return f"scale: determined; distances are known to {ends} (standard deviation)"
+    return (
+        f"the scale is not determined: distances may be wrong by {ends} (standard deviation, "
+        f"{100.0 * scale.before:.2g} mm before). Numbers that depend on it are marked no, and "
+        "stay near the file's values. Measure distances as well (--measure height,distance)"
+    )
+
+
+def plan_table(robot: Robot, plan: Plan) -> list[str]:
+    """The CSV of a plan: joints, poses and an empty column for each quantity."""
+    names = [f"{name}.position" for name in robot.controller.names]
+    columns = [plan.joints]
+    if plan.second is not None:
+        names += [f"{name}_2" for name in names]
+        columns.append(plan.second)
+    poses = [name for name in robot.pose_names if name not in plan.quantity]
+    shown = [robot.pose_names.index(name) for name in poses]
+    rows = np.hstack([*columns, plan.poses[:, shown]])
+    head = [*names, *(f"planned_{name}" for name in poses), *plan.quantity]
+    empty = [""] * len(plan.quantity)
+    return [",".join(head), *(",".join([*(f"{v:.9g}" for v in row), *empty]) for row in rows)]
+
+
+def planned(robot: Robot, plan: Plan, accuracy: float | None, out: Path) -> Report:
+    """How well the machine will be known after so many measurements."""
+    last, needed = len(plan.position) - 1, None if accuracy is None else plan.needed(accuracy)
+    known = f"{1e3 * plan.position[-1]:.3g} mm*"
+    reached = f"the position is known to {known} after {last} measurements"
+    if accuracy is not None:
+        goal = f"{1e3 * accuracy:g} mm"
+        reached = (
+            f"{needed} measurements give the position to {goal}*" if needed is not None else
+            f"the position is not known to {goal} after {last} measurements: it stays at {known}"
+        )  # fmt: skip
+    columns = [
+        Column("", text="position*, worst axis", scale=1e3, shown="mm"),
+        Column("", text="distances", scale=100.0, shown="mm per 100 mm"),
+        *(Column("", text=n, scale=1e3, shown=f"m{KINDS[n].unit}") for n in plan.quantity),
+    ]
+    each = [
+        plan.position.tolist(),
+        plan.scale.tolist(),
+        *(v.tolist() for v in plan.quantity.values()),
+    ]
+    rows = {
+        str(k): [values[k] for values in each]
+        for k in sorted({*(k for k in STEPS_SHOWN if k < last), last})
+    }
+    title = "predicted standard deviations over the workspace, by number of measurements"
+    names = [Column(n) for n in ("unit", "prior", "standard_deviation", "observed")]
+    return Report(
+        reached,
+        [
+            Fact("robot", robot.name),
+            Fact("count", len(plan.joints)),
+            Fact("needed", needed),
+            Fact("position_deviation_m", plan.position, "m"),
+            Fact("scale_relative_deviation", plan.scale),
+            Fact("quantity_deviation", plan.quantity),
+            Fact("parameters", Table("", names, {
+                p.name: [p.unit, p.prior, p.deviation, p.observed] for p in plan.known.parameters
+            }).data),
+        ],
+        [Table("", columns, rows, title, "measurements")],
+        notes=["* apart from a rigid motion of the whole workspace", *_open(plan.known)],
+        files={"out": out},
+    )  # fmt: skip
+
+
+def parse_noise(texts: Sequence[str]) -> dict[str, float]:
+    """Of ``KIND=VALUE`` separated by commas, m or rad.
+
+    :raises ParameterError: no number above zero, or no such kind.
+    """
+    found = {}
+    for text in ",".join(texts).split(",") if texts else ():
+        name, _, value = (part.strip() for part in text.partition("="))
+        if name not in KINDS:
+            raise UnknownNameError("--noise", name, list(KINDS))
+        try:
+            found[name] = float(value)
+        except ValueError:
+            found[name] = np.nan
+        if not 0.0 < found[name] < 1.0:
+            raise ParameterError("--noise", text, "KIND=VALUE, m or rad, as height=0.00002")
+    return found
+
+
+def parse_within(text: str | None) -> dict[str, tuple[float, float]]:
+    """Of ``x=-0.1:0.1, z=0``: least and greatest values, m or rad.
+
+    :raises ParameterError: anything else.
+    """
+    found = {}
+    for part in (text or "").split(",") if text else ():
+        name, _, ends = (one.strip() for one in part.partition("="))
+        try:
+            values = [float(end) for end in ends.split(":")]
+        except ValueError:
+            values = []
+        if len(values) not in (1, 2) or not np.isfinite(values).all() or values[0] > values[-1]:
+            raise ParameterError("--within", part, "COORDINATE=LEAST:GREATEST, as x=-0.1:0.1")
+        found[name] = values[0], values[-1]
+    return found
+
+
+COMMAND = command(calibrate, "Identification and calibration")
