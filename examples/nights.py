@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from delta_dynamics import inverse_dynamics
 from pkm_twin import Robot, load
 from pkm_twin.apps.history import append, measure
-from pkm_twin.apps.recorded import read_recording
+from pkm_twin.recordings import read
 
 NIGHTS, WORN = 24, 17
 DAY, FIRST = 86400.0, 1.7621e9
@@ -67,7 +67,7 @@ def record(history: Path) -> None:
             # From night to night the friction of a healthy drive differs too.
             coulomb = tuple(np.array(dry) + rng.normal(0.0, 0.003, 3))
             path = night(Path(folder) / f"{k}.csv", robot, rng, (0.05, 0.05, 0.05), coulomb)
-            numbers = measure(read_recording(path, robot))
+            numbers = measure(read(path, robot))
             append(history, "cell 3", robot.name, path, FIRST + DAY * k, True, numbers)
 
 

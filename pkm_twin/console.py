@@ -25,7 +25,7 @@ from rich.progress import (
 )
 
 from pkm_twin.errors import PkmTwinError, one_line
-from pkm_twin.files import STANDARD, decimal, require_replaceable
+from pkm_twin.files import STANDARD, parse_numbers, require_replaceable
 
 
 @contextmanager
@@ -56,15 +56,6 @@ def progress(what: str, total: int | None) -> Iterator[Callable[[int], None]]:
             drawing.update(task, completed=count)
 
         yield update
-
-
-def parse_numbers(text: str) -> list[float]:
-    """Finite numbers separated by commas; an empty list for any other text."""
-    try:
-        numbers = [decimal(word) for word in text.split(",")]
-    except ValueError:
-        return []
-    return numbers if all(map(math.isfinite, numbers)) else []
 
 
 def numbers(text: str, count: int, expected: str = "") -> list[float]:

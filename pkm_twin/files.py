@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import errno
 import io
+import math
 import os
 import stat
 import sys
@@ -59,6 +60,15 @@ def decimal(text: str) -> float:
     if "_" in text or not text.isascii():
         raise ValueError(f"{text!r} is not a number")
     return float(text)
+
+
+def parse_numbers(text: str) -> list[float]:
+    """Finite numbers separated by commas; an empty list for any other text."""
+    try:
+        numbers = [decimal(word) for word in text.split(",")]
+    except ValueError:
+        return []
+    return numbers if all(map(math.isfinite, numbers)) else []
 
 
 def require_replaceable(path: Path) -> None:

@@ -17,6 +17,7 @@ OWN = {"pkm_twin.errors", "pkm_twin.files", "pkm_twin.threads", "pkm_twin.settin
 GRAPH = {"pkm_twin.codegen", "pkm_twin.machine", "pkm_twin.kinematics"}
 CORE = GRAPH | {"pkm_twin.robot"}
 STREAMS = CORE | {"pkm_twin.messages", "pkm_twin.streams"}
+RECORDINGS = STREAMS | {"pkm_twin.bags"}
 NODE = STREAMS | {"pkm_twin", "pkm_twin.bags", "pkm_twin.ros"}
 TWINS = {"delta_dynamics", "stiffness_monitor"}
 MAY = {
@@ -39,10 +40,11 @@ MAY = {
     "pkm_twin.identification": STREAMS | TWINS | {"pkm_twin.design"},
     "pkm_twin.messages": CORE | {"pkm_twin.bags"},
     "pkm_twin.streams": CORE | {"pkm_twin.messages"},
+    "pkm_twin.recordings": RECORDINGS,
     "pkm_twin.state": STREAMS,
     "delta_dynamics": STREAMS,
     "stiffness_monitor": STREAMS,
-    "pkm_twin.paths": CORE | {"delta_dynamics"},
+    "pkm_twin.paths": RECORDINGS | {"delta_dynamics", "pkm_twin.recordings"},
     "pkm_twin.ros": STREAMS | {"pkm_twin.bags"},
     "delta_dynamics.node": NODE | {"delta_dynamics"},
     "stiffness_monitor.node": NODE | {"stiffness_monitor"},
@@ -51,7 +53,8 @@ MAY = {
     "pkm_twin.apps": NODE
     | TWINS
     | {"pkm_twin.console", "pkm_twin.maps", "pkm_twin.export", "pkm_twin.identification"}
-    | {"pkm_twin.paths", "pkm_twin.design", "pkm_twin.options", "pkm_twin.report"},
+    | {"pkm_twin.paths", "pkm_twin.design", "pkm_twin.options", "pkm_twin.report"}
+    | {"pkm_twin.recordings"},
 }
 """Rooms that each may import, beside itself and :data:`OWN`; so nobody imports apps or a node."""
 ROS = re.compile(r"rclpy|\w+_msgs|\w+_interfaces")

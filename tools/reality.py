@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from pkm_twin import Robot, load
-from pkm_twin.apps.columns import read_columns
 from pkm_twin.apps.drive_friction import GRAVITY
 from pkm_twin.apps.pose_table import read_poses
 from pkm_twin.identification.calibration import HELD_OUT, Calibration, Errors, calibrate, geometric
 from pkm_twin.identification.calibration_state import Poses, rotations
 from pkm_twin.identification.hanging_mass import drive_friction, lines
+from pkm_twin.recordings import read_table
 
 Array = NDArray[np.float64]
 
@@ -128,7 +128,7 @@ def page() -> str:
         )
         apart = max(apart, abs(one.value - own) / float(np.hypot(one.deviation, own_sd)))
     halves = _transfer(robot, poses)
-    columns = read_columns(DATA / "leg_currents.csv")
+    columns = read_table(DATA / "leg_currents.csv")
     drive = drive_friction(
         GRAVITY * SPOOL * columns["mass_kg"], columns["iq_up_A"], columns["iq_down_A"]
     )

@@ -16,8 +16,8 @@ import scipy
 from numpy.typing import NDArray
 
 from delta_dynamics import inverse_dynamics
-from pkm_twin.apps.recorded import Recording, read_recording
 from pkm_twin.bags.reader import read_messages
+from pkm_twin.recordings import Recording, read
 
 Array = NDArray[np.float64]
 BAGS: Final = Path(__file__).resolve().parents[1]
@@ -61,7 +61,7 @@ def share(values: Array, peak: float) -> float:
 
 def pick_and_place() -> str:
     """The table of the Delta's recording."""
-    r = read_recording(BAGS / "delta_cu_pick_and_place.mcap")
+    r = read(BAGS / "delta_cu_pick_and_place.mcap")
     assert r.load is not None and r.qd is not None and r.effort is not None
     near = r.load.near_change(r.time, AROUND)
     held = r.load.held(r.time) & ~near
@@ -84,7 +84,7 @@ def pick_and_place() -> str:
 
 def lifts() -> str:
     """How many of the commanded moves go up on their way."""
-    r = read_recording(BAGS / "delta_cu_pick_and_place.mcap")
+    r = read(BAGS / "delta_cu_pick_and_place.mcap")
     moves = read_messages(
         BAGS / "delta_cu_pick_and_place.mcap", ["/delta_dynamics/joint_trajectory"]
     )
@@ -102,7 +102,7 @@ def lifts() -> str:
 
 def milling() -> str:
     """The table of the 3-PRRU's recording."""
-    r = read_recording(BAGS / "prru_milling.mcap")
+    r = read(BAGS / "prru_milling.mcap")
     assert r.qd is not None and r.effort is not None
     passes = ((2.0, 9.4), (11.5, 18.9))
     cut = np.logical_or.reduce([(r.time > a) & (r.time < b) for a, b in passes])

@@ -14,13 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from delta_dynamics import inverse_dynamics, torque_deviation
-from pkm_twin.apps.limits import ranges
-from pkm_twin.apps.recorded import Recording
-from pkm_twin.apps.recorded_motion import at_rest
 from pkm_twin.apps.verdict import Item, Verdict, judged_item
 from pkm_twin.errors import SingularityError, UnreachableError, one_line
 from pkm_twin.identification.compare import Compared, by_held, compare
 from pkm_twin.identification.rows import Recorded
+from pkm_twin.recordings import Recording, at_rest
+from pkm_twin.robot.limits import ranges
 from pkm_twin.robot.plausibility import why_no_torques
 from pkm_twin.streams.drives import COUNT, SAME, idle_samples
 from pkm_twin.streams.rates import BLOCK, STANDS, STEPS, RateAgreement, likely_cause, rms

@@ -22,13 +22,11 @@ from pkm_twin.apps.check import (
     compared_of,
     recorded_of,
 )
-from pkm_twin.apps.loads import Load
-from pkm_twin.apps.recorded import Recording
 from pkm_twin.apps.verdict import Verdict
-from pkm_twin.apps.wrench_frames import FRAMES
 from pkm_twin.errors import PkmTwinError
 from pkm_twin.identification.compare import Compared, by_held
 from pkm_twin.identification.plausible import held_payload
+from pkm_twin.recordings import Load, Recording
 from pkm_twin.robot.entries import with_entries
 from pkm_twin.robot.robot import Robot
 from pkm_twin.streams.rates import rms
@@ -111,7 +109,7 @@ def _retold(r: Recording, c: Compared, bound: float) -> Iterator[tuple[str, Reco
         yield f"efforts of {names} have the opposite sign", replace(r, effort=effort)
     if r.wrench is not None and r.wrench.any():
         rotation, axes = r.robot.rotation(r.robot.forward(r.q)), "platform"
-        if r.topics.frame and r.topics.frame != FRAMES.get().base_frame:
+        if r.topics.turns:
             rotation, axes = rotation.swapaxes(-1, -2), "base"
         both = r.wrench.reshape(-1, 2, 3)
         moved = np.einsum("nij,nkj->nki", rotation, both).reshape(-1, 6)

@@ -21,7 +21,7 @@ from pkm_twin.apps.options import (
     OptionalRobot,
     Payload,
     Platform,
-    load_of,
+    read_options,
 )
 from pkm_twin.console import print_json, progress, table_console, tell
 from pkm_twin.errors import ParameterError, PkmTwinError, one_line
@@ -30,7 +30,7 @@ from pkm_twin.threads import one_blas_thread_for_children
 
 if TYPE_CHECKING:
     from pkm_twin.apps.check import Checked
-    from pkm_twin.apps.loads import Load
+    from pkm_twin.recordings import ReadOptions
 
 METADATA: Final = "metadata.yaml"
 """What makes a folder a rosbag2 bag."""
@@ -42,8 +42,7 @@ class Request:
 
     robot: str | None
     residual: float
-    topics: tuple[str, ...]
-    carried: Load | None
+    how: ReadOptions
     history: Path | None
     machine: str | None
     platform: str | None = None
@@ -65,18 +64,18 @@ def is_collection(path: Path) -> bool:
 
 
 def check_one(path: Path, request: Request, update: Any = None, thorough: bool = True) -> Checked:
-    """Judge a recording, and append it to the history; errors as ``read_recording``."""
+    """Judge a recording, and append it to the history; errors as of ``recordings.read``."""
     from pkm_twin import load
     from pkm_twin.apps.check import Bounds
     from pkm_twin.apps.check_causes import judged
-    from pkm_twin.apps.recorded import read_recording
+    from pkm_twin.recordings import read
 
     robot: Any = request.robot
     if request.platform is not None:
         if robot is None:
             raise ParameterError("--robot", None, "a file, for the platform that --platform names")
         robot = load(robot, platform=request.platform)
-    recording = read_recording(path, robot, update, topics=request.topics, carried=request.carried)
+    recording = read(path, robot, request.how, update)
     report = judged(recording, Bounds(residual=request.residual), thorough)
     if request.history is not None:
         from pkm_twin.apps.history import append, measure, recorded_at
@@ -195,8 +194,8 @@ def check(
     from pkm_twin.apps.verdict import Verdict, items_table
     from pkm_twin.bags.reader import DamagedBagError
 
-    carried = load_of(payload, load_times)
-    request = Request(robot, residual, tuple(topic), carried, history, machine, platform)
+    how = read_options(topic, payload, load_times, limited=True)
+    request = Request(robot, residual, how, history, machine, platform)
     if is_collection(bag):
         if not _check_folder(bag, request, jobs, as_json):
             raise typer.Exit(REFUSED)

@@ -16,10 +16,10 @@ from rich.table import Table
 
 from delta_dynamics import inverse_dynamics
 from pkm_twin import load
-from pkm_twin.apps.recorded import Recording, read_recording
-from pkm_twin.apps.recorded_motion import motion
 from pkm_twin.bags.reader import inspect, read_messages
 from pkm_twin.messages.stamps import stamp_of
+from pkm_twin.recordings import ReadOptions, Recording, read
+from pkm_twin.recordings.recording import differentiated
 from pkm_twin.robot.robot import Robot
 
 Array = NDArray[np.float64]
@@ -80,7 +80,7 @@ def report_dynamics(
     bag: Path, recording: Path, prefix: str
 ) -> tuple[list[Finding], DynamicsSeries]:
     """Compare recorded efforts with the answered ones."""
-    r = read_recording(bag)
+    r = read(bag, how=ReadOptions(limited=True))
     robot, unit = r.robot, " or ".join(dict.fromkeys(r.robot.effort_units))
     torques = _by_stamp(recording, f"/{prefix}/delta_dynamics/joint_torques")
     residuals = _by_stamp(recording, f"/{prefix}/delta_dynamics/torque_residual")
@@ -176,7 +176,7 @@ def _payload(
     step = np.linalg.norm(series.residual[held].mean(0) - series.residual[free].mean(0))
     scatter = np.linalg.norm(np.std(series.residual[free], 0))
     # What one kilogram would need, along the recorded motion.
-    qd, qdd, _ = motion(r)
+    qd, qdd, _ = differentiated(r)
     state = [values[answered][held] for values in (r.q, qd, qdd)]
     kilogram = inverse_dynamics(r.robot.changed(payload={"mass": 1.0}), *state)
     kilogram -= inverse_dynamics(r.robot, *state)

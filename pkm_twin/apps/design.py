@@ -8,7 +8,7 @@ from typing import Annotated, Final
 
 import typer
 
-from pkm_twin.apps.options import Json, Payload, Platform, RobotName, loaded
+from pkm_twin.apps.options import Json, Payload, Platform, RobotName, loaded, read_options
 from pkm_twin.console import answer, numbers, progress, refuse_existing
 from pkm_twin.errors import ParameterError, UnknownNameError
 from pkm_twin.options import OptionalPath, OptionalText, file_name
@@ -120,7 +120,7 @@ def design_command(
     for target in (out, picture):
         if target is not None:
             refuse_existing(target, overwrite, path)
-    machine, carried = loaded(robot, platform, payload)
+    machine, _ = loaded(robot, platform, payload)
     load_on = None if wrench is None else numbers(wrench, 6, "fx,fy,fz,mx,my,mz")
     if tolerance:
         if vary or minimise or sweep or subject_to or out or picture:
@@ -135,7 +135,7 @@ def design_command(
         raise typer.BadParameter("--monte-carlo needs --tolerance")
     if path is None:
         raise typer.BadParameter("give the motion with --path, see `pkm-twin path`")
-    machine, way = report.read_path(path, machine, load_on, carried)
+    machine, way = report.read_path(path, machine, load_on, read_options((), payload))
     box = parse_vary(vary)
     if sweep is not None:
         if sweep not in SWEEPS:

@@ -5,15 +5,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pkm_twin.apps.loads import Load
-from pkm_twin.apps.sizes import compared
-from pkm_twin.apps.torques import motion_of
 from pkm_twin.console import finite
 from pkm_twin.design import QUANTITIES, Design, DesignPoint, PosePath, Sweep
 from pkm_twin.design.pose_path import Followed
@@ -21,6 +19,8 @@ from pkm_twin.design.variants import Variants
 from pkm_twin.errors import ParameterError, warn
 from pkm_twin.maps.extras import require
 from pkm_twin.maps.store import writing
+from pkm_twin.paths.along import compared
+from pkm_twin.recordings import ReadOptions, read
 from pkm_twin.report import plots
 from pkm_twin.robot.edited import Chosen, edited_yaml, write_edited
 from pkm_twin.robot.entries import entries
@@ -33,15 +33,14 @@ FILE_DIGITS: Final = 12
 
 
 def read_path(
-    path: Path, robot: Robot, wrench: Sequence[float] | None, carried: Load | None = None
+    path: Path, robot: Robot, wrench: Sequence[float] | None, how: ReadOptions
 ) -> tuple[Robot, PosePath]:
     """The robot with the motion's payload, and the platform's path.
 
-    :param carried: in place of the motion's payload.
     :raises ParameterError: a table that is no motion, or a payload that is held part of the time.
     :raises BagError: a bag without a motion.
     """
-    motion = motion_of(path, robot, (), carried)
+    motion = read(path, robot, replace(how, planned=True)).with_rates()
     if motion.load is not None:
         held = motion.load.held(motion.time)
         if not held.all():
@@ -51,8 +50,9 @@ def read_path(
         robot = motion.load.on(robot)
     if robot.has_masses and (unlike := compared(motion, "file").unlike):
         warn(path, unlike)
-    load = motion.wrench + (np.zeros(6) if wrench is None else np.asarray(wrench))
-    way = PosePath.of_joints(robot, motion.time, motion.q, motion.qd, motion.qdd, load)
+    q, qd, qdd, load = motion.motion
+    load = load + (np.zeros(6) if wrench is None else np.asarray(wrench))
+    way = PosePath.of_joints(robot, motion.time, q, qd, qdd, load)
     return robot, way
 
 

@@ -8,10 +8,10 @@ from typing import Annotated
 
 import typer
 
-from pkm_twin.apps.columns import read_columns
 from pkm_twin.apps.options import Json
 from pkm_twin.console import print_json
 from pkm_twin.errors import ParameterError
+from pkm_twin.recordings import read_table
 
 GRAVITY = 9.80665
 """Standard gravity, m/s2."""
@@ -40,10 +40,8 @@ def drive_friction_command(
     """
     from pkm_twin.identification.hanging_mass import drive_friction, lines
 
-    columns = read_columns(table)
-    for name in ("iq_up_A", "iq_down_A"):
-        if name not in columns:
-            raise ParameterError(str(table), ", ".join(columns), f"a column {name!r}")
+    columns = read_table(table)
+    columns.require(["iq_up_A", "iq_down_A"])
     if "torque_nm" in columns:
         torque = columns["torque_nm"]
     elif "mass_kg" in columns:

@@ -134,10 +134,10 @@ def write_motion(
 
     :returns: the motion, and how many points are written.
     """
-    from pkm_twin.apps.torques import write_table
-    from pkm_twin.apps.trajectories import write_trajectory
     from pkm_twin.identification.excitation import excite as design
     from pkm_twin.identification.sweeps import sweeps
+    from pkm_twin.recordings import write_table
+    from pkm_twin.recordings.trajectories import write_trajectory
 
     machine, table = judge.robot, out.with_suffix(".csv")
     best: Any
@@ -164,10 +164,10 @@ def write_motion(
 
 def _condition_of(path: Path, judge: Any) -> float:
     """Condition number of a recorded motion."""
-    from pkm_twin.apps.recorded import read_recording
     from pkm_twin.identification.samples import tracks
+    from pkm_twin.recordings import read
 
-    r = read_recording(path, judge.robot, limited=False)
+    r = read(path, judge.robot)
     none = np.zeros((len(r.time), 6))
     pieces, _ = tracks(r.time, r.q, np.zeros_like(r.q), none, none[:, 0])
     if not pieces:

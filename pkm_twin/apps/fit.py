@@ -12,8 +12,6 @@ import numpy as np
 import typer
 from numpy.typing import NDArray
 
-from pkm_twin.apps.limits import beyond_limits as find_beyond
-from pkm_twin.apps.limits import refuse_beyond
 from pkm_twin.apps.options import (
     Accept,
     BagTopics,
@@ -22,7 +20,7 @@ from pkm_twin.apps.options import (
     LoadTimes,
     Payload,
     Platform,
-    load_of,
+    read_options,
 )
 from pkm_twin.console import print_json, progress, refuse_existing, writing
 from pkm_twin.errors import BagError, ParameterError, PkmTwinError, UnknownNameError, one_line
@@ -30,9 +28,13 @@ from pkm_twin.files import replace_file
 from pkm_twin.machine.strict_yaml import parse_yaml
 from pkm_twin.options import OptionalText, file_name
 from pkm_twin.robot.catalogue import robot_of_data
+from pkm_twin.robot.limits import beyond_limits as find_beyond
+from pkm_twin.robot.limits import refuse_beyond
 
 if TYPE_CHECKING:
     from pkm_twin.apps.fit_report import Report
+    from pkm_twin.identification.deflections import Deflected
+    from pkm_twin.recordings import ReadOptions, Recording
 
 Array = NDArray[np.float64]
 
@@ -141,10 +143,10 @@ def fit(
 
     kinds, laws = kinds_of(what), laws_of(friction)
     text, machine = robot_text(robot, platform=platform, per_copy=per_copy)
-    carried = load_of(payload, load_times)
+    how = read_options(topic, payload, load_times)
     with progress("fit", 2 * len(recordings)) as update:
         result, beyond, choices = fit_recordings(
-            machine, recordings, kinds, topic, carried, update, limited=not beyond_limits,
+            machine, recordings, kinds, how, update, limited=not beyond_limits,
             accept=accept, laws=laws, constant=torque_constant,
         )  # fmt: skip
     marks = [
@@ -230,10 +232,10 @@ def _fit_compliance(
     beyond_limits: bool, accept: bool,
 ) -> None:  # fmt: skip
     """The fit of elastic elements, its files and what it says."""
-    from pkm_twin.apps.elastic_recordings import read_deflected
     from pkm_twin.apps.elastic_report import elastic_report
     from pkm_twin.apps.fit_files import robot_text
     from pkm_twin.identification.deflections import fit_elements
+    from pkm_twin.recordings import read as read_recording
 
     if what.strip() != COMPLIANCE:
         raise ParameterError(
@@ -244,7 +246,8 @@ def _fit_compliance(
     with progress("fit", 2 * len(recordings)) as update:
         read = []
         for path in recordings:
-            read.append(read_deflected(path, machine, topics))
+            how = read_options(topics, deflected=True)
+            read.append(deflected_of(read_recording(path, machine, how)))
             update(len(read))
         beyond = _beyond(machine, [(r.name, r.q) for r in read], not beyond_limits)
         result = fit_elements(machine, read, lambda k: update(len(recordings) + k), accept=accept)
@@ -257,8 +260,7 @@ def fit_recordings(
     machine: Any,
     recordings: Sequence[Path],
     kinds: Sequence[Any],
-    topics: Sequence[str] = (),
-    carried: Any = None,
+    how: Any = None,
     update: Callable[[int], None] | None = None,
     limited: bool = True,
     accept: bool = False,
@@ -267,6 +269,7 @@ def fit_recordings(
 ) -> tuple[Any, list[str], Any]:
     """The fit of recordings, read as ``pkm-twin fit`` reads them.
 
+    :param how: as :class:`pkm_twin.recordings.ReadOptions`.
     :param limited: refuse what is beyond the robot's limits.
     :param accept: fit recordings that the machine cannot have made, too.
     :param laws: of friction beside the file's, see
@@ -279,9 +282,10 @@ def fit_recordings(
     from pkm_twin.apps.check import recorded_of, step_fault
     from pkm_twin.identification.fit import refuse_faults
     from pkm_twin.identification.friction_laws import fit_with_laws
+    from pkm_twin.recordings import ReadOptions
 
-    efforts = ("measured", "effort") if constant is None else ("current", "measured", "effort")
-    read = [_read(path, machine, topics, carried, efforts) for path in recordings]
+    how = dataclasses.replace(how or ReadOptions(), currents=constant is not None)
+    read = [_read(path, machine, how) for path in recordings]
     beyond = _beyond(
         machine,
         [(one_line(p.name, 100), r.q) for p, r in zip(recordings, read, strict=True)],
@@ -343,26 +347,28 @@ def kinds_of(what: str) -> tuple[Any, ...]:
     return tuple(kind for kind in KINDS if kind in words)
 
 
-def _read(
-    path: Path, machine: Any, topics: Sequence[str], carried: Any, efforts: Sequence[str]
-) -> Any:
+def deflected_of(r: Recording) -> Deflected:
+    """A recording with deflections, as the fit of compliance takes it."""
+    from pkm_twin.identification.deflections import Deflected
+
+    assert r.wrench is not None and r.deflection is not None  # noqa: S101  asked for
+    return Deflected(r.name, r.time, r.q, r.wrench, r.deflection)
+
+
+def _read(path: Path, machine: Any, how: ReadOptions) -> Recording:
     """A recording with efforts.
 
     :raises PkmTwinError: there are none, or no wrench is accepted.
     """
-    from pkm_twin.apps.recorded import read_recording, recorded_table
-    from pkm_twin.bags.storage import is_bag
+    from pkm_twin.recordings import read
 
-    if not is_bag(path):
-        r = recorded_table(path, machine, carried, efforts)
-        if r.effort is None:
-            joint = machine.joint_names[0]
-            raise ParameterError(
-                str(path), "no efforts", f"columns {joint}.effort ... of the drives, or "
-                f"{joint}.current ... with --torque-constant"
-            )  # fmt: skip
-        return r
-    r = read_recording(path, robot=machine, topics=topics, carried=carried, limited=False)
+    r = read(path, machine, how)
+    if r.effort is None and r.bag is None:
+        joint = machine.joint_names[0]
+        raise ParameterError(
+            str(path), "no efforts", f"columns {joint}.effort ... of the drives, or "
+            f"{joint}.current ... with --torque-constant"
+        )  # fmt: skip
     if r.effort is None:
         raise BagError(
             f"no efforts on {r.topics.joint_states}: a fit needs the efforts of the drives",

@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pkm_twin.apps.check import compared_of, idle_of, recorded_of
-from pkm_twin.apps.recorded import Recording
 from pkm_twin.errors import FileError, PkmTwinError
 from pkm_twin.identification.fit import fit
+from pkm_twin.recordings import ReadOptions, Recording, read
 from pkm_twin.robot.plausibility import why_no_torques
 
 Array = NDArray[np.float64]
@@ -116,14 +116,15 @@ def _efforts(r: Recording) -> list[Measured]:
 
 
 def _elasticity(r: Recording) -> list[Measured]:
-    from pkm_twin.apps.elastic_recordings import read_deflected
+    from pkm_twin.apps.fit import deflected_of
     from pkm_twin.identification.deflections import fit_elements
     from stiffness_monitor.modes import has_modes, natural_frequencies
 
     if r.bag is None:
         return []
     try:
-        fit = fit_elements(r.robot, [read_deflected(r.bag.report.path, r.robot)])
+        deflected = read(r.source, r.robot, ReadOptions(deflected=True))
+        fit = fit_elements(r.robot, [deflected_of(deflected)])
     except PkmTwinError:
         return []
     known = fit.of("fitted")

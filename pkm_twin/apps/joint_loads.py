@@ -19,7 +19,6 @@ import yaml
 from numpy.typing import NDArray
 
 from delta_dynamics.elastic_reactions import elastic_reactions
-from pkm_twin.apps.loads import by_load
 from pkm_twin.apps.options import (
     BagTopics,
     Follow,
@@ -28,9 +27,8 @@ from pkm_twin.apps.options import (
     Payload,
     Platform,
     RobotName,
-    load_of,
+    read_options,
 )
-from pkm_twin.apps.torques import Motion, motion_of
 from pkm_twin.console import answer, finite, progress, refuse_existing, writing
 from pkm_twin.errors import ParameterError
 from pkm_twin.files import STANDARD, replace_file, replacing
@@ -38,11 +36,12 @@ from pkm_twin.machine import schema
 from pkm_twin.machine.graph import BASE
 from pkm_twin.options import OptionalPath, file_name
 from pkm_twin.paths.durability import Cycles, Life, Reversals, bearing_life, rainflow
+from pkm_twin.recordings import Recording, by_load, read
+from pkm_twin.recordings.tables import WRENCH as AXES
 from pkm_twin.robot.robot import Robot
 
 Array = NDArray[np.float64]
 
-AXES: Final = ("fx", "fy", "fz", "mx", "my", "mz")
 BLOCK: Final = 512
 """Samples at once: each has matrices of all unknowns."""
 CLASSES: Final = 32
@@ -80,15 +79,15 @@ class JointLoad:
     turned: Array
 
 
-def joint_loads(motion: Motion) -> Iterator[list[JointLoad]]:
+def joint_loads(motion: Recording) -> Iterator[list[JointLoad]]:
     """Loads of all joints along a motion in blocks, each from the last sample of the one before.
 
     Errors as ``reactions``.
     """
     last: dict[str, tuple[Array, ...]] = {}
     for robot, rows in by_load(motion.robot, motion.load, motion.time, BLOCK):
-        q = motion.q[rows]
-        found = elastic_reactions(robot, q, motion.qd[rows], motion.qdd[rows], motion.wrench[rows])
+        q, *others = (values[rows] for values in motion.motion)
+        found = elastic_reactions(robot, q, *others)
         rotations, _ = motion.robot.placements(q)
         turn = {BASE: np.broadcast_to(np.eye(3), (len(q), 3, 3)), **rotations}
         order = list(found.names)
@@ -228,7 +227,9 @@ def bearing_load(force: Array, spec: BearingSpec, axis: Array | None) -> Array:
     return np.asarray(spec.X * across + spec.Y * np.abs(along), np.float64)
 
 
-def report(motion: Motion, loads: Sequence[Summary], exponent: float) -> tuple[dict[str, Any], str]:
+def report(
+    motion: Recording, loads: Sequence[Summary], exponent: float
+) -> tuple[dict[str, Any], str]:
     """The result as plain data and as text."""
     robot = motion.robot
     data: dict[str, Any] = {
@@ -301,7 +302,7 @@ def spectra(loads: Sequence[Summary]) -> str:
     return text.getvalue()
 
 
-def draw(motion: Motion, loads: Sequence[Summary], path: Path) -> None:
+def draw(motion: Recording, loads: Sequence[Summary], path: Path) -> None:
     """Forces of the joints with the largest ones over time, and their rainflow spectra."""
     from pkm_twin.maps import figures
     from pkm_twin.report import plots
@@ -328,7 +329,7 @@ def draw(motion: Motion, loads: Sequence[Summary], path: Path) -> None:
     plots.save(figure, path)
 
 
-def summaries(motion: Motion, bearings: Path | None, out: Path | None) -> list[Summary]:
+def summaries(motion: Recording, bearings: Path | None, out: Path | None) -> list[Summary]:
     """The loads of all joints along a motion, computed and written block by block."""
     result: list[Summary] = []
     begin = 0
@@ -349,7 +350,7 @@ def summaries(motion: Motion, bearings: Path | None, out: Path | None) -> list[S
                 summary.add(load)
             end = result[0].samples
             if writer is not None:
-                write_rows(writer, motion.time[begin:end], block)
+                write_rows(writer, motion.clock[begin:end], block)
             begin = end
             update(end)
     return result
@@ -398,7 +399,8 @@ def loads(
         if target is not None:
             refuse_existing(target, overwrite, motion)
     machine = load(robot, platform=platform)
-    taken = motion_of(motion, machine, topic, load_of(payload, load_times), follow)
+    how = read_options(topic, payload, load_times, follow, planned=True)
+    taken = read(motion, machine, how).with_rates()
     if len(taken.time) < 2:
         raise ParameterError(str(motion), f"{len(taken.time)} samples", "2 or more")
     with writing(out):

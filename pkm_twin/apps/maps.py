@@ -311,10 +311,11 @@ def _along(
     kind: Kind, machine: Robot, cases: Sequence[Case], path: Path, options: _Options
 ) -> None:
     """Print the worst of each case along a path; write table and picture where asked."""
-    from pkm_twin.apps.torques import motion_of
+    from pkm_twin.apps.options import read_options
     from pkm_twin.maps import figures
     from pkm_twin.maps.kind import counts, found_of
     from pkm_twin.maps.sweep import check
+    from pkm_twin.recordings import read
 
     out = options.out
     drawing = out.with_suffix(".png") if out is not None and options.picture else None
@@ -325,7 +326,7 @@ def _along(
             refuse_existing(target, options.overwrite, path)
     cases = tuple(cases) or kind.cases(machine)
     check(machine, kind, cases)
-    motion = motion_of(path, machine)
+    motion = read(path, machine, read_options(planned=True))
     pose, elements = machine.forward(motion.q), kind.elements(machine)
     least = kind.least if options.singularity is None else options.singularity
     known = np.ones(len(pose), bool)
@@ -336,7 +337,7 @@ def _along(
         k = int(np.nanargmax(one.value if case.largest else -one.value))
         answer: dict[str, Any] = {
             "case": case.name, "what": case.what, "answer": case.answer,
-            "value": float(one.value[k]), "unit": case.unit, "time_s": float(motion.time[k]),
+            "value": float(one.value[k]), "unit": case.unit, "time_s": float(motion.clock[k]),
             "pose": dict(zip(machine.pose_names, pose[k].tolist(), strict=True)),
         }  # fmt: skip
         if one.direction is not None and axes:
@@ -346,7 +347,7 @@ def _along(
         worst.append(answer)
     files = [str(target) for target in (out, drawing) if target is not None]
     if out is not None:
-        _write(out, machine, motion.time, pose, inside, cases, found, elements)
+        _write(out, machine, motion.clock, pose, inside, cases, found, elements)
     units = dict(zip(machine.pose_names, machine.pose_units, strict=True))
     texts = [
         ("" if len(cases) == 1 else f"{one['case']}: ")
@@ -355,7 +356,7 @@ def _along(
     ]
     if drawing is not None:
         head = f"{machine.name}: {kind.question}"
-        _draw(drawing, head, kind.element, texts, motion.time, cases, found, elements)
+        _draw(drawing, head, kind.element, texts, motion.clock, cases, found, elements)
     beyond = int((~inside).sum())
     if options.as_json:
         print_json(

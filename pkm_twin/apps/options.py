@@ -18,9 +18,8 @@ from pkm_twin.options import OptionalPath, OptionalText, file_name
 from pkm_twin.settings import setting
 
 if TYPE_CHECKING:
-    from pkm_twin.apps.limits import Beyond
-    from pkm_twin.apps.tables import Dialect
-    from pkm_twin.apps.wrench_frames import WrenchFrames
+    from pkm_twin.recordings import Dialect, ReadOptions, WrenchFrames
+    from pkm_twin.robot.limits import Beyond
     from pkm_twin.robot.robot import Robot
     from stiffness_monitor.chatter import Milling
 
@@ -116,9 +115,9 @@ class ReadsTables:
 
         :raises ParameterError: an option that is none.
         """
-        from pkm_twin.apps.tables import dialect_of
+        from pkm_twin.recordings import Dialect
 
-        return dialect_of(self.separator, self.decimal, self.columns, self.units, self.time)
+        return Dialect.of(self.separator, self.decimal, self.columns, self.units, self.time)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -135,7 +134,7 @@ class ReadsWrenches:
     @property
     def frames(self) -> WrenchFrames:
         """As the readers of bags take them."""
-        from pkm_twin.apps.wrench_frames import WrenchFrames
+        from pkm_twin.recordings import WrenchFrames
 
         return WrenchFrames(self.wrench_frame, self.base_frame)
 
@@ -147,6 +146,13 @@ class ReadsRecordings(ReadsTables, ReadsWrenches):
     topic: tuple[str, ...] = setting(
         (), "topic of joint states or wrenches; default: found by the robot's joint names"
     )
+
+    def reading(self, **more: Any) -> ReadOptions:
+        """How its recordings are read; ``more``: other fields of ``ReadOptions``."""
+        from pkm_twin.recordings import ReadOptions
+
+        held, follow = getattr(self, "load", None), getattr(self, "follow", None)
+        return ReadOptions(self.topic, held, follow, self.dialect, self.frames, **more)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -174,7 +180,7 @@ class BeyondLimitsToo:
 
         :raises ParameterError: something, and it is not allowed.
         """
-        from pkm_twin.apps.limits import beyond_limits, refuse_beyond
+        from pkm_twin.robot.limits import beyond_limits, refuse_beyond
 
         _, found = beyond_limits(machine, machine.inverse(pose))
         if not self.beyond_limits:
@@ -392,7 +398,7 @@ MotionOut = Annotated[
 
 def load_of(payload: str | None, times: str | None) -> Any:
     """The payload that a command line tells of, None where it tells of none."""
-    from pkm_twin.apps.loads import Load, parse_payload, parse_times
+    from pkm_twin.recordings.payload import Load, parse_payload, parse_times
 
     if payload is None:
         if times is not None:
@@ -403,6 +409,20 @@ def load_of(payload: str | None, times: str | None) -> Any:
         return Load(*parse_payload(payload), spans)
     except ParameterError as error:
         raise typer.BadParameter(str(error)) from None
+
+
+def read_options(
+    topics: Sequence[str] = (), payload: str | None = None, times: str | None = None,
+    follow: str | None = None, **more: Any,
+) -> Any:  # fmt: skip
+    """How a command line wants recordings read; ``more``: fields of ``ReadOptions``."""
+    from pkm_twin.apps.tables import CHOSEN
+    from pkm_twin.apps.wrench_frames import FRAMES
+    from pkm_twin.recordings import ReadOptions
+
+    return ReadOptions(
+        tuple(topics), load_of(payload, times), follow, CHOSEN.get(), FRAMES.get(), **more
+    )
 
 
 def loaded(robot: str, platform: str | None, payload: str | None) -> tuple[Any, Any]:

@@ -11,8 +11,6 @@ import numpy as np
 import typer
 from numpy.typing import NDArray
 
-from pkm_twin.apps.loads import COLUMNS as PAYLOAD
-from pkm_twin.apps.loads import Load
 from pkm_twin.apps.options import (
     Json,
     LimitShare,
@@ -25,13 +23,15 @@ from pkm_twin.apps.options import (
     drawing_of,
     loaded,
 )
-from pkm_twin.console import answer, numbers, parse_numbers, writing
+from pkm_twin.console import answer, numbers, writing
 from pkm_twin.errors import ParameterError, UnknownNameError, warn
-from pkm_twin.files import STANDARD
+from pkm_twin.files import STANDARD, parse_numbers
 from pkm_twin.options import OptionalFloat, OptionalPath, OptionalText
 from pkm_twin.paths.geometry import Path as Way
 from pkm_twin.paths.geometry import Space
 from pkm_twin.paths.motion import TimedPath
+from pkm_twin.recordings import Load, kinds_of, read_table
+from pkm_twin.recordings.tables import PAYLOAD
 from pkm_twin.robot.robot import Robot
 
 Array = NDArray[np.float64]
@@ -52,10 +52,10 @@ def read_waypoints(
     :param carried: the payload of the motion; that of the table is not used.
     :raises ParameterError: a column is missing, unknown, or a number is out of range.
     """
-    from pkm_twin.apps.columns import read_columns
+    from pkm_twin.apps.tables import CHOSEN
     from pkm_twin.paths import lines, through
 
-    columns = read_columns(file, robot)
+    columns = read_table(file, kinds_of(robot), CHOSEN.get())
     joints = [f"{name}.position" for name in robot.joint_names]
     words = ("velocity", "acceleration", "effort")
     others = {f"{j}.{word}" for j in (*robot.joint_names, *robot.pose_names) for word in words}
@@ -66,9 +66,7 @@ def read_waypoints(
     if not (by_pose or by_joints):
         known = f"{', '.join(robot.pose_names)} or {', '.join(joints)}"
         raise ParameterError(f"{file}: columns", ", ".join(columns), known)
-    for name in needed:
-        if name not in columns:
-            raise ParameterError(f"{file}: columns", ", ".join(columns), f"a column {name}")
+    points = columns.stack(needed)
     known_names = {*robot.pose_names, *joints, *others, *OPTIONS, *PAYLOAD, "time"}
     for name in columns:
         if name not in known_names:
@@ -76,7 +74,6 @@ def read_waypoints(
     planned = float(columns.get(PAYLOAD[0], np.zeros(1)).max())
     if planned > 0.0 and carried is None:
         warn(file, f"its payload of {planned:g} kg is not used; give --payload")
-    points = np.stack([columns[name] for name in needed], -1)
     if blend is None and not any(name in columns for name in OPTIONS):
         return through(robot, points, space=space)
     given = {name: columns[name] for name in OPTIONS if name in columns}

@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pkm_twin.apps.loads import Load, payload_columns
 from pkm_twin.paths import Samples, ShapedPath, TimedPath
+from pkm_twin.recordings import Load, write_table
+from pkm_twin.recordings.payload import payload_columns
 
 Array = NDArray[np.float64]
 
@@ -41,11 +42,9 @@ def write(
 ) -> None:
     """The motion as a table or as a bag with one JointTrajectory."""
     if out.suffix != ".mcap":
-        from pkm_twin.apps.torques import write_table
-
         write_table(columns_of(motion, samples) | payload_columns(carried, samples.time), out)
         return
-    from pkm_twin.apps.trajectories import write_trajectory
+    from pkm_twin.recordings.trajectories import write_trajectory
 
     facts: dict[str, Any] = {
         "robot": motion.robot.name, "source": "pkm-twin path", "law": motion.law,

@@ -11,10 +11,10 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from pkm_twin.apps.columns import read_columns
 from pkm_twin.errors import ParameterError, UnknownNameError
 from pkm_twin.identification.calibration_state import Poses, rotations
 from pkm_twin.identification.measurements import KINDS, Kind, Measured, measured_of
+from pkm_twin.recordings import read_table
 from pkm_twin.robot.robot import Robot
 
 Array = NDArray[np.float64]
@@ -143,7 +143,7 @@ def _columns_of(
     :raises ParameterError: two columns of one name, or a joint that the robot has not.
     """
     known = [*joints, *others]
-    table = read_columns(path, blank=blank)
+    table = read_table(path, blank=blank)
     headers = _named(table, known, renamed or {})
     columns: dict[str, Array] = {}
     for header, values in table.items():

@@ -14,12 +14,12 @@ import typer
 
 from pkm_twin.apps.excite import write_motion
 from pkm_twin.apps.options import Json, Platform
-from pkm_twin.apps.topics import DEFINITIONS, JOINT_STATE, TRAJECTORY, WRENCH, is_output
-from pkm_twin.apps.trajectories import SECOND
 from pkm_twin.bags.reader import Bag, BagWriter, open_bag
 from pkm_twin.console import print_json, refuse_existing, writing
 from pkm_twin.errors import BagError, ParameterError
+from pkm_twin.messages.stamps import SECOND
 from pkm_twin.options import OptionalPath, OptionalText
+from pkm_twin.recordings.topics import DEFINITIONS, JOINT_STATE, TRAJECTORY, WRENCH, is_output
 from pkm_twin.robot.robot import Robot
 from pkm_twin.streams.wrench import PLATFORM, WrenchSettings
 

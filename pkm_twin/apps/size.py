@@ -16,6 +16,7 @@ from pkm_twin.apps.options import (
     Platform,
     RobotName,
     load_of,
+    read_options,
 )
 from pkm_twin.console import answer, numbers, refuse_existing, writing
 from pkm_twin.errors import LEAST_LIMIT, check_limit
@@ -100,8 +101,9 @@ def size(
     """
     from pkm_twin import load
     from pkm_twin.apps import sizes
-    from pkm_twin.apps.torques import motion_of
+    from pkm_twin.paths.along import compared
     from pkm_twin.paths.sizing import Gear
+    from pkm_twin.recordings import read
 
     if efforts not in ("file", "model"):
         raise typer.BadParameter(f"--efforts {efforts}: file or model")
@@ -130,7 +132,8 @@ def size(
         data, text = sizes.worst_report(machine, speed, change, singularity)
     else:
         assert motion is not None  # noqa: S101  one of the two is given
-        taken = sizes.compared(motion_of(motion, machine, topic, carried, follow), efforts)
+        how = read_options(topic, payload, load_times, follow, planned=True)
+        taken = compared(read(motion, machine, how).with_rates(), efforts)
         result = sizes.duties(taken, motors, gear)
         data, text = sizes.report(taken, result)
         if picture is not None:

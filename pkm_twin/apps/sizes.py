@@ -14,11 +14,9 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from delta_dynamics import inverse_dynamics
-from pkm_twin.apps.loads import by_load
-from pkm_twin.apps.torques import Motion
 from pkm_twin.errors import FileError, ParameterError, UnknownNameError
 from pkm_twin.machine import schema
+from pkm_twin.paths.along import Compared
 from pkm_twin.paths.sizing import DriveDuty, Fit, Gear, Motor, size_drives
 from pkm_twin.paths.worst import worst_over_workspace
 from pkm_twin.robot.catalogue import config_folder
@@ -30,62 +28,13 @@ MOST_PERCENT: Final = 1000.0
 """A used part of more is printed as more."""
 SHIPPED: Final = "shipped"
 RPM: Final = 2 * math.pi / 60
-UNLIKE: Final = 0.05
-"""Difference between a file's efforts and the model's, over the RMS, from which it is reported."""
 
 
-@dataclass(frozen=True)
-class Taken:
-    """A motion with the efforts that are sized, shape (k, n), and where these are from.
-
-    ``model``: what the robot's model computes for the motion, shape (k, n).
-    """
-
-    motion: Motion
-    effort: Array
-    source: str
-    model: Array
-
-    @property
-    def difference(self) -> Array:
-        """RMS difference between efforts and model over the model's RMS, shape (n,)."""
-        squares = ((self.effort - self.model) ** 2).mean(0)
-        return np.asarray(np.sqrt(squares / np.maximum((self.model**2).mean(0), 1e-24)))
-
-    @property
-    def unlike(self) -> str:
-        """Says of which joint the file's efforts are not the model's; empty where they are."""
-        worst = int(self.difference.argmax())
-        if not self.difference[worst] > UNLIKE:
-            return ""
-        return (
-            f"the file's efforts of {self.motion.robot.joint_names[worst]} differ from the model's "
-            f"by {100 * self.difference[worst]:.3g} % RMS: the file may be of another robot, "
-            "payload or rotor"
-        )
-
-
-def compared(motion: Motion, efforts: str) -> Taken:
-    """A motion with the file's efforts where it has them and they are asked for, else the model's.
-
-    :raises ParameterError: a robot without masses.
-    """
-    model = np.empty_like(motion.q)
-    for machine, part in by_load(motion.robot, motion.load, motion.time, 4096):
-        model[part] = inverse_dynamics(
-            machine, motion.q[part], motion.qd[part], motion.qdd[part], motion.wrench[part]
-        )
-    given = motion.measured if motion.planned is None else motion.planned
-    if given is not None and efforts == "file":
-        return Taken(motion, given, "the file's", model)
-    return Taken(motion, model, "the model's", model)
-
-
-def duties(taken: Taken, motors: Sequence[Motor], gear: Gear | None = None) -> list[DriveDuty]:
+def duties(taken: Compared, motors: Sequence[Motor], gear: Gear | None = None) -> list[DriveDuty]:
     """What each drive gives."""
     m = taken.motion
-    robot = m.robot if m.load is None else m.load.on(m.robot)
-    return size_drives(robot, m.time, m.q, m.qd, m.qdd, taken.effort, motors, gear)
+    robot = m.carried or m.robot
+    return size_drives(robot, m.time, *m.motion[:3], taken.effort, motors, gear)
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,7 +120,7 @@ def read_motors(path: Path, names: Sequence[str] = ()) -> list[Motor]:
     ]
 
 
-def report(taken: Taken, result: Sequence[DriveDuty]) -> tuple[dict[str, Any], str]:
+def report(taken: Compared, result: Sequence[DriveDuty]) -> tuple[dict[str, Any], str]:
     """The result as plain data and as text."""
     m = taken.motion
     duration = float(m.time[-1] - m.time[0])
@@ -267,7 +216,7 @@ def near(duty: DriveDuty) -> list[Fit]:
     return fits[max(first - 3, 0) : first + 1]
 
 
-def draw(taken: Taken, result: Sequence[DriveDuty], path: Path) -> None:
+def draw(taken: Compared, result: Sequence[DriveDuty], path: Path) -> None:
     """Torque against speed, an axes for each drive, with the curves of motors."""
     from pkm_twin.report import plots
 
@@ -279,7 +228,7 @@ def draw(taken: Taken, result: Sequence[DriveDuty], path: Path) -> None:
             side, speeds, torques = "motor", d.speeds / RPM, d.torques
             labels = "speed of the motor (1/min)", "torque (N m)"
         else:
-            side, speeds, torques = "joint", m.qd[:, k], taken.effort[:, k]
+            side, speeds, torques = "joint", m.motion[1][:, k], taken.effort[:, k]
             unit = m.robot.joint_units[k]
             labels = f"speed of the joint ({unit}/s)", f"effort ({m.robot.effort_units[k]})"
         ax.plot(speeds, torques, color="black", lw=1.5, label="motion")

@@ -11,6 +11,7 @@ from typing import Any, Final
 import numpy as np
 
 from pkm_twin.apps.design_report import read_path
+from pkm_twin.apps.options import read_options
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.design import Tolerances, drawn, tolerances
 from pkm_twin.design.tolerance import workspace_states
@@ -61,7 +62,7 @@ def budget(
     if path is None:
         q, where = workspace_states(robot, STATES, seed), "the workspace"
     else:
-        q, where = robot.inverse(read_path(path, robot, None, None)[1].pose), path.name
+        q, where = robot.inverse(read_path(path, robot, None, read_options())[1].pose), path.name
     found = tolerances(robot, sigma, q, wrench)
     variance = {name: float((found.part(name)[..., :3] ** 2).sum()) for name in sigma}
     whole = sum(variance.values())

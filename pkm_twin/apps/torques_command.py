@@ -16,7 +16,7 @@ from pkm_twin.apps.options import (
     Payload,
     Platform,
     RobotName,
-    load_of,
+    read_options,
 )
 from pkm_twin.console import progress, refuse_existing, writing
 from pkm_twin.files import STANDARD
@@ -58,26 +58,28 @@ def torques(
     its limits.
     """
     from pkm_twin import load
-    from pkm_twin.apps.limits import beyond_limits as find_beyond
-    from pkm_twin.apps.limits import refuse_beyond
-    from pkm_twin.apps.torques import check_target, motion_of, table, write_table
     from pkm_twin.bags.storage import is_bag
+    from pkm_twin.paths.along import torque_table
+    from pkm_twin.recordings import read, write_table
+    from pkm_twin.recordings.tables import check_target
     from pkm_twin.report import plots
+    from pkm_twin.robot.limits import beyond_limits as find_beyond
+    from pkm_twin.robot.limits import refuse_beyond
 
     check_target(out)
     drawing, piped = out.with_suffix(".png"), str(out) == STANDARD
     picture = picture and not piped
     for target in (out, drawing) if picture else (out,):
         refuse_existing(target, overwrite, motion)
-    carried = load_of(payload, load_times)
+    how = read_options(topic, payload, load_times, follow, planned=True)
     if topic and not is_bag(motion):
         raise typer.BadParameter(f"--topic is for bags; {motion} is read as CSV")
-    data = motion_of(motion, load(robot, platform=platform), topic, carried, follow)
+    data = read(motion, load(robot, platform=platform), how).with_rates()
     _, found = find_beyond(data.robot, data.q, data.qd)
     if not beyond_limits:
         refuse_beyond(found)
     with progress("torques", len(data.time)) as update:
-        columns = table(data, update)
+        columns = torque_table(data, update)
     with writing(out):
         write_table(columns, out)
         typer.echo(f"{out}: {len(data.time)} rows, {len(columns)} columns", err=piped)

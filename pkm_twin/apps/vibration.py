@@ -21,9 +21,9 @@ from pkm_twin.apps.options import (
     drawing_of,
     loaded,
 )
-from pkm_twin.console import answer, numbers, parse_numbers
+from pkm_twin.console import answer, numbers
 from pkm_twin.errors import ParameterError
-from pkm_twin.files import STANDARD
+from pkm_twin.files import STANDARD, parse_numbers
 from pkm_twin.options import OptionalFloat, OptionalPath, OptionalText, file_name
 
 if TYPE_CHECKING:
@@ -106,8 +106,8 @@ def _prepared(
     picture: bool, overwrite: bool, beyond: bool,
 ) -> tuple[Robot, list[float], Path | None]:  # fmt: skip
     """The loaded robot, the pose, and the picture's name, of a command line."""
-    from pkm_twin.apps.limits import beyond_limits, refuse_beyond
-    from pkm_twin.apps.torques import ENDINGS, check_target
+    from pkm_twin.recordings.tables import ENDINGS, check_target
+    from pkm_twin.robot.limits import beyond_limits, refuse_beyond
 
     drawing = drawing_of(out, picture, overwrite, ENDINGS)
     if out is not None:
@@ -202,7 +202,7 @@ def frf(
         f"{1e6 * size[k, 0]:.4g} µm/N, {ratio:.3g} times the static compliance"
     )
     if out is not None:
-        from pkm_twin.apps.torques import write_table
+        from pkm_twin.recordings import write_table
 
         columns = {"frequency": grid}
         for i, row in enumerate(AXES):
@@ -285,7 +285,7 @@ def lobes(
     The table has the columns speed (rpm), depth (m) and open: 1 where the cut is stable up to the
     largest depth that was computed.
     """
-    from pkm_twin.apps.torques import write_table
+    from pkm_twin.recordings import write_table
     from stiffness_monitor.chatter import MARGIN, lobes_between
     from stiffness_monitor.vibration import tool_modes
 

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError, SingularityError, UnreachableError
 from pkm_twin.paths.geometry import Path, Stretch
+from pkm_twin.robot.derivatives import joint_rates
 from pkm_twin.robot.robot import Robot
 
 Index = NDArray[np.int64]
@@ -171,15 +172,6 @@ class JointPath:
             part = (np.arange(len(at)) - np.repeat(np.cumsum(count) - count, count)) / count[at]
             grid.append(np.append(own[at] + part * np.diff(own)[at], own[-1]))
         return self.curve.at(grid)
-
-
-def joint_rates(robot: Robot, q: Array, rate: Array, change: Array) -> tuple[Array, Array]:
-    """First and second derivatives of joints (k, n) by those of the pose, shape (k, m) each."""
-    jacobian = robot.jacobian(q)
-    first = np.asarray(np.linalg.solve(jacobian, rate[..., None])[..., 0], np.float64)
-    own = robot.pose_acceleration(q, first, np.zeros_like(first))
-    second = np.linalg.solve(jacobian, (change - own)[..., None])[..., 0]
-    return first, np.asarray(second, np.float64)
 
 
 def velocity_of(robot: Robot, q: Array, qd: Array) -> Array:

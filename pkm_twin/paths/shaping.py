@@ -21,8 +21,9 @@ from numpy.typing import ArrayLike
 from delta_dynamics import inverse_dynamics
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError, UnknownNameError
-from pkm_twin.paths.joint_path import check_positions, joint_rates, velocity_of
+from pkm_twin.paths.joint_path import check_positions, velocity_of
 from pkm_twin.paths.motion import Moments, Samples, TimedPath, peaks
+from pkm_twin.robot.derivatives import joint_rates
 
 DELAYS: Final = {"zv": 1, "zvd": 2}
 """Half vibrations that each shaper takes."""

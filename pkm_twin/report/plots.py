@@ -91,7 +91,7 @@ def torques(motion: Any, table: Mapping[str, Any]) -> Any:
     figure, axes = columns(1, len(robot.joint_names))
     terms = ("gravity", "inertia", "velocity", "payload", "friction", "external")
     for ax, joint, unit in zip(axes[0], robot.joint_names, robot.effort_units, strict=True):
-        if motion.measured is not None:
+        if f"{joint}.measured" in table:
             ax.plot(table["time"], table[f"{joint}.measured"], color="0.7", lw=2, label="measured")
         ax.plot(table["time"], table[f"{joint}.effort"], color="black", lw=1, label="sum")
         if f"{joint}.effort_deviation" in table:

@@ -31,6 +31,15 @@ class Derivatives:
     by: Mapping[str, Array]
 
 
+def joint_rates(robot: Robot, q: Array, rate: Array, change: Array) -> tuple[Array, Array]:
+    """First and second derivatives of joints (k, n) by those of the pose, shape (k, m) each."""
+    jacobian = robot.jacobian(q)
+    first = np.asarray(np.linalg.solve(jacobian, rate[..., None])[..., 0], np.float64)
+    own = robot.pose_acceleration(q, first, np.zeros_like(first))
+    second = np.linalg.solve(jacobian, (change - own)[..., None])[..., 0]
+    return first, np.asarray(second, np.float64)
+
+
 def forward_derivatives(robot: Robot, q: ArrayLike, by: Sequence[str] = ()) -> Derivatives:
     """Derivatives of :meth:`Robot.forward`: ``state`` by q (..., m, n), ``by[path]`` (..., m).
 

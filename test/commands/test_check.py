@@ -3,7 +3,6 @@
 
 import json
 import re
-from collections import Counter
 from dataclasses import replace
 
 import numpy as np
@@ -15,9 +14,9 @@ from mcap.writer import CompressionType, Writer
 from delta_dynamics import inverse_dynamics
 from pkm_twin.apps.check import MEASURED
 from pkm_twin.apps.check_causes import judged
-from pkm_twin.apps.recorded import Recording
-from pkm_twin.apps.topics import JOINT_STATE, Topics
 from pkm_twin.bags.reader import inspect, read_messages
+from pkm_twin.recordings import Recording
+from pkm_twin.recordings.topics import JOINT_STATE
 from test.bags.folders import make_folder
 from test.commands.conftest import COLLISION, DELTA, JOINTS, MILLING, STIFFNESS, rewrite
 from test.identification.machines import machine
@@ -541,7 +540,4 @@ def recording_of(robot, m, efforts):
     """A recording of a drawn motion, with efforts (samples, n) of 0.5 % noise."""
     noise = np.random.default_rng(3).normal(size=efforts.shape)
     efforts = efforts + 0.005 * np.sqrt(np.mean(efforts**2, 0)) * noise
-    stamps = np.round(1e9 * m.time).astype(np.int64)
-    return Recording(
-        robot, None, Topics("drawn"), None, stamps, m.time, m.q, m.qd, efforts, None, Counter(), ""
-    )
+    return Recording(robot, m.time, m.q, m.qd, effort=efforts)

@@ -9,11 +9,10 @@ import pytest
 pytest.importorskip("mcap")
 from mcap.writer import Writer
 
-from pkm_twin.apps.columns import read_columns
-from pkm_twin.apps.recorded import read_recording
-from pkm_twin.apps.topics import JOINT_STATE, WRENCH
 from pkm_twin.bags.reader import BagWriter, open_bag
 from pkm_twin.errors import BagError
+from pkm_twin.recordings import ReadOptions, read, read_table
+from pkm_twin.recordings.topics import JOINT_STATE, WRENCH
 from test.commands.conftest import COLLISION, DELTA, JOINTS, MILLING, rewrite
 from test.support.mapped import sides
 
@@ -91,7 +90,7 @@ class TestTopics:
         for name, source in (("delta_cu", one), (robot, bag)):
             out = tmp_path / f"{source.stem}.csv"
             assert twin("torques", name, source, "--no-picture", "--out", out).code == 0
-            tables.append(read_columns(out))
+            tables.append(read_table(out))
         assert list(tables[1]) == list(tables[0])
         for name, values in tables[0].items():
             np.testing.assert_allclose(tables[1][name], values, rtol=1e-6, atol=1e-6)
@@ -182,8 +181,8 @@ class TestFrames:
         assert data["topics"]["frame"] == accepted
 
     def test_axes_are_those_of_the_frame(self, tmp_path):
-        turned = read_recording(framed(tmp_path, "platform"))
-        fixed = read_recording(framed(tmp_path, "base_link"))
+        turned = read(framed(tmp_path, "platform"))
+        fixed = read(framed(tmp_path, "base_link"))
         rotation = turned.robot.platform(turned.q)[1]
         force = np.einsum("kij,kj->ki", rotation, fixed.wrench[:, :3])
         np.testing.assert_allclose(turned.wrench[:, :3], force, atol=1e-9)
@@ -191,12 +190,12 @@ class TestFrames:
 
 def test_what_no_sensor_publishes_is_read_on_request(twin):
     bag = COLLISION
-    chosen = read_recording(bag)
+    chosen = read(bag)
     assert chosen.wrench is None and "/ground_truth/wrench" in chosen.topics.left_out
-    truth = read_recording(bag, topics=["/ground_truth/wrench"])
+    truth = read(bag, how=ReadOptions(("/ground_truth/wrench",)))
     assert (truth.topics.wrench, truth.topics.frame) == ("/ground_truth/wrench", "base_link")
     assert np.abs(truth.wrench).max() > 10.0
-    assert read_recording(MILLING, topics=[JOINTS]).wrench is None
+    assert read(MILLING, how=ReadOptions((JOINTS,))).wrench is None
 
 
 @pytest.mark.parametrize("kind", ["sensor_msgs/JointState", JOINT_STATE])
@@ -210,4 +209,4 @@ def test_another_encoding_is_named(tmp_path, kind):
         writer.add_message(channel, 1, b"{}", 1)
         writer.finish()
     with pytest.raises(BagError, match="encoding is json"):
-        read_recording(path, "delta")
+        read(path, "delta")

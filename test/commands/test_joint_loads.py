@@ -159,22 +159,20 @@ def test_what_nothing_decides_is_named(tmp_path, capsys):
 
 def test_turning_of_a_hinge_and_of_a_rod(rng):
     from pkm_twin.apps.joint_loads import joint_loads
-    from pkm_twin.apps.torques import Motion
+    from pkm_twin.recordings import Recording
 
     robot = load("five_bar")
     time = np.linspace(0.0, 1.0, 50)
     q = robot.graph.home + 0.1 * np.outer(np.sin(7 * time), [1.0, -0.6])
     zero = np.zeros_like(q)
-    found = {
-        j.name: j for j in next(joint_loads(Motion(robot, time, q, zero, zero, np.zeros((50, 6)))))
-    }
+    found = {j.name: j for j in next(joint_loads(Recording(robot, time, q, zero, zero)))}
     np.testing.assert_allclose(found["left"].turned, np.abs(np.diff(q[:, 0])), atol=1e-12)
     elbow = robot.passive(q)[:, robot.passive_joints.index("elbow_right")]
     np.testing.assert_allclose(found["elbow_right"].turned, np.abs(np.diff(elbow)), atol=1e-12)
     robot = load("linear_delta")
     q = 0.3 + 0.03 * np.outer(np.sin(7 * time), [1.0, -0.6, 0.3])
     zero = np.zeros_like(q)
-    loads = next(joint_loads(Motion(robot, time, q, zero, zero, np.zeros((50, 6)))))
+    loads = next(joint_loads(Recording(robot, time, q, zero, zero)))
     rod = robot.graph.rods["left_1"]
     way = rod.ends[1] - rod.ends[0] + robot.platform(q)[0] - robot.graph.origin
     way = way - np.outer(q[:, 0] - 0.3, [0, 0, 1])

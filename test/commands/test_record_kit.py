@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from pkm_twin.apps.record_kit import readme
-from pkm_twin.apps.recorded import read_recording
-from pkm_twin.apps.trajectories import read_trajectory
 from pkm_twin.bags.reader import BagWriter, open_bag
+from pkm_twin.recordings import read
+from pkm_twin.recordings.trajectories import read_trajectory
 from test.commands.conftest import DELTA, MILLING
 from test.support.command import command
 from test.support.robots import load
@@ -28,9 +28,9 @@ def test_a_kit_has_motions_notes_and_commands(tmp_path, capsys):
     for name in ("excitation", "friction"):
         motion = read_trajectory(open_bag(out / f"{name}.mcap"), robot)
         assert motion is not None
-        lengths[name] = motion[0][-1]
+        lengths[name] = motion.time[-1]
         table = np.genfromtxt(out / f"{name}.csv", delimiter=",", names=True)
-        np.testing.assert_allclose(table["time"], motion[0], atol=1e-6)
+        np.testing.assert_allclose(table["time"], motion.time, atol=1e-6)
     assert lengths["friction"] > lengths["excitation"]
     for name in ("README.md", "NOTES.md"):
         text = (out / name).read_text()
@@ -114,7 +114,7 @@ def test_kept_names_can_be_judged_and_other_joints_go(tmp_path, capsys):
     kept = command(capsys, "record-kit", "delta_cu", "--anonymise", given, "--out", out,
                    "--keep-names")  # fmt: skip
     assert kept.code == 0
-    one, other = read_recording(out), read_recording(given, robot)
+    one, other = read(out), read(given, robot)
     assert one.robot.name == "delta_cu"
     np.testing.assert_array_equal(one.q, other.q)
     np.testing.assert_array_equal(one.effort, other.effort)

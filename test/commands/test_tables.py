@@ -14,9 +14,8 @@ import numpy as np
 import pytest
 from scipy.io import loadmat
 
-from pkm_twin.apps.recorded import recorded_table
-from pkm_twin.apps.torques import motion_of_csv
 from pkm_twin.errors import ParameterError
+from pkm_twin.recordings import ReadOptions, read
 from test.support.command import command
 from test.support.robots import load
 
@@ -129,7 +128,7 @@ def test_a_cell_without_a_number_is_named(cell, motion, rng):
     lines[1 + row][column] = cell
     Path("a.csv").write_text("\n".join(map(",".join, lines)))
     with pytest.raises(ParameterError) as error:
-        recorded_table(Path("a.csv"), robot, None)
+        read("a.csv", robot)
     assert f"line {2 + row}, column {header[column]}" in str(error.value)
 
 
@@ -140,11 +139,11 @@ def test_columns_without_any_number_are_not_there(motion):
     lines = written(header, [time, *q.T]).splitlines()
     table = "\n".join([f"{lines[0]},elbow.fx", *(f"{line}," for line in lines[1:])]) + "\n"
     Path("empty.csv").write_text(table)
-    assert motion_of_csv(Path("empty.csv"), robot).q == pytest.approx(q, abs=1e-12)
+    assert read("empty.csv", robot).q == pytest.approx(q, abs=1e-12)
     # A cell that is empty in one row alone is an error.
     Path("empty.csv").write_text(table.rstrip("\n") + "1.0\n")
     with pytest.raises(ParameterError, match=r"line 2, column elbow\.fx"):
-        motion_of_csv(Path("empty.csv"), robot)
+        read("empty.csv", robot)
 
 
 @pytest.mark.parametrize("name", ["five_bar", "delta", "linear_delta"])
@@ -167,7 +166,7 @@ def test_positions_in_degrees_are_noticed(name, tmp_path, rng):
         path.write_text(written(header, [time, *values.T]))
         with warnings.catch_warnings(record=True) as told:
             warnings.simplefilter("always")
-            recorded_table(path, robot, None)
+            read(path, robot)
         assert sum("--units deg" in str(one.message) for one in told) == noticed
 
 
@@ -179,14 +178,14 @@ def test_a_pose_has_to_be_that_of_the_joints(name, tmp_path, rng):
     q = robot.graph.home + 0.1 * np.sin(np.outer(time, rng.uniform(2.0, 8.0, robot.joints_count)))
     pose, path = robot.forward(q), tmp_path / "a.csv"
     header = ["time", *(f"{j}.position" for j in robot.joint_names), *robot.pose_names]
-    for read in (motion_of_csv, lambda path, robot: recorded_table(path, robot, None)):
+    for how in (ReadOptions(), ReadOptions(planned=True)):
         path.write_text(written(header, [time, *q.T, *pose.T]))
-        assert read(path, robot).q == pytest.approx(q)
+        assert read(path, robot, how).q == pytest.approx(q)
         wrong = pose.copy()
         wrong[7, 0] += 0.01 * robot.size
         path.write_text(written(header, [time, *q.T, *wrong.T]))
         with pytest.raises(ParameterError, match="sample 7"):
-            read(path, robot)
+            read(path, robot, how)
 
 
 def test_matlab_files_have_the_columns(motion, capsys):

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from pkm_twin.apps.history import Measured, Series, append, measure, read_history
-from pkm_twin.apps.recorded import read_recording
 from pkm_twin.apps.trend import judged
+from pkm_twin.recordings import read
 from test.support.command import command
 from test.support.nights import night
 from test.support.robots import load, often
@@ -78,7 +78,7 @@ def test_a_recording_tells_friction_and_payload(tmp_path, rng):
     robot = load("delta")
     viscous, coulomb = (0.05, 0.1, 0.2), (0.1, 0.3, 0.2)
     path = night(tmp_path / "night.csv", robot, rng, viscous, coulomb, 0.12)
-    found = {(m.quantity, m.part): m for m in measure(read_recording(path, robot))}
+    found = {(m.quantity, m.part): m for m in measure(read(path, robot))}
     for k, name in enumerate(robot.joint_names):
         for what, true in (("viscous", viscous), ("coulomb", coulomb)):
             one = found[f"friction {what}", name]

@@ -9,7 +9,7 @@ import yaml
 
 from delta_dynamics import inverse_dynamics, torque_deviation
 from pkm_twin.apps.check import DEVIATIONS, compared_of
-from pkm_twin.apps.recorded import read_recording
+from pkm_twin.recordings import read
 from test.commands.conftest import DELTA, rewrite
 from test.support.command import command
 from test.support.robots import load, parameters_of
@@ -36,7 +36,7 @@ def test_check_counts_the_residuals_inside_the_model_s_band(capsys, unsure, part
     done = command(capsys, "check", part, "--robot", unsure, "--json")
     assert done.code == 0, done.err
     data = json.loads(done.out)
-    recording = read_recording(part, str(unsure))
+    recording = read(part, str(unsure))
     compared = compared_of(recording, np.zeros(len(recording.time), bool))
     (track,) = compared.tracks
     rows = np.isin(track.time, compared.time)

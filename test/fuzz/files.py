@@ -11,17 +11,17 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
-from unittest import mock
 
 import numpy as np
 import yaml
 
 from delta_dynamics import inverse_dynamics
 from pkm_twin import load, robot_names
-from pkm_twin.apps import torques
-from pkm_twin.apps.limits import beyond_limits
 from pkm_twin.bags.reader import inspect
+from pkm_twin.paths.along import torque_table
+from pkm_twin.recordings import ReadOptions, read
 from pkm_twin.robot.catalogue import config_folder, robot_of_data
+from pkm_twin.robot.limits import beyond_limits
 from pkm_twin.robot.robot import Robot
 from pkm_twin.robot.robot_urdf import robot_urdf
 from test.bags.folders import make_folder
@@ -247,10 +247,9 @@ class Csv(Kind):
         path.write_bytes(content)
 
         def compute() -> None:
-            with mock.patch.object(torques, "load", self.load):
-                motion = torques.motion_of_csv(path, name)
+            motion = read(path, self.load(name), ReadOptions(planned=True)).with_rates()
             beyond_limits(motion.robot, motion.q, motion.qd)
-            columns = torques.table(motion)
+            columns = torque_table(motion)
             assert {len(values) for values in columns.values()} == {len(motion.time)}
             # What rigid bodies leave open of a reaction is not a number in the table.
             for column in (f"{joint}.effort" for joint in motion.robot.joint_names):

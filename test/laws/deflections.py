@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pkm_twin.apps.elastic_recordings import read_deflected
 from pkm_twin.identification.deflections import Deflected
+from pkm_twin.recordings import ReadOptions, read
 from stiffness_monitor.response import ElementResponse, element_response
 from test.support.robots import load
 
@@ -41,7 +41,8 @@ def frame_recording(factors: tuple[tuple[str, float], ...] = (), count: int = 20
 def bag_recording() -> tuple[Deflected, ElementResponse]:
     """What the bag of a soft joint has, and the sound twin in its poses."""
     robot = load("upr_rpu")
-    recording = read_deflected(BAGS / "upr_rpu_soft_joint.mcap", robot)
+    r = read(BAGS / "upr_rpu_soft_joint.mcap", robot, ReadOptions(deflected=True))
+    recording = Deflected(r.name, r.time, r.q, r.wrench, r.deflection)
     return recording, element_response(robot, robot.forward(recording.q))
 
 

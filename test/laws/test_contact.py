@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from delta_dynamics import Contact, ContactMonitor, inverse_dynamics
 from pkm_twin import Robot
-from pkm_twin.apps.recorded import Recording, read_recording
-from pkm_twin.apps.recorded_motion import motion
 from pkm_twin.bags.reader import open_bag
 from pkm_twin.machine.places import given
+from pkm_twin.recordings import Recording, read
+from pkm_twin.recordings.recording import differentiated
 from pkm_twin.robot.catalogue import robot_of_data
 from test.laws.contacts import OFF, RATE, REST, Stream, measured, moves, pushed, seen_after
 from test.support.robots import load, massive, partly_long
@@ -29,7 +29,7 @@ PICKS = BAGS / "delta_cu_pick_and_place.mcap"
 def watched(r: Recording, robot: Robot, begin: float, end: float) -> tuple[Array, list[Contact]]:
     """What the monitor says from one time to another."""
     assert r.effort is not None
-    qd, qdd, used = motion(r)
+    qd, qdd, used = differentiated(r)
     monitor, times, found = ContactMonitor(robot), [], []
     for k in np.flatnonzero(used & (r.time > begin) & (r.time < end)):
         contact = monitor.push(float(r.time[k]), (r.q[k], qd[k], qdd[k]), r.effort[k])
@@ -40,7 +40,7 @@ def watched(r: Recording, robot: Robot, begin: float, end: float) -> tuple[Array
 
 
 def test_a_collision_is_seen_within_milliseconds_and_nothing_before() -> None:
-    r = read_recording(COLLISION)
+    r = read(COLLISION)
     facts = open_bag(COLLISION).report.metadata["pkm_twin"]
     begin, force = float(facts["contact_begins_s"]), float(facts["contact_force_N"])
     time, found = watched(r, r.robot, 1.2, 3.0)
@@ -59,7 +59,7 @@ def test_a_collision_is_seen_within_milliseconds_and_nothing_before() -> None:
 
 def test_fast_picks_are_no_contact() -> None:
     """Two seconds of picks without the payload; with it where it is told of."""
-    r = read_recording(PICKS)
+    r = read(PICKS)
     assert r.load is not None
     laden = r.robot.changed(payload={"mass": r.load.mass})
     for robot, begin in ((r.robot, 2.0), (laden, 9.0)):

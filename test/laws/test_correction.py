@@ -10,9 +10,9 @@ import pytest
 from numpy.typing import NDArray
 
 from pkm_twin import Robot
-from pkm_twin.apps.recorded import read_recording
 from pkm_twin.bags.reader import read_messages
 from pkm_twin.machine.rotations import skew
+from pkm_twin.recordings import read
 from stiffness_monitor import setpoint_correction, strain_energy
 from test.support.robots import elastic, every_robot, joint_range, load
 
@@ -98,7 +98,7 @@ def test_no_load_wants_no_offset(name: str) -> None:
 def test_the_recorded_tool_deflects_less_by_far() -> None:
     """The frame's own deflection, corrected by the twin's offsets from the measured wrench."""
     bag = BAGS / "upr_rpu_milling.mcap"
-    recorded = read_recording(bag)
+    recorded = read(bag)
     assert recorded.wrench is not None
     truth = [m.message for m in read_messages(bag, ["/ground_truth/deflection"])][::8]
     begin = 1_700_000_000

@@ -4,8 +4,8 @@
 import numpy as np
 import pytest
 
-from pkm_twin.apps.loads import Load
 from pkm_twin.errors import ParameterError
+from pkm_twin.recordings import Load
 from test.support.robots import load as robot_of
 
 TIME = np.array([0.4, 0.6, 1.0, 1.4, 1.6, 2.0, 2.4, 2.6])

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from delta_dynamics import PayloadEstimator, inverse_dynamics
 from pkm_twin import Robot
-from pkm_twin.apps.recorded import read_recording
-from pkm_twin.apps.recorded_motion import motion
+from pkm_twin.recordings import read
+from pkm_twin.recordings.recording import differentiated
 from test.support.robots import joint_range, load
 
 Array = NDArray[np.float64]
@@ -64,9 +64,9 @@ def test_a_load_is_found_with_what_the_machine_feels_of_it(name: str, feels: boo
 
 def test_a_pick_is_seen_and_weighed_within_a_second() -> None:
     """The recorded load of 0.15 kg comes at 8.275 s and goes at 14.875 s."""
-    r = read_recording(BAGS / "delta_cu_pick_and_place.mcap")
+    r = read(BAGS / "delta_cu_pick_and_place.mcap")
     assert r.effort is not None
-    qd, qdd, used = motion(r)
+    qd, qdd, used = differentiated(r)
     near = used & (r.time > 6.5) & (r.time < 9.3)
     estimator = PayloadEstimator(r.robot)
     told = []

@@ -15,7 +15,8 @@ from delta_dynamics.feedforward import Feedforward
 from delta_dynamics.rest import beyond_friction, friction_reach, moving_rates
 from delta_dynamics.settings import Settings
 from pkm_twin import Robot
-from pkm_twin.apps.torques import motion_of_csv, table
+from pkm_twin.paths.along import torque_table
+from pkm_twin.recordings import ReadOptions, read
 from pkm_twin.streams.differentiator import Differentiator
 from pkm_twin.streams.rest import RestWatch, fit_gain, gradient_gain, noise, rate_doubt
 from test.nodes.harness import SECOND, Maker, Plain
@@ -164,7 +165,7 @@ def test_a_table_of_positions_rubs_in_no_wrong_direction(
         writer = csv.writer(file)
         writer.writerow(["time", *(f"{joint}.position" for joint in robot.joint_names)])
         writer.writerows(np.column_stack([time, q]).tolist())
-    found = table(motion_of_csv(path, name))
+    found = torque_table(read(path, name, ReadOptions(planned=True)).with_rates())
     way, coulomb = np.sign(true[-1] - true[0]), robot.friction.coulomb
     for k, joint in enumerate(robot.joint_names):
         rubs = found[f"{joint}.effort_friction"]

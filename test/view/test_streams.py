@@ -4,11 +4,11 @@
 import numpy as np
 import pytest
 
-from pkm_twin.apps.recorded import read_recording
-from pkm_twin.apps.recorded_motion import predicted
 from pkm_twin.apps.view import texts
 from pkm_twin.apps.view.live import SPAN, Live
 from pkm_twin.apps.view.timeline import POINTS, Timeline
+from pkm_twin.paths.along import predicted
+from pkm_twin.recordings import read
 from stiffness_monitor import strain_energy
 from test.commands.conftest import DELTA, MILLING, rewrite
 from test.nodes.harness import SECOND, Maker, Plain
@@ -21,13 +21,13 @@ PLAIN = Plain()
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory):
     path = tmp_path_factory.mktemp("view") / "sample.mcap"
-    return read_recording(rewrite(DELTA, path, seconds=1.5))
+    return read(rewrite(DELTA, path, seconds=1.5))
 
 
 @pytest.fixture(scope="module")
 def milling(tmp_path_factory):
     path = tmp_path_factory.mktemp("view") / "milling.mcap"
-    return read_recording(rewrite(MILLING, path, seconds=0.4))
+    return read(rewrite(MILLING, path, seconds=0.4))
 
 
 def test_the_time_line_has_a_node_s_residual(recording):

@@ -14,12 +14,12 @@ from pathlib import Path
 import numpy as np
 
 from pkm_twin import load
-from pkm_twin.apps.recorded import read_recording
 from pkm_twin.apps.view.door import Door, listen
 from pkm_twin.apps.view.model import Model
 from pkm_twin.apps.view.page import Page, serving
 from pkm_twin.apps.view.panels import BagPanel
 from pkm_twin.apps.view.timeline import Timeline
+from pkm_twin.recordings import read
 from test.maps.browser import Browser, find_browser
 
 SIZE = (1100, 900)
@@ -38,7 +38,7 @@ def loaded(page: Page) -> str:
 
 def recorded(page: Page) -> str:
     """A recording, amid a stroke with the payload."""
-    panel = BagPanel(page, Timeline.of(read_recording("bags/delta_cu_pick_and_place.mcap")))
+    panel = BagPanel(page, Timeline.of(read("bags/delta_cu_pick_and_place.mcap")))
     panel.show(9.05)
     return "Move"
 

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from pkm_twin.apps.frame import command
-from pkm_twin.apps.limits import beyond_limits, refuse_beyond
 from pkm_twin.apps.options import Accepts, BeyondLimitsToo, OfRobot, Overwrites
 from pkm_twin.apps.pose_table import LENGTHS, parse_columns, read_measured, read_poses
 from pkm_twin.console import progress, refuse_existing
@@ -28,6 +27,7 @@ from pkm_twin.identification.plan import plan as plan_of
 from pkm_twin.identification.transmission import Transmission, written
 from pkm_twin.report import Column, Fact, Report, Table
 from pkm_twin.robot.edited import Fitted, edited_yaml, write_edited
+from pkm_twin.robot.limits import beyond_limits, refuse_beyond
 from pkm_twin.settings import setting
 
 if TYPE_CHECKING:

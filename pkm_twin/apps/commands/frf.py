@@ -11,8 +11,8 @@ import numpy as np
 
 from pkm_twin.apps.frame import command
 from pkm_twin.apps.options import AtPose, Draws, OfTool, Writes
-from pkm_twin.apps.torques import ENDINGS, write_table
 from pkm_twin.errors import ParameterError
+from pkm_twin.recordings.tables import ENDINGS, write_table
 from pkm_twin.report import Fact, Report, plots
 from pkm_twin.settings import setting
 

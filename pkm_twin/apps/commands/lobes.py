@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 from pkm_twin.apps.commands.frf import of_modes
 from pkm_twin.apps.frame import command
 from pkm_twin.apps.options import AtPose, Draws, OfMilling, OfTool, Writes
-from pkm_twin.apps.torques import ENDINGS, write_table
 from pkm_twin.errors import ParameterError
+from pkm_twin.recordings.tables import ENDINGS, write_table
 from pkm_twin.report import Fact, Report, plots
 from pkm_twin.settings import setting
 

@@ -7,13 +7,17 @@ import threading
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from pkm_twin.apps.options import BagTopics, LoadTimes, Payload, Platform, RobotName, load_of
+from pkm_twin.apps.options import BagTopics, LoadTimes, Payload, Platform, RobotName, read_options
 from pkm_twin.console import progress
 from pkm_twin.options import OptionalPath
+
+if TYPE_CHECKING:
+    from pkm_twin.apps.view.timeline import Timeline
+    from pkm_twin.recordings import ReadOptions
 
 
 def view(
@@ -52,8 +56,8 @@ def view(
     from pkm_twin.apps.view.door import Door, listen
     from pkm_twin.maps.extras import require
 
-    carried = load_of(payload, load_times)
-    if bag is None and (topic or carried is not None):
+    how = read_options(topic, payload, load_times, limited=True)
+    if bag is None and (topic or how.load is not None):
         raise typer.BadParameter("--topic, --payload and --load-times need --bag")
     if bag is not None and live:
         raise typer.BadParameter("give --bag or --live, not both")
@@ -70,7 +74,7 @@ def view(
     with ExitStack() as stack:
         door_socket = stack.enter_context(listen(host, port))
         machine = load(robot, platform=platform)
-        timeline = None if bag is None else _timeline(bag, robot, topic, carried)
+        timeline = None if bag is None else _timeline(bag, robot, how)
         model = Model(machine)
         server = stack.enter_context(serving(door, door_socket))
         page = Page(server, model)
@@ -87,12 +91,12 @@ def view(
         page.run()
 
 
-def _timeline(bag: Path, robot: str, topic: list[str], carried: Any) -> Any:
-    from pkm_twin.apps.recorded import read_recording
+def _timeline(bag: Path, robot: str, how: ReadOptions) -> Timeline:
     from pkm_twin.apps.view.timeline import Timeline
+    from pkm_twin.recordings import read
 
     with progress("reading", None) as update:
-        recording = read_recording(bag, robot, update, topics=topic, carried=carried)
+        recording = read(bag, robot, how, update)
     return Timeline.of(recording)
 
 

@@ -14,9 +14,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from delta_dynamics import inverse_dynamics
 from delta_dynamics.settings import Settings
-from pkm_twin.apps.limits import beyond_limits
 from pkm_twin.errors import ParameterError, PkmTwinError, one_line
 from pkm_twin.robot.clearance import has_clearance, joint_clearance
+from pkm_twin.robot.limits import beyond_limits
 from pkm_twin.robot.robot import Robot
 from pkm_twin.robot.workspace import has_joint_angles
 from stiffness_monitor import PlatformResponse, platform_response

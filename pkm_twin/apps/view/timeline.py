@@ -9,8 +9,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from pkm_twin.apps.recorded import Recording
-from pkm_twin.apps.recorded_motion import predicted
+from pkm_twin.paths.along import predicted
+from pkm_twin.recordings import Recording
 from pkm_twin.robot.plausibility import why_no_torques
 
 Array = NDArray[np.float64]

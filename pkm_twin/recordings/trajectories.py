@@ -8,17 +8,16 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-from pkm_twin.apps.topics import DEFINITIONS, TRAJECTORY
 from pkm_twin.bags.reader import Bag, BagWriter
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import BagError
+from pkm_twin.messages.stamps import SECOND
+from pkm_twin.recordings.recording import Recording
+from pkm_twin.recordings.topics import DEFINITIONS, TRAJECTORY, Topics
 from pkm_twin.robot.robot import Robot
 
-Array = NDArray[np.float64]
-
 TOPIC: Final = "/delta_dynamics/joint_trajectory"
-SECOND: Final = 1_000_000_000
 
 
 def write_trajectory(
@@ -65,13 +64,10 @@ def write_trajectory(
         bag.write(TOPIC, message, 0)
 
 
-def read_trajectory(
-    bag: Bag, robot: Robot
-) -> tuple[Array, Array, Array, Array, Array | None] | None:
-    """Time (k,), q, qd, qdd and efforts (k, n) of a bag's only JointTrajectory.
+def read_trajectory(bag: Bag, robot: Robot) -> Recording | None:
+    """The motion of a bag's only JointTrajectory, in the model's numbers.
 
-    In the model's numbers. None where the bag has no trajectory with velocities and accelerations,
-    and for efforts that it does not have.
+    None where the bag has no trajectory with velocities and accelerations.
 
     :raises BagError: joints of another robot, or several trajectories.
     """
@@ -91,14 +87,18 @@ def read_trajectory(
     points = message.points
     if len(points) < 2 or any(not len(p.velocities) or not len(p.accelerations) for p in points):
         return None
-    time = np.array(
-        [p.time_from_start.sec + p.time_from_start.nanosec / SECOND for p in points], float
+
+    def column(what: str) -> Array:
+        return np.array([getattr(p, what) for p in points], float)[:, order]
+
+    return Recording(
+        robot,
+        np.array([p.time_from_start.sec + p.time_from_start.nanosec / SECOND for p in points]),
+        own.positions(column("positions")),
+        own.rates(column("velocities")),
+        own.rates(column("accelerations")),
+        own.efforts(column("effort")) if all(len(p.effort) for p in points) else None,
+        efforts="effort",
+        bag=bag,
+        topics=Topics(names[0]),
     )
-    q, qd, qdd = (
-        np.array([getattr(p, what) for p in points], float)[:, order]
-        for what in ("positions", "velocities", "accelerations")
-    )
-    effort = None
-    if all(len(p.effort) for p in points):
-        effort = own.efforts(np.array([p.effort for p in points], float)[:, order])
-    return time, own.positions(q), own.rates(qd), own.rates(qdd), effort

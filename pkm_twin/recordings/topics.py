@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which topics of a bag are a machine's joint states and wrenches."""
+"""Which topics of a bag are a machine's joint states, wrenches and deflections."""
 
 from __future__ import annotations
 
@@ -27,7 +27,9 @@ TWIN_OUTPUTS: Final = (
     "strain_energy_stamped",
     "natural_frequencies_stamped",
 )
-"""Last names of the twin's own topics of these two types, or a name before the last."""
+"""Last names of the twin's own topics of these types, or a name before the last."""
+COMPUTED: Final = ["stiffness_monitor", "deflection"]
+"""The end of the topic that the twin's own, computed, deflections come on."""
 TRUTHS: Final = ("ground_truth", "groundtruth")
 """Names in topics that a simulation publishes and no sensor does."""
 
@@ -77,29 +79,38 @@ class Topics:
 
     joint_states: str
     wrench: str | None = None
+    deflection: str | None = None
     left_out: Mapping[str, str] = field(default_factory=dict)
     frame: str = ""
     """Of the accepted wrenches."""
+    turns: bool = False
+    """Whether that frame turns with the platform."""
 
     def __str__(self) -> str:
         text = f"joint states {self.joint_states}, wrench {self.wrench or 'none'}"
         text += f" (frame {self.frame})" if self.frame else ""
+        text += f", deflection {self.deflection}" if self.deflection else ""
         if self.left_out:
             text += "; left out: " + ", ".join(f"{k} ({v})" for k, v in self.left_out.items())
         return one_line(text, 1000)
 
 
-def choose_topics(bag: Bag, robot: Robot, wanted: Sequence[str] = ()) -> Topics:
+def choose_topics(
+    bag: Bag, robot: Robot, wanted: Sequence[str] = (), deflected: bool = False
+) -> Topics:
     """The joint-state topic that carries the robot's joints, and the wrench topic.
 
     The twin's own outputs, and what no sensor publishes, are left out. Of several that fit,
-    ``/joint_states`` and ``/wrench`` are taken. ``wanted`` names them otherwise: then a wrench is
-    read only if it is named.
+    ``/joint_states``, ``/wrench`` and ``/measured_deflection`` are taken. ``wanted`` names them
+    otherwise: who names the joint states alone wants no wrench.
 
+    :param deflected: also the topic of measured deflections.
     :raises BagError: a wanted topic is missing or of another type, no topic has the joints, or
         several fit.
     """
     kinds: dict[str, list[str]] = {JOINT_STATE: [], WRENCH: []}
+    if deflected:
+        kinds[TRANSFORM] = []
     for name in wanted:
         info = bag.report.topics.get(name)
         if info is None or type_of(info) not in kinds:
@@ -114,10 +125,27 @@ def choose_topics(bag: Bag, robot: Robot, wanted: Sequence[str] = ()) -> Topics:
             )
     left_out: dict[str, str] = {}
     joints = _choose_joints(bag, robot, kinds[JOINT_STATE], left_out)
-    wrench = _choose_wrench(bag, kinds[WRENCH], bool(wanted), left_out)
-    for name in filter(None, (joints, wrench)):
+    wrenches = _candidates(bag, WRENCH, kinds[WRENCH], left_out)
+    if kinds[JOINT_STATE] and not kinds[WRENCH]:
+        left_out.update({name: "not chosen" for name in wrenches})
+        wrenches = []
+    wrench = _only(bag, "wrenches", wrenches, "wrench", left_out)
+    deflection = None
+    if deflected:
+        fit = _candidates(bag, TRANSFORM, kinds[TRANSFORM], left_out)
+        fit = [name for name in fit if bag.report.topics[name].count]
+        deflection = _only(bag, "deflections", fit, "measured_deflection", left_out)
+        missing = (
+            (deflection, "deflection", f"no deflection in the bag: a topic of {TRANSFORM} from the "
+             "platform to the deflected platform"),
+            (wrench, "wrench", "no wrench in the bag; compliance needs the applied wrench"),
+        )  # fmt: skip
+        for topic, what, text in missing:
+            if topic is None:
+                raise _choice_error(bag, text, f"no {what}")
+    for name in filter(None, (joints, wrench, deflection)):
         require_definition(bag, name)
-    return Topics(joints, wrench, left_out)
+    return Topics(joints, wrench, deflection, left_out)
 
 
 def _choose_joints(bag: Bag, robot: Robot, wanted: list[str], left_out: dict[str, str]) -> str:
@@ -147,25 +175,13 @@ def _choose_joints(bag: Bag, robot: Robot, wanted: list[str], left_out: dict[str
             f"it has {', '.join(sorted(seen[name])) or 'none'}",
             "no joint states",
         )
-    return _only(bag, "joint states", fit, "joint_states", left_out)
-
-
-def _choose_wrench(
-    bag: Bag, wanted: list[str], chosen: bool, left_out: dict[str, str]
-) -> str | None:
-    fit = _candidates(bag, WRENCH, wanted, left_out)
-    if not fit:
-        return None
-    if chosen and not wanted:
-        # Who names the joint states alone wants no wrench.
-        left_out.update({name: "not chosen" for name in fit})
-        return None
-    return _only(bag, "wrenches", fit, "wrench", left_out)
+    return _only(bag, "joint states", fit, "joint_states", left_out) or fit[0]
 
 
 def is_output(topic: str) -> bool:
     """Whether the name is one of the twin's own topics."""
-    return any(part in TWIN_OUTPUTS for part in topic.split("/")[-2:])
+    last = topic.split("/")[-2:]
+    return last == COMPUTED or any(part in TWIN_OUTPUTS for part in last)
 
 
 def is_truth(topic: str) -> bool:
@@ -198,7 +214,10 @@ def _candidates(bag: Bag, kind: str, wanted: list[str], left_out: dict[str, str]
     return fit
 
 
-def _only(bag: Bag, what: str, fit: list[str], usual: str, left_out: dict[str, str]) -> str:
+def _only(bag: Bag, what: str, fit: list[str], usual: str, left_out: dict[str, str]) -> str | None:
+    """The topic of several that has the usual name, None of none."""
+    if not fit:
+        return None
     preferred = [name for name in fit if name.split("/")[-1] == usual]
     if len(fit) > 1 and len(preferred) != 1:
         raise _choice_error(bag, f"{what} on {', '.join(fit)}; choose one with --topic")

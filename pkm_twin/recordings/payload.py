@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The payload of a recording: as its bag tells it, or as it is asked for."""
+"""The payload of a recording: as its bag or table tells it, or as it is asked for."""
 
 from __future__ import annotations
 
@@ -7,20 +7,17 @@ import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from itertools import pairwise
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pkm_twin.bags.reader import Bag
-from pkm_twin.console import parse_numbers
+from pkm_twin.codegen.arrays import Array, Mask
 from pkm_twin.errors import BagError, ParameterError
+from pkm_twin.files import parse_numbers
+from pkm_twin.recordings.tables import PAYLOAD, Table
 from pkm_twin.robot.plausibility import payload_findings
 from pkm_twin.robot.robot import Robot
-
-Array = NDArray[np.float64]
-
 
 SOURCES = {"bag": "recording", "table": "table"}
 
@@ -38,14 +35,14 @@ class Load:
     times: tuple[tuple[float, float], ...] = ()
     source: str = "option"
 
-    def held(self, time: Array) -> NDArray[np.bool_]:
+    def held(self, time: Array) -> Mask:
         """When it is on the platform, shape (n,)."""
         if not self.times:
             return np.ones(len(time), np.bool_)
         spans = [(time >= begin) & (time <= end) for begin, end in self.times]
         return np.asarray(np.logical_or.reduce(spans), np.bool_)
 
-    def near_change(self, time: Array, within: float) -> NDArray[np.bool_]:
+    def near_change(self, time: Array, within: float) -> Mask:
         """Where a pick or release is less than ``within`` seconds away, shape (n,)."""
         edges = [edge for span in self.times for edge in span]
         if not edges:
@@ -85,35 +82,32 @@ class Load:
         return f"{self.mass:g} kg{at}, {spans}, {told}"
 
 
-COLUMNS = ("payload.mass", "payload.x", "payload.y", "payload.z")
-"""Of a table: mass (kg) and centre (m)."""
-
-
 def payload_columns(carried: Load | None, time: Array) -> dict[str, Array]:
     """A table's columns of its payload; none without one."""
     if carried is None:
         return {}
     values = (carried.mass, *(carried.com or ()))
     held = carried.held(time)
-    return {name: np.where(held, v, 0.0) for name, v in zip(COLUMNS, values, strict=False)}
+    return {name: np.where(held, v, 0.0) for name, v in zip(PAYLOAD, values, strict=False)}
 
 
-def load_of_columns(path: Path, time: Array, columns: Mapping[str, Array]) -> Load | None:
+def load_of_table(table: Table, time: Array) -> Load | None:
     """The payload of a table's columns, None where there is none.
 
     :raises ParameterError: a negative mass, several payloads, or a part of a centre.
     """
-    mass = columns.get(COLUMNS[0])
+    mass = table.get(PAYLOAD[0])
     if mass is None or not mass.any():
         return None
     held = mass > 0.0
-    there = [name for name in COLUMNS if name in columns]
-    values = np.stack([columns[name][held] for name in there], -1)
+    there = [name for name in PAYLOAD if name in table]
+    values = table.stack(there)[held]
     if (mass < 0.0).any() or np.ptp(values, axis=0).any() or len(there) not in (1, 4):
         raise ParameterError(
-            f"{path}: payload", f"columns {', '.join(there)}, {mass.min():g} to {mass.max():g} kg",
-            f"one payload of 0 kg or more, in {COLUMNS[0]} or in all of {', '.join(COLUMNS)}",
-        )  # fmt: skip
+            f"{table.path}: payload",
+            f"columns {', '.join(there)}, {mass.min():g} to {mass.max():g} kg",
+            f"one payload of 0 kg or more, in {PAYLOAD[0]} or in all of {', '.join(PAYLOAD)}",
+        )
     edges = [0, *(np.flatnonzero(np.diff(held)) + 1).tolist(), len(held)]
     spans = [(float(time[b]), float(time[e - 1])) for b, e in pairwise(edges) if held[b]]
     row = values[0].tolist()

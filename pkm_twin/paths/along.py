@@ -1,0 +1,147 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The model along a recorded or planned motion: efforts, their terms and joint reactions."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+from typing import Final
+
+import numpy as np
+
+from delta_dynamics import dynamics_terms, inverse_dynamics, reactions, torque_deviation
+from delta_dynamics.rest import friction_reach, moving_rates
+from pkm_twin.codegen.arrays import Array, Mask
+from pkm_twin.errors import ParameterError, PkmTwinError, SingularityError, UnreachableError
+from pkm_twin.recordings.payload import by_load, payload_columns
+from pkm_twin.recordings.recording import Recording, at_rest, differentiated
+from pkm_twin.recordings.tables import WRENCH
+from pkm_twin.robot.limits import beyond_limits
+
+BLOCK: Final = 4096
+"""Samples computed at a time, so that memory stays flat."""
+BEYOND_LIMITS: Final = "beyond_limits"
+UNLIKE: Final = 0.05
+"""Difference between a file's efforts and the model's, over the RMS, from which it is reported."""
+
+
+@dataclass(frozen=True)
+class Compared:
+    """A motion with the efforts that are sized, shape (k, n), and where these are from.
+
+    ``model``: what the robot's model computes for the motion, shape (k, n).
+    """
+
+    motion: Recording
+    effort: Array
+    source: str
+    model: Array
+
+    @property
+    def difference(self) -> Array:
+        """RMS difference between efforts and model over the model's RMS, shape (n,)."""
+        squares = ((self.effort - self.model) ** 2).mean(0)
+        return np.asarray(np.sqrt(squares / np.maximum((self.model**2).mean(0), 1e-24)))
+
+    @property
+    def unlike(self) -> str:
+        """Says of which joint the file's efforts are not the model's; empty where they are."""
+        worst = int(self.difference.argmax())
+        if not self.difference[worst] > UNLIKE:
+            return ""
+        return (
+            f"the file's efforts of {self.motion.robot.joint_names[worst]} differ from the model's "
+            f"by {100 * self.difference[worst]:.3g} % RMS: the file may be of another robot, "
+            "payload or rotor"
+        )
+
+
+def compared(motion: Recording, efforts: str = "file") -> Compared:
+    """A motion with the file's efforts where it has them and they are asked for, else the model's.
+
+    :raises ParameterError: a robot without masses.
+    """
+    model = np.empty_like(motion.q)
+    for robot, part in by_load(motion.robot, motion.load, motion.time, BLOCK):
+        model[part] = inverse_dynamics(robot, *(values[part] for values in motion.motion))
+    if motion.effort is not None and efforts == "file":
+        return Compared(motion, motion.effort, "the file's", model)
+    return Compared(motion, model, "the model's", model)
+
+
+def predicted(r: Recording) -> tuple[Array, Mask]:
+    """Efforts that the model expects (samples, n), zero where its window is not full; and where.
+
+    Where a joint stands still dry friction has no direction, and the model none of it.
+    """
+    if r.qd is not None and r.qdd is not None:
+        qd, qdd, used = r.qd, r.qdd, np.ones(len(r.time), np.bool_)
+    else:
+        qd, qdd, used = differentiated(r)
+    qd = moving_rates(qd, at_rest(r, qd), friction_reach(r.robot))
+    wrench = np.zeros((len(r.time), 6)) if r.wrench is None else r.wrench
+    efforts = np.zeros_like(r.q)
+    for robot, part in by_load(r.robot, r.load, r.time, BLOCK):
+        rows = np.arange(part.start, part.stop)[used[part]]
+        efforts[rows] = inverse_dynamics(robot, r.q[rows], qd[rows], qdd[rows], wrench[rows])
+    return efforts, used
+
+
+def torque_table(m: Recording, progress: Callable[[int], None] | None = None) -> dict[str, Array]:
+    """Named columns: time, the motion, efforts, their terms, and every joint's reaction.
+
+    The terms ``NAME.effort_gravity``, ``NAME.effort_inertia`` ... sum to ``NAME.effort``. A
+    reaction that rigid bodies do not determine is left empty (NaN) in the table. Where a sample is
+    beyond the limits, there is a column :data:`BEYOND_LIMITS`, 1 for such samples, 0 for others.
+    Of a robot whose file has an ``uncertainty``, ``NAME.effort_deviation`` is what that makes.
+
+    :raises UnreachableError: by the sample's index in the motion.
+    :raises SingularityError: likewise.
+    :raises PkmTwinError: values so large that the model's result is not finite.
+    """
+    columns: dict[str, list[Array]] = {}
+
+    def put(name: str, values: Array) -> None:
+        columns.setdefault(name, []).append(values)
+
+    q, qd, qdd, wrench = m.motion
+    outside, _ = beyond_limits(m.robot, q, qd)
+    rates = qd if m.still is None else moving_rates(qd, m.still, friction_reach(m.robot))
+    for robot, part in by_load(m.robot, m.load, m.time, BLOCK):
+        begin = part.start
+        state = (robot, q[part], rates[part], qdd[part], wrench[part])
+        try:
+            tau, terms, react = inverse_dynamics(*state), dynamics_terms(*state), reactions(*state)
+            spread = torque_deviation(*state) if robot.uncertainty else None
+        except UnreachableError as e:
+            at = (begin + e.index[0],)
+            raise UnreachableError("joint state", e.limb, at, e.miss) from None
+        except SingularityError as e:
+            at = (begin + e.index[0],)
+            raise SingularityError("joint state", at, e.measure, e.bound) from None
+        except ParameterError:
+            raise
+        except ValueError as e:
+            seconds = f"{m.clock[part][0]:g} to {m.clock[part][-1]:g} s"
+            raise PkmTwinError(f"between {seconds}: {e}") from None
+        put("time", m.clock[part])
+        if outside.any():
+            put(BEYOND_LIMITS, outside[part].astype(np.float64))
+        for i, joint in enumerate(m.robot.joint_names):
+            put(f"{joint}.position", q[part][:, i])
+            put(f"{joint}.velocity", qd[part][:, i])
+            put(f"{joint}.acceleration", qdd[part][:, i])
+            put(f"{joint}.effort", tau[:, i])
+            if spread is not None:
+                put(f"{joint}.effort_deviation", spread[:, i])
+            if m.effort is not None and m.efforts == "measured":
+                put(f"{joint}.measured", m.effort[part][:, i])
+            for field in fields(terms):
+                put(f"{joint}.effort_{field.name}", getattr(terms, field.name)[:, i])
+        for k, name in enumerate(react.names):
+            for i, axis in enumerate(WRENCH):
+                put(f"{name}.{axis}", react.wrenches[:, k, i])
+        if progress is not None:
+            progress(part.stop)
+    whole = {name: np.concatenate(parts) for name, parts in columns.items()}
+    return whole | payload_columns(m.load, m.time)

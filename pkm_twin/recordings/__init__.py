@@ -1,0 +1,22 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Recordings and planned motions: one type, one reader of bags and tables."""
+
+from pkm_twin.recordings.payload import Load, by_load
+from pkm_twin.recordings.read import read
+from pkm_twin.recordings.recording import ReadOptions, Recording, WrenchFrames, at_rest
+from pkm_twin.recordings.tables import Dialect, Table, kinds_of, read_table, write_table
+
+__all__ = [
+    "Dialect",
+    "Load",
+    "ReadOptions",
+    "Recording",
+    "Table",
+    "WrenchFrames",
+    "at_rest",
+    "by_load",
+    "kinds_of",
+    "read",
+    "read_table",
+    "write_table",
+]

@@ -1,0 +1,249 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Recordings of bags: joint states, wrenches, deflections and trajectories as nodes read them."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pkm_twin.bags.reader import Bag, open_bag
+from pkm_twin.codegen.arrays import Array
+from pkm_twin.errors import BagError, MessageError, one_line
+from pkm_twin.messages.reading import JointReader, JointSample
+from pkm_twin.messages.stamps import SECOND, StampRules
+from pkm_twin.messages.wrenches import WrenchSample, read_wrench
+from pkm_twin.recordings.payload import metadata_error, told_load
+from pkm_twin.recordings.recording import MAPPED, ReadOptions, Recording
+from pkm_twin.recordings.topics import JOINT_STATE, TRAJECTORY, Topics, choose_topics
+from pkm_twin.recordings.trajectories import read_trajectory
+from pkm_twin.robot.catalogue import load, robot_names
+from pkm_twin.robot.robot import Robot
+from pkm_twin.streams.deflection import DeflectionSample, in_base_axes, read_deflection
+from pkm_twin.streams.wrench import PLATFORM
+
+Stamps = NDArray[np.int64]
+
+APART: Final = 0.02
+"""Farthest that a wrench or a joint state may be from a deflection, s."""
+
+
+def read_bag(
+    path: Path, robot: str | Robot | None, how: ReadOptions,
+    progress: Callable[[int], None] | None = None,
+) -> Recording:  # fmt: skip
+    """A bag's joint states and what was measured beside them; every message checked as by a node.
+
+    Of a bag without joint states, where ``how.planned``, the motion of its JointTrajectory.
+
+    :param progress: called with the number of messages read so far.
+    :raises BagError: the bag is damaged, names no robot, or lacks what is asked for.
+    """
+    bag = open_bag(path)
+    machine = _robot_of(bag, robot)
+    held = how.load or told_load(bag)
+    kinds = {topic.type for topic in bag.report.topics.values()}
+    if how.planned and JOINT_STATE not in kinds and TRAJECTORY in kinds:
+        plan = read_trajectory(bag, machine)
+        if plan is not None:
+            return replace(plan, load=held, source=str(path))
+    topics = choose_topics(bag, machine, how.topics, how.deflected)
+    found = _messages(bag, machine, topics, how, progress)
+    frame = found.wrenches[0].frame if found.wrenches else ""
+    topics = replace(topics, frame=frame, turns=bool(frame) and frame != how.frames.base_frame)
+    notes = [str(topics), f"payload: {held or 'as in the robot file'}"]
+    if found.rejected:
+        refused = ", ".join(f"{reason}: {count}" for reason, count in found.rejected.items())
+        notes.append(f"rejected messages, left out: {refused}; first: {found.first_reject}")
+    if not machine.controller.plain:
+        notes.append(MAPPED)
+    stamps = np.array([s.stamp for s in found.samples], np.int64)
+    r = Recording(
+        machine,
+        (stamps - stamps[0]) / 1e9,
+        np.array([s.q for s in found.samples]),
+        qd=_stacked([s.qd for s in found.samples]),
+        effort=_stacked([s.effort for s in found.samples]),
+        load=held,
+        source=str(path),
+        notes=tuple(notes),
+        start=int(stamps[0]),
+        bag=bag,
+        topics=topics,
+        rejected=found.rejected,
+        first_reject=found.first_reject,
+    )
+    if how.deflected:
+        return _at_deflections(r, stamps, found, how)
+    if not found.wrenches:
+        return r
+    at, wrench = _wrenches(found.wrenches)
+    wrench = wrench[_nearest(at, stamps)]
+    if topics.turns:
+        wrench = in_base_axes(wrench, machine.rotation(machine.forward(r.q)))
+    return replace(r, wrench=wrench)
+
+
+def _robot_of(bag: Bag, name: str | Robot | None) -> Robot:
+    """The robot, by name too, or the one that the bag's metadata names.
+
+    :raises BagError: neither is given, or the bag names one that is not in ``config/``.
+    """
+    if name is not None:
+        return name if isinstance(name, Robot) else load(name)
+    recorded = bag.report.metadata.get("pkm_twin", {}).get("robot")
+    if recorded is None:
+        raise BagError(
+            "the bag names no robot; use --robot", path=bag.report.path, reason="no robot"
+        )
+    # Not a path: a bag does not choose which files are opened.
+    if recorded not in robot_names():
+        raise metadata_error(
+            bag, "robot", recorded, f"one of {', '.join(robot_names())}; or give --robot"
+        )
+    return load(recorded)
+
+
+class _Found(NamedTuple):
+    samples: list[JointSample]
+    wrenches: list[WrenchSample]
+    deflections: list[DeflectionSample]
+    rejected: Counter[str]
+    first_reject: str
+
+
+def _messages(
+    bag: Bag, robot: Robot, topics: Topics, how: ReadOptions,
+    progress: Callable[[int], None] | None,
+) -> _Found:  # fmt: skip
+    """The accepted messages of the chosen topics, joint states in the order of their stamps.
+
+    :raises BagError: no joint state is accepted.
+    """
+    reader, rules = JointReader(robot, limited=how.limited), StampRules(future_tolerance=2**62)
+    wrench_of = _wrench_reader(how, rules)
+    found, first = _Found([], [], [], Counter(), ""), ""
+    names = [topics.joint_states, topics.wrench, topics.deflection]
+    for i, message in enumerate(bag.messages([name for name in names if name is not None])):
+        if progress is not None:
+            progress(i + 1)
+        try:
+            if message.topic == topics.joint_states:
+                sample = reader.joint_state(message.message, message.log_time, rules)
+                if found.samples and sample.stamp <= found.samples[-1].stamp:
+                    raise MessageError("stamp order", f"stamp {sample.stamp} is not after the last")
+                found.samples.append(sample)
+            elif message.topic == topics.wrench:
+                found.wrenches.append(wrench_of(message.message, message.log_time))
+            else:
+                moved = read_deflection(message.message, message.log_time, rules)
+                found.deflections.append(moved)
+        except MessageError as error:
+            text = f"{message.topic}: {error}"
+            if how.deflected and error.reason == "frame" and message.topic == topics.wrench:
+                # Between wrenches of two frames there is no middle.
+                raise BagError(text, path=bag.report.path, reason="frames") from None
+            found.rejected[error.reason] += 1
+            first = first or one_line(text)
+    if not found.samples:
+        raise BagError(
+            f"no usable joint state for {robot.name}: {first}",
+            path=bag.report.path,
+            reason="no joint states",
+        )
+    return found._replace(first_reject=first)
+
+
+def _wrench_reader(how: ReadOptions, rules: StampRules) -> Callable[[Any, int], WrenchSample]:
+    """Reads a geometry_msgs/WrenchStamped and its log time, ns, of one frame, as a node does."""
+    accepted = how.frames.wrench_frame
+
+    def read(message: Any, now: int) -> WrenchSample:
+        nonlocal accepted
+        given = message.header.frame_id
+        if accepted is None and given in (PLATFORM, how.frames.base_frame):
+            accepted = given
+        try:
+            return read_wrench(message, now, rules, accepted or PLATFORM, accept_empty=False)
+        except MessageError as error:
+            if error.reason != "frame" or not given:
+                raise
+            raise MessageError(
+                "frame", f"{error}; --wrench-frame accepts a frame that turns with the platform, "
+                "--base-frame one with base axes"
+            ) from None  # fmt: skip
+
+    return read
+
+
+def _stacked(values: list[Array | None]) -> Array | None:
+    present = [v for v in values if v is not None]
+    return np.array(present) if len(present) == len(values) else None
+
+
+def _wrenches(samples: list[WrenchSample]) -> tuple[Stamps, Array]:
+    """Stamps and wrenches (k, 6) in the order of the stamps; of one stamp the last."""
+    by_stamp = {one.stamp: one.wrench for one in samples}
+    at = sorted(by_stamp)
+    return np.array(at, np.int64), np.array([by_stamp[stamp] for stamp in at])
+
+
+def _nearest(stamps: Stamps, others: Stamps) -> NDArray[np.intp]:
+    """Of sorted stamps the index of the nearest to each of the others."""
+    right = np.minimum(np.searchsorted(stamps, others), len(stamps) - 1)
+    left = np.maximum(right - 1, 0)
+    before = np.abs(stamps[left] - others) <= np.abs(stamps[right] - others)
+    return np.where(before, left, right)
+
+
+def _at_deflections(r: Recording, joints: Stamps, found: _Found, how: ReadOptions) -> Recording:
+    """The recording at the times of its deflections, linear between joint states and wrenches.
+
+    :raises BagError: no deflection has both near it.
+    """
+    counts = {r.topics.wrench: found.wrenches, r.topics.deflection: found.deflections}
+    for topic, samples in counts.items():
+        if not samples:
+            text = f"no usable message on {topic}: {r.first_reject}"
+            raise BagError(text, path=r.source, reason="no messages")
+    moved = {one.stamp: one for one in found.deflections}
+    stamps = np.array(sorted(moved), np.int64)
+    times, wrench = _wrenches(found.wrenches)
+    apart = [np.abs(at[_nearest(at, stamps)] - stamps) / SECOND for at in (times, joints)]
+    near = stamps[(np.array(apart) <= APART).all(0)]
+    if not len(near):
+        raise BagError(
+            f"no deflection on {r.topics.deflection} has a wrench and a joint state within "
+            f"{APART:g} s",
+            path=r.source, reason="no pairs",
+        )  # fmt: skip
+    q, wrench = _between(near, joints, r.q), _between(near, times, wrench)
+    rotation = r.robot.platform(q)[1]
+    values = np.array([moved[stamp].values for stamp in near.tolist()])
+    fixed = np.array([moved[stamp].frame == how.frames.base_frame for stamp in near.tolist()])
+    return Recording(
+        r.robot,
+        (near - near[0]) / SECOND,
+        q,
+        wrench=in_base_axes(wrench, rotation) if r.topics.turns else wrench,
+        deflection=np.where(fixed[:, None], values, in_base_axes(values, rotation)),
+        source=r.source,
+        notes=r.notes,
+        start=int(near[0]),
+        bag=r.bag,
+        topics=r.topics,
+        rejected=r.rejected,
+        first_reject=r.first_reject,
+    )
+
+
+def _between(stamps: Stamps, others: Stamps, values: Array) -> Array:
+    """Values (k, n) at the stamps, linear between two."""
+    at = (stamps - others[0]) / SECOND
+    known = (others - others[0]) / SECOND
+    return np.stack([np.interp(at, known, column) for column in values.T], -1)

@@ -1,0 +1,312 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One reader of recordings and planned motions: MCAP files, rosbag2 folders, tables."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from pkm_twin.bags.storage import is_bag
+from pkm_twin.codegen.arrays import Array, Mask
+from pkm_twin.errors import ParameterError, UnknownNameError, one_line, warn
+from pkm_twin.messages.reading import TINY
+from pkm_twin.messages.wrenches import MAX_FORCE, MAX_MOMENT
+from pkm_twin.recordings.bags import read_bag
+from pkm_twin.recordings.payload import load_of_table
+from pkm_twin.recordings.recording import MAPPED, ReadOptions, Recording
+from pkm_twin.recordings.tables import (
+    DEFLECTION,
+    EFFORTS,
+    PAYLOAD,
+    RATES,
+    UNITS,
+    WRENCH,
+    Dialect,
+    Table,
+    kinds_of,
+    read_table,
+)
+from pkm_twin.robot.catalogue import load
+from pkm_twin.robot.derivatives import joint_rates
+from pkm_twin.robot.limits import beyond_limits
+from pkm_twin.robot.robot import Robot
+from pkm_twin.streams.deflection import MAX_SHIFT, MAX_TURN
+
+RECORDING: Final = (
+    "an MCAP file, a rosbag2 folder, or a table with columns time, JOINT.position ..."
+)
+FOLLOW: Final = ("joints", "pose")
+POSE_MISS: Final = 1e-3
+"""Difference between a table's pose and that of its joint positions, of the robot's size."""
+BLOCK: Final = 4096
+"""Samples computed at a time, so that memory stays flat."""
+MOST_EFFORT: Final = 1e9
+"""Greatest effort or wrench of a file that can be a machine's, N m or N."""
+SIZES: Final = dict(
+    zip(
+        (*WRENCH, *DEFLECTION),
+        np.repeat([MAX_FORCE, MAX_MOMENT, MAX_SHIFT, MAX_TURN], 3).tolist(),
+        strict=True,
+    )
+)
+"""Greatest values of a table with deflections, as of messages: N, N m, m, rad."""
+LONGEST_STEP: Final = 0.2
+"""Between two samples of a motion, s, from which on the times look like milliseconds."""
+SHORTEST_STEP: Final = 1e-9
+"""Between two times, s: what a bag's stamps resolve."""
+LONGEST: Final = 1e6
+"""From the first time to the last, s; of a trajectory it is the same."""
+SOME: Final = 500
+"""Samples of a motion by which its units are judged."""
+DEFAULT: Final = ReadOptions()
+
+
+def read(
+    path: str | Path, robot: str | Robot | None = None, how: ReadOptions = DEFAULT,
+    progress: Callable[[int], None] | None = None,
+) -> Recording:  # fmt: skip
+    """A recording of a robot, with a file's own robot where none is given.
+
+    Columns of a table, in any order: ``time``; for every joint NAME ``NAME.position``, or in their
+    place all coordinates of the pose (m, rad); optionally ``NAME.velocity`` and
+    ``NAME.acceleration`` (of the coordinates where the joints follow the pose), efforts, the wrench
+    ``fx fy fz mx my mz`` and the deflection ``dx dy dz rx ry rz``, whose absent parts are zero or
+    not measured, and the payload. Other columns are left alone.
+
+    :param path: an MCAP file, a rosbag2 folder, a CSV or Parquet file, or ``-`` for a CSV in stdin.
+    :param progress: called with the number of messages read so far.
+    :raises BagError: the bag is damaged, names no robot, or has no usable joint state.
+    :raises ParameterError: a table that is no recording of this robot, or an option that the file
+        cannot have.
+    """
+    path = Path(path)
+    if how.follow not in (None, *FOLLOW):
+        raise UnknownNameError("follow", str(how.follow), FOLLOW)
+    if is_bag(path):
+        if how.follow is not None:
+            raise ParameterError("follow", how.follow, "no --follow: a bag has no pose columns")
+        r = read_bag(path, robot, how, progress)
+    elif how.topics:
+        raise ParameterError("topic", how.topics[0], f"no --topic: {path} is a table")
+    else:
+        r = _of_table(path, robot, how)
+    for name, values in (("wrench", r.wrench), ("efforts", r.effort)):
+        if values is not None and not np.abs(values).max(initial=0.0) <= MOST_EFFORT:
+            row = int(np.abs(values).max(1).argmax())
+            value = float(np.abs(values[row]).max())
+            raise ParameterError(
+                f"{path}: {name}, sample {row}", value, f"up to {MOST_EFFORT:g} N or N m"
+            )
+    return r
+
+
+def _of_table(path: Path, name: str | Robot | None, how: ReadOptions) -> Recording:
+    """A recording as a table; see :func:`read`."""
+    if name is None:
+        _require_recording(path)
+        raise ParameterError("--robot", None, "a robot, because a table does not name its robot")
+    robot = name if isinstance(name, Robot) else load(name)
+    joints, table = robot.joint_names, read_table(path, kinds_of(robot), how.dialect)
+    _refuse_misspelt(table, robot, how)
+    q = table.stack_if([f"{joint}.position" for joint in joints])
+    pose = None
+    if all(name in table for name in robot.pose_names):
+        pose = table.stack(robot.pose_names)
+    posed = q is None or how.follow == "pose"
+    deflection = table.fill(DEFLECTION, np.nan)
+    times = table.get("time")
+    if times is None and (how.deflected or deflection is not None):
+        times = np.arange(float(table.rows))
+    if (pose is None and posed) or times is None:
+        needed = ", ".join(f"{joint}.position" for joint in joints)
+        or_pose = f"; or time, {', '.join(robot.pose_names)}"
+        raise ParameterError(str(path), ", ".join(table), f"columns time, {needed}{or_pose}")
+    time, notes, effort, word = times_of(path, times), [], None, how.efforts[0]
+    if posed:
+        assert pose is not None  # noqa: S101  one of the two is there
+        q, qd, qdd = _of_pose(table, robot, pose)
+        rates = "" if qd is not None else "; velocities and accelerations differentiated"
+        notes.append(f"joints computed from the pose, {', '.join(robot.pose_names)}{rates}")
+    else:
+        assert q is not None  # noqa: S101
+        if pose is not None and how.follow is None:
+            hint = "; --follow pose plans its pose again, --follow joints ignores it"
+            check_pose(path, robot, q, pose, hint if how.planned else "")
+        qd, qdd = (table.stack_if([f"{joint}.{what}" for joint in joints]) for what in RATES[1:])
+    if not (posed and how.planned):
+        for word in how.efforts:
+            effort = table.stack_if([f"{joint}.{word}" for joint in joints])
+            if effort is not None:
+                break
+    check_units(path, robot, time, q, qd, how.dialect)
+    wrench = table.fill(WRENCH)
+    if how.deflected:
+        for what, values, axes in (
+            ("wrench", wrench, WRENCH), ("deflection", deflection, DEFLECTION)
+        ):  # fmt: skip
+            if values is None:
+                raise ParameterError(
+                    str(path), f"no {what}", f"a column {axes[0]} or more of {', '.join(axes)}"
+                )
+        _check_sizes(table)
+    held = how.load or load_of_table(table, time)
+    return Recording(
+        robot, time, q, qd, qdd, effort, wrench, deflection, held, efforts=word, source=str(path),
+        notes=(
+            *([] if held is None else [f"payload: {held}"]),
+            *notes,
+            *([] if robot.controller.plain else [MAPPED]),
+        ),
+        start=round(1e9 * float(times[0])),
+    )  # fmt: skip
+
+
+def _require_recording(path: Path) -> None:
+    """Refuse what is no recording of any robot.
+
+    :raises ParameterError: no table, or one without times and positions.
+    """
+    try:
+        columns = list(read_table(path))
+    except ParameterError as error:
+        expected = f"{RECORDING} ({error})"
+        raise ParameterError(str(path), "neither a bag nor a table", expected) from None
+    if "time" not in columns or not any(name.endswith(".position") for name in columns):
+        raise ParameterError(str(path), f"columns {one_line(', '.join(columns), 80)}", RECORDING)
+
+
+def _refuse_misspelt(table: Table, robot: Robot, how: ReadOptions) -> None:
+    """Reject what would be read if its name were right, where nothing else may be there.
+
+    :raises UnknownNameError: by the column.
+    """
+    inputs = [f"{joint}.{what}" for joint in robot.joint_names for what in RATES]
+    if how.planned:
+        for name in table:
+            joint, dot, what = name.rpartition(".")
+            computed = what in EFFORTS or what.startswith("effort_")
+            if dot and joint in robot.joint_names and name not in inputs and not computed:
+                raise UnknownNameError(f"{table.path}: column", name, inputs)
+    if how.deflected:
+        known = ("time", *SIZES, *PAYLOAD, *robot.pose_names, *inputs)
+        for name in table:
+            _, dot, what = name.rpartition(".")
+            if name not in known and (not dot or what == "position"):
+                raise UnknownNameError(f"{table.path}: column", name, known)
+
+
+def _of_pose(table: Table, robot: Robot, pose: Array) -> tuple[Array, Array | None, Array | None]:
+    """Joint positions of a pose, and their rates where the table has those of the pose."""
+    q = robot.inverse(pose)
+    # Joint rates in the table are those of the machine whose joint positions it has.
+    qd, qdd = (
+        table.stack_if([f"{name}.{what}" for name in robot.pose_names]) for what in RATES[1:]
+    )
+    if set(robot.joint_names) & set(robot.pose_names) or qd is None or qdd is None:
+        return q, None, None
+    return q, *joint_rates(robot, q, qd, qdd)
+
+
+def times_of(path: Path, values: Array) -> Array:
+    """A column of times from its first on, s.
+
+    :raises ParameterError: they do not rise, or farther than a recording lasts.
+    """
+    # Between the greatest numbers there is none.
+    with np.errstate(over="ignore"):
+        time: Array = np.asarray(values - values[0], np.float64)
+        rising = bool((np.diff(values) >= SHORTEST_STEP).all())
+    if not rising or not time[-1] <= LONGEST:
+        raise ParameterError(
+            f"{path}: time",
+            f"{values[0]:g} to {values[-1]:g}" if rising else "not rising",
+            f"rising times, {SHORTEST_STEP:g} s or more apart, up to {LONGEST:g} s in all",
+        )
+    return time
+
+
+def check_pose(path: Path, robot: Robot, q: Array, pose: Array, how: str = "") -> None:
+    """Reject a table whose joint positions and pose are not those of one machine.
+
+    :param how: what else the table may be read as.
+    :raises ParameterError: by the sample that is farthest off.
+    """
+    for begin in range(0, len(q), BLOCK):
+        rows = slice(begin, begin + BLOCK)
+        found, good = robot.try_forward(q[rows])
+        off = found - pose[rows]
+        turns = [i for i, unit in enumerate(robot.pose_units) if unit != "m"]
+        off[:, turns] = (off[:, turns] + np.pi) % (2.0 * np.pi) - np.pi
+        # What has no pose is rejected with its own reason later.
+        size = np.where(good, np.linalg.norm(off * robot.pose_scales, axis=1), 0.0)
+        worst = int(size.argmax())
+        if size[worst] > POSE_MISS * robot.size:
+            names = ", ".join(robot.pose_names)
+            raise ParameterError(
+                f"{path}: {names}, sample {begin + worst}",
+                f"{1e3 * size[worst]:.4g} mm from the pose of the joint positions on {robot.name}",
+                f"a table of this machine{how}",
+            )  # fmt: skip
+
+
+def check_units(
+    path: Path, robot: Robot, time: Array, q: Array, qd: Array | None, dialect: Dialect
+) -> None:
+    """Units of a motion: the steps of its times are short, its velocities those of its positions.
+
+    Positions that may be in degrees give a warning.
+
+    :param time: shape (samples,); q and qd, shape (samples, n), qd where the file tells it.
+    :raises ParameterError: velocities are a thousand times those of the positions.
+    """
+    if "angle" not in dialect.units and _in_degrees(robot, q):
+        most = float(np.abs(q).max())
+        warn(path, f"positions up to {most:.4g}; expected rad; are these degrees? --units deg")
+    step = float(np.median(np.diff(time))) if len(time) > 1 else 0.0
+    if qd is not None and len(time) > 2:
+        with np.errstate(all="ignore"):
+            moved = float(np.sqrt(np.mean(np.gradient(q, time, axis=0) ** 2)))
+            told = float(np.sqrt(np.mean(qd**2)))
+        if moved > 0.0 and 300.0 < told / moved < 3000.0:
+            raise ParameterError(
+                f"{path}: time", f"steps of {step:g} s",
+                f"seconds: velocities are {told / moved:.4g} times those of the positions, as with "
+                "times in milliseconds",
+            )  # fmt: skip
+    if step > LONGEST_STEP:
+        warn(path, f"time: steps of {step:g} s; expected seconds; are these milliseconds?")
+
+
+def _in_degrees(robot: Robot, q: Array) -> bool:
+    """Whether most joint states are none of the robot, and all are if they are in degrees.
+
+    What is beyond a limit by a little is in rad: most have a joint more than half a turn from zero.
+    """
+    turns = np.array([unit == "rad" for unit in robot.joint_units])
+    if not turns.any():
+        return False
+    some = q[:: max(1, len(q) // SOME)]
+
+    def possible(states: Array) -> Mask:
+        outside, _ = beyond_limits(robot, states)
+        return np.asarray(robot.try_forward(states)[1] & ~outside, np.bool_)
+
+    far = np.abs(some[:, turns]).max(1) > np.pi
+    if np.mean(far & ~possible(some)) <= 0.5:
+        return False
+    return bool(possible(np.where(turns, some * UNITS["deg"][1], some)).all())
+
+
+def _check_sizes(table: Table) -> None:
+    """As of a message: no number that no machine has, and none below every measurement."""
+    for name, bound in SIZES.items():
+        sizes = np.abs(table.get(name, np.zeros(1)))
+        bad = np.flatnonzero((sizes > bound) | ((sizes < TINY) & (sizes > 0.0)))
+        if len(bad):
+            raise ParameterError(
+                f"{table.line(bad[0])}: {name}", float(table[name][bad[0]]),
+                f"0, or {TINY:g} to {bound:g} in size",
+            )  # fmt: skip

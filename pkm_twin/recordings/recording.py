@@ -1,0 +1,227 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A recorded or planned motion of one robot as arrays, whatever file it is from."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from pkm_twin.bags.reader import Bag
+from pkm_twin.codegen.arrays import Array, Mask
+from pkm_twin.errors import MessageError, PkmTwinError, one_line
+from pkm_twin.recordings.payload import Load
+from pkm_twin.recordings.tables import PLAIN, Dialect
+from pkm_twin.recordings.topics import Topics
+from pkm_twin.robot.robot import Robot
+from pkm_twin.streams.differentiator import Differentiator
+from pkm_twin.streams.rest import SIGMAS, fit_gain, gradient_gain, noise, rate_doubt
+from pkm_twin.streams.wrench import WrenchSettings
+
+BY_SAMPLE: Final = (
+    "time", "q", "qd", "qdd", "effort", "wrench", "deflection", "still"
+)  # fmt: skip
+"""Fields with a row for each sample."""
+MAPPED: Final = "tables use the model's joint values; joint_map applies to messages and bags only"
+"""Printed for a robot that has a map."""
+# Of the differentiator: degree of the velocity's polynomial, samples.
+_ORDER, _WINDOW = 3, 9
+
+
+@dataclass(frozen=True)
+class WrenchFrames:
+    """Wrenches of one frame are accepted, as a node accepts them.
+
+    ``wrench_frame``: as the node's parameter; None is the platform's or the base frame, whichever
+    comes first. ``base_frame``: has base axes; every other frame turns with the platform.
+    """
+
+    wrench_frame: str | None = None
+    base_frame: str = WrenchSettings.base_frame
+
+
+USUAL: Final = WrenchFrames()
+
+
+@dataclass(frozen=True)
+class ReadOptions:
+    """How a recording is read, as options of commands say it.
+
+    ``topics``: of a bag, where names and joints do not tell. ``load``: the payload; None is the one
+    that the file tells of. ``follow``: ``joints`` or ``pose``: which columns of a table that has
+    both are the motion; None: both, which have to agree. ``limited``: messages beyond the robot's
+    limits are rejected, as a node does. ``planned``: the trajectory of a bag and the efforts of a
+    plan are read too. ``currents``: efforts of a table may be motor currents. ``deflected``:
+    deflections are needed, and a bag is read at their times.
+    """
+
+    topics: tuple[str, ...] = ()
+    load: Load | None = None
+    follow: str | None = None
+    dialect: Dialect = PLAIN
+    frames: WrenchFrames = USUAL
+    limited: bool = False
+    planned: bool = False
+    currents: bool = False
+    deflected: bool = False
+
+    @property
+    def efforts(self) -> tuple[str, ...]:
+        """Columns of a table's efforts; the first that are there are taken."""
+        if self.planned:
+            return ("effort",)
+        return (*(["current"] if self.currents else []), "measured", "effort")
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """Joint states of n joints on a common time axis, and what was measured beside them.
+
+    time (samples,) in s since the first sample; q, qd, qdd, effort (samples, n), rad or m, per s
+    and s2, N m or N; wrench (samples, 6) in base axes at the platform's reference point, N and N m;
+    deflection (samples, 6) there, m and rad, NaN where not measured. None is not known.
+    """
+
+    robot: Robot
+    time: Array
+    q: Array
+    qd: Array | None = None
+    qdd: Array | None = None
+    effort: Array | None = None
+    wrench: Array | None = None
+    deflection: Array | None = None
+    load: Load | None = None
+    """A payload beside the robot's own."""
+    still: Mask | None = None
+    """Where differentiation cannot tell a joint from one at rest, so that dry friction has no
+    direction, shape (samples, n); None is nowhere."""
+    efforts: str = "measured"
+    """What the efforts are: ``measured``, the ``effort`` of a plan, or a ``current``, A."""
+    source: str = ""
+    """The file, as it was named."""
+    notes: tuple[str, ...] = ()
+    """For people: what was read and what was left out."""
+    start: int = 0
+    """Stamp of the first sample, ns."""
+    bag: Bag | None = None
+    """None of a table."""
+    topics: Topics = field(default_factory=lambda: Topics("columns of the table"))
+    rejected: Counter[str] = field(default_factory=Counter)
+    """Refused messages by reason."""
+    first_reject: str = ""
+
+    @property
+    def name(self) -> str:
+        """The file's name, in one line."""
+        return one_line(Path(self.source).name, 100)
+
+    @property
+    def stamps(self) -> np.ndarray[Any, np.dtype[np.int64]]:
+        """Times in ns, shape (samples,)."""
+        return self.start + np.round(1e9 * self.time).astype(np.int64)
+
+    @property
+    def clock(self) -> Array:
+        """Times as a table has them, s; of a bag since its first sample."""
+        return self.time if self.bag is not None else self.time + self.start / 1e9
+
+    @property
+    def message_count(self) -> int:
+        """How many messages the chosen topics have; of a table its rows."""
+        if self.bag is None:
+            return len(self.time)
+        names = (self.topics.joint_states, self.topics.wrench)
+        return sum(self.bag.report.topics[name].count for name in names if name is not None)
+
+    @property
+    def held(self) -> Array | None:
+        """1 where the payload is on the platform, else 0, shape (samples,)."""
+        return None if self.load is None else self.load.held(self.time).astype(np.float64)
+
+    @property
+    def carried(self) -> Robot | None:
+        """The robot with the payload."""
+        return None if self.load is None else self.load.on(self.robot)
+
+    @property
+    def motion(self) -> tuple[Array, Array, Array, Array]:
+        """q, qd, qdd (samples, n) and the wrench (samples, 6), zero where there is none.
+
+        :raises PkmTwinError: rates are not known, see :meth:`with_rates`.
+        """
+        if self.qd is None or self.qdd is None:
+            raise PkmTwinError(f"{self.source}: no velocities and accelerations")
+        wrench = np.zeros((len(self.time), 6)) if self.wrench is None else self.wrench
+        return self.q, self.qd, self.qdd, wrench
+
+    def part(self, rows: Any) -> Recording:
+        """Some of the samples, by a slice, mask or indices; times stay as they are."""
+        values = {name: getattr(self, name) for name in BY_SAMPLE}
+        return replace(self, **{k: v[rows] for k, v in values.items() if v is not None})
+
+    def with_rates(self) -> Recording:
+        """The samples whose rates and accelerations are known, with these.
+
+        A recording that has both is left as it is. Those of a table are second-order differences,
+        those of a bag are the ones that a node's differentiator finds in the middle of its window.
+
+        :raises PkmTwinError: too few samples in a row.
+        """
+        if self.qd is not None and self.qdd is not None:
+            return self
+        if self.bag is not None:
+            qd, qdd, used = differentiated(self)
+            if not used.any():
+                raise PkmTwinError(
+                    f"{self.source}: too few joint states in a row to differentiate: "
+                    f"{len(self.time)}"
+                )
+            still = at_rest(self, qd)
+            return replace(self, qd=qd, qdd=qdd, still=still).part(used)
+        if len(self.time) < 3:
+            raise PkmTwinError(f"{self.source}: {len(self.time)} rows; 3 or more to differentiate")
+        qd = _differences(self.q, self.time) if self.qd is None else self.qd
+        rest = None
+        if self.qd is None:
+            rest = np.abs(qd) <= rate_doubt(self.time, self.q, gradient_gain(self.time))
+        qdd = _differences(qd, self.time) if self.qdd is None else self.qdd
+        return replace(self, qd=qd, qdd=qdd, still=rest)
+
+
+def _differences(values: Array, time: Array) -> Array:
+    """Second-order differences on uneven times, shape (samples, n)."""
+    # What overflows is not finite, which the model refuses in one line.
+    with np.errstate(all="ignore"):
+        return np.gradient(values, time, axis=0, edge_order=2)
+
+
+def at_rest(r: Recording, qd: Array) -> Mask:
+    """Which joints stand still, shape (samples, n), as far as their rates ``qd`` can tell."""
+    if r.qd is not None:
+        return np.asarray(np.abs(qd) <= SIGMAS * noise(r.time, r.qd))
+    if len(r.time) < 3:
+        return np.zeros(r.q.shape, np.bool_)
+    gain = fit_gain(_ORDER + 1, _WINDOW, _WINDOW // 2) / float(np.median(np.diff(r.time)))
+    return np.asarray(np.abs(qd) <= rate_doubt(r.time, r.q, gain, _WINDOW // 2))
+
+
+def differentiated(r: Recording) -> tuple[Array, Array, Mask]:
+    """Rates and accelerations (samples, n) by the differentiator's middle, and where they are."""
+    late = _WINDOW // 2
+    differentiator = Differentiator(order=_ORDER, window=_WINDOW, middle=True)
+    gap = 10 * float(np.median(np.diff(r.time))) if len(r.time) > 1 else 1.0
+    qd, qdd = np.zeros_like(r.q), np.zeros_like(r.q)
+    used = np.zeros(len(r.time), bool)
+    for i, stamp in enumerate(r.stamps.tolist()):
+        if i and r.time[i] - r.time[i - 1] > gap:
+            differentiator.reset()
+        try:
+            rates = differentiator.push(stamp, r.q[i], None if r.qd is None else r.qd[i])
+        except MessageError:  # stamps too uneven here
+            continue
+        if rates is not None:
+            used[i - late], qd[i - late], qdd[i - late] = True, *rates
+    return qd, qdd, used

@@ -1,0 +1,408 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Tables: files with a header row as other programs write them, as columns in SI units.
+
+What a header row makes certain (separator, decimal comma, units behind names) is found and
+reported; the rest is a :class:`Dialect`.
+"""
+
+from __future__ import annotations
+
+import array
+import csv
+import importlib.util
+import io
+import itertools
+import math
+import os
+import re
+import sys
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import nullcontext
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, BinaryIO, Final, TextIO
+
+import numpy as np
+
+from pkm_twin.codegen.arrays import Array
+from pkm_twin.errors import FileError, ParameterError, UnknownNameError, warn
+from pkm_twin.files import STANDARD, decimal, open_regular, replacing
+from pkm_twin.robot.robot import Robot
+
+MAX_BYTES: Final = 1024**3
+"""Largest table that is read: some millions of samples."""
+MAX_LINE: Final = 1024**2
+"""Longest line of it, characters."""
+ENDINGS: Final = (".csv", ".parquet", ".mat")
+"""Of tables that are written."""
+SEPARATORS: Final = {",": ",", ";": ";", "tab": "\t", "\t": "\t"}
+UNITS: Final = {
+    "rad": ("angle", 1.0), "mrad": ("angle", 1e-3), "deg": ("angle", math.pi / 180.0),
+    "m": ("length", 1.0), "cm": ("length", 1e-2), "mm": ("length", 1e-3), "µm": ("length", 1e-6),
+    "um": ("length", 1e-6), "s": ("time", 1.0), "ms": ("time", 1e-3), "us": ("time", 1e-6),
+}  # fmt: skip
+"""Units of a table: what they are of, and their size in SI."""
+RATES: Final = ("position", "velocity", "acceleration")
+EFFORTS: Final = ("effort", "measured", "current")
+WRENCH: Final = ("fx", "fy", "fz", "mx", "my", "mz")
+DEFLECTION: Final = ("dx", "dy", "dz", "rx", "ry", "rz")
+PAYLOAD: Final = ("payload.mass", "payload.x", "payload.y", "payload.z")
+"""Mass (kg) and centre (m) of what the platform holds."""
+_UNIT: Final = re.compile(
+    r"(.*?)(?:\s*[\[(]\s*(\w+)(?:/s2?)?\s*[\])]|_(mm|cm|[uµ]m|deg|mrad|ms|us))"
+)
+
+
+@dataclass(frozen=True)
+class Dialect:
+    """How a table is written; None: as its header row says.
+
+    ``columns``: the table's name by ours; ``*`` in both stands for the same text. ``units``: by
+    angle, length and time, of columns whose header has none; rates are per second all the same.
+    """
+
+    separator: str | None = None
+    decimal: str | None = None
+    columns: Mapping[str, str] = field(default_factory=dict)
+    units: Mapping[str, str] = field(default_factory=dict)
+
+    @classmethod
+    def of(
+        cls, separator: str | None = None, decimal: str | None = None,
+        columns: str | Sequence[str] | None = None, units: str | None = None,
+        time: str | None = None,
+    ) -> Dialect:  # fmt: skip
+        """As options of a command tell it.
+
+        :raises ParameterError: by the option.
+        """
+        if separator is not None and separator not in SEPARATORS:
+            raise ParameterError("--separator", separator, "one of , ; tab")
+        if decimal not in (None, ".", ","):
+            raise ParameterError("--decimal", decimal, ". or ,")
+        names: dict[str, str] = {}
+        text = columns if isinstance(columns, str) else ",".join(columns or ())
+        for pair in text.split(",") if text else ():
+            ours, sign, theirs = (part.strip() for part in pair.partition("="))
+            if not (ours and sign and theirs) or ours.count("*") != theirs.count("*") > 1:
+                raise ParameterError("--columns", pair, "NAME=COLUMN, several with commas between")
+            names[ours] = theirs
+        if time is not None:
+            if not time.strip() or names.get("time", time.strip()) != time.strip():
+                raise ParameterError("--time", time, "one column's name")
+            names["time"] = time.strip()
+        chosen: dict[str, str] = {}
+        for word in map(str.strip, (units or "").split(",")) if units else ():
+            if word not in UNITS:
+                raise UnknownNameError("--units", word, tuple(UNITS))
+            if UNITS[word][0] in chosen:
+                raise ParameterError("--units", units, f"one unit of {UNITS[word][0]}")
+            chosen[UNITS[word][0]] = word
+        return cls(None if separator is None else SEPARATORS[separator], decimal, names, chosen)
+
+    def size(self, kind: str) -> float:
+        """Of a number without a unit, in SI."""
+        return UNITS[self.units[kind]][1] if kind in self.units else 1.0
+
+
+PLAIN: Final = Dialect()
+
+
+class Table(dict[str, Array]):
+    """Columns of a file by name, shape (rows,) each, in SI units."""
+
+    def __init__(self, path: Path, columns: Mapping[str, Array], above: int = 0) -> None:
+        super().__init__(columns)
+        self.path = path
+        self._first = 2 + above
+
+    @property
+    def rows(self) -> int:
+        """How many rows it has."""
+        return len(next(iter(self.values()))) if self else 0
+
+    def line(self, row: int) -> str:
+        """Where a row is, for people."""
+        return f"{self.path}: line {self._first + row}"
+
+    def require(self, names: Iterable[str]) -> None:
+        """Reject a table without one of these columns.
+
+        :raises ParameterError: by the first that is missing.
+        """
+        for name in names:
+            if name not in self:
+                raise ParameterError(
+                    str(self.path), ", ".join(self),
+                    f"a column {name!r}; --columns {name}=HEADER names another",
+                )  # fmt: skip
+
+    def stack(self, names: Sequence[str]) -> Array:
+        """Columns side by side, shape (rows, names).
+
+        :raises ParameterError: by the first that is missing.
+        """
+        self.require(names)
+        return np.stack([self[name] for name in names], -1)
+
+    def stack_if(self, names: Sequence[str]) -> Array | None:
+        """Columns side by side, None where all are missing.
+
+        :raises ParameterError: some are missing.
+        """
+        return self.stack(names) if any(name in self for name in names) else None
+
+    def fill(self, names: Sequence[str], missing: float = 0.0) -> Array | None:
+        """As :meth:`stack_if`, missing columns as a number."""
+        if not any(name in self for name in names):
+            return None
+        return np.stack([self.get(n, np.full(self.rows, missing)) for n in names], -1)
+
+
+def kinds_of(robot: Robot) -> dict[str, str]:
+    """What the columns of a robot's motion measure: angle, length, time, or another quantity."""
+    kinds = {"time": "time"}
+    units = dict(zip(robot.joint_names, robot.joint_units, strict=True))
+    units |= dict(zip(robot.pose_names, robot.pose_units, strict=True))
+    for name, unit in units.items():
+        kinds |= dict.fromkeys((f"{name}.{what}" for what in RATES), UNITS[unit][0])
+        kinds |= dict.fromkeys((f"{name}.{what}" for what in EFFORTS), "effort")
+    kinds |= dict.fromkeys((*DEFLECTION[:3], *PAYLOAD[1:], "blend"), "length")
+    kinds |= dict.fromkeys(DEFLECTION[3:], "angle")
+    kinds |= dict.fromkeys((*WRENCH, PAYLOAD[0], "dwell", "arc"), "")
+    # A joint that has a coordinate's name is measured as the joint.
+    pose = zip(robot.pose_names, robot.pose_units, strict=True)
+    return kinds | {name: UNITS[unit][0] for name, unit in pose}
+
+
+def read_table(
+    path: Path, kinds: Mapping[str, str] | None = None, dialect: Dialect = PLAIN, *,
+    blank: bool = False,
+) -> Table:  # fmt: skip
+    """Columns of a CSV or, by its ending, Parquet file with a header row, in SI units.
+
+    Lines above the header row that begin with # are comments. A column without any number is left
+    out: `torques` writes such reactions. A header may end in its unit: ``x [mm]``, ``x_mm``.
+
+    :param path: ``-`` is stdin.
+    :param kinds: of known columns, what they measure; only these have units and other names.
+    :param blank: whether cells may be empty, which are NaN.
+    :raises ParameterError: not readable, too large, a value is no finite number, or a name of the
+        dialect that is not there.
+    """
+    if kinds is None and dialect.units:
+        raise ParameterError("units", ", ".join(dialect.units.values()), "none for this table")
+    try:
+        file: Any = nullcontext(sys.stdin.buffer)
+        if str(path) != STANDARD:
+            file = open_regular(path)
+            size = os.fstat(file.fileno()).st_size
+            if size > MAX_BYTES:
+                raise ParameterError(str(path), f"{size} bytes", f"at most {MAX_BYTES}")
+        with file as data:
+            read = _parquet if path.suffix == ".parquet" else _csv
+            header, values, above = read(path, data, dialect)
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise FileError(path, error, "a table, CSV or Parquet") from None
+    names, sizes = _named(header, kinds or {}, dialect)
+    if len(set(names)) != len(names):
+        raise ParameterError(f"{path}: header row", ", ".join(names), "different names")
+    table = Table(path, dict(zip(names, values, strict=True)), above)
+    for name, scale in zip(names, sizes, strict=True):
+        empty = np.isnan(table[name])
+        if empty.all() and not blank:
+            del table[name]
+        elif empty.any() and not blank:
+            where = f"{table.line(int(empty.argmax()))}, column {name}"
+            raise ParameterError(where, "empty", "a finite number")
+        elif scale != 1.0:
+            table[name] = scale * table[name]
+    return table
+
+
+def _csv(path: Path, data: BinaryIO, dialect: Dialect) -> tuple[list[str], Array, int]:
+    """Header cells, numbers (columns, rows), and how many lines are above the header."""
+    # Spreadsheets put a byte order mark before the header row.
+    with io.TextIOWrapper(data, encoding="utf-8-sig", newline="") as text:
+        lines, above = _lines(text, path), 0
+        while (first := next(lines, "")).startswith("#"):
+            above += 1
+        rows = _cells(path, itertools.chain([first], lines), first, dialect)
+        header = [name.strip() for name in next(rows, [])]
+        cells, number = array.array("d"), above + 1
+        for number, row in enumerate(rows, above + 2):
+            if len(row) != len(header):
+                raise ParameterError(f"{path}: line {number}", len(row), f"{len(header)} values")
+            for name, cell in zip(header, row, strict=True):
+                try:
+                    cells.append(_number(cell))
+                except ValueError:
+                    where = f"{path}: line {number}, column {name}"
+                    raise ParameterError(where, cell, "a finite number") from None
+    if not cells:
+        raise ParameterError(str(path), f"{number if header else 0} lines", "a header row and rows")
+    table = np.frombuffer(cells, np.float64).reshape(-1, len(header))
+    return header, np.ascontiguousarray(table.T), above
+
+
+def _parquet(path: Path, data: BinaryIO, dialect: Dialect) -> tuple[list[str], Array, int]:
+    """As :func:`_csv`; no number is a cell without one."""
+    del dialect
+    require_pyarrow(path)
+    import pyarrow
+    from pyarrow import parquet
+
+    try:
+        table = parquet.read_table(data)
+        values = [column.cast("float64").to_numpy() for column in table.columns]
+    except pyarrow.ArrowException as error:
+        raise FileError(path, error, "a Parquet file of numbers") from None
+    if not len(table):
+        raise ParameterError(str(path), "no rows", "rows of numbers")
+    numbers = np.array(values, np.float64)
+    if np.isinf(numbers).any():
+        column, row = np.argwhere(np.isinf(numbers))[0]
+        where = f"{path}: row {row + 1}, column {table.column_names[column]}"
+        raise ParameterError(where, numbers[column, row], "a finite number")
+    return list(table.column_names), numbers, 0
+
+
+def _lines(text: TextIO, path: Path) -> Iterator[str]:
+    """The lines of a file, none so long that a row takes all the memory."""
+    while line := text.readline(MAX_LINE):
+        if len(line) == MAX_LINE:
+            raise ParameterError(
+                f"{path}: a line", f"{line[:40]}...", f"at most {MAX_LINE} characters"
+            )
+        yield line
+
+
+def _cells(path: Path, lines: Iterator[str], first: str, dialect: Dialect) -> Iterator[list[str]]:
+    """Rows with decimal points; what is found by itself is told."""
+    separator = dialect.separator
+    if separator is None:
+        # Names hold no separators: one that is there, and no other, is certain.
+        there = [mark for mark in (";", "\t") if mark in first]
+        separator = there[0] if len(there) == 1 and "," not in first else ","
+        if separator != ",":
+            name = "tabs" if separator == "\t" else separator
+            warn(path, f"columns are separated by {name}")
+    rows = csv.reader(lines, delimiter=separator)
+    yield next(rows, [])
+    comma = dialect.decimal == ","
+    for row in rows:
+        if dialect.decimal is None and separator != "," and not comma:
+            comma = any("," in cell for cell in row)
+            if comma:
+                warn(path, "numbers have a decimal comma")
+        yield [cell.replace(",", ".") for cell in row] if comma else row
+
+
+def _number(cell: str) -> float:
+    """A cell's number; NaN of an empty one.
+
+    :raises ValueError: no finite number.
+    """
+    if not cell.strip():
+        return math.nan
+    value = decimal(cell)
+    if not math.isfinite(value):
+        raise ValueError(f"{cell!r} is not finite")
+    return value
+
+
+def _named(
+    header: Sequence[str], kinds: Mapping[str, str], dialect: Dialect
+) -> tuple[list[str], list[float]]:
+    """Our names of a table's columns, and the sizes in SI of their numbers.
+
+    :raises ParameterError: a unit of another kind.
+    :raises UnknownNameError: a name that no column has, or a header that is not there.
+    """
+    ours: dict[str, tuple[str, str]] = {}
+    for cell in header:
+        match = _UNIT.fullmatch(cell)
+        if match is not None and match[1] in kinds:
+            ours[cell] = match[1], match[2] or match[3]
+    for name, text in dialect.columns.items():
+        match = _UNIT.fullmatch(text) if text not in header else None
+        stem, unit = (match[1], match[2] or match[3]) if match else (text, "")
+        pattern = re.compile(re.escape(stem).replace(r"\*", "(.+)"))
+        fits = [(cell, m) for cell in header if (m := pattern.fullmatch(cell))]
+        if not fits and name not in header:
+            raise UnknownNameError("--columns", stem, header)
+        for cell, m in fits:
+            whole = name.replace("*", m[1]) if "*" in stem else name
+            if kinds and whole not in kinds:
+                raise UnknownNameError("--columns", whole, kinds)
+            ours[cell] = whole, unit
+    names: list[str] = []
+    sizes: list[float] = []
+    for cell in header:
+        name, unit = ours.get(cell, (cell, ""))
+        kind = kinds.get(name, "")
+        if unit and UNITS.get(unit, ("",))[0] != kind:
+            fit = [word for word, (of, _) in UNITS.items() if of == kind]
+            raise ParameterError(f"{cell}: unit", unit, f"one of {', '.join(fit) or 'none'}")
+        names.append(name)
+        sizes.append(UNITS[unit][1] if unit else dialect.size(kind))
+    return names, sizes
+
+
+def require_pyarrow(path: Path) -> None:
+    """Refuse Parquet before the work where it cannot be read or written.
+
+    :raises ParameterError: pyarrow is missing.
+    """
+    if path.suffix == ".parquet" and importlib.util.find_spec("pyarrow") is None:
+        raise ParameterError(str(path), "Parquet", "CSV; Parquet needs the Python package pyarrow")
+
+
+def check_target(path: Path) -> None:
+    """Refuse a table's name before the work, not after it.
+
+    :raises ParameterError: the ending is none of :data:`ENDINGS`, or pyarrow is missing for it.
+    """
+    if path.suffix not in ENDINGS and str(path) != STANDARD:
+        raise ParameterError("out", str(path), f"a name that ends in {' or '.join(ENDINGS)}")
+    require_pyarrow(path)
+
+
+def write_table(columns: Mapping[str, Array], path: Path) -> None:
+    """Write CSV, or where the name ends so Parquet (needs pyarrow) or a MATLAB file.
+
+    The file appears only once it is complete. In MATLAB a name's points and spaces are underscores.
+
+    :raises ParameterError: another ending, or pyarrow is missing.
+    """
+    check_target(path)
+    with replacing(path) as hidden:
+        {".parquet": _write_parquet, ".mat": _write_mat}.get(path.suffix, _write_csv)(
+            columns, hidden
+        )
+
+
+def _write_csv(columns: Mapping[str, Array], path: Path) -> None:
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(columns)
+        for row in zip(*(values.tolist() for values in columns.values()), strict=True):
+            # An undetermined reaction is an empty cell; repr keeps every digit.
+            writer.writerow(["" if value != value else repr(value) for value in row])
+
+
+def _write_mat(columns: Mapping[str, Array], path: Path) -> None:
+    from scipy.io import savemat  # type: ignore[import-untyped]
+
+    named = {re.sub(r"^(?=[\d_])", "x", re.sub(r"\W", "_", name)): v for name, v in columns.items()}
+    if len(named) < len(columns):
+        raise ParameterError("out", str(path), "CSV: names of columns are the same in MATLAB")
+    with path.open("wb") as file:
+        savemat(file, named, oned_as="column")
+
+
+def _write_parquet(columns: Mapping[str, Array], path: Path) -> None:
+    import pyarrow
+    from pyarrow import parquet
+
+    parquet.write_table(pyarrow.table(dict(columns)), path)
