@@ -143,8 +143,8 @@ def _touching(robot: Robot) -> list[tuple[str, str]]:
     pairs = []
     for one, other in combinations(robot_tree(robot).capsules, 2):
         gap = distance(one.start, one.end - one.start, other.start, other.end - other.start)
-        if one.body != other.body and not gap > one.radius + other.radius:
-            pairs.append((min(one.body, other.body), max(one.body, other.body)))
+        if one.link != other.link and not gap > one.radius + other.radius:
+            pairs.append((min(one.link, other.link), max(one.link, other.link)))
     return list(dict.fromkeys(pairs))
 
 

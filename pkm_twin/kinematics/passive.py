@@ -9,8 +9,6 @@ two revolutes, that turn them from their direction at home.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -23,70 +21,8 @@ from pkm_twin.kinematics.engine import Engine
 from pkm_twin.kinematics.motion import cross
 from pkm_twin.kinematics.traced import Traced
 from pkm_twin.machine.graph import Rod
-from pkm_twin.machine.joints import across, unit
+from pkm_twin.machine.joints import Free, across, single_names, unit
 from pkm_twin.machine.tree import Link
-
-_LETTERS = "xyz"
-
-
-@dataclass(frozen=True, eq=False)
-class Axis:
-    """One single joint: its name, its kind (R, P, or empty: fixed), its axis and a point of it.
-
-    At home. ``inner``, ``outer``: bodies; of several axes in a row those between are named for
-    them. ``driven``: whether its number is one of q.
-    """
-
-    name: str
-    kind: str
-    axis: Array
-    point: Array
-    inner: str
-    outer: str
-    joint: str
-    driven: bool = False
-
-
-def single_joints(engine: Engine) -> list[Axis]:
-    """All single joints of the tree from the ground outwards, then those of the rods."""
-    graph, tree = engine.graph, engine.tree
-    result: list[Axis] = []
-
-    def chain(
-        joint: str, kinds: str, axes: Numbers, point: Array, inner: str, outer: str,
-        names: Sequence[str], driven: bool = False,
-    ) -> None:  # fmt: skip
-        before = inner
-        for k, (kind, axis) in enumerate(zip(kinds, axes, strict=True)):
-            after = outer if k == len(kinds) - 1 else f"{names[k]}_link"
-            at_home = np.asarray(axis, float)
-            own = driven and k == 0
-            result.append(Axis(names[k], kind, at_home, point, before, after, joint, own))
-            before = after
-
-    for link in tree.links.values():
-        steps = link.steps
-        name = link.joint or f"{link.body}_free"
-        ends = link.at, link.parent, link.body
-        if not steps:
-            result.append(Axis(name, "", np.zeros(3), *ends, name))
-        elif steps[0].ball:
-            chain(name, "RRR", np.eye(3), *ends, [f"{name}_{c}" for c in _LETTERS])
-        elif steps[0].free:
-            names = [f"{name}_p{c}" for c in _LETTERS] + [f"{name}_{c}" for c in _LETTERS]
-            chain(name, "PPPRRR", [*np.eye(3), *np.eye(3)], *ends, names)
-        else:
-            kinds = "".join("R" * step.turns + "P" * bool(step.slide) for step in steps)
-            axes = [step.sign * step.axis for step in steps]
-            names = [f"{name}_{c}" for c in (_LETTERS if len(steps) == 3 else "12")]
-            if len(steps) == 1:
-                names, axes = [name, f"{name}_slide"][: len(kinds)], axes * len(kinds)
-            chain(name, kinds, axes, *ends, names, steps[0].actuated)
-    for rod in graph.rods.values():
-        first, second = rod_axes(rod)
-        names = [f"{rod.name}_1", f"{rod.name}_2"]
-        chain(rod.name, "RR", [first, second], rod.ends[0], rod.inner, rod.name, names)
-    return result
 
 
 def rod_axes(rod: Rod) -> tuple[Array, Array]:
@@ -95,8 +31,15 @@ def rod_axes(rod: Rod) -> tuple[Array, Array]:
 
 
 def passive_names(engine: Engine) -> tuple[str, ...]:
-    """Names of all passive numbers."""
-    return tuple(axis.name for axis in single_joints(engine) if axis.kind and not axis.driven)
+    """Names of all passive numbers: of the tree from the ground outwards, then of the rods."""
+    names: list[str] = []
+    for link in engine.tree.links.values():
+        joint = None if link.joint is None else engine.graph.joints[link.joint]
+        if joint is None:
+            names += single_names(f"{link.body}_free", Free.freedoms(np.zeros((0, 3)), 0.0))
+        else:
+            names += single_names(joint.name, joint.freedoms)[joint.actuated :]
+    return (*names, *(f"{rod}_{k}" for rod in engine.graph.rods for k in (1, 2)))
 
 
 def passive_program(t: Traced) -> Program:

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The assembly of a tree with loop closures that is nearest to the zeros of its joints.
+"""The assembly of a tree with loop closures that is nearest to the drawing.
 
-Every joint is a row of single steps, along or about one axis each; a closure compares two frames.
-Only numbers, once a file: speed is no concern here.
+Every joint is a row of single steps, along or about one axis each, whose values count from the
+drawing; a closure compares two frames. Only numbers, once a file: speed is no concern here.
 """
 
 from __future__ import annotations
@@ -14,10 +14,8 @@ import numpy as np
 
 from pkm_twin.codegen.arrays import Array, Mask
 from pkm_twin.errors import ParameterError
-from pkm_twin.machine.joints import TYPES
-from pkm_twin.machine.loop_tree import Closure, Joint, LoopTree, ordered
-from pkm_twin.machine.rotations import skew
-from pkm_twin.machine.urdf_xml import Pose
+from pkm_twin.machine.loop_tree import Joint, LoopTree
+from pkm_twin.machine.rotations import Pose, skew
 
 ROUNDS: Final = 100
 """Corrections of one closing, and steps towards the zeros."""
@@ -38,84 +36,83 @@ ROUNDED: Final = 20.0
 
 
 class Assembly:
-    """The tree of a URDF, placed by its joint values, with its closures' residuals.
+    """The tree of a file, placed by its joint values, with its closures' residuals.
 
     ``steps``: the joint of each single step, in the order of the values; ``turns``: whether it is a
     turn. ``size``: of the drawing, m.
     """
 
-    def __init__(self, urdf: LoopTree) -> None:
-        self.urdf = urdf
+    def __init__(self, tree: LoopTree) -> None:
+        self.tree = tree
         least, most = CLOSED
-        self.closed = min(most, max(least, ROUNDED * urdf.accuracy))
+        self.closed = min(most, max(least, ROUNDED * tree.accuracy))
         """A loop that misses by more is open, m or rad."""
-        self.order = ordered(urdf.root, urdf.joints.values())
-        self.steps: list[str] = []
-        turns: list[bool] = []
-        slides: list[float] = []
-        self._axes: list[Array] = []
-        self._first: dict[str, int] = {}
-        self._count: dict[str, int] = {}
-        self._moved: dict[str, list[int]] = {urdf.root: []}
-        for joint in self.order:
-            self._first[joint.name] = len(self.steps)
-            for turning, slide, axis in _steps(joint):
-                self.steps.append(joint.name)
-                turns.append(turning)
-                slides.append(slide)
-                self._axes.append(axis)
-            self._count[joint.name] = len(self.steps) - self._first[joint.name]
-            own = list(range(self._first[joint.name], len(self.steps)))
-            before = self._moved[joint.parent]
-            self._moved[joint.child] = before + own if own else before
-        skews = [skew(axis) for axis in self._axes]
-        self._turning = [(first, first @ first) for first in skews]
-        self.turns, self._slides = np.array(turns, bool), np.array(slides)
-        self.links: dict[str, Pose] = {}
-        self.axes = np.zeros((0, 3))
-        """The steps' axes at the placed values, root axes, unit vectors, shape (count, 3)."""
-        self._points = np.zeros((0, 3))
-        self.place(np.zeros(len(self.steps)))
-        self.size = self._extent()
+        self._rows = [(hung, hung.joint.freedoms(hung.parent)) for hung in tree.hung]
+        self.steps = [hung.joint.name for hung, freedoms in self._rows for _ in freedoms]
+        every = [freedom for _, freedoms in self._rows for freedom in freedoms]
+        self.turns = np.array([freedom.turns for freedom in every], bool)
+        self._slides = np.array([freedom.slide for freedom in every])
+        # Rodrigues: 1 + sin K + (1 - cos) K K.
+        self._turning = [(k, k @ k) for k in (skew(freedom.axis) for freedom in every)]
+        self._moved: dict[str, list[int]] = {tree.root: []}
+        count = 0
+        for (_, parent, child), freedoms in self._rows:
+            before, own = self._moved[parent], list(range(count, count + len(freedoms)))
+            self._moved[child] = before + own if own else before
+            count += len(own)
+        self.moves: dict[str, Pose] = {}
+        """Of each link since it was drawn, in the root's axes."""
+        self.place(np.zeros(count))
+        extent = float(np.ptp(self.places(), axis=0).max(initial=0.0))
+        self.size = extent if extent > 1e-6 else 1.0
 
     def place(self, values: Array) -> None:
-        """Set ``links`` (poses in the root) and ``axes`` for the steps' values, shape (count,)."""
-        self.links = {self.urdf.root: Pose()}
-        # Rodrigues: 1 + sin K + (1 - cos) K K.
+        """Set ``moves`` for the steps' values, shape (count,)."""
+        self.moves = {self.tree.root: Pose()}
         sines, lacks = np.sin(values).tolist(), (1.0 - np.cos(values)).tolist()
-        axes, points = [], []
-        for joint in self.order:
-            pose = self.links[joint.parent] @ joint.origin
-            start = self._first[joint.name]
-            for i in range(start, start + self._count[joint.name]):
-                axis = self._axes[i]
-                axes.append(pose.rotation @ axis)
-                points.append(pose.position)
-                turned, position = pose.rotation, pose.position
-                if self._slides[i]:
-                    position = position + axes[-1] * (values[i] * self._slides[i])
-                if self.turns[i]:
-                    first, second = self._turning[i]
-                    turned = turned + turned @ (sines[i] * first + lacks[i] * second)
-                pose = Pose(turned, position)
-            self.links[joint.child] = pose @ joint.beyond
-        self.axes, self._points = np.reshape(axes, (-1, 3)), np.reshape(points, (-1, 3))
+        axes: list[Array] = []
+        points: list[Array] = []
+        for (joint, parent, child), freedoms in self._rows:
+            pose = self.moves[parent]
+            for freedom in freedoms:
+                k = len(axes)
+                axes.append(pose.rotation @ freedom.axis)
+                points.append(pose.point(joint.at))
+                turned, at = pose.rotation, points[-1]
+                if freedom.slide:
+                    at = at + axes[-1] * (values[k] * freedom.slide)
+                if freedom.turns:
+                    first, second = self._turning[k]
+                    turned = turned + turned @ (sines[k] * first + lacks[k] * second)
+                pose = Pose(turned, at - turned @ joint.at)
+            self.moves[child] = pose
+        self._axes, self._points = np.reshape(axes, (-1, 3)), np.reshape(points, (-1, 3))
 
-    def frame(self, closure: Closure, end: int) -> Pose:
-        """A closure's frame on one of its links, in the root."""
-        return self.links[closure.links[end]] @ closure.frames[end]
+    def places(self) -> Array:
+        """Where the links are, shape (links, 3), m."""
+        links = self.tree.links
+        return np.array([move.point(links[n].frame.position) for n, move in self.moves.items()])
+
+    def frame(self, joint: Joint, end: int) -> Pose:
+        """A joint's frame on one of its links."""
+        return self.moves[(joint.inner, joint.outer)[end]] @ joint.frames[end]
+
+    def axes(self, joint: Joint) -> Array:
+        """A joint's axes: the first turns with the inner link, the last with the outer one."""
+        ends = (self.moves[end].rotation for end in (joint.inner, joint.outer))
+        return np.reshape([r @ a for r, a in zip(ends, joint.axes, strict=False)], (-1, 3))
 
     def twist(self, link: str, point: Array) -> tuple[Array, Array]:
         """Velocity of a link's point and its angular velocity per step's rate, (3, count) each."""
         linear, angular = np.zeros((2, 3, len(self.steps)))
         moved = self._moved[link]
-        axes, turns = self.axes[moved].T, self.turns[moved]
-        arms = np.cross(self.axes[moved], point - self._points[moved]).T
+        axes, turns = self._axes[moved].T, self.turns[moved]
+        arms = np.cross(self._axes[moved], point - self._points[moved]).T
         linear[:, moved] = np.where(turns, arms, 0.0) + axes * self._slides[moved]
         angular[:, moved] = np.where(turns, axes, 0.0)
         return linear, angular
 
-    def residual(self, closure: Closure, rates: bool = True) -> tuple[Array, Array]:
+    def residual(self, closure: Joint, rates: bool = True) -> tuple[Array, Array]:
         """How far a closure is open, shape (rows,), m and rad, and its rates, (rows, count).
 
         :param rates: without them their count is zero.
@@ -123,15 +120,16 @@ class Assembly:
         a, b = self.frame(closure, 0), self.frame(closure, 1)
         (va, wa), (vb, wb) = (
             self.twist(link, pose.position) if rates else np.zeros((2, 3, 0))
-            for link, pose in zip(closure.links, (a, b), strict=True)
+            for link, pose in ((closure.inner, a), (closure.outer, b))
         )
         apart, slip, turn = b.position - a.position, vb - va, wb - wa
         across = np.eye(3)
-        if closure.axes is not None:
-            first, second = a.rotation @ closure.axes[0], b.rotation @ closure.axes[1]
+        if len(closure.axes):
+            first = self.moves[closure.inner].rotation @ closure.axes[0]
+            second = self.moves[closure.outer].rotation @ closure.axes[-1]
             across = np.eye(3) - np.outer(first, first)
         rows: list[tuple[Array, Array]] = []
-        for held in TYPES[closure.type].holds:
+        for held in closure.type.holds:
             if held == "point":
                 rows.append((apart, slip))
             elif held in ("line", "flat"):
@@ -151,7 +149,7 @@ class Assembly:
 
     def residuals(self, rates: bool = True) -> tuple[Array, Array]:
         """All closures' rows."""
-        rows = [self.residual(closure, rates) for closure in self.urdf.closures]
+        rows = [self.residual(closure, rates) for closure in self.tree.closures]
         if not rows:
             return np.zeros(0), np.zeros((0, len(self.steps) if rates else 0))
         return np.concatenate([r for r, _ in rows]), np.vstack([j for _, j in rows])
@@ -208,7 +206,7 @@ class Assembly:
         return float(np.abs(self.residuals(rates=False)[0]).max(initial=0.0))
 
     def anywhere(self) -> tuple[Array, float]:
-        """Values that close the loops, the nearest to zero that are found at once, and their miss.
+        """Values that close the loops, the nearest to the drawing found at once, and their miss.
 
         :raises ParameterError: a loop that does not close, by how much.
         """
@@ -217,7 +215,7 @@ class Assembly:
         for spread in (0.05, 0.1, 0.2, 0.4, 0.8) * 2:
             if miss <= self.closed:
                 break
-            # Zero may be a place from which no small step helps.
+            # The drawing may be a place from which no small step helps.
             start = rng.uniform(-spread, spread, len(self.steps))
             other, less = self.close(start)
             if less < miss:
@@ -228,7 +226,7 @@ class Assembly:
         return values, miss
 
     def relaxed(self, values: Array, held: Mask | None = None) -> Array:
-        """The values nearest to zero to which closed loops can move from these, and place them.
+        """The values nearest to the drawing that closed loops can move to from these; place them.
 
         :param held: steps that keep their values, shape (count,); by default none does.
         """
@@ -254,34 +252,19 @@ class Assembly:
 
     def _open(self) -> ParameterError:
         """The error of loops that do not close, with the one that misses the most."""
-        misses = {c.name: self.residual(c)[0] for c in self.urdf.closures}
+        misses = {c.name: self.residual(c)[0] for c in self.tree.closures}
         worst = max(misses, key=lambda name: float(np.abs(misses[name]).max()))
-        closure = next(c for c in self.urdf.closures if c.name == worst)
+        closure = next(c for c in self.tree.closures if c.name == worst)
         a, b = (self.frame(closure, end) for end in (0, 1))
         apart = 1e3 * float(np.linalg.norm(b.position - a.position))
         turned = float(np.linalg.norm(_angle(a.rotation.T, b.rotation)))
         what = f"{apart:.3g} mm"
-        if closure.type == "fixed":
+        if closure.kind == "fixed":
             what += f" and {turned:.3g} rad"
         return ParameterError(
-            worst, f"open by {what} between {closure.links[0]} and {closure.links[1]}",
+            worst, f"open by {what} between {closure.inner} and {closure.outer}",
             f"loops that close within {self.closed:g} (m or rad)",
         )  # fmt: skip
-
-    def _extent(self) -> float:
-        """Greatest distance of two links along a root axis, m; 1 where all are one point."""
-        extent = float(np.ptp([p.position for p in self.links.values()], axis=0).max(initial=0.0))
-        return extent if extent > 1e-6 else 1.0
-
-
-def _steps(joint: Joint) -> list[tuple[bool, float, Array]]:
-    """Single steps: whether each turns, how far it slides per unit, and its axis."""
-    if joint.type == "spherical":
-        return [(True, 0.0, axis) for axis in np.eye(3)]
-    if joint.type == "free":
-        return [(turns, float(not turns), axis) for turns in (False, True) for axis in np.eye(3)]
-    slide = 1.0 if joint.type == "prismatic" else joint.pitch
-    return [(joint.type != "prismatic", slide, axis) for axis in joint.axes]
 
 
 def _between(first: Array, second: Array) -> Array:

@@ -18,6 +18,7 @@ from pkm_twin.errors import ParameterError
 from pkm_twin.machine.joints import TYPES, Constraint, Freedom, JointType
 
 T = TypeVar("T", bound=Hashable)
+K = TypeVar("K", bound=Hashable)
 
 BASE: Final = "base"
 """Name of the ground."""
@@ -317,13 +318,27 @@ def rotation_about_z(angle: Any) -> Array:
 def groups(things: Iterable[T], pairs: Iterable[tuple[T, T]]) -> list[list[T]]:
     """What pairs connect, each group in the order of the things; of others pairs say nothing."""
     own = {thing: [thing] for thing in things}
-    for a, b in pairs:
-        if a in own and b in own and own[a] is not own[b]:
-            own[a].extend(own[b])
-            own |= dict.fromkeys(own[b], own[a])
     place = {thing: k for k, thing in enumerate(own)}
+    for pair in pairs:
+        _join(own, *pair)
     found = {id(group): group for group in own.values()}
     return [sorted(group, key=place.__getitem__) for group in found.values()]
+
+
+def spanning(things: Iterable[T], pairs: Mapping[K, tuple[T, T]]) -> list[K]:
+    """The pairs that make trees: each that joins what no earlier ones do."""
+    own = {thing: [thing] for thing in things}
+    return [key for key, pair in pairs.items() if _join(own, *pair)]
+
+
+def _join(own: dict[T, list[T]], a: T, b: T) -> bool:
+    """Make the groups of two things one; whether they are there and were two."""
+    if a not in own or b not in own or own[a] is own[b]:
+        return False
+    small, large = sorted((own[a], own[b]), key=len)
+    large.extend(small)
+    own |= dict.fromkeys(small, large)
+    return True
 
 
 def limbs(graph: Graph) -> list[list[str]]:

@@ -199,6 +199,22 @@ class Planar(JointType):
         return (*slides, Freedom(axes[0]))
 
 
+class Free(JointType):
+    """Of a body that nothing but the joints after it holds: slides, then turns; no entry of a file.
+
+    A file's joints are those in TYPES.
+    """
+
+    name, steps, holds = "free", ("slide",) * 3 + ("turn",) * 3, ()
+    count, cost = 0, 6
+
+    @classmethod
+    def freedoms(cls, axes: Array, pitch: float) -> tuple[Freedom, ...]:
+        """Slides first."""
+        slides = (Freedom(axis, turns=False, slide=1.0) for axis in UNITS)
+        return (*slides, *(Freedom(axis) for axis in UNITS))
+
+
 TYPES: Final = {
     kind.name: kind
     for kind in (
@@ -209,3 +225,11 @@ TYPES: Final = {
 
 TURN: Final = 2.0 * math.pi
 """A full turn, rad: a screw's lead is its pitch times this."""
+
+
+def single_names(name: str, freedoms: Sequence[Freedom]) -> list[str]:
+    """Names of a joint's freedoms as single turns and slides; a screw is one of each."""
+    if len(freedoms) == 1:
+        return [name, f"{name}_slide"] if freedoms[0].turns and freedoms[0].slide else [name]
+    marks = {2: ("1", "2"), 3: ("x", "y", "z"), 6: ("px", "py", "pz", "x", "y", "z")}
+    return [f"{name}_{mark}" for mark in marks.get(len(freedoms), ())]

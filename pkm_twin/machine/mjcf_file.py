@@ -11,7 +11,6 @@ from __future__ import annotations
 import math
 import re
 import xml.etree.ElementTree as ET
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
@@ -20,9 +19,8 @@ import numpy as np
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError, install, warn
 from pkm_twin.machine import urdf_xml
-from pkm_twin.machine.loop_tree import Closure, Joint, Link, LoopTree
-from pkm_twin.machine.rotations import about, from_quaternion
-from pkm_twin.machine.urdf_xml import Pose
+from pkm_twin.machine.loop_tree import Joint, Link, LoopTree
+from pkm_twin.machine.rotations import Pose, from_quaternion
 
 _ENDLESS: Final = re.compile(
     r"(?:^|\s)[-+]?(?:nan(?:\(\S*\))?|inf|infinity)(?:\s|$)", re.IGNORECASE
@@ -68,7 +66,7 @@ def read(path: Path, top: ET.Element) -> LoopTree:
         if model is None:
             raise ParameterError(str(path), text, "a model that MuJoCo compiles") from None
         warn(path, f"read without its meshes, as its bodies have inertias: {text}")
-    return _Reader(mujoco, model, path).urdf()
+    return _Reader(mujoco, model, path).tree()
 
 
 def _without_meshes(mujoco: Any, path: Path) -> Any:
@@ -140,7 +138,7 @@ def _copies(element: ET.Element) -> int:
 class _Reader:
     def __init__(self, mujoco: Any, model: Any, path: Path) -> None:
         self.mj, self.model, self.path = mujoco, model, path
-        self.links = {WORLD: Link(WORLD, 0.0, np.zeros(3), np.zeros((3, 3)))}
+        self.links = {WORLD: Link(WORLD)}
         self.joints: dict[str, Joint] = {}
         self.names: dict[tuple[str, int], str] = {}
         # The names of the file, and those that are made up beside them.
@@ -153,28 +151,33 @@ class _Reader:
             int(kinds.mjJNT_SLIDE): "prismatic",
             int(kinds.mjJNT_HINGE): "revolute",
         }
+        self.locks = self._locks()
+        self.data = mujoco.MjData(model)
+        for joint, value in self.locks.items():
+            self.data.qpos[model.jnt_qposadr[joint]] = value
+        mujoco.mj_kinematics(model, self.data)
 
-    def urdf(self) -> LoopTree:
-        locks = self._locks()
-        self._warn(locks)
+    def tree(self) -> LoopTree:
+        self._warn()
         for body in range(1, self.model.nbody):
-            self._body(body, locks)
+            self._body(body)
         for site in range(self.model.nsite):
-            name = self._link(self._name("SITE", site))
-            place = Pose(_rotation(self.model.site_quat[site]), self.model.site_pos[site])
+            name = self._name("SITE", site)
+            place = _pose(self.data.site_xmat[site], self.data.site_xpos[site])
+            self.links[name] = Link(name, place)
+            label = urdf_xml.free_name(f"{name}_frame", self.joint_names)
             owner = self._name("BODY", self.model.site_bodyid[site])
-            self._joint(
-                urdf_xml.free_name(f"{name}_frame", self.joint_names), "fixed", owner, name, place
-            )
+            self.joints[label] = Joint(label, "fixed", owner, name, (place, place))
+        actuated = self._actuated()
         return LoopTree(
             self.path.stem,
             WORLD,
             self.links,
             self.joints,
             tuple(self._closures()),
-            actuated := self._actuated(locks),
+            actuated,
             self.model.opt.gravity.tolist(),
-            {name: self._start(self.model.joint(name).id) for name in actuated},
+            {name: self.joints[name].drawn for name in actuated},
         )
 
     def _named(self, **counts: int) -> set[str]:
@@ -208,50 +211,35 @@ class _Reader:
         own = self.names.get((kind, int(index))) or self._given(kind, index)
         return own or f"{kind.lower()}_{index}"
 
-    def _link(self, name: str) -> str:
-        self.links[name] = Link(name, 0.0, np.zeros(3), np.zeros((3, 3)))
-        return name
-
-    def _joint(
-        self, name: str, kind: str, parent: str, child: str, origin: Pose, **more: Any
-    ) -> None:
-        values: dict[str, Any] = {"axes": np.zeros((0, 3)), "limits": {}, **more}
-        values = {"viscous": 0.0, "coulomb": 0.0, **values}
-        self.joints[name] = Joint(name, kind, parent, child, origin, **values)
-
-    def _body(self, body: int, locks: dict[int, float]) -> None:
+    def _body(self, body: int) -> None:
         """A body on its joints, one after another, each in the body's frame."""
         m, name = self.model, self._name("BODY", body)
-        turn = _rotation(m.body_iquat[body])
+        place = _pose(self.data.xmat[body], self.data.xpos[body])
+        turn = self.data.ximat[body].reshape(3, 3)
         inertia = turn @ np.diag(m.body_inertia[body]) @ turn.T
         parent = self._name("BODY", m.body_parentid[body])
-        place = Pose(_rotation(m.body_quat[body]), m.body_pos[body].copy())
-        own = Link(name, float(m.body_mass[body]), m.body_ipos[body].copy(), inertia)
         count = int(m.body_jntnum[body])
         if not count:
             label = urdf_xml.free_name(f"{name}_body", self.joint_names)
-            self._joint(label, "fixed", parent, name, place)
+            self.joints[label] = Joint(label, "fixed", parent, name, (place, place))
         for k in range(count):
-            joint, last = int(m.body_jntadr[body]) + k, k == count - 1
+            joint = int(m.body_jntadr[body]) + k
             label, link = self._name("JOINT", joint), name
-            if not last:
-                link = self._link(urdf_xml.free_name(f"{label}_link", self.link_names))
-            kind, axis = self.types[int(m.jnt_type[joint])], m.jnt_axis[joint].copy()
-            at = np.zeros(3) if kind == "free" else m.jnt_pos[joint].copy()
-            # Every link has the body's frame; a joint's is at its point.
-            origin, beyond = place @ Pose(position=at), Pose(position=-at)
-            place = Pose()
-            if kind in ("revolute", "prismatic"):
-                # The file's frames are those at ``ref``; a joint's origin is where its value is 0.
-                origin @= _moved(kind, axis, -self._start(joint))
+            if k < count - 1:
+                link = urdf_xml.free_name(f"{label}_link", self.link_names)
+                self.links[link] = Link(link, place)
+            kind = self.types[int(m.jnt_type[joint])]
+            at = Pose(place.rotation, self.data.xanchor[joint].copy())
             more: dict[str, Any] = self._resistance(joint)
-            if joint in locks:
-                kind, origin, more = "fixed", origin @ _moved(kind, axis, locks[joint]), {}
+            if joint in self.locks:
+                kind, more = "fixed", {}
             elif kind in ("revolute", "prismatic"):
-                more |= {"axes": axis[None], "limits": self._limits(joint)}
-            self._joint(label, kind, parent, link, origin, beyond=beyond, **more)
+                axes, start = self.data.xaxis[joint][None].copy(), self._start(joint)
+                more |= {"axes": axes, "drawn": start, "limits": self._limits(joint)}
+            self.joints[label] = Joint(label, kind, parent, link, (at, at), **more)
             parent = link
-        self.links[name] = own
+        mass, com = float(m.body_mass[body]), self.data.xipos[body].copy()
+        self.links[name] = Link(name, place, mass, com, inertia)
 
     def _limits(self, joint: int) -> dict[str, Any]:
         """Of a hinge or a slide: its range, and the effort that its actuators can apply."""
@@ -312,9 +300,9 @@ class _Reader:
                 found[key] += sum(float(values[i]) * gear**2 for i, gear in gears.items())
         return found
 
-    def _warn(self, locks: Mapping[int, float]) -> None:
+    def _warn(self) -> None:
         """Of what acts in MuJoCo and not here."""
-        held = {("JOINT", joint) for joint in locks}
+        held = {("JOINT", joint) for joint in self.locks}
         for what, kind, arrays in IGNORED:
             values = [np.abs(array) for name in arrays
                       if (array := getattr(self.model, name, None)) is not None]  # fmt: skip
@@ -369,7 +357,7 @@ class _Reader:
             locks[joint] = self._start(joint) + float(data[0])
         return locks
 
-    def _closures(self) -> list[Closure]:
+    def _closures(self) -> list[Joint]:
         kinds = self.mj.mjtEq
         weld = int(kinds.mjEQ_WELD)
         closures = []
@@ -390,10 +378,11 @@ class _Reader:
             else:
                 frames = Pose(position=data[:3].copy()), Pose(position=data[3:6].copy())
             ends = [self._name("SITE" if sites else "BODY", i) for i in ids]
-            closures.append(Closure(name, closure, (ends[0], ends[1]), frames, None))
+            joint = Joint(name, closure, ends[0], ends[1], frames)
+            closures.append(joint.placed(*(self.links[end].frame for end in ends)))
         return closures
 
-    def _actuated(self, locks: dict[int, float]) -> tuple[str, ...]:
+    def _actuated(self) -> tuple[str, ...]:
         names: list[str] = []
         for i in range(self.model.nu):
             name = self._name("ACTUATOR", i)
@@ -401,7 +390,7 @@ class _Reader:
             if i not in self._drives(joint):
                 raise ParameterError(f"actuator.{name}", name, "an actuator of a joint")
             own = self._name("JOINT", joint)
-            if joint in locks or self.joints[own].type not in ("revolute", "prismatic"):
+            if joint in self.locks or self.joints[own].kind not in ("revolute", "prismatic"):
                 raise ParameterError(
                     f"actuator.{name}", own, "an actuator of a hinge or slide that can move"
                 )
@@ -414,9 +403,9 @@ class _Reader:
         return tuple(names)
 
 
-def _moved(kind: str, axis: Array, value: float) -> Pose:
-    """A slide or a hinge at a value."""
-    return Pose(position=axis * value) if kind == "prismatic" else Pose(about(axis, value))
+def _pose(rotation: Array, position: Array) -> Pose:
+    """A frame of MuJoCo's."""
+    return Pose(rotation.reshape(3, 3).copy(), position.copy())
 
 
 def _rotation(quaternion: Array) -> Array:

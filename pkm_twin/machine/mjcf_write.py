@@ -9,20 +9,14 @@ from __future__ import annotations
 
 import xml.etree.ElementTree as ET
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
 
 from pkm_twin.codegen.arrays import Array
-from pkm_twin.machine.simulated import Hung, hang, sound, split
-from pkm_twin.machine.urdf_write import (
-    GROUND,
-    PLATFORM,
-    UrdfCapsule,
-    UrdfJoint,
-    UrdfTree,
-    number_text,
-)
+from pkm_twin.machine.loop_tree import Capsule, Hung, Joint, Link, LoopTree, Single, singles
+from pkm_twin.machine.urdf_write import GROUND, PLATFORM, number_text
 
 TIMESTEP: Final = 1e-3
 """s."""
@@ -30,13 +24,19 @@ SOLREF: Final = (2.0 * TIMESTEP, 1.0)
 """Time constant, s, and damping ratio of the constraints: as stiff as the time step allows."""
 SOLIMP: Final = (0.9999, 0.9999, 0.001)
 """Impedance of the constraints: how little they give way."""
+SPECK: Final = 1e-12
+"""Inertia that is added about every axis, part of the body's."""
+LEAST: Final = 3e-14
+"""Or this, kg m2: MuJoCo takes 1e-14 for none."""
+SPECK_MASS: Final = 1e-12
+"""Of a body that has none, kg."""
 TYPES: Final = {"revolute": "hinge", "prismatic": "slide"}
 HOME: Final = "home"
 """The keyframe's name."""
 
 
 def write_mjcf(
-    tree: UrdfTree,
+    tree: LoopTree,
     gravity: Array,
     efforts: Sequence[float] | None = None,
 ) -> str:
@@ -48,8 +48,7 @@ def write_mjcf(
     :param gravity: (3,) m/s2.
     :param efforts: of the actuators at the keyframe ``home``, shape (n,), N m or N.
     """
-    tree, welds = split(tree)
-    hung = hang(tree)
+    tree, welds = _split(tree)
     top = ET.Element("mujoco", model=tree.name)
     ET.SubElement(top, "compiler", angle="radian", autolimits="true", inertiafromgeom="false")
     ET.SubElement(
@@ -59,32 +58,42 @@ def write_mjcf(
     default = ET.SubElement(top, "default")
     ET.SubElement(default, "geom", contype="0", conaffinity="0", group="1", rgba="0.6 0.65 0.7 1")
     ET.SubElement(default, "equality", solref=number_text(SOLREF), solimp=number_text(SOLIMP))
-    world = ET.SubElement(top, "worldbody")
-    elements, places = {GROUND: world}, {GROUND: np.zeros(3)}
+    elements = {GROUND: ET.SubElement(top, "worldbody")}
+    places = {GROUND: np.zeros(3)}
     home: list[float] = []
-    for link in _depth_first(hung):
-        element = _body(elements[link.parent], link, places[link.parent])
-        elements[link.name], places[link.name] = element, link.place
-        home += [joint.home for joint in link.joints]
+    screws: list[tuple[Single, Single]] = []
+    for parent, child, row in rows(tree):
+        link = tree.links[child]
+        place = row[0].joint.at if row else link.frame.position
+        elements[child] = _body(elements[parent], link, place, places[parent])
+        places[child] = place
+        for k, part in enumerate(row):
+            ET.SubElement(elements[child], "joint", _joint(part, place))
+            home.append(part.home)
+            if part.joint.type.threaded() and not part.whole:
+                screws.append((row[k - 1], part))
     for capsule in tree.capsules:
-        if capsule.body in elements:
-            _capsule(elements[capsule.body], capsule, places[capsule.body])
+        if capsule.link in elements:
+            _capsule(elements[capsule.link], capsule, places[capsule.link])
     at = number_text(tree.origin - places[tree.platform])
     ET.SubElement(elements[tree.platform], "site", name=PLATFORM, pos=at, size="0.005")
     loops = ET.SubElement(top, "equality")
     for closure in tree.closures:
-        ends = {"body1": closure.parent, "body2": closure.child}
+        ends = {"body1": closure.inner, "body2": closure.outer}
         ends = {key: "world" if name == GROUND else name for key, name in ends.items()}
-        if closure.type == "fixed":
+        if closure.kind == "fixed":
             ET.SubElement(loops, "weld", {"name": closure.name, **ends})
         else:
-            at = number_text(closure.point - places[closure.parent])
+            at = number_text(closure.at - places[closure.inner])
             ET.SubElement(loops, "connect", {"name": closure.name, **ends, "anchor": at})
-    for body, part in welds:
-        ET.SubElement(loops, "weld", name=f"{part}_weld", body1=body, body2=part)
-    for slide, turn, pitch in tree.screws:
-        fit = number_text([-pitch * _home(hung, turn) + _home(hung, slide), pitch, 0.0, 0.0, 0.0])
-        ET.SubElement(loops, "joint", name=slide, joint1=slide, joint2=turn, polycoef=fit)
+    for body, split in welds:
+        ET.SubElement(loops, "weld", name=f"{split}_weld", body1=body, body2=split)
+    for turn, slide in screws:
+        pitch = turn.joint.pitch
+        fit = number_text([-pitch * turn.home, pitch, 0.0, 0.0, 0.0])
+        ET.SubElement(
+            loops, "joint", name=slide.name, joint1=slide.name, joint2=turn.name, polycoef=fit
+        )
     motors = ET.SubElement(top, "actuator")
     for name in tree.actuated:
         ET.SubElement(motors, "motor", name=name, joint=name)
@@ -95,54 +104,100 @@ def write_mjcf(
     return ET.tostring(top, encoding="unicode") + "\n"
 
 
-def _depth_first(hung: list[Hung]) -> list[Hung]:
-    """In the order of the file, which is that of MuJoCo's joint positions."""
-    children: dict[str, list[Hung]] = {}
-    for link in hung:
-        children.setdefault(link.parent, []).append(link)
-    result: list[Hung] = []
-    todo = children.get(GROUND, [])[::-1]
+def rows(tree: LoopTree) -> list[tuple[str, str, list[Single]]]:
+    """Bodies depth first, as MuJoCo numbers joints: parent, child, single joints between.
+
+    A link without mass is left out where one joint alone goes on from it, which then has its
+    joints too.
+    """
+    after: dict[str, list[Hung]] = {}
+    for one in tree.hung:
+        after.setdefault(one.parent, []).append(one)
+    held = {end for one in tree.closures for end in (one.inner, one.outer)} | {tree.platform}
+    found: list[tuple[str, str, list[Single]]] = []
+    todo = [(GROUND, one, list[Single]()) for one in after.get(GROUND, [])[::-1]]
     while todo:
-        result.append(todo.pop())
-        todo += children.get(result[-1].name, [])[::-1]
-    return result
+        start, (joint, parent, child), row = todo.pop()
+        row = row + [one for one in singles(joint, parent, child, set()) if one.kind != "fixed"]
+        link, beyond = tree.links[child], after.get(child, [])
+        empty = not link.mass and not link.inertia.any()
+        if empty and len(beyond) == 1 and child not in held:
+            todo.append((start, beyond[0], row))
+            continue
+        found.append((start, child, row))
+        todo += [(child, one, []) for one in beyond[::-1]]
+    return found
 
 
-def _body(parent: ET.Element, link: Hung, place: Array) -> ET.Element:
-    element = ET.SubElement(parent, "body", name=link.name, pos=number_text(link.place - place))
-    body = sound(link.body)
+def _split(tree: LoopTree) -> tuple[LoopTree, list[tuple[str, str]]]:
+    """The tree with its closures but balls and fixed joints as joints of the tree; what to weld.
+
+    Such a joint leads to a part of the outer body, or of the inner one, that is welded to the rest
+    of it: mass and inertia are shared out evenly, so that their sums stay.
+    """
+    kept = [c for c in tree.closures if c.kind in ("spherical", "fixed")]
+    cut = [(c, _owner(c, tree)) for c in tree.closures if c not in kept]
+    shares = dict.fromkeys(tree.links, 1)
+    for _, owner in cut:
+        shares[owner] += 1
+    links = {
+        name: replace(link, mass=link.mass / shares[name], inertia=link.inertia / shares[name])
+        for name, link in tree.links.items()
+    }
+    joints, welds = dict(tree.joints), []
+    for closure, owner in cut:
+        part = f"{closure.name}_part"
+        links[part] = replace(links[owner], name=part)
+        inner, outer = (part if end == owner else end for end in (closure.inner, closure.outer))
+        joints[closure.name] = replace(closure, inner=inner, outer=outer)
+        welds.append((owner, part))
+    return replace(tree, links=links, joints=joints, closures=tuple(kept)), welds
+
+
+def _owner(closure: Joint, tree: LoopTree) -> str:
+    """The end that is split: the outer body, unless it has no mass and the other one has some."""
+    ends = [end for end in (closure.outer, closure.inner) if end != tree.root]
+    return max(ends, key=lambda end: tree.links[end].mass > 0.0)
+
+
+def _body(parent: ET.Element, link: Link, place: Array, before: Array) -> ET.Element:
+    """A body with some mass, and some inertia about every axis.
+
+    What is added is below the twelfth digit: a thin bar's inertia about itself is none.
+    """
+    element = ET.SubElement(parent, "body", name=link.name, pos=number_text(place - before))
+    inertia = link.inertia + np.eye(3) * max(SPECK * float(np.trace(link.inertia)), LEAST)
     order = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
     ET.SubElement(
-        element, "inertial", pos=number_text(body.com - link.place), mass=f"{body.mass:.15g}",
-        fullinertia=" ".join(f"{body.inertia[i, k]:.15g}" for i, k in order),
+        element, "inertial", pos=number_text(link.com - place),
+        mass=f"{link.mass or SPECK_MASS:.15g}",
+        fullinertia=" ".join(f"{inertia[i, k]:.15g}" for i, k in order),
     )  # fmt: skip
-    for joint in link.joints:
-        ET.SubElement(element, "joint", _joint(joint, link.place))
     return element
 
 
-def _joint(joint: UrdfJoint, place: Array) -> dict[str, str]:
-    drive = joint.drive
-    found = {"name": joint.name, "type": TYPES[joint.type], "axis": number_text(joint.axis)}
-    if joint.type == "revolute":
-        found["pos"] = number_text(joint.point - place)
-    if joint.home:
-        found["ref"] = number_text([joint.home])
-    if drive.position is not None:
-        found["range"] = number_text(drive.position)
-    if drive.effort is not None:
-        found["actuatorfrcrange"] = number_text([-drive.effort, drive.effort])
+def _joint(part: Single, place: Array) -> dict[str, str]:
+    joint, limits = part.joint, part.joint.limits if part.whole else {}
+    found = {"name": part.name, "type": TYPES[part.kind], "axis": number_text(part.axis)}
+    if part.kind == "revolute":
+        found["pos"] = number_text(joint.at - place)
+    if part.home:
+        found["ref"] = number_text([part.home])
+    if "position" in limits:
+        found["range"] = number_text(limits["position"])
+    if "effort" in limits:
+        found["actuatorfrcrange"] = number_text([-limits["effort"], limits["effort"]])
     for key, value in (
-        ("damping", drive.damping),
-        ("frictionloss", drive.friction),
-        ("armature", drive.rotor_inertia),
+        ("damping", joint.viscous),
+        ("frictionloss", joint.coulomb),
+        ("armature", joint.rotor_inertia),
     ):
-        if value:
+        if value and part.whole:
             found[key] = number_text([value])
     return found
 
 
-def _capsule(body: ET.Element, capsule: UrdfCapsule, place: Array) -> None:
+def _capsule(body: ET.Element, capsule: Capsule, place: Array) -> None:
     ends = number_text([*(capsule.start - place), *(capsule.end - place)])
     size = number_text([capsule.radius])
     if np.linalg.norm(capsule.end - capsule.start) > 0.0:
@@ -150,7 +205,3 @@ def _capsule(body: ET.Element, capsule: UrdfCapsule, place: Array) -> None:
     else:
         at = number_text(capsule.start - place)
         ET.SubElement(body, "geom", type="sphere", pos=at, size=size)
-
-
-def _home(hung: list[Hung], name: str) -> float:
-    return next(joint.home for link in hung for joint in link.joints if joint.name == name)

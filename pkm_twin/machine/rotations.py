@@ -1,14 +1,34 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rotation matrices: about an axis, and from REP 103's rpy, Rz(yaw) Ry(pitch) Rx(roll)."""
+"""Rotation matrices and frames; REP 103's rpy is Rz(yaw) Ry(pitch) Rx(roll)."""
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from pkm_twin.codegen.arrays import Array
+
+
+@dataclass(frozen=True, eq=False)
+class Pose:
+    """A frame in another: ``rotation`` (3, 3), ``position`` (3,), m."""
+
+    rotation: Array = field(default_factory=lambda: np.eye(3))
+    position: Array = field(default_factory=lambda: np.zeros(3))
+
+    def __matmul__(self, other: Pose) -> Pose:
+        return Pose(self.rotation @ other.rotation, self.point(other.position))
+
+    def point(self, at: Array) -> Array:
+        """A point of this frame in the other one, (3,) m."""
+        return np.asarray(self.rotation @ at + self.position, np.float64)
+
+    def inverse(self) -> Pose:
+        """The other frame in this one."""
+        return Pose(self.rotation.T, -self.rotation.T @ self.position)
 
 
 def about(axis: Array, angle: ArrayLike) -> Array:

@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import re
 import xml.etree.ElementTree as ET
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Final
@@ -21,11 +21,11 @@ import numpy as np
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError, UnknownNameError, warn
 from pkm_twin.machine import urdf_xml
+from pkm_twin.machine.graph import spanning
 from pkm_twin.machine.joints import TURN, TYPES
-from pkm_twin.machine.loop_tree import Closure, Joint, Link, LoopTree
+from pkm_twin.machine.loop_tree import Joint, Link, LoopTree, hung, link_of
 from pkm_twin.machine.motors import actuated_joints, read_beside
-from pkm_twin.machine.rotations import from_rpy
-from pkm_twin.machine.urdf_xml import Pose
+from pkm_twin.machine.rotations import Pose, from_rpy
 
 WORLD: Final = "world"
 """The root's name."""
@@ -47,49 +47,6 @@ WELDS: Final = {
 """Gazebo's plugins that hold two links together as they are drawn, and where they name them."""
 
 
-@dataclass(frozen=True, eq=False)
-class Edge:
-    """A joint between two links, with its frame as drawn, in the world; axes in that frame."""
-
-    name: str
-    type: str
-    links: tuple[str, str]
-    place: Pose
-    axes: Array = field(default_factory=lambda: np.zeros((0, 3)))
-    limits: dict[str, Any] = field(default_factory=dict)
-    viscous: float = 0.0
-    coulomb: float = 0.0
-    pitch: float = 0.0
-
-    def joint(self, places: Mapping[str, Pose], parent: str) -> Joint:
-        """As a joint of the tree, outwards from one of its links."""
-        forward = parent == self.links[0]
-        child = self.links[1] if forward else self.links[0]
-        # The inner link against the outer one: the same number about the opposite axes.
-        axes = self.axes if forward else -self.axes[::-1]
-        return Joint(
-            self.name, self.type, parent, child, places[parent].inverse() @ self.place, axes,
-            self.limits, self.viscous, self.coulomb,
-            beyond=self.place.inverse() @ places[child], pitch=self.pitch,
-        )  # fmt: skip
-
-    def closure(self, places: Mapping[str, Pose]) -> Closure:
-        """As a joint that closes a loop.
-
-        :raises ParameterError: a screw.
-        """
-        kind = TYPES[self.type]
-        if kind.threaded():
-            raise ParameterError(f"joint.{self.name}.type", "screw", "a loop with other joints too")
-        first, second = (places[link].inverse() @ self.place for link in self.links)
-        axes = (self.axes[0], self.axes[-1]) if kind.count else None
-        cosine = float(self.axes[0] @ self.axes[1]) if kind.count == 2 else 0.0
-        return Closure(
-            self.name, self.type, self.links, (first, second), axes, self.viscous, self.coulomb,
-            cosine,
-        )  # fmt: skip
-
-
 def read(path: Path, top: ET.Element) -> LoopTree:
     """Read an SDF file.
 
@@ -102,42 +59,69 @@ def read(path: Path, top: ET.Element) -> LoopTree:
     outside, element, gravity = _model(path, top)
     title, world = urdf_xml.name(element, ()), Model(outside, version)
     model = world.models[title]
-    links = {WORLD: Link(WORLD, 0.0, np.zeros(3), np.zeros((3, 3)))}
-    links |= {name: _link(path, part, name) for name, part in model.all("link")}
-    places = {name: model.place(name) for name in links}
-    edges: dict[str, Edge] = {}
-    for edge in world.edges(path):
-        if edge.name in edges:
-            raise ParameterError(f"joint.{edge.name}", edge.name, "a unique name")
-        edges[edge.name] = edge
-    taken = set(edges)
-    welded = welds(path, top, title, places, taken)
-    edges |= {edge.name: edge for edge in welded}
+    links = {WORLD: Link(WORLD)}
+    for name, part in model.all("link"):
+        links[name] = _link(path, part, name).moved(model.place(name))
+    places = {name: link.frame for name, link in links.items()}
+    joints: dict[str, Joint] = {}
+    for joint in model.joints(path):
+        if joint.name in joints:
+            raise ParameterError(f"joint.{joint.name}", joint.name, "a unique name")
+        joints[joint.name] = joint
+    taken = set(joints)
+    for joint in world.own_joints(path):
+        # Names are of their own in the world.
+        own = urdf_xml.free_name(joint.name, taken, "_of_world")
+        joints[own] = replace(joint, name=own)
+    joints |= {joint.name: joint for joint in welds(path, top, title, places, taken)}
     for name, _ in model.all("frame"):
         owner = model.link(name)
         if owner in links and name not in links:
-            links[name] = Link(name, 0.0, np.zeros(3), np.zeros((3, 3)))
-            places[name] = model.place(name)
+            links[name] = Link(name, model.place(name))
             own = urdf_xml.free_name(f"{name}_frame", taken)
-            edges[own] = Edge(own, "fixed", (owner, name), places[name])
-    if not any(WORLD in edge.links for edge in edges.values()):
+            joints[own] = _fixed(own, owner, name, links[name].frame)
+    if not any(WORLD in (joint.inner, joint.outer) for joint in joints.values()):
         held = model.link(MODEL)
         warn(path, f"no joint holds the model in the world: link {held} is taken for the ground")
         own = urdf_xml.free_name("world_fixed", taken)
-        edges[own] = Edge(own, "fixed", (WORLD, held), places[held])
-    types = {name: edge.type for name, edge in edges.items()}
-    actuated = actuated_joints(path, top, read_beside(path), types, effort_limited(edges))
-    joints, closures = spanned(edges, actuated, places)
-    for name in dict.fromkeys(links).keys() - {WORLD, *(joint.child for joint in joints)}:
+        joints[own] = _fixed(own, WORLD, held, places[held])
+    types = {name: joint.kind for name, joint in joints.items()}
+    # Where only some joints have an effort limit, these are motors.
+    limited = [name for name, joint in joints.items() if "effort" in joint.limits]
+    actuated = actuated_joints(path, top, read_beside(path), types, limited)
+
+    def rank(joint: Joint) -> tuple[bool, bool, int]:
+        return joint.kind != "fixed", joint.name not in actuated, joint.type.cost
+
+    pairs = {joint.name: (joint.inner, joint.outer) for joint in sorted(joints.values(), key=rank)}
+    tree = set(spanning(links, pairs))
+    spanned = {name: joint for name, joint in joints.items() if name in tree}
+    reached = {WORLD, *(one.child for one in hung(WORLD, spanned.values()))}
+    for name in [name for name in links if name not in reached]:
         raise ParameterError(f"link.{name}", None, "a joint that connects it")
     return LoopTree(
-        title, WORLD, links, {joint.name: joint for joint in joints},
-        tuple(edge.closure(places) for edge in closures), actuated,
-        _gravity(path, model, gravity, edges), accuracy=urdf_xml.accuracy(
+        title, WORLD, links, spanned,
+        tuple(closing(joint) for name, joint in joints.items() if name not in tree), actuated,
+        _gravity(path, model, gravity, joints.values()), accuracy=urdf_xml.accuracy(
             word for part in element.iter() if part.tag in ("pose", "xyz")
             for word in (part.text or "").split()
         ),
     )  # fmt: skip
+
+
+def _fixed(name: str, inner: str, outer: str, place: Pose) -> Joint:
+    return Joint(name, "fixed", inner, outer, (place, place))
+
+
+def closing(joint: Joint) -> Joint:
+    """A joint as one that closes a loop.
+
+    :raises ParameterError: a screw.
+    """
+    if joint.type.threaded():
+        raise ParameterError(f"joint.{joint.name}.type", "screw", "a loop with other joints too")
+    cosine = float(joint.axes[0] @ joint.axes[1]) if joint.type.count == 2 else 0.0
+    return replace(joint, cosine=cosine)
 
 
 def _version(top: ET.Element) -> tuple[int, int]:
@@ -173,14 +157,14 @@ def _of_include(element: ET.Element) -> ParameterError:
 
 
 def _gravity(
-    path: Path, model: Model, stated: list[float] | None, edges: Mapping[str, Edge]
+    path: Path, model: Model, stated: list[float] | None, joints: Iterable[Joint]
 ) -> list[float] | None:
     """The world's gravity, or none where no link that can move has weight.
 
     :raises ParameterError: only some have.
     """
     held = {WORLD}
-    bolts = [edge.links for edge in edges.values() if edge.type == "fixed"]
+    bolts = [(joint.inner, joint.outer) for joint in joints if joint.kind == "fixed"]
     while reached := {end for pair in bolts if held & set(pair) for end in pair} - held:
         held |= reached
     weight = {name: _flag(part, "gravity", True) for name, part in model.all("link")}
@@ -323,15 +307,19 @@ class Model:
             own = end or MODEL
         raise ParameterError(where, name, "frames that do not lead back to themselves")
 
-    def edges(self, path: Path) -> Iterator[Edge]:
+    def joints(self, path: Path) -> Iterator[Joint]:
         """The joints, nested models' too; the path is for warnings."""
+        yield from self.own_joints(path)
+        for one in self.models.values():
+            yield from () if one.static else one.joints(path)
+
+    def own_joints(self, path: Path) -> Iterator[Joint]:
+        """The same, of no nested model."""
         for part in self.element.findall("joint"):
-            yield _edge(path, part, self)
+            yield _joint(path, part, self)
         for part in self.element:
             if FOREIGN.fullmatch(part.tag):
                 raise ParameterError(part.tag, part.get("name"), "joints and closures of SDF alone")
-        for one in self.models.values():
-            yield from () if one.static else one.edges(path)
 
 
 def _end(joint: ET.Element, tag: str) -> str:
@@ -375,20 +363,15 @@ def _link(path: Path, element: ET.Element, name: str) -> Link:
     stated = set() if inertial is None else {part.tag for part in inertial.iter()}
     if missing := [key for key in ("mass", "ixx", "iyy", "izz") if key not in stated]:
         warn(path, f"link {name} has no {', '.join(missing)}: SDF then has 1 kg and 1 kg m2")
-    mass = _text(inertial, "mass", where, 1.0)
-    if mass < 0.0:
-        raise ParameterError(f"{where}.mass", mass, "zero or more, kg")
     moments = None if inertial is None else urdf_xml.single(inertial, "inertia", where)
-    xx, xy, xz, yy, yz, zz = (
-        _text(moments, key, f"{where}.inertia", float(key[1] == key[2]))
-        for key in ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
-    )
     at = pose(None if inertial is None else urdf_xml.single(inertial, "pose", where), where)
-    matrix = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-    return Link(name, mass, at.position, at.rotation @ matrix @ at.rotation.T)
+    return link_of(
+        name, _text(inertial, "mass", where, 1.0), at,
+        lambda key: _text(moments, key, f"{where}.inertia", float(key[1] == key[2])),
+    )  # fmt: skip
 
 
-def _edge(path: Path, part: ET.Element, model: Model) -> Edge:
+def _joint(path: Path, part: ET.Element, model: Model) -> Joint:
     """A joint with its frame in the world."""
     name = model.prefix + urdf_xml.name(part, ())
     where = f"joint.{name}"
@@ -406,11 +389,11 @@ def _edge(path: Path, part: ET.Element, model: Model) -> Edge:
         if far > NEAR:
             warn(path, f"{where}: the frame {ends[0]} is drawn {far:.3g} m from the joint; "
                  "a joint of SDF holds its links as they are drawn")  # fmt: skip
-    return joint_edge(path, part, name, links, at, lambda frame: place(frame).rotation,
-                      model.version)  # fmt: skip
+    return joint_of(path, part, name, links, at, lambda frame: place(frame).rotation,
+                    model.version)  # fmt: skip
 
 
-def joint_edge(
+def joint_of(
     path: Path,
     part: ET.Element,
     name: str,
@@ -418,7 +401,7 @@ def joint_edge(
     place: Pose,
     turn: Callable[[str], Array],
     version: tuple[int, int] = NEWEST,
-) -> Edge:
+) -> Joint:
     """A ``<joint>`` whose frame is known.
 
     :param turn: gives the rotation of a frame in the world by its name.
@@ -429,7 +412,7 @@ def joint_edge(
         raise UnknownNameError(f"{where}.type", part.get("type"), KINDS)
     kind = KINDS[str(part.get("type"))]
     axes: list[Array] = []
-    found: dict[str, Any] = {"limits": {}}
+    limits: dict[str, Any] = {}
     tags = ("axis", "axis2")[: 0 if kind == "spherical" else TYPES[kind].count]
     for tag in ("gearbox_ratio", "mimic"):
         if part.find(f".//{tag}") is not None:
@@ -454,11 +437,11 @@ def joint_edge(
             stated = {k: v for k, v in stated.items() if k in ("lower", "upper") or v[:1] != "-"}
             stated = {"lower": "-inf", "upper": "inf", **stated}
             turns = "revolute" if kind == "helical" else kind
-            found["limits"] = urdf_xml.limits(stated, where, turns)
+            limits = urdf_xml.limits(stated, where, turns)
     pitch = _pitch(part, where) if kind == "helical" else 0.0
-    return Edge(
-        name, kind, links, place, np.reshape(axes, (-1, 3)), viscous=max(viscous),
-        coulomb=max(coulomb), pitch=pitch, **found,
+    return Joint(
+        name, kind, *links, (place, place), np.reshape(axes, (-1, 3)), limits=limits,
+        viscous=max(viscous), coulomb=max(coulomb), pitch=pitch,
     )  # fmt: skip
 
 
@@ -479,7 +462,7 @@ def _axis(
     turn: Callable[[str], Array],
     version: tuple[int, int],
 ) -> Array:
-    """A unit vector in the joint's frame."""
+    """A unit vector, in the world."""
     stated = None if element is None else urdf_xml.single(element, "xyz", where)
     text = "0 0 1" if stated is None else stated.text
     value = urdf_xml.vector(text, f"{where}.xyz", 3)
@@ -490,14 +473,12 @@ def _axis(
     old = None if element is None else element.findtext("use_parent_model_frame")
     if version <= OLDEST or (old and urdf_xml.boolean(old, f"{where}.use_parent_model_frame")):
         frame = frame or MODEL
-    if frame:
-        return np.asarray(place.rotation.T @ turn(frame) @ value / size)
-    return value / size
+    return np.asarray((turn(frame) if frame else place.rotation) @ value / size)
 
 
 def welds(
     path: Path, top: ET.Element, model: str, places: Mapping[str, Pose], taken: set[str]
-) -> Iterator[Edge]:
+) -> Iterator[Joint]:
     """What Gazebo's plugins hold together: two links of this model, as they are drawn.
 
     :param taken: names of joints and closures; the welds' own are added.
@@ -516,47 +497,4 @@ def welds(
             if end not in places:
                 raise UnknownNameError(f"plugin.{kind}.{tag}", end, places)
         name = urdf_xml.free_name("_".join(ends), taken)
-        yield Edge(name, "fixed", (ends[0], ends[1]), places[ends[1]])
-
-
-def effort_limited(edges: Mapping[str, Edge]) -> list[str]:
-    """Joints with an effort limit; where only some have one, these are motors."""
-    return [name for name, edge in edges.items() if "effort" in edge.limits]
-
-
-def spanned(
-    edges: Mapping[str, Edge], actuated: Sequence[str], places: Mapping[str, Pose]
-) -> tuple[list[Joint], list[Edge]]:
-    """A tree of joints from the world outwards, and the joints that close loops."""
-    group = {name: name for name in places}
-
-    def root(name: str) -> str:
-        while group[name] != name:
-            name = group[name]
-        return name
-
-    def rank(edge: Edge) -> tuple[bool, bool, int]:
-        return edge.type != "fixed", edge.name not in actuated, TYPES[edge.type].cost
-
-    hanging: dict[str, list[Edge]] = {name: [] for name in places}
-    closures = []
-    for edge in sorted(edges.values(), key=rank):
-        first, second = map(root, edge.links)
-        if first == second:
-            closures.append(edge)
-            continue
-        group[first] = second
-        for link in edge.links:
-            hanging[link].append(edge)
-    joints: list[Joint] = []
-    reached, level = {WORLD}, [WORLD]
-    while level:
-        for link in level:
-            for edge in hanging[link]:
-                if not reached.issuperset(edge.links):
-                    joints.append(edge.joint(places, link))
-                    reached |= set(edge.links)
-        level = [joint.child for joint in joints if joint.parent in level]
-    order = list(edges)
-    joints.sort(key=lambda joint: order.index(joint.name))
-    return joints, sorted(closures, key=lambda edge: order.index(edge.name))
+        yield _fixed(name, ends[0], ends[1], places[ends[1]])

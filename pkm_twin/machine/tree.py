@@ -21,7 +21,7 @@ from pkm_twin.codegen.arrays import Array
 from pkm_twin.codegen.expressions import norm, plain, reference, snapped, snapped_all
 from pkm_twin.codegen.operations import atan2
 from pkm_twin.errors import ParameterError
-from pkm_twin.machine.graph import BASE, Graph, rotation_about_z
+from pkm_twin.machine.graph import BASE, Graph, rotation_about_z, spanning
 from pkm_twin.machine.joints import Freedom, across, unit
 
 BALL: Final = (1.0, 0.0, 0.0, 0.0)
@@ -131,39 +131,29 @@ class Tree:
 
     def _span(self) -> dict[str, list[tuple[str, str | None]]]:
         graph = self.graph
-        edges: list[tuple[bool, float, int, str | None, str, str]] = []
-        for k, joint in enumerate(graph.joints.values()):
-            cost = joint.type.cost
-            edges.append((not joint.actuated, cost, k, joint.name, joint.inner, joint.outer))
-        edges += [(True, 6, 10**6 + k, None, BASE, body) for k, body in enumerate(graph.bodies)]
-        group = {name: name for name in [BASE, *graph.bodies]}
-        neighbours: dict[str, list[tuple[str, str | None]]] = {name: [] for name in group}
-        cut: list[str] = []
-
-        def root(name: str) -> str:
-            while group[name] != name:
-                name = group[name]
-            return name
-
-        for passive, _, _, name, a, b in sorted(edges, key=lambda edge: edge[:3]):
-            if root(a) == root(b):
-                if name is not None:
-                    if graph.joints[name].type.threaded():
-                        # Its turn is known but for whole ones.
-                        raise ParameterError(
-                            f"joints.{name}.type", "helical", "a loop that has other joints too"
-                        )
-                    if not passive:
-                        raise ParameterError(
-                            f"joints.{name}.actuated", True, "actuated joints that close no loop "
-                            "of their own"
-                        )  # fmt: skip
-                    cut.append(name)
-                continue
-            group[root(a)] = root(b)
+        order = sorted(graph.joints.values(), key=lambda j: (not j.actuated, j.type.cost))
+        pairs: dict[str | tuple[str], tuple[str, str]]
+        pairs = {joint.name: (joint.inner, joint.outer) for joint in order}
+        pairs |= {(body,): (BASE, body) for body in graph.bodies}
+        neighbours: dict[str, list[tuple[str, str | None]]] = {n: [] for n in (BASE, *graph.bodies)}
+        spanned = spanning(neighbours, pairs)
+        for key in spanned:
+            a, b = pairs[key]
+            name = key if isinstance(key, str) else None
             neighbours[a].append((b, name))
             neighbours[b].append((a, name))
-        self.cut = tuple(name for name in graph.joints if name in cut)
+        self.cut = tuple(name for name in graph.joints if name not in spanned)
+        for name in self.cut:
+            if graph.joints[name].type.threaded():
+                # Its turn is known but for whole ones.
+                raise ParameterError(
+                    f"joints.{name}.type", "helical", "a loop that has other joints too"
+                )
+            if graph.joints[name].actuated:
+                raise ParameterError(
+                    f"joints.{name}.actuated", True, "actuated joints that close no loop "
+                    "of their own"
+                )  # fmt: skip
         return neighbours
 
     def _hang(self, parent: str, body: str, name: str | None) -> None:

@@ -1,11 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A URDF file as it stands: links, joints and loop closures, each in its own frames."""
+"""A URDF file: links, joints and what closes loops, in three ways that people write it.
+
+``<constraint>`` elements (urdfdom pull request 264), ``<loop>`` elements (Chignoli, Slotine,
+Wensing, Kim 2024, URDF+, arXiv:2411.19753), pairs of frames in a YAML file (Batto, De Matteis,
+Mansard 2025, Extended URDF, arXiv:2504.04767).
+"""
 
 from __future__ import annotations
 
 import math
 import xml.etree.ElementTree as ET
-from collections.abc import Mapping
+from collections import ChainMap
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
@@ -14,16 +20,35 @@ import numpy as np
 
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError, UnknownNameError, warn
-from pkm_twin.machine import sdf_file, urdf_loops, urdf_xml
-from pkm_twin.machine.loop_tree import Closure, Joint, Link, LoopTree, drawn
+from pkm_twin.machine import sdf_file, urdf_xml
+from pkm_twin.machine.joints import TYPES
+from pkm_twin.machine.loop_tree import Joint, Link, LoopTree, hung, link_of
 from pkm_twin.machine.motors import actuated_joints, read_beside
-from pkm_twin.machine.urdf_xml import Pose
+from pkm_twin.machine.rotations import Pose
 
 _PLACES: Final = ("axis", "parent_axis", "child_axis")
 LARGE: Final = 10.0
 """Offsets beyond this, m, look like millimetres."""
 
 JOINTS: Final = ("revolute", "continuous", "prismatic", "fixed", "spherical")
+CONSTRAINTS: Final = {
+    **{name: name for name, kind in TYPES.items() if not kind.threaded()},
+    "continuous": "revolute",
+    "link": "fixed",  # a link that was cut in two
+}
+PARTS: Final = (
+    "parent",
+    "parent_origin",
+    "parent_axis",
+    "child",
+    "child_origin",
+    "child_axis",
+    "dynamics",
+)
+LOOPS: Final = {
+    name: CONSTRAINTS[name]
+    for name in ("revolute", "continuous", "prismatic", "fixed", "spherical")
+}
 
 
 def read(path: Path, robot: ET.Element) -> LoopTree:
@@ -53,14 +78,18 @@ def read(path: Path, robot: ET.Element) -> LoopTree:
         )
     beside = read_beside(path)
     joints = _retyped(joints, beside)
-    closures = urdf_loops.closures(
-        robot, beside, links, {name: joint.child for name, joint in joints.items()}
-    )
-    closures |= _of_gazebo(path, robot, joints, root, {*joints, *closures})
+    closures = _closures(robot, beside, links, {n: joint.outer for n, joint in joints.items()})
     _warn_of_units(path, robot, joints, closures)
-    actuated = actuated_joints(
-        path, robot, beside, {name: joint.type for name, joint in joints.items()}
+    frames = {root: Pose()}
+    for joint, parent, child in hung(root, joints.values()):
+        frames[child] = frames[parent] @ joint.frames[0]
+    links = {n: link.moved(frames[n]) for n, link in links.items()}
+    joints, closures = (
+        {n: one.placed(frames[one.inner], frames[one.outer]) for n, one in some.items()}
+        for some in (joints, closures)
     )
+    closures |= _of_gazebo(path, robot, frames, {*joints, *closures})
+    actuated = actuated_joints(path, robot, beside, {n: joint.kind for n, joint in joints.items()})
     name = robot.get("name") or path.stem
     initial = _parameters(robot, actuated, "initial_value")
     rotors = _parameters(robot, actuated, "rotor_inertia")
@@ -81,56 +110,50 @@ def read(path: Path, robot: ET.Element) -> LoopTree:
 
 
 def _of_gazebo(
-    path: Path, robot: ET.Element, joints: Mapping[str, Joint], root: str, taken: set[str]
-) -> dict[str, Closure]:
+    path: Path, robot: ET.Element, frames: Mapping[str, Pose], taken: set[str]
+) -> dict[str, Joint]:
     """Joints of SDF inside ``<gazebo>``, and links that its plugins hold together, by name.
 
-    :param taken: names of joints and closures; those of these are added.
+    :param frames: of the links. ``taken``: names of joints and closures; those of these are added.
     """
-    places = drawn(root, joints)
 
     def turn(frame: str) -> Array:
-        return places[frame].rotation if frame in places else np.eye(3)
+        return frames[frame].rotation if frame in frames else np.eye(3)
 
-    edges: list[sdf_file.Edge] = []
+    found: list[Joint] = []
     for element in robot.findall("gazebo/joint"):
         taken.add(name := urdf_xml.name(element, taken))
         where = f"gazebo.joint.{name}"
         first, second = (
-            urdf_xml.known_link(f"{where}.{end}", (element.findtext(end) or "").strip(), places)
+            urdf_xml.known_link(f"{where}.{end}", (element.findtext(end) or "").strip(), frames)
             for end in ("parent", "child")
         )
         stated = urdf_xml.single(element, "pose", where)
         start = second if stated is None else stated.get("relative_to") or second
-        start = urdf_xml.known_link(f"{where}.pose", start, places)
-        place = places[start] @ sdf_file.pose(stated, f"{where}.pose")
-        edge = sdf_file.joint_edge(path, element, name, (first, second), place, turn)
-        edges.append(edge)
-    edges += sdf_file.welds(path, robot, robot.get("name", ""), places, taken)
-    return {edge.name: edge.closure(places) for edge in edges}
+        start = urdf_xml.known_link(f"{where}.pose", start, frames)
+        place = frames[start] @ sdf_file.pose(stated, f"{where}.pose")
+        found.append(sdf_file.joint_of(path, element, name, (first, second), place, turn))
+    found += sdf_file.welds(path, robot, robot.get("name", ""), frames, taken)
+    return {joint.name: sdf_file.closing(joint) for joint in found}
 
 
 def _link(element: ET.Element, name: str) -> Link:
     inertial = urdf_xml.single(element, "inertial", f"link.{name}")
     if inertial is None:
-        return Link(name, 0.0, np.zeros(3), np.zeros((3, 3)))
+        return Link(name)
     where = f"link.{name}.inertial"
     mass = urdf_xml.single(inertial, "mass", where)
     value = urdf_xml.number(None if mass is None else mass.get("value"), f"{where}.mass")
-    if value < 0.0:
-        raise ParameterError(f"{where}.mass", value, "zero or more, kg")
     inertia = urdf_xml.single(inertial, "inertia", where)
     if inertia is None:
         raise ParameterError(f"{where}.inertia", None, "an <inertia> for the mass, kg m2")
-    xx, xy, xz, yy, yz, zz = (
-        urdf_xml.number(
-            inertia.get(key, "0" if key[1] != key[2] else None), f"{where}.inertia.{key}"
-        )
-        for key in ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
-    )
     pose = urdf_xml.origin(urdf_xml.single(inertial, "origin", where), where)
-    matrix = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-    return Link(name, value, pose.position, pose.rotation @ matrix @ pose.rotation.T)
+
+    def moment(key: str) -> float:
+        stated = inertia.get(key, None if key[1] == key[2] else "0")
+        return urdf_xml.number(stated, f"{where}.inertia.{key}")
+
+    return link_of(name, value, pose, moment)
 
 
 def _joint(element: ET.Element, name: str, links: dict[str, Link]) -> Joint:
@@ -156,21 +179,22 @@ def _joint(element: ET.Element, name: str, links: dict[str, Link]) -> Joint:
     viscous, coulomb = urdf_xml.friction(element, where)
     kind = "revolute" if kind == "continuous" else kind
     return Joint(
-        name, kind, parent, child, origin, np.reshape(axes, (-1, 3)), limits, viscous, coulomb
-    )
+        name, kind, parent, child, (origin, Pose()), np.reshape(axes, (-1, 3)), limits=limits,
+        viscous=viscous, coulomb=coulomb,
+    )  # fmt: skip
 
 
 def _root(links: dict[str, Link], joints: dict[str, Joint]) -> str:
     parents: dict[str, Joint] = {}
     for joint in joints.values():
-        if joint.child in parents:
+        if joint.outer in parents:
             raise ParameterError(
                 f"joint.{joint.name}.child",
-                joint.child,
-                f"a tree of links: {joint.child!r} already has the parent joint "
-                f"{parents[joint.child].name!r}; close the loop with a <constraint> element",
+                joint.outer,
+                f"a tree of links: {joint.outer!r} already has the parent joint "
+                f"{parents[joint.outer].name!r}; close the loop with a <constraint> element",
             )
-        parents[joint.child] = joint
+        parents[joint.outer] = joint
     roots = [name for name in links if name not in parents]
     if len(roots) != 1:
         raise ParameterError("robot", roots, "exactly one root link (a link that is not a child)")
@@ -185,7 +209,7 @@ def _root(links: dict[str, Link], joints: dict[str, Joint]) -> str:
                     f"joint.{parents[link].name}", circle, "a tree; these links form a circle"
                 )
             way[link] = None
-            link = parents[link].parent
+            link = parents[link].inner
         known.update(way)
     return roots[0]
 
@@ -208,8 +232,116 @@ def _retyped(joints: dict[str, Joint], beside: dict[str, Any]) -> dict[str, Join
         else:
             raise UnknownNameError("joint_type", kind, ["SPHERICAL", "FIXED", *universal])
         rows = np.reshape(axes, (-1, 3))
-        joints[name] = replace(joints[name], type=changed, axes=rows, limits={})
+        joints[name] = replace(joints[name], kind=changed, axes=rows, limits={})
     return joints
+
+
+def _closures(
+    robot: ET.Element, beside: Mapping[str, Any], links: Collection[str], joints: Mapping[str, str]
+) -> dict[str, Joint]:
+    """All closures of a robot by name.
+
+    :param beside: the YAML file's entries.
+    :param joints: the joints' names, each with its child link.
+    :raises ParameterError: an element that is refused, by name.
+    """
+    found: dict[str, Joint] = {}
+    taken = ChainMap[str, Any](found, dict(joints))
+    for element in robot.findall("constraint"):
+        name = urdf_xml.name(element, taken)
+        found[name] = _constraint(element, name, links)
+    for element in robot.findall("loop"):
+        name = urdf_xml.name(element, taken)
+        found[name] = _loop(element, name, links)
+    for closure in _pairs(beside, links, joints):
+        if closure.name in joints or closure.name in found:
+            raise ParameterError("closed_loop", closure.name, "each pair once")
+        found[closure.name] = closure
+    return found
+
+
+def _constraint(element: ET.Element, name: str, links: Collection[str]) -> Joint:
+    where = f"constraint.{name}"
+    kind = (element.get("type") or "").removesuffix("_joint")
+    if kind not in CONSTRAINTS:
+        raise UnknownNameError(f"{where}.type", element.get("type"), CONSTRAINTS)
+    urdf_xml.only(element, where, PARTS)
+    for end in ("parent", "child"):
+        urdf_xml.only(urdf_xml.single(element, end, where), f"{where}.{end}", ())
+    ends = tuple(
+        urdf_xml.reference(element.find(e), f"{where}.{e}", links) for e in ("parent", "child")
+    )
+    frames = tuple(
+        urdf_xml.origin(urdf_xml.single(element, f"{e}_origin", where), f"{where}.{e}_origin")
+        for e in ("parent", "child")
+    )
+    parent = urdf_xml.axis(element, "parent_axis", where)
+    # The child's axis is the parent's where the two frames meet, unless it is given.
+    alone = kind != "universal" and element.find("child_axis") is None
+    child = parent if alone else urdf_xml.axis(element, "child_axis", where)
+    viscous, coulomb = urdf_xml.friction(element, where)
+    closure = _closure(name, CONSTRAINTS[kind], ends, frames, (parent, child))
+    angle = urdf_xml.number(element.get("angle", repr(math.pi / 2)), f"{where}.angle")
+    cosine = math.cos(angle) if "angle" in element.attrib and kind == "universal" else 0.0
+    return replace(closure, viscous=viscous, coulomb=coulomb, cosine=cosine)
+
+
+def _loop(element: ET.Element, name: str, links: Collection[str]) -> Joint:
+    where = f"loop.{name}"
+    kind = element.get("type")
+    if kind not in LOOPS:
+        raise UnknownNameError(f"{where}.type", kind, LOOPS)
+    urdf_xml.only(element, where, ("predecessor", "successor", "sucessor", "axis"))
+    ends, frames = [], []
+    for tags in (("predecessor",), ("successor", "sucessor")):
+        stated = [e for tag in tags if (e := urdf_xml.single(element, tag, where)) is not None]
+        if len(stated) > 1:
+            raise ParameterError(f"{where}.{tags[0]}", f"{len(stated)} elements", "one")
+        end = stated[0] if stated else None
+        urdf_xml.only(end, f"{where}.{tags[0]}", ("origin",))
+        ends.append(urdf_xml.reference(end, f"{where}.{tags[0]}", links))
+        origin = None if end is None else urdf_xml.single(end, "origin", f"{where}.{tags[0]}")
+        frames.append(urdf_xml.origin(origin, f"{where}.{tags[0]}"))
+    axis = urdf_xml.axis(element, "axis", where)
+    return _closure(name, LOOPS[kind], ends, frames, (axis, axis))
+
+
+def _pairs(
+    beside: Mapping[str, Any], links: Collection[str], joints: Mapping[str, str]
+) -> list[Joint]:
+    """The closures of the YAML file: two frames that meet whole (6d) or in their origins (3d)."""
+    pairs = beside.get("closed_loop", [])
+    kinds = beside.get("type", ["6d"] * len(pairs))
+    if len(kinds) != len(pairs):
+        raise ParameterError("type", kinds, f"{len(pairs)}, one per pair in closed_loop")
+    closures = []
+    for i, (pair, kind) in enumerate(zip(pairs, kinds, strict=True)):
+        if not isinstance(pair, list) or len(pair) != 2:
+            raise ParameterError(f"closed_loop[{i}]", pair, "a pair of frame names")
+        types = {"6d": "fixed", "3d": "spherical"}
+        if str(kind).lower() not in types:
+            raise UnknownNameError(f"type[{i}]", kind, types)
+        # A joint's frame moves with its child, so that the child link's frame is the same.
+        known = [*links, *joints]
+        found = [urdf_xml.known_link(f"closed_loop[{i}]", name, known) for name in pair]
+        ends = [joints.get(name, name) for name in found]
+        closures.append(
+            _closure("_".join(pair), types[str(kind).lower()], ends, (Pose(), Pose()), ())
+        )
+    return closures
+
+
+def _closure(
+    name: str,
+    kind: str,
+    links: Sequence[str],
+    frames: Sequence[Pose],
+    axes: Sequence[Array],
+) -> Joint:
+    if links[0] == links[1]:
+        raise ParameterError(name, links[0], "a closure between two links")
+    rows = np.reshape(axes if TYPES[kind].count else (), (-1, 3))
+    return Joint(name, kind, links[0], links[1], (frames[0], frames[1]), rows)
 
 
 def _parameters(robot: ET.Element, actuated: tuple[str, ...], key: str) -> dict[str, float]:
@@ -228,9 +360,9 @@ def _parameters(robot: ET.Element, actuated: tuple[str, ...], key: str) -> dict[
 
 
 def _warn_of_units(
-    path: Path, robot: ET.Element, joints: dict[str, Joint], closures: dict[str, Closure]
+    path: Path, robot: ET.Element, joints: dict[str, Joint], closures: dict[str, Joint]
 ) -> None:
-    offsets = {f"joint.{n}.origin": j.origin for n, j in joints.items()}
+    offsets = {f"joint.{n}.origin": j.frames[0] for n, j in joints.items()}
     offsets |= {f"{n}.{i}": f for n, c in closures.items() for i, f in enumerate(c.frames)}
     where, pose = max(
         offsets.items(),

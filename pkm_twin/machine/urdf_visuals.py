@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from pkm_twin.errors import ParameterError, warn
 from pkm_twin.machine import urdf_xml
-from pkm_twin.machine.urdf_xml import Pose
+from pkm_twin.machine.rotations import Pose
 
 Array = NDArray[np.float64]
 

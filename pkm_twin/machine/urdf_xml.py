@@ -9,7 +9,6 @@ import re
 import stat
 import xml.etree.ElementTree as ET
 from collections.abc import Collection, Container, Iterable, Mapping
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 from xml.parsers import expat
@@ -20,7 +19,7 @@ from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import FileError, ParameterError, UnknownNameError
 from pkm_twin.files import decimal
 from pkm_twin.machine import schema
-from pkm_twin.machine.rotations import from_quaternion, from_rpy
+from pkm_twin.machine.rotations import Pose, from_quaternion, from_rpy
 
 MAX_FILE_SIZE: Final = 4 * 1024 * 1024
 """Largest URDF that is read, bytes."""
@@ -34,21 +33,6 @@ UNLIMITED: Final = {
     "effort": 1e6,
 }
 """From here on a limit is none, as a URDF needs numbers: rad, m, per second, N m or N."""
-
-
-@dataclass(frozen=True, eq=False)
-class Pose:
-    """A frame in another: ``rotation`` (3, 3), ``position`` (3,), m."""
-
-    rotation: Array = field(default_factory=lambda: np.eye(3))
-    position: Array = field(default_factory=lambda: np.zeros(3))
-
-    def __matmul__(self, other: Pose) -> Pose:
-        return Pose(self.rotation @ other.rotation, self.rotation @ other.position + self.position)
-
-    def inverse(self) -> Pose:
-        """The other frame in this one."""
-        return Pose(self.rotation.T, -self.rotation.T @ self.position)
 
 
 def elements(path: Path) -> ET.Element:

@@ -3,25 +3,32 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any, Final
 
 import numpy as np
 
-from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import warn
-from pkm_twin.kinematics.passive import single_joints
+from pkm_twin.kinematics.passive import rod_axes
 from pkm_twin.machine import schema
 from pkm_twin.machine.friction import all_keys
-from pkm_twin.machine.graph import POSE
+from pkm_twin.machine.graph import BASE, POSE, Body, Graph
 from pkm_twin.machine.graph_description import graph_description
+from pkm_twin.machine.loop_tree import Capsule, Joint, Link, LoopTree
 from pkm_twin.machine.mjcf_write import write_mjcf
 from pkm_twin.machine.places import has_entry
+from pkm_twin.machine.rotations import Pose
 from pkm_twin.machine.sdf_write import write_sdf
+from pkm_twin.machine.tree import Tree
 from pkm_twin.machine.urdf_control import Control, tree_names
-from pkm_twin.machine.urdf_write import MOCK, UrdfBody, UrdfDrive, UrdfTree, write_urdf
+from pkm_twin.machine.urdf_write import GROUND, MOCK, PLATFORM, write_urdf
+from pkm_twin.machine.urdf_xml import plain_name
+from pkm_twin.robot.outline import bars
 from pkm_twin.robot.robot import Robot
-from pkm_twin.robot.urdf_tree import urdf_tree
+
+PAYLOAD: Final = "payload"
+"""The link of a payload, apart from the platform's."""
 
 
 def robot_urdf(robot: Robot, hardware: str = MOCK, prefix: str = "") -> str:
@@ -78,10 +85,10 @@ def robot_sdf(robot: Robot) -> str:
     tree = robot_tree(robot)
     left_out = [
         f"{what} of {joint.name}"
-        for joint in tree.joints
+        for joint in tree.joints.values()
         for what, value in (
-            ("the rotor inertia", joint.drive.rotor_inertia),
-            ("the constant friction", joint.drive.offset),
+            ("the rotor inertia", joint.rotor_inertia),
+            ("the constant friction", joint.offset),
         )
         if value
     ]
@@ -96,17 +103,82 @@ def _warn_of_laws(robot: Robot, where: str) -> None:
         warn("friction", f"{where} has no {' or '.join(robot.laws)} friction: it is left out")
 
 
-def robot_tree(robot: Robot) -> UrdfTree:
-    """The robot's bodies, single joints and closures with all that description formats tell."""
-    engine, load = robot.engine, robot.payload
-    return urdf_tree(
-        robot.graph,
-        single_joints(engine),
-        engine.tree.cut,
-        robot.name or robot.mechanism,
-        drives=_drives(robot),
-        payload=UrdfBody("payload", load.mass, load.com, load.inertia),
+def robot_tree(robot: Robot) -> LoopTree:
+    """The robot's links, joints and closures with all that description formats tell."""
+    name, load = robot.name or robot.mechanism, robot.payload
+    payload = Body(PAYLOAD, load.mass, load.com, load.inertia)
+    return graph_tree(robot.graph, robot.engine.tree, name, _drives(robot), payload)
+
+
+def graph_tree(
+    graph: Graph,
+    tree: Tree,
+    name: str,
+    drives: Mapping[str, Mapping[str, Any]],
+    payload: Body | None = None,
+) -> LoopTree:
+    """A graph as description formats have it, drawn at home, with bars to look at.
+
+    :param drives: limits and friction of the actuated joints, as :class:`Joint` has them.
+    :param payload: with its centre from the platform's reference point.
+    """
+    names = _link_names([BASE, *graph.bodies, *graph.rods])
+    links, joints = {GROUND: Link(GROUND)}, dict[str, Joint]()
+
+    def joint_of(source: str) -> Joint:
+        one, at = graph.joints[source], Pose(position=graph.joints[source].at)
+        made = Joint(
+            one.name, one.kind, names[one.inner], names[one.outer], (at, at), one.axes, one.home,
+            viscous=one.viscous, coulomb=one.coulomb, rotor_inertia=one.rotor_inertia,
+            pitch=one.pitch,
+        )  # fmt: skip
+        return replace(made, **drives.get(source, {}))
+
+    for link in tree.links.values():
+        body, at = graph.bodies[link.body], Pose(position=link.at)
+        own = names[link.body]
+        links[own] = Link(own, at, body.mass, body.com, body.inertia)
+        if link.joint is None:
+            label = f"{link.body}_free"
+            joints[label] = Joint(label, "free", names[link.parent], own, (at, at))
+        else:
+            joints[link.joint] = joint_of(link.joint)
+    closures = [joint_of(source) for source in tree.cut]
+    for rod in graph.rods.values():
+        start, end = (Pose(position=place) for place in rod.ends)
+        along = end.position - start.position
+        inertia = rod.mass / 12.0 * (along @ along * np.eye(3) - np.outer(along, along))
+        own, middle = names[rod.name], (start.position + end.position) / 2.0
+        links[own] = Link(own, start, rod.mass, middle, inertia)
+        axes = np.array(rod_axes(rod))
+        inner, outer = names[rod.inner], names[rod.outer]
+        joints[rod.name] = Joint(rod.name, "universal", inner, own, (start, start), axes)
+        closures.append(Joint(f"{rod.name}_end", "spherical", own, outer, (end, end)))
+    platform = names[graph.platform]
+    if payload is not None and payload.mass > 0.0:
+        at = Pose(position=graph.origin + payload.com)
+        links[PAYLOAD] = Link(PAYLOAD, at, payload.mass, at.position, payload.inertia)
+        label = f"{PAYLOAD}_frame"
+        joints[label] = Joint(label, "fixed", platform, PAYLOAD, (at, at))
+    capsules = (
+        Capsule(names[bar.part], bar.start[1], bar.end[1], bar.radius) for bar in bars(graph)
     )
+    return LoopTree(
+        name, GROUND, links, joints, tuple(closures), graph.actuated, capsules=tuple(capsules),
+        platform=platform, origin=graph.origin,
+    )  # fmt: skip
+
+
+def _link_names(names: Sequence[str]) -> dict[str, str]:
+    """A link for each name, apart from those that the file has of its own."""
+    links = {BASE: GROUND}
+    # What needs no change keeps its name, whatever else would come to have it.
+    for name in sorted(names, key=lambda name: plain_name(name) != name):
+        link = plain_name(name)
+        while name not in links and link in (GROUND, PLATFORM, PAYLOAD, *links.values()):
+            link += "_body"
+        links.setdefault(name, link)
+    return links
 
 
 def robot_description(robot: Robot) -> dict[str, Any]:
@@ -143,14 +215,8 @@ def robot_description(robot: Robot) -> dict[str, Any]:
             data["joints"][name]["drive"] = own
     for name, drive in _drives(robot).items():
         joint = data["joints"][name]
-        limits: dict[str, Any] = {}
-        if drive.position is not None:
-            limits["position"] = list(drive.position)
-        for key, value in (("velocity", drive.velocity), ("effort", drive.effort)):
-            if value is not None:
-                limits[key] = value
-        if limits:
-            joint["limits"] = limits
+        if drive["limits"]:
+            joint["limits"] = drive["limits"]
         k = robot.graph.actuated.index(name)
         more = {key: float(getattr(robot.friction, key)[k]) for key in all_keys()}
         if any(more.values()):
@@ -169,25 +235,18 @@ def robot_description(robot: Robot) -> dict[str, Any]:
     return data
 
 
-def _drives(robot: Robot) -> dict[str, UrdfDrive]:
+def _drives(robot: Robot) -> dict[str, dict[str, Any]]:
     """Limits and friction of the actuated joints, by the graph's names."""
-    limits, friction = robot.limits, robot.friction
-
-    def one(values: Array | None, k: int) -> float | None:
-        return None if values is None or not np.isfinite(values[k]) else float(values[k])
-
+    stated, friction = robot.limits, robot.friction
     drives = {}
     for k, name in enumerate(robot.graph.actuated):
-        position = None
-        if limits.position is not None:
-            position = float(limits.position[k][0]), float(limits.position[k][1])
-        drives[name] = UrdfDrive(
-            position,
-            one(limits.velocity, k),
-            one(limits.effort, k),
-            float(friction.viscous[k]),
-            float(friction.coulomb[k]),
-            robot.graph.joints[name].rotor_inertia,
-            float(friction.offset[k]),
-        )
+        limits: dict[str, Any] = {}
+        if stated.position is not None:
+            limits["position"] = stated.position[k].tolist()
+        for key in ("velocity", "effort"):
+            values = getattr(stated, key)
+            if values is not None and np.isfinite(values[k]):
+                limits[key] = float(values[k])
+        rub = {key: float(getattr(friction, key)[k]) for key in ("viscous", "coulomb", "offset")}
+        drives[name] = {"limits": limits, **rub}
     return drives

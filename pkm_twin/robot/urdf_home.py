@@ -84,19 +84,21 @@ class HomeSearch:
 
     def __init__(self, assembly: Assembly, describe: Callable[[], dict[str, Any]]) -> None:
         self.assembly, self.describe = assembly, describe
-        urdf = assembly.urdf
-        steps = assembly.steps
-        self.held = np.array([name in urdf.actuated for name in steps], bool)
+        tree, steps = assembly.tree, assembly.steps
+        self.held = np.array([name in tree.actuated for name in steps], bool)
         self.turns = assembly.turns
         self.units = np.where(self.turns, 1.0, assembly.size)
-        bounds = [urdf.joints[name].limits.get("position", (-math.inf, math.inf)) for name in steps]
-        self.low, self.high = np.reshape(bounds, (-1, 2)).T
-        self.wanted = np.zeros(len(steps))
+        # Values count from the drawing.
+        drawn = np.array([tree.joints[name].drawn for name in steps])
+        bounds = [tree.joints[name].limits.get("position", (-math.inf, math.inf)) for name in steps]
+        self.low, self.high = np.reshape(bounds, (-1, 2)).T - drawn
+        self.wanted = np.where(self.held, -drawn, 0.0)
         self.place = "zero"
-        if all(name in urdf.initial for name in urdf.actuated):
-            start = np.array([urdf.initial.get(name, 0.0) for name in steps])
+        if all(name in tree.initial for name in tree.actuated):
+            start = np.array([tree.initial.get(name, 0.0) for name in steps])
             if start.any():
-                self.wanted, self.place = start, "the file's initial values"
+                self.wanted = np.where(self.held, start - drawn, 0.0)
+                self.place = "the file's initial values"
         outside = self.held & ((self.wanted < self.low) | (self.wanted > self.high))
         if outside.any():
             self.wanted[outside] = (self.low[outside] + self.high[outside]) / 2
@@ -183,8 +185,7 @@ class HomeSearch:
     def _places(self, values: Array) -> Array:
         """Where the links are, in parts of the size."""
         self.assembly.place(values)
-        links = self.assembly.links.values()
-        return np.array([pose.position for pose in links]) / self.assembly.size
+        return self.assembly.places() / self.assembly.size
 
     def _wrapped(self, values: Array) -> Array:
         """The same with no turn of more than half a circle."""
@@ -239,7 +240,7 @@ class HomeSearch:
             data = self.describe()
             graph = graph_of_entries(data, written_out(data)[0])
             settled = self._settle(
-                graph, max(ROUNDED[2], 10 * miss, 20 * self.assembly.urdf.accuracy)
+                graph, max(ROUNDED[2], 10 * miss, 20 * self.assembly.tree.accuracy)
             )
             index = 0.0 if settled is None else singularity_at_home(settled[0])
         except (ParameterError, SingularityError, np.linalg.LinAlgError):

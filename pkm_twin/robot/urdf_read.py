@@ -15,11 +15,11 @@ from pkm_twin.errors import ParameterError, warn
 from pkm_twin.machine import mjcf_file, sdf_file, urdf_file, urdf_xml
 from pkm_twin.machine.assembly import EXACT, Assembly
 from pkm_twin.machine.graph import Graph, groups
-from pkm_twin.machine.joints import TURN, TYPES
-from pkm_twin.machine.loop_tree import Closure, Joint, Link, LoopTree
+from pkm_twin.machine.joints import TURN
+from pkm_twin.machine.loop_tree import SINGLE, Joint, LoopTree
+from pkm_twin.machine.rotations import Pose
 from pkm_twin.machine.urdf_control import take_drives
 from pkm_twin.machine.urdf_visuals import Visual, visuals
-from pkm_twin.machine.urdf_xml import Pose
 from pkm_twin.robot.urdf_home import Home, HomeSearch
 
 PLATFORMS: Final = (
@@ -39,8 +39,6 @@ PLATFORMS: Final = (
     "tcp",
 )
 """Names of links that are taken for the platform, the first that is there."""
-SINGLE: Final = tuple(name for name, kind in TYPES.items() if len(kind.steps) == 1)
-"""Joint types of one degree of freedom."""
 MOST_MOVING: Final = 1000
 """Most joints that are not fixed: assembling takes the cube of their number."""
 BALANCED: Final = 1e-6
@@ -97,18 +95,18 @@ def read_tree(
     top = urdf_xml.elements(path)
     controller = take_drives(top)
     readers = {"mujoco": mjcf_file.read, "sdf": sdf_file.read}
-    urdf = readers.get(top.tag, urdf_file.read)(path, top)
-    _require_closed(path, urdf)
-    tool = _platform(urdf, platform)
-    ground = urdf.root if base is None else base
-    ground = urdf_xml.known_link("base", ground, urdf.links)
-    assembly = Assembly(urdf)
-    bodies = _bodies(urdf, assembly.order, tool, ground)
-    _require_moving(urdf, bodies, tool)
+    tree = readers.get(top.tag, urdf_file.read)(path, top)
+    _require_closed(path, tree)
+    tool = _platform(tree, platform)
+    ground = tree.root if base is None else base
+    ground = urdf_xml.known_link("base", ground, tree.links)
+    assembly = Assembly(tree)
+    bodies = _bodies(tree, tool, ground)
+    _require_moving(tree, bodies, tool)
     home = HomeSearch(assembly, lambda: _description(assembly, bodies, tool, ground)).home()
     assembly.place(home.values)
     data = _description(assembly, bodies, tool, ground, home.values)
-    notes = _left_out(urdf)
+    notes = _left_out(tree)
     if home.miss > EXACT:
         notes.append(f"the loops close within {home.miss:.1g} only (m or rad)")
     if home.graph is not None:
@@ -128,9 +126,8 @@ def read_tree(
             )
     if controller:
         data["joint_map"] = controller
-    view = assembly.links[ground].inverse()
-    places = {name: view @ pose for name, pose in assembly.links.items()}
-    shown = () if top.tag in readers else visuals(path, top, places, bodies)
+    frames = {name: move @ tree.links[name].frame for name, move in _seen(assembly, ground).items()}
+    shown = () if top.tag in readers else visuals(path, top, frames, bodies)
     return UrdfReading(data, home.text, tuple(notes), tuple(shown))
 
 
@@ -139,7 +136,7 @@ def _require_closed(path: Path, tree: LoopTree) -> None:
 
     :raises ParameterError: by their number, or by name.
     """
-    moving = [joint.name for joint in tree.joints.values() if joint.type != "fixed"]
+    moving = [joint.name for joint in tree.joints.values() if joint.kind != "fixed"]
     if len(moving) > MOST_MOVING:
         raise ParameterError(str(path), f"{len(moving)} joints that move", f"at most {MOST_MOVING}")
     idle = [name for name in moving if name not in tree.actuated]
@@ -159,10 +156,9 @@ def _require_moving(tree: LoopTree, bodies: dict[str, str], tool: str) -> None:
 
     :raises ParameterError: such joints, with the joints at which they can be cut out.
     """
-    joints = [joint for joint in tree.joints.values() if joint.type != "free"]
-    ends = {joint.name: (joint.parent, joint.child) for joint in joints}
-    ends |= {closure.name: closure.links for closure in tree.closures}
-    pairs = {name: (bodies[a], bodies[b]) for name, (a, b) in ends.items()}
+    joints = [joint for joint in tree.joints.values() if joint.kind != "free"]
+    joints += tree.closures
+    pairs = {joint.name: (bodies[joint.inner], bodies[joint.outer]) for joint in joints}
     pairs = {name: pair for name, pair in pairs.items() if pair[0] != pair[1]}
     target = {GROUND, bodies[tool]}
     every = [*pairs.values(), (GROUND, bodies[tool])]
@@ -186,18 +182,23 @@ def _require_moving(tree: LoopTree, bodies: dict[str, str], tool: str) -> None:
 def _left_out(tree: LoopTree) -> list[str]:
     """Of friction and rotors in joints that the engine has none for."""
     found = []
-    parts: list[Joint | Closure] = [*tree.joints.values(), *tree.closures]
-    for part in parts:
+    for part in (*tree.joints.values(), *tree.closures):
         values = {
             "damping": part.viscous,
             "friction": part.coulomb,
-            "rotor inertia": getattr(part, "rotor_inertia", 0.0),
+            "rotor inertia": part.rotor_inertia,
         }
-        if part.type not in (*SINGLE, "fixed"):
+        if part.kind not in (*SINGLE, "fixed"):
             found += [f"{key} {value:g} of {part.name}" for key, value in values.items() if value]
     if not found:
         return []
     return [f"ignored, because the joint has several degrees of freedom: {', '.join(found)}"]
+
+
+def _seen(assembly: Assembly, ground: str) -> dict[str, Pose]:
+    """What moves each link from where it is drawn to its place in the base's axes."""
+    view = (assembly.moves[ground] @ assembly.tree.links[ground].frame).inverse()
+    return {name: view @ move for name, move in assembly.moves.items()}
 
 
 def _description(
@@ -205,39 +206,29 @@ def _description(
 ) -> dict[str, Any]:
     """The machine at the placed values.
 
-    :param values: of the joints, shape (steps,); without them all are zero.
+    :param values: of the joints since they were drawn, shape (steps,); without them all are zero.
     """
-    urdf = assembly.urdf
-    view = assembly.links[ground].inverse()
+    tree, moves = assembly.tree, _seen(assembly, ground)
     at = np.zeros(len(assembly.steps)) if values is None else values
     home = dict(zip(assembly.steps, at.tolist(), strict=True))
-    axes: dict[str, list[Array]] = {}
-    for name, axis in zip(assembly.steps, assembly.axes, strict=True):
-        axes.setdefault(name, []).append(view.rotation @ axis)
-    places = {name: view @ pose for name, pose in assembly.links.items()}
-    joints: dict[str, Any] = {}
-    passive = [n for n, j in urdf.joints.items() if j.type != "fixed" and n not in urdf.actuated]
-    for name in (*urdf.actuated, *passive):
-        joint = urdf.joints[name]
-        if joint.type == "free":
-            continue
-        joints[name] = _joint(joint, bodies, places, axes[name], home[name], name in urdf.actuated)
-    for closure in urdf.closures:
-        if bodies[closure.links[0]] != bodies[closure.links[1]]:
-            joints[closure.name] = _closure(closure, bodies, view @ assembly.frame(closure, 0))
-            if closure.axes is not None and closure.type == "universal":
-                second = view @ assembly.frame(closure, 1)
-                joints[closure.name]["axes"][1] = _snapped(second.rotation @ closure.axes[1])
+    passive = [n for n, j in tree.joints.items() if j.kind != "fixed" and n not in tree.actuated]
+    joints = [tree.joints[name] for name in (*tree.actuated, *passive)]
+    joints += [one for one in tree.closures if bodies[one.inner] != bodies[one.outer]]
     gravity = {}
-    if urdf.gravity is not None:
-        gravity = {"gravity": _snapped(view.rotation @ urdf.gravity)}
+    if tree.gravity is not None:
+        view = moves[tree.root]
+        gravity = {"gravity": _snapped(view.rotation @ tree.gravity)}
     return {
         "mechanism": "machine",
         **gravity,
         "platform": bodies[tool],
-        "origin": _snapped(places[tool].position),
-        "bodies": _masses(urdf, bodies, places),
-        "joints": joints,
+        "origin": _snapped(moves[tool].point(tree.links[tool].frame.position)),
+        "bodies": _masses(tree, bodies, moves),
+        "joints": {
+            joint.name: _joint(joint, bodies, moves, home, joint.name in tree.actuated)
+            for joint in joints
+            if joint.kind != "free"
+        },
     }
 
 
@@ -259,27 +250,27 @@ def _take(data: dict[str, Any], home: Home, graph: Graph) -> None:
                 joint["axis"] = axes[0]
 
 
-def _platform(urdf: LoopTree, asked: str | None) -> str:
+def _platform(tree: LoopTree, asked: str | None) -> str:
     if asked is not None:
-        return urdf_xml.known_link("platform", asked, urdf.links)
-    lower = {name.lower(): name for name in urdf.links}
+        return urdf_xml.known_link("platform", asked, tree.links)
+    lower = {name.lower(): name for name in tree.links}
     for name in PLATFORMS:
         if name in lower:
             return lower[name]
     raise ParameterError(
-        "platform", None, f"the link that carries the tool, one of {', '.join(sorted(urdf.links))}"
+        "platform", None, f"the link that carries the tool, one of {', '.join(sorted(tree.links))}"
     )
 
 
-def _bodies(urdf: LoopTree, order: list[Joint], tool: str, ground: str) -> dict[str, str]:
+def _bodies(tree: LoopTree, tool: str, ground: str) -> dict[str, str]:
     """Each link's body, named by its link nearest to the root; the tool's is named by the tool.
 
     :raises ParameterError: the tool is fixed to the ground.
     """
-    group = {name: name for name in urdf.links}
-    for joint in order:
-        if joint.type == "fixed":
-            group[joint.child] = group[joint.parent]
+    group = {name: name for name in tree.links}
+    for joint, parent, child in tree.hung:
+        if joint.kind == "fixed":
+            group[child] = group[parent]
     if group[tool] == group[ground]:
         raise ParameterError("platform", tool, "a link that can move")
     names, taken = {group[ground]: GROUND}, {GROUND}
@@ -293,83 +284,60 @@ def _bodies(urdf: LoopTree, order: list[Joint], tool: str, ground: str) -> dict[
 def _joint(
     joint: Joint,
     bodies: dict[str, str],
-    places: dict[str, Pose],
-    axes: list[Array],
-    home: float,
+    moves: dict[str, Pose],
+    home: dict[str, float],
     actuated: bool,
 ) -> dict[str, Any]:
     data: dict[str, Any] = {
-        "type": joint.type,
-        "between": [bodies[joint.parent], bodies[joint.child]],
-        "at": _snapped((places[joint.parent] @ joint.origin).position),
+        "type": joint.kind,
+        "between": [bodies[joint.inner], bodies[joint.outer]],
+        "at": _snapped(moves[joint.inner].point(joint.at)),
     }
-    if joint.type == "universal":
-        data["axes"] = [_snapped(axis) for axis in axes]
-    elif joint.type != "spherical":
-        data["axis"] = _snapped(axes[0])
-        if joint.pitch:
-            data["lead"] = joint.pitch * TURN
-        if actuated:
-            data["actuated"] = True
-        value = round(home, 14) + 0.0
-        if value != 0.0 or (actuated and joint.type == "prismatic"):
+    axes = [
+        _snapped(moves[end].rotation @ axis)
+        for end, axis in zip((joint.inner, joint.outer), joint.axes, strict=False)
+    ]
+    if joint.type.count == 2:
+        data["axes"] = axes
+    elif axes:
+        data["axis"] = axes[0]
+    if joint.pitch:
+        data["lead"] = joint.pitch * TURN
+    if actuated:
+        data["actuated"] = True
+    if joint.kind in SINGLE:
+        value = round(home.get(joint.name, 0.0) + joint.drawn, 14) + 0.0
+        if value != 0.0 or (actuated and joint.kind == "prismatic"):
             data["home"] = value
+        if joint.viscous > 0.0 or joint.coulomb > 0.0:
+            data["friction"] = {"viscous": joint.viscous, "coulomb": joint.coulomb}
+        if joint.rotor_inertia > 0.0:
+            data["rotor_inertia"] = joint.rotor_inertia
     if actuated and joint.limits:
         data["limits"] = joint.limits
-    data |= _friction(joint, data)
     if actuated and joint.offset:
         data["friction"] = {"viscous": 0.0, "coulomb": 0.0, **data.get("friction", {})}
         data["friction"]["offset"] = joint.offset
-    if "axis" in data and joint.rotor_inertia > 0.0:
-        data["rotor_inertia"] = joint.rotor_inertia
     return data
 
 
-def _friction(part: Joint | Closure, data: dict[str, Any]) -> dict[str, Any]:
-    """The entry of a joint of one freedom that has friction."""
-    if data["type"] in SINGLE and (part.viscous > 0.0 or part.coulomb > 0.0):
-        return {"friction": {"viscous": part.viscous, "coulomb": part.coulomb}}
-    return {}
-
-
-def _closure(closure: Closure, bodies: dict[str, str], place: Pose) -> dict[str, Any]:
-    data: dict[str, Any] = {
-        "type": closure.type,
-        "between": [bodies[link] for link in closure.links],
-        "at": _snapped(place.position),
-    }
-    if closure.axes is not None:
-        first = _snapped(place.rotation @ closure.axes[0])
-        if closure.type == "universal":
-            data["axes"] = [first, first]
-        else:
-            data["axis"] = first
-    return data | _friction(closure, data)
-
-
 def _masses(
-    urdf: LoopTree, bodies: dict[str, str], places: dict[str, Pose]
+    tree: LoopTree, bodies: dict[str, str], moves: dict[str, Pose]
 ) -> dict[str, dict[str, Any]]:
     """Masses, centres (m) and inertias about them of all bodies but the ground, base axes."""
     result: dict[str, dict[str, Any]] = {}
-    members: dict[str, list[Link]] = {body: [] for body in bodies.values() if body != GROUND}
-    for link in urdf.links.values():
-        if bodies[link.name] != GROUND:
-            members[bodies[link.name]].append(link)
-    for body, links in members.items():
-        centres = [
-            places[link.name].rotation @ link.com + places[link.name].position for link in links
+    for body in dict.fromkeys(body for body in bodies.values() if body != GROUND):
+        links = [
+            link.moved(moves[name]) for name, link in tree.links.items() if bodies[name] == body
         ]
         mass = sum(link.mass for link in links)
-        com = centres[0]
+        com = links[0].com
         if mass > 0.0:
-            com = sum(
-                (link.mass / mass * c for link, c in zip(links, centres, strict=True)), np.zeros(3)
-            )
+            com = sum((link.mass / mass * link.com for link in links), np.zeros(3))
         inertia = np.zeros((3, 3))
-        for link, centre in zip(links, centres, strict=True):
-            rotation, arm = places[link.name].rotation, centre - com
-            inertia += rotation @ link.inertia @ rotation.T
+        for link in links:
+            arm = link.com - com
+            inertia += link.inertia
             inertia += link.mass * (arm @ arm * np.eye(3) - np.outer(arm, arm))
         result[body] = {"mass": mass, "com": _snapped(com), "inertia": _moments(inertia)}
     return result

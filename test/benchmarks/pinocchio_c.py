@@ -19,7 +19,7 @@ from delta_dynamics import inverse_dynamics
 from pkm_twin import load
 from pkm_twin.export.c_package import c_package
 from pkm_twin.machine.joints import across
-from pkm_twin.machine.simulated import hang
+from pkm_twin.machine.mjcf_write import rows
 from pkm_twin.machine.tree import axes_with_z
 from pkm_twin.machine.urdf_write import GROUND
 from pkm_twin.robot.catalogue import robot_of_data
@@ -51,50 +51,51 @@ def description(robot):
     tree = robot_tree(robot)
     places = {GROUND: (0, np.eye(4))}
     joints, inertias, numbers, home = [], [], {}, []
-    for link in hang(tree):
-        index, above = places[link.parent]
-        for joint in link.joints:
-            here = frame(axes_with_z(joint.axis, across(joint.axis)[0]), joint.point)
+    for parent, child, row in rows(tree):
+        index, above = places[parent]
+        for part in row:
+            here = frame(axes_with_z(part.axis, across(part.axis)[0]), part.joint.at)
             zero = here.copy()
-            c, s = np.cos(joint.home), np.sin(joint.home)
-            if joint.type == "revolute":
+            c, s = np.cos(part.home), np.sin(part.home)
+            if part.kind == "revolute":
                 zero[:3, :3] = here[:3, :3] @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
             else:
-                zero[:3, 3] -= joint.home * joint.axis
+                zero[:3, 3] -= part.home * part.axis
             at = np.linalg.inv(above) @ zero
-            kind = "R" if joint.type == "revolute" else "P"
+            kind = "R" if part.kind == "revolute" else "P"
             joints.append(f"{index} {kind} {flat(at[:3, :3], at[:3, 3])}")
             index, above = len(joints), here
-            numbers[joint.name] = index - 1
-            home.append(joint.home)
-        places[link.name] = index, above
-        if link.body.mass and index:
+            numbers[part.name] = index - 1
+            home.append(part.home)
+        places[child] = index, above
+        link = tree.links[child]
+        if link.mass and index:
             turned = above[:3, :3]
-            com = turned.T @ (link.body.com - above[:3, 3])
-            about = turned.T @ link.body.inertia @ turned
-            inertias.append(f"{index} {flat([link.body.mass], com, about)}")
+            com = turned.T @ (link.com - above[:3, 3])
+            about = turned.T @ link.inertia @ turned
+            inertias.append(f"{index} {flat([link.mass], com, about)}")
     points, angles = [], []
     for closure in tree.closures:
-        ends = [places[closure.parent], places[closure.child]]
-        local = [(np.linalg.inv(above) @ [*closure.point, 1.0])[:3] for _, above in ends]
+        ends = [places[closure.inner], places[closure.outer]]
+        local = [(np.linalg.inv(above) @ [*closure.at, 1.0])[:3] for _, above in ends]
         points += [f"{index} {flat(at)}" for (index, _), at in zip(ends, local, strict=True)]
         pairs = []
-        if closure.type == "universal":
+        if closure.kind == "universal":
             pairs = [closure.axes]
-        elif closure.type == "revolute":
+        elif closure.kind == "revolute":
             pairs = [(e, closure.axes[0]) for e in across(closure.axes[0])]
-        elif closure.type != "spherical":
-            raise ValueError(closure.type)
+        elif closure.kind != "spherical":
+            raise ValueError(closure.kind)
         for first, second in pairs:
             sides = [
                 f"{index} {flat(above[:3, :3].T @ axis)}"
                 for (index, above), axis in zip(ends, (first, second), strict=True)
             ]
             angles.append(f"{' '.join(sides)} {float(first @ second)!r}")
-    rows = [str(len(joints)), *joints, str(len(inertias)), *inertias, flat(robot.gravity)]
-    rows += [str(len(points) // 2), *points, str(len(angles)), *angles]
-    rows += [str(robot.joints_count), *(str(numbers[name]) for name in tree.actuated)]
-    return [*rows, flat(home)]
+    lines = [str(len(joints)), *joints, str(len(inertias)), *inertias, flat(robot.gravity)]
+    lines += [str(len(points) // 2), *points, str(len(angles)), *angles]
+    lines += [str(robot.joints_count), *(str(numbers[name]) for name in tree.actuated)]
+    return [*lines, flat(home)]
 
 
 def path(robot):

@@ -3,15 +3,12 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-
 import numpy as np
 
-from pkm_twin.kinematics.passive import single_joints
 from pkm_twin.machine.graph import Body, Graph, Joint, Rod, array
+from pkm_twin.machine.loop_tree import singles
 from pkm_twin.machine.tree import Tree
-from pkm_twin.machine.urdf_write import UrdfBody, UrdfDrive
-from pkm_twin.robot.urdf_tree import urdf_tree
+from pkm_twin.robot.robot_urdf import graph_tree
 
 
 def turned(angle, vector):
@@ -235,24 +232,15 @@ def graph_of(data):
 def tree_of(data):
     """The tree that is written, its single joints' names and their values at home."""
     graph = graph_of(data)
-    tree = Tree(graph)
-    axes = single_joints(SimpleNamespace(graph=graph, tree=tree))
     drives = {}
     for name, j in data["joints"].items():
         if j.get("actuated"):
-            limits, friction = j.get("limits", {}), j.get("friction", {})
-            position = limits.get("position")
-            drives[name] = UrdfDrive(
-                None if position is None else tuple(position),
-                limits.get("velocity"),
-                limits.get("effort"),
-                friction.get("viscous", 0.0),
-                friction.get("coulomb", 0.0),
-            )
+            drives[name] = {"limits": j.get("limits", {}), **j.get("friction", {})}
     load = data.get("payload")
     if load is not None:
-        load = UrdfBody("payload", load["mass"], array(load["com"]), np.diag(load["inertia"]))
-    written = urdf_tree(graph, axes, tree.cut, "machine", drives=drives, payload=load)
-    names = [axis.name for axis in axes if axis.kind]
-    homes = [data["joints"].get(name, {}).get("home", 0.0) for name in names]
-    return written, names, np.array(homes)
+        load = Body("payload", load["mass"], array(load["com"]), np.diag(load["inertia"]))
+    written = graph_tree(graph, Tree(graph), "machine", drives, load)
+    parts = [
+        part for hung in written.hung for part in singles(*hung, set()) if part.kind != "fixed"
+    ]
+    return written, [part.name for part in parts], np.array([part.home for part in parts])

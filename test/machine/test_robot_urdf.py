@@ -15,7 +15,7 @@ from pkm_twin import robot_names
 from pkm_twin.errors import ParameterError
 from pkm_twin.machine import urdf_file, urdf_xml
 from pkm_twin.mechanisms.machine import Machine
-from pkm_twin.robot import urdf_tree
+from pkm_twin.robot import robot_urdf as writing
 from pkm_twin.robot.catalogue import robot_of_data
 from pkm_twin.robot.robot_urdf import joint_names, robot_description, robot_urdf
 from pkm_twin.robot.urdf_read import read_urdf
@@ -76,15 +76,17 @@ def test_the_platform_stands_where_the_robot_says_and_all_loops_are_closed(robot
     model = pin.buildModelFromUrdf(str(path))
     assert model.nq == model.nv == len(robot.joint_names) + len(robot.passive_joints)
     ends = []
-    for closure in urdf_file.read(path, urdf_xml.elements(path)).closures:
+    tree = urdf_file.read(path, urdf_xml.elements(path))
+    for closure in tree.closures:
         pair = []
-        for link, at in zip(closure.links, closure.frames, strict=True):
+        for link, drawn in zip((closure.inner, closure.outer), closure.frames, strict=True):
+            at = tree.links[link].frame.inverse() @ drawn
             body = model.frames[model.getFrameId(link, pin.BODY)]
             place = body.placement * pin.SE3(at.rotation, at.position)
             frame = pin.Frame(f"{closure.name}_{link}", body.parentJoint, place, pin.OP_FRAME)
             pair.append(model.addFrame(frame))
-        axis = None if closure.axes is None else closure.axes[0]
-        ends.append((closure.type, *pair, axis))
+        axis = closure.frames[0].rotation.T @ closure.axes[0] if len(closure.axes) else None
+        ends.append((closure.kind, *pair, axis))
     assert ends
     data = model.createData()
     position, rotation = robot.platform(states)
@@ -214,7 +216,7 @@ def test_links_need_no_quoting_and_their_old_names_are_found(robot, tmp_path):
     ],
 )
 def test_a_link_s_name_is_plain_and_its_own(names, links):
-    found = urdf_tree._link_names(names)
+    found = writing._link_names(names)
     assert tuple(found[name] for name in names) == links
 
 

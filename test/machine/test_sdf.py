@@ -359,6 +359,24 @@ def test_what_stands_in_the_world_is_the_same_machine(way, tmp_path):
     )
 
 
+def test_a_joint_of_the_world_may_be_called_as_one_of_the_model(tmp_path):
+    right = load(five_bar(tmp_path), platform="tool")
+    limit = "<xyz>0 0 1</xyz><limit><effort>5</effort></limit></axis></joint>"
+    path = five_bar(tmp_path, motors="")
+    text = path.read_text().replace("<xyz>0 0 1</xyz></axis></joint>", limit)
+    own = M1.replace("<xyz>0 0 1</xyz></axis></joint>", limit)
+    assert own in text
+    text = text.replace(own, "").replace("<static>1</static>", '<static>1</static><link name="g"/>')
+    own = own.replace("m1", "e1").replace("world", "ground::g").replace(">arm", ">five_bar::arm")
+    path.write_text(text.replace(MODEL, own + MODEL))
+    found = load(path, platform="tool")
+    assert found.joint_names == ("m2", "e1_of_world")
+    motion = random_motion(right, np.random.default_rng(8), 3)
+    np.testing.assert_allclose(
+        inverse_dynamics(found, *motion), inverse_dynamics(right, *motion), 1e-8, 1e-10
+    )
+
+
 @pytest.mark.parametrize(("limit", "right"), [
     ("<lower>-1</lower>", [-1.0, TURN]), ("<upper>1</upper>", [-TURN, 1.0]),
     ("<lower>-1</lower><upper>2</upper>", [-1.0, 2.0]), ("<effort>3</effort>", None),
