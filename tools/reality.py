@@ -12,11 +12,11 @@ from scipy.optimize import least_squares
 
 from pkm_twin import Robot, load
 from pkm_twin.apps.drive_friction import GRAVITY
-from pkm_twin.apps.pose_table import read_poses
 from pkm_twin.identification.calibration import HELD_OUT, Calibration, Errors, calibrate, geometric
 from pkm_twin.identification.calibration_state import Poses, rotations
 from pkm_twin.identification.hanging_mass import drive_friction, lines
-from pkm_twin.recordings import read_table
+from pkm_twin.identification.pose_tables import read_poses
+from pkm_twin.recordings import Dialect, read_table
 
 Array = NDArray[np.float64]
 
@@ -95,7 +95,7 @@ def lengths(robot: Robot, found: Calibration, poses: Poses) -> Array:
 
 def recorded(robot: Robot) -> Poses:
     """The grid, z from the base."""
-    poses = read_poses(DATA / "grid_180x180.csv", robot, unit="mm")
+    poses = read_poses(DATA / "grid_180x180.csv", robot, Dialect(units={"length": "mm"}))
     return Poses(poses.joints, poses.position + np.array([0.0, 0.0, HOME]), poses.rotation)
 
 

@@ -103,8 +103,10 @@ class ReadsTables:
 
     separator: str | None = setting(None, "of a table's columns: , ; or tab; default: found")
     decimal: str | None = setting(None, "of a table's numbers: . or ,")
-    columns: str | None = setting(
-        None, "names of a table's columns, OURS=THEIRS,...: time=t,arm_1.position=q1"
+    columns: tuple[str, ...] = setting(
+        (),
+        "names of a table's columns, OURS=THEIRS,...: time=t,arm_1.position=q1; * in both stands "
+        "for the same text; may be repeated",
     )
     units: str | None = setting(None, "of a table: of rad, deg, m, mm, s, ms, us; default SI")
     time: str | None = setting(None, "name of a table's column of times")

@@ -17,10 +17,10 @@ from bags.recording.capture import machine_parameters
 from bags.recording.record_poses import NOISE, OFFSETS, SHIFTS, TURNS, record
 from pkm_twin import Robot
 from pkm_twin.apps.cli import app
-from pkm_twin.apps.pose_table import read_poses
 from pkm_twin.errors import ParameterError
 from pkm_twin.identification.calibration import calibrate, geometric
 from pkm_twin.identification.calibration_state import Poses
+from pkm_twin.identification.pose_tables import read_poses
 from pkm_twin.robot.entries import entries, with_entries
 from test.support.robots import load, random_joints
 

@@ -16,13 +16,14 @@ from typer.testing import CliRunner
 
 from pkm_twin import Robot
 from pkm_twin.apps.cli import app
-from pkm_twin.apps.pose_table import parse_columns, read_poses
 from pkm_twin.errors import ParameterError
 from pkm_twin.identification.calibration import HELD_OUT, calibrate, geometric
 from pkm_twin.identification.calibration_state import Poses
+from pkm_twin.identification.pose_tables import read_poses
 from pkm_twin.identification.transmission import Transmission
 from pkm_twin.machine.joint_map import JointMap, JointMapEntry
 from pkm_twin.messages.reading import JointReader
+from pkm_twin.recordings import Dialect
 from pkm_twin.robot.entries import data_of, with_entries
 from test.support.robots import load, partly_long, random_joints
 from tools.reality import BALL, FOOT, fit_a_leg, leg_poses
@@ -140,13 +141,11 @@ def test_tables_are_read_as_recordings_have_them(tmp_path: Path, how: str) -> No
     robot = load(EXAMPLES / "hexapod.yaml")
     path = recording(tmp_path)
     raw = np.genfromtxt(path, delimiter=",", names=True)
-    columns: dict[str, str] = {}
+    columns: list[str] = []
     unit = "mm"
     if how == "named":
-        columns = parse_columns(
-            ["leg_*.position=leg_length_*,x=meas_pos_x [mm],y=meas_pos_y [mm]",
-             "z=meas_pos_z [mm], q*=meas_ori_*"]
-        )  # fmt: skip
+        columns = ["leg_*.position=leg_length_*,x=meas_pos_x [mm],y=meas_pos_y [mm]",
+                   "z=meas_pos_z [mm], q*=meas_ori_*"]  # fmt: skip
         unit = "m"
     elif how == "headers with units":
         head, *rows = path.read_text().splitlines()
@@ -159,7 +158,7 @@ def test_tables_are_read_as_recordings_have_them(tmp_path: Path, how: str) -> No
         head = head.replace("meas_ori_", "q").replace("cmd_", "wanted_cmd_")
         path.write_text("\n".join([head, *rows]))
         unit = "m"
-    poses = read_poses(path, robot, columns, unit)
+    poses = read_poses(path, robot, Dialect.of(columns=columns, units=unit))
     assert poses.joints[:, 3] == pytest.approx(raw["leg_length_4"])
     assert poses.position[:, 1] == pytest.approx(1e-3 * raw["meas_pos_y"])
     turn = Rotation.from_quat(np.stack([raw[f"meas_ori_{c}"] for c in "xyzw"], -1))
@@ -181,7 +180,7 @@ def test_micrometres_have_two_spellings(tmp_path: Path, header: str) -> None:
 def test_columns_that_there_are_not_are_rejected(tmp_path: Path, columns: list[str]) -> None:
     path = recording(tmp_path)
     with pytest.raises(ParameterError):
-        read_poses(path, load(EXAMPLES / "hexapod.yaml"), parse_columns(columns))
+        read_poses(path, load(EXAMPLES / "hexapod.yaml"), Dialect.of(columns=columns))
 
 
 @pytest.mark.parametrize("how", ["shared", "travel"])

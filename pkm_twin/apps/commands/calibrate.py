@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from textwrap import fill
@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from pkm_twin.apps.frame import command
-from pkm_twin.apps.options import Accepts, BeyondLimitsToo, OfRobot, Overwrites
-from pkm_twin.apps.pose_table import LENGTHS, parse_columns, read_measured, read_poses
+from pkm_twin.apps.options import Accepts, BeyondLimitsToo, OfRobot, Overwrites, ReadsTables
 from pkm_twin.console import progress, refuse_existing
 from pkm_twin.errors import ParameterError, UnknownNameError, one_line
 from pkm_twin.files import replace_file
@@ -21,9 +20,10 @@ from pkm_twin.identification.calibration import Calibration, Estimate, Scale, ge
 from pkm_twin.identification.calibration import calibrate as calibrated
 from pkm_twin.identification.calibration_fit import STEPS
 from pkm_twin.identification.calibration_state import BESIDE, Poses
-from pkm_twin.identification.measurements import KINDS, Measured, kinds_of
+from pkm_twin.identification.measurements import KINDS, Kind, Measured, kinds_of
 from pkm_twin.identification.plan import MOST, Plan
 from pkm_twin.identification.plan import plan as plan_of
+from pkm_twin.identification.pose_tables import read_measured, read_poses
 from pkm_twin.identification.transmission import Transmission, written
 from pkm_twin.report import Column, Fact, Report, Table
 from pkm_twin.robot.edited import Fitted, edited_yaml, write_edited
@@ -42,7 +42,7 @@ STEPS_SHOWN: Final = (0, 1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Calibrate(OfRobot, BeyondLimitsToo, Accepts, Overwrites):
+class Calibrate(OfRobot, ReadsTables, BeyondLimitsToo, Accepts, Overwrites):
     """Fit a robot's geometry and joint offsets to poses that an instrument measured.
 
     A robust least-squares fit with the machine's closures. A pose that does not fit the others gets
@@ -85,11 +85,11 @@ class Calibrate(OfRobot, BeyondLimitsToo, Accepts, Overwrites):
     )
     columns: tuple[str, ...] = setting(
         (),
-        "NAME=HEADER of columns with other headers, separated by commas: "
-        "'leg_*.position=motor_*, x=pos_x [mm]'; may be repeated",
+        "names of a table's columns, OURS=THEIRS,...: 'leg_*.position=motor_*, x=pos_x [mm]'; may "
+        "be repeated",
     )
-    units: str = setting(
-        "m", "of x, y and z where their headers have none", choices=tuple(LENGTHS),
+    units: str | None = setting(
+        None, "of columns without one: of m, cm, mm, µm (um), rad, mrad, deg; default SI",
         older=("--unit",),
     )  # fmt: skip
     measure: tuple[str, ...] = setting(
@@ -136,14 +136,9 @@ def calibrate(given: Calibrate) -> Report:
         refuse_existing(out, given.overwrite, given.poses)
     machine = given.machine()
     kinds = kinds_of(given.measure or (["position"] if given.plan else []))
-    known, named = parse_noise(given.noise), parse_columns(given.columns)
-    measured: Poses | Measured | None = None
-    if given.poses is None:
-        pass
-    elif kinds:
-        measured = read_measured(given.poses, machine, kinds, known, named, given.units)
-    else:
-        measured = read_poses(given.poses, machine, named, given.units)
+    known, measured = parse_noise(given.noise), None
+    if given.poses is not None:
+        measured = _read(given, machine, kinds, known)
     notes = []
     if measured is not None:
         q = machine.controller.positions(measured.joints)
@@ -182,6 +177,15 @@ def calibrate(given: Calibrate) -> Report:
     head += [f"Outlier, with a small weight: {one}." for one in result.outliers]
     write_edited(out, [*head, *marks], edited_yaml(machine, given.robot, values))
     return report_of(machine, source, result, notes, marks, out)
+
+
+def _read(
+    given: Calibrate, machine: Robot, kinds: Sequence[Kind], noise: Mapping[str, float]
+) -> Poses | Measured:
+    assert given.poses is not None  # noqa: S101  the caller asks
+    if kinds:
+        return read_measured(given.poses, machine, kinds, noise, given.dialect)
+    return read_poses(given.poses, machine, given.dialect)
 
 
 def _fitted(machine: Robot, result: Calibration, source: str) -> dict[str, Fitted]:
