@@ -67,7 +67,8 @@ class Assembly:
         self.size = extent if extent > 1e-6 else 1.0
 
     def place(self, values: Array) -> None:
-        """Set ``moves`` for the steps' values, shape (count,)."""
+        """Set ``values`` of the steps, shape (count,), and ``moves``."""
+        self.values = values
         self.moves = {self.tree.root: Pose()}
         sines, lacks = np.sin(values).tolist(), (1.0 - np.cos(values)).tolist()
         axes: list[Array] = []

@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
@@ -23,7 +23,6 @@ from pkm_twin.kinematics.singularity import singularity_at_home
 from pkm_twin.kinematics.spins import hold, without_spins
 from pkm_twin.machine.assembly import EXACT, Assembly
 from pkm_twin.machine.graph import Graph
-from pkm_twin.machine.graph_file import graph_of_entries, written_out
 
 DRAWN: Final = 0.1
 """A closed assembly is as drawn where no joint is farther from zero, rad or parts of the size."""
@@ -79,11 +78,11 @@ class Home:
 class HomeSearch:
     """Looks for the home of an assembly.
 
-    :param describe: the description of the machine at the assembly's placed values, no spin held.
+    :param graph: gives the machine at the assembly's placed values, no spin held.
     """
 
-    def __init__(self, assembly: Assembly, describe: Callable[[], dict[str, Any]]) -> None:
-        self.assembly, self.describe = assembly, describe
+    def __init__(self, assembly: Assembly, graph: Callable[[], Graph]) -> None:
+        self.assembly, self.graph = assembly, graph
         tree, steps = assembly.tree, assembly.steps
         self.held = np.array([name in tree.actuated for name in steps], bool)
         self.turns = assembly.turns
@@ -237,14 +236,12 @@ class HomeSearch:
     def _home(self, values: Array, miss: float, how: str) -> Home:
         self.assembly.place(values)
         try:
-            data = self.describe()
-            graph = graph_of_entries(data, written_out(data)[0])
             settled = self._settle(
-                graph, max(ROUNDED[2], 10 * miss, 20 * self.assembly.tree.accuracy)
+                self.graph(), max(ROUNDED[2], 10 * miss, 20 * self.assembly.tree.accuracy)
             )
             index = 0.0 if settled is None else singularity_at_home(settled[0])
         except (ParameterError, SingularityError, np.linalg.LinAlgError):
-            # The description is looked at again by whoever makes a robot of it.
+            # The machine is looked at again by whoever makes a robot of it.
             settled, index = None, 0.0
         sound, held, rounding = settled or (None, {}, 0.0)
         return Home(values, miss, how, self.place, sound, held, rounding, index)

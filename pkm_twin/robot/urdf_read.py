@@ -12,15 +12,16 @@ import numpy as np
 
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError, warn
+from pkm_twin.machine import graph as graphs
 from pkm_twin.machine import mjcf_file, sdf_file, urdf_file, urdf_xml
 from pkm_twin.machine.assembly import EXACT, Assembly
 from pkm_twin.machine.graph import Graph, groups
-from pkm_twin.machine.joints import TURN
+from pkm_twin.machine.graph_description import graph_description
 from pkm_twin.machine.loop_tree import SINGLE, Joint, LoopTree
 from pkm_twin.machine.rotations import Pose
 from pkm_twin.machine.urdf_control import take_drives
 from pkm_twin.machine.urdf_visuals import Visual, visuals
-from pkm_twin.robot.urdf_home import Home, HomeSearch
+from pkm_twin.robot.urdf_home import HomeSearch
 
 PLATFORMS: Final = (
     "platform",
@@ -103,27 +104,26 @@ def read_tree(
     assembly = Assembly(tree)
     bodies = _bodies(tree, tool, ground)
     _require_moving(tree, bodies, tool)
-    home = HomeSearch(assembly, lambda: _description(assembly, bodies, tool, ground)).home()
+    home = HomeSearch(assembly, lambda: _graph(assembly, bodies, tool, ground)).home()
     assembly.place(home.values)
-    data = _description(assembly, bodies, tool, ground, home.values)
+    graph = home.graph or _graph(assembly, bodies, tool, ground)
+    data = _description(assembly, graph, ground)
     notes = _left_out(tree)
     if home.miss > EXACT:
         notes.append(f"the loops close within {home.miss:.1g} only (m or rad)")
-    if home.graph is not None:
-        _take(data, home, home.graph)
-        if home.rounding:
-            notes.append(
-                f"axes and points were moved by up to {home.rounding:.1g} (rad, or parts of the "
-                "machine's size), so that the machine can move: the file is rounded"
-            )
-        if home.held:
-            notes.append(f"held, as they only let a part spin about itself: {', '.join(home.held)}")
-        heavy = {name: value for name, value in home.held.items() if value > BALANCED}
-        if heavy:
-            notes.append(
-                "efforts depend on the angle at which parts with their mass off the axis are held: "
-                + ", ".join(f"{name} ({value:.3g} kg m)" for name, value in heavy.items())
-            )
+    if home.rounding:
+        notes.append(
+            f"axes and points were moved by up to {home.rounding:.1g} (rad, or parts of the "
+            "machine's size), so that the machine can move: the file is rounded"
+        )
+    if home.held:
+        notes.append(f"held, as they only let a part spin about itself: {', '.join(home.held)}")
+    heavy = {name: value for name, value in home.held.items() if value > BALANCED}
+    if heavy:
+        notes.append(
+            "efforts depend on the angle at which parts with their mass off the axis are held: "
+            + ", ".join(f"{name} ({value:.3g} kg m)" for name, value in heavy.items())
+        )
     if controller:
         data["joint_map"] = controller
     frames = {name: move @ tree.links[name].frame for name, move in _seen(assembly, ground).items()}
@@ -201,53 +201,53 @@ def _seen(assembly: Assembly, ground: str) -> dict[str, Pose]:
     return {name: view @ move for name, move in assembly.moves.items()}
 
 
-def _description(
-    assembly: Assembly, bodies: dict[str, str], tool: str, ground: str, values: Array | None = None
-) -> dict[str, Any]:
-    """The machine at the placed values.
+def _description(assembly: Assembly, graph: Graph, ground: str) -> dict[str, Any]:
+    """The graph of the placed machine with what the file tells beside."""
+    tree = assembly.tree
+    data = graph_description(graph)
+    if tree.gravity is not None:
+        gravity = _seen(assembly, ground)[tree.root].rotation @ tree.gravity
+        data["gravity"] = _snapped(gravity).tolist()
+    for name in tree.actuated:
+        joint, entry = tree.joints[name], data["joints"][name]
+        if joint.limits:
+            entry["limits"] = joint.limits
+        if joint.offset:
+            entry["friction"] = {"viscous": 0.0, "coulomb": 0.0, **entry.get("friction", {})}
+            entry["friction"]["offset"] = joint.offset
+    return data
 
-    :param values: of the joints since they were drawn, shape (steps,); without them all are zero.
-    """
+
+def _graph(assembly: Assembly, bodies: dict[str, str], tool: str, ground: str) -> Graph:
+    """The machine at the placed values."""
     tree, moves = assembly.tree, _seen(assembly, ground)
-    at = np.zeros(len(assembly.steps)) if values is None else values
-    home = dict(zip(assembly.steps, at.tolist(), strict=True))
+    home = dict(zip(assembly.steps, assembly.values.tolist(), strict=True))
     passive = [n for n, j in tree.joints.items() if j.kind != "fixed" and n not in tree.actuated]
     joints = [tree.joints[name] for name in (*tree.actuated, *passive)]
     joints += [one for one in tree.closures if bodies[one.inner] != bodies[one.outer]]
-    gravity = {}
-    if tree.gravity is not None:
-        view = moves[tree.root]
-        gravity = {"gravity": _snapped(view.rotation @ tree.gravity)}
-    return {
-        "mechanism": "machine",
-        **gravity,
-        "platform": bodies[tool],
-        "origin": _snapped(moves[tool].point(tree.links[tool].frame.position)),
-        "bodies": _masses(tree, bodies, moves),
-        "joints": {
-            joint.name: _joint(joint, bodies, moves, home, joint.name in tree.actuated)
-            for joint in joints
-            if joint.kind != "free"
-        },
-    }
 
+    def joint_of(joint: Joint) -> graphs.Joint:
+        ends = moves[joint.inner], moves[joint.outer]
+        axes = [e.rotation @ axis for e, axis in zip(ends, joint.axes, strict=False)]
+        axes = axes[: joint.type.count]
+        own = {}
+        if joint.kind in SINGLE:
+            value = round(home.get(joint.name, 0.0) + joint.drawn, 14) + 0.0
+            own = {key: getattr(joint, key) for key in ("viscous", "coulomb", "rotor_inertia")}
+            own |= {"home": value, "pitch": joint.pitch}
+        return graphs.Joint(
+            joint.name, joint.kind, bodies[joint.inner], bodies[joint.outer],
+            _snapped(ends[0].point(joint.at)), np.reshape([_snapped(a) for a in axes], (-1, 3)),
+            joint.name in tree.actuated, **own,
+        )  # fmt: skip
 
-def _take(data: dict[str, Any], home: Home, graph: Graph) -> None:
-    """Write the idealised places and axes of a home into a description, and what holds spins."""
-    for name, joint in data["joints"].items():
-        ideal = graph.joints[name]
-        if name in home.held:
-            joint = data["joints"][name] = {
-                "type": ideal.kind, **{k: joint[k] for k in ("between", "at")}
-            }  # fmt: skip
-        if home.rounding:
-            joint["at"] = _snapped(ideal.at)
-        if home.rounding or name in home.held:
-            axes = [_snapped(axis) for axis in ideal.axes]
-            if ideal.kind == "universal":
-                joint["axes"] = axes
-            elif axes:
-                joint["axis"] = axes[0]
+    return Graph(
+        _masses(tree, bodies, moves),
+        {joint.name: joint_of(joint) for joint in joints if joint.kind != "free"},
+        {},
+        bodies[tool],
+        _snapped(moves[tool].point(tree.links[tool].frame.position)),
+    )
 
 
 def _platform(tree: LoopTree, asked: str | None) -> str:
@@ -281,51 +281,11 @@ def _bodies(tree: LoopTree, tool: str, ground: str) -> dict[str, str]:
     return {link: names[first] for link, first in group.items()}
 
 
-def _joint(
-    joint: Joint,
-    bodies: dict[str, str],
-    moves: dict[str, Pose],
-    home: dict[str, float],
-    actuated: bool,
-) -> dict[str, Any]:
-    data: dict[str, Any] = {
-        "type": joint.kind,
-        "between": [bodies[joint.inner], bodies[joint.outer]],
-        "at": _snapped(moves[joint.inner].point(joint.at)),
-    }
-    axes = [
-        _snapped(moves[end].rotation @ axis)
-        for end, axis in zip((joint.inner, joint.outer), joint.axes, strict=False)
-    ]
-    if joint.type.count == 2:
-        data["axes"] = axes
-    elif axes:
-        data["axis"] = axes[0]
-    if joint.pitch:
-        data["lead"] = joint.pitch * TURN
-    if actuated:
-        data["actuated"] = True
-    if joint.kind in SINGLE:
-        value = round(home.get(joint.name, 0.0) + joint.drawn, 14) + 0.0
-        if value != 0.0 or (actuated and joint.kind == "prismatic"):
-            data["home"] = value
-        if joint.viscous > 0.0 or joint.coulomb > 0.0:
-            data["friction"] = {"viscous": joint.viscous, "coulomb": joint.coulomb}
-        if joint.rotor_inertia > 0.0:
-            data["rotor_inertia"] = joint.rotor_inertia
-    if actuated and joint.limits:
-        data["limits"] = joint.limits
-    if actuated and joint.offset:
-        data["friction"] = {"viscous": 0.0, "coulomb": 0.0, **data.get("friction", {})}
-        data["friction"]["offset"] = joint.offset
-    return data
-
-
 def _masses(
     tree: LoopTree, bodies: dict[str, str], moves: dict[str, Pose]
-) -> dict[str, dict[str, Any]]:
-    """Masses, centres (m) and inertias about them of all bodies but the ground, base axes."""
-    result: dict[str, dict[str, Any]] = {}
+) -> dict[str, graphs.Body]:
+    """All bodies but the ground, base axes."""
+    result: dict[str, graphs.Body] = {}
     for body in dict.fromkeys(body for body in bodies.values() if body != GROUND):
         links = [
             link.moved(moves[name]) for name, link in tree.links.items() if bodies[name] == body
@@ -339,21 +299,14 @@ def _masses(
             arm = link.com - com
             inertia += link.inertia
             inertia += link.mass * (arm @ arm * np.eye(3) - np.outer(arm, arm))
-        result[body] = {"mass": mass, "com": _snapped(com), "inertia": _moments(inertia)}
+        # Rounding left over by rotations is dropped.
+        inertia = (inertia + inertia.T) / 2
+        clean = np.where(np.abs(inertia) > 1e-14 * float(np.abs(inertia).max()), inertia, 0.0)
+        short = np.array([[float(f"{x:.15g}") for x in row] for row in clean.tolist()])
+        result[body] = graphs.Body(body, mass, _snapped(com), short)
     return result
 
 
-def _moments(inertia: Array) -> list[Any]:
-    """A diagonal as three numbers, else the matrix; rounding left over by rotations is dropped."""
-    inertia = (inertia + inertia.T) / 2
-    scale = float(np.abs(inertia).max())
-    clean = np.where(np.abs(inertia) > 1e-14 * scale, inertia, 0.0)
-    short = [[float(f"{x:.15g}") for x in row] for row in clean.tolist()]
-    if np.count_nonzero(clean - np.diag(np.diag(clean))) == 0:
-        return [short[i][i] for i in range(3)]
-    return short
-
-
-def _snapped(vector: Array) -> list[float]:
-    """A vector as a list without what rotations leave in the sixteenth digit."""
-    return [round(float(x), 14) + 0.0 for x in vector]
+def _snapped(vector: Array) -> Array:
+    """A vector without what rotations leave in the sixteenth digit."""
+    return np.array([round(float(x), 14) + 0.0 for x in vector])
