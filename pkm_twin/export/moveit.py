@@ -22,7 +22,8 @@ from numpy.typing import NDArray
 
 from delta_dynamics import inverse_dynamics, mass_matrix
 from pkm_twin.errors import ParameterError
-from pkm_twin.machine.urdf_write import GROUND, PLATFORM
+from pkm_twin.machine.loop_tree import LoopTree, Single
+from pkm_twin.machine.urdf_write import GROUND, PLATFORM, parts_of
 from pkm_twin.robot.clearance import distance
 from pkm_twin.robot.robot import Robot
 from pkm_twin.robot.robot_urdf import robot_tree, robot_urdf
@@ -51,11 +52,10 @@ def moveit_package(robot: Robot, kinematics: str = "") -> dict[str, str]:
             "joint_map", list(robot.controller.names), "none: MoveIt plans in the URDF's numbers"
         )
     name = re.sub(r"\W", "_", robot.name or robot.mechanism)
-    urdf = robot_urdf(robot, hardware="")
-    groups = srdf(robot, urdf)
+    groups = srdf(robot)
     package = f"{name}_moveit_config"
     texts = {
-        f"config/{name}.urdf": urdf,
+        f"config/{name}.urdf": robot_urdf(robot, hardware=""),
         f"config/{name}.srdf": groups,
         "config/joint_limits.yaml": _yaml(_joint_limits(robot, accelerations(robot))),
         "config/kinematics.yaml": _yaml(_kinematics(kinematics, f'name="{LIMB}"' in groups)),
@@ -83,18 +83,16 @@ def accelerations(robot: Robot) -> list[float]:
         return list(SHARE * np.maximum(limits - weight, 0.0) / inertia)
 
 
-def srdf(robot: Robot, urdf: str) -> str:
-    """Groups, passive joints, the home state, and the links that always touch.
-
-    :param urdf: the robot's, whose links and joints are named.
-    """
-    tree = ET.fromstring(urdf)  # noqa: S314, made here
-    root = ET.Element("robot", name=tree.get("name", ""))
+def srdf(robot: Robot) -> str:
+    """Groups, passive joints, the home state, and the links that always touch."""
+    tree = robot_tree(robot)
+    parts = parts_of(tree)
+    root = ET.Element("robot", name=tree.name)
     joints = list(robot.joint_names)
     group = ET.SubElement(root, "group", name=GROUP)
     for joint in joints:
         ET.SubElement(group, "joint", name=joint)
-    if _drives_of_chain(tree, joints):
+    if _drives_of_chain(parts, joints):
         limb = ET.SubElement(root, "group", name=LIMB)
         ET.SubElement(limb, "chain", base_link=GROUND, tip_link=PLATFORM)
     home = ET.SubElement(root, "group_state", name="home", group=GROUP)
@@ -105,54 +103,47 @@ def srdf(robot: Robot, urdf: str) -> str:
     )
     for joint in robot.passive_joints:
         ET.SubElement(root, "passive_joint", name=joint)
-    touching = dict.fromkeys(_touching(robot), "Default") | dict.fromkeys(_held(tree), "Adjacent")
+    touching = dict.fromkeys(_touching(tree), "Default")
+    touching |= dict.fromkeys(_held(tree, parts), "Adjacent")
     for (first, second), reason in touching.items():
         ET.SubElement(root, "disable_collisions", link1=first, link2=second, reason=reason)
     ET.indent(root)
     return '<?xml version="1.0"?>\n' + ET.tostring(root, encoding="unicode") + "\n"
 
 
-def _drives_of_chain(tree: ET.Element, actuated: Sequence[str]) -> list[str]:
+def _drives_of_chain(parts: Sequence[Single], actuated: Sequence[str]) -> list[str]:
     """Actuated joints between the ground and the platform."""
-    above = {_ends(joint)[1]: joint for joint in tree.findall("joint")}
+    above = {part.child: part for part in parts}
     found, link = [], PLATFORM
     while link in above:
-        found += [name] if (name := above[link].get("name", "")) in actuated else []
-        link = _ends(above[link])[0]
+        found += [above[link].name] if above[link].name in actuated else []
+        link = above[link].parent
     return found
 
 
-def _held(tree: ET.Element) -> list[tuple[str, str]]:
+def _held(tree: LoopTree, parts: Sequence[Single]) -> list[tuple[str, str]]:
     """Pairs of links that joints, or a loop that the tree cuts, hold together.
 
     A link without mass and shape stands between the axes of one joint: it joins its neighbours.
     """
-    pairs = [_ends(element) for tag in ("joint", "constraint") for element in tree.findall(tag)]
-    for link in tree.findall("link"):
-        mass = link.find("inertial/mass")
-        empty = mass is not None and float(mass.get("value", "0")) == 0.0
-        if empty and link.find("collision") is None:
-            own = link.get("name", "")
-            near = {name for pair in pairs if own in pair for name in pair} - {own}
-            pairs += combinations(sorted(near), 2)
+    pairs = [(part.parent, part.child) for part in parts]
+    pairs += [(closure.inner, closure.outer) for closure in tree.closures]
+    solid = {GROUND, PLATFORM, *(capsule.link for capsule in tree.capsules)}
+    solid |= {name for name, link in tree.links.items() if link.mass}
+    for own in [part.child for part in parts if part.child not in solid]:
+        near = {name for pair in pairs if own in pair for name in pair} - {own}
+        pairs += combinations(sorted(near), 2)
     return list(dict.fromkeys((min(pair), max(pair)) for pair in pairs))
 
 
-def _touching(robot: Robot) -> list[tuple[str, str]]:
+def _touching(tree: LoopTree) -> list[tuple[str, str]]:
     """Pairs of links whose shapes intersect at home: bars that meet in one point of a body."""
     pairs = []
-    for one, other in combinations(robot_tree(robot).capsules, 2):
+    for one, other in combinations(tree.capsules, 2):
         gap = distance(one.start, one.end - one.start, other.start, other.end - other.start)
         if one.link != other.link and not gap > one.radius + other.radius:
             pairs.append((min(one.link, other.link), max(one.link, other.link)))
     return list(dict.fromkeys(pairs))
-
-
-def _ends(element: ET.Element) -> tuple[str, str]:
-    """Parent and child link."""
-    ends = (element.find(tag) for tag in ("parent", "child"))
-    parent, child = ("" if end is None else end.get("link", "") for end in ends)
-    return parent, child
 
 
 def _joint_limits(robot: Robot, accelerations: Sequence[float]) -> dict[str, Any]:

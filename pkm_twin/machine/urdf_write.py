@@ -48,19 +48,16 @@ def write_urdf(
     :param prefix: of the names of all links, joints and closures, for several machines in one file.
     """
     robot = ET.Element("robot", name=tree.name)
-    taken = {PLATFORM, *tree.links}
-    parts = [part for hung in tree.hung for part in singles(*hung, taken)]
+    parts = parts_of(tree)
     places = {name: link.frame.position for name, link in tree.links.items()}
     _shapes(ET.SubElement(robot, "link", name=GROUND), tree, GROUND)
     for part in parts:
         at = places.setdefault(part.child, part.joint.at)
         link = ET.SubElement(robot, "link", name=part.child)
-        _inertial(link, tree.links.get(part.child, Link(part.child, com=at)), at)
-        _shapes(link, tree, part.child)
-    ET.SubElement(robot, "link", name=PLATFORM)
-    place = Pose(position=tree.origin)
-    tool = Joint(f"{PLATFORM}_frame", "fixed", tree.platform, PLATFORM, (place, place))
-    for part in (*parts, *singles(tool, tree.platform, PLATFORM, taken)):
+        if part.child != PLATFORM:
+            _inertial(link, tree.links.get(part.child, Link(part.child, com=at)), at)
+            _shapes(link, tree, part.child)
+    for part in parts:
         _joint(robot, part, places)
     for closure in tree.closures:
         _closure(robot, closure, places)
@@ -74,6 +71,14 @@ def write_urdf(
                     element.set(key, prefix + element.attrib[key])
     ET.indent(robot)
     return '<?xml version="1.0"?>\n' + ET.tostring(robot, encoding="unicode") + "\n"
+
+
+def parts_of(tree: LoopTree) -> list[Single]:
+    """The joints of the URDF, from the ground outwards; the last one leads to ``platform``."""
+    place, taken = Pose(position=tree.origin), {PLATFORM, *tree.links}
+    tool = Joint(f"{PLATFORM}_frame", "fixed", tree.platform, PLATFORM, (place, place))
+    hung = (*tree.hung, (tool, tree.platform, PLATFORM))
+    return [part for one in hung for part in singles(*one, taken)]
 
 
 def _inertial(link: ET.Element, body: Link, place: Array) -> None:
