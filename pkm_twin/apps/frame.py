@@ -16,14 +16,14 @@ from typing import Annotated, Any, Final, Optional, TypeVar, Union, get_args, ge
 from typing import get_type_hints as hints_of
 
 import typer
-from typer.core import TyperCommand
+from typer.core import TyperCommand, TyperGroup
 
 from pkm_twin.apps.options import BESIDE, ReadsTables, ReadsWrenches
 from pkm_twin.console import numbers, refuse_existing
-from pkm_twin.errors import ParameterError
+from pkm_twin.errors import ParameterError, UnknownNameError
 from pkm_twin.files import STANDARD, decimal
 from pkm_twin.options import Commands, file_name
-from pkm_twin.report import Report, present
+from pkm_twin.report import Fact, Report, present
 from pkm_twin.settings import Setting
 
 G = TypeVar("G")
@@ -92,18 +92,39 @@ def command(run: Callable[[G], Report], task: str = "", *, hidden: bool = False)
 
 @dataclass(frozen=True)
 class Group:
-    """Commands under one name."""
+    """Commands under one name; ``metavar``: what follows the name, in help."""
 
     text: str
     commands: dict[str, Command]
     task: str = ""
+    metavar: str = "COMMAND [OPTIONS]"
+
+    def ordered(self, words: list[str]) -> list[str]:
+        """The words after the group's name, the command's name first."""
+        return words
 
     def app(self, name: str) -> typer.Typer:
         """The group as a program."""
-        app = Commands(help=self.text, name=name)
+        cls = type("_Ordered", (_Ordered,), {"group": self})
+        text = inspect.cleandoc(self.text)
+        app = Commands(help=text, name=name, cls=cls, subcommand_metavar=self.metavar)
         for each, one in self.commands.items():
             one.add_to(app, each)
         return app
+
+
+class _Ordered(TyperGroup):
+    """A group that names the command closest to a wrong one."""
+
+    group: Group
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        return super().parse_args(ctx, self.group.ordered(args))
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        if args[0] not in self.commands:
+            raise UnknownNameError(str(ctx.info_name), args[0], tuple(self.commands))
+        return super().resolve_command(ctx, args)
 
 
 def execute(command: Command, name: str, given: Any, as_json: bool) -> None:
@@ -116,7 +137,7 @@ def execute(command: Command, name: str, given: Any, as_json: bool) -> None:
     _check_targets(given)
     drawing = given.drawing(name) if hasattr(given, "drawing") else None
     if drawing is not None:
-        refuse_existing(drawing, given.overwrite, _source(given))
+        refuse_existing(drawing, getattr(given, "overwrite", True), _source(given))
     with _readers(given):
         report = command.run(given)
         if hasattr(given, "drawing"):
@@ -142,17 +163,21 @@ def _readers(given: Any) -> Iterator[None]:
 
 
 def _drawn(report: Report, drawing: Path | None) -> Report:
-    """Write the pictures of a report; the first is its ``picture``."""
+    """Write the pictures of a report; the first is its ``picture``, ``pictures`` are all."""
     from pkm_twin.report import plots
 
     written = []
     for suffix, figure in report.figures.items() if drawing is not None else ():
         assert drawing is not None  # noqa: S101  the loop is empty without
-        target = drawing.with_stem(f"{drawing.stem}{suffix}")
-        written.append(plots.save(figure(), target))
-    first = written[0] if written else None
-    rest = {f"picture{k + 1}": path for k, path in enumerate(written) if k}
-    return report.and_files(picture=first, **rest)
+        ending = re.sub(r"[^A-Za-z0-9_.-]+", "_", f"_{suffix}" if suffix else "")
+        written.append(plots.save(figure(), drawing.with_stem(f"{drawing.stem}{ending}")))
+    files = [*written, *(path for name, path in report.files.items() if name == "page" and path)]
+    return dataclasses.replace(
+        report,
+        facts=[*report.facts, Fact("picture", str(written[0]) if written else None),
+               Fact("pictures", list(map(str, files)))],
+        notes=[*report.notes, *map(str, written)],
+    )  # fmt: skip
 
 
 def _check_targets(given: Any) -> None:
@@ -186,14 +211,23 @@ def _fields(given: type[Any]) -> list[tuple[str, Any, Setting, Any]]:
     Arguments come first, those of the classes below before the class's own; of options, the
     class's own come first.
     """
-    hints = hints_of(given)
-    own = vars(given).get("__annotations__", {})
+    hints, order = hints_of(given), list(given.__mro__)
+
+    def rank(field: str) -> int:
+        return next(
+            k for k, one in enumerate(order) if field in vars(one).get("__annotations__", {})
+        )
+
     found = [
         (f.name, hints[f.name], f.metadata["setting"], f.default)
         for f in dataclasses.fields(given)
         if "setting" in f.metadata
     ]
-    return sorted(found, key=lambda row: (not row[2].argument, (row[0] in own) == row[2].argument))
+    first = [row for row in found if row[2].argument]
+    return [
+        *sorted(first, key=lambda row: -rank(row[0])),
+        *sorted((row for row in found if not row[2].argument), key=lambda row: rank(row[0])),
+    ]
 
 
 def _spelled(field: str, row: Setting) -> str:

@@ -68,9 +68,7 @@ TASKS: Final[Mapping[str, Mapping[str, Entry]]] = {
         "size": Entry("size:size", tables=True, wrenches=True),
         "loads": Entry("joint_loads:loads", tables=True, wrenches=True),
     },
-    "Stiffness, workspace and vibration": {
-        "map": Entry("maps:app"),
-    },
+    "Stiffness, workspace and vibration": {},
     "Recordings": {
         "check": Entry("check_command:check", tables=True, wrenches=True),
         "trend": Entry("trend:trend"),

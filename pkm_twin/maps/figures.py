@@ -6,7 +6,6 @@ from __future__ import annotations
 import math
 import re
 import textwrap
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -290,12 +289,3 @@ def _panel(one: dict[str, Any], ax: Axes, scale: float, low: float, high: float)
     if one["units"][0] == one["units"][1]:
         ax.set_aspect("equal")
     return mesh
-
-
-def save_all(data: Dataset, out: Path) -> list[Path]:
-    """Write all pictures as PNG beside a path, ``<stem>.png`` or ``<stem>_<name>.png``."""
-    saved = []
-    for name, figure in draw(data).items():
-        ending = "".join(f"_{re.sub(r'[^A-Za-z0-9_.-]+', '_', part)}" for part in [name] if part)
-        saved.append(plots.save(figure, out.with_name(f"{out.stem}{ending}.png"), FINE))
-    return saved

@@ -37,7 +37,7 @@ def pyplot() -> Any:
 def columns(count: int, rows: int) -> tuple[Any, list[Any]]:
     """A figure of ``count`` columns with ``rows`` axes each."""
     figure, axes = pyplot().subplots(
-        rows, count, figsize=(WIDTH, 3 * rows), squeeze=False, layout="constrained"
+        rows, count, figsize=(WIDTH, max(3 * rows, 4.2)), squeeze=False, layout="constrained"
     )
     return figure, list(axes.T)
 

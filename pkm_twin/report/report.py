@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -150,10 +149,6 @@ class Report:
         found |= {"verdict": self.verdict} if self.verdict is not None else {}
         found |= {"error": self.error} if self.error else {}
         return dict(plain(found))
-
-    def and_files(self, **files: Path | None) -> Report:
-        """With more files."""
-        return dataclasses.replace(self, files={**self.files, **files})
 
 
 def plain(value: Any) -> Any:

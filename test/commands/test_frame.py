@@ -70,7 +70,7 @@ def test_json_has_the_facts_with_units_and_the_terminal_the_answer_first(run):
     code, out = run("cart", "--json", "--bad")
     assert code == 1
     assert json.loads(out) == {
-        "mass": 2.0, "lost": None, "verdict": "bad", "picture": None,
+        "mass": 2.0, "lost": None, "verdict": "bad", "picture": None, "pictures": [],
         "parts": {"arm": {"mass": 1.5, "length": 0.25}, "rod": {"mass": 0.5, "length": None}},
         "units": {"mass": "kg", "parts.mass": "kg", "parts.length": "m"},
     }  # fmt: skip

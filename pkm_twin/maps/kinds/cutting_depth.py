@@ -19,11 +19,10 @@ class CuttingDepth(Frequency):
     """The least axial depth of cut of the stability lobes, in the zero-order approximation.
 
     At small immersions single speeds chatter below it: `lobes` is exact at one pose.
-
-    ``damping`` and ``tool`` as of :func:`~stiffness_monitor.vibration.tool_modes`.
     """
 
     milling: Milling
+    # As of stiffness_monitor.vibration.tool_modes.
     damping: tuple[float, ...] | None = None
     tool: tuple[float, ...] = (0.0, 0.0, 0.0)
 

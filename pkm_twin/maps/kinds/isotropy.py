@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated
 
 import numpy as np
 
@@ -12,6 +11,7 @@ from delta_dynamics.isotropy import ENERGY, driving_force_peak, energy_transfer_
 from pkm_twin.errors import ParameterError
 from pkm_twin.maps.kind import Array, Case, Found, Kind
 from pkm_twin.robot.robot import Robot
+from pkm_twin.settings import setting
 
 TRANSFER = Case(
     "energy", "least share of the kinetic energy in the platform", "", "moves itself most", False
@@ -22,7 +22,7 @@ TRANSFER = Case(
 class Isotropy(Kind):
     """Kinetic energy and driving force in the worst direction."""
 
-    energy: Annotated[float, "the platform's kinetic energy for the driving force (J)"] = ENERGY
+    energy: float = setting(ENERGY, "the platform's kinetic energy for the driving force (J)")
 
     name = "isotropy"
     question = "what does the worst direction cost?"

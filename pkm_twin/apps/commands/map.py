@@ -1,0 +1,281 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``pkm-twin map ROBOT KIND``: a quantity over the workspace or along a path."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, get_type_hints
+
+from pkm_twin.apps.frame import Command, Group, command
+from pkm_twin.apps.options import Carries, Draws, OfMilling, OfTool, Parallel, Writes
+from pkm_twin.console import numbers, progress
+from pkm_twin.errors import ParameterError
+from pkm_twin.files import replace_file
+from pkm_twin.maps.kinds import KINDS
+from pkm_twin.maps.kinds.cutting_depth import CuttingDepth
+from pkm_twin.report import Fact, Report
+from pkm_twin.ros.signals import INTERRUPTED, first_signal
+from pkm_twin.settings import setting
+from pkm_twin.threads import one_blas_thread
+
+if TYPE_CHECKING:
+    from xarray import Dataset
+
+    from pkm_twin.maps.kind import Case, Kind
+    from pkm_twin.robot.robot import Robot
+
+MOST: Final = 10**11
+"""Poses beyond which a number is a slip."""
+SIX: Final = "six numbers separated by commas, N and N m; or NAME=six numbers"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Pages:
+    """A page of the result."""
+
+    html: bool = setting(False, "also an offline interactive HTML page")
+
+
+@dataclass(frozen=True, kw_only=True)
+class OfMap(Carries, Pages, Writes, Draws, Parallel):
+    """The options of all maps."""
+
+    kind: str = ""
+    points: int | None = setting(
+        None, "approximate number of poses; default: by kind", low=1, high=MOST
+    )
+    at: str | None = setting(
+        None, "pose that the planes go through: numbers separated by commas; default: the worst"
+    )
+    along: Path | None = setting(
+        None,
+        "instead of the workspace: a CSV of `pkm-twin path`, or any motion that `pkm-twin torques` "
+        "reads; --out FILE.csv writes the values",
+    )
+    singularity: float | None = setting(
+        None,
+        "singularity index (0 to 1) below which a pose does not count; default: 0.05, of "
+        "`workspace` 0",
+    )
+    least_clearance: float = setting(
+        0.0, "distance between limbs (m) below which a pose does not count"
+    )
+    out: Path | None = setting(None, "file to write; default: ROBOT_KIND.nc", writes=True)
+    scheduler: str | None = setting(None, "address of a Dask scheduler: tcp://HOST:8786")
+
+    @property
+    def target(self) -> Path:
+        """The file of the map."""
+        return self.out or Path(f"{Path(self.robot).stem}_{self.kind}.nc")
+
+    def drawing(self, command: str) -> Path | None:
+        """The pictures' common name, next to the map's file."""
+        if self.along is not None and self.out is None and self.picture is None:
+            return None
+        beside = dataclasses.replace(self, out=self.target)
+        return super(OfMap, beside).drawing(command)
+
+    def cases(self, kind: Kind, machine: Robot) -> list[Case]:
+        """The load cases, where the kind has any.
+
+        :raises ParameterError: two of one name, or a wrench that is none.
+        """
+        found: dict[str, Case] = {}
+        for text in getattr(self, "wrench", ()):
+            name, given, values = text.rpartition("=")
+            name = name.strip() if given else text
+            if name in found:
+                raise ParameterError("wrench", text, "another name for each load case")
+            found[name] = kind.loaded(machine, name, numbers(values, 6, SIX))
+        return list(found.values())
+
+
+@dataclass(frozen=True, kw_only=True)
+class Loads:
+    """The option of kinds with load cases."""
+
+    wrench: tuple[str, ...] = setting(
+        (),
+        f"force and moment on the platform, base axes: {SIX}; several times for several load cases",
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Show(Pages):
+    """Plot a stored map: PNGs, and with --html an offline interactive HTML page."""
+
+    file: Path = setting(..., "a file that `pkm-twin map` wrote", argument=True)
+    out: Path | None = setting(None, "stem of the PNGs; default: that of the file")
+
+    def drawing(self, _command: str) -> Path:
+        """The pictures' common name."""
+        return (self.out or self.file).with_suffix(".png")
+
+
+def show(given: Show) -> Report:
+    """What a stored map answers, with its pictures."""
+    return stored(given.file, given.drawing(""), given.html)
+
+
+def compute(given: OfMap) -> Report:
+    """Compute a map, or values along a path.
+
+    :raises PkmTwinError: what the kind or the file rejects.
+    """
+    from pkm_twin.maps.run import run
+    from pkm_twin.maps.sweep import map_of
+
+    kind, machine = kind_of(given), given.machine()
+    cases = given.cases(kind, machine)
+    one_blas_thread()
+    if given.along is not None:
+        return along_path(given, kind, machine, cases, given.along)
+    names = machine.pose_names
+    sweep = map_of(
+        machine, kind, given.points, cases=cases,
+        at=None if given.at is None else numbers(given.at, len(names), f"a pose: {names}"),
+        least_singularity=given.singularity, least_clearance=given.least_clearance,
+    )  # fmt: skip
+    target = given.target
+    with (
+        first_signal(KeyboardInterrupt),
+        progress(f"{kind.name} of {machine.name}", sweep.points) as update,
+    ):
+        try:
+            run(
+                sweep, target, workers=given.jobs, scheduler=given.scheduler,
+                overwrite=given.overwrite, progress=update,
+            )  # fmt: skip
+        except KeyboardInterrupt:
+            kept = f"stopped; finished parts are in {target}.parts, the same command continues"
+            return Report(error=f"{kept} from there", code=INTERRUPTED)
+    return stored(target, given.drawing(""), given.html)
+
+
+def stored(file: Path, drawing: Path | None, html: bool) -> Report:
+    """What a stored map answers.
+
+    :param drawing: the pictures' common name; None for none.
+    """
+    from pkm_twin.maps import figures
+    from pkm_twin.maps.page import write_page
+    from pkm_twin.maps.store import open_map, reading
+
+    with open_map(file) as data:
+        with reading(file):
+            first, *rest = figures.lines(data)
+            facts = [
+                Fact("robot", data.attrs["robot"]),
+                Fact("kind", data.attrs["kind"]),
+                Fact("sizes", {str(name): size for name, size in data.sizes.items()}),
+                Fact("worst", figures.answers(data)),
+                Fact("facts", scalars(data)),
+            ]
+        drawn = {} if drawing is None else figures.draw(data)
+        page = None
+        if html:
+            page = write_page(data, (drawing or file).with_suffix(".html"))
+        pictures = {name: lambda one=one: one for name, one in drawn.items()}
+        return Report(
+            first, facts, figures=pictures, notes=rest, files={"file": file, "page": page}
+        )
+
+
+def scalars(data: Dataset) -> dict[str, Any]:
+    """Single numbers of a map, with their units."""
+    return {
+        str(name): {"value": float(variable), "unit": variable.attrs.get("units", "")}
+        for name, variable in data.data_vars.items()
+        if not variable.dims and math.isfinite(float(variable))
+    }
+
+
+def along_path(
+    given: OfMap, kind: Kind, machine: Robot, cases: list[Case], path: Path
+) -> Report:  # fmt: skip
+    """The worst of each case along a path."""
+    from pkm_twin.maps.along import along
+    from pkm_twin.recordings import ReadOptions, read
+
+    if given.out is not None and given.out.suffix != ".csv":
+        raise ParameterError("out", str(given.out), "a name that ends in .csv")
+    motion = read(path, machine, ReadOptions(planned=True))
+    found = along(
+        kind, machine, motion.clock, motion.q, cases=cases,
+        least=given.singularity, least_clearance=given.least_clearance,
+    )  # fmt: skip
+    if given.out is not None:
+        replace_file(given.out, found.table().encode())
+    beyond = int((~found.counted).sum())
+    first, *rest = found.sentences
+    notes = [*rest, f"{len(found.time)} samples of {path}"]
+    if beyond:
+        notes.append(f"{beyond} samples are beyond limits, near a singularity, or limbs interfere")
+    return Report(
+        first,
+        [
+            Fact("robot", machine.name),
+            Fact("kind", kind.name),
+            Fact("samples", len(found.time)),
+            Fact("samples_that_do_not_count", beyond),
+            Fact("worst", found.worst),
+        ],
+        figures={"": found.draw},
+        notes=notes,
+        files={"out": given.out},
+    )
+
+
+def kind_of(given: OfMap) -> Kind:
+    """The kind with its own options."""
+    if isinstance(given, OfMilling) and isinstance(given, OfTool):
+        return CuttingDepth(given.milling, given.damping, given.tool)
+    kind = KINDS[given.kind]
+    return kind(**{field.name: getattr(given, field.name) for field in dataclasses.fields(kind)})
+
+
+def offered(kind: type[Kind]) -> Command:
+    """A kind as a command, with its own options and those of all maps."""
+    milling = kind is CuttingDepth
+    own = [] if milling else [(f.name, get_type_hints(kind)[f.name], f)
+                              for f in dataclasses.fields(kind)]  # fmt: skip
+    more: list[type[Any]] = [Loads] if kind.takes_wrench else []
+    more += [OfMilling, OfTool] if milling else []
+    given = dataclasses.make_dataclass(
+        kind.__name__, [*own, ("kind", str, kind.name)], bases=(*more, OfMap),
+        namespace={"__doc__": kind.__doc__, "__module__": __name__}, frozen=True, kw_only=True,
+    )  # fmt: skip
+    return Command(given, compute)
+
+
+class AfterRobot(Group):
+    """Kinds as commands after the robot; ``show`` stands in its place."""
+
+    def ordered(self, words: list[str]) -> list[str]:
+        """The robot and the kind change places."""
+        if not words or words[0] in ("show", *KINDS):
+            return words
+        if len(words) == 1 or words[1].startswith("-"):
+            return [word for word in words if word.startswith("-")]
+        return [words[1], words[0], *words[2:]]
+
+
+COMMANDS: Final[Mapping[str, Command]] = {name: offered(kind) for name, kind in KINDS.items()}
+COMMAND = AfterRobot(
+    """Map a quantity over the workspace, find its worst pose, and draw planes through it.
+
+    `pkm-twin map ROBOT KIND` computes a map, `pkm-twin map show FILE` plots a stored one again.
+
+    Ctrl-C stops it. Finished parts stay in FILE.nc.parts, and the same command continues from there
+    with the same result. Only one run at a time can write a file. docs/scale.md has the cost.
+
+    For the options of a kind use `pkm-twin map ROBOT KIND --help`.
+    """,
+    {"show": command(show), **COMMANDS},
+    "Stiffness, workspace and vibration",
+    "ROBOT KIND [OPTIONS]",
+)

@@ -1,0 +1,127 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A kind of map along a path instead of over the workspace: values over time, and the worst."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pkm_twin.maps import figures
+from pkm_twin.maps.kind import Array, Case, Found, Kind, counts, found_of
+from pkm_twin.maps.sweep import check
+from pkm_twin.report import plots
+from pkm_twin.robot.robot import Robot
+
+
+@dataclass(frozen=True, eq=False)
+class Along:
+    """What a kind finds on a path: ``time`` (k,), s; ``pose`` (k, m); ``found`` of each case.
+
+    ``counted``: which samples keep all limits, shape (k,).
+    """
+
+    robot: Robot
+    kind: Kind
+    cases: tuple[Case, ...]
+    time: Array
+    pose: Array
+    counted: NDArray[np.bool_]
+    found: Sequence[Found]
+
+    @property
+    def worst(self) -> list[dict[str, Any]]:
+        """The worst sample of each case as plain data, as of a stored map, with its time."""
+        answers, axes = [], self.kind.axes(self.robot)
+        elements = self.kind.elements(self.robot)
+        for case, one in zip(self.cases, self.found, strict=True):
+            k = int(np.nanargmax(one.value if case.largest else -one.value))
+            answer: dict[str, Any] = {
+                "case": case.name, "what": case.what, "answer": case.answer,
+                "value": float(one.value[k]), "unit": case.unit, "time_s": float(self.time[k]),
+                "pose": dict(zip(self.robot.pose_names, self.pose[k].tolist(), strict=True)),
+            }  # fmt: skip
+            if one.direction is not None and axes:
+                answer |= {"direction": one.direction[k].tolist(), "axes": list(axes)}
+            if one.element is not None and elements:
+                answer["element"] = elements[int(one.element[k])]
+            answers.append(answer)
+        return answers
+
+    @property
+    def sentences(self) -> list[str]:
+        """The worst of each case in words."""
+        units = dict(zip(self.robot.pose_names, self.robot.pose_units, strict=True))
+        return [
+            ("" if len(self.cases) == 1 else f"{one['case']}: ")
+            + f"{figures.sentence(one, units)}; at {one['time_s']:.4g} s"
+            for one in self.worst
+        ]
+
+    def table(self) -> str:
+        """A CSV of each case's value, direction and element over time."""
+        header = ["time", *self.robot.pose_names, "counts"]
+        columns: list[list[Any]] = [
+            self.time.tolist(), *self.pose.T.tolist(), self.counted.astype(int).tolist()
+        ]  # fmt: skip
+        elements = self.kind.elements(self.robot)
+        for case, one in zip(self.cases, self.found, strict=True):
+            before = "" if len(self.cases) == 1 else f"{case.name}."
+            header.append(f"{before}value")
+            columns.append(one.value.tolist())
+            if one.direction is not None and one.direction.shape[-1] == 3:
+                header += [f"{before}{axis}" for axis in "xyz"]
+                columns += one.direction.T.tolist()
+            if one.element is not None and elements:
+                header.append(f"{before}element")
+                columns.append([elements[k] for k in one.element])
+        text = io.StringIO()
+        csv.writer(text).writerows([header, *zip(*columns, strict=True)])
+        return text.getvalue()
+
+    def draw(self) -> Any:
+        """The values of each case over time, in the colours of the elements to blame."""
+        elements = self.kind.elements(self.robot)
+        indices = [one.element for one in self.found if one.element is not None and elements]
+        # An element has one colour in all panels.
+        blamed = np.unique(np.concatenate(indices)).tolist() if indices else []
+        figure, ((*axes,),) = plots.columns(1, len(self.found))
+        for ax, case, one, text in zip(axes, self.cases, self.found, self.sentences, strict=True):
+            scale, unit = figures.scale_of(float(np.nanmax(np.abs(one.value))), case.unit)
+            values = scale * one.value
+            ax.plot(self.time, values, color="0.7", lw=1)
+            for n, element in enumerate(blamed):
+                own = one.element == element
+                if np.any(own):
+                    colour = plots.COLOURS[n % len(plots.COLOURS)]
+                    dots = ax.plot(self.time[own], values[own], ".", ms=4, color=colour)
+                    dots[0].set_label(elements[element])
+            plots.label(ax, "time (s)", f"{case.what} ({unit})", text, 9)
+            if blamed:
+                plots.legend(ax)
+        figure.suptitle(f"{self.robot.name}: {self.kind.question}", fontsize=10)
+        return figure
+
+
+def along(
+    kind: Kind, robot: Robot, time: Array, q: Array, *, cases: Sequence[Case] = (),
+    least: float | None = None, least_clearance: float = 0.0,
+) -> Along:  # fmt: skip
+    """A kind's quantity at joint positions q (k, n) at times (k,), s.
+
+    :param cases: load cases; by default the kind's own.
+    :param least: singularity index below which a sample does not count; by default the kind's.
+    :raises ParameterError: the robot's file lacks what the quantity needs.
+    """
+    chosen = tuple(cases) or kind.cases(robot)
+    check(robot, kind, chosen)
+    pose = robot.forward(q)
+    known = np.ones(len(pose), bool)
+    least = kind.least if least is None else least
+    counted = counts(robot, q, pose, known, least, least_clearance)
+    return Along(robot, kind, chosen, time, pose, counted, found_of(kind, robot, q, chosen))
