@@ -71,7 +71,6 @@ TASKS: Final[Mapping[str, Mapping[str, Entry]]] = {
     "Stiffness, workspace and vibration": {},
     "Recordings": {
         "check": Entry("check_command:check", tables=True, wrenches=True),
-        "trend": Entry("trend:trend"),
         "recover": Entry("replay:recover"),
         "play": Entry("replay:play"),
         "monitor-torques": Entry("guard_check:guard_check"),

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import sqlite3
 from collections.abc import Iterator, Sequence
@@ -10,7 +11,7 @@ from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +28,8 @@ WAIT: Final = 60.0
 """How long a writer waits for the others, s."""
 SINCE: Final = 1e17
 """Stamps above this, ns, are since 1970; smaller ones are since a start."""
+FEWEST: Final = 6
+"""Recordings below which no series is judged."""
 HISTORY: Final = "a history that `pkm-twin check --history` wrote"
 _TABLES: Final = """
 CREATE TABLE IF NOT EXISTS checks (
@@ -68,11 +71,17 @@ class Series:
         """Machine, quantity and part in words."""
         return f"{self.machine}: {WORDS.get(self.quantity, self.quantity)} of {self.part}"
 
+    @property
+    def days(self) -> list[datetime]:
+        """The times of its recordings."""
+        return [datetime.fromtimestamp(time, UTC) for time in self.time]
 
+
+UNKNOWN: Final = "payload beyond the load"
 WORDS: Final = {
     "friction viscous": "viscous friction",
     "friction coulomb": "Coulomb friction",
-    "payload beyond the load": "unknown payload",
+    UNKNOWN: "unknown payload",
 }
 """Quantities whose name in a history's file is not the field's."""
 
@@ -101,17 +110,17 @@ def _efforts(r: Recording) -> list[Measured]:
         loaded, known = r.load.on(r.robot), r.load.mass
     recorded = replace(recorded_of(r, idle), carried=None)
     try:
-        numbers = fit(loaded, [recorded], ("friction", "payload"), accept=True).of("fitted")
+        result = fit(loaded, [recorded], ("friction", "payload"), accept=True)
     except (PkmTwinError, ValueError, np.linalg.LinAlgError):
         return found
-    for number in numbers:
-        if number.key == ("payload", "mass"):
-            what, part, value = "payload beyond the load", "platform", number.after - known
-        elif number.key[:2] in (("friction", "viscous"), ("friction", "coulomb")):
-            what, part, value = f"friction {number.key[1]}", names[int(number.key[2])], number.after
-        else:
-            continue
-        found.append(Measured(what, part, value, number.deviation, number.unit))
+    owners = {key: g.name for g in result.problem.parameters.groups for key in g.keys(g.values)}
+    for one in result.of("fitted"):
+        part, _, law = owners[one.key].rpartition(".")
+        if part in names and law in ("viscous", "coulomb"):
+            found.append(Measured(f"friction {law}", part, one.after, one.deviation, one.unit))
+        elif one.key == ("payload", "mass"):
+            beyond = one.after - known
+            found.append(Measured(UNKNOWN, "platform", beyond, one.deviation, one.unit))
     return found
 
 
@@ -170,31 +179,24 @@ def append(
 
     :raises ParameterError: the file is no history, or stays locked.
     """
-    judged = datetime.now(UTC).isoformat(timespec="seconds")
-    row = recorded, judged, machine, robot, os.fspath(file), int(good)
+    when = datetime.now(UTC).isoformat(timespec="seconds")
+    row = recorded, when, machine, robot, os.fspath(file), int(good)
     with _opened(path) as base:
         base.execute("PRAGMA foreign_keys = ON")
         base.execute("BEGIN IMMEDIATE")
         for statement in _TABLES.split(";")[:-1]:
             base.execute(statement)
-        base.execute(
-            "DELETE FROM checks WHERE machine = ? AND recorded = ? AND file = ?",
-            (machine, recorded, os.fspath(file)),
-        )
         key = base.execute(
-            "INSERT INTO checks (recorded, judged, machine, robot, file, good) "
+            "INSERT OR REPLACE INTO checks (recorded, judged, machine, robot, file, good) "
             "VALUES (?, ?, ?, ?, ?, ?)",
             row,
         ).lastrowid
+        # SQLite stores NaN as NULL.
         base.executemany(
             "INSERT INTO numbers VALUES (?, ?, ?, ?, ?, ?)",
-            [(key, n.quantity, n.part, n.value, _known(n.deviation), n.unit) for n in numbers],
+            [(key, n.quantity, n.part, n.value, n.deviation, n.unit) for n in numbers],
         )
         base.execute("COMMIT")
-
-
-def _known(value: float) -> float | None:
-    return float(value) if np.isfinite(value) else None
 
 
 def read_history(path: Path, machine: str | None = None) -> list[Series]:
@@ -215,3 +217,103 @@ def read_history(path: Path, machine: str | None = None) -> list[Series]:
             known = np.nan if deviation is None else float(deviation)
             grouped.setdefault((name, quantity, part, unit), []).append((time, value, known))
     return [Series(*key, *np.array(values).T) for key, values in grouped.items()]
+
+
+@dataclass(frozen=True, eq=False)
+class Judged:
+    """A series with its control limits.
+
+    ``centre``, ``low``, ``high``: of the first ``baseline`` recordings, NaN where these are too
+    few. ``beyond``: which recordings are outside, (k,). ``change``: index of the first recording
+    after the most likely change of the mean, or None; ``chance`` that there is such a one without
+    any; ``before`` and ``after``: means on its sides.
+    """
+
+    series: Series
+    baseline: int
+    centre: float
+    low: float
+    high: float
+    beyond: NDArray[np.bool_]
+    change: int | None
+    chance: float
+    before: float
+    after: float
+
+    @property
+    def drifts(self) -> bool:
+        """The mean has changed, or the last recording is outside the limits."""
+        return self.change is not None or bool(self.beyond[-1])
+
+    @property
+    def changed(self) -> str | None:
+        """When the mean changed; None where it did not."""
+        return (
+            None
+            if self.change is None
+            else self.series.days[self.change].isoformat(timespec="minutes")
+        )
+
+    @property
+    def line(self) -> str:
+        """The series in a line."""
+        s = self.series
+        text = f"{s.label}: {s.value[-1]:.4g} {s.unit}"
+        if len(s.value) < FEWEST:
+            return f"{text}, not judged"
+        text += f", control limits {self.low:.4g} to {self.high:.4g}"
+        if self.change is not None:
+            move = f"from {self.before:.4g} to {self.after:.4g} {s.unit}"
+            return f"{text}; DRIFT: {move} on {self.changed}"
+        return text + "; DRIFT: the last recording is outside the control limits" * self.drifts
+
+    def as_json(self) -> dict[str, Any]:
+        """Plain data for a script; NaN is not known."""
+        s = self.series
+        return {
+            "machine": s.machine, "quantity": s.quantity, "part": s.part, "unit": s.unit,
+            "recordings": len(s.value), "last": s.value[-1], "centre": self.centre,
+            "low": self.low, "high": self.high, "beyond": int(self.beyond.sum()),
+            "last_beyond": bool(self.beyond[-1]), "changed": self.changed, "chance": self.chance,
+            "before": self.before, "after": self.after, "drifts": self.drifts,
+        }  # fmt: skip
+
+
+def judged(series: Series, baseline: int, alarm: float) -> Judged:
+    """Control limits and a change of the mean of one series.
+
+    Limits: where a single further recording lies but for the chance ``alarm``, by mean and standard
+    deviation of the first ``baseline`` recordings (Student's t). The change: of all splits with two
+    recordings or more on each side the one with the greatest Student's t of the means; the chance
+    is that of any split (Bonferroni), for errors that are normal and independent.
+
+    :param alarm: chance of a false alarm of this series.
+    """
+    from scipy import stats  # type: ignore[import-untyped]
+
+    y, k = series.value, len(series.value)
+    if k < FEWEST:
+        none = math.nan
+        return Judged(series, 0, none, none, none, np.zeros(k, bool), None, none, none, none)
+    first = min(baseline, k)
+    mean, spread = float(y[:first].mean()), float(y[:first].std(ddof=1))
+    reach = stats.t.ppf(1.0 - alarm / 2.0, first - 1) * spread * math.sqrt(1.0 + 1.0 / first)
+    beyond = np.abs(y - mean) > reach
+    beyond[:first] = False
+    splits = np.arange(2, k - 1)
+    sums, squares = np.cumsum(y - mean), np.cumsum((y - mean) ** 2)
+    left = sums[splits - 1] / splits
+    right = (sums[-1] - sums[splits - 1]) / (k - splits)
+    within = squares[-1] - splits * left**2 - (k - splits) * right**2
+    # What rounding leaves of a constant is no spread.
+    least = (1e-12 * (abs(mean) + float(np.abs(y).max()))) ** 2
+    noise = np.sqrt(np.maximum(within, k * least) / (k - 2))
+    apart = np.abs(right - left) / np.sqrt(1.0 / splits + 1.0 / (k - splits))
+    scores = np.divide(apart, noise, out=np.zeros(len(splits)), where=noise > 0.0)
+    best = int(scores.argmax())
+    chance = min(1.0, 2.0 * float(stats.t.sf(scores[best], k - 2)) * len(splits))
+    change = int(splits[best]) if chance < alarm else None
+    return Judged(
+        series, first, mean, mean - reach, mean + reach, beyond, change, chance,
+        float(mean + left[best]), float(mean + right[best]),
+    )  # fmt: skip

@@ -15,7 +15,7 @@ from examples.nights import record
 from pkm_twin.apps import cli
 
 SHOWN: Final = 5
-"""Lines of the output on the page, besides the last."""
+"""Lines of the output on the page, besides the first."""
 
 
 def printed(history, picture):
@@ -36,7 +36,7 @@ def rewritten(text, picture):
         history = Path(folder) / "nights.db"
         record(history)
         lines = printed(history, picture)
-    block = "\n".join(["```text", *lines[:SHOWN], "...", lines[-1], "```"])
+    block = "\n".join(["```text", *lines[: SHOWN + 1], "...", "```"])
     before, trend, after = text.partition("## Find a trend over nights")
     after = re.sub(r"```text\n.*?```", lambda _: block, after, count=1, flags=re.DOTALL)
     return before + trend + after
