@@ -61,7 +61,8 @@ ROS = re.compile(r"rclpy|\w+_msgs|\w+_interfaces")
 WITHOUT_ROS = {"pkm_twin.ros.arguments", "pkm_twin.ros.signals"}
 """Of the folder that is about ROS."""
 APPS_WITH_ROS = {
-    f"pkm_twin.apps.{name}" for name in ("demo", "demo_recorder", "demo_tracking", "guard_check")
+    f"pkm_twin.apps.{name}"
+    for name in ("demo", "demo_recorder", "demo_tracking", "commands.monitor_torques")
 }
 
 

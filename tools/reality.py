@@ -235,7 +235,7 @@ prepares one:
 writes an exciting motion and slow friction sweeps inside the limits of the robot file, `NOTES.md`
 with what to note, and `README.md` with the commands to record and to judge. After the recording
 
-    pkm-twin record-kit delta_cu --anonymise bags/delta_cu_collision.mcap --out anonymous.mcap
+    pkm-twin anonymise bags/delta_cu_collision.mcap --robot delta_cu --out anonymous.mcap
 
 writes a bag of joint states, wrenches and trajectories alone. Joints are `joint_1`, `joint_2` and
 so on, in the order of the robot file. Topics and frames have neutral names, time begins at zero,

@@ -71,12 +71,8 @@ TASKS: Final[Mapping[str, Mapping[str, Entry]]] = {
     "Stiffness, workspace and vibration": {},
     "Recordings": {
         "check": Entry("check_command:check", tables=True, wrenches=True),
-        "recover": Entry("replay:recover"),
-        "play": Entry("replay:play"),
-        "monitor-torques": Entry("guard_check:guard_check"),
     },
     "Identification and calibration": {
-        "record-kit": Entry("record_kit:record_kit"),
         "excite": Entry("excite:excite"),
         "fit": Entry("fit:fit", tables=True, wrenches=True),
         "drive-friction": Entry("drive_friction:drive_friction_command"),
@@ -182,6 +178,8 @@ class Tasks(TyperGroup):
         """A command, by its name or an older one."""
         if args and args[0] in OLDER:
             args = [*OLDER[args[0]], *args[1:]]
+        if args[:1] == ["record-kit"] and "--anonymise" in args[:-1]:
+            args = _anonymise(args)
         return super().parse_args(ctx, args)
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
@@ -202,6 +200,14 @@ class Tasks(TyperGroup):
             ]
             with formatter.section(title):
                 formatter.write_dl(rows)
+
+
+def _anonymise(args: list[str]) -> list[str]:
+    """The words of `anonymise` for the older `record-kit [ROBOT] --anonymise BAG`."""
+    place = args.index("--anonymise")
+    rest = [*args[1:place], *args[place + 2 :]]
+    robot = ["--robot", rest.pop(0)] if rest and not rest[0].startswith("-") else []
+    return ["anonymise", args[place + 1], *robot, *rest]
 
 
 def greet(ctx: typer.Context) -> None:

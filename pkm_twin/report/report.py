@@ -135,7 +135,7 @@ class Report:
         """
         found = {fact.name: fact.value for fact in self.facts if fact.name}
         items = [
-            {"what": f.text, "value": f.value, "bound": f.bound, "verdict": f.verdict}
+            {"what": f.text, "value": f.words, "bound": f.bound, "verdict": f.verdict}
             for f in self.facts
             if f.verdict is not None
         ]

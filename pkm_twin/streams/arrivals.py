@@ -8,9 +8,8 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
+from pkm_twin.messages.stamps import SECOND
 from pkm_twin.streams.monitor import TopicStatistics
-
-SECOND = 1_000_000_000
 
 
 @dataclass

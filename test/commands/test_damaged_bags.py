@@ -113,9 +113,9 @@ class TestPlay:
         ("arguments", "code", "text"),
         [
             (("--remap", "no pair"), 2, "FROM:=TO"),
-            (("--rate", "fast"), 2, "rate"),
-            (("--rate", "0"), 1, "rate"),
-            (("--rate", "nan"), 1, "rate"),
+            (("--speed", "fast"), 2, "speed"),
+            (("--rate", "0"), 2, "speed"),
+            (("--speed", "nan"), 2, "nan"),
             (("--topic", "/absent"), 1, "/absent"),
         ],
     )

@@ -145,6 +145,7 @@ def test_the_sizes_of_the_engine_are_todays():
     assert table.sub("", page) == table.sub("", now)
 
 
+@pytest.mark.long
 def test_the_output_of_the_trend_page_is_todays(tmp_path):
     """Else `make pages` writes it and draws its picture."""
     page = (DOCS / "recordings.md").read_text(encoding="utf-8")

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pkm_twin.apps.guard_check import Offer, judge
-from pkm_twin.apps.verdict import Verdict
+from pkm_twin.apps.commands.monitor_torques import Offer, judge
+from pkm_twin.report import Verdict
 from pkm_twin.streams.arrivals import Arrivals
 from test.nodes.harness import SECOND
 
@@ -35,14 +35,14 @@ def stream(count=10, **changes):
 
 
 def bad(arrivals, offer=SOUND):
-    return {i.what for i in judge("/t", arrivals, offer).items if i.verdict is Verdict.BAD}
+    facts = judge("/t", arrivals, offer).facts
+    return {fact.text for fact in facts if fact.verdict is Verdict.BAD}
 
 
 def test_a_sound_stream_is_good():
-    report = judge("/t", stream(), SOUND)
-    assert report.good
-    assert all(item.verdict is Verdict.GOOD for item in report.items)
-    data = report.as_json()
+    data = judge("/t", stream(), SOUND).data
+    assert data["good"]
+    assert {item["verdict"] for item in data["items"]} == {"good"}
     assert data["messages"] == 10
     assert data["longest_silence_s"] == 0.001
     assert data["mean_age_s"] == data["oldest_s"] == 0.001
@@ -105,10 +105,10 @@ def test_every_fault_of_a_message_is_told(fault, changes):
 
 
 def test_a_topic_of_which_nothing_came_is_bad_and_the_rest_unknown():
-    report = judge("/t", Arrivals(0.1), Offer(0, math.inf, math.inf))
-    assert not report.good
-    assert bad(report.arrivals, Offer(0, math.inf, math.inf)) == {"messages", "publishers"}
-    assert report.as_json()["mean_age_s"] is None
+    data = judge("/t", Arrivals(0.1), Offer()).data
+    assert not data["good"]
+    assert bad(Arrivals(0.1), Offer()) == {"messages", "publishers"}
+    assert data["mean_age_s"] is None
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,176 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``pkm-twin monitor-torques``: a subscriber that judges torques as a controller would."""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import dataclass
+from typing import Any, Final
+
+from pkm_twin.apps.frame import command
+from pkm_twin.errors import MessageError, PkmTwinError
+from pkm_twin.messages.stamps import SECOND, stamp_of
+from pkm_twin.report import Fact, Report, Verdict, judged
+from pkm_twin.ros.listener import listening_node
+from pkm_twin.ros.signals import first_signal
+from pkm_twin.settings import setting
+from pkm_twin.streams.arrivals import Arrivals
+
+TYPE: Final = "sensor_msgs/msg/JointState"
+DEPTH: Final = 1000
+"""Deep enough that a stall of this process is no loss of the topic's."""
+LOOK: Final = 0.05
+"""How often silence, signals and the end of the time are looked for, s."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class MonitorTorques:
+    """Monitor the torques of a running node as a controller would.
+
+    Checks that torques arrive fresh, that no gap is longer than the deadline, that no message is
+    lost, that every message is finite, has one effort per joint and a later stamp than the one
+    before, and that there is exactly one publisher, which offers deadline and lifespan. Needs ROS.
+
+    Exit code 0: nothing is bad. 1: an item is bad, or no torques arrived.
+    """
+
+    topic: str = setting("delta_dynamics/joint_torques", "topic of stamped torques", argument=True)
+    deadline: float = setting(
+        0.1, "longest gap and greatest age (s) that the controller tolerates", low=1e-6, high=3600.0
+    )
+    duration: float = setting(10.0, "how long to watch, s; Ctrl-C ends earlier", low=1e-3, high=1e7)
+    wait: float = setting(5.0, "longest wait (s) for the first message", low=1e-3, high=1e7)
+    sim_time: bool = setting(False, "time stamps are in simulated time, /clock")
+
+
+@dataclass(frozen=True)
+class Offer:
+    """What the topic's publishers promise: how many they are, and the weakest promise, s."""
+
+    publishers: int = 0
+    deadline: float = math.inf
+    lifespan: float = math.inf
+
+
+def judge(topic: str, arrivals: Arrivals, offer: Offer) -> Report:
+    """The report of what came, against what a controller needs."""
+    a, count = arrivals, arrivals.count
+    most = f"at most {1e3 * a.deadline:g} ms"
+    duration = (a.last - a.first) / SECOND
+    rate = f", {count / duration:.1f} per second" if duration > 0.0 else ""
+    silence, oldest = a.longest_silence / SECOND, a.oldest / SECOND
+    mean = a.ages / count / SECOND if count else None
+    beyond = f", {a.silences} beyond it" if a.silences else ""
+
+    def item(
+        name: str, value: Any, unit: str, text: str, words: str, bound: str, good: bool
+    ) -> Fact:
+        # Nothing is known of torques that never came.
+        verdict = Verdict.UNKNOWN if not count else Verdict.GOOD if good else Verdict.BAD
+        return Fact(name, value, unit, text, words if count else "no message", bound, verdict)
+
+    faults = ", ".join(f"{reason}: {number}" for reason, number in a.faults.items()) or "none"
+    ages = f"mean {1e3 * (mean or 0.0):.1f}, largest {1e3 * oldest:.1f} ms"
+    lost = a.topic.missed
+    items = [
+        Fact("messages", count, text="messages", shown=f"{count}{rate}", bound="1 or more",
+             verdict=Verdict.GOOD if count else Verdict.BAD),
+        item("longest_silence_s", silence, "s", "longest gap", f"{1e3 * silence:.1f} ms{beyond}",
+             most, not a.silences),
+        item("oldest_s", oldest, "s", "age on arrival", ages, most, not a.late),
+        item("lost_messages", lost, "", "lost messages", str(lost), "0", not lost),
+        item("faults", dict(a.faults), "", "faults", faults, "none", not a.faults),
+        judged("publishers", str(offer.publishers), "1", offer.publishers == 1),
+    ]  # fmt: skip
+    for what, value in (("deadline", offer.deadline), ("lifespan", offer.lifespan)):
+        if offer.publishers:
+            # A hair for what the middleware rounds.
+            good = value <= a.deadline * (1.0 + 1e-9)
+            words = f"{1e3 * value:g} ms" if math.isfinite(value) else "none"
+            items.append(judged(f"{what} offered", words, most, good))
+    bad = [fact.text or "" for fact in items if fact.verdict is Verdict.BAD]
+    facts = [
+        Fact("topic", topic), Fact("good", not bad), Fact("mean_age_s", mean, "s"),
+        Fact("silences_beyond_deadline", a.silences), Fact("late_messages", a.late),
+    ]  # fmt: skip
+    answer = f"{topic}: bad: {', '.join(bad)}" if bad else f"{topic}: good, {count} messages"
+    return Report(answer, [*facts, *items], verdict=Verdict.BAD if bad else Verdict.GOOD)
+
+
+def monitor_torques(given: MonitorTorques) -> Report:
+    """Subscribe for a while, or until the first signal.
+
+    :raises PkmTwinError: no ROS, or a topic of another type.
+    """
+    arrivals, offer, subscribed = Arrivals(given.deadline), Offer(), False
+    with listening_node("monitor_torques", given.sim_time) as (node, spin):
+        name = node.resolve_topic_name(given.topic)
+        now = node.get_clock().now
+
+        def take(message: Any, info: Any) -> None:
+            try:
+                stamp = stamp_of(message.header)
+            except MessageError:
+                stamp = 0
+            arrivals.arrived(
+                message.name, message.effort, stamp, now().nanoseconds, time.monotonic_ns(),
+                info["publication_sequence_number"], info["source_timestamp"],
+            )  # fmt: skip
+
+        began = time.monotonic()
+        try:
+            with first_signal(KeyboardInterrupt):
+                while time.monotonic() - began < given.wait or arrivals.count:
+                    subscribed = subscribed or _subscribe(node, name, take)
+                    spin(LOOK)
+                    offer = _offer(node, name) or offer
+                    end = arrivals.first + given.duration * SECOND
+                    if arrivals.count and time.monotonic_ns() > end:
+                        break
+        except KeyboardInterrupt:
+            pass  # What was seen until then is the report.
+        arrivals.ended(time.monotonic_ns())
+    return judge(name, arrivals, offer)
+
+
+def _subscribe(node: Any, topic: str, take: Any) -> bool:
+    """Subscribe as the topic's publishers offer it; False while there are none.
+
+    :raises PkmTwinError: the topic carries something else.
+    """
+    from rclpy.qos import QoSProfile, ReliabilityPolicy
+    from sensor_msgs.msg import JointState
+
+    infos = node.get_publishers_info_by_topic(topic)
+    if not infos:
+        return False
+    other = {info.topic_type for info in infos} - {TYPE}
+    if other:
+        raise PkmTwinError(
+            f"{topic} carries {', '.join(sorted(other))}; expected a topic of {TYPE}, which has "
+            "time stamps, for example delta_dynamics/joint_torques"
+        )
+    reliable, best_effort = ReliabilityPolicy.RELIABLE, ReliabilityPolicy.BEST_EFFORT
+    all_reliable = all(info.qos_profile.reliability == reliable for info in infos)
+    qos = QoSProfile(depth=DEPTH, reliability=reliable if all_reliable else best_effort)
+    node.create_subscription(JointState, topic, take, qos)
+    return True
+
+
+def _offer(node: Any, topic: str) -> Offer | None:
+    """What the publishers of now promise; None where there are none."""
+    profiles = [info.qos_profile for info in node.get_publishers_info_by_topic(topic)]
+
+    def weakest(promises: tuple[Any, ...]) -> float:
+        """In s; the middleware's largest number means no promise."""
+        seconds = [promise.nanoseconds / SECOND for promise in promises]
+        return max(one if 0.0 < one < 1e9 else math.inf for one in seconds)
+
+    if not profiles:
+        return None
+    deadline, lifespan = zip(*((one.deadline, one.lifespan) for one in profiles), strict=True)
+    return Offer(len(profiles), weakest(deadline), weakest(lifespan))
+
+
+COMMAND = command(monitor_torques, "Recordings")
