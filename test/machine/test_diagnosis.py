@@ -6,6 +6,7 @@ import copy
 import numpy as np
 import pytest
 
+from pkm_twin.apps.certificate.description import expand
 from pkm_twin.errors import MobilityError, ParameterError
 from pkm_twin.kinematics.conditions import Conditions
 from pkm_twin.kinematics.diagnosis import is_right, near_conditions
@@ -14,7 +15,6 @@ from pkm_twin.machine.graph_file import graph_of_entries, written_out
 from pkm_twin.mechanisms.machine import Machine
 from test.support.robots import partly_long
 
-from .descriptions import rod_delta
 from .random_machines import changed, plain
 
 PLANAR = ("rrr3_planar", "four_bar", "slider_crank", "bolted", "five_bar")
@@ -64,21 +64,21 @@ def test_an_axis_that_misses_the_centre_is_named(shift, rng):
 
 def guided():
     """A linear Delta of six rods whose platform a guide keeps from turning: three too many."""
-    return rod_delta(False) | {
-        "joints": rod_delta(False)["joints"] | {"guide": rod_delta(True)["joints"]["guide"]}
-    }
+    data = expand(plain("linear_delta"))
+    data["joints"]["guide"] = {"type": "translation", "between": ["platform", "base"]}
+    return data
 
 
 @pytest.mark.parametrize("shift", DEVIATIONS)
 def test_a_rod_whose_end_is_elsewhere_is_named(shift, rng):
     data = guided()
     assert is_right(graph_of(data))
-    rod = data["rods"]["rod_1p"]
+    rod = data["rods"]["left_1"]
     shifted = np.array(rod["ends"])
     shifted[1] += shift * np.array([0.0, 0.0, 1.0])
     rod["ends"] = shifted.tolist()
     causes = near_conditions(graph_of(data))
-    assert causes and all({"rod_1p", "rod_1n"} & set(cause.parts) for cause in causes)
+    assert causes and all({"left_1", "right_1"} & set(cause.parts) for cause in causes)
     assert causes[0].deviation == pytest.approx(shift, rel=1e-2)
 
 
@@ -138,8 +138,8 @@ def test_drives_are_counted(joint, value, numbers, rng):
 
 
 def balls():
-    """A linear Delta whose rods are bodies between two ball joints, and spin."""
-    data = rod_delta(True)
+    """A Delta whose rods are bodies between two ball joints, and spin."""
+    data = expand(plain("delta_translation"))
     for name, rod in data.pop("rods").items():
         inner, outer = rod["between"]
         along = np.subtract(*rod["ends"])
@@ -160,12 +160,12 @@ def test_parts_that_spin_are_named_and_can_be_held():
     with pytest.raises(MobilityError) as error:
         Machine.from_data(data, "x")
     assert (error.value.actuated, error.value.freedoms) == (3, 6)
-    assert all(any(f"rod_{i}" in cause for cause in error.value.causes) for i in range(3))
+    assert all(any(f"forearm_{i}" in cause for cause in error.value.causes) for i in (1, 2, 3))
     graph, held = without_spins(graph_of(data))
     assert is_right(graph) and len(held) == 3
     assert [graph.joints[name].kind for name in held] == ["universal"] * 3
     # As with rods, which have no spin.
-    alone, none = without_spins(graph_of(rod_delta(True)))
+    alone, none = without_spins(graph_of(plain("delta_translation")))
     assert is_right(alone) and not none
 
 

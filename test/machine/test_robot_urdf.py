@@ -5,6 +5,9 @@ from __future__ import annotations
 
 import dataclasses
 import re
+import subprocess
+import sys
+from pathlib import Path
 from xml.etree import ElementTree as ET
 
 import numpy as np
@@ -19,6 +22,7 @@ from pkm_twin.robot import robot_urdf as writing
 from pkm_twin.robot.catalogue import robot_of_data
 from pkm_twin.robot.robot_urdf import joint_names, robot_description, robot_urdf
 from pkm_twin.robot.urdf_read import read_urdf
+from test.machine.random_machines import plain
 from test.support.mapped import sides
 from test.support.robots import load, partly_long, random_joints
 
@@ -109,8 +113,15 @@ def test_masses_sum_to_the_robot_s(robot):
 
 
 def test_mock_hardware_begins_inside_the_limits(robot):
-    joints = ET.fromstring(robot_urdf(robot)).find("ros2_control").findall("joint")
+    root = ET.fromstring(robot_urdf(robot))
+    joints = root.find("ros2_control").findall("joint")
     assert [joint.get("name") for joint in joints] == list(robot.joint_names)
+    for joint, most in zip(joints, np.broadcast_to(robot.limits.effort, len(joints)), strict=True):
+        for kind, count in (("command_interface", 2), ("state_interface", 3)):
+            found = {interface.get("name") for interface in joint.findall(kind)}
+            assert len(found) == count and {"position", "effort"} <= found
+        limit = root.find(f"joint[@name='{joint.get('name')}']/limit")
+        assert most is None or float(limit.get("effort")) == pytest.approx(most, rel=1e-13)
     start = np.array([float(joint.find("state_interface/param").text) for joint in joints])
     limits = robot.limits.position
     if limits is not None:
@@ -248,6 +259,41 @@ def test_the_text_is_the_same_each_time(robot):
     assert robot_urdf(robot) == robot_urdf(load(robot.name).changed(
         payload={"mass": 0.3, "com": [0.01, 0.02, -0.05]}
     ))  # fmt: skip
+
+
+def test_the_text_is_the_same_byte_for_byte_on_any_machine():
+    assert robot_urdf(load("five_bar")) == Path(__file__).with_name("five_bar.urdf").read_text()
+    rng = np.random.default_rng(5)
+
+    def shaken(value):
+        """In the last bit."""
+        if isinstance(value, dict):
+            return {key: shaken(item) for key, item in value.items()}
+        if isinstance(value, list):
+            return [shaken(item) for item in value]
+        return value * (1.0 + 1e-16 * rng.integers(-1, 2)) if isinstance(value, float) else value
+
+    data = plain("linear_delta")
+    one, other = (robot_of_data(numbers, "x") for numbers in (data, shaken(data)))
+    assert robot_urdf(one) == robot_urdf(other)
+
+
+def test_other_parsers_read_it(robot, tmp_path):
+    path = tmp_path / "robot.urdf"
+    path.write_text(robot_urdf(robot))
+    tool = Path(sys.executable).with_name("check_urdf")
+    if tool.exists():
+        done = subprocess.run([tool, path], capture_output=True, text=True, check=False, timeout=60)
+        assert done.returncode == 0, done.stdout + done.stderr
+        assert "root Link: base_link" in done.stdout
+    yourdfpy = pytest.importorskip("yourdfpy")
+    tree, q = yourdfpy.URDF.load(str(path)), robot.graph.home
+    assert tree.validate() and tree.base_link == "base_link"
+    names = (*robot.joint_names, *robot.passive_joints)
+    tree.update_cfg(dict(zip(names, (*q, *robot.passive(q)), strict=True)))
+    place = tree.get_transform("platform")
+    np.testing.assert_allclose(place[:3, 3], robot.graph.origin, atol=1e-7)
+    np.testing.assert_allclose(place[:3, :3], np.eye(3), atol=1e-7)
 
 
 def test_the_description_has_all_that_the_graph_has(robot):
