@@ -100,7 +100,9 @@ class Tape:
         if known is not None:
             return known
         level = max(map(_level_of, args))
-        value = op.one(*[x.value for x in args]) if level == PARAMETER else math.nan
+        value = math.nan
+        if level == PARAMETER:
+            value = (op.one or op.numbers)(*[x.value for x in args])
         return self._new(key, op, args, level, value)
 
     def _new(

@@ -7,7 +7,7 @@ Products that are used once are fused with the sum that uses them where the proc
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Final
+from typing import Any, Final
 
 from pkm_twin.codegen.assembly import (
     BIT,
@@ -56,10 +56,12 @@ class Lanes:
         full = f"llvm.{name}.{f'v{LANES}f64' if self.wide else 'f64'}"
         return self.b.call(full, self.type, arguments)
 
-    def instruction(self, name: str, *arguments: Value) -> Value:
-        """An instruction, or an intrinsic, by its name."""
-        known: Callable[..., Value] | None = getattr(self.b, name, None)
-        return self.call(name, *arguments) if known is None else known(*arguments)
+    def operation(self, lanes: str | Callable[..., Value], e: Any, x: Sequence[Value]) -> Value:
+        """The instructions of an operation, ``e``, on its arguments."""
+        if isinstance(lanes, str):
+            known: Callable[..., Value] | None = getattr(self.b, lanes, None)
+            return self.call(lanes, *x) if known is None else known(*x)
+        return lanes(self, e, *x)
 
     def fused(self, x: Value, y: Value, z: Value) -> Value:
         """X y + z."""

@@ -105,7 +105,7 @@ class Emitter(Lanes):
             return self.number(e.value)
         parts = fused(e, self.used, self.known.places)
         if parts is None:
-            return e.op.lanes(self, e, *[self.known[x.number] for x in e.args])
+            return self.operation(e.op.lanes, e, [self.known[x.number] for x in e.args])
         first, product, rest = parts
         x, y, z = [self.known[v.number] for v in (*product.args, rest)]
         if e.op is sub:

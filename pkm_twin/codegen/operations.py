@@ -10,8 +10,9 @@ from __future__ import annotations
 import math
 import operator
 import re
-from collections.abc import Container, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Final
+from collections.abc import Callable, Container, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
@@ -78,204 +79,7 @@ def _series(coefficients: Sequence[float]) -> str:
     return text
 
 
-class Operation:
-    """An operation on one to three arguments.
-
-    ``infix``: of it on texts, else it is a function: ``name`` in Python; in C ``body`` is what
-    @_name(x, y, z) returns, or it is math.h's ``c``. ``instruction``: LLVM's, or its intrinsic
-    function. ``numbers``: on floats and arrays, for what is computed while a program is written.
-    ``one``, ``many``: on floats and on arrays, in a program: NaN or infinite without a result.
-    """
-
-    name: ClassVar[str]
-    infix: ClassVar[str] = ""
-    c: ClassVar[str] = ""
-    body: ClassVar[str] = ""
-    instruction: ClassVar[str] = ""
-    commutes: ClassVar[bool] = False
-    numbers: ClassVar[Any]
-    one: ClassVar[Any]
-    many: ClassVar[Any]
-
-    def __call__(self, *values: Any) -> Any:
-        """The operation on numbers, arrays or expressions, folded where it can be."""
-        for value in values:
-            tape = getattr(value, "tape", None)
-            if tape is not None:
-                given = [tape.lift(x) for x in values]
-                if any([x.level for x in given]):
-                    return self.fold(*given)
-                return tape.constant(float(self.numbers(*[x.value for x in given])))
-        return self.numbers(*values)
-
-    def fold(self, *given: Any) -> Any:
-        """An expression of the same value, by default the operation itself."""
-        return given[0].tape.make(self, *given)
-
-    def in_python(self, texts: Sequence[str]) -> str:
-        """The operation on what these texts say."""
-        return self.infix.format(*texts) if self.infix else f"{self.name}({', '.join(texts)})"
-
-    def in_c(self, texts: Sequence[str]) -> str:
-        """The same in C."""
-        if self.infix:
-            return self.infix.format(*texts)
-        return f"{f'@_{self.name}' if self.body else self.c or self.name}({', '.join(texts)})"
-
-    @property
-    def helper(self) -> str:
-        """A C function that :meth:`in_c` calls; there may be none."""
-        names = ", ".join(f"double {x}" for x in "xyz" if re.search(rf"\b{x}\b", self.body))
-        head = f"static double @_{self.name}({names})"
-        return f"{head}\n{{\n    return {self.body};\n}}\n" if self.body else ""
-
-    def lanes(self, to: Lanes, e: Any, *x: Value) -> Value:
-        """Its instructions on vectors, or on one double."""
-        return to.instruction(self.instruction, *x)
-
-    def slopes(self, e: Any, *x: Any) -> tuple[Any, ...]:
-        """Derivatives of its value ``e`` by the arguments, expressions or numbers."""
-        return (0.0,) * len(x)
-
-    def __repr__(self) -> str:
-        return self.name
-
-
-class _Add(Operation):
-    name, infix, instruction, commutes = "add", "({} + {})", "fadd", True
-    numbers = one = many = operator.add
-
-    def fold(self, a: Any, b: Any) -> Any:
-        if a.level == CONSTANT and a.value == 0.0:
-            return b
-        if b.level == CONSTANT and b.value == 0.0:
-            return a
-        if b.op is neg:
-            return sub.fold(a, *b.args)
-        if a.op is neg:
-            return sub.fold(b, *a.args)
-        return a.tape.make(self, a, b)
-
-    def slopes(self, e: Any, *x: Any) -> tuple[Any, ...]:
-        return 1.0, 1.0
-
-
-class _Sub(Operation):
-    name, infix, instruction = "sub", "({} - {})", "fsub"
-    numbers = one = many = operator.sub
-
-    def fold(self, a: Any, b: Any) -> Any:
-        if a is b:
-            return a.tape.constant(0.0)
-        if b.level == CONSTANT and b.value == 0.0:
-            return a
-        if a.level == CONSTANT and a.value == 0.0:
-            return neg.fold(b)
-        if b.op is neg:
-            return add.fold(a, *b.args)
-        if a.op is neg:
-            return neg.fold(add.fold(a.args[0], b))
-        return a.tape.make(self, a, b)
-
-    def slopes(self, e: Any, *x: Any) -> tuple[Any, ...]:
-        return 1.0, -1.0
-
-
-class _Mul(Operation):
-    name, infix, instruction, commutes = "mul", "({} * {})", "fmul", True
-    numbers = one = many = operator.mul
-
-    def fold(self, a: Any, b: Any) -> Any:
-        for u, v in ((a, b), (b, a)):
-            if u.level == CONSTANT and u.value in (0.0, 1.0, -1.0):
-                return u if u.value == 0.0 else v if u.value > 0.0 else neg.fold(v)
-        if a.op is neg:
-            positive = b.op is neg
-            return mul.fold(*a.args, *b.args) if positive else neg.fold(mul.fold(a.args[0], b))
-        if b.op is neg:
-            return neg.fold(mul.fold(a, *b.args))
-        return a.tape.make(self, a, b)
-
-    def slopes(self, e: Any, *x: Any) -> tuple[Any, ...]:
-        return x[1], x[0]
-
-
-class _Neg(Operation):
-    name, infix, instruction = "neg", "(-{})", "fneg"
-    numbers = one = many = operator.neg
-
-    def fold(self, a: Any) -> Any:
-        if a.op is neg:
-            return a.args[0]
-        return sub.fold(*a.args[::-1]) if a.op is sub else a.tape.make(self, a)
-
-    def slopes(self, e: Any, *x: Any) -> tuple[Any, ...]:
-        return (-1.0,)
-
-
-class _Inv(Operation):
-    name = "inv"
-
-    @staticmethod
-    def numbers(x: Any) -> Any:
-        return 1.0 / x
-
-    many = numbers
-
-    @staticmethod
-    def one(x: float) -> float:
-        return 1.0 / x if x else math.copysign(math.inf, x)
-
-    def fold(self, a: Any) -> Any:
-        return neg.fold(inv.fold(*a.args)) if a.op is neg else a.tape.make(self, a)
-
-    def in_c(self, texts: Sequence[str]) -> str:
-        return f"(1.0 / {texts[0]})"
-
-    def lanes(self, to: Lanes, e: Any, *x: Value) -> Value:
-        return to.b.fdiv(to.number(1.0), *x)
-
-    def slopes(self, e: Any, *x: Any) -> tuple[Any, ...]:
-        return (-(e * e),)
-
-
-class _Divide(Operation):
-    """A quotient, as a product with a reciprocal, which is shared."""
-
-    @staticmethod
-    def numbers(a: float, b: float) -> float:
-        return a * (1.0 / b)
-
-    def fold(self, a: Any, b: Any) -> Any:
-        if a.is_constant(0.0):
-            return a
-        if a.op is neg:
-            return neg.fold(self.fold(a.args[0], b))
-        if b.op is neg:
-            return neg.fold(self.fold(a, *b.args))
-        return mul.fold(a, inv(b))
-
-
-class _Sqrt(Operation):
-    name = instruction = "sqrt"
-    numbers = many = np.sqrt
-
-    @staticmethod
-    def one(x: float) -> float:
-        return math.sqrt(x) if x >= 0.0 else math.nan
-
-    def slopes(self, e: Any, *x: Any) -> tuple[Any, ...]:
-        # The length of a vector that is zero has no slope; where it counts, a greater length does.
-        # Of one that is zero in the known case, its square has none there either.
-        return (0.5 / (maximum(e, _LEAST) if e.value == 0.0 else e),)
-
-
-class _Turn(Operation):
-    """Sine or cosine, each with the other computed at once."""
-
-    index: ClassVar[int]
-    within: ClassVar[Any]
-    helper = f"""\
+TURN: Final = f"""\
 /* Sines and cosines: polynomials after Cody and Waite's reduction by quarter turns. NaN where
    the angle is so large that the reduction loses digits. */
 static void @_turn(const double *x, double *s, double *c, int count)
@@ -305,60 +109,110 @@ static void @_turn(const double *x, double *s, double *c, int count)
 }}
 """
 
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Operation:
+    """An operation on one to three arguments.
+
+    ``numbers``: on floats and arrays, while a program is written. ``one``, ``many``: on floats and
+    on arrays in a program, NaN or infinite without a result; by default the same. ``slopes``: its
+    derivatives, of its value and its arguments. ``lanes``: its instruction in LLVM's language, or a
+    function that writes some. ``infix``: of it on texts; else it is a function, in C math.h's, or
+    ``c``, or one that returns ``body``, of x, y and z. ``fold``: an expression of the same value.
+    """
+
+    name: str
+    numbers: Callable[..., Any]
+    lanes: str | Callable[..., Value]
+    slopes: Callable[..., tuple[Any, ...]] = lambda e, *x: (0.0,) * len(x)
+    one: Callable[..., Any] | None = None
+    many: Callable[..., Any] | None = None
+    infix: str = ""
+    c: str = ""
+    body: str = ""
+    helper: str = ""
+    folds: Callable[..., Any] | None = None
+    commutes: bool = False
+
+    def __call__(self, *values: Any) -> Any:
+        """The operation on numbers, arrays or expressions."""
+        for value in values:
+            tape = getattr(value, "tape", None)
+            if tape is not None:
+                given = [tape.lift(x) for x in values]
+                if any([x.level for x in given]):
+                    return self.fold(*given)
+                return tape.constant(float(self.numbers(*[x.value for x in given])))
+        return self.numbers(*values)
+
     def fold(self, *given: Any) -> Any:
-        circle = _circle(*given)
-        return super().fold(*given) if circle is None else circle[self.index]
+        """An expression of the value, by default the operation itself."""
+        return given[0].tape.make(self, *given) if self.folds is None else self.folds(*given)
 
-    @classmethod
-    def one(cls, x: float) -> float:
-        return float(cls.within(x)) if abs(x) < MAX_ANGLE else math.nan
+    def text(self, texts: Sequence[str], *, in_c: bool = False) -> str:
+        """The operation on what these texts say, in Python or in C."""
+        infix = self.infix or (self.c if in_c and "{" in self.c else "")
+        if infix:
+            return infix.format(*texts)
+        c = f"@_{self.name}" if self.body else self.c or self.name
+        return f"{c if in_c else self.name}({', '.join(texts)})"
 
-    @classmethod
-    def many(cls, x: Any) -> Any:
-        return cls.numbers(np.where(np.abs(x) < MAX_ANGLE, x, np.nan))
+    @property
+    def helpers(self) -> str:
+        """C functions that its text calls."""
+        names = ", ".join(f"double {x}" for x in "xyz" if re.search(rf"\b{x}\b", self.body))
+        head = f"static double @_{self.name}({names})"
+        return f"{head}\n{{\n    return {self.body};\n}}\n" if self.body else self.helper
 
-    def lanes(self, to: Lanes, e: Any, *x: Value) -> Value:
-        number = e.args[0].number
-        if number not in to.turned:
-            to.turned[number] = self._both(to, *x)
-        return to.turned[number][self.index]
-
-    @staticmethod
-    def _both(to: Lanes, x: Value) -> tuple[Value, Value]:
-        """Cosine and sine."""
-        b, n = to.b, to.number
-        quarters = to.call("rint", b.fmul(x, n(2 / math.pi)))
-        y = b.select(b.fcmp("olt", to.call("fabs", x), n(MAX_ANGLE)), x, n(math.nan))
-        for part in QUARTER:
-            y = to.fused(quarters, n(-part), y)
-        z = b.fmul(y, y)
-        sine = to.fused(b.fmul(z, y), to.polynomial(z, SINE), y)
-        cosine = b.fadd(
-            to.fused(z, n(-0.5), n(1.0)), b.fmul(b.fmul(z, z), to.polynomial(z, COSINE))
-        )
-        k = b.fptosi(quarters, to.integer)
-        odd = b.icmp("ne", b.and_(k, to.whole(1)), to.whole(0))
-
-        def signed(value: Value, turns: Value) -> Value:
-            flip = b.shl(b.and_(turns, to.whole(2)), to.whole(62))
-            return b.bitcast(b.xor(b.bitcast(value, to.integer), flip), to.type)
-
-        turned = signed(b.select(odd, cosine, sine), k)
-        return signed(b.select(odd, sine, cosine), b.add(k, to.whole(1))), turned
+    def __repr__(self) -> str:
+        return self.name
 
 
-class _Sin(_Turn):
-    name, index, numbers, within = "sin", 1, np.sin, math.sin
+def _sum(a: Any, b: Any) -> Any:
+    if a.level == CONSTANT and a.value == 0.0:
+        return b
+    if b.level == CONSTANT and b.value == 0.0:
+        return a
+    if b.op is neg:
+        return _difference(a, *b.args)
+    return _difference(b, *a.args) if a.op is neg else a.tape.make(add, a, b)
 
-    def slopes(self, e: Any, *x: Any) -> tuple[Any, ...]:
-        return (cos(*x),)
+
+def _difference(a: Any, b: Any) -> Any:
+    if a is b:
+        return a.tape.constant(0.0)
+    if b.level == CONSTANT and b.value == 0.0:
+        return a
+    if a.level == CONSTANT and a.value == 0.0:
+        return _negative(b)
+    if b.op is neg:
+        return _sum(a, *b.args)
+    return _negative(_sum(a.args[0], b)) if a.op is neg else a.tape.make(sub, a, b)
 
 
-class _Cos(_Turn):
-    name, index, numbers, within = "cos", 0, np.cos, math.cos
+def _product(a: Any, b: Any) -> Any:
+    for u, v in ((a, b), (b, a)):
+        if u.level == CONSTANT and u.value in (0.0, 1.0, -1.0):
+            return u if u.value == 0.0 else v if u.value > 0.0 else _negative(v)
+    if a.op is neg:
+        both = b.op is neg
+        return _product(*a.args, *b.args) if both else _negative(_product(a.args[0], b))
+    return _negative(_product(a, *b.args)) if b.op is neg else a.tape.make(mul, a, b)
 
-    def slopes(self, e: Any, *x: Any) -> tuple[Any, ...]:
-        return (-sin(*x),)
+
+def _negative(a: Any) -> Any:
+    if a.op is neg:
+        return a.args[0]
+    return _difference(*a.args[::-1]) if a.op is sub else a.tape.make(neg, a)
+
+
+def _quotient(a: Any, b: Any) -> Any:
+    """A product with a reciprocal, which is shared."""
+    if a.is_constant(0.0):
+        return a
+    if a.op is neg:
+        return _negative(_quotient(a.args[0], b))
+    return _negative(_quotient(a, *b.args)) if b.op is neg else _product(a, inv(b))
 
 
 def _circle(e: Any) -> tuple[Any, Any] | None:
@@ -380,135 +234,126 @@ def _circle(e: Any) -> tuple[Any, Any] | None:
     return c * d - s * t, s * d + c * t
 
 
-class _Exp(Operation):
-    name, numbers, many = "exp", np.exp, np.exp
+def _turn(name: str, index: int, slope: Callable[[Any], Any]) -> Operation:
+    """Sine or cosine, each with the other computed at once."""
+    numbers, within = getattr(np, name), getattr(math, name)
 
-    @staticmethod
-    def one(x: float) -> float:
-        try:
-            return math.exp(x)
-        except OverflowError:
-            return math.inf
+    def folds(x: Any) -> Any:
+        circle = _circle(x)
+        return x.tape.make(turn, x) if circle is None else circle[index]
 
-    def lanes(self, to: Lanes, e: Any, *x: Value) -> Value:
-        b, n, power = to.b, to.number, x[0]
-        for bound, condition in ((n(LARGEST_POWER), "ogt"), (n(-LARGEST_POWER), "olt")):
-            power = b.select(b.fcmp(condition, power, bound), bound, power)
-        twos = to.call("rint", b.fmul(power, n(1.0 / math.log(2.0))))
-        for part in LN2:
-            power = to.fused(twos, n(-part), power)
-        z = b.fmul(power, power)
-        odd = b.fmul(power, to.polynomial(z, EXP_P))
-        ratio = b.fdiv(odd, b.fsub(to.polynomial(z, EXP_Q), odd))
-        result = to.fused(ratio, n(2.0), n(1.0))
-        # In two parts: 2^k alone may be infinite, or zero, where the result is not.
-        half = to.call("rint", b.fmul(twos, n(0.5)))
-        for share in (half, b.fsub(twos, half)):
-            bits = b.shl(b.add(b.fptosi(share, to.integer), to.whole(1023)), to.whole(52))
-            result = b.fmul(result, b.bitcast(bits, to.type))
-        return result
+    def lanes(to: Lanes, e: Any, x: Value) -> Value:
+        number = e.args[0].number
+        if number not in to.turned:
+            to.turned[number] = _both(to, x)
+        return to.turned[number][index]
 
-    def slopes(self, e: Any, *x: Any) -> tuple[Any, ...]:
-        return (e,)
+    turn = Operation(
+        name, numbers, lanes, lambda e, x: (slope(x),),
+        lambda x: within(x) if abs(x) < MAX_ANGLE else math.nan,
+        lambda x: numbers(np.where(np.abs(x) < MAX_ANGLE, x, np.nan)),
+        folds=folds, helper=TURN,
+    )  # fmt: skip
+    return turn
 
 
-class _Tanh(Operation):
-    name, numbers, many, one = "tanh", np.tanh, np.tanh, math.tanh
+def _both(to: Lanes, x: Value) -> tuple[Value, Value]:
+    """Cosine and sine."""
+    b, n = to.b, to.number
+    quarters = to.call("rint", b.fmul(x, n(2 / math.pi)))
+    y = b.select(b.fcmp("olt", to.call("fabs", x), n(MAX_ANGLE)), x, n(math.nan))
+    for part in QUARTER:
+        y = to.fused(quarters, n(-part), y)
+    z = b.fmul(y, y)
+    sine = to.fused(b.fmul(z, y), to.polynomial(z, SINE), y)
+    cosine = b.fadd(to.fused(z, n(-0.5), n(1.0)), b.fmul(b.fmul(z, z), to.polynomial(z, COSINE)))
+    k = b.fptosi(quarters, to.integer)
+    odd = b.icmp("ne", b.and_(k, to.whole(1)), to.whole(0))
 
-    def lanes(self, to: Lanes, e: Any, *x: Value) -> Value:
-        b, n, (y,) = to.b, to.number, x
-        size, z = to.call("fabs", y), b.fmul(y, y)
-        ratio = b.fdiv(to.polynomial(z, TANH_P), to.polynomial(z, TANH_Q))
-        power = exp.lanes(to, None, b.fmul(size, n(2.0)))
-        large = b.fsub(n(1.0), b.fdiv(n(2.0), b.fadd(power, n(1.0))))
-        small = b.fcmp("olt", size, n(0.625))
-        return b.select(small, to.fused(b.fmul(y, z), ratio, y), to.call("copysign", large, y))
+    def signed(value: Value, turns: Value) -> Value:
+        flip = b.shl(b.and_(turns, to.whole(2)), to.whole(62))
+        return b.bitcast(b.xor(b.bitcast(value, to.integer), flip), to.type)
 
-    def slopes(self, e: Any, *x: Any) -> tuple[Any, ...]:
-        return (1.0 - e * e,)
-
-
-class _Abs(Operation):
-    name, c, instruction = "abs", "fabs", "fabs"
-    numbers, many, one = np.abs, np.abs, abs
-
-    def slopes(self, e: Any, *x: Any) -> tuple[Any, ...]:
-        return (sign(*x),)
+    turned = signed(b.select(odd, cosine, sine), k)
+    return signed(b.select(odd, sine, cosine), b.add(k, to.whole(1))), turned
 
 
-class _Sign(Operation):
-    """-1, 0 or 1."""
-
-    name, numbers, many = "sign", np.sign, np.sign
-    body = "(x > 0.0) ? 1.0 : ((x < 0.0) ? -1.0 : x * 0.0)"
-
-    @staticmethod
-    def one(x: float) -> float:
-        return 1.0 if x > 0.0 else -1.0 if x < 0.0 else x * 0.0
-
-    def lanes(self, to: Lanes, e: Any, *x: Value) -> Value:
-        b, n, (y,) = to.b, to.number, x
-        down = b.select(b.fcmp("olt", y, n(0.0)), n(-1.0), b.fmul(y, n(0.0)))
-        return b.select(b.fcmp("ogt", y, n(0.0)), n(1.0), down)
-
-
-class _Atan2(Operation):
-    """The angle of (x, y)."""
-
-    name, numbers, many, one = "atan2", np.arctan2, np.arctan2, math.atan2
-
-    def lanes(self, to: Lanes, e: Any, *x: Value) -> Value:
-        b, n, (down, right) = to.b, to.number, x
-        ay, ax = to.call("fabs", down), to.call("fabs", right)
-        steep = b.fcmp("ogt", ay, ax)
-        small, large = b.select(steep, ax, ay), b.select(steep, ay, ax)
-        zero = b.fcmp("oeq", large, n(0.0))
-        t = b.fdiv(small, b.select(zero, n(1.0), large))
-        high = b.fcmp("ogt", t, n(0.66))
-        u = b.select(high, b.fdiv(b.fsub(t, n(1.0)), b.fadd(t, n(1.0))), t)
-        z = b.fmul(u, u)
-        ratio = b.fdiv(to.polynomial(z, ATAN_P), to.polynomial(z, ATAN_Q))
-        angle = to.fused(b.fmul(u, z), ratio, u)
-        angle = b.select(high, b.fadd(b.fadd(angle, n(MORE / 2)), n(math.pi / 4)), angle)
-        angle = b.select(steep, b.fadd(b.fsub(n(math.pi / 2), angle), n(MORE)), angle)
-        back = b.icmp("slt", b.bitcast(right, to.integer), to.whole(0))
-        angle = b.select(back, b.fadd(b.fsub(n(math.pi), angle), n(2 * MORE)), angle)
-        signs = b.and_(b.bitcast(down, to.integer), to.whole(-(2**63)))
-        return b.bitcast(b.or_(b.bitcast(angle, to.integer), signs), to.type)
-
-    def slopes(self, e: Any, *x: Any) -> tuple[Any, ...]:
-        square = x[0] * x[0] + x[1] * x[1]
-        return x[1] / square, -x[0] / square
+def _exponential(to: Lanes, x: Value) -> Value:
+    b, n = to.b, to.number
+    for bound, condition in ((n(LARGEST_POWER), "ogt"), (n(-LARGEST_POWER), "olt")):
+        x = b.select(b.fcmp(condition, x, bound), bound, x)
+    twos = to.call("rint", b.fmul(x, n(1.0 / math.log(2.0))))
+    for part in LN2:
+        x = to.fused(twos, n(-part), x)
+    z = b.fmul(x, x)
+    odd = b.fmul(x, to.polynomial(z, EXP_P))
+    ratio = b.fdiv(odd, b.fsub(to.polynomial(z, EXP_Q), odd))
+    result = to.fused(ratio, n(2.0), n(1.0))
+    # In two parts: 2^k alone may be infinite, or zero, where the result is not.
+    half = to.call("rint", b.fmul(twos, n(0.5)))
+    for share in (half, b.fsub(twos, half)):
+        bits = b.shl(b.add(b.fptosi(share, to.integer), to.whole(1023)), to.whole(52))
+        result = b.fmul(result, b.bitcast(bits, to.type))
+    return result
 
 
-class _Min(Operation):
-    name, numbers, many, commutes = "min", np.minimum, np.minimum, True
-    body = "(x < y) ? x : y"
-
-    @staticmethod
-    def one(x: float, y: float) -> float:
-        return x if x < y else y
-
-    def lanes(self, to: Lanes, e: Any, *x: Value) -> Value:
-        return to.b.select(to.b.fcmp("olt", *x), *x)
-
-    def slopes(self, e: Any, *x: Any) -> tuple[Any, ...]:
-        return _greater(x[1], x[0]), _greater(*x)
+def _power(x: float) -> float:
+    try:
+        return math.exp(x)
+    except OverflowError:
+        return math.inf
 
 
-class _Max(Operation):
-    name, numbers, many, commutes = "max", np.maximum, np.maximum, True
-    body = "(x > y) ? x : y"
+def _hyperbolic(to: Lanes, e: Any, x: Value) -> Value:
+    b, n = to.b, to.number
+    size, z = to.call("fabs", x), b.fmul(x, x)
+    ratio = b.fdiv(to.polynomial(z, TANH_P), to.polynomial(z, TANH_Q))
+    power = _exponential(to, b.fmul(size, n(2.0)))
+    large = b.fsub(n(1.0), b.fdiv(n(2.0), b.fadd(power, n(1.0))))
+    small = b.fcmp("olt", size, n(0.625))
+    return b.select(small, to.fused(b.fmul(x, z), ratio, x), to.call("copysign", large, x))
 
-    @staticmethod
-    def one(x: float, y: float) -> float:
-        return x if x > y else y
 
-    def lanes(self, to: Lanes, e: Any, *x: Value) -> Value:
-        return to.b.select(to.b.fcmp("ogt", *x), *x)
+def _arctangent(to: Lanes, e: Any, y: Value, x: Value) -> Value:
+    b, n = to.b, to.number
+    ay, ax = to.call("fabs", y), to.call("fabs", x)
+    steep = b.fcmp("ogt", ay, ax)
+    small, large = b.select(steep, ax, ay), b.select(steep, ay, ax)
+    zero = b.fcmp("oeq", large, n(0.0))
+    t = b.fdiv(small, b.select(zero, n(1.0), large))
+    high = b.fcmp("ogt", t, n(0.66))
+    u = b.select(high, b.fdiv(b.fsub(t, n(1.0)), b.fadd(t, n(1.0))), t)
+    z = b.fmul(u, u)
+    ratio = b.fdiv(to.polynomial(z, ATAN_P), to.polynomial(z, ATAN_Q))
+    angle = to.fused(b.fmul(u, z), ratio, u)
+    angle = b.select(high, b.fadd(b.fadd(angle, n(MORE / 2)), n(math.pi / 4)), angle)
+    angle = b.select(steep, b.fadd(b.fsub(n(math.pi / 2), angle), n(MORE)), angle)
+    back = b.icmp("slt", b.bitcast(x, to.integer), to.whole(0))
+    angle = b.select(back, b.fadd(b.fsub(n(math.pi), angle), n(2 * MORE)), angle)
+    signs = b.and_(b.bitcast(y, to.integer), to.whole(-(2**63)))
+    return b.bitcast(b.or_(b.bitcast(angle, to.integer), signs), to.type)
 
-    def slopes(self, e: Any, *x: Any) -> tuple[Any, ...]:
-        return _greater(*x), _greater(x[1], x[0])
+
+def _signed(to: Lanes, e: Any, x: Value) -> Value:
+    b, n = to.b, to.number
+    down = b.select(b.fcmp("olt", x, n(0.0)), n(-1.0), b.fmul(x, n(0.0)))
+    return b.select(b.fcmp("ogt", x, n(0.0)), n(1.0), down)
+
+
+def _below(to: Lanes, e: Any, x: Value, y: Value) -> Value:
+    mask = to.masks[e.number] = to.b.fcmp("olt", x, y)
+    return to.b.select(mask, to.number(1.0), to.number(0.0))
+
+
+def _selected(to: Lanes, e: Any, x: Value, y: Value, z: Value) -> Value:
+    number = e.args[0].number
+    if number not in to.masks:
+        to.masks[number] = to.b.fcmp("ogt", x, to.number(0.0))
+    return to.b.select(to.masks[number], y, z)
+
+
+def _choice(x: Any, y: Any, z: Any) -> Any:
+    return (y if x.value > 0.0 else z) if x.level == CONSTANT else x.tape.make(select, x, y, z)
 
 
 def _greater(a: Any, b: Any) -> Any:
@@ -516,61 +361,73 @@ def _greater(a: Any, b: Any) -> Any:
     return 0.5 + 0.5 * sign(a - b)
 
 
-class _Less(Operation):
-    """1 where the first one is less than the second, else 0, also of NaN."""
-
-    name, body = "less", "(x < y) ? 1.0 : 0.0"
-
-    @staticmethod
-    def one(x: float, y: float) -> float:
-        return 1.0 if x < y else 0.0
-
-    @staticmethod
-    def many(x: Any, y: Any) -> Any:
-        return np.where(x < y, 1.0, 0.0)
-
-    numbers = many
-
-    def lanes(self, to: Lanes, e: Any, *x: Value) -> Value:
-        mask = to.masks[e.number] = to.b.fcmp("olt", *x)
-        return to.b.select(mask, to.number(1.0), to.number(0.0))
+def _steepness(e: Any, x: Any) -> tuple[Any, ...]:
+    # The length of a vector that is zero has no slope; where it counts, a greater length does.
+    # Of one that is zero in the known case, its square has none there either.
+    return (0.5 / (maximum(e, 1e-150) if e.value == 0.0 else e),)
 
 
-class _Select(Operation):
-    """The second one where the first one is above zero, else the third."""
-
-    name, body = "select", "(x > 0.0) ? y : z"
-
-    @staticmethod
-    def one(x: float, y: float, z: float) -> float:
-        return y if x > 0.0 else z
-
-    @staticmethod
-    def many(x: Any, y: Any, z: Any) -> Any:
-        return np.where(x > 0.0, y, z)
-
-    numbers = many
-
-    def fold(self, x: Any, y: Any, z: Any) -> Any:
-        return (y if x.value > 0.0 else z) if x.level == CONSTANT else super().fold(x, y, z)
-
-    def lanes(self, to: Lanes, e: Any, *x: Value) -> Value:
-        number = e.args[0].number
-        if number not in to.masks:
-            to.masks[number] = to.b.fcmp("ogt", x[0], to.number(0.0))
-        return to.b.select(to.masks[number], *x[1:])
-
-    def slopes(self, e: Any, *x: Any) -> tuple[Any, ...]:
-        return 0.0, select(x[0], 1.0, 0.0), select(x[0], 0.0, 1.0)
-
-
-_LEAST: Final = 1e-150
-add, sub, mul, neg = _Add(), _Sub(), _Mul(), _Neg()
-inv, divide = _Inv(), _Divide()
-sqrt, sin, cos, exp, tanh = _Sqrt(), _Sin(), _Cos(), _Exp(), _Tanh()
-absolute, sign, atan2 = _Abs(), _Sign(), _Atan2()
-minimum, maximum, less, select = _Min(), _Max(), _Less(), _Select()
-OPERATIONS: Final[Sequence[Operation]] = (
+add: Final = Operation(
+    "add", operator.add, "fadd", lambda e, a, b: (1.0, 1.0),
+    infix="({} + {})", folds=_sum, commutes=True,
+)  # fmt: skip
+sub: Final = Operation(
+    "sub", operator.sub, "fsub", lambda e, a, b: (1.0, -1.0), infix="({} - {})", folds=_difference
+)
+mul: Final = Operation(
+    "mul", operator.mul, "fmul", lambda e, a, b: (b, a),
+    infix="({} * {})", folds=_product, commutes=True,
+)  # fmt: skip
+neg: Final = Operation(
+    "neg", operator.neg, "fneg", lambda e, x: (-1.0,), infix="(-{})", folds=_negative
+)
+inv: Final[Operation] = Operation(
+    "inv", lambda x: 1.0 / x, lambda to, e, x: to.b.fdiv(to.number(1.0), x),
+    lambda e, x: (-(e * e),), lambda x: 1.0 / x if x else math.copysign(math.inf, x),
+    c="(1.0 / {})", folds=lambda x: _negative(inv(*x.args)) if x.op is neg else x.tape.make(inv, x),
+)  # fmt: skip
+divide: Final = Operation("divide", lambda a, b: a * (1.0 / b), "", folds=_quotient)
+sqrt: Final = Operation(
+    "sqrt", np.sqrt, "sqrt", _steepness, lambda x: math.sqrt(x) if x >= 0.0 else math.nan
+)
+sin: Final = _turn("sin", 1, lambda x: cos(x))
+cos: Final[Operation] = _turn("cos", 0, lambda x: -sin(x))
+exp: Final = Operation(
+    "exp", np.exp, lambda to, e, x: _exponential(to, x), lambda e, x: (e,), _power
+)
+tanh: Final = Operation("tanh", np.tanh, _hyperbolic, lambda e, x: (1.0 - e * e,), math.tanh)
+absolute: Final = Operation("abs", np.abs, "fabs", lambda e, x: (sign(x),), abs, c="fabs")
+sign: Final[Operation] = Operation(
+    "sign", np.sign, _signed, one=lambda x: 1.0 if x > 0.0 else -1.0 if x < 0.0 else x * 0.0,
+    body="(x > 0.0) ? 1.0 : ((x < 0.0) ? -1.0 : x * 0.0)",
+)  # fmt: skip
+"""-1, 0 or 1."""
+atan2: Final = Operation(
+    "atan2", np.arctan2, _arctangent,
+    lambda e, y, x: (x / (y * y + x * x), -y / (y * y + x * x)), math.atan2,
+)  # fmt: skip
+minimum: Final = Operation(
+    "min", np.minimum, lambda to, e, x, y: to.b.select(to.b.fcmp("olt", x, y), x, y),
+    lambda e, x, y: (_greater(y, x), _greater(x, y)), lambda x, y: x if x < y else y,
+    body="(x < y) ? x : y", commutes=True,
+)  # fmt: skip
+maximum: Final = Operation(
+    "max", np.maximum, lambda to, e, x, y: to.b.select(to.b.fcmp("ogt", x, y), x, y),
+    lambda e, x, y: (_greater(x, y), _greater(y, x)), lambda x, y: x if x > y else y,
+    body="(x > y) ? x : y", commutes=True,
+)  # fmt: skip
+less: Final = Operation(
+    "less", lambda x, y: np.where(x < y, 1.0, 0.0), _below,
+    one=lambda x, y: 1.0 if x < y else 0.0, body="(x < y) ? 1.0 : 0.0",
+)  # fmt: skip
+"""1 where the first one is less than the second, else 0, also of NaN."""
+select: Final[Operation] = Operation(
+    "select", lambda x, y, z: np.where(x > 0.0, y, z), _selected,
+    lambda e, x, y, z: (0.0, select(x, 1.0, 0.0), select(x, 0.0, 1.0)),
+    lambda x, y, z: y if x > 0.0 else z, body="(x > 0.0) ? y : z", folds=_choice,
+)  # fmt: skip
+"""The second one where the first one is above zero, else the third."""
+OPERATIONS: Final = (
     add, sub, mul, neg, inv, sqrt, sin, cos, exp, tanh, absolute, sign, atan2, minimum, maximum,
     less, select,
 )  # fmt: skip

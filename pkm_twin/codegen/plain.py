@@ -35,8 +35,8 @@ _LONGEST: Final = 200
 
 
 _NUMBERS: Final = {"inf": math.inf, "nan": math.nan}
-_ONE: Final = {op.name: op.one for op in OPERATIONS} | _NUMBERS
-_MANY: Final = {op.name: op.many for op in OPERATIONS} | _NUMBERS
+_ONE: Final = {op.name: op.one or op.numbers for op in OPERATIONS} | _NUMBERS
+_MANY: Final = {op.name: op.many or op.numbers for op in OPERATIONS} | _NUMBERS
 
 
 def source(
@@ -65,7 +65,7 @@ def source(
         elif e.op is None:
             text[e.number] = f"({e.value!r})"
         else:
-            written = e.op.in_python([text[x.number] for x in e.args])
+            written = e.op.text([text[x.number] for x in e.args])
             if counts[e.number] == 1 and len(written) < _LONGEST:
                 text[e.number] = written
             else:

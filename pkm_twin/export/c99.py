@@ -148,7 +148,7 @@ class Unit:
 
     def text(self) -> str:
         """Helpers and all functions."""
-        helpers = dict.fromkeys(op.helper for op in OPERATIONS if op in self._needed and op.helper)
+        needed = (op.helpers for op in OPERATIONS if op in self._needed)
         steps = ", ".join(map(str, LADDER))
         ladder = f"""\
 /* Attempts of Newton's method; fewer shorten the worst case, and reject some valid states. */
@@ -160,7 +160,7 @@ class Unit:
 #endif
 static const int @_steps[{len(LADDER)}] = {{{steps}}};
 """
-        parts = [*helpers, _FIXED, ladder, *self._parts]
+        parts = [*dict.fromkeys(filter(None, needed)), _FIXED, ladder, *self._parts]
         return "\n".join(parts).replace("@", self.prefix)
 
     def add(self, text: str) -> None:

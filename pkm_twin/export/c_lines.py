@@ -100,7 +100,7 @@ class Lines:
         parts = fused(e, self._used, self._known)
         if parts is None:
             self.needed.add(op)
-            return op.in_c([self._text[x.number] for x in e.args])
+            return op.text([self._text[x.number] for x in e.args], in_c=True)
         first, product, rest = parts
         x, y, z = (self._text[v.number] for v in (*product.args, rest))
         if op is sub:
