@@ -256,7 +256,7 @@ class Package:
                 "            if (@_full_turn[i] > 0.0) {\n"
                 "                apart = remainder(apart, @_full_turn[i]);\n            }\n"
             )
-        self.unit.add(table("@_same", [SAME_POSE / float(unit) for unit in robot.pose_scales]))
+        self.unit.add(table("@_same", [SAME_POSE / float(unit) for unit in robot.unit_scales]))
         self.unit.add(f"""\
 {self.unit.signature(self.inverse, given=True)}
 {{

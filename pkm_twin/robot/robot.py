@@ -248,7 +248,7 @@ class Robot(Mechanism):
             if self.turn_mask.any():
                 turned = np.remainder(apart + math.pi, math.tau) - math.pi
                 apart = np.where(self.turn_mask, turned, apart)
-            same = (np.abs(apart) * self.pose_scales <= SAME_POSE).all(-1)
+            same = (np.abs(apart) * self.unit_scales <= SAME_POSE).all(-1)
         if codes is None:
             if same.all():
                 return q, None
@@ -263,7 +263,7 @@ class Robot(Mechanism):
         return np.array([len(c.entries) == 2 for c in self.coordinates])
 
     @cached_property
-    def pose_scales(self) -> Array:
+    def unit_scales(self) -> Array:
         """What makes pose coordinates of unit one, shape (m,)."""
         return np.array([1.0 if c.entries else 1.0 / self.graph.size for c in self.coordinates])
 
