@@ -11,12 +11,14 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from pkm_twin import Robot, load
-from pkm_twin.apps.drive_friction import GRAVITY
+from pkm_twin.apps.commands.fit import GRAVITY
+from pkm_twin.apps.fit_report import drive_report
 from pkm_twin.identification.calibration import HELD_OUT, Calibration, Errors, calibrate, geometric
 from pkm_twin.identification.calibration_state import Poses, rotations
-from pkm_twin.identification.hanging_mass import drive_friction, lines
+from pkm_twin.identification.drives import drive_friction
 from pkm_twin.identification.pose_tables import read_poses
 from pkm_twin.recordings import Dialect, read_table
+from pkm_twin.report import text_of
 
 Array = NDArray[np.float64]
 
@@ -132,7 +134,7 @@ def page() -> str:
     drive = drive_friction(
         GRAVITY * SPOOL * columns["mass_kg"], columns["iq_up_A"], columns["iq_down_A"]
     )
-    told = "\n".join(lines(drive))
+    told = text_of(drive_report(drive))
     return PAGE.format(
         count=count, table=table, ratios="\n".join(ratios), apart=apart, halves=halves, drive=told
     )
@@ -205,7 +207,7 @@ to day. The standard deviations assume independent errors; the poses of a grid s
 ## A drive that lifts weights
 
 One leg of the same machine, four weights at 0.6 revolutions a second, up and down: `pkm-twin
-drive-friction` with `leg_currents.csv` and `--lever 0.011391` prints
+fit --drive leg_currents.csv` with `--lever 0.011391` prints
 
 ```text
 {drive}

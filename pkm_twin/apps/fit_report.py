@@ -1,347 +1,271 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a fit says: on a terminal, as data, in the head of its file, and as one HTML page."""
+"""What a fit says: its answer, numbers, verdict, what was held out, and pictures."""
 
 from __future__ import annotations
 
-import base64
-import html
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any, Final
 
 import numpy as np
-import typer
-from rich.table import Table
 
-from pkm_twin.console import finite, table_console
-from pkm_twin.identification.fit import Fit
-from pkm_twin.identification.parameters import Number
-from pkm_twin.report.plots import COLOURS, columns, label, rendered
-from pkm_twin.robot.robot import Robot
+from pkm_twin.codegen.arrays import Array
+from pkm_twin.identification.deflections import ElasticFit
+from pkm_twin.identification.drives import DriveFriction
+from pkm_twin.identification.fit import Fit, Judged, Result
+from pkm_twin.identification.parameters import Combination, Group, Number
+from pkm_twin.report import Column, Fact, Report, Table, plots
 
-HEAD_OF_PAGE: Final = """<!DOCTYPE html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<title>{title}</title>
-<style>
-body {{ font: 15px/1.5 sans-serif; margin: 2em auto; max-width: 70em; padding: 0 1em; }}
-table {{ border-collapse: collapse; margin: 1em 0; }}
-td, th {{ border-bottom: 1px solid #ccc; padding: 0.2em 0.8em; text-align: right; }}
-td:first-child, th:first-child, td.word {{ text-align: left; }}
-img {{ max-width: 100%; }}
-</style>
-</head>
-<body>
-<h1>{title}</h1>
-"""
 MOST_SAMPLES: Final = 4000
 """Drawn of each recording."""
+COMBINED: Final = "known only in combination with others"
+BY_AXIS: Final = "m_m_m_rad_rad_rad"
+"""The end of a key in JSON: units of a deflection's directions."""
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Report:
-    """A fit in words; what differs between fits, and what is made of it for all.
+def report_of(
+    result: Result, recordings: Sequence[str], marks: Sequence[str] = ()
+) -> tuple[Report, list[Table]]:
+    """A fit's report, and tables for its page alone.
 
-    ``result``: with numbers of a file, a verdict and what was held out. ``recordings``: names of
-    what it was fitted to. ``label``: a number's name in lists. ``number_data``: data of a number
-    behind its key, ``data_before`` and ``data_after``: around that of the numbers. ``units``: of
-    the verdict's channels, ``names``: of the fitted numbers in its data, ``blind``: what the fit
-    cannot see. ``groups``: what is known of several numbers together. ``residuals``: by recording
-    and channel name, channel, rms before and after, peak, unit; ``late``: a line before them by
-    recording. ``figure``: the residuals of a recording. ``held_out``: HTML between their table and
-    their figures, ``signals``: at the end.
+    :param recordings: names of what it was fitted to. ``marks``: notes that come first.
     """
-
-    result: Any
-    recordings: Sequence[str]
-    combinations: int
-    units: Sequence[str]
-    names: Sequence[str]
-    blind: Sequence[str]
-    label: Callable[[Number], str]
-    number_data: Callable[[Number], dict[str, Any]]
-    data_before: Mapping[str, Any]
-    data_after: Mapping[str, Any]
-    table: Table
-    residuals: Sequence[Sequence[tuple[str, ...]]]
-    residuals_header: Sequence[str]
-    figure: Callable[[int], Any]
-    fitted: str
-    heading: str
-    excited_by: str
-    counted: str
-    about: str
-    bound: str
-    """What a bound means, on a terminal; ``bound_of_page``: on the page."""
-    bound_of_page: str
-    groups: Sequence[str] = ()
-    late: Sequence[str] = ()
-    held_out: str = ""
-    signals: str = ""
-
-    @property
-    def shown(self) -> list[Number]:
-        """Numbers that the recordings say something of."""
-        return [n for n in self.result.numbers if n.status != "not excited"]
-
-    @property
-    def idle(self) -> list[str]:
-        """Names of the others."""
-        return [self.label(n) for n in self.result.of("not excited")]
-
-    def as_json(self) -> dict[str, Any]:
-        """Plain data, units in the keys or beside the numbers; null for what was not measured."""
-        result, e = self.result, self.result.estimate
-        return {
-            "robot": result.robot.name,
-            "verdict": result.verdict.as_json(self.units, self.names),
-            "accepted": list(result.accepted),
-            "condition": finite(e.condition),
-            "combinations_determined": self.combinations,
-            "held_by_a_physical_bound": e.bound,
-            "samples_fitted": result.samples,
-            **self.data_before,
-            "parameters": [
-                {
-                    "key": n.name, **self.number_data(n), "before": n.before, "value": n.after,
-                    "standard_deviation": finite(n.deviation),
-                    "status": n.status,
-                }
-                for n in result.numbers
-            ],
-            "not_excited": self.idle,
-            **self.data_after,
-        }  # fmt: skip
-
-    def head(self) -> list[str]:
-        """Lines for the head of the file: from what, how well, and what stays open."""
-        result = self.result
-        lines = [
-            f"{self.fitted} from {', '.join(self.recordings)}: {self.combinations} combinations, "
-            f"condition number {result.estimate.condition:.3g}."
-        ]
-        lines += [f"Verdict: {line}." for line in result.verdict.lines(self.units)]
-        lines += [f"{text}." for text in self.groups]
-        for judged in result.judged:
-            before, after = (
-                ", ".join(f"{v:.3g}" for v in judged.rms(which) if np.isfinite(v))
-                for which in (judged.before, judged.after)
-            )
-            lines.append(f"Residual rms held out of {judged.name}: {before} before, {after} now.")
-        return lines
-
-    def echo(self) -> None:
-        """Print all of it."""
-        result, e = self.result, self.result.estimate
-        table_console().print(self.table)
-        if self.idle:
-            names = ", ".join(self.idle)
-            typer.echo(f"not excited by the {self.excited_by}, the file's value stays: {names}")
-        for line in self.groups:
-            typer.echo(line)
-        typer.echo(self.counted)
-        if e.bound:
-            typer.echo(self.bound)
-        for line in [*result.verdict.lines(self.units), *self.blind]:
-            typer.echo(line)
-        for k, rows in enumerate(self.residuals):
-            for line in self.late[k : k + 1]:
-                typer.echo(line)
-            for name, channel, before, after, _, unit in rows:
-                typer.echo(
-                    f"{name}, held out, {channel}: RMS residual {before} {unit} with the file's "
-                    f"values, {after} {unit} with the fitted ones"
-                )
-
-    def page(self, notes: Sequence[str] = ()) -> str:
-        """The whole page.
-
-        :param notes: lines of warning, which come first.
-        """
-        result = self.result
-        names = html.escape(", ".join(self.recordings))
-        title = f"{html.escape(result.robot.name)}: fitted from {names}"
-        parts = [
-            HEAD_OF_PAGE.format(title=title),
-            *(f"<p>{html.escape(line)}</p>" for line in notes),
-            "<h2>Does the model explain the recordings?</h2>",
-            self._verdict(),
-            f"<h2>{self.heading}</h2>",
-            html_table(
-                ("parameter", "in the file", "fitted", "standard deviation", "unit", ""),
-                [
-                    (n.name, f"{n.before:.6g}", f"{n.after:.6g}", n.spread, n.unit, note_of(n))
-                    for n in self.shown
-                ],
-            ),
-            f"<p>{self.about}</p>",
-        ]
-        if result.estimate.bound:
-            parts.append(f"<p>{self.bound_of_page}</p>")
-        if self.idle:
-            idle = html.escape(", ".join(self.idle))
-            parts.append(
-                f"<p>Not excited by the {self.excited_by}, the file's value stays: {idle}.</p>"
-            )
-        parts += [f"<p>{html.escape(text)}.</p>" for text in self.groups]
-        parts += [
-            "<h2>Parameters, in the file and fitted</h2>",
-            picture(changes_figure(self.shown)),
-        ]
-        parts.append("<h2>Held out: the last third of each recording</h2>")
-        parts.append(html_table(self.residuals_header, [row for k in self.residuals for row in k]))
-        parts += [self.held_out] if self.held_out else []
-        parts += [picture(self.figure(k)) for k in range(len(result.judged))]
-        parts += [self.signals] if self.signals else []
-        return "\n".join([*parts, "</body>", "</html>", ""])
-
-    def _verdict(self) -> str:
-        """The verdict's sentences, and the residual by channel."""
-        verdict = self.result.verdict
-        lines = [*verdict.lines(self.units), *self.blind]
-        text = "".join(f"<li>{html.escape(line)}</li>" for line in lines)
-        rows = [
-            (
-                c.name, f"{c.residual:.3g}", f"{c.noise:.3g}", unit, f"{100 * c.left:.2g} %",
-                f"{c.held_out:.3g}",
-            )
-            for c, unit in zip(verdict.channels, self.units, strict=True)
-        ]  # fmt: skip
-        header = (
-            "", "RMS residual in the band of the motion", "RMS noise there", "unit",
-            "variation without a known cause", "held out over fitted",
-        )  # fmt: skip
-        return f"<ul>{text}</ul>{html_table(header, rows)}"
-
-
-def effort_report(result: Fit, recordings: Sequence[str]) -> Report:
-    """Of a fit to efforts."""
-    joints, units = result.robot.joint_names, result.robot.effort_units
-    parameters, e = result.problem.parameters, result.estimate
-    table = Table(box=None)
-    table.add_column("parameter")
-    for name in ("in the file", "fitted", "standard deviation"):
-        table.add_column(name, justify="right")
-    table.add_column("unit")
-    table.add_column("")
-    for n in result.numbers:
-        if n.status != "not excited":
-            cells = f"{n.before:.6g}", f"{n.after:.6g}", n.spread, n.unit, note_of(n)
-            table.add_row(n.name, *cells)
-    filters = [
-        (
-            name, f"{how.window}", "none" if how.cutoff is None else f"{how.cutoff:.3g}",
-            f"{how.keep_every}", f"{1e3 * delay:.3g}",
-        )
-        for name, how, delay in zip(recordings, result.filtering, result.delays, strict=True)
+    verdict, e, elastic = result.verdict, result.estimate, isinstance(result, ElasticFit)
+    label = _element if elastic else _name
+    units = dict(zip(result.channels, result.units, strict=True))
+    own = tuple(units[channel.name] for channel in verdict.channels)
+    shown = [n for n in result.numbers if n.status != "not excited"]
+    idle = [label(n) for n in result.of("not excited")]
+    held = _held_out(result)
+    if isinstance(result, Fit):
+        names, facts = result.problem.parameters.names, _effort_facts(result)
+        blind = verdict.blind_lines(names, result.problem.parameters.units)
+        more = _delays(result, recordings)
+        more += [f"{result.outliers} efforts were outliers"] if result.outliers else []
+    elif isinstance(result, ElasticFit):
+        names = tuple(map(_element, result.numbers))
+        factors = tuple(f"the factor of {name}" for name in names)
+        blind, facts = verdict.blind_lines(factors, ("",) * len(names)), _elastic_facts(result)
+        more = list(map(_group_text, result.groups))
+    notes = [*marks, *verdict.lines(own), *more, *blind]
+    if idle:
+        notes.append(f"not excited, the file's value stays: {', '.join(idle)}")
+    if e.bound:
+        what = "a negative compliance" if elastic else "negative friction or an impossible body"
+        notes.append(f"some values are at a physical bound: without it the fit would give {what}")
+    parameters = [
+        {
+            "key": n.name, **_of_number(n, elastic), "before": n.before, "value": n.after,
+            "standard_deviation": n.deviation, "status": n.status,
+        }
+        for n in result.numbers
     ]  # fmt: skip
-    filters_header = (
-        "recording", "window of the differentiation (samples)", "low-pass (Hz)",
-        "every so many samples kept", "efforts late (ms)",
-    )  # fmt: skip
     return Report(
-        result=result, recordings=recordings, combinations=e.directions, units=units,
-        names=parameters.names,
-        blind=result.verdict.blind_lines(parameters.names, parameters.units),
-        label=lambda n: n.name, number_data=lambda n: {"unit": n.unit},
-        data_before={"outliers_replaced": result.outliers, "efforts_late_s": list(result.delays)},
-        data_after={
-            "effort_noise": dict(zip(joints, e.noise.tolist(), strict=True)),
-            "effort_units": dict(zip(joints, units, strict=True)),
-            "held_out": [
-                {
-                    "recording": judged.name,
-                    "from_s": float(judged.time[0]), "to_s": float(judged.time[-1]),
-                    "residual_rms_before": judged.rms(judged.before).tolist(),
-                    "residual_rms_after": judged.rms(judged.after).tolist(),
-                    "effort_deviation_rms_after": np.sqrt(np.mean(judged.deviation**2, 0)).tolist(),
-                    "peak_effort": np.abs(judged.measured).max(0).tolist(),
-                }
-                for judged in result.judged
-            ],
-            "filtering": [
-                {
-                    "window_samples": how.window, "cutoff_Hz": how.cutoff,
-                    "kept_every": how.keep_every, "position_noise": list(how.position_noise),
-                }
-                for how in result.filtering
-            ],
-        },
-        table=table, residuals=[_joint_residuals(judged, result.robot) for judged in result.judged],
-        residuals_header=("recording", "joint", "RMS before", "RMS now", "peak effort", "unit"),
-        figure=lambda k: _efforts(result.judged[k], result.robot),
-        late=[
-            f"{judged.name}: efforts are {1e3 * delay:.3g} ms later than the positions"
-            for judged, delay in zip(result.judged, result.delays, strict=True)
+        _answer(result, held),
+        [
+            Fact("robot", result.robot.name), Fact("verdict", verdict.as_json(own, names)),
+            Fact("accepted", result.accepted),
+            Fact("condition", e.condition, text="condition number"),
+            Fact("combinations_determined", result.combinations, text="combinations identified"),
+            Fact("held_by_a_physical_bound", e.bound), Fact("samples_fitted", result.samples),
+            Fact("parameters", parameters), Fact("not_excited", idle), *facts,
         ],
-        fitted="Fitted", heading="What was fitted", excited_by="motion",
-        counted=f"condition number {e.condition:.3g} of {e.directions} identifiable combinations",
-        about=f"{result.samples} filtered samples identify {e.directions} combinations of "
-        f"parameters; condition number {e.condition:.3g}. The standard deviation "
-        "includes noise, differentiation and the file's prior values.",
-        bound="some values are at a physical bound: without it the fit would give negative "
-        "friction or an impossible body",
-        bound_of_page="Without physical bounds the fit would give negative friction, or masses and "
-        "inertias that no body has; these are the nearest possible ones.",
-        held_out="<p>The band is two standard deviations of the model's own torques, by what the "
-        "fit does not know of its numbers; noise of the measured efforts is not in it.</p>",
-        signals="<h2>What was done to the signals</h2>\n" + html_table(filters_header, filters)
-        + f"<p>{result.outliers} efforts were outliers.</p>",
-    )  # fmt: skip
+        [_numbers({label(n): n for n in shown}), _residual_table(held)],
+        {"": partial(_changes, {label(n): n for n in shown})}
+        | {f"_{k}": partial(_residuals, one, units) for k, one in enumerate(result.judged)},
+        notes,
+    ), [_channels(result, own)]  # fmt: skip
 
 
-def _joint_residuals(judged: Any, robot: Robot) -> list[tuple[str, ...]]:
-    sizes = judged.rms(judged.before), judged.rms(judged.after), np.abs(judged.measured).max(0)
-    texts = ([f"{value:.4g}" for value in column] for column in sizes)
-    rows = zip(robot.joint_names, *texts, robot.effort_units, strict=True)
-    return [(judged.name, *row) for row in rows]
+def _name(number: Number) -> str:
+    return number.name
 
 
-def _efforts(judged: Any, robot: Robot) -> Any:
-    """Residuals of each joint before and now, with the model's own deviation."""
+def _element(number: Number) -> str:
+    return str(number.key[-1])
+
+
+def _of_number(number: Number, elastic: bool) -> dict[str, Any]:
+    if not elastic:
+        return {"unit": number.unit}
+    return {"element": _element(number), "unit": "of the file's compliance"}
+
+
+def _held_out(result: Result) -> dict[str, tuple[float, float, float, str]]:
+    """RMS residuals before and now, measured peak, unit: of the channels that were measured."""
+    rows = {}
+    for judged in result.judged:
+        sizes = judged.rms(judged.before), judged.rms(judged.after), np.abs(judged.measured).max(0)
+        for name, unit, *row in zip(result.channels, result.units, *sizes, strict=True):
+            if np.isfinite(row).all():
+                before, after, peak = map(float, row)
+                rows[f"{judged.name}, {name}"] = before, after, peak, unit
+    return rows
+
+
+def _answer(result: Result, held: Mapping[str, tuple[float, float, float, str]]) -> str:
+    """Whether the model explains the recordings, and the worst held-out channel."""
+    name, (before, after, peak, unit) = max(
+        held.items(), key=lambda row: row[1][1] / max(row[1][2], 1e-300)
+    )
+    return (
+        f"{result.robot.name}: {result.verdict}; the worst held-out residual is "
+        f"{after:.3g} {unit} ({name}), {100 * after / peak:.2g} % of the peak, {before:.3g} {unit} "
+        "with the file's values"
+    )
+
+
+def _numbers(numbers: Mapping[str, Number]) -> Table:
+    columns = [
+        Column("", text="in the file", form=".6g"), Column("", text="fitted", form=".6g"),
+        Column("", text="standard deviation"), Column("", text="unit"), Column("", text=" "),
+    ]  # fmt: skip
+    rows = {
+        name: (n.before, n.after, n.spread, n.unit, COMBINED if n.status == "combination" else "")
+        for name, n in numbers.items()
+    }
+    return Table("", columns, rows, "parameters", "parameter")
+
+
+def _residual_table(held: Mapping[str, tuple[float, float, float, str]]) -> Table:
+    columns = [
+        Column("", text="RMS with the file's values", form=".3g"),
+        Column("", text="with the fitted ones", form=".3g"),
+        Column("", text="measured peak", form=".3g"), Column("", text="unit"),
+    ]  # fmt: skip
+    return Table("", columns, held, "residual of the last third, which was held out", "recording")
+
+
+def _channels(result: Result, units: Sequence[str]) -> Table:
+    """What the verdict says of each channel."""
+    columns = [
+        Column("", text=text)
+        for text in ("RMS residual in the band of the motion", "RMS noise there", "unit",
+                     "variation without a known cause (%)", "held out over fitted")
+    ]  # fmt: skip
+    rows = {
+        c.name: (c.residual, c.noise, unit, 100.0 * c.left, c.held_out)
+        for c, unit in zip(result.verdict.channels, units, strict=True)
+    }
+    return Table("", columns, rows, "verdict", "channel")
+
+
+def _delays(result: Fit, recordings: Sequence[str]) -> list[str]:
+    """What was done to the signals, by recording."""
+    lines = []
+    for name, how, delay in zip(recordings, result.filtering, result.delays, strict=True):
+        cutoff = "no low-pass" if how.cutoff is None else f"low-pass at {how.cutoff:.3g} Hz"
+        lines.append(
+            f"{name}: efforts are {1e3 * delay:.3g} ms later than the positions; differentiated "
+            f"over {how.window} samples, {cutoff}, one of {how.keep_every} samples kept"
+        )
+    return lines
+
+
+def _effort_facts(result: Fit) -> list[Fact]:
+    """Noise, delays, filters and what was held out."""
+    joints, units = result.channels, result.units
+    held = [
+        {
+            "recording": judged.name,
+            "from_s": judged.time[0], "to_s": judged.time[-1],
+            "residual_rms_before": judged.rms(judged.before),
+            "residual_rms_after": judged.rms(judged.after),
+            "effort_deviation_rms_after": np.sqrt(np.mean(judged.deviation**2, 0)),
+            "peak_effort": np.abs(judged.measured).max(0),
+        }
+        for judged in result.judged
+    ]  # fmt: skip
+    filters = [
+        {
+            "window_samples": how.window, "cutoff_Hz": how.cutoff,
+            "kept_every": how.keep_every, "position_noise": how.position_noise,
+        }
+        for how in result.filtering
+    ]  # fmt: skip
+    return [
+        Fact("outliers_replaced", result.outliers), Fact("efforts_late_s", result.delays),
+        Fact("effort_noise", dict(zip(joints, result.estimate.noise, strict=True))),
+        Fact("effort_units", dict(zip(joints, units, strict=True))),
+        Fact("held_out", held), Fact("filtering", filters),
+    ]  # fmt: skip
+
+
+def _elastic_facts(result: ElasticFit) -> list[Fact]:
+    """Groups, noise and what was held out; null for what was not measured."""
+    groups = [
+        {
+            "elements": group.elements,
+            "known": [
+                {"weights": c.weights, "value": c.value, "standard_deviation": c.deviation}
+                for c in group.known
+            ],
+        }
+        for group in result.groups
+    ]
+    each = zip(result.judged, result.zeros, result.measured, strict=True)
+    held = [
+        {
+            "recording": judged.name,
+            "from_s": judged.time[0], "to_s": judged.time[-1],
+            f"zero_{BY_AXIS}": np.where(measured, zero, np.nan),
+            f"residual_rms_before_{BY_AXIS}": judged.rms(judged.before),
+            f"residual_rms_after_{BY_AXIS}": judged.rms(judged.after),
+        }
+        for judged, zero, measured in each
+    ]  # fmt: skip
+    noise = np.where(result.measured.any(0), result.estimate.noise, np.nan)
+    return [
+        Fact("not_told_apart", groups), Fact(f"deflection_noise_{BY_AXIS}", noise),
+        Fact("held_out", held),
+    ]  # fmt: skip
+
+
+def _group_text(group: Group) -> str:
+    """One line on elements that the loads do not distinguish."""
+    told = "; ".join(map(_sum_text, group.known)) or "nothing"
+    return f"Loads do not distinguish {' and '.join(group.elements)}; they identify {told}"
+
+
+def _sum_text(one: Combination) -> str:
+    terms = " ".join(f"{w:+.2f} {name}" for name, w in one.weights.items())
+    return f"{terms.removeprefix('+')} = {one.value:.4g} +- {one.deviation:.2g}"
+
+
+def _residuals(judged: Judged, units: Mapping[str, str]) -> Any:
+    """Residuals of each measured channel before and now, with the model's own deviation."""
     step = max(1, len(judged.time) // MOST_SAMPLES)
+    rows: dict[str, list[Array]] = {}
+    series = (judged.measured - judged.before, judged.measured - judged.after, judged.deviation)
+    for k, name in enumerate(units):
+        if np.isfinite(judged.measured[:, k]).any():
+            rows[name] = [one[::step, k] for one in series]
     time = judged.time[::step]
-    figure, ((*axes,),) = columns(1, len(robot.joint_names))
-    for k, (ax, joint) in enumerate(zip(axes, robot.joint_names, strict=True)):
-        for values, colour, name in (
-            (judged.before, COLOURS[1], "before"), (judged.after, COLOURS[0], "now"),
-        ):  # fmt: skip
-            ax.plot(time, (judged.measured - values)[::step, k], color=colour, lw=0.8, label=name)
-        band, name = 2.0 * judged.deviation[::step, k], "now, two standard deviations"
-        ax.fill_between(time, -band, band, color=COLOURS[0], alpha=0.25, lw=0, label=name)
-        title = f"{judged.name}, {joint}: measured minus predicted effort, held out"
-        label(ax, "time (s)", f"effort ({robot.effort_units[k]})", title)
-        ax.legend(loc="upper right", fontsize=8)
+    figure, ((*axes,),) = plots.columns(1, len(rows))
+    for ax, (name, (before, now, deviation)) in zip(axes, rows.items(), strict=True):
+        ax.plot(time, before, color=plots.COLOURS[1], lw=0.8, label="before")
+        ax.plot(time, now, color=plots.COLOURS[0], lw=0.8, label="now")
+        style: dict[str, Any] = {"color": plots.COLOURS[0], "alpha": 0.25, "lw": 0}
+        band = 2.0 * deviation
+        ax.fill_between(time, -band, band, label="of the model: two\nstandard deviations", **style)
+        title = f"{judged.name}, {name}: measured minus predicted, held out"
+        plots.label(ax, "time (s)", f"residual ({units[name]})", title)
+        plots.legend(ax)
     return figure
 
 
-def note_of(number: Number) -> str:
-    """What is to be said of a number that is shown."""
-    return "known only in combination with others" if number.status == "combination" else ""
-
-
-def html_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A table of plain texts."""
-    head = "".join(f"<th>{html.escape(cell)}</th>" for cell in header)
-    body = "".join(
-        "<tr>" + "".join(f"<td>{html.escape(cell)}</td>" for cell in row) + "</tr>" for row in rows
-    )
-    return f"<table><tr>{head}</tr>{body}</table>"
-
-
-def changes_figure(shown: Sequence[Number]) -> Any:
+def _changes(shown: Mapping[str, Number]) -> Any:
     """By how many deviations each number moved, and how sure it is."""
-    figure, ((ax,),) = columns(1, 1)
-    figure.set_size_inches(9, 1 + 0.25 * len(shown))
+    figure, ((ax,),) = plots.columns(1, 1)
+    figure.set_size_inches(plots.WIDTH, 1 + 0.25 * len(shown))
     places = np.arange(len(shown))[::-1]
-    for place, n in zip(places, shown, strict=True):
+    for place, n in zip(places, shown.values(), strict=True):
         deviation = n.deviation if np.isfinite(n.deviation) else 0.0
         size = max(abs(n.before), abs(n.after), 3 * deviation, 1e-300)
-        colour = COLOURS[0] if n.status == "fitted" else COLOURS[4]
+        colour = plots.COLOURS[0] if n.status == "fitted" else plots.COLOURS[4]
         ax.errorbar(n.after / size, place, xerr=3 * deviation / size, fmt="o", color=colour)
         ax.plot(n.before / size, place, "x", color="0.4")
-    ax.set_yticks(places, [n.name for n in shown], fontsize=8)
+    ax.set_yticks(places, list(shown), fontsize=8)
     ax.set_xlim(-2, 2)
     ax.set_xlabel(
         "relative to the larger value; cross: before, dot: now, bar: 3 standard deviations"
@@ -350,7 +274,43 @@ def changes_figure(shown: Sequence[Number]) -> Any:
     return figure
 
 
-def picture(figure: Any) -> str:
-    """A figure as an image in a page; it is closed."""
-    data = base64.b64encode(rendered(figure, 90)).decode()
-    return f'<img alt="" src="data:image/png;base64,{data}">'
+def drive_report(found: DriveFriction) -> Report:
+    """Of a drive's torque constant and friction law."""
+    rows: dict[str, dict[str, Any]] = {}
+    for law in found.laws:
+        each = zip(law.terms, law.values, law.deviations, strict=True)
+        rows[law.name] = {term: {"value": v, "standard_deviation": d} for term, v, d in each}
+        rows[law.name] |= {
+            "residual_a": law.residual, "held_out_a": law.held_out,
+            "held_out_drive_a": law.other_drives,
+        }  # fmt: skip
+    notes = []
+    for law in found.laws:
+        terms = [
+            f"{term} {value:.3f} +- {deviation:.3f}" + (" A" if term != "load-dependent" else "")
+            for term, value, deviation in zip(law.terms, law.values, law.deviations, strict=True)
+        ]
+        line = f"{law.name}: {', '.join(terms)}; residual {law.residual:.3f} A"
+        line += f", held-out runs {law.held_out:.3f} A"
+        if np.isfinite(law.other_drives):
+            line += f", held-out drives {law.other_drives:.3f} A"
+        notes.append(line)
+    if not found.viscous_told:
+        notes.append("one speed: Coulomb and viscous friction cannot be distinguished")
+    if len(found.laws) > 1:
+        rejected = found.chosen is found.laws[-1]
+        simpler = found.laws[-2].name if rejected else found.chosen.name
+        verdict = "rejected" if rejected else "not rejected"
+        notes.append(f"{simpler} alone: {verdict} (p = {found.chance:.2g})")
+    return Report(
+        f"torque constant {found.torque_constant:.4f} +- {found.torque_constant_deviation:.4f} "
+        f"N m/A; zero current {found.zero:.3f} A",
+        [
+            Fact("torque_constant_nm_per_a", found.torque_constant),
+            Fact("torque_constant_deviation_nm_per_a", found.torque_constant_deviation),
+            Fact("zero_current_a", found.zero), Fact("chosen", found.chosen.name),
+            Fact("chance", found.chance), Fact("viscous_distinguished", found.viscous_told),
+            Fact("laws", rows),
+        ],
+        notes=notes,
+    )  # fmt: skip

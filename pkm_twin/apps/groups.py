@@ -72,11 +72,7 @@ TASKS: Final[Mapping[str, Mapping[str, Entry]]] = {
     "Recordings": {
         "check": Entry("check_command:check", tables=True, wrenches=True),
     },
-    "Identification and calibration": {
-        "excite": Entry("excite:excite"),
-        "fit": Entry("fit:fit", tables=True, wrenches=True),
-        "drive-friction": Entry("drive_friction:drive_friction_command"),
-    },
+    "Identification and calibration": {},
     "Design and export": {
         "design": Entry("design:design_command"),
     },
@@ -84,7 +80,7 @@ TASKS: Final[Mapping[str, Mapping[str, Entry]]] = {
 """Commands that are not in the folder yet, in the order in which tasks need them."""
 OLDER: Final[Mapping[str, tuple[str, ...]]] = {
     "atlas": ("map",), "guard-check": ("monitor-torques",), "printer": ("convert",),
-    "urdf": ("export", "urdf"),
+    "urdf": ("export", "urdf"), "drive-friction": ("fit", "--drive"),
 }  # fmt: skip
 """Older names of commands, which help does not list, with the words in their place."""
 GREETING: Final = """pkm-twin: torques, stiffness and recordings of parallel robots. Try

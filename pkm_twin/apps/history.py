@@ -125,7 +125,7 @@ def _efforts(r: Recording) -> list[Measured]:
 
 
 def _elasticity(r: Recording) -> list[Measured]:
-    from pkm_twin.apps.fit import deflected_of
+    from pkm_twin.apps.commands.fit import deflected_of
     from pkm_twin.identification.deflections import fit_elements
     from stiffness_monitor.modes import has_modes, natural_frequencies
 

@@ -90,13 +90,28 @@ class ElasticFit(Result):
     """A fit of deflections: ``numbers`` are the factors of the file's ``element_compliance``.
 
     ``zeros``: of the instrument by recording, (recordings, 6). ``measured``: which directions are,
-    (recordings, 6). ``told``: how many combinations of factors are known.
+    (recordings, 6).
     """
 
     groups: tuple[Group, ...]
     zeros: Array
     measured: Mask
     told: int
+
+    @property
+    def channels(self) -> tuple[str, ...]:
+        """Directions of the deflections."""
+        return AXES
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """Of the directions."""
+        return UNITS
+
+    @property
+    def combinations(self) -> int:
+        """How many combinations of the factors are known."""
+        return self.told
 
 
 @dataclass(frozen=True, eq=False)

@@ -66,6 +66,21 @@ class Result:
     verdict: Verdict
     accepted: tuple[str, ...] = ()
 
+    @property
+    def channels(self) -> tuple[str, ...]:
+        """Names of what was measured: actuated joints."""
+        return self.robot.joint_names
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """Of the channels."""
+        return self.robot.effort_units
+
+    @property
+    def combinations(self) -> int:
+        """How many combinations of the numbers are known."""
+        return self.estimate.directions
+
     def of(self, status: Status) -> tuple[Number, ...]:
         """The numbers of a status."""
         return tuple(number for number in self.numbers if number.status == status)

@@ -7,20 +7,27 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
-from typing import Final, Literal
+from pathlib import Path
+from typing import Any, Final, Literal
 
 import numpy as np
 
 from delta_dynamics.regressor import TEN, parameter_names
 from delta_dynamics.virtual_work import mass_matrix
 from pkm_twin.codegen.arrays import Array
+from pkm_twin.errors import PkmTwinError, UnknownNameError
 from pkm_twin.machine.inertia import transport
 from pkm_twin.machine.places import path_of
 from pkm_twin.machine.shared import KINDS, Key, Kind, Shared
+from pkm_twin.machine.strict_yaml import parse_yaml
+from pkm_twin.machine.yaml_edit import edit_yaml
+from pkm_twin.robot.catalogue import robot_of_data
 from pkm_twin.robot.robot import Robot
 
 Status = Literal["fitted", "combination", "not excited"]
 
+COMPLIANCE: Final = "compliance"
+"""What is fitted to deflections, not to efforts."""
 SURE: Final = 0.2
 """A number that is known this much better than before is fitted."""
 OBSERVED: Final = 0.5
@@ -107,6 +114,18 @@ def file_parameters(robot: Robot, what: Sequence[Kind] = KINDS) -> FileParameter
             mixing[place[name], start:end] += row
         start = end
     return FileParameters(tuple(kept), mixing)
+
+
+def kinds_of(what: str) -> tuple[Kind, ...]:
+    """The kinds of numbers in words with commas between.
+
+    :raises UnknownNameError: another word.
+    """
+    words = tuple(word.strip() for word in what.split(","))
+    for word in words:
+        if word not in KINDS:
+            raise UnknownNameError("what", word, (*KINDS, COMPLIANCE))
+    return tuple(kind for kind in KINDS if kind in words)
 
 
 @dataclass(frozen=True)
@@ -250,3 +269,57 @@ def _group(
             )
         )  # fmt: skip
     return Group(tuple(names[k] for k in members), tuple(told))
+
+
+def fitted_yaml(text: str, fitted: Sequence[Number], recordings: Sequence[str], out: Path) -> str:
+    """The robot's file with what was fitted, each number's deviation and source in a comment.
+
+    :param text: of the file before. ``out``: the file that it will be.
+    :raises PkmTwinError: numbers that no file may have: it could not be read again.
+    """
+    groups: dict[Key, list[Number]] = {}
+    for number in fitted:
+        base: Key = tuple(k for k in number.key if not isinstance(k, int))
+        # A section of a list is no place in a vector.
+        if number.key[:1] == ("limbs",) and isinstance(number.key[1], int):
+            base = (*number.key[:2], *base[1:])
+        groups.setdefault(base, []).append(number)
+    values: dict[Key, Any] = {}
+    notes: dict[Key, str] = {}
+    source = ", ".join(recordings)
+    for base, numbers in groups.items():
+        if all(number.status == "not excited" for number in numbers):
+            continue
+        values[base] = _value(base, numbers)
+        told = [n for n in numbers if n.status != "not excited"]
+        spread = ", ".join(n.spread for n in told)
+        alone = all(n.status == "fitted" for n in told)
+        how = "" if alone else "; known only in combination with others"
+        was = ", ".join(f"{n.before:.6g}" for n in told)
+        unit = f" {told[0].unit}" if told[0].unit else ""
+        notes[base] = (
+            f"{'.'.join(str(k) for k in base[-2:])}: fitted from {source}, +- {spread}{unit} "
+            f"(one standard deviation), was {was}{how}"
+        )
+    made = edit_yaml(text, values, notes)
+    try:
+        robot_of_data(parse_yaml(made, str(out)), out.stem)
+    except ValueError as error:
+        raise PkmTwinError(
+            f"the fitted values are not a valid robot, so {out} is not written: {error}"
+        ) from None
+    return made
+
+
+def _value(base: Key, numbers: Sequence[Number]) -> Any:
+    """A number, a list, or a matrix of what stands below one key."""
+    tails = {n.key[len(base) :]: n.after for n in numbers}
+    if () in tails:
+        return tails[()]
+    if len(next(iter(tails))) == 1:
+        return [tails[k,] for k in range(len(tails))]
+    matrix = [[tails.get((i, j), tails.get((j, i))) for j in range(3)] for i in range(3)]
+    apart = max(abs(matrix[i][j] or 0.0) for i in range(3) for j in range(3) if i != j)
+    if apart == 0.0:
+        return [matrix[i][i] for i in range(3)]
+    return matrix

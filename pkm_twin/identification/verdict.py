@@ -125,13 +125,15 @@ class Verdict:
             return "withheld"
         return "widened" if self.findings or self.hints or self.inflation > 1.0 else "as estimated"
 
+    def __str__(self) -> str:
+        return f"the model {SENTENCE[self.answer]} the recordings"
+
     def lines(self, units: tuple[str, ...]) -> list[str]:
-        """The verdict in plain sentences.
+        """What it says beyond its answer, in plain sentences.
 
         :param units: of the channels' measurements.
         """
-        told = [f"the model {SENTENCE[self.answer]} the recordings"]
-        told += [f"likely cause: {one}" for one in self.findings]
+        told = [f"likely cause: {one}" for one in self.findings]
         if self.slow:
             told.append(
                 "the motion is too slow to show inertia above the noise: inertia parameters are "

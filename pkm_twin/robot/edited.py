@@ -10,13 +10,15 @@ from typing import Any
 
 import yaml
 
-from pkm_twin.errors import PkmTwinError, one_line
+from pkm_twin.errors import ParameterError, PkmTwinError, one_line
 from pkm_twin.files import replace_file
 from pkm_twin.machine.machine_yaml import describe_machine_yaml
 from pkm_twin.machine.places import given, has_entry, keys_of
 from pkm_twin.machine.yaml_edit import edit_yaml
-from pkm_twin.robot.catalogue import TREES, robot_path
+from pkm_twin.robot.catalogue import TREES, load, robot_of_data, robot_path
 from pkm_twin.robot.robot import Robot
+from pkm_twin.robot.robot_urdf import robot_description
+from pkm_twin.robot.urdf_read import read_urdf
 
 
 @dataclass(frozen=True)
@@ -81,3 +83,38 @@ def write_edited(path: Path, head: Sequence[str], text: str) -> None:
         replace_file(path, whole.encode())
     except OSError as error:
         raise PkmTwinError(f"{path} cannot be written: {error.strerror}") from None
+
+
+def robot_text(
+    name: str, *, platform: str | None = None, per_copy: bool = False
+) -> tuple[str, Robot]:
+    """A robot and the text of its file; of a URDF, or with ``per_copy``, as a machine's YAML.
+
+    :raises ParameterError: the file is refused; or it is to be written out, and would lose what it
+        says of elasticity.
+    """
+    robot = load(name, platform=platform)
+    if per_copy and not robot.elastic_entries() and _elastic(robot):
+        raise ParameterError(
+            "--per-copy",
+            robot.name,
+            f"a robot whose elastic members can be written out; a {robot.mechanism}'s cannot: take "
+            "a file without them, or fit without --per-copy",
+        )
+    path = robot_path(name)
+    if path.suffix in TREES:
+        data = read_urdf(path, platform=platform)
+    elif per_copy:
+        data = robot_description(robot)
+    else:
+        return path.read_text(encoding="utf-8"), robot
+    return describe_machine_yaml(data), robot_of_data(data, path.stem)
+
+
+def _elastic(robot: Robot) -> bool:
+    """Whether its file has elastic members or joints."""
+    try:
+        robot.structure()
+    except ParameterError:
+        return False
+    return True

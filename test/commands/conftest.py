@@ -8,7 +8,6 @@ from pathlib import Path
 
 import pytest
 
-from pkm_twin.apps import fit_report
 from pkm_twin.bags.reader import BagWriter, open_bag
 from pkm_twin.report import plots
 from test.support.command import Result
@@ -48,8 +47,7 @@ def coarse_pictures():
         return drawn(figure, 30, form)
 
     with pytest.MonkeyPatch.context() as patch:
-        for module in (plots, fit_report):
-            patch.setattr(module, "rendered", coarse)
+        patch.setattr(plots, "rendered", coarse)
         yield
 
 

@@ -32,7 +32,7 @@ def test_limits_hold_at_any_time_of_a_long_trajectory(name, duration, terms):
     assert (q >= low).all() and (q <= high).all()
     assert (np.abs(qd) <= robot.limits.velocity).all()
     assert (np.abs(qdd) <= 20.0).all()
-    assert (robot.singularity(q) > 0.1 * 0.99).all()
+    assert (robot.singularity(q) > bounds.singularity * 0.99).all()
     efforts = inverse_dynamics(robot, q, qd, qdd)
     assert (np.abs(efforts) <= robot.limits.effort).all()
     # Some limit, or the workspace, is what stops it from being larger.

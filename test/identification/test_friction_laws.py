@@ -7,13 +7,12 @@ from scipy.signal import lfilter
 
 from delta_dynamics import inverse_dynamics
 from pkm_twin.errors import ParameterError, PkmTwinError, UnknownNameError
-from pkm_twin.identification.excitation import Bounds, Judge
+from pkm_twin.identification.drives import fitted_constants, given_constants
+from pkm_twin.identification.excitation import Bounds, Judge, sweeps
 from pkm_twin.identification.friction_laws import fit_with_laws, laws_of
 from pkm_twin.identification.noise import resonances_of
 from pkm_twin.identification.parameters import file_parameters
 from pkm_twin.identification.samples import Filtering
-from pkm_twin.identification.sweeps import sweeps
-from pkm_twin.identification.torque_constant import fitted_constants, given_constants
 from test.identification.machines import machine, noisy
 from test.support.robots import load, partly_long
 
@@ -131,7 +130,7 @@ def test_sweeps_stay_inside_the_limits_and_move_one_joint_at_a_time(name):
     low, high = robot.limits.position.T
     assert (q >= low - 1e-12).all() and (q <= high + 1e-12).all()
     assert (np.abs(qd) <= robot.limits.velocity * (1.0 + 1e-12)).all()
-    assert (robot.singularity(q[::50]) > 0.1 * 0.99).all()
+    assert (robot.singularity(q[::50]) > Bounds().singularity * 0.99).all()
     assert np.isfinite(found.condition)
     for least in (0.05, 1.0):
         slow = sweeps(judge, 60.0, Bounds(share=1.0, acceleration=least * np.abs(qdd).max()))

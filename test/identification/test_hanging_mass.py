@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 from pkm_twin.apps.cli import app
 from pkm_twin.errors import ParameterError
-from pkm_twin.identification.hanging_mass import drive_friction
+from pkm_twin.identification.drives import drive_friction
 
 MEASURED = Path(__file__).parents[2] / "examples/machines/hexapod/leg_currents.csv"
 
@@ -20,7 +20,7 @@ MEASURED = Path(__file__).parents[2] / "examples/machines/hexapod/leg_currents.c
 def test_the_measured_drive_has_friction_that_grows_with_the_load() -> None:
     """The owner's torque constant; 1.07 A + 0.10 |load current| is what the runs fit."""
     result = CliRunner().invoke(
-        app, ["drive-friction", str(MEASURED), "--lever", "0.011391", "--json"]
+        app, ["fit", "--drive", str(MEASURED), "--lever", "0.011391", "--json"]
     )
     assert result.exit_code == 0, result.output
     data = json.loads(result.stdout)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from pkm_twin.apps.excite import write_motion
+from pkm_twin.apps.commands.excite import write_motion
 from pkm_twin.apps.frame import command
 from pkm_twin.apps.options import OfRobot, Overwrites
 from pkm_twin.console import refuse_existing, writing

@@ -1,0 +1,166 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``pkm-twin excite``: a trajectory from which a fit learns much, as a bag and a table."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from pkm_twin.apps.frame import command
+from pkm_twin.apps.options import AwayFromSingular, OfRobot, Seeded, Writes
+from pkm_twin.console import progress, refuse_existing, writing
+from pkm_twin.errors import BagError
+from pkm_twin.report import Fact, Report
+from pkm_twin.settings import setting
+
+if TYPE_CHECKING:
+    from pkm_twin.identification.excitation import Bounds, Judge
+
+LARGE: Final = 1e3
+"""Condition number from which on a fit knows some parameters badly."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Excite(OfRobot, AwayFromSingular, Seeded, Writes):
+    """Design a trajectory that excites the parameters to identify.
+
+    Every joint follows a finite Fourier series that starts and ends at rest. The trajectory is
+    D-optimal for the base parameters of what is to be fitted. It stays inside the robot file's
+    position, velocity and effort limits and inside the workspace, away from singularities. The
+    command writes a trajectory_msgs/JointTrajectory on /delta_dynamics/joint_trajectory, and a CSV
+    for `pkm-twin torques`.
+
+    With --friction every joint alone sweeps its range up and down at three speeds, 1 : 4 : 16, and
+    --duration is that of all sweeps; --harmonics, --trials and --seed are not used.
+    """
+
+    what: str = setting(
+        "friction,rotor,payload,inertia",
+        "what a fit shall identify: friction,rotor,payload,inertia or some",
+    )
+    out: Path = setting(
+        Path("excite.mcap"), "MCAP to write; the CSV has the same name with .csv", writes=True,
+        endings=(".mcap",),
+    )  # fmt: skip
+    beside: Path | None = setting(None, "also report the condition number of this bag")
+    friction: bool = setting(
+        False, "slow sweeps up and down, a joint at a time, which show friction"
+    )
+    duration: float = setting(10.0, "duration, s", low=1.0, high=600.0)
+    harmonics: int = setting(6, "harmonics per joint", low=3, high=50)
+    rate: float = setting(100.0, "points per second", low=10.0, high=1000.0)
+    share: float = setting(0.9, "fraction of all limits to use", low=0.05, high=1.0)
+    acceleration: float | None = setting(
+        None, "acceleration limit of every joint, rad/s2 or m/s2; default: none"
+    )
+    trials: int = setting(300, "number of trajectories to try", low=10, high=10**6)
+
+
+def excite(given: Excite) -> Report:
+    """The trajectory's condition number, and that of a bag.
+
+    :raises PkmTwinError: no trajectory keeps to the limits.
+    """
+    from pkm_twin.identification.excitation import Bounds, Judge
+    from pkm_twin.identification.parameters import file_parameters, kinds_of
+
+    table = given.out.with_suffix(".csv")
+    refuse_existing(table, given.overwrite)
+    machine = given.machine()
+    judge = Judge.of(machine, file_parameters(machine, kinds_of(given.what)))
+    other = None if given.beside is None else _condition_of(given.beside, judge)
+    bounds = Bounds(given.share, given.acceleration, given.singularity, given.rate)
+    best, points = write_motion(
+        judge, given.out, bounds, given.duration, given.harmonics, trials=given.trials,
+        seed=given.seed, friction=given.friction, overwrite=given.overwrite,
+    )  # fmt: skip
+    notes = []
+    if other is not None:
+        told = f"{other:.4g}" if np.isfinite(other) else "infinite, it does not excite all of them"
+        notes.append(f"condition number of {given.beside}: {told}")
+    if not best.condition < LARGE and not given.friction:
+        notes.append(
+            f"a condition number above {LARGE:g}: a fit will know some parameters badly; try a "
+            "longer --duration, more --harmonics or --trials, a smaller --singularity, wider "
+            "limits in the robot file, or fewer kinds with --what"
+        )
+    shape = (
+        [Fact("speeds", best.speeds), Fact("speed_units", machine.joint_units)]
+        if given.friction
+        else [Fact("frequencies_Hz", best.harmonics / best.duration)]
+    )
+    return Report(
+        f"{machine.name}: condition number {best.condition:.4g} over {len(judge.columns)} base "
+        f"parameters, {points} points in {best.duration:.4g} s",
+        facts=[
+            Fact("robot", machine.name), Fact("condition", best.condition),
+            Fact("duration_s", best.duration, "s"), Fact("base_parameters", len(judge.columns)),
+            *shape, Fact("beside", given.beside), Fact("condition_beside", other),
+        ],
+        notes=notes,
+        files={"out": given.out, "table": table},
+    )  # fmt: skip
+
+
+def write_motion(
+    judge: Judge,
+    out: Path,
+    bounds: Bounds,
+    duration: float,
+    harmonics: int = 6,
+    *,
+    trials: int,
+    seed: int = 0,
+    friction: bool = False,
+    overwrite: bool = False,
+) -> tuple[Any, int]:
+    """Design a motion, or slow sweeps with ``friction``, and write its bag and its table.
+
+    :returns: the motion, and how many points are written.
+    """
+    from pkm_twin.identification.excitation import excite as design
+    from pkm_twin.identification.excitation import sweeps
+    from pkm_twin.recordings import write_table
+    from pkm_twin.recordings.trajectories import write_trajectory
+
+    machine, table = judge.robot, out.with_suffix(".csv")
+    best: Any
+    if friction:
+        best = sweeps(judge, duration, bounds)
+    else:
+        with progress("excite", trials) as update:
+            best = design(
+                judge, duration, harmonics, bounds, trials=trials, seed=seed, progress=update
+            )
+    time = np.arange(round(best.duration * bounds.rate) + 1) / bounds.rate
+    time = time[time <= best.duration]
+    motion = best.at(time)
+    facts = {"robot": machine.name, "source": "pkm-twin excite", "condition": best.condition}
+    write_trajectory(out, machine, time, motion, None, facts, overwrite)
+    columns = {"time": time}
+    for i, joint in enumerate(machine.joint_names):
+        for word, values in zip(("position", "velocity", "acceleration"), motion, strict=True):
+            columns[f"{joint}.{word}"] = values[:, i]
+    with writing(table):
+        write_table(columns, table)
+    return best, len(time)
+
+
+def _condition_of(path: Path, judge: Judge) -> float:
+    """Condition number of a recorded motion."""
+    from pkm_twin.identification.samples import tracks
+    from pkm_twin.recordings import read
+
+    r = read(path, judge.robot)
+    pieces, _ = tracks(r.time, r.q, np.zeros_like(r.q))
+    if not pieces:
+        raise BagError("too few joint states in a row", path=path, reason="too short")
+    parts = [np.concatenate([getattr(p, k) for p in pieces]) for k in ("q", "qd", "qdd")]
+    step = max(1, len(parts[0]) // 2000)
+    return judge.condition(*(part[::step] for part in parts))
+
+
+COMMAND = command(excite, "Identification and calibration")

@@ -1,0 +1,67 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A report as one HTML page that needs no network: answer, notes, facts, tables, pictures."""
+
+from __future__ import annotations
+
+import base64
+import html
+from collections.abc import Sequence
+from typing import Final
+
+from pkm_twin.report import plots
+from pkm_twin.report.report import Report, Table
+
+SHELL: Final = """<!DOCTYPE html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<title>{title}</title>
+<style>
+body {{ font: 15px/1.5 sans-serif; margin: 2em auto; max-width: 70em; padding: 0 1em; }}
+table {{ border-collapse: collapse; margin: 1em 0; }}
+td, th {{ border-bottom: 1px solid #ccc; padding: 0.2em 0.8em; text-align: right; }}
+td:first-child, th:first-child {{ text-align: left; }}
+img {{ max-width: 100%; }}
+</style>
+</head>
+<body>
+<h1>{title}</h1>
+{body}
+</body>
+</html>
+"""
+DPI: Final = 100
+"""Of its pictures: 900 pixels wide."""
+
+
+def page(title: str, report: Report, more: Sequence[Table] = ()) -> str:
+    """The whole page.
+
+    :param more: tables that the terminal does not show.
+    """
+    notes = "".join(f"<li>{html.escape(note)}</li>" for note in report.notes)
+    parts = [f"<p>{html.escape(report.answer)}</p>", f"<ul>{notes}</ul>"]
+    for fact in report.facts:
+        if fact.text is not None:
+            parts.append(f"<p>{html.escape(f'{fact.text}: {fact.words}')}</p>")
+    parts += [_table(table) for table in (*report.tables, *more) if table.rows]
+    for draw in report.figures.values():
+        data = base64.b64encode(plots.rendered(draw(), DPI)).decode()
+        parts.append(f'<img alt="" src="data:image/png;base64,{data}">')
+    return SHELL.format(title=html.escape(title), body="\n".join(parts))
+
+
+def _table(table: Table) -> str:
+    shown = [k for k, column in enumerate(table.columns) if column.text is not None]
+    columns = [table.columns[k] for k in shown]
+    head = (table.head, *(column.heading for column in columns))
+    rows = [
+        (name, *(column.cell(values[k]) for k, column in zip(shown, columns, strict=True)))
+        for name, values in table.rows.items()
+    ]
+    lines = [_row("th", head), *(_row("td", row) for row in rows)]
+    return f"<h2>{html.escape(table.title)}</h2>\n<table>{''.join(lines)}</table>"
+
+
+def _row(tag: str, cells: Sequence[str]) -> str:
+    return f"<tr>{''.join(f'<{tag}>{html.escape(cell)}</{tag}>' for cell in cells)}</tr>"
