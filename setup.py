@@ -20,7 +20,7 @@ setup(
     packages=[
         "pkm_twin",
         "pkm_twin.apps",
-        "pkm_twin.apps.certificate",
+        "pkm_twin.certify",
         "pkm_twin.apps.commands",
         "pkm_twin.apps.view",
         "pkm_twin.maps",

@@ -59,7 +59,6 @@ class Entry:
 TASKS: Final[Mapping[str, Mapping[str, Entry]]] = {
     "Robots": {
         "view": Entry("view.command:view"),
-        "certify": Entry("certify_command:certify"),
     },
     "Torques, paths and drives": {
         "torques": Entry("torques_command:torques", tables=True, wrenches=True),

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from delta_dynamics import inverse_dynamics
 from pkm_twin import Robot
-from pkm_twin.apps.certificate.maximal import Maximal, State
+from pkm_twin.certify.maximal import Maximal, State
 from pkm_twin.identification.fit import fit
 from pkm_twin.identification.rows import Recorded
 from pkm_twin.robot.robot_urdf import robot_description

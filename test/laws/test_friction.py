@@ -14,7 +14,7 @@ from delta_dynamics import (
     torque_derivatives,
 )
 from delta_dynamics.plant import Plant
-from pkm_twin.apps.certificate.maximal import Maximal
+from pkm_twin.certify.maximal import Maximal
 from pkm_twin.errors import ParameterError
 from pkm_twin.export.fmu import Fmu
 from pkm_twin.machine.friction import BASIC, LAWS, all_keys

@@ -13,8 +13,8 @@ from scipy.optimize import minimize_scalar
 
 from delta_dynamics import reactions
 from pkm_twin import Robot, robot_names
-from pkm_twin.apps.certificate.maximal import Maximal
-from pkm_twin.apps.certificate.rows import stacked
+from pkm_twin.certify.maximal import Maximal
+from pkm_twin.certify.rows import stacked
 from pkm_twin.errors import SingularityError
 from pkm_twin.kinematics.singularity import Placed
 from pkm_twin.machine.graph_description import graph_description

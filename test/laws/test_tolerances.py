@@ -8,8 +8,8 @@ import copy
 import numpy as np
 import pytest
 
-from pkm_twin.apps.certificate.description import across
-from pkm_twin.apps.certificate.maximal import Maximal, rotation_of
+from pkm_twin.certify.description import across
+from pkm_twin.certify.maximal import Maximal, rotation_of
 from pkm_twin.design import drawn, tolerances
 from pkm_twin.design.parts import Assembly, part_of
 from pkm_twin.design.tolerance import workspace_states

@@ -10,7 +10,7 @@ import pytest
 
 from delta_dynamics import inverse_dynamics, mass_matrix, reactions
 from pkm_twin import Robot, variants
-from pkm_twin.apps.certificate.description import expand
+from pkm_twin.certify.description import expand
 from pkm_twin.codegen.lu import pivot_order
 from pkm_twin.errors import ParameterError, PkmTwinError
 from pkm_twin.kinematics.motion import Motion

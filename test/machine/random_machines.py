@@ -11,8 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
-from pkm_twin.apps.certificate.description import expand, tensor
-from pkm_twin.apps.certificate.maximal import Maximal, rotation_of
+from pkm_twin.certify.description import expand, tensor
+from pkm_twin.certify.maximal import Maximal, rotation_of
 from pkm_twin.machine.strict_yaml import read_yaml
 from pkm_twin.robot.catalogue import config_folder
 

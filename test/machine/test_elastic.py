@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import yaml
 
-from pkm_twin.apps.certificate.description import expand
+from pkm_twin.certify.description import expand
 from pkm_twin.errors import ParameterError, SingularityError
 from pkm_twin.robot.catalogue import robot_of_data
 from pkm_twin.robot.clearance import clearance

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from delta_dynamics import forward_dynamics, inverse_dynamics, mass_matrix
-from pkm_twin.apps.certificate.maximal import Maximal
-from pkm_twin.apps.certificate.states import random_states
-from pkm_twin.apps.certify import effort_differences, relative
+from pkm_twin.certify.certificate import effort_differences, relative
+from pkm_twin.certify.maximal import Maximal
+from pkm_twin.certify.states import random_states
 from pkm_twin.errors import ParameterError, PkmTwinError
 from test.machine.random_machines import NAMES, plain, variant
 from test.support.robots import load, partly_long

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from pkm_twin import load
-from pkm_twin.apps.certify import certificate_of
+from pkm_twin.certify.certificate import certificate_of
 from pkm_twin.robot.outline import base_face, platform_face
 from pkm_twin.robot.plausibility import findings
 from stiffness_monitor import compliance

@@ -6,10 +6,10 @@ import importlib
 import numpy as np
 import pytest
 
-from pkm_twin.apps.certificate.description import expand, read
-from pkm_twin.apps.certificate.maximal import Maximal
-from pkm_twin.apps.certificate.states import random_states
-from pkm_twin.apps.certify import ENGINES, certificate_of, effort_differences, relative
+from pkm_twin.certify.certificate import ENGINES, certificate_of, effort_differences, relative
+from pkm_twin.certify.description import expand, read
+from pkm_twin.certify.maximal import Maximal
+from pkm_twin.certify.states import random_states
 from pkm_twin.machine.joints import TYPES
 from test.machine.random_machines import FREE, NAMES, plain, variant
 from test.machine.test_helical import driven, slide

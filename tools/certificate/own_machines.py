@@ -19,7 +19,7 @@ from rich.console import Console
 from rich.progress import Progress
 
 from pkm_twin import load, robot_names
-from pkm_twin.apps.certify import BOUNDS, certificate_of
+from pkm_twin.certify.certificate import BOUNDS, certificate_of
 from pkm_twin.errors import PkmTwinError
 from pkm_twin.robot.catalogue import config_folder
 from test.machine.random_machines import NAMES, plain, variant

@@ -9,8 +9,8 @@ from typing import Final
 
 import numpy as np
 
-from pkm_twin.apps.certificate.description import Array, UnfitError
-from pkm_twin.apps.certificate.maximal import Maximal
+from pkm_twin.certify.description import Array, UnfitError
+from pkm_twin.certify.maximal import Maximal
 
 WITHIN: Final = 0.8
 """Part of the joints' limits that positions are drawn from."""

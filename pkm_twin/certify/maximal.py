@@ -15,7 +15,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from pkm_twin.apps.certificate.description import (
+from pkm_twin.certify.description import (
     POSE_NAMES,
     Array,
     Description,
@@ -24,7 +24,7 @@ from pkm_twin.apps.certificate.description import (
     cross,
     read,
 )
-from pkm_twin.apps.certificate.rows import SINGULAR, Frame, Moving, skewed
+from pkm_twin.certify.rows import SINGULAR, Frame, Moving, skewed
 
 FIRST_STEP: Final = 1.0 / 16.0
 """Part of the way home to goal that the first step goes."""

@@ -15,9 +15,9 @@ from xml.etree import ElementTree as Xml
 import mujoco
 import numpy as np
 
-from pkm_twin.apps.certificate.description import BASE, Array, Body, Description
-from pkm_twin.apps.certificate.rows import Frame
-from pkm_twin.apps.certificate.trees import Steps, Tree
+from pkm_twin.certify.description import BASE, Array, Body, Description
+from pkm_twin.certify.rows import Frame
+from pkm_twin.certify.trees import Steps, Tree
 
 TINY: Final = 1e-14
 """Mass (kg) and moments of inertia (kg m2) that are added to every body."""

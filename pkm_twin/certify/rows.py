@@ -19,7 +19,7 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from pkm_twin.apps.certificate.description import (
+from pkm_twin.certify.description import (
     BASE,
     Array,
     Joint,

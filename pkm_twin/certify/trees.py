@@ -15,7 +15,7 @@ from typing import Final
 
 import numpy as np
 
-from pkm_twin.apps.certificate.description import (
+from pkm_twin.certify.description import (
     BASE,
     Array,
     Body,
@@ -26,7 +26,7 @@ from pkm_twin.apps.certificate.description import (
     across,
     read,
 )
-from pkm_twin.apps.certificate.rows import Moving, Rows
+from pkm_twin.certify.rows import Moving, Rows
 
 STEPS: Final = 64
 """Steps from home to a state."""

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from pkm_twin.apps.certificate.description import BASE, Array, Body, Description
-from pkm_twin.apps.certificate.rows import Frame
-from pkm_twin.apps.certificate.trees import Steps, Tree
+from pkm_twin.certify.description import BASE, Array, Body, Description
+from pkm_twin.certify.rows import Frame
+from pkm_twin.certify.trees import Steps, Tree
 
 
 class PinocchioTree(Tree):

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A robot's certificate: its torques and places beside other engines', over random states.
 
-The judges compute from the machine's description alone, see ``pkm_twin.apps.certificate``. One of
+The judges compute from the machine's description alone, see ``pkm_twin.certify``. One of
 them needs numpy only; Pinocchio and MuJoCo are asked where they are installed.
 """
 
@@ -10,7 +10,7 @@ from __future__ import annotations
 import importlib
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
 from typing import Any, Final, Protocol
 
@@ -18,10 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from delta_dynamics import inverse_dynamics, mass_matrix
-from pkm_twin.apps.certificate.description import UnfitError
-from pkm_twin.apps.certificate.maximal import Maximal
-from pkm_twin.apps.certificate.states import States, random_states
-from pkm_twin.console import finite
+from pkm_twin.certify.description import UnfitError
+from pkm_twin.certify.maximal import Maximal
+from pkm_twin.certify.states import States, random_states
 from pkm_twin.errors import (
     ParameterError,
     PkmTwinError,
@@ -36,9 +35,9 @@ from pkm_twin.robot.variation import KINDS, varied
 Array = NDArray[np.float64]
 
 ENGINES: Final = {
-    "maximal": ("pkm_twin.apps.certificate.maximal:Maximal", "numpy"),
-    "pinocchio": ("pkm_twin.apps.certificate.pinocchio_tree:PinocchioTree", "pin"),
-    "mujoco": ("pkm_twin.apps.certificate.mujoco_tree:MujocoTree", "mujoco"),
+    "maximal": ("pkm_twin.certify.maximal:Maximal", "numpy"),
+    "pinocchio": ("pkm_twin.certify.pinocchio_tree:PinocchioTree", "pin"),
+    "mujoco": ("pkm_twin.certify.mujoco_tree:MujocoTree", "mujoco"),
 }
 """A judge's name to its class and to the distribution that it needs."""
 BOUNDS: Final = {
@@ -117,33 +116,15 @@ class Certificate:
         """Whether every bound is kept."""
         return all(item.good for item in self.items)
 
-    def as_json(self) -> dict[str, Any]:
+    @property
+    def data(self) -> dict[str, Any]:
         """Numbers and names only; differences relative, or in m and rad where ``what`` is so."""
-        return {
-            "robot": self.robot,
-            "good": self.good,
-            "seed": self.seed,
-            "states": self.states,
-            "variants": self.variants,
-            "drawn": self.drawn,
-            "skipped": self.skipped,
-            "mobility": self.mobility,
-            "rank": self.rank,
-            "constraints": self.rows,
-            "versions": dict(self.versions),
-            "missing": dict(self.missing),
-            "items": [
-                {
-                    "engine": item.engine,
-                    "what": item.what,
-                    "worst": finite(item.worst),
-                    "median": finite(item.median),
-                    "bound": item.bound,
-                    "good": item.good,
-                }
-                for item in self.items
-            ],
-        }
+        found = asdict(self)
+        found["constraints"] = found.pop("rows")
+        found["items"] = [
+            asdict(item) | {"good": item.good} for item in self.items
+        ]  # fmt: skip
+        return found | {"good": self.good}
 
 
 def certify(
