@@ -6,7 +6,7 @@ import copy
 import numpy as np
 import pytest
 
-from pkm_twin.apps.certificate.description import expand
+from pkm_twin.certify.description import expand
 from pkm_twin.errors import MobilityError, ParameterError
 from pkm_twin.kinematics.conditions import Conditions
 from pkm_twin.kinematics.diagnosis import is_right, near_conditions

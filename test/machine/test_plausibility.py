@@ -10,7 +10,7 @@ import pytest
 import yaml
 
 import pkm_twin
-from pkm_twin.apps.certificate.description import expand
+from pkm_twin.certify.description import expand
 from pkm_twin.errors import ParameterError, RobotWarning
 from pkm_twin.mechanisms.machine import Machine
 from pkm_twin.robot.plausibility import findings
