@@ -17,10 +17,10 @@ from delta_dynamics.virtual_work import mass_matrix
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import PkmTwinError, UnknownNameError
 from pkm_twin.machine.inertia import transport
+from pkm_twin.machine.machine_yaml import edit_yaml
 from pkm_twin.machine.places import path_of
 from pkm_twin.machine.shared import KINDS, Key, Kind, Shared
 from pkm_twin.machine.strict_yaml import parse_yaml
-from pkm_twin.machine.yaml_edit import edit_yaml
 from pkm_twin.robot.catalogue import robot_of_data
 from pkm_twin.robot.robot import Robot
 

@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A machine's file as a graph: the entries of bodies, joints and rods, and limbs written out."""
+"""A machine's file as a graph, and back: bodies, joints, rods, limbs written out, and drives."""
 
 from __future__ import annotations
 
 import copy
 import dataclasses
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Final, TypeVar
@@ -26,7 +27,15 @@ from pkm_twin.machine.graph import (
 from pkm_twin.machine.joints import TURN, TYPES, Freedom, unit
 from pkm_twin.machine.members import Tube, compliances
 from pkm_twin.machine.places import number_in, path_of, placed
-from pkm_twin.machine.sections import DriveSpec, check_angles, length, mass, rare
+from pkm_twin.machine.sections import (
+    DriveSpec,
+    check_angles,
+    friction_of,
+    length,
+    limits_of,
+    mass,
+    rare,
+)
 from pkm_twin.machine.shared import Key
 
 T = TypeVar("T")
@@ -438,3 +447,110 @@ def graph_of_entries(data: Mapping[str, Any], specs: Mapping[str, Mapping[str, A
     joints = {n: j.joint(n, f"joints.{n}") for n, j in specs["joints"].items()}
     rods = {n: Rod(n, r.between[0], r.between[1], r.ends, r.mass) for n, r in specs["rods"].items()}
     return Graph(bodies, joints, rods, platform, array(place))
+
+
+def drives_of(graph: Graph, joints: Mapping[str, JointSpec]) -> dict[str, Any]:
+    """Friction and limits of the actuated joints."""
+    drives = graph.actuated
+    limits = [joints[j].limits or LimitSpec() for j in drives]
+    rubs = [joints[j].friction or FrictionSpec() for j in drives]
+    n = len(drives)
+    return {
+        "friction": friction_of(n)(
+            **{key: array([getattr(rub, key) for rub in rubs]) for key in all_keys()}
+        ),
+        "limits": limits_of(n)(
+            position=_together([v.position for v in limits], [-math.inf, math.inf]),
+            velocity=_together([v.velocity for v in limits], math.inf),
+            effort=_together([v.effort for v in limits], math.inf),
+        ),
+    }
+
+
+def driven(joint: JointSpec, friction: Any, limits: Any, k: int) -> JointSpec:
+    """The entry of the actuated joint k with friction and limits as :func:`drives_of` gives them.
+
+    A limit may be one for all joints.
+    """
+    n = len(friction.viscous)
+    position = limits.position
+    velocity, effort = (
+        None if value is None else float(np.broadcast_to(value, n)[k])
+        for value in (limits.velocity, limits.effort)
+    )
+    bounds = LimitSpec(
+        position=None if position is None else array(np.broadcast_to(position, (n, 2))[k]),
+        velocity=velocity,
+        effort=effort,
+    )
+    rub = FrictionSpec(**{key: float(getattr(friction, key)[k]) for key in all_keys()})
+    return dataclasses.replace(joint, friction=rub, limits=bounds)
+
+
+def _together(values: list[Any], absent: Any) -> Array | None:
+    """One array of what joints have; None where none has it."""
+    if all(value is None for value in values):
+        return None
+    return array([absent if value is None else value for value in values])
+
+
+def graph_description(graph: Graph) -> dict[str, Any]:
+    """Bodies, joints and rods of a graph.
+
+    Two rods that are taken as one are told as one: what they hold beside, a joint of the graph
+    holds already.
+    """
+    data: dict[str, Any] = {
+        "mechanism": "machine",
+        "platform": graph.platform,
+        "origin": _numbers(graph.origin),
+        "bodies": {name: _body_entry(body) for name, body in graph.bodies.items()},
+        "joints": {name: _joint_entry(joint) for name, joint in graph.joints.items()},
+    }
+    if graph.rods:
+        data["rods"] = {
+            name: {
+                "between": [rod.inner, rod.outer],
+                "ends": [_numbers(end) for end in rod.ends],
+                "mass": rod.mass,
+            }
+            for name, rod in graph.rods.items()
+        }
+    return data
+
+
+def _body_entry(body: Body) -> dict[str, Any]:
+    inertia: list[Any] = [_numbers(row) for row in body.inertia]
+    if np.count_nonzero(body.inertia - np.diag(np.diag(body.inertia))) == 0:
+        inertia = _numbers(np.diag(body.inertia))
+    return {"mass": body.mass, "com": _numbers(body.com), "inertia": inertia}
+
+
+def _joint_entry(joint: Joint) -> dict[str, Any]:
+    data: dict[str, Any] = {
+        "type": joint.kind,
+        "between": [joint.inner, joint.outer],
+        "at": _numbers(joint.at),
+    }
+    if len(joint.axes) == 1:
+        data["axis"] = _numbers(joint.axes[0])
+    elif len(joint.axes) == 2:
+        data["axes"] = [_numbers(axis) for axis in joint.axes]
+    if joint.pitch:
+        data["lead"] = joint.pitch * TURN
+    if joint.actuated:
+        data["actuated"] = True
+    # Of a slide the file says where it counts from, lest a leg seems to have no length.
+    if joint.home or (joint.actuated and joint.kind == "prismatic"):
+        data["home"] = joint.home
+    if joint.rotor_inertia:
+        data["rotor_inertia"] = joint.rotor_inertia
+    if joint.viscous or joint.coulomb:
+        data["friction"] = {"viscous": joint.viscous, "coulomb": joint.coulomb}
+    return data
+
+
+def _numbers(values: Array) -> list[float]:
+    """A list without what rotations leave in the sixteenth digit of a place of a few metres."""
+    least = 1e-15 * max(1.0, float(np.abs(values).max(initial=0.0)))
+    return [0.0 if abs(x) < least else float(x) for x in values]

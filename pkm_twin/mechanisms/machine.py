@@ -32,12 +32,13 @@ from pkm_twin.machine.graph import (
     limb_numbers,
     rotation_about_z,
 )
-from pkm_twin.machine.graph_drives import driven, drives_of
 from pkm_twin.machine.graph_file import (
     KINDS,
     PER_COPY,
     LimitSpec,
     Source,
+    driven,
+    drives_of,
     graph_of_entries,
     number_of_entry,
     numbered_entry,

@@ -12,9 +12,8 @@ import yaml
 
 from pkm_twin.errors import ParameterError, PkmTwinError, one_line
 from pkm_twin.files import replace_file
-from pkm_twin.machine.machine_yaml import describe_machine_yaml
+from pkm_twin.machine.machine_yaml import describe_machine_yaml, edit_yaml
 from pkm_twin.machine.places import given, has_entry, keys_of
-from pkm_twin.machine.yaml_edit import edit_yaml
 from pkm_twin.robot.catalogue import TREES, load, robot_of_data, robot_path
 from pkm_twin.robot.robot import Robot
 from pkm_twin.robot.robot_urdf import robot_description

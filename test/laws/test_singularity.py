@@ -17,7 +17,7 @@ from pkm_twin.certify.maximal import Maximal
 from pkm_twin.certify.rows import stacked
 from pkm_twin.errors import SingularityError
 from pkm_twin.kinematics.singularity import Placed
-from pkm_twin.machine.graph_description import graph_description
+from pkm_twin.machine.graph_file import graph_description
 from pkm_twin.robot.robot_urdf import robot_description
 from stiffness_monitor import compliance
 from test.machine.random_machines import NAMES, plain

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import yaml
 
-from pkm_twin.machine.yaml_edit import edit_yaml, flow
+from pkm_twin.machine.machine_yaml import edit_yaml, flow
 from pkm_twin.robot.catalogue import config_folder, robot_of_data
 from test.support.robots import massive, parameters_of
 
