@@ -71,7 +71,6 @@ class Estimates:
             "estimate_payload",
             False,
             "publish ~/payload: the payload estimated from the measured efforts",
-            read_only=True,
         ):
             return None
         self._load = node.create_guarded_publisher("~/payload")
@@ -85,7 +84,6 @@ class Estimates:
             "observe_wrench",
             False,
             "publish ~/external_wrench and ~/contact, estimated with a momentum observer",
-            read_only=True,
         )
         bandwidth = node.declare(
             "observer.bandwidth",
@@ -94,7 +92,6 @@ class Estimates:
             unit="1/s",
             low=0.1,
             high=1e4,
-            read_only=True,
         )
         sigmas = node.declare(
             "observer.sigmas",
@@ -102,7 +99,6 @@ class Estimates:
             "contact threshold in standard deviations of model and noise together",
             low=1.0,
             high=1e3,
-            read_only=True,
         )
         if not wanted:
             return None

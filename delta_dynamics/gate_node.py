@@ -5,6 +5,8 @@ from __future__ import annotations
 
 import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Final
 
 import numpy as np
@@ -14,10 +16,9 @@ from delta_dynamics.gate import Gate, GateSettings
 from delta_dynamics.parameters_node import changed, declare_changes
 from delta_dynamics.topics import GATE
 from delta_dynamics.virtual_work import inverse_dynamics
-from pkm_twin.bags.definitions import message_definition
 from pkm_twin.errors import MessageError
 from pkm_twin.machine.joint_map import ControllerNumbers
-from pkm_twin.messages.intake import JointStateDecoder
+from pkm_twin.messages.intake import JointStateView
 from pkm_twin.messages.stamps import SECOND
 from pkm_twin.ros import health
 from pkm_twin.ros.changes import follow_changes
@@ -52,21 +53,20 @@ class CommandGate(TwinNode):
         # The same with names and a stamp, for recordings and plots.
         self._stamped = JointPublisher(self, robot, "~/commands_stamped")
         self._declare_robot(settings)
-        # A stranger's message of any size takes no time of the torques.
-        definition = message_definition("sensor_msgs/msg/JointState")
-        self._decode_torques = JointStateDecoder(definition)
-        self._decode_state = JointStateDecoder(definition)
         self.create_guarded_subscription(
             TORQUES,
             self._on_torques,
-            raw=True,
+            refuse=self._refuse_torques,
             awaited=True,
             expires=lambda: settings.deadline,
             expiry=settings.deadline,
         )
         if settings.on_stop == "gravity":
             self.create_guarded_subscription(
-                "joint_states", self._on_joint_state, raw=True, awaited=True
+                "joint_states",
+                lambda m: self._gate.joint_state(m, self.now(), time.monotonic_ns()),
+                refuse=self._gate.refuse_joint_state,
+                awaited=True,
             )
         follow_changes(
             self,
@@ -160,28 +160,25 @@ class CommandGate(TwinNode):
             inverse_dynamics(robot, robot.inverse(robot.home()), zeros, zeros)
         self._gate.change_robot(robot)
 
-    def _on_torques(self, data: bytes) -> None:
+    @contextmanager
+    def _watching(self) -> Iterator[None]:
+        """Where torques close the gate, its command is sent at once."""
         running = not self._gate.stream.stopped
         try:
-            try:
-                message = self._decode_torques(data)
-            except MessageError as error:
-                self._gate.refuse_torques(error)
-                raise
-            command = self._gate.torques(message, self.now(), time.monotonic_ns())
+            yield
         finally:
             if running and self._gate.stream.stopped:
                 self._watch()
+
+    def _refuse_torques(self, error: MessageError) -> None:
+        with self._watching():
+            self._gate.refuse_torques(error)
+
+    def _on_torques(self, message: JointStateView) -> None:
+        with self._watching():
+            command = self._gate.torques(message, self.now(), time.monotonic_ns())
         if command is not None:
             self._send(command)
-
-    def _on_joint_state(self, data: bytes) -> None:
-        try:
-            message = self._decode_state(data)
-        except MessageError as error:
-            self._gate.refuse_joint_state(error)
-            raise
-        self._gate.joint_state(message, self.now(), time.monotonic_ns())
 
     def _watch(self) -> None:
         """While the gate is closed its command is repeated: a controller may come late."""
@@ -209,10 +206,8 @@ class CommandGate(TwinNode):
         self._stamped.publish(self.now(), command)
 
 
-def main() -> None:
-    """Entry point of ``ros2 run pkm_twin command_gate``."""
-    sys.exit(run(CommandGate))
-
+NODE = CommandGate
+"""What a process of one or several nodes makes."""
 
 if __name__ == "__main__":
-    main()
+    sys.exit(run(NODE))

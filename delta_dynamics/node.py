@@ -20,9 +20,8 @@ from delta_dynamics.parameters_node import CHANGES, changed, declare_changes
 from delta_dynamics.reactions import reactions
 from delta_dynamics.settings import Settings
 from delta_dynamics.topics import TWIN
-from pkm_twin.bags.definitions import message_definition
 from pkm_twin.errors import MessageError, ParameterError, PkmTwinError
-from pkm_twin.messages.intake import JointStateDecoder, RawTrajectory
+from pkm_twin.messages.intake import JointStateView, RawTrajectory
 from pkm_twin.messages.stamps import SECOND
 from pkm_twin.robot.robot import Robot
 from pkm_twin.ros import health
@@ -54,7 +53,7 @@ class DeltaDynamics(TwinNode):
         robot = changed(robot, declare_changes(self, robot))
         settings = self.declare_settings(Settings)
         self._feedforward = Feedforward(robot, settings, self._create_wrenches(settings))
-        commands = self.declare("publish_commands", False, "publish ~/commands", read_only=True)
+        commands = self.declare("publish_commands", False, "publish ~/commands")
         if commands and "on_stop" not in self.given:
             # A controller of plain commands holds the last one for ever.
             raise ParameterError(
@@ -77,12 +76,11 @@ class DeltaDynamics(TwinNode):
         self._feedforward.doubted = self._estimates.wanted
         if self._estimates.warning():
             self.get_logger().warning(self._estimates.warning())
-        self._decode = JointStateDecoder(message_definition("sensor_msgs/msg/JointState"))
         self.create_guarded_subscription("~/joint_trajectory", self._on_trajectory, raw=True)
         self.create_guarded_subscription(
             "joint_states",
             self._on_joint_state,
-            raw=True,
+            refuse=self._refuse_joint_state,
             awaited=True,
             expires=lambda: self._feedforward.settings.stale_after,
         )
@@ -220,7 +218,6 @@ class DeltaDynamics(TwinNode):
             "",
             "FollowJointTrajectory action of the controller that ~/follow_joint_trajectory "
             "forwards to; empty: none",
-            read_only=True,
         )
         hold = self.declare(
             "on_cancel",
@@ -228,7 +225,6 @@ class DeltaDynamics(TwinNode):
             "what happens when a goal ends early: hold sends a hold point with the effort against "
             "gravity, controller leaves the reaction to the controller",
             choices=("hold", "controller"),
-            read_only=True,
         )
         if not controller:
             return None
@@ -265,19 +261,14 @@ class DeltaDynamics(TwinNode):
             "use_wrench",
             False,
             "include the measured wrench in torques and residual of joint states",
-            read_only=True,
         )
         age = self.declare(
-            "max_wrench_age",
-            0.1,
-            "largest time between a joint state and its wrench",
-            read_only=True,
-            **SECONDS,
+            "max_wrench_age", 0.1, "largest time between a joint state and its wrench", **SECONDS
         )
         policy = self.declare(
             "no_wrench", "ignore", "without a fresh wrench: ignore computes without one, stop "
             "stops the stream",
-            choices=("ignore", "stop"), read_only=True,
+            choices=("ignore", "stop")
         )  # fmt: skip
         wrench = self.declare_settings(
             WrenchSettings,
@@ -306,15 +297,9 @@ class DeltaDynamics(TwinNode):
 
     def _create_reaction_publishers(self, robot: Robot) -> dict[str, Any]:
         """A publisher for each joint's reaction, where the parameter asks for them."""
-        wanted = self.declare("publish_reactions", False, "publish ~/reactions/*", read_only=True)
+        wanted = self.declare("publish_reactions", False, "publish ~/reactions/*")
         rate = self.declare(
-            "reactions_rate",
-            50.0,
-            "rate of ~/reactions/*",
-            unit="Hz",
-            low=1e-3,
-            high=1e4,
-            read_only=True,
+            "reactions_rate", 50.0, "rate of ~/reactions/*", unit="Hz", low=1e-3, high=1e4
         )
         self._reactions_pace = Pace(rate)
         if not wanted:
@@ -364,15 +349,13 @@ class DeltaDynamics(TwinNode):
         if self._action is not None:
             self._action.other_motion()
 
-    def _on_joint_state(self, data: bytes) -> None:
+    def _refuse_joint_state(self, error: MessageError) -> None:
+        with self._telling_stop():
+            self._feedforward.refuse_joint_state(error)
+
+    def _on_joint_state(self, message: JointStateView) -> None:
         core, came = self._feedforward, time.monotonic_ns()
-        running = not core.stream.stopped
-        try:
-            try:
-                message = self._decode(data)
-            except MessageError as error:
-                core.refuse_joint_state(error)
-                raise
+        with self._telling_stop():
             torques = core.joint_state(message, self.now())
             if torques is not None:
                 # The process may have stood still since.
@@ -381,9 +364,6 @@ class DeltaDynamics(TwinNode):
             self._accepted = came, message
             if torques is None:
                 return
-        finally:
-            if running and core.stream.stopped:
-                self._send_stop()
         effort = core.sent(torques.effort)
         self._torques.publish(torques.stamp, effort)
         residual = torques.residual
@@ -463,13 +443,7 @@ class DeltaDynamics(TwinNode):
 
 
 NODE = DeltaDynamics
-"""What a process of several nodes makes."""
-
-
-def main() -> None:
-    """Run the node until a signal ends it."""
-    sys.exit(run(DeltaDynamics))
-
+"""What a process of one or several nodes makes."""
 
 if __name__ == "__main__":
-    main()
+    sys.exit(run(NODE))

@@ -50,12 +50,7 @@ def declare_changes(
         if name == "payload.mass":
             bounds = {"low": 0.0, "high": MAX_MASS}
         given = node.declare(
-            name,
-            default,
-            text,
-            unit=unit,
-            usual="the robot file's",
-            **bounds,
+            name, default, text, unit=unit, usual="the robot file's", changeable=True, **bounds
         )
         if name in node.given:
             changes[name] = given

@@ -6,7 +6,7 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Sequence
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
@@ -82,12 +82,8 @@ class MachineSim(TwinNode):
             np.zeros_like(settings.start), np.zeros(6), settings.period / settings.substeps
         )
         self._simulation.restart()
-        self._frame = self.declare(
-            "wrench_frame", "platform", "frame id of ~/wrench", read_only=True
-        )
-        self._base = self.declare(
-            "base_frame", "base_link", "frame of ~/applied_wrench", read_only=True
-        )
+        self._frame = self.declare("wrench_frame", "platform", "frame id of ~/wrench")
+        self._base = self.declare("base_frame", "base_link", "frame of ~/applied_wrench")
         self._create_topics()
         self._due = time.monotonic()
         self._heard = self._due
@@ -144,19 +140,18 @@ class MachineSim(TwinNode):
         return level, message, values
 
     def _declare_spread(self, robot: Robot) -> Variation:
-        fixed: dict[str, Any] = {"read_only": True}
         size = self.declare(
             "spread", 0.0, "relative perturbation of the robot file's parameters",
-            low=0.0, high=MAX_SPREAD, **fixed,
+            low=0.0, high=MAX_SPREAD
         )  # fmt: skip
         kinds = self.declare(
-            "spread_kinds", list(KINDS), f"parameters to perturb: {', '.join(KINDS)}", **fixed
+            "spread_kinds", list(KINDS), f"parameters to perturb: {', '.join(KINDS)}"
         )
-        seed = self.declare("seed", 1, "seed of the perturbation", low=0, high=2**31 - 1, **fixed)
+        seed = self.declare("seed", 1, "seed of the perturbation", low=0, high=2**31 - 1)
         distribution = self.declare(
             "distribution", "normal", "normal: spread is the standard deviation; uniform: the "
             "bound",
-            choices=("normal", "uniform"), **fixed,
+            choices=("normal", "uniform")
         )  # fmt: skip
         return varied(robot, dict.fromkeys(kinds, size), seed, distribution)
 
@@ -164,11 +159,11 @@ class MachineSim(TwinNode):
         self._clock_kind = self.declare(
             "clock", "wall", "wall: the computer's clock; simulated: publishes /clock at "
             "real_time_factor; lockstep: publishes /clock, one period per effort command",
-            choices=("wall", "simulated", "lockstep"), read_only=True,
+            choices=("wall", "simulated", "lockstep")
         )  # fmt: skip
         self._factor = self.declare(
             "real_time_factor", 1.0, "speed of the simulated clock; 0: as fast as possible",
-            low=0.0, high=1000.0, read_only=True,
+            low=0.0, high=1000.0
         )  # fmt: skip
         self._simulated = self._clock_kind != "wall"
         self._lockstep = self._clock_kind == "lockstep"
@@ -180,10 +175,9 @@ class MachineSim(TwinNode):
 
     def _declare_settings(self, robot: Robot) -> MachineSettings:
         """Drives and sensors by the model: who tunes them does not know what was drawn."""
-        fixed: dict[str, Any] = {"read_only": True}
         bandwidth = self.declare(
             "bandwidth", 10.0, "bandwidth of the position control, critically damped", unit="Hz",
-            low=0.01, high=1000.0, **fixed,
+            low=0.01, high=1000.0
         )  # fmt: skip
         stiffness, damping = tuned(robot, bandwidth)
         home = robot.inverse(robot.home())
@@ -195,7 +189,7 @@ class MachineSim(TwinNode):
             ),
             effort_limits=self._row(
                 "effort_limits", effort_limits(robot), "largest effort of the drives, N m or N",
-                0.0, "the robot's",
+                0.0, "the robot's"
             ),
             stiffness=self._row(
                 "stiffness", stiffness, "of the position control", 0.0, "from bandwidth"
@@ -212,7 +206,7 @@ class MachineSim(TwinNode):
                 self._row("wrench.amplitude", np.zeros(6), "amplitude of a sine added to it"),
                 self.declare(
                     "wrench.frequency", 1.0, "frequency of the "
-                    "sine", unit="Hz", low=0.0, high=1e4, **fixed
+                    "sine", unit="Hz", low=0.0, high=1e4
                 ),
             ),
         )  # fmt: skip
@@ -243,7 +237,7 @@ class MachineSim(TwinNode):
         """Events as three lists; by default the robot's own payload from the start."""
         own = robot.payload
         times, masses, coms = (
-            self.declare(name, default, text, usual=usual, read_only=True)
+            self.declare(name, default, text, usual=usual)
             for name, default, text, usual in (
                 (
                     "payload.times", [0.0], "times at which the payload changes, s after the "
@@ -276,7 +270,7 @@ class MachineSim(TwinNode):
         self, name: str, default: Array, text: str, low: float | None = None, usual: str = ""
     ) -> Array:
         """A parameter of one number a joint (or component); one stands for all."""
-        given = self.declare(name, default.tolist(), text, usual=usual, read_only=True)
+        given = self.declare(name, default.tolist(), text, usual=usual)
         values = np.asarray(given, np.float64)
         if len(values) not in (1, len(default)):
             raise ParameterError(name, list(given), f"{len(default)} numbers, or one for all")
@@ -403,13 +397,7 @@ def _refuse_sim_time(changes: Sequence[Parameter]) -> SetParametersResult:
 
 
 NODE = MachineSim
-"""What a process of several nodes makes."""
-
-
-def main() -> None:
-    """Entry point of ``ros2 run pkm_twin machine_sim``."""
-    sys.exit(run(MachineSim))
-
+"""What a process of one or several nodes makes."""
 
 if __name__ == "__main__":
-    main()
+    sys.exit(run(NODE))

@@ -47,20 +47,15 @@ class StiffnessAlarmTopics:
             True,
             "subscribe to measured_deflection and publish ~/stiffness_alarm: elements whose "
             "compliance differs from the file",
-            read_only=True,
         )
         settings = self._declare_settings()
         age = node.declare(
             "alarm.wrench_age", 0.02, "largest time between a deflection and the wrenches before "
             "and after it",
-            read_only=True, **SECONDS,
+            **SECONDS
         )  # fmt: skip
         period = node.declare(
-            "alarm.period",
-            0.1,
-            "shortest time between two deflections that are used",
-            read_only=True,
-            **SECONDS,
+            "alarm.period", 0.1, "shortest time between two deflections that are used", **SECONDS
         )
         if not wanted:
             return
@@ -72,8 +67,7 @@ class StiffnessAlarmTopics:
     def _declare_settings(self) -> AlarmSettings:
         node = self._node
         words = node.declare(
-            "alarm.directions", list(DIRECTIONS), "measured directions, of x y z rx ry rz",
-            read_only=True,
+            "alarm.directions", list(DIRECTIONS), "measured directions, of x y z rx ry rz"
         )  # fmt: skip
         for word in words:
             if word not in DIRECTIONS:

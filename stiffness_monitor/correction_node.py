@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from pkm_twin.errors import MessageError, ParameterError
+from pkm_twin.messages.intake import JointStateView
 from pkm_twin.messages.reading import JointReader
 from pkm_twin.messages.stamps import SECOND, StampRules
 from pkm_twin.robot.robot import Robot
@@ -34,13 +35,12 @@ class SetpointCorrection:
     ``~/setpoint_with_torques``.
     """
 
-    def __init__(self, node: TwinNode, robot: Robot, rules: StampRules, decode: Any) -> None:
+    def __init__(self, node: TwinNode, robot: Robot, rules: StampRules) -> None:
         """Declare the parameters and create the topics that they ask for.
 
         :param rules: what the stamps of set points have to keep to.
-        :param decode: of raw joint states.
         """
-        self._node, self._robot, self._rules, self._decode = node, robot, rules, decode
+        self._node, self._robot, self._rules = node, robot, rules
         self._reader = JointReader(robot)
         self._offset: tuple[int, Any] | None = None
         self.bounded = 0
@@ -50,7 +50,6 @@ class SetpointCorrection:
             "correct_setpoint",
             False,
             "publish joint offsets that compensate the tool point's deflection",
-            read_only=True,
         )
         self._tool = np.array(
             triple(
@@ -67,7 +66,6 @@ class SetpointCorrection:
             unit="rad or m",
             low=0.0,
             high=MAX_BOUND,
-            read_only=True,
         )
         self._age = node.declare(
             "correction_age",
@@ -76,14 +74,12 @@ class SetpointCorrection:
             unit="s",
             low=0.0,
             high=3600.0,
-            read_only=True,
         )
         paired = node.declare(
             "pair_torques",
             False,
             "also publish ~/setpoint_with_torques: the corrected set point, and the torques of the "
             "same stamp; needs correct_setpoint, and delta_dynamics needs the set points as well",
-            read_only=True,
         )
         self._waiting: dict[int, tuple[str, Any]] = {}
         self.unpaired = 0
@@ -97,11 +93,11 @@ class SetpointCorrection:
         fields = ("position",)
         self._offsets = JointPublisher(node, robot, "~/setpoint_offset", fields)
         self._corrected = JointPublisher(node, robot, "~/corrected_setpoint", fields)
-        node.create_guarded_subscription("setpoint", self._on_setpoint, raw=True)
+        node.create_guarded_subscription("setpoint", self._on_setpoint, refuse=self._refuse)
         if paired:
             both = ("position", "effort")
             self._both = JointPublisher(node, robot, "~/setpoint_with_torques", both)
-            node.create_guarded_subscription("torques", self._on_torques, raw=True)
+            node.create_guarded_subscription("torques", self._on_torques)
 
     def reset(self) -> None:
         """Forget the last wrench, as when the clock jumps."""
@@ -141,16 +137,19 @@ class SetpointCorrection:
             values["set points and torques without a pair"] = self.unpaired
         return values | {f"set points rejected: {k}": v for k, v in self.setpoints.rejected.items()}
 
-    def _on_setpoint(self, data: bytes) -> None:
+    def _refuse(self, error: MessageError) -> None:
+        self.setpoints.reject(error.reason, str(error))
+
+    def _on_setpoint(self, message: JointStateView) -> None:
         try:
-            self._correct(data)
+            self._correct(message)
         except MessageError as error:
-            self.setpoints.reject(error.reason, str(error))
+            self._refuse(error)
             raise
         self.setpoints.accept()
 
-    def _correct(self, data: bytes) -> None:
-        sample = self._reader.positions(self._decode(data), self._node.now(), self._rules)
+    def _correct(self, message: JointStateView) -> None:
+        sample = self._reader.positions(message, self._node.now(), self._rules)
         if self._offset is None:
             raise MessageError("no wrench", "no wrench to compute a correction from has arrived")
         stamp, offset = self._offset
@@ -165,8 +164,8 @@ class SetpointCorrection:
         if self._paired:
             self._pair(sample.stamp, "position", corrected)
 
-    def _on_torques(self, data: bytes) -> None:
-        sample = self._reader.efforts(self._decode(data), self._node.now(), self._rules)
+    def _on_torques(self, message: JointStateView) -> None:
+        sample = self._reader.efforts(message, self._node.now(), self._rules)
         self._pair(sample.stamp, "effort", sample.given)
 
     def _pair(self, stamp: int, what: str, numbers: Any) -> None:

@@ -20,9 +20,7 @@ from rclpy.time import Time
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray, Header, MultiArrayDimension, String
 
-from pkm_twin.bags.definitions import message_definition
-from pkm_twin.errors import MessageError, PkmTwinError
-from pkm_twin.messages.intake import JointStateDecoder
+from pkm_twin.errors import PkmTwinError
 from pkm_twin.ros import health
 from pkm_twin.ros.changes import follow_changes
 from pkm_twin.ros.node import TwinNode
@@ -60,7 +58,6 @@ class StiffnessMonitor(TwinNode):
             "",
             "frame of ~/deflection; empty: wrench_frame, or platform if wrench_frame is base_frame "
             "or the sensor is not at the platform's reference point",
-            read_only=True,
         )
         mounts = declare_mounts(self, given or PLATFORM)
         self._platform_frame = given or ("" if mounts is None else PLATFORM)
@@ -69,11 +66,10 @@ class StiffnessMonitor(TwinNode):
             self.declare(
                 "rate", 0.0, "largest rate of answers, by the stamps of the wrenches; 0: every "
                 "wrench",
-                unit="Hz", low=0.0, high=1e4, read_only=True,
+                unit="Hz", low=0.0, high=1e4
             )
         )  # fmt: skip
-        self._decode = JointStateDecoder(message_definition("sensor_msgs/msg/JointState"))
-        self._correction = SetpointCorrection(self, robot, settings.stamp_rules, self._decode)
+        self._correction = SetpointCorrection(self, robot, settings.stamp_rules)
         self._alarm = StiffnessAlarmTopics(
             self, robot, settings.stamp_rules,
             (settings.base_frame, self._platform_frame or settings.platform_frame),
@@ -94,7 +90,7 @@ class StiffnessMonitor(TwinNode):
         """Stamp of the joint state whose frequencies were published last."""
         rate = self.declare(
             "frequencies_rate", 10.0, "largest rate of ~/natural_frequencies; 0: none",
-            unit="Hz", low=0.0, high=1000.0, read_only=True,
+            unit="Hz", low=0.0, high=1000.0
         )  # fmt: skip
         if rate > 0.0 and has_modes(robot):
             # What the first call loads and compiles is not waited for in a callback.
@@ -105,7 +101,10 @@ class StiffnessMonitor(TwinNode):
             )
             self.create_guarded_timer(1.0 / rate, self._publish_frequencies)
         self.create_guarded_subscription(
-            "joint_states", self._on_joint_state, raw=True, awaited=True
+            "joint_states",
+            lambda message: self._monitor.joint_state(message, self.now()),
+            refuse=self._monitor.refuse_joint_state,
+            awaited=True,
         )
         self.create_guarded_subscription("wrench", self._on_wrench)
         follow_changes(
@@ -161,14 +160,6 @@ class StiffnessMonitor(TwinNode):
         self._correction.change_rules(settings.stamp_rules)
         platform = self._platform_frame or settings.platform_frame
         self._alarm.change_rules(settings.stamp_rules, (settings.base_frame, platform))
-
-    def _on_joint_state(self, data: bytes) -> None:
-        try:
-            message = self._decode(data)
-        except MessageError as error:
-            self._monitor.refuse_joint_state(error)
-            raise
-        self._monitor.joint_state(message, self.now())
 
     def _on_wrench(self, message: WrenchStamped) -> None:
         answer = self._monitor.wrench(message, self.now())
@@ -282,13 +273,7 @@ def _matrix(answer: Answer) -> Float64MultiArray:
 
 
 NODE = StiffnessMonitor
-"""What a process of several nodes makes."""
-
-
-def main() -> None:
-    """Run the node until a signal ends it."""
-    sys.exit(run(StiffnessMonitor))
-
+"""What a process of one or several nodes makes."""
 
 if __name__ == "__main__":
-    main()
+    sys.exit(run(NODE))

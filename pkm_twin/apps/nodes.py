@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import importlib
 import sys
+from collections.abc import Sequence
 
 from pkm_twin.errors import install
 from pkm_twin.files import open_standard_streams
@@ -70,25 +71,22 @@ def composed() -> None:
             file=sys.stderr,
         )
         sys.exit(2)
-    _require_ros("composed")
-    nodes = [importlib.import_module(MODULES[name]).NODE for name in names]
-    sys.exit(importlib.import_module("pkm_twin.ros.run").run(*nodes))
+    _start("composed", names)
 
 
 def _run(name: str) -> None:
     leave_at_once()
     open_standard_streams()
     answer(name, SUMMARIES[name], sys.argv[1:])
-    _require_ros(name)
-    importlib.import_module(MODULES[name]).main()
+    _start(name, [name])
 
 
-def _require_ros(name: str) -> None:
+def _start(command: str, names: Sequence[str]) -> None:
     try:
         importlib.import_module("rclpy")
     except ImportError as error:
-        print(
-            f"cannot start: {name} needs ROS 2: source its setup, or {install('jazzy')} ({error})",
-            file=sys.stderr,
-        )
+        needed = f"source its setup, or {install('jazzy')} ({error})"
+        print(f"cannot start: {command} needs ROS 2: {needed}", file=sys.stderr)
         sys.exit(1)
+    nodes = [importlib.import_module(MODULES[name]).NODE for name in names]
+    sys.exit(importlib.import_module("pkm_twin.ros.run").run(*nodes))

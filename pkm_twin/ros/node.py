@@ -25,14 +25,16 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 from rosgraph_msgs.msg import Clock as ClockMessage
 from std_srvs.srv import Trigger
 
+from pkm_twin.bags.definitions import message_definition
 from pkm_twin.errors import MessageError, ParameterError
+from pkm_twin.messages.intake import JointStateDecoder
 from pkm_twin.messages.stamps import SECOND
 from pkm_twin.ros.health import QOS, RELIABILITY, Health, Misfit, cut
 from pkm_twin.ros.parameters import ParameterNode
 from pkm_twin.ros.qos import EXPIRY, OVERRIDES, input_qos, latched_qos, output_qos
 from pkm_twin.ros.turns import SELDOM_PERIOD, SeldomGroup, Task, Tasks
 from pkm_twin.streams.monitor import TopicStatistics
-from pkm_twin.streams.topics import Topic
+from pkm_twin.streams.topics import JOINTS, Topic
 
 # The middleware's threads hold its locks while they report an event, and wait there for the lock
 # that the executor holds while it takes one or ends: a node could stand still for ever.
@@ -57,23 +59,22 @@ class GuardedNode(ParameterNode):
         self.seldom = SeldomGroup()
         super().__init__(name)
         self.autostart: bool = self.declare(
-            "autostart", True, "configure and activate the node at start", read_only=True
+            "autostart", True, "configure and activate the node at start"
         )
         self.executor_kind: str = self.declare(
             "executor",
             "events",
             "rclpy's executor: single (SingleThreadedExecutor) or events (EventsExecutor)",
             choices=("single", "events"),
-            read_only=True,
         )
         self.queue_depth: int = self.declare(
             "queue_depth", 1000, "messages of a topic that can wait for the node",
-            low=1, high=100_000, read_only=True,
+            low=1, high=100_000
         )  # fmt: skip
         self.thread_priority: int = self.declare(
             "thread_priority", 0,
             "real-time priority (SCHED_FIFO) of the process, with its memory locked; 0: none",
-            low=0, high=99, read_only=True,
+            low=0, high=99
         )  # fmt: skip
         # The diagnostics run on the steady clock: they have to tell that the ROS clock stands.
         self.steady = Clock(clock_type=ClockType.STEADY_TIME)
@@ -127,6 +128,7 @@ class GuardedNode(ParameterNode):
         topic: str,
         callback: Callable[[Any], None],
         *,
+        refuse: Callable[[MessageError], None] | None = None,
         raw: bool = False,
         awaited: bool = False,
         expires: Callable[[], float] | None = None,
@@ -136,8 +138,10 @@ class GuardedNode(ParameterNode):
 
         QoS overrides are parameters. By default messages may be lost for the newest, and publishers
         of both kinds match. Of a topic that is ``whole`` none is lost, as long messages need it,
-        until a best-effort publisher comes: from there on as others.
+        until a best-effort publisher comes: from there on as others. Joint states are read from
+        their bytes.
 
+        :param refuse: takes what is wrong with bytes that are no joint state.
         :param raw: the callback takes the message's bytes.
         :param awaited: the diagnostics warn until the first message.
         :param expires: how long a message may wait for the node, s; older ones count as lost.
@@ -147,7 +151,7 @@ class GuardedNode(ParameterNode):
             self.health.awaited.append(topic)
         row = self.topics[topic]
         GuardedSubscription(
-            self, row.message, topic, callback,
+            self, row, topic, callback, refuse,
             raw=raw, best_effort=not row.whole, expires=expires, expiry=expiry,
         )  # fmt: skip
 
@@ -215,17 +219,21 @@ class GuardedSubscription:
     def __init__(
         self,
         node: GuardedNode,
-        kind: type[Any],
+        row: Topic,
         topic: str,
         callback: Callable[[Any], None],
+        refuse: Callable[[MessageError], None] | None,
         *,
         raw: bool,
         best_effort: bool,
         expires: Callable[[], float] | None,
         expiry: float | None,
     ) -> None:
-        self._node, self._kind, self._topic, self._callback = node, kind, topic, callback
-        self._raw, self._best_effort = raw, best_effort
+        self._node, self._kind, self._topic, self._callback = node, row.message, topic, callback
+        self._refuse, self._decode = refuse, None
+        if row.kind == JOINTS:
+            self._decode = JointStateDecoder(message_definition("sensor_msgs/msg/JointState"))
+        self._raw, self._best_effort = raw or self._decode is not None, best_effort
         self._expires, self._expiry = expires, expiry
         self._statistics = node.health.statistics[topic] = TopicStatistics()
         self._name = node.resolve_topic_name(topic)
@@ -277,10 +285,19 @@ class GuardedSubscription:
                     statistics.missed += 1
                     return
             node.health.seen["messages"] += 1
-            self._callback(message)
+            self._callback(message if self._decode is None else self._decoded(message))
         except Exception as error:
             node.failed(self._topic, error)
         statistics.handled(time.perf_counter() - began)
+
+    def _decoded(self, data: bytes) -> Any:
+        assert self._decode is not None  # noqa: S101  asked for with it
+        try:
+            return self._decode(data)
+        except MessageError as error:
+            if self._refuse is not None:
+                self._refuse(error)
+            raise
 
     def _misfit(self, what: Misfit) -> None:
         """From there on publishers of both kinds are taken."""

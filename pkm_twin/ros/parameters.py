@@ -79,15 +79,16 @@ class ParameterNode(LifecycleNode):
         high: float | None = None,
         choices: Sequence[str] = (),
         usual: str = "",
-        read_only: bool = False,
+        changeable: bool = False,
     ) -> Any:
         """Declare a parameter and return its value; a whole number is taken for a float.
 
         :param low: least value, ``high``: greatest; ``choices``: the words that are allowed.
         :param usual: words for a default that depends on the robot.
+        :param changeable: whether it may change while the node runs.
         :raises ParameterError: the given value has another type or is out of range, naming both.
         """
-        row = Setting(description, name, unit, low, high, tuple(choices), read_only, usual)
+        row = Setting(description, name, unit, low, high, tuple(choices), not changeable, usual)
         return self._declare(default, row)
 
     def declare_robot(self, default: str = "delta_cu") -> Robot:
@@ -96,7 +97,7 @@ class ParameterNode(LifecycleNode):
         :raises PkmTwinError: there is no such robot, or its file is rejected.
         """
         text = "robot: a name, or the path of a file"
-        return load(self.declare("mechanism", default, text, read_only=True))
+        return load(self.declare("mechanism", default, text))
 
     def _declare(self, default: Any, row: Setting) -> Any:
         self.rows[row.name] = default, row

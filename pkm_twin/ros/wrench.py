@@ -23,8 +23,7 @@ def declare_mounts(node: TwinNode, platform_frame: str = PLATFORM) -> Mounts | N
     """
     wanted = node.declare(
         "use_tf", False, "take the sensor's pose from /tf in place of sensor.xyz and sensor.rpy, "
-        "between wrench_frame and platform_frame at the wrench's stamp; needs tf2_ros",
-        read_only=True,
+        "between wrench_frame and platform_frame at the wrench's stamp; needs tf2_ros"
     )  # fmt: skip
     if not wanted:
         return None
@@ -36,7 +35,7 @@ def triple(node: TwinNode, name: str, text: str, unit: str) -> tuple[float, floa
 
     :raises ParameterError: not three.
     """
-    values = node.declare(name, [0.0, 0.0, 0.0], text, unit=unit, read_only=True)
+    values = node.declare(name, [0.0, 0.0, 0.0], text, unit=unit)
     if len(values) != 3:
         raise ParameterError(name, list(values), f"3 numbers, {unit}")
     x, y, z = values

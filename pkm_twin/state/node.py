@@ -18,7 +18,6 @@ from geometry_msgs.msg import (
     TransformStamped,
     TwistStamped,
     Vector3,
-    WrenchStamped,
 )
 from numpy.typing import NDArray
 from rclpy.duration import Duration
@@ -27,10 +26,9 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import ColorRGBA, String
 from visualization_msgs.msg import Marker, MarkerArray
 
-from pkm_twin.bags.definitions import message_definition
-from pkm_twin.errors import MessageError, ParameterError, PkmTwinError
+from pkm_twin.errors import ParameterError, PkmTwinError
 from pkm_twin.machine import rotations
-from pkm_twin.messages.intake import JointStateDecoder
+from pkm_twin.messages.intake import JointStateView
 from pkm_twin.messages.stamps import SECOND
 from pkm_twin.robot.robot import Robot
 from pkm_twin.robot.robot_urdf import joint_names, robot_urdf
@@ -211,13 +209,12 @@ class MachineStateNode(TwinNode):
             self.declare(
                 "rate", 100.0, "largest rate of ~/joint_states, ~/pose and ~/twist; 0: every "
                 "sample",
-                unit="Hz", low=0.0, high=1e4, read_only=True,
+                unit="Hz", low=0.0, high=1e4
             )
         )  # fmt: skip
         self._scene = Scene(robot, self.declare_settings(Scales, fixed=True))
         self._elastic = _is_elastic(robot)
         _warm_up(robot, self._elastic)
-        self._decode = JointStateDecoder(message_definition("sensor_msgs/msg/JointState"))
         self._joints = self.create_guarded_publisher("~/joint_states")
         self._pose = self.create_guarded_publisher("~/pose")
         self._twist = self.create_guarded_publisher("~/twist")
@@ -226,7 +223,7 @@ class MachineStateNode(TwinNode):
         hardware = self.declare(
             "hardware_plugin", "", "hardware plugin in the ros2_control element of "
             "robot_description; "
-            "empty: no such element", read_only=True,
+            "empty: no such element"
         )  # fmt: skip
         self._urdf = robot_urdf(robot, hardware)
         self._names = joint_names(robot, hardware)
@@ -235,9 +232,9 @@ class MachineStateNode(TwinNode):
         """Stamp of the state that was drawn last."""
         self._create_markers()
         self.create_guarded_subscription(
-            "joint_states", self._on_joint_state, raw=True, awaited=True
+            "joint_states", self._on_joint_state, refuse=self._core.refuse_joint_state, awaited=True
         )
-        self.create_guarded_subscription("wrench", self._on_wrench)
+        self.create_guarded_subscription("wrench", lambda m: self._core.wrench(m, self.now()))
         follow_changes(
             self,
             changeable(WrenchSettings),
@@ -287,7 +284,7 @@ class MachineStateNode(TwinNode):
         return level, message, values
 
     def _declare_frame(self, name: str, default: str, text: str) -> str:
-        frame: str = self.declare(name, default, f"frame id {text}", read_only=True)
+        frame: str = self.declare(name, default, f"frame id {text}")
         if not frame:
             raise ParameterError(name, frame, "a frame's name")
         return frame
@@ -300,12 +297,10 @@ class MachineStateNode(TwinNode):
             "transforms to publish: all (base to platform, platform to tool), tool (if "
             "robot_state_publisher publishes the platform) or none",
             choices=("all", "tool", "none"),
-            read_only=True,
         )
         rate = self.declare(
             "tf_rate", 100.0, "largest rate of the transform from base to "
-            "platform", unit="Hz", low=0.1, high=1e4,
-            read_only=True,
+            "platform", unit="Hz", low=0.1, high=1e4
         )  # fmt: skip
         self._transforms_pace = Pace(rate)
         if wanted == "none":
@@ -323,19 +318,13 @@ class MachineStateNode(TwinNode):
     def _create_markers(self) -> None:
         rate = self.declare(
             "markers_rate", 20.0, "largest rate of ~/markers; 0: "
-            "none", unit="Hz", low=0.0, high=1000.0,
-            read_only=True,
+            "none", unit="Hz", low=0.0, high=1000.0
         )  # fmt: skip
         if rate > 0.0:
             self._markers = self.create_guarded_publisher("~/markers")
             self.create_guarded_timer(1.0 / rate, self._publish_markers)
 
-    def _on_joint_state(self, data: bytes) -> None:
-        try:
-            message = self._decode(data)
-        except MessageError as error:
-            self._core.refuse_joint_state(error)
-            raise
+    def _on_joint_state(self, message: JointStateView) -> None:
         state = self._core.joint_state(message, self.now())
         if state is None:
             return
@@ -351,9 +340,6 @@ class MachineStateNode(TwinNode):
         if self._transforms_pace.due(state.stamp):
             self._transforms_pace.answered(state.stamp)
             self._transforms.send_platform(stamp, state.position, quaternion)
-
-    def _on_wrench(self, message: WrenchStamped) -> None:
-        self._core.wrench(message, self.now())
 
     def _publish_markers(self) -> None:
         """Of the latest state: shapes are for the eye, and elasticity takes its milliseconds."""
@@ -410,13 +396,7 @@ def _warm_up(robot: Robot, elastic: bool) -> None:
 
 
 NODE = MachineStateNode
-"""What a process of several nodes makes."""
-
-
-def main() -> None:
-    """Run the node until a signal ends it."""
-    sys.exit(run(MachineStateNode))
-
+"""What a process of one or several nodes makes."""
 
 if __name__ == "__main__":
-    main()
+    sys.exit(run(NODE))

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A maker of messages of both kinds, and per module a domain, a peer and processes."""
 
-import functools
 import os
 
 import numpy as np
@@ -73,12 +72,6 @@ def launch(domain):
 def launch_alone(domain):
     """The same for one test: what it leaves is no other test's peer."""
     yield from started(domain)
-
-
-@pytest.fixture
-def refused(domain):
-    """Start a node that ends by itself: refused(module, *parameters)."""
-    return functools.partial(ForkedNode, domain)
 
 
 def started(domain):

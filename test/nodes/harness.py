@@ -230,6 +230,12 @@ def flags(parameters, arguments):
     return ["--ros-args", *pairs, *arguments]
 
 
+def renamed(name, **topics):
+    """ROS arguments of a node of this name, with topics below it: what each is called there."""
+    pairs = [f"__node:={name}", *(f"{topic}:=/{name}/{own}" for topic, own in topics.items())]
+    return [word for pair in pairs for word in ("-r", pair)]
+
+
 NODES = (
     "delta_dynamics.node",
     "delta_dynamics.gate_node",
@@ -240,7 +246,7 @@ NODES = (
 
 
 def fork_of(module, words, environment, *outputs):
-    """Run ``main`` of a module in this process, which is a fork of one that has imported all."""
+    """Run a node, or ``main`` of a module, in this process, a fork of one that has imported all."""
     os.setsid()
     end_with_parent()
     for output, stream in zip(outputs, (sys.stdout, sys.stderr), strict=True):
@@ -251,7 +257,10 @@ def fork_of(module, words, environment, *outputs):
     os.environ.clear()
     os.environ.update(environment)
     sys.argv = [module, *words]
-    importlib.import_module(module).main()
+    entry = importlib.import_module(module)
+    if hasattr(entry, "NODE"):
+        sys.exit(entry.run(entry.NODE))
+    entry.main()
 
 
 class ForkedNode(Process):
@@ -334,6 +343,9 @@ class Peer:
         self._publishers[topic] = self.node.create_publisher(kind, topic, qos)
 
     def hear(self, kind, topic):
+        if topic in self._received:
+            self.clear_topic(topic)
+            return
         received = self._received[topic] = []
 
         def take(message, info):

@@ -3,9 +3,7 @@
 
 import time
 
-from diagnostic_msgs.msg import DiagnosticArray
-
-from test.nodes.twin import COMMON, MODULE, Twin, count_of, state
+from test.nodes.twin import count_of, launched, state
 
 QUICK = 0.015
 """stale_after of a node that has to stop within 20 ms, s."""
@@ -28,7 +26,7 @@ def late(robot, q, *rest):
         os.kill(os.getpid(), signal.SIGSTOP)
     return solve(robot, q, *rest)
 feedforward.inverse_dynamics = late
-node.main()
+raise SystemExit(node.run(node.NODE))
 """
 SETTINGS = {
     "quick": (f"stale_after:={QUICK}", "on_stop:=zeros"),
@@ -40,14 +38,10 @@ SETTINGS = {
 
 def started(peer, launch, *names):
     """Nodes by name, started at once, each with settings of its own."""
-    peer.hear(DiagnosticArray, "/diagnostics")
-    twins = {}
-    for name in names:
-        remap = ("-r", f"__node:={name}", "-r", f"joint_states:=/{name}/states")
-        code = LATE if name in ("late", "strict") else None
-        process = launch(MODULE, *COMMON, *SETTINGS[name], arguments=remap, code=code)
-        twins[name] = Twin(peer, process, name)
-    return twins
+    codes = dict.fromkeys(("late", "strict"), LATE)
+    return {
+        name: launched(peer, launch, name, *SETTINGS[name], code=codes.get(name)) for name in names
+    }
 
 
 def at_pace(twin, count, period=1e-3, **fields):

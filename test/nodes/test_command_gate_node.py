@@ -11,7 +11,6 @@ from pkm_twin import robot_names
 from test.nodes.harness import (
     SECOND,
     counts_of,
-    one_line_refusal,
     stamp_of,
     text_of,
     values_of,
@@ -28,7 +27,7 @@ from rclpy.qos import QoSProfile
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
-from test.nodes.twin import COMMON, MODULE, NAMES, ROBOT, Q, Twin, state
+from test.nodes.twin import NAMES, ROBOT, Q, launched, state
 
 GATE = "delta_dynamics.gate_node"
 DEADLINE = 1.0
@@ -160,9 +159,7 @@ def test_an_inactive_gate_has_said_zeros_and_is_silent(gated):
 
 def test_a_killed_twin_leaves_zeros(heard, launch):
     """What the whole is for: kill -9 of the node whose torques move the machine."""
-    remap = ("-r", "__node:=twin", "-r", "joint_states:=/twin/states")
-    process = launch(MODULE, *COMMON, f"stale_after:={DEADLINE}", arguments=remap)
-    twin = Twin(heard, process, "twin").ready()
+    twin = launched(heard, launch, "twin", f"stale_after:={DEADLINE}").ready()
     heard.hear(Float64MultiArray, "/guarded/commands")
     remap = ("-r", "__node:=guarded", "-r", "delta_dynamics/joint_torques:=/twin/joint_torques")
     launch(GATE, *SETTINGS, arguments=remap)
@@ -175,7 +172,7 @@ def test_a_killed_twin_leaves_zeros(heard, launch):
     # Every command is a torque that the twin has sent, bit for bit, whichever arrived here first.
     moving = {tuple(m.data) for m in commands} - {tuple(ZEROS)}
     heard.until(lambda: moving <= {tuple(m.effort) for m in torques})
-    process.process.kill()
+    twin.process.process.kill()
     heard.until(lambda: list(commands[-1].data) == ZEROS)
 
 
@@ -199,24 +196,6 @@ def test_a_publisher_that_promises_no_deadline_is_told_of(heard, launch):
     )
     assert all(command == ZEROS for command in gated.commands)
     gated.process.stop()
-
-
-@pytest.mark.parametrize(
-    ("parameters", "named"),
-    [
-        (["on_stop:=nothing"], "on_stop: 'nothing'"),
-        (["on_stop:=gravty"], "did you mean 'gravity'"),
-        (["deadline:=0.0"], "deadline: 0.0"),
-        (["deadline:=.nan"], "deadline: nan"),
-        (["mechanism:=delta_uc"], "did you mean 'delta_cu'"),
-        (["effort_limits:=[1.0, .nan, 1.0]"], "effort[1]: nan"),
-        (["deadlin:=0.2"], "did you mean 'deadline'"),
-    ],
-)
-def test_a_bad_configuration_is_refused_in_one_line(refused, parameters, named):
-    line = one_line_refusal(refused(GATE, *parameters))
-    assert line.startswith("cannot start: ")
-    assert named in line
 
 
 @pytest.mark.parametrize("name", partly_long(robot_names(), "five_bar", "upr_rpu", "stewart"))

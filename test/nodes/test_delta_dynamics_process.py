@@ -9,13 +9,13 @@ import threading
 
 import pytest
 
-from test.nodes.harness import counts_of, stamp_of, text_of, values_of
+from test.nodes.harness import counts_of, renamed, stamp_of, text_of, values_of
 
 pytest.importorskip("rclpy", exc_type=ImportError)
 
 from diagnostic_msgs.msg import DiagnosticArray
 
-from test.nodes.twin import COMMON, MODULE, WINDOW, Twin, state
+from test.nodes.twin import MODULE, WINDOW, launched, state
 from test.support.robots import partly_long
 
 CALLBACKS = "_on_joint_state", "_publish_diagnostics"
@@ -25,9 +25,7 @@ class TestProcess:
     @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
     def test_a_signal_in_the_middle_of_a_stream_ends_the_node(self, peer, launch, number):
         name = f"ending_{number}"
-        remap = ("-r", f"__node:={name}", "-r", f"joint_states:=/{name}/states")
-        twin = Twin(peer, launch(MODULE, *COMMON, arguments=remap, fresh=True), name)
-        twin.ready()
+        twin = launched(peer, launch, name, fresh=True).ready()
         enough = threading.Event()
 
         def stream():
@@ -68,12 +66,11 @@ def interrupted(self, *arguments):
     # The topics are there until the callback is over, and for the node's last words.
     self._torques.publish(0, np.zeros(3))
 node.DeltaDynamics.{callback} = interrupted
-node.main()
+raise SystemExit(node.run(node.NODE))
 """
         name = f"interrupted_{number}{callback}"
-        remap = ("-r", f"__node:={name}", "-r", f"joint_states:=/{name}/states")
-        process = launch(None, *COMMON, arguments=remap, code=code)
-        twin = Twin(peer, process, name)
+        twin = launched(peer, launch, name, code=code)
+        process = twin.process
         twin.peer.until(
             lambda: not process.alive(), repeat=lambda: twin.send_state(state(twin.stamp()))
         )
@@ -89,25 +86,21 @@ def broken(self, message, now):
         raise ZeroDivisionError("made for the test")
     return solve(self, message, now)
 node.Feedforward._joint_state = broken
-node.main()
+raise SystemExit(node.run(node.NODE))
 """
-        remap = ("-r", "__node:=broken", "-r", "joint_states:=/broken/states")
-        process = launch(None, *COMMON, "stale_after:=5.0", arguments=remap, code=code)
-        peer.hear(DiagnosticArray, "/diagnostics")
-        twin = Twin(peer, process, "broken").ready()
+        twin = launched(peer, launch, "broken", "stale_after:=5.0", code=code).ready()
         twin.stream(3, position=(0.125, 0.2, 0.3))
         array = twin.diagnostics(lambda a: values_of(a)["exceptions"] == "3")
         assert array.status[0].level == b"\x02"
         assert counts_of(array, "stopped") == {"exception": 1}
-        assert process.output.count("Traceback") == 1
+        assert twin.process.output.count("Traceback") == 1
         stamps = twin.stream(WINDOW + 3)
         assert [stamp_of(m) for m in twin.since(stamps)] == stamps[WINDOW:]
-        assert process.alive()
+        assert twin.process.alive()
 
     def test_a_clock_that_never_comes_is_told(self, peer, launch):
         peer.hear(DiagnosticArray, "/diagnostics")
-        remap = ("-r", "__node:=waiting")
-        process = launch(MODULE, "use_sim_time:=true", arguments=remap)
+        process = launch(MODULE, "use_sim_time:=true", arguments=renamed("waiting"))
         array = peer.diagnostics("/waiting")
         assert "use_sim_time is set and no /clock arrives" in text_of(array)
         assert array.status[0].level == b"\x01"

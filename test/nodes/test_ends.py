@@ -13,9 +13,8 @@ from test.nodes.harness import DEADLINE, counts_of
 
 pytest.importorskip("rclpy", exc_type=ImportError)
 
-from diagnostic_msgs.msg import DiagnosticArray
 
-from test.nodes.twin import COMMON, MODULE, Twin, state
+from test.nodes.twin import MODULE, launched, state
 from test.support.waiting import wait_until
 
 
@@ -86,10 +85,8 @@ def said(output):
 
 
 def test_a_flood_of_refusals_is_a_line_a_second(peer, launch):
-    peer.hear(DiagnosticArray, "/diagnostics")
-    remap = ("-r", "__node:=flooded", "-r", "joint_states:=/flooded/states")
     began = time.monotonic()
-    twin = Twin(peer, launch(MODULE, *COMMON, arguments=remap), "flooded")
+    twin = launched(peer, launch, "flooded")
     peer.until(peer.matched, 90.0)
     reasons = {
         "length": {"position": [0.1]},

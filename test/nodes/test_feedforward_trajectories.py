@@ -9,7 +9,6 @@ from delta_dynamics.feedforward import SLICE
 from test.nodes.feedforward_core import (
     NAMES,
     NOW,
-    ORDERS,
     ROBOT,
     STEP,
     UNREACHABLE,
@@ -32,15 +31,6 @@ class TestTrajectories:
         rows = [(p.positions, p.velocities, p.accelerations) for p in message.points]
         q, qd, qdd = (np.array(values) for values in zip(*rows, strict=True))
         assert np.abs(efforts - inverse_dynamics(ROBOT, q, qd, qdd)).max() < 1e-12
-
-    @pytest.mark.parametrize("rates", [True, False])
-    def test_permuted_joints_have_bit_identical_efforts(self, make, rates):
-        options = {"rates": rates, "accelerations": rates}
-        expected = core(differentiate=True).trajectory(trajectory(make, **options), NOW)
-        for order in ORDERS:
-            message = trajectory(make, order=order, **options)
-            efforts = core(differentiate=True).trajectory(message, NOW)
-            assert (efforts == expected[:, order]).all()
 
     def test_differentiation_is_exact_for_constant_acceleration(self, make):
         times = np.array([0.0, 0.1, 0.25, 0.3, 0.5])

@@ -14,7 +14,7 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
-from test.nodes.twin import COMMON, MODULE, Twin, state
+from test.nodes.twin import launched, state
 
 GENEROUS = 30.0
 """Longer than a loaded machine keeps a process waiting, s."""
@@ -36,9 +36,7 @@ def check(domain):
 
 @pytest.fixture(scope="module")
 def twin(peer, launch):
-    remap = ("-r", "__node:=judged", "-r", "joint_states:=/judged/states")
-    process = launch(MODULE, *COMMON, f"stale_after:={GENEROUS}", arguments=remap)
-    return Twin(peer, process, "judged").ready()
+    return launched(peer, launch, "judged", f"stale_after:={GENEROUS}").ready()
 
 
 def stream_until_end(twin, process):

@@ -20,7 +20,7 @@ from delta_dynamics import inverse_dynamics
 from delta_dynamics.sim_node import LOOK
 from delta_dynamics.simulation import MachineSettings, Simulation, WrenchSignal, tuned
 from pkm_twin.robot.variation import varied
-from test.nodes.harness import SECOND, counts_of, one_line_refusal, stamp_of
+from test.nodes.harness import SECOND, counts_of, stamp_of
 from test.support.robots import load
 
 MODULE = "delta_dynamics.sim_node"
@@ -168,16 +168,3 @@ def test_who_comes_late_gets_what_was_drawn(peer, machine):
 def test_it_ends_on_a_signal(peer, machine):
     assert machine.stop() == 0
     assert "Traceback" not in machine.output
-
-
-@pytest.mark.parametrize(
-    ("parameters", "word"),
-    [
-        (("start:=[0.0, 2.0, 0.0]",), "start, arm_2: 2.0; expected -0.9 to 1.3"),
-        (("use_sim_time:=true",), "use_sim_time: True; expected false"),
-        (("payload.masses:=[1.0, 2.0]",), "payload.masses"),
-        (("bandwidth:=10.0", "period:=0.01"), "bandwidth: 10.0; expected at most 3.5 Hz"),
-    ],
-)
-def test_a_bad_parameter_is_refused_in_one_line(refused, parameters, word):
-    assert word in one_line_refusal(refused(MODULE, *parameters))

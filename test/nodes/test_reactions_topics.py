@@ -62,7 +62,7 @@ def singular(robot, q, *rest):
         raise SingularityError("constraints", (), 0.0, 1e-9)
     return solve(robot, q, *rest)
 node.reactions = singular
-node.main()
+raise SystemExit(node.run(node.NODE))
 """
 
 

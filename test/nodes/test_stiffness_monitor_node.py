@@ -7,23 +7,26 @@ import signal
 import numpy as np
 import pytest
 
-from stiffness_monitor import compliance, strain_energy
+from stiffness_monitor import compliance, setpoint_correction, strain_energy
+from stiffness_monitor.modes import natural_frequencies
 from test.nodes.harness import (
     SECOND,
     Maker,
     Ros,
     counts_of,
-    one_line_refusal,
+    renamed,
     stamp_of,
     text_of,
     values_of,
 )
-from test.support.robots import load
+from test.support.robots import load, massless
 
 pytest.importorskip("rclpy", exc_type=ImportError)
 
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import TransformStamped, WrenchStamped
+from rcl_interfaces.srv import SetParameters
+from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray, String
 
@@ -35,22 +38,29 @@ Q = ROBOT.inverse(POSE)
 WRENCH = (300.0, -200.0, -1000.0, 30.0, -20.0, 10.0)
 MAKE = Maker(Ros())
 STEP = SECOND // 1000
+RATE = 5.0
 OUTPUTS = {
     "compliance": Float64MultiArray,
     "strain_energy": DiagnosticArray,
     "dominant_element": String,
     "deflection": TransformStamped,
 }
+STAMPED = ("compliance_stamped", "strain_energy_stamped", "natural_frequencies_stamped")
+ALL = OUTPUTS | {"natural_frequencies": Float64MultiArray} | dict.fromkeys(STAMPED, JointState)
 
 
 class Monitor:
     """A running node and its topics, seen from this side."""
 
-    def __init__(self, peer, process, name):
-        self.peer, self.process, self.name = peer, process, name
+    def __init__(self, peer, launch, name, *parameters, robot=ROBOT, q=Q, heard=OUTPUTS, **options):
+        self.peer, self.name, self.robot, self.q, self._heard = peer, name, robot, q, heard
+        own = {"joint_states": "states", "wrench": "wrench"}
+        own |= {topic: topic for topic in ("setpoint", "torques")}
+        self.process = launch(MODULE, *parameters, arguments=renamed(name, **own), **options)
+        peer.hear(DiagnosticArray, "/diagnostics")
         peer.talk(JointState, f"/{name}/states")
         peer.talk(WrenchStamped, f"/{name}/wrench")
-        for topic, kind in OUTPUTS.items():
+        for topic, kind in heard.items():
             peer.hear(kind, f"/{name}/{topic}")
         self._last = 0
 
@@ -62,26 +72,37 @@ class Monitor:
         self._last = max(self.peer.now(), self._last + STEP)
         return self._last
 
-    def send_state(self, q=Q, stamp=None):
+    def joints(self, q, stamp=None, **fields):
+        """A joint state in another order than the robot's."""
+        order = np.roll(np.arange(len(q)), 1)
+        names, values = [self.robot.joint_names[i] for i in order], [float(q[i]) for i in order]
         stamp = self.stamp() if stamp is None else stamp
-        order = [2, 0, 1]
-        names, values = [NAMES[i] for i in order], [float(q[i]) for i in order]
-        self.peer.send(f"/{self.name}/states", MAKE.joint_state(names, values, stamp=stamp))
-        return stamp
+        return MAKE.joint_state(names, values, stamp=stamp, **fields)
+
+    def send_state(self, stamp=None):
+        assert self.process.alive(), self.process.output
+        self.peer.send(f"/{self.name}/states", self.joints(self.q, stamp))
 
     def send_wrench(self, values=WRENCH, frame="platform", stamp=None):
         stamp = self.stamp() if stamp is None else stamp
         self.peer.send(f"/{self.name}/wrench", MAKE.wrench(map(float, values), stamp, frame))
         return stamp
 
-    def ready(self):
-        def repeat():
-            assert self.process.alive(), self.process.output
-            self.send_state()
-            self.send_wrench()
+    def send(self):
+        self.send_state()
+        self.send_wrench()
 
-        self.peer.until(lambda: all(self.received(t) for t in OUTPUTS), repeat=repeat)
+    def run(self, seconds, send=True):
+        end = self.peer.now() + round(seconds * SECOND)
+        repeat = self.send if send else None
+        self.peer.until(lambda: self.peer.now() > end, seconds + 30.0, repeat)
+
+    def ready(self):
+        self.peer.until(lambda: all(map(self.received, self._heard)), repeat=self.send)
         return self
+
+    def last(self, topic):
+        return self.received(topic)[-1]
 
     def answer(self, *arguments, **options):
         """Send a state and a wrench: the four messages that answer this wrench, by topic."""
@@ -99,9 +120,9 @@ class Monitor:
         def answered():
             energies, deflections = by_stamp("strain_energy"), by_stamp("deflection")
             both = energies.keys() & deflections.keys() & set(stamps)
-            if not both or not all(self.received(topic) for topic in OUTPUTS):
+            if not both or not all(map(self.received, OUTPUTS)):
                 return None
-            answers = {topic: self.received(topic)[-1] for topic in OUTPUTS}
+            answers = {topic: self.last(topic) for topic in OUTPUTS}
             stamp = max(both)
             return answers | {"strain_energy": energies[stamp], "deflection": deflections[stamp]}
 
@@ -118,21 +139,13 @@ class Monitor:
 @pytest.fixture(scope="module")
 def fleet(peer, launch):
     """The node with its defaults, and one that takes wrenches in the base frame."""
-    peer.hear(DiagnosticArray, "/diagnostics")
-    options = {
-        "defaults": ("max_state_age:=1.0",),
-        "fixed": ("wrench_frame:=base_link", "accept_empty_frame:=true", "max_state_age:=1.0"),
+    heard = OUTPUTS | {"natural_frequencies": Float64MultiArray}
+    fixed = ("wrench_frame:=base_link", "accept_empty_frame:=true", "frequencies_rate:=0.0")
+    options = {"defaults": (f"frequencies_rate:={RATE}",), "fixed": fixed}
+    monitors = {
+        name: Monitor(peer, launch, name, "max_state_age:=1.0", *given, heard=heard, fresh=True)
+        for name, given in options.items()
     }
-    monitors = {}
-    for name, parameters in options.items():
-        pairs = {
-            "__node": name,
-            "joint_states": f"/{name}/states",
-            "wrench": f"/{name}/wrench",
-        }
-        remap = [part for pair in pairs.items() for part in ("-r", ":=".join(pair))]
-        process = launch(MODULE, *parameters, arguments=remap, fresh=True)
-        monitors[name] = Monitor(peer, process, name)
     assert monitors["defaults"].ready()
     # The other one expects another frame.
     monitors["fixed"].answer(WRENCH, "base_link")
@@ -149,9 +162,9 @@ def fixed(fleet):
     return fleet["fixed"]
 
 
-def turned(wrench=WRENCH):
+def turned(wrench=WRENCH, robot=ROBOT, pose=POSE):
     """A wrench in the platform's axes, told in fixed ones."""
-    rotation = ROBOT.rotation(POSE)
+    rotation = robot.rotation(pose)
     return np.concatenate((rotation @ wrench[:3], rotation @ wrench[3:]))
 
 
@@ -262,17 +275,14 @@ class TestRejects:
         assert "last reject: no pose" in text_of(array)
 
     def test_no_pose_before_a_joint_state_and_too_far_from_one(self, peer, launch):
-        peer.hear(DiagnosticArray, "/diagnostics")
-        remap = ("-r", "__node:=young", "-r", "joint_states:=/young/states")
-        process = launch(MODULE, arguments=(*remap, "-r", "wrench:=/young/wrench"))
-        young = Monitor(peer, process, "young")
+        young = Monitor(peer, launch, "young")
         peer.until(peer.matched)
 
         def rejected(count):
             return lambda a: counts_of(a, "wrenches rejected").get("no pose", 0) >= count
 
         def until_rejected(count):
-            peer.until(lambda: process.output.count("no pose") >= 1, repeat=young.send_wrench)
+            peer.until(lambda: young.process.output.count("no pose") >= 1, repeat=young.send_wrench)
             return young.diagnostics(rejected(count))
 
         array = until_rejected(1)
@@ -284,19 +294,143 @@ class TestRejects:
         assert "no pose: the nearest joint state" in text_of(array)
         assert "allowed 0.1 s" in text_of(array)
 
-    @pytest.mark.parametrize(
-        ("parameters", "named"),
-        [
-            (["wrench_fram:=tool0"], "did you mean 'wrench_frame'"),
-            (["max_state_age:=.nan"], "max_state_age: nan"),
-            (["wrench_frame:=''"], "wrench_frame: ''"),
-            (["accept_empty_frame:=1"], "accept_empty_frame: 1"),
-        ],
-    )
-    def test_a_bad_configuration_is_refused_in_one_line(self, refused, parameters, named):
-        line = one_line_refusal(refused(MODULE, *parameters))
-        assert line.startswith("cannot start: ")
-        assert named in line
+
+class TestFrequencies:
+    def test_of_the_latest_pose_at_most_at_their_rate(self, platform):
+        told = platform.received("natural_frequencies")
+        platform.peer.until(lambda: told, repeat=platform.send)
+        (dim,) = told[-1].layout.dim
+        assert (dim.label, dim.size, dim.stride) == ("frequency", 6, 6)
+        assert np.allclose(told[-1].data, natural_frequencies(ROBOT, POSE), rtol=1e-9)
+        told.clear()
+        platform.run(2.0)
+        assert 2 <= len(told) <= 2.0 * RATE + 2
+        # No new pose, no new frequencies.
+        platform.run(1.0, send=False)
+        told.clear()
+        platform.run(1.0, send=False)
+        assert not told
+
+    @pytest.mark.parametrize("name", ["delta_cu", "prru"])
+    def test_a_machine_solved_as_a_frame(self, name, peer, launch):
+        """Frequencies from joint states alone, every answer to a wrench, and what plots draw."""
+        robot = load(name)
+        pose = robot.home() + (np.array([0.02, -0.03, 0.01]) if name == "delta_cu" else 0.02)
+        given = (f"mechanism:={name}", "max_state_age:=1.0")
+        q = robot.inverse(pose)
+        talk = Monitor(peer, launch, f"frame_{name}", *given, robot=robot, q=q, heard=ALL)
+        peer.until(lambda: talk.received("natural_frequencies_stamped"), repeat=talk.send_state)
+        found = talk.last("natural_frequencies").data
+        assert np.allclose(found, natural_frequencies(robot, pose), rtol=1e-6)
+        message = talk.last("natural_frequencies_stamped")
+        assert message.name == [f"mode_{k}" for k in range(1, 7)]
+        assert np.allclose(message.position, found, rtol=1e-6)
+        assert not talk.received("compliance")
+        talk.ready()
+        matrix = np.reshape(talk.last("compliance").data, (6, 6))
+        expected = compliance(robot, pose)
+        assert matrix == pytest.approx(expected, rel=1e-6, abs=1e-9 * expected.max())
+        message = talk.last("compliance_stamped")
+        assert stamp_of(message) > 0 and message.header.frame_id == "base_link"
+        assert message.name[:7] == ["x_x", "x_y", "x_z", "x_rx", "x_ry", "x_rz", "y_y"]
+        assert np.allclose(message.position, matrix[np.triu_indices(6)], rtol=1e-9)
+        energy = strain_energy(robot, pose, turned(WRENCH, robot, pose))
+        assert talk.last("dominant_element").data == energy.dominant
+        message = talk.last("strain_energy_stamped")
+        assert tuple(message.name) == energy.elements
+        assert np.allclose(message.position, energy.factors, rtol=1e-6, atol=1e-12)
+        assert np.allclose(message.effort, energy.energies, rtol=1e-6, atol=1e-15)
+
+    def test_none_when_off_or_without_masses(self, fixed, peer, launch, tmp_path):
+        light = f"mechanism:={massless(tmp_path / 'light.yaml')}"
+        heard = {topic: ALL[topic] for topic in ("deflection", "natural_frequencies")}
+        still = Monitor(peer, launch, "still", light, "max_state_age:=1.0", heard=heard)
+        peer.until(lambda: len(still.received("deflection")) > 20, repeat=still.send)
+        still.run(0.5)
+        assert not still.received("natural_frequencies")
+        fixed.run(0.5)
+        assert not fixed.received("natural_frequencies")
+
+
+FORCE = (160.0, 90.0, 120.0)
+TOOL = [0.0, 0.0, -0.15]
+OFFSETS = dict.fromkeys(
+    ("setpoint_offset", "corrected_setpoint", "setpoint_with_torques"), JointState
+)
+SINGULAR = """
+import stiffness_monitor.node as node
+from pkm_twin.errors import SingularityError
+def singular(self, answer):
+    raise SingularityError("correction", (), 0.0, 1e-9)
+node.SetpointCorrection.take = node.StiffnessAlarmTopics.take = singular
+raise SystemExit(node.run(node.NODE))
+"""
+
+
+class TestCorrection:
+    q = np.array([0.62, 0.6, 0.65])
+
+    def test_set_points_are_corrected_by_the_measured_wrench(self, peer, launch):
+        ages = [f"{name}:=600.0" for name in ("max_state_age", "correction_age")]
+        node = Monitor(
+            peer, launch, "correcting", "correct_setpoint:=true", f"tool.xyz:={TOOL}", *ages,
+            "future_tolerance:=600.0", "pair_torques:=true", q=self.q, heard=OFFSETS,
+        )  # fmt: skip
+        for topic in ("setpoint", "torques"):
+            peer.talk(JointState, f"/correcting/{topic}")
+        peer.until(peer.matched)
+
+        def push():
+            node.send_state()
+            node.send_wrench((*FORCE, 0.0, 0.0, 0.0), "base_link")
+            node.send_wrench((*FORCE, 0.0, 0.0, 0.0))
+            peer.send("/correcting/setpoint", node.joints(self.q + 1e-3))
+
+        offsets, corrected, both = map(node.received, OFFSETS)
+        peer.until(lambda: corrected and offsets, repeat=push)
+        wrench = turned((*FORCE, 0.0, 0.0, 0.0), pose=ROBOT.forward(self.q))
+        energy = strain_energy(ROBOT, ROBOT.forward(self.q), wrench)
+        expected = setpoint_correction(ROBOT, self.q, energy.deflection, tool=TOOL).offset
+        assert list(offsets[-1].name) == list(NAMES)
+        np.testing.assert_allclose(offsets[-1].position, expected, rtol=1e-9, atol=1e-15)
+        assert np.abs(expected).max() > 1e-5
+        np.testing.assert_allclose(corrected[-1].position, self.q + 1e-3 + expected, atol=1e-12)
+        # Torques of the same stamp are in one message with it, whichever comes first.
+        for first in (0, 1):
+            stamp = node.stamp()
+            efforts = MAKE.joint_state(NAMES, (), effort=[1.0, -2.0, 3.0], stamp=stamp)
+            sent = [("setpoint", node.joints(self.q + 2e-3, stamp)), ("torques", efforts)]
+            before = len(both)
+            for topic, message in sent[first:] + sent[:first]:
+                peer.send(f"/correcting/{topic}", message)
+            peer.until(lambda before=before: len(both) > before)
+            assert stamp_of(both[-1]) == stamp and list(both[-1].name) == list(NAMES)
+            np.testing.assert_allclose(both[-1].position, self.q + 2e-3 + expected, atol=1e-12)
+            assert list(both[-1].effort) == [1.0, -2.0, 3.0]
+        peer.send(
+            "/correcting/torques", MAKE.joint_state(NAMES, (), effort=[1.0] * 3, stamp=stamp + 1)
+        )
+        # What the stamps of wrenches have to keep to holds for set points, as soon as it is set.
+        request = SetParameters.Request()
+        request.parameters = [Parameter("future_tolerance", value=0.1).to_parameter_msg()]
+        (result,) = peer.call(SetParameters, "/correcting/set_parameters", request).results
+        assert result.successful
+        late = node.joints(self.q, peer.now() + 300 * SECOND)
+        for bad in (late, node.joints([np.nan, 0.6, 0.65])):
+            peer.send("/correcting/setpoint", bad)
+        array = node.diagnostics(lambda a: len(counts_of(a, "set points rejected")) >= 2)
+        told = counts_of(array, "set points rejected")
+        assert told["future stamp"] == told["not finite"] == 1
+        assert int(values_of(array)["set points corrected"]) >= 1
+        assert len(both) == 2
+
+    def test_a_wrench_without_a_correction_has_its_compliance(self, peer, launch):
+        heard = {"compliance_stamped": JointState}
+        node = Monitor(
+            peer, launch, "loose", "correct_setpoint:=true", q=self.q, heard=heard, code=SINGULAR
+        ).ready()
+        peer.until(lambda: "no correction or alarm: " in node.process.output)
+        assert values_of(node.diagnostics())["exceptions"] == "0"
 
 
 class TestProcess:

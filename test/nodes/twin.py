@@ -2,13 +2,14 @@
 """A running delta_dynamics and its topics, seen from the other side; needs rclpy."""
 
 import numpy as np
+from diagnostic_msgs.msg import DiagnosticArray
 from rcl_interfaces.srv import SetParametersAtomically
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 from trajectory_msgs.msg import JointTrajectory
 
-from test.nodes.harness import SECOND, Maker, Ros, stamp_of, values_of
+from test.nodes.harness import SECOND, Maker, Ros, renamed, stamp_of, values_of
 from test.support.robots import load
 
 MODULE = "delta_dynamics.node"
@@ -24,6 +25,16 @@ COMMON = (
     "on_stop:=nothing",
 )
 Q = np.array([0.1, 0.2, 0.3])
+
+
+def launched(peer, launch, name, *parameters, code=None, fresh=False):
+    """A node of this name in a process, its topics not yet connected."""
+    peer.hear(DiagnosticArray, "/diagnostics")
+    process = launch(
+        MODULE, *COMMON, *parameters, arguments=renamed(name, joint_states="states"),
+        code=code, fresh=fresh,
+    )  # fmt: skip
+    return Twin(peer, process, name)
 
 
 class Twin:
