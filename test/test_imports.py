@@ -44,7 +44,7 @@ MAY = {
     "pkm_twin.state": STREAMS,
     "delta_dynamics": STREAMS,
     "stiffness_monitor": STREAMS,
-    "pkm_twin.paths": RECORDINGS | {"delta_dynamics", "pkm_twin.recordings"},
+    "pkm_twin.paths": RECORDINGS | TWINS | {"pkm_twin.recordings"},
     "pkm_twin.ros": STREAMS | {"pkm_twin.bags"},
     "delta_dynamics.node": NODE | {"delta_dynamics"},
     "stiffness_monitor.node": NODE | {"stiffness_monitor"},

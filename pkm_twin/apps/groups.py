@@ -60,13 +60,7 @@ TASKS: Final[Mapping[str, Mapping[str, Entry]]] = {
     "Robots": {
         "view": Entry("view.command:view"),
     },
-    "Torques, paths and drives": {
-        "torques": Entry("torques_command:torques", tables=True, wrenches=True),
-        "path": Entry("path:path_command", tables=True),
-        "feed": Entry("feed:feed", tables=True),
-        "size": Entry("size:size", tables=True, wrenches=True),
-        "loads": Entry("joint_loads:loads", tables=True, wrenches=True),
-    },
+    "Torques, paths and drives": {},
     "Stiffness, workspace and vibration": {},
     "Recordings": {
         "check": Entry("check_command:check", tables=True, wrenches=True),
@@ -78,8 +72,8 @@ TASKS: Final[Mapping[str, Mapping[str, Entry]]] = {
 }
 """Commands that are not in the folder yet, in the order in which tasks need them."""
 OLDER: Final[Mapping[str, tuple[str, ...]]] = {
-    "atlas": ("map",), "guard-check": ("monitor-torques",), "printer": ("convert",),
-    "urdf": ("export", "urdf"), "drive-friction": ("fit", "--drive"),
+    "atlas": ("map",), "feed": ("path", "--slow-where-soft"), "guard-check": ("monitor-torques",),
+    "printer": ("convert",), "urdf": ("export", "urdf"), "drive-friction": ("fit", "--drive"),
 }  # fmt: skip
 """Older names of commands, which help does not list, with the words in their place."""
 GREETING: Final = """pkm-twin: torques, stiffness and recordings of parallel robots. Try

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -18,7 +18,7 @@ from pkm_twin.options import OptionalPath, OptionalText, file_name
 from pkm_twin.settings import setting
 
 if TYPE_CHECKING:
-    from pkm_twin.recordings import Dialect, ReadOptions, WrenchFrames
+    from pkm_twin.recordings import Dialect, Recording, WrenchFrames
     from pkm_twin.robot.limits import Beyond
     from pkm_twin.robot.robot import Robot
     from stiffness_monitor.chatter import Milling
@@ -96,6 +96,10 @@ class CarriesAtTimes(Carries):
         "default: always",
     )
 
+    def machine(self) -> Robot:
+        """The robot alone: what it carries and when is its recording's."""
+        return OfRobot.machine(self)
+
 
 @dataclass(frozen=True, kw_only=True)
 class ReadsTables:
@@ -149,12 +153,19 @@ class ReadsRecordings(ReadsTables, ReadsWrenches):
         (), "topic of joint states or wrenches; default: found by the robot's joint names"
     )
 
-    def reading(self, **more: Any) -> ReadOptions:
-        """How its recordings are read; ``more``: other fields of ``ReadOptions``."""
-        from pkm_twin.recordings import ReadOptions
+    def read(
+        self, path: Path, robot: Robot | str | None, progress: Callable[[int], None] | None = None,
+        **more: Any,
+    ) -> Recording:  # fmt: skip
+        """A recording; ``more``: other fields of ``ReadOptions``."""
+        from pkm_twin.bags.storage import is_bag
+        from pkm_twin.recordings import ReadOptions, read
 
+        if self.topic and not is_bag(path):
+            raise typer.BadParameter(f"--topic is for bags; {path} is read as a table")
         held, follow = getattr(self, "load", None), getattr(self, "follow", None)
-        return ReadOptions(self.topic, held, follow, self.dialect, self.frames, **more)
+        how = ReadOptions(self.topic, held, follow, self.dialect, self.frames, **more)
+        return read(path, robot, how, progress)
 
 
 @dataclass(frozen=True, kw_only=True)

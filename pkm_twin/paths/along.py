@@ -17,6 +17,7 @@ from pkm_twin.recordings.payload import by_load, payload_columns
 from pkm_twin.recordings.recording import Recording, at_rest, differentiated
 from pkm_twin.recordings.tables import WRENCH
 from pkm_twin.robot.limits import beyond_limits
+from pkm_twin.robot.robot import Robot
 
 BLOCK: Final = 4096
 """Samples computed at a time, so that memory stays flat."""
@@ -85,6 +86,19 @@ def predicted(r: Recording) -> tuple[Array, Mask]:
         rows = np.arange(part.start, part.stop)[used[part]]
         efforts[rows] = inverse_dynamics(robot, r.q[rows], qd[rows], qdd[rows], wrench[rows])
     return efforts, used
+
+
+def bend_per_feed(robot: Robot, force: float, q: Array, way: Array) -> Array:
+    """Deflection of the reference point per feed, m per m/s, shape (p,).
+
+    :param force: of the cut per feed, against the motion, N per m/s.
+    :param q: joint positions (p, n); ``way``: directions of the motion (p, 3), base axes.
+    :raises ParameterError: a robot without elastic members.
+    """
+    from stiffness_monitor import platform_response
+
+    matrix = platform_response(robot, q, np.zeros(6)).compliance[..., :3, :3]
+    return np.asarray(force * np.linalg.norm(matrix @ way[..., None], axis=(-2, -1)))
 
 
 def torque_table(m: Recording, progress: Callable[[int], None] | None = None) -> dict[str, Array]:

@@ -16,18 +16,24 @@ import dataclasses
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+import yaml
 
 from delta_dynamics import mass_matrix
 from pkm_twin.codegen.arrays import Array
-from pkm_twin.errors import ParameterError
+from pkm_twin.errors import FileError, ParameterError, UnknownNameError
+from pkm_twin.machine import schema
 from pkm_twin.machine.sections import DriveSpec
+from pkm_twin.robot.catalogue import config_folder
 from pkm_twin.robot.robot import Robot
 
 LEAST: Final = 2
 """Samples of a motion."""
+SHIPPED: Final = "shipped"
+RPM: Final = 2 * math.pi / 60
 
 
 @dataclass(frozen=True)
@@ -100,6 +106,89 @@ class Motor:
         amount = np.abs(speed)
         inside = np.interp(amount, self.curve[:, 0], self.curve[:, 1])
         return np.where(amount > self.curve[-1, 0], 0.0, inside)
+
+
+@dataclass(frozen=True, eq=False)
+class MotorSpec:
+    """A motor as its data sheet has it: torques in N m, speeds in 1/min, inertia in kg m2.
+
+    ``curve``: rows of speed and greatest torque; without it the peak torque up to the rated speed,
+    then a straight line to the continuous torque at the greatest speed.
+    """
+
+    inertia: float = schema.number(at_least=1e-10, at_most=1e4, unit="kg m2")
+    continuous_torque: float = schema.number(at_least=1e-6, at_most=1e7, unit="N m")
+    peak_torque: float = schema.number(at_least=1e-6, at_most=1e7, unit="N m")
+    rated_speed: float = schema.number(at_least=1e-3, at_most=1e7, unit="1/min")
+    max_speed: float = schema.number(at_least=1e-3, at_most=1e7, unit="1/min")
+    source: str = schema.text(default="")
+    curve: Any = dataclasses.field(
+        default=None, metadata={"check": lambda field, value: _curve(field, value), "key": None}
+    )
+
+    def verify(self, path: str) -> None:
+        """What a data sheet says of one motor agrees."""
+        most, where = self.peak_torque, "peak_torque"
+        if self.curve is not None and self.curve[:, 1].max() < most:
+            most, where = float(self.curve[:, 1].max()), "the curve's greatest torque"
+        for name, value, bound, what in (
+            ("continuous_torque", self.continuous_torque, most, where),
+            ("rated_speed", self.rated_speed, self.max_speed, "max_speed"),
+        ):
+            if value > bound:
+                raise ParameterError(f"{path}.{name}", value, f"at most {what}, {bound:g}")
+
+    def motor(self, name: str) -> Motor:
+        """In SI units."""
+        rows = self.curve
+        if rows is None:
+            rows = np.array(
+                [[0.0, self.peak_torque], [self.rated_speed, self.peak_torque],
+                 [self.max_speed, self.continuous_torque]]
+            )  # fmt: skip
+        return Motor(
+            name, self.inertia, self.continuous_torque, rows * np.array([RPM, 1.0]), self.source
+        )
+
+
+def _curve(field: str, value: Any) -> Array:
+    try:
+        rows = np.array(value, float)
+    except (TypeError, ValueError):
+        rows = np.zeros(0)
+    pairs = rows.ndim == 2 and rows.shape[1:] == (2,) and len(rows) > 1
+    if not (
+        pairs and rows[0, 0] == 0.0 and (np.diff(rows[:, 0]) > 0.0).all()
+        and ((rows >= 0.0) & (rows <= 1e7)).all() and rows[:, 1].any()
+    ):  # fmt: skip
+        raise ParameterError(
+            field, value, "rows of speed (1/min, rising from 0) and torque (N m), up to 1e+07"
+        )
+    return rows
+
+
+def read_motors(path: Path, names: Sequence[str] = ()) -> list[Motor]:
+    """Motors of a YAML with a mapping ``drives`` of names to data.
+
+    :raises ParameterError: by the field.
+    """
+    if str(path) == SHIPPED:
+        path = config_folder() / "drives" / "servos.yaml"
+    try:
+        data = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        raise FileError(path, error, "a YAML file of drives") from None
+    entries = data.get("drives") if isinstance(data, dict) else None
+    if not isinstance(entries, dict) or not entries:
+        raise ParameterError(str(path), None, "a mapping drives of names to data")
+    for name in names:
+        if name not in entries:
+            raise UnknownNameError(f"{path}: motor", name, [str(n) for n in entries])
+    return [
+        schema.build(MotorSpec, entry, f"{path}: drives.{name}").motor(str(name))
+        for name, entry in entries.items()
+        if not names or name in names
+    ]
 
 
 @dataclass(frozen=True)

@@ -115,6 +115,18 @@ def load_of_table(table: Table, time: Array) -> Load | None:
     return Load(row[0], com, () if held.all() else tuple(spans), "table")
 
 
+def load_facts(carried: Load | None, end: float) -> dict[str, Any]:
+    """What a bag's metadata tell of its payload, that is there until after ``end``, s."""
+    if carried is None:
+        return {}
+    picked, released = carried.times[0] if carried.times else (0.0, end + 1.0)
+    facts = {
+        "payload_mass_kg": carried.mass, "payload_picked_s": picked, "payload_released_s": released,
+    }  # fmt: skip
+    com = {} if carried.com is None else {"payload_com_m": " ".join(map(repr, carried.com))}
+    return facts | com
+
+
 def told_load(bag: Bag) -> Load | None:
     """The payload that the bag's metadata tell of.
 

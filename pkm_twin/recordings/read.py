@@ -154,8 +154,8 @@ def _of_table(path: Path, name: str | Robot | None, how: ReadOptions) -> Recordi
         _check_sizes(table)
     held = how.load or load_of_table(table, time)
     return Recording(
-        robot, time, q, qd, qdd, effort, wrench, deflection, held, efforts=word, source=str(path),
-        notes=(
+        robot, time, q, qd, qdd, effort, wrench, deflection, pose, held, efforts=word,
+        source=str(path), notes=(
             *([] if held is None else [f"payload: {held}"]),
             *notes,
             *([] if robot.controller.plain else [MAPPED]),

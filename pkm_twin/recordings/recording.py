@@ -22,7 +22,7 @@ from pkm_twin.streams.rest import SIGMAS, fit_gain, gradient_gain, noise, rate_d
 from pkm_twin.streams.wrench import WrenchSettings
 
 BY_SAMPLE: Final = (
-    "time", "q", "qd", "qdd", "effort", "wrench", "deflection", "still"
+    "time", "q", "qd", "qdd", "effort", "wrench", "deflection", "pose", "still"
 )  # fmt: skip
 """Fields with a row for each sample."""
 MAPPED: Final = "tables use the model's joint values; joint_map applies to messages and bags only"
@@ -93,6 +93,8 @@ class Recording:
     effort: Array | None = None
     wrench: Array | None = None
     deflection: Array | None = None
+    pose: Array | None = None
+    """Coordinates of the pose where they are known beside q, shape (samples, m)."""
     load: Load | None = None
     """A payload beside the robot's own."""
     still: Mask | None = None

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A JointTrajectory in a bag of its own: written for a controller, read back as arrays."""
+"""Planned motions as files: a JointTrajectory in a bag of its own, read back too, or a table."""
 
 from __future__ import annotations
 
@@ -13,35 +13,36 @@ from pkm_twin.bags.reader import Bag, BagWriter
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import BagError
 from pkm_twin.messages.stamps import SECOND
+from pkm_twin.recordings.payload import load_facts, payload_columns
 from pkm_twin.recordings.recording import Recording
+from pkm_twin.recordings.tables import write_table
 from pkm_twin.recordings.topics import DEFINITIONS, TRAJECTORY, Topics
 from pkm_twin.robot.robot import Robot
 
 TOPIC: Final = "/delta_dynamics/joint_trajectory"
 
 
-def write_trajectory(
-    path: Path,
-    robot: Robot,
-    time: Array,
-    motion: tuple[Array, Array, Array],
-    effort: Array | None,
-    facts: Mapping[str, Any],
-    overwrite: bool,
+def write_motion(
+    path: Path, r: Recording, facts: Mapping[str, Any], overwrite: bool = False
 ) -> None:
-    """One message in the controller's numbers, whose zero stamp means a start on receipt.
+    """Write a planned motion: a bag with one JointTrajectory, FILE.mcap, or a table.
 
-    :param time: shape (k,), s from the start.
-    :param motion: the model's q, qd and qdd, shape (k, n).
-    :param effort: the model's, shape (k, n), None for none.
-    :raises BagError: the file exists or cannot be written.
+    A table has time, the joints' motion and efforts, the pose with its rates, and the payload. In a
+    bag numbers are the controller's, and a zero stamp means a start on receipt.
+
+    :param r: with rates and accelerations.
+    :param facts: of the bag's metadata, beside its robot and payload.
+    :raises BagError: the bag exists or cannot be written.
     """
-    own = robot.controller
-    q, qd, qdd = motion
-    empty: list[list[float]] = [[]] * len(time)
-    efforts = empty if effort is None else own.controller_efforts(effort).tolist()
+    if path.suffix != ".mcap":
+        write_table(_columns(r) | payload_columns(r.load, r.time), path)
+        return
+    own = r.robot.controller
+    q, qd, qdd, _ = r.motion
+    empty: list[list[float]] = [[]] * len(r.time)
+    efforts = empty if r.effort is None else own.controller_efforts(r.effort).tolist()
     rows = zip(
-        time.tolist(), own.controller_positions(q).tolist(), own.controller_rates(qd).tolist(),
+        r.time.tolist(), own.controller_positions(q).tolist(), own.controller_rates(qd).tolist(),
         own.controller_rates(qdd).tolist(), efforts, strict=True,
     )  # fmt: skip
     points = []
@@ -58,10 +59,29 @@ def write_trajectory(
         "joint_names": list(own.names),
         "points": points,
     }
-    metadata = {"pkm_twin": {key: str(value) for key, value in facts.items()}}
+    told = {"robot": r.robot.name, **facts, **load_facts(r.load, float(r.time[-1]))}
+    metadata = {"pkm_twin": {key: str(value) for key, value in told.items()}}
     with BagWriter(path, overwrite=overwrite, metadata=metadata, flush_period=None) as bag:
         bag.add_topic(TOPIC, TRAJECTORY, definition=DEFINITIONS[TRAJECTORY])
         bag.write(TOPIC, message, 0)
+
+
+def _columns(r: Recording) -> dict[str, Array]:
+    """Columns of a table: time, the joints' motion and efforts, the pose and its rates."""
+    q, qd, qdd, _ = r.motion
+    words = {"position": q, "velocity": qd, "acceleration": qdd}
+    words |= {} if r.effort is None else {"effort": r.effort}
+    columns = {"time": r.time}
+    for i, joint in enumerate(r.robot.joint_names):
+        columns |= {f"{joint}.{word}": values[:, i] for word, values in words.items()}
+    if r.pose is not None:
+        rate = (r.robot.jacobian(q) @ qd[..., None])[..., 0]
+        change = r.robot.pose_acceleration(q, qd, qdd)
+        for word, values in (("", r.pose), (".velocity", rate), (".acceleration", change)):
+            for i, name in enumerate(r.robot.pose_names):
+                # A joint that has a coordinate's name is told as the joint.
+                columns.setdefault(f"{name}{word}", values[:, i])
+    return columns
 
 
 def read_trajectory(bag: Bag, robot: Robot) -> Recording | None:

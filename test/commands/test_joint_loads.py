@@ -62,7 +62,7 @@ def test_loads_in_blocks_are_those_of_the_whole(tmp_path, capsys, monkeypatch):
     (tmp_path / "bearings.yaml").write_text("bearings: {elbow_right: {C: 5000, Y: 1.5}}")
     results = []
     for block in (512, 7):
-        monkeypatch.setattr("pkm_twin.apps.joint_loads.BLOCK", block)
+        monkeypatch.setattr("pkm_twin.paths.joint_loads.BLOCK", block)
         out = tmp_path / f"{block}.csv"
         done = command(
             capsys, "loads", "five_bar", path(robot, tmp_path), "--bearings",
@@ -158,7 +158,7 @@ def test_what_nothing_decides_is_named(tmp_path, capsys):
 
 
 def test_turning_of_a_hinge_and_of_a_rod(rng):
-    from pkm_twin.apps.joint_loads import joint_loads
+    from pkm_twin.paths.joint_loads import joint_loads
     from pkm_twin.recordings import Recording
 
     robot = load("five_bar")

@@ -11,11 +11,11 @@ import yaml
 from scipy.integrate import trapezoid
 
 from delta_dynamics import inverse_dynamics, mass_matrix
-from pkm_twin.apps.sizes import read_motors
 from pkm_twin.bags.reader import read_messages
 from pkm_twin.errors import ParameterError
 from pkm_twin.machine.sections import DriveSpec
 from pkm_twin.paths import cycle, fastest, timed
+from pkm_twin.paths.sizing import read_motors
 from pkm_twin.recordings import write_table
 from test.support.robots import load, parameters_of
 

@@ -123,8 +123,8 @@ def write_motion(
     """
     from pkm_twin.identification.excitation import excite as design
     from pkm_twin.identification.excitation import sweeps
-    from pkm_twin.recordings import write_table
-    from pkm_twin.recordings.trajectories import write_trajectory
+    from pkm_twin.recordings import Recording
+    from pkm_twin.recordings import trajectories as plans
 
     machine, table = judge.robot, out.with_suffix(".csv")
     best: Any
@@ -137,15 +137,11 @@ def write_motion(
             )
     time = np.arange(round(best.duration * bounds.rate) + 1) / bounds.rate
     time = time[time <= best.duration]
-    motion = best.at(time)
-    facts = {"robot": machine.name, "source": "pkm-twin excite", "condition": best.condition}
-    write_trajectory(out, machine, time, motion, None, facts, overwrite)
-    columns = {"time": time}
-    for i, joint in enumerate(machine.joint_names):
-        for word, values in zip(("position", "velocity", "acceleration"), motion, strict=True):
-            columns[f"{joint}.{word}"] = values[:, i]
+    plan = Recording(machine, time, *best.at(time))
     with writing(table):
-        write_table(columns, table)
+        for file in (out, table):
+            facts = {"source": "pkm-twin excite", "condition": best.condition}
+            plans.write_motion(file, plan, facts, overwrite)
     return best, len(time)
 
 

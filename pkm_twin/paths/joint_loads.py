@@ -1,54 +1,36 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``pkm-twin loads``: forces and moments in the joints along a motion, cycles and bearing life."""
+"""Forces and moments in the joints along a motion, cycles and bearing life."""
 
 from __future__ import annotations
 
 import csv
 import fnmatch
 import io
-import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Final
+from typing import Any, Final
 
 import numpy as np
-import typer
 import yaml
-from numpy.typing import NDArray
 
 from delta_dynamics.elastic_reactions import elastic_reactions
-from pkm_twin.apps.options import (
-    BagTopics,
-    Follow,
-    Json,
-    LoadTimes,
-    Payload,
-    Platform,
-    RobotName,
-    read_options,
-)
-from pkm_twin.console import answer, finite, progress, refuse_existing, writing
-from pkm_twin.errors import ParameterError
-from pkm_twin.files import STANDARD, replace_file, replacing
+from pkm_twin.codegen.arrays import Array
+from pkm_twin.errors import FileError, ParameterError
+from pkm_twin.files import replacing
 from pkm_twin.machine import schema
 from pkm_twin.machine.graph import BASE
-from pkm_twin.options import OptionalPath, file_name
 from pkm_twin.paths.durability import Cycles, Life, Reversals, bearing_life, rainflow
-from pkm_twin.recordings import Recording, by_load, read
+from pkm_twin.recordings import Recording, by_load
 from pkm_twin.recordings.tables import WRENCH as AXES
 from pkm_twin.robot.robot import Robot
-
-Array = NDArray[np.float64]
 
 BLOCK: Final = 512
 """Samples at once: each has matrices of all unknowns."""
 CLASSES: Final = 32
 ALONG: Final = 1e-9
 """Part of a direction below which it is across another."""
-SHOWN: Final = 6
-"""Most joints in a picture."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -186,8 +168,7 @@ def read_bearings(path: Path, names: tuple[str, ...]) -> dict[str, BearingSpec]:
     try:
         data = yaml.safe_load(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        what = error.strerror if isinstance(error, OSError) else str(error)
-        raise ParameterError(str(path), what, "a readable YAML file of bearings") from None
+        raise FileError(path, error, "a YAML file of bearings") from None
     entries = data.get("bearings") if isinstance(data, dict) else None
     if not isinstance(entries, dict) or not entries:
         raise ParameterError(str(path), None, "a mapping bearings of joints to data")
@@ -227,61 +208,6 @@ def bearing_load(force: Array, spec: BearingSpec, axis: Array | None) -> Array:
     return np.asarray(spec.X * across + spec.Y * np.abs(along), np.float64)
 
 
-def report(
-    motion: Recording, loads: Sequence[Summary], exponent: float
-) -> tuple[dict[str, Any], str]:
-    """The result as plain data and as text."""
-    robot = motion.robot
-    data: dict[str, Any] = {
-        "robot": robot.name, "samples": len(motion.time),
-        "duration_s": float(motion.time[-1] - motion.time[0]), "exponent": exponent, "joints": {},
-    }  # fmt: skip
-    lines = [
-        f"{robot.name}: {len(motion.time)} samples, {data['duration_s']:.4g} s; payload: "
-        f"{motion.load or 'as in the robot file'}"
-    ]
-    for load in loads:
-        open_axes = [axis for axis, good in zip(AXES, load.determined, strict=True) if not good]
-        entry: dict[str, Any] = {"undetermined": open_axes, "turned_rad": load.turned}
-        text = f"{load.name}:"
-        for what, unit, k in (("force", "N", 0), ("moment", "N_m", 1)):
-            known = bool(np.isfinite(load.peaks[k]))
-            peak = float(load.peaks[k]) if known else None
-            rms = math.sqrt(load.squares[k] / load.samples) if known else None
-            entry |= {f"{what}_peak_{unit}": peak, f"{what}_rms_{unit}": rms}
-            if known:
-                text += f" {what} peak {peak:.4g}, RMS {rms:.4g} {unit.replace('_', ' ')};"
-        entry["equivalent_range"] = {
-            axis: load.cycles(k).equivalent_range(exponent)
-            for k, axis in enumerate(AXES)
-            if axis not in open_axes
-        }
-        ranges = {a: v for a, v in entry["equivalent_range"].items() if a[0] == "f"}
-        if ranges:
-            worst = max(ranges, key=lambda a: ranges[a])
-            text += f" equivalent load range {ranges[worst]:.4g} N ({worst})"
-        if open_axes:
-            text += f" undetermined: {', '.join(open_axes)}"
-        if load.spec is not None:
-            if not load.known:
-                entry["life"] = None
-                text += "; no life, as the force is undetermined"
-            else:
-                life = load.life(data["duration_s"])
-                entry["life"] = {
-                    "equivalent_load_N": life.load, "turns": life.turns,
-                    "L10_turns": finite(life.life_turns), "L10_hours": finite(life.life_hours),
-                }  # fmt: skip
-                text += f"; bearing: P {life.load:.4g} N, L10 {life.life_hours:.4g} h"
-        data["joints"][load.name] = entry
-        lines.append(text)
-    if any(entry["undetermined"] for entry in data["joints"].values()):
-        lines.append(
-            "undetermined: neither rigid-body equations nor elastic members or joints determine it"
-        )
-    return data, "\n".join(lines)
-
-
 def write_rows(writer: Any, time: Array, loads: Sequence[JointLoad]) -> None:
     """Wrenches over time in base axes, as rows of a CSV; empty where undetermined."""
     rows = np.concatenate([time[:, None], *(load.wrench[-len(time) :] for load in loads)], -1)
@@ -302,38 +228,19 @@ def spectra(loads: Sequence[Summary]) -> str:
     return text.getvalue()
 
 
-def draw(motion: Recording, loads: Sequence[Summary], path: Path) -> None:
-    """Forces of the joints with the largest ones over time, and their rainflow spectra."""
-    from pkm_twin.maps import figures
-    from pkm_twin.report import plots
+def summaries(
+    motion: Recording, bearings: Path | None, out: Path | None,
+    progress: Callable[[int], None] | None = None,
+) -> list[Summary]:  # fmt: skip
+    """The loads of all joints along a motion, computed and written block by block.
 
-    shown = sorted((load for load in loads if load.known), key=lambda load: -load.peaks[0])[:SHOWN]
-    figure, axes = figures.subplots(1, 2, figsize=(9, 4.6), layout="constrained")
-    for colour, load in zip(figures.LINES, shown, strict=False):
-        axes[0].plot(motion.time, np.concatenate(load.sizes), color=colour, lw=1, label=load.name)
-        axis = max(range(3), key=lambda k: float(np.ptp(load.reversals[k].values)))
-        cycles = load.cycles(axis)
-        down = np.argsort(-cycles.ranges)
-        label = f"{load.name}, {AXES[axis]}"
-        reached = np.cumsum(cycles.counts[down])
-        axes[1].step(reached, cycles.ranges[down], color=colour, where="pre", label=label)
-    plots.label(axes[0], "time (s)", "force (N)", "force in the joints")
-    x = "cycles of at least this range"
-    plots.label(axes[1], x, "range (N)", "load cycles of one component")
-    for ax in axes:
-        if shown:
-            # Below: beside curves that fill their axes there is no room.
-            ax.legend(fontsize=9, ncol=2, loc="upper center", bbox_to_anchor=(0.5, -0.16))
-    worst = f" {shown[0].name}, {shown[0].peaks[0]:.4g} N" if shown else ""
-    figure.suptitle(f"{motion.robot.name}: which joint bears most?{worst}")
-    plots.save(figure, path)
-
-
-def summaries(motion: Recording, bearings: Path | None, out: Path | None) -> list[Summary]:
-    """The loads of all joints along a motion, computed and written block by block."""
+    :raises ParameterError: fewer than two samples, or by the field of a bearing.
+    """
+    if len(motion.time) < 2:
+        raise ParameterError(motion.source, f"{len(motion.time)} samples", "2 or more")
     result: list[Summary] = []
     begin = 0
-    with ExitStack() as files, progress("loads", len(motion.time)) as update:
+    with ExitStack() as files:
         writer: Any = None
         if out is not None:
             hidden = files.enter_context(replacing(out))
@@ -352,62 +259,6 @@ def summaries(motion: Recording, bearings: Path | None, out: Path | None) -> lis
             if writer is not None:
                 write_rows(writer, motion.clock[begin:end], block)
             begin = end
-            update(end)
+            if progress is not None:
+                progress(end)
     return result
-
-
-def loads(
-    robot: RobotName,
-    motion: Annotated[
-        Path, typer.Argument(help="a recording or a path: MCAP, rosbag2 folder or CSV")
-    ],
-    bearings: Annotated[
-        OptionalPath, typer.Option(help="YAML of bearings by joint: C (N), p, and X, Y")
-    ] = None,
-    exponent: Annotated[
-        float, typer.Option(help="Woehler exponent of the equivalent load range", min=1.0, max=50.0)
-    ] = 5.0,
-    follow: Follow = None,
-    payload: Payload = None,
-    load_times: LoadTimes = None,
-    platform: Platform = None,
-    topic: BagTopics = [],  # noqa: B006  typer copies it
-    out: Annotated[
-        OptionalPath, typer.Option(help="CSV of the loads over time", callback=file_name)
-    ] = None,
-    spectrum: Annotated[
-        OptionalPath, typer.Option(help="CSV of the rainflow counts", callback=file_name)
-    ] = None,
-    picture: Annotated[
-        OptionalPath, typer.Option(help="PNG of forces and spectra", callback=file_name)
-    ] = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="replace the files")] = False,
-    as_json: Json = False,
-) -> None:
-    """Report forces and moments in the joints along a motion.
-
-    For each joint it prints peak and RMS force and moment, and the equivalent load range: one cycle
-    of this range does the same damage as all cycles of the motion (rainflow counting, in axes that
-    turn with the joint's inner body). With --bearings also equivalent load and L10 life (ISO 281).
-
-    In an overconstrained machine the elasticity of members and joints determines what rigid-body
-    equations do not. Without elasticity these components are reported as undetermined.
-    """
-    from pkm_twin import load
-
-    for target in (out, spectrum, picture):
-        if target is not None:
-            refuse_existing(target, overwrite, motion)
-    machine = load(robot, platform=platform)
-    how = read_options(topic, payload, load_times, follow, planned=True)
-    taken = read(motion, machine, how).with_rates()
-    if len(taken.time) < 2:
-        raise ParameterError(str(motion), f"{len(taken.time)} samples", "2 or more")
-    with writing(out):
-        found = summaries(taken, bearings, out)
-        data, text = report(taken, found, exponent)
-        if spectrum is not None:
-            replace_file(spectrum, spectra(found).encode())
-        if picture is not None:
-            draw(taken, found, picture)
-    answer(data, text, as_json, piped=STANDARD in (str(out), str(spectrum)))

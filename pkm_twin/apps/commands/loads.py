@@ -1,0 +1,159 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``pkm-twin loads``: forces and moments in the joints along a motion, cycles and bearing life."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from pkm_twin.apps.frame import command
+from pkm_twin.apps.options import CarriesAtTimes, Draws, ReadsMotions, Writes
+from pkm_twin.console import progress, writing
+from pkm_twin.files import replace_file
+from pkm_twin.recordings.tables import WRENCH
+from pkm_twin.report import Column, Fact, Report, Table, plots
+from pkm_twin.settings import setting
+
+if TYPE_CHECKING:
+    from pkm_twin.paths.joint_loads import Summary
+    from pkm_twin.recordings import Recording
+
+SHOWN: Final = 6
+"""Most joints in a picture."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Loads(CarriesAtTimes, ReadsMotions, Writes, Draws):
+    """Report forces and moments in the joints along a motion.
+
+    For each joint it prints peak and RMS force and moment, and the equivalent load range: one cycle
+    of this range does the same damage as all cycles of the motion (rainflow counting, in axes that
+    turn with the joint's inner body). With --bearings also equivalent load and L10 life (ISO 281).
+
+    In an overconstrained machine the elasticity of members and joints determines what rigid-body
+    equations do not. Without elasticity these components are reported as undetermined.
+    """
+
+    motion: Path = setting(
+        ..., "a recording or a path: MCAP, rosbag2 folder or table", argument=True
+    )
+    bearings: Path | None = setting(None, "YAML of bearings by joint: C (N), p, and X, Y")
+    exponent: float = setting(
+        5.0, "Woehler exponent of the equivalent load range", low=1.0, high=50.0
+    )
+    out: Path | None = setting(None, "CSV of the loads over time", writes=True)
+    spectrum: Path | None = setting(None, "CSV of the rainflow counts", writes=True)
+
+
+def loads(given: Loads) -> Report:
+    """The loads of all joints, the largest first in the answer."""
+    from pkm_twin.paths.joint_loads import spectra, summaries
+
+    motion = given.read(given.motion, given.machine(), planned=True).with_rates()
+    with progress("loads", len(motion.time)) as update, writing(given.out):
+        found = summaries(motion, given.bearings, given.out, update)
+    if given.spectrum is not None:
+        replace_file(given.spectrum, spectra(found).encode())
+    robot, duration = motion.robot, float(motion.time[-1] - motion.time[0])
+    joints = {load.name: of_joint(load, given.exponent, duration) for load in found}
+    known = [load for load in found if load.known]
+    worst = max(known, key=lambda load: load.peaks[0], default=None)
+    answer = f"{robot.name}: no joint's force is determined"
+    if worst is not None:
+        answer = f"{robot.name}: {worst.name} bears most, a force of up to {worst.peaks[0]:.4g} N"
+    return Report(
+        answer,
+        [
+            Fact("robot", robot.name),
+            Fact("samples", len(motion.time), text="samples"),
+            Fact("duration_s", duration, "s", "duration"),
+            Fact("payload", None if motion.load is None else motion.load.as_json(),
+                 text="payload", shown=str(motion.load or "as in the robot file")),
+            Fact("exponent", given.exponent),
+            Fact("joints", joints),
+        ],
+        _tables(joints),
+        figures={"": lambda: draw(motion, found, answer)},
+        notes=["undetermined: neither rigid-body equations nor elastic members or joints "
+               "determine it"] if any(one["undetermined"] for one in joints.values()) else (),
+        files={"out": given.out, "spectrum": given.spectrum},
+    )  # fmt: skip
+
+
+def of_joint(load: Summary, exponent: float, duration: float) -> dict[str, Any]:
+    """What is reported of one joint, units in the keys."""
+    open_axes = [axis for axis, good in zip(WRENCH, load.determined, strict=True) if not good]
+    entry: dict[str, Any] = {"undetermined": open_axes, "turned_rad": load.turned}
+    for k, (what, unit) in enumerate((("force", "N"), ("moment", "N_m"))):
+        rms = math.sqrt(load.squares[k] / load.samples)
+        entry |= {f"{what}_peak_{unit}": float(load.peaks[k]), f"{what}_rms_{unit}": rms}
+    entry["equivalent_range"] = {
+        axis: load.cycles(k).equivalent_range(exponent)
+        for k, axis in enumerate(WRENCH)
+        if axis not in open_axes
+    }
+    if load.spec is not None:
+        entry["life"] = None
+        if load.known:
+            life = load.life(duration)
+            entry["life"] = {
+                "equivalent_load_N": life.load, "turns": life.turns, "L10_turns": life.life_turns,
+                "L10_hours": life.life_hours,
+            }  # fmt: skip
+    return entry
+
+
+def _tables(joints: dict[str, Any]) -> list[Table]:
+    """Peaks, ranges and lives, as the terminal shows them."""
+    columns = [
+        Column("force_peak_N", "N", "force peak"), Column("force_rms_N", "N", "RMS"),
+        Column("moment_peak_N_m", "N m", "moment peak"), Column("moment_rms_N_m", "N m", "RMS"),
+    ]  # fmt: skip
+    rows: dict[str, list[Any]] = {}
+    for name, entry in joints.items():
+        forces = {a: v for a, v in entry["equivalent_range"].items() if a[0] == "f"}
+        worst = max(forces, key=lambda axis: forces[axis], default=None)
+        ranges = "" if worst is None else f"{forces[worst]:.4g} ({worst})"
+        values = [entry[column.name] for column in columns]
+        rows[name] = [*values, ranges, ", ".join(entry["undetermined"])]
+    columns += [Column("", "N", "equivalent range"), Column("", "", "undetermined")]
+    tables = [Table("", columns, rows, head="joint")]
+    lives = {name: entry["life"] for name, entry in joints.items() if "life" in entry}
+    if lives:
+        shown = [Column("", "N", "equivalent load"), Column("", "h", "L10")]
+        keys = ("equivalent_load_N", "L10_hours")
+        found = {n: [math.nan if v is None else v[k] for k in keys] for n, v in lives.items()}
+        tables.append(Table("", shown, found, head="bearing"))
+    return tables
+
+
+def draw(motion: Recording, loads: Sequence[Summary], title: str) -> Any:
+    """Forces of the joints with the largest ones over time, and their rainflow spectra."""
+    shown = sorted((load for load in loads if load.known), key=lambda load: -load.peaks[0])[:SHOWN]
+    figure, axes = plots.columns(2, 1)
+    (force,), (counted,) = axes
+    for colour, load in zip(plots.COLOURS, shown, strict=False):
+        force.plot(motion.clock, np.concatenate(load.sizes), color=colour, lw=1, label=load.name)
+        axis = max(range(3), key=lambda k: float(np.ptp(load.reversals[k].values)))
+        cycles = load.cycles(axis)
+        down = np.argsort(-cycles.ranges)
+        label = f"{load.name}, {WRENCH[axis]}"
+        reached = np.cumsum(cycles.counts[down])
+        counted.step(reached, cycles.ranges[down], color=colour, where="pre", label=label)
+    plots.label(force, "time (s)", "force (N)", "force in the joints")
+    x = "cycles of at least this range"
+    plots.label(counted, x, "range (N)", "load cycles of one component")
+    for ax in (force, counted):
+        if shown:
+            # Below: beside curves that fill their axes there is no room.
+            ax.legend(ncol=2, loc="upper center", bbox_to_anchor=(0.5, -0.16))
+    figure.suptitle(title)
+    return figure
+
+
+COMMAND = command(loads, "Torques, paths and drives")

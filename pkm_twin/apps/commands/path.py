@@ -1,0 +1,387 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``pkm-twin path``: a motion along waypoints, a cycle or a circle, as a trajectory or table."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+import typer
+
+from pkm_twin.apps.frame import command
+from pkm_twin.apps.options import Carries, Draws, ReadsTables, Writes
+from pkm_twin.console import writing
+from pkm_twin.errors import check_limit
+from pkm_twin.recordings.tables import ENDINGS
+from pkm_twin.report import Column, Fact, Report, Table, plots
+from pkm_twin.settings import setting
+
+if TYPE_CHECKING:
+    from pkm_twin.paths import Path as Way
+    from pkm_twin.paths import TimedPath
+    from pkm_twin.robot.robot import Robot
+
+LEAST_CYCLE: Final = 1.0
+"""Millimetres below which a cycle's numbers look like metres."""
+SHOWN: Final = 0.3
+"""Greatest used part of a limit from which on the picture has its line."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Motion(Carries, ReadsTables, Writes, Draws):
+    """Plan a motion along a path, also the fastest one, or a cut that is slower where it bends.
+
+    The table of waypoints has a header row and the pose's coordinates (m, rad) or JOINT.position of
+    every joint. The platform passes through the points on a smooth curve without a stop. With a
+    column blend (m), dwell (s) or arc (1: the middle of an arc), or with --blend, it follows
+    straight lines and arcs, and stops where blend is 0. It does not stop between an arc and a
+    tangent line.
+
+    --fastest finds the shortest time within effort, velocity, acceleration, jerk and speed limits.
+    It uses the exact inverse dynamics with payload and friction. The command prints the duration,
+    which limit binds when, and the largest fraction of each limit that the motion uses.
+
+    --slow-where-soft plans a cut: a force that is proportional to the feed and against the motion
+    deflects the platform's reference point by its compliance at the pose. The motion is the fastest
+    one whose feed is at most --speed and whose deflection is at most --tolerance.
+
+    The table that it writes has the columns time, JOINT.position, JOINT.velocity,
+    JOINT.acceleration, JOINT.effort, the pose's coordinates with their velocity and acceleration,
+    and the payload (payload.mass, and payload.x, .y, .z where given). `pkm-twin torques`, `size`,
+    `loads` and `design` read it.
+    """
+
+    waypoints: Path | None = setting(
+        None, "table of waypoints, unless --cycle or --circle is given", argument=True
+    )
+    cycle: tuple[float, ...] | None = setting(
+        None, "pick-and-place cycle there and back, in mm, as in 25,305,25", count=0,
+        metavar="HEIGHT,WIDTH[,LIFT]",
+    )  # fmt: skip
+    circle: float | None = setting(None, "follow a circle of this radius, m")
+    at: tuple[float, ...] | None = setting(
+        None, "centre of --cycle (between pick and place) or --circle: the pose's coordinates; "
+        "default: home", count=0,
+    )  # fmt: skip
+    direction: float = setting(
+        0.0, "direction of the cycle in the xy plane, degrees from x towards y"
+    )
+    blend: float | None = setting(
+        None, "distance from a corner at which rounding begins, m; 0 stops at every waypoint; "
+        "default: a smooth curve through the waypoints; in a cycle 0.8 of its rise", low=0.0,
+    )  # fmt: skip
+    dwell: float = setting(0.0, "dwell at pick and at place, s", low=0.0)
+    fastest: bool = setting(False, "plan the shortest motion within all limits")
+    slow_where_soft: bool = setting(False, "plan the fastest cut within --tolerance")
+    force: float | None = setting(
+        None, "of --slow-where-soft: cutting force per feed, N per m/s, against the motion", low=0.0
+    )
+    tolerance: float | None = setting(
+        None, "of --slow-where-soft: largest deflection of the platform, m"
+    )
+    law: str = setting(
+        "quintic", "motion law without --fastest: quintic or s-curve, from stop to stop"
+    )
+    duration: float | None = setting(None, "duration of the motion, s; default: the shortest")
+    effort: tuple[float, ...] | None = setting(
+        None, "effort limit, one for all joints or one per joint, N m or N; default: the file's",
+        count=0,
+    )  # fmt: skip
+    velocity: tuple[float, ...] | None = setting(
+        None, "velocity limit of the joints, rad/s or m/s; default: the file's", count=0
+    )
+    acceleration: tuple[float, ...] | None = setting(
+        None, "acceleration limit of the joints, rad/s2 or m/s2; default: none", count=0
+    )
+    jerk: tuple[float, ...] | None = setting(
+        None, "jerk limit of the joints, rad/s3 or m/s3; default: none", count=0
+    )
+    speed: float | None = setting(
+        None, "speed limit of the tool point, m/s; default: none; of --slow-where-soft the "
+        "programmed feed",
+    )  # fmt: skip
+    share: float = setting(1.0, "fraction of the file's effort and velocity limits to use")
+    singularity: float = setting(
+        0.01, "least singularity index on the path, 0 to 1", low=0.0, high=1.0
+    )
+    shaper: str | None = setting(
+        None, "input shaper for the first natural frequency, which depends on the pose: zv, or "
+        "zvd, which tolerates more error of the frequency; costs half or one vibration at each "
+        "stop",
+    )  # fmt: skip
+    damping: float | None = setting(
+        None, "damping ratio of that mode; default: `modal_damping` of the robot file"
+    )
+    rate: float = setting(1000.0, "samples per second in the file", low=1.0, high=1e5)
+    out: Path | None = setting(
+        None, "file to write: FILE.mcap (a JointTrajectory with efforts), or a table, FILE.csv, "
+        ".parquet or .mat", writes=True, endings=(".mcap", *ENDINGS),
+    )  # fmt: skip
+
+
+def path(given: Motion) -> Report:
+    """The motion, and which limits it uses."""
+    from pkm_twin.paths import ShapedPath, timed
+    from pkm_twin.recordings import Recording
+    from pkm_twin.recordings.trajectories import write_motion
+
+    machine = given.machine()
+    if given.slow_where_soft:
+        for name, value, unit in (
+            ("tolerance", given.tolerance, "m"),
+            ("speed", given.speed, "m/s"),
+        ):
+            check_limit(name, math.nan if value is None else value, unit)
+        if given.force is None:
+            raise typer.BadParameter("--slow-where-soft needs --force")
+    elif given.force is not None or given.tolerance is not None:
+        raise typer.BadParameter("--force and --tolerance are for --slow-where-soft")
+    bounds: dict[str, Any] = {
+        name: _limit(name, getattr(given, name), machine)
+        for name in ("effort", "velocity", "acceleration", "jerk")
+    }
+    law = "fastest" if given.fastest or given.slow_where_soft else given.law
+    motion = timed(
+        machine, _way(given, machine), law, duration=given.duration, speed=given.speed,
+        share=given.share, singularity=given.singularity, **bounds, **_slower(given, machine),
+    )  # fmt: skip
+    if given.shaper is not None:
+        motion = _shaped(given, motion)
+    elif given.damping is not None:
+        raise typer.BadParameter("--damping is for --shaper")
+    if given.out is not None:
+        s = motion.uniform(given.rate)
+        plan = Recording(machine, s.time, s.q, s.qd, s.qdd, s.effort, pose=s.pose, load=given.load)
+        with writing(given.out):
+            source = {"source": "pkm-twin path", "law": motion.law}
+            write_motion(given.out, plan, source, given.overwrite)
+    fine, robot = motion.fine, motion.robot
+    answer = (
+        f"{robot.name}: {motion.path.kind}, {motion.path.length:.4g} m in {motion.duration:.6g} s, "
+        f"at most {fine.speed.max():.4g} m/s"
+    )
+    facts = [
+        Fact("robot", robot.name),
+        Fact("path", motion.path.kind),
+        Fact("law", motion.law, text="motion law"),
+        Fact("duration_s", motion.duration, "s"),
+        Fact("length_m", motion.path.length, "m"),
+        Fact("stretches", [
+            {"begin_s": round(begin, 9), "duration_s": run.duration, "length_m": stretch.length,
+             "dwell_s": stretch.dwell}
+            for begin, run, stretch in zip(
+                motion.begins, motion.runs, motion.path.stretches, strict=True
+            )
+        ], text="segments from stop to stop", shown=str(len(motion.runs))),
+        Fact("payload", None if given.load is None else given.load.as_json(),
+             text="payload", shown=str(given.load or "as in the robot file")),
+        Fact("limits", [bound.as_json() for bound in motion.bounds]),
+        Fact("used", motion.worst),
+        Fact("peaks", _peaks(motion)),
+        Fact("greatest_speed_m_s", float(fine.speed.max()), "m/s"),
+    ]  # fmt: skip
+    if isinstance(motion, ShapedPath):
+        low, high = motion.frequencies
+        shaper = {
+            "kind": motion.shaper, "added_s": motion.added, "lowest_hz": low, "highest_hz": high,
+        }  # fmt: skip
+        words = f"{motion.shaper} for {low:.4g} to {high:.4g} Hz, takes {motion.added:.4g} s of it"
+        facts.append(Fact("shaper", shaper, text="shaper", shown=words))
+    draw: Any = draw_limits
+    if given.slow_where_soft:
+        cut = Cut.of(given, motion)
+        facts += cut.facts()
+        draw = cut.draw
+    return Report(
+        answer, facts, _tables(motion), {"": lambda: draw(motion, answer)},
+        files={"out": given.out},
+    )  # fmt: skip
+
+
+def _way(given: Motion, machine: Robot) -> Way:
+    """The path that a command line asks for."""
+    from pkm_twin import paths
+    from pkm_twin.paths.waypoints import read_waypoints
+
+    if sum(one is not None for one in (given.waypoints, given.cycle, given.circle)) != 1:
+        raise typer.BadParameter("give one of WAYPOINTS, --cycle and --circle")
+    if given.waypoints is not None:
+        if given.at is not None or given.dwell or given.direction:
+            raise typer.BadParameter("--at, --direction and --dwell are for --cycle and --circle")
+        return read_waypoints(given.waypoints, machine, given.blend, given.load, given.dialect)
+    if given.at is not None and len(given.at) != len(machine.pose_names):
+        names = ", ".join(machine.pose_names)
+        raise typer.BadParameter(f"--at has {len(given.at)} numbers; expected a pose: {names}")
+    if given.circle is not None:
+        home = machine.home() if given.at is None else np.array(given.at)
+        return paths.circle(machine, home, given.circle)
+    lengths = given.cycle or ()
+    if len(lengths) not in (2, 3) or min(lengths) < LEAST_CYCLE:
+        found = ",".join(f"{length:g}" for length in lengths)
+        raise typer.BadParameter(
+            f"--cycle {found}: HEIGHT,WIDTH[,LIFT] in millimetres, for example 25,305,25"
+        )
+    metres = [1e-3 * value for value in lengths]
+    return paths.cycle(
+        machine, *metres, at=given.at, direction=math.radians(given.direction), blend=given.blend,
+        dwell=given.dwell,
+    )  # fmt: skip
+
+
+def _limit(name: str, values: tuple[float, ...] | None, machine: Robot) -> list[float] | None:
+    n = machine.joints_count
+    if values is not None and (len(values) not in (1, n) or min(values) <= 0.0):
+        found = ",".join(f"{value:g}" for value in values)
+        raise typer.BadParameter(
+            f"--{name} {found}: one number above 0, or {n} with commas between"
+        )
+    return None if values is None else list(values)
+
+
+def _slower(given: Motion, machine: Robot) -> dict[str, Any]:
+    """What slows a cut down where the machine is soft."""
+    from pkm_twin.paths.along import bend_per_feed
+
+    if not given.slow_where_soft or given.speed is None or given.tolerance is None:
+        return {}
+    ratio, force = given.speed / given.tolerance, given.force or 0.0
+    return {"slowdown": lambda q, way: np.maximum(
+        1.0, ratio * bend_per_feed(machine, force, q, way)
+    )}  # fmt: skip
+
+
+def _shaped(given: Motion, motion: TimedPath) -> TimedPath:
+    """The motion with an input shaper for the first mode of its robot, actuators locked."""
+    from pkm_twin.paths import shaped
+    from stiffness_monitor.modes import natural_frequencies
+    from stiffness_monitor.vibration import damping_ratios
+
+    robot = motion.robot
+    return shaped(
+        motion, str(given.shaper), lambda poses: natural_frequencies(robot, poses, 1)[..., 0],
+        float(damping_ratios(robot, given.damping, 1)[0]), singularity=given.singularity,
+    )  # fmt: skip
+
+
+def _peaks(motion: TimedPath) -> dict[str, dict[str, dict[str, Any]]]:
+    """Largest amounts of each joint."""
+    robot, fine, peaks = motion.robot, motion.fine, {}
+    for i, joint in enumerate(robot.joint_names):
+        unit = robot.joint_units[i]
+        values = [("velocity", fine.qd, f"{unit}/s"), ("acceleration", fine.qdd, f"{unit}/s2")]
+        if fine.effort is not None:
+            values.append(("effort", fine.effort, robot.effort_units[i]))
+        peaks[joint] = {
+            word: {"value": float(np.abs(v[:, i]).max()), "unit": unit} for word, v, unit in values
+        }
+    return peaks
+
+
+def _tables(motion: TimedPath) -> list[Table]:
+    """What the terminal shows of limits and peaks."""
+    rows: dict[str, list[Any]] = {}
+    for bound in motion.bounds:
+        what = bound.what or f"none (largest fraction of a limit: {100 * bound.used:.0f} %)"
+        rows[f"{bound.begin:.4f} to {bound.end:.4f}"] = [what]
+    peaks = {
+        joint: [f"{one['value']:.4g} {one['unit']}" for one in values.values()]
+        for joint, values in _peaks(motion).items()
+    }
+    words = [Column("", "", word) for word in next(iter(_peaks(motion).values()))]
+    worst = sorted(motion.worst.items(), key=lambda item: -item[1])[:6]
+    used = {name: [100.0 * value] for name, value in worst}
+    tables = [
+        Table("", [Column("", "", "limit that binds")], rows, head="time (s)"),
+        Table("", words, peaks, head="peak"),
+    ]
+    if used:
+        tables.append(Table("", [Column("", "%", "used")], used, head="limit"))
+    return tables
+
+
+def draw_limits(motion: TimedPath, title: str) -> Any:
+    """How much of each limit is used when, coloured by the one that binds."""
+    from pkm_twin.paths.constraints import names_of
+
+    figure, axes = plots.columns(1, 2)
+    used, time = motion.used, motion.fine.time
+    top, low = axes[0]
+    names = names_of(motion.robot)
+    shown = [i for i in np.argsort(-used.max(0)) if used[:, i].max() > SHOWN][:8]
+    colours = {names[i]: plots.COLOURS[k] for k, i in enumerate(shown)}
+    for i in shown:
+        top.plot(time, 100 * used[:, i], color=colours[names[i]], lw=1.2, label=names[i])
+    for bound in motion.bounds:
+        colour = colours.get(bound.what)
+        if colour is not None:
+            for ax in (top, low):
+                ax.axvspan(bound.begin, bound.end, color=colour, alpha=0.15, lw=0)
+    figure.suptitle(f"{title}: which limit binds when ({motion.law})")
+    plots.label(top, "time (s)", "fraction of the limit (%)")
+    top.set_ylim(0, 105)
+    if shown:
+        plots.legend(top)
+    low.plot(time, motion.fine.speed, color="black", lw=1.2)
+    plots.label(
+        low,
+        "time (s)",
+        "speed of the tool point (m/s)",
+        "colours are those of the limit that binds",
+    )
+    low.set_ylim(bottom=0)
+    return figure
+
+
+@dataclass(frozen=True, eq=False)
+class Cut:
+    """A cut along a motion: its deflection per feed at the samples, m per m/s, and its bounds."""
+
+    bend: Any
+    speeds: Any
+    speed: float
+    tolerance: float
+
+    @classmethod
+    def of(cls, given: Motion, motion: TimedPath) -> Cut:
+        """Of a command line."""
+        from pkm_twin.paths.along import bend_per_feed
+
+        s, robot = motion.fine, motion.robot
+        moved = (robot.platform_jacobian(s.q)[:, :3] @ s.qd[..., None])[..., 0]
+        way = moved / np.maximum(s.speed, 1e-300)[:, None]
+        bend = bend_per_feed(robot, given.force or 0.0, s.q, way)
+        return cls(bend, s.speed, float(given.speed or 0.0), float(given.tolerance or 0.0))
+
+    def facts(self) -> list[Fact]:
+        """What it is beside a motion."""
+        soft, most = float(self.bend.max()), float((self.bend * self.speeds).max())
+        # The largest constant feed within the tolerance.
+        even = min(self.speed, self.tolerance / soft) if soft > 0.0 else self.speed
+        return [
+            Fact("greatest_feed_m_s", float(self.speeds.max()), "m/s", "greatest feed"),
+            Fact("greatest_deflection_m", most, "m", "greatest deflection",
+                 f"{1e6 * most:.4g} µm (tolerance {1e6 * self.tolerance:.4g} µm)"),
+            Fact("constant_feed_m_s", even, "m/s", "largest constant feed within the tolerance"),
+            Fact("tolerance_m", self.tolerance, "m"),
+        ]  # fmt: skip
+
+    def draw(self, motion: TimedPath, title: str) -> Any:
+        """Feed and deflection over time, with their bounds."""
+        figure, axes = plots.columns(1, 2)
+        for ax, values, label, limit in zip(
+            axes[0], (1e3 * self.speeds, 1e6 * self.bend * self.speeds),
+            ("feed (mm/s)", "deflection (µm)"), (1e3 * self.speed, 1e6 * self.tolerance),
+            strict=True,
+        ):  # fmt: skip
+            ax.plot(motion.fine.time, values, color=plots.COLOURS[0], lw=1.2)
+            ax.axhline(limit, color=plots.COLOURS[1], lw=1.0)
+            plots.label(ax, "time (s)", label)
+            ax.set_ylim(bottom=0.0)
+        figure.suptitle(title)
+        return figure
+
+
+COMMAND = command(path, "Torques, paths and drives")
