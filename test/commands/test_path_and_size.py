@@ -56,6 +56,7 @@ def test_a_cycle_as_a_table_that_torques_reads(twin, tmp_path):
     assert data["duration_s"] == pytest.approx(
         fastest(robot, cycle(robot, 0.025, 0.305, 0.025)).duration
     )
+    assert data["length_m"] == pytest.approx(0.71)
     ends = [limit["to_s"] for limit in data["limits"]]
     assert ends == sorted(ends)
     assert {"effort arm_1", "velocity arm_1"} <= {limit["limit"] for limit in data["limits"]}
