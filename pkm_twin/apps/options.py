@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from pkm_twin.console import numbers, refuse_existing
+from pkm_twin.console import numbers
 from pkm_twin.errors import ParameterError
 from pkm_twin.files import STANDARD
-from pkm_twin.options import OptionalPath, OptionalText, file_name
+from pkm_twin.options import OptionalText
 from pkm_twin.settings import setting
 
 if TYPE_CHECKING:
@@ -349,7 +349,6 @@ OptionalRobot = Annotated[
     OptionalText,
     typer.Option("--robot", help="a robot's name or file; default: the robot that the bag names"),
 ]
-BagPath = Annotated[Path, typer.Argument(help="a bag: an MCAP file or a rosbag2 folder")]
 BagTopics = Annotated[
     list[str],
     typer.Option(
@@ -371,13 +370,6 @@ LoadTimes = Annotated[
         "default: always"
     ),
 ]
-Follow = Annotated[
-    OptionalText,
-    typer.Option(
-        help="which columns of a table with joint positions and pose are the motion: joints, or "
-        "pose, which plans it again for this robot; default: both, which have to agree"
-    ),
-]
 BeyondLimits = Annotated[
     bool,
     typer.Option(
@@ -395,18 +387,6 @@ Platform = Annotated[
     OptionalText, typer.Option(help="for a URDF, MJCF or SDF: the link that carries the tool")
 ]
 OverwriteBoth = Annotated[bool, typer.Option("--overwrite", help="replace both files")]
-LimitShare = Annotated[
-    float, typer.Option(help="fraction of the file's effort and velocity limits to use")
-]
-SampleRate = Annotated[float, typer.Option(help="samples per second in the file", min=1.0, max=1e5)]
-MotionOut = Annotated[
-    OptionalPath,
-    typer.Option(
-        help="file to write: FILE.mcap (a JointTrajectory with efforts), or a table, FILE.csv, "
-        ".parquet or .mat",
-        callback=file_name,
-    ),
-]
 
 
 def load_of(payload: str | None, times: str | None) -> Any:
@@ -444,27 +424,3 @@ def loaded(robot: str, platform: str | None, payload: str | None) -> tuple[Any, 
 
     machine, carried = load(robot, platform=platform), load_of(payload, None)
     return (machine if carried is None else carried.on(machine)), carried
-
-
-def drawing_of(
-    out: Path | None,
-    picture: bool,
-    overwrite: bool,
-    endings: Sequence[str],
-    source: Path | None = None,
-) -> Path | None:
-    """The picture's name beside a file to write, None for none, both checked before the work.
-
-    :raises ParameterError: another ending.
-    :raises PkmTwinError: a file that may not be replaced.
-    """
-    piped = str(out) == STANDARD
-    if out is None:
-        return None
-    if out.suffix not in endings and not piped:
-        raise ParameterError("out", str(out), f"a name that ends in {' or '.join(endings)}")
-    drawing = out.with_suffix(".png") if picture and not piped else None
-    for target in (out, drawing):
-        if target is not None:
-            refuse_existing(target, overwrite, source)
-    return drawing

@@ -227,7 +227,7 @@ def over_workspace(given: Size) -> Report:
         answer,
         [
             Fact("robot", robot.name), Fact("speed_m_s", speed),
-            Fact("acceleration_m_s2", change), 
+            Fact("acceleration_m_s2", change),
             Fact("poses", worst.poses, text="poses of the workspace"), Fact("drives", data),
         ],
         [Table("", columns, rows, head="joint")],
