@@ -132,7 +132,6 @@ def fit(given: Fit) -> Report:
         raise typer.BadParameter("a robot and recordings are missing; give both, or --drive TABLE")
     if given.page is not None:
         refuse_existing(given.page, given.overwrite)
-    _check_topics(given)
     compliant = COMPLIANCE in [word.strip() for word in given.what.split(",")]
     if compliant and (given.per_copy or given.payload is not None or given.load_times is not None):
         raise ParameterError(
@@ -149,15 +148,6 @@ def fit(given: Fit) -> Report:
     ]
     names = [one_line(path.name, 100) for path in given.recordings]
     return _written(given, result, names, text, marks, choices, beyond)
-
-
-def _check_topics(given: Fit) -> None:
-    """A topic is a bag's."""
-    from pkm_twin.bags.storage import is_bag
-
-    tables = [path for path in given.recordings if not is_bag(path)] if given.topic else []
-    if tables:
-        raise typer.BadParameter(f"--topic is for bags; {tables[0]} is read as CSV")
 
 
 def _beyond(given: Fit, machine: Robot, recordings: Sequence[Array]) -> list[str]:
@@ -182,7 +172,6 @@ def _of_deflections(
 ) -> tuple[Result, Sequence[Choice], list[str]]:
     """The fit of elastic elements."""
     from pkm_twin.identification.deflections import fit_elements
-    from pkm_twin.recordings import read as read_recording
 
     if given.what.strip() != COMPLIANCE:
         raise ParameterError(
@@ -191,7 +180,7 @@ def _of_deflections(
     _ = machine.elastic
     read = []
     for path in given.recordings:
-        read.append(deflected_of(read_recording(path, machine, given.reading(deflected=True))))
+        read.append(deflected_of(given.read(path, machine, deflected=True)))
         update(len(read))
     beyond = _beyond(given, machine, [r.q for r in read])
     result = fit_elements(machine, read, lambda k: update(len(read) + k), accept=given.accept)
@@ -265,9 +254,7 @@ def _read(given: Fit, path: Path, machine: Robot) -> Recording:
 
     :raises PkmTwinError: there are none, or no wrench is accepted.
     """
-    from pkm_twin.recordings import read
-
-    r = read(path, machine, given.reading(currents=given.torque_constant is not None))
+    r = given.read(path, machine, currents=given.torque_constant is not None)
     if r.effort is None and r.bag is None:
         joint = machine.joint_names[0]
         raise ParameterError(
