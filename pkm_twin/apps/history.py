@@ -125,7 +125,6 @@ def _efforts(r: Recording) -> list[Measured]:
 
 
 def _elasticity(r: Recording) -> list[Measured]:
-    from pkm_twin.apps.commands.fit import deflected_of
     from pkm_twin.identification.deflections import fit_elements
     from stiffness_monitor.modes import has_modes, natural_frequencies
 
@@ -133,7 +132,7 @@ def _elasticity(r: Recording) -> list[Measured]:
         return []
     try:
         deflected = read(r.source, r.robot, ReadOptions(deflected=True))
-        fit = fit_elements(r.robot, [deflected_of(deflected)])
+        fit = fit_elements(r.robot, [deflected])
     except PkmTwinError:
         return []
     known = fit.of("fitted")

@@ -7,7 +7,7 @@
 :mod:`~pkm_twin.identification.measurements` of them, which :mod:`~pkm_twin.identification.plan`
 chooses;
 :mod:`~pkm_twin.identification.excitation` designs motions that identify.
-:mod:`~pkm_twin.identification.verdict` judges a fit by its residual,
+:mod:`~pkm_twin.identification.judge` judges a fit by its residual,
 :mod:`~pkm_twin.identification.plausible` judges a recording before it is fitted,
 :mod:`~pkm_twin.identification.noise` has noise and robust weights.
 """

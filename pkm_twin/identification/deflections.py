@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import combinations
 from typing import Final
 
@@ -21,11 +22,11 @@ from pkm_twin.codegen.arrays import Array, Mask
 from pkm_twin.errors import PkmTwinError
 from pkm_twin.identification.estimation import Estimate, estimate
 from pkm_twin.identification.fit import Judged, Result, refuse_faults
-from pkm_twin.identification.judge import Evidence, judge
+from pkm_twin.identification.judge import Evidence, Suspect, Verdict, judge
 from pkm_twin.identification.parameters import SURE, Group, Number, groups_of, number_of
 from pkm_twin.identification.rows import HELD_OUT
-from pkm_twin.identification.verdict import Suspect, Verdict
 from pkm_twin.machine.shared import above_zero
+from pkm_twin.recordings import Recording
 from pkm_twin.robot.robot import Robot
 from pkm_twin.streams.deflection import in_base_axes
 from stiffness_monitor.response import ElementResponse, element_response
@@ -64,27 +65,6 @@ SMOOTH: Final = 0.2
 """Of neighbours' difference over the signal: below, what differs between neighbours is noise."""
 
 
-@dataclass(frozen=True, eq=False)
-class Deflected:
-    """A recording: ``time`` (k,), s; joints ``q`` (k, n); what was on the platform, and its answer.
-
-    ``wrench`` and ``deflection``: at the platform's reference point, base axes, (k, 6), N and N m,
-    m and rad; NaN in a column of the deflection: not measured.
-    """
-
-    name: str
-    time: Array
-    q: Array
-    wrench: Array
-    deflection: Array
-
-    def thinned(self) -> Deflected:
-        """With so many samples at most."""
-        step = -(-len(self.time) // MOST_SAMPLES)
-        cut = {k: getattr(self, k)[::step] for k in ("time", "q", "wrench", "deflection")}
-        return replace(self, **cut)
-
-
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ElasticFit(Result):
     """A fit of deflections: ``numbers`` are the factors of the file's ``element_compliance``.
@@ -116,24 +96,63 @@ class ElasticFit(Result):
 
 @dataclass(frozen=True, eq=False)
 class _Part:
-    """One recording with the model in its poses; what is fitted comes first."""
+    """A recording's loads and deflections, and the model in its poses; the fitted part is first."""
 
-    recording: Deflected
+    name: str
+    time: Array
+    q: Array
+    wrench: Array
+    deflection: Array
     response: ElementResponse
-    measured: Mask
+
+    @classmethod
+    def of(cls, robot: Robot, r: Recording) -> _Part:
+        """A recording that a fit can begin with.
+
+        :raises PkmTwinError: it is too short, or has no loads or deflections.
+        """
+        if r.wrench is None or r.deflection is None:
+            raise PkmTwinError(f"{r.name}: no wrench or no deflection")
+        count = int(np.isfinite(r.deflection).any(1).sum())
+        if count < LEAST_SAMPLES:
+            raise PkmTwinError(
+                f"{r.name}: too short to fit, {count} deflections; {LEAST_SAMPLES} or more"
+            )
+        if not r.wrench.any():
+            raise PkmTwinError(f"{r.name}: no load, every wrench is zero")
+        values = r.deflection[:, np.isfinite(r.deflection).any(0)]
+        if not (np.nanmax(values, 0) > np.nanmin(values, 0)).any():
+            raise PkmTwinError(f"{r.name}: no deflection, every one is the same")
+        few = slice(None, None, -(-len(r.time) // MOST_SAMPLES))
+        q = r.q[few]
+        return cls(
+            r.name, r.time[few], q, r.wrench[few], r.deflection[few],
+            element_response(robot, robot.forward(q)),
+        )  # fmt: skip
+
+    @cached_property
+    def measured(self) -> Mask:
+        """Which directions were, (6,)."""
+        return np.asarray(np.isfinite(self.deflection).any(0))
+
+    @property
+    def size(self) -> Array:
+        """RMS of the fitted deflections, (6,); zero where none was measured."""
+        squares = np.where(self.measured, self.deflection[: self.split], 0.0) ** 2
+        return np.asarray(np.nan_to_num(np.sqrt(np.nanmean(squares, 0))), np.float64)
 
     @property
     def split(self) -> int:
-        return round((1.0 - HELD_OUT) * len(self.recording.time))
+        return round((1.0 - HELD_OUT) * len(self.time))
 
     def moved(self, factors: Array) -> tuple[Array, Array]:
         """Deflections by the model (k, 6), and their derivatives by the factors (k, 6, e)."""
-        return self.response.deflection(self.recording.wrench, factors)
+        return self.response.deflection(self.wrench, factors)
 
     def rows(self, factors: Array) -> tuple[Array, Array, Array]:
         """Of what is fitted: derivatives (k, 6, e), target and what counts, (k, 6) each."""
         moved, slopes = (one[: self.split] for one in self.moved(factors))
-        target = self.recording.deflection[: self.split] - moved + slopes @ factors
+        target = self.deflection[: self.split] - moved + slopes @ factors
         counts = np.isfinite(target)
         slopes = np.where(counts[..., None], slopes, 0.0)
         return slopes, np.where(counts, target, 0.0), counts.astype(np.float64)
@@ -141,7 +160,7 @@ class _Part:
 
 def fit_elements(
     robot: Robot,
-    recordings: Sequence[Deflected],
+    recordings: Sequence[Recording],
     update: Callable[[int], None] | None = None,
     *,
     accept: bool = False,
@@ -156,14 +175,10 @@ def fit_elements(
     """
     parts = []
     for i, recording in enumerate(recordings):
-        _check(recording)
-        thin = recording.thinned()
-        response = element_response(robot, robot.forward(thin.q))
-        measured = np.asarray(np.isfinite(thin.deflection).any(0))
-        parts.append(_Part(thin, response, measured))
+        parts.append(_Part.of(robot, recording))
         if update is not None:
             update(i + 1)
-    _check_loads(recordings, robot)
+    _check_loads(parts, robot)
     faults = _scale_faults(parts)
     refuse_faults(faults, accept)
     names = parts[0].response.names
@@ -217,32 +232,18 @@ def _numbers(
     return tuple(numbers)
 
 
-def _check(recording: Deflected) -> None:
-    """Refuse what no fit can begin with."""
-    count = int(np.isfinite(recording.deflection).any(1).sum())
-    if count < LEAST_SAMPLES:
-        raise PkmTwinError(
-            f"{recording.name}: too short to fit, {count} deflections; {LEAST_SAMPLES} or more"
-        )
-    if not recording.wrench.any():
-        raise PkmTwinError(f"{recording.name}: no load, every wrench is zero")
-    values = recording.deflection[:, np.isfinite(recording.deflection).any(0)]
-    if not (np.nanmax(values, 0) > np.nanmin(values, 0)).any():
-        raise PkmTwinError(f"{recording.name}: no deflection, every one is the same")
-
-
-def _check_loads(recordings: Sequence[Deflected], robot: Robot) -> None:
+def _check_loads(parts: Sequence[_Part], robot: Robot) -> None:
     """One load in one pose gives one deflection, whatever its size.
 
     :raises PkmTwinError: that is all there is.
     """
-    loads = np.concatenate([r.wrench for r in recordings]) / np.repeat([1.0, robot.size], 3)
+    loads = np.concatenate([part.wrench for part in parts]) / np.repeat([1.0, robot.size], 3)
     # Squares of the smallest numbers are zero.
     loads /= np.abs(loads).max()
     sizes = np.linalg.norm(loads, axis=1)
     loads = loads[sizes > 0.1 * sizes.max()]
     singular = np.linalg.svd(loads, compute_uv=False)
-    q = np.concatenate([r.q for r in recordings]) * robot.joint_scales
+    q = np.concatenate([part.q for part in parts]) * robot.joint_scales
     apart = float(np.ptp(q, axis=0).max())
     if singular[1:].max(initial=0.0) < ALIKE * singular[0] and apart < ALIKE * robot.size:
         raise PkmTwinError(
@@ -258,10 +259,9 @@ def _scale_faults(parts: Sequence[_Part]) -> list[str]:
     """
     faults = []
     for part in parts:
-        r = part.recording
         moved, _ = part.moved(np.ones(len(part.response.names)))
-        seen = np.where(np.isfinite(r.deflection), moved, np.nan)[:, part.measured]
-        told = r.deflection[:, part.measured]
+        seen = np.where(np.isfinite(part.deflection), moved, np.nan)[:, part.measured]
+        told = part.deflection[:, part.measured]
         seen, told = (v - np.nanmean(v, 0) for v in (seen, told))
         size = np.sqrt(np.nanmean(seen**2, 0))
         seen, told = (v / np.where(size > 0.0, size, np.inf) for v in (seen, told))
@@ -271,12 +271,12 @@ def _scale_faults(parts: Sequence[_Part]) -> list[str]:
             continue
         if both < 0.0:
             faults.append(
-                f"{r.name}: the platform moves against its loads: signs, or the axes of either"
+                f"{part.name}: the platform moves against its loads: signs, or the axes of either"
             )
         elif not 1.0 / SCALE <= both / own <= SCALE:
             faults.append(
-                f"{r.name}: deflections are {both / own:.3g} times what the robot's file makes of "
-                "the loads: units? m and rad, N and N m"
+                f"{part.name}: deflections are {both / own:.3g} times what the robot's file makes "
+                "of the loads: units? m and rad, N and N m"
             )
     return faults
 
@@ -288,7 +288,7 @@ def _part_left(part: _Part, factors: Array, zero: Array) -> float:
     each by its own variation; zero where none does.
     """
     moved, _ = part.moved(factors)
-    told = (part.recording.deflection - zero)[: part.split, part.measured]
+    told = (part.deflection - zero)[: part.split, part.measured]
     left = told - moved[: part.split, part.measured]
     size = np.nanmean((told - np.nanmean(told, 0)) ** 2, 0)
     noise = 0.5 * np.nanmean(np.diff(told, axis=0) ** 2, 0)
@@ -317,12 +317,12 @@ def _unexplained(
         cause, best = _best_repair(robot, part, len(factors), left)
         if cause and best < BETTER * left:
             faults.append(
-                f"{part.recording.name}: {cause}: put right, elastic elements leave "
+                f"{part.name}: {cause}: put right, elastic elements leave "
                 f"{100 * best:.2g} % of the deflections' variation, as recorded {100 * left:.2g} %"
             )
         elif left > UNEXPLAINED:
             faults.append(
-                f"{part.recording.name}: no compliance of this robot explains the deflections: "
+                f"{part.name}: no compliance of this robot explains the deflections: "
                 "other loads, poses or axes than the recording's?"
             )
     return faults
@@ -331,8 +331,7 @@ def _unexplained(
 def _best_repair(robot: Robot, part: _Part, count: int, most: float) -> tuple[str, float]:
     """The fault without which the least is left of a recording, and how much; at most ``most``."""
     best, cause = most, ""
-    for text, recording in _repairs(robot, part.recording):
-        other = replace(part, recording=recording)
+    for text, other in _repairs(robot, part):
         try:
             found, _ = _solve([other], count)
         except (PkmTwinError, np.linalg.LinAlgError):
@@ -347,8 +346,9 @@ def _best_repair(robot: Robot, part: _Part, count: int, most: float) -> tuple[st
 def _solve(parts: Sequence[_Part], count: int) -> tuple[Estimate, Array]:
     """Of the factors and the zeros, by steps of linear least squares; and the columns of both."""
     factors = np.ones(count)
-    sizes = [np.nan_to_num(np.sqrt(np.nanmean(_measured(part) ** 2, 0))) for part in parts]
-    scales = np.concatenate([np.full(count, PRIOR), *(np.maximum(s, 1e-12) for s in sizes)])
+    scales = np.concatenate(
+        [np.full(count, PRIOR), *(np.maximum(part.size, 1e-12) for part in parts)]
+    )
     start = np.concatenate([factors, np.zeros(6 * len(parts))])
     cones = [(slice(k, k + 1), above_zero(0, 1)) for k in range(count)]
     for _ in range(STEPS):
@@ -391,20 +391,14 @@ def _level(table: Array, change: Array, judged: Array) -> Array | None:
     )
 
 
-def _measured(part: _Part) -> Array:
-    """The fitted part's deflections; a direction that is not measured is zero."""
-    values = part.recording.deflection[: part.split]
-    return np.where(part.measured, values, 0.0)
-
-
 def _judged(part: _Part, factors: Array, zero: Array, covariance: Array) -> Judged:
     """What is held out, without the instrument's zero."""
-    r, end = part.recording, slice(part.split, None)
+    end = slice(part.split, None)
     before, _ = part.moved(np.ones(len(factors)))
     after, slopes = part.moved(factors)
     spread = np.sqrt(np.sum((slopes @ covariance) * slopes, -1).clip(0.0))
-    measured = r.deflection[end] - zero
-    return Judged(r.name, r.time[end], measured, before[end], after[end], spread[end])
+    measured = part.deflection[end] - zero
+    return Judged(part.name, part.time[end], measured, before[end], after[end], spread[end])
 
 
 def _verdict(
@@ -421,7 +415,7 @@ def _verdict(
     suspects: tuple[Suspect, ...] = ()
     for i, (part, zero) in enumerate(zip(parts, zeros, strict=True)):
         moved, slopes = part.moved(factors)
-        left = part.recording.deflection - moved - zero
+        left = part.deflection - moved - zero
         counts = np.isfinite(left)
         suspects, errors = zip(*_errors(robot, part, factors), strict=True)
         own = np.where(counts, moved, 0.0)
@@ -480,7 +474,7 @@ def _noise(left: Array, moved: Array, fitted: int) -> Array:
 
 def _errors(robot: Robot, part: _Part, factors: Array) -> Iterator[tuple[Suspect, Array]]:
     """Errors of a machine or a recording, with the derivatives of the deflections, (k, 6)."""
-    q, wrench = part.recording.q, part.recording.wrench
+    q, wrench = part.q, part.wrench
     moved, _ = part.moved(factors)
 
     def bent(load: Array) -> Array:
@@ -516,16 +510,16 @@ def _errors(robot: Robot, part: _Part, factors: Array) -> Iterator[tuple[Suspect
             yield pose, moved * here[:, None] * e
 
 
-def _repairs(robot: Robot, r: Deflected) -> Iterator[tuple[str, Deflected]]:
+def _repairs(robot: Robot, r: _Part) -> Iterator[tuple[str, _Part]]:
     """Faults of a recording, and the recording without each."""
     rotation = robot.rotation(robot.forward(r.q))
     back = np.swapaxes(rotation, -1, -2)
     base, platform = "the base's axes", "the platform's"
 
-    def loaded(wrench: Array) -> Deflected:
+    def loaded(wrench: Array) -> _Part:
         return replace(r, wrench=wrench)
 
-    def moved(deflection: Array) -> Deflected:
+    def moved(deflection: Array) -> _Part:
         return replace(r, deflection=deflection)
 
     own, other = (in_base_axes(r.wrench, one) for one in (rotation, back))

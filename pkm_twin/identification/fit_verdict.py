@@ -15,6 +15,9 @@ from pkm_twin.identification.judge import (
     SIGMAS,
     VALUES,
     Evidence,
+    Finding,
+    Suspect,
+    Verdict,
     basis_of,
     judge,
 )
@@ -31,7 +34,6 @@ from pkm_twin.identification.suspects import (
     Lengths,
     errors_of,
 )
-from pkm_twin.identification.verdict import Finding, Suspect, Verdict
 
 OF_THE_FILE: Final = {
     "friction": "friction other than the file's",

@@ -18,10 +18,10 @@ import numpy as np
 from delta_dynamics.derivatives import numbers_slopes, torques_by_numbers
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError
+from pkm_twin.identification.judge import Suspect
 from pkm_twin.identification.parameters import FileParameters
 from pkm_twin.identification.rows import BLOCK, Rows
 from pkm_twin.identification.samples import by_blocks
-from pkm_twin.identification.verdict import Suspect
 from pkm_twin.machine.friction import turning_keys
 from pkm_twin.machine.places import path_of
 from pkm_twin.machine.uncertainty import numbers_below

@@ -6,8 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pkm_twin.identification.judge import Evidence, judge
-from pkm_twin.identification.verdict import Suspect, Verdict
+from pkm_twin.identification.judge import Evidence, Suspect, Verdict, judge
 
 ROWS, CHANNELS, FITTED, ERRORS = 300, 2, 3, 12
 

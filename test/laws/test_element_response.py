@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from pkm_twin.errors import ParameterError, UnknownNameError
-from pkm_twin.identification.deflections import Deflected, fit_elements
+from pkm_twin.identification.deflections import fit_elements
+from pkm_twin.recordings import Recording
 from pkm_twin.robot.entries import with_entries
 from stiffness_monitor import compliance, strain_energy
 from stiffness_monitor.response import element_response
@@ -84,7 +85,8 @@ def test_members_of_a_frame_are_fitted():
     robot, poses, wrenches, factors = drawn("delta_cu", 12)
     response = element_response(robot, poses)
     moved, _ = response.deflection(wrenches, factors)
-    recording = Deflected("frame", np.arange(12.0), robot.inverse(poses), wrenches, moved)
+    time, q = np.arange(12.0), robot.inverse(poses)
+    recording = Recording(robot, time, q, wrench=wrenches, deflection=moved)
     numbers = fit_elements(robot, [recording]).numbers
     np.testing.assert_allclose([n.after for n in numbers], factors, rtol=1e-6)
 

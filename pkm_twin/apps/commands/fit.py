@@ -28,7 +28,6 @@ from pkm_twin.settings import setting
 
 if TYPE_CHECKING:
     from pkm_twin.codegen.arrays import Array
-    from pkm_twin.identification.deflections import Deflected
     from pkm_twin.identification.fit import Result
     from pkm_twin.identification.friction_laws import Choice
     from pkm_twin.identification.rows import Recorded
@@ -180,19 +179,11 @@ def _of_deflections(
     _ = machine.elastic
     read = []
     for path in given.recordings:
-        read.append(deflected_of(given.read(path, machine, deflected=True)))
+        read.append(given.read(path, machine, deflected=True))
         update(len(read))
     beyond = _beyond(given, machine, [r.q for r in read])
     result = fit_elements(machine, read, lambda k: update(len(read) + k), accept=given.accept)
     return result, (), beyond
-
-
-def deflected_of(r: Recording) -> Deflected:
-    """A recording with deflections, as the fit of compliance takes it."""
-    from pkm_twin.identification.deflections import Deflected
-
-    assert r.wrench is not None and r.deflection is not None  # noqa: S101  asked for
-    return Deflected(r.name, r.time, r.q, r.wrench, r.deflection)
 
 
 def _of_efforts(
