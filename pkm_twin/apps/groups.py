@@ -66,9 +66,7 @@ TASKS: Final[Mapping[str, Mapping[str, Entry]]] = {
         "check": Entry("check_command:check", tables=True, wrenches=True),
     },
     "Identification and calibration": {},
-    "Design and export": {
-        "design": Entry("design:design_command"),
-    },
+    "Design and export": {},
 }
 """Commands that are not in the folder yet, in the order in which tasks need them."""
 OLDER: Final[Mapping[str, tuple[str, ...]]] = {

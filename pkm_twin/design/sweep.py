@@ -14,10 +14,11 @@ from numpy.typing import NDArray
 
 from pkm_twin.design.optimise import sobol
 from pkm_twin.design.pose_path import PosePath
-from pkm_twin.design.quantities import quantity_of
+from pkm_twin.design.quantities import QUANTITIES, quantity_of
 from pkm_twin.design.search import Problem
 from pkm_twin.design.variables import Variables
 from pkm_twin.errors import ParameterError
+from pkm_twin.robot.entries import entries
 from pkm_twin.robot.robot import Robot
 
 Array = NDArray[np.float64]
@@ -39,6 +40,27 @@ class Sweep:
     shape: tuple[int, ...]
     variables: Mapping[str, Array]
     quantities: Mapping[str, Array]
+
+    def dataset(self, robot: Robot, path: str, kind: str) -> Any:
+        """As xarray has it: a grid with the variables as axes, other machines in a row.
+
+        :param path: what the machines follow, in words. ``kind``: grid or sobol.
+        """
+        from xarray import Dataset
+
+        names = tuple(self.variables)
+        dims = names if kind == "grid" else ("machine",)
+        coordinates: dict[str, Any] = {}
+        for k, (name, values) in enumerate(self.variables.items()):
+            units = {"units": entries(robot).get(name, (0.0, ""))[1]}
+            along = np.moveaxis(values, k, 0).reshape(len(values), -1)[:, 0]
+            coordinates[name] = ((name,), along, units) if kind == "grid" else (dims, values, units)
+        fields = {
+            name: (dims, values, {"units": QUANTITIES[name].unit(robot) or "1",
+                                  "long_name": QUANTITIES[name].meaning})
+            for name, values in self.quantities.items()
+        }  # fmt: skip
+        return Dataset(fields, coordinates, {"robot": robot.name, "path": path, "sweep": kind})
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,0 +1,469 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``pkm-twin design``: numbers of a robot's file that are best for a path; sweeps, tolerances."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+import typer
+
+from pkm_twin.apps.frame import command
+from pkm_twin.apps.options import Carries, Draws, ReadsMotions, Seeded, Writes
+from pkm_twin.console import progress, writing
+from pkm_twin.errors import ParameterError, UnknownNameError, warn
+from pkm_twin.report import Column, Fact, Report, Table, plots
+from pkm_twin.settings import setting
+
+if TYPE_CHECKING:
+    from pkm_twin.design import Design as Found
+    from pkm_twin.design import DesignPoint, PosePath
+    from pkm_twin.robot.robot import Robot
+
+SWEEPS: Final = ("grid", "sobol")
+FILE_DIGITS: Final = 12
+"""Significant digits of a number that is written."""
+STATES: Final = 2000
+"""Joint states that stand for the workspace."""
+DRAWN_STATES: Final = 25
+"""Joint states, spread over all, in which drawn machines are assembled."""
+Box = Mapping[str, tuple[float, float]]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Design(Carries, ReadsMotions, Writes, Draws, Seeded):
+    """Optimise values of a robot's file for a path.
+
+    The platform of every machine follows the same path; machines that cannot follow it are
+    rejected. peak-effort is the greatest effort of any joint, rms-effort the greatest RMS effort of
+    a joint, energy what the drives supply without regeneration, deflection the greatest translation
+    of the reference point under the wrench, mass that of all bodies and rods without payload;
+    singularity is the least singularity index on the path. The search uses exact gradients from
+    several starts and ends in a local optimum.
+
+    --sweep writes all quantities of machines within the bounds to a NetCDF file, with --scheduler
+    computed by a Dask cluster. --tolerance prints
+    the standard deviations of the platform's position and rotation, with the share of each part,
+    on the path or, without --path, over the workspace. The actuated joints keep their positions.
+    Parts are rods.NAME.length, bodies.NAME.length, joints.NAME.at[0..2], joints.NAME.axis[0..1] and
+    joints.NAME.offset; with limbs. in front all copies are alike.
+    """
+
+    vary: tuple[str, ...] = setting(
+        (),
+        "PATH=LOW:HIGH: a value of the robot's file and its bounds, e.g. "
+        "geometry.arm_length=0.15:0.3; PATH,PATH,-PATH=LOW:HIGH changes several by the same amount",
+    )
+    path: Path | None = setting(
+        None, "motion of the robot: CSV or MCAP of `pkm-twin path`, or a recording"
+    )
+    minimise: tuple[str, ...] = setting(
+        (), "peak-effort, rms-effort, energy, deflection or mass; two of them give a Pareto front"
+    )
+    subject_to: tuple[str, ...] = setting(
+        (), "bound on a quantity, e.g. 'singularity>=0.1' or 'peak-effort<=20'"
+    )
+    tolerance: tuple[str, ...] = setting(
+        (),
+        "PATH=SIGMA: the standard deviation of a part's error, e.g. rods.left_1.length=2e-5; "
+        "prints the pose error budget",
+    )
+    monte_carlo: int = setting(
+        0, "of --tolerance: machines to draw and assemble exactly as well", low=0
+    )
+    sweep: str | None = setting(
+        None, "grid or sobol: compute machines within the bounds into --out FILE.nc"
+    )
+    samples: int = setting(
+        20, "machines of a sweep: per axis of a grid, or in total with sobol", low=1
+    )
+    scheduler: str | None = setting(
+        None, "of a sweep: address of a Dask scheduler: tcp://HOST:8786"
+    )
+    wrench: tuple[float, ...] | None = setting(
+        None,
+        "force and moment on the platform, N and N m, base axes; added to the path's",
+        count=6, metavar="fx,fy,fz,mx,my,mz",
+    )  # fmt: skip
+    starts: int = setting(64, "machines to start from; the best are optimised", low=1)
+    points: int = setting(9, "points of a Pareto front", low=3)
+    out: Path | None = setting(
+        None, "FILE.yaml: the robot's file with the new values; for a sweep FILE.nc", writes=True
+    )
+
+
+def design(given: Design) -> Report:
+    """The best machine, a sweep of machines, or the budget of pose errors.
+
+    :raises PkmTwinError: what cannot be asked, or cannot be computed.
+    """
+    if given.tolerance:
+        others = (given.vary, given.minimise, given.sweep, given.subject_to, given.out)
+        if any(others) or given.picture:
+            raise typer.BadParameter(
+                "--tolerance can only be combined with --path, --wrench, --monte-carlo, --seed and "
+                "--json"
+            )
+        return budget(given)
+    if given.monte_carlo:
+        raise typer.BadParameter("--monte-carlo needs --tolerance")
+    if given.path is None:
+        raise typer.BadParameter("give the motion with --path, see `pkm-twin path`")
+    if given.sweep is not None:
+        return swept(given, given.path, given.sweep)
+    if given.scheduler is not None:
+        raise typer.BadParameter("--scheduler needs --sweep")
+    if not given.minimise:
+        raise typer.BadParameter("give --minimise, --sweep or --tolerance")
+    if given.out is not None and given.out.suffix not in (".yaml", ".yml"):
+        raise ParameterError("out", str(given.out), "a name that ends in .yaml or .yml")
+    return optimised(given, given.path)
+
+
+def read_path(given: Design, path: Path) -> tuple[Robot, PosePath]:
+    """The robot with the motion's payload, and the platform's path.
+
+    :raises ParameterError: a table that is no motion, or a payload that is held part of the time.
+    :raises BagError: a bag without a motion.
+    """
+    from pkm_twin.design import PosePath
+    from pkm_twin.paths.along import compared
+    from pkm_twin.recordings import read
+
+    robot = given.machine()
+    motion = read(path, robot, given.reading(planned=True)).with_rates()
+    if motion.load is not None:
+        if not motion.load.held(motion.time).all():
+            bound = "one that is held throughout"
+            raise ParameterError(f"{path}: payload", str(motion.load), bound)
+        robot = motion.load.on(robot)
+    if robot.has_masses and (unlike := compared(motion, "file").unlike):
+        warn(path, unlike)
+    q, qd, qdd, load = motion.motion
+    load = load + np.asarray(given.wrench or np.zeros(6))
+    return robot, PosePath.of_joints(robot, motion.time, q, qd, qdd, load)
+
+
+def optimised(given: Design, path: Path) -> Report:
+    """The machine that is best for a path."""
+    from pkm_twin.design import QUANTITIES
+    from pkm_twin.design import design as find
+    from pkm_twin.design.optimise import searches
+    from pkm_twin.design.variables import parse_vary
+    from pkm_twin.robot.entries import entries
+
+    robot, way = read_path(given, path)
+    box = parse_vary(given.vary)
+    with progress("searches", searches(len(given.minimise), given.points)) as update:
+        found = find(
+            robot, box, way, given.minimise, given.subject_to, starts=given.starts,
+            points=given.points, seed=given.seed, progress=update,
+        )  # fmt: skip
+    if given.out is not None:
+        write_robot(robot, given.robot, found, path, given.out)
+    before, best = found.before, found.best
+    units = {name: entries(robot).get(name, (0.0, ""))[1] for name in best.numbers}
+    bounds = dict(zip(best.variables, box.values(), strict=True))
+    limits = beyond_position(found.robot, way)
+    both = [Column("before", form=".5g"), Column("after", form=".5g")]
+    unit = Column("unit", text=" ")
+    tables = [
+        Table(
+            "variables",
+            [*both, Column("low", text=None), Column("high", text=None), unit,
+             Column("", text=" ")],
+            {
+                name: [before.variables[name], value, *bounds[name], units.get(name, ""),
+                       at_bound(value, bounds[name])]
+                for name, value in best.variables.items()
+            },
+        ),
+        Table(
+            "quantities",
+            [*both, unit],
+            {
+                name: [before.quantities.get(name), value, QUANTITIES[name].unit(robot)]
+                for name, value in best.quantities.items()
+            },
+        ),
+    ]  # fmt: skip
+    if found.front:
+        names = [*found.minimise, *best.variables]
+        rows = {
+            str(k): [*(point.quantities[n] for n in found.minimise), *point.variables.values()]
+            for k, point in enumerate(found.front, 1)
+        }
+        columns = [Column("", text=name, form=".5g") for name in names]
+        tables.append(Table("", columns, rows, "Pareto front"))
+    notes = [f"{joint} leaves its position limits on the path" for joint in limits]
+    if not before.feasible:
+        notes.insert(
+            0, "before: the file's machine cannot follow the path or does not keep the bounds"
+        )
+    return Report(
+        f"{robot.name}: least {' and '.join(found.minimise)} on a path of {way.duration:.4g} s, "
+        f"{len(way.time)} samples; {found.machines} machines computed",
+        [
+            Fact("robot", robot.name),
+            Fact("minimise", list(found.minimise)),
+            Fact("subject_to", [str(bound) for bound in found.constraints]),
+            Fact("numbers", dict(best.numbers)),
+            Fact("before_feasible", before.feasible),
+            Fact("front", [_point(point) for point in found.front]),
+            Fact("machines", found.machines),
+            Fact("rejected_starts", found.rejected),
+            Fact("beyond_position_limits", limits),
+        ],
+        tables,
+        {"": lambda: draw(robot, found, way)},
+        notes,
+        {"out": given.out},
+    )
+
+
+def at_bound(value: float, bound: tuple[float, float]) -> str:
+    """Whether a value is at a bound, in words."""
+    near = 1e-6 * (bound[1] - bound[0])
+    low, high = abs(value - bound[0]) < near, abs(value - bound[1]) < near
+    return "at its lower bound" if low else "at its upper bound" if high else ""
+
+
+def _point(point: DesignPoint) -> dict[str, Any]:
+    return {"variables": dict(point.variables), "quantities": dict(point.quantities)}
+
+
+def beyond_position(robot: Robot, path: PosePath) -> list[str]:
+    """Joints whose limits of position the robot leaves on the path."""
+    limits = robot.limits.position
+    if limits is None:
+        return []
+    q = robot.inverse(path.pose)
+    beyond = np.asarray(((q < limits[:, 0]) | (q > limits[:, 1])).any(0))
+    return [name for name, out in zip(robot.joint_names, beyond, strict=True) if out]
+
+
+def write_robot(robot: Robot, source: str, found: Found, path: Path, out: Path) -> None:
+    """Write the robot's file with the new numbers.
+
+    :raises PkmTwinError: not writable.
+    """
+    from pkm_twin.robot.edited import Chosen, edited_yaml, write_edited
+
+    kept = "".join(f", {bound}" for bound in found.constraints)
+    values = {
+        name: Chosen(float(f"{value:.{FILE_DIGITS}g}"), f"{name}: was {robot.number(name):.6g}")
+        for name, value in found.best.numbers.items()
+    }
+    aim = " and ".join(found.minimise)
+    head = [f"{robot.name}, designed for {path}: least {aim}{kept}."]
+    write_edited(out, head, edited_yaml(robot, source, values))
+
+
+def draw(robot: Robot, found: Found, path: PosePath) -> Any:
+    """The Pareto front, or the efforts before and after."""
+    from pkm_twin.design import QUANTITIES
+    from pkm_twin.design.pose_path import Followed
+    from pkm_twin.design.variants import Variants
+
+    if found.front:
+        figure, ((ax,),) = plots.columns(1, 1)
+        first, second = found.minimise
+        table = np.array([[p.quantities[first], p.quantities[second]] for p in found.front])
+        ax.plot(*table.T, "o-", color=plots.COLOURS[0], label="Pareto front")
+        best, old = found.best.quantities, found.before.quantities
+        ax.plot(best[first], best[second], "D", color=plots.COLOURS[2], label="chosen")
+        if found.before.feasible:
+            ax.plot(old[first], old[second], "s", color=plots.COLOURS[1], label="before")
+        x, y = (f"{aim} ({QUANTITIES[aim].unit(robot)})" for aim in found.minimise)
+        plots.label(ax, x, y, f"{robot.name}: {first} against {second}")
+        plots.legend(ax)
+        return figure
+    numbers = found.best.numbers
+    both = [{n: [robot.number(n)] for n in numbers}, {n: [v] for n, v in numbers.items()}]
+    efforts = [Followed(Variants(robot, one), path).efforts[0] for one in both]
+    figure, (axes,) = plots.columns(1, 2)
+    most = np.nanmax(np.abs(efforts)) * 1.05
+    for ax, table, title in zip(axes, efforts, ("before", "after"), strict=True):
+        for k, joint in enumerate(robot.joint_names):
+            colour = plots.COLOURS[k % len(plots.COLOURS)]
+            ax.plot(path.time, table[:, k], color=colour, lw=1.2, label=joint)
+        unit = " or ".join(sorted(set(robot.effort_units)))
+        plots.label(
+            ax, "time (s)", f"effort ({unit})", f"{robot.name} {title}: efforts on the path"
+        )
+        ax.set_ylim(-most, most)
+    plots.legend(axes[0])
+    return figure
+
+
+def swept(given: Design, path: Path, kind: str) -> Report:
+    """All quantities of machines within bounds, as NetCDF.
+
+    :raises MissingExtraError: h5netcdf or xarray is not installed.
+    """
+    from pkm_twin.design import sweep as sweep_box
+    from pkm_twin.design.sweep import here
+    from pkm_twin.design.variables import parse_vary
+    from pkm_twin.maps.extras import require
+    from pkm_twin.maps.run import on_cluster
+
+    out = given.out
+    if kind not in SWEEPS:
+        raise UnknownNameError("sweep", kind, SWEEPS)
+    if given.minimise or given.subject_to or given.picture:
+        raise typer.BadParameter(
+            "--sweep computes all quantities; leave out --minimise and --subject-to"
+        )
+    if out is None or out.suffix != ".nc":
+        raise ParameterError("out", str(out), "a name that ends in .nc, for --sweep")
+    require("h5netcdf", "atlas")
+    require("xarray", "atlas")
+    robot, way = read_path(given, path)
+    box = parse_vary(given.vary)
+    grid = kind == "grid"
+    compute = here if given.scheduler is None else partial(on_cluster, scheduler=given.scheduler)
+    with progress("machines", given.samples ** len(box) if grid else given.samples) as update:
+        table = sweep_box(
+            robot, box, way, known_quantities(robot, way), given.samples,
+            "grid" if grid else "sobol", seed=given.seed, progress=update, compute=compute,
+        )  # fmt: skip
+    with writing(out):
+        table.dataset(robot, path.name, kind).to_netcdf(out, engine="h5netcdf")
+    count, lost = int(np.prod(table.shape)), int(np.isnan(table.quantities["peak-effort"]).sum())
+    return Report(
+        f"{robot.name}: {count} machines, {lost} cannot follow the path",
+        [Fact("robot", robot.name), Fact("machines", count), Fact("rejected", lost)],
+        files={"out": out},
+    )
+
+
+def known_quantities(robot: Robot, path: PosePath) -> list[str]:
+    """Quantities that the robot's file and the path have data for."""
+    from pkm_twin.design import QUANTITIES
+
+    names = list(QUANTITIES)
+    try:
+        elastic = bool(robot.element_names)
+    except ParameterError:
+        elastic = False
+    if not (path.wrench.any() and elastic):
+        names.remove("deflection")
+    return names
+
+
+def parse_tolerances(texts: Sequence[str]) -> dict[str, float]:
+    """Standard deviations by path of ``PATH=SIGMA`` texts.
+
+    :raises ParameterError: another form, or a path that is given twice.
+    """
+    found: dict[str, float] = {}
+    for text in texts:
+        path, _, value = text.rpartition("=")
+        try:
+            sigma = float(value)
+        except ValueError:
+            sigma = math.nan
+        if not path or path in found or not 0.0 <= sigma < math.inf:
+            raise ParameterError(
+                "tolerance", text, "PATH=SIGMA, each path once, a standard deviation of 0 or more"
+            )
+        found[path] = sigma
+    return found
+
+
+def rms(vectors: Any) -> float:
+    """Root mean square length of vectors (..., 3)."""
+    return float(np.sqrt((vectors**2).sum(-1).mean()))
+
+
+def _most(vectors: Any) -> float:
+    return float(np.linalg.norm(vectors, axis=-1).max())
+
+
+def budget(given: Design) -> Report:
+    """The pose error budget over a path, or over the workspace without one.
+
+    :raises ParameterError: as :func:`~pkm_twin.design.tolerances`, or a file without limits.
+    """
+    from pkm_twin.design import drawn, tolerances
+    from pkm_twin.design.tolerance import workspace_states
+
+    sigma, robot, where = parse_tolerances(given.tolerance), given.machine(), "the workspace"
+    if given.path is None:
+        q = workspace_states(robot, STATES, given.seed)
+    else:
+        q, where = robot.inverse(read_path(given, given.path)[1].pose), given.path.name
+    found = tolerances(robot, sigma, q, given.wrench)
+    variance = {name: float((found.part(name)[..., :3] ** 2).sum()) for name in sigma}
+    whole = sum(variance.values())
+    rows: dict[str, list[Any]] = {}
+    for name in sorted(sigma, key=lambda name: -variance[name]):
+        moves, turns = np.split(found.part(name), 2, -1)
+        still = not np.any(np.abs(found.sensitivity[name]) > 1e-9)
+        rows[name] = [
+            sigma[name], found.units[name], rms(moves), _most(moves), rms(turns), _most(turns),
+            variance[name] / whole if whole > 0.0 else 0.0, found.texts[name],
+            "moves nothing" if still else "",
+        ]  # fmt: skip
+    columns = [
+        Column("sigma"),
+        Column("unit", text=" "),
+        Column("rms_position_m", "m", "RMS", 1e3, "mm"),
+        Column("greatest_position_m", "m", "max", 1e3, "mm"),
+        Column("rms_angle_rad", "rad", "RMS", 1e3, "mrad"),
+        Column("greatest_angle_rad", "rad", None),
+        Column("share", "", "share", 100.0, "%", ".3g"),
+        Column("varied", text="what varies"),
+        Column("", text=" "),
+    ]
+    moves, turns = found.deviation[:, :3], found.deviation[:, 3:]
+    worst = robot.forward(q[int(np.linalg.norm(moves, axis=-1).argmax())])
+    at = ", ".join(f"{n} {value:.4g}" for n, value in zip(robot.pose_names, worst, strict=True))
+    facts = [
+        Fact("robot", robot.name),
+        Fact("states", len(q)),
+        Fact("path", None if given.path is None else str(given.path)),
+        _length("rms_position_m", rms(moves)),
+        _length("greatest_position_m", _most(moves), "largest position error", f" at {at}"),
+        Fact("rms_angle_rad", rms(turns), "rad", "RMS rotation",
+             f"{1e3 * rms(turns):.4g} mrad"),
+        Fact("greatest_angle_rad", _most(turns), "rad"),
+        Fact("worst_pose", worst),
+    ]  # fmt: skip
+    if given.monte_carlo:
+        chosen = np.unique(np.linspace(0, len(q) - 1, DRAWN_STATES).round().astype(int))
+        errors = drawn(robot, sigma, q[chosen], given.monte_carlo, given.seed)
+        exact = {
+            "machines": given.monte_carlo, "states": len(chosen),
+            "rms_position_m": rms(errors[..., :3]), "greatest_position_m": _most(errors[..., :3]),
+            "rms_angle_rad": rms(errors[..., 3:]), "first_order_rms_position_m": rms(moves[chosen]),
+        }  # fmt: skip
+        words = (
+            f"in {len(chosen)} of the states: RMS {1e3 * exact['rms_position_m']:.4g} mm, to first "
+            f"order there {1e3 * exact['first_order_rms_position_m']:.4g} mm; largest error "
+            f"{1e3 * exact['greatest_position_m']:.4g} mm"
+        )
+        label = f"{given.monte_carlo} drawn machines, assembled exactly"
+        facts.append(Fact("monte_carlo", exact, text=label, shown=words))
+    if found.deflection is not None:
+        bent = rms(found.deflection[..., :3])
+        label = "deflection under the wrench, not in the table: RMS"
+        facts.append(_length("rms_deflection_m", bent, label))
+    return Report(
+        f"{robot.name}: standard deviation of the platform's position {1e3 * rms(moves):.4g} mm "
+        f"RMS over {where}, {len(q)} states, actuated joints held",
+        facts,
+        [Table("contributions", columns, rows, head="error")],
+    )
+
+
+def _length(name: str, value: float, text: str | None = None, more: str = "") -> Fact:
+    return Fact(name, value, "m", text, f"{1e3 * value:.4g} mm{more}")
+
+
+COMMAND = command(design, "Design and export")
