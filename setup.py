@@ -22,7 +22,7 @@ setup(
         "pkm_twin.apps",
         "pkm_twin.certify",
         "pkm_twin.apps.commands",
-        "pkm_twin.apps.view",
+        "pkm_twin.view",
         "pkm_twin.maps",
         "pkm_twin.maps.kinds",
         "pkm_twin.bags",

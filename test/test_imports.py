@@ -51,11 +51,14 @@ MAY = {
     "pkm_twin.state.node": NODE | {"pkm_twin.state", "stiffness_monitor"},
     "pkm_twin.maps": NODE | TWINS | {"pkm_twin.console", "pkm_twin.options", "pkm_twin.report"},
     "pkm_twin.certify": CORE | {"delta_dynamics"},
+    "pkm_twin.view": NODE
+    | TWINS
+    | {"pkm_twin.recordings", "pkm_twin.maps", "pkm_twin.report", "pkm_twin.paths"},
     "pkm_twin.apps": NODE
     | TWINS
     | {"pkm_twin.console", "pkm_twin.maps", "pkm_twin.export", "pkm_twin.identification"}
     | {"pkm_twin.paths", "pkm_twin.design", "pkm_twin.options", "pkm_twin.report"}
-    | {"pkm_twin.recordings", "pkm_twin.certify"},
+    | {"pkm_twin.recordings", "pkm_twin.certify", "pkm_twin.view"},
 }
 """Rooms that each may import, beside itself and :data:`OWN`; so nobody imports apps or a node."""
 ROS = re.compile(r"rclpy|\w+_msgs|\w+_interfaces")

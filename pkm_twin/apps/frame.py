@@ -320,7 +320,8 @@ def _one(name: str, kind: Any, row: Setting, word: Any) -> Any:
     if not (low <= value <= high and math.isfinite(value)):
         what = "a whole number" if kind is int else "a number"
         span = f", {row.low:g} or more" if row.low is not None else ""
-        span += f", at most {row.high:g}" if row.high is not None else ""
+        if row.high is not None:
+            span = f", {row.low:g} to {row.high:g}" if span else f", at most {row.high:g}"
         raise typer.BadParameter(f"{name}: {word.strip()!r}; expected {what}{span}")
     return value
 

@@ -57,9 +57,7 @@ class Entry:
 
 
 TASKS: Final[Mapping[str, Mapping[str, Entry]]] = {
-    "Robots": {
-        "view": Entry("view.command:view"),
-    },
+    "Robots": {},
     "Torques, paths and drives": {},
     "Stiffness, workspace and vibration": {},
     "Recordings": {

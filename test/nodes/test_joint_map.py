@@ -19,13 +19,13 @@ from delta_dynamics.gate import Gate, GateSettings, effort_limits
 from delta_dynamics.settings import Settings
 from delta_dynamics.simulation import MachineSettings, Simulation, tuned
 from delta_dynamics.topics import GATE, SIMULATION, TWIN
-from pkm_twin.apps.view.live import Live
 from pkm_twin.errors import MessageError
 from pkm_twin.messages.reading import JointReader
 from pkm_twin.messages.stamps import StampRules
 from pkm_twin.state.state import STATE, MachineState
 from pkm_twin.streams.topics import JOINTS, NUMBERS, TRAJECTORY
 from pkm_twin.streams.wrench import WrenchSettings
+from pkm_twin.view.live import Live
 from stiffness_monitor.monitor import Monitor
 from stiffness_monitor.topics import STIFFNESS
 from test.nodes.harness import REPOSITORY, SECOND, Maker, Plain

@@ -9,9 +9,9 @@ pytest.importorskip("rclpy", exc_type=ImportError)
 from sensor_msgs.msg import JointState
 
 from delta_dynamics import inverse_dynamics
-from pkm_twin.apps.view.command import listening
-from pkm_twin.apps.view.live import Live
+from pkm_twin.apps.commands.view import listening
 from pkm_twin.errors import PkmTwinError
+from pkm_twin.view.live import Live
 from test.nodes.harness import Maker, Ros
 from test.support.robots import load
 

@@ -15,8 +15,8 @@ from urllib.parse import urlsplit
 import numpy as np
 import pytest
 
-from pkm_twin.apps.view.door import listen
-from pkm_twin.apps.view.texts import number
+from pkm_twin.view.door import listen
+from pkm_twin.view.texts import number
 from stiffness_monitor import strain_energy
 from test.commands.conftest import DELTA, REPOSITORY
 from test.maps.browser import Browser, find_browser

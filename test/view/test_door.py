@@ -8,8 +8,8 @@ import socket
 import numpy as np
 import pytest
 
-from pkm_twin.apps.view.door import LEAST_TOKEN, Door, is_loopback, listen
 from pkm_twin.errors import ParameterError, PkmTwinError
+from pkm_twin.view.door import LEAST_TOKEN, Door, is_loopback, listen
 
 TOKEN = "correct-horse-battery"
 LOCAL = {"host": "127.0.0.1:8080"}
@@ -96,7 +96,7 @@ def test_a_port_in_use_is_told():
 def served():
     """A server with a token and something to hide; its port."""
     pytest.importorskip("viser")
-    from pkm_twin.apps.view.page import serving
+    from pkm_twin.view.page import serving
 
     with (
         listen("127.0.0.1", 0) as listening,

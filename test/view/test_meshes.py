@@ -8,10 +8,10 @@ from scipy.spatial.transform import Rotation
 pytest.importorskip("trimesh", reason="trimesh comes with viser: the extra view")
 
 from pkm_twin import load
-from pkm_twin.apps.view.meshes import body_meshes
-from pkm_twin.apps.view.scene import Scene
 from pkm_twin.errors import RobotWarning
 from pkm_twin.robot.outline import Posture
+from pkm_twin.view.meshes import body_meshes
+from pkm_twin.view.scene import Scene
 from test.commands.conftest import REPOSITORY
 
 SOURCE = (REPOSITORY / "examples/machines/dual_scara.urdf").read_text(encoding="utf-8")

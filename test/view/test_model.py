@@ -9,10 +9,10 @@ import pytest
 
 from delta_dynamics import inverse_dynamics
 from pkm_twin import robot_names
-from pkm_twin.apps.view import texts
-from pkm_twin.apps.view.model import Model, _round, _step
-from pkm_twin.apps.view.scene import SCALE, Scene, plate, round_mesh, share_colours
 from pkm_twin.robot.clearance import clearance, has_clearance
+from pkm_twin.view import texts
+from pkm_twin.view.model import Model, _round, _step
+from pkm_twin.view.scene import SCALE, Scene, plate, round_mesh, share_colours
 from stiffness_monitor import compliance
 from test.support.robots import has, load, rigid
 

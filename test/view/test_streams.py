@@ -4,11 +4,11 @@
 import numpy as np
 import pytest
 
-from pkm_twin.apps.view import texts
-from pkm_twin.apps.view.live import SPAN, Live
-from pkm_twin.apps.view.timeline import POINTS, Timeline
 from pkm_twin.paths.along import predicted
 from pkm_twin.recordings import read
+from pkm_twin.view import texts
+from pkm_twin.view.live import SPAN, Live
+from pkm_twin.view.timeline import POINTS, Timeline
 from stiffness_monitor import strain_energy
 from test.commands.conftest import DELTA, MILLING, rewrite
 from test.nodes.harness import SECOND, Maker, Plain

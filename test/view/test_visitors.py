@@ -17,12 +17,12 @@ import msgspec
 from websockets.asyncio.client import connect
 from websockets.exceptions import ConnectionClosed
 
-from pkm_twin.apps.view.door import Door, listen
-from pkm_twin.apps.view.model import Model
-from pkm_twin.apps.view.page import Page, serving
-from pkm_twin.apps.view.panels import BagPanel
-from pkm_twin.apps.view.stage import farther
-from pkm_twin.apps.view.timeline import Timeline
+from pkm_twin.view.door import Door, listen
+from pkm_twin.view.model import Model
+from pkm_twin.view.page import Page, serving
+from pkm_twin.view.panels import BagPanel
+from pkm_twin.view.stage import farther
+from pkm_twin.view.timeline import Timeline
 from test.support.robots import load
 
 CAMERA = {

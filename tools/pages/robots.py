@@ -7,8 +7,8 @@ import sys
 from pathlib import Path
 
 from pkm_twin import load, robot_names
-from pkm_twin.apps.drawing import DPI, draw
 from pkm_twin.report import plots
+from pkm_twin.view.drawing import DPI, draw
 
 MACHINES = Path(__file__).parents[2] / "examples/machines"
 GALLERY = sorted(path for path in MACHINES.iterdir() if path.suffix in (".yaml", ".urdf"))

@@ -14,12 +14,12 @@ from pathlib import Path
 import numpy as np
 
 from pkm_twin import load
-from pkm_twin.apps.view.door import Door, listen
-from pkm_twin.apps.view.model import Model
-from pkm_twin.apps.view.page import Page, serving
-from pkm_twin.apps.view.panels import BagPanel
-from pkm_twin.apps.view.timeline import Timeline
 from pkm_twin.recordings import read
+from pkm_twin.view.door import Door, listen
+from pkm_twin.view.model import Model
+from pkm_twin.view.page import Page, serving
+from pkm_twin.view.panels import BagPanel
+from pkm_twin.view.timeline import Timeline
 from test.maps.browser import Browser, find_browser
 
 SIZE = (1100, 900)

@@ -98,7 +98,7 @@ def info(given: Info) -> Report:
 
 
 def _picture(robot: Robot) -> Any:
-    from pkm_twin.apps.drawing import draw
+    from pkm_twin.view.drawing import draw
 
     return draw(robot)
 

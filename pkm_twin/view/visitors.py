@@ -10,8 +10,8 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from pkm_twin.apps.view.door import UNKNOWN
 from pkm_twin.errors import PkmTwinError
+from pkm_twin.view.door import UNKNOWN
 
 
 def guard(server: Any) -> None:

@@ -10,10 +10,10 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from pkm_twin.apps.view import texts
-from pkm_twin.apps.view.live import SPAN, TOPICS, TRACES, Live
-from pkm_twin.apps.view.page import Page
-from pkm_twin.apps.view.timeline import Timeline
+from pkm_twin.view import texts
+from pkm_twin.view.live import SPAN, TOPICS, TRACES, Live
+from pkm_twin.view.page import Page
+from pkm_twin.view.timeline import Timeline
 
 Array = NDArray[np.float64]
 

@@ -9,10 +9,10 @@ import numpy as np
 from matplotlib.path import Path as Outline
 from numpy.typing import NDArray
 
-from pkm_twin.apps.view.scene import GROUND, PLATFORM, Scene
-from pkm_twin.apps.view.stage import LOOK
 from pkm_twin.report.plots import pyplot
 from pkm_twin.robot.robot import Robot
+from pkm_twin.view.scene import GROUND, PLATFORM, Scene
+from pkm_twin.view.stage import LOOK
 
 Array = NDArray[np.float64]
 
@@ -29,7 +29,7 @@ LIGHT: Final = np.array([-0.45, 0.65, -0.61])
 
 
 class Camera:
-    """Parallel projection from :data:`~pkm_twin.apps.view.stage.LOOK` on a grid of samples.
+    """Parallel projection from :data:`~pkm_twin.view.stage.LOOK` on a grid of samples.
 
     Coordinates of the camera are right, up, and the distance from the eye, m. Each ``draw`` keeps
     what is nearer than what was drawn before.

@@ -19,13 +19,13 @@ from typing import Any, Final, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from pkm_twin.apps.view import texts
-from pkm_twin.apps.view.door import Door, behind
-from pkm_twin.apps.view.model import Model, Range, State
-from pkm_twin.apps.view.scene import DRIVE, Scene
-from pkm_twin.apps.view.stage import SHEET, Stage
-from pkm_twin.apps.view.visitors import guard
 from pkm_twin.errors import one_line
+from pkm_twin.view import texts
+from pkm_twin.view.door import Door, behind
+from pkm_twin.view.model import Model, Range, State
+from pkm_twin.view.scene import DRIVE, Scene
+from pkm_twin.view.stage import SHEET, Stage
+from pkm_twin.view.visitors import guard
 
 Array = NDArray[np.float64]
 

@@ -12,9 +12,9 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from pkm_twin.apps.view.meshes import body_meshes
-from pkm_twin.apps.view.scene import BODY, GROUND, PLATFORM, Scene, plate, round_mesh
 from pkm_twin.machine.graph import BASE
+from pkm_twin.view.meshes import body_meshes
+from pkm_twin.view.scene import BODY, GROUND, PLATFORM, Scene, plate, round_mesh
 
 Array = NDArray[np.float64]
 

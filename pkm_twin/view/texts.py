@@ -10,11 +10,11 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from pkm_twin.apps.view.live import Heard
-from pkm_twin.apps.view.model import Grade, Model, Numbers, State
-from pkm_twin.apps.view.scene import share_colours
-from pkm_twin.apps.view.timeline import Instant, Timeline
 from pkm_twin.robot.robot import Robot
+from pkm_twin.view.live import Heard
+from pkm_twin.view.model import Grade, Model, Numbers, State
+from pkm_twin.view.scene import share_colours
+from pkm_twin.view.timeline import Instant, Timeline
 
 Array = NDArray[np.float64]
 

@@ -3,48 +3,28 @@
 
 from __future__ import annotations
 
+import os
 import threading
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
 import typer
 
-from pkm_twin.apps.options import BagTopics, LoadTimes, Payload, Platform, RobotName, read_options
+from pkm_twin.apps.frame import command
+from pkm_twin.apps.options import CarriesAtTimes, ReadsRecordings
 from pkm_twin.console import progress
-from pkm_twin.options import OptionalPath
+from pkm_twin.report import Report
+from pkm_twin.settings import setting
 
 if TYPE_CHECKING:
-    from pkm_twin.apps.view.timeline import Timeline
-    from pkm_twin.recordings import ReadOptions
+    from pkm_twin.view.timeline import Timeline
 
 
-def view(
-    robot: RobotName,
-    platform: Platform = None,
-    bag: Annotated[OptionalPath, typer.Option(help="replay this recording on a timeline")] = None,
-    topic: BagTopics = [],  # noqa: B006  typer copies it
-    payload: Payload = None,
-    load_times: LoadTimes = None,
-    live: Annotated[bool, typer.Option("--live", help="follow running nodes; needs ROS")] = False,
-    namespace: Annotated[
-        str, typer.Option(help="the robot's namespace, with --live", show_default=False)
-    ] = "",
-    host: Annotated[
-        str, typer.Option(help="address to listen on; every address except loopback needs --token")
-    ] = "127.0.0.1",
-    port: Annotated[int, typer.Option(help="port to listen on; 0: any free port")] = 8080,
-    token: Annotated[
-        str,
-        typer.Option(
-            envvar="PKM_TWIN_TOKEN",
-            help="access token, at least 16 characters; prefer the environment variable, because "
-            "other users can see the command line",
-            show_default=False,
-        ),
-    ] = "",
-) -> None:
+@dataclass(frozen=True, kw_only=True)
+class View(CarriesAtTimes, ReadsRecordings):
     """Show a robot in the browser, with sliders for pose and load.
 
     The page shows joint positions and their limits, the singularity index, the clearance between
@@ -53,58 +33,80 @@ def view(
 
     Runs until Ctrl-C, and is reachable from this machine only, unless --host and --token are given.
     """
-    from pkm_twin.apps.view.door import Door, listen
-    from pkm_twin.maps.extras import require
 
-    how = read_options(topic, payload, load_times, limited=True)
-    if bag is None and (topic or how.load is not None):
+    bag: Path | None = setting(None, "replay this recording on a timeline")
+    live: bool = setting(False, "follow running nodes; needs ROS")
+    namespace: str = setting("", "the robot's namespace, with --live")
+    host: str = setting(
+        "127.0.0.1", "address to listen on; every address except loopback needs --token"
+    )
+    port: int = setting(8080, "port to listen on; 0: any free port")
+    token: str | None = setting(
+        None,
+        "access token, at least 16 characters; prefer the environment variable PKM_TWIN_TOKEN, "
+        "because other users can see the command line",
+    )
+
+
+def view(given: View) -> Report:
+    """Serve the page until a signal ends it.
+
+    :raises PkmTwinError: a recording that cannot be read, or an address that is not free.
+    """
+    from pkm_twin.maps.extras import require
+    from pkm_twin.view.door import Door, listen
+
+    bag = given.bag
+    if bag is None and (given.topic or given.load is not None):
         raise typer.BadParameter("--topic, --payload and --load-times need --bag")
-    if bag is not None and live:
+    if bag is not None and given.live:
         raise typer.BadParameter("give --bag or --live, not both")
-    if namespace and not live:
+    if given.namespace and not given.live:
         raise typer.BadParameter("--namespace needs --live")
     require("viser", "view")
-    door = Door(host, token)
+    token = given.token or os.environ.get("PKM_TWIN_TOKEN", "")
+    door = Door(given.host, token)
     from pkm_twin import load
-    from pkm_twin.apps.view.live import Live
-    from pkm_twin.apps.view.model import Model
-    from pkm_twin.apps.view.page import Page, serving
-    from pkm_twin.apps.view.panels import BagPanel, LivePanel
+    from pkm_twin.view.live import Live
+    from pkm_twin.view.model import Model
+    from pkm_twin.view.page import Page, serving
+    from pkm_twin.view.panels import BagPanel, LivePanel
 
     with ExitStack() as stack:
-        door_socket = stack.enter_context(listen(host, port))
-        machine = load(robot, platform=platform)
-        timeline = None if bag is None else _timeline(bag, robot, how)
+        door_socket = stack.enter_context(listen(given.host, given.port))
+        machine = load(given.robot, platform=given.platform)
+        timeline = None if bag is None else _timeline(bag, given)
         model = Model(machine)
         server = stack.enter_context(serving(door, door_socket))
         page = Page(server, model)
         if timeline is not None:
             BagPanel(page, timeline)
-        if live:
+        if given.live:
             heard = Live(machine)
-            stack.enter_context(listening(heard, namespace))
+            stack.enter_context(listening(heard, given.namespace))
             LivePanel(page, heard)
         name, number = door_socket.getsockname()[:2]
         shown = f"[{name}]" if ":" in name else name
         asked = "?token=TOKEN" if token else ""
         typer.echo(f"{machine.name}: http://{shown}:{number}/{asked}  (Ctrl-C ends)")
         page.run()
+    return Report()
 
 
-def _timeline(bag: Path, robot: str, how: ReadOptions) -> Timeline:
-    from pkm_twin.apps.view.timeline import Timeline
+def _timeline(bag: Path, given: View) -> Timeline:
     from pkm_twin.recordings import read
+    from pkm_twin.view.timeline import Timeline
 
     with progress("reading", None) as update:
-        recording = read(bag, robot, how, update)
+        recording = read(bag, given.robot, given.reading(limited=True), update)
     return Timeline.of(recording)
 
 
 @contextmanager
 def listening(live: Any, namespace: str) -> Iterator[None]:
     """Messages of the nodes in a namespace reach ``live`` while the block lasts."""
-    from pkm_twin.apps.view.live import TOPICS
     from pkm_twin.ros.listener import listening_node, subscribe_best_effort
+    from pkm_twin.view.live import TOPICS
 
     ended = threading.Event()
     with listening_node("view", namespace=namespace) as (node, spin):
@@ -122,3 +124,6 @@ def listening(live: Any, namespace: str) -> Iterator[None]:
         finally:
             ended.set()
             thread.join()
+
+
+COMMAND = command(view, "Robots")
