@@ -112,7 +112,9 @@ class ReadsTables:
         "names of a table's columns, OURS=THEIRS,...: time=t,arm_1.position=q1; * in both stands "
         "for the same text; may be repeated",
     )
-    units: str | None = setting(None, "of a table: of rad, deg, m, mm, s, ms, us; default SI")
+    units: str | None = setting(
+        None, "of a table: of rad, mrad, deg, m, cm, mm, um, s, ms, us; default SI"
+    )
     time: str | None = setting(None, "name of a table's column of times")
 
     @property

@@ -58,7 +58,7 @@ class Dialect:
     """How a table is written; None: as its header row says.
 
     ``columns``: the table's name by ours; ``*`` in both stands for the same text. ``units``: by
-    angle, length and time, of columns whose header has none; rates are per second all the same.
+    angle, length and time, of columns whose header has none; rates are always per second.
     """
 
     separator: str | None = None
