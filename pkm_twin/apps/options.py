@@ -18,7 +18,7 @@ from pkm_twin.options import OptionalText
 from pkm_twin.settings import setting
 
 if TYPE_CHECKING:
-    from pkm_twin.recordings import Dialect, Recording, WrenchFrames
+    from pkm_twin.recordings import Dialect, ReadOptions, Recording, WrenchFrames
     from pkm_twin.robot.limits import Beyond
     from pkm_twin.robot.robot import Robot
     from stiffness_monitor.chatter import Milling
@@ -161,13 +161,18 @@ class ReadsRecordings(ReadsTables, ReadsWrenches):
     ) -> Recording:  # fmt: skip
         """A recording; ``more``: other fields of ``ReadOptions``."""
         from pkm_twin.bags.storage import is_bag
-        from pkm_twin.recordings import ReadOptions, read
+        from pkm_twin.recordings import read
 
         if self.topic and not is_bag(path):
             raise typer.BadParameter(f"--topic is for bags; {path} is read as a table")
+        return read(path, robot, self.reading(**more), progress)
+
+    def reading(self, **more: Any) -> ReadOptions:
+        """How its recordings are read; ``more``: other fields of ``ReadOptions``."""
+        from pkm_twin.recordings import ReadOptions
+
         held, follow = getattr(self, "load", None), getattr(self, "follow", None)
-        how = ReadOptions(self.topic, held, follow, self.dialect, self.frames, **more)
-        return read(path, robot, how, progress)
+        return ReadOptions(self.topic, held, follow, self.dialect, self.frames, **more)
 
 
 @dataclass(frozen=True, kw_only=True)
