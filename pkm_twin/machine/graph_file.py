@@ -148,7 +148,7 @@ class JointSpec:
     """
 
     type: str = schema.choice(*TYPES)
-    between: tuple[str, ...] = schema.names(2)
+    between: tuple[str, ...] = schema.words(size=2)
     at: Array | None = schema.vector(3, unit="m", default=None)
     axis: Array | None = schema.vector(3, default=None)
     axes: Array | None = schema.matrix(2, 3, default=None)
@@ -245,7 +245,7 @@ class RodSpec:
     ``swivel``: how far it may lean from its direction at home, against each body, rad.
     """
 
-    between: tuple[str, ...] = schema.names(2)
+    between: tuple[str, ...] = schema.words(size=2)
     ends: Array = schema.matrix(2, 3, unit="m")
     mass: float = mass(default=0.0)
     section: Tube | None = schema.section(Tube, default=None)
@@ -304,7 +304,7 @@ def written_out(
         for key in section:
             if key not in ("azimuths", *KINDS):
                 raise UnknownNameError(f"{path}{key}", key, ("azimuths", *KINDS))
-        azimuths = schema.checked(schema.many(), f"{path}azimuths", section.get("azimuths"))
+        azimuths = schema.checked(schema.vector(0), f"{path}azimuths", section.get("azimuths"))
         for i, azimuth in enumerate(azimuths):
             check_angles(float(azimuth), f"{path}azimuths[{i}]")
         own = set(_section(section, "bodies", path))

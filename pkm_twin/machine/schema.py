@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, ItemsView, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import reduce
 from typing import Any, Final, TypeVar
 
@@ -62,13 +62,14 @@ def vector(
 ) -> Any:
     """Field: ``size`` numbers, read-only array; with ``spread`` one number stands for all.
 
-    ``key``: its name in the file, where that is no name in Python.
+    Of no size, any number of them, but none only where there is a default. ``key``: its name in the
+    file, where that is no name in Python.
     """
 
     def check(field: str, value: Any) -> Array:
         if spread and isinstance(value, (int, float)) and not isinstance(value, bool):
             value = [value] * size
-        items = _sequence(field, value, size)
+        items = _sequence(field, value, size, "numbers", least=default is dataclasses.MISSING)
         return frozen(
             [
                 _number(f"{field}[{i}]", item, above, at_least, at_most, infinite)
@@ -76,29 +77,11 @@ def vector(
             ]
         )
 
-    bound = f"{size} numbers" + _bound(above, at_least, at_most, infinite)
+    bound = f"{size} numbers" if size else "one number or more"
+    bound += _bound(above, at_least, at_most, infinite)
     if spread:
         bound += "; one stands for all"
     return _field(check, default, bound, unit, key=key)
-
-
-def many(
-    *,
-    above: float = -math.inf,
-    at_most: float = math.inf,
-    default: Any = dataclasses.MISSING,
-) -> Any:
-    """Field: one number or more, read-only array; also none, where that is the default."""
-    least = 1 if default is dataclasses.MISSING else 0
-
-    def check(field: str, value: Any) -> Array:
-        if not isinstance(value, (list, tuple, np.ndarray)) or len(value) < least:
-            raise ParameterError(field, value, "a list of numbers")
-        return frozen(
-            [_number(f"{field}[{i}]", item, above, at_most=at_most) for i, item in enumerate(value)]
-        )
-
-    return _field(check, default, "one number or more" + _bound(above, at_most=at_most))
 
 
 def matrix(rows: int, columns: int, *, unit: str = "", default: Any = dataclasses.MISSING) -> Any:
@@ -121,32 +104,23 @@ def text(*, default: Any = dataclasses.MISSING) -> Any:
     return _field(check, default, "a non-empty text")
 
 
-def mapping(kind: type, *, default: Any = dataclasses.MISSING) -> Any:
-    """Field: names to sections with the schema of the dataclass ``kind``."""
+def mapping(entry: Any, *, default: Any = dataclasses.MISSING) -> Any:
+    """Field: names to sections with the schema of a dataclass, or to values of another field."""
+    section = isinstance(entry, type)
+    what = "entries" if section else "numbers"
 
     def check(field: str, value: Any) -> dict[str, Any]:
-        pairs = _named(field, value, "entries")
-        return {name: build(kind, entry, _join(field, name)) for name, entry in pairs}
+        if not isinstance(value, Mapping) or not all(isinstance(k, str) and k for k in value):
+            raise ParameterError(field, value, f"a mapping of names to {what}")
+        judge = (
+            (lambda path, item: build(entry, item, path)) if section else entry.metadata["check"]
+        )
+        return {name: judge(_join(field, name), item) for name, item in value.items()}
 
-    return _field(check, default, "a mapping of names to entries", entries=kind)
-
-
-def numbers(
-    *,
-    at_least: float = -math.inf,
-    at_most: float = math.inf,
-    default: Any = dataclasses.MISSING,
-) -> Any:
-    """Field: names to numbers within bounds."""
-
-    def check(field: str, value: Any) -> dict[str, float]:
-        return {
-            name: _number(_join(field, name), entry, at_least=at_least, at_most=at_most)
-            for name, entry in _named(field, value, "numbers")
-        }
-
-    bound = "a mapping of names to numbers" + _bound(at_least=at_least, at_most=at_most)
-    return _field(check, default, bound)
+    bound = f"a mapping of names to {what}"
+    if not section:
+        bound += entry.metadata["bound"].removeprefix("number")
+    return _field(check, default, bound, entries=entry if section else None)
 
 
 def flag(*, default: Any = dataclasses.MISSING) -> Any:
@@ -160,20 +134,26 @@ def flag(*, default: Any = dataclasses.MISSING) -> Any:
     return _field(check, default, "true or false")
 
 
-def words(*allowed: str, default: Any = dataclasses.MISSING) -> Any:
-    """Field: one or more different words of the allowed."""
+def words(
+    *allowed: str, size: int = 0, distinct: bool = True, default: Any = dataclasses.MISSING
+) -> Any:
+    """Field: ``size`` words, by default one or more, each of the allowed where there are any."""
 
     def check(field: str, value: Any) -> tuple[str, ...]:
-        if not isinstance(value, (list, tuple)) or not value:
-            raise ParameterError(field, value, f"a list of {', '.join(allowed)}")
-        for i, item in enumerate(value):
-            if item not in allowed:
+        items = _sequence(field, value, size, ", ".join(allowed))
+        for i, item in enumerate(items):
+            if allowed and item not in allowed:
                 raise UnknownNameError(f"{field}[{i}]", item, allowed)
-        if len(set(value)) != len(value):
+            if not isinstance(item, str) or not item:
+                raise ParameterError(f"{field}[{i}]", item, "a non-empty name")
+        if distinct and len(set(items)) != len(items):
             raise ParameterError(field, list(value), "different names")
-        return tuple(value)
+        return tuple(items)
 
-    return _field(check, default, f"different ones of {', '.join(allowed)}")
+    bound = f"different ones of {', '.join(allowed)}" if allowed else f"{size} different names"
+    if not distinct:
+        bound = f"{size} words, each {' or '.join(allowed)}"
+    return _field(check, default, bound)
 
 
 def checked(field: Any, path: str, value: Any) -> Any:
@@ -274,21 +254,6 @@ def _least_pivot(diagonal: Sequence[Any], products: Sequence[Any]) -> Any:
     return minimum(minimum(xx, middle), last)
 
 
-def names(size: int, *, default: Any = dataclasses.MISSING) -> Any:
-    """Field: ``size`` different non-empty names."""
-
-    def check(field: str, value: Any) -> tuple[str, ...]:
-        items = _sequence(field, value, size)
-        for i, item in enumerate(items):
-            if not isinstance(item, str) or not item:
-                raise ParameterError(f"{field}[{i}]", item, "a non-empty name")
-        if len(set(items)) != size:
-            raise ParameterError(field, value, "different names")
-        return tuple(items)
-
-    return _field(check, default, f"{size} different names")
-
-
 def choice(*allowed: str, default: Any = dataclasses.MISSING) -> Any:
     """Field: one of the allowed words."""
 
@@ -298,19 +263,6 @@ def choice(*allowed: str, default: Any = dataclasses.MISSING) -> Any:
         return str(value)
 
     return _field(check, default, " or ".join(allowed))
-
-
-def choices(size: int, *allowed: str) -> Any:
-    """Field: ``size`` words, each one of the allowed."""
-
-    def check(field: str, value: Any) -> tuple[str, ...]:
-        items = _sequence(field, value, size)
-        for i, item in enumerate(items):
-            if item not in allowed:
-                raise UnknownNameError(f"{field}[{i}]", item, allowed)
-        return tuple(items)
-
-    return _field(check, dataclasses.MISSING, f"{size} words, each {' or '.join(allowed)}")
 
 
 def section(kind: type, *, default: Any = dataclasses.MISSING) -> Any:
@@ -484,20 +436,15 @@ def _table(field: str, rows: Sequence[Any], columns: int) -> list[list[float]]:
     ]
 
 
-def _sequence(field: str, value: Any, size: int) -> Sequence[Any]:
+def _sequence(field: str, value: Any, size: int, what: str = "", least: int = 1) -> Sequence[Any]:
+    """A list of that size, or of any from the least on."""
     if isinstance(value, np.ndarray):
         value = value.tolist()
-    if not isinstance(value, (list, tuple)):
-        raise ParameterError(field, value, f"a list of {size}")
-    if len(value) != size:
+    if not isinstance(value, (list, tuple)) or len(value) < least:
+        raise ParameterError(field, value, f"a list of {size or what}")
+    if size and len(value) != size:
         raise ParameterError(field, value, f"a list of {size}, not {len(value)}")
     return value
-
-
-def _named(field: str, value: Any, what: str) -> ItemsView[str, Any]:
-    if not isinstance(value, Mapping) or not all(isinstance(k, str) and k for k in value):
-        raise ParameterError(field, value, f"a mapping of names to {what}")
-    return value.items()
 
 
 def _join(path: str, name: str) -> str:

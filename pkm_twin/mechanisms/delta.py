@@ -57,7 +57,7 @@ class Delta(TwinRobot):
     mechanism: str = schema.choice("delta")
     geometry: Geometry = schema.section(Geometry)
     inertia: Inertia = schema.section(Inertia)
-    joints: tuple[str, ...] = schema.names(3, default=["joint_1", "joint_2", "joint_3"])
+    joints: tuple[str, ...] = schema.words(size=3, default=["joint_1", "joint_2", "joint_3"])
     members: Members | None = schema.section(Members, default=None)
 
     mobility: ClassVar[str] = "3: translations x, y, z"

@@ -21,7 +21,7 @@ class Geometry:
     arm_length: float = length()
     forearm_length: float = length()
     azimuths: Array = schema.vector(3, unit="rad")
-    closures: tuple[str, ...] = schema.choices(3, "rod", "rcu")
+    closures: tuple[str, ...] = schema.words("rod", "rcu", size=3, distinct=False)
 
     def verify(self, path: str) -> None:
         """Limbs apart, and at most one of them an rcu."""

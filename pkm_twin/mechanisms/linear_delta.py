@@ -70,7 +70,7 @@ class LinearDelta(TwinRobot):
     mechanism: str = schema.choice("linear_delta")
     geometry: Geometry = schema.section(Geometry)
     inertia: Inertia = schema.section(Inertia)
-    joints: tuple[str, ...] = schema.names(3, default=["stepper_a", "stepper_b", "stepper_c"])
+    joints: tuple[str, ...] = schema.words(size=3, default=["stepper_a", "stepper_b", "stepper_c"])
 
     mobility: ClassVar[str] = "3: translations x, y, z"
     coordinates: ClassVar[tuple[Coordinate, ...]] = tuple(COORDINATES[c] for c in "xyz")

@@ -134,7 +134,7 @@ class Prru(TwinRobot):
     mechanism: str = schema.choice("prru")
     geometry: Geometry = schema.section(Geometry)
     inertia: Inertia = schema.section(Inertia)
-    joints: tuple[str, ...] = schema.names(3, default=["slider_1", "slider_2", "slider_3"])
+    joints: tuple[str, ...] = schema.words(size=3, default=["slider_1", "slider_2", "slider_3"])
     members: Members | None = schema.section(Members, default=None)
 
     description: ClassVar[str] = "3-PRRU head, three vertical sliders and two links per limb"

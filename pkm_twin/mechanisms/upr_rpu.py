@@ -68,7 +68,7 @@ class UprRpu(TwinRobot):
     members: Members = schema.section(Members)
     joints_compliance: JointsCompliance = schema.section(JointsCompliance)
     limits: Limits = schema.section(Limits, default={})
-    joints: tuple[str, ...] = schema.names(3, default=["limb_1", "limb_2", "limb_3"])
+    joints: tuple[str, ...] = schema.words(size=3, default=["limb_1", "limb_2", "limb_3"])
     inertia: Inertia | None = schema.section(Inertia, default=None)
 
     description: ClassVar[str] = "2UPR-RPU head, three actuated telescopic limbs"

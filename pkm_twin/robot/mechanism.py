@@ -86,9 +86,11 @@ class Mechanism:
     """Rotor and gear of every actuated joint, in place of ``inertia.rotor_inertia``."""
     joint_map: Mapping[str, JointMapEntry] = schema.mapping(JointMapEntry, default={})
     uncertainty: Mapping[str, UncertaintyEntry] = schema.mapping(UncertaintyEntry, default={})
-    element_compliance: Mapping[str, float] = schema.numbers(at_least=1e-6, at_most=1e6, default={})
+    element_compliance: Mapping[str, float] = schema.mapping(
+        schema.number(at_least=1e-6, at_most=1e6), default={}
+    )
     """Factors on the compliance of elastic elements, by name; 1 where left out."""
-    modal_damping: Array = schema.many(above=0.0, at_most=0.99, default=[])
+    modal_damping: Array = schema.vector(0, above=0.0, at_most=0.99, default=[])
     """Damping ratios of the natural modes from the lowest on; the last is that of all others."""
     home_joint: float | None = None
     """Value of every actuated joint at home, where a mechanism chooses it: kept by copies, so that
