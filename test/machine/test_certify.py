@@ -137,18 +137,6 @@ def test_a_machine_that_no_judge_can_take(echoes):
         judged(twin)
 
 
-@pytest.mark.parametrize(
-    "name",
-    partly_long(["five_bar", "linear_delta", "rps3", "slider_crank"], "five_bar", "slider_crank"),
-)
-def test_the_command_certifies_a_file(name):
-    from pkm_twin.certify.certificate import certificate_of
-
-    result = certificate_of(load(FILES[name]), states=3)
-    assert result.good, [item for item in result.items if not item.good]
-    assert result.robot == name
-
-
 def test_a_file_that_is_not_the_machine_fails(tmp_path):
 
     data = plain("five_bar")
