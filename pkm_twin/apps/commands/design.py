@@ -133,10 +133,9 @@ def read_path(given: Design, path: Path) -> tuple[Robot, PosePath]:
     """
     from pkm_twin.design import PosePath
     from pkm_twin.paths.along import compared
-    from pkm_twin.recordings import read
 
     robot = given.machine()
-    motion = read(path, robot, given.reading(planned=True)).with_rates()
+    motion = given.read(path, robot, planned=True).with_rates()
     if motion.load is not None:
         if not motion.load.held(motion.time).all():
             bound = "one that is held throughout"

@@ -94,11 +94,10 @@ def view(given: View) -> Report:
 
 
 def _timeline(bag: Path, given: View) -> Timeline:
-    from pkm_twin.recordings import read
     from pkm_twin.view.timeline import Timeline
 
     with progress("reading", None) as update:
-        recording = read(bag, given.robot, given.reading(limited=True), update)
+        recording = given.read(bag, given.robot, update, limited=True)
     return Timeline.of(recording)
 
 
