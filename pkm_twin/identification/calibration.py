@@ -32,7 +32,7 @@ from pkm_twin.identification.calibration_faults import (
     outliers_of,
     place_fault,
 )
-from pkm_twin.identification.calibration_fit import KNOWN, Fitted, Parameter, UnsettledError, fit
+from pkm_twin.identification.calibration_fit import Fitted, Parameter, UnsettledError, fit
 from pkm_twin.identification.calibration_state import (
     BESIDE,
     FRAME,
@@ -50,6 +50,7 @@ from pkm_twin.identification.measurements import (
     scale_slopes,
     whole_of,
 )
+from pkm_twin.identification.parameters import OBSERVED
 from pkm_twin.identification.transmission import Transmission, numbers
 from pkm_twin.identification.undetermined import undetermined
 from pkm_twin.machine.joint_map import JointMap
@@ -108,7 +109,7 @@ class Estimate:
         """Orthonormal directions, in units of the priors, that the poses do not tell, (p, u)."""
         prior = np.array([p.prior for p in self.parameters])
         values, vectors = np.linalg.eigh(self.covariance / np.outer(prior, prior))
-        return np.asarray(vectors[:, values > KNOWN**2], np.float64)
+        return np.asarray(vectors[:, values > OBSERVED**2], np.float64)
 
     @property
     def undetermined(self) -> list[str]:

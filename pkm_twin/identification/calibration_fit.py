@@ -13,10 +13,9 @@ from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError, PkmTwinError
 from pkm_twin.identification.calibration_state import FRAME, State, moved, value_of
 from pkm_twin.identification.measurements import Measured, Weights
+from pkm_twin.identification.parameters import OBSERVED
 from pkm_twin.robot.robot import Robot
 
-KNOWN: Final = 0.5
-"""A parameter whose deviation stays above this part of its prior one was not observed."""
 STEPS: Final = 60
 WEIGHED: Final = 12
 """Steps after which noise and weights stay: else they and the fit may go round in circles."""
@@ -52,7 +51,7 @@ class Parameter:
     @property
     def observed(self) -> bool:
         """Whether the poses tell it: they, not the prior, make its deviation."""
-        return self.deviation < KNOWN * self.prior and not self.scaled
+        return self.deviation < OBSERVED * self.prior and not self.scaled
 
 
 class UnsettledError(ParameterError):

@@ -10,10 +10,10 @@ these explains as well as a sound one has that fault; of others no cause is name
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import combinations
+from itertools import combinations, product
 from typing import Any, Final
 
 import numpy as np
@@ -21,7 +21,28 @@ import scipy  # type: ignore[import-untyped]  # its parts come when they are ask
 from numpy.typing import NDArray
 
 from pkm_twin.codegen.arrays import Array, Mask
+from pkm_twin.errors import PkmTwinError
+from pkm_twin.identification.rows import LARGEST, Rows, rows_of
+from pkm_twin.machine.friction import turning_keys
+from pkm_twin.machine.inertia import ten_numbers
 
+OFFSET: Final = 0.1
+"""Part of the efforts that a current sensor is off by."""
+HEAVIER: Final = 0.3
+"""Part of its value that a mass or a rotor of the file is off by."""
+REACH: Final = 1.5
+"""Machine sizes from the platform within which a payload is."""
+SOME: Final = 2000
+"""Samples by which other positions and times are judged: those that are explained worst."""
+TIMES: Final = {
+    "the time is in ms, not in s": 1e-3, "the time is in us, not in s": 1e-6,
+    "the time is in ns, not in s": 1e-9, "the time is in minutes, not in s": 60.0,
+    "the time is in s, and was taken for ms": 1e3,
+}  # fmt: skip
+ANGLES: Final = {
+    "positions are in degrees": np.pi / 180.0, "positions are in rad, and were taken for degrees":
+    180.0 / np.pi, "positions are in mm": 1e-3, "positions are in turns": 2.0 * np.pi,
+}  # fmt: skip
 GOOD: Final = 0.015
 """Part of the efforts' variation that a sound model may leave."""
 INDEPENDENT: Final = 15.0
@@ -114,7 +135,7 @@ def held_payload(
 
 
 @dataclass(frozen=True, eq=False)
-class Problem:
+class Case:
     """A recording's efforts and the machines that may have made them: k rows, n joints.
 
     ``effort``: measured, (k, n); ``late``: its derivative in time. ``rest``: what is certain;
@@ -146,11 +167,11 @@ class Problem:
         """Of the rows, s."""
         return float(np.median(np.diff(self.time)))
 
-    def backwards(self) -> Problem:
+    def backwards(self) -> Case:
         """The same with time reversed: friction helps the motion."""
         return replace(self, columns=np.where(self.friction, -1.0, 1.0) * self.columns)
 
-    def faster(self, rate: float) -> Problem:
+    def faster(self, rate: float) -> Case:
         """The same where time runs so many times as fast as recorded."""
         extra = 0.0 if self.inertial is None else (rate**2 - 1.0) * self.inertial
         return replace(self, columns=self.columns + extra)
@@ -165,12 +186,12 @@ class Problem:
         """The part of the variation that is noise."""
         return float(np.sqrt(np.mean((self.noise / self.variation) ** 2)))
 
-    def judged(self) -> Judged:
+    def judged(self) -> Score:
         """How well, and how likely, the best of these machines explains the efforts."""
         return self._best[0]
 
     @cached_property
-    def _best(self) -> tuple[Judged, Array]:
+    def _best(self) -> tuple[Score, Array]:
         none = np.zeros((*self.effort.shape, 0))
         return self._solved(none, self.effort, self.variation)
 
@@ -180,7 +201,7 @@ class Problem:
         told = self.rest + self.columns @ x[:-1] - x[-1] * self.late
         return np.asarray(self.counts * (self.effort - told) / self.variation, np.float64)
 
-    def loaded_in_part(self) -> tuple[str, Problem]:
+    def loaded_in_part(self) -> tuple[str, Case]:
         """The same with the payload on the platform only while the efforts ask for one; in words.
 
         Of the best machine's numbers those of the payload are left out.
@@ -220,7 +241,7 @@ class Problem:
         """What is not certain as it is usually, shape (c,)."""
         return np.asarray(np.linalg.pinv(self.prior) @ self.usual, np.float64)
 
-    def _solved(self, free: Array, effort: Array, size: Array) -> tuple[Judged, Array]:
+    def _solved(self, free: Array, effort: Array, size: Array) -> tuple[Score, Array]:
         """By rows whose squares sum to the part of ``size``; and the numbers found."""
         weight = self.counts / size / np.sqrt(max(float(self.counts.sum()), 1.0))
         table = np.concatenate([self.columns, -self.late[..., None], free], -1) * weight[..., None]
@@ -245,11 +266,11 @@ class Problem:
             if abs(left - before) < 0.01 * GOOD:
                 break
         cost = INDEPENDENT * np.log(left**2 + GOOD**2) + np.sum((prior @ x - self.usual) ** 2)
-        return Judged(left, float(cost)), x
+        return Score(left, float(cost)), x
 
 
 @dataclass(frozen=True)
-class Judged:
+class Score:
     """The part of the efforts' variation that is left, and what the machine costs.
 
     Minus twice a logarithm of its probability: of what is left, and of numbers far from the file's.
@@ -259,41 +280,41 @@ class Judged:
     cost: float
 
 
-Retold = tuple[str, Callable[[], Problem | None]]
-"""A fault, and the recording without it; None where the machine cannot move so."""
+def recording_fault(rows: Rows) -> str | None:
+    """Why this machine cannot have made a recording; None where it can.
 
-
-def fault_of(
-    problem: Problem, joints: Sequence[str], retold: Sequence[Retold],
-    some: Callable[[], Problem | None], period: float,
-) -> str | None:  # fmt: skip
-    """The fault for which no such machine can have made a recording, or None.
-
-    :param retold: some samples of the recording with other positions or times. ``some``: the same
-        samples as they were recorded.
-    :param period: between samples, s.
+    :param rows: with all parameters of the file.
     """
+    time, motion = rows.recording.time, rows.signals.motion
+    joints, everything = rows.model.robot.joint_names, rows.model.parameters
+    period = float(np.median(np.diff(time)))
     if period > SLOWEST:
         return f"samples {period:.3g} s apart show no motion (is the time in ms?)"
-    told = problem.judged()
+    still = replace(motion, qd=0.0 * motion.qd, qdd=0.0 * motion.qdd)
+    moving, standing = (rows.model.columns(one)[0] for one in (motion, still))
+    rubs = [group.kind == "friction" for group in everything.groups for _ in group.names]
+    case = case_of(rows, np.where(rubs, 0.0, moving - standing))
+    told = case.judged()
     if told.left < GOOD and told.cost < INDEPENDENT * np.log(2.0 * GOOD**2):
         return None
     best, cause = told, ""
-    others = [*_efforts(problem, joints), ("time runs backwards", problem.backwards(), RARE)]
-    loaded = (problem.loaded_in_part(),) if problem.payload.any() else ()
+    others = [*_efforts(case, joints), ("time runs backwards", case.backwards(), RARE)]
+    loaded = (case.loaded_in_part(),) if case.payload.any() else ()
     others += [(*one, UNIT) for one in loaded]
     for text, other, price in others:
         found = other.judged()
         if found.cost + price < best.cost:
-            best, cause = Judged(found.left, found.cost + price), text
-    known = min(float(np.hypot(BESIDE_NOISE, problem.noisy)), 2.0 * POOR)
+            best, cause = Score(found.left, found.cost + price), text
+    known = min(float(np.hypot(BESIDE_NOISE, case.noisy)), 2.0 * POOR)
     unclear = bool(cause) and best.left > known
-    here = some() if unclear or best.left > FAR else None
+    first = int(np.searchsorted(time, _worst(case, SOME * period)))
+    first = max(0, min(first, len(time) - SOME))
+    some = slice(first, first + SOME)
+    here = _again(rows, some) if unclear or best.left > FAR else None
     if here is not None:
         # All of them by the same samples: how much better than as recorded?
         gain, own = told.cost - best.cost, here.judged()
-        for text, make in retold:
-            made = make()
+        for text, made in _repaired(rows, some):
             found = own if made is None else made.judged()
             if own.cost - found.cost - RARE > gain:
                 gain, told, cause = own.cost - found.cost - RARE, own, text
@@ -306,7 +327,7 @@ def fault_of(
                 f"the efforts' variation unexplained, as recorded {100 * told.left:.2g} %"
             )
         return f"{cause}: as recorded, masses and payload would be far from the file's"
-    if cause or told.left**2 > POOR**2 + problem.noisy**2:
+    if cause or told.left**2 > POOR**2 + case.noisy**2:
         return (
             "no machine like the file's explains the efforts, and no single mistake does: "
             f"{100 * told.left:.2g} % of their variation is left (another machine, another motion, "
@@ -315,19 +336,126 @@ def fault_of(
     return None
 
 
-def _efforts(problem: Problem, joints: Sequence[str]) -> Iterator[tuple[str, Problem, float]]:
+def _repaired(rows: Rows, some: slice) -> Iterator[tuple[str, Case | None]]:
+    """Faults of positions and times, and some samples without each.
+
+    None where the machine cannot move so.
+    """
+    r, robot = rows.recording, rows.model.robot
+    names, eye = robot.joint_names, np.eye(robot.joints_count)
+    for text, scale in TIMES.items():
+        yield text, _again(rows, some, time=r.time * scale)
+    for text, scale in ANGLES.items():
+        yield text, _again(rows, some, q=r.q * scale)
+    if len(names) > 1:
+        yield "positions of all joints have the wrong sign", _again(rows, some, q=-r.q)
+    # A drive that counts the wrong way is mirrored at zero, where it was homed, or anywhere.
+    middles = 0.0 * robot.graph.home, robot.graph.home, r.q.mean(0)
+    for (name, e), middle in product(zip(names, eye, strict=True), middles):
+        turned = 1.0 - 2.0 * e
+        q = middle + turned * (r.q - middle)
+        text = f"of {name} have the wrong sign (joint_map?)"
+        yield f"positions {text}", _again(rows, some, q=q)
+        yield f"positions and efforts {text}", _again(rows, some, q=q, effort=turned * r.effort)
+    for i, k in combinations(range(len(names)), 2):
+        order = _swap(len(names), i, k)
+        text = f"{names[i]} and {names[k]} are exchanged"
+        yield f"positions of {text}", _again(rows, some, q=r.q[:, order])
+        yield text, _again(rows, some, q=r.q[:, order], effort=r.effort[:, order])
+
+
+def _again(rows: Rows, some: slice, **changes: Array) -> Case | None:
+    """Some samples of a recording with changes; None where the machine cannot move so."""
+    model = rows.model
+    try:
+        made = rows_of(model.robot, model.parameters, rows.recording.part(some, **changes))
+    except (PkmTwinError, ValueError, np.linalg.LinAlgError):
+        return None
+    needs = made.rest + made.table @ model.parameters.values
+    return case_of(made) if np.abs(needs).max() < LARGEST else None
+
+
+def _worst(case: Case, duration: float) -> float:
+    """Where the part of such a duration begins that is explained worst, s."""
+    total = np.concatenate([[0.0], np.cumsum(np.sum(case.missed() ** 2, 1))])
+    ends = np.searchsorted(case.time, case.time + duration)
+    return float(case.time[np.argmax(total[ends] - total[:-1])])
+
+
+def case_of(rows: Rows, inertial: Array | None = None) -> Case:
+    """The machines that may have made a recording, around the robot's file.
+
+    :param inertial: the part of the rows' table that grows with the square of the rate of time.
+    """
+    robot, everything = rows.model.robot, rows.model.parameters
+    tables = [rows.table] if inertial is None else [rows.table, inertial]
+    told = rows.rest + rows.table @ everything.values
+    size = np.sqrt(np.mean(told**2, 0))
+    total = sum(body.mass for body in robot.graph.bodies.values())
+    total += sum(rod.mass for rod in robot.graph.rods.values()) + robot.payload.mass
+    parts: list[list[Array]] = []
+    bounds: list[tuple[float, float]] = []
+    prior: list[tuple[slice, float, float]] = []
+    friction: list[bool] = []
+    payload: list[bool] = []
+    turning = turning_keys() | {"viscous"}
+    for where, group in zip(everything.slices, everything.groups, strict=True):
+        own, value = [table[..., where] for table in tables], float(group.values[0])
+        scale, first = float(everything.scales[where][0]), len(bounds)
+        rubs = group.kind == "friction" and group.name.rpartition(".")[2] in turning
+        bound, known = (0.0, np.inf), (value, scale)
+        if group.kind == "inertia":
+            own = [(one @ group.values)[..., None] for one in own]
+            bound, known = (0.3, 2.5), (1.0, HEAVIER)
+        elif group.kind == "payload":
+            own = [one @ _points(REACH * robot.size) for one in own]
+            bound, known = (0.0, total), (value, scale)
+        elif group.kind == "rotor" and value > 0.0:
+            known = (value, HEAVIER * value)
+        elif group.name.endswith("offset"):
+            most = OFFSET * float(np.max(np.abs(own[0]).max((0, 1)) * size))
+            bound, known = (-np.inf, np.inf), (value, most)
+        parts.append(own)
+        bounds += [bound] * own[0].shape[-1]
+        friction += [rubs] * own[0].shape[-1]
+        payload += [group.kind == "payload"] * own[0].shape[-1]
+        if not rubs and known[1] > 0.0:
+            prior.append((slice(first, len(bounds)), *known))
+    rows_of_prior = np.zeros((len(prior), len(bounds)))
+    for row, (columns, _, spread) in zip(rows_of_prior, prior, strict=True):
+        row[columns] = 1.0 / spread
+    low, high = np.array(bounds).T
+    wholes = [np.concatenate(each, -1) for each in zip(*parts, strict=True)]
+    return Case(
+        rows.effort, rows.change, rows.rest, wholes[0], low, high, rows_of_prior,
+        np.array([value / spread for _, value, spread in prior]), np.array(friction), rows.counts,
+        rows.signals.noise * np.sqrt(rows.signals.band), rows.time, np.array(payload),
+        None if inertial is None else wholes[1],
+    )  # fmt: skip
+
+
+def _points(reach: float) -> Array:
+    """Ten numbers of a kilogram at the platform's point and around it, shape (10, points)."""
+    corners = (
+        reach / np.sqrt(3.0) * np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T
+    )
+    places = [np.zeros(3), *(reach * np.eye(3)), *(-reach * np.eye(3)), *corners]
+    return np.stack([ten_numbers(1.0, place, np.zeros((3, 3))) for place in places], -1)
+
+
+def _efforts(case: Case, joints: Sequence[str]) -> Iterator[tuple[str, Case, float]]:
     """Faults of the efforts, with their prices: signs, scales, columns, delays."""
     n = len(joints)
 
-    def scaled(factors: Array) -> Problem:
-        return replace(problem, effort=factors * problem.effort, late=factors * problem.late)
+    def scaled(factors: Array) -> Case:
+        return replace(case, effort=factors * case.effort, late=factors * case.late)
 
-    for signs in _signs(problem.scales(np.eye(n))):
+    for signs in _signs(case.scales(np.eye(n))):
         negative = [joint for joint, sign in zip(joints, signs, strict=True) if sign < 0.0]
         yield f"efforts of {_listed(negative, n)} have the wrong sign", scaled(signs), RARE
     for which in [np.ones(n), *np.eye(n)] if n > 1 else [np.ones(1)]:
         # The likeliest scale is looked for, as the one of least squares is near it alone.
-        near = problem.scales(which[:, None])[int(np.argmax(which))]
+        near = case.scales(which[:, None])[int(np.argmax(which))]
         tried = [near * step for step in SCALES] + [1.0 / unit for unit in UNITS.values()]
         factors = [np.where(which > 0.0, one, 1.0) for one in tried if one != 0.0]
         likely = min(factors, key=lambda one: scaled(one).judged().cost)
@@ -343,13 +471,13 @@ def _efforts(problem: Problem, joints: Sequence[str]) -> Iterator[tuple[str, Pro
                    for s in (1, n - 1)]  # fmt: skip
         orders.append(("columns of the efforts are in another order", np.arange(n)[::-1]))
     for text, order in orders:
-        other = replace(problem, effort=problem.effort[:, order], late=problem.late[:, order])
+        other = replace(case, effort=case.effort[:, order], late=case.late[:, order])
         yield text, other, RARE
-    yield from ((text, other, RARE) for text, other in _delays(problem, joints))
-    if problem.inertial is not None:
+    yield from ((text, other, RARE) for text, other in _delays(case, joints))
+    if case.inertial is not None:
         for rate in RATES:
             text = f"the motion was {rate:.2g} times as fast as its time stamps are (time steps?)"
-            yield text, problem.faster(rate), UNIT
+            yield text, case.faster(rate), UNIT
 
 
 def _signs(scales: Array) -> list[Array]:
@@ -367,39 +495,39 @@ def _swap(n: int, i: int, k: int) -> NDArray[np.int64]:
     return order
 
 
-def _delays(problem: Problem, joints: Sequence[str]) -> Iterator[tuple[str, Problem]]:
+def _delays(case: Case, joints: Sequence[str]) -> Iterator[tuple[str, Case]]:
     """Efforts, of all joints or of one, that belong to another time."""
-    k, n = problem.effort.shape
-    most = min(int(SEARCHED / problem.period), k // 4)
+    k, n = case.effort.shape
+    most = min(int(SEARCHED / case.period), k // 4)
     steps = range(-most, most + 1)
-    if most * problem.period < SHORT:
+    if most * case.period < SHORT:
         return
     inner = slice(most, k - most)
     missed = np.empty((len(steps), n))
     for j in range(n):
-        table = np.concatenate([problem.columns[inner, j], problem.late[inner, j, None]], 1)
+        table = np.concatenate([case.columns[inner, j], case.late[inner, j, None]], 1)
         table = table[:, np.abs(table).max(0) > 0.0]
         basis = np.linalg.qr(table / np.linalg.norm(table, axis=0))[0]
-        rest = problem.rest[inner, j] / problem.variation[j]
-        own = problem.effort[:, j] / problem.variation[j]
+        rest = case.rest[inner, j] / case.variation[j]
+        own = case.effort[:, j] / case.variation[j]
         shifted = np.stack([own[most + s : k - most + s] for s in steps]) - rest
         missed[:, j] = np.sum(shifted**2, 1) - np.sum((shifted @ basis) ** 2, 1)
     choices: list[tuple[Sequence[int], int]] = [(range(n), int(np.argmin(missed.sum(1))))]
     choices += [((j,), int(np.argmin(missed[:, j]))) for j in range(n)] if n > 1 else []
     for which, place in choices:
         step = steps[place]
-        if abs(step) * problem.period < SHORT:
+        if abs(step) * case.period < SHORT:
             continue
         names = _listed([joints[j] for j in which], n)
-        late = step * problem.period
+        late = step * case.period
         text = f"efforts of {names} are {abs(late):.2g} s {'late' if late > 0 else 'early'}"
         parts = ("rest", "columns", "counts", "time")
-        cut = {name: getattr(problem, name)[inner] for name in parts}
-        effort, change = problem.effort[inner].copy(), problem.late[inner].copy()
+        cut = {name: getattr(case, name)[inner] for name in parts}
+        effort, change = case.effort[inner].copy(), case.late[inner].copy()
         for j in which:
             there = slice(most + step, k - most + step)
-            effort[:, j], change[:, j] = problem.effort[there, j], problem.late[there, j]
-        yield text, replace(problem, effort=effort, late=change, **cut)
+            effort[:, j], change[:, j] = case.effort[there, j], case.late[there, j]
+        yield text, replace(case, effort=effort, late=change, **cut)
 
 
 def _scale_text(names: str, scale: float) -> str:

@@ -84,6 +84,12 @@ class Recorded:
     held: Array | None = None
     carried: Robot | None = None
 
+    def part(self, rows: slice, **changes: Array) -> Recorded:
+        """Some of the samples, with other values of the whole recording."""
+        names = ("time", "q", "effort", "wrench", "held")
+        whole = {name: changes.get(name, getattr(self, name)) for name in names}
+        return replace(self, **{k: v[rows] for k, v in whole.items() if v is not None})
+
 
 @dataclass(frozen=True, eq=False)
 class Model:

@@ -16,9 +16,9 @@ from delta_dynamics import inverse_dynamics, mass_matrix
 from pkm_twin.errors import PkmTwinError
 from pkm_twin.identification.estimation import estimate
 from pkm_twin.identification.fit import Fit, fit
-from pkm_twin.identification.fit_plausible import problem_of, recording_fault
 from pkm_twin.identification.friction_laws import fit_with_laws
 from pkm_twin.identification.parameters import file_parameters
+from pkm_twin.identification.plausible import case_of, recording_fault
 from pkm_twin.identification.rows import Recorded, rows_of
 from pkm_twin.machine.shared import above_zero
 from test.identification.machines import IMPOSSIBLE, WRONG, Drawn, machine, noisy, shifted, unit_of
@@ -111,7 +111,7 @@ def test_a_payload_that_is_on_the_platform_for_a_while_is_named(name: str) -> No
     efforts = np.where(held[:, None], m.efforts, inverse_dynamics(bare, m.q, m.qd, m.qdd))
     record = noisy(m.recorded(effort=efforts), np.random.default_rng(7))
     rows = rows_of(m.robot, file_parameters(m.robot), record)
-    _, part = problem_of(rows).loaded_in_part()
+    _, part = case_of(rows).loaded_in_part()
     used = part.time[np.abs(part.columns[..., part.payload]).max((1, 2)) > 0.0]
     assert (used[0], used[-1]) == pytest.approx((5.0, 9.0), abs=0.2)
     fault = recording_fault(rows)
