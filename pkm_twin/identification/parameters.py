@@ -22,6 +22,7 @@ from pkm_twin.machine.places import path_of
 from pkm_twin.machine.shared import KINDS, Key, Kind, Shared
 from pkm_twin.machine.strict_yaml import parse_yaml
 from pkm_twin.robot.catalogue import robot_of_data
+from pkm_twin.robot.identifiable import shared_parameters
 from pkm_twin.robot.robot import Robot
 
 Status = Literal["fitted", "combination", "not excited"]
@@ -100,7 +101,7 @@ def file_parameters(robot: Robot, what: Sequence[Kind] = KINDS) -> FileParameter
 
     :raises ParameterError: the robot's file gives no masses.
     """
-    kept = [_scaled(g, robot) for g in robot.shared_parameters() if g.kind in what]
+    kept = [_scaled(g, robot) for g in shared_parameters(robot) if g.kind in what]
     place = {name: k for k, name in enumerate(parameter_names(robot))}
     tree = robot.engine.tree
     mixing = np.zeros((len(place), sum(len(group.names) for group in kept)))
@@ -186,23 +187,12 @@ def numbers_of_group(
         high, low = group.keys(values + step), group.keys(values - step)
         columns.append([(high[key] - low[key]) / (2.0 * step.sum()) for key in after])
     numbers = []
-    for slope, (key, value) in zip(np.array(columns).T, after.items(), strict=True):
+    each = zip(np.array(columns).T, after.items(), group.units, strict=True)
+    for slope, (key, value), unit in each:
         plain, wide = (float(np.sqrt(max(slope @ one @ slope, 0.0))) for one in covariances)
         usual = float(np.linalg.norm(slope * prior))
-        unit = _unit(group, key)
         numbers.append(number_of(key, unit, before[key], value, (plain, wide), usual))
     return numbers
-
-
-def _unit(group: Shared, key: Key) -> str:
-    """Unit of a number of the file."""
-    words = [str(k) for k in key if isinstance(k, str)]
-    if len(group.names) == 1:
-        return group.units[0]
-    last = words[-1]
-    if last.endswith("com"):
-        return "m" if len(key) > 2 and isinstance(key[-1], int) else ""
-    return "kg" if last.endswith("mass") else "kg m2"
 
 
 @dataclass(frozen=True)

@@ -17,8 +17,8 @@ import numpy as np
 
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.machine.friction import all_keys
-from pkm_twin.machine.graph import Body, Graph
-from pkm_twin.machine.inertia import TEN, matrix_of, ten_numbers, transport
+from pkm_twin.machine.graph import Graph
+from pkm_twin.machine.inertia import matrix_of
 
 Kind = Literal["friction", "rotor", "payload", "inertia"]
 Key = tuple[str | int, ...]
@@ -75,65 +75,6 @@ def pseudo_inertia() -> Array:
     return np.stack(parts, -1)
 
 
-def com_and_inertia(ten: Array, place: Array) -> tuple[Array, Array]:
-    """Centre of mass (m) and inertia about it of ten numbers about a place of those axes."""
-    mass = ten[0]
-    if not mass > 0.0:
-        return place, np.zeros((3, 3))
-    c = ten[1:4] / mass
-    inertia = matrix_of(ten) - mass * (c @ c * np.eye(3) - np.outer(c, c))
-    # A solver stops beside the edge of what a body can be: its second moments are not negative.
-    values, vectors = np.linalg.eigh(0.5 * np.trace(inertia) * np.eye(3) - inertia)
-    if values[0] < 0.0:
-        second = (vectors * np.maximum(values, 0.0)) @ vectors.T
-        inertia = np.trace(second) * np.eye(3) - second
-    return place + c, inertia
-
-
-def shared_body(
-    name: str,
-    body: Body,
-    path: Key,
-    copies: Mapping[str, Array],
-    *,
-    kind: Kind = "inertia",
-    words: Sequence[str] = ("mass", "com", "inertia"),
-    origin: Array | None = None,
-    mass_scale: float = 0.0,
-    length: float = 0.1,
-) -> Shared:
-    """All ten numbers of a body that a file gives, about its centre of mass as the file has it.
-
-    :param body: as the file has it, base axes of the first copy.
-    :param path: of the entry in the file. ``words``: its keys there.
-    :param copies: by body of the graph the rotation about the base's origin, shape (3, 3).
-    :param origin: the point that the file's ``com`` starts at; default the base's origin.
-    :param mass_scale: how far the mass may be off; by default by all of it.
-    :param length: a length of the body, m.
-    """
-    start = np.zeros(3) if origin is None else origin
-    scale = mass_scale or body.mass
-    place, inertia = body.com, body.inertia
-    values = ten_numbers(body.mass, np.zeros(3), inertia)
-
-    def keys(new: Array) -> dict[Key, float]:
-        com, about = com_and_inertia(new, place)
-        result: dict[Key, float] = {(*path, words[0]): float(new[0])}
-        result |= {(*path, words[1], i): float(com[i] - start[i]) for i in range(3)}
-        pairs = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
-        return result | {(*path, words[2], i, j): float(about[i, j]) for i, j in pairs}
-
-    return Shared(
-        kind, name, tuple(f"{name}.{what}" for what in TEN), TEN_UNITS, values,
-        scale * np.array([1.0, *[length] * 3, *[length**2] * 6]), keys,
-        {
-            copy: transport(rotation.T, np.zeros(3)) @ transport(np.eye(3), place)
-            for copy, rotation in copies.items()
-        },
-        cones=(pseudo_inertia(),),
-    )  # fmt: skip
-
-
 def shared_number(
     kind: Kind,
     name: str,
@@ -142,32 +83,18 @@ def shared_number(
     scale: float,
     path: Key,
     *,
-    bodies: Mapping[str, Array] | None = None,
     others: Sequence[str] = (),
     signed: bool = False,
 ) -> Shared:
     """One number of a file, not negative unless ``signed``.
 
-    :param bodies: by body the ten numbers about the base's origin that a unit of it gives, (10,).
     :param others: rods' and joints' parameters that are this number.
     """
     return Shared(
         kind, name, (name,), (unit,), np.array([value]), np.array([scale]),
         lambda new: {path: float(new[0])},
-        {body: ten.reshape(10, 1) for body, ten in (bodies or {}).items()},
-        {other: np.ones(1) for other in others},
-        () if signed else (above_zero(0, 1),),
-    )  # fmt: skip
-
-
-def shared_payload(
-    graph: Graph, mass: float, com: Array, inertia: Array, mass_scale: float, length: float
-) -> Shared:
-    """The payload section of a file, as a part of the platform."""
-    body = Body("payload", mass, graph.origin + com, inertia)
-    return shared_body(
-        "payload", body, ("payload",), {graph.platform: np.eye(3)}, kind="payload",
-        origin=graph.origin, mass_scale=max(mass, mass_scale), length=length,
+        others={other: np.ones(1) for other in others},
+        cones=() if signed else (above_zero(0, 1),),
     )  # fmt: skip
 
 
@@ -185,27 +112,6 @@ def friction_number(graph: Graph, joint: str, key: str, value: float, path: Key)
         "friction", name, drive_units(graph, joint)[key], value, math.nan, path, others=[name],
         signed=all_keys()[key].at_least is None,
     )  # fmt: skip
-
-
-def point_mass(place: Array) -> Array:
-    """Ten numbers of a kilogram at a place, shape (10,)."""
-    return ten_numbers(1.0, place, np.zeros((3, 3)))
-
-
-def bar(pivot: Array, along: Array) -> Array:
-    """Ten numbers by mass, first and second moment along a line from a pivot, shape (10, 3).
-
-    Kg, kg m, kg m2; a bar without thickness, ``along`` of length one.
-    """
-    across = np.eye(3) - np.outer(along, along)
-    local = np.array(
-        [
-            [1.0, 0, 0, 0, 0, 0, 0, 0, 0, 0],
-            [0.0, *along, 0, 0, 0, 0, 0, 0],
-            [0.0, 0, 0, 0, *np.diag(across), across[0, 1], across[0, 2], across[1, 2]],
-        ]
-    )
-    return np.asarray(transport(np.eye(3), pivot) @ local.T, np.float64)
 
 
 def behind_gear(reflected: Shared, turns: float) -> Callable[[Array], Mapping[Key, float]]:

@@ -34,12 +34,10 @@ from pkm_twin.kinematics.motion import cross
 from pkm_twin.kinematics.pose import COORDINATES, Coordinate
 from pkm_twin.machine import schema
 from pkm_twin.machine.graph import BASE, PLATFORM, UP, Body, Direction, Graph, Joint, Rod, array
-from pkm_twin.machine.inertia import ten_numbers
 from pkm_twin.machine.joints import unit
 from pkm_twin.machine.members import Beam, Structure, axial, disc
 from pkm_twin.machine.pose_grid import PoseGrid
 from pkm_twin.machine.sections import shared_middle
-from pkm_twin.machine.shared import Key, Shared, above_zero, bar, point_mass, shared_number
 from pkm_twin.mechanisms import TwinRobot
 from pkm_twin.mechanisms.delta_file import Geometry, Inertia, Members
 from pkm_twin.robot.mechanism import Inverse
@@ -273,7 +271,8 @@ class Delta(TwinRobot):
 
     def make_graph(self) -> Graph:
         """Arms on the base, forearms as parallelograms or on an rcu's joints, a platform."""
-        g, m = self.geometry, self.inertia
+        g = self.geometry
+        m: Any = self.spelled.inertia
         q, platform = self._home
         rotor = self.reflected_rotor(m.rotor_inertia, slides=False)
         bodies: dict[str, Body] = {}
@@ -285,9 +284,8 @@ class Delta(TwinRobot):
             arm, forearm = f"arm {limb}", f"forearm {limb}"
             pivot = array(g.base_radius * out)
             lever = plain(self._elbow(i, q[i])) - pivot
-            about = m.arm_mass * g.arm_length**2 / 12 if m.arm_inertia is None else m.arm_inertia
             bodies[arm] = Body(
-                arm, m.arm_mass, array(pivot + m.arm_com * lever), _thin(about, lever)
+                arm, m.arm_mass, array(pivot + m.arm_com * lever), _thin(m.arm_inertia, lever)
             )
             fixed = tuple(
                 Direction(name, BASE, array(v)) for name, v in (("r", out), ("t", along), ("z", UP))
@@ -328,57 +326,13 @@ class Delta(TwinRobot):
         )
         return Graph(bodies, {**joints, **sliding}, rods, PLATFORM, array(platform))
 
-    def shared_inertia(self) -> tuple[Shared, ...]:
-        """One arm, one forearm, one platform; the limbs are alike in this file."""
-        g, m, graph = self.geometry, self.inertia, self.graph
-        reach = g.arm_length
-        about = m.arm_mass * reach**2 / 12 if m.arm_inertia is None else m.arm_inertia
-        moment = m.arm_mass * m.arm_com * reach
-        values = np.array([m.arm_mass, moment, about + moment * m.arm_com * reach])
-        arms, forearms = {}, {}
-        for i, limb in enumerate(LIMBS):
-            pivot = graph.joints[self.joints[i]].at
-            lever = np.asarray(self._elbow(i, self._home[0][i]), float) - pivot
-            arms[f"arm {limb}"] = bar(pivot, lever / reach)
-            forearm = graph.bodies.get(f"forearm {limb}")
-            if forearm is not None:
-                unit = _thin(g.forearm_length**2 / 12, self._forearm(i, *self._at_home(i)))
-                forearms[forearm.name] = ten_numbers(1.0, forearm.com, unit)
-        # Positive masses along the arm, none beyond its end.
-        line = np.zeros((2, 2, 3))
-        line[0, 0, 0] = line[0, 1, 1] = line[1, 0, 1] = line[1, 1, 2] = 1.0
-        end = np.array([reach, -1.0, 0.0]).reshape(1, 1, 3)
-
-        def keys(new: Array) -> dict[Key, float]:
-            mass, first, second = (float(v) for v in new)
-            return {
-                ("inertia", "arm_mass"): mass,
-                ("inertia", "arm_com"): min(1.0, max(0.0, first / (mass * reach))),
-                ("inertia", "arm_inertia"): max(0.0, second - first**2 / mass),
-            }
-
-        arm = Shared(
-            "inertia", "arm", ("arm.mass", "arm.moment", "arm.inertia"), ("kg", "kg m", "kg m2"),
-            values, m.arm_mass * np.array([1.0, reach, reach**2]), keys, arms,
-            cones=(line, above_zero(1, 3), end),
-        )  # fmt: skip
-        rods = [f"{name}.mass" for name in graph.rods]
-        where = point_mass(graph.origin)
-        return (
-            arm,
-            shared_number(
-                "inertia", "forearm.mass", "kg", m.forearm_mass, m.forearm_mass,
-                ("inertia", "forearm_mass"), bodies=forearms, others=rods,
-            ),
-            shared_number(
-                "inertia", "platform.mass", "kg", m.platform_mass, m.platform_mass,
-                ("inertia", "platform_mass"), bodies={PLATFORM: where},
-            ),
-        )  # fmt: skip
-
-    def _at_home(self, i: int) -> tuple[float, Array]:
-        q, platform = self._home
-        return float(q[i]), platform
+    @property
+    def spelled(self) -> Delta:
+        """With the arms' inertia: of even bars."""
+        m = self.inertia
+        bar = m.arm_mass * self.geometry.arm_length**2 / 12
+        given = bar if m.arm_inertia is None else m.arm_inertia
+        return self._with(inertia=replace(m, arm_inertia=given))
 
     @cached_property
     def beams(self) -> tuple[Beam, ...]:

@@ -27,7 +27,6 @@ from pkm_twin.machine.graph import BASE, PLATFORM, UP, Body, Graph, Joint, Rod, 
 from pkm_twin.machine.members import disc
 from pkm_twin.machine.pose_grid import PoseGrid
 from pkm_twin.machine.sections import check_azimuths, length, mass
-from pkm_twin.machine.shared import Shared, point_mass, shared_number
 from pkm_twin.mechanisms import TwinRobot
 
 LIMBS: Final = ("a", "b", "c")
@@ -127,23 +126,3 @@ class LinearDelta(TwinRobot):
             "translation", "translation", BASE, PLATFORM, array(np.zeros(3)), given=True
         )
         return Graph(bodies, joints, rods, PLATFORM, array(np.zeros(3)))
-
-    def shared_inertia(self) -> tuple[Shared, ...]:
-        """One carriage, one rod pair, one platform; the towers are alike in this file."""
-        m, graph = self.inertia, self.graph
-        carriages = {f"carriage {limb}" for limb in LIMBS}
-        return (
-            shared_number(
-                "inertia", "platform.mass", "kg", m.platform_mass, m.platform_mass,
-                ("inertia", "platform_mass"), bodies={PLATFORM: point_mass(graph.origin)},
-            ),
-            shared_number(
-                "inertia", "carriage.mass", "kg", m.carriage_mass, m.carriage_mass,
-                ("inertia", "carriage_mass"),
-                bodies={name: point_mass(graph.bodies[name].com) for name in sorted(carriages)},
-            ),
-            shared_number(
-                "inertia", "rod.mass", "kg", m.rod_mass, m.platform_mass, ("inertia", "rod_mass"),
-                others=[f"{name}.mass" for name in graph.rods],
-            ),
-        )  # fmt: skip

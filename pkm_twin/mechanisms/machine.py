@@ -26,11 +26,8 @@ from pkm_twin.machine import schema
 from pkm_twin.machine.friction import linear_keys
 from pkm_twin.machine.graph import (
     BASE,
-    Body,
     Graph,
-    array,
     limb_numbers,
-    rotation_about_z,
 )
 from pkm_twin.machine.graph_file import (
     KINDS,
@@ -63,7 +60,6 @@ from pkm_twin.machine.shared import (
     behind_gear,
     drive_units,
     friction_number,
-    shared_body,
     shared_number,
 )
 from pkm_twin.machine.uncertainty import UncertaintyEntry
@@ -329,40 +325,18 @@ class Machine(TwinRobot):
             result.append(one)
         return tuple(result)
 
-    def shared_inertia(self) -> tuple[Shared, ...]:
-        """Every body with a mass and every rod, one for all copies of a limb."""
-        groups: dict[Key, list[str]] = {}
+    def mass_keys(self) -> Iterator[Key]:
+        """Of every body with a mass and every rod, once for all copies of a limb."""
+        found: dict[Key, None] = {}
         for kind, entries in (("bodies", self.graph.bodies), ("rods", self.graph.rods)):
             for name, entry in entries.items():
+                path = self.sources[kind, name].path
                 if entry.mass > 0.0:
-                    groups.setdefault(self.sources[kind, name].path, []).append(name)
-        return tuple(self._shared_group(path, names) for path, names in groups.items())
-
-    def _shared_group(self, path: Key, names: list[str]) -> Shared:
-        kind = "rods" if names[0] in self.graph.rods else "bodies"
-        first = self.sources[kind, names[0]]
-        alone = names[0] if len(names) == 1 else first.name
-        if kind == "rods":
-            mass = self.graph.rods[names[0]].mass
-            return shared_number(
-                "inertia", f"{alone}.mass", "kg", mass, mass, (*path, "mass"),
-                others=[f"{name}.mass" for name in names],
-            )  # fmt: skip
-        body = self.graph.bodies[names[0]]
-        turned = rotation_about_z(first.azimuth).T
-        own = Body(alone, body.mass, array(turned @ body.com), turned @ body.inertia @ turned.T)
-        return shared_body(
-            alone, own, path,
-            {name: rotation_about_z(self.sources[kind, name].azimuth) for name in names},
-            length=self._length_of(names[0]),
-        )  # fmt: skip
-
-    def _length_of(self, name: str) -> float:
-        """A body's extent: greatest distance of its joints and rods from its centre, m."""
-        graph, body = self.graph, self.graph.bodies[name]
-        points = graph.joint_points(name)
-        far = max((float(np.linalg.norm(p - body.com)) for p in points), default=0.0)
-        return far if far > 1e-3 * graph.size else 0.1 * graph.size
+                    found |= dict.fromkeys([(*path, "mass")])
+                if entry.mass > 0.0 and kind == "bodies":
+                    found |= dict.fromkeys((*path, "com", i) for i in range(3))
+                    found |= dict.fromkeys((*path, "inertia", *ij) for ij in np.ndindex(3, 3))
+        return iter(found)
 
     @cached_property
     def beams(self) -> tuple[Beam, ...]:

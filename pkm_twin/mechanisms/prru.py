@@ -44,19 +44,9 @@ from pkm_twin.kinematics.motion import Motion
 from pkm_twin.kinematics.pose import COORDINATES, Coordinate, about_x, about_y
 from pkm_twin.machine import schema
 from pkm_twin.machine.graph import BASE, PLATFORM, UP, Body, Direction, Graph, Joint, array
-from pkm_twin.machine.inertia import transport
 from pkm_twin.machine.members import Beam, Structure, Tube, axial, disc
 from pkm_twin.machine.pose_grid import PoseGrid
 from pkm_twin.machine.sections import check_azimuths, length, mass, shared_middle
-from pkm_twin.machine.shared import (
-    Key,
-    Shared,
-    above_zero,
-    bar,
-    point_mass,
-    shared_body,
-    shared_number,
-)
 from pkm_twin.mechanisms import TwinRobot
 from pkm_twin.robot.mechanism import Inverse
 from pkm_twin.robot.robot import SINGULARITY_BOUND
@@ -298,12 +288,11 @@ class Prru(TwinRobot):
 
     def make_graph(self) -> Graph:
         """Sliders, links and platform, level."""
-        g, m = self.geometry, self.inertia
+        g = self.geometry
+        m: Any = self.spelled.inertia
         height = self.chosen_home() if self.home_joint is None else self.home_joint
         l = g.limb_length  # noqa: E741
-        thin = np.array([l**2 / 12, 0.0])
-        lower = m.lower_link_mass * thin if m.lower_link_inertia is None else m.lower_link_inertia
-        upper = m.upper_link_mass * thin if m.upper_link_inertia is None else m.upper_link_inertia
+        lower, upper = m.lower_link_inertia, m.upper_link_inertia
         rotor = self.reflected_rotor(m.rotor_inertia, slides=True)
         bodies: dict[str, Body] = {}
         joints: dict[str, Joint] = {}
@@ -332,87 +321,24 @@ class Prru(TwinRobot):
             ):
                 full = f"{label} {limb}"
                 joints[full] = Joint(full, kind, *pair, at, array(axes), directions=along)
-        own = disc(m.platform_mass, g.platform_radius)
-        inertia = own if m.platform_inertia is None else m.platform_inertia
         bodies[PLATFORM] = Body(
-            PLATFORM, m.platform_mass, array(origin + m.platform_com), array(inertia)
+            PLATFORM, m.platform_mass, array(origin + m.platform_com), array(m.platform_inertia)
         )
         return Graph(bodies, joints, {}, PLATFORM, origin)
 
-    def shared_inertia(self) -> tuple[Shared, ...]:
-        """One slider, one pair of links, the platform; the limbs are alike in this file.
-
-        The two links of a limb tell their masses apart by nothing but each other's spin: their
-        moments along the limb are one parameter each, as their file's ``link_com`` is one.
-        """
-        m, graph = self.inertia, self.graph
-        l = self.geometry.limb_length  # noqa: E741
-        sliders, lower, upper = {}, {}, {}
-        for limb in LIMBS:
-            foot = graph.bodies[f"slider {limb}"].com
-            head = graph.joints[f"platform joint {limb}"].at
-            d = (head - foot) / l
-            line, spin = bar(foot, d), transport(np.eye(3), foot) @ _spin(d)
-            none = np.zeros(10)
-            sliders[f"slider {limb}"] = point_mass(foot)
-            lower[f"lower link {limb}"] = np.stack(
-                [line[:, 0], none, line[:, 1], line[:, 2], spin, none], -1
-            )
-            upper[f"upper link {limb}"] = np.stack([none, line[:, 0], none, none, none, spin], -1)
-        com = m.link_com * l
-        thin = np.array([l**2 / 12, 0.0])
-        pair = [
-            mass * thin if given is None else given
-            for mass, given in (
-                (m.lower_link_mass, m.lower_link_inertia),
-                (m.upper_link_mass, m.upper_link_inertia),
-            )
-        ]
-        both = m.lower_link_mass + m.upper_link_mass
-        across = pair[0][0] + pair[1][0]
-        share = pair[0][0] / across if across > 0.0 else 0.5
-        values = np.array(
-            [
-                m.lower_link_mass, m.upper_link_mass, both * com, across + both * com**2,
-                pair[0][1], pair[1][1],
-            ]
-        )  # fmt: skip
-        line = np.zeros((2, 2, 6))
-        line[0, 0, 0] = line[0, 0, 1] = line[0, 1, 2] = line[1, 0, 2] = line[1, 1, 3] = 1.0
-        end = np.array([l, l, -1.0, 0.0, 0.0, 0.0]).reshape(1, 1, 6)
-
-        def keys(new: Array) -> dict[Key, float]:
-            first, second, moment, about, *own = (float(v) for v in new)
-            rest = max(about - moment**2 / (first + second), sum(own) / 2)
-            return {
-                ("inertia", "lower_link_mass"): first,
-                ("inertia", "upper_link_mass"): second,
-                ("inertia", "link_com"): min(1.0, max(0.0, moment / ((first + second) * l))),
-                ("inertia", "lower_link_inertia", 0): share * rest,
-                ("inertia", "lower_link_inertia", 1): own[0],
-                ("inertia", "upper_link_inertia", 0): (1.0 - share) * rest,
-                ("inertia", "upper_link_inertia", 1): own[1],
-            }
-
-        names = ("lower.mass", "upper.mass", "moment", "inertia", "lower.axial", "upper.axial")
-        links = Shared(
-            "inertia", "links", tuple(f"links.{name}" for name in names),
-            ("kg", "kg", "kg m", *["kg m2"] * 3), values,
-            both * np.array([1.0, 1.0, l, l**2, 0.01 * l**2, 0.01 * l**2]), keys,
-            lower | upper, cones=(line, *(above_zero(k, 6) for k in (0, 1, 2, 4, 5)), end),
-        )  # fmt: skip
-        return (
-            shared_number(
-                "inertia", "slider.mass", "kg", m.slider_mass, m.slider_mass,
-                ("inertia", "slider_mass"), bodies=sliders,
-            ),
-            links,
-            shared_body(
-                PLATFORM, graph.bodies[PLATFORM], ("inertia",), {PLATFORM: np.eye(3)},
-                words=("platform_mass", "platform_com", "platform_inertia"), origin=graph.origin,
-                length=self.geometry.platform_radius,
-            ),
-        )  # fmt: skip
+    @property
+    def spelled(self) -> Prru:
+        """With the inertias of links, thin rods, and of the platform, a disc."""
+        g, m = self.geometry, self.inertia
+        thin = np.array([g.limb_length**2 / 12, 0.0])
+        usual: dict[str, Any] = {
+            "lower_link_inertia": m.lower_link_mass * thin,
+            "upper_link_inertia": m.upper_link_mass * thin,
+            "platform_inertia": disc(m.platform_mass, g.platform_radius),
+        }
+        left = {name: value for name, value in usual.items() if getattr(m, name) is None}
+        made: Prru = self._with(inertia=replace(m, **left))
+        return made
 
     @cached_property
     def beams(self) -> tuple[Beam, ...]:
@@ -442,14 +368,6 @@ class Prru(TwinRobot):
         spread = (m.lower_link_mass + m.upper_link_mass) / self.geometry.limb_length
         section = self.members.limb.section(spread, "members.limb")
         return Structure(self.beams, {beam.name: section for beam in self.beams}, {})
-
-
-def _spin(along: Array) -> Array:
-    """Ten numbers of a kg m2 about an axis alone, shape (10,)."""
-    turned = np.outer(along, along)
-    return np.array(
-        [0.0, 0, 0, 0, *np.diag(turned), turned[0, 1], turned[0, 2], turned[1, 2]], np.float64
-    )
 
 
 def _named(body: str, **vectors: Array) -> tuple[Direction, ...]:

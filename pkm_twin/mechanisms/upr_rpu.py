@@ -41,11 +41,9 @@ from pkm_twin.kinematics.engine import Engine
 from pkm_twin.kinematics.pose import COORDINATES, Coordinate, about_x, about_y
 from pkm_twin.machine import schema
 from pkm_twin.machine.graph import BASE, PLATFORM, Body, Direction, Graph, Joint, array
-from pkm_twin.machine.inertia import ten_numbers
 from pkm_twin.machine.members import Beam, Section, Structure, axial, disc
 from pkm_twin.machine.pose_grid import PoseGrid
 from pkm_twin.machine.sections import shared_middle
-from pkm_twin.machine.shared import Shared, shared_body, shared_number
 from pkm_twin.mechanisms import TwinRobot
 from pkm_twin.mechanisms.upr_rpu_file import Geometry, Inertia, JointsCompliance, Limits, Members
 from pkm_twin.robot.mechanism import Inverse
@@ -300,7 +298,7 @@ class UprRpu(TwinRobot):
         origin = array([0.0, 0.0, self._height])
         bodies: dict[str, Body] = {}
         joints: dict[str, Joint] = {}
-        inertia = self.inertia
+        inertia: Any = self.spelled.inertia
         given = 0.0 if inertia is None else inertia.rotor_inertia
         rotor = self.reflected_rotor(given, slides=True)
         for i, limb in enumerate("123"):
@@ -338,39 +336,18 @@ class UprRpu(TwinRobot):
         if inertia is None:
             bodies[PLATFORM] = Body(PLATFORM, 0.0, origin)
         else:
-            own = inertia.platform_inertia
-            turning_inertia = disc(inertia.platform_mass, a) if own is None else own
-            bodies[PLATFORM] = Body(
-                PLATFORM, inertia.platform_mass, array(origin + inertia.platform_com),
-                array(turning_inertia),
-            )  # fmt: skip
+            com, about = origin + inertia.platform_com, inertia.platform_inertia
+            bodies[PLATFORM] = Body(PLATFORM, inertia.platform_mass, array(com), array(about))
         return Graph(bodies, joints, {}, PLATFORM, origin)
 
-    def shared_inertia(self) -> tuple[Shared, ...]:
-        """The bars' density and the platform.
-
-        :raises ParameterError: the robot's file gives no masses.
-        """
-        # The engine's own graph may be that of a machine with other masses.
-        self.massive()
-        graph, inertia = self.graph, self.inertia
-        assert inertia is not None  # noqa: S101
-        tubes = {
-            name: ten_numbers(body.mass, body.com, body.inertia) / inertia.density
-            for name, body in graph.bodies.items()
-            if name != PLATFORM
-        }
-        return (
-            shared_number(
-                "inertia", "bars.density", "kg/m3", inertia.density, inertia.density,
-                ("inertia", "density"), bodies=tubes,
-            ),
-            shared_body(
-                PLATFORM, graph.bodies[PLATFORM], ("inertia",), {PLATFORM: np.eye(3)},
-                words=("platform_mass", "platform_com", "platform_inertia"), origin=graph.origin,
-                length=self._radii[0],
-            ),
-        )  # fmt: skip
+    @property
+    def spelled(self) -> UprRpu:
+        """With the platform's inertia, of a disc."""
+        m = self.inertia
+        if m is None or m.platform_inertia is not None:
+            return self
+        usual = disc(m.platform_mass, self.geometry.platform_radius)
+        return self._with(inertia=replace(m, platform_inertia=usual))
 
     def _tube(self, name: str, i: int, reach: float, d: Array, com: Array) -> Body:
         """A round bar of half the limb."""

@@ -231,6 +231,17 @@ class Mechanism:
         """Rotor and gear of each actuated joint, None where the file does not give them."""
         return (self.drive,) * self.joints_count
 
+    @property
+    def spelled(self: R) -> R:
+        """The same with every inertia that its file may leave out."""
+        return self
+
+    def mass_keys(self) -> Iterator[tuple[Key, ...]]:
+        """Where its file has masses, centres and inertias, of one that is :attr:`spelled` out."""
+        for name, value in self.parameter_sections()["inertia"].items():
+            if name != "rotor_inertia":
+                yield from (("inertia", name, *index) for index in np.ndindex(np.shape(value)))
+
     def reflected_rotor(self, given: float, slides: bool) -> float:
         """Rotor inertia at the joints, kg m2 or kg: of the file's ``drive``, else as given.
 

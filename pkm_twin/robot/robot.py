@@ -38,7 +38,6 @@ from pkm_twin.machine.shared import (
     drive_units,
     friction_number,
     shared_number,
-    shared_payload,
 )
 from pkm_twin.robot.mechanism import Mechanism
 
@@ -79,13 +78,6 @@ class Robot(Mechanism):
     Frozen; :meth:`changed` gives a copy with other parameters.
     """
 
-    def shared_inertia(self) -> tuple[Shared, ...]:
-        """What the file says of masses, as linear parameters.
-
-        :raises ParameterError: the robot's file gives no masses.
-        """
-        raise NotImplementedError
-
     def shared_drives(self) -> tuple[Shared, ...]:
         """Friction of each actuated joint and the rotors, as linear parameters of the file."""
         graph, friction = self.graph, self.friction
@@ -104,19 +96,6 @@ class Robot(Mechanism):
         if drive is not None:
             rotor = dataclasses.replace(rotor, keys=behind_gear(rotor, drive.turns))
         return (*result, rotor)
-
-    def shared_parameters(self) -> tuple[Shared, ...]:
-        """All that a fit of the robot's file may change: drives, payload, bodies and rods.
-
-        :raises ParameterError: the robot's file gives no masses.
-        """
-        # The engine's own graph may be that of a machine with other masses.
-        self.massive()
-        graph, load = self.graph, self.payload
-        masses = [body.mass for body in graph.bodies.values()]
-        heavy = max(graph.bodies[graph.platform].mass, 0.1 * sum(masses))
-        payload = shared_payload(graph, load.mass, load.com, load.inertia, heavy, 0.3 * graph.size)
-        return (*self.shared_drives(), payload, *self.shared_inertia())
 
     @cached_property
     def engine(self) -> Engine:

@@ -13,6 +13,7 @@ from delta_dynamics import inverse_dynamics
 from pkm_twin.bags.reader import open_bag
 from pkm_twin.robot.edited import robot_text
 from pkm_twin.robot.entries import entries, with_entries
+from pkm_twin.robot.identifiable import shared_parameters
 from stiffness_monitor import compliance
 from test.commands.conftest import DELTA, STIFFNESS, rewrite
 from test.laws.recordings import smooth_motion
@@ -154,7 +155,7 @@ def test_copies_of_a_limb_keep_elastic_parts_and_the_joint_map(tmp_path):
     for other in (written, load(str(out))):
         assert other.controller.offsets == pytest.approx(robot.controller.offsets)
         assert other.controller.factors == pytest.approx(robot.controller.factors)
-        assert len(other.shared_parameters()) > len(robot.shared_parameters())
+        assert len(shared_parameters(other)) > len(shared_parameters(robot))
         expected = compliance(robot, robot.home())
         assert compliance(other, other.home()) == pytest.approx(expected, rel=1e-9)
     again = with_entries(robot, {"origin[2]": entries(robot)["origin[2]"][0]})

@@ -16,6 +16,9 @@ from delta_dynamics import (
 )
 from delta_dynamics.base_parameters import random_states
 from pkm_twin import Robot
+from pkm_twin.identification.estimation import possible
+from pkm_twin.identification.parameters import file_parameters
+from pkm_twin.machine.places import path_of
 from pkm_twin.robot.catalogue import robot_of_data
 from test.machine.random_machines import NAMES, variant
 from test.support.robots import load, loaded, massive, random_motion
@@ -41,6 +44,31 @@ def test_regressor_times_parameters_is_inverse_dynamics(name):
     assert error.max() < 1e-12
     # Without a wrench its column is nothing.
     assert not regressor(robot, q[0], qd[0], qdd[0])[:, -1].any()
+
+
+@massive
+def test_numbers_of_a_file_are_linear_parameters(name):
+    """A file with other masses, centres and inertias needs the efforts that are linear in them."""
+    robot, rng = complete(name), np.random.default_rng(2)
+    parameters = file_parameters(robot)
+    values, numbers = parameters.values.copy(), {}
+    for where, group in zip(parameters.slices, parameters.groups, strict=True):
+        step = 0.3 * np.nan_to_num(group.scales) * rng.normal(size=len(group.names))
+        new = 1.2 * group.values + step
+        while not possible(new, [(slice(None), cone) for cone in group.cones]):
+            step *= 0.5
+            new = 1.2 * group.values + step
+        if group.kind in ("payload", "inertia"):
+            values[where] = new
+            for key, value in group.keys(new).items():
+                numbers[path_of(key)] = value
+                if isinstance(key[-2], int):
+                    numbers[path_of((*key[:-2], key[-1], key[-2]))] = value
+    q, qd, qdd, _ = random_motion(robot, rng, 10)
+    table = regressor(robot, q, qd, qdd) @ parameters.mixing
+    for other, own in ((robot, parameters.values), (robot.spelled.numbered(numbers), values)):
+        efforts = inverse_dynamics(other, q, qd, qdd)
+        assert np.abs(table @ own - efforts).max() < 1e-12 * np.abs(efforts).max()
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,258 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Numbers of a robot's file that efforts identify, as linear parameters, by exact derivatives.
+
+Efforts are linear in ten numbers of each body about a fixed point. About the centre of mass that
+the file has, these ten change in proportion to masses and inertias of the file, and to its centres
+times the mass; what is left, the inertia about the centre that has moved, is the parallel axis
+theorem. So the derivatives of the bodies by the file's numbers tell the parameters of any file.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Final
+
+import numpy as np
+
+from pkm_twin.codegen.arrays import Array, Indices
+from pkm_twin.machine.inertia import ten_numbers, transport
+from pkm_twin.machine.places import path_of
+from pkm_twin.machine.shared import Key, Shared, above_zero, pseudo_inertia
+from pkm_twin.robot.numbers import FileNumbers
+from pkm_twin.robot.robot import Robot
+
+LOAD: Final = "payload"
+"""Name of the payload among the bodies."""
+UPPER: Final = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+"""Entries of an inertia matrix among ten numbers."""
+EMPTY: Final = 1e-12
+"""Part of the greatest entry below which one is zero."""
+LONG: Final = 0.3
+"""Of the machine's size: a length of the payload; and where a body has no joint apart, a third."""
+
+
+def shared_parameters(robot: Robot) -> tuple[Shared, ...]:
+    """All that a fit of the robot's file may change: drives, payload, bodies and rods.
+
+    :raises ParameterError: the robot's file gives no masses.
+    """
+    # The engine's own graph may be that of a machine with other masses.
+    robot.massive()
+    numbers = _Numbers(robot.spelled)
+    return (*robot.shared_drives(), *numbers.groups())
+
+
+def _tens(robot: Robot) -> list[Any]:
+    """Ten numbers of each body and of the payload about the base's origin, masses of rods."""
+    graph, load = robot.make_graph(), robot.payload
+    bodies = [*graph.bodies.values()]
+    tens = [ten_numbers(body.mass, body.com, body.inertia) for body in bodies]
+    tens.append(ten_numbers(load.mass, graph.origin + load.com, load.inertia))
+    return [*(value for ten in tens for value in ten), *(rod.mass for rod in graph.rods.values())]
+
+
+@dataclass(frozen=True, eq=False)
+class _Numbers:
+    """Masses, centres and inertias of a file that gives all of them, k in all."""
+
+    robot: Robot
+
+    @cached_property
+    def keys(self) -> tuple[Key, ...]:
+        """Where they stand; of an inertia matrix the upper half."""
+        load = [(LOAD, "mass"), *((LOAD, "com", i) for i in range(3))]
+        load += [(LOAD, "inertia", i, j) for i in range(3) for j in range(3)]
+        return tuple(
+            key
+            for key in (*load, *self.robot.mass_keys())
+            if not isinstance(key[-2], int) or int(key[-2]) <= int(key[-1])
+        )
+
+    @cached_property
+    def words(self) -> list[str]:
+        """What each is: ``mass``, ``density``, ``com`` or ``inertia``."""
+        named = ([k for k in key if isinstance(k, str)][-1] for key in self.keys)
+        return [name.rpartition("_")[2] for name in named]
+
+    @cached_property
+    def places(self) -> dict[str, Indices]:
+        """Where masses and densities, centres and inertias are among them."""
+        masses = [word in ("mass", "density") for word in self.words]
+        others = {w: [word == w for word in self.words] for w in ("com", "inertia")}
+        return {w: np.flatnonzero(rows) for w, rows in {"mass": masses, **others}.items()}
+
+    @cached_property
+    def values(self) -> Array:
+        """The file's, shape (k,)."""
+        return np.array([self.robot.number(path_of(key)) for key in self.keys])
+
+    @cached_property
+    def reference(self) -> Array:
+        """The same with masses above zero, shape (k,): as much as each may be off."""
+        values, masses = self.values.copy(), self.places["mass"]
+        bodies = self.robot.graph.bodies
+        heavy = max(
+            bodies[self.robot.graph.platform].mass, 0.1 * sum(b.mass for b in bodies.values())
+        )
+        least = [heavy if self.keys[k][0] == LOAD else 0.0 for k in masses]
+        values[masses] = np.maximum(values[masses], least)
+        values[masses[values[masses] == 0.0]] = heavy
+        return values
+
+    @cached_property
+    def slopes(self) -> Array:
+        """Derivatives of :func:`_tens` at the reference, shape (rows, k)."""
+        paths, tied = [], []
+        for k, key in enumerate(self.keys):
+            mirrored = (*key[:-2], key[-1], key[-2]) if isinstance(key[-2], int) else key
+            for one in dict.fromkeys((key, mirrored)):
+                paths.append(path_of(one))
+                tied.append(np.eye(len(self.keys))[k])
+        made, tie = FileNumbers(self.robot, paths, _tens), np.array(tied)
+        return np.asarray(made.slopes_at((tie @ self.reference)[None])[0] @ tie, np.float64)
+
+    def groups(self) -> Iterator[Shared]:
+        """Numbers that move the same bodies, together."""
+        graph, load = self.robot.graph, self.robot.payload
+        coms = [body.com for body in graph.bodies.values()] + [graph.origin + load.com]
+        tens = self.slopes[: 10 * len(coms)].reshape(len(coms), 10, -1)
+        rods = self.slopes[10 * len(coms) :]
+        moved = [transport(np.eye(3), -com) @ ten for com, ten in zip(coms, tens, strict=True)]
+        own = np.array(moved)
+        own[np.abs(own) < EMPTY * np.abs(own).max((1, 2), keepdims=True, initial=1e-300)] = 0.0
+        touched = np.vstack([own.any(1), rods != 0.0]).astype(int)
+        linked = np.linalg.matrix_power((touched.T @ touched > 0).astype(float), 4) > 0.0
+        names = [*graph.bodies, LOAD]
+        for row in dict.fromkeys(tuple(np.flatnonzero(one).tolist()) for one in linked):
+            if row:
+                yield self._group(np.array(row), names, tens, own, rods)
+
+    def _group(
+        self, chosen: Indices, names: list[str], tens: Array, own: Array, rods: Array
+    ) -> Shared:
+        """One of them.
+
+        :param own: ten numbers of the bodies about the file's centres of mass, (bodies, 10, k).
+        """
+        graph, keys = self.robot.graph, [self.keys[k] for k in chosen]
+        inside = [b for b in range(len(names)) if own[b][:, chosen].any()]
+        places = {w: np.flatnonzero(np.isin(chosen, k)) for w, k in self.places.items()}
+        masses, coms = places["mass"], places["com"]
+        part = _Part(
+            tuple(keys), self.values[chosen], self.reference[chosen],
+            own[inside][:, :, chosen], masses, coms, places["inertia"],
+        )  # fmt: skip
+        values = part.values.copy()
+        values[coms] = 0.0
+        scales = part.reference.copy()
+        if inside:
+            far = [_length(self.robot, names[b]) for b in inside]
+            for k in (*coms, *places["inertia"]):
+                b = int(np.flatnonzero(part.own[:, :, k].any(1))[0])
+                mass = part.own[b, 0] @ part.reference
+                away = np.linalg.norm(part.own[b, 1:4, k]) / mass
+                scales[k] = far[b] / away if k in coms else mass * far[b] ** 2
+        units = [_unit(self.words[k], self.keys[k]) for k in chosen]
+        payload = keys[0][0] == LOAD
+        return Shared(
+            "payload" if payload else "inertia", path_of(keys[0]), tuple(map(path_of, keys)),
+            tuple(units), values, scales, part.numbers,
+            {graph.platform if payload else names[b]: tens[b][:, chosen] for b in inside},
+            {f"{rod}.mass": row[chosen] for rod, row in zip(graph.rods, rods, strict=True)
+             if row[chosen].any()},
+            tuple(part.cones()),
+        )  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class _Part:
+    """Numbers that move the same bodies, and ten numbers of these by them, (bodies, 10, k)."""
+
+    keys: tuple[Key, ...]
+    values: Array
+    reference: Array
+    own: Array
+    masses: Indices
+    coms: Indices
+    inertias: Indices
+
+    def numbers(self, new: Array) -> Mapping[Key, float]:
+        """The file's numbers by parameters: masses and inertias, and centres times the mass."""
+        result, change = new.copy(), new[self.coms]
+        whole = float(new[self.masses].sum())
+        before = float(self.reference[self.masses].sum())
+        change = change * before / whole if whole > 0.0 else 0.0 * change
+        result[self.coms] = self._within(self.values[self.coms] + change)
+        if len(self.coms) and len(self.inertias):
+            change = result[self.coms] - self.values[self.coms]
+            usual, mass = (
+                self.own[:, 0, self.masses] @ v[self.masses] for v in (self.reference, new)
+            )
+            away = self.own[:, 1:4, self.coms] @ change / usual[:, None]
+            table, target = self.own[:, 4:, self.inertias], []
+            for m, d, rows in zip(mass, away, table, strict=True):
+                about = m * (d @ d * np.eye(3) - np.outer(d, d))
+                target.append(rows @ new[self.inertias] - [about[i, j] for i, j in UPPER])
+            flat = table.reshape(-1, len(self.inertias))
+            found = np.linalg.lstsq(flat, np.concatenate(target), rcond=None)[0]
+            result[self.inertias] = _possible(found) if whole > 0.0 else 0.0
+        return dict(zip(self.keys, result.tolist(), strict=True))
+
+    def _within(self, centres: Array) -> Array:
+        """Centres that are parts of a length are within it."""
+        parts = self._parts()
+        return np.where(parts, np.clip(centres, 0.0, 1.0), centres)
+
+    def _parts(self) -> list[bool]:
+        return [not isinstance(self.keys[k][-1], int) for k in self.coms]
+
+    def cones(self) -> Iterator[Array]:
+        """Matrices that have to be positive semidefinite, (d, d, k) each."""
+        count, total = len(self.keys), np.zeros(len(self.keys))
+        total[self.masses] = 1.0
+        if not len(self.coms):
+            yield from (above_zero(k, count) for k in self.masses)
+            return
+        for k, part in zip(self.coms, self._parts(), strict=True):
+            if part:
+                once = np.eye(count)[k] * float(self.reference[self.masses].sum())
+                yield (self.values[k] * total + once).reshape(1, 1, -1)
+                yield ((1.0 - self.values[k]) * total - once).reshape(1, 1, -1)
+        # Copies of a body depend on the same masses.
+        first = {tuple(ten[0].tolist()): ten for ten in self.own[::-1]}
+        for ten in first.values():
+            cone = np.einsum("ijt,tk->ijk", pseudo_inertia(), ten)
+            axes, sizes, _ = np.linalg.svd(cone.reshape(4, -1), full_matrices=False)
+            axes = axes[:, sizes > EMPTY * sizes[0]]
+            yield np.einsum("ia,ijk,jb->abk", axes, cone, axes)
+
+
+def _possible(inertia: Array) -> Array:
+    """A solver stops beside the edge of what a body can be: second moments are not negative."""
+    upper = np.triu_indices(3)
+    if len(inertia) != len(upper[0]):
+        return np.maximum(inertia, 0.0)
+    whole = np.zeros((3, 3))
+    whole[upper] = whole[upper[::-1]] = inertia
+    values, vectors = np.linalg.eigh(0.5 * np.trace(whole) * np.eye(3) - whole)
+    if values[0] < 0.0:
+        second = (vectors * np.maximum(values, 0.0)) @ vectors.T
+        whole = np.trace(second) * np.eye(3) - second
+    return np.asarray(whole[upper], np.float64)
+
+
+def _length(robot: Robot, name: str) -> float:
+    """A body's extent: greatest distance of its joints and rods from its centre, m."""
+    graph = robot.graph
+    if name == LOAD:
+        return LONG * graph.size
+    points = graph.joint_points(name)
+    far = max((float(np.linalg.norm(p - graph.bodies[name].com)) for p in points), default=0.0)
+    return far if far > 1e-3 * graph.size else LONG / 3.0 * graph.size
+
+
+def _unit(word: str, key: Key) -> str:
+    units = {"mass": "kg", "density": "kg/m3", "inertia": "kg m2"}
+    return units.get(word, "m" if isinstance(key[-1], int) else "")
