@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from delta_dynamics import inverse_dynamics
 from pkm_twin import Robot, load
-from pkm_twin.apps.history import append, measure
+from pkm_twin.identification.history import append, measure
 from pkm_twin.recordings import read
 
 NIGHTS, WORN = 24, 17

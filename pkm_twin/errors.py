@@ -41,7 +41,8 @@ class FileError(ParameterError):
         system = error.strerror if isinstance(error, OSError) else None
         what = " ".join((system or str(error)).split()) or type(error).__name__
         super().__init__(str(path), what, bound)
-        text = "no such file" if missing else what if system else f"not {bound}: {what}"
+        wanted = f"no such file; expected {bound}"
+        text = wanted if missing else what if system else f"not {bound}: {what}"
         self.args = (one_line(f"{path}: {text}", 2000),)
 
 

@@ -37,7 +37,9 @@ MAY = {
     "pkm_twin.mechanisms": CORE | {"delta_dynamics"},
     "pkm_twin.export": CORE | TWINS,
     "pkm_twin.design": CORE | TWINS,
-    "pkm_twin.identification": STREAMS | TWINS | {"pkm_twin.design", "pkm_twin.recordings"},
+    "pkm_twin.identification": STREAMS
+    | TWINS
+    | {"pkm_twin.design", "pkm_twin.recordings", "pkm_twin.report"},
     "pkm_twin.messages": CORE | {"pkm_twin.bags"},
     "pkm_twin.streams": CORE | {"pkm_twin.messages"},
     "pkm_twin.recordings": RECORDINGS,

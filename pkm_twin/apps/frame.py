@@ -23,7 +23,8 @@ from pkm_twin.console import numbers, refuse_existing
 from pkm_twin.errors import ParameterError, UnknownNameError
 from pkm_twin.files import STANDARD, decimal
 from pkm_twin.options import Commands, file_name
-from pkm_twin.report import Fact, Report, present
+from pkm_twin.report import Fact, Report
+from pkm_twin.report.terminal import present
 from pkm_twin.settings import Setting
 
 G = TypeVar("G")

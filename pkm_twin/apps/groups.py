@@ -60,9 +60,7 @@ TASKS: Final[Mapping[str, Mapping[str, Entry]]] = {
     "Robots": {},
     "Torques, paths and drives": {},
     "Stiffness, workspace and vibration": {},
-    "Recordings": {
-        "check": Entry("check_command:check", tables=True, wrenches=True),
-    },
+    "Recordings": {},
     "Identification and calibration": {},
     "Design and export": {},
 }

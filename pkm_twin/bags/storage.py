@@ -54,7 +54,11 @@ class BagFile:
             # The budget is that of the bytes on the disk.
             yield RecordReader(self._unpacked, Budget(size))
         except FileNotFoundError as error:
-            raise BagError("no such file", path=self.path, reason="not_found") from error
+            raise BagError(
+                "no such file; expected an MCAP file or a rosbag2 folder",
+                path=self.path,
+                reason="not_found",
+            ) from error
         except OSError as error:
             raise BagError(
                 f"cannot be read: {error.strerror or error}", path=self.path, reason="io"

@@ -11,7 +11,7 @@ import numpy as np
 
 from pkm_twin.bags.storage import is_bag
 from pkm_twin.codegen.arrays import Array, Mask
-from pkm_twin.errors import ParameterError, UnknownNameError, one_line, warn
+from pkm_twin.errors import FileError, ParameterError, UnknownNameError, one_line, warn
 from pkm_twin.messages.reading import TINY
 from pkm_twin.messages.wrenches import MAX_FORCE, MAX_MOMENT
 from pkm_twin.recordings.bags import read_bag
@@ -85,7 +85,11 @@ def read(
     path = Path(path)
     if how.follow not in (None, *FOLLOW):
         raise UnknownNameError("follow", str(how.follow), FOLLOW)
-    if is_bag(path):
+    try:
+        bag = is_bag(path)
+    except OSError as error:
+        raise FileError(path, error, RECORDING) from None
+    if bag:
         if how.follow is not None:
             raise ParameterError("follow", how.follow, "no --follow: a bag has no pose columns")
         r = read_bag(path, robot, how, progress)

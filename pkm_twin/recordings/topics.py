@@ -156,6 +156,12 @@ def _choose_joints(bag: Bag, robot: Robot, wanted: list[str], left_out: dict[str
         text = (
             f"no joint states that can be read: {aside}" if aside else "no joint states in the bag"
         )
+        plans = [n for n, i in bag.report.topics.items() if type_of(i) == TRAJECTORY and i.count]
+        if plans and not aside:
+            text += (
+                f": {plans[0]} is a planned trajectory, which `pkm-twin torques` and `size` take; "
+                "record /joint_states while `pkm-twin play` sends it to the machine"
+            )
         raise _choice_error(bag, text, "no joint states")
     for name in filled:
         require_definition(bag, name)

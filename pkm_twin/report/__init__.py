@@ -2,9 +2,5 @@
 """What a command answers: facts, tables and figures, for the terminal, scripts and the browser."""
 
 from pkm_twin.report.report import Column, Fact, Report, Table, Verdict, judged, number, plain
-from pkm_twin.report.terminal import present, text_of
 
-__all__ = [
-    "Column", "Fact", "Report", "Table", "Verdict", "judged", "number", "plain", "present",
-    "text_of",
-]  # fmt: skip
+__all__ = ["Column", "Fact", "Report", "Table", "Verdict", "judged", "number", "plain"]

@@ -118,7 +118,9 @@ def _masses(robot: Robot, graph: Graph) -> Iterator[Finding]:
     if not total > 0.0:
         return
     # As dense as a box of the machine's extent would be: grams or tonnes change it a thousandfold.
-    density = total / max(_extent(graph), 1e-9) ** 3 if _extent(graph) else 0.0
+    # Lengths in another unit are reported alone.
+    extent = _extent(graph)
+    density = total / extent**3 if SMALLEST <= extent <= LARGEST else 0.0
     whole = f"{total:.4g} kg in all; masses in"
     yield from _outside(
         "masses", "all that moves over the cube of the extent", density, (LIGHTEST, DENSEST),

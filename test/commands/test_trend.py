@@ -9,7 +9,7 @@ import sqlite3
 import numpy as np
 import pytest
 
-from pkm_twin.apps.history import Measured, Series, append, judged, measure, read_history
+from pkm_twin.identification.history import Measured, Series, append, judged, measure, read_history
 from pkm_twin.recordings import read
 from test.support.command import command
 from test.support.nights import night

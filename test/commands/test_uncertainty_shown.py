@@ -8,7 +8,7 @@ import pytest
 import yaml
 
 from delta_dynamics import inverse_dynamics, torque_deviation
-from pkm_twin.apps.check import DEVIATIONS, compared_of
+from pkm_twin.identification.check import DEVIATIONS, compared_of
 from pkm_twin.recordings import read
 from test.commands.conftest import DELTA, rewrite
 from test.support.command import command
@@ -87,8 +87,8 @@ def test_torques_have_a_column_of_deviations(capsys, unsure, tmp_path):
 
 def test_info_and_compliance_tell_it(capsys, unsure):
     shown = " ".join(command(capsys, "info", unsure).out.split())
-    assert "uncertainty: inertia.platform_mass: deviation │ 0.004" in shown
-    assert "uncertainty: inertia.forearm_mass: relative │ 0.05" in shown
+    assert "uncertainty: inertia.platform_mass: deviation: 0.004" in shown
+    assert "uncertainty: inertia.forearm_mass: relative: 0.05" in shown
     stiff = (
         "compliance",
         "upr_rpu",

@@ -13,11 +13,11 @@ from typing import Any
 import zstandard
 from hypothesis import strategies as st
 
-from pkm_twin.apps.check_causes import judged
 from pkm_twin.bags.cdr import MessageCodec
 from pkm_twin.bags.qos import parse_qos, require_topic
 from pkm_twin.bags.reader import BagWriter, inspect, read_messages
 from pkm_twin.bags.recover import recover
+from pkm_twin.identification.causes import judged
 from pkm_twin.recordings import ReadOptions, read
 from test.bags.conftest import DEFINITIONS
 from test.bags.folders import write_split

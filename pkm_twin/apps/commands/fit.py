@@ -190,7 +190,7 @@ def _of_efforts(
     given: Fit, machine: Robot, update: Any
 ) -> tuple[Result, Sequence[Choice], list[str]]:
     """The fit of efforts, read as ``check`` reads them."""
-    from pkm_twin.apps.check import recorded_of, step_fault
+    from pkm_twin.identification.check import recorded_of, step_fault
     from pkm_twin.identification.fit import refuse_faults
     from pkm_twin.identification.friction_laws import fit_with_laws, laws_of
     from pkm_twin.identification.parameters import kinds_of

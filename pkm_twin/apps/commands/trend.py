@@ -16,7 +16,7 @@ from pkm_twin.report import Fact, Report, Verdict
 from pkm_twin.settings import setting
 
 if TYPE_CHECKING:
-    from pkm_twin.apps.history import Judged
+    from pkm_twin.identification.history import Judged
 
 SHOWN: Final = 4
 """Most series in a picture."""
@@ -45,7 +45,7 @@ def trend(given: Trend) -> Report:
 
     :raises ParameterError: no history, or one without numbers of this machine.
     """
-    from pkm_twin.apps.history import FEWEST, judged, read_history
+    from pkm_twin.identification.history import FEWEST, judged, read_history
 
     found = read_history(given.history, given.machine)
     if not found:

@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from delta_dynamics import inverse_dynamics
-from pkm_twin.apps.check import (
+from pkm_twin.errors import PkmTwinError
+from pkm_twin.identification.check import (
     MEASURED,
     NEAR,
     POSITION_STEPS,
@@ -22,11 +23,10 @@ from pkm_twin.apps.check import (
     compared_of,
     recorded_of,
 )
-from pkm_twin.apps.verdict import Verdict
-from pkm_twin.errors import PkmTwinError
 from pkm_twin.identification.compare import Compared, by_held
 from pkm_twin.identification.plausible import held_payload
 from pkm_twin.recordings import Load, Recording
+from pkm_twin.report import Verdict
 from pkm_twin.robot.entries import with_entries
 from pkm_twin.robot.robot import Robot
 from pkm_twin.streams.rates import rms

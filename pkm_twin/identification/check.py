@@ -14,11 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from delta_dynamics import inverse_dynamics, torque_deviation
-from pkm_twin.apps.verdict import Item, Verdict, judged_item
 from pkm_twin.errors import SingularityError, UnreachableError, one_line
 from pkm_twin.identification.compare import Compared, by_held, compare
 from pkm_twin.identification.rows import Recorded
 from pkm_twin.recordings import Recording, at_rest
+from pkm_twin.report import Fact, Verdict, judged
 from pkm_twin.robot.limits import ranges
 from pkm_twin.robot.plausibility import why_no_torques
 from pkm_twin.streams.drives import COUNT, SAME, idle_samples
@@ -77,7 +77,7 @@ class Checked:
     """
 
     recording: Recording
-    items: list[Item]
+    items: list[Fact]
     bands: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     unjudged: str = ""
     compared: Compared | None = None
@@ -94,9 +94,20 @@ class Checked:
             return "bad"
         return "not judged" if self.unjudged else "good"
 
+    @property
+    def agreement(self) -> str:
+        """How well efforts and model agree, in words."""
+        r, c = self.recording, self.compared
+        if c is None:
+            return f"nothing contradicts {r.robot.name}"
+        part = c.rms / np.maximum(c.peak, 1e-12)
+        worst = int(part.argmax())
+        size = f"{100 * part[worst]:.2g} % of the peak effort of {r.robot.joint_names[worst]}"
+        return f"the efforts agree with {r.robot.name}, largest residual {size}"
+
     def named(self, verdict: Verdict) -> list[str]:
         """What got this verdict."""
-        return [item.what for item in self.items if item.verdict is verdict]
+        return [str(item.text) for item in self.items if item.verdict is verdict]
 
 
 def checked(r: Recording, bounds: Bounds) -> Checked:
@@ -108,7 +119,7 @@ def checked(r: Recording, bounds: Bounds) -> Checked:
     if r.effort is None:
         reason = reason or "the bag carries no efforts"
     if reason or r.effort is None:
-        return Checked(r, [*items, Item(RESIDUAL, reason, bound, Verdict.UNKNOWN)])
+        return Checked(r, [*items, judged(RESIDUAL, reason, bound, None)])
     try:
         idle = idle_of(r)
         left_out = idle | near_jumps(r)
@@ -116,23 +127,23 @@ def checked(r: Recording, bounds: Bounds) -> Checked:
         bands = {} if compared is None else _bands(r, compared)
     # ValueError: numbers within bounds whose result is not finite.
     except (UnreachableError, SingularityError, ValueError) as error:
-        return Checked(r, [*items, Item(RESIDUAL, one_line(str(error)), bound, Verdict.BAD)])
+        return Checked(r, [*items, judged(RESIDUAL, one_line(str(error)), bound, False)])
     shares, unjudged = _shares(r, idle, compared, bounds)
     items += shares
     if compared is not None and not unjudged:
         stuck = _stuck_efforts(r, compared, compared.good(bounds.residual))
         if stuck:
-            items.append(Item(MEASURED, stuck, "change as the model's", Verdict.BAD))
+            items.append(judged(MEASURED, stuck, "change as the model's", False))
         items += _residuals(r, compared, bands, bounds, bound)
     return Checked(r, items, bands, unjudged, compared, left_out)
 
 
-def _file(r: Recording, bounds: Bounds) -> list[Item]:
+def _file(r: Recording, bounds: Bounds) -> list[Fact]:
     if r.bag is None:
         found = f"a table of {len(r.time)} rows, all numbers finite"
-        return [Item("file", found, "finite numbers", Verdict.GOOD)]
+        return [judged("file", found, "finite numbers", True)]
     report = r.bag.report
-    verdict = Verdict.UNKNOWN if report.warnings else Verdict.GOOD
+    whole = None if report.warnings else True
     text = "; ".join(report.warnings) or "complete; checksums and counts agree"
     refused, total = sum(r.rejected.values()), r.message_count
     reasons = ", ".join(f"{k}: {v}" for k, v in r.rejected.items())
@@ -140,34 +151,34 @@ def _file(r: Recording, bounds: Bounds) -> list[Item]:
     bound = f"at most {100 * bounds.rejected:g} %"
     good = refused <= bounds.rejected * total
     return [
-        Item("file", text, "complete and consistent", Verdict.BAD if report.miscounts else verdict),
-        judged_item("messages that a node rejects", value, bound, good),
+        judged("file", text, "complete and consistent", False if report.miscounts else whole),
+        judged("messages that a node rejects", value, bound, good),
     ]
 
 
-def _motion(r: Recording, bounds: Bounds) -> list[Item]:
+def _motion(r: Recording, bounds: Bounds) -> list[Fact]:
     """The items on time stamps, steps and velocities."""
     if len(r.time) < 3:
-        return [Item("rate", f"{len(r.time)} joint states", "3 or more", Verdict.UNKNOWN)]
+        return [judged("rate", f"{len(r.time)} joint states", "3 or more", None)]
     periods = np.diff(r.time)
     median, longest = float(np.median(periods)), float(periods.max())
     gap = f"{1e3 * longest:.3f} ms at {r.time[int(periods.argmax())]:.3f} s"
     sampling, most = sampling_of(r.time), f"at most {100 * bounds.missing:g} %"
     if sampling.missing is None:
         text = "the samples have no common period"
-        missing = Item("missing samples", text, most, Verdict.UNKNOWN)
+        missing = judged("missing samples", text, most, None)
     else:
         share = sampling.missing / sampling.expected
         text = f"{sampling.missing} of {sampling.expected}"
         text += f" ({100 * share:.3g} %)" if sampling.missing else ""
-        missing = judged_item("missing samples", text, most, share <= bounds.missing)
+        missing = judged("missing samples", text, most, share <= bounds.missing)
     steps, within = steps_in(r), bounds.gap * median
     fault = step_fault(r, steps)
     items = [
-        Item("rate", f"{1 / median:.1f} Hz over {r.time[-1]:.3f} s", "", Verdict.GOOD),
+        judged("rate", f"{1 / median:.1f} Hz over {r.time[-1]:.3f} s", "", True),
         missing,
-        judged_item("longest gap", gap, f"at most {1e3 * within:.3f} ms", longest <= within),
-        judged_item(POSITION_STEPS, fault or "no jumps", "within rates and limits", not fault),
+        judged("longest gap", gap, f"at most {1e3 * within:.3f} ms", longest <= within),
+        judged(POSITION_STEPS, fault or "no jumps", "within rates and limits", not fault),
     ]
     return (
         items if r.qd is None or steps.publishers else items + _velocities(r, r.qd, steps, bounds)
@@ -229,7 +240,7 @@ def stuck_from(time: Array, values: Array, told: Array, count: int = 1) -> tuple
     return None
 
 
-def _velocities(r: Recording, qd: Array, steps: Steps, bounds: Bounds) -> list[Item]:
+def _velocities(r: Recording, qd: Array, steps: Steps, bounds: Bounds) -> list[Fact]:
     """How far measured velocities are from what the positions move by, over short times."""
     names, span = r.robot.joint_names, np.diff(r.time)
     period = float(np.median(span))
@@ -241,7 +252,7 @@ def _velocities(r: Recording, qd: Array, steps: Steps, bounds: Bounds) -> list[I
             begin, end = r.time[list(found)]
             text = f"the position of {names[j]} stands still from {begin:.3f} s to {end:.3f} s"
             text += " while its velocity does not (encoder?)"
-            return [judged_item(VELOCITIES, text, bound, False)]
+            return [judged(VELOCITIES, text, bound, False)]
     agreement = RateAgreement(r.robot, blocks=None)
     apart = np.concatenate([[False], (span > GAP * period) | steps.jumps.any(1)])
     for stamp, q, rate, other in zip(r.stamps.tolist(), r.q, qd, apart.tolist(), strict=True):
@@ -264,10 +275,10 @@ def _velocities(r: Recording, qd: Array, steps: Steps, bounds: Bounds) -> list[I
     ]
     worst = int(np.argmax(part))
     value = ", ".join(texts) or f"{100 * part[worst]:.2g} %, {names[worst]}"
-    return [judged_item(VELOCITIES, f"RMS difference {value}", bound, not texts)]
+    return [judged(VELOCITIES, f"RMS difference {value}", bound, not texts)]
 
 
-def _limits(r: Recording) -> list[Item]:
+def _limits(r: Recording) -> list[Fact]:
     """Effort limits; position and velocity limits are already a node's reason to reject."""
     effort = r.robot.limits.effort
     bounds = list(ranges(r.robot))
@@ -284,20 +295,20 @@ def _limits(r: Recording) -> list[Item]:
         worst = {u: max(x for x, v in zip(used, units, strict=True) if v == u) for u in units}
         margins = ", ".join(f"{-most:.4g} {unit}" for unit, most in worst.items())
         good = bool((used <= 0).all())
-        items.append(judged_item(f"{what} limits", f"least margin {margins}", "0 or more", good))
+        items.append(judged(f"{what} limits", f"least margin {margins}", "0 or more", good))
     return items
 
 
-def _singularity(r: Recording, bounds: Bounds) -> Item:
+def _singularity(r: Recording, bounds: Bounds) -> Fact:
     what = "singularity index"
     bound = f"{bounds.singularity:g} or more"
     try:
         measure = r.robot.singularity(r.q)
     except (UnreachableError, SingularityError) as error:
-        return Item(what, str(error), bound, Verdict.BAD)
+        return judged(what, str(error), bound, False)
     worst = int(measure.argmin())
     value = f"{measure[worst]:.4f} at {r.time[worst]:.3f} s"
-    return judged_item(what, value, bound, bool(measure[worst] >= bounds.singularity))
+    return judged(what, value, bound, bool(measure[worst] >= bounds.singularity))
 
 
 def recorded_of(r: Recording, leave_out: Mask | None = None) -> Recorded:
@@ -305,15 +316,12 @@ def recorded_of(r: Recording, leave_out: Mask | None = None) -> Recorded:
 
     :param leave_out: more samples that are left out, (samples,): a gap divides the recording.
     """
-    assert r.effort is not None  # noqa: S101
     keep = np.ones(len(r.time), np.bool_) if leave_out is None else ~leave_out
     if r.load is not None:
         keep &= ~r.load.near_change(r.time, NEAR)
-    wrench = None if r.wrench is None else r.wrench[keep]
-    held = None if r.load is None else r.load.held(r.time[keep]).astype(np.float64)
-    carried = None if r.load is None else r.load.on(r.robot)
-    name = one_line(r.source.rpartition("/")[2], 100)
-    return Recorded(name, r.time[keep], r.q[keep], r.effort[keep], wrench, held, carried)
+    part = r.part(keep)
+    assert part.effort is not None  # noqa: S101
+    return Recorded(r.name, part.time, part.q, part.effort, part.wrench, part.held, r.carried)
 
 
 def compared_of(r: Recording, idle: Mask) -> Compared | None:
@@ -333,9 +341,7 @@ def idle_of(r: Recording) -> Mask:
     assert r.effort is not None  # noqa: S101
     still = np.zeros_like(r.q)
     wrench = np.zeros((len(r.time), 6)) if r.wrench is None else r.wrench
-    carried = None if r.load is None else r.load.on(r.robot)
-    held = None if r.load is None else r.load.held(r.time).astype(np.float64)
-    needed = by_held(r.robot, carried, held, inverse_dynamics, r.q, still, still, wrench)
+    needed = by_held(r.robot, r.carried, r.held, inverse_dynamics, r.q, still, still, wrench)
     rates = r.qd
     if rates is None:
         rates = np.gradient(r.q, r.time, axis=0) if len(r.time) > 1 else still
@@ -344,20 +350,19 @@ def idle_of(r: Recording) -> Mask:
 
 def _shares(
     r: Recording, idle: Mask, compared: Compared | None, bounds: Bounds
-) -> tuple[list[Item], str]:
+) -> tuple[list[Fact], str]:
     """What is left out, and why there is no verdict, if there is none."""
     items, total = [], max(float(r.time[-1]), 1e-9)
     used = 0 if compared is None else sum(len(track.time) for track in compared.tracks)
     share = used / len(r.time)
     enough = share >= bounds.judged
-    verdict = Verdict.GOOD if enough else Verdict.UNKNOWN
     if idle.any():
         seconds = float(np.sum(np.gradient(r.time)[idle])) if len(r.time) > 1 else 0.0
         text = f"{seconds:.3f} s of {total:.3f} s, left out: efforts zero or constant at standstill"
-        items.append(Item("drives off or braked", text, "some efforts measured", verdict))
+        items.append(judged("drives off or braked", text, "some efforts measured", enough or None))
     text = f"{100 * share:.3g} % of {len(r.time)} samples"
     bound = f"at least {100 * bounds.judged:g} %"
-    items.append(Item("compared efforts", text, bound, verdict))
+    items.append(judged("compared efforts", text, bound, enough or None))
     return (
         items,
         "" if enough else f"efforts can be compared in {text}, {bound} needed for a verdict",
@@ -393,7 +398,7 @@ def _stuck_efforts(r: Recording, c: Compared, good: Mask) -> str:
 
 def _residuals(
     r: Recording, c: Compared, bands: Mapping[str, Mapping[str, Any]], bounds: Bounds, bound: str
-) -> list[Item]:
+) -> list[Fact]:
     good, limit, (worst, at) = c.good(bounds.residual), c.limit(bounds.residual), c.local()
     begins = c.begins(limit)
     items = []
@@ -412,10 +417,10 @@ def _residuals(
         if not good[i]:
             text += f"; largest {worst[i]:.4g} {unit} at {at[i]:.3f} s"
             text += f", begins at {begins:.3f} s" if begins is not None else ""
-        items.append(judged_item(f"{RESIDUAL} of {name}", text, bound, bool(good[i])))
+        items.append(judged(f"{RESIDUAL} of {name}", text, bound, bool(good[i])))
     if good.all() and abs(c.late) > 0.1 * c.period:
         late = f"{1e3 * abs(c.late):.3g} ms {'late' if c.late > 0.0 else 'early'}, taken out"
-        items.append(Item("efforts against positions", late, "", Verdict.GOOD))
+        items.append(judged("efforts against positions", late, "", True))
     return items
 
 
@@ -423,8 +428,7 @@ def _bands(r: Recording, c: Compared) -> dict[str, dict[str, Any]]:
     """By joint, where the robot's file has an ``uncertainty``."""
     if not r.robot.uncertainty:
         return {}
-    carried = None if r.load is None else r.load.on(r.robot)
-    parts = []
+    carried, parts = r.carried, []
     for track, rows in zip(c.tracks, c.inner, strict=True):
         made = by_held(r.robot, carried, track.held, torque_deviation, *track.motion)
         parts.append(made[rows])

@@ -1,0 +1,184 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``pkm-twin check``: recordings against the model, one or a folder of them."""
+
+from __future__ import annotations
+
+import multiprocessing
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from pkm_twin.apps.frame import command
+from pkm_twin.apps.options import REFUSED, SALVAGED, CarriesAtTimes, ReadsRecordings
+from pkm_twin.console import progress
+from pkm_twin.errors import ParameterError, PkmTwinError, one_line
+from pkm_twin.report import Fact, Report, Verdict
+from pkm_twin.settings import setting
+from pkm_twin.threads import one_blas_thread_for_children
+
+METADATA: Final = "metadata.yaml"
+"""What makes a folder a rosbag2 bag."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Check(CarriesAtTimes, ReadsRecordings):
+    """Compare a recording, or a folder of them, with the model.
+
+    Checks that the file is complete, that a node would accept every joint state and wrench, that
+    no samples are missing, that positions and velocities belong to one moving machine, that joints
+    stay inside their limits and away from singularities, and that the measured efforts agree with
+    the model. If they do not, an explanation is named only if it makes them agree. An item without
+    data (no CRCs, no efforts, a robot without masses) is unknown, which is neither good nor bad.
+
+    Exit code 0: good. 1: an item is bad, too few efforts can be compared for a verdict, or the file
+    is no recording. 3: the file is damaged, but `pkm-twin recover` can save part of it.
+    """
+
+    bag: Path = setting(
+        ..., "a bag: an MCAP file or a rosbag2 folder; a table; or a folder of bags", argument=True
+    )
+    robot: str | None = setting(  # type: ignore[assignment]  # an argument of other commands
+        None, "a robot's name or file; default: the robot that the recording names"
+    )
+    residual: float = setting(
+        0.05,
+        "largest RMS torque residual that is good, as a fraction of the peak: 0.05 is 5 %",
+        low=0.0,
+        high=1.0,
+    )
+    history: Path | None = setting(
+        None,
+        "also append residual, friction, payload and stiffness to this file, for `pkm-twin trend`",
+    )
+    machine_name: str | None = setting(
+        None, "name in the history; default: the robot's", name="machine"
+    )
+    jobs: int = setting(1, "processes for a folder of bags", low=1, high=10**4)
+
+
+def check(given: Check) -> Report:
+    """Judge a recording, or all of a folder."""
+    from pkm_twin.bags.reader import DamagedBagError
+
+    if is_collection(given.bag):
+        return _of_folder(given)
+    try:
+        with progress("reading", None) as update:
+            return check_one(given, given.bag, update)
+    except PkmTwinError as error:
+        saved = error.salvageable if isinstance(error, DamagedBagError) else 0
+        facts = [Fact("bag", str(given.bag)), Fact("good", False), Fact("salvageable", saved)]
+        return Report(facts=facts, code=SALVAGED if saved else REFUSED, error=str(error))
+
+
+def check_one(given: Check, path: Path, update: Any = None, thorough: bool = True) -> Report:
+    """Judge a recording, and append it to the history; errors as of ``recordings.read``."""
+    from pkm_twin import load
+    from pkm_twin.identification.causes import judged
+    from pkm_twin.identification.check import Bounds
+
+    robot: Any = given.robot
+    if given.platform is not None:
+        if robot is None:
+            raise ParameterError("--robot", None, "a file, for the platform that --platform names")
+        robot = load(robot, platform=given.platform)
+    r = given.read(path, robot, update, limited=True)
+    found = judged(r, Bounds(residual=given.residual), thorough)
+    good = found.answer == "good"
+    if given.history is not None:
+        from pkm_twin.identification.history import append, measure, recorded_at
+
+        name = given.machine_name or r.robot.name
+        append(given.history, name, r.robot.name, path, recorded_at(r, path), good, measure(r))
+    bad, unknown = found.named(Verdict.BAD), found.named(Verdict.UNKNOWN)
+    answer = f"{found.answer}: {', '.join(bad) or found.unjudged or found.agreement}"
+    none = "uncertainty: none in the robot file, so the model has no uncertainty band"
+    why, findings = "; ".join(found.causes), "; ".join(found.findings)
+    return Report(
+        answer + (f"; not judged: {', '.join(unknown)}" if unknown else ""),
+        [
+            Fact("causes", found.causes, text="explanation" if why else None, shown=why),
+            Fact("findings", found.findings, shown=findings,
+                 text="no explanation; `fit` finds" if findings else None),
+            Fact("bag", str(r.source)), Fact("robot", r.robot.name, text="robot"),
+            Fact("topics", asdict(r.topics), text="topics", shown=str(r.topics)),
+            Fact("payload", None if r.load is None else r.load.as_json(), text="payload",
+                 shown=str(r.load or "as in the robot file")),
+            *found.items,
+            Fact("uncertainty", found.bands or None), Fact("answer", found.answer),
+            Fact("not_judged", found.unjudged or None), Fact("good", good),
+        ],
+        notes=[] if r.robot.uncertainty else [none],
+        verdict=Verdict.GOOD if good else Verdict.BAD if bad else Verdict.UNKNOWN,
+        code=0 if good else REFUSED,
+    )  # fmt: skip
+
+
+def bags_of(folder: Path) -> list[Path]:
+    """Recordings in a folder and below: MCAP files and rosbag2 folders, by name."""
+    whole = {path.parent for path in folder.rglob(METADATA)}
+    files = [p for p in folder.rglob("*.mcap") if not whole & set(p.parents)]
+    return sorted([*whole, *files])
+
+
+def is_collection(path: Path) -> bool:
+    """Whether a path is a folder of recordings, not a rosbag2 bag itself."""
+    if not path.is_dir() or (path / METADATA).exists():
+        return False
+    # A bag whose metadata is lost has its files side by side.
+    return bool(bags_of(path)) and not any(path.glob("*.db3"))
+
+
+def _facts(given: Check, path: Path) -> dict[str, Any]:
+    """One recording of many, as plain data; a damaged one too."""
+    try:
+        return check_one(given, path, thorough=False).data
+    except (PkmTwinError, OSError) as error:
+        return {"bag": str(path), "good": False, "error": one_line(str(error))}
+
+
+def _judged_all(given: Check, paths: Sequence[Path]) -> Iterator[tuple[Path, dict[str, Any]]]:
+    """Verdicts as they come, on so many processes."""
+    jobs = min(given.jobs, len(paths))
+    if jobs == 1:
+        yield from ((path, _facts(given, path)) for path in paths)
+        return
+    context = multiprocessing.get_context("spawn")
+    with one_blas_thread_for_children(), ProcessPoolExecutor(jobs, mp_context=context) as pool:
+        flying = {pool.submit(_facts, given, path): path for path in paths}
+        for future in as_completed(flying):
+            yield flying[future], future.result()
+
+
+def _of_folder(given: Check) -> Report:
+    """Judge all recordings of a folder."""
+    paths = bags_of(given.bag)
+    found: dict[Path, dict[str, Any]] = {}
+    with progress("checking", len(paths)) as update:
+        for path, facts in _judged_all(given, paths):
+            found[path] = facts
+            update(len(found))
+    results = [found[path] for path in paths]
+    notes = []
+    for result in results:
+        bad = [item["what"] for item in result.get("items", ()) if item["verdict"] == "bad"]
+        because = ", ".join(bad) or result.get("not_judged")
+        why = result.get("error") or f"{result['answer']}{f': {because}' if because else ''}"
+        notes.append(f"{result['bag']}: {why}")
+    count = sum(not result["good"] for result in results)
+    unjudged = sum(result.get("answer") == "not judged" for result in results)
+    answer = f"{len(results)} recordings, {count - unjudged} bad"
+    answer += f", {unjudged} not judged" if unjudged else ""
+    return Report(
+        answer if count else f"{len(results)} good",
+        [
+            Fact("folder", str(given.bag)), Fact("good", not count), Fact("recordings", results),
+        ],
+        notes=notes,
+        verdict=Verdict.BAD if count else Verdict.GOOD,
+    )  # fmt: skip
+
+
+COMMAND = command(check, "Recordings")
