@@ -9,7 +9,7 @@ one as drawn is taken, else the best conditioned; where there is none, the best 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Final
 
@@ -32,6 +32,8 @@ SINGULAR: Final = 1e-4
 """Singularity index below which a home is no home: hardly a way leads away from it."""
 BETTER: Final = 1.05
 """Of assemblies whose indices differ by less than this factor the nearest to zero is taken."""
+SAME: Final = 1e-4
+"""Assemblies are one where no link is farther apart, parts of the size."""
 STARTS: Final = 12
 """Random starts from which other assemblies are looked for."""
 REACHES: Final = (0.05, 0.1, 0.2, 0.4, 0.8)
@@ -103,6 +105,8 @@ class HomeSearch:
             self.wanted[outside] = (self.low[outside] + self.high[outside]) / 2
             self.place = "zero or amid their limits"
 
+        self._known: list[Array] = []
+        """Where the links are in the assemblies that were looked at, shape (links, 3), m."""
         self._hinges: dict[str, float] | None = None
         """The joints that hold the spins of an assembly, which hold those of others too."""
 
@@ -140,9 +144,7 @@ class HomeSearch:
         if drawn is None:
             # What closes nowhere is rejected before much is tried.
             closed = self.assembly.anywhere()[0]
-        found = [] if drawn is None else [drawn]
-        found += self._others(found)
-        chosen = self._chosen(found)
+        chosen = self._chosen([home for home in (drawn, *self._others()) if home is not None])
         if chosen is not None and chosen.index >= SINGULAR:
             return chosen
         near = self._near()
@@ -163,28 +165,27 @@ class HomeSearch:
             values, miss = self.assembly.close(values, self.held)
         if miss > self.assembly.closed:
             return None
+        self._known.append(self.assembly.places())
         far = float((np.abs(values) / self.units)[~self.held].max(initial=0.0))
         return self._home(values, miss, "drawn" if far <= DRAWN else "wanted")
 
-    def _others(self, found: list[Home]) -> Iterator[Home]:
-        """Assemblies with the actuated joints at the same values, from random starts."""
-        rng = np.random.default_rng(0)
-        known = [self._places(home.values) for home in found]
-        for _ in range(STARTS if not self.held.all() else 0):
-            reach = np.where(self.turns, math.pi, 0.5 * self.assembly.size)
-            start = np.where(self.held, self.wanted, rng.uniform(-reach, reach))
-            values, miss = self.assembly.close(start, self.held)
-            if miss > self.assembly.closed:
-                continue
-            places = self._places(values)
-            if all(float(np.abs(places - other).max()) > 1e-4 for other in known):
-                known.append(places)
-                yield self._home(self._wrapped(values), miss, "wanted")
+    def _reached(self, start: Array, how: str) -> Home | None:
+        """The assembly that a start leads to; None where loops stay open, or it is known."""
+        values, miss = self.assembly.close(start, self.held)
+        if miss > self.assembly.closed and how == "near":
+            values, miss = self.assembly.close(values)
+        places, apart = self.assembly.places(), SAME * self.assembly.size
+        known = any(float(np.abs(places - other).max()) <= apart for other in self._known)
+        if miss > self.assembly.closed or known:
+            return None
+        self._known.append(places)
+        return self._home(self._wrapped(values), miss, how)
 
-    def _places(self, values: Array) -> Array:
-        """Where the links are, in parts of the size."""
-        self.assembly.place(values)
-        return self.assembly.places() / self.assembly.size
+    def _others(self) -> list[Home | None]:
+        """Assemblies with the actuated joints at the same values, from random starts."""
+        rng, reach = np.random.default_rng(0), np.where(self.turns, math.pi, self.units / 2)
+        starts = rng.uniform(-reach, reach, (0 if self.held.all() else STARTS, len(reach)))
+        return [self._reached(np.where(self.held, self.wanted, s), "wanted") for s in starts]
 
     def _wrapped(self, values: Array) -> Array:
         """The same with no turn of more than half a circle."""
@@ -207,25 +208,16 @@ class HomeSearch:
     def _near(self) -> Home | None:
         """The best conditioned of the assemblies within the least reach that has a good one."""
         rng = np.random.default_rng(1)
+        tried: list[Home] = []
         best: Home | None = None
-        tried = 0
         for reach in REACHES:
             for _ in range(TRIES):
                 start = self.wanted + rng.uniform(-reach, reach, len(self.wanted)) * self.units
-                low, high = (np.where(self.held, b, s) for b, s in
-                             ((self.low, -math.inf), (self.high, math.inf)))  # fmt: skip
-                start = np.minimum(np.maximum(start, low), high)
-                values, miss = self.assembly.close(start, self.held)
-                if miss > self.assembly.closed:
-                    values, miss = self.assembly.close(values)
-                if miss > self.assembly.closed:
-                    continue
-                home = self._home(self._wrapped(values), miss, "near")
-                tried += 1
-                if self._inside(np.where(self.held, home.values, self.low)) and (
-                    best is None or home.index > best.index
-                ):
-                    best = home
+                start = np.where(self.held, np.clip(start, self.low, self.high), start)
+                home = self._reached(start, "near")
+                tried += [] if home is None else [home]
+            good = [h for h in tried if self._inside(np.where(self.held, h.values, self.low))]
+            best = max(good, key=lambda home: home.index, default=None)
             if best is not None and best.index >= 5 * SMALL:
                 return best
             if tried and (best is None or best.index < SINGULAR):
