@@ -10,8 +10,8 @@ import yaml
 
 from delta_dynamics import inverse_dynamics
 from pkm_twin.errors import ParameterError
-from pkm_twin.machine.assembly import Assembly
 from pkm_twin.mechanisms.machine import Machine
+from pkm_twin.robot.urdf_home import Assembly
 from pkm_twin.robot.urdf_read import read_tree
 from test.support.robots import often, partly_long, random_joints
 
