@@ -11,11 +11,12 @@ from typing import Any, Final
 import numpy as np
 
 from delta_dynamics.isolation import ContactLocator, ContactPlace
-from delta_dynamics.noise import AVERAGED, Noise
 from delta_dynamics.observer import MomentumObserver, platform_wrench
 from delta_dynamics.rest import LoadShare, friction_reach, moving_rates
 from delta_dynamics.uncertainty import (
+    AVERAGED,
     EffortParts,
+    Noise,
     effort_parts,
     states_efforts,
     torque_deviation,

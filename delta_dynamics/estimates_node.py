@@ -24,7 +24,7 @@ from pkm_twin.messages.stamps import SECOND
 from pkm_twin.robot.robot import Robot
 from pkm_twin.ros.joints import JointPublisher
 from pkm_twin.ros.node import TwinNode
-from pkm_twin.streams.pace import Pace
+from pkm_twin.streams.monitor import Pace
 
 PAYLOAD_RATE = 250.0
 """Samples a second that the payload is estimated from: errors last longer."""

@@ -21,7 +21,6 @@ from pkm_twin.machine.joint_map import ControllerNumbers
 from pkm_twin.messages.intake import JointStateView
 from pkm_twin.messages.stamps import SECOND
 from pkm_twin.ros import health
-from pkm_twin.ros.changes import follow_changes
 from pkm_twin.ros.joints import CommandPublisher, JointPublisher
 from pkm_twin.ros.node import TwinNode
 from pkm_twin.ros.run import run
@@ -68,8 +67,7 @@ class CommandGate(TwinNode):
                 refuse=self._gate.refuse_joint_state,
                 awaited=True,
             )
-        follow_changes(
-            self,
+        self.follow(
             ["effort_limits", *PAYLOAD],
             lambda values: changed(self._gate.robot, values),
             self._gate.change_robot,

@@ -25,7 +25,6 @@ from pkm_twin.messages.intake import JointStateView, RawTrajectory
 from pkm_twin.messages.stamps import SECOND
 from pkm_twin.robot.robot import Robot
 from pkm_twin.ros import health
-from pkm_twin.ros.changes import follow_changes
 from pkm_twin.ros.joints import CommandPublisher, JointPublisher
 from pkm_twin.ros.node import TwinNode
 from pkm_twin.ros.run import run
@@ -33,7 +32,7 @@ from pkm_twin.ros.turns import Task
 from pkm_twin.ros.wrench import declare_mounts
 from pkm_twin.settings import SECONDS, changeable, with_parameters
 from pkm_twin.streams.matched import WrenchWindow
-from pkm_twin.streams.pace import Pace
+from pkm_twin.streams.monitor import Pace
 from pkm_twin.streams.wrench import WrenchReader, WrenchSettings
 
 LAST_WORD: Final = 0.5
@@ -85,8 +84,7 @@ class DeltaDynamics(TwinNode):
             expires=lambda: self._feedforward.settings.stale_after,
         )
         self._action = self._create_action()
-        follow_changes(
-            self,
+        self.follow(
             [*CHANGES, *changeable(Settings)],
             self._prepare,
             self._take,

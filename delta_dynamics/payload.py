@@ -10,9 +10,9 @@ from typing import Final
 
 import numpy as np
 
-from delta_dynamics.noise import Noise
 from delta_dynamics.regressor import PAYLOAD, parameter_names, regressor
 from delta_dynamics.rest import LoadShare, beyond_friction, friction_reach, moving_rates
+from delta_dynamics.uncertainty import Noise
 from delta_dynamics.virtual_work import inverse_dynamics
 from pkm_twin.codegen.arrays import Array, later, one_vector
 from pkm_twin.messages.stamps import SECOND

@@ -35,8 +35,7 @@ from pkm_twin.robot.robot import Robot
 from pkm_twin.robot.variation import KINDS, MAX_SPREAD, Variation, varied
 from pkm_twin.ros import health
 from pkm_twin.ros.joints import FIELDS, JointPublisher
-from pkm_twin.ros.node import TwinNode
-from pkm_twin.ros.qos import latched_qos
+from pkm_twin.ros.node import TwinNode, latched_qos
 from pkm_twin.ros.run import run
 
 Array = NDArray[np.float64]

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import difflib
+import importlib
 import sys
 import warnings
 from collections.abc import Iterable, Iterator, Sequence
@@ -264,3 +265,23 @@ def _plain(value: Any) -> Any:
 def install(extra: str) -> str:
     """The command that installs an extra, from a clone, because no package index has pkm_twin."""
     return f"pip install '.[{extra}]' in a clone of pkm_twin"
+
+
+class MissingExtraError(PkmTwinError, ImportError):
+    """A package that is not installed; ``extra`` is the extra of pkm_twin that brings it."""
+
+    def __init__(self, package: str, extra: str) -> None:
+        super().__init__(f"{package} is not installed; {install(extra)} brings it")
+        self.package = package
+        self.extra = extra
+
+
+def require(module: str, extra: str) -> Any:
+    """Import a module of an extra.
+
+    :raises MissingExtraError: naming the extra.
+    """
+    try:
+        return importlib.import_module(module)
+    except ImportError:
+        raise MissingExtraError(module.partition(".")[0], extra) from None

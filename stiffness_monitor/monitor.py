@@ -10,12 +10,10 @@ import numpy as np
 
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import MessageError
-from pkm_twin.messages.reading import as_message_error
+from pkm_twin.messages.reading import WrenchSample, as_message_error
 from pkm_twin.messages.stamps import SECOND
-from pkm_twin.messages.wrenches import WrenchSample
-from pkm_twin.streams.pace import Pace
-from pkm_twin.streams.pairing import PairingCore
-from pkm_twin.streams.wrench import Mount, Recent, WrenchSettings
+from pkm_twin.streams.monitor import Pace
+from pkm_twin.streams.wrench import Mount, PairingCore, Recent, WrenchSettings
 from stiffness_monitor.compliance import PlatformResponse, platform_response
 
 Settings = WrenchSettings

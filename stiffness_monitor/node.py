@@ -22,12 +22,11 @@ from std_msgs.msg import Float64MultiArray, Header, MultiArrayDimension, String
 
 from pkm_twin.errors import PkmTwinError
 from pkm_twin.ros import health
-from pkm_twin.ros.changes import follow_changes
 from pkm_twin.ros.node import TwinNode
 from pkm_twin.ros.run import run
 from pkm_twin.ros.wrench import declare_mounts
 from pkm_twin.settings import changeable, with_parameters
-from pkm_twin.streams.pace import Pace
+from pkm_twin.streams.monitor import Pace
 from pkm_twin.streams.wrench import PLATFORM
 from stiffness_monitor.alarm_node import StiffnessAlarmTopics
 from stiffness_monitor.compliance import kernels
@@ -107,8 +106,7 @@ class StiffnessMonitor(TwinNode):
             awaited=True,
         )
         self.create_guarded_subscription("wrench", self._on_wrench)
-        follow_changes(
-            self,
+        self.follow(
             changeable(Settings),
             lambda values: with_parameters(self._monitor.settings, values),
             self._change_settings,

@@ -9,10 +9,9 @@ from dataclasses import dataclass, field
 from typing import Any, Final
 
 from pkm_twin.errors import MessageError, SingularityError, UnreachableError
-from pkm_twin.messages.reading import shown
+from pkm_twin.messages.reading import DeflectionSample, in_base_axes, read_deflection, shown
 from pkm_twin.messages.stamps import SECOND, StampRules
 from pkm_twin.robot.robot import Robot
-from pkm_twin.streams.deflection import DeflectionSample, in_base_axes, read_deflection
 from pkm_twin.streams.wrench import Recent, check_order, counting
 from stiffness_monitor.alarm import AlarmSettings, Departure, StiffnessAlarm
 from stiffness_monitor.monitor import Answer

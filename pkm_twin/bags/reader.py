@@ -32,9 +32,8 @@ from pkm_twin.bags.format import (
     utf8,
 )
 from pkm_twin.bags.recover import RecoverResult, count_salvageable, recover
-from pkm_twin.bags.report import BagReport, TopicInfo, join_topic
 from pkm_twin.bags.storage import METADATA_FILE, BagFile, Storage, find_storage
-from pkm_twin.bags.strict import Check, Segment
+from pkm_twin.bags.strict import BagReport, Check, Segment, TopicInfo, join_topic
 from pkm_twin.bags.writer import BagWriter
 from pkm_twin.errors import BagError
 

@@ -26,9 +26,9 @@ from pkm_twin.identification.judge import Evidence, Suspect, Verdict, judge
 from pkm_twin.identification.parameters import SURE, Group, Number, groups_of, number_of
 from pkm_twin.identification.rows import HELD_OUT
 from pkm_twin.machine.shared import above_zero
+from pkm_twin.messages.reading import in_base_axes
 from pkm_twin.recordings import Recording
 from pkm_twin.robot.robot import Robot
-from pkm_twin.streams.deflection import in_base_axes
 from stiffness_monitor.response import ElementResponse, element_response
 
 PRIOR: Final = 1.0

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from pkm_twin.errors import require
 from pkm_twin.files import replace_file
 from pkm_twin.maps import figures
-from pkm_twin.maps.extras import require
 from pkm_twin.maps.pages import (
     CAMERA,
     CONFIG,

@@ -24,8 +24,7 @@ from pathlib import Path
 from typing import Any, Final, Protocol
 
 import pkm_twin
-from pkm_twin.errors import ParameterError, PkmTwinError
-from pkm_twin.maps.extras import require
+from pkm_twin.errors import ParameterError, PkmTwinError, require
 from pkm_twin.maps.store import MapError, Parts, join, save_part, writing
 from pkm_twin.maps.sweep import Chunk, Map
 from pkm_twin.maps.variables import Values

@@ -24,9 +24,8 @@ from typing import TYPE_CHECKING, Any, BinaryIO, Final
 
 import numpy as np
 
-from pkm_twin.errors import PkmTwinError
+from pkm_twin.errors import PkmTwinError, require
 from pkm_twin.files import replace_file
-from pkm_twin.maps.extras import require
 from pkm_twin.maps.soundness import SEALED, nonsense, seal, seal_holds
 from pkm_twin.maps.variables import FORMAT, Values
 

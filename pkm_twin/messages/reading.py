@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Joint messages to checked arrays, by attributes only: live messages and decoded ones alike.
+"""Messages to checked arrays, by attributes only: live messages and decoded ones alike.
+
+Joint states, trajectories, wrenches and measured deflections.
 
 Every function either returns finite, complete, ordered data or raises
 :class:`~pkm_twin.errors.MessageError` with a short stable reason for counting. Times are
@@ -435,3 +437,93 @@ def _times_from_start(times: NDArray[np.int64]) -> NDArray[np.int64]:
             f"{nanoseconds[i - 1] / SECOND:g} s",
         )
     return nanoseconds
+
+
+MAX_FORCE: Final = 1e7
+MAX_MOMENT: Final = 1e7
+
+
+@dataclass(frozen=True)
+class WrenchSample:
+    """A wrench as it came: force and moment, shape (6,), N and N m, in ``frame``'s axes."""
+
+    stamp: int
+    frame: str
+    wrench: Array
+
+
+def read_wrench(
+    message: Any, now: int, rules: StampRules, frame: str, accept_empty: bool
+) -> WrenchSample:
+    """A geometry_msgs/WrenchStamped in the expected frame; an empty frame only where allowed."""
+    given = message.header.frame_id
+    if given != frame and not (given == "" and accept_empty):
+        hint = "; set accept_empty_frame to allow it" if given == "" else ""
+        raise MessageError("frame", f"frame is {shown(given)}, expected {frame!r}{hint}")
+    stamp = rules.check(stamp_of(message.header), now)
+    force, torque = message.wrench.force, message.wrench.torque
+    values = [force.x, force.y, force.z, torque.x, torque.y, torque.z]
+    labels = ("force.x", "force.y", "force.z", "torque.x", "torque.y", "torque.z")
+    for i, (label, value) in enumerate(zip(labels, values, strict=True)):
+        bound = MAX_FORCE if i < 3 else MAX_MOMENT
+        if not math.isfinite(value):
+            raise MessageError("not finite", f"{label} is {value}")
+        if abs(value) > bound or 0.0 < abs(value) < TINY:
+            raise MessageError("bounds", f"{label} is {value:g}, allowed up to {bound:g}")
+    return WrenchSample(stamp, given or frame, np.array(values, np.float64))
+
+
+MAX_SHIFT: Final = 0.1
+MAX_TURN: Final = 0.1
+"""Greatest deflection that is one, m and rad: beyond, nothing is linear, or the pose is another."""
+UNIT: Final = 1e-3
+"""By how much a quaternion's length may miss one."""
+
+
+class DeflectionSample(NamedTuple):
+    """Displacement and small rotation (6,), m and rad, in the axes of ``frame``."""
+
+    stamp: int
+    frame: str
+    values: Array
+
+
+def read_deflection(message: Any, now: int, rules: StampRules) -> DeflectionSample:
+    """A geometry_msgs/TransformStamped from the platform without load to the platform under it.
+
+    :raises MessageError: a frame without a name, a bad stamp, a value that is not finite or no
+        deflection.
+    """
+    frame = message.header.frame_id
+    if not frame:
+        raise MessageError("frame", "frame is '', expected the base's or the platform's")
+    stamp = rules.check(stamp_of(message.header), now)
+    move, turn = message.transform.translation, message.transform.rotation
+    labels = ("translation.x", "translation.y", "translation.z", *"xyzw")
+    values = (move.x, move.y, move.z, turn.x, turn.y, turn.z, turn.w)
+    for label, value in zip(labels, values, strict=True):
+        if not math.isfinite(value):
+            raise MessageError("not finite", f"{label} is {value}")
+        if 0.0 < abs(value) < TINY:
+            raise MessageError("bounds", f"{label} is {value:g}, too small for a measurement")
+    far = max(abs(value) for value in values[:3])
+    if far > MAX_SHIFT:
+        raise MessageError("bounds", f"translation is {far:g} m, allowed up to {MAX_SHIFT:g}")
+    length = math.hypot(*values[3:])
+    if abs(length - 1.0) > UNIT:
+        raise MessageError("bounds", f"the rotation's length is {length:g}, not 1")
+    # A quaternion and its negative are one rotation.
+    sign = math.copysign(1.0, turn.w)
+    size = math.hypot(turn.x, turn.y, turn.z)
+    angle = 2.0 * math.atan2(size, abs(turn.w))
+    if angle > MAX_TURN:
+        raise MessageError("bounds", f"rotation is {angle:g} rad, allowed up to {MAX_TURN:g}")
+    scale = sign * (2.0 if size < 1e-9 else angle / size)
+    rotation = (scale * turn.x, scale * turn.y, scale * turn.z)
+    return DeflectionSample(stamp, frame, np.array((*values[:3], *rotation), np.float64))
+
+
+def in_base_axes(values: Array, rotation: Array) -> Array:
+    """A deflection (..., 6) that was measured in platform axes, of rotations (..., 3, 3)."""
+    shift, turn = (rotation @ values[..., k : k + 3, None] for k in (0, 3))
+    return np.asarray(np.concatenate([shift[..., 0], turn[..., 0]], -1), np.float64)

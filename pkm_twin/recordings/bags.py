@@ -15,16 +15,22 @@ from numpy.typing import NDArray
 from pkm_twin.bags.reader import Bag, open_bag
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import BagError, MessageError, one_line
-from pkm_twin.messages.reading import JointReader, JointSample
+from pkm_twin.messages.reading import (
+    DeflectionSample,
+    JointReader,
+    JointSample,
+    WrenchSample,
+    in_base_axes,
+    read_deflection,
+    read_wrench,
+)
 from pkm_twin.messages.stamps import SECOND, StampRules
-from pkm_twin.messages.wrenches import WrenchSample, read_wrench
 from pkm_twin.recordings.payload import metadata_error, told_load
 from pkm_twin.recordings.recording import MAPPED, ReadOptions, Recording
 from pkm_twin.recordings.topics import JOINT_STATE, TRAJECTORY, Topics, choose_topics
 from pkm_twin.recordings.trajectories import read_trajectory
 from pkm_twin.robot.catalogue import load, robot_names
 from pkm_twin.robot.robot import Robot
-from pkm_twin.streams.deflection import DeflectionSample, in_base_axes, read_deflection
 from pkm_twin.streams.wrench import PLATFORM
 
 Stamps = NDArray[np.int64]

@@ -12,8 +12,7 @@ import numpy as np
 from pkm_twin.bags.storage import is_bag
 from pkm_twin.codegen.arrays import Array, Mask
 from pkm_twin.errors import FileError, ParameterError, UnknownNameError, one_line, warn
-from pkm_twin.messages.reading import TINY
-from pkm_twin.messages.wrenches import MAX_FORCE, MAX_MOMENT
+from pkm_twin.messages.reading import MAX_FORCE, MAX_MOMENT, MAX_SHIFT, MAX_TURN, TINY
 from pkm_twin.recordings.bags import read_bag
 from pkm_twin.recordings.payload import load_of_table
 from pkm_twin.recordings.recording import MAPPED, ReadOptions, Recording
@@ -33,7 +32,6 @@ from pkm_twin.robot.catalogue import load
 from pkm_twin.robot.derivatives import joint_rates
 from pkm_twin.robot.limits import beyond_limits
 from pkm_twin.robot.robot import Robot
-from pkm_twin.streams.deflection import MAX_SHIFT, MAX_TURN
 
 RECORDING: Final = (
     "an MCAP file, a rosbag2 folder, or a table with columns time, JOINT.position ..."

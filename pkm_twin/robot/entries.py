@@ -1,14 +1,24 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The numbers of a robot's file, and the same robot with some of them changed."""
+"""The numbers of a robot's file, and the same robot or the same file with some of them changed."""
 
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, TypeVar
 
-from pkm_twin.machine.places import given, numbers_of
+import yaml
+
+from pkm_twin.errors import ParameterError, PkmTwinError, one_line
+from pkm_twin.files import replace_file
+from pkm_twin.machine.machine_yaml import describe_machine_yaml, edit_yaml
+from pkm_twin.machine.places import given, has_entry, keys_of, numbers_of
+from pkm_twin.robot.catalogue import TREES, load, robot_of_data, robot_path
 from pkm_twin.robot.robot import Robot
+from pkm_twin.robot.robot_urdf import robot_description
+from pkm_twin.robot.urdf_read import read_urdf
 
 R = TypeVar("R", bound=Robot)
 
@@ -34,3 +44,102 @@ def with_entries(robot: R, values: Mapping[str, float]) -> R:
     :raises ParameterError: a path that there is not, or a value that the file may not have.
     """
     return type(robot).from_data(data_of(robot, values), robot.name)
+
+
+@dataclass(frozen=True)
+class Chosen:
+    """A new number of a file, and what stands above it."""
+
+    value: float
+    comment: str
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """A new number of a file, its standard deviation in the same unit, and where it is from."""
+
+    value: float
+    deviation: float
+    unit: str
+    source: str
+
+    @property
+    def comment(self) -> str:
+        """What stands above the number."""
+        unit = f" {self.unit}" if self.unit else ""
+        return f"+- {self.deviation:.2g}{unit} (standard deviation), {self.source}"
+
+
+def edited_yaml(robot: Robot, source: str, values: Mapping[str, Fitted | Chosen]) -> str:
+    """The text of a robot's file with other numbers, each with its comment.
+
+    Where the file writes a number once for several limbs, or is no YAML, the text is a new one with
+    every body, joint and rod written out.
+
+    :param source: the name or path that the robot was loaded by.
+    :param values: by dotted path, of :func:`pkm_twin.robot.entries.entries`; of ``joint_map``
+        also such as the file does not have yet.
+    :raises ParameterError: a path that no such file can have.
+    """
+    path = robot_path(source)
+    text = "" if path.suffix in TREES else path.read_text(encoding="utf-8")
+    data: Any = yaml.safe_load(text)
+    plain = [name for name in values if not name.startswith("joint_map.")]
+    if not all(has_entry(data, name) for name in plain):
+        sections = given(robot.parameter_sections())
+        told = {k: v for k, v in sections.items() if v or not isinstance(v, Mapping)}
+        text = describe_machine_yaml({"mechanism": robot.mechanism, **told})
+    keys = {name: tuple(keys_of(name)) for name in values}
+    return edit_yaml(
+        text,
+        {keys[name]: fit.value for name, fit in values.items()},
+        {keys[name]: f"{name}: {fit.comment}" for name, fit in values.items()},
+    )
+
+
+def write_edited(path: Path, head: Sequence[str], text: str) -> None:
+    """Write a file with lines of comment at its head, whole or not at all.
+
+    :raises PkmTwinError: not writable.
+    """
+    # A name in it may have anything in it, a new line too.
+    whole = "".join(f"# {one_line(line, 2000)}\n" for line in head) + text
+    try:
+        replace_file(path, whole.encode())
+    except OSError as error:
+        raise PkmTwinError(f"{path} cannot be written: {error.strerror}") from None
+
+
+def robot_text(
+    name: str, *, platform: str | None = None, per_copy: bool = False
+) -> tuple[str, Robot]:
+    """A robot and the text of its file; of a URDF, or with ``per_copy``, as a machine's YAML.
+
+    :raises ParameterError: the file is refused; or it is to be written out, and would lose what it
+        says of elasticity.
+    """
+    robot = load(name, platform=platform)
+    if per_copy and not robot.elastic_entries() and _elastic(robot):
+        raise ParameterError(
+            "--per-copy",
+            robot.name,
+            f"a robot whose elastic members can be written out; a {robot.mechanism}'s cannot: take "
+            "a file without them, or fit without --per-copy",
+        )
+    path = robot_path(name)
+    if path.suffix in TREES:
+        data = read_urdf(path, platform=platform)
+    elif per_copy:
+        data = robot_description(robot)
+    else:
+        return path.read_text(encoding="utf-8"), robot
+    return describe_machine_yaml(data), robot_of_data(data, path.stem)
+
+
+def _elastic(robot: Robot) -> bool:
+    """Whether its file has elastic members or joints."""
+    try:
+        robot.structure()
+    except ParameterError:
+        return False
+    return True

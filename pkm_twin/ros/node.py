@@ -21,6 +21,7 @@ from rclpy.clock import Clock, ClockChange, ClockType, JumpThreshold
 from rclpy.duration import Duration
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
+from rclpy.qos import DurabilityPolicy, QoSPolicyKind, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rosgraph_msgs.msg import Clock as ClockMessage
 from std_srvs.srv import Trigger
@@ -31,10 +32,40 @@ from pkm_twin.messages.intake import JointStateDecoder
 from pkm_twin.messages.stamps import SECOND
 from pkm_twin.ros.health import QOS, RELIABILITY, Health, Misfit, cut
 from pkm_twin.ros.parameters import ParameterNode
-from pkm_twin.ros.qos import EXPIRY, OVERRIDES, input_qos, latched_qos, output_qos
 from pkm_twin.ros.turns import SELDOM_PERIOD, SeldomGroup, Task, Tasks
 from pkm_twin.streams.monitor import TopicStatistics
 from pkm_twin.streams.topics import JOINTS, Topic
+
+OVERRIDES: Final = (QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH, QoSPolicyKind.RELIABILITY)
+EXPIRY: Final = (QoSPolicyKind.LIFESPAN, QoSPolicyKind.DEADLINE)
+"""QoS policies that parameters may override; the second ones of topics that expire."""
+
+
+def output_qos() -> QoSProfile:
+    """Reliable and volatile: a torque or a compliance is for now, never for a late joiner."""
+    return QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
+
+
+def latched_qos() -> QoSProfile:
+    """What does not change while a node runs, such as a description: late joiners get it too."""
+    return QoSProfile(
+        depth=1,
+        reliability=ReliabilityPolicy.RELIABLE,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL,
+    )
+
+
+def input_qos(depth: int, *, best_effort: bool, expiry: float | None = None) -> QoSProfile:
+    """Best effort takes what publishers of both kinds send; reliable only what reliable ones do.
+
+    :param expiry: lifespan and deadline that they have to offer, s; None is any.
+    """
+    kind = ReliabilityPolicy.BEST_EFFORT if best_effort else ReliabilityPolicy.RELIABLE
+    qos = QoSProfile(depth=depth, reliability=kind)
+    if expiry is not None:
+        qos.lifespan = qos.deadline = Duration(seconds=expiry)
+    return qos
+
 
 # The middleware's threads hold its locks while they report an event, and wait there for the lock
 # that the executor holds while it takes one or ends: a node could stand still for ever.

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
 S = TypeVar("S", bound="DataclassInstance")
+V = TypeVar("V")
 
 KNOWN = "7.1"
 """The rclpy that keeps parameter overrides as below, that of Jazzy."""
@@ -154,6 +155,42 @@ class ParameterNode(LifecycleNode):
         words = descriptor.additional_constraints.removeprefix("one of ").split(", ")
         if words != [""] and value not in words:
             raise UnknownNameError(name, value, words)
+
+    def follow(
+        self,
+        names: Iterable[str],
+        prepare: Callable[[dict[str, Any]], V],
+        take: Callable[[V], object],
+    ) -> None:
+        """A set of parameters is taken or refused whole, between two messages.
+
+        :param names: of all parameters that ``prepare`` knows.
+        :param prepare: makes what the new values, by name, come to; nothing else hangs on it yet. A
+            PkmTwinError refuses the set.
+        :param take: goes on with that, once the parameters have their values.
+        """
+        prepared: list[V] = []
+
+        def judge(changes: Sequence[Parameter]) -> SetParametersResult:
+            # What another callback has refused after this one is never taken.
+            prepared.clear()
+            values = {change.name: change.value for change in changes}
+            try:
+                for name, value in values.items():
+                    if self.has_parameter(name):
+                        self.check_parameter(name, value)
+                prepared.append(prepare(values))
+            except PkmTwinError as error:
+                return SetParametersResult(successful=False, reason=str(error))
+            return SetParametersResult(successful=True)
+
+        def follow(changes: Sequence[Parameter]) -> None:
+            while prepared:
+                take(prepared.pop())
+
+        self.followed.update(names)
+        self.add_on_set_parameters_callback(judge)
+        self.add_post_set_parameters_callback(follow)
 
     def close_declarations(self) -> None:
         """All parameters are declared: from here on others are refused, now and when set.

@@ -33,14 +33,13 @@ from pkm_twin.messages.stamps import SECOND
 from pkm_twin.robot.robot import Robot
 from pkm_twin.robot.robot_urdf import joint_names, robot_urdf
 from pkm_twin.ros import health
-from pkm_twin.ros.changes import follow_changes
 from pkm_twin.ros.node import TwinNode
 from pkm_twin.ros.run import run
 from pkm_twin.ros.wrench import declare_mounts, triple
 from pkm_twin.settings import changeable, with_parameters
 from pkm_twin.state.scene import Load, Scales, Scene, Shape
 from pkm_twin.state.state import STATE, MachineState, State, moving_state_kernel, state_kernel
-from pkm_twin.streams.pace import Pace
+from pkm_twin.streams.monitor import Pace
 from pkm_twin.streams.wrench import PLATFORM, Mount, WrenchSettings
 from stiffness_monitor.compliance import kernels, member_deflections, platform_response
 
@@ -235,8 +234,7 @@ class MachineStateNode(TwinNode):
             "joint_states", self._on_joint_state, refuse=self._core.refuse_joint_state, awaited=True
         )
         self.create_guarded_subscription("wrench", lambda m: self._core.wrench(m, self.now()))
-        follow_changes(
-            self,
+        self.follow(
             changeable(WrenchSettings),
             lambda values: with_parameters(self._core.settings, values),
             self._core.change_settings,

@@ -12,14 +12,12 @@ from numpy.typing import NDArray
 from pkm_twin.codegen.kernels import Kernel
 from pkm_twin.errors import MessageError
 from pkm_twin.kinematics.passive import moving_state_program, state_program
-from pkm_twin.messages.reading import JointSample, as_message_error
+from pkm_twin.messages.reading import JointSample, WrenchSample, as_message_error
 from pkm_twin.messages.stamps import SECOND
-from pkm_twin.messages.wrenches import WrenchSample
 from pkm_twin.robot.robot import Robot
-from pkm_twin.streams.pace import Pace
-from pkm_twin.streams.pairing import PairingCore
+from pkm_twin.streams.monitor import Pace
 from pkm_twin.streams.topics import JOINTS, TEXT, WRENCH, Topic, table
-from pkm_twin.streams.wrench import Mount, Recent, check_order
+from pkm_twin.streams.wrench import Mount, PairingCore, Recent, check_order
 
 _TRANSFORMS: Final = "tf2_msgs/TFMessage"
 

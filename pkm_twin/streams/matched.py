@@ -20,9 +20,8 @@ import numpy as np
 
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import MessageError
-from pkm_twin.messages.reading import JointSample
+from pkm_twin.messages.reading import JointSample, WrenchSample
 from pkm_twin.messages.stamps import SECOND
-from pkm_twin.messages.wrenches import WrenchSample
 from pkm_twin.streams.monitor import StreamMonitor
 from pkm_twin.streams.wrench import Mount, Recent, WrenchReader, counting
 

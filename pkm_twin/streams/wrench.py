@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any, Final, Generic, TypeVar
 
@@ -17,8 +18,9 @@ import numpy as np
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import MessageError, ParameterError
 from pkm_twin.machine import rotations
+from pkm_twin.messages.reading import JointReader, WrenchSample, read_wrench
 from pkm_twin.messages.stamps import SECOND, StampRules
-from pkm_twin.messages.wrenches import WrenchSample, read_wrench
+from pkm_twin.robot.robot import Robot
 from pkm_twin.settings import FUTURE, SECONDS, ZERO_STAMP, setting
 from pkm_twin.streams.monitor import StreamMonitor
 
@@ -225,3 +227,51 @@ class Recent(Generic[V]):
 def counting() -> StreamMonitor:
     """Counts messages that each stand for themselves: nothing stops them."""
     return StreamMonitor(trip_count=2**62, recovery_count=1)
+
+
+@dataclass
+class PairingCore:
+    """Settings that may change between two messages, and counts of what is taken and refused.
+
+    ``mounts``: tells where a wrench's frame stands; None is the settings' fixed mount.
+    """
+
+    robot: Robot
+    settings: WrenchSettings = field(default_factory=WrenchSettings)
+    mounts: Mounts | None = None
+
+    def __post_init__(self) -> None:
+        self.states = counting()
+        self.wrenches = counting()
+        self.last_reject = ""
+        self._reader = JointReader(self.robot)
+        self.change_settings(self.settings)
+
+    @property
+    def dropped(self) -> int:
+        """Joint states that were older than the one before."""
+        return self.states.rejected[STAMP_ORDER]
+
+    def change_settings(self, settings: WrenchSettings) -> None:
+        """Answer by other settings from the next message on."""
+        self.settings = settings
+        self._rules = settings.stamp_rules
+        self._wrench_reader = WrenchReader(settings, self.mounts)
+
+    def refuse_joint_state(self, error: MessageError) -> None:
+        """Count a joint state that is refused."""
+        self._refuse(self.states, error)
+
+    @contextmanager
+    def _judging(self, counts: StreamMonitor) -> Iterator[None]:
+        """Count a message as taken where all went well, else as refused."""
+        try:
+            yield
+        except MessageError as error:
+            self._refuse(counts, error)
+            raise
+        counts.accept()
+
+    def _refuse(self, counts: StreamMonitor, error: MessageError) -> None:
+        counts.reject(error.reason, str(error))
+        self.last_reject = str(error)

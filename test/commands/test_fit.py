@@ -11,8 +11,7 @@ import yaml
 
 from delta_dynamics import inverse_dynamics
 from pkm_twin.bags.reader import open_bag
-from pkm_twin.robot.edited import robot_text
-from pkm_twin.robot.entries import entries, with_entries
+from pkm_twin.robot.entries import entries, robot_text, with_entries
 from pkm_twin.robot.identifiable import shared_parameters
 from stiffness_monitor import compliance
 from test.commands.conftest import DELTA, STIFFNESS, rewrite

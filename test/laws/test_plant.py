@@ -10,7 +10,7 @@ import pytest
 from delta_dynamics import energy, inverse_dynamics, mass_matrix
 from delta_dynamics.complementarity import resisting
 from delta_dynamics.equations import Equations
-from delta_dynamics.plant import Plant
+from delta_dynamics.simulation import Plant
 from pkm_twin.errors import PkmTwinError
 from pkm_twin.machine.inertia import loaded_joints
 from pkm_twin.robot.catalogue import robot_of_data

@@ -18,9 +18,8 @@ import pytest
 from pkm_twin import load, robot_names
 from pkm_twin.design.pose_path import PosePath
 from pkm_twin.design.sweep import sweep as design_sweep
-from pkm_twin.errors import PkmTwinError
+from pkm_twin.errors import MissingExtraError, PkmTwinError
 from pkm_twin.maps import run as running
-from pkm_twin.maps.extras import MissingExtraError
 from pkm_twin.maps.run import ClusterError, on_cluster, run
 from pkm_twin.maps.store import MapError, Parts, open_map
 from test.maps.conftest import few, same

@@ -10,9 +10,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pkm_twin.errors import MessageError
-from pkm_twin.messages.reading import MAX_ACCELERATION, MAX_EFFORT, MAX_POINTS, JointReader
+from pkm_twin.messages.reading import (
+    MAX_ACCELERATION,
+    MAX_EFFORT,
+    MAX_FORCE,
+    MAX_POINTS,
+    JointReader,
+    read_wrench,
+)
 from pkm_twin.messages.stamps import MAX_DURATION, StampRules, stamp_of
-from pkm_twin.messages.wrenches import MAX_FORCE, read_wrench
 from test.nodes.harness import SECOND, Maker, Plain
 from test.support.rejects import reject
 from test.support.robots import load

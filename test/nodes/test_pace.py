@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from pkm_twin.streams.pace import Pace
+from pkm_twin.streams.monitor import Pace
 
 SECOND = 10**9
 

@@ -8,8 +8,8 @@ import pytest
 
 from pkm_twin.bags.reader import open_bag
 from pkm_twin.errors import MessageError
+from pkm_twin.messages.reading import in_base_axes, read_deflection
 from pkm_twin.messages.stamps import SECOND, StampRules
-from pkm_twin.streams.deflection import in_base_axes, read_deflection
 from stiffness_monitor.alarm import AlarmSettings, StiffnessAlarm
 from stiffness_monitor.monitor import Monitor
 from stiffness_monitor.watch import WAITING, StiffnessWatch

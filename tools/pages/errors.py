@@ -37,6 +37,10 @@ ERRORS = {
         errors.UnknownNameError("robot", "delt", robot_names()),
         "use the suggested name; `pkm-twin robots` lists the robots",
     ),
+    errors.MissingExtraError: (
+        errors.MissingExtraError("h5netcdf", "atlas"),
+        "install the extra that the line names",
+    ),
     errors.MobilityError: (
         errors.MobilityError(2, 1, ["elbow_2's axis is 1e-05 rad from parallel to motor_1's axis"]),
         "correct the named joint, or the number of `actuated` joints "

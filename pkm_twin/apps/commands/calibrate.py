@@ -26,7 +26,7 @@ from pkm_twin.identification.plan import plan as plan_of
 from pkm_twin.identification.pose_tables import read_measured, read_poses
 from pkm_twin.identification.transmission import Transmission, written
 from pkm_twin.report import Column, Fact, Report, Table
-from pkm_twin.robot.edited import Fitted, edited_yaml, write_edited
+from pkm_twin.robot.entries import Fitted, edited_yaml, write_edited
 from pkm_twin.robot.limits import beyond_limits, refuse_beyond
 from pkm_twin.settings import setting
 

@@ -251,7 +251,7 @@ def write_robot(robot: Robot, source: str, found: Found, path: Path, out: Path) 
 
     :raises PkmTwinError: not writable.
     """
-    from pkm_twin.robot.edited import Chosen, edited_yaml, write_edited
+    from pkm_twin.robot.entries import Chosen, edited_yaml, write_edited
 
     kept = "".join(f", {bound}" for bound in found.constraints)
     values = {
@@ -308,7 +308,7 @@ def swept(given: Design, path: Path, kind: str) -> Report:
     from pkm_twin.design import sweep as sweep_box
     from pkm_twin.design.sweep import here
     from pkm_twin.design.variables import parse_vary
-    from pkm_twin.maps.extras import require
+    from pkm_twin.errors import require
     from pkm_twin.maps.run import on_cluster
 
     out = given.out

@@ -123,7 +123,7 @@ def fit(given: Fit) -> Report:
 
     :raises PkmTwinError: recordings that show nothing, or that the machine cannot have made.
     """
-    from pkm_twin.robot.edited import robot_text
+    from pkm_twin.robot.entries import robot_text
 
     if given.drive is not None:
         return _of_drive(given, given.drive)
@@ -276,7 +276,7 @@ def _written(
     from pkm_twin.apps.fit_report import report_of
     from pkm_twin.identification.parameters import fitted_yaml
     from pkm_twin.report.page import page
-    from pkm_twin.robot.edited import write_edited
+    from pkm_twin.robot.entries import write_edited
 
     report, more = report_of(result, names, marks)
     facts = [

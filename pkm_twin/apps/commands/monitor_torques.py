@@ -12,7 +12,7 @@ from pkm_twin.apps.frame import command
 from pkm_twin.errors import MessageError, PkmTwinError
 from pkm_twin.messages.stamps import SECOND, stamp_of
 from pkm_twin.report import Fact, Report, Verdict, judged
-from pkm_twin.ros.listener import listening_node
+from pkm_twin.ros.context import listening_node
 from pkm_twin.ros.signals import first_signal
 from pkm_twin.settings import setting
 from pkm_twin.streams.arrivals import Arrivals

@@ -53,7 +53,7 @@ def view(given: View) -> Report:
 
     :raises PkmTwinError: a recording that cannot be read, or an address that is not free.
     """
-    from pkm_twin.maps.extras import require
+    from pkm_twin.errors import require
     from pkm_twin.view.door import Door, listen
 
     bag = given.bag
@@ -104,7 +104,7 @@ def _timeline(bag: Path, given: View) -> Timeline:
 @contextmanager
 def listening(live: Any, namespace: str) -> Iterator[None]:
     """Messages of the nodes in a namespace reach ``live`` while the block lasts."""
-    from pkm_twin.ros.listener import listening_node, subscribe_best_effort
+    from pkm_twin.ros.context import listening_node, subscribe_best_effort
     from pkm_twin.view.live import TOPICS
 
     ended = threading.Event()
