@@ -113,7 +113,9 @@ class ReadsTables:
         "for the same text; may be repeated",
     )
     units: str | None = setting(
-        None, "of a table: of rad, mrad, deg, m, cm, mm, um, s, ms, us; default SI"
+        None,
+        "of a table: of rad, mrad, deg, rev, m, cm, mm, um, s, ms, us, percent (of the motor's "
+        "rated torque, with --side motor); default SI",
     )
     time: str | None = setting(None, "name of a table's column of times")
 
@@ -154,6 +156,10 @@ class ReadsRecordings(ReadsTables, ReadsWrenches):
     topic: tuple[str, ...] = setting(
         (), "topic of joint states or wrenches; default: found by the robot's joint names"
     )
+    side: str = setting(
+        "joint", "whose values a table's joints have: the joint's, the controller's (joint_map) or "
+        "the motor's (drive)", choices=("joint", "controller", "motor"),
+    )  # fmt: skip
 
     def read(
         self, path: Path, robot: Robot | str | None, progress: Callable[[int], None] | None = None,
@@ -172,7 +178,7 @@ class ReadsRecordings(ReadsTables, ReadsWrenches):
         from pkm_twin.recordings import ReadOptions
 
         held, follow = getattr(self, "load", None), getattr(self, "follow", None)
-        return ReadOptions(self.topic, held, follow, self.dialect, self.frames, **more)
+        return ReadOptions(self.topic, held, follow, self.dialect, self.side, self.frames, **more)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -421,7 +427,7 @@ def read_options(
     from pkm_twin.recordings import ReadOptions
 
     return ReadOptions(
-        tuple(topics), load_of(payload, times), follow, CHOSEN.get(), FRAMES.get(), **more
+        tuple(topics), load_of(payload, times), follow, CHOSEN.get(), "joint", FRAMES.get(), **more
     )
 
 

@@ -92,6 +92,7 @@ class DriveSpec:
     the joint is ``rotor_inertia``.
 
     ``efficiency``: of the gear or screw, for sizing motors; the dynamics do not use it.
+    ``rated_torque``: the motor's (N m), for tables whose efforts are in per cent of it.
     """
 
     inertia: float = schema.number(at_least=0.0, unit="kg m2")
@@ -100,6 +101,7 @@ class DriveSpec:
     )
     lead: float | None = schema.number(at_least=1e-6, at_most=1e6, unit="m per turn", default=None)
     efficiency: float = schema.number(above=0.0, at_most=1.0, default=1.0)
+    rated_torque: float | None = schema.number(above=0.0, unit="N m", default=None)
 
     def verify(self, path: str) -> None:
         """One of the two."""

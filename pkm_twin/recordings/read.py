@@ -3,7 +3,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
@@ -12,6 +13,8 @@ import numpy as np
 from pkm_twin.bags.storage import is_bag
 from pkm_twin.codegen.arrays import Array, Mask
 from pkm_twin.errors import FileError, ParameterError, UnknownNameError, one_line, warn
+from pkm_twin.machine.joint_map import JointMap
+from pkm_twin.machine.sections import DriveSpec
 from pkm_twin.messages.reading import MAX_FORCE, MAX_MOMENT, MAX_SHIFT, MAX_TURN, TINY
 from pkm_twin.recordings.bags import read_bag
 from pkm_twin.recordings.payload import load_of_table
@@ -37,6 +40,14 @@ RECORDING: Final = (
     "an MCAP file, a rosbag2 folder, or a table with columns time, JOINT.position ..."
 )
 FOLLOW: Final = ("joints", "pose")
+SIDES: Final = ("joint", "controller", "motor")
+CONVERTED: Final[Mapping[str, Callable[[JointMap, Array], Array]]] = {
+    "position": JointMap.positions, "velocity": JointMap.rates, "acceleration": JointMap.rates,
+    "effort": JointMap.efforts, "measured": JointMap.efforts,
+    # A current is made an effort at the joint by one factor, which has the gear.
+    "current": lambda own, values: values * np.sign(own.factors),
+}  # fmt: skip
+"""The joints' values of a controller's or motor's, by the column's word."""
 POSE_MISS: Final = 1e-3
 """Difference between a table's pose and that of its joint positions, of the robot's size."""
 BLOCK: Final = 4096
@@ -111,9 +122,17 @@ def _of_table(path: Path, name: str | Robot | None, how: ReadOptions) -> Recordi
         _require_recording(path)
         raise ParameterError("--robot", None, "a robot, because a table does not name its robot")
     robot = name if isinstance(name, Robot) else load(name)
-    joints, table = robot.joint_names, read_table(path, kinds_of(robot), how.dialect)
-    _refuse_misspelt(table, robot, how)
-    q = table.stack_if([f"{joint}.position" for joint in joints])
+    table, side = read_table(path, kinds_of(robot, how.side), how.dialect), _side(robot, how.side)
+    joints = robot.joint_names if side is None else side.names
+    _refuse_misspelt(table, robot, joints, how)
+
+    def stack(word: str) -> Array | None:
+        values = table.stack_if([f"{joint}.{word}" for joint in joints])
+        if values is not None and word in EFFORTS[:2] and "effort" in how.dialect.units:
+            values = values * _rated(robot, how.side)
+        return values if values is None or side is None else CONVERTED[word](side, values)
+
+    q = stack("position")
     pose = None
     if all(name in table for name in robot.pose_names):
         pose = table.stack(robot.pose_names)
@@ -137,10 +156,10 @@ def _of_table(path: Path, name: str | Robot | None, how: ReadOptions) -> Recordi
         if pose is not None and how.follow is None:
             hint = "; --follow pose plans its pose again, --follow joints ignores it"
             check_pose(path, robot, q, pose, hint if how.planned else "")
-        qd, qdd = (table.stack_if([f"{joint}.{what}" for joint in joints]) for what in RATES[1:])
+        qd, qdd = map(stack, RATES[1:])
     if not (posed and how.planned):
         for word in how.efforts:
-            effort = table.stack_if([f"{joint}.{word}" for joint in joints])
+            effort = stack(word)
             if effort is not None:
                 break
     check_units(path, robot, time, q, qd, how.dialect)
@@ -160,7 +179,8 @@ def _of_table(path: Path, name: str | Robot | None, how: ReadOptions) -> Recordi
         source=str(path), notes=(
             *([] if held is None else [f"payload: {held}"]),
             *notes,
-            *([] if robot.controller.plain else [MAPPED]),
+            *([f"joints have the {how.side}'s values"] if side is not None else []),
+            *([] if robot.controller.plain or side is not None else [MAPPED]),
         ),
         start=round(1e9 * float(times[0])),
     )  # fmt: skip
@@ -180,17 +200,50 @@ def _require_recording(path: Path) -> None:
         raise ParameterError(str(path), f"columns {one_line(', '.join(columns), 80)}", RECORDING)
 
 
-def _refuse_misspelt(table: Table, robot: Robot, how: ReadOptions) -> None:
+def _side(robot: Robot, side: str) -> JointMap | None:
+    """What makes the joints' values of a table's; None where they are the joints' own.
+
+    :raises ParameterError: motors of a robot without drives.
+    """
+    if side not in SIDES:
+        raise UnknownNameError("side", side, SIDES)
+    own = robot.controller
+    if side != "motor":
+        return own if side == "controller" else None
+    turns = np.array([drive.turns for drive in _drives(robot)])
+    zero = np.zeros(len(turns))
+    factors = np.sign(own.factors) * turns
+    return replace(own, factors=factors, offsets=zero, changes=zero, centres=zero)
+
+
+def _drives(robot: Robot) -> list[DriveSpec]:
+    for joint, drive in zip(robot.joint_names, robot.drives, strict=True):
+        if drive is None:
+            raise ParameterError(f"{robot.name}: drive of {joint}", None, "a drive, for its motor")
+    return [drive for drive in robot.drives if drive is not None]
+
+
+def _rated(robot: Robot, side: str) -> Array:
+    """The motors' rated torques, shape (n,), N m."""
+    if side != "motor":
+        raise ParameterError("--units", "percent", "--side motor: it is the motor's rated torque")
+    rated = [drive.rated_torque for drive in _drives(robot)]
+    if None in rated:
+        raise ParameterError(f"{robot.name}: drive.rated_torque", None, "N m, for per cent of it")
+    return np.array(rated, np.float64)
+
+
+def _refuse_misspelt(table: Table, robot: Robot, joints: Sequence[str], how: ReadOptions) -> None:
     """Reject what would be read if its name were right, where nothing else may be there.
 
     :raises UnknownNameError: by the column.
     """
-    inputs = [f"{joint}.{what}" for joint in robot.joint_names for what in RATES]
+    inputs = [f"{joint}.{what}" for joint in joints for what in RATES]
     if how.planned:
         for name in table:
             joint, dot, what = name.rpartition(".")
             computed = what in EFFORTS or what.startswith("effort_")
-            if dot and joint in robot.joint_names and name not in inputs and not computed:
+            if dot and joint in joints and name not in inputs and not computed:
                 raise UnknownNameError(f"{table.path}: column", name, inputs)
     if how.deflected:
         known = ("time", *SIZES, *PAYLOAD, *robot.pose_names, *inputs)

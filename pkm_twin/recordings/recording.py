@@ -50,18 +50,21 @@ USUAL: Final = WrenchFrames()
 class ReadOptions:
     """How a recording is read, as options of commands say it.
 
-    ``topics``: of a bag, where names and joints do not tell. ``load``: the payload; None is the one
-    that the file tells of. ``follow``: ``joints`` or ``pose``: which columns of a table that has
-    both are the motion; None: both, which have to agree. ``limited``: messages beyond the robot's
-    limits are rejected, as a node does. ``planned``: the trajectory of a bag and the efforts of a
-    plan are read too. ``currents``: efforts of a table may be motor currents. ``deflected``:
-    deflections are needed, and a bag is read at their times.
+    ``topics``: of a bag, where names and joints do not tell. ``load``: the payload; None is the
+    one that the file tells of. ``follow``: ``joints`` or ``pose``: which columns of a table
+    that has both are the motion; None: both, which have to agree. ``side``: whose values a
+    table's joints have: of the ``joint``, the ``controller`` (joint_map) or the ``motor``
+    (drive). ``limited``: messages beyond the robot's limits are rejected, as a node does.
+    ``planned``: the trajectory of a bag and the efforts of a plan are read too. ``currents``:
+    efforts of a table may be motor currents. ``deflected``: deflections are needed, and a bag
+    is read at their times.
     """
 
     topics: tuple[str, ...] = ()
     load: Load | None = None
     follow: str | None = None
     dialect: Dialect = PLAIN
+    side: str = "joint"
     frames: WrenchFrames = USUAL
     limited: bool = False
     planned: bool = False

@@ -38,8 +38,9 @@ ENDINGS: Final = (".csv", ".parquet", ".mat")
 SEPARATORS: Final = {",": ",", ";": ";", "tab": "\t", "\t": "\t"}
 UNITS: Final = {
     "rad": ("angle", 1.0), "mrad": ("angle", 1e-3), "deg": ("angle", math.pi / 180.0),
-    "m": ("length", 1.0), "cm": ("length", 1e-2), "mm": ("length", 1e-3), "µm": ("length", 1e-6),
-    "um": ("length", 1e-6), "s": ("time", 1.0), "ms": ("time", 1e-3), "us": ("time", 1e-6),
+    "rev": ("angle", math.tau), "m": ("length", 1.0), "cm": ("length", 1e-2),
+    "mm": ("length", 1e-3), "µm": ("length", 1e-6), "um": ("length", 1e-6), "s": ("time", 1.0),
+    "ms": ("time", 1e-3), "us": ("time", 1e-6), "percent": ("effort", 1e-2),
 }  # fmt: skip
 """Units of a table: what they are of, and their size in SI."""
 RATES: Final = ("position", "velocity", "acceleration")
@@ -159,14 +160,20 @@ class Table(dict[str, Array]):
         return np.stack([self.get(n, np.full(self.rows, missing)) for n in names], -1)
 
 
-def kinds_of(robot: Robot) -> dict[str, str]:
-    """What the columns of a robot's motion measure: angle, length, time, or another quantity."""
+def kinds_of(robot: Robot, side: str = "joint") -> dict[str, str]:
+    """What the columns of a robot's motion measure: angle, length, time, or another quantity.
+
+    :param side: whose numbers the joints' are; a motor turns.
+    """
     kinds = {"time": "time"}
-    units = dict(zip(robot.joint_names, robot.joint_units, strict=True))
-    units |= dict(zip(robot.pose_names, robot.pose_units, strict=True))
+    names = robot.joint_names if side == "joint" else robot.controller.names
+    joints = ["rad" if side == "motor" else unit for unit in robot.joint_units]
+    units = dict(zip((*names, *robot.pose_names), (*joints, *robot.pose_units), strict=True))
+    units |= dict(zip(names, joints, strict=True))
     for name, unit in units.items():
         kinds |= dict.fromkeys((f"{name}.{what}" for what in RATES), UNITS[unit][0])
-        kinds |= dict.fromkeys((f"{name}.{what}" for what in EFFORTS), "effort")
+        kinds |= dict.fromkeys((f"{name}.{what}" for what in EFFORTS[:2]), "effort")
+        kinds[f"{name}.{EFFORTS[2]}"] = ""
     kinds |= dict.fromkeys((*DEFLECTION[:3], *PAYLOAD[1:], "blend"), "length")
     kinds |= dict.fromkeys(DEFLECTION[3:], "angle")
     kinds |= dict.fromkeys((*WRENCH, PAYLOAD[0], "dwell", "arc"), "")

@@ -3,6 +3,7 @@
 
 import csv
 import json
+import math
 import os
 import re
 import subprocess
@@ -12,19 +13,23 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 from scipy.io import loadmat
 
+from pkm_twin.bags.reader import BagWriter
 from pkm_twin.errors import ParameterError
-from pkm_twin.recordings import ReadOptions, read
+from pkm_twin.recordings import Dialect, ReadOptions, read, write_table
+from pkm_twin.recordings.topics import DEFINITIONS, JOINT_STATE
+from test.bags.folders import make_folder
 from test.support.command import command
-from test.support.robots import load
+from test.support.robots import load, parameters_of
 
 ROOT = Path(__file__).parents[2]
 
 
 @pytest.fixture
 def motion(tmp_path, monkeypatch):
-    """Times, positions and velocities of a motion of the linear Delta, and the robot."""
+    """A robot, and times and positions of a motion of it."""
     monkeypatch.chdir(tmp_path)
     robot = load("five_bar")
     time = np.linspace(0.0, 0.4, 21)
@@ -43,80 +48,154 @@ def plain(robot, time, q):
     return written(["time", *(f"{j}.position" for j in robot.joint_names)], [time, *q.T])
 
 
-def sized(capsys, *words):
-    done = command(capsys, "size", "five_bar", *words, "--json")
-    assert done.code == 0, done.err
-    return json.loads(done.out)["drives"]
+def bag(path, robot, time, q):
+    """The motion as joint states of an MCAP file."""
+    with BagWriter(path, flush_period=None) as writer:
+        writer.add_topic("/joint_states", JOINT_STATE, definition=DEFINITIONS[JOINT_STATE])
+        for t, row in zip(time.tolist(), q.tolist(), strict=True):
+            stamp = round(1e9 * t) + 1
+            header = {"stamp": {"sec": 0, "nanosec": stamp}, "frame_id": ""}
+            names = {"name": list(robot.joint_names), "position": row}
+            writer.write("/joint_states", {"header": header} | names, stamp)
+    return path
 
 
-def numbers_of(data):
-    if isinstance(data, dict):
-        return [n for value in data.values() for n in numbers_of(value)]
-    if isinstance(data, list):
-        return [n for value in data for n in numbers_of(value)]
-    return [data] if isinstance(data, float | int) else []
-
-
-def same(one, other):
-    np.testing.assert_allclose(numbers_of(one), numbers_of(other), rtol=1e-6, atol=1e-9)
+def saved(kind, robot, time, q):
+    """The motion as a file of a kind, and the dialect that it needs."""
+    joints = [f"{joint}.position" for joint in robot.joint_names]
+    deg, path = np.degrees(q.T), Path("a.csv")
+    text = {
+        "comma": lambda: written(["time", *joints], [time, *q.T]),
+        "semicolon": lambda: written(["time", *joints], [time, *q.T], ";"),
+        "decimal comma": lambda: written(["time", *joints], [time, *q.T], ";", ","),
+        "tabs": lambda: written(["time", *joints], [time, *q.T], "\t", ","),
+        "units in headers": lambda: written(
+            ["time (ms)", *(f"{joint} [deg]" for joint in joints)], [1e3 * time, *deg]
+        ),
+        "other names": lambda: "# of a logger\n" + written(["t", "q1", "q2"], [1e3 * time, *deg]),
+    }
+    if kind in text:
+        path.write_text(text[kind]())
+        names = f"{joints[0]}=q1,{joints[1]}=q2"
+        other = Dialect.of(columns=names, units="deg,ms", time="t")
+        return path, other if kind == "other names" else Dialect()
+    if kind == "Parquet":
+        pytest.importorskip("pyarrow")
+        write_table(dict(zip(["time", *joints], [time, *q.T], strict=True)), Path("a.parquet"))
+        return Path("a.parquet"), Dialect()
+    path = bag(Path("a.mcap"), robot, time, q)
+    return path if kind == "MCAP" else make_folder(Path("bag"), path), Dialect()
 
 
 @pytest.mark.parametrize(
-    ("separator", "point", "options"),
+    "kind",
     [
-        (";", ".", ()),
-        (";", ",", ()),
-        ("\t", ",", ()),
-        (";", ",", ("--separator", ";", "--decimal", ",")),
-        ("\t", ".", ("--separator", "tab")),
+        "comma", "semicolon", "decimal comma", "tabs", "units in headers", "other names",
+        "Parquet", "MCAP", "rosbag2 folder",
     ],
-)
-def test_separators_and_decimal_commas(separator, point, options, motion, capsys):
+)  # fmt: skip
+def test_a_recording_is_the_same_in_all_kinds_of_files(kind, motion):
     robot, time, q = motion
-    Path("a.csv").write_text(plain(robot, time, q))
-    header = ["time", *(f"{j}.position" for j in robot.joint_names)]
-    Path("b.csv").write_text(written(header, [time, *q.T], separator, point))
-    same(sized(capsys, "b.csv", *options), sized(capsys, "a.csv"))
-
-
-def test_names_and_units_of_columns(motion, capsys):
-    robot, time, q = motion
-    Path("a.csv").write_text(plain(robot, time, q))
-    Path("b.csv").write_text(written(["t", "q1", "q2"], [1e3 * time, *np.degrees(q.T)], ";", ","))
-    names = f"time=t,{robot.joint_names[0]}.position=q1,{robot.joint_names[1]}.position=q2"
-    same(
-        sized(capsys, "b.csv", "--columns", names, "--units", "deg,ms"), sized(capsys, "a.csv")
-    )  # fmt: skip
-    others = names.removeprefix("time=t,")
-    both = ("--time", "t", "--columns", others, "--units", "deg,ms")
-    same(sized(capsys, "b.csv", *both), sized(capsys, "a.csv"))
-    # Lengths stay as they are where a joint slides.
-    legs = load("stewart")
-    q = np.tile(legs.graph.home, (5, 1))
-    Path("c.csv").write_text(plain(legs, 0.1 * np.arange(5), q))
-    done = command(capsys, "size", "stewart", "c.csv", "--units", "deg", "--json")
-    assert done.code == 0, done.err
+    path, dialect = saved(kind, robot, time, q)
+    r = read(path, robot, ReadOptions(dialect=dialect))
+    np.testing.assert_allclose(r.time, time, atol=1e-9)
+    np.testing.assert_allclose(r.q, q, rtol=1e-12)
+    assert (r.qd, r.effort, r.wrench, r.load) == (None, None, None, None)
+    found = r.with_rates()
+    inner = slice(8, -8)
+    exact = 0.1 * np.array([5.0, 7.0]) * np.cos(np.outer(found.time, [5.0, 7.0]))
+    np.testing.assert_allclose(found.qd[inner], exact[inner], atol=0.01)
 
 
 @pytest.mark.parametrize(
     "options",
     [
-        ("--separator", "|"), ("--decimal", ";"), ("--units", "inch"), ("--units", "deg,rad"),
-        ("--columns", "time"), ("--columns", "time=nothing"), ("--time", "nothing"),
-        ("--time", "t", "--columns", "time=u"),
+        {"separator": "|"}, {"decimal": ";"}, {"units": "inch"}, {"units": "deg,rad"},
+        {"columns": "time"}, {"columns": "time=nothing"}, {"time": "nothing"},
+        {"time": "t", "columns": "time=u"}, {"columns": "elbow=t"},
     ],
 )  # fmt: skip
-def test_what_cannot_be_is_refused(options, motion, capsys):
+def test_what_cannot_be_is_refused(options, motion):
     Path("a.csv").write_text(plain(*motion).replace("time", "t"))
-    assert command(capsys, "size", "five_bar", "a.csv", *options).code == 1
+    with pytest.raises(ParameterError):
+        read("a.csv", motion[0], ReadOptions(dialect=Dialect.of(**options)))
 
 
-def test_an_ambiguous_table_is_refused(motion, capsys):
+@pytest.mark.parametrize("header", ["time [mm]", "time_ms,time"])
+def test_a_header_with_a_wrong_unit_or_twice_is_refused(header, motion):
+    robot, time, q = motion
+    text = plain(robot, time, q)
+    Path("a.csv").write_text(text.replace("time", header.partition(",")[0]))
+    if "," in header:
+        columns = [header.split(",")[0], "time", *(f"{j}.position" for j in robot.joint_names)]
+        Path("a.csv").write_text(written(columns, [time, time, *q.T]))
+    with pytest.raises(ParameterError, match=r"unit|different names"):
+        read("a.csv", robot)
+
+
+def test_an_ambiguous_table_is_refused(motion):
     """Commas between columns and a decimal comma: nobody can tell."""
     robot, time, q = motion
     header = ["time", *(f"{j}.position" for j in robot.joint_names)]
     Path("a.csv").write_text(written(header, [time, *q.T], ",", ","))
-    assert command(capsys, "size", "five_bar", "a.csv").code == 1
+    with pytest.raises(ParameterError):
+        read("a.csv", robot)
+
+
+def test_options_of_a_command_are_the_dialect(motion, capsys):
+    robot, time, q = motion
+    Path("a.csv").write_text(plain(robot, time, q))
+    Path("b.csv").write_text(written(["t", "q1", "q2"], [1e3 * time, *np.degrees(q.T)], ";", ","))
+    names = f"{robot.joint_names[0]}.position=q1,{robot.joint_names[1]}.position=q2"
+    given = ("--time", "t", "--columns", names, "--units", "deg,ms", "--decimal", ",")
+    told = []
+    for words in (("a.csv",), ("b.csv", "--separator", ";", *given)):
+        done = command(capsys, "size", "five_bar", *words, "--json")
+        assert done.code == 0, done.err
+        told.append(json.loads(done.out)["energy_J"])
+    assert told[1] == pytest.approx(told[0], rel=1e-6)
+
+
+@pytest.mark.parametrize("name", ["five_bar", "linear_delta"])
+def test_values_of_the_controller_and_of_the_motor_are_made_the_joints(name, tmp_path, rng):
+    """By joint_map, and by the drive's gear or screw; efforts in per cent of the rated torque."""
+    data = parameters_of(name)
+    joints = data["joints"] if name == "five_bar" else data["limbs"]["joints"]
+    gear = {"ratio": 20.0} if name == "five_bar" else {"lead": 0.01}
+    for joint in joints.values():
+        if joint.pop("rotor_inertia", None) is not None or joint.get("actuated"):
+            joint["drive"] = {"inertia": 1e-5, "rated_torque": 1.5, **gear}
+    names = load(name).joint_names
+    data["joint_map"] = {
+        joint: {"name": f"axis_{k}", "sign": (-1) ** k, "offset": 3.0, "ratio": 50.0}
+        for k, joint in enumerate(names)
+    }
+    path, out = tmp_path / f"{name}.yaml", tmp_path / "a.csv"
+    path.write_text(yaml.safe_dump(data))
+    robot = load(path)
+    time = np.linspace(0.0, 0.4, 21)
+    q = robot.graph.home + 0.05 * np.sin(np.outer(time, rng.uniform(2.0, 8.0, len(names))))
+    qd, effort = np.gradient(q, time, axis=0), rng.normal(size=q.shape)
+    turns = np.array([(-1) ** k * drive.turns for k, drive in enumerate(robot.drives)])
+    own = robot.controller
+    motor = (turns * q / math.tau, turns * qd / math.tau, 100.0 * effort / turns / 1.5)
+    controller = (own.controller_positions(q), own.controller_rates(qd),
+                  own.controller_efforts(effort))  # fmt: skip
+    header = [f"axis_{k}.{word}" for word in ("position", "velocity", "effort")
+              for k in range(len(names))]  # fmt: skip
+    for side, units, values in (
+        ("motor", "rev,ms,percent", motor),
+        ("controller", "ms", controller),
+    ):
+        out.write_text(written(["time", *header], [1e3 * time, *np.hstack(values).T]))
+        r = read(out, robot, ReadOptions(dialect=Dialect.of(units=units), side=side))
+        for found, expected in ((r.q, q), (r.qd, qd), (r.effort, effort)):
+            np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-12)
+    with pytest.raises(ParameterError, match="side motor"):
+        read(out, robot, ReadOptions(dialect=Dialect.of(units="percent"), side="controller"))
+    out.write_text(written(["time", *header], [time, *np.hstack(motor).T]).replace("axis", "leg"))
+    with pytest.raises(ParameterError, match=r"axis_0\.position"):
+        read(out, robot, ReadOptions(side="motor"))
 
 
 @pytest.mark.parametrize("cell", ["nan", "-inf", "1_0", "x", ""])
