@@ -42,6 +42,8 @@ class Lanes:
         """Cosines and sines by the number of their angle."""
         self.masks: dict[int, Value] = {}
         """Where expressions are above zero."""
+        self.flags: set[int] = set()
+        """Expressions that are 1 there and 0 elsewhere."""
 
     def number(self, value: float) -> Value:
         """A constant."""

@@ -27,18 +27,23 @@ from pkm_twin.codegen.assembly import (
     whole,
 )
 from pkm_twin.codegen.expressions import GEOMETRY, PARAMETERS, Expression, ordered, uses
-from pkm_twin.codegen.lanes import ALIGN, LANES, MASK, TRUE, VECTOR, Lanes
+from pkm_twin.codegen.lanes import ALIGN, LANES, TRUE, VECTOR, Lanes
 from pkm_twin.codegen.native import CPU, FEATURES, OPTIMISATION, PREPARE, QUICK, SYMBOL
 from pkm_twin.codegen.operations import CONSTANT, fused, sub
 from pkm_twin.codegen.program import (
-    CHANGE,
-    CLOSED,
-    CONTRACTION,
+    ALIVE,
+    BEFORE,
     LARGE,
-    RESIDUAL,
-    STEPPED,
+    MOVING,
+    ONCE,
+    PART,
+    PLACES,
+    REACHED,
+    SIZE,
+    STATE,
     TURNS,
     UNKNOWNS,
+    Equations,
     Program,
 )
 
@@ -95,6 +100,7 @@ class Emitter(Lanes):
     ) -> None:
         super().__init__(function, wide=wide)
         self.used, self.known = used, Known(known, function, prepared)
+        self._done = {*known, *self.known.places}
 
     def value(self, e: Expression, inputs: Mapping[str, Sequence[Value]]) -> Value:
         """The instructions of one expression, its arguments known."""
@@ -116,8 +122,9 @@ class Emitter(Lanes):
         self, results: Sequence[Expression], inputs: Mapping[str, Sequence[Value]]
     ) -> list[Value]:
         """Values of the results; every shared expression once."""
-        for e in ordered(results, [*self.known, *self.known.places]):
+        for e in ordered(results, self._done):
             self.known[e.number] = self.value(e, inputs)
+            self._done.add(e.number)
         return [self.known[e.number] for e in results]
 
 
@@ -140,11 +147,14 @@ class _Counter:
         b.go_to(self.body)
         return index
 
-    def close(self) -> None:
-        """Go round, and on behind it."""
+    def close(self, more: Value | None = None) -> None:
+        """Go round, by default in any case, and on behind it."""
         b = self.b
         b.store(b.add(b.load(self._place), whole(self.step)), self._place)
-        b.branch(self.head)
+        if more is None:
+            b.branch(self.head)
+        else:
+            b.cbranch(more, self.head, self.after)
         b.go_to(self.after)
 
 
@@ -229,11 +239,11 @@ class _Writer:
     def emitter(self) -> Emitter:
         return Emitter(self.b, self.used, self.constants, wide=True, prepared=self.prepared)
 
-    def _not(self, mask: Value) -> Value:
-        return self.b.xor(mask, TRUE)
-
     def _any(self, mask: Value) -> Value:
         return self.b.call(f"llvm.vector.reduce.or.v{LANES}i1", BIT, [mask])
+
+    def _above(self, value: Value) -> Value:
+        return self.b.fcmp("ogt", value, self.emitter().number(0.0))
 
     def _load(self, name: str, size: int) -> list[Value]:
         """An input's entries, a vector each."""
@@ -298,16 +308,13 @@ class _Writer:
         if program.equations is None:
             alive, reached = TRUE, self.emitter().number(1.0)
         else:
-            values[UNKNOWNS], alive, reached = self._solve(values)
+            values[UNKNOWNS], alive, reached = self._solve(program.equations, values)
         out = self.emitter()
         names = list(program.outputs)
         rows = {name: out.run(list(program.outputs[name]), values) for name in names}
         good = alive
         if program.equations is not None:
-            residual = out.run([program.equations.residual], values)[0]
-            good = b.and_(good, b.fcmp("ole", residual, out.number(RESIDUAL**2)))
-            for value in out.run(list(program.equations.branch), values):
-                good = b.and_(good, b.fcmp("ogt", value, out.number(0.0)))
+            good = b.and_(good, self._above(*out.run([program.equations.held], values)))
         total = out.number(0.0)
         for row in rows.values():
             for value in row:
@@ -324,101 +331,61 @@ class _Writer:
             target = self.pointers[f"to {name}"]
             self._save(target, [b.select(good, v, nothing) for v in rows[name]])
         self._save(self.pointers[f"to {STATUS}"], [code, reached])
-        bad = b.zext(self._any(self._not(good)), INT64)
+        bad = b.zext(self._any(b.xor(good, TRUE)), INT64)
         b.store(b.or_(b.load(self.flags), bad), self.flags)
         samples.close()
 
-    def _solve(self, values: Mapping[str, list[Value]]) -> tuple[list[Value], Value, Value]:
+    def _solve(
+        self, q: Equations, values: Mapping[str, list[Value]]
+    ) -> tuple[list[Value], Value, Value]:
         """Newton's method in steps; the unknowns, the lanes that got there, and how far."""
-        q = self.program.equations
-        assert q is not None  # noqa: S101
-        b = self.b
-        x = [b.alloca(VECTOR) for _ in q.home]
-        t = [b.alloca(VECTOR) for _ in q.origin]
-        alive, moving = b.alloca(MASK), b.alloca(MASK)
-        size, determinant, reached = b.alloca(VECTOR), b.alloca(VECTOR), b.alloca(VECTOR)
-        step, turn = b.alloca(INT64), b.alloca(INT64)
-        block = {
-            name: b.block(name)
-            for name in ("direct", "stepped", "step", "newton", "next", "solved")
-        }
-        n = self.emitter().number
-        known = self.emitter().run([*q.home, *q.origin], values)
-        home, origins = known[: len(q.home)], known[len(q.home) :]
-        b.store(TRUE, alive)
-        b.store(n(0.0), reached)
-        b.store(ONE, step)
-        once = b.icmp("eq", self.steps, ONE)
-        b.cbranch(once, block["direct"], block["stepped"])
-
-        b.go_to(block["direct"])
-        start = home if q.start is None else self.emitter().run(list(q.start), values)
-        for place, value in zip(x, start, strict=True):
-            b.store(value, place)
-        b.branch(block["step"])
-
-        b.go_to(block["stepped"])
-        for place, value in zip(x, home, strict=True):
-            b.store(value, place)
-        b.branch(block["step"])
-
-        b.go_to(block["step"])
-        k = b.load(step)
-        unity = real(1.0)
-        left = b.fsub(unity, b.fdiv(b.sitofp(k, DOUBLE), b.sitofp(self.steps, DOUBLE)))
-        # As `progress` has it.
-        part = b.fsub(unity, b.fmul(b.fmul(left, left), left))
-        final = b.icmp("eq", k, self.steps)
-        for place, origin, value in zip(t, origins, values[q.target], strict=True):
-            way = b.fmul(b.splat(part, LANES), b.fsub(value, origin))
-            b.store(b.select(final, value, b.fadd(origin, way)), place)
-        b.store(b.load(alive), moving)
-        begun = real(q.before), real(1e300)
-        b.store(b.splat(b.select(once, *begun), LANES), size)
-        b.store(n(0.0), determinant)
-        b.store(ZERO, turn)
-        b.branch(block["newton"])
-
-        b.go_to(block["newton"])
-        on = b.load(moving)
-        at = [b.load(place) for place in x]
-        out = self.emitter()
-        inputs = {**values, UNKNOWNS: at, q.target: [b.load(place) for place in t]}
-        *new, square, det = out.run(q.results, inputs)
-        for place, old, value in zip(x, at, new, strict=True):
-            b.store(b.select(on, value, old), place)
-        contracts = b.fcmp("ole", square, b.fmul(b.load(size), n(CONTRACTION**2)))
-        before = b.load(determinant)
-        first = b.fcmp("oeq", before, n(0.0))
-        steady = b.and_(
-            b.fcmp("ole", before, b.fmul(det, n(CHANGE))),
-            b.fcmp("ole", det, b.fmul(before, n(CHANGE))),
+        b, number = self.b, self.emitter().number
+        x, aim, n, (size,) = (
+            [b.alloca(VECTOR) for _ in range(count)]
+            for count in (len(q.home), len(q.origin), PLACES, 1)
         )
-        least = b.splat(b.select(once, real(q.least), real(STEPPED)), LANES)
-        # NaN fails every comparison.
-        sound = b.and_(b.and_(contracts, b.or_(first, steady)), b.fcmp("ogt", det, least))
-        live = b.and_(b.load(alive), b.or_(sound, self._not(on)))
-        b.store(live, alive)
-        b.store(square, size)
-        b.store(det, determinant)
-        on = b.and_(b.and_(on, live), b.fcmp("ogt", square, n(CLOSED**2)))
-        b.store(on, moving)
-        done = b.add(b.load(turn), ONE)
-        b.store(done, turn)
-        again = b.and_(self._any(on), b.icmp("slt", done, whole(TURNS)))
-        b.cbranch(again, block["newton"], block["next"])
 
-        b.go_to(block["next"])
-        live = b.and_(b.load(alive), self._not(b.load(moving)))
-        b.store(live, alive)
-        b.store(b.select(live, b.splat(part, LANES), b.load(reached)), reached)
-        k = b.add(b.load(step), ONE)
-        b.store(k, step)
-        onward = b.and_(self._any(live), b.icmp("sle", k, self.steps))
-        b.cbranch(onward, block["step"], block["solved"])
+        def run(
+            results: Sequence[Expression],
+            *to: Value,
+            first: Sequence[Expression] = (),
+            **moved: Sequence[Value],
+        ) -> None:
+            """Results of the state and of what has moved."""
+            here = {name: [b.load(place) for place in row] for name, row in moved.items()}
+            here[STATE] = [b.load(place) for place in n]
+            out, given = self.emitter(), {**values, **here}
+            out.masks |= uniform
+            # All of a correction before what is kept of it: fewer values wait in registers.
+            out.run(first, given)
+            for place, e in zip(to, results, strict=True):
+                b.store(out.run([e], given)[0], place)
 
-        b.go_to(block["solved"])
-        return [b.load(place) for place in x], b.load(alive), b.load(reached)
+        once = b.icmp("eq", self.steps, ONE)
+        b.store(b.select(once, number(1.0), number(0.0)), n[ONCE])
+        b.store(number(1.0), n[ALIVE])
+        b.store(number(0.0), n[REACHED])
+        # The same for all lanes: a jump, which is foreseen, instead of a choice by lane.
+        uniform = {q.state[ONCE].number: once}
+        run(q.begin, *x, size)
+        steps = _Counter(b, "step", self.steps)
+        k = b.add(steps.begin(), ONE)
+        uniform[q.underway.number] = b.icmp("slt", k, self.steps)
+        # As `progress` has it.
+        left = b.fsub(real(1.0), b.fdiv(b.sitofp(k, DOUBLE), b.sitofp(self.steps, DOUBLE)))
+        part = b.fsub(real(1.0), b.fmul(b.fmul(left, left), left))
+        b.store(b.splat(part, LANES), n[PART])
+        b.store(b.load(size), n[SIZE])
+        b.store(number(0.0), n[BEFORE])
+        b.store(b.load(n[ALIVE]), n[MOVING])
+        run(q.aim, *aim)
+        turns = _Counter(b, "turn", whole(TURNS))
+        turns.begin()
+        run(q.correct, *x, *n[SIZE : ALIVE + 1], first=q.results, **{UNKNOWNS: x, q.target: aim})
+        turns.close(self._any(self._above(b.load(n[MOVING]))))
+        run(q.arrive, n[ALIVE], n[REACHED])
+        steps.close(self._any(self._above(b.load(n[ALIVE]))))
+        return [b.load(place) for place in x], self._above(b.load(n[ALIVE])), b.load(n[REACHED])
 
 
 def emit(program: Program) -> str:

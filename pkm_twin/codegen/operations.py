@@ -245,7 +245,7 @@ def _turn(name: str, index: int, slope: Callable[[Any], Any]) -> Operation:
     def lanes(to: Lanes, e: Any, x: Value) -> Value:
         number = e.args[0].number
         if number not in to.turned:
-            to.turned[number] = _both(to, x)
+            to.turned[number] = _turned(to, x)
         return to.turned[number][index]
 
     turn = Operation(
@@ -257,7 +257,7 @@ def _turn(name: str, index: int, slope: Callable[[Any], Any]) -> Operation:
     return turn
 
 
-def _both(to: Lanes, x: Value) -> tuple[Value, Value]:
+def _turned(to: Lanes, x: Value) -> tuple[Value, Value]:
     """Cosine and sine."""
     b, n = to.b, to.number
     quarters = to.call("rint", b.fmul(x, n(2 / math.pi)))
@@ -340,16 +340,25 @@ def _signed(to: Lanes, e: Any, x: Value) -> Value:
     return b.select(b.fcmp("ogt", x, n(0.0)), n(1.0), down)
 
 
-def _below(to: Lanes, e: Any, x: Value, y: Value) -> Value:
-    mask = to.masks[e.number] = to.b.fcmp("olt", x, y)
+def _flag(to: Lanes, e: Any, mask: Value) -> Value:
+    """1 or 0, for what selects by it the condition itself."""
+    to.masks[e.number] = mask
+    to.flags.add(e.number)
     return to.b.select(mask, to.number(1.0), to.number(0.0))
 
 
+def _below(to: Lanes, e: Any, x: Value, y: Value) -> Value:
+    return _flag(to, e, to.masks.get(e.number) or to.b.fcmp("olt", x, y))
+
+
 def _selected(to: Lanes, e: Any, x: Value, y: Value, z: Value) -> Value:
-    number = e.args[0].number
-    if number not in to.masks:
-        to.masks[number] = to.b.fcmp("ogt", x, to.number(0.0))
-    return to.b.select(to.masks[number], y, z)
+    where, value, other = e.args
+    if where.number not in to.masks:
+        to.masks[where.number] = to.b.fcmp("ogt", x, to.number(0.0))
+    mask = to.masks[where.number]
+    if value.number in to.flags and other.is_constant(0.0):
+        return _flag(to, e, to.b.and_(mask, to.masks[value.number]))
+    return to.b.select(mask, y, z)
 
 
 def _choice(x: Any, y: Any, z: Any) -> Any:
@@ -431,6 +440,11 @@ OPERATIONS: Final = (
     add, sub, mul, neg, inv, sqrt, sin, cos, exp, tanh, absolute, sign, atan2, minimum, maximum,
     less, select,
 )  # fmt: skip
+
+
+def both(x: Any, y: Any) -> Any:
+    """1 where two conditions are met, 1 or 0 as they are, else 0."""
+    return select(x, y, 0.0)
 
 
 def fused(e: Any, used: Mapping[int, int], known: Container[int]) -> tuple[bool, Any, Any] | None:

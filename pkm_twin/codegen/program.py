@@ -9,7 +9,7 @@ from functools import cached_property
 from typing import Any, Final
 
 from pkm_twin.codegen.expressions import GEOMETRY, PARAMETERS, Expression, Tape, count, ordered
-from pkm_twin.codegen.operations import PARAMETER, SAMPLE
+from pkm_twin.codegen.operations import PARAMETER, SAMPLE, both, less, select
 from pkm_twin.errors import PkmTwinError
 
 UNKNOWNS: Final = "x"
@@ -36,12 +36,12 @@ RESIDUAL: Final = 1e-10
 """Largest residual of all equations, those that were not solved too, lengths over the size."""
 
 
-def ahead(origin: Sequence[Any], goal: Sequence[Any], k: int, steps: int) -> Sequence[Any]:
-    """The target of step ``k``, 1 to ``steps``, on the way from the origin to ``goal``."""
-    if k == steps:
-        return goal
-    part = progress(k / steps)
-    return [a + part * (b - a) for a, b in zip(origin, goal, strict=True)]
+STATE: Final = "n"
+"""Name of the input that Newton's method keeps between corrections, by these places:"""
+ONCE, PART, SIZE, BEFORE, MOVING, ALIVE, REACHED, PLACES = range(8)
+"""1 in a single step, else 0; part of the way to the target of a step; square of the last
+correction, and the determinant there, 0 before the first one; 1 as long as a sample is corrected,
+as long as it is not refused; part of the way that it has reached. And how many there are."""
 
 
 def progress(share: float) -> float:
@@ -82,24 +82,81 @@ class Equations:
     branch: Sequence[Expression] = ()
     """Above zero in the mechanism's own branch, at the target."""
 
-    @property
-    def least(self) -> float:
-        """Least determinant of a state that is reached at once.
-
-        A closed form of the start is in the right assembly; a guess may lead to another.
-        """
-        return DIRECT if self.start is None or self.guessed else STEPPED
-
-    @property
-    def before(self) -> float:
-        """Square of what the first correction of a single step has to contract from."""
-        known = self.start is not None and not self.guessed
-        return 1e300 if known else (FIRST / CONTRACTION) ** 2
+    lone: bool = False
+    """Whether a sample is solved alone: its state says nothing of whether it moves."""
 
     @property
     def results(self) -> list[Expression]:
         """All expressions of one correction."""
         return [*self.corrected, self.size, self.determinant]
+
+    @cached_property
+    def state(self) -> list[Any]:
+        """:data:`STATE` as expressions."""
+        state = list(self.size.tape.inputs(STATE, PLACES))
+        if self.lone:
+            state[MOVING] = state[ALIVE] = self.size.tape.constant(1.0)
+        return state
+
+    def _lift(self, *values: Any) -> list[Expression]:
+        return [self.size.tape.lift(value) for value in values]
+
+    @cached_property
+    def begin(self) -> list[Expression]:
+        """Unknowns to begin with, and the square that the first correction contracts from."""
+        once, known = self.state[ONCE], self.start is not None and not self.guessed
+        starts = zip(self.start or self.home, self.home, strict=True)
+        size = 1e300 if known else select(once, (FIRST / CONTRACTION) ** 2, 1e300)
+        return self._lift(*(select(once, start, home) for start, home in starts), size)
+
+    @cached_property
+    def underway(self) -> Expression:
+        """1 in a step that does not lead to the target, else 0."""
+        return self._lift(less(self.state[PART], 1.0))[0]
+
+    @cached_property
+    def aim(self) -> list[Expression]:
+        """The target of a step."""
+        part, more = self.state[PART], self.underway
+        goal = self.size.tape.inputs(self.target, len(self.origin))
+        ways = zip(self.origin, goal, strict=True)
+        return self._lift(*(select(more, a + part * (b - a), b) for a, b in ways))
+
+    @cached_property
+    def correct(self) -> list[Expression]:
+        """After a correction: the unknowns, then the state from SIZE to ALIVE.
+
+        A sample stays refused where a correction does not contract, or where the determinant is
+        too small or changes too much. A closed form of the start is in the right assembly; a guess
+        may lead to another.
+        """
+        state, size, determinant = self.state, self.size, self.determinant
+        once, before, moving = state[ONCE], state[BEFORE], state[MOVING]
+        known = self.start is not None and not self.guessed
+        x = self.size.tape.inputs(UNKNOWNS, len(self.home))
+        new = (select(moving, a, b) for a, b in zip(self.corrected, x, strict=True))
+        near = select(less(0.0, before), before, determinant)
+        steady = both(less(near, CHANGE * determinant), less(determinant, CHANGE * near))
+        least = STEPPED if known else select(once, DIRECT, STEPPED)
+        sound = both(less(size, CONTRACTION**2 * state[SIZE]), less(least, determinant))
+        sound = both(sound, steady)
+        moves = both(moving, both(sound, less(CLOSED**2, size)))
+        return self._lift(*new, size, determinant, moves, select(moving, sound, state[ALIVE]))
+
+    @cached_property
+    def arrive(self) -> list[Expression]:
+        """After a step: the state ALIVE and REACHED. What still moves is refused."""
+        n = self.state
+        alive = select(n[MOVING], 0.0, n[ALIVE])
+        return self._lift(alive, select(alive, n[PART], n[REACHED]))
+
+    @cached_property
+    def held(self) -> Expression:
+        """1 where all equations hold, in the mechanism's own branch, else 0."""
+        held = less(self.residual, RESIDUAL**2)
+        for value in self.branch:
+            held = both(held, less(0.0, value))
+        return self._lift(held)[0]
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,7 +176,7 @@ class Program:
     def __post_init__(self) -> None:
         known = {**self.inputs, PARAMETERS: self.parameters, GEOMETRY: self.geometry}
         if self.equations is not None:
-            known[UNKNOWNS] = len(self.equations.home)
+            known |= {UNKNOWNS: len(self.equations.home), STATE: PLACES}
         for e in ordered(self.results):
             name, index = e.source or ("", -1)
             if not index < known.get(name, 0):
@@ -136,7 +193,7 @@ class Program:
         rows = [e for row in self.outputs.values() for e in row]
         q = self.equations
         if q is not None:
-            rows += [*q.home, *q.origin, *(q.start or ()), *q.results, q.residual, *q.branch]
+            rows += [*q.begin, *q.aim, *q.correct, *q.arrive, q.held]
         return rows
 
     @cached_property

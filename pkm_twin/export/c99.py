@@ -8,26 +8,27 @@ as the other back ends.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from textwrap import indent
 from typing import Any, Final
 
 from pkm_twin.codegen.code import STEPS
 from pkm_twin.codegen.expressions import Expression, Tape, count, ordered
-from pkm_twin.codegen.operations import OPERATIONS, PARAMETER, SAMPLE, Operation, c_number
+from pkm_twin.codegen.operations import OPERATIONS, PARAMETER, SAMPLE, Operation
 from pkm_twin.codegen.program import (
-    CHANGE,
-    CLOSED,
-    CONTRACTION,
+    BEFORE,
     LARGE,
-    RESIDUAL,
-    STEPPED,
+    MOVING,
+    ONCE,
+    PART,
+    SIZE,
+    STATE,
     TURNS,
     UNKNOWNS,
     Equations,
 )
-from pkm_twin.export.c_lines import Lines, bare, table
+from pkm_twin.export.c_lines import Lines, bare
 
 LADDER: Final = (1, *STEPS)
 """Steps of Newton's method, one attempt after the other."""
@@ -63,7 +64,7 @@ class Folding:
         return Equations(
             q.target, self(q.home, given), self(q.origin, given),
             None if q.start is None else self(q.start, given), self(q.corrected, given),
-            size, determinant, residual, q.guessed, self(q.branch, given),
+            size, determinant, residual, q.guessed, self(q.branch, given), lone=True,
         )  # fmt: skip
 
 
@@ -103,18 +104,11 @@ static int @_finite(const double *values, int count)
     return (total < {LARGE!r}) ? 1 : 0;
 }}
 
-/* Status of results r, behind which stand the square of the closures' residual, and numbers that
-   are above zero in the machine's own assembly. */
-static int @_judged(const double *r, int results, int branches)
+/* Status of results r, behind which stands whether the closures hold. */
+static int @_judged(const double *r, int results)
 {{
-    int i;
-    if (!(r[results] <= {RESIDUAL**2!r})) {{
+    if (!(r[results] > 0.0)) {{
         return 1;
-    }}
-    for (i = 1; i <= branches; i++) {{
-        if (!(r[results + i] > 0.0)) {{
-            return 1;
-        }}
     }}
     return (@_finite(r, results) != 0) ? 0 : 2;
 }}
@@ -198,66 +192,49 @@ static const int @_steps[{len(LADDER)}] = {{{steps}}};
         n, m = len(q.home), len(q.origin)
         if not n:
             return
-        # What the unknowns have no part in is computed once a step, and the last for the results.
-        ahead = _without(UNKNOWNS, q.results)
+        # What does not change in a step is computed once, and the last of it serves the results.
+        ahead = _without((UNKNOWNS, STATE), q.correct)
         known = self._ahead[name] = {e.number: f"h[{k}]" for k, e in enumerate(ahead)}
         aim = {q.target: "aim"}
         prepare = self.function(f"{name}_ahead", ahead, {}, aim) % "h" if ahead else "(void)h"
-        call = self.function(f"{name}_correct", q.results, known, aim)
-        start = ""
-        if q.start is not None:
-            begin = self.function(f"{name}_start", q.start, known, aim) % "x"
-            start = f"\n        if (steps == 1) {{\n            {begin};\n        }}"
-        least, size = _choice(q.least, STEPPED), _choice(q.before, LARGE)
-        self.add(table(f"@_{name}_home", [e.value for e in q.home]))
-        self.add(table(f"@_{name}_origin", [e.value for e in q.origin]))
+        begin = self.function(f"{name}_begin", q.begin, known, aim)
+        correct = self.function(f"{name}_correct", q.correct, known, aim) % "next"
+        target = self.function(f"{name}_aim", q.aim, {}) % "aim"
         self.add(f"""\
 /* Newton's method from the known assembly in so many steps; 0 where it does not get there. */
 static int @_{name}(const double *{q.target}, int steps, double *h, double *x)
 {{
-    double aim[{m}], next[{n + 2}];
+    double {STATE}[{MOVING}], aim[{m}], next[{n + 4}], first = 0.0;
     int i, k;
-    for (i = 0; i < {n}; i++) {{
-        x[i] = @_{name}_home[i];
-    }}
+    {STATE}[{ONCE}] = (steps == 1) ? 1.0 : 0.0;
     for (k = 1; k <= steps; k++) {{
         const double left = 1.0 - ((double)k / (double)steps);
-        const double part = 1.0 - ((left * left) * left);
-        double size = {size};
-        double before = 0.0;
-        int turn;
-        for (i = 0; i < {m}; i++) {{
-            const double from = @_{name}_origin[i];
-            aim[i] = (k == steps) ? {q.target}[i] : (from + (part * ({q.target}[i] - from)));
-        }}
-        {prepare};{start}
-        for (turn = 0; turn < {TURNS}; turn++) {{
-            double square, det;
-            {call % "next"};
-            square = next[{n}];
-            det = next[{n + 1}];
-            if (!(square <= ({CONTRACTION**2!r} * size))) {{
-                return 0;
-            }}
-            if (!(det > {least})) {{
-                return 0;
-            }}
-            if ((turn > 0) && !(before <= ({CHANGE!r} * det))) {{
-                return 0;
-            }}
-            if ((turn > 0) && !(det <= ({CHANGE!r} * before))) {{
-                return 0;
-            }}
+        int turn, moving = 1;
+        {STATE}[{PART}] = 1.0 - ((left * left) * left);
+        {target};
+        {prepare};
+        if (k == 1) {{
+            {begin % "next"};
             for (i = 0; i < {n}; i++) {{
                 x[i] = next[i];
             }}
-            size = square;
-            before = det;
-            if (size <= {CLOSED**2!r}) {{
-                break;
+            first = next[{n}];
+        }}
+        {STATE}[{SIZE}] = first;
+        {STATE}[{BEFORE}] = 0.0;
+        for (turn = 0; (turn < {TURNS}) && (moving != 0); turn++) {{
+            {correct};
+            for (i = 0; i < {n}; i++) {{
+                x[i] = next[i];
+            }}
+            {STATE}[{SIZE}] = next[{n}];
+            {STATE}[{BEFORE}] = next[{n + 1}];
+            moving = (next[{n + 2}] > 0.0) ? 1 : 0;
+            if (!(next[{n + 3}] > 0.0)) {{
+                return 0;
             }}
         }}
-        if (!(size <= {CLOSED**2!r})) {{
+        if (moving != 0) {{
             return 0;
         }}
     }}
@@ -280,12 +257,12 @@ static int @_{name}(const double *{q.target}, int steps, double *h, double *x)
         q = self._solvers.get(routine.solver)
         results = [e for row in routine.outputs.values() for e in row]
         wanted = [*results, *routine.gates]
-        judged = [] if q is None else [q.residual, *q.branch]
+        judged = [] if q is None else [q.held]
         known = self._known | self._ahead.get(routine.solver, {})
         given = {"p": "parameters"}
         call = self.function(f"{routine.name}_of", [*wanted, *judged], known, given) % "r"
         finite = [f"(@_finite({name}, {size}) != 0)" for name, size in routine.inputs.items()]
-        verdict = f"status = @_judged(r, {len(wanted)}, {len(judged) - 1});"
+        verdict = f"status = @_judged(r, {len(wanted)});"
         if q is None:
             verdict = f"status = (@_finite(r, {len(wanted)}) != 0) ? 0 : 2;"
         lines = [f"    double r[{len(wanted) + len(judged)}];"]
@@ -331,7 +308,7 @@ static int @_{name}(const double *{q.target}, int steps, double *h, double *x)
     def operations(self, routine: Routine) -> tuple[int, int]:
         """Operations of one correction, and of the results."""
         q = self._solvers.get(routine.solver)
-        judged = [] if q is None else [q.residual, *q.branch]
+        judged = [] if q is None else [q.held]
         results = [e for row in routine.outputs.values() for e in row]
         solving = count(q.results) if q is not None and q.home else 0
         return solving, count([*results, *routine.gates, *judged])
@@ -348,20 +325,13 @@ def edge(rows: Iterable[Sequence[Expression]]) -> list[Expression]:
     return list(found.values())
 
 
-def _without(name: str, results: Sequence[Expression]) -> list[Expression]:
-    """What hangs on other inputs alone, and what hangs on this one reads."""
+def _without(names: Container[str], results: Sequence[Expression]) -> list[Expression]:
+    """What hangs on other inputs alone, and what hangs on these reads."""
     moved: set[int] = set()
     found: dict[int, Expression] = {}
     for e in ordered(results):
-        if (e.source or "")[:1] == (name,) or any(x.number in moved for x in e.args):
+        if (e.source or ("",))[0] in names or any(x.number in moved for x in e.args):
             moved.add(e.number)
             still = (x for x in e.args if x.number not in moved and x.op is not None)
             found |= {x.number: x for x in still}
     return list(found.values())
-
-
-def _choice(once: float, stepped: float) -> str:
-    """A bound of Newton's method in one step, and in more."""
-    if once == stepped:
-        return c_number(once)
-    return f"((steps == 1) ? {c_number(once)} : {c_number(stepped)})"
