@@ -142,25 +142,7 @@ def everywhere(names, how):
         (everywhere(WRENCH, lambda v: v * 1e250), "line 2: fx"),
         (everywhere(WRENCH, lambda v: v * 1e-311), "line 2: fx"),
         (everywhere(DEFLECTION, lambda v: v * 1e300), "line 2: dx"),
-        (everywhere(DEFLECTION, lambda v: 1e3 * v), "units? m and rad"),
-        (everywhere(WRENCH, lambda v: 1e-3 * v), "units? m and rad"),
-        (everywhere(DEFLECTION, lambda v: -v), "against its loads"),
-        (everywhere(DEFLECTION, np.zeros_like), "no deflection, every one is the same"),
-        (everywhere(DEFLECTION, lambda v: 0.0 * v + 1e-4), "no deflection, every one is the same"),
-        pytest.param(
-            {n: np.random.default_rng(k).permutation for k, n in enumerate(DEFLECTION)},
-            "no compliance of this robot explains",
-            marks=pytest.mark.long,
-        ),
-        (
-            {
-                n: lambda v, k=k: 1e-6 * np.random.default_rng(k).normal(size=v.shape)
-                for k, n in enumerate(DEFLECTION)
-            },
-            "no compliance of this robot explains",
-        ),
         ({"limb_2__position": lambda v: 0.0 * v}, "limb_2.position at sample 0"),
-        ({"limb_2__position": lambda v: 0.0 * v + 0.29}, "--beyond-limits"),
     ],
 )
 def test_numbers_that_are_no_recording_of_this_machine(
