@@ -100,7 +100,7 @@ class Fit(Result):
     @property
     def delays(self) -> tuple[float, ...]:
         """How late the efforts are against the positions, s, by recording."""
-        return self.problem.solved.delays
+        return self.problem.delays
 
     @property
     def outliers(self) -> int:
@@ -141,10 +141,10 @@ def fitted(
     :param accepted: why the machine cannot have made the recordings, although they are fitted.
     :raises PkmTwinError: recordings that show nothing.
     """
-    parameters, result = problem.parameters, problem.solved.estimate
+    parameters, result = problem.parameters, problem.estimate
     other = problem.again([next_window(made.how.window) for made in problem.whole], progress)
     # What another differentiation changes is uncertain too.
-    change = other.solved.estimate.values - result.values
+    change = other.estimate.values - result.values
     result = replace(result, covariance=result.covariance + np.outer(change, change))
     verdict = verdict_of(problem)
     if accepted:

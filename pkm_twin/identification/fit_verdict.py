@@ -128,12 +128,11 @@ class _Court:
     """All recordings of a fit, to be judged by several sets of parameters and suspects."""
 
     def __init__(self, problem: Problem, lengths: Lengths) -> None:
-        self.robot, self.everything, self.solved = problem.robot, problem.everything, problem.solved
-        self.chosen, self.values = problem.chosen, problem.values
+        self.problem, self.everything, self.values = problem, problem.everything, problem.values
         self.kinds = np.array([g.kind for g in self.everything.groups for _ in g.names])
         self.recordings: list[_Recording] = []
         self.suspects: tuple[Suspect, ...] = ()
-        for rows, delay in zip(problem.whole, self.solved.delays, strict=True):
+        for rows, delay in zip(problem.whole, problem.delays, strict=True):
             errors, missed = errors_of(rows, self.values)
             own = np.stack([column for _, column in errors], -1)
             columns = np.concatenate([own, lengths.columns(rows, self.values)], -1)
@@ -150,13 +149,13 @@ class _Court:
             for k in np.flatnonzero(~free)
         ]
         cases = [self._evidence(i, free) for i in range(len(self.recordings))]
-        e = self.solved.estimate
+        e = self.problem.estimate
         values = np.where(free, self.values, file.values)
         prior = (
-            (values - file.values)[free], e.prior[free[self.chosen]],
+            (values - file.values)[free], e.prior[free[self.problem.chosen]],
             np.sqrt(np.diag(e.covariance)),
         )  # fmt: skip
-        return judge(self.robot.joint_names, suspects, cases, prior, self.solved.response)
+        return judge(self.problem.robot.joint_names, suspects, cases, prior, self.problem.response)
 
     def late_or_elastic(self, free: Mask) -> tuple[Finding, Array] | None:
         """The delay of the efforts where elastic drives explain the residual nearly as well.
@@ -198,7 +197,7 @@ class _Court:
             (Suspect(ELASTIC, sizes),),
         )  # fmt: skip
         signals = [case.suspects[..., which] @ gives.clip(0.0)[:, None] for case in cases]
-        return finding, self.solved.response(signals)[:, 0]
+        return finding, self.problem.response(signals)[:, 0]
 
     def inertia_shown(self) -> bool:
         """Whether the recordings would show time at twice or half its rate, friction being any."""
@@ -233,6 +232,6 @@ class _Court:
             np.concatenate([rows.change[..., None], one.missed], -1),
             np.sqrt(np.sum(np.mean(one.missed**2, 0), -1)),
             np.concatenate([one.columns, others], -1),
-            rows.signals.noise, rows.signals.band, rows.counts, self.solved.counts[i],
+            rows.signals.noise, rows.signals.band, rows.counts, rows.held_from,
             np.sqrt(np.mean(effort**2, 0)), np.std(effort, 0),
         )  # fmt: skip

@@ -181,7 +181,7 @@ def _compared(name: str, before: Fit, after: Problem) -> Choice:
 def _least(problem: Problem, rows: Rows) -> Array:
     """Held-out efforts by least squares alone, (k, n)."""
     end = rows.held_out
-    return end.rest + end.table @ problem.solved.estimate.values
+    return end.rest + end.table @ problem.estimate.values
 
 
 def _opened(before: Problem, name: str) -> tuple[dict[str, Searched], Robot]:
@@ -245,8 +245,8 @@ class _Search:
     def __init__(self, before: Problem, name: str) -> None:
         self.robot, self.law = before.robot, LAWS[name]
         self._name, self._rows = name, before.rows
-        values, left, weight = before.solved.estimate.values, [], []
-        for rows, delay in zip(self._rows, before.solved.delays, strict=True):
+        values, left, weight = before.estimate.values, [], []
+        for rows, delay in zip(self._rows, before.delays, strict=True):
             some = rows.fitted
             left.append(some.target - some.table @ values + delay * some.change)
             weight.append(some.counts / np.maximum(some.signals.noise, 1e-300))

@@ -36,39 +36,6 @@ not leave."""
 
 
 @dataclass(frozen=True, eq=False)
-class Solved:
-    """An estimate of the parameters, and how late the efforts of each recording are, s.
-
-    ``whole``: of parameters and delays; ``table``: their columns, (samples, n, parameters and
-    delays), the fitted rows of all recordings one after the other, ``counts`` of each.
-    """
-
-    whole: Estimate
-    table: Array
-    counts: tuple[int, ...]
-
-    @property
-    def estimate(self) -> Estimate:
-        """Of the parameters alone."""
-        e, k = self.whole, self.table.shape[-1] - len(self.counts)
-        return replace(
-            e, values=e.values[:k], covariance=e.covariance[:k, :k], prior=e.prior[:k],
-            inverse=e.inverse[:k, :k],
-        )  # fmt: skip
-
-    @property
-    def delays(self) -> tuple[float, ...]:
-        """Of the recordings, s."""
-        return tuple(self.whole.values[self.table.shape[-1] - len(self.counts) :].tolist())
-
-    def response(self, signals: Sequence[Array]) -> Array:
-        """What signals (k, n, m) added to the efforts change in the parameters, (p, m)."""
-        used = [one[:count] for one, count in zip(signals, self.counts, strict=True)]
-        moved = self.whole.response(self.table, np.concatenate(used))
-        return moved[: self.table.shape[-1] - len(self.counts)]
-
-
-@dataclass(frozen=True, eq=False)
 class Problem:
     """Recordings as one least-squares problem in some of the parameters of a robot's file.
 
@@ -136,31 +103,56 @@ class Problem:
         return tuple(made.only(self.chosen, self.everything.values) for made in self.whole)
 
     @cached_property
-    def solved(self) -> Solved:
-        """By least squares: the parameters, and how late the efforts of each recording are."""
+    def columns(self) -> Array:
+        """Of parameters and delays, (samples, n, both): the fitted rows one after the other."""
         used = [made.fitted for made in self.rows]
-        table, target, rest, counts = (
-            np.concatenate([getattr(made, name) for made in used])
-            for name in ("table", "target", "rest", "counts")
-        )
-        scales = prior_scales(self.parameters, table, target + rest)
         # Late by a delay is less the delay times the change.
         late = [
             np.concatenate([-made.change * (i == j) for j, made in enumerate(used)])
             for i in range(len(used))
         ]
-        whole = np.concatenate([table, np.stack(late, -1)], -1)
-        found = estimate(
-            whole, target, np.append(self.parameters.values, np.zeros(len(used))),
-            np.append(scales, [LATE * made.period for made in used]), self.parameters.cones, counts,
+        table = np.concatenate([made.table for made in used])
+        return np.concatenate([table, np.stack(late, -1)], -1)
+
+    @cached_property
+    def both(self) -> Estimate:
+        """The parameters by least squares, then how late the efforts of each recording are, s."""
+        used, count = [made.fitted for made in self.rows], len(self.rows)
+        target, effort, counts = (
+            np.concatenate([getattr(made, name) for made in used])
+            for name in ("target", "effort", "counts")
+        )
+        p, table = self.parameters, self.columns
+        scales = prior_scales(p, table[..., :-count], effort)
+        return estimate(
+            table, target, np.append(p.values, np.zeros(count)),
+            np.append(scales, [LATE * made.period for made in used]), p.cones, counts,
         )  # fmt: skip
-        return Solved(found, whole, tuple(len(made.time) for made in used))
+
+    @cached_property
+    def estimate(self) -> Estimate:
+        """Of the parameters alone."""
+        e, k = self.both, slice(0, -len(self.rows))
+        return replace(
+            e, values=e.values[k], covariance=e.covariance[k, k], prior=e.prior[k],
+            inverse=e.inverse[k, k],
+        )  # fmt: skip
+
+    @property
+    def delays(self) -> tuple[float, ...]:
+        """How late the efforts of each recording are, s."""
+        return tuple(self.both.values[-len(self.rows) :].tolist())
+
+    def response(self, signals: Sequence[Array]) -> Array:
+        """What signals (k, n, m) added to the efforts change in the parameters, (p, m)."""
+        used = [one[: made.held_from] for one, made in zip(signals, self.rows, strict=True)]
+        return self.both.response(self.columns, np.concatenate(used))[: -len(self.rows)]
 
     @property
     def values(self) -> Array:
         """All parameters, those that are fitted as they were found."""
         values = self.everything.values.copy()
-        values[self.chosen] = self.solved.estimate.values
+        values[self.chosen] = self.estimate.values
         return values
 
     def check_count(self) -> None:
@@ -168,7 +160,7 @@ class Problem:
 
         :raises PkmTwinError: with how many there are.
         """
-        directions = self.solved.whole.directions
+        directions = self.both.directions
         used = ((made.fitted.counts.sum(), made.signals.band) for made in self.rows)
         values = sum(float(count) * band for count, band in used)
         if values < FEW * directions:
@@ -187,7 +179,7 @@ class Problem:
         """Recordings whose held-out part the fitted values predict worse than the file's."""
         robot, told = self.robot, []
         for made in self.rows:
-            end, after = made.held_out, self.solved.estimate.values
+            end, after = made.held_out, self.estimate.values
             old, new = (
                 np.sqrt(np.mean(end.counts * (end.target - end.table @ v) ** 2, 0))
                 for v in (self.parameters.values, after)
