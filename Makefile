@@ -41,7 +41,7 @@ $(VENV)/%.stamp: $(VENV)/demo.stamp
 	touch $@
 
 demo: $(VENV)/demo.stamp
-	$(BIN)/python -m pkm_twin.apps.demo --bags bags --out out
+	$(BIN)/python -m pkm_twin.demo.run --bags bags --out out
 
 # At once, as types are one process's work: the last lines are those of the tests.
 test: $(VENV)/test.stamp

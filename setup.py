@@ -28,6 +28,7 @@ setup(
         "pkm_twin.bags",
         "pkm_twin.codegen",
         "pkm_twin.config",
+        "pkm_twin.demo",
         "pkm_twin.design",
         "pkm_twin.export",
         "pkm_twin.identification",

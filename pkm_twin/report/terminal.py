@@ -37,7 +37,8 @@ def text_of(report: Report) -> str:
     for fact in report.facts:
         if fact.text is not None and fact.verdict is None:
             found.append(f"{fact.text}: {fact.words}" if fact.text else fact.words)
-    found += _judged([fact for fact in report.facts if fact.verdict is not None])
+    if judged := [fact for fact in report.facts if fact.verdict is not None]:
+        found += ["", *_judged(judged)] if found else _judged(judged)
     for table in report.tables:
         found += ["", *table_lines(table)] if found else table_lines(table)
     if report.tables and (report.notes or any(report.files.values())):
@@ -48,8 +49,6 @@ def text_of(report: Report) -> str:
 
 def _judged(facts: Sequence[Fact]) -> Iterator[str]:
     """Judged properties as a table."""
-    if not facts:
-        return
     rows = [(f.text or f.name, f.words, _words(f.bound), f.verdict or "") for f in facts]
     lines = aligned([("", "value", "limit", "verdict"), *rows], "<<<<")
     yield next(lines)

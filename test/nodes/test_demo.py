@@ -19,8 +19,9 @@ from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rich.console import Console
 
-from pkm_twin.apps import demo, demo_recorder
 from pkm_twin.bags.reader import BagWriter, inspect, read_messages
+from pkm_twin.demo import recorder as demo_recorder
+from pkm_twin.demo import run as demo
 from pkm_twin.errors import PkmTwinError
 from pkm_twin.messages.stamps import stamp_of
 

@@ -11,7 +11,7 @@ import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +23,8 @@ from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from pkm_twin import load
-from pkm_twin.apps.demo_recorder import (
+from pkm_twin.bags.reader import read_messages
+from pkm_twin.demo.recorder import (
     DEPTH,
     STATE,
     TRAJECTORY,
@@ -32,11 +33,11 @@ from pkm_twin.apps.demo_recorder import (
     process,
     wait_for,
 )
-from pkm_twin.apps.demo_report import Finding, share
-from pkm_twin.bags.reader import read_messages
+from pkm_twin.demo.report import share, told
 from pkm_twin.errors import BagError
 from pkm_twin.messages.reading import JointReader
 from pkm_twin.messages.stamps import SECOND, stamp_of
+from pkm_twin.report import Fact, judged, plots
 from pkm_twin.streams.path import JointPath
 
 Array = NDArray[np.float64]
@@ -181,15 +182,25 @@ class TrackingSeries:
     joints: tuple[str, ...]
     runs: Mapping[float, tuple[Run, Run]]
 
+    def draw(self, ax: Any) -> None:
+        """Tracking errors of PD alone and with feedforward, by the error of the model."""
+        for i, (perturbation, runs) in enumerate(self.runs.items()):
+            for run, what, line in zip(runs, ("PD", "with feedforward"), ("-", "--"), strict=True):
+                size = 1e3 * np.linalg.norm(run.error, axis=1)
+                label = f"{what}, {100 * perturbation:g} %"
+                ax.plot(run.time, size, line, color=plots.COLOURS[i], lw=1.2, label=label)
+        ax.set_title("machine_sim: tracking error by model error")
+        ax.set_ylabel("error, all joints (mrad)")
+
 
 def prefix(spread: float) -> str:
     """Under what a spread's topics stand in the recording."""
     return f"machine_sim_{100 * spread:g}_percent"
 
 
-def report(recording: Path) -> tuple[list[Finding], TrackingSeries]:
+def report(recording: Path) -> tuple[list[Fact], TrackingSeries]:
     """Tracking error and torque of both runs of every model error."""
-    findings: list[Finding] = []
+    findings: list[Fact] = []
     runs = {}
     robot = load(ROBOT)
     for spread in SPREADS:
@@ -201,13 +212,13 @@ def report(recording: Path) -> tuple[list[Finding], TrackingSeries]:
         for what, way in (("PD", plain), ("PD and feedforward", ahead)):
             peaks = ", ".join(f"{peak:.3g}" for peak in np.abs(way.effort).max(0))
             value = f"{1e3 * way.rms:.3f} mrad RMS, {1e3 * np.abs(way.error).max():.3f} worst"
-            findings.append(Finding(name, f"tracking error, {what}", value))
-            findings.append(Finding(name, f"peak effort, {what}", f"{peaks} {robot.effort_unit}"))
+            findings.append(told(name, f"tracking error, {what}", value))
+            findings.append(told(name, f"peak effort, {what}", f"{peaks} {robot.effort_unit}"))
         ratio = plain.rms / ahead.rms
         what = f"feedforward at {100 * spread:g} % parameter error"
         bound = f"{TIMES_BETTER:g} or more" if spread == min(SPREADS) else ""
         value = f"{ratio:.1f} times better"
-        findings.append(Finding(name, what, value, bound, ratio >= TIMES_BETTER))
+        findings.append(judged(f"{name}: {what}", value, bound, bool(ratio >= TIMES_BETTER)))
     return findings, TrackingSeries(robot.joint_names, runs)
 
 

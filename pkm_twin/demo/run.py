@@ -23,9 +23,9 @@ from rclpy.executors import SingleThreadedExecutor
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-from pkm_twin.apps import demo_tracking
-from pkm_twin.apps.demo_pictures import draw
-from pkm_twin.apps.demo_recorder import (
+from pkm_twin.bags.reader import BagMessage, BagWriter, inspect
+from pkm_twin.demo import tracking
+from pkm_twin.demo.recorder import (
     DEPTH,
     PATIENCE,
     STATE,
@@ -36,9 +36,9 @@ from pkm_twin.apps.demo_recorder import (
     process,
     wait_for,
 )
-from pkm_twin.apps.demo_report import REPORTS, Finding, print_findings
-from pkm_twin.bags.reader import BagMessage, BagWriter, inspect
+from pkm_twin.demo.report import REPORTS, draw
 from pkm_twin.errors import PkmTwinError
+from pkm_twin.report import Fact, Report, Verdict, present
 from pkm_twin.ros.context import middleware_arguments
 from pkm_twin.ros.player import play
 from pkm_twin.ros.signals import INTERRUPTED, first_signal
@@ -186,17 +186,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         # The children too have to end with this process.
         with first_signal(KeyboardInterrupt):
-            findings = run(options.bags, options.out, console)
+            report = run(options.bags, options.out, console)
     except KeyboardInterrupt:
         return INTERRUPTED
     except PkmTwinError as error:
         console.print(f"[red]demo failed:[/red] {error}")
         return 1
-    return 0 if all(finding.good for finding in findings) else 1
+    present(report, False)
+    return report.exit_code
 
 
-def run(bags: Path, out: Path, console: Console) -> list[Finding]:
-    """Bags through their nodes, a machine by the twin; print and draw what came back."""
+def run(bags: Path, out: Path, console: Console) -> Report:
+    """Bags through their nodes, a machine by the twin; draw what came back."""
     recording = out / "demo.mcap"
     context = Context()
     rclpy.init(args=middleware_arguments([]), context=context)
@@ -208,25 +209,29 @@ def run(bags: Path, out: Path, console: Console) -> list[Finding]:
             recorder = Recorder(node, writer)
             for stage in STAGES:
                 run_stage(stage, bags / f"{stage.bag}.mcap", recorder, executor, console)
-            for spread in demo_tracking.SPREADS:
-                demo_tracking.run(spread, recorder, executor, console)
+            for spread in tracking.SPREADS:
+                tracking.run(spread, recorder, executor, console)
     finally:
         executor.shutdown()
         node.destroy_node()
         rclpy.try_shutdown(context=context)
-    findings: list[Finding] = []
+    findings: list[Fact] = []
     series = {}
     for stage in STAGES:
         found, series[stage.bag] = REPORTS[stage.bag](
             bags / f"{stage.bag}.mcap", recording, stage.bag
         )
         findings += found
-    found, series["machine_sim"] = demo_tracking.report(recording)
+    found, series["machine_sim"] = tracking.report(recording)
     findings += found
     picture = draw(series, out / "demo.png")
-    print_findings(console, findings)
-    console.print(f"picture {picture}, recording {recording}")
-    return findings
+    bad = any(fact.verdict is Verdict.BAD for fact in findings)
+    return Report(
+        f"{'OFF' if bad else 'good'}: recorded bags and a simulated machine through the nodes",
+        findings,
+        files={"picture": picture, "recording": recording},
+        verdict=Verdict.BAD if bad else Verdict.GOOD,
+    )
 
 
 if __name__ == "__main__":

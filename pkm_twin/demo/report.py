@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the demonstration found: figures and verdicts, read from its recording."""
+"""What the demonstration found: figures, verdicts and a picture, read from its recording."""
 
 from __future__ import annotations
 
@@ -11,8 +11,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from rich.console import Console
-from rich.table import Table
 
 from delta_dynamics import inverse_dynamics
 from pkm_twin import load
@@ -20,6 +18,8 @@ from pkm_twin.bags.reader import inspect, read_messages
 from pkm_twin.messages.stamps import stamp_of
 from pkm_twin.recordings import ReadOptions, Recording, read
 from pkm_twin.recordings.recording import differentiated
+from pkm_twin.report import Fact, plots
+from pkm_twin.report import judged as judge
 from pkm_twin.robot.robot import Robot
 
 Array = NDArray[np.float64]
@@ -39,17 +39,6 @@ makes 0.4 %; a wrench left unturned, 8 %."""
 
 
 @dataclass(frozen=True)
-class Finding:
-    """One line of the table; ``good`` is None where nothing is judged."""
-
-    bag: str
-    what: str
-    value: str
-    bound: str = ""
-    good: bool = True
-
-
-@dataclass(frozen=True)
 class DynamicsSeries:
     """A recorded joint-state stream and the twin's answer, on common times."""
 
@@ -64,6 +53,17 @@ class DynamicsSeries:
     """Where neither payload nor cutting force is on the platform."""
     loaded: tuple[float, float] | None
 
+    def draw(self, ax: Any) -> None:
+        """Recorded and predicted effort of the first joint over two seconds."""
+        middle = float(self.time[len(self.time) // 8]) if len(self.time) else 0.0
+        near = (self.time >= middle) & (self.time <= middle + 2.0)
+        ax.plot(self.time[near], self.measured[near, 0], color="0.6", lw=2.5, label="recorded")
+        ax.plot(
+            self.time[near], self.predicted[near, 0], color=plots.COLOURS[1], lw=1, label="twin"
+        )
+        ax.set_title(f"{self.title}: effort of {self.joints[0]}")
+        ax.set_ylabel(f"effort ({self.unit})")
+
 
 @dataclass(frozen=True)
 class StiffnessSeries:
@@ -75,10 +75,26 @@ class StiffnessSeries:
     truth_time: Array
     truth: Array
 
+    def draw(self, ax: Any) -> None:
+        """Deflection of the platform and that of a finite-element frame over 0.6 seconds."""
+        begin = float(self.time[len(self.time) // 8]) if len(self.time) else 0.0
+        part, true = (
+            (time >= begin) & (time <= begin + 0.6) for time in (self.time, self.truth_time)
+        )
+        for i, axis in enumerate("xyz"):
+            ax.plot(
+                self.time[part], 1e6 * self.deflection[part, i],
+                color=plots.COLOURS[i], lw=0.8, label=axis,
+            )  # fmt: skip
+            ax.plot(
+                self.truth_time[true], 1e6 * self.truth[true, i], "o",
+                color=plots.COLOURS[i], ms=4, mec="black", mew=0.4,
+            )  # fmt: skip
+        ax.set_title(f"{self.title}: deflection (dots: finite elements)")
+        ax.set_ylabel("deflection (µm)")
 
-def report_dynamics(
-    bag: Path, recording: Path, prefix: str
-) -> tuple[list[Finding], DynamicsSeries]:
+
+def report_dynamics(bag: Path, recording: Path, prefix: str) -> tuple[list[Fact], DynamicsSeries]:
     """Compare recorded efforts with the answered ones."""
     r = read(bag, how=ReadOptions(limited=True))
     robot, unit = r.robot, " or ".join(dict.fromkeys(r.robot.effort_units))
@@ -109,15 +125,14 @@ def report_dynamics(
     if not stamps:
         return findings, series
     peak = np.abs(series.predicted).max(0)
-    findings.append(Finding(prefix, "peak effort", _listed(peak, unit)))
+    findings.append(told(prefix, "peak effort", _listed(peak, unit)))
     rms = np.sqrt(np.mean(series.predicted**2, 0))
-    findings.append(Finding(prefix, "RMS effort", _listed(rms, unit)))
+    findings.append(told(prefix, "RMS effort", _listed(rms, unit)))
     free = series.free
     part = np.sqrt(np.mean(series.residual[free] ** 2, 0)) / np.abs(series.measured).max(0)
     findings.append(
-        Finding(
-            prefix,
-            "residual RMS without load",
+        judge(
+            f"{prefix}: residual RMS without load",
             _listed(100 * part, "% of peak"),
             f"below {100 * MAX_RESIDUAL:g} %",
             bool((part < MAX_RESIDUAL).all()),
@@ -130,13 +145,12 @@ def report_dynamics(
     return findings, series
 
 
-def _cutting(prefix: str, series: DynamicsSeries) -> Finding:
+def _cutting(prefix: str, series: DynamicsSeries) -> Fact:
     """The residual where a force acts, which the node was told."""
     cut = series.residual[~series.free]
     part = np.sqrt(np.mean(cut**2, 0)) / np.abs(series.measured).max(0)
-    return Finding(
-        prefix,
-        "residual RMS while cutting",
+    return judge(
+        f"{prefix}: residual RMS while cutting",
         _listed(100 * part, "% of peak"),
         f"below {100 * MAX_CUTTING_RESIDUAL:g} %",
         bool((part < MAX_CUTTING_RESIDUAL).all()),
@@ -166,9 +180,7 @@ def _free(r: Recording) -> NDArray[np.bool_]:
     return np.asarray(nearest > 0.5, np.bool_)
 
 
-def _payload(
-    prefix: str, r: Recording, answered: list[int], series: DynamicsSeries
-) -> list[Finding]:
+def _payload(prefix: str, r: Recording, answered: list[int], series: DynamicsSeries) -> list[Fact]:
     """The step that the payload makes in the residual, and the mass that it means."""
     assert series.loaded is not None and r.load is not None  # noqa: S101
     free = series.free
@@ -183,16 +195,14 @@ def _payload(
     change = series.residual[held] - series.residual[free].mean(0)
     mass = float(np.sum(kilogram * change) / np.sum(kilogram**2))
     return [
-        Finding(
-            prefix,
-            "step of the residual at the pick",
+        judge(
+            f"{prefix}: step of the residual at the pick",
             f"{step:.3f} {series.unit}, {step / scatter:.1f} times its scatter",
             "above 3 times",
             bool(step > 3 * scatter),
         ),
-        Finding(
-            prefix,
-            "payload mass seen in the residual",
+        judge(
+            f"{prefix}: payload mass seen in the residual",
             f"{mass:.3f} kg (recorded with {r.load.mass:.3f} kg)",
             "within 10 %",
             abs(mass - r.load.mass) < 0.1 * r.load.mass,
@@ -200,9 +210,7 @@ def _payload(
     ]
 
 
-def report_stiffness(
-    bag: Path, recording: Path, prefix: str
-) -> tuple[list[Finding], StiffnessSeries]:
+def report_stiffness(bag: Path, recording: Path, prefix: str) -> tuple[list[Fact], StiffnessSeries]:
     """Compare answered deflections with the frame's, and say what dominated."""
     wrenches = _by_stamp(bag, "/wrench")
     energies = _by_stamp(recording, f"/{prefix}/stiffness_monitor/strain_energy")
@@ -229,14 +237,14 @@ def report_stiffness(
         return findings, series
     dominant = Counter(energies[s].status[0].message for s in common)
     findings.append(
-        Finding(
+        told(
             prefix,
             "dominant element over time",
             ", ".join(f"{e} {100 * n / len(common):.0f} %" for e, n in dominant.most_common(4)),
         )
     )
     largest = np.linalg.norm(fixed, axis=1).max()
-    findings.append(Finding(prefix, "largest deflection", f"{1e6 * largest:.2f} µm"))
+    findings.append(told(prefix, "largest deflection", f"{1e6 * largest:.2f} µm"))
     findings.append(share(prefix, "deflections with ground truth", len(judged), len(truth)))
     if judged:
         place = np.searchsorted(common, judged)
@@ -245,9 +253,8 @@ def report_stiffness(
             np.mean(np.sum((fixed[place] - true) ** 2, 1)) / np.mean(np.sum(true**2, 1))
         )
         findings.append(
-            Finding(
-                prefix,
-                "RMS difference to the frame's deflection",
+            judge(
+                f"{prefix}: RMS difference to the frame's deflection",
                 f"{100 * error:.1f} % (frame's largest {greatest:.2f} µm)",
                 f"below {100 * MAX_DEFLECTION_ERROR:g} %",
                 bool(error < MAX_DEFLECTION_ERROR),
@@ -256,25 +263,12 @@ def report_stiffness(
     return findings, series
 
 
-Report = Callable[[Path, Path, str], tuple[list[Finding], Any]]
-REPORTS: dict[str, Report] = {
+Reports = Callable[[Path, Path, str], tuple[list[Fact], Any]]
+REPORTS: dict[str, Reports] = {
     "delta_cu_pick_and_place": report_dynamics,
     "prru_milling": report_dynamics,
     "upr_rpu_milling": report_stiffness,
 }
-
-
-def print_findings(console: Console, findings: list[Finding]) -> None:
-    """The table that a person reads."""
-    table = Table(title="pkm_twin on recorded bags and a simulated machine")
-    for column in ("bag", "what", "value", "limit", ""):
-        table.add_column(column)
-    last = ""
-    for f in findings:
-        verdict = "" if not f.bound else ("[green]good[/green]" if f.good else "[red]OFF[/red]")
-        table.add_row(f.bag if f.bag != last else "", f.what, f.value, f.bound, verdict)
-        last = f.bag
-    console.print(table)
 
 
 def _by_stamp(bag: Path, topic: str) -> dict[int, Any]:
@@ -287,15 +281,19 @@ def _efforts(messages: Mapping[int, Any], stamps: list[int], robot: Robot) -> Ar
     return np.array(efforts).reshape(-1, len(robot.joint_names))
 
 
-def share(bag: str, what: str, count: int, total: int) -> Finding:
+def share(bag: str, what: str, count: int, total: int) -> Fact:
     """How many of so many there are, judged by :data:`MIN_ANSWERED`."""
-    return Finding(
-        bag,
-        what,
+    return judge(
+        f"{bag}: {what}",
         f"{count} of {total}",
         f"{100 * MIN_ANSWERED:g} % or more",
         total > 0 and count >= MIN_ANSWERED * total,
     )
+
+
+def told(bag: str, what: str, words: str) -> Fact:
+    """A figure that is not judged."""
+    return Fact("", words, text=f"{bag}: {what}")
 
 
 def _listed(values: Array, unit: str) -> str:
@@ -304,3 +302,17 @@ def _listed(values: Array, unit: str) -> str:
 
 def _xyz(vector: Any) -> list[float]:
     return [vector.x, vector.y, vector.z]
+
+
+def draw(series: Mapping[str, Any], path: Path) -> Path:
+    """One picture of all stages: a panel each."""
+    figure, columns = plots.columns(2, 2)
+    panels = [columns[k % 2][k // 2] for k in range(4)]
+    for ax, data in zip(panels, series.values(), strict=False):
+        data.draw(ax)
+        ax.set_xlabel("time (s)")
+        ax.legend(loc="best")
+        ax.grid(alpha=0.3)
+    for ax in panels[len(series) :]:
+        ax.set_visible(False)
+    return plots.save(figure, path)
