@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import json
-import math
 import os
 import sys
 from collections.abc import Callable, Iterator
@@ -70,28 +69,9 @@ def numbers(text: str, count: int, expected: str = "") -> list[float]:
     return values
 
 
-def table_console() -> Console:
-    """Stdout; where it is no terminal, as wide as a table here needs."""
-    console = Console()
-    return console if console.is_terminal else Console(width=140)
-
-
-def finite(value: float | None) -> float | None:
-    """A number for JSON, which has no infinity; None where it is not known."""
-    return float(value) if value is not None and math.isfinite(value) else None
-
-
 def print_json(data: Any) -> None:
     """JSON proper: a number that is not finite is a mistake here."""
     typer.echo(json.dumps(data, indent=2, allow_nan=False))
-
-
-def answer(data: Any, text: str, as_json: bool, *, piped: bool = False) -> None:
-    """Print a result as data or as text; where a table is ``piped`` to stdout, text to stderr."""
-    if as_json:
-        print_json(data)
-    else:
-        typer.echo(text, err=piped)
 
 
 def refuse_existing(path: Path, overwrite: bool, source: Path | None = None) -> None:

@@ -9,7 +9,7 @@ from graphlib import TopologicalSorter
 
 import pytest
 
-from pkm_twin.apps.groups import commands
+from pkm_twin.apps.groups import commands, module_of
 from test.support.sources import ROOT, arrows, imports, room, sources, within
 
 OWN = {"pkm_twin.errors", "pkm_twin.files", "pkm_twin.threads", "pkm_twin.settings"}
@@ -27,7 +27,6 @@ MAY = {
     "pkm_twin.threads": set(),
     "pkm_twin.settings": set(),
     "pkm_twin.console": set(),
-    "pkm_twin.options": set(),
     "pkm_twin.report": {"pkm_twin.console"},
     "pkm_twin.codegen": set(),
     "pkm_twin.bags": set(),
@@ -51,7 +50,7 @@ MAY = {
     "delta_dynamics.node": NODE | {"delta_dynamics"},
     "stiffness_monitor.node": NODE | {"stiffness_monitor"},
     "pkm_twin.state.node": NODE | {"pkm_twin.state", "stiffness_monitor"},
-    "pkm_twin.maps": NODE | TWINS | {"pkm_twin.console", "pkm_twin.options", "pkm_twin.report"},
+    "pkm_twin.maps": NODE | TWINS | {"pkm_twin.console", "pkm_twin.report"},
     "pkm_twin.certify": CORE | {"delta_dynamics"},
     "pkm_twin.view": NODE
     | TWINS
@@ -60,7 +59,7 @@ MAY = {
     "pkm_twin.apps": NODE
     | TWINS
     | {"pkm_twin.console", "pkm_twin.maps", "pkm_twin.export", "pkm_twin.identification"}
-    | {"pkm_twin.paths", "pkm_twin.design", "pkm_twin.options", "pkm_twin.report"}
+    | {"pkm_twin.paths", "pkm_twin.design", "pkm_twin.report"}
     | {"pkm_twin.recordings", "pkm_twin.certify", "pkm_twin.view"},
 }
 """Rooms that each may import, beside itself and :data:`OWN`; so nobody imports apps or a node."""
@@ -142,7 +141,7 @@ def loaded_by(code):
 
 def test_a_command_and_a_node_start_without_what_they_may_never_need():
     """Parts of scipy take longer to load than all the rest of a command."""
-    modules = set(commands().places())
+    modules = set(map(module_of, commands()))
     loaded = loaded_by(
         f"import {', '.join(modules)}, delta_dynamics, stiffness_monitor, pkm_twin.state"
     )

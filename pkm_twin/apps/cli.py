@@ -1,20 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """The command ``pkm-twin``. Exit codes: 0 good, 1 rejected, 2 usage, 3 recovered with loss."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Sequence
 from typing import Annotated, NoReturn
 
 import typer
 
+from pkm_twin.apps.frame import Commands
 from pkm_twin.apps.groups import Tasks, greet
 from pkm_twin.apps.options import REFUSED
 from pkm_twin.console import flush_output, silence_output, system_error, tell
 from pkm_twin.errors import PkmTwinError, plain_warnings
 from pkm_twin.files import open_standard_streams
-from pkm_twin.options import Commands
 from pkm_twin.ros.signals import INTERRUPTED, first_signal
 
 app = Commands(cls=Tasks, invoke_without_command=True, add_completion=True)

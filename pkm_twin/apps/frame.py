@@ -8,7 +8,6 @@ import inspect
 import math
 import re
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from types import UnionType
@@ -18,11 +17,10 @@ from typing import get_type_hints as hints_of
 import typer
 from typer.core import TyperCommand, TyperGroup
 
-from pkm_twin.apps.options import BESIDE, ReadsTables, ReadsWrenches
+from pkm_twin.apps.options import BESIDE
 from pkm_twin.console import numbers, refuse_existing
-from pkm_twin.errors import ParameterError, UnknownNameError
+from pkm_twin.errors import ParameterError, PkmTwinError, UnknownNameError
 from pkm_twin.files import STANDARD, decimal
-from pkm_twin.options import Commands, file_name
 from pkm_twin.report import Fact, Report
 from pkm_twin.report.terminal import present
 from pkm_twin.settings import Setting
@@ -38,6 +36,16 @@ _JSON: Final = inspect.Parameter(
     default=False,
     annotation=Annotated[bool, typer.Option("--json", help="print JSON")],
 )
+
+
+class Commands(typer.Typer):
+    """A program: its help is plain text, and its errors are this package's own."""
+
+    def __init__(self, *, add_completion: bool = False, **settings: Any) -> None:
+        super().__init__(
+            add_completion=add_completion, pretty_exceptions_enable=False, rich_markup_mode=None,
+            **settings,
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -139,28 +147,12 @@ def execute(command: Command, name: str, given: Any, as_json: bool) -> None:
     drawing = given.drawing(name) if hasattr(given, "drawing") else None
     if drawing is not None:
         refuse_existing(drawing, getattr(given, "overwrite", True), _source(given))
-    with _readers(given):
-        report = command.run(given)
-        if hasattr(given, "drawing"):
-            report = _drawn(report, drawing)
+    report = command.run(given)
+    if hasattr(given, "drawing"):
+        report = _drawn(report, drawing)
     present(report, as_json, piped=piped)
     if report.exit_code:
         raise typer.Exit(report.exit_code)
-
-
-@contextmanager
-def _readers(given: Any) -> Iterator[None]:
-    """What readers of tables and bags look up while the command runs."""
-    with ExitStack() as stack:
-        if isinstance(given, ReadsTables):
-            from pkm_twin.apps.tables import CHOSEN
-
-            stack.callback(CHOSEN.reset, CHOSEN.set(given.dialect))
-        if isinstance(given, ReadsWrenches):
-            from pkm_twin.apps.wrench_frames import FRAMES
-
-            stack.callback(FRAMES.reset, FRAMES.set(given.frames))
-        yield
 
 
 def _drawn(report: Report, drawing: Path | None) -> Report:
@@ -190,6 +182,9 @@ def _check_targets(given: Any) -> None:
         target = getattr(given, field)
         if not row.writes or target is None or str(target) == STANDARD:
             continue
+        if target.name in ("", ".."):
+            what = f"{_spelled(field, row)}: {str(target)!r}"
+            raise PkmTwinError(f"{what} is a folder; expected a file name")
         if row.endings and target.suffix not in row.endings:
             raise ParameterError(
                 _spelled(field, row), str(target), f"a name that ends in {' or '.join(row.endings)}"
@@ -263,7 +258,6 @@ def _parameter(name: str, kind: Any, row: Setting, default: Any) -> inspect.Para
         default = list(map(str, default)) if repeated else _written(default)
     word = item if item in (bool, Path) else str
     typed: Any = list[word] if repeated else word  # type: ignore[valid-type]
-    settings["callback"] = file_name if row.writes else None
     settings["show_default"] = not required and default not in (None, "", [])
     if row.argument:
         declared: Any = typer.Argument(**{**settings, "metavar": row.metavar or name.upper()})

@@ -5,11 +5,10 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
 from functools import cache
 from importlib import import_module
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import typer
 from typer.core import TyperGroup
@@ -18,53 +17,21 @@ from typer.main import get_command
 from pkm_twin.apps.options import USAGE
 from pkm_twin.console import tell
 from pkm_twin.errors import UnknownNameError
-from pkm_twin.options import Commands, UsageError
 
+if TYPE_CHECKING:
+    from pkm_twin.apps.frame import Command, Group
+
+UsageError: Any = typer.BadParameter.__mro__[1]
+"""Of the click that this typer has."""
 WIDE: Final = 200
 """Characters of a command's purpose, never cut."""
 
 
-@dataclass(frozen=True)
-class Entry:
-    """A command's module below ``pkm_twin.apps``, and its function or group there.
-
-    ``tables``: it reads tables and takes the options of their dialect. ``wrenches``: it reads
-    wrenches of bags and takes the options of their frames. ``settings``: of typer.
-    """
-
-    place: str
-    tables: bool = False
-    wrenches: bool = False
-    settings: Mapping[str, Any] = field(default_factory=dict)
-
-    def app(self, name: str) -> typer.Typer:
-        """The command under its name, or the group."""
-        module, _, attribute = self.place.partition(":")
-        found = getattr(import_module(f"pkm_twin.apps.{module}"), attribute)
-        if isinstance(found, typer.Typer):
-            return found
-        if self.wrenches:
-            from pkm_twin.apps.wrench_frames import wrench_frames
-
-            found = wrench_frames(found)
-        if self.tables:
-            from pkm_twin.apps.tables import tables
-
-            found = tables(found)
-        app = Commands()
-        app.command(name, **self.settings)(found)
-        return app
-
-
-TASKS: Final[Mapping[str, Mapping[str, Entry]]] = {
-    "Robots": {},
-    "Torques, paths and drives": {},
-    "Stiffness, workspace and vibration": {},
-    "Recordings": {},
-    "Identification and calibration": {},
-    "Design and export": {},
-}
-"""Commands that are not in the folder yet, in the order in which tasks need them."""
+TASKS: Final = (
+    "Robots", "Torques, paths and drives", "Stiffness, workspace and vibration", "Recordings",
+    "Identification and calibration", "Design and export",
+)  # fmt: skip
+"""Headings of the list of commands, each command names its own."""
 OLDER: Final[Mapping[str, tuple[str, ...]]] = {
     "atlas": ("map",), "feed": ("path", "--slow-where-soft"), "guard-check": ("monitor-torques",),
     "printer": ("convert",), "urdf": ("export", "urdf"), "drive-friction": ("fit", "--drive"),
@@ -86,8 +53,7 @@ class Loaded(Mapping[str, Any]):
 
     def __init__(self) -> None:
         folder = Path(__file__).parent / "commands"
-        self.files = sorted(path.stem.replace("_", "-") for path in folder.glob("[a-z]*.py"))
-        self.older = {name: e for names in TASKS.values() for name, e in names.items()}
+        self.names = sorted(path.stem.replace("_", "-") for path in folder.glob("[a-z]*.py"))
         self._built: dict[str, Any] = {}
 
     def __getitem__(self, name: str) -> Any:
@@ -97,35 +63,25 @@ class Loaded(Mapping[str, Any]):
         return self._built[name]
 
     def __contains__(self, name: object) -> bool:
-        return name in self.files or name in self.older
+        return name in self.names
 
     def __iter__(self) -> Iterator[str]:
-        return iter([*self.files, *self.older])
+        return iter(self.names)
 
     def __len__(self) -> int:
-        return len(self.files) + len(self.older)
+        return len(self.names)
 
-    def places(self) -> list[str]:
-        """The modules of all commands."""
-        older = {f"pkm_twin.apps.{e.place.partition(':')[0]}" for e in self.older.values()}
-        return [*map(_module, self.files), *older]
-
-    def declared(self, name: str) -> Any:
+    def declared(self, name: str) -> Command | Group:
         """What the file of a command declares; its ``app`` is the command as a program."""
-        if name in self.older:
-            return self.older[name]
-        if name not in self.files:
+        if name not in self.names:
             raise KeyError(name)
-        return import_module(_module(name)).COMMAND
+        found: Command | Group = import_module(module_of(name)).COMMAND
+        return found
 
     def tasks(self) -> dict[str, list[str]]:
         """Names by task; this loads every command."""
-        found: dict[str, list[str]] = {title: [] for title in TASKS}
-        for name in self.files:
-            found[self.declared(name).task].append(name)
-        for title, entries in TASKS.items():
-            found[title] += entries
-        return found
+        tasks = {name: self.declared(name).task for name in self.names}
+        return {title: [name for name, task in tasks.items() if task == title] for title in TASKS}
 
 
 @cache
@@ -134,7 +90,8 @@ def commands() -> Loaded:
     return Loaded()
 
 
-def _module(name: str) -> str:
+def module_of(name: str) -> str:
+    """The module of a command."""
     return f"pkm_twin.apps.commands.{name.replace('-', '_')}"
 
 

@@ -7,14 +7,13 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
 import typer
 
 from pkm_twin.console import numbers
 from pkm_twin.errors import ParameterError
 from pkm_twin.files import STANDARD
-from pkm_twin.options import OptionalText
 from pkm_twin.settings import setting
 
 if TYPE_CHECKING:
@@ -353,55 +352,6 @@ class AwayFromSingular:
     )
 
 
-RobotName = Annotated[
-    str,
-    typer.Argument(help="a robot's name (see `pkm-twin robots`), or its YAML, URDF, MJCF, SDF"),
-]
-Json = Annotated[bool, typer.Option("--json", help="machine-readable output")]
-OptionalRobot = Annotated[
-    OptionalText,
-    typer.Option("--robot", help="a robot's name or file; default: the robot that the bag names"),
-]
-BagTopics = Annotated[
-    list[str],
-    typer.Option(
-        "--topic",
-        help="topic of joint states or wrenches; default: found by the robot's joint names",
-    ),
-]
-Payload = Annotated[
-    OptionalText,
-    typer.Option(
-        help="payload on the platform: MASS[,x,y,z], kg, m from the platform's reference point; "
-        "default: that of the bag or the robot file"
-    ),
-]
-LoadTimes = Annotated[
-    OptionalText,
-    typer.Option(
-        help="intervals in which --payload is held: FROM,TO[,FROM,TO...], s from the start; "
-        "default: always"
-    ),
-]
-BeyondLimits = Annotated[
-    bool,
-    typer.Option(
-        "--beyond-limits", help="also compute outside the joint limits, and mark these results"
-    ),
-]
-Accept = Annotated[
-    bool,
-    typer.Option(
-        "--accept",
-        help="also use data that this machine cannot have produced, and mark the results",
-    ),
-]
-Platform = Annotated[
-    OptionalText, typer.Option(help="for a URDF, MJCF or SDF: the link that carries the tool")
-]
-OverwriteBoth = Annotated[bool, typer.Option("--overwrite", help="replace both files")]
-
-
 def load_of(payload: str | None, times: str | None) -> Any:
     """The payload that a command line tells of, None where it tells of none."""
     from pkm_twin.recordings.payload import Load, parse_payload, parse_times
@@ -415,25 +365,3 @@ def load_of(payload: str | None, times: str | None) -> Any:
         return Load(*parse_payload(payload), spans)
     except ParameterError as error:
         raise typer.BadParameter(str(error)) from None
-
-
-def read_options(
-    topics: Sequence[str] = (), payload: str | None = None, times: str | None = None,
-    follow: str | None = None, **more: Any,
-) -> Any:  # fmt: skip
-    """How a command line wants recordings read; ``more``: fields of ``ReadOptions``."""
-    from pkm_twin.apps.tables import CHOSEN
-    from pkm_twin.apps.wrench_frames import FRAMES
-    from pkm_twin.recordings import ReadOptions
-
-    return ReadOptions(
-        tuple(topics), load_of(payload, times), follow, CHOSEN.get(), "joint", FRAMES.get(), **more
-    )
-
-
-def loaded(robot: str, platform: str | None, payload: str | None) -> tuple[Any, Any]:
-    """The robot of a command line with its payload, and that payload, None where none is given."""
-    from pkm_twin import load
-
-    machine, carried = load(robot, platform=platform), load_of(payload, None)
-    return (machine if carried is None else carried.on(machine)), carried

@@ -38,7 +38,8 @@ from pkm_twin.demo.recorder import (
 )
 from pkm_twin.demo.report import REPORTS, draw
 from pkm_twin.errors import PkmTwinError
-from pkm_twin.report import Fact, Report, Verdict, present
+from pkm_twin.report import Fact, Report, Verdict
+from pkm_twin.report.terminal import present
 from pkm_twin.ros.context import middleware_arguments
 from pkm_twin.ros.player import play
 from pkm_twin.ros.signals import INTERRUPTED, first_signal
