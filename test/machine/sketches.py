@@ -197,12 +197,49 @@ def closure_rows(model, data, ends, q):
         )
         values.append(data.oMf[b].translation - data.oMf[a].translation)
         rows.append(jb[:3] - ja[:3])
-        if kind == "revolute":
+        if kind == "fixed":
+            values.append(pin.log3(data.oMf[b].rotation @ data.oMf[a].rotation.T))
+            rows.append(jb[3:] - ja[3:])
+        elif kind == "revolute":
             u, v = (data.oMf[f].rotation @ axis for f in (a, b))
             side = np.eye(3) - np.outer(u, u)
             values.append(np.cross(u, v))
             rows.append(side @ (jb[3:] - ja[3:]))
     return np.concatenate(values), np.vstack(rows)
+
+
+class Tree:
+    """A tree in Pinocchio with closures as ``closure_rows`` has them, and its actuated joints."""
+
+    def __init__(self, model, ends, actuated):
+        self.model, self.data, self.ends = model, model.createData(), ends
+        self.driven = [model.joints[model.getJointId(name)].idx_v for name in actuated]
+        self.loose = [i for i in range(model.nv) if i not in self.driven]
+
+    def rows(self, q):
+        """How far the closures are open, and their rates."""
+        return closure_rows(self.model, self.data, self.ends, q)
+
+    def _follow(self, rates, known, bias):
+        full = np.zeros(self.model.nv)
+        full[self.driven] = known
+        rest = -bias - rates[:, self.driven] @ known
+        full[self.loose] = np.linalg.lstsq(rates[:, self.loose], rest, rcond=1e-6)[0]
+        return full
+
+    def torques(self, q, qd, qdd):
+        """Efforts of the motors, all other joints rubbing."""
+        _, rates = self.rows(q)
+        v = self._follow(rates, qd, np.zeros(len(rates)))
+        step = 1e-5
+        before, after = (self.rows(q + s * step * v)[1] for s in (-1, 1))
+        a = self._follow(rates, qdd, (after - before) @ v / (2 * step))
+        damping, friction = self.model.damping, self.model.friction
+        efforts = pin.rnea(self.model, self.data, q, v, a) + damping * v + friction * np.sign(v)
+        select = np.eye(self.model.nv)[:, self.driven]
+        _, rates = self.rows(q)
+        solved = np.linalg.lstsq(np.hstack([select, rates.T]), efforts, rcond=1e-6)[0]
+        return solved[: len(self.driven)]
 
 
 def four_bar():

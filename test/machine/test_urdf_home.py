@@ -19,74 +19,31 @@ pytest.importorskip("pinocchio")
 
 import pinocchio as pin
 
-from .sketches import SKETCHES, delta, five_bar, palletizer, rrr3, stewart
+from .sketches import SKETCHES, Tree, delta, five_bar, palletizer, rrr3, stewart
 
 pytestmark = pytest.mark.usefixtures("quickly_compiled")
 DRAWINGS = (palletizer, five_bar, SKETCHES["four_bar"])
 
 
-class Tree:
+def spheres_of(path):
     """A URDF and its YAML file in Pinocchio, every pair of frames a closure of six equations."""
+    model = pin.buildModelFromUrdf(str(path))
+    beside = yaml.safe_load(path.with_suffix(".yaml").read_text())
+    ends = [("fixed", *map(model.getFrameId, pair), None) for pair in beside["closed_loop"]]
+    return Tree(model, ends, beside["name_mot"])
 
-    def __init__(self, path):
-        self.model = pin.buildModelFromUrdf(str(path))
-        self.data = self.model.createData()
-        beside = yaml.safe_load(path.with_suffix(".yaml").read_text())
-        self.pairs = [[self.model.getFrameId(n) for n in p] for p in beside["closed_loop"]]
-        self.driven = [self.index(name) for name in beside["name_mot"]]
-        self.loose = [i for i in range(self.model.nv) if i not in self.driven]
 
-    def index(self, name):
-        return self.model.joints[self.model.getJointId(name)].idx_v
-
-    def rows(self, q):
-        """How far the closures are open, and their rates."""
-        pin.computeJointJacobians(self.model, self.data, q)
-        pin.updateFramePlacements(self.model, self.data)
-        values, rates = [], []
-        for a, b in self.pairs:
-            ja, jb = (
-                pin.getFrameJacobian(self.model, self.data, f, pin.LOCAL_WORLD_ALIGNED)
-                for f in (a, b)
-            )
-            pa, pb = self.data.oMf[a], self.data.oMf[b]
-            values += [pb.translation - pa.translation]
-            values += [pin.log3(pb.rotation @ pa.rotation.T)]
-            rates.append(jb - ja)
-        return np.concatenate(values), np.vstack(rates)
-
-    def closed(self, robot, q):
-        """All joint values: the robot's, and of joints that it holds those that close the loops."""
-        known = dict(zip(robot.joint_names, q, strict=True))
-        known |= dict(zip(robot.passive_joints, robot.passive(q), strict=True))
-        full = np.array([float(known.get(name, 0.0)) for name in self.model.names[1:]])
-        free = [i for i, name in enumerate(self.model.names[1:]) if name not in known]
-        for _ in range(60):
-            value, rates = self.rows(full)
-            step = np.linalg.lstsq(rates[:, free], -value, rcond=1e-6)[0]
-            full[free] += np.clip(step, -0.5, 0.5)
-        return full
-
-    def follow(self, rates, known, bias):
-        full = np.zeros(self.model.nv)
-        full[self.driven] = known
-        rest = -bias - rates[:, self.driven] @ known
-        full[self.loose] = np.linalg.lstsq(rates[:, self.loose], rest, rcond=1e-6)[0]
-        return full
-
-    def torques(self, q, qd, qdd):
-        """Efforts of the motors, all other joints rubbing, and their rates and accelerations."""
-        _, rates = self.rows(q)
-        v = self.follow(rates, qd, np.zeros(len(rates)))
-        step = 1e-5
-        before, after = (self.rows(q + s * step * v)[1] for s in (-1, 1))
-        a = self.follow(rates, qdd, (after - before) @ v / (2 * step))
-        damping, friction = self.model.damping, self.model.friction
-        efforts = pin.rnea(self.model, self.data, q, v, a) + damping * v + friction * np.sign(v)
-        select = np.eye(self.model.nv)[:, self.driven]
-        _, rates = self.rows(q)
-        solved = np.linalg.lstsq(np.hstack([select, rates.T]), efforts, rcond=1e-6)[0]
-        return solved[: len(self.driven)]
+def closed(tree, robot, q):
+    """All joint values: the robot's, and of joints that it holds those that close the loops."""
+    known = dict(zip(robot.joint_names, q, strict=True))
+    known |= dict(zip(robot.passive_joints, robot.passive(q), strict=True))
+    full = np.array([float(known.get(name, 0.0)) for name in tree.model.names[1:]])
+    free = [i for i, name in enumerate(tree.model.names[1:]) if name not in known]
+    for _ in range(60):
+        value, rates = tree.rows(full)
+        step = np.linalg.lstsq(rates[:, free], -value, rcond=1e-6)[0]
+        full[free] += np.clip(step, -0.5, 0.5)
+    return full
 
 
 def read(path, **options):
@@ -147,10 +104,10 @@ def test_a_drawing_with_spheres_is_the_machine_that_pinocchio_has(drawing, expor
         assert sorted(ends) == ["fixed", "revolute"]
     hinges = [n for n, kind, *_ in drawing().joints if joints[n]["type"] == "revolute"]
     assert len(hinges) == len(drawing().joints)
-    tree = Tree(path)
+    tree = spheres_of(path)
     rng = np.random.default_rng(1)
     for q in rng.uniform(-0.15, 0.15, (3, len(home))):
-        full = tree.closed(robot, q)
+        full = closed(tree, robot, q)
         assert np.abs(tree.rows(full)[0]).max() < accuracy
         qd, qdd = rng.normal(size=(2, len(home)))
         expected = tree.torques(full, qd, qdd)
@@ -163,7 +120,7 @@ def test_of_several_assemblies_the_best_conditioned_is_home(tries, tmp_path):
     path = spheres(palletizer(), tmp_path)
     _, robot = read(path)
     best = float(robot.singularity(robot.inverse(robot.home())))
-    tree = Tree(path)
+    tree = spheres_of(path)
     rng, found = np.random.default_rng(2), []
     for _ in range(tries):
         q = np.zeros(tree.model.nv)

@@ -15,9 +15,8 @@ from test.support.robots import load, partly_long
 
 pytest.importorskip("pinocchio")
 
-import pinocchio as pin
 
-from .sketches import SKETCHES, closure_rows
+from .sketches import SKETCHES, Tree, closure_rows
 
 pytestmark = pytest.mark.usefixtures("quickly_compiled")
 NEAR = ("rrr3",)
@@ -112,42 +111,15 @@ def test_the_three_dialects_say_the_same(sketch, described, tmp_path):
         assert beside["bodies"][name]["mass"] == body["mass"]
 
 
-def constrained_torques(sketch, model, data, ends, q, v, a):
-    """Actuator efforts and closure forces that give the accelerations, all other efforts zero."""
-    free = pin.rnea(model, data, q, v, a) + 0.1 * v + 0.2 * np.sign(v)
-    _, rows = closure_rows(model, data, ends, q)
-    driven = [model.joints[model.getJointId(name)].idx_v for name in sketch.actuated]
-    select = np.zeros((model.nv, len(driven)))
-    select[driven, range(len(driven))] = 1.0
-    solved, *_ = np.linalg.lstsq(np.hstack([select, rows.T]), free, rcond=1e-10)
-    return solved[: len(driven)]
-
-
 def test_torques_are_pinocchios_constrained_solution(sketch, described):
-    description = described
-    robot = Machine.from_data(description, "sketch")
-    model, data, ends = sketch.model()
-    q = values(model, description)
-    driven = [model.joints[model.getJointId(name)].idx_v for name in robot.joint_names]
-    loose = [i for i in range(model.nv) if i not in driven]
+    robot = Machine.from_data(described, "sketch")
+    model, _, ends = sketch.model()
+    tree = Tree(model, ends, robot.joint_names)
+    q = values(model, described)
     rng = np.random.default_rng(0)
-    for _ in range(5):
-        _, rows = closure_rows(model, data, ends, q)
-
-        def follow(known, bias, rows=rows):
-            full = np.zeros(model.nv)
-            full[driven] = known
-            rest = -bias - rows[:, driven] @ known
-            full[loose] = np.linalg.lstsq(rows[:, loose], rest, rcond=1e-9)[0]
-            return full
-
-        v = follow(rng.normal(size=len(driven)), np.zeros(len(rows)))
-        step = 1e-5
-        before, after = (closure_rows(model, data, ends, q + s * step * v)[1] for s in (-1, 1))
-        a = follow(rng.normal(size=len(driven)), (after - before) @ v / (2 * step))
-        expected = constrained_torques(sketch, model, data, ends, q, v, a)
-        found = inverse_dynamics(robot, q[driven], v[driven], a[driven])
-        np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-6)
+    for qd, qdd in rng.normal(size=(5, 2, len(tree.driven))):
+        found = inverse_dynamics(robot, q[tree.driven], qd, qdd)
+        np.testing.assert_allclose(found, tree.torques(q, qd, qdd), rtol=1e-6, atol=1e-6)
 
 
 def test_passive_joints_have_the_values_of_the_urdf(sketch, described):
