@@ -23,12 +23,12 @@ from pkm_twin.robot.robot import Robot
 from pkm_twin.streams.continuity import Continuity
 from pkm_twin.streams.differentiator import Differentiator
 from pkm_twin.streams.matched import WrenchWindow
-from pkm_twin.streams.monitor import StreamMonitor
+from pkm_twin.streams.monitor import Core, StreamMonitor, counting
 from pkm_twin.streams.rates import RateAgreement
 from pkm_twin.streams.rest import RestWatch, fit_gain, gradient_gain, rate_doubt
-from pkm_twin.streams.wrench import counting
 
-STOPPING: Final = ("non-finite result", "singular", "jump", "no wrench")
+OVERFLOW: Final = "non-finite result"
+STOPPING: Final = (OVERFLOW, "singular", "jump", "no wrench")
 """Reasons for which one sample stops the stream: it is none that the model describes."""
 SLICE: Final = 256
 """Points of a trajectory that are answered in one go."""
@@ -60,7 +60,7 @@ class Torques(NamedTuple):
 
 
 @dataclass
-class Feedforward:
+class Feedforward(Core):
     """Answers trajectories and a stream of joint states with feedforward efforts.
 
     ``wrenches``: those that the stream's efforts bear; None bears none. ``doubted``: the doubt of
@@ -81,7 +81,6 @@ class Feedforward:
         self.dropped = 0
         self.near_singular = False
         self.near_singularities = 0
-        self.last_reject = ""
         self._last_stamp = 0
         self._last_now = 0
         self._last_good: Array | None = None
@@ -153,14 +152,8 @@ class Feedforward:
 
         :returns: the generator's value, the efforts.
         """
-        try:
+        with self.refusing(self.trajectories):
             efforts = yield from self._trajectory_steps(message, now)
-        except MessageError as error:
-            self.refuse_trajectory(error)
-            if error.reason == "non-finite result":
-                # The input was finite: the model itself cannot be trusted now.
-                self.stream.stop(error.reason, str(error))
-            raise
         self.trajectories.accept()
         return efforts
 
@@ -169,26 +162,20 @@ class Feedforward:
 
         :raises MessageError: the message is rejected, and counted.
         """
-        try:
+        with self.refusing(self.stream):
             torques = self._joint_state(message, now)
-        except MessageError as error:
-            self.refuse_joint_state(error)
-            raise
         if torques is None or not self.stream.accept():
             return None
         self.saturations += torques.saturated
         return torques
 
-    def refuse_trajectory(self, error: MessageError) -> None:
-        """Count a trajectory that is refused."""
-        self.trajectories.reject(error.reason, str(error))
-        self.last_reject = str(error)
+    def refuse(self, counts: StreamMonitor, error: MessageError) -> None:
+        """Count a message that is refused; several joint states in a row stop the stream.
 
-    def refuse_joint_state(self, error: MessageError) -> None:
-        """Count a joint state that is refused; several in a row stop the stream."""
-        self.stream.reject(error.reason, str(error))
-        self.last_reject = str(error)
-        if error.reason in STOPPING:
+        A trajectory stops it where its input was finite: the model cannot be trusted then.
+        """
+        super().refuse(counts, error)
+        if error.reason in (STOPPING if counts is self.stream else (OVERFLOW,)):
             self.stream.stop(error.reason, str(error))
 
     def check_age(self, torques: Torques, now: int) -> None:
@@ -198,13 +185,12 @@ class Feedforward:
         """
         age = now - torques.stamp
         if age > self.settings.stale_after * SECOND:
-            error = MessageError(
-                "late answer",
-                f"the answer is ready {age / SECOND:.3f} s after the state's stamp, allowed "
-                f"{self.settings.stale_after:g} s",
-            )
-            self.refuse_joint_state(error)
-            raise error
+            with self.refusing(self.stream):
+                raise MessageError(
+                    "late answer",
+                    f"the answer is ready {age / SECOND:.3f} s after the state's stamp, allowed "
+                    f"{self.settings.stale_after:g} s",
+                )
 
     def stop_effort(self) -> Array | None:
         """What is sent once on entering a stop, by the setting ``on_stop``; None is nothing."""
@@ -432,7 +418,7 @@ def _gate(robot: Robot, policy: LimitPolicy, effort: Array) -> tuple[Array, bool
 def _require_finite(effort: Array) -> None:
     one = effort.ndim == 1
     if not (all(map(math.isfinite, effort.tolist())) if one else np.isfinite(effort).all()):
-        raise MessageError("non-finite result", "the model gave a value that is not finite")
+        raise MessageError(OVERFLOW, "the model gave a value that is not finite")
 
 
 def _beyond(effort: Array, limits: Array) -> bool:

@@ -20,8 +20,7 @@ from pkm_twin.messages.reading import JointReader
 from pkm_twin.messages.stamps import SECOND, StampRules
 from pkm_twin.robot.robot import Robot
 from pkm_twin.settings import COUNT, FUTURE, LATE, SECONDS, setting
-from pkm_twin.streams.monitor import StreamMonitor
-from pkm_twin.streams.wrench import counting
+from pkm_twin.streams.monitor import Core, StreamMonitor, counting
 
 OnStop = Literal["zeros", "gravity"]
 
@@ -52,7 +51,7 @@ class GateSettings:
 
 
 @dataclass
-class Gate:
+class Gate(Core):
     """Forwards the torques of one robot; closed from the start, and whenever they stop.
 
     The controller behind it may still hold what a gate before this one has sent, so that a new
@@ -67,7 +66,6 @@ class Gate:
         self.stream = StreamMonitor(s.trip_count, s.recovery_count)
         self.stream.stop(WAITING, "no torque yet")
         self.states = counting()
-        self.last_reject = ""
         self._rules = StampRules(
             future_tolerance=round(s.future_tolerance * SECOND),
             max_age=round(s.deadline * SECOND),
@@ -101,38 +99,21 @@ class Gate:
         :raises MessageError: the message is refused, and counted.
         """
         self.watch(steady)
-        try:
+        with self.refusing(self.stream):
             sample = self._reader.efforts(message, now, self._rules)
             self._check(sample.stamp, sample.given)
-        except MessageError as error:
-            self.refuse_torques(error)
-            raise
         self._last_stamp = sample.stamp
         self._last_arrival = steady
         return sample.given if self.stream.accept() else None
-
-    def refuse_torques(self, error: MessageError) -> None:
-        """Count torques that are refused; several in a row close the gate."""
-        self.stream.reject(error.reason, str(error))
-        self.last_reject = str(error)
 
     def joint_state(self, message: Any, now: int, steady: int) -> None:
         """Keep where the robot stands: gravity is that of a measured state, never of a guess.
 
         :raises MessageError: the message is refused, and counted.
         """
-        try:
+        with self.taking(self.states):
             q = self._reader.joint_state(message, now, self._rules).q
-        except MessageError as error:
-            self.refuse_joint_state(error)
-            raise
         self._state = steady, q
-        self.states.accept()
-
-    def refuse_joint_state(self, error: MessageError) -> None:
-        """Count a joint state that is refused."""
-        self.states.reject(error.reason, str(error))
-        self.last_reject = str(error)
 
     def watch(self, steady: int) -> None:
         """Close the gate where the torques have gone silent."""

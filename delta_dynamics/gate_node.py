@@ -7,6 +7,7 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from typing import Final
 
 import numpy as np
@@ -64,7 +65,7 @@ class CommandGate(TwinNode):
             self.create_guarded_subscription(
                 "joint_states",
                 lambda m: self._gate.joint_state(m, self.now(), time.monotonic_ns()),
-                refuse=self._gate.refuse_joint_state,
+                refuse=partial(self._gate.refuse, self._gate.states),
                 awaited=True,
             )
         self.follow(
@@ -170,7 +171,7 @@ class CommandGate(TwinNode):
 
     def _refuse_torques(self, error: MessageError) -> None:
         with self._watching():
-            self._gate.refuse_torques(error)
+            self._gate.refuse(self._gate.stream, error)
 
     def _on_torques(self, message: JointStateView) -> None:
         with self._watching():

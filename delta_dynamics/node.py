@@ -320,19 +320,13 @@ class DeltaDynamics(TwinNode):
                 self._send_stop()
 
     def _on_trajectory(self, data: bytes) -> None:
-        try:
+        with self._feedforward.refusing(self._feedforward.trajectories):
             self.defer("~/joint_trajectory", self._answer_trajectory(data))
-        except MessageError as error:
-            self._feedforward.refuse_trajectory(error)
-            raise
 
     def _answer_trajectory(self, data: bytes) -> Task:
         """In steps, so that the stream is answered meanwhile."""
-        try:
+        with self._feedforward.refusing(self._feedforward.trajectories):
             raw = RawTrajectory.of(data)
-        except MessageError as error:
-            self._feedforward.refuse_trajectory(error)
-            raise
         steps = self._feedforward.trajectory_steps(raw.fields, self.now())
         while True:
             yield
@@ -349,7 +343,7 @@ class DeltaDynamics(TwinNode):
 
     def _refuse_joint_state(self, error: MessageError) -> None:
         with self._telling_stop():
-            self._feedforward.refuse_joint_state(error)
+            self._feedforward.refuse(self._feedforward.stream, error)
 
     def _on_joint_state(self, message: JointStateView) -> None:
         core, came = self._feedforward, time.monotonic_ns()

@@ -310,11 +310,8 @@ class MachineSim(TwinNode):
                 self._advance()
 
     def _on_trajectory(self, data: bytes) -> None:
-        try:
+        with self._simulation.refusing(self._simulation.trajectories):
             raw = RawTrajectory.of(data)
-        except MessageError as error:
-            self._simulation.refuse_trajectory(error)
-            raise
         self._simulation.trajectory(raw.fields)
 
     def _catch_up(self) -> None:

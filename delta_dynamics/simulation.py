@@ -30,8 +30,8 @@ from pkm_twin.robot.robot import Robot
 from pkm_twin.robot.workspace import random_joints
 from pkm_twin.settings import setting
 from pkm_twin.streams.continuity import Continuity
+from pkm_twin.streams.monitor import Core, counting
 from pkm_twin.streams.path import JointPath
-from pkm_twin.streams.wrench import counting
 
 CHANGES: Final = 60
 """Changes of what sticks or slides in a step that are followed one by one."""
@@ -367,7 +367,7 @@ class Measured:
     """At the platform's reference point, platform axes, without the payload's own, shape (6,)."""
 
 
-class Simulation:
+class Simulation(Core):
     """One machine with brakes, which the first command opens.
 
     Effort commands and trajectories take turns: what came last is obeyed.
@@ -430,12 +430,8 @@ class Simulation:
 
         :raises MessageError: refused whole, and counted; what was commanded before stays.
         """
-        try:
+        with self.taking(self.stream):
             effort = self._reader.commands(message.data)
-        except MessageError as error:
-            self.stream.reject(error.reason, str(error))
-            raise
-        self.stream.accept()
         self._path = None
         self._commanded = self.now
         self.braked = False
@@ -449,14 +445,10 @@ class Simulation:
         :param message: the message or its TrajectoryFields.
         :raises MessageError: refused whole, and counted; what was commanded before stays.
         """
-        try:
+        with self.taking(self.trajectories):
             t = self._reader.trajectory(message, self.now)
             if self.stable_share < 1.0:
                 raise MessageError("unstable control", self.control_fault())
-        except MessageError as error:
-            self.refuse_trajectory(error)
-            raise
-        self.trajectories.accept()
         self._path = (t.stamp or self.now, JointPath(t).from_here(self._seen))
 
     @cached_property
@@ -471,22 +463,14 @@ class Simulation:
             f"machine's inertia; {self.stable_share:.2g} times its bandwidth is stable"
         )
 
-    def refuse_trajectory(self, error: MessageError) -> None:
-        """Count a trajectory that is refused."""
-        self.trajectories.reject(error.reason, str(error))
-
     def push(self, message: Any, frame: str) -> None:
         """A geometry_msgs/WrenchStamped in the base frame, which stays until the next.
 
         :raises MessageError: it is refused, and counted.
         """
         rules = StampRules(accept_zero=True, future_tolerance=SECOND)
-        try:
+        with self.taking(self.wrenches):
             self._pushed = read_wrench(message, self.now, rules, frame, False).wrench
-        except MessageError as error:
-            self.wrenches.reject(error.reason, str(error))
-            raise
-        self.wrenches.accept()
 
     def measured(self) -> Measured:
         """What the sensors tell now."""

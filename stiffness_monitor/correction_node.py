@@ -6,6 +6,7 @@ Only the node ``stiffness_monitor`` imports this module.
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,7 @@ from pkm_twin.robot.robot import Robot
 from pkm_twin.ros.joints import JointPublisher
 from pkm_twin.ros.node import TwinNode
 from pkm_twin.ros.wrench import triple
-from pkm_twin.streams.wrench import counting
+from pkm_twin.streams.monitor import Core, counting
 from stiffness_monitor.correction import setpoint_correction
 from stiffness_monitor.monitor import Answer
 
@@ -28,7 +29,7 @@ WAITING = 64
 """Most set points and torques that wait for the other of their stamp."""
 
 
-class SetpointCorrection:
+class SetpointCorrection(Core):
     """``~/setpoint_offset`` of every wrench; ``setpoint`` with it is ``~/corrected_setpoint``.
 
     With ``pair_torques``, that and the ``torques`` of the same stamp are one message,
@@ -93,7 +94,9 @@ class SetpointCorrection:
         fields = ("position",)
         self._offsets = JointPublisher(node, robot, "~/setpoint_offset", fields)
         self._corrected = JointPublisher(node, robot, "~/corrected_setpoint", fields)
-        node.create_guarded_subscription("setpoint", self._on_setpoint, refuse=self._refuse)
+        node.create_guarded_subscription(
+            "setpoint", self._on_setpoint, refuse=partial(self.refuse, self.setpoints)
+        )
         if paired:
             both = ("position", "effort")
             self._both = JointPublisher(node, robot, "~/setpoint_with_torques", both)
@@ -137,16 +140,9 @@ class SetpointCorrection:
             values["set points and torques without a pair"] = self.unpaired
         return values | {f"set points rejected: {k}": v for k, v in self.setpoints.rejected.items()}
 
-    def _refuse(self, error: MessageError) -> None:
-        self.setpoints.reject(error.reason, str(error))
-
     def _on_setpoint(self, message: JointStateView) -> None:
-        try:
+        with self.taking(self.setpoints):
             self._correct(message)
-        except MessageError as error:
-            self._refuse(error)
-            raise
-        self.setpoints.accept()
 
     def _correct(self, message: JointStateView) -> None:
         sample = self._reader.positions(message, self._node.now(), self._rules)

@@ -65,7 +65,7 @@ class Monitor(PairingCore):
 
         :raises MessageError: the message is rejected, and counted.
         """
-        with self._judging(self.states):
+        with self.taking(self.states):
             sample = self._reader.positions(message, now, self._rules)
             self._recent.push(sample.stamp, sample.q)
 
@@ -78,7 +78,7 @@ class Monitor(PairingCore):
 
         :raises MessageError: the message is rejected, and counted.
         """
-        with self._judging(self.wrenches):
+        with self.taking(self.wrenches):
             return self._wrench(message, now)
 
     def _wrench(self, message: Any, now: int) -> Answer | None:

@@ -11,6 +11,7 @@ import math
 import sys
 from array import array
 from collections.abc import Sequence
+from functools import partial
 from typing import Final
 
 import numpy as np
@@ -102,7 +103,7 @@ class StiffnessMonitor(TwinNode):
         self.create_guarded_subscription(
             "joint_states",
             lambda message: self._monitor.joint_state(message, self.now()),
-            refuse=self._monitor.refuse_joint_state,
+            refuse=partial(self._monitor.refuse, self._monitor.states),
             awaited=True,
         )
         self.create_guarded_subscription("wrench", self._on_wrench)

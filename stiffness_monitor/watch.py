@@ -12,7 +12,8 @@ from pkm_twin.errors import MessageError, SingularityError, UnreachableError
 from pkm_twin.messages.reading import DeflectionSample, in_base_axes, read_deflection, shown
 from pkm_twin.messages.stamps import SECOND, StampRules
 from pkm_twin.robot.robot import Robot
-from pkm_twin.streams.wrench import Recent, check_order, counting
+from pkm_twin.streams.monitor import Core, counting
+from pkm_twin.streams.wrench import Recent, check_order
 from stiffness_monitor.alarm import AlarmSettings, Departure, StiffnessAlarm
 from stiffness_monitor.monitor import Answer
 
@@ -23,7 +24,7 @@ JUDGED: Final = 1.0
 
 
 @dataclass
-class StiffnessWatch:
+class StiffnessWatch(Core):
     """Pairs each measured deflection with the wrenches around it, and judges a window of pairs.
 
     ``frames``: of the base and of the platform: a deflection is along the axes of either.
@@ -40,7 +41,6 @@ class StiffnessWatch:
 
     def __post_init__(self) -> None:
         self.taken = counting()
-        self.last_reject = ""
         self.departures: tuple[Departure, ...] | None = None
         """What the last judgement found; None before there was one."""
         self._alarm = StiffnessAlarm(self.robot, self.settings)
@@ -81,21 +81,18 @@ class StiffnessWatch:
 
         :raises MessageError: the message is rejected, and counted.
         """
-        try:
+        with self.refusing(self.taken):
             sample = read_deflection(message, now, self.rules)
             if sample.frame not in self.frames:
                 told = " or ".join(map(repr, dict.fromkeys(self.frames)))
                 raise MessageError("frame", f"frame is {shown(sample.frame)}, expected {told}")
             check_order(sample.stamp, self._last)
-        except MessageError as error:
-            self._refuse(error)
-            raise
         insort(self._waiting, sample, key=lambda waiting: waiting.stamp)
         self._pair()
         if len(self._waiting) > WAITING:
             self._waiting.pop()
             text = f"{WAITING} deflections are already waiting for the wrench after them"
-            self._refuse(MessageError("no wrench", text))
+            self.refuse(self.taken, MessageError("no wrench", text))
 
     def judgement(self) -> Generator[None, None, bool] | None:
         """A judgement in slices, where it is time for one; else None.
@@ -120,10 +117,6 @@ class StiffnessWatch:
             if self._judging is mine:
                 self._judging = None
 
-    def _refuse(self, error: MessageError) -> None:
-        self.taken.reject(error.reason, str(error))
-        self.last_reject = str(error)
-
     def _pair(self) -> None:
         """Pair what waits and has a wrench behind it."""
         latest = self._answers.latest
@@ -132,7 +125,7 @@ class StiffnessWatch:
             try:
                 self._take(sample)
             except MessageError as error:
-                self._refuse(error)
+                self.refuse(self.taken, error)
                 continue
             self._last = sample.stamp
             self.taken.accept()

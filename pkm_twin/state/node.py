@@ -6,6 +6,7 @@ from __future__ import annotations
 import sys
 from array import array
 from collections.abc import Iterable, Mapping, Sequence
+from functools import partial
 from typing import Any, Final
 
 import numpy as np
@@ -231,7 +232,10 @@ class MachineStateNode(TwinNode):
         """Stamp of the state that was drawn last."""
         self._create_markers()
         self.create_guarded_subscription(
-            "joint_states", self._on_joint_state, refuse=self._core.refuse_joint_state, awaited=True
+            "joint_states",
+            self._on_joint_state,
+            refuse=partial(self._core.refuse, self._core.states),
+            awaited=True,
         )
         self.create_guarded_subscription("wrench", lambda m: self._core.wrench(m, self.now()))
         self.follow(

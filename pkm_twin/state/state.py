@@ -101,7 +101,7 @@ class MachineState(PairingCore):
 
         :raises MessageError: the message is rejected, and counted.
         """
-        with self._judging(self.states):
+        with self.taking(self.states):
             sample = self._reader.joint_state(message, now, self._rules)
             if self.latest is not None:
                 check_order(sample.stamp, self._last_stamp)
@@ -118,7 +118,7 @@ class MachineState(PairingCore):
 
         :raises MessageError: the message is rejected, and counted.
         """
-        with self._judging(self.wrenches):
+        with self.taking(self.wrenches):
             sample, mount = self._wrench_reader.read(message, now)
             self._recent.push(sample.stamp, (sample, mount))
 

@@ -22,8 +22,8 @@ from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import MessageError
 from pkm_twin.messages.reading import JointSample, WrenchSample
 from pkm_twin.messages.stamps import SECOND
-from pkm_twin.streams.monitor import StreamMonitor
-from pkm_twin.streams.wrench import Mount, Recent, WrenchReader, counting
+from pkm_twin.streams.monitor import Core, StreamMonitor, counting
+from pkm_twin.streams.wrench import Mount, Recent, WrenchReader
 
 NoWrench = Literal["ignore", "stop"]
 
@@ -68,7 +68,7 @@ class _Row:
 
 
 @dataclass
-class WrenchWindow:
+class WrenchWindow(Core):
     """Wrenches for a stream of joint states.
 
     ``max_age``: between a joint state and its wrench, ns. ``no_wrench``: without one the joint
@@ -83,7 +83,6 @@ class WrenchWindow:
     window: int = 25
     without: int = 0
     """Joint states without a fresh wrench, counted."""
-    last_reject: str = ""
     stream: StreamMonitor = field(default_factory=counting)
 
     def __post_init__(self) -> None:
@@ -122,14 +121,9 @@ class WrenchWindow:
 
         :raises MessageError: it is refused, and counted.
         """
-        try:
+        with self.taking(self.stream):
             sample, mount = self.reader.read(message, now)
             self._recent.push(sample.stamp, (sample, mount))
-        except MessageError as error:
-            self.stream.reject(error.reason, str(error))
-            self.last_reject = str(error)
-            raise
-        self.stream.accept()
         for row in reversed(self._rows):
             # It came after the joint state that it was measured with.
             if row.stamp < sample.stamp or row.since >= sample.stamp:

@@ -4,8 +4,12 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Final
+
+from pkm_twin.errors import MessageError
 
 MANY: Final = 5
 """Rejects since a stop from which the status has their reason."""
@@ -82,6 +86,41 @@ class StreamMonitor:
         stopped, self.stopped = self.stopped, False
         self._bad = self._good = 0
         return stopped
+
+
+def counting() -> StreamMonitor:
+    """Counts messages that each stand for themselves: nothing stops them."""
+    return StreamMonitor(trip_count=2**62, recovery_count=1)
+
+
+class Core:
+    """What takes messages, and counts those that it refuses.
+
+    ``last_reject``: why the last one was refused, of whichever stream; empty before the first.
+    """
+
+    last_reject = ""
+
+    def refuse(self, counts: StreamMonitor, error: MessageError) -> None:
+        """Count a message that is refused."""
+        counts.reject(error.reason, str(error))
+        self.last_reject = str(error)
+
+    @contextmanager
+    def refusing(self, counts: StreamMonitor) -> Iterator[None]:
+        """Count the message that is refused in here."""
+        try:
+            yield
+        except MessageError as error:
+            self.refuse(counts, error)
+            raise
+
+    @contextmanager
+    def taking(self, counts: StreamMonitor) -> Iterator[None]:
+        """Count the message that is read in here, as taken or as refused."""
+        with self.refusing(counts):
+            yield
+        counts.accept()
 
 
 @dataclass

@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, Final, Generic, TypeVar
 
@@ -22,7 +21,7 @@ from pkm_twin.messages.reading import JointReader, WrenchSample, read_wrench
 from pkm_twin.messages.stamps import SECOND, StampRules
 from pkm_twin.robot.robot import Robot
 from pkm_twin.settings import FUTURE, SECONDS, ZERO_STAMP, setting
-from pkm_twin.streams.monitor import StreamMonitor
+from pkm_twin.streams.monitor import Core, counting
 
 Triple = tuple[float, float, float]
 V = TypeVar("V")
@@ -224,13 +223,8 @@ class Recent(Generic[V]):
         self.items.clear()
 
 
-def counting() -> StreamMonitor:
-    """Counts messages that each stand for themselves: nothing stops them."""
-    return StreamMonitor(trip_count=2**62, recovery_count=1)
-
-
 @dataclass
-class PairingCore:
+class PairingCore(Core):
     """Settings that may change between two messages, and counts of what is taken and refused.
 
     ``mounts``: tells where a wrench's frame stands; None is the settings' fixed mount.
@@ -243,7 +237,6 @@ class PairingCore:
     def __post_init__(self) -> None:
         self.states = counting()
         self.wrenches = counting()
-        self.last_reject = ""
         self._reader = JointReader(self.robot)
         self.change_settings(self.settings)
 
@@ -257,21 +250,3 @@ class PairingCore:
         self.settings = settings
         self._rules = settings.stamp_rules
         self._wrench_reader = WrenchReader(settings, self.mounts)
-
-    def refuse_joint_state(self, error: MessageError) -> None:
-        """Count a joint state that is refused."""
-        self._refuse(self.states, error)
-
-    @contextmanager
-    def _judging(self, counts: StreamMonitor) -> Iterator[None]:
-        """Count a message as taken where all went well, else as refused."""
-        try:
-            yield
-        except MessageError as error:
-            self._refuse(counts, error)
-            raise
-        counts.accept()
-
-    def _refuse(self, counts: StreamMonitor, error: MessageError) -> None:
-        counts.reject(error.reason, str(error))
-        self.last_reject = str(error)
