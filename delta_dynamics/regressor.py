@@ -22,8 +22,14 @@ from pkm_twin.codegen.program import Program
 from pkm_twin.kinematics.traced import Traced
 from pkm_twin.machine.friction import friction_values, linear_keys, taken
 from pkm_twin.machine.graph import Joint, Rod
-from pkm_twin.machine.inertia import TEN, loaded_joints, ten_numbers, transport
-from pkm_twin.machine.shared import TEN_UNITS, drive_units
+from pkm_twin.machine.inertia import (
+    TEN,
+    TEN_UNITS,
+    drive_units,
+    loaded_joints,
+    ten_numbers,
+    transport,
+)
 from pkm_twin.robot.robot import Robot
 
 DRIVE: Final = ("viscous", "coulomb", "offset", "rotor_inertia")

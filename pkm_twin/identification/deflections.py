@@ -22,10 +22,10 @@ from pkm_twin.codegen.arrays import Array, Mask
 from pkm_twin.errors import PkmTwinError
 from pkm_twin.identification.estimation import Estimate, estimate
 from pkm_twin.identification.fit import Judged, Result, refuse_faults
+from pkm_twin.identification.identifiable import above_zero
 from pkm_twin.identification.judge import Evidence, Suspect, Verdict, judge
 from pkm_twin.identification.parameters import SURE, Group, Number, groups_of, number_of
 from pkm_twin.identification.rows import HELD_OUT
-from pkm_twin.machine.shared import above_zero
 from pkm_twin.messages.reading import in_base_axes
 from pkm_twin.recordings import Recording
 from pkm_twin.robot.robot import Robot

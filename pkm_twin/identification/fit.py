@@ -16,6 +16,7 @@ from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import PkmTwinError
 from pkm_twin.identification.estimation import Estimate, nearest, possible
 from pkm_twin.identification.fit_verdict import verdict_of
+from pkm_twin.identification.identifiable import KINDS, Kind
 from pkm_twin.identification.judge import Verdict
 from pkm_twin.identification.parameters import (
     FileParameters,
@@ -26,7 +27,6 @@ from pkm_twin.identification.parameters import (
 from pkm_twin.identification.problem import Problem
 from pkm_twin.identification.rows import Recorded, next_window
 from pkm_twin.identification.samples import Filtering
-from pkm_twin.machine.shared import KINDS, Kind
 from pkm_twin.robot.robot import Robot
 
 

@@ -18,6 +18,7 @@ import numpy as np
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import PkmTwinError, UnknownNameError
 from pkm_twin.identification.fit import Fit, fit, fitted
+from pkm_twin.identification.identifiable import KINDS, Kind, of_drives
 from pkm_twin.identification.judge import SIGMAS
 from pkm_twin.identification.noise import EXACT
 from pkm_twin.identification.parameters import Number
@@ -26,7 +27,6 @@ from pkm_twin.identification.rows import Recorded, Rows
 from pkm_twin.identification.samples import Track, low_pass
 from pkm_twin.identification.suspects import RESONANCE
 from pkm_twin.machine.friction import BASIC, LAWS, taken
-from pkm_twin.machine.shared import KINDS, Kind
 from pkm_twin.robot.robot import Robot
 
 AUTO: Final = "auto"
@@ -231,10 +231,10 @@ def _widened(result: Fit, found: dict[str, Searched]) -> dict[tuple[str | int, .
 
 def _joint_of(robot: Robot, key: tuple[str | int, ...]) -> int:
     """The actuated joint of a number of friction: by its group, in order."""
-    groups = [g for g in robot.shared_drives() if g.kind == "friction"]
+    groups = [g for g in of_drives(robot) if g.kind == "friction"]
     for group in groups:
         if key in group.keys(group.values):
-            joint = group.name.rpartition(".")[0]
+            joint = group.names[0].rpartition(".")[0]
             return robot.joint_names.index(joint)
     raise KeyError(key)
 

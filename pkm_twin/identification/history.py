@@ -113,7 +113,7 @@ def _efforts(r: Recording) -> list[Measured]:
         result = fit(loaded, [recorded], ("friction", "payload"), accept=True)
     except (PkmTwinError, ValueError, np.linalg.LinAlgError):
         return found
-    owners = {key: g.name for g in result.problem.parameters.groups for key in g.keys(g.values)}
+    owners = {key: g.names[0] for g in result.problem.parameters.groups for key in g.keys(g.values)}
     for one in result.of("fitted"):
         part, _, law = owners[one.key].rpartition(".")
         if part in names and law in ("viscous", "coulomb"):

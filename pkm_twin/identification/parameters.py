@@ -16,13 +16,12 @@ from delta_dynamics.regressor import TEN, parameter_names
 from delta_dynamics.virtual_work import mass_matrix
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import PkmTwinError, UnknownNameError
+from pkm_twin.identification.identifiable import KINDS, Identifiable, Kind, identifiable
 from pkm_twin.machine.inertia import transport
 from pkm_twin.machine.machine_yaml import edit_yaml
-from pkm_twin.machine.places import path_of
-from pkm_twin.machine.shared import KINDS, Key, Kind, Shared
+from pkm_twin.machine.places import Keys, path_of
 from pkm_twin.machine.strict_yaml import parse_yaml
 from pkm_twin.robot.catalogue import robot_of_data
-from pkm_twin.robot.identifiable import shared_parameters
 from pkm_twin.robot.robot import Robot
 
 Status = Literal["fitted", "combination", "not excited"]
@@ -51,7 +50,7 @@ class FileParameters:
     grows with the load is taken, shape (k,); None: the file's.
     """
 
-    groups: tuple[Shared, ...]
+    groups: tuple[Identifiable, ...]
     mixing: Array
     loads: Array | None = None
 
@@ -88,7 +87,7 @@ class FileParameters:
         return tuple((where, cone) for where, group in pairs for cone in group.cones)
 
 
-def _scaled(group: Shared, robot: Robot) -> Shared:
+def _scaled(group: Identifiable, robot: Robot) -> Identifiable:
     """A rotor may weigh as much as all that the joints move at home."""
     if group.kind != "rotor":
         return group
@@ -101,7 +100,7 @@ def file_parameters(robot: Robot, what: Sequence[Kind] = KINDS) -> FileParameter
 
     :raises ParameterError: the robot's file gives no masses.
     """
-    kept = [_scaled(g, robot) for g in shared_parameters(robot) if g.kind in what]
+    kept = [_scaled(g, robot) for g in identifiable(robot) if g.kind in what]
     place = {name: k for k, name in enumerate(parameter_names(robot))}
     tree = robot.engine.tree
     mixing = np.zeros((len(place), sum(len(group.names) for group in kept)))
@@ -139,7 +138,7 @@ class Number:
     stays.
     """
 
-    key: Key
+    key: Keys
     unit: str
     before: float
     after: float
@@ -159,7 +158,7 @@ class Number:
 
 
 def number_of(
-    key: Key, unit: str, before: float, value: float, deviations: tuple[float, float], prior: float
+    key: Keys, unit: str, before: float, value: float, deviations: tuple[float, float], prior: float
 ) -> Number:
     """A number with how well it is known: by the noise alone.
 
@@ -175,7 +174,7 @@ def number_of(
 
 
 def numbers_of_group(
-    group: Shared, values: Array, prior: Array, covariances: tuple[Array, Array]
+    group: Identifiable, values: Array, prior: Array, covariances: tuple[Array, Array]
 ) -> list[Number]:
     """A group's numbers of the file, their standard deviations by the derivatives of its keys.
 
@@ -267,15 +266,15 @@ def fitted_yaml(text: str, fitted: Sequence[Number], recordings: Sequence[str], 
     :param text: of the file before. ``out``: the file that it will be.
     :raises PkmTwinError: numbers that no file may have: it could not be read again.
     """
-    groups: dict[Key, list[Number]] = {}
+    groups: dict[Keys, list[Number]] = {}
     for number in fitted:
-        base: Key = tuple(k for k in number.key if not isinstance(k, int))
+        base: Keys = tuple(k for k in number.key if not isinstance(k, int))
         # A section of a list is no place in a vector.
         if number.key[:1] == ("limbs",) and isinstance(number.key[1], int):
             base = (*number.key[:2], *base[1:])
         groups.setdefault(base, []).append(number)
-    values: dict[Key, Any] = {}
-    notes: dict[Key, str] = {}
+    values: dict[Keys, Any] = {}
+    notes: dict[Keys, str] = {}
     source = ", ".join(recordings)
     for base, numbers in groups.items():
         if all(number.status == "not excited" for number in numbers):
@@ -301,7 +300,7 @@ def fitted_yaml(text: str, fitted: Sequence[Number], recordings: Sequence[str], 
     return made
 
 
-def _value(base: Key, numbers: Sequence[Number]) -> Any:
+def _value(base: Keys, numbers: Sequence[Number]) -> Any:
     """A number, a list, or a matrix of what stands below one key."""
     tails = {n.key[len(base) :]: n.after for n in numbers}
     if () in tails:

@@ -402,7 +402,7 @@ def case_of(rows: Rows, inertial: Array | None = None) -> Case:
     for where, group in zip(everything.slices, everything.groups, strict=True):
         own, value = [table[..., where] for table in tables], float(group.values[0])
         scale, first = float(everything.scales[where][0]), len(bounds)
-        rubs = group.kind == "friction" and group.name.rpartition(".")[2] in turning
+        rubs = group.kind == "friction" and group.names[0].rpartition(".")[2] in turning
         bound, known = (0.0, np.inf), (value, scale)
         if group.kind == "inertia":
             own = [(one @ group.values)[..., None] for one in own]
@@ -412,7 +412,7 @@ def case_of(rows: Rows, inertial: Array | None = None) -> Case:
             bound, known = (0.0, total), (value, scale)
         elif group.kind == "rotor" and value > 0.0:
             known = (value, HEAVIER * value)
-        elif group.name.endswith("offset"):
+        elif group.names[0].endswith("offset"):
             most = OFFSET * float(np.max(np.abs(own[0]).max((0, 1)) * size))
             bound, known = (-np.inf, np.inf), (value, most)
         parts.append(own)

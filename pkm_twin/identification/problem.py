@@ -17,12 +17,12 @@ import numpy as np
 from pkm_twin.codegen.arrays import Array, Mask
 from pkm_twin.errors import PkmTwinError, SingularityError, UnreachableError
 from pkm_twin.identification.estimation import Estimate, estimate
+from pkm_twin.identification.identifiable import Kind
 from pkm_twin.identification.noise import EXACT
 from pkm_twin.identification.parameters import FileParameters, file_parameters
 from pkm_twin.identification.plausible import recording_fault
 from pkm_twin.identification.rows import LATE, Recorded, Rows, prior_scales, rows_of
 from pkm_twin.machine.friction import LAWS, FrictionLaw
-from pkm_twin.machine.shared import Kind
 from pkm_twin.robot.robot import Robot
 
 LOADED: Final = frozenset(name for name, law in LAWS.items() if law.share is not FrictionLaw.share)

@@ -26,7 +26,7 @@ from pkm_twin.machine.graph import (
 )
 from pkm_twin.machine.joints import TURN, TYPES, Freedom, unit
 from pkm_twin.machine.members import Tube, compliances
-from pkm_twin.machine.places import number_in, path_of, placed
+from pkm_twin.machine.places import Keys, number_in, path_of, placed
 from pkm_twin.machine.sections import (
     DriveSpec,
     check_angles,
@@ -36,7 +36,6 @@ from pkm_twin.machine.sections import (
     mass,
     rare,
 )
-from pkm_twin.machine.shared import Key
 
 T = TypeVar("T")
 
@@ -257,7 +256,7 @@ class RodSpec:
 class Source:
     """Where an entry stands in the file, its name there, and which copy of how many it is."""
 
-    path: Key
+    path: Keys
     name: str
     copy: int = 0
     copies: int = 1
@@ -319,7 +318,7 @@ def written_out(
             }
             for kind, spec in KINDS.items()
         }
-        place: Key = ("limbs", k) if isinstance(limbs, list) else ("limbs",)
+        place: Keys = ("limbs", k) if isinstance(limbs, list) else ("limbs",)
         for number, azimuth in enumerate(azimuths, 1):
             for kind, entries in checked.items():
                 for name, entry in entries.items():
@@ -384,7 +383,7 @@ def _turned(entry: Any, azimuth: Any, own: set[str], number: int) -> Any:
     return dataclasses.replace(entry, **new)
 
 
-def numbered_entry(entry: T, values: Mapping[Key, Any], azimuth: float, path: str) -> T:
+def numbered_entry(entry: T, values: Mapping[Keys, Any], azimuth: float, path: str) -> T:
     """An entry with other numbers or expressions; nothing is checked.
 
     :param values: by keys of the number in the entry; ``azimuth`` alone: the limb's own, by which

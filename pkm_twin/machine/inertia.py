@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from pkm_twin.codegen.arrays import Array, Indices
 from pkm_twin.codegen.expressions import plain
-from pkm_twin.machine.friction import keys_of
+from pkm_twin.machine.friction import all_keys, keys_of
 from pkm_twin.machine.graph import Graph, Joint
 from pkm_twin.machine.tree import Tree
 
@@ -22,6 +22,7 @@ Objects = NDArray[Any]
 
 TEN: Final = ("mass", "mx", "my", "mz", "ixx", "iyy", "izz", "ixy", "ixz", "iyz")
 """Names of a body's ten numbers: mass, kg; first moments, kg m; inertia, kg m2."""
+TEN_UNITS: Final = ("kg", *["kg m"] * 3, *["kg m2"] * 6)
 PARTS: Final = (
     "bodies", "rods", "gravity", "viscous", "coulomb", "offset", "laws", "rotors", "passive",
 )  # fmt: skip
@@ -83,6 +84,13 @@ def _turned(ten: Objects, axes: Objects) -> Objects:
 def loaded_joints(graph: Graph) -> tuple[Joint, ...]:
     """Passive joints with friction or a rotor."""
     return tuple(joint for joint in graph.joints.values() if joint.loaded)
+
+
+def drive_units(graph: Graph, joint: str) -> dict[str, str]:
+    """Units of a joint's friction and rotor."""
+    slides = graph.joints[joint].slides
+    units = {key: one.in_units(slides=slides) for key, one in all_keys().items()}
+    return units | {"rotor_inertia": "kg" if slides else "kg m2"}
 
 
 class Coefficients(Protocol):

@@ -19,6 +19,8 @@ from pkm_twin.machine import schema
 T = TypeVar("T")
 _PART: Final = re.compile(r"([^.\[\]]+)|\[(\d+)\]")
 Key = str | int
+Keys = tuple[Key, ...]
+"""Where a number stands in a file: keys, and places in lists."""
 
 
 def keys_of(path: str) -> list[Key]:

@@ -9,7 +9,6 @@ where. ``inverse`` goes the straight way in the pose coordinates.
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -23,7 +22,6 @@ from pkm_twin.errors import ParameterError, UnknownNameError
 from pkm_twin.kinematics.pose import COORDINATES, Coordinate
 from pkm_twin.kinematics.scheme import check_masses, choose_coordinates
 from pkm_twin.machine import schema
-from pkm_twin.machine.friction import linear_keys
 from pkm_twin.machine.graph import (
     BASE,
     Graph,
@@ -45,6 +43,7 @@ from pkm_twin.machine.joint_map import JointMapEntry
 from pkm_twin.machine.joints import unit
 from pkm_twin.machine.members import Beam, Structure
 from pkm_twin.machine.places import (
+    Keys,
     check_number,
     full_keys,
     given,
@@ -54,14 +53,6 @@ from pkm_twin.machine.places import (
 )
 from pkm_twin.machine.reach import PassiveLimit
 from pkm_twin.machine.sections import DriveSpec, Payload
-from pkm_twin.machine.shared import (
-    Key,
-    Shared,
-    behind_gear,
-    drive_units,
-    friction_number,
-    shared_number,
-)
 from pkm_twin.machine.uncertainty import UncertaintyEntry
 from pkm_twin.mechanisms import TwinRobot
 from pkm_twin.robot.robot_urdf import robot_description
@@ -171,7 +162,7 @@ class Machine(TwinRobot):
         specs = {kind: dict(entries) for kind, entries in self.specs.items()}
         rest, origin = {}, self.described.origin
         # Of an entry: numbers of its limb, then its azimuth, then the copy's own, each at once.
-        changes: dict[tuple[str, str, int, str, float], dict[Key, Any]] = {}
+        changes: dict[tuple[str, str, int, str, float], dict[Keys, Any]] = {}
         for path, value in values.items():
             keys = full_keys(path)
             found = list(self.named(keys))
@@ -210,7 +201,7 @@ class Machine(TwinRobot):
             return number_of_entry(self.specs[kind][name], where, azimuth, path)
         return super().number(path)
 
-    def named(self, keys: Sequence[str | int]) -> Iterator[tuple[str, str, Key, float]]:
+    def named(self, keys: Sequence[str | int]) -> Iterator[tuple[str, str, Keys, float]]:
         """As of every robot; of a limb's entry all copies; keys ``azimuth`` for a limb's own."""
         keys = list(keys)
         for (kind, name), source in self.sources.items():
@@ -294,40 +285,22 @@ class Machine(TwinRobot):
                 result[kind][name] = schema.units(spec, entry, words)
         return result
 
-    def shared_drives(self) -> tuple[Shared, ...]:
-        """Friction of each joint, and the rotors, one for the copies of a limb."""
-        graph, friction = self.graph, self.friction
-        result: list[Shared] = []
-        rotors: dict[Key, list[str]] = {}
-        for name, joint in graph.joints.items():
-            if not (joint.actuated or joint.loaded):
-                continue
-            source = self.sources["joints", name]
-            tail: Key = () if source.copies == 1 else (source.copy,)
-            for what in linear_keys(self.laws) if joint.actuated else ("viscous", "coulomb"):
-                k = graph.actuated.index(name) if joint.actuated else 0
-                value = getattr(friction, what)[k] if joint.actuated else getattr(joint, what)
-                path = (*source.path, "friction", what, *tail)
-                result.append(friction_number(graph, name, what, float(value), path))
-            if joint.actuated or joint.rotor_inertia:
-                rotors.setdefault(source.path, []).append(name)
-        for path, names in rotors.items():
-            first, drive = graph.joints[names[0]], self.specs["joints"][names[0]].drive
-            alone = names[0] if len(names) == 1 else self.sources["joints", names[0]].name
-            tail = ("rotor_inertia",) if drive is None else ("drive", "inertia")
-            one = shared_number(
-                "rotor", f"{alone}.rotor_inertia",
-                drive_units(graph, names[0])["rotor_inertia"], first.rotor_inertia, math.nan,
-                (*path, *tail), others=[f"{name}.rotor_inertia" for name in names],
-            )  # fmt: skip
-            if drive is not None:
-                one = dataclasses.replace(one, keys=behind_gear(one, drive.turns))
-            result.append(one)
-        return tuple(result)
+    def friction_key(self, joint: str, what: str) -> Keys:
+        """Of a limb's joint in a list, one number a copy."""
+        source = self.sources["joints", joint]
+        tail: Keys = () if source.copies == 1 else (source.copy,)
+        return (*source.path, "friction", what, *tail)
 
-    def mass_keys(self) -> Iterator[Key]:
+    def rotor_key(self, joint: str) -> Keys:
+        """Of a limb's joint once for all copies."""
+        tail = (
+            ["rotor_inertia"] if self.specs["joints"][joint].drive is None else ["drive", "inertia"]
+        )
+        return (*self.sources["joints", joint].path, *tail)
+
+    def mass_keys(self) -> Iterator[Keys]:
         """Of every body with a mass and every rod, once for all copies of a limb."""
-        found: dict[Key, None] = {}
+        found: dict[Keys, None] = {}
         for kind, entries in (("bodies", self.graph.bodies), ("rods", self.graph.rods)):
             for name, entry in entries.items():
                 path = self.sources[kind, name].path

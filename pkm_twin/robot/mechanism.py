@@ -29,6 +29,7 @@ from pkm_twin.machine.joint_map import JointMap, JointMapEntry
 from pkm_twin.machine.members import Beam, Structure
 from pkm_twin.machine.places import (
     Key,
+    Keys,
     check_number,
     full_keys,
     given,
@@ -217,7 +218,7 @@ class Mechanism:
         """Joints that have no point of their own in the file."""
         return frozenset()
 
-    def named(self, keys: Sequence[Key]) -> Iterator[tuple[str, str, tuple[Key, ...], float]]:
+    def named(self, keys: Sequence[Key]) -> Iterator[tuple[str, str, Keys, float]]:
         """Entries of the graph that a path's keys are about: kind, name, keys in it, azimuth.
 
         The azimuth is a limb's, by which the entry's vectors are turned about base z.
@@ -236,11 +237,20 @@ class Mechanism:
         """The same with every inertia that its file may leave out."""
         return self
 
-    def mass_keys(self) -> Iterator[tuple[Key, ...]]:
+    def mass_keys(self) -> Iterator[Keys]:
         """Where its file has masses, centres and inertias, of one that is :attr:`spelled` out."""
         for name, value in self.parameter_sections()["inertia"].items():
             if name != "rotor_inertia":
                 yield from (("inertia", name, *index) for index in np.ndindex(np.shape(value)))
+
+    def friction_key(self, joint: str, what: str) -> Keys:
+        """Where its file has a joint's friction."""
+        return ("friction", what, self.joint_names.index(joint))
+
+    def rotor_key(self, joint: str) -> Keys:
+        """Where its file has a joint's rotor."""
+        del joint
+        return ("inertia", "rotor_inertia") if self.drive is None else ("drive", "inertia")
 
     def reflected_rotor(self, given: float, slides: bool) -> float:
         """Rotor inertia at the joints, kg m2 or kg: of the file's ``drive``, else as given.

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -29,16 +28,8 @@ from pkm_twin.kinematics.scheme import Closed
 from pkm_twin.kinematics.singularity import singularity_kernel
 from pkm_twin.kinematics.traced import Traced
 from pkm_twin.machine import schema
-from pkm_twin.machine.friction import linear_keys
 from pkm_twin.machine.graph import Graph
 from pkm_twin.machine.inertia import Layout
-from pkm_twin.machine.shared import (
-    Shared,
-    behind_gear,
-    drive_units,
-    friction_number,
-    shared_number,
-)
 from pkm_twin.robot.mechanism import Mechanism
 
 SINGULARITY_BOUND: Final = 1e-9
@@ -77,25 +68,6 @@ class Robot(Mechanism):
 
     Frozen; :meth:`changed` gives a copy with other parameters.
     """
-
-    def shared_drives(self) -> tuple[Shared, ...]:
-        """Friction of each actuated joint and the rotors, as linear parameters of the file."""
-        graph, friction = self.graph, self.friction
-        result = []
-        for k, joint in enumerate(graph.actuated):
-            for what in linear_keys(self.laws):
-                value = float(getattr(friction, what)[k])
-                result.append(friction_number(graph, joint, what, value, ("friction", what, k)))
-        first, rotors = graph.actuated[0], [f"{j}.rotor_inertia" for j in graph.actuated]
-        drive = self.drive
-        rotor = shared_number(
-            "rotor", "rotor_inertia", drive_units(graph, first)["rotor_inertia"],
-            graph.joints[first].rotor_inertia, math.nan,
-            ("inertia", "rotor_inertia") if drive is None else ("drive", "inertia"), others=rotors,
-        )  # fmt: skip
-        if drive is not None:
-            rotor = dataclasses.replace(rotor, keys=behind_gear(rotor, drive.turns))
-        return (*result, rotor)
 
     @cached_property
     def engine(self) -> Engine:

@@ -11,8 +11,8 @@ import yaml
 
 from delta_dynamics import inverse_dynamics
 from pkm_twin.bags.reader import open_bag
+from pkm_twin.identification.identifiable import identifiable
 from pkm_twin.robot.entries import entries, robot_text, with_entries
-from pkm_twin.robot.identifiable import shared_parameters
 from stiffness_monitor import compliance
 from test.commands.conftest import DELTA, STIFFNESS, rewrite
 from test.laws.recordings import smooth_motion
@@ -154,7 +154,7 @@ def test_copies_of_a_limb_keep_elastic_parts_and_the_joint_map(tmp_path):
     for other in (written, load(str(out))):
         assert other.controller.offsets == pytest.approx(robot.controller.offsets)
         assert other.controller.factors == pytest.approx(robot.controller.factors)
-        assert len(shared_parameters(other)) > len(shared_parameters(robot))
+        assert len(identifiable(other)) > len(identifiable(robot))
         expected = compliance(robot, robot.home())
         assert compliance(other, other.home()) == pytest.approx(expected, rel=1e-9)
     again = with_entries(robot, {"origin[2]": entries(robot)["origin[2]"][0]})

@@ -17,10 +17,10 @@ from pkm_twin.errors import PkmTwinError
 from pkm_twin.identification.estimation import estimate
 from pkm_twin.identification.fit import Fit, fit
 from pkm_twin.identification.friction_laws import fit_with_laws
+from pkm_twin.identification.identifiable import above_zero
 from pkm_twin.identification.parameters import file_parameters
 from pkm_twin.identification.plausible import case_of, recording_fault
 from pkm_twin.identification.rows import Recorded, rows_of
-from pkm_twin.machine.shared import above_zero
 from test.identification.machines import IMPOSSIBLE, WRONG, Drawn, machine, noisy, shifted, unit_of
 from test.laws.test_fit import truths
 from test.support.robots import load, partly_long

@@ -16,10 +16,10 @@ from pkm_twin import Robot
 from pkm_twin.errors import PkmTwinError
 from pkm_twin.identification.estimation import estimate, possible
 from pkm_twin.identification.fit import Fit, fit
+from pkm_twin.identification.identifiable import pseudo_inertia
 from pkm_twin.identification.parameters import file_parameters
 from pkm_twin.identification.rows import Recorded
 from pkm_twin.machine.inertia import ten_numbers
-from pkm_twin.machine.shared import pseudo_inertia
 from pkm_twin.robot.catalogue import robot_of_data
 from pkm_twin.robot.entries import entries, with_entries
 from test.laws.recordings import smooth_motion

@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 import yaml
 
+from pkm_twin.identification.identifiable import identifiable
 from pkm_twin.machine.machine_yaml import edit_yaml, flow
 from pkm_twin.robot.catalogue import config_folder, robot_of_data
-from pkm_twin.robot.identifiable import shared_parameters
 from test.support.robots import massive, parameters_of
 
 
@@ -19,7 +19,7 @@ def text_of(name):
 def test_friction_and_payload_are_written_into_every_file(name):
     robot = robot_of_data(parameters_of(name), name)
     values, notes = {}, {}
-    for group in shared_parameters(robot):
+    for group in identifiable(robot):
         for key, value in group.keys(group.values + 0.01 * (group.kind == "friction")).items():
             base = tuple(k for k in key if not isinstance(k, int))
             if group.kind == "friction":

@@ -9,20 +9,23 @@ theorem. So the derivatives of the bodies by the file's numbers tell the paramet
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 import numpy as np
 
-from pkm_twin.codegen.arrays import Array, Indices
-from pkm_twin.machine.inertia import ten_numbers, transport
-from pkm_twin.machine.places import path_of
-from pkm_twin.machine.shared import Key, Shared, above_zero, pseudo_inertia
+from pkm_twin.codegen.arrays import Array, Indices, Mask
+from pkm_twin.machine.friction import all_keys, linear_keys
+from pkm_twin.machine.inertia import drive_units, matrix_of, ten_numbers, transport
+from pkm_twin.machine.places import Keys, path_of
 from pkm_twin.robot.numbers import FileNumbers
 from pkm_twin.robot.robot import Robot
 
+Kind = Literal["friction", "rotor", "payload", "inertia"]
+KINDS: Final[tuple[Kind, ...]] = ("friction", "rotor", "payload", "inertia")
 LOAD: Final = "payload"
 """Name of the payload among the bodies."""
 UPPER: Final = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
@@ -33,15 +36,97 @@ LONG: Final = 0.3
 """Of the machine's size: a length of the payload; and where a body has no joint apart, a third."""
 
 
-def shared_parameters(robot: Robot) -> tuple[Shared, ...]:
+@dataclass(frozen=True, eq=False)
+class Identifiable:
+    """Parameters that numbers of a file give together, k of them, a number each.
+
+    ``values``: shape (k,), in ``units``. ``scales``: how far each may be from the file's for all
+    that is known, shape (k,). ``bodies``: by body, what a unit of each adds to its ten numbers
+    about the base's origin at home, base axes, shape (10, k). ``others``: by ``OWNER.WHAT``, of
+    rods (``mass``) and joints, shape (k,). ``cones``: matrices, shape (d, d, k), whose sum over
+    the parameters has to be positive semidefinite. ``keys``: what stands in the file for values.
+    """
+
+    kind: Kind
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    values: Array
+    scales: Array
+    keys: Callable[[Array], Mapping[Keys, float]]
+    bodies: Mapping[str, Array] = field(default_factory=dict)
+    others: Mapping[str, Array] = field(default_factory=dict)
+    cones: tuple[Array, ...] = ()
+
+
+def above_zero(k: int, count: int) -> Array:
+    """The cone of a parameter that is not negative."""
+    return np.asarray(np.eye(count)[k].reshape(1, 1, -1), np.float64)
+
+
+def pseudo_inertia() -> Array:
+    """The cone of ten numbers that a body can have, shape (4, 4, 10).
+
+    Wensing, Kim, Slotine, Linear matrix inequalities for physically consistent inertial parameter
+    identification, 2018, doi:10.1109/LRA.2017.2729659.
+    """
+    parts = []
+    for ten in np.eye(10):
+        about = matrix_of(ten)
+        block = np.zeros((4, 4))
+        block[:3, :3] = 0.5 * np.trace(about) * np.eye(3) - about
+        block[:3, 3] = block[3, :3] = ten[1:4]
+        block[3, 3] = ten[0]
+        parts.append(block)
+    return np.stack(parts, -1)
+
+
+def identifiable(robot: Robot) -> tuple[Identifiable, ...]:
     """All that a fit of the robot's file may change: drives, payload, bodies and rods.
 
     :raises ParameterError: the robot's file gives no masses.
     """
     # The engine's own graph may be that of a machine with other masses.
     robot.massive()
-    numbers = _Numbers(robot.spelled)
-    return (*robot.shared_drives(), *numbers.groups())
+    return (*of_drives(robot), *_Numbers(robot.spelled).groups())
+
+
+def of_drives(robot: Robot) -> tuple[Identifiable, ...]:
+    """Friction of each joint that has some, and the rotors, one for joints of one number."""
+    graph, friction = robot.graph, robot.friction
+    found, rotors = [], dict[Keys, list[str]]()
+
+    def number(kind: Kind, name: str, value: float, key: Keys, joints: Sequence[str]) -> None:
+        word = name.rpartition(".")[2]
+        signed = word in all_keys() and all_keys()[word].at_least is None
+        # Of a rotor behind a gear the file has the inertia at the motor.
+        drive = dict(zip(robot.joint_names, robot.drives, strict=True)).get(joints[0])
+        less = drive.turns**-2 if drive is not None and kind == "rotor" else 1.0
+        found.append(
+            Identifiable(
+                kind, (name,), (drive_units(graph, joints[0])[word],), np.array([value]),
+                np.array([math.nan]), lambda new: {key: less * float(new[0])},
+                others={f"{joint}.{word}": np.ones(1) for joint in joints},
+                cones=() if signed else (above_zero(0, 1),),
+            )
+        )  # fmt: skip
+
+    for name, joint in graph.joints.items():
+        if joint.actuated:
+            k = graph.actuated.index(name)
+            values = {what: getattr(friction, what)[k] for what in linear_keys(robot.laws)}
+        else:
+            words = ("viscous", "coulomb") if joint.loaded else ()
+            values = {what: getattr(joint, what) for what in words}
+        for what, value in values.items():
+            key = robot.friction_key(name, what)
+            number("friction", f"{name}.{what}", float(value), key, [name])
+        if joint.actuated or joint.rotor_inertia:
+            rotors.setdefault(robot.rotor_key(name), []).append(name)
+    for key, names in rotors.items():
+        owner = names[0] if len(names) == 1 else path_of(key[:-1])
+        value = graph.joints[names[0]].rotor_inertia
+        number("rotor", f"{owner}.rotor_inertia", value, key, names)
+    return tuple(found)
 
 
 def _tens(robot: Robot) -> list[Any]:
@@ -60,7 +145,7 @@ class _Numbers:
     robot: Robot
 
     @cached_property
-    def keys(self) -> tuple[Key, ...]:
+    def keys(self) -> tuple[Keys, ...]:
         """Where they stand; of an inertia matrix the upper half."""
         load = [(LOAD, "mass"), *((LOAD, "com", i) for i in range(3))]
         load += [(LOAD, "inertia", i, j) for i in range(3) for j in range(3)]
@@ -113,7 +198,7 @@ class _Numbers:
         made, tie = FileNumbers(self.robot, paths, _tens), np.array(tied)
         return np.asarray(made.slopes_at((tie @ self.reference)[None])[0] @ tie, np.float64)
 
-    def groups(self) -> Iterator[Shared]:
+    def groups(self) -> Iterator[Identifiable]:
         """Numbers that move the same bodies, together."""
         graph, load = self.robot.graph, self.robot.payload
         coms = [body.com for body in graph.bodies.values()] + [graph.origin + load.com]
@@ -131,7 +216,7 @@ class _Numbers:
 
     def _group(
         self, chosen: Indices, names: list[str], tens: Array, own: Array, rods: Array
-    ) -> Shared:
+    ) -> Identifiable:
         """One of them.
 
         :param own: ten numbers of the bodies about the file's centres of mass, (bodies, 10, k).
@@ -156,8 +241,8 @@ class _Numbers:
                 scales[k] = far[b] / away if k in coms else mass * far[b] ** 2
         units = [_unit(self.words[k], self.keys[k]) for k in chosen]
         payload = keys[0][0] == LOAD
-        return Shared(
-            "payload" if payload else "inertia", path_of(keys[0]), tuple(map(path_of, keys)),
+        return Identifiable(
+            "payload" if payload else "inertia", tuple(map(path_of, keys)),
             tuple(units), values, scales, part.numbers,
             {graph.platform if payload else names[b]: tens[b][:, chosen] for b in inside},
             {f"{rod}.mass": row[chosen] for rod, row in zip(graph.rods, rods, strict=True)
@@ -170,7 +255,7 @@ class _Numbers:
 class _Part:
     """Numbers that move the same bodies, and ten numbers of these by them, (bodies, 10, k)."""
 
-    keys: tuple[Key, ...]
+    keys: tuple[Keys, ...]
     values: Array
     reference: Array
     own: Array
@@ -178,13 +263,14 @@ class _Part:
     coms: Indices
     inertias: Indices
 
-    def numbers(self, new: Array) -> Mapping[Key, float]:
+    def numbers(self, new: Array) -> Mapping[Keys, float]:
         """The file's numbers by parameters: masses and inertias, and centres times the mass."""
         result, change = new.copy(), new[self.coms]
         whole = float(new[self.masses].sum())
         before = float(self.reference[self.masses].sum())
         change = change * before / whole if whole > 0.0 else 0.0 * change
-        result[self.coms] = self._within(self.values[self.coms] + change)
+        centres = self.values[self.coms] + change
+        result[self.coms] = np.where(self.parts, np.clip(centres, 0.0, 1.0), centres)
         if len(self.coms) and len(self.inertias):
             change = result[self.coms] - self.values[self.coms]
             usual, mass = (
@@ -200,13 +286,10 @@ class _Part:
             result[self.inertias] = _possible(found) if whole > 0.0 else 0.0
         return dict(zip(self.keys, result.tolist(), strict=True))
 
-    def _within(self, centres: Array) -> Array:
-        """Centres that are parts of a length are within it."""
-        parts = self._parts()
-        return np.where(parts, np.clip(centres, 0.0, 1.0), centres)
-
-    def _parts(self) -> list[bool]:
-        return [not isinstance(self.keys[k][-1], int) for k in self.coms]
+    @property
+    def parts(self) -> Mask:
+        """Which centres are parts of a length, 0 to 1."""
+        return np.array([not isinstance(self.keys[k][-1], int) for k in self.coms], bool)
 
     def cones(self) -> Iterator[Array]:
         """Matrices that have to be positive semidefinite, (d, d, k) each."""
@@ -215,11 +298,10 @@ class _Part:
         if not len(self.coms):
             yield from (above_zero(k, count) for k in self.masses)
             return
-        for k, part in zip(self.coms, self._parts(), strict=True):
-            if part:
-                once = np.eye(count)[k] * float(self.reference[self.masses].sum())
-                yield (self.values[k] * total + once).reshape(1, 1, -1)
-                yield ((1.0 - self.values[k]) * total - once).reshape(1, 1, -1)
+        for k in self.coms[self.parts]:
+            once = np.eye(count)[k] * float(self.reference[self.masses].sum())
+            yield (self.values[k] * total + once).reshape(1, 1, -1)
+            yield ((1.0 - self.values[k]) * total - once).reshape(1, 1, -1)
         # Copies of a body depend on the same masses.
         first = {tuple(ten[0].tolist()): ten for ten in self.own[::-1]}
         for ten in first.values():
@@ -253,6 +335,6 @@ def _length(robot: Robot, name: str) -> float:
     return far if far > 1e-3 * graph.size else LONG / 3.0 * graph.size
 
 
-def _unit(word: str, key: Key) -> str:
+def _unit(word: str, key: Keys) -> str:
     units = {"mass": "kg", "density": "kg/m3", "inertia": "kg m2"}
     return units.get(word, "m" if isinstance(key[-1], int) else "")
