@@ -10,7 +10,6 @@ from typing import Final
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from numpy.typing import NDArray
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.parameter import Parameter
 from rclpy.time import Time
@@ -28,6 +27,7 @@ from delta_dynamics.simulation import (
 )
 from delta_dynamics.topics import SIMULATION
 from pkm_twin.bags.definitions import message_definition
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import MessageError, ParameterError, short
 from pkm_twin.messages.intake import DoublesTemplate, RawTrajectory
 from pkm_twin.messages.stamps import SECOND
@@ -37,8 +37,6 @@ from pkm_twin.ros import health
 from pkm_twin.ros.joints import FIELDS, JointPublisher
 from pkm_twin.ros.node import TwinNode, latched_qos
 from pkm_twin.ros.run import run
-
-Array = NDArray[np.float64]
 
 BEGIN: Final = SECOND
 """Simulated time at the start, ns: a stamp of zero would be none."""

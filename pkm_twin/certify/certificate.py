@@ -15,12 +15,12 @@ from importlib.metadata import version
 from typing import Any, Final, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from delta_dynamics import inverse_dynamics, mass_matrix
 from pkm_twin.certify.description import UnfitError
 from pkm_twin.certify.maximal import Maximal
 from pkm_twin.certify.states import States, random_states
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import (
     ParameterError,
     PkmTwinError,
@@ -31,8 +31,6 @@ from pkm_twin.errors import (
 from pkm_twin.robot.robot import Robot
 from pkm_twin.robot.robot_urdf import robot_description
 from pkm_twin.robot.variation import KINDS, varied
-
-Array = NDArray[np.float64]
 
 ENGINES: Final = {
     "maximal": ("pkm_twin.certify.maximal:Maximal", "numpy"),

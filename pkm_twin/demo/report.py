@@ -15,14 +15,13 @@ from numpy.typing import NDArray
 from delta_dynamics import inverse_dynamics
 from pkm_twin import load
 from pkm_twin.bags.reader import inspect, read_messages
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.messages.stamps import stamp_of
 from pkm_twin.recordings import ReadOptions, Recording, read
 from pkm_twin.recordings.recording import differentiated
 from pkm_twin.report import Fact, plots
 from pkm_twin.report import judged as judge
 from pkm_twin.robot.robot import Robot
-
-Array = NDArray[np.float64]
 
 MAX_RESIDUAL = 0.05
 """Largest residual RMS without payload, part of the joint's peak effort."""

@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import QoSProfile
 from rich.console import Console
@@ -24,6 +23,7 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from pkm_twin import load
 from pkm_twin.bags.reader import read_messages
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.demo.recorder import (
     DEPTH,
     STATE,
@@ -39,8 +39,6 @@ from pkm_twin.messages.reading import JointReader
 from pkm_twin.messages.stamps import SECOND, stamp_of
 from pkm_twin.report import Fact, judged, plots
 from pkm_twin.streams.path import JointPath
-
-Array = NDArray[np.float64]
 
 TIMES_BETTER: Final = 5.0
 """How much smaller feedforward has to make the tracking error at the smallest spread."""

@@ -13,9 +13,10 @@ from typing import Final
 
 import numpy as np
 
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.design.pose_path import PosePath
 from pkm_twin.design.quantities import Constraint, Quantity, quantity_of
-from pkm_twin.design.search import KEPT, Array, DesignPoint, Problem, Search, better
+from pkm_twin.design.search import KEPT, DesignPoint, Problem, Search, better
 from pkm_twin.design.variables import Variables
 from pkm_twin.errors import ParameterError, PkmTwinError
 from pkm_twin.robot.entries import with_entries

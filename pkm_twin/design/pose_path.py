@@ -23,12 +23,12 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.design import programs
 from pkm_twin.design.variants import Variants
 from pkm_twin.errors import ParameterError
 from pkm_twin.robot.robot import Robot
 
-Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 
 

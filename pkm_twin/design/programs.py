@@ -8,12 +8,12 @@ from functools import cached_property
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from delta_dynamics.derivatives import motion_gradient, numbers_gradient
 from delta_dynamics.reactions import loads_kernel
 from delta_dynamics.virtual_work import masses_kernel
 from delta_dynamics.virtual_work import torques as torques_kernel
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.codegen.kernels import Kernel
 from pkm_twin.kinematics.gradients import free_forward, platform_gradient, pose_motion_gradient
 from pkm_twin.kinematics.singularity import singularity_gradient
@@ -23,8 +23,6 @@ from pkm_twin.robot.robot import Robot
 from stiffness_monitor.derivatives import compliance_gradient
 from stiffness_monitor.numbers import numbers_of
 from stiffness_monitor.programs import elastic_of
-
-Array = NDArray[np.float64]
 
 
 class NumberFunctions:

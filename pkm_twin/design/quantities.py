@@ -16,12 +16,12 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.design.pose_path import Followed
 from pkm_twin.errors import ParameterError, UnknownNameError
 from pkm_twin.robot.numbers import FileNumbers
 from pkm_twin.robot.robot import Robot
 
-Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 
 CONSTRAINT: Final = re.compile(r"\s*([\w-]+)\s*(<=|>=)\s*(\S+)\s*")

@@ -17,6 +17,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.design.pose_path import Followed, PosePath
 from pkm_twin.design.quantities import QUANTITIES, Constraint, Quantity
 from pkm_twin.design.variables import Variables
@@ -24,7 +25,6 @@ from pkm_twin.design.variants import Variants
 from pkm_twin.errors import ParameterError
 from pkm_twin.robot.robot import Robot
 
-Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 
 ROUNDS: Final = 20

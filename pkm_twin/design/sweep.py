@@ -10,8 +10,8 @@ from typing import Any, Final, Literal
 from uuid import uuid4
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.design.optimise import sobol
 from pkm_twin.design.pose_path import PosePath
 from pkm_twin.design.quantities import QUANTITIES, quantity_of
@@ -20,8 +20,6 @@ from pkm_twin.design.variables import Variables
 from pkm_twin.errors import ParameterError
 from pkm_twin.robot.entries import entries
 from pkm_twin.robot.robot import Robot
-
-Array = NDArray[np.float64]
 
 MOST: Final = 10_000_000
 """Machines of a sweep."""

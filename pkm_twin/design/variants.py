@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from delta_dynamics.reactions import BALANCE_BOUND, Reactions, balanced, known_alone
-from pkm_twin.codegen.arrays import doubles
+from pkm_twin.codegen.arrays import Array, doubles
 from pkm_twin.codegen.code import Code
 from pkm_twin.codegen.kernels import MISSED, Kernel
 from pkm_twin.design import programs
@@ -34,7 +34,6 @@ from pkm_twin.robot.robot import Robot
 from stiffness_monitor.compliance import HELD
 from stiffness_monitor.programs import elastic_of
 
-Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 CORNERS: Final = 5

@@ -9,10 +9,10 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from delta_dynamics.equations import motion_kernel
 from delta_dynamics.virtual_work import accelerations, inverse_dynamics, masses_kernel, torques
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.codegen.expressions import GEOMETRY, PARAMETERS, Expression
 from pkm_twin.codegen.kernels import Kernel
 from pkm_twin.codegen.program import TURNS
@@ -33,8 +33,6 @@ from pkm_twin.machine.sections import MAX_LENGTH, MAX_MASS, payload_margins
 from pkm_twin.robot.robot import SAME_POSE, SINGULARITY_BOUND, Robot
 from stiffness_monitor.compliance import HELD
 from stiffness_monitor.programs import Elastic, elastic_of
-
-Array = NDArray[np.float64]
 
 SOLVER: Final = "assembly"
 """Newton's method for the passive joints, of all functions of q."""

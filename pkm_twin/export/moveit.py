@@ -18,7 +18,6 @@ from typing import Any, Final
 
 import numpy as np
 import yaml
-from numpy.typing import NDArray
 
 from delta_dynamics import inverse_dynamics, mass_matrix
 from pkm_twin.errors import ParameterError
@@ -27,8 +26,6 @@ from pkm_twin.machine.urdf_write import GROUND, PLATFORM, parts_of
 from pkm_twin.robot.clearance import distance
 from pkm_twin.robot.robot import Robot
 from pkm_twin.robot.robot_urdf import robot_tree, robot_urdf
-
-Array = NDArray[np.float64]
 
 GROUP: Final = "actuated"
 """The planning group."""

@@ -18,16 +18,14 @@ from xml.sax.saxutils import escape
 
 import numpy as np
 import yaml
-from numpy.typing import NDArray
 
 from delta_dynamics.simulation import tuned
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import check_limit
 from pkm_twin.export.c_package import c_package, identifier
 from pkm_twin.machine.graph import POSE
 from pkm_twin.machine.sections import MAX_LENGTH, MAX_MASS
 from pkm_twin.robot.robot import Robot
-
-Array = NDArray[np.float64]
 
 CONTROLLER: Final = "feedforward_controller"
 GRAVITY: Final = "gravity_controller"

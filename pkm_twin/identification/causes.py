@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from delta_dynamics import inverse_dynamics
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import PkmTwinError
 from pkm_twin.identification.check import (
     MEASURED,
@@ -31,7 +32,6 @@ from pkm_twin.robot.entries import with_entries
 from pkm_twin.robot.robot import Robot
 from pkm_twin.streams.rates import rms
 
-Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 SPANS: Final = 50

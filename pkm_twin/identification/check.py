@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from delta_dynamics import inverse_dynamics, torque_deviation
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import SingularityError, UnreachableError, one_line
 from pkm_twin.identification.compare import Compared, by_held, compare
 from pkm_twin.identification.rows import Recorded
@@ -26,7 +27,6 @@ from pkm_twin.streams.rates import BLOCK, STANDS, STEPS, RateAgreement, likely_c
 from pkm_twin.streams.rest import SIGMAS, noise
 from pkm_twin.streams.steps import GAP, Steps, sampling_of, steps_of
 
-Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 POSITION_STEPS: Final = "position steps"

@@ -16,13 +16,12 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import FileError, PkmTwinError
 from pkm_twin.identification.check import compared_of, idle_of, recorded_of
 from pkm_twin.identification.fit import fit
 from pkm_twin.recordings import ReadOptions, Recording, read
 from pkm_twin.robot.plausibility import why_no_torques
-
-Array = NDArray[np.float64]
 
 WAIT: Final = 60.0
 """How long a writer waits for the others, s."""

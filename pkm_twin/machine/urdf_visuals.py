@@ -8,14 +8,10 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError, warn
 from pkm_twin.machine import urdf_xml
 from pkm_twin.machine.rotations import Pose
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,13 +11,11 @@ import math
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError
 from pkm_twin.robot.robot import Robot
 from pkm_twin.robot.workspace import reachable, try_forward
-
-Array = NDArray[np.float64]
 
 JOINT_STATES: Final = 2**14
 """Joint states, evenly spread between the limits, whose poses bound a workspace."""

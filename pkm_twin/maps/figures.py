@@ -9,8 +9,8 @@ import textwrap
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import UnknownNameError
 from pkm_twin.maps.kind import Kind
 from pkm_twin.maps.kinds import KINDS
@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from xarray import Dataset
 
-Array = NDArray[np.float64]
 
 MAP: Final = "viridis"
 LINES: Final = tuple(colour for colour in plots.COLOURS if colour != "#F0E442")

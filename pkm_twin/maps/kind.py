@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError, PkmTwinError
 from pkm_twin.robot.robot import Robot
 from pkm_twin.robot.workspace import keeps_limits
@@ -25,7 +26,6 @@ if TYPE_CHECKING:
 
     from pkm_twin.maps.variables import Variable
 
-Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import require
 from pkm_twin.files import replace_file
 from pkm_twin.maps import figures
@@ -37,7 +37,6 @@ from pkm_twin.maps.store import reading, source, writing
 if TYPE_CHECKING:
     from xarray import Dataset
 
-Array = NDArray[np.float64]
 
 MOST: Final = (15, 61)
 """Layers, and samples along the sides of a layer."""

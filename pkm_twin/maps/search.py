@@ -9,8 +9,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError
-from pkm_twin.maps.kind import Array, Case, Kind, Space, Worst, found_of
+from pkm_twin.maps.kind import Case, Kind, Space, Worst, found_of
 from pkm_twin.robot.workspace import causes
 
 HALVINGS: Final = 12

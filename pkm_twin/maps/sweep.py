@@ -21,9 +21,10 @@ from typing import Any, Final
 import numpy as np
 
 import pkm_twin
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError
 from pkm_twin.maps.box import FULL, workspace_box
-from pkm_twin.maps.kind import Array, Case, Found, Kind, Mask, Space, Worst, found_of
+from pkm_twin.maps.kind import Case, Found, Kind, Mask, Space, Worst, found_of
 from pkm_twin.maps.search import badness, worst_of
 from pkm_twin.maps.variables import (
     FLAG,

@@ -9,10 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError
 from pkm_twin.robot.robot import Robot
 
-Array = NDArray[np.float64]
 OPTION = "--beyond-limits"
 
 

@@ -14,13 +14,11 @@ from enum import StrEnum
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError
 from pkm_twin.files import decimal
 from pkm_twin.robot.robot import Robot
-
-Array = NDArray[np.float64]
 
 ANGLES: Final = np.array([210.0, 330.0, 90.0])
 """Nominal angles of the towers, degrees."""

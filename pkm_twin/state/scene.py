@@ -11,8 +11,8 @@ from dataclasses import dataclass, field
 from typing import Final, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.machine import rotations
 from pkm_twin.machine.members import Place
 from pkm_twin.robot.outline import Posture, robot_bars
@@ -20,7 +20,6 @@ from pkm_twin.robot.robot import Robot
 from pkm_twin.settings import LARGE, setting
 from pkm_twin.state.state import State
 
-Array = NDArray[np.float64]
 Kind = Literal["cylinder", "sphere", "arrow", "line", "text"]
 Colour = tuple[float, float, float, float]
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.codegen.kernels import Kernel
 from pkm_twin.errors import MessageError
 from pkm_twin.kinematics.passive import moving_state_program, state_program
@@ -42,8 +42,6 @@ STATE: Final = table(
           "`platform_frame` to `tool_frame`, if tf2_msgs is installed", latched=True),
 )  # fmt: skip
 
-
-Array = NDArray[np.float64]
 
 NONE: Final = np.zeros(0)
 """The programs' parameters: a geometry is all that they take."""

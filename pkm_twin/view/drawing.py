@@ -7,14 +7,12 @@ from typing import Any, Final
 
 import numpy as np
 from matplotlib.path import Path as Outline
-from numpy.typing import NDArray
 
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.report.plots import pyplot
 from pkm_twin.robot.robot import Robot
 from pkm_twin.view.scene import GROUND, PLATFORM, Scene
 from pkm_twin.view.stage import LOOK
-
-Array = NDArray[np.float64]
 
 PICTURES: Final = (".png", ".svg")
 """What a picture's name may end in."""

@@ -14,15 +14,13 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation  # type: ignore[import-untyped]
 
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import MessageError, one_line
 from pkm_twin.messages.reading import JointReader
 from pkm_twin.messages.stamps import SECOND, StampRules, stamp_of
 from pkm_twin.robot.robot import Robot
-
-Array = NDArray[np.float64]
 
 SPAN: Final = 20.0
 """How much of the past is drawn, s."""

@@ -11,11 +11,10 @@ from urllib.parse import unquote
 import numpy as np
 from numpy.typing import NDArray
 
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import one_line, warn
 from pkm_twin.machine.urdf_visuals import Visual
 from pkm_twin.robot.robot import Robot
-
-Array = NDArray[np.float64]
 
 LARGEST: Final = 64 * 1024 * 1024
 """Largest file of a mesh that is read, bytes."""

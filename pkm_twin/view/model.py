@@ -10,10 +10,11 @@ from functools import cached_property
 from typing import Final, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from delta_dynamics import inverse_dynamics
 from delta_dynamics.settings import Settings
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError, PkmTwinError, one_line
 from pkm_twin.robot.clearance import has_clearance, joint_clearance
 from pkm_twin.robot.limits import beyond_limits
@@ -21,7 +22,6 @@ from pkm_twin.robot.robot import Robot
 from pkm_twin.robot.workspace import has_joint_angles
 from stiffness_monitor import PlatformResponse, platform_response
 
-Array = NDArray[np.float64]
 Grade = Literal["good", "warn", "bad"]
 
 AXES: Final = ("fx", "fy", "fz", "mx", "my", "mz")

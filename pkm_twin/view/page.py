@@ -17,8 +17,8 @@ from functools import partial
 from typing import Any, Final, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import one_line
 from pkm_twin.view import texts
 from pkm_twin.view.door import Door, behind
@@ -26,8 +26,6 @@ from pkm_twin.view.model import Model, Range, State
 from pkm_twin.view.scene import DRIVE, Scene
 from pkm_twin.view.stage import SHEET, Stage
 from pkm_twin.view.visitors import guard
-
-Array = NDArray[np.float64]
 
 _LOG: Final = logging.getLogger("pkm_twin")
 PERIOD: Final = 0.05

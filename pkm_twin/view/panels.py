@@ -8,14 +8,12 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.view import texts
 from pkm_twin.view.live import SPAN, TOPICS, TRACES, Live
 from pkm_twin.view.page import Page
 from pkm_twin.view.timeline import Timeline
-
-Array = NDArray[np.float64]
 
 COLOURS: Final = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 """Of the joints' curves (Okabe and Ito 2008)."""

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation  # type: ignore[import-untyped]
 
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.machine.graph import BASE, Joint
 from pkm_twin.machine.members import Place
 from pkm_twin.robot.outline import (
@@ -25,7 +26,6 @@ from pkm_twin.robot.outline import (
 )
 from pkm_twin.robot.robot import Robot
 
-Array = NDArray[np.float64]
 Colour = tuple[int, int, int]
 
 

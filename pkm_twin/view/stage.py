@@ -12,11 +12,10 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.machine.graph import BASE
 from pkm_twin.view.meshes import body_meshes
 from pkm_twin.view.scene import BODY, GROUND, PLATFORM, Scene, plate, round_mesh
-
-Array = NDArray[np.float64]
 
 FORCE: Final = (0, 158, 115)
 MOMENT: Final = (204, 121, 167)

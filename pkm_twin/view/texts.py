@@ -8,15 +8,12 @@ from html import escape
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pkm_twin.robot.robot import Robot
 from pkm_twin.view.live import Heard
 from pkm_twin.view.model import Grade, Model, Numbers, State
 from pkm_twin.view.scene import share_colours
 from pkm_twin.view.timeline import Instant, Timeline
-
-Array = NDArray[np.float64]
 
 GRADES: Final[Mapping[Grade, str]] = {"good": "#009E73", "warn": "#B87800", "bad": "#D55E00"}
 """Colours of Okabe and Ito; the middle one darker, so that text in it is read on white."""

@@ -7,13 +7,11 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.paths.along import predicted
 from pkm_twin.recordings import Recording
 from pkm_twin.robot.plausibility import why_no_torques
-
-Array = NDArray[np.float64]
 
 POINTS: Final = 800
 """Points of a curve that are drawn."""

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
@@ -23,8 +22,6 @@ from pkm_twin.identification.calibration_state import Poses
 from pkm_twin.identification.pose_tables import read_poses
 from pkm_twin.robot.entries import entries, with_entries
 from test.support.robots import load, random_joints
-
-Array = NDArray[np.float64]
 
 DELTA_LENGTHS = [f"geometry.{name}" for name in SHIFTS]
 

@@ -10,12 +10,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
 from pkm_twin import Robot
 from pkm_twin.apps.cli import app
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError
 from pkm_twin.identification.calibration import HELD_OUT, calibrate, geometric
 from pkm_twin.identification.calibration_state import Poses
@@ -27,8 +27,6 @@ from pkm_twin.recordings import Dialect
 from pkm_twin.robot.entries import data_of, with_entries
 from test.support.robots import load, partly_long, random_joints
 from tools.reality import BALL, FOOT, fit_a_leg, leg_poses
-
-Array = NDArray[np.float64]
 
 NOISE = 2e-5
 RATIOS = (13.2, 14.1, 13.8)

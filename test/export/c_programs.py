@@ -12,14 +12,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from delta_dynamics import forward_dynamics, inverse_dynamics, mass_matrix
 from pkm_twin import Robot
+from pkm_twin.codegen.arrays import Array
 from stiffness_monitor import platform_response
 from test.support.robots import has
-
-Array = NDArray[np.float64]
 
 COMPILERS = [name for name in ("gcc", "clang") if shutil.which(name)]
 SANITIZED = ("-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")

@@ -7,17 +7,15 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from delta_dynamics import inverse_dynamics
 from pkm_twin import Robot
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import PkmTwinError
 from pkm_twin.identification.rows import Recorded
 from pkm_twin.identification.suspects import Lengths
 from pkm_twin.robot.entries import entries, with_entries
 from test.laws.recordings import smooth_motion
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

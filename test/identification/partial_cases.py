@@ -7,18 +7,16 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from pkm_twin import Robot
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.identification.calibration import geometric
 from pkm_twin.identification.measurements import Measured, measured_of
 from pkm_twin.robot.catalogue import robot_of_data
 from pkm_twin.robot.entries import with_entries
 from test.support.robots import random_joints
-
-Array = NDArray[np.float64]
 
 NOISE = {
     **dict.fromkeys(("height", "plane"), 2e-5), **dict.fromkeys(("radius", "range"), 1e-5),

@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
@@ -23,8 +22,6 @@ from pkm_twin.identification.measurements import whole_of
 from pkm_twin.identification.undetermined import LINES, undetermined
 from pkm_twin.robot.entries import data_of, entries, with_entries
 from test.support.robots import load, random_joints
-
-Array = NDArray[np.float64]
 
 NOISE = 2e-5
 QUARTER = Rotation.from_euler("z", 90.0, degrees=True).as_matrix()

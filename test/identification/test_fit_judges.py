@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from delta_dynamics import inverse_dynamics, mass_matrix
 from pkm_twin.errors import PkmTwinError
@@ -24,8 +23,6 @@ from pkm_twin.identification.rows import Recorded, rows_of
 from test.identification.machines import IMPOSSIBLE, WRONG, Drawn, machine, noisy, shifted, unit_of
 from test.laws.test_fit import truths
 from test.support.robots import load, partly_long
-
-Array = NDArray[np.float64]
 
 KINDS: Any = ("friction", "payload")
 COMMON = (

@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
 from delta_dynamics import inverse_dynamics
 from pkm_twin import Robot
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.identification.fit import fit
 from pkm_twin.identification.parameters import file_parameters
 from pkm_twin.identification.rows import Recorded, derivative, rows_of
@@ -25,7 +25,6 @@ from test.machine.random_machines import variant
 from test.support.robots import load
 
 KINDS: Any = ("friction", "payload")
-Array = NDArray[np.float64]
 
 
 def robot_named(name: str) -> Robot:

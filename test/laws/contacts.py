@@ -7,18 +7,17 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
 from delta_dynamics import ContactMonitor, inverse_dynamics
 from delta_dynamics.isolation import CLAMPING, PLATFORM, joined_bodies, limbs_of
 from delta_dynamics.regressor import PAYLOAD, TEN, parameter_names, parameter_values, regressor
 from pkm_twin import Robot
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.machine.graph import BASE
 from pkm_twin.machine.members import Place
 from pkm_twin.robot.outline import Bar, body_points, robot_bars
 from test.support.robots import joint_range
 
-Array = NDArray[np.float64]
 Spot = tuple[Place, Place, float]
 
 RATE = 500.0

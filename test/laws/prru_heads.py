@@ -8,12 +8,10 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.machine import schema
 from pkm_twin.mechanisms.prru import Prru
-
-Array = NDArray[np.float64]
 
 THIRDS = (math.pi, 5 * math.pi / 3, math.pi / 3)
 MACHINES: dict[str, dict[str, Any]] = {

@@ -6,12 +6,10 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pkm_twin import Robot
+from pkm_twin.codegen.arrays import Array
 from test.support.robots import joint_range
-
-Array = NDArray[np.float64]
 
 
 def smooth_motion(

@@ -7,19 +7,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from delta_dynamics import Contact, ContactMonitor, inverse_dynamics
 from pkm_twin import Robot
 from pkm_twin.bags.reader import open_bag
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.machine.places import given
 from pkm_twin.recordings import Recording, read
 from pkm_twin.recordings.recording import differentiated
 from pkm_twin.robot.catalogue import robot_of_data
 from test.laws.contacts import OFF, RATE, REST, Stream, measured, moves, pushed, seen_after
 from test.support.robots import load, massive, partly_long
-
-Array = NDArray[np.float64]
 
 BAGS = Path(__file__).resolve().parents[2] / "bags"
 COLLISION = BAGS / "delta_cu_collision.mcap"

@@ -7,16 +7,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from pkm_twin import Robot
 from pkm_twin.bags.reader import read_messages
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.machine.rotations import skew
 from pkm_twin.recordings import read
 from stiffness_monitor import setpoint_correction, strain_energy
 from test.support.robots import elastic, every_robot, joint_range, load
-
-Array = NDArray[np.float64]
 
 BAGS = Path(__file__).resolve().parents[2] / "bags"
 TOOL = np.array([0.02, -0.01, -0.15])

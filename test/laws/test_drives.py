@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.streams.drives import DriveWatch, idle_samples
 
-Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
 PERIOD = 2e-3

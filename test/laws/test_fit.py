@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from delta_dynamics import inverse_dynamics, regressor
 from pkm_twin import Robot
@@ -24,8 +23,6 @@ from pkm_twin.robot.catalogue import robot_of_data
 from pkm_twin.robot.entries import entries, with_entries
 from test.laws.recordings import smooth_motion
 from test.support.robots import load, massive, parameters_of, random_motion
-
-Array = NDArray[np.float64]
 
 TRUTH = {
     "friction": {"viscous": [40.0, 60.0, 55.0], "coulomb": [15.0, 22.0, 9.0]},

@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from delta_dynamics import inverse_dynamics
 from pkm_twin import Robot
 from pkm_twin.certify.maximal import Maximal, State
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.identification.fit import fit
 from pkm_twin.identification.rows import Recorded
 from pkm_twin.robot.robot_urdf import robot_description
@@ -21,8 +21,6 @@ from test.identification.machines import machine
 from test.laws.recordings import engine_efforts
 from test.laws.test_fit import truths
 from test.support.robots import load
-
-Array = NDArray[np.float64]
 
 KINDS: Any = ("friction", "payload")
 ROBOTS = ["delta", "delta_cu", "prru", "upr_rpu", "five_bar", "rps3"]

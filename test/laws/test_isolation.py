@@ -7,7 +7,6 @@ from itertools import product
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from delta_dynamics import ContactMonitor, inverse_dynamics
 from delta_dynamics.isolation import (
@@ -20,8 +19,6 @@ from delta_dynamics.isolation import (
 )
 from test.laws.contacts import place_and_jacobian, spot
 from test.support.robots import load, often, partly_long, random_joints
-
-Array = NDArray[np.float64]
 
 NAMES = ["delta_cu", "linear_delta", "rps3", "stewart", "prru", "upr_rpu", "five_bar"]
 

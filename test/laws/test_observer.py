@@ -5,13 +5,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from delta_dynamics import MomentumObserver, inverse_dynamics, platform_wrench
 from pkm_twin import Robot
+from pkm_twin.codegen.arrays import Array
 from test.support.robots import FREE, joint_range, load, loaded, massive
-
-Array = NDArray[np.float64]
 
 BANDWIDTH = 40.0
 DURATION = 0.4

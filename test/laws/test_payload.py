@@ -7,15 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from delta_dynamics import PayloadEstimator, inverse_dynamics
 from pkm_twin import Robot
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.recordings import read
 from pkm_twin.recordings.recording import differentiated
 from test.support.robots import joint_range, load
-
-Array = NDArray[np.float64]
 
 BAGS = Path(__file__).resolve().parents[2] / "bags"
 PERIOD = 4e-3

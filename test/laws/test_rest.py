@@ -8,21 +8,19 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from delta_dynamics import inverse_dynamics
 from delta_dynamics.feedforward import Feedforward
 from delta_dynamics.rest import beyond_friction, friction_reach, moving_rates
 from delta_dynamics.settings import Settings
 from pkm_twin import Robot
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.paths.along import torque_table
 from pkm_twin.recordings import ReadOptions, read
 from pkm_twin.streams.differentiator import Differentiator
 from pkm_twin.streams.rest import RestWatch, fit_gain, gradient_gain, noise, rate_doubt
 from test.nodes.harness import SECOND, Maker, Plain
 from test.support.robots import SHIPPED, joint_range, load, loaded_like, partly_long
-
-Array = NDArray[np.float64]
 
 MAKE = Maker(Plain())
 NOW = 1_000 * SECOND

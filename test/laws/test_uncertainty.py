@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from delta_dynamics import inverse_dynamics, mass_matrix, torque_deviation
 from delta_dynamics.derivatives import torque_effects
 from delta_dynamics.uncertainty import effort_parts
 from pkm_twin import Robot, variants
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.design.variants import Variants
 from pkm_twin.errors import ParameterError
 from pkm_twin.machine.places import given
@@ -23,8 +23,6 @@ from pkm_twin.robot.entries import entries, with_entries
 from stiffness_monitor import compliance, compliance_deviation, strain_energy
 from stiffness_monitor.derivatives import compliance_effects, energy_effects
 from test.support.robots import joint_range, load, massive, random_joints
-
-Array = NDArray[np.float64]
 
 DELTA = {
     "inertia.platform_mass": {"deviation": 0.01},

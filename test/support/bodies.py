@@ -12,17 +12,16 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from pkm_twin import Robot
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.codegen.code import STEPS
 from pkm_twin.codegen.program import Program
 from pkm_twin.kinematics.engine import Engine
 from pkm_twin.kinematics.traced import Traced
 from pkm_twin.machine.graph import BASE, Joint
 from test.support.plain import PlainKernel
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

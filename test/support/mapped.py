@@ -9,13 +9,11 @@ from typing import Any
 
 import numpy as np
 import yaml
-from numpy.typing import NDArray
 
 from pkm_twin import Robot
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.robot.catalogue import robot_of_data
 from test.support.robots import load, parameters_of
-
-Array = NDArray[np.float64]
 
 
 @dataclasses.dataclass(frozen=True)

@@ -4,12 +4,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.codegen.plain import PlainCode
 from pkm_twin.codegen.program import Program
-
-Array = NDArray[np.float64]
 
 
 class PlainKernel:

@@ -18,14 +18,12 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from numpy.typing import NDArray
 
 import pkm_twin
 from pkm_twin import Robot, robot_names
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError
 from pkm_twin.robot.catalogue import config_folder
-
-Array = NDArray[np.float64]
 
 LIMITED = 0.7
 """Part of the joint range that random states are drawn from."""

@@ -6,11 +6,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pkm_twin.codegen.arrays import Array
 from stiffness_monitor import RegularWorkspace
-
-Array = NDArray[np.float64]
 
 
 def polar_samples(workspace: RegularWorkspace, step: float = math.radians(1.0)) -> Array:

@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 
 from delta_dynamics import inverse_dynamics
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.maps.kind import (
-    Array,
     Case,
     Found,
     Kind,

@@ -8,7 +8,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from pkm_twin.maps.kind import Array, Case, Found, Kind, largest_axis, size_and_direction
+from pkm_twin.codegen.arrays import Array
+from pkm_twin.maps.kind import Case, Found, Kind, largest_axis, size_and_direction
 from pkm_twin.robot.robot import Robot
 from stiffness_monitor import platform_response
 

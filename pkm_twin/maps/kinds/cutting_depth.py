@@ -7,7 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pkm_twin.maps.kind import Array, Found, size_and_direction
+from pkm_twin.codegen.arrays import Array
+from pkm_twin.maps.kind import Found, size_and_direction
 from pkm_twin.maps.kinds.frequency import Frequency
 from pkm_twin.robot.robot import Robot
 from stiffness_monitor.chatter import Milling, stable_depth_of

@@ -5,7 +5,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from pkm_twin.maps.kind import Array, Case, Found, Kind, size_and_direction
+from pkm_twin.codegen.arrays import Array
+from pkm_twin.maps.kind import Case, Found, Kind, size_and_direction
 from pkm_twin.maps.kinds.compliance import Compliance
 from pkm_twin.robot.robot import Robot
 from stiffness_monitor.modes import modes

@@ -11,9 +11,10 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import require
 from pkm_twin.machine.graph import BASE
-from pkm_twin.maps.kind import Array, Case, Space
+from pkm_twin.maps.kind import Case, Space
 from pkm_twin.maps.kinds.frequency import Frequency
 from pkm_twin.maps.variables import POSITIVE, SHARE, Variable, about
 from pkm_twin.report import plots

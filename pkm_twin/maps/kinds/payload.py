@@ -6,7 +6,8 @@ from __future__ import annotations
 import numpy as np
 
 from delta_dynamics import inverse_dynamics
-from pkm_twin.maps.kind import Array, Case, Found, Kind, limits_of
+from pkm_twin.codegen.arrays import Array
+from pkm_twin.maps.kind import Case, Found, Kind, limits_of
 from pkm_twin.robot.robot import Robot
 
 

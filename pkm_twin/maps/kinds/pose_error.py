@@ -8,9 +8,10 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError
 from pkm_twin.machine.places import keys_of
-from pkm_twin.maps.kind import Array, Case, Found, Kind, largest_axis
+from pkm_twin.maps.kind import Case, Found, Kind, largest_axis
 from pkm_twin.robot.derivatives import position_effects
 from pkm_twin.robot.robot import Robot
 

@@ -5,8 +5,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.maps.kind import (
-    Array,
     Case,
     Found,
     Kind,

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pkm_twin.maps.kind import Array, Case, Found, size_and_direction
+from pkm_twin.codegen.arrays import Array
+from pkm_twin.maps.kind import Case, Found, size_and_direction
 from pkm_twin.maps.kinds.compliance import Compliance
 from pkm_twin.robot.robot import Robot
 from stiffness_monitor import platform_response

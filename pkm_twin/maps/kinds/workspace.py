@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pkm_twin.maps.kind import Array, Case, Found, Kind, Space
+from pkm_twin.codegen.arrays import Array
+from pkm_twin.maps.kind import Case, Found, Kind, Space
 from pkm_twin.maps.variables import POSITIVE, SHARE, Variable, about, number
 from pkm_twin.robot.clearance import has_clearance, joint_clearance
 from pkm_twin.robot.robot import Robot
