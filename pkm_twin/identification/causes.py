@@ -18,13 +18,12 @@ from pkm_twin.identification.check import (
     NEAR,
     POSITION_STEPS,
     VELOCITIES,
-    Bounds,
     Checked,
     checked,
     compared_of,
     recorded_of,
 )
-from pkm_twin.identification.compare import Compared, by_held
+from pkm_twin.identification.compare import MAX_RESIDUAL, Compared, by_held
 from pkm_twin.identification.plausible import held_payload
 from pkm_twin.recordings import Load, Recording
 from pkm_twin.report import Verdict
@@ -50,32 +49,30 @@ FOUND: Final = 2
 """Findings of a fit that are named."""
 
 
-def judged(r: Recording, bounds: Bounds | None = None, thorough: bool = True) -> Checked:
+def judged(r: Recording, residual: float = MAX_RESIDUAL, thorough: bool = True) -> Checked:
     """Compare a recording with the model, and find why they disagree.
 
+    :param residual: largest good one, RMS, part of the peak effort.
     :param thorough: also ask what `fit` finds, which takes some seconds.
     """
-    bounds = bounds or Bounds()
-    found = checked(r, bounds)
-    causes, findings = _causes_of(found, bounds.residual, thorough)
+    found = checked(r, residual)
+    causes, findings = _causes_of(found, thorough)
     return replace(found, causes=causes, findings=findings)
 
 
-def _causes_of(
-    found: Checked, bound: float, thorough: bool
-) -> tuple[tuple[str, ...], tuple[str, ...]]:
+def _causes_of(found: Checked, thorough: bool) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """The first cause that makes the efforts agree, and what `fit` finds where there is none."""
     c, r, bad = found.compared, found.recording, found.named(Verdict.BAD)
     # Of positions that are none the efforts say nothing.
-    if {POSITION_STEPS, VELOCITIES, MEASURED} & set(bad) or c is None or c.good(bound).all():
+    if {POSITION_STEPS, VELOCITIES, MEASURED} & set(bad) or c is None or c.good.all():
         return (), ()
 
     def good(other: Recording, without: Mask) -> bool:
         try:
-            compared = compared_of(other, without)
+            compared = compared_of(other, without, c.bound)
         except (PkmTwinError, ValueError):
             return False
-        return compared is not None and bool(compared.good(bound).all())
+        return compared is not None and bool(compared.good.all())
 
     def explained(other: Recording) -> bool:
         """Whether it makes the efforts agree on samples on which they do not as recorded."""
@@ -84,13 +81,13 @@ def _causes_of(
         without = found.left_out | other.load.near_change(r.time, NEAR)
         return good(other, without) and not good(r, without)
 
-    for text, other in _retold(r, c, bound):
+    for text, other in _retold(r, c):
         if explained(other):
             return (text,), ()
-    saturated = _saturated(r, c, bound)
+    saturated = _saturated(r, c)
     if saturated:
         return saturated, ()
-    contact, without = _contact(r, c, bound)
+    contact, without = _contact(r, c)
     if contact and good(r, found.left_out | without):
         return (contact,), ()
     fitted, findings = _of_fit(r, found.left_out) if thorough else (None, ())
@@ -99,10 +96,10 @@ def _causes_of(
     return (), findings
 
 
-def _retold(r: Recording, c: Compared, bound: float) -> Iterator[tuple[str, Recording]]:
+def _retold(r: Recording, c: Compared) -> Iterator[tuple[str, Recording]]:
     """Efforts and wrenches of the other sign, wrenches in other axes, a payload."""
     assert r.effort is not None  # noqa: S101
-    turned = ~c.good(bound) & (np.sum(c.measured * c.expected, 0) < 0.0)
+    turned = ~c.good & (np.sum(c.measured * c.expected, 0) < 0.0)
     if turned.any():
         names = ", ".join(np.array(r.robot.joint_names)[turned].tolist())
         effort = r.effort * np.where(turned, -1.0, 1.0)
@@ -121,10 +118,10 @@ def _retold(r: Recording, c: Compared, bound: float) -> Iterator[tuple[str, Reco
         text = "without the wrench the efforts agree: it does not act on the platform"
         yield text, replace(r, wrench=None)
     if r.load is None:
-        yield from _payloads(r, c, bound)
+        yield from _payloads(r, c)
 
 
-def _payloads(r: Recording, c: Compared, bound: float) -> Iterator[tuple[str, Recording]]:
+def _payloads(r: Recording, c: Compared) -> Iterator[tuple[str, Recording]]:
     """The payload that explains most, while it is held."""
 
     def more(robot: Robot, *motion: Array) -> Array:
@@ -135,7 +132,7 @@ def _payloads(r: Recording, c: Compared, bound: float) -> Iterator[tuple[str, Re
         columns = [by_held(r.robot, None, None, more, *track.motion) for track in c.tracks]
     except PkmTwinError:
         return
-    weight = 1.0 / c.limit(bound) ** 2
+    weight = 1.0 / c.limit**2
     mass, spans, held = held_payload(c.time, c.filtered(columns), c.residual, weight)
     total = sum(body.mass for body in r.robot.graph.bodies.values())
     if not mass > LIGHTEST * total or len(spans) > SPANS:
@@ -148,9 +145,9 @@ def _payloads(r: Recording, c: Compared, bound: float) -> Iterator[tuple[str, Re
     yield text, replace(r, load=load)
 
 
-def _contact(r: Recording, c: Compared, bound: float) -> tuple[str, Mask]:
+def _contact(r: Recording, c: Compared) -> tuple[str, Mask]:
     """When something else begins to act on the machine, and the samples from then on."""
-    begins = c.begins(c.limit(bound))
+    begins = c.begins()
     if begins is None:
         return "", np.zeros(0, np.bool_)
     before = c.time < begins
@@ -164,14 +161,14 @@ def _contact(r: Recording, c: Compared, bound: float) -> tuple[str, Mask]:
     return text if found else "", r.time >= begins - 2.0 * c.edge
 
 
-def _saturated(r: Recording, c: Compared, bound: float) -> tuple[str, ...]:
+def _saturated(r: Recording, c: Compared) -> tuple[str, ...]:
     """Joints whose effort stays at its greatest while the model needs more, and else agrees."""
     assert r.effort is not None  # noqa: S101
     rows = np.searchsorted(r.time, c.time - 1e-9).clip(0, len(r.time) - 1)
-    measured, limit = r.effort[rows], c.limit(bound)
+    measured, limit = r.effort[rows], c.limit
     expected = measured - c.raw
     texts = []
-    for j in np.flatnonzero(~c.good(bound)):
+    for j in np.flatnonzero(~c.good):
         most = np.abs(measured[:, j]).max()
         full = np.abs(measured[:, j]) >= most * (1.0 - 1e-9)
         less = c.raw[~full, j]

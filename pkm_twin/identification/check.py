@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from delta_dynamics import inverse_dynamics, torque_deviation
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import SingularityError, UnreachableError, one_line
-from pkm_twin.identification.compare import Compared, by_held, compare
+from pkm_twin.identification.compare import MAX_RESIDUAL, Compared, by_held, compare
 from pkm_twin.identification.rows import Recorded
 from pkm_twin.recordings import Recording, at_rest
 from pkm_twin.report import Fact, Verdict, judged
@@ -43,28 +43,18 @@ TICKS: Final = 10.0
 """and by how many of its least steps it has to change meanwhile."""
 NEAR: Final = 0.5
 """Around a pick or release the payload is neither held nor gone, s."""
+MAX_GAP: Final = 5.0
+"""Longest good time between joint states, in median periods."""
+MIN_SINGULARITY: Final = 1e-3
+"""Least good singularity index, 0 in a singularity, 1 at best."""
+MAX_MISSING: Final = 0.01
+"""Joint states that may be missing, part of those that there should be."""
+MAX_RATE: Final = 0.15
+"""Difference of the measured velocities from the positions' rates, part of them, RMS."""
+MIN_COMPARED: Final = 0.1
+"""Least part of the recording whose efforts are compared."""
 DEVIATIONS: Final = (1, 2, 3)
 """Of the model, inside which residuals are counted."""
-
-
-@dataclass(frozen=True)
-class Bounds:
-    """What a good bag keeps to."""
-
-    residual: float = 0.05
-    """Torque residual RMS, part of the joint's peak effort."""
-    gap: float = 5.0
-    """Longest time between joint states, in median periods."""
-    rejected: float = 0.0
-    """Messages that a node would reject, part of all."""
-    singularity: float = 1e-3
-    """Least singularity index, 0 in a singularity, 1 at best."""
-    missing: float = 0.01
-    """Joint states that are missing, part of those that there should be."""
-    rate: float = 0.15
-    """Difference of the measured velocities from the positions' rates, part of them, RMS."""
-    judged: float = 0.1
-    """Least part of the recording whose efforts are compared."""
 
 
 @dataclass(frozen=True)
@@ -110,11 +100,14 @@ class Checked:
         return [str(item.text) for item in self.items if item.verdict is verdict]
 
 
-def checked(r: Recording, bounds: Bounds) -> Checked:
-    """Compare a recording with the model, without a look for causes."""
-    items = [*_file(r, bounds), *_motion(r, bounds), *_limits(r), _singularity(r, bounds)]
+def checked(r: Recording, residual: float) -> Checked:
+    """Compare a recording with the model, without a look for causes.
+
+    :param residual: largest good one, RMS, part of the peak effort.
+    """
+    items = [*_file(r), *_motion(r), *_limits(r), _singularity(r)]
     left_out = np.zeros(len(r.time), np.bool_)
-    bound = f"RMS below {100 * bounds.residual:g} % of peak"
+    bound = f"RMS below {100 * residual:g} % of peak"
     reason = why_no_torques(r.robot)
     if r.effort is None:
         reason = reason or "the bag carries no efforts"
@@ -123,22 +116,22 @@ def checked(r: Recording, bounds: Bounds) -> Checked:
     try:
         idle = idle_of(r)
         left_out = idle | near_jumps(r)
-        compared = compared_of(r, left_out)
+        compared = compared_of(r, left_out, residual)
         bands = {} if compared is None else _bands(r, compared)
     # ValueError: numbers within bounds whose result is not finite.
     except (UnreachableError, SingularityError, ValueError) as error:
         return Checked(r, [*items, judged(RESIDUAL, one_line(str(error)), bound, False)])
-    shares, unjudged = _shares(r, idle, compared, bounds)
+    shares, unjudged = _shares(r, idle, compared)
     items += shares
     if compared is not None and not unjudged:
-        stuck = _stuck_efforts(r, compared, compared.good(bounds.residual))
+        stuck = _stuck_efforts(r, compared)
         if stuck:
             items.append(judged(MEASURED, stuck, "change as the model's", False))
-        items += _residuals(r, compared, bands, bounds, bound)
+        items += _residuals(r, compared, bands, bound)
     return Checked(r, items, bands, unjudged, compared, left_out)
 
 
-def _file(r: Recording, bounds: Bounds) -> list[Fact]:
+def _file(r: Recording) -> list[Fact]:
     if r.bag is None:
         found = f"a table of {len(r.time)} rows, all numbers finite"
         return [judged("file", found, "finite numbers", True)]
@@ -148,22 +141,20 @@ def _file(r: Recording, bounds: Bounds) -> list[Fact]:
     refused, total = sum(r.rejected.values()), r.message_count
     reasons = ", ".join(f"{k}: {v}" for k, v in r.rejected.items())
     value = f"{refused} of {total}" + (f" ({reasons}; first: {r.first_reject})" if refused else "")
-    bound = f"at most {100 * bounds.rejected:g} %"
-    good = refused <= bounds.rejected * total
     return [
         judged("file", text, "complete and consistent", False if report.miscounts else whole),
-        judged("messages that a node rejects", value, bound, good),
+        judged("messages that a node rejects", value, "at most 0 %", not refused),
     ]
 
 
-def _motion(r: Recording, bounds: Bounds) -> list[Fact]:
+def _motion(r: Recording) -> list[Fact]:
     """The items on time stamps, steps and velocities."""
     if len(r.time) < 3:
         return [judged("rate", f"{len(r.time)} joint states", "3 or more", None)]
     periods = np.diff(r.time)
     median, longest = float(np.median(periods)), float(periods.max())
     gap = f"{1e3 * longest:.3f} ms at {r.time[int(periods.argmax())]:.3f} s"
-    sampling, most = sampling_of(r.time), f"at most {100 * bounds.missing:g} %"
+    sampling, most = sampling_of(r.time), f"at most {100 * MAX_MISSING:g} %"
     if sampling.missing is None:
         text = "the samples have no common period"
         missing = judged("missing samples", text, most, None)
@@ -171,8 +162,8 @@ def _motion(r: Recording, bounds: Bounds) -> list[Fact]:
         share = sampling.missing / sampling.expected
         text = f"{sampling.missing} of {sampling.expected}"
         text += f" ({100 * share:.3g} %)" if sampling.missing else ""
-        missing = judged("missing samples", text, most, share <= bounds.missing)
-    steps, within = steps_in(r), bounds.gap * median
+        missing = judged("missing samples", text, most, share <= MAX_MISSING)
+    steps, within = steps_in(r), MAX_GAP * median
     fault = step_fault(r, steps)
     items = [
         judged("rate", f"{1 / median:.1f} Hz over {r.time[-1]:.3f} s", "", True),
@@ -180,9 +171,7 @@ def _motion(r: Recording, bounds: Bounds) -> list[Fact]:
         judged("longest gap", gap, f"at most {1e3 * within:.3f} ms", longest <= within),
         judged(POSITION_STEPS, fault or "no jumps", "within rates and limits", not fault),
     ]
-    return (
-        items if r.qd is None or steps.publishers else items + _velocities(r, r.qd, steps, bounds)
-    )
+    return items if r.qd is None or steps.publishers else items + _velocities(r, r.qd, steps)
 
 
 def steps_in(r: Recording) -> Steps:
@@ -240,11 +229,11 @@ def stuck_from(time: Array, values: Array, told: Array, count: int = 1) -> tuple
     return None
 
 
-def _velocities(r: Recording, qd: Array, steps: Steps, bounds: Bounds) -> list[Fact]:
+def _velocities(r: Recording, qd: Array, steps: Steps) -> list[Fact]:
     """How far measured velocities are from what the positions move by, over short times."""
     names, span = r.robot.joint_names, np.diff(r.time)
     period = float(np.median(span))
-    bound = f"RMS below {100 * bounds.rate:g} % of the positions' rate"
+    bound = f"RMS below {100 * MAX_RATE:g} % of the positions' rate"
     turned = np.cumsum(0.5 * (qd[1:] + qd[:-1]) * span[:, None], 0)
     for j, told in enumerate(np.concatenate([0.0 * turned[:1], turned]).T):
         found = stuck_from(r.time, r.q[:, j], told)
@@ -268,7 +257,7 @@ def _velocities(r: Recording, qd: Array, steps: Steps, bounds: Bounds) -> list[F
     size, width = rms(told - moved), max(STEPS, BLOCK / period)
     noisy = 2.0 * noise(r.time, r.q) + np.sqrt(width) * period * noise(r.time, qd)
     part = size / np.maximum(np.maximum(most, floor), 1e-300)
-    bad = (part > bounds.rate) & (size > SIGMAS * noisy)
+    bad = (part > MAX_RATE) & (size > SIGMAS * noisy)
     texts = [
         f"{names[j]} {100 * part[j]:.3g} %{likely_cause(moved[:, j], told[:, j])}"
         for j in np.flatnonzero(bad)
@@ -299,16 +288,16 @@ def _limits(r: Recording) -> list[Fact]:
     return items
 
 
-def _singularity(r: Recording, bounds: Bounds) -> Fact:
+def _singularity(r: Recording) -> Fact:
     what = "singularity index"
-    bound = f"{bounds.singularity:g} or more"
+    bound = f"{MIN_SINGULARITY:g} or more"
     try:
         measure = r.robot.singularity(r.q)
     except (UnreachableError, SingularityError) as error:
         return judged(what, str(error), bound, False)
     worst = int(measure.argmin())
     value = f"{measure[worst]:.4f} at {r.time[worst]:.3f} s"
-    return judged(what, value, bound, bool(measure[worst] >= bounds.singularity))
+    return judged(what, value, bound, bool(measure[worst] >= MIN_SINGULARITY))
 
 
 def recorded_of(r: Recording, leave_out: Mask | None = None) -> Recorded:
@@ -324,7 +313,7 @@ def recorded_of(r: Recording, leave_out: Mask | None = None) -> Recorded:
     return Recorded(r.name, part.time, part.q, part.effort, part.wrench, part.held, r.carried)
 
 
-def compared_of(r: Recording, idle: Mask) -> Compared | None:
+def compared_of(r: Recording, idle: Mask, bound: float = MAX_RESIDUAL) -> Compared | None:
     """The efforts in the band of the motion, without samples whose drives are idle."""
     recorded = recorded_of(r, idle)
     if len(recorded.time) < 3:
@@ -333,7 +322,7 @@ def compared_of(r: Recording, idle: Mask) -> Compared | None:
     if r.qd is not None and r.qdd is not None:
         keep = np.isin(r.time, recorded.time)
         known = r.qd[keep], r.qdd[keep]
-    return compare(r.robot, recorded, known)
+    return compare(r.robot, recorded, known, bound)
 
 
 def idle_of(r: Recording) -> Mask:
@@ -348,20 +337,18 @@ def idle_of(r: Recording) -> Mask:
     return idle_samples(r.time, at_rest(r, rates), r.effort, needed)
 
 
-def _shares(
-    r: Recording, idle: Mask, compared: Compared | None, bounds: Bounds
-) -> tuple[list[Fact], str]:
+def _shares(r: Recording, idle: Mask, compared: Compared | None) -> tuple[list[Fact], str]:
     """What is left out, and why there is no verdict, if there is none."""
     items, total = [], max(float(r.time[-1]), 1e-9)
     used = 0 if compared is None else sum(len(track.time) for track in compared.tracks)
     share = used / len(r.time)
-    enough = share >= bounds.judged
+    enough = share >= MIN_COMPARED
     if idle.any():
         seconds = float(np.sum(np.gradient(r.time)[idle])) if len(r.time) > 1 else 0.0
         text = f"{seconds:.3f} s of {total:.3f} s, left out: efforts zero or constant at standstill"
         items.append(judged("drives off or braked", text, "some efforts measured", enough or None))
     text = f"{100 * share:.3g} % of {len(r.time)} samples"
-    bound = f"at least {100 * bounds.judged:g} %"
+    bound = f"at least {100 * MIN_COMPARED:g} %"
     items.append(judged("compared efforts", text, bound, enough or None))
     return (
         items,
@@ -369,11 +356,11 @@ def _shares(
     )
 
 
-def _stuck_efforts(r: Recording, c: Compared, good: Mask) -> str:
+def _stuck_efforts(r: Recording, c: Compared) -> str:
     """Efforts that were not measured, or not all the time; saturated ones are no such; or empty."""
     assert r.effort is not None  # noqa: S101
     rows = np.searchsorted(r.time, c.time).clip(0, len(r.time) - 1)
-    texts = []
+    texts, good = [], c.good
     for j, (joint, unit) in enumerate(zip(r.robot.joint_names, r.robot.effort_units, strict=True)):
         values = r.effort[:, j].copy()
         most, told = np.abs(values).max(), np.full(len(values), np.nan)
@@ -397,10 +384,9 @@ def _stuck_efforts(r: Recording, c: Compared, good: Mask) -> str:
 
 
 def _residuals(
-    r: Recording, c: Compared, bands: Mapping[str, Mapping[str, Any]], bounds: Bounds, bound: str
+    r: Recording, c: Compared, bands: Mapping[str, Mapping[str, Any]], bound: str
 ) -> list[Fact]:
-    good, limit, (worst, at) = c.good(bounds.residual), c.limit(bounds.residual), c.local()
-    begins = c.begins(limit)
+    good, begins, (worst, at) = c.good, c.begins(), c.local()
     items = []
     for i, (name, unit) in enumerate(zip(r.robot.joint_names, r.robot.effort_units, strict=True)):
         share = 100 * c.rms[i] / max(c.peak[i], 1e-12)

@@ -22,6 +22,8 @@ from pkm_twin.identification.rows import BLOCK, Recorded, shaken_efforts
 from pkm_twin.identification.samples import Filtering, Track, by_blocks, low_pass, tracks
 from pkm_twin.robot.robot import Robot
 
+MAX_RESIDUAL: Final = 0.05
+"""Largest good torque residual RMS, part of the joint's peak effort."""
 LEAST: Final = 40
 """Samples that a piece needs: fewer than for a fit, as nothing is fitted."""
 TURNS: Final = 5
@@ -39,10 +41,10 @@ class Compared:
     """Efforts of a recording in the band of its motion, k rows, n joints.
 
     ``time``: (k,), s; ``measured``, ``expected``, ``residual``: (k, n), N m or N; ``raw``: the
-    residual before the filter; ``change``: of the efforts in time. ``noise``: standard deviation in
-    the band, ``peak``: of the model's efforts, (n,). ``late``: of the efforts against the
-    positions, taken out, s. ``starts``: the first rows of the pieces. ``tracks``: their motion
-    before the filter, and ``inner``, which part of it has rows.
+    residual before the filter. ``noise``: standard deviation in the band, ``peak``: of the model's
+    efforts, (n,). ``late``: of the efforts against the positions, taken out, s. ``starts``: the
+    first rows of the pieces. ``tracks``: their motion before the filter, and ``inner``, which part
+    of it has rows. ``bound``: of a good residual, RMS, as a part of the peak.
     """
 
     time: Array
@@ -50,7 +52,6 @@ class Compared:
     expected: Array
     residual: Array
     raw: Array
-    change: Array
     noise: Array
     peak: Array
     late: float
@@ -59,6 +60,7 @@ class Compared:
     tracks: tuple[Track, ...]
     inner: tuple[slice, ...]
     how: Filtering
+    bound: float
 
     def filtered(self, columns: Sequence[Array]) -> Array:
         """Signals of the tracks, (samples, m) each, filtered as the efforts are, shape (k, m)."""
@@ -76,13 +78,14 @@ class Compared:
         """Of the residual, shape (n,)."""
         return np.asarray(np.sqrt(np.mean(self.residual**2, 0)), np.float64)
 
-    def limit(self, bound: float) -> Array:
+    @property
+    def limit(self) -> Array:
         """Largest good residual, RMS, shape (n,): a part of the peak, and not below the noise.
 
         What is as large as the noise in the band explains the recording, as the verdict of a fit
         has it.
         """
-        return np.maximum(bound * self.peak, LOUD * self.noise)
+        return np.maximum(self.bound * self.peak, LOUD * self.noise)
 
     def local(self) -> tuple[Array, Array]:
         """The largest RMS over a short time, and the time of its middle, s, shape (n,) each."""
@@ -100,23 +103,23 @@ class Compared:
             at = np.where(more, self.time[begin + place + some // 2], at)
         return worst, at
 
-    def begins(self, limit: Array) -> float | None:
+    def begins(self) -> float | None:
         """When the residual first leaves the local bound of any joint, s; None: never.
 
         Before the filter, which spreads a step in time.
         """
         away = np.abs(self.raw)
-        usual = usual_size(self.raw)
+        usual, limit = usual_size(self.raw), self.limit
         far = away > MORE * limit + 4.0 * np.minimum(usual, limit)
         beyond: Mask = np.asarray(far.any(1), np.bool_)
         # Two in a row: one is noise's.
         rows = np.flatnonzero(beyond[1:] & beyond[:-1])
         return float(self.time[rows[0]]) if len(rows) else None
 
-    def good(self, bound: float) -> Mask:
+    @property
+    def good(self) -> Mask:
         """Which joints' efforts agree with the model, shape (n,)."""
-        limit = self.limit(bound)
-        return np.asarray((self.rms <= limit) & (self.local()[0] <= MORE * limit))
+        return np.asarray((self.rms <= self.limit) & (self.local()[0] <= MORE * self.limit))
 
 
 def by_held(
@@ -143,12 +146,16 @@ def by_held(
 
 
 def compare(
-    robot: Robot, recorded: Recorded, rates: tuple[Array, Array] | None = None
+    robot: Robot,
+    recorded: Recorded,
+    rates: tuple[Array, Array] | None = None,
+    bound: float = MAX_RESIDUAL,
 ) -> Compared | None:
     """Compare a recording with the model; None where no piece of it is long enough.
 
     :param recorded: ``carried`` and ``held`` tell of a payload.
     :param rates: velocities and accelerations (k, n) that are known, to be used as they are.
+    :param bound: of a good residual, RMS, as a part of the peak effort.
     """
     r, reach = recorded, friction_reach(robot)
     held = None if r.carried is None else r.held
@@ -188,10 +195,10 @@ def compare(
     greatest = np.array([size[units == unit].max() for unit in units])
     residual = left + late * change
     return Compared(
-        time, expected + residual, expected, residual, sharp + late * turn, change,
+        time, expected + residual, expected, residual, sharp + late * turn,
         density * np.sqrt(passed_band(how, 1.0 / period) / period),
         np.maximum(size, LIGHT * greatest), late, period,
-        tuple(starts), tuple(pieces), tuple(inside), how,
+        tuple(starts), tuple(pieces), tuple(inside), how, bound,
     )  # fmt: skip
 
 

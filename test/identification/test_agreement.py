@@ -17,8 +17,6 @@ from pkm_twin.robot.entries import with_entries
 from test.identification.machines import IMPOSSIBLE, WRONG, machine, noisy, shifted
 from test.support.robots import load
 
-BOUND = 0.05
-"""Of the residual, as `check` has it by default."""
 MACHINES = (
     "delta", "delta_cu", "five_bar", "linear_delta", "prru", "rps3", "stewart",
     "machines/rsur", "machines/prru3", "machines/rcuu",
@@ -36,11 +34,11 @@ def agree(robot: Robot, recorded: Recorded) -> str:
         result = fit(robot, [recorded], ("friction", "rotor"))
     except PkmTwinError:
         found = compare(robot, recorded)
-        assert found is None or not found.good(BOUND).all()
+        assert found is None or not found.good.all()
         return "rejected"
     compared = compare(fitted(result), recorded)
     assert compared is not None
-    good = bool(compared.good(BOUND).all())
+    good = bool(compared.good.all())
     if result.verdict.answer == "explains":
         assert good
         np.testing.assert_allclose(compared.late, result.delays[0], atol=0.2 * compared.period)
@@ -65,7 +63,7 @@ def test_an_encoder_s_noise_is_not_the_model_s_fault(name: str) -> None:
     friction = {n.name: n.after for n in result.numbers if n.name.startswith("friction")}
     robot = with_entries(m.truth, friction)
     compared = compare(robot, recorded)
-    assert compared is not None and compared.good(BOUND).all()
+    assert compared is not None and compared.good.all()
     held_out = result.judged[0]
     rms = held_out.rms(held_out.after)
     assert compared.rms == pytest.approx(rms, abs=0.01 * float(compared.peak.max()))

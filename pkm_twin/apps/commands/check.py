@@ -5,8 +5,9 @@ from __future__ import annotations
 
 import multiprocessing
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -77,7 +78,6 @@ def check_one(given: Check, path: Path, update: Any = None, thorough: bool = Tru
     """Judge a recording, and append it to the history; errors as of ``recordings.read``."""
     from pkm_twin import load
     from pkm_twin.identification.causes import judged
-    from pkm_twin.identification.check import Bounds
 
     robot: Any = given.robot
     if given.platform is not None:
@@ -85,7 +85,7 @@ def check_one(given: Check, path: Path, update: Any = None, thorough: bool = Tru
             raise ParameterError("--robot", None, "a file, for the platform that --platform names")
         robot = load(robot, platform=given.platform)
     r = given.read(path, robot, update, limited=True)
-    found = judged(r, Bounds(residual=given.residual), thorough)
+    found = judged(r, given.residual, thorough)
     good = found.answer == "good"
     if given.history is not None:
         from pkm_twin.identification.history import append, measure, recorded_at
@@ -139,28 +139,24 @@ def _facts(given: Check, path: Path) -> dict[str, Any]:
         return {"bag": str(path), "good": False, "error": one_line(str(error))}
 
 
-def _judged_all(given: Check, paths: Sequence[Path]) -> Iterator[tuple[Path, dict[str, Any]]]:
-    """Verdicts as they come, on so many processes."""
-    jobs = min(given.jobs, len(paths))
+def _judged_all(given: Check, paths: Sequence[Path]) -> Iterator[dict[str, Any]]:
+    """Verdicts in the order of the recordings, as they come, on so many processes."""
+    each, jobs = partial(_facts, given), min(given.jobs, len(paths))
     if jobs == 1:
-        yield from ((path, _facts(given, path)) for path in paths)
+        yield from map(each, paths)
         return
     context = multiprocessing.get_context("spawn")
     with one_blas_thread_for_children(), ProcessPoolExecutor(jobs, mp_context=context) as pool:
-        flying = {pool.submit(_facts, given, path): path for path in paths}
-        for future in as_completed(flying):
-            yield flying[future], future.result()
+        yield from pool.map(each, paths)
 
 
 def _of_folder(given: Check) -> Report:
     """Judge all recordings of a folder."""
-    paths = bags_of(given.bag)
-    found: dict[Path, dict[str, Any]] = {}
+    paths, results = bags_of(given.bag), list[dict[str, Any]]()
     with progress("checking", len(paths)) as update:
-        for path, facts in _judged_all(given, paths):
-            found[path] = facts
-            update(len(found))
-    results = [found[path] for path in paths]
+        for result in _judged_all(given, paths):
+            results.append(result)
+            update(len(results))
     notes = []
     for result in results:
         bad = [item["what"] for item in result.get("items", ()) if item["verdict"] == "bad"]
