@@ -17,8 +17,10 @@ from pkm_twin.identification.drives import drive_friction
 MEASURED = Path(__file__).parents[2] / "examples/machines/hexapod/leg_currents.csv"
 
 
-def test_the_measured_drive_has_friction_that_grows_with_the_load() -> None:
+def test_the_measured_drive_has_friction_that_grows_with_the_load(tmp_path, monkeypatch) -> None:
     """The owner's torque constant; 1.07 A + 0.10 |load current| is what the runs fit."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "fitted.yaml").touch()  # of a fit; this one writes none
     result = CliRunner().invoke(
         app, ["fit", "--drive", str(MEASURED), "--lever", "0.011391", "--json"]
     )

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-import numpy as np
 import typer
 
 from pkm_twin.apps.frame import command
@@ -89,9 +88,9 @@ class Fit(CarriesAtTimes, ReadsRecordings, BeyondLimitsToo, Accepts):
         "friction,rotor,payload,inertia",
         "what to fit: friction,rotor,payload,inertia or some of them; or compliance",
     )
-    out: Path = setting(
-        Path("fitted.yaml"), "YAML to write; the report has the same name with .html", writes=True,
-        endings=(".yaml", ".yml"),
+    out: Path | None = setting(
+        None, "YAML to write; the report has the same name with .html; default: fitted.yaml",
+        writes=True, endings=(".yaml", ".yml"),
     )  # fmt: skip
     no_report: bool = setting(False, "write no report with pictures")
     per_copy: bool = setting(False, "fit each copy of a limb by itself, and write all of them")
@@ -113,9 +112,10 @@ class Fit(CarriesAtTimes, ReadsRecordings, BeyondLimitsToo, Accepts):
     overwrite: bool = setting(False, "replace the YAML and the report")
 
     @property
-    def page(self) -> Path | None:
-        """The report's file."""
-        return None if self.no_report else self.out.with_suffix(".html")
+    def files(self) -> dict[str, Path | None]:
+        """What is written."""
+        out = self.out or Path("fitted.yaml")
+        return {"out": out, "report": None if self.no_report else out.with_suffix(".html")}
 
 
 def fit(given: Fit) -> Report:
@@ -129,8 +129,8 @@ def fit(given: Fit) -> Report:
         return _of_drive(given, given.drive)
     if not given.robot or not given.recordings:
         raise typer.BadParameter("a robot and recordings are missing; give both, or --drive TABLE")
-    if given.page is not None:
-        refuse_existing(given.page, given.overwrite)
+    for target in filter(None, given.files.values()):
+        refuse_existing(target, given.overwrite)
     compliant = COMPLIANCE in [word.strip() for word in given.what.split(",")]
     if compliant and (given.per_copy or given.payload is not None or given.load_times is not None):
         raise ParameterError(
@@ -283,24 +283,23 @@ def _written(
         Fact("beyond_limits", beyond),
         Fact("friction_laws", [dataclasses.asdict(choice) for choice in choices]),
     ]
-    fitted = fitted_yaml(text, result.numbers, names, given.out)
+    out, html = given.files.values()
+    assert out is not None  # noqa: S101
+    fitted = fitted_yaml(text, result.numbers, names, out)
     head = [
         *marks, f"{report.answer}.", f"Fitted from {', '.join(names)}.",
         *(f"{note}." for note in report.notes[len(marks) :]),
     ]  # fmt: skip
-    for judged in result.judged:
-        before, after = (
-            ", ".join(f"{v:.3g}" for v in judged.rms(which) if np.isfinite(v))
-            for which in (judged.before, judged.after)
-        )
-        head.append(f"Residual rms held out of {judged.name}: {before} before, {after} now.")
-    with writing(given.out):
-        write_edited(given.out, head, fitted)
-        if given.page is not None:
+    head += [
+        f"Residual rms held out of {name}: {before:.3g} before, {after:.3g} now, {unit}."
+        for name, (before, after, _, unit) in report.tables[-1].rows.items()
+    ]
+    with writing(out):
+        write_edited(out, head, fitted)
+        if html is not None:
             title = f"{result.robot.name}: fitted from {', '.join(names)}"
-            replace_file(given.page, page(title, report, more).encode())
-    files = {"out": given.out, "report": given.page}
-    return dataclasses.replace(report, facts=[*report.facts, *facts], files=files)
+            replace_file(html, page(title, report, more).encode())
+    return dataclasses.replace(report, facts=[*report.facts, *facts], files=given.files)
 
 
 def _of_drive(given: Fit, path: Path) -> Report:
