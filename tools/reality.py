@@ -18,7 +18,7 @@ from pkm_twin.identification.calibration_state import Poses, rotations
 from pkm_twin.identification.drives import drive_friction
 from pkm_twin.identification.pose_tables import read_poses
 from pkm_twin.recordings import Dialect, read_table
-from pkm_twin.report import text_of
+from pkm_twin.report.terminal import text_of
 
 Array = NDArray[np.float64]
 

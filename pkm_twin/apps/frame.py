@@ -189,7 +189,7 @@ def _check_targets(given: Any) -> None:
             raise ParameterError(
                 _spelled(field, row), str(target), f"a name that ends in {' or '.join(row.endings)}"
             )
-        refuse_existing(target, given.overwrite, _source(given))
+        refuse_existing(target, getattr(given, "overwrite", True), _source(given))
 
 
 def _source(given: Any) -> Path | None:
@@ -227,6 +227,8 @@ def _fields(given: type[Any]) -> list[tuple[str, Any, Setting, Any]]:
 
 
 def _spelled(field: str, row: Setting) -> str:
+    if row.argument:
+        return field.upper()
     return f"--{row.name or field.replace('_', '-')}"
 
 
@@ -290,7 +292,7 @@ def _taken(field: str, kind: Any, row: Setting, value: Any) -> Any:
     if value is None:
         return None
     bare, _ = _plain_type(kind)
-    name = field.upper() if row.argument else _spelled(field, row)
+    name = _spelled(field, row)
     if get_origin(bare) is tuple and row.count is None:
         return tuple(_one(name, get_args(bare)[0], row, word) for word in value)
     return _one(name, bare, row, value)

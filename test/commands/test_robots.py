@@ -11,7 +11,7 @@ import pytest
 
 from pkm_twin import load, robot_names
 from pkm_twin.apps.commands.info import Info, info
-from pkm_twin.report import text_of
+from pkm_twin.report.terminal import text_of
 from stiffness_monitor import compliance, strain_energy
 from test.commands.conftest import REPOSITORY
 from test.support.command import forked

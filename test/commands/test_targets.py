@@ -75,7 +75,7 @@ def test_a_folder_or_nothing_is_no_files_name(twin, tmp_path, monkeypatch, defle
         where = next(k for k, word in enumerate(line) if str(word).startswith(f"{tmp_path}/target"))
         done = twin(*line[:where], name, *line[where + 1 :], "--overwrite")
         assert done.code == 1 and "Traceback" not in done.err
-        option = line[where - 1] if str(line[where - 1]).startswith("--") else "out"
+        option = line[where - 1] if str(line[where - 1]).startswith("--") else "OUT"
         assert done.one_line_error().startswith(f"pkm-twin: {option}: ")
         tried += 1
     for line in (("torques", "five_bar", "none.csv", "--out"), ("map", "show", "none.nc", "--out")):
@@ -195,7 +195,17 @@ def test_names_of_anything_in_titles_and_comments(tmp_path, deflections):
         ("info", five.name, "--picture", f"{ODD}.png"),
         (*EXCITE, "--out", "motion.mcap"),
         ("torques", five.name, "motion.csv", "--out", f"torques {ODD}.csv"),
-        ("map", five.name, "workspace", "--points", 1000, "--out", f"{ODD}.nc", "--html"),
+        (
+            "map",
+            five.name,
+            "workspace",
+            "--points",
+            1000,
+            "--out",
+            f"{ODD}.nc",
+            "--html",
+            "--overwrite",
+        ),
         ("urdf", robot.name),
         ("info", robot.name, "--json"),
     ):

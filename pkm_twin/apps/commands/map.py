@@ -109,7 +109,7 @@ class Show(Pages):
     """Plot a stored map: PNGs, and with --html an offline interactive HTML page."""
 
     file: Path = setting(..., "a file that `pkm-twin map` wrote", argument=True)
-    out: Path | None = setting(None, "stem of the PNGs; default: that of the file")
+    out: Path | None = setting(None, "stem of the PNGs; default: that of the file", writes=True)
 
     def drawing(self, _command: str) -> Path:
         """The pictures' common name."""
