@@ -59,9 +59,7 @@ class Equations:
         :raises ValueError: a value that is not finite.
         """
         robot = self.robot
-        flat = robot.call_one("motion", lambda: motion_kernel(robot), robot.inertial, q, qd)
-        if flat is None:
-            (flat,) = robot.evaluate(motion_kernel(robot), robot.inertial, q, qd)
+        flat = robot.bound("motion", motion_kernel, robot.inertial)(q, qd)
         mass, bias, energies, twists, rows, drift = self._parts
         n, _ = self._shapes[0]
         kinetic, height = flat[energies].tolist()

@@ -191,10 +191,7 @@ class Places:
     def at(self, q: Array) -> tuple[Array, Array, Array]:
         """Positions (P, 3), Jacobians (P, n, 3) and directions of the bars (P, 3), base axes."""
         n, count = self.robot.joints_count, len(self.robot.graph.bodies)
-        robot, none = self.robot, np.zeros(0)
-        flat = robot.call_one(TWISTS, lambda: _kernel(robot), none, q)
-        if flat is None:
-            (flat,) = robot.evaluate(_kernel(robot), none, q)
+        flat = self.robot.bound(TWISTS, _kernel)(q)
         placed = np.concatenate([flat[: 12 * count], BASE_PLACED]).reshape(count + 1, 12)
         rates = np.zeros((n, count + 1, 6))
         rates[:, :count] = flat[12 * count :].reshape(n, count, 6)

@@ -47,17 +47,10 @@ def inverse_dynamics(
     :raises ValueError: a wrong last axis, or a value that is not finite.
     """
     load = _NO_WRENCH if wrench is None else wrench
-    # As Robot.call_one, without its call: a stream's sample takes a microsecond or two.
-    call = robot.calls.get("torques")
-    if call is None:
-        call = robot.calls["torques"] = torques(robot).first_of_one(robot.inertial)
-    try:
-        tau: Array | None = call(q, qd, qdd, load)
-    except (TypeError, ValueError):
-        tau = None
-    if tau is not None:
-        return tau
-    return robot.evaluate(torques(robot), robot.inertial, q, qd, qdd, load)[0]
+    # Without a call where it is made: a stream's sample takes a microsecond or two.
+    call = robot.calls.get("torques") or robot.bound("torques", torques, robot.inertial)
+    tau: Array = call(q, qd, qdd, load)
+    return tau
 
 
 def torques(robot: Robot) -> Kernel:
@@ -71,10 +64,7 @@ def torques(robot: Robot) -> Kernel:
 def mass_matrix(robot: Robot, q: ArrayLike) -> Array:
     """Generalised mass matrix on the actuated joints, payload included, shape (..., n, n)."""
     # A simulation asks for one sample, several thousand times a second.
-    one = robot.call_one("mass matrix", lambda: masses_kernel(robot), robot.inertial, q)
-    if one is not None:
-        return one.reshape(robot.joints_count, -1)
-    return _square(robot, robot.evaluate(masses_kernel(robot), robot.inertial, q)[0])
+    return _square(robot, robot.bound("mass matrix", masses_kernel, robot.inertial)(q))
 
 
 def masses_kernel(robot: Robot) -> Kernel:
@@ -105,12 +95,13 @@ def forward_dynamics(
         :func:`inverse_dynamics`.
     """
     load = _NO_WRENCH if wrench is None else wrench
-    p = robot.inertial
-    one = robot.call_one("accelerations", lambda: accelerations(robot), p, q, qd, tau, load)
-    if one is not None:
-        return one
-    efforts = vectors(tau, robot.joints_count, "efforts")
-    return robot.evaluate(accelerations(robot), p, q, qd, efforts, load)[0]
+
+    def checked(q: ArrayLike, qd: ArrayLike, tau: ArrayLike, load: ArrayLike) -> Array:
+        efforts = vectors(tau, robot.joints_count, "efforts")
+        return robot.evaluate(accelerations(robot), robot.inertial, q, qd, efforts, load)[0]
+
+    call = robot.bound("accelerations", accelerations, robot.inertial, checked)
+    return call(q, qd, tau, load)
 
 
 def accelerations(robot: Robot) -> Kernel:

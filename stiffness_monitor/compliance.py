@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Final
 
 import numpy as np
@@ -95,12 +95,18 @@ def platform_response(robot: Robot, q: ArrayLike, wrench: ArrayLike) -> Platform
 
 def _row(robot: Robot, q: ArrayLike, wrench: ArrayLike) -> Array:
     """What the program answers, shape (..., size), rejected by sample."""
-    elastic = elastic_of(robot)
-    one = robot.call_one("response", lambda: elastic.response, NONE, q, wrench)
-    if one is not None and one[-1] > HELD:
-        return one
+    checked = partial(_checked, robot)
+    row = robot.bound("response", _response, otherwise=checked)(q, wrench)
+    return row if row.ndim > 1 or row[-1] > HELD else checked(q, wrench)
+
+
+def _response(robot: Robot) -> Kernel:
+    return elastic_of(robot).response
+
+
+def _checked(robot: Robot, q: ArrayLike, wrench: ArrayLike) -> Array:
     q, wrench = doubles(q, "joint positions"), vectors(wrench, 6, "the wrench")
-    (rows,), status = elastic.response(NONE, q, wrench)
+    (rows,), status = elastic_of(robot).response(NONE, q, wrench)
     check(robot, q, wrench, rows[..., -1], status)
     return rows
 

@@ -21,7 +21,7 @@ from pkm_twin.codegen.key import ProgramKey
 from pkm_twin.codegen.parts import in_parts
 from pkm_twin.codegen.plain import PlainCode
 from pkm_twin.codegen.program import Program
-from pkm_twin.codegen.rooms import Space, aligned, caller, take_none
+from pkm_twin.codegen.rooms import Space, aligned, caller
 
 SWITCH: Final = "PKM_TWIN_PLAIN"
 """Set to 1: plain Python, as on a machine without llvmlite."""
@@ -288,24 +288,24 @@ class Code:
         status = self._finished(prepared.reshape(1, -1), rows, outputs, status, 1)
         return [output[0] for output in outputs], None if status is None else status[0]
 
-    def first_of_one(self, prepared: Array) -> Callable[..., Array | None]:
-        """The first output of one sample, as fast as can be; on plain Python always None.
-
-        The function takes arrays of doubles of exactly the inputs' shapes, (size,) each, else it
-        raises TypeError or ValueError; it gives None where a sample is not good at once.
-        """
+    def bound(
+        self, prepared: Array, otherwise: Callable[..., Any], outputs: int
+    ) -> Callable[..., Any]:
+        """The program of one machine as a function of its inputs, see :meth:`.Kernel.bound`."""
         code = self._loaded[3]
         if code is None:
-            return take_none
+            return otherwise
         sizes = self.sizes
 
         def room() -> tuple[Any, ...]:
             space = Space(*sizes)
             space.point_at(prepared)
-            return (*space.takers(), space.address, space.outputs[0].copy, space)
+            copies = (view.copy for view in space.outputs[:outputs])
+            return (*space.takers(), *copies, space.address, space)
 
-        result: Callable[..., Array | None] = caller(len(sizes[0]))(code, room, np.ndarray)
-        return result
+        make = caller(len(sizes[0]), outputs)
+        call: Callable[..., Any] = make(code, room, np.ndarray, otherwise)
+        return call
 
     def _solved(
         self, prepared: Array, rows: Sequence[Array], count: int

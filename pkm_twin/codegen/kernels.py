@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -62,9 +62,25 @@ class Kernel:
         """
         return self.code.run(self.prepared(p), *inputs)
 
-    def first_of_one(self, p: Array) -> Callable[..., Array | None]:
-        """The first output of one sample, see :meth:`Code.first_of_one`."""
-        return self.code.first_of_one(self.prepared(p))
+    def bound(
+        self, p: Array, otherwise: Callable[..., Any] | None = None, *, outputs: int = 1
+    ) -> Callable[..., Any]:
+        """The program on a machine's parameters, as a function of its inputs.
+
+        One sample that is good at once takes the fastest way: arrays of doubles of exactly the
+        inputs' shapes, (size,) each.
+
+        :param p: the program's own parameters, shape (k,); not changed afterwards.
+        :param otherwise: function of the inputs that answers in any other case, by default the
+            program, whatever its status.
+        :param outputs: how many of the first outputs it gives: one as it is, more as a tuple.
+        """
+
+        def whole(*inputs: ArrayLike) -> Any:
+            found, _ = self(p, *inputs)
+            return found[0] if outputs == 1 else tuple(found[:outputs])
+
+        return self.code.bound(self.prepared(p), otherwise or whole, outputs)
 
 
 class BoundCall:

@@ -48,39 +48,38 @@ class Space:
         return [memoryview(view.data) for view in self.inputs]
 
 
-def take_none(*_: Any) -> Array | None:
-    """On plain Python every sample goes the way of a batch."""
-    return None
-
-
 @remembered
-def caller(inputs: int) -> Callable[..., Any]:
+def caller(inputs: int, outputs: int) -> Callable[..., Any]:
     """Makes the fast call of a number of inputs, without a loop over them.
 
     A call takes its room from those that are free, so that threads do not share one.
     """
     names = [f"a{k}" for k in range(inputs)]
-    takers = ", ".join(f"t{k}" for k in range(inputs))
+    given, takers = ", ".join(names), ", ".join(f"t{k}" for k in range(inputs))
+    copies = [f"c{k}" for k in range(outputs)]
     lines = [
-        "def make(code, room, array):",
+        "def make(code, room, array, otherwise):",
         "    free = []",
         "    take, give = free.pop, free.append",
-        f"    def call({', '.join(names)}):",
+        f"    def call({given}):",
         # A masked array is no array here: its buffer tells nothing of the mask.
         f"        if not ({' is '.join(['array', *(f'type({name})' for name in names)])})"
         " or a0.ndim != 1:",
-        "            raise TypeError",
+        f"            return otherwise({given})",
         "        try:",
         "            place = take()",
         "        except IndexError:",
         "            place = room()",
-        f"        {takers}, address, copy, _ = place",
+        f"        {takers}, {', '.join(copies)}, address, _ = place",
         "        try:",
         *(f"            t{k}[:] = a{k}" for k in range(inputs)),
         "        except (TypeError, ValueError):",
         "            give(place)",
-        "            raise",
-        "        result = None if code(address) else copy()",
+        f"            return otherwise({given})",
+        "        if code(address):",
+        "            give(place)",
+        f"            return otherwise({given})",
+        f"        result = {', '.join(f'{copy}()' for copy in copies)}",
         "        give(place)",
         "        return result",
         "    return call",

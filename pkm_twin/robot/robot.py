@@ -58,6 +58,14 @@ class ControlLoop(Protocol):
         """0 all samples are good, 1 one has no assembly, 2 one is not finite."""
 
 
+def _forward(robot: Robot) -> Kernel:
+    return robot.engine.forward
+
+
+def _undecided(*inputs: Any) -> None:
+    del inputs
+
+
 def _alone(kernel: Kernel, *inputs: ArrayLike) -> tuple[list[Array], Array | None]:
     return kernel(_NONE, *inputs)
 
@@ -90,19 +98,29 @@ class Robot(Mechanism):
         """What is made once a robot, by name: functions for one sample, tables, maps' bounds."""
         return {}
 
-    def call_one(
-        self, name: str, kernel: Callable[[], Kernel], p: Array, *inputs: Any
-    ) -> Array | None:
-        """First output of one good sample, as fast as can be; None where it takes a batch's way."""
-        call = self.calls.get(name)
+    def bound(
+        self,
+        name: str,
+        kernel: Callable[[Any], Kernel],
+        p: Array = _NONE,
+        otherwise: Callable[..., Array] | None = None,
+    ) -> Callable[..., Array]:
+        """A robot's program as a function of its inputs to its first output, made once.
+
+        One sample takes the fastest way, any other input that of :meth:`evaluate`.
+
+        :param name: of the program, for this robot. ``kernel``: of a robot.
+        :param p: the program's parameters. ``otherwise``: in place of :meth:`evaluate`.
+        """
+        call: Callable[..., Array] | None = self.calls.get(name)
         if call is None:
-            call = self.calls[name] = kernel().first_of_one(p)
-        try:
-            result: Array | None = call(*inputs)
-        except (TypeError, ValueError):
-            # A batch, a list, numbers of another kind, or a wrong length.
-            return None
-        return result
+            made = kernel(self)
+
+            def whole(*inputs: ArrayLike) -> Array:
+                return self.evaluate(made, p, *inputs)[0]
+
+            call = self.calls[name] = made.bound(p, otherwise or whole)
+        return call
 
     def evaluate(self, kernel: Kernel, p: Array, q: ArrayLike, *inputs: ArrayLike) -> list[Array]:
         """Outputs of a program of joint positions and other inputs.
@@ -155,10 +173,40 @@ class Robot(Mechanism):
         :raises UnreachableError: naming limb, sample and miss.
         :raises SingularityError: a pose beyond a singularity, or in one.
         """
+        one = self._inverse_of_one(pose)
+        if one is not None:
+            return one
         q, codes = self.judged_inverse(pose, _alone)
         if codes is not None:
             self._refuse_pose(codes, pose)
         return q
+
+    @cached_property
+    def _inverse_of_one(self) -> Callable[[Any], Array | None]:
+        """The inverse of one pose without numpy; None where another way has to decide."""
+        closed = self.has_inverse
+        joints = self.inverse_kernel.bound(_NONE, _undecided, outputs=1 + closed)
+        forward = self.engine.forward.bound(_NONE, _undecided)
+        checks = list(zip(self.unit_scales.tolist(), self.turn_mask.tolist(), strict=True))
+
+        def inverse(pose: Any) -> Array | None:
+            q = joints(pose)
+            if closed and q is not None:
+                q, faults = q
+                *misses, measure = faults.tolist()
+                if not measure > SINGULARITY_BOUND or any([miss > 0.0 for miss in misses]):
+                    return None
+            there = None if q is None else forward(q)
+            if there is None:
+                return None
+            for a, b, (scale, turn) in zip(there.tolist(), pose.tolist(), checks, strict=True):
+                apart = math.remainder(a - b, math.tau) if turn else a - b
+                if not abs(apart) * scale <= SAME_POSE:
+                    return None
+            found: Array = q
+            return found
+
+        return inverse
 
     def try_inverse(self, pose: ArrayLike) -> tuple[Array, Mask]:
         """Joint positions (..., n), NaN for an invalid pose; and which poses are valid, (...)."""
@@ -264,11 +312,7 @@ class Robot(Mechanism):
         :raises UnreachableError: naming limb, sample and miss.
         :raises SingularityError: a singularity on the way from home.
         """
-        pose = self.call_one("forward", self._forward_kernel, _NONE, q)
-        return self.evaluate(self.engine.forward, _NONE, q)[0] if pose is None else pose
-
-    def _forward_kernel(self) -> Kernel:
-        return self.engine.forward
+        return self.bound("forward", _forward)(q)
 
     def try_forward(self, q: ArrayLike) -> tuple[Array, Mask]:
         """Poses (..., m), NaN where there is no assembly; and which q are valid, (...)."""
@@ -344,11 +388,7 @@ class Robot(Mechanism):
         edge of the workspace); see ``kinematics.singularity``. It is dimensionless and independent
         of the machine's scale. Errors as :meth:`forward`.
         """
-        one = self.call_one("singularity", self.singularity_kernel, _NONE, q)
-        if one is not None:
-            return np.asarray(one[0])
-        (measure,) = self.evaluate(self.singularity_kernel(), _NONE, q)
-        return np.asarray(measure[..., 0], np.float64)
+        return np.asarray(self.bound("singularity", Robot.singularity_kernel)(q)[..., 0])
 
     def singularity_kernel(self) -> Kernel:
         """The same as a program, q to the measure (1)."""

@@ -5,11 +5,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
 from pkm_twin.codegen.arrays import Array
+from pkm_twin.codegen.kernels import Kernel
 from pkm_twin.errors import MessageError
 from pkm_twin.kinematics.stream import stream_kernel
 from pkm_twin.messages.stamps import SECOND
@@ -26,6 +27,10 @@ class _State:
 
     stamp: int
     numbers: Array
+
+
+def _kernel(robot: Robot) -> Kernel:
+    return stream_kernel(robot.engine)
 
 
 class Continuity:
@@ -48,8 +53,7 @@ class Continuity:
         n, m = len(robot.joint_names), len(self._scales)
         self._told = n + m + m * n
         self._nothing = np.zeros(self._told + m + 1)
-        self._kernel = stream_kernel(robot.engine)
-        self._call = self._kernel.first_of_one(self._scales)
+        self._call = robot.bound("stream", _kernel, self._scales)
         self.reset()
 
     def reset(self) -> None:
@@ -70,11 +74,7 @@ class Continuity:
         """
         last = self._last
         before = self._nothing if last is None else last.numbers
-        result: Any = self._call(q, before)
-        if result is None:
-            (result,), status = self._kernel(self._scales, q, before)
-            if status is not None:
-                self.robot.refuse_joints(status, q)
+        result = self._call(q, before)
         state = _State(stamp, result)
         *beyond, measure = result.tolist()[self._told :]
         if last is not None:

@@ -176,8 +176,7 @@ class _Fit:
 
     def __init__(self, degree: int, window: int, joints: int) -> None:
         self.joints, self._window = joints, window
-        self._kernel = _kernel(degree, joints, solved=True)
-        self._call = self._kernel.first_of_one(_NONE)
+        self._call = _kernel(degree, joints, solved=True).bound(_NONE)
         self._sums = _kernel(degree, joints, solved=False)
         size = degree + 1
         self._nothing = np.zeros(2 * degree + 1 + size * joints)
@@ -207,9 +206,7 @@ class _Fit:
             weights = self._all
         first = end - BLOCK
         inputs = sums, stamps[first:end], values[first * n : end * n], weights, place
-        result: Any = self._call(*inputs)
-        if result is None:
-            (result,), _ = self._kernel(_NONE, *inputs)
+        result: Array = self._call(*inputs)
         if not min(result[2 * n :].tolist()) > LEAST_PIVOT:
             raise MessageError(
                 "uneven stamps", "the stamps of the window are too uneven to differentiate"

@@ -58,7 +58,12 @@ def test_no_pose_is_answered_with_joints_of_another(name, count, rng):
     assert 0 < good.sum() < len(good)
     assert np.isnan(q[~good]).all()
     assert np.abs(apart(robot, robot.forward(q[good]), poses[good])).max() < 1e-6
+    # One pose has the bits and the verdict of its batch.
+    for answer, pose in zip(q[good][:20], poses[good], strict=False):
+        np.testing.assert_array_equal(robot.inverse(pose), answer)
     for pose in poses[~good][:8]:
+        with pytest.raises((SingularityError, UnreachableError)):
+            robot.inverse(pose)
         with pytest.raises((SingularityError, UnreachableError)) as caught:
             robot.inverse(np.stack([robot.home(), pose]))
         assert caught.value.index == (1,)
