@@ -8,8 +8,8 @@ recursion of rigid bodies in base axes (Featherstone, Rigid Body Dynamics Algori
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -24,6 +24,12 @@ from pkm_twin.machine.tree import Link, Step, Tree
 
 Columns = dict[tuple[str, int], Any]
 """By rate ("u" or "q", index): a vector, or a number."""
+Placed = tuple[str, Any]
+"""A body, and where a point of it is."""
+
+
+def _none() -> Any:
+    raise NotImplementedError("the acceleration of this equation is not needed")
 
 
 def cross(a: Any, b: Any) -> Objects:
@@ -74,16 +80,25 @@ class Motion:
 
     :param x: unknowns, as ``tree.home``.
     :param q: positions of the actuated joints, shape (n,).
+    :param bodies: those that are placed, in the tree's order; default all.
+    :param start: the body from whose frame they are placed, in its axes.
     """
 
-    def __init__(self, tree: Tree, x: Numbers, q: Numbers) -> None:
+    def __init__(
+        self, tree: Tree, x: Numbers, q: Numbers, bodies: Iterable[str] | None = None,
+        start: str = BASE,
+    ) -> None:  # fmt: skip
         self.tree, self.graph = tree, tree.graph
-        origin = tree.graph.home
-        self.rotation: dict[str, Any] = {BASE: UNITS}
-        self.origin: dict[str, Any] = {BASE: np.zeros(3)}
+        self.rotation: dict[str, Any] = {start: UNITS}
+        self.origin: dict[str, Any] = {start: np.zeros(3)}
         self.lever: dict[str, Any] = {}
         self.axis: dict[int, Any] = {}
-        for link in tree.links.values():
+        self.place(tree.links if bodies is None else bodies, x, q)
+
+    def place(self, bodies: Iterable[str], x: Numbers, q: Numbers) -> None:
+        """Place further bodies, in the tree's order."""
+        origin = self.graph.home
+        for link in map(self.tree.links.__getitem__, bodies):
             turned = self.rotation[link.parent]
             lever = turned @ link.arm
             for step in link.steps:
@@ -271,7 +286,6 @@ class Motion:
         a, b, (start, end) = rod.inner, rod.outer, rod.ends
         xa, xb = self.point(a, start), self.point(b, end)
         apart = xb - xa
-        columns = difference(self.point_columns(b, xb), self.point_columns(a, xa))
         square = (end - start) @ (end - start)
 
         def bias() -> Any:
@@ -279,9 +293,15 @@ class Motion:
             change = self.acceleration(b, end) - self.acceleration(a, start)
             return apart @ change + speed @ speed
 
+        return replace(self.distance(rod.name, (a, xa), (b, xb), square), bias=bias)
+
+    def distance(self, part: str, a: Placed, b: Placed, square: Any) -> Row:
+        """The points have a distance, m2; without a bias."""
+        apart = b[1] - a[1]
+        columns = difference(self.point_columns(*b), self.point_columns(*a))
         return Row(
-            rod.name, 0.5 * (apart @ apart - square), {k: c @ apart for k, c in columns.items()},
-            bias, 1.0 / (self.tree.size * sqrt(square)), a, b, xb, apart, np.zeros(3),
+            part, 0.5 * (apart @ apart - square), {k: c @ apart for k, c in columns.items()},
+            _none, 1.0 / (self.tree.size * sqrt(square)), a[0], b[0], b[1], apart, np.zeros(3),
         )  # fmt: skip
 
     # Velocities and accelerations.

@@ -18,6 +18,7 @@ from pkm_twin.codegen.lu import Order, independent_rows, pivot_order
 from pkm_twin.errors import ParameterError
 from pkm_twin.kinematics import pose as poses
 from pkm_twin.kinematics.diagnosis import mobility_error, singular_home
+from pkm_twin.kinematics.limbs import Limb, LimbPose, find_limbs
 from pkm_twin.kinematics.linkage import Linkage, rank_of
 from pkm_twin.kinematics.motion import Motion, Row, matrices, numbers
 from pkm_twin.kinematics.pose import Coordinate
@@ -67,6 +68,7 @@ class Scheme(Linkage):
         return self._mark.also(repr((
             self.graph.topology, pattern_of(self.tree), self.coordinates,
             self.closed.start is not None, self.branch is not None, self.kept, self.pivots,
+            self.limbs, self.solved_pivots,
         )))  # fmt: skip
 
     @cached_property
@@ -85,6 +87,39 @@ class Scheme(Linkage):
     def pivots(self) -> Order:
         """Of the kept closures by the unknowns, good in states near home."""
         return pivot_order(self._sampled[0][:, self.kept])
+
+    @cached_property
+    def limbs(self) -> tuple[Limb, ...]:
+        """Limbs whose turns follow in closed form."""
+        return find_limbs(self.tree, self.kept)
+
+    @cached_property
+    def solved(self) -> tuple[list[int], list[int]]:
+        """What Newton's method has: indices of the unknowns, and of their rates."""
+        roots = {limb.root for limb in self.limbs}
+        places, rates = list(range(len(self.tree.home))), list(range(self.tree.unknown_rates))
+        for step in (step for root in roots for step in self.tree.links[root].steps):
+            places = [k for k in places if k not in (step.position, step.position + 1)]
+            rates.remove(step.rate)
+        return places, rates
+
+    def solved_rows(self, rows: Sequence[Row], poses: Sequence[LimbPose]) -> list[Row]:
+        """Of the kept closures those of no limb; and what the limbs' turns cannot meet."""
+        limbs = {k for limb in self.limbs for k in limb.rows}
+        return [rows[k] for k in self.kept if k not in limbs] + [pose.row() for pose in poses]
+
+    @cached_property
+    def solved_pivots(self) -> Order:
+        """As :attr:`pivots`, of the equations that Newton's method has."""
+        if not self.limbs:
+            return self.pivots
+        samples = []
+        for x, q in self.samples:
+            motion, rows = self.at(x, q)
+            poses = [LimbPose(motion, limb, q) for limb in self.limbs]
+            table, _ = self._scaled(self.solved_rows(rows, poses))
+            samples.append(table[:, self.solved[1]])
+        return pivot_order(np.array(samples))
 
     @cached_property
     def inverse_pivots(self) -> Order:

@@ -15,7 +15,8 @@ from pkm_twin.codegen.expressions import GEOMETRY, Expression, Numbers, Objects,
 from pkm_twin.codegen.lu import SparseLU
 from pkm_twin.codegen.operations import cos, sin
 from pkm_twin.codegen.program import UNKNOWNS, Equations
-from pkm_twin.kinematics.motion import Motion, cross, matrices
+from pkm_twin.kinematics.limbs import LimbPose
+from pkm_twin.kinematics.motion import Motion, Row, cross, matrices
 from pkm_twin.kinematics.scheme import Scheme
 from pkm_twin.machine.geometry import graph_on
 from pkm_twin.machine.tree import Tree
@@ -44,10 +45,29 @@ class Traced:
 
     def solve(self) -> None:
         """Take unknowns and closures."""
-        self.motion = Motion(self.tree, self.x, self.q)
+        scheme, tree = self.scheme, self.tree
+        places, _ = scheme.solved
+        self.unknowns = self.tape.inputs(UNKNOWNS, len(places))
+        x: list[Any] = [0.0] * len(tree.home)
+        for k, value in zip(places, self.unknowns, strict=True):
+            x[k] = value
+        inner = [body for limb in scheme.limbs for body in limb.bodies]
+        motion = Motion(tree, x, self.q, [body for body in tree.links if body not in inner])
+        self.limbs = [LimbPose(motion, limb, self.q) for limb in scheme.limbs]
+        for limb in self.limbs:
+            for k, value in limb.unknowns().items():
+                x[k] = value
+        motion.place(inner, x, self.q)
+        self.x, self.motion = np.array(x, dtype=object), motion
         self.rows = self.motion.closures()
-        self.ju, self.jq = matrices(self.tree, self.rows)
-        self.lu = SparseLU(self.ju[self.scheme.kept], self.scheme.pivots)
+        self.ju, self.jq = matrices(tree, self.rows)
+        self.lu = SparseLU(self.ju[scheme.kept], scheme.pivots)
+        self.solved = scheme.solved_rows(self.rows, self.limbs)
+        self.newton = SparseLU(self._table(self.solved), scheme.solved_pivots)
+
+    def _table(self, solved: Sequence[Row]) -> Objects:
+        """Derivatives of Newton's equations by the rates of its unknowns."""
+        return matrices(self.tree, solved)[0][:, self.scheme.solved[1]]
 
     @property
     def drive_scales(self) -> list[Any]:
@@ -64,18 +84,33 @@ class Traced:
     def equations(self) -> Equations:
         """Newton's method for the unknowns at q, from home or the mechanism's closed form."""
         scheme, tree = self.scheme, self.tree
-        step = -self.lu.solve([self.rows[k].value for k in scheme.kept])
+        places, rates = scheme.solved
+        step = -self.newton.solve([row.value for row in self.solved])
+        rows: list[Any] = [0.0] * tree.unknown_rates
+        for k, value in zip(rates, step, strict=True):
+            rows[k] = value
         closed = scheme.closed.start
         start = self._along() if closed is None else self._ordered(closed(self.closed, self.q))
+        moved = self.motion.retracted(self.x, rows)
         return Equations(
-            "q", self.lift(tree.home), self.lift(self.graph.home), self.lift(start),
-            self.lift(self.motion.retracted(self.x, step)),
-            self.square(step, tree.scales),
-            self.tape.lift(self._at_home[2].inverse_determinant / self.lu.inverse_determinant),
+            "q", self.lift([tree.home[k] for k in places]), self.lift(self.graph.home),
+            self.lift([start[k] for k in places]), self.lift([moved[k] for k in places]),
+            self.square(step, [tree.scales[k] for k in rates]), self.tape.lift(self._determinant()),
             self.square([r.value for r in self.rows], [r.scale for r in self.rows]),
             closed is None,
             () if scheme.branch is None else self.lift(scheme.branch(self.motion)),
         )  # fmt: skip
+
+    def _determinant(self) -> Any:
+        """Of all closures, over that at home: of Newton's equations and of the limbs' turns."""
+        scheme, motion = self.scheme, self.home
+        limbs = [LimbPose(motion, limb, self.graph.home) for limb in scheme.limbs]
+        table = self._table(scheme.solved_rows(motion.closures(), limbs))
+        lu = SparseLU(snapped_all(table), scheme.solved_pivots)
+        result = lu.inverse_determinant / self.newton.inverse_determinant
+        for here, there in zip(self.limbs, limbs, strict=True):
+            result = result * (here.steepness / there.steepness)
+        return result
 
     @cached_property
     def home(self) -> Motion:
@@ -131,10 +166,15 @@ class Traced:
         The unknowns x follow from f(x, q, g) = 0: with J' m = ds/du, J = df/du, the derivative is
         ds - m df (adjoint of the implicit function theorem).
         """
-        found = adjoints(sums, [*by, *self.x])
-        direct, by_x = found[: len(by)], found[len(by) :]
-        multipliers = self.lu.solve_transposed(self._by_rates(by_x))
-        values = [self.rows[k].value for k in self.scheme.kept]
+        found = adjoints(sums, [*by, *self.unknowns])
+        direct = found[: len(by)]
+        by_x: list[Any] = [0.0] * len(self.x)
+        places, rates = self.scheme.solved
+        for k, value in zip(places, found[len(by) :], strict=True):
+            by_x[k] = value
+        by_rates = self._by_rates(by_x)
+        multipliers = self.newton.solve_transposed([by_rates[k] for k in rates])
+        values = [row.value for row in self.solved]
         through = adjoints(list(zip(values, multipliers, strict=True)), by)
         return [a - b for a, b in zip(direct, through, strict=True)]
 
