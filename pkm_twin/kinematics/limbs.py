@@ -15,7 +15,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from pkm_twin.codegen.expressions import Numbers, absolute, sqrt
+from pkm_twin.codegen.expressions import Numbers
+from pkm_twin.codegen.operations import absolute, sqrt
 from pkm_twin.kinematics.motion import Motion, Row
 from pkm_twin.machine.graph import BASE
 from pkm_twin.machine.tree import Link, Tree

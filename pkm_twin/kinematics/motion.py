@@ -24,7 +24,7 @@ from pkm_twin.machine.tree import Link, Step, Tree
 
 Columns = dict[tuple[str, int], Any]
 """By rate ("u" or "q", index): a vector, or a number."""
-Placed = tuple[str, Any]
+BodyPoint = tuple[str, Any]
 """A body, and where a point of it is."""
 
 
@@ -295,7 +295,7 @@ class Motion:
 
         return replace(self.distance(rod.name, (a, xa), (b, xb), square), bias=bias)
 
-    def distance(self, part: str, a: Placed, b: Placed, square: Any) -> Row:
+    def distance(self, part: str, a: BodyPoint, b: BodyPoint, square: Any) -> Row:
         """The points have a distance, m2; without a bias."""
         apart = b[1] - a[1]
         columns = difference(self.point_columns(*b), self.point_columns(*a))

@@ -1,0 +1,100 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Limbs in closed form: of random hexapods, all closures hold and nothing else is accepted."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import numpy as np
+import pytest
+
+from pkm_twin.kinematics.iterations import newton
+from pkm_twin.kinematics.limbs import LimbPose
+from pkm_twin.kinematics.motion import Motion, matrices, numbers
+from pkm_twin.robot.catalogue import robot_of_data
+
+
+def unit(vector):
+    return vector / np.linalg.norm(vector)
+
+
+def hexapod(seed):
+    """Feet, centres and axes anywhere near a hexapod's; every second one has legs off the feet."""
+    rng = np.random.default_rng(seed)
+    turns = np.radians(60.0) * np.arange(6) + rng.uniform(-0.2, 0.2, (2, 6))
+    turns += np.array([[0.3, -0.3], [-0.24, 0.24]]).repeat(3, 0).reshape(2, 6)
+    height = rng.uniform(0.4, 0.9)
+    body = {"mass": 1.0, "com": [0.0, 0.0, height], "inertia": [0.01, 0.01, 0.02]}
+    bodies, joints = {"platform": body}, {}
+    for k, (foot, top) in enumerate(turns.T):
+        start = 0.5 * np.array([np.cos(foot), np.sin(foot), 0.0]) + rng.uniform(-0.03, 0.03, 3)
+        end = 0.25 * np.array([np.cos(top), np.sin(top), 0.0]) + rng.uniform(-0.03, 0.03, 3)
+        end[2] += height
+        along = unit(end - start)
+        first = unit(np.cross(along, rng.normal(size=3)))
+        second = unit(np.cross(along, first) + 0.2 * rng.normal(size=3))
+        second = unit(second - (second @ first) * first)
+        off = 0.03 * rng.normal(size=3) * (seed % 2)
+        for name, part in (("lower", 0.3), ("upper", 0.7)):
+            com = (start + part * (end - start)).tolist()
+            bodies[f"{name}_{k}"] = {"mass": 0.2, "com": com, "inertia": [1e-3] * 3}
+        joints |= {
+            f"foot_{k}": {"type": "universal", "between": ["base", f"lower_{k}"],
+                          "at": start.tolist(), "axes": [first.tolist(), second.tolist()]},
+            f"leg_{k}": {"type": "prismatic", "between": [f"lower_{k}", f"upper_{k}"],
+                         "at": (start + off).tolist(), "axis": unit(along + off).tolist(),
+                         "actuated": True},
+            f"ball_{k}": {"type": "spherical", "between": [f"upper_{k}", "platform"],
+                          "at": end.tolist()},
+        }  # fmt: skip
+    return robot_of_data({
+        "mechanism": "machine", "platform": "platform", "origin": [0.0, 0.0, height],
+        "pose": ["x", "y", "z", "roll", "pitch", "yaw"], "bodies": bodies, "joints": joints,
+    }, "hexapod")  # fmt: skip
+
+
+def followed(engine, q, steps=128):
+    """The unknowns at q by small steps of all closures; None where they end."""
+    x, home = np.array(engine.tree.home, float), engine.graph.home
+    for k in range(1, steps + 1):
+        there = home + k / steps * (q - home)
+        x = newton(x, partial(engine._look, there), partial(engine._moved, there))
+        if x is None:
+            return None
+    return x
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_the_platform_and_the_turns_are_those_of_all_closures(seed):
+    robot = hexapod(seed)
+    engine = robot.engine
+    assert len(engine.limbs) == 5
+    rng = np.random.default_rng(seed)
+    q = engine.graph.home + rng.uniform(-0.15, 0.15, (400, 6)) * engine.tree.size
+    pose, known = robot.try_forward(q)
+    assert 20 < known.sum() < 400
+    for k in np.flatnonzero(known)[:20]:
+        x = followed(engine, q[k])
+        position, _ = Motion(engine.tree, x, q[k]).platform()
+        np.testing.assert_allclose(pose[k, :3], numbers(position), atol=1e-10)
+        motion = Motion(engine.tree, x, q[k])
+        for limb in engine.limbs:
+            for place, value in LimbPose(motion, limb, q[k]).unknowns().items():
+                assert value == pytest.approx(x[place], abs=1e-10)
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_the_determinant_is_that_of_all_closures(seed):
+    engine = hexapod(seed).engine
+    ratios = []
+    for x, q in engine.samples:
+        motion, rows = engine.at(x, q)
+        limbs = [LimbPose(motion, limb, q) for limb in engine.limbs]
+        solved = numbers(matrices(engine.tree, engine.solved_rows(rows, limbs))[0])
+        whole = numbers(matrices(engine.tree, rows)[0])[engine.kept]
+        turns = np.prod([float(limb.steepness) for limb in limbs])
+        part = np.linalg.det(solved[:, engine.solved[1]]) * turns
+        ratios.append(np.linalg.det(whole) / part)
+    assert len(ratios) > 3
+    np.testing.assert_allclose(ratios, ratios[0], rtol=1e-9)
+    assert abs(ratios[0]) == pytest.approx(1.0, rel=1e-9)
