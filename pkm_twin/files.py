@@ -16,6 +16,8 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import BinaryIO, Final
 
+from pkm_twin.errors import FileError, ParameterError
+
 STANDARD: Final = "-"
 """Name of standard input and output."""
 _KINDS: Final = (
@@ -44,6 +46,22 @@ def open_regular(path: Path) -> BinaryIO:
     except BaseException:
         os.close(descriptor)
         raise
+
+
+def read_bounded(path: Path, most: int, what: str) -> bytes:
+    """The content of a regular file.
+
+    :param most: bytes. ``what``: such a file in words, for the error.
+    :raises ParameterError: not readable, or larger.
+    """
+    try:
+        with open_regular(path) as file:
+            content = file.read(most + 1)
+    except (OSError, ValueError) as error:
+        raise FileError(path, error, what) from None
+    if len(content) > most:
+        raise ParameterError(str(path), f"{path.stat().st_size} bytes", f"at most {most} bytes")
+    return content
 
 
 def _require_regular(mode: int, path: Path) -> None:

@@ -3,15 +3,14 @@
 
 from __future__ import annotations
 
-import errno
 import re
-import stat
 from pathlib import Path
 from typing import Any, Final
 
 import yaml
 
 from pkm_twin.errors import FileError, ParameterError
+from pkm_twin.files import read_bounded
 
 MAX_FILE_SIZE: Final = 256 * 1024
 """Largest parameter file that is read, bytes; the shipped ones are below 4 kB."""
@@ -74,18 +73,8 @@ def read_yaml(path: Path) -> dict[str, Any]:
     :raises ParameterError: not readable, too large, not plain YAML, or not a mapping.
     """
     try:
-        if not stat.S_ISREG(path.stat().st_mode):
-            raise OSError(errno.EISDIR, "a folder or device, not a file")
-        with path.open("rb") as file:
-            content = file.read(MAX_FILE_SIZE + 1)
-        if len(content) > MAX_FILE_SIZE:
-            raise ParameterError(
-                str(path), f"{path.stat().st_size} bytes", f"at most {MAX_FILE_SIZE} bytes"
-            )
-        text = content.decode("utf-8")
-    except ParameterError:
-        raise
-    except (OSError, ValueError) as error:
+        text = read_bounded(path, MAX_FILE_SIZE, "plain YAML").decode("utf-8")
+    except UnicodeDecodeError as error:
         raise FileError(path, error, "plain YAML") from None
     return parse_yaml(text, str(path))
 

@@ -3,10 +3,8 @@
 
 from __future__ import annotations
 
-import errno
 import math
 import re
-import stat
 import xml.etree.ElementTree as ET
 from collections.abc import Collection, Container, Iterable, Mapping
 from pathlib import Path
@@ -16,8 +14,8 @@ from xml.parsers import expat
 import numpy as np
 
 from pkm_twin.codegen.arrays import Array
-from pkm_twin.errors import FileError, ParameterError, UnknownNameError
-from pkm_twin.files import decimal
+from pkm_twin.errors import ParameterError, UnknownNameError
+from pkm_twin.files import decimal, read_bounded
 from pkm_twin.machine import schema
 from pkm_twin.machine.rotations import Pose, from_quaternion, from_rpy
 
@@ -40,17 +38,7 @@ def elements(path: Path) -> ET.Element:
 
     :raises ParameterError: not readable, too large, too deep, or not well-formed.
     """
-    try:
-        if not stat.S_ISREG(path.stat().st_mode):
-            raise OSError(errno.EISDIR, "a folder or device, not a file")
-        with path.open("rb") as file:
-            content = file.read(MAX_FILE_SIZE + 1)
-    except OSError as error:
-        raise FileError(path, error, "a URDF file") from None
-    if len(content) > MAX_FILE_SIZE:
-        raise ParameterError(
-            str(path), f"{path.stat().st_size} bytes", f"at most {MAX_FILE_SIZE} bytes"
-        )
+    content = read_bounded(path, MAX_FILE_SIZE, "a URDF file")
     builder = ET.TreeBuilder()
     depth = 0
 

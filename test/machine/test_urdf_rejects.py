@@ -222,7 +222,7 @@ def test_an_open_loop_is_refused_with_its_miss(tmp_path):
 
 
 def test_files_that_are_no_files_or_too_much_are_refused(tmp_path):
-    with pytest.raises(ParameterError, match="not a file"):
+    with pytest.raises(ParameterError, match="a folder"):
         read_urdf(tmp_path)
     with pytest.raises(ParameterError, match="no such file"):
         read_urdf(tmp_path / "none.urdf")
