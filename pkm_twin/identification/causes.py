@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -194,7 +194,7 @@ def _of_fit(r: Recording, leave_out: Mask) -> tuple[Recording | None, tuple[str,
     from pkm_twin.identification.fit import fit
     from pkm_twin.identification.suspects import ELASTIC
 
-    recorded: Any = recorded_of(r, leave_out)
+    recorded = recorded_of(r, leave_out)
     try:
         result = fit(r.robot, [recorded], ("friction",), accept=True)
         fitted = with_entries(r.robot, {one.name: one.after for one in result.numbers})

@@ -17,7 +17,6 @@ from delta_dynamics import inverse_dynamics, torque_deviation
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import SingularityError, UnreachableError, one_line
 from pkm_twin.identification.compare import MAX_RESIDUAL, Compared, by_held, compare
-from pkm_twin.identification.rows import Recorded
 from pkm_twin.recordings import Recording, at_rest
 from pkm_twin.report import Fact, Verdict, judged
 from pkm_twin.robot.limits import ranges
@@ -300,29 +299,19 @@ def _singularity(r: Recording) -> Fact:
     return judged(what, value, bound, bool(measure[worst] >= MIN_SINGULARITY))
 
 
-def recorded_of(r: Recording, leave_out: Mask | None = None) -> Recorded:
-    """A recording with efforts as `fit` reads it, without samples around a pick or release.
+def recorded_of(r: Recording, leave_out: Mask | None = None) -> Recording:
+    """A recording without samples around a pick or release.
 
     :param leave_out: more samples that are left out, (samples,): a gap divides the recording.
     """
     keep = np.ones(len(r.time), np.bool_) if leave_out is None else ~leave_out
-    if r.load is not None:
-        keep &= ~r.load.near_change(r.time, NEAR)
-    part = r.part(keep)
-    assert part.effort is not None  # noqa: S101
-    return Recorded(r.name, part.time, part.q, part.effort, part.wrench, part.held, r.carried)
+    return r.part(keep if r.load is None else keep & ~r.load.near_change(r.time, NEAR))
 
 
 def compared_of(r: Recording, idle: Mask, bound: float = MAX_RESIDUAL) -> Compared | None:
     """The efforts in the band of the motion, without samples whose drives are idle."""
-    recorded = recorded_of(r, idle)
-    if len(recorded.time) < 3:
-        return None
-    known = None
-    if r.qd is not None and r.qdd is not None:
-        keep = np.isin(r.time, recorded.time)
-        known = r.qd[keep], r.qdd[keep]
-    return compare(r.robot, recorded, known, bound)
+    part = recorded_of(r, idle)
+    return None if len(part.time) < 3 else compare(r.robot, part, bound)
 
 
 def idle_of(r: Recording) -> Mask:

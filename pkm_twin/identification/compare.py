@@ -18,8 +18,9 @@ from pkm_twin.codegen.arrays import Array, Mask
 from pkm_twin.identification.judge import LOUD
 from pkm_twin.identification.noise import SEGMENT, huber, noise_of, passed_band, usual_size
 from pkm_twin.identification.plausible import LATEST
-from pkm_twin.identification.rows import BLOCK, Recorded, shaken_efforts
+from pkm_twin.identification.rows import BLOCK, shaken_efforts
 from pkm_twin.identification.samples import Filtering, Track, by_blocks, low_pass, tracks
+from pkm_twin.recordings import Recording
 from pkm_twin.robot.robot import Robot
 
 MAX_RESIDUAL: Final = 0.05
@@ -145,21 +146,17 @@ def by_held(
     return made
 
 
-def compare(
-    robot: Robot,
-    recorded: Recorded,
-    rates: tuple[Array, Array] | None = None,
-    bound: float = MAX_RESIDUAL,
-) -> Compared | None:
+def compare(robot: Robot, r: Recording, bound: float = MAX_RESIDUAL) -> Compared | None:
     """Compare a recording with the model; None where no piece of it is long enough.
 
-    :param recorded: ``carried`` and ``held`` tell of a payload.
-    :param rates: velocities and accelerations (k, n) that are known, to be used as they are.
+    Velocities and accelerations of a recording that has both are used as they are.
+
     :param bound: of a good residual, RMS, as a part of the peak effort.
     """
-    r, reach = recorded, friction_reach(robot)
+    reach = friction_reach(robot)
+    rates = None if r.qd is None or r.qdd is None else (r.qd, r.qdd)
     held = None if r.carried is None else r.held
-    pieces, how = tracks(r.time, r.q, r.effort, r.wrench, held, rates=rates, least=LEAST)
+    pieces, how = tracks(r.time, r.q, r.measured, r.wrench, held, rates=rates, least=LEAST)
     if not pieces:
         return None
 

@@ -25,9 +25,10 @@ from numpy.typing import ArrayLike, NDArray
 from delta_dynamics import inverse_dynamics
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError, PkmTwinError
-from pkm_twin.identification.rows import Recorded, next_window
+from pkm_twin.identification.rows import next_window
 from pkm_twin.identification.samples import low_pass, tracks
 from pkm_twin.machine.friction import all_keys
+from pkm_twin.recordings import Recording
 from pkm_twin.robot.robot import Robot
 
 FIT: Final = "fit"
@@ -46,9 +47,9 @@ class TorqueConstants:
     values: Array
     deviations: Array
 
-    def applied(self, recorded: Recorded) -> Recorded:
+    def applied(self, recorded: Recording) -> Recording:
         """A recording whose efforts are currents, A, with efforts."""
-        return replace(recorded, effort=recorded.effort * self.values)
+        return replace(recorded, effort=recorded.measured * self.values)
 
     def lines(self, robot: Robot) -> list[str]:
         """In words, of those that were fitted."""
@@ -76,7 +77,7 @@ def given_constants(robot: Robot, words: str) -> TorqueConstants:
     return TorqueConstants(np.broadcast_to(values, (n,)).copy(), np.zeros(n))
 
 
-def fitted_constants(robot: Robot, recordings: Sequence[Recorded]) -> TorqueConstants:
+def fitted_constants(robot: Robot, recordings: Sequence[Recording]) -> TorqueConstants:
     """By the file's masses: from recordings whose efforts are currents, A.
 
     Viscous, Coulomb and load-dependent friction and an offset of the current are free beside.
@@ -90,7 +91,7 @@ def fitted_constants(robot: Robot, recordings: Sequence[Recorded]) -> TorqueCons
 
 
 def _constants(
-    robot: Robot, recordings: Sequence[Recorded], windows: Sequence[int] | None
+    robot: Robot, recordings: Sequence[Recording], windows: Sequence[int] | None
 ) -> tuple[Array, Array, list[int]]:
     """Constants, standard deviations, and the windows of the differentiation."""
     tables: list[list[Array]] = [[] for _ in robot.joint_names]
@@ -98,7 +99,7 @@ def _constants(
     used = []
     for i, r in enumerate(recordings):
         window = None if windows is None else windows[i]
-        pieces, how = tracks(r.time, r.q, r.effort, r.wrench, window=window)
+        pieces, how = tracks(r.time, r.q, r.measured, r.wrench, window=window)
         used.append(how.window)
         model = robot if r.carried is None else r.carried
         model = model.changed(friction=dict.fromkeys(all_keys(), 0.0))

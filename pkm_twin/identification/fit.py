@@ -25,8 +25,9 @@ from pkm_twin.identification.parameters import (
     numbers_of_group,
 )
 from pkm_twin.identification.problem import Problem
-from pkm_twin.identification.rows import Recorded, next_window
+from pkm_twin.identification.rows import next_window
 from pkm_twin.identification.samples import Filtering
+from pkm_twin.recordings import Recording
 from pkm_twin.robot.robot import Robot
 
 
@@ -110,7 +111,7 @@ class Fit(Result):
 
 def fit(
     robot: Robot,
-    recordings: Sequence[Recorded],
+    recordings: Sequence[Recording],
     what: Sequence[Kind] = KINDS,
     *,
     accept: bool = False,

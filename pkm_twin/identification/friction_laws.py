@@ -23,10 +23,11 @@ from pkm_twin.identification.judge import SIGMAS
 from pkm_twin.identification.noise import EXACT
 from pkm_twin.identification.parameters import Number
 from pkm_twin.identification.problem import Problem
-from pkm_twin.identification.rows import Recorded, Rows
+from pkm_twin.identification.rows import Rows
 from pkm_twin.identification.samples import Track, low_pass
 from pkm_twin.identification.suspects import RESONANCE
 from pkm_twin.machine.friction import BASIC, LAWS, taken
+from pkm_twin.recordings import Recording
 from pkm_twin.robot.robot import Robot
 
 AUTO: Final = "auto"
@@ -96,7 +97,7 @@ def laws_of(words: str) -> tuple[str, ...] | None:
 
 def fit_with_laws(
     robot: Robot,
-    recordings: Sequence[Recorded],
+    recordings: Sequence[Recording],
     what: Sequence[Kind] = KINDS,
     laws: Sequence[str] | None = None,
     **options: Any,

@@ -107,7 +107,9 @@ def _efforts(r: Recording) -> list[Measured]:
     loaded, known = r.robot, 0.0
     if r.load is not None:
         loaded, known = r.load.on(r.robot), r.load.mass
-    recorded = replace(recorded_of(r, idle), carried=None)
+    recorded = recorded_of(r, idle)
+    if r.load is not None:
+        recorded = replace(recorded, load=replace(r.load, sought=True))
     try:
         result = fit(loaded, [recorded], ("friction", "payload"), accept=True)
     except (PkmTwinError, ValueError, np.linalg.LinAlgError):

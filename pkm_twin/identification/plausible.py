@@ -356,19 +356,19 @@ def _repaired(rows: Rows, some: slice) -> Iterator[tuple[str, Case | None]]:
         q = middle + turned * (r.q - middle)
         text = f"of {name} have the wrong sign (joint_map?)"
         yield f"positions {text}", _again(rows, some, q=q)
-        yield f"positions and efforts {text}", _again(rows, some, q=q, effort=turned * r.effort)
+        yield f"positions and efforts {text}", _again(rows, some, q=q, effort=turned * r.measured)
     for i, k in combinations(range(len(names)), 2):
         order = _swap(len(names), i, k)
         text = f"{names[i]} and {names[k]} are exchanged"
         yield f"positions of {text}", _again(rows, some, q=r.q[:, order])
-        yield text, _again(rows, some, q=r.q[:, order], effort=r.effort[:, order])
+        yield text, _again(rows, some, q=r.q[:, order], effort=r.measured[:, order])
 
 
-def _again(rows: Rows, some: slice, **changes: Array) -> Case | None:
+def _again(rows: Rows, some: slice, **changes: Any) -> Case | None:
     """Some samples of a recording with changes; None where the machine cannot move so."""
     model = rows.model
     try:
-        made = rows_of(model.robot, model.parameters, rows.recording.part(some, **changes))
+        made = rows_of(model.robot, model.parameters, replace(rows.recording, **changes).part(some))
     except (PkmTwinError, ValueError, np.linalg.LinAlgError):
         return None
     needs = made.rest + made.table @ model.parameters.values

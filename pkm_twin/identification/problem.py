@@ -21,8 +21,9 @@ from pkm_twin.identification.identifiable import Kind
 from pkm_twin.identification.noise import EXACT
 from pkm_twin.identification.parameters import FileParameters, file_parameters
 from pkm_twin.identification.plausible import recording_fault
-from pkm_twin.identification.rows import LATE, Recorded, Rows, prior_scales, rows_of
+from pkm_twin.identification.rows import LATE, Rows, prior_scales, rows_of
 from pkm_twin.machine.friction import LAWS, FrictionLaw
+from pkm_twin.recordings import Recording
 from pkm_twin.robot.robot import Robot
 
 LOADED: Final = frozenset(name for name, law in LAWS.items() if law.share is not FrictionLaw.share)
@@ -50,7 +51,7 @@ class Problem:
 
     @classmethod
     def of(
-        cls, robot: Robot, recordings: Sequence[Recorded], what: Sequence[Kind],
+        cls, robot: Robot, recordings: Sequence[Recording], what: Sequence[Kind],
         passes: int = LOAD_PASSES, progress: Callable[[int], None] | None = None,
     ) -> Problem:  # fmt: skip
         """Filter recordings.

@@ -37,6 +37,7 @@ from pkm_twin.identification.samples import (
     tracks,
 )
 from pkm_twin.machine.friction import linear_keys
+from pkm_twin.recordings.recording import Recording
 from pkm_twin.robot.robot import Robot
 
 BLOCK: Final = 2048
@@ -66,29 +67,6 @@ CENTRAL: Final = (7, 6)
 sixth order."""
 ENDS: Final = (9, 4)
 """And of the one that is differentiated at the ends of a piece: there are no samples beyond."""
-
-
-@dataclass(frozen=True, eq=False)
-class Recorded:
-    """A recording: ``time`` (k,), s; q and efforts (k, n); wrench (k, 6) or None.
-
-    ``held``: 1 where the payload that is looked for is on the platform, shape (k,). ``carried``:
-    a robot with the payload that is known, while it is held; None where there is none.
-    """
-
-    name: str
-    time: Array
-    q: Array
-    effort: Array
-    wrench: Array | None = None
-    held: Array | None = None
-    carried: Robot | None = None
-
-    def part(self, rows: slice, **changes: Array) -> Recorded:
-        """Some of the samples, with other values of the whole recording."""
-        names = ("time", "q", "effort", "wrench", "held")
-        whole = {name: changes.get(name, getattr(self, name)) for name in names}
-        return replace(self, **{k: v[rows] for k, v in whole.items() if v is not None})
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,7 +154,7 @@ class Rows:
     ``how``. ``model``: of all parameters.
     """
 
-    recording: Recorded
+    recording: Recording
     model: Model
     how: Filtering
     tracks: tuple[Track, ...]
@@ -237,7 +215,7 @@ def next_window(window: int) -> int:
 
 
 def rows_of(
-    robot: Robot, parameters: FileParameters, recording: Recorded, window: int | None = None
+    robot: Robot, parameters: FileParameters, recording: Recording, window: int | None = None
 ) -> Rows:
     """A recording's filtered rows.
 
@@ -250,7 +228,7 @@ def rows_of(
         raise PkmTwinError(
             f"{r.name}: too short to fit, {len(r.time)} samples; {LEAST} or more in a row"
         )
-    pieces, how = tracks(r.time, r.q, r.effort, r.wrench, r.held, window)
+    pieces, how = tracks(r.time, r.q, r.measured, r.wrench, r.held, window)
     if not pieces:
         raise PkmTwinError(f"{r.name}: too short to fit, no {LEAST // 2} samples without a gap")
     model = Model(robot, parameters, r.carried)
@@ -278,7 +256,7 @@ def rows_of(
 
 
 def shaken_efforts(
-    r: Recorded, track: Track, how: Filtering, efforts: Callable[[Track], Array]
+    r: Recording, track: Track, how: Filtering, efforts: Callable[[Track], Array]
 ) -> Array:
     """What noise of the positions, as large as theirs, changes in the efforts, (samples, n).
 
@@ -335,8 +313,8 @@ class _Piece:
         return time[:, 0], table.reshape(len(table), n, -1), target, rest, counts, change
 
 
-def _check_efforts(robot: Robot, r: Recorded) -> None:
-    for joint, effort in zip(robot.joint_names, r.effort.T, strict=True):
+def _check_efforts(robot: Robot, r: Recording) -> None:
+    for joint, effort in zip(robot.joint_names, r.measured.T, strict=True):
         worst = float(effort[np.argmax(~(np.abs(effort) < LARGEST))])
         if not abs(worst) < LARGEST:
             raise PkmTwinError(

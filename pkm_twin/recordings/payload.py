@@ -34,6 +34,8 @@ class Load:
     com: tuple[float, float, float] | None = None
     times: tuple[tuple[float, float], ...] = ()
     source: str = "option"
+    sought: bool = False
+    """Whether it is fitted, and is the robot's own."""
 
     def held(self, time: Array) -> Mask:
         """When it is on the platform, shape (n,)."""

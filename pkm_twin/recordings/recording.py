@@ -148,8 +148,18 @@ class Recording:
 
     @property
     def carried(self) -> Robot | None:
-        """The robot with the payload."""
-        return None if self.load is None else self.load.on(self.robot)
+        """The robot with the payload that is known."""
+        return None if self.load is None or self.load.sought else self.load.on(self.robot)
+
+    @property
+    def measured(self) -> Array:
+        """The efforts, shape (samples, n).
+
+        :raises PkmTwinError: there are none.
+        """
+        if self.effort is None:
+            raise PkmTwinError(f"{self.source}: no efforts")
+        return self.effort
 
     @property
     def motion(self) -> tuple[Array, Array, Array, Array]:

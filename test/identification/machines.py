@@ -12,8 +12,8 @@ from delta_dynamics import inverse_dynamics
 from pkm_twin import Robot
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import PkmTwinError
-from pkm_twin.identification.rows import Recorded
 from pkm_twin.identification.suspects import Lengths
+from pkm_twin.recordings import Recording
 from pkm_twin.robot.entries import entries, with_entries
 from test.laws.recordings import smooth_motion
 
@@ -35,10 +35,10 @@ class Drawn:
         """Rms of the efforts by joint, shape (n,)."""
         return np.sqrt(np.mean(self.efforts**2, 0))
 
-    def recorded(self, q: Array | None = None, effort: Array | None = None) -> Recorded:
-        return Recorded(
-            "recording", self.time, self.q if q is None else q,
-            self.efforts if effort is None else effort,
+    def recorded(self, q: Array | None = None, effort: Array | None = None) -> Recording:
+        return Recording(
+            self.robot, self.time, self.q if q is None else q,
+            effort=self.efforts if effort is None else effort,
         )  # fmt: skip
 
 
@@ -86,8 +86,8 @@ def of_prior(robot: Robot, rng: np.random.Generator) -> Drawn:
 
 
 def noisy(
-    recorded: Recorded, rng: np.random.Generator, share: float = 0.01, steps: float = 1e5
-) -> Recorded:
+    recorded: Recording, rng: np.random.Generator, share: float = 0.01, steps: float = 1e5
+) -> Recording:
     """White noise of the efforts by their rms, an encoder of so many steps a span."""
     shape = recorded.q.shape
     size = np.sqrt(np.mean(recorded.effort**2, 0))
@@ -104,14 +104,14 @@ def shifted(values: Array, time: Array, by: float) -> Array:
 # What is wrong with the model ------------------------------------------------------------------
 
 
-def gain(m: Drawn, rng: np.random.Generator) -> Recorded:
+def gain(m: Drawn, rng: np.random.Generator) -> Recording:
     """One joint's efforts 5 % high."""
     factor = np.ones(len(m.size))
     factor[rng.integers(len(factor))] = 1.05
     return m.recorded(effort=m.efforts * factor)
 
 
-def gains(m: Drawn, rng: np.random.Generator) -> Recorded:
+def gains(m: Drawn, rng: np.random.Generator) -> Recording:
     """All efforts 5 % high."""
     return m.recorded(effort=1.05 * m.efforts)
 
@@ -121,19 +121,19 @@ def unit_of(robot: Robot) -> Array:
     return np.array([robot.size if unit == "m" else 1.0 for unit in robot.joint_units])
 
 
-def sensor(m: Drawn, rng: np.random.Generator) -> Recorded:
+def sensor(m: Drawn, rng: np.random.Generator) -> Recording:
     """One joint's sensor off by 0.01 rad."""
     off = np.zeros(len(m.size))
     off[rng.integers(len(off))] = 0.01
     return m.recorded(q=m.q + off * unit_of(m.robot))
 
 
-def sensors(m: Drawn, rng: np.random.Generator) -> Recorded:
+def sensors(m: Drawn, rng: np.random.Generator) -> Recording:
     """Every joint's sensor off by 0.01 rad."""
     return m.recorded(q=m.q + 0.01 * rng.choice([-1.0, 1.0], len(m.size)) * unit_of(m.robot))
 
 
-def late(m: Drawn, rng: np.random.Generator) -> Recorded:
+def late(m: Drawn, rng: np.random.Generator) -> Recording:
     """One joint's efforts 2 ms late."""
     j = rng.integers(len(m.size))
     effort = m.efforts.copy()
@@ -141,25 +141,25 @@ def late(m: Drawn, rng: np.random.Generator) -> Recorded:
     return m.recorded(effort=effort)
 
 
-def load_friction(m: Drawn, rng: np.random.Generator) -> Recorded:
+def load_friction(m: Drawn, rng: np.random.Generator) -> Recording:
     """Friction of 5 % of the load."""
     return m.recorded(effort=m.efforts + 0.05 * np.abs(m.efforts) * np.sign(m.qd))
 
 
-def stribeck(m: Drawn, rng: np.random.Generator) -> Recorded:
+def stribeck(m: Drawn, rng: np.random.Generator) -> Recording:
     """Static friction of twice the Coulomb friction, below a tenth of the rms speed."""
     slow = 0.1 * np.sqrt(np.mean(m.qd**2, 0))
     peak = m.truth.friction.coulomb * np.exp(-((m.qd / slow) ** 2)) * np.sign(m.qd)
     return m.recorded(effort=m.efforts + peak)
 
 
-def elastic(m: Drawn, rng: np.random.Generator) -> Recorded:
+def elastic(m: Drawn, rng: np.random.Generator) -> Recording:
     """Drives that give 5 mrad under their greatest effort, measured at the motor."""
     give = 5e-3 * unit_of(m.robot) / np.abs(m.efforts).max(0)
     return m.recorded(q=m.q + give * m.efforts)
 
 
-def lengths(m: Drawn, rng: np.random.Generator) -> Recorded:
+def lengths(m: Drawn, rng: np.random.Generator) -> Recording:
     """One length of the geometry off by 1 %, or a place by 1 % of the machine's size."""
     robot = m.truth
     found = {
@@ -182,7 +182,7 @@ def lengths(m: Drawn, rng: np.random.Generator) -> Recorded:
     raise AssertionError(f"no length of {robot.name} can change alone")
 
 
-WRONG: dict[str, Callable[[Drawn, np.random.Generator], Recorded]] = {
+WRONG: dict[str, Callable[[Drawn, np.random.Generator], Recording]] = {
     f.__name__: f
     for f in (gain, gains, sensor, sensors, late, load_friction, stribeck, elastic, lengths)
 }
@@ -192,32 +192,32 @@ WRONG: dict[str, Callable[[Drawn, np.random.Generator], Recorded]] = {
 # What no machine of this file makes ------------------------------------------------------------
 
 
-def _but(rec: Recorded, rng: np.random.Generator, effort: bool) -> tuple[Array, int]:
+def _but(rec: Recording, rng: np.random.Generator, effort: bool) -> tuple[Array, int]:
     values = (rec.effort if effort else rec.q).copy()
     return values, int(rng.integers(values.shape[1]))
 
 
-def efforts_negated(r: Recorded, rng: np.random.Generator) -> Recorded:
+def efforts_negated(r: Recording, rng: np.random.Generator) -> Recording:
     return replace(r, effort=-r.effort)
 
 
-def one_effort_negated(r: Recorded, rng: np.random.Generator) -> Recorded:
+def one_effort_negated(r: Recording, rng: np.random.Generator) -> Recording:
     effort, j = _but(r, rng, effort=True)
     effort[:, j] *= -1.0
     return replace(r, effort=effort)
 
 
-def positions_negated(r: Recorded, rng: np.random.Generator) -> Recorded:
+def positions_negated(r: Recording, rng: np.random.Generator) -> Recording:
     return replace(r, q=-r.q)
 
 
-def one_position_negated(r: Recorded, rng: np.random.Generator) -> Recorded:
+def one_position_negated(r: Recording, rng: np.random.Generator) -> Recording:
     q, j = _but(r, rng, effort=False)
     q[:, j] = 2.0 * q[:, j].mean() - q[:, j]
     return replace(r, q=q)
 
 
-def one_joint_negated(r: Recorded, rng: np.random.Generator) -> Recorded:
+def one_joint_negated(r: Recording, rng: np.random.Generator) -> Recording:
     """Positions about their middle, so that the machine can take them."""
     q, j = _but(r, rng, effort=False)
     q[:, j] = 2.0 * q[:, j].mean() - q[:, j]
@@ -226,15 +226,15 @@ def one_joint_negated(r: Recorded, rng: np.random.Generator) -> Recorded:
     return replace(r, q=q, effort=effort)
 
 
-def time_reversed(r: Recorded, rng: np.random.Generator) -> Recorded:
+def time_reversed(r: Recording, rng: np.random.Generator) -> Recording:
     return replace(r, q=r.q[::-1], effort=r.effort[::-1])
 
 
-def efforts_reversed(r: Recorded, rng: np.random.Generator) -> Recorded:
+def efforts_reversed(r: Recording, rng: np.random.Generator) -> Recording:
     return replace(r, effort=r.effort[::-1])
 
 
-def effort_columns_swapped(r: Recorded, rng: np.random.Generator) -> Recorded:
+def effort_columns_swapped(r: Recording, rng: np.random.Generator) -> Recording:
     n = r.q.shape[1]
     i, k = rng.permutation(n)[:2]
     order = np.arange(n)
@@ -242,11 +242,11 @@ def effort_columns_swapped(r: Recorded, rng: np.random.Generator) -> Recorded:
     return replace(r, effort=r.effort[:, order])
 
 
-def effort_columns_rolled(r: Recorded, rng: np.random.Generator) -> Recorded:
+def effort_columns_rolled(r: Recording, rng: np.random.Generator) -> Recording:
     return replace(r, effort=np.roll(r.effort, 1, 1))
 
 
-def position_columns_swapped(r: Recorded, rng: np.random.Generator) -> Recorded:
+def position_columns_swapped(r: Recording, rng: np.random.Generator) -> Recording:
     n = r.q.shape[1]
     i, k = rng.permutation(n)[:2]
     order = np.arange(n)
@@ -254,78 +254,78 @@ def position_columns_swapped(r: Recorded, rng: np.random.Generator) -> Recorded:
     return replace(r, q=r.q[:, order])
 
 
-def columns_taken_for_each_other(r: Recorded, rng: np.random.Generator) -> Recorded:
+def columns_taken_for_each_other(r: Recording, rng: np.random.Generator) -> Recording:
     """Positions as efforts and efforts as positions."""
     return replace(r, q=r.effort, effort=r.q)
 
 
-def milliseconds(r: Recorded, rng: np.random.Generator) -> Recorded:
+def milliseconds(r: Recording, rng: np.random.Generator) -> Recording:
     return replace(r, time=1e3 * r.time)
 
 
-def seconds_for_milliseconds(r: Recorded, rng: np.random.Generator) -> Recorded:
+def seconds_for_milliseconds(r: Recording, rng: np.random.Generator) -> Recording:
     return replace(r, time=1e-3 * r.time)
 
 
-def half_speed(r: Recorded, rng: np.random.Generator) -> Recorded:
+def half_speed(r: Recording, rng: np.random.Generator) -> Recording:
     return replace(r, time=2.0 * r.time)
 
 
-def kgf_cm(r: Recorded, rng: np.random.Generator) -> Recorded:
+def kgf_cm(r: Recording, rng: np.random.Generator) -> Recording:
     return replace(r, effort=r.effort * 100.0 / 9.80665)
 
 
-def newton_millimetres(r: Recorded, rng: np.random.Generator) -> Recorded:
+def newton_millimetres(r: Recording, rng: np.random.Generator) -> Recording:
     return replace(r, effort=1e3 * r.effort)
 
 
-def kilogram_force(r: Recorded, rng: np.random.Generator) -> Recorded:
+def kilogram_force(r: Recording, rng: np.random.Generator) -> Recording:
     return replace(r, effort=r.effort / 9.80665)
 
 
-def three_times(r: Recorded, rng: np.random.Generator) -> Recorded:
+def three_times(r: Recording, rng: np.random.Generator) -> Recording:
     return replace(r, effort=3.0 * r.effort)
 
 
-def a_third(r: Recorded, rng: np.random.Generator) -> Recorded:
+def a_third(r: Recording, rng: np.random.Generator) -> Recording:
     return replace(r, effort=r.effort / 3.0)
 
 
-def motor_side(r: Recorded, rng: np.random.Generator) -> Recorded:
+def motor_side(r: Recording, rng: np.random.Generator) -> Recording:
     """Of one joint the torque before its gear."""
     effort, j = _but(r, rng, effort=True)
     effort[:, j] /= 20.0
     return replace(r, effort=effort)
 
 
-def degrees(r: Recorded, rng: np.random.Generator) -> Recorded:
+def degrees(r: Recording, rng: np.random.Generator) -> Recording:
     return replace(r, q=np.degrees(r.q))
 
 
-def radians_for_degrees(r: Recorded, rng: np.random.Generator) -> Recorded:
+def radians_for_degrees(r: Recording, rng: np.random.Generator) -> Recording:
     return replace(r, q=np.radians(r.q))
 
 
-def millimetres(r: Recorded, rng: np.random.Generator) -> Recorded:
+def millimetres(r: Recording, rng: np.random.Generator) -> Recording:
     return replace(r, q=1e3 * r.q)
 
 
-def efforts_late(r: Recorded, rng: np.random.Generator) -> Recorded:
+def efforts_late(r: Recording, rng: np.random.Generator) -> Recording:
     by = 0.3 * rng.choice([-1.0, 1.0])
     return replace(r, effort=shifted(r.effort, r.time, by))
 
 
-def one_effort_late(r: Recorded, rng: np.random.Generator) -> Recorded:
+def one_effort_late(r: Recording, rng: np.random.Generator) -> Recording:
     effort, j = _but(r, rng, effort=True)
     effort[:, j] = shifted(r.effort, r.time, 0.3)[:, j]
     return replace(r, effort=effort)
 
 
-def efforts_shuffled(r: Recorded, rng: np.random.Generator) -> Recorded:
+def efforts_shuffled(r: Recording, rng: np.random.Generator) -> Recording:
     return replace(r, effort=rng.permutation(r.effort))
 
 
-def noise_for_efforts(r: Recorded, rng: np.random.Generator) -> Recorded:
+def noise_for_efforts(r: Recording, rng: np.random.Generator) -> Recording:
     return replace(r, effort=r.effort.mean(0) + r.effort.std(0) * rng.normal(size=r.effort.shape))
 
 
@@ -337,7 +337,7 @@ _ALL = (
     a_third, motor_side, degrees, radians_for_degrees, millimetres, efforts_late, one_effort_late,
     efforts_shuffled, noise_for_efforts,
 )  # fmt: skip
-IMPOSSIBLE: dict[str, Callable[[Recorded, np.random.Generator], Recorded]] = {
+IMPOSSIBLE: dict[str, Callable[[Recording, np.random.Generator], Recording]] = {
     f.__name__: f for f in _ALL
 }
 """Recordings that no machine of the file can have made."""

@@ -12,7 +12,7 @@ from pkm_twin import Robot
 from pkm_twin.errors import PkmTwinError
 from pkm_twin.identification.compare import compare
 from pkm_twin.identification.fit import Fit, fit
-from pkm_twin.identification.rows import Recorded
+from pkm_twin.recordings import Recording
 from pkm_twin.robot.entries import with_entries
 from test.identification.machines import IMPOSSIBLE, WRONG, machine, noisy, shifted
 from test.support.robots import load
@@ -28,7 +28,7 @@ def fitted(result: Fit) -> Robot:
     return with_entries(result.robot, {number.name: number.after for number in result.numbers})
 
 
-def agree(robot: Robot, recorded: Recorded) -> str:
+def agree(robot: Robot, recorded: Recording) -> str:
     """What a fit says; and `check` has to say the same, of the fitted machine or of the file's."""
     try:
         result = fit(robot, [recorded], ("friction", "rotor"))

@@ -19,7 +19,8 @@ from pkm_twin.identification.friction_laws import fit_with_laws
 from pkm_twin.identification.identifiable import above_zero
 from pkm_twin.identification.parameters import file_parameters
 from pkm_twin.identification.plausible import case_of, recording_fault
-from pkm_twin.identification.rows import Recorded, rows_of
+from pkm_twin.identification.rows import rows_of
+from pkm_twin.recordings import Load, Recording
 from test.identification.machines import IMPOSSIBLE, WRONG, Drawn, machine, noisy, shifted, unit_of
 from test.laws.test_fit import truths
 from test.support.robots import load, partly_long
@@ -42,7 +43,7 @@ def drawn(name: str, seed: int) -> Drawn:
     return machine(load(name), np.random.default_rng([seed, *name.encode()]))
 
 
-def recorded(what: str, name: str, seed: int) -> Recorded:
+def recorded(what: str, name: str, seed: int) -> Recording:
     """Of a machine of the file, another one's, or nobody's."""
     m, rng = drawn(name, seed), np.random.default_rng([seed, 17])
     made = noisy(WRONG[what](m, rng) if what in WRONG else m.recorded(), rng)
@@ -84,7 +85,7 @@ def test_a_recording_with_gaps_is_fitted_like_the_whole_one() -> None:
     keep = np.ones(len(whole.time), bool)
     for begin in np.cumsum([110, 30, 180, 340]):
         keep[begin : begin + 8] = False
-    cut = replace(whole, time=whole.time[keep], q=whole.q[keep], effort=whole.effort[keep])
+    cut = whole.part(keep)
     one, other = (fit(m.robot, [record], KINDS) for record in (whole, cut))
     assert other.verdict.answer == "explains" and worst(other, m) < 4.0
     for n, k in zip(one.numbers, other.numbers, strict=True):
@@ -118,8 +119,7 @@ def test_a_payload_that_is_on_the_platform_for_a_while_is_named(name: str) -> No
 def test_a_known_payload_that_the_efforts_do_not_show_is_rejected() -> None:
     """Also where time in another unit would ask for efforts beyond any number."""
     m, record = drawn("delta_cu", 3), recorded("sound", "delta_cu", 3)
-    loaded, held = m.robot.changed(payload={"mass": 20.0}), np.ones(len(m.time))
-    record = replace(record, carried=loaded, held=held)
+    record = replace(record, load=Load(20.0))
     rows = rows_of(m.robot, file_parameters(m.robot), record)
     assert recording_fault(rows) is not None
 

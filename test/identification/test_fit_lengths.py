@@ -15,8 +15,9 @@ from pkm_twin import Robot
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.identification.fit import fit
 from pkm_twin.identification.parameters import file_parameters
-from pkm_twin.identification.rows import Recorded, derivative, rows_of
+from pkm_twin.identification.rows import derivative, rows_of
 from pkm_twin.identification.suspects import USUAL, Lengths
+from pkm_twin.recordings import Recording
 from pkm_twin.robot.catalogue import robot_of_data
 from pkm_twin.robot.entries import data_of, with_entries
 from test.identification.machines import machine, noisy, of_prior
@@ -172,12 +173,12 @@ def test_numbers_of_machines_with_usual_lengths_are_as_sure_as_they_are_said(
     assert np.isfinite(parts).mean() > 0.9
 
 
-def slower(name: str, factor: float) -> tuple[Robot, Recorded]:
+def slower(name: str, factor: float) -> tuple[Robot, Recording]:
     """A sound recording of a motion that takes so many times as long."""
     robot = load(name)
     m = machine(robot, np.random.default_rng(6))
     efforts = inverse_dynamics(m.truth, m.q, m.qd / factor, m.qdd / factor**2)
-    record = Recorded("slow", factor * m.time, m.q, efforts)
+    record = Recording("slow", factor * m.time, m.q, efforts)
     return robot, noisy(record, np.random.default_rng(7))
 
 

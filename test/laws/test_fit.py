@@ -17,8 +17,8 @@ from pkm_twin.identification.estimation import estimate, possible
 from pkm_twin.identification.fit import Fit, fit
 from pkm_twin.identification.identifiable import pseudo_inertia
 from pkm_twin.identification.parameters import file_parameters
-from pkm_twin.identification.rows import Recorded
 from pkm_twin.machine.inertia import ten_numbers
+from pkm_twin.recordings import Recording
 from pkm_twin.robot.catalogue import robot_of_data
 from pkm_twin.robot.entries import entries, with_entries
 from test.laws.recordings import smooth_motion
@@ -34,7 +34,7 @@ TRUTH = {
 
 
 @cache
-def pinocchio_recording(duration: float) -> tuple[Recorded, Robot]:
+def pinocchio_recording(duration: float) -> tuple[Recording, Robot]:
     """Efforts by Pinocchio with loop constraints, and the robot as it is in truth."""
     pytest.importorskip("pinocchio")
     from bags.recording.pinocchio_prru import PrruEngine
@@ -47,7 +47,7 @@ def pinocchio_recording(duration: float) -> tuple[Recorded, Robot]:
         tree = engine.state(*state, near)
         near = tree.q
         efforts.append(engine.actuator_effort(tree)[0] + engine.friction(state[1]))
-    recorded = Recorded("recording", motion[0], motion[1], np.array(efforts))
+    recorded = Recording(load("prru"), motion[0], motion[1], effort=np.array(efforts))
     return recorded, robot_of_data(data, "truth")
 
 
@@ -129,14 +129,14 @@ def test_true_values_are_within_three_deviations_in_95_of_100_noisy_fits():
     assert good >= 95
 
 
-def still_joint() -> Recorded:
+def still_joint() -> Recording:
     """A five-bar whose right motor holds still."""
     robot = load("five_bar")
     time, q, qd, qdd = smooth_motion(robot, np.random.default_rng(2), 5.0, 100.0)
     for values, held in ((q, q[0, 1]), (qd, 0.0), (qdd, 0.0)):
         values[:, 1] = held
     changed = robot.changed(friction={"viscous": [0.05, 0.08], "coulomb": [0.2, 0.3]})
-    return Recorded("still", time, q, inverse_dynamics(changed, q, qd, qdd))
+    return Recording(robot, time, q, effort=inverse_dynamics(changed, q, qd, qdd), source="still")
 
 
 def test_what_the_motion_does_not_show_keeps_the_file_s_value_and_is_named():
@@ -154,7 +154,7 @@ def test_what_the_motion_does_not_show_keeps_the_file_s_value_and_is_named():
 def test_a_payload_of_a_delta_has_a_mass_and_no_place():
     robot = load("delta").changed(payload={"mass": 0.3, "com": [0.01, 0.02, -0.03]})
     time, q, qd, qdd = smooth_motion(robot, np.random.default_rng(3), 5.0, 100.0)
-    recorded = Recorded("delta", time, q, inverse_dynamics(robot, q, qd, qdd))
+    recorded = Recording(robot, time, q, effort=inverse_dynamics(robot, q, qd, qdd))
     result = fit(load("delta"), [recorded], ("payload",))
     assert by_name(result)["payload.mass"].after == pytest.approx(0.3, rel=0.01)
     idle = {number.name for number in result.of("not excited")}
@@ -168,7 +168,7 @@ def test_late_efforts_and_outliers_are_no_friction():
     efforts = inverse_dynamics(true, q, qd, qdd)
     late = np.array([np.interp(time - 1e-3, time, column) for column in efforts.T]).T
     late[::101] += 5.0
-    result = fit(robot, [Recorded("late", time, q, late)], ("friction",))
+    result = fit(robot, [Recording(robot, time, q, effort=late)], ("friction",))
     assert result.delays[0] == pytest.approx(1e-3, abs=1e-4)
     assert result.outliers >= len(late[::101]) * 3 - 10
     for name, number in by_name(result).items():

@@ -15,7 +15,7 @@ from pkm_twin import Robot
 from pkm_twin.certify.maximal import Maximal, State
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.identification.fit import fit
-from pkm_twin.identification.rows import Recorded
+from pkm_twin.recordings import Recording
 from pkm_twin.robot.robot_urdf import robot_description
 from test.identification.machines import machine
 from test.laws.recordings import engine_efforts
@@ -42,14 +42,14 @@ class Walking(Maximal):
 
 
 @cache
-def drawn(name: str) -> tuple[Robot, Robot, Recorded, Array]:
+def drawn(name: str) -> tuple[Robot, Robot, Recording, Array]:
     """The robot as its file has it and in truth, a recording, and the efforts' size by joint."""
     rng = np.random.default_rng([7, *name.encode()])
     robot = load(name)
     m = machine(robot, rng)
     size = np.sqrt(np.mean(inverse_dynamics(robot, m.q, m.qd, m.qdd) ** 2, 0))
     efforts = engine_efforts(Walking(robot_description(m.truth)), m.q, m.qd, m.qdd)
-    return robot, m.truth, Recorded(name, m.time, m.q, efforts), size
+    return robot, m.truth, Recording(robot, m.time, m.q, effort=efforts), size
 
 
 @pytest.mark.long

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -29,7 +29,6 @@ if TYPE_CHECKING:
     from pkm_twin.codegen.arrays import Array
     from pkm_twin.identification.fit import Result
     from pkm_twin.identification.friction_laws import Choice
-    from pkm_twin.identification.rows import Recorded
     from pkm_twin.recordings import Recording
     from pkm_twin.robot.robot import Robot
 
@@ -213,7 +212,9 @@ def _of_efforts(
             masses = ", ".join(f"{load.mass:g}" for load in loads)
             raise PkmTwinError(f"recordings with payloads of {masses} kg: fit one at a time")
         machine = loads[0].on(machine) if loads else machine
-        made = [dataclasses.replace(one, carried=None) for one in made]
+        made = [
+            r if r.load is None else replace(r, load=replace(r.load, sought=True)) for r in made
+        ]
     if given.torque_constant is not None:
         made, told = _with_efforts(machine, made, given.torque_constant, kinds)
         beyond = [*told, *beyond]
@@ -224,8 +225,8 @@ def _of_efforts(
 
 
 def _with_efforts(
-    machine: Robot, recordings: Sequence[Recorded], constant: str, kinds: Sequence[str]
-) -> tuple[list[Recorded], list[str]]:
+    machine: Robot, recordings: Sequence[Recording], constant: str, kinds: Sequence[str]
+) -> tuple[list[Recording], list[str]]:
     """Recordings of currents with efforts, and a line on each torque constant that was fitted."""
     from pkm_twin.identification.drives import FIT, fitted_constants, given_constants
 
