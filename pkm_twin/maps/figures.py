@@ -23,23 +23,11 @@ if TYPE_CHECKING:
 
 
 MAP: Final = "viridis"
-LINES: Final = tuple(colour for colour in plots.COLOURS if colour != "#F0E442")
-"""Colours of lines on white, where yellow is hard to see."""
 PREFIXES: Final = {-12: "p", -9: "n", -6: "µ", -3: "m", 0: "", 3: "k", 6: "M"}
 PANELS: Final = 3
 """Most planes in a picture."""
-WIDE: Final = 9.0
-"""Of a picture, inches."""
 LETTERS: Final = 105
 """In a line of a picture's title."""
-FINE: Final = 200
-"""Dots per inch."""
-
-
-def subplots(*shape: int, **options: Any) -> tuple[Figure, Any]:
-    """A new figure and its axes, as ``pyplot.subplots`` has them."""
-    figure, axes = plots.pyplot().subplots(*shape, **options)
-    return figure, axes
 
 
 def scale_of(greatest: float, unit: str) -> tuple[float, str]:
@@ -218,19 +206,20 @@ def planes(data: Dataset, case: int) -> Figure:
     label = f"{part.case_what.values} ({unit or 'dimensionless'})"
     words = [row for text in title(data, case) for row in textwrap.wrap(text, LETTERS)]
     with plots.pyplot().rc_context({"font.size": 9}):
-        high_of = 0.5 * WIDE if count < PANELS else WIDE / PANELS + 0.9
-        figure, axes = subplots(
-            1, count, figsize=(WIDE, high_of + 0.2 * len(words)), layout="constrained",
-            squeeze=False, gridspec_kw={"width_ratios": _widths(drawn)},
-        )  # fmt: skip
-        for one, ax in zip(drawn, axes[0], strict=True):
+        high_of = 0.5 * plots.WIDTH if count < PANELS else plots.WIDTH / PANELS + 0.9
+        figure: Figure
+        figure, columns = plots.columns(
+            count, 1, high_of + 0.2 * len(words), gridspec_kw={"width_ratios": _widths(drawn)}
+        )
+        axes = [column[0] for column in columns]
+        for one, ax in zip(drawn, axes, strict=True):
             if len(one["names"]) == 1:
                 _line(one, ax, scale, label)
                 continue
             mesh = _panel(one, ax, scale, scale * low, scale * high)
             kind.overlay(data, one["names"], ax)
         if len(drawn[0]["names"]) > 1:
-            bar = figure.colorbar(mesh, ax=list(axes[0]), aspect=25, pad=0.01)
+            bar = figure.colorbar(mesh, ax=axes, aspect=25, pad=0.01)
             bar.set_label(label)
         figure.suptitle("\n".join(words), fontsize=10)
         figure.supxlabel(_caption(data, drawn), fontsize=8.5, color="0.3")

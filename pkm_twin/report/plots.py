@@ -34,11 +34,14 @@ def pyplot() -> Any:
     return pyplot
 
 
-def columns(count: int, rows: int) -> tuple[Any, list[Any]]:
-    """A figure of ``count`` columns with ``rows`` axes each."""
+def columns(
+    count: int, rows: int, height: float | None = None, **options: Any
+) -> tuple[Any, list[Any]]:
+    """A figure of ``count`` columns with ``rows`` axes each; ``height``: inches."""
     figure, axes = pyplot().subplots(
-        rows, count, figsize=(WIDTH, max(3 * rows, 4.2)), squeeze=False, layout="constrained"
-    )
+        rows, count, figsize=(WIDTH, height or max(3 * rows, 4.2)), squeeze=False,
+        layout="constrained", **options,
+    )  # fmt: skip
     return figure, list(axes.T)
 
 

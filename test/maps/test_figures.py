@@ -16,6 +16,7 @@ from pkm_twin.maps.kinds import KINDS, modes
 from pkm_twin.maps.kinds.modes import deformed, grounded, structure_edges
 from pkm_twin.maps.page import write_page
 from pkm_twin.maps.store import open_map
+from pkm_twin.report import plots
 from stiffness_monitor.modes import modes as modes_of
 from stiffness_monitor.structure import structural_model
 from test.support.robots import load, partly_long
@@ -48,7 +49,7 @@ def test_a_picture_answers_and_the_star_has_its_cells_colour(stored):
         # At 900 pixels of width.
         texts = [t for ax in panels for t in (ax.title, ax.xaxis.label, *ax.get_xticklabels())]
         sizes = [text.get_fontsize() for text in [*texts, *(t for ax in panels for t in ax.texts)]]
-        assert min(sizes) * 900 / figures.WIDE / 72 >= 10.6
+        assert min(sizes) * 900 / plots.WIDTH / 72 >= 10.6
         if name not in told:
             continue
         assert figures.sentence(told[name], units).split(",")[0] in figure.get_suptitle()

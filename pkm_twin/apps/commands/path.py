@@ -12,7 +12,7 @@ import numpy as np
 import typer
 
 from pkm_twin.apps.frame import command
-from pkm_twin.apps.options import Carries, Draws, ReadsTables, Writes
+from pkm_twin.apps.options import AwayFromSingular, Carries, Draws, ReadsTables, Writes
 from pkm_twin.console import writing
 from pkm_twin.errors import check_limit
 from pkm_twin.recordings.tables import ENDINGS
@@ -31,7 +31,7 @@ SHOWN: Final = 0.3
 
 
 @dataclass(frozen=True, kw_only=True)
-class Motion(Carries, ReadsTables, Writes, Draws):
+class Motion(Carries, ReadsTables, AwayFromSingular, Writes, Draws):
     """Plan a motion along a path, also the fastest one, or a cut that is slower where it bends.
 
     The table of waypoints has a header row and the pose's coordinates (m, rad) or JOINT.position of
@@ -104,9 +104,6 @@ class Motion(Carries, ReadsTables, Writes, Draws):
         "programmed feed",
     )  # fmt: skip
     share: float = setting(1.0, "fraction of the file's effort and velocity limits to use")
-    singularity: float = setting(
-        0.01, "least singularity index on the path, 0 to 1", low=0.0, high=1.0
-    )
     shaper: str | None = setting(
         None, "input shaper for the first natural frequency, which depends on the pose: zv, or "
         "zvd, which tolerates more error of the frequency; costs half or one vibration at each "

@@ -81,9 +81,8 @@ class Modes(Frequency):
         """The shapes of the lowest modes, in colours of how far each point moves."""
         from mpl_toolkits.mplot3d.art3d import Line3DCollection  # type: ignore[import-untyped]
 
-        figure, axes = plots.pyplot().subplots(
-            1, DRAWN, figsize=(9, 4.6), layout="constrained", subplot_kw={"projection": "3d"}
-        )
+        figure, columns = plots.columns(DRAWN, 1, 4.6, subplot_kw={"projection": "3d"})
+        axes = [column[0] for column in columns]
         rest, edges = data.position.values, data.line.values
         low, high = _ends(rest)
         for mode, ax in enumerate(axes):
@@ -99,7 +98,7 @@ class Modes(Frequency):
             ax.view_init(elev=18, azim=-58)
             ax.set_axis_off()
             ax.set_title("\n".join(_head(data, mode)), fontsize=9)
-        figure.colorbar(drawn, ax=axes.tolist(), aspect=25, pad=0.01).set_label(
+        figure.colorbar(drawn, ax=axes, aspect=25, pad=0.01).set_label(
             "displacement over the mode's largest (dimensionless)", fontsize=9
         )
         figure.suptitle(
