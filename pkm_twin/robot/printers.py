@@ -255,21 +255,14 @@ def _points(text: str, firmware: Firmware, radius: float) -> Array:
 def _height_map(text: str) -> Iterator[tuple[float, float, float]]:
     """Of RepRapFirmware's heightmap.csv: points that were probed."""
     lines = text.splitlines()
-    start = next((k for k, line in enumerate(lines) if line.startswith("xmin,")), None)
-    start = (
-        start
-        if start is not None
-        else next((k for k, line in enumerate(lines) if line.startswith("axis0,")), None)
-    )
+    heads = (k for k, line in enumerate(lines) if line.startswith(("xmin,", "axis0,")))
+    start = next(heads, None)
     if start is None:
         return
     names = [name.strip() for name in lines[start].split(",")]
     given = dict(zip(names, lines[start + 1].split(","), strict=False))
-    keys = (
-        ("xmin", "ymin", "xspacing", "yspacing")
-        if "xmin" in given
-        else ("min0", "min1", "spacing0", "spacing1")
-    )
+    keys = ("xmin", "ymin", "xspacing", "yspacing")
+    keys = keys if "xmin" in given else ("min0", "min1", "spacing0", "spacing1")
     x0, y0, dx, dy = (float(given.get(key, given.get("spacing", "nan"))) for key in keys)
     for row, line in enumerate(lines[start + 2 :]):
         for column, cell in enumerate(line.split(",")):
