@@ -104,7 +104,8 @@ def checked(r: Recording, residual: float) -> Checked:
 
     :param residual: largest good one, RMS, part of the peak effort.
     """
-    items = [*_file(r), *_motion(r), *_limits(r), _singularity(r)]
+    steps = steps_in(r)
+    items = [*_file(r), *_motion(r, steps), *_limits(r), _singularity(r)]
     left_out = np.zeros(len(r.time), np.bool_)
     bound = f"RMS below {100 * residual:g} % of peak"
     reason = why_no_torques(r.robot)
@@ -114,7 +115,7 @@ def checked(r: Recording, residual: float) -> Checked:
         return Checked(r, [*items, judged(RESIDUAL, reason, bound, None)])
     try:
         idle = idle_of(r)
-        left_out = idle | near_jumps(r)
+        left_out = idle | _near_jumps(steps, len(r.time))
         compared = compared_of(r, left_out, residual)
         bands = {} if compared is None else _bands(r, compared)
     # ValueError: numbers within bounds whose result is not finite.
@@ -146,7 +147,7 @@ def _file(r: Recording) -> list[Fact]:
     ]
 
 
-def _motion(r: Recording) -> list[Fact]:
+def _motion(r: Recording, steps: Steps) -> list[Fact]:
     """The items on time stamps, steps and velocities."""
     if len(r.time) < 3:
         return [judged("rate", f"{len(r.time)} joint states", "3 or more", None)]
@@ -162,7 +163,7 @@ def _motion(r: Recording) -> list[Fact]:
         text = f"{sampling.missing} of {sampling.expected}"
         text += f" ({100 * share:.3g} %)" if sampling.missing else ""
         missing = judged("missing samples", text, most, share <= MAX_MISSING)
-    steps, within = steps_in(r), MAX_GAP * median
+    within = MAX_GAP * median
     fault = step_fault(r, steps)
     items = [
         judged("rate", f"{1 / median:.1f} Hz over {r.time[-1]:.3f} s", "", True),
@@ -201,10 +202,9 @@ def step_fault(r: Recording, steps: Steps | None = None) -> str:
     return f"{len(found)} jumps: {', '.join(texts)}{more}" if found else ""
 
 
-def near_jumps(r: Recording) -> Mask:
-    """Samples so near to a jump that no derivative holds there, shape (samples,)."""
-    steps = steps_in(r)
-    found = np.zeros(len(r.time), np.bool_)
+def _near_jumps(steps: Steps, count: int) -> Mask:
+    """Samples so near to a jump that no derivative holds there, shape (count,)."""
+    found = np.zeros(count, np.bool_)
     for k in np.flatnonzero(steps.jumps.any(1)):
         found[max(k - CLEAR, 0) : k + CLEAR + 2] = True
     return found
@@ -268,13 +268,9 @@ def _velocities(r: Recording, qd: Array, steps: Steps) -> list[Fact]:
 
 def _limits(r: Recording) -> list[Fact]:
     """Effort limits; position and velocity limits are already a node's reason to reject."""
-    effort = r.robot.limits.effort
-    bounds = list(ranges(r.robot))
-    if effort is not None:
-        bounds.append(("effort", -effort, effort, list(r.robot.effort_units)))
     recorded = {"position": r.q, "velocity": r.qd, "effort": r.effort}
     items = []
-    for what, low, high, units in bounds:
+    for what, low, high, units in ranges(r.robot):
         values = recorded[what]
         if values is None:
             continue

@@ -47,6 +47,8 @@ def ranges(robot: Robot) -> Iterator[tuple[str, Array, Array, list[str]]]:
         yield "position", limits.position[:, 0], limits.position[:, 1], units
     if limits.velocity is not None:
         yield "velocity", -limits.velocity, limits.velocity, [f"{unit}/s" for unit in units]
+    if limits.effort is not None:
+        yield "effort", -limits.effort, limits.effort, list(robot.effort_units)
 
 
 def beyond_limits(

@@ -98,16 +98,6 @@ def test_plain_commands_cannot_be_judged(peer, check):
     assert "delta_dynamics/joint_torques" in line
 
 
-@pytest.mark.parametrize(
-    ("option", "value"), [("--deadline", "0"), ("--duration", "nan"), ("--wait", "inf")]
-)
-def test_a_bound_that_is_no_time_is_refused(check, option, value):
-    process = check(option, value)
-    assert process.wait() == 2
-    (line,) = process.errors.splitlines()
-    assert option in line or value in line
-
-
 def test_it_matches_a_publisher_of_either_reliability(peer, check):
     topic = "/best/torques"
     qos = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
