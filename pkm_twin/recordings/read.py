@@ -15,7 +15,7 @@ from pkm_twin.codegen.arrays import Array, Mask
 from pkm_twin.errors import FileError, ParameterError, UnknownNameError, one_line, warn
 from pkm_twin.machine.joint_map import JointMap
 from pkm_twin.machine.sections import DriveSpec
-from pkm_twin.messages.reading import MAX_FORCE, MAX_MOMENT, MAX_SHIFT, MAX_TURN, TINY
+from pkm_twin.messages.reading import MAX_EFFORT, MAX_FORCE, MAX_MOMENT, MAX_SHIFT, MAX_TURN, TINY
 from pkm_twin.recordings.bags import read_bag
 from pkm_twin.recordings.payload import load_of_table
 from pkm_twin.recordings.recording import MAPPED, ReadOptions, Recording
@@ -52,8 +52,6 @@ POSE_MISS: Final = 1e-3
 """Difference between a table's pose and that of its joint positions, of the robot's size."""
 BLOCK: Final = 4096
 """Samples computed at a time, so that memory stays flat."""
-MOST_EFFORT: Final = 1e9
-"""Greatest effort or wrench of a file that can be a machine's, N m or N."""
 SIZES: Final = dict(
     zip(
         (*WRENCH, *DEFLECTION),
@@ -61,7 +59,7 @@ SIZES: Final = dict(
         strict=True,
     )
 )
-"""Greatest values of a table with deflections, as of messages: N, N m, m, rad."""
+"""Greatest values of a table's columns, as of messages: N, N m, m, rad."""
 LONGEST_STEP: Final = 0.2
 """Between two samples of a motion, s, from which on the times look like milliseconds."""
 SHORTEST_STEP: Final = 1e-9
@@ -101,19 +99,10 @@ def read(
     if bag:
         if how.follow is not None:
             raise ParameterError("follow", how.follow, "no --follow: a bag has no pose columns")
-        r = read_bag(path, robot, how, progress)
-    elif how.topics:
+        return read_bag(path, robot, how, progress)
+    if how.topics:
         raise ParameterError("topic", how.topics[0], f"no --topic: {path} is a table")
-    else:
-        r = _of_table(path, robot, how)
-    for name, values in (("wrench", r.wrench), ("efforts", r.effort)):
-        if values is not None and not np.abs(values).max(initial=0.0) <= MOST_EFFORT:
-            row = int(np.abs(values).max(1).argmax())
-            value = float(np.abs(values[row]).max())
-            raise ParameterError(
-                f"{path}: {name}, sample {row}", value, f"up to {MOST_EFFORT:g} N or N m"
-            )
-    return r
+    return _of_table(path, robot, how)
 
 
 def _of_table(path: Path, name: str | Robot | None, how: ReadOptions) -> Recording:
@@ -172,7 +161,8 @@ def _of_table(path: Path, name: str | Robot | None, how: ReadOptions) -> Recordi
                 raise ParameterError(
                     str(path), f"no {what}", f"a column {axes[0]} or more of {', '.join(axes)}"
                 )
-        _check_sizes(table)
+    efforts = (f"{joint}.{what}" for joint in joints for what in EFFORTS)
+    _check_sizes(table, SIZES | dict.fromkeys(efforts, MAX_EFFORT))
     held = how.load or load_of_table(table, time)
     return Recording(
         robot, time, q, qd, qdd, effort, wrench, deflection, pose, held, efforts=word,
@@ -355,9 +345,9 @@ def _in_degrees(robot: Robot, q: Array) -> bool:
     return bool(possible(np.where(turns, some * UNITS["deg"][1], some)).all())
 
 
-def _check_sizes(table: Table) -> None:
+def _check_sizes(table: Table, bounds: Mapping[str, float]) -> None:
     """As of a message: no number that no machine has, and none below every measurement."""
-    for name, bound in SIZES.items():
+    for name, bound in bounds.items():
         sizes = np.abs(table.get(name, np.zeros(1)))
         bad = np.flatnonzero((sizes > bound) | ((sizes < TINY) & (sizes > 0.0)))
         if len(bad):

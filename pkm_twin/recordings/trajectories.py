@@ -7,11 +7,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
-import numpy as np
-
 from pkm_twin.bags.reader import Bag, BagWriter
 from pkm_twin.codegen.arrays import Array
-from pkm_twin.errors import BagError
+from pkm_twin.errors import BagError, MessageError
+from pkm_twin.messages.reading import JointReader
 from pkm_twin.messages.stamps import SECOND
 from pkm_twin.recordings.payload import load_facts, payload_columns
 from pkm_twin.recordings.recording import Recording
@@ -89,7 +88,7 @@ def read_trajectory(bag: Bag, robot: Robot) -> Recording | None:
 
     None where the bag has no trajectory with velocities and accelerations.
 
-    :raises BagError: joints of another robot, or several trajectories.
+    :raises BagError: one that a node rejects, or several trajectories.
     """
     names = [name for name, topic in bag.report.topics.items() if topic.type == TRAJECTORY]
     messages = list(bag.messages(names)) if names else []
@@ -98,27 +97,15 @@ def read_trajectory(bag: Bag, robot: Robot) -> Recording | None:
     if len(messages) > 1:
         text = f"{len(messages)} trajectories; expected one"
         raise BagError(text, path=bag.report.path, reason="trajectories")
-    message = messages[0].message
-    own = robot.controller
-    if sorted(message.joint_names) != sorted(own.names):
-        text = f"joints {', '.join(message.joint_names)}; expected {', '.join(own.names)}"
-        raise BagError(text, path=bag.report.path, reason="joints")
-    order = [list(message.joint_names).index(name) for name in own.names]
-    points = message.points
-    if len(points) < 2 or any(not len(p.velocities) or not len(p.accelerations) for p in points):
+    reader = JointReader(robot, limited=False, with_effort=True)
+    try:
+        plan = reader.trajectory(messages[0].message, 0)
+    except MessageError as error:
+        text = f"topic {names[0]}: {error}"
+        raise BagError(text, path=bag.report.path, reason=error.reason) from None
+    if plan.qd is None or plan.qdd is None or len(plan.times) < 2:
         return None
-
-    def column(what: str) -> Array:
-        return np.array([getattr(p, what) for p in points], float)[:, order]
-
     return Recording(
-        robot,
-        np.array([p.time_from_start.sec + p.time_from_start.nanosec / SECOND for p in points]),
-        own.positions(column("positions")),
-        own.rates(column("velocities")),
-        own.rates(column("accelerations")),
-        own.efforts(column("effort")) if all(len(p.effort) for p in points) else None,
-        efforts="effort",
-        bag=bag,
+        robot, plan.times, plan.q, plan.qd, plan.qdd, plan.effort, efforts="effort", bag=bag,
         topics=Topics(names[0]),
-    )
+    )  # fmt: skip

@@ -315,7 +315,7 @@ def test_efforts_that_no_drive_has_are_rejected(twin, tmp_path, column):
     for command in ("size", "loads"):
         result = twin(command, "delta", out)
         assert result.code == 1
-        assert "sample 3" in result.one_line_error()
+        assert "line 5" in result.one_line_error()
 
 
 def test_a_recording_is_sized_by_its_measured_efforts(twin):

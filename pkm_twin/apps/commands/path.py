@@ -189,9 +189,8 @@ def path(given: Motion) -> Report:
         facts.append(Fact("shaper", shaper, text="shaper", shown=words))
     draw: Any = draw_limits
     if given.slow_where_soft:
-        cut = Cut.of(given, motion)
-        facts += cut.facts()
-        draw = cut.draw
+        more, draw = _cut(given, motion)
+        facts += more
     return Report(
         answer, facts, _tables(motion), {"": lambda: draw(motion, answer)},
         files={"out": given.out},
@@ -332,53 +331,39 @@ def draw_limits(motion: TimedPath, title: str) -> Any:
     return figure
 
 
-@dataclass(frozen=True, eq=False)
-class Cut:
-    """A cut along a motion: its deflection per feed at the samples, m per m/s, and its bounds."""
+def _cut(given: Motion, motion: TimedPath) -> tuple[list[Fact], Any]:
+    """What a cut is beside a motion, and its picture: feed and deflection with their bounds."""
+    from pkm_twin.paths.along import bend_per_feed
 
-    bend: Any
-    speeds: Any
-    speed: float
-    tolerance: float
+    s, robot, speed, tolerance = motion.fine, motion.robot, given.speed, given.tolerance
+    assert speed is not None and tolerance is not None  # noqa: S101  checked before
+    moved = (robot.platform_jacobian(s.q)[:, :3] @ s.qd[..., None])[..., 0]
+    way = moved / np.maximum(s.speed, 1e-300)[:, None]
+    bend = bend_per_feed(robot, given.force or 0.0, s.q, way)
+    soft, most = float(bend.max()), float((bend * s.speed).max())
+    # The largest constant feed within the tolerance.
+    even = min(speed, tolerance / soft) if soft > 0.0 else speed
+    facts = [
+        Fact("greatest_feed_m_s", float(s.speed.max()), "m/s", "greatest feed"),
+        Fact("greatest_deflection_m", most, "m", "greatest deflection",
+             f"{1e6 * most:.4g} µm (tolerance {1e6 * tolerance:.4g} µm)"),
+        Fact("constant_feed_m_s", even, "m/s", "largest constant feed within the tolerance"),
+        Fact("tolerance_m", tolerance, "m"),
+    ]  # fmt: skip
 
-    @classmethod
-    def of(cls, given: Motion, motion: TimedPath) -> Cut:
-        """Of a command line."""
-        from pkm_twin.paths.along import bend_per_feed
-
-        s, robot = motion.fine, motion.robot
-        moved = (robot.platform_jacobian(s.q)[:, :3] @ s.qd[..., None])[..., 0]
-        way = moved / np.maximum(s.speed, 1e-300)[:, None]
-        bend = bend_per_feed(robot, given.force or 0.0, s.q, way)
-        return cls(bend, s.speed, float(given.speed or 0.0), float(given.tolerance or 0.0))
-
-    def facts(self) -> list[Fact]:
-        """What it is beside a motion."""
-        soft, most = float(self.bend.max()), float((self.bend * self.speeds).max())
-        # The largest constant feed within the tolerance.
-        even = min(self.speed, self.tolerance / soft) if soft > 0.0 else self.speed
-        return [
-            Fact("greatest_feed_m_s", float(self.speeds.max()), "m/s", "greatest feed"),
-            Fact("greatest_deflection_m", most, "m", "greatest deflection",
-                 f"{1e6 * most:.4g} µm (tolerance {1e6 * self.tolerance:.4g} µm)"),
-            Fact("constant_feed_m_s", even, "m/s", "largest constant feed within the tolerance"),
-            Fact("tolerance_m", self.tolerance, "m"),
-        ]  # fmt: skip
-
-    def draw(self, motion: TimedPath, title: str) -> Any:
-        """Feed and deflection over time, with their bounds."""
+    def draw(motion: TimedPath, title: str) -> Any:
         figure, axes = plots.columns(1, 2)
-        for ax, values, label, limit in zip(
-            axes[0], (1e3 * self.speeds, 1e6 * self.bend * self.speeds),
-            ("feed (mm/s)", "deflection (µm)"), (1e3 * self.speed, 1e6 * self.tolerance),
-            strict=True,
-        ):  # fmt: skip
-            ax.plot(motion.fine.time, values, color=plots.COLOURS[0], lw=1.2)
+        curves = ((1e3 * s.speed, "feed (mm/s)", 1e3 * speed),
+                  (1e6 * bend * s.speed, "deflection (µm)", 1e6 * tolerance))  # fmt: skip
+        for ax, (values, label, limit) in zip(axes[0], curves, strict=True):
+            ax.plot(s.time, values, color=plots.COLOURS[0], lw=1.2)
             ax.axhline(limit, color=plots.COLOURS[1], lw=1.0)
             plots.label(ax, "time (s)", label)
             ax.set_ylim(bottom=0.0)
         figure.suptitle(title)
         return figure
+
+    return facts, draw
 
 
 COMMAND = command(path, "Torques, paths and drives")
