@@ -24,7 +24,7 @@ from pkm_twin.identification.noise import EXACT
 from pkm_twin.identification.parameters import Number
 from pkm_twin.identification.problem import Problem
 from pkm_twin.identification.rows import Rows
-from pkm_twin.identification.samples import Track, low_pass
+from pkm_twin.identification.samples import Track, filtered
 from pkm_twin.identification.suspects import RESONANCE
 from pkm_twin.machine.friction import BASIC, LAWS, taken
 from pkm_twin.recordings import Recording
@@ -267,13 +267,8 @@ class _Search:
         """Columns of tracks, (samples, n, c), at the fitted rows."""
         made = []
         for rows in self._rows:
-            parts = []
-            for track in rows.tracks:
-                values = columns(track)
-                flat = values.reshape(len(values), -1)
-                smooth = low_pass(flat, track.period, rows.how)
-                parts.append(smooth.reshape(-1, *values.shape[1:]))
-            made.append(np.concatenate(parts)[: rows.held_from])
+            parts = [{"": columns(track)} for track in rows.tracks]
+            made.append(filtered(parts, rows.period, rows.how)[""][: rows.held_from])
         return np.concatenate(made)
 
     def found(self) -> dict[str, Searched]:

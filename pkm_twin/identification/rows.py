@@ -6,7 +6,7 @@ With them the signals of the same rows that a fit's residual is held against.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -33,7 +33,7 @@ from pkm_twin.identification.samples import (
     Motion,
     Track,
     by_blocks,
-    low_pass,
+    filtered,
     tracks,
 )
 from pkm_twin.machine.friction import linear_keys
@@ -129,16 +129,16 @@ class Signals:
 
     ``motion``: without noise beyond the motion's band, and ``missed``: what the
     differentiation misses of qd and qdd; ``load``: of the efforts without friction, with its first
-    and second derivative, (k, n) each. ``effort``: what a first fit predicts, and its derivative.
+    and second derivative, (k, n) each. ``effort``: what a first fit predicts, (k, n).
     ``own``: friction of other laws, a unit of each, (k, n, laws). ``noise``: deviation of a row's
     noise as if rows were independent, (n,). ``band``: the part of the rows' rate that the filter
     passes. ``resonances``: of the residual above the band.
     """
 
     motion: Motion
-    missed: tuple[Array, Array]
-    load: tuple[Array, Array, Array]
-    effort: tuple[Array, Array]
+    missed: Array
+    load: Array
+    effort: Array
     own: Array
     noise: Array
     band: float
@@ -236,22 +236,25 @@ def rows_of(
     if all(not part.moves.any() for part in parts):
         raise PkmTwinError(f"{r.name}: no excitation, the joints stand still")
     first, outliers = _drop_outliers(parts, parameters, how.keep_every)
-    made = [part.filtered(first, track, how) for part, track in zip(parts, pieces, strict=True)]
-    time, table, target, rest, counts, change = (
-        np.concatenate([one[k] for one in made]) for k in range(6)
-    )
-    told = [part.rest + part.table @ first for part in parts]
-    rubs = model.of_drives
-    rub = [part.table[..., rubs] @ first[rubs] for part in parts]
+    speed = np.sqrt(np.mean(np.concatenate([track.qd for track in pieces]) ** 2, 0))
+    f = filtered([part.columns(model, first, speed, how) for part in parts], pieces[0].period, how)
     left = [part.target - part.table @ first for part in parts]
     longest = max(pieces, key=lambda t: len(t.time))
     shaken = shaken_efforts(r, longest, how, lambda track: model.efforts(track, first))
     noise = noise_of(left, shaken, longest.period, how)
-    size = np.sqrt(np.mean(np.concatenate([part.target + part.rest for part in parts]) ** 2, 0))
+    size = np.sqrt(np.mean(np.concatenate([track.effort for track in pieces]) ** 2, 0))
     rings = resonances_of(left, longest.period, how, size)
+    rate = 1.0 / (longest.period * how.keep_every)
+    missed, load = (np.moveaxis(f[name], -1, 0) for name in ("missed", "load"))
+    signals = Signals(
+        Motion(f["q"], f["qd"], f["qdd"], f["wrench"], f["held"]), missed, load, f["effort"],
+        f["own"], noise * np.sqrt(rate), passed_band(how, rate), rings,
+    )  # fmt: skip
+    # Where standing still is in the filter's reach, friction's sign is not known.
+    counts = (f["moves"] > 0.8).astype(np.float64)
     return Rows(
-        r, model, how, tuple(pieces), time, table, target, rest, counts, change, outliers,
-        signals_of(pieces, told, rub, how, noise, rings),
+        r, model, how, tuple(pieces), f["time"], f["table"], f["target"], f["rest"], counts,
+        f["change"], outliers, signals,
     )  # fmt: skip
 
 
@@ -284,6 +287,7 @@ def shaken_efforts(
 class _Piece:
     """One even piece before the filter."""
 
+    track: Track
     table: Array
     target: Array
     rest: Array
@@ -294,23 +298,40 @@ class _Piece:
     def of(cls, model: Model, track: Track, how: Filtering) -> _Piece:
         """Of a track."""
         table, rest = model.columns(track)
-        return cls(table, track.effort - rest, rest, track.moves(how).astype(np.float64))
+        moves = track.moves(how).astype(np.float64)
+        return cls(track, table, track.effort - rest, rest, moves)
 
-    def filtered(self, first: Array, track: Track, how: Filtering) -> tuple[Array, ...]:
-        """Time, table, target, rest, what counts and the efforts' change, all filtered alike."""
-        samples = len(self.table)
-        change = np.gradient(self.rest + self.table @ first, track.period, axis=0)
-        flat = np.concatenate(
-            [self.table.reshape(samples, -1), self.target, self.rest, self.moves, change,
-             track.time[:, None]], 1,
-        )  # fmt: skip
-        smooth = low_pass(flat, track.period, how)
-        n = self.target.shape[1]
-        ends = np.cumsum([self.table[0].size, n, n, n, n])
-        table, target, rest, moves, change, time = np.split(smooth, ends, 1)
-        # Where standing still is in the filter's reach, friction's sign is not known.
-        counts = (moves > 0.8).astype(np.float64)
-        return time[:, 0], table.reshape(len(table), n, -1), target, rest, counts, change
+    def columns(self, model: Model, first: Array, speed: Array, how: Filtering) -> dict[str, Array]:
+        """All that is filtered, by name, (samples, ...) each.
+
+        Motion and load are those in the motion's own band, where nearly no noise is: noise in both
+        of two columns would look like something in common.
+
+        :param first: parameters of a first fit. ``speed``: RMS rates, (n,).
+        """
+        track, rubs = self.track, model.of_drives
+        told = self.rest + self.table @ first
+        load, sign = told - self.table[..., rubs] @ first[rubs], np.sign(track.qd)
+        laws = [np.abs(load) * sign, track.qd * np.abs(track.qd)]
+        for share in STRIBECK:
+            laws.append(np.exp(-((track.qd / np.maximum(share * speed, 1e-300)) ** 2)) * sign)
+        cutoff = None if how.cutoff is None else MOTION * how.cutoff
+        motion, force = (calm(values, track.period, cutoff) for values in (track.q, load))
+        inner = slice(how.window // 2 + 3, len(load) - how.window // 2 - 3)
+        missed = np.zeros((*load.shape, 2))
+        for k in (1, 2):
+            rough = scipy.signal.savgol_filter(
+                motion[0], how.window, DEGREE, k, track.period, axis=0
+            )
+            missed[inner, :, k - 1] = (rough - motion[k])[inner]
+        return {
+            "time": track.time, "table": self.table, "target": self.target, "rest": self.rest,
+            "moves": self.moves, "effort": told,
+            "change": np.gradient(told, track.period, axis=0),
+            "q": motion[0], "qd": motion[1], "qdd": motion[2], "missed": missed,
+            "load": np.stack(force, -1), "own": np.stack(laws, -1), "wrench": track.wrench,
+            "held": track.held,
+        }  # fmt: skip
 
 
 def _check_efforts(robot: Robot, r: Recording) -> None:
@@ -372,58 +393,6 @@ def prior_scales(parameters: FileParameters, table: Array, effort: Array) -> Arr
         alike = [s for s, kind in zip(scales, kinds, strict=True) if kind == kinds[k] and s > 0.0]
         scales[k] = max(alike, default=1.0)
     return scales
-
-
-def signals_of(
-    tracks: Sequence[Track], told: Sequence[Array], rub: Sequence[Array], how: Filtering,
-    noise: Array, resonances: tuple[Resonance, ...] = (),
-) -> Signals:  # fmt: skip
-    """The signals of a recording's pieces.
-
-    :param told: efforts of a first fit, every sample, (samples, n) each. ``rub``: the part of them
-        that is friction of the drives.
-        ``noise``: of :func:`.noise.noise_of`. ``resonances``: of :func:`.noise.resonances_of`.
-    """
-    speed = np.sqrt(np.mean(np.concatenate([t.qd for t in tracks]) ** 2, 0))
-    parts = []
-    for track, effort, friction in zip(tracks, told, rub, strict=True):
-        load, sign = effort - friction, np.sign(track.qd)
-        laws = [np.abs(load) * sign, track.qd * np.abs(track.qd)]
-        for share in STRIBECK:
-            laws.append(np.exp(-((track.qd / np.maximum(share * speed, 1e-300)) ** 2)) * sign)
-        change = np.gradient(effort, track.period, axis=0)
-        columns = [effort, change, *_calm(track, load, how), *laws, track.wrench]
-        whole = np.concatenate([*columns, track.held[:, None]], 1)
-        parts.append(low_pass(whole, track.period, how))
-    whole = np.concatenate(parts)
-    count = 10 + 2 + len(STRIBECK)
-    each = np.split(whole[:, : count * tracks[0].q.shape[1]], count, 1)
-    rate = 1.0 / (tracks[0].period * how.keep_every)
-    return Signals(
-        Motion(each[2], each[3], each[4], whole[:, -7:-1], whole[:, -1]), (each[5], each[6]),
-        (each[7], each[8], each[9]), (each[0], each[1]), np.stack(each[10:], -1),
-        noise * np.sqrt(rate), passed_band(how, rate), resonances,
-    )  # fmt: skip
-
-
-def _calm(track: Track, load: Array, how: Filtering) -> list[Array]:
-    """Motion and load in the motion's own band, where nearly no noise is, (samples, n) each.
-
-    Positions, rates and accelerations; what the local polynomials miss of the latter two; the load
-    and its derivatives. Noise in both of two columns would look like something in common.
-    """
-    cutoff = None if how.cutoff is None else MOTION * how.cutoff
-    motion, force = (calm(values, track.period, cutoff) for values in (track.q, load))
-    missed = []
-    inner = slice(how.window // 2 + 3, len(load) - how.window // 2 - 3)
-    for order in (1, 2):
-        rough = scipy.signal.savgol_filter(
-            motion[0], how.window, DEGREE, order, track.period, axis=0
-        )
-        apart = np.zeros_like(rough)
-        apart[inner] = (rough - motion[order])[inner]
-        missed.append(apart)
-    return [*motion, *missed, *force]
 
 
 def calm(values: Array, period: float, cutoff: float | None) -> list[Array]:

@@ -11,7 +11,7 @@ backwards): both sides of tau = Y pi stay equal, what the noise has beyond the m
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from math import comb
@@ -221,6 +221,21 @@ def low_pass(values: Array, period: float, how: Filtering) -> Array:
     # What the filter makes up at the ends dies out in a period of its cut-off.
     edge = min(int(1.0 / (how.cutoff * period)), len(values) // 4)
     return np.asarray(smooth[edge : len(values) - edge : how.keep_every], np.float64)
+
+
+def filtered(
+    pieces: Sequence[Mapping[str, Array]], period: float, how: Filtering
+) -> dict[str, Array]:
+    """Signals of pieces by name, (samples, ...) each, filtered alike, one piece after the other."""
+    shapes = {name: values.shape[1:] for name, values in pieces[0].items()}
+    ends = np.cumsum([int(np.prod(shape)) for shape in shapes.values()])[:-1]
+    smooth = [
+        low_pass(np.concatenate([v.reshape(len(v), -1) for v in one.values()], 1), period, how)
+        for one in pieces
+    ]
+    parts = np.split(np.concatenate(smooth), ends, 1)
+    named = zip(shapes.items(), parts, strict=True)
+    return {name: part.reshape(len(part), *shape) for (name, shape), part in named}
 
 
 def by_blocks(rows: int, block: int, evaluate: Callable[[slice], Array]) -> Array:

@@ -73,7 +73,7 @@ def errors_of(rows: Rows, values: Array) -> tuple[Errors, Array]:
         q, qd, qdd = motion.q + q, motion.qd + qd, motion.qdd + qdd
         return rows.model.efforts(replace(motion, q=q, qd=qd, qdd=qdd), smooth)
 
-    here, (told, change) = need(), s.effort
+    here, told, change = need(), s.effort, rows.change
     load, square, *static = np.moveaxis(s.own, -1, 0)
     # A law of the robot is fitted.
     share = None if "load-dependent" in robot.laws else 0.05
