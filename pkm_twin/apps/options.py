@@ -77,7 +77,17 @@ class Carries(OfRobot):
     @property
     def load(self) -> Any:
         """The payload, None where none is given."""
-        return load_of(self.payload, getattr(self, "load_times", None))
+        from pkm_twin.recordings.payload import Load, parse_payload, parse_times
+
+        times = getattr(self, "load_times", None)
+        if self.payload is None:
+            if times is not None:
+                raise typer.BadParameter("--load-times needs --payload")
+            return None
+        try:
+            return Load(*parse_payload(self.payload), () if times is None else parse_times(times))
+        except ParameterError as error:
+            raise typer.BadParameter(str(error)) from None
 
     def machine(self) -> Robot:
         """The robot with its payload."""
@@ -108,13 +118,14 @@ class ReadsTables:
     decimal: str | None = setting(None, "of a table's numbers: . or ,")
     columns: tuple[str, ...] = setting(
         (),
-        "names of a table's columns, OURS=THEIRS,...: time=t,arm_1.position=q1; * in both stands "
-        "for the same text; may be repeated",
+        "names of a table's columns, OURS=THEIRS,...: 'leg_*.position=motor_*, x=pos_x [mm]'; * in "
+        "both stands for the same text; may be repeated",
     )
     units: str | None = setting(
         None,
-        "of a table: of rad, mrad, deg, rev, m, cm, mm, um, s, ms, us, percent (of the motor's "
-        "rated torque, with --side motor); default SI",
+        "of a table's columns without one: of rad, mrad, deg, rev, m, cm, mm, um, s, ms, us, "
+        "percent (of the motor's rated torque, with --side motor); default SI",
+        older=("--unit",),
     )
     time: str | None = setting(None, "name of a table's column of times")
 
@@ -350,18 +361,3 @@ class AwayFromSingular:
     singularity: float = setting(
         0.05, "least singularity index of a pose, 0 to 1", low=0.0, high=1.0
     )
-
-
-def load_of(payload: str | None, times: str | None) -> Any:
-    """The payload that a command line tells of, None where it tells of none."""
-    from pkm_twin.recordings.payload import Load, parse_payload, parse_times
-
-    if payload is None:
-        if times is not None:
-            raise typer.BadParameter("--load-times needs --payload")
-        return None
-    try:
-        spans = () if times is None else parse_times(times)
-        return Load(*parse_payload(payload), spans)
-    except ParameterError as error:
-        raise typer.BadParameter(str(error)) from None

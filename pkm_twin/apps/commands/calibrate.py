@@ -83,15 +83,6 @@ class Calibrate(OfRobot, ReadsTables, BeyondLimitsToo, Accepts, Overwrites):
         "with travel (a spool), or none (file); auto: each of sliding joints that have a ratio",
         choices={str(how): how for how in Transmission},
     )
-    columns: tuple[str, ...] = setting(
-        (),
-        "names of a table's columns, OURS=THEIRS,...: 'leg_*.position=motor_*, x=pos_x [mm]'; may "
-        "be repeated",
-    )
-    units: str | None = setting(
-        None, "of columns without one: of m, cm, mm, µm (um), rad, mrad, deg; default SI",
-        older=("--unit",),
-    )  # fmt: skip
     measure: tuple[str, ...] = setting(
         (),
         "what was measured, where not whole poses, separated by commas: height, distance (of two "
