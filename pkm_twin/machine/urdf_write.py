@@ -13,15 +13,16 @@ from __future__ import annotations
 import math
 import xml.etree.ElementTree as ET
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
 
 from pkm_twin.codegen.arrays import Array
-from pkm_twin.machine import rotations
+from pkm_twin.machine import rotations, urdf_xml
 from pkm_twin.machine.loop_tree import Joint, Link, LoopTree, Single, singles
 from pkm_twin.machine.rotations import Pose
-from pkm_twin.machine.urdf_control import Control, add_drives
+from pkm_twin.machine.urdf_control import DRIVE, Control, tree_names
 from pkm_twin.machine.urdf_xml import UNLIMITED
 
 GROUND: Final = "base_link"
@@ -57,13 +58,18 @@ def write_urdf(
         if part.child != PLATFORM:
             _inertial(link, tree.links.get(part.child, Link(part.child, com=at)), at)
             _shapes(link, tree, part.child)
-    for part in parts:
-        _joint(robot, part, places)
+    drives = {c.joint: c for c in controls} if hardware else {}
+    names = tree_names((part.name for part in parts), drives.values())
+    elements = {part.name: _joint(robot, part, places) for part in parts}
+    for name, element in elements.items():
+        element.set("name", names[name])
     for closure in tree.closures:
         _closure(robot, closure, places)
+    for part in parts:
+        if part.name in drives and not drives[part.name].same:
+            _drive(robot, part, drives[part.name], places, elements[part.name])
     if hardware:
-        _control(robot, tree, hardware)
-        add_drives(robot, controls)
+        _control(robot, tree, hardware, drives)
     if prefix:
         for element in robot.iter():
             for key in ("name", "link", "joint"):
@@ -127,7 +133,7 @@ def rpy_along(direction: Array) -> str:
     return number_text([0.0, math.atan2(math.hypot(x, y), z), math.atan2(y, x)])
 
 
-def _joint(robot: ET.Element, part: Single, places: Mapping[str, Array]) -> None:
+def _joint(robot: ET.Element, part: Single, places: Mapping[str, Array]) -> ET.Element:
     element = ET.SubElement(robot, "joint", name=part.name, type=part.kind)
     xyz, rpy = part.joint.at - places[part.parent], np.zeros(3)
     # The joint's frame is where the child stands at the value zero.
@@ -139,7 +145,7 @@ def _joint(robot: ET.Element, part: Single, places: Mapping[str, Array]) -> None
     ET.SubElement(element, "parent", link=part.parent)
     ET.SubElement(element, "child", link=part.child)
     if part.kind == "fixed":
-        return
+        return element
     ET.SubElement(element, "axis", xyz=number_text(part.axis))
     limits = part.joint.limits if part.whole else {}
     free = UNLIMITED[part.kind]
@@ -149,6 +155,28 @@ def _joint(robot: ET.Element, part: Single, places: Mapping[str, Array]) -> None
     ET.SubElement(element, "limit", {key: number_text([v]) for key, v in bounds.items()})
     if part.whole:
         _dynamics(element, part.joint)
+    return element
+
+
+def _drive(
+    robot: ET.Element, part: Single, control: Control, places: dict[str, Array],
+    follower: ET.Element,
+) -> None:  # fmt: skip
+    """The joint of a controller, with a link without mass, and the joint that follows it."""
+    link = urdf_xml.free_name(control.name + DRIVE, {PLATFORM, *places})
+    places[link] = part.joint.at
+    # A motor that turns, or a slide where the controller counts the metres of one.
+    slides = part.kind == "prismatic" and abs(control.factor) == 1.0
+    joint = replace(
+        part.joint, name=control.name, drawn=0.0, viscous=0.0, coulomb=0.0,
+        limits=control.limits(part.joint.limits, part.kind),
+    )  # fmt: skip
+    kind = "prismatic" if slides else "revolute"
+    _joint(robot, Single(control.name, kind, part.axis, part.parent, link, joint), places)
+    ET.SubElement(robot, "link", name=link)
+    back = control.inverse()
+    numbers = {"multiplier": repr(back.factor), "offset": repr(back.offset + 0.0)}
+    ET.SubElement(follower, "mimic", {"joint": control.name, **numbers})
 
 
 def _dynamics(element: ET.Element, joint: Joint) -> None:
@@ -174,17 +202,17 @@ def _closure(robot: ET.Element, closure: Joint, places: Mapping[str, Array]) -> 
             element.set("angle", number_text([math.acos(cosine)]))
 
 
-def _control(robot: ET.Element, tree: LoopTree, plugin: str) -> None:
-    control = ET.SubElement(robot, "ros2_control", name=tree.name, type="system")
-    hardware = ET.SubElement(control, "hardware")
+def _control(robot: ET.Element, tree: LoopTree, plugin: str, drives: Mapping[str, Control]) -> None:
+    system = ET.SubElement(robot, "ros2_control", name=tree.name, type="system")
+    hardware = ET.SubElement(system, "hardware")
     ET.SubElement(hardware, "plugin").text = plugin
     for name in tree.actuated:
-        joint = tree.joints[name]
-        element = ET.SubElement(control, "joint", name=name)
+        joint, control = tree.joints[name], drives.get(name, Control(name, name, 1.0, 0.0))
+        element = ET.SubElement(system, "joint", name=control.name)
         for interface in ("position", "effort"):
             ET.SubElement(element, "command_interface", name=interface)
         position = ET.SubElement(element, "state_interface", name="position")
-        start = number_text([_start(joint)])
+        start = number_text([control.value("", _start(joint))])
         ET.SubElement(position, "param", name="initial_value").text = start
         for interface in ("velocity", "effort"):
             ET.SubElement(element, "state_interface", name=interface)
@@ -192,7 +220,8 @@ def _control(robot: ET.Element, tree: LoopTree, plugin: str) -> None:
             ("rotor_inertia", joint.rotor_inertia), ("friction_offset", joint.offset)
         ):  # fmt: skip
             if value:
-                ET.SubElement(element, "param", name=key).text = number_text([value])
+                text = number_text([control.value(key, value)])
+                ET.SubElement(element, "param", name=key).text = text
 
 
 def _start(joint: Joint) -> float:
