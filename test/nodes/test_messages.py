@@ -2,7 +2,7 @@
 """Readers of messages: every fault is named, what comes through is finite and in order."""
 
 import math
-from itertools import permutations
+from itertools import permutations, product
 
 import numpy as np
 import pytest
@@ -27,6 +27,7 @@ NOW = 1_000 * SECOND
 NAMES = ("arm_1", "arm_2", "arm_3")
 Q = (0.1, 0.2, 0.3)
 QD = (1.0, -2.0, 3.0)
+WRENCH = (1.0, -2.0, 3.0, -0.1, 0.2, -0.3)
 DAMAGED = [math.nan, math.inf, -math.inf, 1e308, -1e308, 5e-324, -2e-310]
 """No measurement: not finite, beyond all bounds, or denormal."""
 RULES = StampRules(max_age=SECOND // 10)
@@ -63,6 +64,123 @@ def with_entry(values, index, value):
     return changed
 
 
+READ = {
+    "state": lambda m: JointReader(ROBOT).joint_state(m, NOW, RULES),
+    "trajectory": lambda m: JointReader(ROBOT).trajectory(m, NOW),
+    "wrench": lambda m: read_wrench(m, NOW, RULES, "platform", False),
+}
+
+
+def changed(make, kind, changes):
+    if kind == "wrench":
+        return make.wrench(**({"values": WRENCH, "stamp": NOW} | changes))
+    return (state if kind == "state" else trajectory)(make, **changes)
+
+
+def damaged(value):
+    """Each value of each kind of message, damaged: the message, the changes, the reason, words."""
+    reason = "" if math.isfinite(value) else "not finite"
+    for what, joint in product(("position", "velocity", "effort"), range(3)):
+        yield "state", {what: with_entry(Q, joint, value)}, reason, (NAMES[joint], what)
+    for what in ("positions", "velocities", "accelerations"):
+        row = with_entry(Q, 1, value)
+        yield "trajectory", {what: with_entry([Q] * 3, 2, row)}, reason, ("point 2: ", "arm_2")
+    for entry in range(6):
+        word = ("force" if entry < 3 else "torque") + "." + "xyz"[entry % 3]
+        yield "wrench", {"values": with_entry(WRENCH, entry, value)}, reason or "bounds", (word,)
+
+
+@pytest.mark.parametrize("value", DAMAGED)
+def test_a_damaged_value_is_named(make, value):
+    for kind, changes, expected, words in damaged(value):
+        reason, text = reject(READ[kind], changed(make, kind, changes))
+        assert reason == expected if expected else reason in ("bounds", "limit")
+        assert all(word in text for word in words)
+
+
+def wrong_lengths():
+    for what, row in product(("position", "velocity", "effort"), ((0.1,), (0.1, 0.2), (*Q, 0.4))):
+        yield "state", {what: row}, f"{len(row)} values for 3 names"
+    rows = ((), (0.1, 0.2), (*Q, 0.4))
+    for what, row, point in product(("positions", "velocities", "accelerations"), rows, range(3)):
+        values = {what: with_entry([Q] * 3, point, row)}
+        yield "trajectory", values, f"point {point}: {len(row)} {what} for 3"
+
+
+def test_a_wrong_length_names_both_lengths(make):
+    for kind, changes, word in wrong_lengths():
+        reason, text = reject(READ[kind], changed(make, kind, changes))
+        assert reason == "length" and word in text
+
+
+def at(values, joint, value):
+    return with_entry(values, joint, value)
+
+
+@pytest.mark.parametrize(
+    ("kind", "changes", "reason", "words"),
+    [
+        *(
+            ("state", {"names": at(NAMES, k, "elbow")}, "missing joint", [repr(NAMES[k])])
+            for k in range(3)
+        ),
+        (
+            "state",
+            {"names": (*NAMES, "arm_2"), "position": (*Q, 0.2), "velocity": (), "effort": ()},
+            "duplicated joint",
+            ["'arm_2'"],
+        ),
+        ("state", {"names": (), "position": ()}, "empty", []),
+        ("state", {"names": ()}, "empty", []),
+        ("state", {"position": ()}, "empty", []),
+        ("state", {"position": (math.nan,) * 3}, "empty", ["all positions are nan"]),
+        ("state", {"position": at(Q, 1, 1.31)}, "limit", ["arm_2", "1.31", "1.3"]),
+        ("state", {"position": at(Q, 1, -0.91)}, "limit", ["arm_2", "-0.91", "-0.9"]),
+        ("state", {"velocity": at(Q, 1, -15.1)}, "limit", ["arm_2", "-15.1", "-15"]),
+        ("state", {"effort": (0.0, MAX_EFFORT * 1.01, 0.0)}, "bounds", []),
+        ("state", {"stamp": 0}, "zero stamp", []),
+        ("state", {"stamp": NOW + SECOND // 10 + 1}, "future stamp", []),
+        ("state", {"stamp": NOW - SECOND // 10 - 1}, "stale stamp", []),
+        ("trajectory", {"names": ()}, "empty", []),
+        ("trajectory", {"times": [], "positions": []}, "empty", []),
+        ("trajectory", {"positions": [()] * 3}, "empty", []),
+        ("trajectory", {"names": ("arm_1", "arm_2")}, "missing joint", []),
+        ("trajectory", {"names": ("arm_1", "arm_2", "arm_2")}, "duplicated joint", []),
+        ("trajectory", {"names": (*NAMES, "arm_1")}, "duplicated joint", []),
+        ("trajectory", {"names": ("arm_1", "arm_2", "wrist")}, "unknown joint", []),
+        ("trajectory", {"names": (*NAMES, "wrist")}, "unknown joint", []),
+        ("trajectory", {"names": ("arm_1", "arm_2", "")}, "unknown joint", []),
+        ("trajectory", {"positions": at([Q] * 3, 0, at(Q, 2, 1.31))}, "limit", []),
+        ("trajectory", {"velocities": at([Q] * 3, 0, at(Q, 2, 15.1))}, "limit", []),
+        (
+            "trajectory",
+            {"accelerations": at([Q] * 3, 0, at(Q, 2, 1.01 * MAX_ACCELERATION))},
+            "bounds",
+            [],
+        ),
+        ("trajectory", {"times": [0, 0, SECOND]}, "time", []),
+        ("trajectory", {"times": [0, SECOND, SECOND]}, "time", []),
+        ("trajectory", {"times": [0, SECOND, SECOND // 2]}, "time", []),
+        ("trajectory", {"times": [-1, SECOND, 2 * SECOND]}, "time", []),
+        ("trajectory", {"times": [-SECOND, 0, SECOND]}, "time", []),
+        ("trajectory", {"times": [0, 1, MAX_DURATION + 1]}, "bounds", []),
+        ("trajectory", {"stamp": NOW - SECOND - 1}, "over", []),
+        *(
+            ("wrench", {"frame": frame}, "frame", [repr(frame), "'platform'"])
+            for frame in ("", "tool0", "Platform", "/platform")
+        ),
+        *(("wrench", {"values": at(WRENCH, k, 1.01 * MAX_FORCE)}, "bounds", []) for k in range(6)),
+        ("wrench", {"stamp": 0}, "zero stamp", []),
+        ("wrench", {"stamp": NOW + SECOND}, "future stamp", []),
+        ("wrench", {"stamp": NOW - SECOND}, "stale stamp", []),
+    ],
+)
+def test_what_is_wrong_is_named(make, kind, changes, reason, words):
+    found, text = reject(READ[kind], changed(make, kind, changes))
+    assert found == reason
+    assert all(word in text for word in words)
+
+
 class TestJointState:
     def test_values_come_in_the_robots_order(self, make, reader):
         message = state(
@@ -79,30 +197,11 @@ class TestJointState:
         assert sample.effort.tolist() == [10, 20, 30]
 
     @pytest.mark.parametrize("absent", ["velocity", "effort"])
-    def test_absent_values_are_none_and_never_zero(self, make, reader, absent):
-        sample = reader.joint_state(state(make, **{absent: ()}), NOW, RULES)
+    @pytest.mark.parametrize("given", [(), (math.nan,) * 3])
+    def test_absent_values_are_none_and_never_zero(self, make, reader, absent, given):
+        sample = reader.joint_state(state(make, **{absent: given}), NOW, RULES)
         assert (sample.qd is None) == (absent == "velocity")
         assert (sample.effort is None) == (absent == "effort")
-
-    @pytest.mark.parametrize("absent", ["velocity", "effort"])
-    def test_a_field_that_is_nan_for_all_of_the_robots_joints_is_absent(self, make, reader, absent):
-        nothing = (math.nan,) * 3
-        sample = reader.joint_state(state(make, **{absent: nothing}), NOW, RULES)
-        assert (sample.qd is None) == (absent == "velocity")
-        assert (sample.effort is None) == (absent == "effort")
-        foreign = state(
-            make,
-            names=("gripper", *NAMES),
-            position=(1.0, *Q),
-            velocity=(0.5, *nothing),
-            effort=(),
-        )
-        assert reader.joint_state(foreign, NOW, RULES).qd is None
-
-    def test_positions_that_are_nan_for_all_are_none(self, make, reader):
-        message = state(make, position=(math.nan,) * 3)
-        reason, text = reject(reader.joint_state, message, NOW, RULES)
-        assert (reason, "all positions are nan" in text) == ("empty", True)
 
     def test_positions_alone_are_read_whatever_else_is_there(self, make, reader):
         message = state(make, velocity=(math.nan, 1e300, 0.0), effort=(0.0,))
@@ -110,72 +209,24 @@ class TestJointState:
         assert sample.q.tolist() == list(Q)
         assert (sample.qd, sample.effort) == (None, None)
 
-    def test_a_long_name_is_cut_in_the_refusal(self, make, reader):
+    def test_a_long_name_is_cut_in_the_refusal(self, make):
         for names in (("x" * 10**6, *NAMES[1:]), tuple("x" * 10**4 for _ in range(3))):
-            _, text = reject(reader.joint_state, state(make, names=names), NOW, RULES)
-            assert len(text) < 1000
-        _, text = reject(reader.trajectory, trajectory(make, names=names), NOW)
-        assert len(text) < 1000
+            for kind in ("state", "trajectory"):
+                _, text = reject(READ[kind], changed(make, kind, {"names": names}))
+                assert len(text) < 1000
 
     def test_other_joints_are_ignored_whatever_they_carry(self, make, reader):
-        message = state(
-            make,
-            names=("gripper", *NAMES, "gripper"),
-            position=(math.nan, *Q, 1e308),
-            velocity=(math.inf, *QD, 5e-324),
-            effort=(),
-        )
-        sample = reader.joint_state(message, NOW, RULES)
-        assert sample.q.tolist() == list(Q)
-        assert sample.qd.tolist() == list(QD)
-
-    @pytest.mark.parametrize("missing", range(3))
-    def test_a_missing_joint_is_named(self, make, reader, missing):
-        names = with_entry(NAMES, missing, "elbow")
-        reason, text = reject(reader.joint_state, state(make, names=names), NOW, RULES)
-        assert reason == "missing joint"
-        assert repr(NAMES[missing]) in text
-
-    def test_a_duplicated_joint_is_named(self, make, reader):
-        message = state(make, names=(*NAMES, "arm_2"), position=(*Q, 0.2), velocity=(), effort=())
-        reason, text = reject(reader.joint_state, message, NOW, RULES)
-        assert (reason, "'arm_2'" in text) == ("duplicated joint", True)
-
-    @pytest.mark.parametrize(
-        "changes", [{"names": (), "position": ()}, {"names": ()}, {"position": ()}]
-    )
-    def test_empty_is_rejected(self, make, reader, changes):
-        reason, _ = reject(reader.joint_state, state(make, **changes), NOW, RULES)
-        assert reason == "empty"
-
-    @pytest.mark.parametrize("what", ["position", "velocity", "effort"])
-    @pytest.mark.parametrize("values", [(0.1,), (0.1, 0.2), (0.1, 0.2, 0.3, 0.4)])
-    def test_a_wrong_length_names_both_lengths(self, make, reader, what, values):
-        reason, text = reject(reader.joint_state, state(make, **{what: values}), NOW, RULES)
-        assert reason == "length"
-        assert what in text and f"{len(values)} values for 3 names" in text
-
-    @pytest.mark.parametrize("what", ["position", "velocity", "effort"])
-    @pytest.mark.parametrize("joint", range(3))
-    @pytest.mark.parametrize("value", DAMAGED)
-    def test_a_damaged_value_is_named(self, make, reader, what, joint, value):
-        values = with_entry(Q, joint, value)
-        reason, text = reject(reader.joint_state, state(make, **{what: values}), NOW, RULES)
-        assert NAMES[joint] in text and what in text
-        if not math.isfinite(value):
-            assert reason == "not finite"
-        else:
-            assert reason in ("bounds", "limit")
-
-    @pytest.mark.parametrize(
-        ("what", "value", "allowed"),
-        [("position", 1.31, "1.3"), ("position", -0.91, "-0.9"), ("velocity", -15.1, "-15")],
-    )
-    def test_a_passed_joint_limit_names_value_and_bound(self, make, reader, what, value, allowed):
-        values = with_entry(Q, 1, value)
-        reason, text = reject(reader.joint_state, state(make, **{what: values}), NOW, RULES)
-        assert reason == "limit"
-        assert "arm_2" in text and f"{value:g}" in text and allowed in text
+        for own in (QD, (math.nan,) * 3):
+            message = state(
+                make,
+                names=("gripper", *NAMES, "gripper"),
+                position=(math.nan, *Q, 1e308),
+                velocity=(math.inf, *own, 5e-324),
+                effort=(),
+            )
+            sample = reader.joint_state(message, NOW, RULES)
+            assert sample.q.tolist() == list(Q)
+            assert sample.qd is None if own != QD else sample.qd.tolist() == list(QD)
 
     def test_values_at_the_limits_are_good(self, make, reader):
         message = state(make, position=(-0.9, 1.3, 0.0), velocity=(15.0, -15.0, 0.0))
@@ -187,24 +238,8 @@ class TestJointState:
         assert reject(JointReader(limitless).joint_state, message, NOW, RULES)[0] == "bounds"
         assert JointReader(limitless).joint_state(state(make, position=(3, 3, 3)), NOW, RULES)
 
-    def test_measured_efforts_have_physical_bounds(self, make, reader):
-        values = (0.0, MAX_EFFORT * 1.01, 0.0)
-        reason, _ = reject(reader.joint_state, state(make, effort=values), NOW, RULES)
-        assert reason == "bounds"
-
 
 class TestStamps:
-    @pytest.mark.parametrize(
-        ("stamp", "reason"),
-        [
-            (0, "zero stamp"),
-            (NOW + SECOND // 10 + 1, "future stamp"),
-            (NOW - SECOND // 10 - 1, "stale stamp"),
-        ],
-    )
-    def test_a_bad_stamp_is_named(self, make, reader, stamp, reason):
-        assert reject(reader.joint_state, state(make, stamp=stamp), NOW, RULES)[0] == reason
-
     @pytest.mark.parametrize("stamp", [NOW - SECOND // 10, NOW, NOW + SECOND // 10])
     def test_stamps_at_the_tolerances_are_good(self, make, reader, stamp):
         assert reader.joint_state(state(make, stamp=stamp), NOW, RULES).stamp == stamp
@@ -242,83 +277,19 @@ class TestTrajectory:
         t = reader.trajectory(message, NOW)
         assert (t.qd, t.qdd) == (None, None)
 
-    @pytest.mark.parametrize(
-        ("changes", "reason"),
-        [
-            ({"names": ()}, "empty"),
-            ({"times": [], "positions": []}, "empty"),
-            ({"positions": [()] * 3}, "empty"),
-            ({"names": ("arm_1", "arm_2")}, "missing joint"),
-            ({"names": ("arm_1", "arm_2", "arm_2")}, "duplicated joint"),
-            ({"names": (*NAMES, "arm_1")}, "duplicated joint"),
-            ({"names": ("arm_1", "arm_2", "wrist")}, "unknown joint"),
-            ({"names": (*NAMES, "wrist")}, "unknown joint"),
-            ({"names": ("arm_1", "arm_2", "")}, "unknown joint"),
-        ],
-    )
-    def test_wrong_joints_and_empty_arrays_are_named(self, make, reader, changes, reason):
-        assert reject(reader.trajectory, trajectory(make, **changes), NOW)[0] == reason
-
-    @pytest.mark.parametrize("what", ["positions", "velocities", "accelerations"])
-    @pytest.mark.parametrize("row", [(), (0.1, 0.2), (0.1, 0.2, 0.3, 0.4)])
-    @pytest.mark.parametrize("point", range(3))
-    def test_a_wrong_length_names_point_and_lengths(self, make, reader, what, row, point):
-        message = trajectory(make, **{what: with_entry([Q] * 3, point, row)})
-        reason, text = reject(reader.trajectory, message, NOW)
-        assert reason == "length"
-        assert f"point {point}: {len(row)} {what} for 3" in text
-
-    @pytest.mark.parametrize("what", ["positions", "velocities", "accelerations"])
-    @pytest.mark.parametrize("value", DAMAGED)
-    def test_a_damaged_value_names_point_and_joint(self, make, reader, what, value):
-        message = trajectory(make, **{what: with_entry([Q] * 3, 2, with_entry(Q, 1, value))})
-        reason, text = reject(reader.trajectory, message, NOW)
-        assert text.startswith("point 2: ") and "arm_2" in text
-        assert (reason == "not finite") == (not math.isfinite(value))
-
-    @pytest.mark.parametrize(
-        ("what", "value", "reason"),
-        [
-            ("positions", 1.31, "limit"),
-            ("velocities", 15.1, "limit"),
-            ("accelerations", 1.01 * MAX_ACCELERATION, "bounds"),
-        ],
-    )
-    def test_a_passed_limit_is_rejected(self, make, reader, what, value, reason):
-        message = trajectory(make, **{what: with_entry([Q] * 3, 0, with_entry(Q, 2, value))})
-        assert reject(reader.trajectory, message, NOW)[0] == reason
-
-    @pytest.mark.parametrize(
-        "times",
-        [
-            [0, 0, SECOND],
-            [0, SECOND, SECOND],
-            [0, SECOND, SECOND // 2],
-            [-1, SECOND, 2 * SECOND],
-            [-SECOND, 0, SECOND],
-        ],
-    )
-    def test_times_that_do_not_rise_from_zero_are_rejected(self, make, reader, times):
-        assert reject(reader.trajectory, trajectory(make, times=times), NOW)[0] == "time"
-
     def test_a_time_of_more_nanoseconds_than_a_second_has_is_rejected(self, make, reader):
         message = trajectory(make, times=[0, SECOND, 2 * SECOND])
         message.points[1].time_from_start = make.kind.duration(sec=0, nanosec=SECOND)
         assert reject(reader.trajectory, message, NOW)[0] == "time"
 
-    def test_a_duration_beyond_the_resolution_of_seconds_is_rejected(self, make, reader):
-        end = MAX_DURATION
-        times = [end - 2, end - 1, end]
+    def test_times_up_to_the_resolution_of_seconds_are_told_apart(self, make, reader):
+        times = [MAX_DURATION - 2, MAX_DURATION - 1, MAX_DURATION]
         t = reader.trajectory(trajectory(make, times=times), NOW)
         assert (np.diff(t.times) > 0).all()
-        message = trajectory(make, times=[0, 1, end + 1])
-        assert reject(reader.trajectory, message, NOW)[0] == "bounds"
 
     def test_only_a_trajectory_whose_end_has_passed_is_over(self, make, reader):
         assert reader.trajectory(trajectory(make, stamp=NOW - SECOND), NOW).stamp
         assert reader.trajectory(trajectory(make, stamp=NOW + SECOND), NOW).stamp
-        over = trajectory(make, stamp=NOW - SECOND - 1)
-        assert reject(reader.trajectory, over, NOW)[0] == "over"
 
     def test_too_many_points_are_rejected_unread(self, reader):
         message = Maker(Plain()).trajectory(NAMES, [], [])
@@ -326,38 +297,14 @@ class TestTrajectory:
         assert reject(reader.trajectory, message, NOW)[0] == "bounds"
 
 
-class TestWrench:
-    VALUES = (1.0, -2.0, 3.0, -0.1, 0.2, -0.3)
-
-    def read(self, message, accept_empty=False):
-        return read_wrench(message, NOW, RULES, "platform", accept_empty)
-
-    def test_values_frame_and_stamp_are_kept(self, make):
-        sample = self.read(make.wrench(self.VALUES, NOW))
-        assert sample.wrench.tolist() == list(self.VALUES)
-        assert (sample.frame, sample.stamp) == ("platform", NOW)
-
-    @pytest.mark.parametrize("frame", ["", "tool0", "Platform", "/platform"])
-    def test_another_frame_is_rejected(self, make, frame):
-        reason, text = reject(self.read, make.wrench(self.VALUES, NOW, frame))
-        assert reason == "frame"
-        assert repr(frame) in text and "'platform'" in text
-
-    def test_an_empty_frame_is_the_expected_one_where_allowed(self, make):
-        assert self.read(make.wrench(self.VALUES, NOW, ""), True).frame == "platform"
-        assert reject(self.read, make.wrench(self.VALUES, NOW, "tool0"), True)[0] == "frame"
-
-    @pytest.mark.parametrize("entry", range(6))
-    @pytest.mark.parametrize("value", [*DAMAGED, 1.01 * MAX_FORCE])
-    def test_a_damaged_value_is_named(self, make, entry, value):
-        message = make.wrench(with_entry(self.VALUES, entry, value), NOW)
-        reason, text = reject(self.read, message)
-        assert reason == ("bounds" if math.isfinite(value) else "not finite")
-        assert ("force" if entry < 3 else "torque") + "." + "xyz"[entry % 3] in text
-
-    @pytest.mark.parametrize("stamp", [0, NOW + SECOND, NOW - SECOND])
-    def test_a_bad_stamp_is_rejected(self, make, stamp):
-        assert "stamp" in reject(self.read, make.wrench(self.VALUES, stamp))[0]
+def test_a_wrench_keeps_its_values_frame_and_stamp(make):
+    sample = READ["wrench"](make.wrench(WRENCH, NOW))
+    assert sample.wrench.tolist() == list(WRENCH)
+    assert (sample.frame, sample.stamp) == ("platform", NOW)
+    # An empty frame is the expected one where it is allowed.
+    allowed = NOW, RULES, "platform", True
+    assert read_wrench(make.wrench(WRENCH, NOW, ""), *allowed).frame == "platform"
+    assert reject(read_wrench, make.wrench(WRENCH, NOW, "tool0"), *allowed)[0] == "frame"
 
 
 class TestAnything:
