@@ -37,6 +37,7 @@ setup(
         "pkm_twin.mechanisms",
         "pkm_twin.messages",
         "pkm_twin.paths",
+        "pkm_twin.recordings",
         "pkm_twin.report",
         "pkm_twin.robot",
         "pkm_twin.ros",

@@ -1,23 +1,26 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The load and the push that delta_dynamics finds, over the real middleware."""
+"""What delta_dynamics tells beside the torques: load, push, reactions, and what a wrench needs."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
+from delta_dynamics import inverse_dynamics, reactions
+from test.nodes.harness import SECOND, Maker, Ros, counts_of, stamp_of, values_of
+from test.support.robots import load
+
 pytest.importorskip("rclpy")
 
+from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import InertiaStamped, PointStamped, WrenchStamped
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool, String
 
-from delta_dynamics import inverse_dynamics
 from delta_dynamics.estimates_node import Estimates
 from delta_dynamics.feedforward import Torques
 from pkm_twin.robot.catalogue import robot_of_data
-from test.nodes.harness import SECOND, Maker, Ros
-from test.support.robots import load, often, parameters_of
+from test.support.robots import often, parameters_of
 
 ROBOT = load("delta_cu")
 PARAMETERS = ("estimate_payload:=true", "observe_wrench:=true", "stale_after:=600.0")
@@ -208,3 +211,142 @@ def test_a_file_that_says_nothing_of_its_efforts_is_warned_of():
     estimates = Estimates(Topics(), lambda: sure, ("base_link", "platform"))
     assert not estimates.warning()
     assert estimates.diagnose()["model uncertainty"] == "robot file"
+
+
+MODULE = "delta_dynamics.node"
+Q = np.array([0.2, 0.3, 0.1])
+NAME = "reacting"
+
+
+def test_every_joint_has_its_wrench_where_asked_for(peer, launch):
+    """A machine that stands still: the wrenches of statics, under each joint's name."""
+    make = Maker(Ros())
+    names = reactions(ROBOT, Q, np.zeros(3), np.zeros(3)).names
+    topics = {name: f"/{NAME}/reactions/{name.replace(' ', '_')}" for name in names}
+    peer.talk(JointState, f"/{NAME}/states")
+    for topic in topics.values():
+        peer.hear(WrenchStamped, topic)
+    launch(
+        MODULE,
+        "publish_reactions:=true",
+        "reactions_rate:=20.0",
+        "base_frame:=floor",
+        arguments=["-r", f"__node:={NAME}", "-r", f"joint_states:=/{NAME}/states"],
+    )
+
+    def send():
+        state = make.joint_state(ROBOT.joint_names, Q.tolist(), [0.0] * 3, stamp=peer.now())
+        peer.send(f"/{NAME}/states", state)
+
+    peer.until(lambda: all(peer.received(t) for t in topics.values()), repeat=send)
+    expected = reactions(ROBOT, Q, np.zeros(3), np.zeros(3))
+    stamps = set()
+    for k, name in enumerate(names):
+        message = peer.received(topics[name])[-1]
+        assert message.header.frame_id == "floor"
+        stamps.add(stamp_of(message))
+        force, torque = message.wrench.force, message.wrench.torque
+        got = [force.x, force.y, force.z, torque.x, torque.y, torque.z]
+        np.testing.assert_allclose(got, expected.wrenches[k], atol=1e-9)
+    assert stamps
+
+
+SINGULAR = """
+import delta_dynamics.node as node
+from pkm_twin.errors import SingularityError
+solve = node.reactions
+def singular(robot, q, *rest):
+    if q[0] == 0.125:
+        raise SingularityError("constraints", (), 0.0, 1e-9)
+    return solve(robot, q, *rest)
+node.reactions = singular
+raise SystemExit(node.run(node.NODE))
+"""
+
+
+def test_a_state_without_reactions_has_its_torque(peer, launch):
+    """In a constraint singularity, where the parameters let the stream pass, reactions are none."""
+    make, name = Maker(Ros()), "loose"
+    peer.talk(JointState, f"/{name}/states")
+    peer.hear(JointState, f"/{name}/joint_torques")
+    peer.hear(DiagnosticArray, "/diagnostics")
+    parameters = ("publish_reactions:=true", "reactions_rate:=1000.0", "recovery_count:=1")
+    remap = ["-r", f"__node:={name}", "-r", f"joint_states:=/{name}/states"]
+    process = launch(None, *parameters, code=SINGULAR, arguments=remap)
+    q = [0.125, 0.3, 0.1]
+
+    def send():
+        for _ in range(30):
+            state = make.joint_state(ROBOT.joint_names, q, [0.0] * 3, stamp=peer.now())
+            peer.send(f"/{name}/states", state)
+
+    peer.until(lambda: len(peer.received(f"/{name}/joint_torques")) > 5, repeat=send)
+    peer.until(lambda: "no reactions or estimates: " in process.output)
+    values = values_of(peer.diagnostics(f"/{name}"))
+    assert values["exceptions"] == "0"
+    assert "stopped: exception" not in values
+
+
+HEAD = load("prru")
+HEAD_Q = HEAD.inverse(HEAD.home())
+REST = np.zeros(3)
+WRENCH = [30.0, -20.0, -100.0, 3.0, -2.0, 1.0]
+MEASURED = [100.0, 110.0, 120.0]
+
+
+def test_torque_residual_and_stop(peer, launch):
+    """At rest the wrench is borne exactly; without it the stream stops."""
+    remap = ("joint_states:=/bearing/states", "wrench:=/bearing/wrench", "__node:=bearing")
+    arguments = [word for pair in remap for word in ("-r", pair)]
+    process = launch(
+        "delta_dynamics.node", "mechanism:=prru", "use_wrench:=true", "no_wrench:=stop",
+        "max_wrench_age:=1.0", "stale_after:=5.0", "differentiator.window:=4", "recovery_count:=1",
+        arguments=arguments,
+    )  # fmt: skip
+    peer.hear(DiagnosticArray, "/diagnostics")
+    for topic in ("joint_torques", "torque_residual"):
+        peer.hear(JointState, f"/bearing/{topic}")
+    peer.talk(JointState, "/bearing/states")
+    peer.talk(WrenchStamped, "/bearing/wrench")
+    peer.until(peer.matched)
+    torques, residuals = (
+        peer.received(f"/bearing/{name}") for name in ("joint_torques", "torque_residual")
+    )
+
+    def send(wrench=True):
+        assert process.alive(), process.output
+        stamp = peer.now()
+        if wrench:
+            peer.send("/bearing/wrench", MAKE.wrench(WRENCH, stamp))
+        names = HEAD.joint_names
+        peer.send("/bearing/states", MAKE.joint_state(names, HEAD_Q, REST, MEASURED, stamp))
+
+    rotation = HEAD.platform(HEAD_Q)[1]
+    fixed = np.concatenate((rotation @ WRENCH[:3], rotation @ WRENCH[3:]))
+    exact = inverse_dynamics(HEAD, HEAD_Q, REST, REST, fixed)
+    assert np.abs(exact - inverse_dynamics(HEAD, HEAD_Q, REST, REST)).max() > 10.0
+
+    def borne():
+        """The torque that bears the wrench, and the residual of its stamp."""
+        right = {stamp_of(m) for m in torques if np.allclose(m.effort, exact, atol=1e-6)}
+        return next((m for m in residuals if stamp_of(m) in right), None)
+
+    residual = peer.until(borne, repeat=send)
+    assert np.allclose(residual.effort, MEASURED - exact, atol=1e-6)
+
+    def stopped():
+        # A state that was heard before the first wrench is a warning of the same name.
+        array = peer.diagnostics("/bearing")
+        status = array.status[0]
+        return array if status.level == b"\x02" and "no wrench" in status.message else None
+
+    array = peer.until(stopped, repeat=lambda: send(wrench=False))
+    assert counts_of(array, "stopped")["no wrench"] >= 1
+    assert int(values_of(array)["wrenches accepted"]) > 3
+    # What is refused is counted, and no wrench.
+    peer.until(
+        lambda: counts_of(peer.diagnostics("/bearing"), "wrenches rejected").get("future stamp"),
+        repeat=lambda: peer.send("/bearing/wrench", MAKE.wrench(WRENCH, peer.now() + 600 * SECOND)),
+    )
+    torques.clear()
+    peer.until(lambda: torques, repeat=send)

@@ -1,0 +1,186 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What is known of a stream: its pace, its losses, and whether rates and positions agree."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from delta_dynamics.feedforward import Feedforward
+from delta_dynamics.settings import Settings
+from pkm_twin.streams.monitor import Pace, TopicStatistics
+from pkm_twin.streams.rates import RateAgreement
+from test.nodes.harness import SECOND
+from test.support.robots import load
+
+
+def answered(pace, stamps):
+    found = []
+    for stamp in stamps:
+        if pace.due(stamp):
+            pace.answered(stamp)
+            found.append(stamp)
+    return found
+
+
+@pytest.mark.parametrize("input_rate", [40.0, 100.0, 101.0, 250.0, 1000.0, 990.0])
+@pytest.mark.parametrize("jitter", [0.0, 0.3])
+def test_the_rate_is_kept_and_a_slower_stream_is_answered_whole(input_rate, jitter):
+    rng = np.random.default_rng(1)
+    steps = np.arange(4000) + jitter * rng.uniform(-1, 1, 4000)
+    stamps = (SECOND * (1000 + steps / input_rate)).astype(int).tolist()
+    found = answered(Pace(100.0), stamps)
+    seconds = len(stamps) / input_rate
+    expected = min(len(stamps), 100.0 * seconds)
+    assert 0.97 * expected - 2 <= len(found) <= expected + 3
+    # Never more than two within a period.
+    assert all(b - a >= SECOND // 100 for a, b in zip(found, found[2:], strict=False))
+
+
+def test_zero_is_every_sample():
+    assert answered(Pace(0.0), [5, 5, 6, 3]) == [5, 5, 6, 3]
+
+
+def test_a_silence_earns_no_burst_and_a_reset_begins_anew():
+    pace = Pace(10.0)
+    period = SECOND // 10
+    stamps = [1000 * period, 5000 * period, *(5000 * period + k for k in range(1, 100))]
+    assert len(answered(pace, stamps)) <= 3
+    assert not pace.due(10)
+    pace.reset()
+    assert pace.due(10)
+
+
+MILLISECOND = 10**6
+
+
+@given(st.lists(st.booleans(), min_size=1, max_size=50))
+def test_what_is_missing_between_two_messages_is_counted(come):
+    topic = TopicStatistics()
+    for number, here in enumerate(come, 1):
+        if here and topic.received(number, number * MILLISECOND):
+            topic.count_missed()
+    first, last = (come.index(True), len(come) - come[::-1].index(True)) if any(come) else (0, 0)
+    assert topic.missed == come[first:last].count(False)
+
+
+def test_a_publisher_that_begins_anew_or_gives_no_numbers_has_lost_nothing():
+    for numbers in ([100, 101, 1, 2, 3], [None, None, None], [7, None, 9]):
+        topic = TopicStatistics()
+        for sent, number in enumerate(numbers, 1):
+            assert not topic.received(number, sent * MILLISECOND)
+
+
+def test_unconfirmed_gaps_are_not_counted():
+    topic = TopicStatistics()
+    assert [topic.received(number, number) for number in (1, 900, 2)] == [False, True, False]
+    assert topic.missed == 0
+
+
+@pytest.mark.parametrize(("took", "overruns"), [(0.9e-3, 0), (1.1e-3, 20)])
+def test_an_answer_that_takes_longer_than_the_period_is_an_overrun(took, overruns):
+    topic = TopicStatistics()
+    for i in range(21):
+        topic.received(i, i * MILLISECOND)
+        topic.handled(took)
+    # The first message has no period yet; stamp zero is none.
+    assert topic.overruns == pytest.approx(overruns, abs=1)
+    assert topic.longest == took
+
+
+def test_the_period_is_a_mean():
+    """Two messages close together do not make a good answer late."""
+    topic = TopicStatistics()
+    sent = 0
+    for i in range(100):
+        sent += MILLISECOND * (4 if i % 2 else 8)
+        topic.received(i, sent)
+        topic.handled(5e-3)
+    assert topic.overruns <= 1
+
+
+def test_a_silence_is_no_period():
+    """Batches of 20 at 1 kHz, a second apart."""
+    topic = TopicStatistics()
+    sent = 0
+    for i in range(200):
+        sent += MILLISECOND * (1 if i % 20 else 1000)
+        topic.received(i, sent)
+        topic.handled(5e-3)
+    assert topic.overruns >= 190
+
+
+def test_a_slower_stream_is_learned():
+    topic = TopicStatistics()
+    sent = 0
+    for i in range(300):
+        sent += MILLISECOND * (1 if i < 100 else 20)
+        topic.received(i, sent)
+        topic.handled(5e-3)
+    assert 98 <= topic.overruns <= 140
+
+
+ROBOTS = ("delta_cu", "five_bar", "stewart")
+
+
+def motion(rng, robot, t):
+    """A random smooth motion of all joints about zero: positions and rates, shape (k, n) each."""
+    units = np.array([1.0 if unit == "rad" else robot.size for unit in robot.joint_units])
+    turns = 2.0 * np.pi * rng.uniform(0.3, 2.0, (4, 1, robot.joints_count))
+    phase, reach = rng.uniform(0.0, 2.0 * np.pi, turns.shape), 0.05 * units
+    angle = turns * t[:, None] + phase
+    return (reach * np.sin(angle)).sum(0), (reach * turns * np.cos(angle)).sum(0)
+
+
+def faults(robot, stamps, q, qd):
+    """What is said after each sample."""
+    agreement, found = RateAgreement(robot), []
+    for stamp, place, rate in zip(stamps.tolist(), q, qd, strict=True):
+        agreement.push(stamp, place, rate)
+        found.append(agreement.fault)
+    return found
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+@pytest.mark.parametrize("rate", [50.0, 200.0, 1000.0])
+def test_a_true_motion_agrees_and_one_of_a_wrong_scale_does_not(rng, name, rate):
+    """With jitter, lost samples, noise and velocities that are 10 ms late."""
+    robot = load(name)
+    t = np.arange(0.0, 4.0, 1.0 / rate)
+    t = (t + rng.uniform(0.0, 0.5 / rate, len(t)))[rng.uniform(size=len(t)) > 0.05]
+    stamps = np.round(1e9 * t).astype(np.int64) + SECOND
+    seed = int(rng.integers(2**31))
+    q, _ = motion(np.random.default_rng(seed), robot, t)
+    _, late = motion(np.random.default_rng(seed), robot, t - 0.01)
+    q = q + 1e-5 * rng.normal(size=q.shape)
+    qd = late + 1e-2 * np.abs(late).max(0) * rng.normal(size=q.shape)
+    assert set(faults(robot, stamps, q, qd)) == {""}
+    for j in range(robot.joints_count):
+        for factor in (0.05, 0.0, -1.0, 57.3):
+            wrong = np.where(np.arange(robot.joints_count) == j, factor, 1.0)
+            for found in (
+                faults(robot, stamps, wrong * q, qd),
+                faults(robot, stamps, q, wrong * qd),
+            ):
+                assert all(text.startswith(robot.joint_names[j]) for text in found[-len(t) // 4 :])
+
+
+def test_noise_at_rest_says_nothing(rng):
+    robot = load("delta_cu")
+    stamps = SECOND + np.arange(3000) * SECOND // 1000
+    noise = rng.normal(size=(3000, 3))
+    assert set(faults(robot, stamps, 1e-5 * noise, 0.05 * noise)) == {""}
+
+
+def test_the_stream_of_the_node_is_judged(make):
+    """Positions scaled by 0.05 with true velocities pass every limit."""
+    robot = load("delta_cu")
+    for factor in (1.0, 0.05):
+        core = Feedforward(robot, Settings())
+        for i in range(2000):
+            t, stamp = 1e-3 * i, SECOND + i * SECOND // 1000
+            q = factor * 0.2 * np.sin(5.0 * t) * np.ones(3)
+            qd = np.cos(5.0 * t) * np.ones(3)
+            core.joint_state(make.joint_state(robot.joint_names, q, qd, stamp=stamp), stamp)
+        assert core.stream.rejected.total() == 0
+        assert bool(core.rates.fault) == (factor != 1.0)
