@@ -129,7 +129,7 @@ def _payloads(r: Recording, c: Compared) -> Iterator[tuple[str, Recording]]:
         return inverse_dynamics(heavy, *motion) - inverse_dynamics(robot, *motion)
 
     try:
-        columns = [by_held(r.robot, None, None, more, *track.motion) for track in c.tracks]
+        columns = [by_held(r.robot, None, more, track) for track in c.tracks]
     except PkmTwinError:
         return
     weight = 1.0 / c.limit**2

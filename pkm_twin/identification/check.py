@@ -17,6 +17,7 @@ from delta_dynamics import inverse_dynamics, torque_deviation
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import SingularityError, UnreachableError, one_line
 from pkm_twin.identification.compare import MAX_RESIDUAL, Compared, by_held, compare
+from pkm_twin.identification.samples import Motion
 from pkm_twin.recordings import Recording, at_rest
 from pkm_twin.report import Fact, Verdict, judged
 from pkm_twin.robot.limits import ranges
@@ -315,7 +316,9 @@ def idle_of(r: Recording) -> Mask:
     assert r.effort is not None  # noqa: S101
     still = np.zeros_like(r.q)
     wrench = np.zeros((len(r.time), 6)) if r.wrench is None else r.wrench
-    needed = by_held(r.robot, r.carried, r.held, inverse_dynamics, r.q, still, still, wrench)
+    held = np.zeros(len(r.time)) if r.held is None else r.held
+    motion = Motion(r.q, still, still, wrench, held)
+    needed = by_held(r.robot, r.carried, inverse_dynamics, motion)
     rates = r.qd
     if rates is None:
         rates = np.gradient(r.q, r.time, axis=0) if len(r.time) > 1 else still
@@ -399,9 +402,9 @@ def _bands(r: Recording, c: Compared) -> dict[str, dict[str, Any]]:
     """By joint, where the robot's file has an ``uncertainty``."""
     if not r.robot.uncertainty:
         return {}
-    carried, parts = r.carried, []
+    parts = []
     for track, rows in zip(c.tracks, c.inner, strict=True):
-        made = by_held(r.robot, carried, track.held, torque_deviation, *track.motion)
+        made = by_held(r.robot, r.carried, torque_deviation, track)
         parts.append(made[rows])
     spread = np.concatenate(parts)
     inside = {str(k): np.mean(np.abs(c.residual) <= k * spread, 0) for k in DEVIATIONS}

@@ -19,7 +19,7 @@ from pkm_twin.identification.judge import LOUD
 from pkm_twin.identification.noise import SEGMENT, huber, noise_of, passed_band, usual_size
 from pkm_twin.identification.plausible import LATEST
 from pkm_twin.identification.rows import BLOCK, shaken_efforts
-from pkm_twin.identification.samples import Filtering, Track, by_blocks, low_pass, tracks
+from pkm_twin.identification.samples import Filtering, Motion, Track, by_blocks, low_pass, tracks
 from pkm_twin.recordings import Recording
 from pkm_twin.robot.robot import Robot
 
@@ -124,25 +124,20 @@ class Compared:
 
 
 def by_held(
-    robot: Robot, carried: Robot | None, held: Array | None, function: Callable[..., Array],
-    *motion: Array,
-) -> Array:  # fmt: skip
-    """A function of robot and motion, with the payload while it is held, shape (k, n).
-
-    :param held: 1 where ``carried`` is the robot, shape (k,); ``motion``: q and others, (k, ...).
-    """
-    loaded: Mask = np.zeros(len(motion[0]), np.bool_)
-    if carried is not None and held is not None:
-        loaded = np.asarray(held > 0.5, np.bool_)
-    made = np.zeros_like(motion[0])
+    robot: Robot, carried: Robot | None, function: Callable[..., Array], motion: Motion
+) -> Array:
+    """A function of robot, joints and wrench, with the payload while it is held, shape (k, n)."""
+    loaded = np.asarray((motion.held > 0.5) & (carried is not None), np.bool_)
+    made = np.zeros_like(motion.q)
     for machine, some in ((robot, ~loaded), (carried, loaded)):
-        if machine is not None and some.any():
-            own = [one[some] for one in motion]
+        own = motion.part(some)
 
-            def block(part: slice, machine: Robot = machine, own: list[Array] = own) -> Array:
-                return function(machine, *(one[part] for one in own))
+        def block(rows: slice, machine: Robot | None = machine, own: Motion = own) -> Array:
+            part = own.part(rows)
+            return function(machine, *part.joints, part.wrench)
 
-            made[some] = by_blocks(int(some.sum()), BLOCK, block)
+        if some.any():
+            made[some] = by_blocks(len(own.q), BLOCK, block)
     return made
 
 
@@ -162,8 +157,7 @@ def compare(robot: Robot, r: Recording, bound: float = MAX_RESIDUAL) -> Compared
 
     def efforts(track: Track) -> Array:
         qd = moving_rates(track.qd, ~track.moves(how), reach)
-        motion = track.q, qd, track.qdd, track.wrench
-        return by_held(robot, r.carried, track.held, inverse_dynamics, *motion)
+        return by_held(robot, r.carried, inverse_dynamics, replace(track, qd=qd))
 
     period, made, raw, inside = pieces[0].period, [], [], []
     one_by_one: Any = replace(how, keep_every=1)

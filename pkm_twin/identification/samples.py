@@ -57,7 +57,7 @@ class Motion:
         """Positions, rates and accelerations."""
         return self.q, self.qd, self.qdd
 
-    def part(self, rows: slice) -> Motion:
+    def part(self, rows: slice | Mask) -> Motion:
         """Some of the rows."""
         return Motion(*(one[rows] for one in (*self.joints, self.wrench, self.held)))
 
@@ -69,11 +69,6 @@ class Track(Motion):
     time: Array
     effort: Array
     period: float
-
-    @property
-    def motion(self) -> tuple[Array, Array, Array, Array]:
-        """Positions, rates, accelerations and wrenches, as functions of a motion take them."""
-        return self.q, self.qd, self.qdd, self.wrench
 
     def moves(self, how: Filtering) -> Mask:
         """Where a joint moves, clear of what noise makes of its rates, shape (k, n)."""
