@@ -130,10 +130,6 @@ class Code:
         header = self._loaded[0]
         return tuple(header["inputs"]), tuple(header["outputs"])
 
-    @cached_property
-    def _stepped(self) -> bool:
-        return bool(self._loaded[0]["stepped"])
-
     def prepare(self, p: Array) -> Array:
         """What samples need of a machine's parameters.
 
@@ -173,54 +169,36 @@ class Code:
         :raises ValueError: an input that is no real numbers, or whose last axis has another size.
         """
         arrays = self._checked(inputs)
-        whole = max(arrays, key=_axes, default=_NO_INPUT)
-        if whole.ndim == 1:
-            return self.run_one(prepared, arrays)
-        shape = whole.shape[:-1]
-        if all(a.flags.c_contiguous and a.shape[:-1] in ((), shape) for a in arrays):
-            quick = self._quick(prepared, arrays, shape)
-            if quick is not None:
-                outputs, status = quick
-                if status is not None:
-                    count = len(status)
-                    rows = [a.reshape(1, 1 if a.ndim == 1 else count, a.shape[-1]) for a in arrays]
-                    flat = [output.reshape(count, output.shape[-1]) for output in outputs]
-                    status = self._finished(prepared.reshape(1, -1), rows, flat, status, count)
-                return outputs, None if status is None else status.reshape(*shape, 2)
-        batch = np.broadcast_shapes(*(array.shape[:-1] for array in arrays))
-        count = math.prod(batch)
-        if count == 0:
-            return [np.empty((*batch, size)) for size in self.sizes[1]], None
-        rows = []
-        for array in arrays:
-            size = array.shape[-1]
-            one = array.size == size
-            whole = array.reshape(size) if one else np.broadcast_to(array, (*batch, size))
-            # The code reads doubles side by side, which a column of a table is not.
-            rows.append(np.ascontiguousarray(whole).reshape(1, 1 if one else count, size))
-        outputs, status = self._solved(prepared.reshape(1, -1), rows, count)
-        shaped = [output.reshape(*batch, output.shape[-1]) for output in outputs]
-        return shaped, None if status is None else status.reshape(*batch, 2)
-
-    def _quick(
-        self, prepared: Array, arrays: Sequence[Array], shape: tuple[int, ...]
-    ) -> tuple[list[Array], Array | None] | None:
-        """A small batch in one step, as :meth:`_run`; None where it is too large."""
-        _, _, code, locked = self._loaded
+        shape = max(arrays, key=_axes, default=_NO_INPUT).shape[:-1]
+        if shape and not all([a.ndim == 1 or a.shape[:-1] == shape for a in arrays]):
+            shape = np.broadcast_shapes(*(a.shape[:-1] for a in arrays))
+            arrays = [
+                a.reshape(-1)
+                if a.size == a.shape[-1]
+                else np.broadcast_to(a, (*shape, a.shape[-1]))
+                for a in arrays
+            ]
         count = math.prod(shape)
-        if locked is None or not 0 < count <= SMALL:
-            return None
-        # Copies into a room cost less than to find where arrays lie.
-        space = self._room(prepared, count)
-        for view, array in zip(space.inputs, arrays, strict=True):
-            view[...] = array if array.ndim <= 2 else array.reshape(count, -1)
-        bad = code(space.address)
-        outputs = [view.copy() for view in space.outputs]
-        if len(shape) > 1 or count == 1:
+        if count == 0:
+            return [np.empty((*shape, size)) for size in self.sizes[1]], None
+        _, _, code, locked = self._loaded
+        if locked is not None and count <= SMALL:
+            # Copies into a room cost less than to find where arrays lie.
+            space = self._room(prepared, count)
+            for view, a in zip(space.inputs, arrays, strict=True):
+                view[...] = a if a.ndim <= 2 else a.reshape(count, -1)
+            bad = (locked if count == 1 else code)(space.address)
+            outputs = [view.copy() for view in space.outputs]
+            status = space.status.reshape(count, 2).copy() if bad else None
+            self._give(space, count)
+        else:
+            outputs, status = self._run(prepared[None], _rows(arrays, count), count, 1)
+        if status is not None:
+            flat = [output.reshape(count, -1) for output in outputs]
+            status = self._retried(prepared[None], _rows(arrays, count), flat, status, count)
+        if len(shape) != (count > 1):
             outputs = [output.reshape(*shape, -1) for output in outputs]
-        status = space.status.reshape(count, 2).copy() if bad else None
-        self._give(space, count)
-        return outputs, status
+        return outputs, None if status is None else status.reshape(*shape, 2)
 
     def _room(self, prepared: Array, count: int) -> Space:
         """A room for so many samples of a machine, for :meth:`_give` to have back."""
@@ -256,7 +234,10 @@ class Code:
         if machines * count == 0:
             return [np.empty((machines, count, size)) for size in self.sizes[1]], None
         rows = [np.ascontiguousarray(array) for array in arrays]
-        outputs, status = self._solved(np.ascontiguousarray(prepared), rows, count)
+        prepared = np.ascontiguousarray(prepared)
+        outputs, status = self._run(prepared, rows, count, 1)
+        if status is not None:
+            status = self._retried(prepared, rows, outputs, status, count)
         shaped = [output.reshape(machines, count, -1) for output in outputs]
         return shaped, None if status is None else status.reshape(machines, count, 2)
 
@@ -266,27 +247,6 @@ class Code:
             if array.ndim == 0 or array.shape[-1] != size:
                 raise ValueError(f"the last axis has to be {size}, the shape is {array.shape}")
         return arrays
-
-    def run_one(self, prepared: Array, inputs: Sequence[Any]) -> tuple[list[Array], Array | None]:
-        """One sample of checked shapes, (size,) each; results as those of :meth:`run`."""
-        code = self._loaded[3]
-        if code is None:
-            rows = [np.asarray(value, _F8).reshape(1, 1, -1) for value in inputs]
-            outputs, status = self._run(prepared.reshape(1, -1), rows, 1, 1)
-        else:
-            space = self._room(prepared, 1)
-            for view, value in zip(space.inputs, inputs, strict=True):
-                view[:] = value
-            if not code(space.address):
-                results = [view.copy() for view in space.outputs]
-                self._give(space, 1)
-                return results, None
-            rows = [view.reshape(1, 1, -1).copy() for view in space.inputs]
-            outputs = [view.reshape(1, -1).copy() for view in space.outputs]
-            status = space.status.reshape(1, 2).copy()
-            self._give(space, 1)
-        status = self._finished(prepared.reshape(1, -1), rows, outputs, status, 1)
-        return [output[0] for output in outputs], None if status is None else status[0]
 
     def bound(
         self, prepared: Array, otherwise: Callable[..., Any], outputs: int
@@ -307,40 +267,22 @@ class Code:
         call: Callable[..., Any] = make(code, room, np.ndarray, otherwise)
         return call
 
-    def _solved(
-        self, prepared: Array, rows: Sequence[Array], count: int
-    ) -> tuple[list[Array], Array | None]:
-        """All samples of all machines, with more steps where one does not do."""
-        outputs, status = self._run(prepared, rows, count, 1)
-        return outputs, self._finished(prepared, rows, outputs, status, count)
-
-    def _finished(
-        self,
-        prepared: Array,
-        rows: Sequence[Array],
-        outputs: Sequence[Array],
-        status: Array | None,
-        count: int,
-    ) -> Array | None:
-        """The status after more steps, with outputs written in place; None if all is good."""
-        if status is None or not self._stepped:
-            return status
-        self._try_again(prepared, rows, outputs, status, count)
-        return status if status[:, 0].any() else None
-
-    def _try_again(
+    def _retried(
         self,
         prepared: Array,
         rows: Sequence[Array],
         outputs: Sequence[Array],
         status: Array,
         count: int,
-    ) -> None:
-        """Samples that one step did not reach, in more and more steps; written in place."""
+    ) -> Array | None:
+        """The status after samples that one step did not reach were tried in more and more.
+
+        Their outputs are written in place; None if all samples are good.
+        """
         for steps in STEPS:
             left = np.flatnonzero(status[:, 0] == REFUSED)
-            if not len(left):
-                return
+            if not len(left) or not self._loaded[0]["stepped"]:
+                break
             machines, samples = np.divmod(left, count)
             for machine in np.unique(machines) if len(prepared) > 1 else [0]:
                 own = left[machines == machine] if len(prepared) > 1 else left
@@ -354,6 +296,7 @@ class Code:
                 for output, values in zip(outputs, found, strict=True):
                     output[own] = values
                 status[own] = np.array([GOOD, 1.0]) if again is None else again
+        return status if status[:, 0].any() else None
 
     def _run(
         self, prepared: Array, rows: Sequence[Array], count: int, steps: int
@@ -394,6 +337,13 @@ class Code:
         whole = machines if machines > 1 else count
         bad = in_parts(part, whole, machines * count)
         return outputs, status if bad else None
+
+
+def _rows(arrays: Sequence[Array], count: int) -> list[Array]:
+    """Doubles side by side, which a column of a table is not: shape (1, 1 or count, size)."""
+    return [
+        np.ascontiguousarray(a).reshape(1, 1 if a.ndim == 1 else count, a.shape[-1]) for a in arrays
+    ]
 
 
 def _header(program: Program, lanes: int) -> dict[str, Any]:

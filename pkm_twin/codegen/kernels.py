@@ -53,7 +53,7 @@ class Kernel:
     def warm_up(self) -> None:
         """Compile, or load what is stored, before the first sample is due."""
         p = np.zeros(self.code.parameters - len(self.geometry))
-        self.code.run_one(self.prepared(p), [np.zeros(n) for n in self.sizes[0]])
+        self(p, *[np.zeros(n) for n in self.sizes[0]])
 
     def __call__(self, p: Array, *inputs: ArrayLike) -> tuple[list[Array], Array | None]:
         """Evaluate over leading batch axes, see :meth:`Code.run`.

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Final, NamedTuple
+from typing import Final
 
 import llvmlite
 import llvmlite.binding as binding
@@ -29,7 +29,7 @@ from pkm_twin.codegen.assembly import (
 from pkm_twin.codegen.expressions import GEOMETRY, PARAMETERS, Expression, ordered, uses
 from pkm_twin.codegen.lanes import ALIGN, LANES, TRUE, VECTOR, Lanes
 from pkm_twin.codegen.native import CPU, FEATURES, OPTIMISATION, PREPARE, QUICK, SYMBOL
-from pkm_twin.codegen.operations import CONSTANT, fused, sub
+from pkm_twin.codegen.operations import fused, sub
 from pkm_twin.codegen.program import (
     ALIVE,
     BEFORE,
@@ -57,50 +57,27 @@ IDENTITY: Final = f"{llvmlite.__version__} {CPU} {FEATURES} {LANES} {OPTIMISATIO
 """What machine code hangs on beside the program."""
 
 
-class Known(dict[int, Value]):
-    """Values by expression; what is prepared is loaded where it is used.
-
-    A value that is held from one end of a program to the other would only be in the way of the
-    registers' allocation.
-    """
-
-    def __init__(self, known: Mapping[int, Value], b: Function, prepared: Prepared | None) -> None:
-        super().__init__(known)
-        self._b = b
-        self.places: Mapping[int, int] = {} if prepared is None else prepared.places
-        self._base = None if prepared is None else prepared.base
-
-    def __missing__(self, number: int) -> Value:
-        if self._base is None:
-            raise KeyError(number)
-        return self._b.load(self._b.gep(self._base, whole(self.places[number])), ALIGN)
-
-
-class Prepared(NamedTuple):
-    """Where the vectors of what is prepared stand, by expression's number."""
-
-    base: Value
-    places: Mapping[int, int]
-
-
 class Emitter(Lanes):
     """Values of expressions at one place of the code, scalar or in lanes.
 
-    :param prepared: where values that are known stand in memory.
+    :param prepared: places of values in memory by expression's number. They are loaded where they
+        are used: held from one end of a program to the other, they would only be in the way of the
+        registers' allocation. ``base``: where they begin.
     """
 
     def __init__(
-        self,
-        function: Function,
-        used: Mapping[int, int],
-        known: Mapping[int, Value],
-        *,
-        wide: bool,
-        prepared: Prepared | None = None,
+        self, b: Function, used: Mapping[int, int], prepared: Mapping[int, int], base: Value | None
     ) -> None:
-        super().__init__(function, wide=wide)
-        self.used, self.known = used, Known(known, function, prepared)
-        self._done = {*known, *self.known.places}
+        super().__init__(b, wide=base is not None)
+        self._used, self._prepared, self._base = used, prepared, base
+        self._known: dict[int, Value] = {}
+
+    def known(self, e: Expression) -> Value:
+        """The value of an expression that was computed before."""
+        if self._base is None or e.number not in self._prepared:
+            return self._known[e.number]
+        place = self.b.gep(self._base, whole(self._prepared[e.number]))
+        return self.b.load(place, ALIGN)
 
     def value(self, e: Expression, inputs: Mapping[str, Sequence[Value]]) -> Value:
         """The instructions of one expression, its arguments known."""
@@ -109,11 +86,11 @@ class Emitter(Lanes):
             return inputs[name][index]
         if e.op is None:
             return self.number(e.value)
-        parts = fused(e, self.used, self.known.places)
+        parts = fused(e, self._used, self._prepared)
         if parts is None:
-            return self.operation(e.op.lanes, e, [self.known[x.number] for x in e.args])
+            return self.operation(e.op.lanes, e, [self.known(x) for x in e.args])
         first, product, rest = parts
-        x, y, z = [self.known[v.number] for v in (*product.args, rest)]
+        x, y, z = [self.known(v) for v in (*product.args, rest)]
         if e.op is sub:
             x, z = (x, self.b.fneg(z)) if first else (self.b.fneg(x), z)
         return self.fused(x, y, z)
@@ -122,10 +99,9 @@ class Emitter(Lanes):
         self, results: Sequence[Expression], inputs: Mapping[str, Sequence[Value]]
     ) -> list[Value]:
         """Values of the results; every shared expression once."""
-        for e in ordered(results, self._done):
-            self.known[e.number] = self.value(e, inputs)
-            self._done.add(e.number)
-        return [self.known[e.number] for e in results]
+        for e in ordered(results, {**self._known, **self._prepared}):
+            self._known[e.number] = self.value(e, inputs)
+        return [self.known(e) for e in results]
 
 
 class _Counter:
@@ -185,7 +161,7 @@ def _preparation(program: Program) -> Function:
         if e.source is not None:
             name, k = e.source
             inputs[name][k] = b.load(b.gep(here, whole(first[name] + k)))
-    out = Emitter(b, uses(results), {}, wide=False)
+    out = Emitter(b, uses(results), {}, None)
     for k, value in enumerate(out.run(results, inputs)):  # type: ignore[arg-type]
         for lane in range(LANES):
             b.store(value, b.gep(there, whole(LANES * k + lane)))
@@ -219,9 +195,8 @@ class _Writer:
         machines = _Counter(b, "machine", _word(b, 0))
         machines.begin()
         self.pointers = {name: b.inttoptr(b.load(at), DOUBLE) for name, at in places.items()}
-        self.constants = self._constants()
-        base = b.inttoptr(b.load(places[""]), VECTOR)
-        self.prepared = Prepared(base, {e.number: k for k, e in enumerate(program.prepared)})
+        self.base = b.inttoptr(b.load(places[""]), VECTOR)
+        self.prepared = {e.number: k for k, e in enumerate(program.prepared)}
         self._write()
         for name, (_, leap) in leaps.items():
             # Pointers are bytes, leaps are doubles.
@@ -229,15 +204,8 @@ class _Writer:
         machines.close()
         b.ret(b.load(self.flags))
 
-    def _constants(self) -> dict[int, Value]:
-        """Constants, in all lanes."""
-        wide = Emitter(self.b, self.used, {}, wide=True)
-        known = [e.number for e in self.program.prepared]
-        constants = [e for e in ordered(self.program.results, known) if e.level == CONSTANT]
-        return {e.number: wide.number(e.value) for e in constants}
-
     def emitter(self) -> Emitter:
-        return Emitter(self.b, self.used, self.constants, wide=True, prepared=self.prepared)
+        return Emitter(self.b, self.used, self.prepared, self.base)
 
     def _any(self, mask: Value) -> Value:
         return self.b.call(f"llvm.vector.reduce.or.v{LANES}i1", BIT, [mask])
@@ -275,23 +243,16 @@ class _Writer:
         """The same in a loop: thousands of stores in a row take minutes to compile."""
         b = self.b
         size = whole(len(values))
-        scratch, counter = b.alloca(VECTOR, len(values)), b.alloca(INT64)
+        scratch = b.alloca(VECTOR, len(values))
         for j, value in enumerate(values):
             b.store(value, b.gep(scratch, whole(j)))
-        loop, done = b.block("save"), b.block("saved")
-        b.store(ZERO, counter)
         rows = [b.mul(place, size) for place in self.places]
-        b.branch(loop)
-        b.go_to(loop)
-        k = b.load(counter)
+        entries = _Counter(b, "save", size)
+        k = entries.begin()
         value = b.load(b.gep(scratch, k))
         for lane, row in enumerate(rows):
-            at = b.gep(base, b.add(row, k))
-            b.store(b.extract_element(value, lane), at)
-        after = b.add(k, ONE)
-        b.store(after, counter)
-        b.cbranch(b.icmp("slt", after, size), loop, done)
-        b.go_to(done)
+            b.store(b.extract_element(value, lane), b.gep(base, b.add(row, k)))
+        entries.close()
 
     def _write(self) -> None:
         """All samples of a machine."""
