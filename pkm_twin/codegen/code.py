@@ -7,8 +7,10 @@ import math
 import os
 import threading
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from functools import cache as remembered
 from functools import cached_property
+from itertools import pairwise
 from types import ModuleType
 from typing import Any, Final
 
@@ -18,10 +20,10 @@ from numpy.typing import ArrayLike
 from pkm_twin.codegen import cache
 from pkm_twin.codegen.arrays import Array, doubles
 from pkm_twin.codegen.key import ProgramKey
-from pkm_twin.codegen.parts import in_parts
 from pkm_twin.codegen.plain import PlainCode
 from pkm_twin.codegen.program import Program
 from pkm_twin.codegen.rooms import Space, aligned, caller
+from pkm_twin.errors import ParameterError
 
 SWITCH: Final = "PKM_TWIN_PLAIN"
 """Set to 1: plain Python, as on a machine without llvmlite."""
@@ -376,3 +378,38 @@ def _sound(header: dict[str, Any]) -> bool:
             sizes = (*taken, *given, p, k)
             return type(s) is bool and all(type(n) is int and 0 <= n < MOST for n in sizes)
     return False
+
+
+THREADS: Final = "PKM_TWIN_THREADS"
+"""How many threads a large batch may use: 1 unless set, 0 for all cores of this process."""
+WORTH: Final = 4096
+"""Samples for which it pays to start a thread."""
+
+
+def threads() -> int:
+    """What the environment says, read at every large batch.
+
+    :raises ParameterError: it is no number of threads.
+    """
+    text = os.environ.get(THREADS, "").strip() or "1"
+    if not text.isascii() or not text.isdigit() or int(text) > 1024:
+        raise ParameterError(THREADS, text, "a number of threads, 0 for all cores")
+    return int(text) or len(os.sched_getaffinity(0))
+
+
+def in_parts(part: Callable[[int, int], bool], whole: int, samples: int) -> bool:
+    """Compute ``part(begin, end)`` of all of ``whole``; whether any of them gives True.
+
+    :param samples: how many samples there are in all.
+    """
+    count = min(whole, samples // WORTH)
+    if count > 1:
+        count = min(count, threads())
+    if count <= 1:
+        return part(0, whole)
+    ends = [whole * k // count for k in range(count + 1)]
+    # Threads of this call alone: those of a pool would be missing in a process that is forked.
+    with ThreadPoolExecutor(count - 1) as others:
+        rest = [others.submit(part, *pair) for pair in pairwise(ends[1:])]
+        bad = part(0, ends[1])
+        return any([one.result() for one in rest]) or bad

@@ -30,22 +30,7 @@ from pkm_twin.codegen.expressions import GEOMETRY, PARAMETERS, Expression, order
 from pkm_twin.codegen.lanes import ALIGN, LANES, TRUE, VECTOR, Lanes
 from pkm_twin.codegen.native import CPU, FEATURES, OPTIMISATION, PREPARE, QUICK, SYMBOL
 from pkm_twin.codegen.operations import fused, sub
-from pkm_twin.codegen.program import (
-    ALIVE,
-    BEFORE,
-    LARGE,
-    MOVING,
-    ONCE,
-    PART,
-    PLACES,
-    REACHED,
-    SIZE,
-    STATE,
-    TURNS,
-    UNKNOWNS,
-    Equations,
-    Program,
-)
+from pkm_twin.codegen.program import AT, LARGE, STATE, TURNS, UNKNOWNS, Equations, Program
 
 STATUS: Final = " status"
 LONG: Final = 100
@@ -303,7 +288,7 @@ class _Writer:
         b, number = self.b, self.emitter().number
         x, aim, n, (size,) = (
             [b.alloca(VECTOR) for _ in range(count)]
-            for count in (len(q.home), len(q.origin), PLACES, 1)
+            for count in (len(q.home), len(q.origin), len(AT), 1)
         )
 
         def run(
@@ -323,11 +308,11 @@ class _Writer:
                 b.store(out.run([e], given)[0], place)
 
         once = b.icmp("eq", self.steps, ONE)
-        b.store(b.select(once, number(1.0), number(0.0)), n[ONCE])
-        b.store(number(1.0), n[ALIVE])
-        b.store(number(0.0), n[REACHED])
+        b.store(b.select(once, number(1.0), number(0.0)), n[AT.once])
+        b.store(number(1.0), n[AT.alive])
+        b.store(number(0.0), n[AT.reached])
         # The same for all lanes: a jump, which is foreseen, instead of a choice by lane.
-        uniform = {q.state[ONCE].number: once}
+        uniform = {q.state[AT.once].number: once}
         run(q.begin, *x, size)
         steps = _Counter(b, "step", self.steps)
         k = b.add(steps.begin(), ONE)
@@ -335,18 +320,24 @@ class _Writer:
         # As `progress` has it.
         left = b.fsub(real(1.0), b.fdiv(b.sitofp(k, DOUBLE), b.sitofp(self.steps, DOUBLE)))
         part = b.fsub(real(1.0), b.fmul(b.fmul(left, left), left))
-        b.store(b.splat(part, LANES), n[PART])
-        b.store(b.load(size), n[SIZE])
-        b.store(number(0.0), n[BEFORE])
-        b.store(b.load(n[ALIVE]), n[MOVING])
+        b.store(b.splat(part, LANES), n[AT.part])
+        b.store(b.load(size), n[AT.size])
+        b.store(number(0.0), n[AT.before])
+        b.store(b.load(n[AT.alive]), n[AT.moving])
         run(q.aim, *aim)
         turns = _Counter(b, "turn", whole(TURNS))
         turns.begin()
-        run(q.correct, *x, *n[SIZE : ALIVE + 1], first=q.results, **{UNKNOWNS: x, q.target: aim})
-        turns.close(self._any(self._above(b.load(n[MOVING]))))
-        run(q.arrive, n[ALIVE], n[REACHED])
-        steps.close(self._any(self._above(b.load(n[ALIVE]))))
-        return [b.load(place) for place in x], self._above(b.load(n[ALIVE])), b.load(n[REACHED])
+        run(
+            q.correct, *x, *n[AT.size : AT.reached], first=q.results, **{UNKNOWNS: x, q.target: aim}
+        )
+        turns.close(self._any(self._above(b.load(n[AT.moving]))))
+        run(q.arrive, n[AT.alive], n[AT.reached])
+        steps.close(self._any(self._above(b.load(n[AT.alive]))))
+        return (
+            [b.load(place) for place in x],
+            self._above(b.load(n[AT.alive])),
+            b.load(n[AT.reached]),
+        )
 
 
 def emit(program: Program) -> str:

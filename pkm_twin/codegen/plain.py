@@ -16,22 +16,7 @@ import numpy as np
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.codegen.expressions import GEOMETRY, PARAMETERS, Expression, ordered, uses
 from pkm_twin.codegen.operations import OPERATIONS
-from pkm_twin.codegen.program import (
-    ALIVE,
-    BEFORE,
-    LARGE,
-    MOVING,
-    ONCE,
-    PART,
-    PLACES,
-    REACHED,
-    SIZE,
-    STATE,
-    TURNS,
-    UNKNOWNS,
-    Program,
-    progress,
-)
+from pkm_twin.codegen.program import AT, LARGE, STATE, TURNS, UNKNOWNS, Program, progress
 
 _LONGEST: Final = 200
 """Characters of an expression that is written into another one."""
@@ -103,7 +88,7 @@ class PlainCode:
         results = [e for row in program.outputs.values() for e in row]
         parts: dict[str, Sequence[Expression]] = {"results": results}
         if q is not None:
-            names |= {UNKNOWNS: len(q.home), STATE: PLACES}
+            names |= {UNKNOWNS: len(q.home), STATE: len(AT)}
             parts = {"results": [*results, q.held], "begin": q.begin, "aim": q.aim}
             parts |= {"correct": q.correct, "arrive": q.arrive}
         known = {e.number: f"{PARAMETERS}[{k}]" for k, e in enumerate(program.prepared)}
@@ -153,23 +138,27 @@ class PlainCode:
         """Newton's method; ``named`` gets the unknowns. Which samples got there, and how far."""
         q = self.program.equations
         assert q is not None  # noqa: S101
-        named[STATE] = n = [0.0] * PLACES
-        n[ONCE], n[ALIVE] = float(steps == 1), 1.0
+        named[STATE] = n = [0.0] * len(AT)
+        n[AT.once], n[AT.alive] = float(steps == 1), 1.0
         *named[UNKNOWNS], size = self._call("begin", named, many=many)
         for k in range(1, steps + 1):
-            n[PART], n[SIZE], n[BEFORE], n[MOVING] = progress(k / steps), size, 0.0, n[ALIVE]
+            n[AT.part], n[AT.size], n[AT.before], n[AT.moving] = (
+                progress(k / steps),
+                size,
+                0.0,
+                n[AT.alive],
+            )
             here = named | {q.target: self._call("aim", named, many=many)}
             for _ in range(TURNS):
-                *here[UNKNOWNS], n[SIZE], n[BEFORE], n[MOVING], n[ALIVE] = self._call(
-                    "correct", here, many=many
-                )
-                if not np.any(n[MOVING]):
+                after = self._call("correct", here, many=many)
+                here[UNKNOWNS], n[AT.size : AT.reached] = after[: len(q.home)], after[len(q.home) :]
+                if not np.any(n[AT.moving]):
                     break
             named[UNKNOWNS] = here[UNKNOWNS]
-            n[ALIVE], n[REACHED] = self._call("arrive", named, many=many)
-            if not np.any(n[ALIVE]):
+            n[AT.alive], n[AT.reached] = self._call("arrive", named, many=many)
+            if not np.any(n[AT.alive]):
                 break
-        return n[ALIVE], n[REACHED]
+        return n[AT.alive], n[AT.reached]
 
 
 def _table(values: Sequence[Any], count: int) -> Array:

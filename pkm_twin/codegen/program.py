@@ -6,10 +6,18 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
-from pkm_twin.codegen.expressions import GEOMETRY, PARAMETERS, Expression, Tape, count, ordered
-from pkm_twin.codegen.operations import PARAMETER, SAMPLE, both, less, select
+from pkm_twin.codegen.expressions import (
+    GEOMETRY,
+    PARAMETERS,
+    Expression,
+    Tape,
+    count,
+    edge,
+    ordered,
+)
+from pkm_twin.codegen.operations import both, less, select
 from pkm_twin.errors import PkmTwinError
 
 UNKNOWNS: Final = "x"
@@ -37,11 +45,28 @@ RESIDUAL: Final = 1e-10
 
 
 STATE: Final = "n"
-"""Name of the input that Newton's method keeps between corrections, by these places:"""
-ONCE, PART, SIZE, BEFORE, MOVING, ALIVE, REACHED, PLACES = range(8)
-"""1 in a single step, else 0; part of the way to the target of a step; square of the last
-correction, and the determinant there, 0 before the first one; 1 as long as a sample is corrected,
-as long as it is not refused; part of the way that it has reached. And how many there are."""
+"""Name of the input that Newton's method keeps between corrections, see :class:`Places`."""
+
+
+class Places(NamedTuple):
+    """Places in the state of Newton's method.
+
+    ``once``: 1 in a single step, else 0. ``part``: of the way, to the target of a step. ``size``,
+    ``before``: square of the last correction, and the determinant there, 0 before the first one.
+    ``moving``, ``alive``: 1 as long as a sample is corrected, and as long as it is not refused.
+    ``reached``: part of the way.
+    """
+
+    once: int
+    part: int
+    size: int
+    before: int
+    moving: int
+    alive: int
+    reached: int
+
+
+AT: Final = Places(*range(7))
 
 
 def progress(share: float) -> float:
@@ -93,9 +118,9 @@ class Equations:
     @cached_property
     def state(self) -> list[Any]:
         """:data:`STATE` as expressions."""
-        state = list(self.size.tape.inputs(STATE, PLACES))
+        state = list(self.size.tape.inputs(STATE, len(AT)))
         if self.lone:
-            state[MOVING] = state[ALIVE] = self.size.tape.constant(1.0)
+            state[AT.moving] = state[AT.alive] = self.size.tape.constant(1.0)
         return state
 
     def _lift(self, *values: Any) -> list[Expression]:
@@ -104,7 +129,7 @@ class Equations:
     @cached_property
     def begin(self) -> list[Expression]:
         """Unknowns to begin with, and the square that the first correction contracts from."""
-        once, known = self.state[ONCE], self.start is not None and not self.guessed
+        once, known = self.state[AT.once], self.start is not None and not self.guessed
         starts = zip(self.start or self.home, self.home, strict=True)
         size = 1e300 if known else select(once, (FIRST / CONTRACTION) ** 2, 1e300)
         return self._lift(*(select(once, start, home) for start, home in starts), size)
@@ -112,43 +137,43 @@ class Equations:
     @cached_property
     def underway(self) -> Expression:
         """1 in a step that does not lead to the target, else 0."""
-        return self._lift(less(self.state[PART], 1.0))[0]
+        return self._lift(less(self.state[AT.part], 1.0))[0]
 
     @cached_property
     def aim(self) -> list[Expression]:
         """The target of a step."""
-        part, more = self.state[PART], self.underway
+        part, more = self.state[AT.part], self.underway
         goal = self.size.tape.inputs(self.target, len(self.origin))
         ways = zip(self.origin, goal, strict=True)
         return self._lift(*(select(more, a + part * (b - a), b) for a, b in ways))
 
     @cached_property
     def correct(self) -> list[Expression]:
-        """After a correction: the unknowns, then the state from SIZE to ALIVE.
+        """After a correction: the unknowns, then the state from size to alive.
 
         A sample stays refused where a correction does not contract, or where the determinant is
         too small or changes too much. A closed form of the start is in the right assembly; a guess
         may lead to another.
         """
         state, size, determinant = self.state, self.size, self.determinant
-        once, before, moving = state[ONCE], state[BEFORE], state[MOVING]
+        once, before, moving = state[AT.once], state[AT.before], state[AT.moving]
         known = self.start is not None and not self.guessed
         x = self.size.tape.inputs(UNKNOWNS, len(self.home))
         new = (select(moving, a, b) for a, b in zip(self.corrected, x, strict=True))
         near = select(less(0.0, before), before, determinant)
         steady = both(less(near, CHANGE * determinant), less(determinant, CHANGE * near))
         least = STEPPED if known else select(once, DIRECT, STEPPED)
-        sound = both(less(size, CONTRACTION**2 * state[SIZE]), less(least, determinant))
+        sound = both(less(size, CONTRACTION**2 * state[AT.size]), less(least, determinant))
         sound = both(sound, steady)
         moves = both(moving, both(sound, less(CLOSED**2, size)))
-        return self._lift(*new, size, determinant, moves, select(moving, sound, state[ALIVE]))
+        return self._lift(*new, size, determinant, moves, select(moving, sound, state[AT.alive]))
 
     @cached_property
     def arrive(self) -> list[Expression]:
-        """After a step: the state ALIVE and REACHED. What still moves is refused."""
+        """After a step: the state's alive and reached. What still moves is refused."""
         n = self.state
-        alive = select(n[MOVING], 0.0, n[ALIVE])
-        return self._lift(alive, select(alive, n[PART], n[REACHED]))
+        alive = select(n[AT.moving], 0.0, n[AT.alive])
+        return self._lift(alive, select(alive, n[AT.part], n[AT.reached]))
 
     @cached_property
     def held(self) -> Expression:
@@ -176,7 +201,7 @@ class Program:
     def __post_init__(self) -> None:
         known = {**self.inputs, PARAMETERS: self.parameters, GEOMETRY: self.geometry}
         if self.equations is not None:
-            known |= {UNKNOWNS: len(self.equations.home), STATE: PLACES}
+            known |= {UNKNOWNS: len(self.equations.home), STATE: len(AT)}
         for e in ordered(self.results):
             name, index = e.source or ("", -1)
             if not index < known.get(name, 0):
@@ -201,11 +226,7 @@ class Program:
         """What hangs on parameters alone and samples read: computed once a machine, by
         :attr:`Program.preparation`, and given to every call.
         """
-        edge = {e.number: e for e in self.results if e.level == PARAMETER}
-        for e in ordered(self.results):
-            if e.level == SAMPLE:
-                edge |= {x.number: x for x in e.args if x.level == PARAMETER}
-        return list(edge.values())
+        return edge(self.results)
 
     @property
     def missed(self) -> Expression:

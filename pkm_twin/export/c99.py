@@ -14,26 +14,137 @@ from textwrap import indent
 from typing import Any, Final
 
 from pkm_twin.codegen.code import STEPS
-from pkm_twin.codegen.expressions import Expression, Tape, count, ordered
-from pkm_twin.codegen.operations import OPERATIONS, PARAMETER, SAMPLE, Operation
-from pkm_twin.codegen.program import (
-    BEFORE,
-    LARGE,
-    MOVING,
-    ONCE,
-    PART,
-    SIZE,
-    STATE,
-    TURNS,
-    UNKNOWNS,
-    Equations,
+from pkm_twin.codegen.expressions import Expression, Tape, count, ordered, uses
+from pkm_twin.codegen.operations import (
+    OPERATIONS,
+    Operation,
+    c_number,
+    cos,
+    fused,
+    mul,
+    sin,
+    sub,
 )
-from pkm_twin.export.c_lines import Lines, bare
+from pkm_twin.codegen.program import AT, LARGE, STATE, TURNS, UNKNOWNS, Equations
 
 LADDER: Final = (1, *STEPS)
 """Steps of Newton's method, one attempt after the other."""
 CORRECTIONS: Final = TURNS * sum(LADDER)
 """Most corrections of a call."""
+
+
+LONGEST: Final = 44
+"""Characters of an expression that is written into another one."""
+
+
+def table(name: str, values: Sequence[float]) -> str:
+    """A constant table, four numbers a line."""
+    texts = [c_number(value).strip("()") for value in values]
+    rows = [", ".join(texts[k : k + 4]) for k in range(0, len(texts), 4)]
+    return f"static const double {name}[{len(texts)}] = {{\n    " + ",\n    ".join(rows) + "\n};\n"
+
+
+HEAD: Final = """\
+#include <math.h>
+
+#if defined(__FINITE_MATH_ONLY__) && (__FINITE_MATH_ONLY__ > 0)
+#error "NaN and infinity are tested for: compile without -ffast-math and -ffinite-math-only"
+#endif
+
+#ifndef PKM_FMA
+#if defined(FP_FAST_FMA) || defined(__FMA__) || defined(__ARM_FEATURE_FMA)
+#define PKM_FMA(x, y, z) fma((x), (y), (z))
+#else
+#define PKM_FMA(x, y, z) ((x) * (y) + (z))
+#endif
+#endif
+"""
+
+
+def bare(text: str) -> str:
+    """Without the brackets around the whole, where it has some."""
+    if not (text.startswith("(") and text.endswith(")")):
+        return text
+    depth = 0
+    for k, letter in enumerate(text):
+        depth += (letter == "(") - (letter == ")")
+        if depth == 0 and k < len(text) - 1:
+            return text
+    return text[1:-1]
+
+
+class Lines:
+    """Straight-line C of some expressions, as the body of a function.
+
+    :param known: texts of expressions that are given.
+    """
+
+    def __init__(self, results: Sequence[Expression], known: Mapping[int, str]) -> None:
+        self.lines: list[str] = []
+        self.doubles = 0
+        self.needed: set[Operation] = set()
+        self._known, self._text, self._used = known, dict(known), uses(results)
+        self._turns = 0
+        for angles in _angles(results, known):
+            self._turn(angles)
+        self._write(results)
+        self.results = [self._text[e.number] for e in results]
+
+    def _turn(self, angles: Mapping[int, Sequence[Expression]]) -> None:
+        """Sines and cosines of angles, by the number of the angle, all at once."""
+        k, size = self._turns, len(angles)
+        self._turns += 1
+        self._write([x for turn in angles.values() for x in turn[0].args])
+        self.needed.add(sin)
+        self.lines.append(f"    double a{k}[{size}], s{k}[{size}], c{k}[{size}];")
+        self.doubles += 3 * size
+        for i, (angle, turn) in enumerate(angles.items()):
+            self.lines.append(f"    a{k}[{i}] = {bare(self._text[angle])};")
+            for e in turn:
+                self._text[e.number] = f"{'s' if e.op is sin else 'c'}{k}[{i}]"
+        self.lines.append(f"    @_turn(a{k}, s{k}, c{k}, {size});")
+
+    def _write(self, results: Sequence[Expression]) -> None:
+        for e in ordered(results, self._text):
+            if e.source is not None:
+                text = "{}[{}]".format(*e.source)
+            elif e.op is None:
+                text = c_number(e.value)
+            else:
+                text = self._operation(e, e.op)
+                once = self._used.get(e.number, 2) == 1
+                # A product that is used once becomes part of a fused operation.
+                if not once or (e.op is not mul and len(text) > LONGEST):
+                    self.lines.append(f"    const double v{self.doubles} = {bare(text)};")
+                    text = f"v{self.doubles}"
+                    self.doubles += 1
+            self._text[e.number] = text
+
+    def _operation(self, e: Expression, op: Operation) -> str:
+        parts = fused(e, self._used, self._known)
+        if parts is None:
+            self.needed.add(op)
+            return op.text([self._text[x.number] for x in e.args], in_c=True)
+        first, product, rest = parts
+        x, y, z = (self._text[v.number] for v in (*product.args, rest))
+        if op is sub:
+            x, z = (x, f"-{z}") if first else (f"-{x}", z)
+        return f"PKM_FMA({x}, {y}, {z})"
+
+
+def _angles(
+    results: Sequence[Expression], known: Mapping[int, str]
+) -> list[dict[int, list[Expression]]]:
+    """Sines and cosines by their angle, those first whose angles need no others."""
+    depth: dict[int, int] = {}
+    groups: dict[int, dict[int, list[Expression]]] = {}
+    for e in ordered(results, known):
+        here = max((depth.get(x.number, 0) for x in e.args), default=0)
+        turns = e.op is sin or e.op is cos
+        depth[e.number] = here + turns
+        if turns:
+            groups.setdefault(here, {}).setdefault(e.args[0].number, []).append(e)
+    return [groups[k] for k in sorted(groups)]
 
 
 class Folding:
@@ -204,13 +315,13 @@ static const int @_steps[{len(LADDER)}] = {{{steps}}};
 /* Newton's method from the known assembly in so many steps; 0 where it does not get there. */
 static int @_{name}(const double *{q.target}, int steps, double *h, double *x)
 {{
-    double {STATE}[{MOVING}], aim[{m}], next[{n + 4}], first = 0.0;
+    double {STATE}[{AT.moving}], aim[{m}], next[{n + 4}], first = 0.0;
     int i, k;
-    {STATE}[{ONCE}] = (steps == 1) ? 1.0 : 0.0;
+    {STATE}[{AT.once}] = (steps == 1) ? 1.0 : 0.0;
     for (k = 1; k <= steps; k++) {{
         const double left = 1.0 - ((double)k / (double)steps);
         int turn, moving = 1;
-        {STATE}[{PART}] = 1.0 - ((left * left) * left);
+        {STATE}[{AT.part}] = 1.0 - ((left * left) * left);
         {target};
         {prepare};
         if (k == 1) {{
@@ -220,15 +331,15 @@ static int @_{name}(const double *{q.target}, int steps, double *h, double *x)
             }}
             first = next[{n}];
         }}
-        {STATE}[{SIZE}] = first;
-        {STATE}[{BEFORE}] = 0.0;
+        {STATE}[{AT.size}] = first;
+        {STATE}[{AT.before}] = 0.0;
         for (turn = 0; (turn < {TURNS}) && (moving != 0); turn++) {{
             {correct};
             for (i = 0; i < {n}; i++) {{
                 x[i] = next[i];
             }}
-            {STATE}[{SIZE}] = next[{n}];
-            {STATE}[{BEFORE}] = next[{n + 1}];
+            {STATE}[{AT.size}] = next[{n}];
+            {STATE}[{AT.before}] = next[{n + 1}];
             moving = (next[{n + 2}] > 0.0) ? 1 : 0;
             if (!(next[{n + 3}] > 0.0)) {{
                 return 0;
@@ -312,17 +423,6 @@ static int @_{name}(const double *{q.target}, int steps, double *h, double *x)
         results = [e for row in routine.outputs.values() for e in row]
         solving = count(q.results) if q is not None and q.home else 0
         return solving, count([*results, *routine.gates, *judged])
-
-
-def edge(rows: Iterable[Sequence[Expression]]) -> list[Expression]:
-    """What hangs on parameters alone and is read by results or what hangs on samples."""
-    found: dict[int, Expression] = {}
-    for results in rows:
-        found |= {e.number: e for e in results if e.level == PARAMETER}
-        for e in ordered(results):
-            if e.level == SAMPLE:
-                found |= {x.number: x for x in e.args if x.level == PARAMETER}
-    return list(found.values())
 
 
 def _without(names: Container[str], results: Sequence[Expression]) -> list[Expression]:

@@ -13,12 +13,11 @@ import numpy as np
 from delta_dynamics.equations import motion_kernel
 from delta_dynamics.virtual_work import accelerations, inverse_dynamics, masses_kernel, torques
 from pkm_twin.codegen.arrays import Array
-from pkm_twin.codegen.expressions import GEOMETRY, PARAMETERS, Expression
+from pkm_twin.codegen.expressions import GEOMETRY, PARAMETERS, Expression, edge
 from pkm_twin.codegen.kernels import Kernel
 from pkm_twin.codegen.program import TURNS
 from pkm_twin.errors import ParameterError
-from pkm_twin.export.c99 import CORRECTIONS, HOT, LADDER, Folding, Routine, Unit, edge
-from pkm_twin.export.c_lines import HEAD, table
+from pkm_twin.export.c99 import CORRECTIONS, HEAD, HOT, LADDER, Folding, Routine, Unit, table
 from pkm_twin.export.c_templates import (
     ABOUT,
     CMAKE,
@@ -87,7 +86,8 @@ class Package:
         self.routines = self._routines()
         rows = [[e for row in r.outputs.values() for e in row] for r in self.routines]
         # A table of no numbers is none in C.
-        self.parameters = edge(rows) or [self.payload[0]]
+        edges = {e.number: e for row in rows for e in edge(row)}
+        self.parameters = [*edges.values()] or [self.payload[0]]
         self.unit = Unit(self.prefix, self.parameters)
         self._write()
 

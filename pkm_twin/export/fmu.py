@@ -17,7 +17,7 @@ from typing import Final
 
 from delta_dynamics.virtual_work import MASSLESS
 from pkm_twin.errors import ParameterError
-from pkm_twin.export.c_lines import table
+from pkm_twin.export.c99 import table
 from pkm_twin.export.c_package import Package
 from pkm_twin.export.fmu_interface import interface, source
 from pkm_twin.export.fmu_xml import Description, Variable, build_of, quoted, text_of

@@ -10,8 +10,15 @@ from typing import Any, Final
 import numpy as np
 
 from pkm_twin.codegen.arrays import Array
-from pkm_twin.codegen.derivatives import adjoints
-from pkm_twin.codegen.expressions import GEOMETRY, Expression, Numbers, Objects, Tape, snapped_all
+from pkm_twin.codegen.expressions import (
+    GEOMETRY,
+    Expression,
+    Numbers,
+    Objects,
+    Tape,
+    adjoints,
+    snapped_all,
+)
 from pkm_twin.codegen.lu import SparseLU
 from pkm_twin.codegen.operations import cos, sin
 from pkm_twin.codegen.program import UNKNOWNS, Equations

@@ -15,8 +15,7 @@ from typing import Any
 import numpy as np
 
 from pkm_twin.codegen.arrays import Array
-from pkm_twin.codegen.derivatives import tangents
-from pkm_twin.codegen.expressions import GEOMETRY, Expression, Tape, references
+from pkm_twin.codegen.expressions import GEOMETRY, Expression, Tape, references, tangents
 from pkm_twin.codegen.plain import functions
 from pkm_twin.machine.geometry import geometry_of
 from pkm_twin.machine.inertia import Layout

@@ -12,7 +12,7 @@ import pytest
 
 from delta_dynamics import inverse_dynamics
 from pkm_twin import load, variants
-from pkm_twin.codegen import parts
+from pkm_twin.codegen import code as codes
 from stiffness_monitor import platform_response
 from test.benchmarks.round_trip import TWIN, Client, start, stop
 from test.nodes.harness import Domain
@@ -52,11 +52,11 @@ def test_inverse_dynamics(benchmark, name, count):
 @pytest.mark.parametrize("threads", ["1", "0"], ids=["one", "all"])
 def test_variants(benchmark, monkeypatch, threads):
     """10,000 machines on 200 samples, on one core and on all."""
-    monkeypatch.setenv(parts.VARIABLE, threads)
+    monkeypatch.setenv(codes.THREADS, threads)
     robot = load("delta")
     lengths = np.random.default_rng(3).uniform(0.18, 0.22, 10_000)
     machines = variants(robot, {"geometry.arm_length": lengths})
-    what = f"variants(delta), {parts.threads()} threads"
+    what = f"variants(delta), {codes.threads()} threads"
     benchmark.extra_info.update(what=what, samples=200 * len(machines))
     run(benchmark, 200 * len(machines), machines.inverse_dynamics, *motion(robot, 200))
 

@@ -13,13 +13,13 @@ import pytest
 
 from delta_dynamics import inverse_dynamics
 from pkm_twin import variants
-from pkm_twin.codegen import cache, parts
+from pkm_twin.codegen import cache
 from pkm_twin.codegen import code as codes
 from pkm_twin.codegen import expressions as ex
 from pkm_twin.codegen import operations as op
 from pkm_twin.codegen.cholesky import FLOOR, traces_over
 from pkm_twin.codegen.code import Code
-from pkm_twin.codegen.derivatives import tangents
+from pkm_twin.codegen.expressions import tangents
 from pkm_twin.codegen.kernels import Kernel
 from pkm_twin.codegen.key import ProgramKey
 from pkm_twin.codegen.lu import SparseLU, independent_rows, pivot_order
@@ -176,12 +176,12 @@ def test_both_back_ends_agree_and_one_sample_has_the_bits_of_its_batch(name, rng
 def test_large_batches_in_threads_have_the_same_bits(rng, monkeypatch):
     """Of one machine and of many, with samples that are refused."""
     robot = load("prru")
-    q = random_joints(robot, rng, 3 * parts.WORTH + 7)
+    q = random_joints(robot, rng, 3 * codes.WORTH + 7)
     motion = (q, *rng.normal(size=(2, *q.shape)))
     few = tuple(array[:101].copy() for array in motion)
     few[0][5, 0] = 40.0
     out_of_reach = np.concatenate((q, few[0]))
-    many = variants(robot, {"geometry.limb_length": rng.uniform(0.5, 0.7, 3 * parts.WORTH // 50)})
+    many = variants(robot, {"geometry.limb_length": rng.uniform(0.5, 0.7, 3 * codes.WORTH // 50)})
 
     def answers():
         with pytest.raises(UnreachableError) as refused:
@@ -190,7 +190,7 @@ def test_large_batches_in_threads_have_the_same_bits(rng, monkeypatch):
         return inverse_dynamics(robot, *motion), many.inverse_dynamics(*few)
 
     alone, used = answers(), []
-    monkeypatch.setattr(parts, "threads", lambda: used.append(3) or 3)
+    monkeypatch.setattr(codes, "threads", lambda: used.append(3) or 3)
     for one, other in zip(alone, answers(), strict=True):
         np.testing.assert_array_equal(one, other)
     assert len(used) >= 3
@@ -216,15 +216,15 @@ def test_a_call_keeps_its_arguments_while_other_threads_allocate(monkeypatch):
 
 
 def test_a_number_of_threads_is_a_number(monkeypatch):
-    monkeypatch.delenv(parts.VARIABLE, raising=False)
-    assert parts.threads() == 1
+    monkeypatch.delenv(codes.THREADS, raising=False)
+    assert codes.threads() == 1
     for text, number in (("", 1), ("3", 3), ("0", len(os.sched_getaffinity(0)))):
-        monkeypatch.setenv(parts.VARIABLE, text)
-        assert parts.threads() == number
+        monkeypatch.setenv(codes.THREADS, text)
+        assert codes.threads() == number
     for text in ("two", "-1", "1.5", "²"):
-        monkeypatch.setenv(parts.VARIABLE, text)
+        monkeypatch.setenv(codes.THREADS, text)
         with pytest.raises(ParameterError):
-            parts.threads()
+            codes.threads()
 
 
 @pytest.mark.parametrize("size", [1, 2, 5, 12])
