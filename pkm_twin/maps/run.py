@@ -25,9 +25,9 @@ from typing import Any, Final, Protocol
 
 import pkm_twin
 from pkm_twin.errors import ParameterError, PkmTwinError, require
+from pkm_twin.maps.kind import Values
 from pkm_twin.maps.store import MapError, Parts, join, save_part, writing
 from pkm_twin.maps.sweep import Chunk, Map
-from pkm_twin.maps.variables import Values
 from pkm_twin.threads import one_blas_thread_for_children
 
 Progress = Callable[[int], None]

@@ -23,21 +23,26 @@ import numpy as np
 import pkm_twin
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError
-from pkm_twin.maps.box import FULL, workspace_box
-from pkm_twin.maps.kind import Case, Found, Kind, Mask, Space, Worst, found_of
-from pkm_twin.maps.search import badness, worst_of
-from pkm_twin.maps.variables import (
+from pkm_twin.maps.kind import (
     FLAG,
     FORMAT,
     POSITIVE,
     SHARE,
+    Case,
     Field,
+    Found,
+    Kind,
+    Mask,
+    Space,
     Values,
     Variable,
+    Worst,
     about,
+    found_of,
     number,
     texts,
 )
+from pkm_twin.maps.search import FULL, badness, workspace_box, worst_of
 from pkm_twin.robot.clearance import has_clearance, joint_clearance
 from pkm_twin.robot.robot import Robot
 from pkm_twin.robot.workspace import keeps_limits

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """``pkm-twin`` alone and ``--help``: every command once, by task, its purpose whole."""
 
-import inspect
 import re
 
 from typer.main import get_command
@@ -26,19 +25,6 @@ def test_help_lists_every_purpose_whole(twin):
     assert "..." not in words.split("Robots:")[1]
 
 
-def leaves(command, words=()):
-    inner = getattr(command, "commands", {})
-    for name, one in inner.items():
-        yield from leaves(one, (*words, name))
-    if not inner:
-        yield words, {parameter.name for parameter in command.params}
-
-
-def test_every_command_that_takes_a_robot_takes_the_platform_of_a_urdf():
-    for words, names in leaves(get_command(app)):
-        assert "robot" not in names or "platform" in names, words
-
-
 def test_each_line_of_the_greeting_is_a_command_that_runs(twin, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     alone = twin()
@@ -55,23 +41,3 @@ def test_an_older_name_runs_the_same_command(twin):
     names = ("monitor-torques", "guard-check")
     new, old = (twin(name, "--help").out.partition("Arguments:")[2] for name in names)
     assert new == old != ""
-
-
-def test_options_are_read_by_the_oldest_typer():
-    """It evaluates no annotations, and would show None as a default."""
-
-    def functions(group):
-        yield group.registered_callback
-        yield from group.registered_commands
-        for inner in group.registered_groups:
-            yield from functions(inner.typer_instance)
-
-    every = [app, *(ALL.declared(name).app(name) for name in ALL)]
-    found = [one for each in every for one in functions(each)]
-    assert len(found) > len(ALL)
-    for one in found:
-        for option in inspect.signature(one.callback).parameters.values() if one else ():
-            assert not isinstance(option.annotation, str), (one.callback, option)
-            if option.default in (None, option.empty):
-                declared = getattr(option.annotation, "__metadata__", ())
-                assert not any(item.show_default for item in declared), (one.callback, option)

@@ -14,7 +14,7 @@ from scipy.optimize import lsq_linear
 
 from delta_dynamics.isotropy import tilted_pose
 from pkm_twin.errors import ParameterError, SingularityError, UnreachableError
-from pkm_twin.maps.box import workspace_box
+from pkm_twin.maps.search import workspace_box
 from pkm_twin.robot.clearance import clearance, distance, has_clearance
 from pkm_twin.robot.workspace import reachable, regular_workspace
 from stiffness_monitor.structure import structural_model

@@ -8,9 +8,9 @@ import pytest
 
 from pkm_twin.errors import ParameterError
 from pkm_twin.maps import figures
-from pkm_twin.maps.box import workspace_box
 from pkm_twin.maps.kinds.workspace import Workspace, circles, largest_cylinder
 from pkm_twin.maps.run import run
+from pkm_twin.maps.search import workspace_box
 from pkm_twin.maps.store import open_map
 from pkm_twin.maps.sweep import map_of
 from pkm_twin.robot.clearance import clearance

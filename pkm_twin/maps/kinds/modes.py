@@ -14,9 +14,8 @@ from numpy.typing import NDArray
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import require
 from pkm_twin.machine.graph import BASE
-from pkm_twin.maps.kind import Case, Space
+from pkm_twin.maps.kind import POSITIVE, SHARE, Case, Space, Variable, about
 from pkm_twin.maps.kinds.frequency import Frequency
-from pkm_twin.maps.variables import POSITIVE, SHARE, Variable, about
 from pkm_twin.report import plots
 from pkm_twin.robot.robot import Robot
 from stiffness_monitor.modes import modes

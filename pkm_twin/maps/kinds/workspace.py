@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pkm_twin.codegen.arrays import Array
-from pkm_twin.maps.kind import Case, Found, Kind, Space
-from pkm_twin.maps.variables import POSITIVE, SHARE, Variable, about, number
+from pkm_twin.maps.kind import POSITIVE, SHARE, Case, Found, Kind, Space, Variable, about, number
 from pkm_twin.robot.clearance import has_clearance, joint_clearance
 from pkm_twin.robot.robot import Robot
 from pkm_twin.robot.workspace import (
