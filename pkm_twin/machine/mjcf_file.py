@@ -164,7 +164,7 @@ class _Reader:
         for site in range(self.model.nsite):
             name = self._name("SITE", site)
             place = _pose(self.data.site_xmat[site], self.data.site_xpos[site])
-            self.links[name] = Link(name, place)
+            self.links[name] = Link(name).moved(place)
             label = urdf_xml.free_name(f"{name}_frame", self.joint_names)
             owner = self._name("BODY", self.model.site_bodyid[site])
             self.joints[label] = Joint(label, "fixed", owner, name, (place, place))
@@ -227,7 +227,7 @@ class _Reader:
             label, link = self._name("JOINT", joint), name
             if k < count - 1:
                 link = urdf_xml.free_name(f"{label}_link", self.link_names)
-                self.links[link] = Link(link, place)
+                self.links[link] = Link(link).moved(place)
             kind = self.types[int(m.jnt_type[joint])]
             at = Pose(place.rotation, self.data.xanchor[joint].copy())
             more: dict[str, Any] = self._resistance(joint)

@@ -77,7 +77,7 @@ def read(path: Path, top: ET.Element) -> LoopTree:
     for name, _ in model.all("frame"):
         owner = model.link(name)
         if owner in links and name not in links:
-            links[name] = Link(name, model.place(name))
+            links[name] = Link(name).moved(model.place(name))
             own = urdf_xml.free_name(f"{name}_frame", taken)
             joints[own] = _fixed(own, owner, name, links[name].frame)
     if not any(WORLD in (joint.inner, joint.outer) for joint in joints.values()):

@@ -26,7 +26,7 @@ from pkm_twin.kinematics.singularity import singularity_at_home
 from pkm_twin.kinematics.spins import hold, without_spins
 from pkm_twin.machine.graph import Graph
 from pkm_twin.machine.loop_tree import Joint, LoopTree
-from pkm_twin.machine.rotations import Pose, skew
+from pkm_twin.machine.rotations import Pose, skew, to_quaternion
 
 ROUNDS: Final = 100
 """Corrections of one closing, and steps towards the zeros."""
@@ -314,9 +314,10 @@ def _between(first: Array, second: Array) -> Array:
 
 def _angle(inverse: Array, rotation: Array) -> Array:
     """The rotation vector from one frame to the other, in the axes both are given in."""
-    from scipy.spatial.transform import Rotation  # type: ignore[import-untyped]
-
-    return np.asarray(Rotation.from_matrix(rotation @ inverse).as_rotvec(), np.float64)
+    quaternion = to_quaternion(rotation @ inverse)
+    half = float(np.linalg.norm(quaternion[:3]))
+    scale = 2.0 * math.atan2(half, float(quaternion[3])) / half if half > 1e-12 else 2.0
+    return np.asarray(scale * quaternion[:3], np.float64)
 
 
 @dataclass(frozen=True, eq=False)
