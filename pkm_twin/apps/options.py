@@ -14,10 +14,11 @@ import typer
 from pkm_twin.console import numbers
 from pkm_twin.errors import ParameterError
 from pkm_twin.files import STANDARD
+from pkm_twin.report import Fact
 from pkm_twin.settings import setting
 
 if TYPE_CHECKING:
-    from pkm_twin.recordings import Dialect, ReadOptions, Recording, WrenchFrames
+    from pkm_twin.recordings import Dialect, Load, ReadOptions, Recording, WrenchFrames
     from pkm_twin.robot.limits import Beyond
     from pkm_twin.robot.robot import Robot
     from stiffness_monitor.chatter import Milling
@@ -361,3 +362,9 @@ class AwayFromSingular:
     singularity: float = setting(
         0.05, "least singularity index of a pose, 0 to 1", low=0.0, high=1.0
     )
+
+
+def payload_fact(carried: Load | None) -> Fact:
+    """The payload that a command used."""
+    data = None if carried is None else carried.as_json()
+    return Fact("payload", data, text="payload", shown=str(carried or "as in the robot file"))

@@ -62,7 +62,7 @@ def read_bag(
     found = _messages(bag, machine, topics, how, progress)
     frame = found.wrenches[0].frame if found.wrenches else ""
     topics = replace(topics, frame=frame, turns=bool(frame) and frame != how.frames.base_frame)
-    notes = [str(topics), f"payload: {held or 'as in the robot file'}"]
+    notes = [str(topics)]
     if found.rejected:
         refused = ", ".join(f"{reason}: {count}" for reason, count in found.rejected.items())
         notes.append(f"rejected messages, left out: {refused}; first: {found.first_reject}")

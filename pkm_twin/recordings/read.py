@@ -167,7 +167,6 @@ def _of_table(path: Path, name: str | Robot | None, how: ReadOptions) -> Recordi
     return Recording(
         robot, time, q, qd, qdd, effort, wrench, deflection, pose, held, efforts=word,
         source=str(path), notes=(
-            *([] if held is None else [f"payload: {held}"]),
             *notes,
             *([f"joints have the {how.side}'s values"] if side is not None else []),
             *([] if robot.controller.plain or side is not None else [MAPPED]),

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from pkm_twin.apps.frame import command
-from pkm_twin.apps.options import REFUSED, SALVAGED, CarriesAtTimes, ReadsRecordings
+from pkm_twin.apps.options import REFUSED, SALVAGED, CarriesAtTimes, ReadsRecordings, payload_fact
 from pkm_twin.console import progress
 from pkm_twin.errors import ParameterError, PkmTwinError, one_line
 from pkm_twin.report import Fact, Report, Verdict
@@ -104,8 +104,7 @@ def check_one(given: Check, path: Path, update: Any = None, thorough: bool = Tru
                  text="no explanation; `fit` finds" if findings else None),
             Fact("bag", str(r.source)), Fact("robot", r.robot.name, text="robot"),
             Fact("topics", asdict(r.topics), text="topics", shown=str(r.topics)),
-            Fact("payload", None if r.load is None else r.load.as_json(), text="payload",
-                 shown=str(r.load or "as in the robot file")),
+            payload_fact(r.load),
             *found.items,
             Fact("uncertainty", found.bands or None), Fact("answer", found.answer),
             Fact("not_judged", found.unjudged or None), Fact("good", good),

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from pkm_twin.apps.frame import command
-from pkm_twin.apps.options import CarriesAtTimes, Draws, ReadsMotions, Writes
+from pkm_twin.apps.options import CarriesAtTimes, Draws, ReadsMotions, Writes, payload_fact
 from pkm_twin.console import progress, writing
 from pkm_twin.files import replace_file
 from pkm_twin.recordings.tables import WRENCH
@@ -25,6 +25,9 @@ if TYPE_CHECKING:
 
 SHOWN: Final = 6
 """Most joints in a picture."""
+UNDETERMINED: Final = (
+    "undetermined: neither rigid-body equations nor elastic members or joints determine it"
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,21 +69,20 @@ def loads(given: Loads) -> Report:
     answer = f"{robot.name}: no joint's force is determined"
     if worst is not None:
         answer = f"{robot.name}: {worst.name} bears most, a force of up to {worst.peaks[0]:.4g} N"
+    open_ = any(one["undetermined"] for one in joints.values())
     return Report(
         answer,
         [
             Fact("robot", robot.name),
             Fact("samples", len(motion.time), text="samples"),
             Fact("duration_s", duration, "s", "duration"),
-            Fact("payload", None if motion.load is None else motion.load.as_json(),
-                 text="payload", shown=str(motion.load or "as in the robot file")),
+            payload_fact(motion.load),
             Fact("exponent", given.exponent),
             Fact("joints", joints),
         ],
         _tables(joints),
         figures={"": lambda: draw(motion, found, answer)},
-        notes=["undetermined: neither rigid-body equations nor elastic members or joints "
-               "determine it"] if any(one["undetermined"] for one in joints.values()) else (),
+        notes=[*motion.notes, *([UNDETERMINED] if open_ else [])],
         files={"out": given.out, "spectrum": given.spectrum},
     )  # fmt: skip
 

@@ -12,7 +12,14 @@ import numpy as np
 import typer
 
 from pkm_twin.apps.frame import command
-from pkm_twin.apps.options import AwayFromSingular, Carries, Draws, ReadsTables, Writes
+from pkm_twin.apps.options import (
+    AwayFromSingular,
+    Carries,
+    Draws,
+    ReadsTables,
+    Writes,
+    payload_fact,
+)
 from pkm_twin.console import writing
 from pkm_twin.errors import check_limit
 from pkm_twin.recordings.tables import ENDINGS
@@ -173,8 +180,7 @@ def path(given: Motion) -> Report:
                 motion.begins, motion.runs, motion.path.stretches, strict=True
             )
         ], text="segments from stop to stop", shown=str(len(motion.runs))),
-        Fact("payload", None if given.load is None else given.load.as_json(),
-             text="payload", shown=str(given.load or "as in the robot file")),
+        payload_fact(given.load),
         Fact("limits", [bound.as_json() for bound in motion.bounds]),
         Fact("used", motion.worst),
         Fact("peaks", _peaks(motion)),

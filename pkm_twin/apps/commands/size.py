@@ -12,7 +12,13 @@ import numpy as np
 import typer
 
 from pkm_twin.apps.frame import command
-from pkm_twin.apps.options import AwayFromSingular, CarriesAtTimes, Draws, ReadsMotions
+from pkm_twin.apps.options import (
+    AwayFromSingular,
+    CarriesAtTimes,
+    Draws,
+    ReadsMotions,
+    payload_fact,
+)
 from pkm_twin.errors import LEAST_LIMIT, check_limit
 from pkm_twin.report import Column, Fact, Report, Table, plots
 from pkm_twin.settings import setting
@@ -110,8 +116,7 @@ def size(given: Size) -> Report:
         Fact("samples", len(motion.time), text="samples"),
         Fact("duration_s", duration, "s", "duration"),
         Fact("efforts", taken.source, text="efforts"),
-        Fact("payload", None if motion.load is None else motion.load.as_json(),
-             text="payload", shown=str(motion.load or "as in the robot file")),
+        payload_fact(motion.load),
         Fact("difference_from_model", taken.difference),
         Fact("drives", {d.joint: d.as_json() for d in duties}),
         Fact("energy_J", energy, "J", "net energy of all drives"),

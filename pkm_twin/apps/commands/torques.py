@@ -9,7 +9,14 @@ from pathlib import Path
 from typing import Any
 
 from pkm_twin.apps.frame import command
-from pkm_twin.apps.options import BeyondLimitsToo, CarriesAtTimes, Draws, ReadsMotions, Writes
+from pkm_twin.apps.options import (
+    BeyondLimitsToo,
+    CarriesAtTimes,
+    Draws,
+    ReadsMotions,
+    Writes,
+    payload_fact,
+)
 from pkm_twin.console import progress, writing
 from pkm_twin.recordings.tables import ENDINGS, check_target, write_table
 from pkm_twin.report import Column, Fact, Report, Table, plots
@@ -75,6 +82,7 @@ def torques(given: Torques) -> Report:
             Fact("robot", robot.name),
             Fact("samples", len(time)),
             Fact("columns", len(columns)),
+            payload_fact(motion.load),
             Fact("beyond_limits", [str(item) for item in beyond]),
         ],
         [
