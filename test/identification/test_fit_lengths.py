@@ -17,7 +17,7 @@ from pkm_twin.identification.fit import fit
 from pkm_twin.identification.parameters import file_parameters
 from pkm_twin.identification.rows import derivative, rows_of
 from pkm_twin.identification.suspects import USUAL, Lengths
-from pkm_twin.recordings import Recording
+from pkm_twin.recordings import Load, Recording
 from pkm_twin.robot.catalogue import robot_of_data
 from pkm_twin.robot.entries import data_of, with_entries
 from test.identification.machines import machine, noisy, of_prior
@@ -50,8 +50,8 @@ def test_columns_are_differences_of_the_efforts(name: str) -> None:
     """Of the machine as fitted, with the payload while it is held."""
     robot = robot_named(name)
     m = machine(robot, np.random.default_rng(3), 6.0)
-    held = (m.time > 3.0).astype(float)
-    record = replace(noisy(m.recorded(), np.random.default_rng(4)), held=held)
+    load = Load(0.4, times=((3.0, 6.0),), sought=True)
+    record = replace(noisy(m.recorded(), np.random.default_rng(4)), load=load)
     everything = file_parameters(robot)
     rows = rows_of(robot, everything, record)
     heavy = robot.changed(payload={"mass": 0.4})
@@ -178,7 +178,7 @@ def slower(name: str, factor: float) -> tuple[Robot, Recording]:
     robot = load(name)
     m = machine(robot, np.random.default_rng(6))
     efforts = inverse_dynamics(m.truth, m.q, m.qd / factor, m.qdd / factor**2)
-    record = Recording("slow", factor * m.time, m.q, efforts)
+    record = Recording(robot, factor * m.time, m.q, effort=efforts)
     return robot, noisy(record, np.random.default_rng(7))
 
 
