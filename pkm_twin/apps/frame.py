@@ -265,10 +265,13 @@ def _parameter(name: str, kind: Any, row: Setting, default: Any) -> inspect.Para
         declared: Any = typer.Argument(**{**settings, "metavar": row.metavar or name.upper()})
     else:
         declared = typer.Option(_spelled(name, row), **settings)
+    if repeated and not required:
+        # An argument of many words has no other default.
+        default, optional = list(default) or None, True
     return inspect.Parameter(
         name,
         inspect.Parameter.KEYWORD_ONLY,
-        default=inspect.Parameter.empty if required else list(default) if repeated else default,
+        default=inspect.Parameter.empty if required else default,
         annotation=Annotated[Optional[typed] if optional else typed, declared],  # noqa: UP045
     )
 
@@ -289,9 +292,9 @@ def _taken(field: str, kind: Any, row: Setting, value: Any) -> Any:
 
     :raises BadParameter: they are none.
     """
+    bare, optional = _plain_type(kind)
     if value is None:
-        return None
-    bare, _ = _plain_type(kind)
+        return () if get_origin(bare) is tuple and not optional else None
     name = _spelled(field, row)
     if get_origin(bare) is tuple and row.count is None:
         return tuple(_one(name, get_args(bare)[0], row, word) for word in value)
