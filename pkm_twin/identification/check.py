@@ -7,6 +7,7 @@ Efforts are compared by the derivative, filter and noise of `fit`, so that both 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any, Final
 
@@ -15,7 +16,7 @@ from numpy.typing import NDArray
 
 from delta_dynamics import inverse_dynamics, torque_deviation
 from pkm_twin.codegen.arrays import Array
-from pkm_twin.errors import SingularityError, UnreachableError, one_line
+from pkm_twin.errors import PkmTwinError, SingularityError, UnreachableError, one_line
 from pkm_twin.identification.compare import MAX_RESIDUAL, Compared, by_held, compare
 from pkm_twin.identification.samples import Motion
 from pkm_twin.recordings import Recording, at_rest
@@ -297,11 +298,18 @@ def _singularity(r: Recording) -> Fact:
 
 
 def recorded_of(r: Recording, leave_out: Mask | None = None) -> Recording:
-    """A recording without samples around a pick or release.
+    """A recording without samples around a pick or release, near steps, and of idle drives.
 
-    :param leave_out: more samples that are left out, (samples,): a gap divides the recording.
+    :param leave_out: the latter two, (samples,), where they are known. A gap divides the recording.
     """
-    keep = np.ones(len(r.time), np.bool_) if leave_out is None else ~leave_out
+    if leave_out is None:
+        leave_out = _near_jumps(steps_in(r), len(r.time))
+        # Currents are not compared with efforts, and what has no state is the fit's to reject.
+        with suppress(PkmTwinError, ValueError):
+            leave_out |= idle_of(r) & (r.efforts != "current")
+        # Where nothing would be left, the efforts themselves are the fault.
+        leave_out &= not leave_out.all()
+    keep = ~leave_out
     return r.part(keep if r.load is None else keep & ~r.load.near_change(r.time, NEAR))
 
 

@@ -223,11 +223,11 @@ def rows_of(
     :raises PkmTwinError: it is too short, its joints stand still, or its efforts are none.
     """
     r = recording
-    _check_efforts(robot, r)
     if len(r.time) < LEAST:
         raise PkmTwinError(
             f"{r.name}: too short to fit, {len(r.time)} samples; {LEAST} or more in a row"
         )
+    _check_efforts(robot, r)
     pieces, how = tracks(r.time, r.q, r.measured, r.wrench, r.held, window)
     if not pieces:
         raise PkmTwinError(f"{r.name}: too short to fit, no {LEAST // 2} samples without a gap")

@@ -10,6 +10,8 @@ import pytest
 
 from pkm_twin import Robot
 from pkm_twin.errors import PkmTwinError
+from pkm_twin.identification.causes import judged
+from pkm_twin.identification.check import recorded_of
 from pkm_twin.identification.compare import compare
 from pkm_twin.identification.fit import Fit, fit
 from pkm_twin.recordings import Recording
@@ -79,6 +81,21 @@ def test_efforts_that_are_late_leave_noise_alone() -> None:
         assert found is not None
         assert found.late == pytest.approx(late, abs=2e-4)
         assert (found.rms < 2.0 * found.noise).all()
+
+
+def test_drives_that_are_off_before_the_motion_are_left_out_of_both() -> None:
+    """Else the efforts that are zero would be the fault of a mass."""
+    rng = np.random.default_rng(5)
+    m = machine(load("delta"), rng, 8.0, 250.0)
+    sound, count = noisy(m.recorded(), rng), 500
+    recorded = replace(
+        sound, robot=m.truth, time=np.arange(count + len(m.time)) / 250.0,
+        q=np.concatenate([np.repeat(m.q[:1], count, 0), m.q]),
+        effort=np.concatenate([np.zeros((count, 3)), sound.measured]),
+    )  # fmt: skip
+    assert judged(recorded).answer == "good"
+    result = fit(m.robot, [recorded_of(recorded)], ("friction", "payload"))
+    assert result.verdict.answer == "explains"
 
 
 @pytest.mark.long
