@@ -88,12 +88,3 @@ def to_quaternion(rotation: Array) -> Array:
     ])  # fmt: skip
     quaternion: Array = np.linalg.eigh(k / 3.0)[1][:, -1]
     return -quaternion if quaternion[3] < 0.0 else quaternion
-
-
-def across(axis: Array) -> Array:
-    """A unit vector across another one, shape (3,)."""
-    # Rounded, so that of two equal components the last bit does not choose.
-    least = int(np.argmin(np.round(np.abs(axis), 9)))
-    side = np.cross(axis, np.eye(3)[least])
-    vector: Array = side / np.linalg.norm(side)
-    return vector

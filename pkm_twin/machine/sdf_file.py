@@ -24,8 +24,8 @@ from pkm_twin.machine import urdf_xml
 from pkm_twin.machine.graph import spanning
 from pkm_twin.machine.joints import TURN, TYPES
 from pkm_twin.machine.loop_tree import Joint, Link, LoopTree, hung, link_of
-from pkm_twin.machine.motors import actuated_joints, read_beside
 from pkm_twin.machine.rotations import Pose, from_rpy
+from pkm_twin.machine.urdf_control import actuated_joints, read_beside
 
 WORLD: Final = "world"
 """The root's name."""

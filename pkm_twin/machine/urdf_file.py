@@ -11,8 +11,8 @@ from __future__ import annotations
 import math
 import xml.etree.ElementTree as ET
 from collections import ChainMap
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -23,8 +23,8 @@ from pkm_twin.errors import ParameterError, UnknownNameError, warn
 from pkm_twin.machine import sdf_file, urdf_xml
 from pkm_twin.machine.joints import TYPES
 from pkm_twin.machine.loop_tree import Joint, Link, LoopTree, hung, link_of
-from pkm_twin.machine.motors import actuated_joints, read_beside
 from pkm_twin.machine.rotations import Pose
+from pkm_twin.machine.urdf_control import actuated_joints, read_beside
 
 _PLACES: Final = ("axis", "parent_axis", "child_axis")
 LARGE: Final = 10.0
@@ -49,6 +49,20 @@ LOOPS: Final = {
     name: CONSTRAINTS[name]
     for name in ("revolute", "continuous", "prismatic", "fixed", "spherical")
 }
+
+
+@dataclass(frozen=True, eq=False)
+class Visual:
+    """A mesh of a body: the name that the URDF ``urdf`` gives it, ``scale`` (3,), and its place.
+
+    ``pose``: of the mesh's frame at home, base axes.
+    """
+
+    urdf: Path
+    mesh: str
+    body: str
+    scale: Array
+    pose: Pose
 
 
 def read(path: Path, robot: ET.Element) -> LoopTree:
@@ -384,3 +398,29 @@ def _warn_of_units(
                 f"{top.tag}.{top.get('name')}.rpy: {largest:g} rad; a URDF uses radians; "
                 "are these degrees?",
             )
+
+
+def visuals(
+    path: Path, robot: ET.Element, places: Mapping[str, Pose], bodies: Mapping[str, str]
+) -> Iterator[Visual]:
+    """Meshes of all links; an invalid one is left out with a warning.
+
+    :param places: of the links at home, base axes; ``bodies``: the body of each link.
+    """
+    for link in robot.findall("link"):
+        name = link.get("name", "")
+        for number, visual in enumerate(link.findall("visual")):
+            mesh = visual.find("geometry/mesh")
+            if mesh is None:
+                continue
+            where = f"link.{name}.visual.{number}"
+            try:
+                pose = urdf_xml.origin(urdf_xml.single(visual, "origin", where), where)
+                scale = urdf_xml.vector(mesh.get("scale", "1 1 1"), f"{where}.scale", 3)
+                if not mesh.get("filename"):
+                    raise ParameterError(f"{where}.filename", None, "the file of the mesh")
+            except ParameterError as error:
+                warn(path, f"{error}; this mesh is not shown")
+                continue
+            file = str(mesh.get("filename"))
+            yield Visual(path, file, bodies[name], scale, places[name] @ pose)

@@ -46,7 +46,7 @@ from pkm_twin.machine.uncertainty import (
     UncertaintyEntry,
     causes_of,
 )
-from pkm_twin.machine.urdf_visuals import Visual
+from pkm_twin.machine.urdf_file import Visual
 
 R = TypeVar("R", bound="Mechanism")
 

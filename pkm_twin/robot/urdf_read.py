@@ -19,7 +19,7 @@ from pkm_twin.machine.graph_file import graph_description
 from pkm_twin.machine.loop_tree import SINGLE, Joint, LoopTree
 from pkm_twin.machine.rotations import Pose
 from pkm_twin.machine.urdf_control import take_drives
-from pkm_twin.machine.urdf_visuals import Visual, visuals
+from pkm_twin.machine.urdf_file import Visual, visuals
 from pkm_twin.robot.urdf_home import EXACT, Assembly, HomeSearch
 
 PLATFORMS: Final = (

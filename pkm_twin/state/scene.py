@@ -14,6 +14,7 @@ import numpy as np
 
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.machine import rotations
+from pkm_twin.machine.joints import across
 from pkm_twin.machine.members import Place
 from pkm_twin.robot.outline import Posture, robot_bars
 from pkm_twin.robot.robot import Robot
@@ -240,7 +241,7 @@ def _along_z(span: Array) -> tuple[float, float, float, float]:
     if not length > 0.0:
         return 0.0, 0.0, 0.0, 1.0
     z = span / length
-    x = rotations.across(z)
+    x = across(z)[0]
     return _quaternion(np.column_stack((x, np.cross(z, x), z)))
 
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import one_line, warn
-from pkm_twin.machine.urdf_visuals import Visual
+from pkm_twin.machine.urdf_file import Visual
 from pkm_twin.robot.robot import Robot
 
 LARGEST: Final = 64 * 1024 * 1024
