@@ -18,7 +18,7 @@ from pkm_twin.report import Fact
 from pkm_twin.settings import setting
 
 if TYPE_CHECKING:
-    from pkm_twin.recordings import Dialect, Load, ReadOptions, Recording, WrenchFrames
+    from pkm_twin.recordings import Dialect, Load, ReadOptions, Recording
     from pkm_twin.robot.limits import Beyond
     from pkm_twin.robot.robot import Robot
     from stiffness_monitor.chatter import Milling
@@ -142,26 +142,7 @@ class ReadsTables:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ReadsWrenches:
-    """The frame of a recording's wrenches."""
-
-    wrench_frame: str | None = setting(
-        None,
-        "accepted frame of a bag's wrenches, which turns with the platform; default: platform or "
-        "--base-frame, whichever comes first",
-    )
-    base_frame: str = setting("base_link", "frame of a bag's wrenches with base axes")
-
-    @property
-    def frames(self) -> WrenchFrames:
-        """As the readers of bags take them."""
-        from pkm_twin.recordings import WrenchFrames
-
-        return WrenchFrames(self.wrench_frame, self.base_frame)
-
-
-@dataclass(frozen=True, kw_only=True)
-class ReadsRecordings(ReadsTables, ReadsWrenches):
+class ReadsRecordings(ReadsTables):
     """Which topics of a recording are read, and how its tables are written."""
 
     topic: tuple[str, ...] = setting(
@@ -171,6 +152,12 @@ class ReadsRecordings(ReadsTables, ReadsWrenches):
         "joint", "whose values a table's joints have: the joint's, the controller's (joint_map) or "
         "the motor's (drive)", choices=("joint", "controller", "motor"),
     )  # fmt: skip
+    wrench_frame: str | None = setting(
+        None,
+        "accepted frame of a bag's wrenches, which turns with the platform; default: platform or "
+        "--base-frame, whichever comes first",
+    )
+    base_frame: str = setting("base_link", "frame of a bag's wrenches with base axes")
 
     def read(
         self, path: Path, robot: Robot | str | None, progress: Callable[[int], None] | None = None,
@@ -188,8 +175,9 @@ class ReadsRecordings(ReadsTables, ReadsWrenches):
         """How its recordings are read; ``more``: other fields of ``ReadOptions``."""
         from pkm_twin.recordings import ReadOptions
 
-        held, follow = getattr(self, "load", None), getattr(self, "follow", None)
-        return ReadOptions(self.topic, held, follow, self.dialect, self.side, self.frames, **more)
+        names = ("load", "follow", "dialect", "side", "wrench_frame", "base_frame")
+        own: dict[str, Any] = {name: getattr(self, name, None) for name in names}
+        return ReadOptions(self.topic, **own, **more)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -3,7 +3,7 @@
 
 from pkm_twin.recordings.payload import Load, by_load
 from pkm_twin.recordings.read import read
-from pkm_twin.recordings.recording import ReadOptions, Recording, WrenchFrames, at_rest
+from pkm_twin.recordings.recording import ReadOptions, Recording, at_rest
 from pkm_twin.recordings.tables import Dialect, Table, kinds_of, read_table, write_table
 
 __all__ = [
@@ -12,7 +12,6 @@ __all__ = [
     "ReadOptions",
     "Recording",
     "Table",
-    "WrenchFrames",
     "at_rest",
     "by_load",
     "kinds_of",

@@ -61,7 +61,7 @@ def read_bag(
     topics = choose_topics(bag, machine, how.topics, how.deflected)
     found = _messages(bag, machine, topics, how, progress)
     frame = found.wrenches[0].frame if found.wrenches else ""
-    topics = replace(topics, frame=frame, turns=bool(frame) and frame != how.frames.base_frame)
+    topics = replace(topics, frame=frame, turns=bool(frame) and frame != how.base_frame)
     notes = [str(topics)]
     if found.rejected:
         refused = ", ".join(f"{reason}: {count}" for reason, count in found.rejected.items())
@@ -167,12 +167,12 @@ def _messages(
 
 def _wrench_reader(how: ReadOptions, rules: StampRules) -> Callable[[Any, int], WrenchSample]:
     """Reads a geometry_msgs/WrenchStamped and its log time, ns, of one frame, as a node does."""
-    accepted = how.frames.wrench_frame
+    accepted = how.wrench_frame
 
     def read(message: Any, now: int) -> WrenchSample:
         nonlocal accepted
         given = message.header.frame_id
-        if accepted is None and given in (PLATFORM, how.frames.base_frame):
+        if accepted is None and given in (PLATFORM, how.base_frame):
             accepted = given
         try:
             return read_wrench(message, now, rules, accepted or PLATFORM, accept_empty=False)
@@ -231,7 +231,7 @@ def _at_deflections(r: Recording, joints: Stamps, found: _Found, how: ReadOption
     q, wrench = _between(near, joints, r.q), _between(near, times, wrench)
     rotation = r.robot.platform(q)[1]
     values = np.array([moved[stamp].values for stamp in near.tolist()])
-    fixed = np.array([moved[stamp].frame == how.frames.base_frame for stamp in near.tolist()])
+    fixed = np.array([moved[stamp].frame == how.base_frame for stamp in near.tolist()])
     return Recording(
         r.robot,
         (near - near[0]) / SECOND,

@@ -32,21 +32,6 @@ _ORDER, _WINDOW = 3, 9
 
 
 @dataclass(frozen=True)
-class WrenchFrames:
-    """Wrenches of one frame are accepted, as a node accepts them.
-
-    ``wrench_frame``: as the node's parameter; None is the platform's or the base frame, whichever
-    comes first. ``base_frame``: has base axes; every other frame turns with the platform.
-    """
-
-    wrench_frame: str | None = None
-    base_frame: str = WrenchSettings.base_frame
-
-
-USUAL: Final = WrenchFrames()
-
-
-@dataclass(frozen=True)
 class ReadOptions:
     """How a recording is read, as options of commands say it.
 
@@ -54,10 +39,12 @@ class ReadOptions:
     one that the file tells of. ``follow``: ``joints`` or ``pose``: which columns of a table
     that has both are the motion; None: both, which have to agree. ``side``: whose values a
     table's joints have: of the ``joint``, the ``controller`` (joint_map) or the ``motor``
-    (drive). ``limited``: messages beyond the robot's limits are rejected, as a node does.
-    ``planned``: the trajectory of a bag and the efforts of a plan are read too. ``currents``:
-    efforts of a table may be motor currents. ``deflected``: deflections are needed, and a bag
-    is read at their times.
+    (drive). ``wrench_frame``: of a bag's wrenches, as the node's parameter; None is the
+    platform's or the base frame, whichever comes first. ``base_frame``: has base axes; every
+    other frame turns with the platform. ``limited``: messages beyond the robot's limits are
+    rejected, as a node does. ``planned``: the trajectory of a bag and the efforts of a plan are
+    read too. ``currents``: efforts of a table may be motor currents. ``deflected``: deflections
+    are needed, and a bag is read at their times.
     """
 
     topics: tuple[str, ...] = ()
@@ -65,7 +52,8 @@ class ReadOptions:
     follow: str | None = None
     dialect: Dialect = PLAIN
     side: str = "joint"
-    frames: WrenchFrames = USUAL
+    wrench_frame: str | None = None
+    base_frame: str = WrenchSettings.base_frame
     limited: bool = False
     planned: bool = False
     currents: bool = False
