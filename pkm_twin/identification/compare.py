@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
@@ -19,9 +19,18 @@ from pkm_twin.identification.judge import LOUD
 from pkm_twin.identification.noise import SEGMENT, huber, noise_of, passed_band, usual_size
 from pkm_twin.identification.plausible import LATEST
 from pkm_twin.identification.rows import BLOCK, shaken_efforts
-from pkm_twin.identification.samples import Filtering, Motion, Track, by_blocks, low_pass, tracks
+from pkm_twin.identification.samples import (
+    Filtering,
+    Motion,
+    Track,
+    by_blocks,
+    filtered,
+    kept_rows,
+    tracks,
+)
 from pkm_twin.recordings import Recording
 from pkm_twin.robot.robot import Robot
+from pkm_twin.streams.rates import rms
 
 MAX_RESIDUAL: Final = 0.05
 """Largest good torque residual RMS, part of the joint's peak effort."""
@@ -65,9 +74,7 @@ class Compared:
 
     def filtered(self, columns: Sequence[Array]) -> Array:
         """Signals of the tracks, (samples, m) each, filtered as the efforts are, shape (k, m)."""
-        one_by_one = replace(self.how, keep_every=1)
-        parts = [low_pass(column, self.period, one_by_one) for column in columns]
-        return np.concatenate(parts)
+        return filtered([{"": column} for column in columns], self.period, self.how)[""]
 
     @property
     def edge(self) -> float:
@@ -77,7 +84,7 @@ class Compared:
     @property
     def rms(self) -> Array:
         """Of the residual, shape (n,)."""
-        return np.asarray(np.sqrt(np.mean(self.residual**2, 0)), np.float64)
+        return rms(self.residual)
 
     @property
     def limit(self) -> Array:
@@ -159,25 +166,25 @@ def compare(robot: Robot, r: Recording, bound: float = MAX_RESIDUAL) -> Compared
         qd = moving_rates(track.qd, ~track.moves(how), reach)
         return by_held(robot, r.carried, inverse_dynamics, replace(track, qd=qd))
 
-    period, made, raw, inside = pieces[0].period, [], [], []
-    one_by_one: Any = replace(how, keep_every=1)
+    period, how = pieces[0].period, replace(how, keep_every=1)
+    sharp: list[dict[str, Array]] = []
     for track in pieces:
         expected = efforts(track)
         left = beyond_friction(track.effort - expected, ~track.moves(how), reach)
         change = np.gradient(expected, period, axis=0)
-        smooth = low_pass(np.concatenate([expected, left, change], 1), period, one_by_one)
-        n, edge = left.shape[1], (len(left) - len(smooth)) // 2
-        inner = slice(edge, edge + len(smooth))
-        parts = [smooth[:, k * n : (k + 1) * n] for k in range(3)]
-        made.append([track.time[inner], *parts, left[inner], change[inner]])
-        raw.append(left)
-        inside.append(inner)
-    starts = np.cumsum([0, *(len(one[0]) for one in made[:-1])]).tolist()
-    time, expected, left, change, sharp, turn = (
-        np.concatenate(one) for one in zip(*made, strict=True)
-    )
+        sharp.append({"expected": expected, "left": left, "change": change})
+    smooth = filtered(sharp, period, how)
+    expected, left, change = (smooth[name] for name in ("expected", "left", "change"))
+    inside = [kept_rows(len(track.time), period, how) for track in pieces]
+    starts = np.cumsum([0, *(rows.stop - rows.start for rows in inside[:-1])]).tolist()
+    time = np.concatenate([one.time[rows] for one, rows in zip(pieces, inside, strict=True)])
+    cut = {
+        name: np.concatenate([one[name][rows] for one, rows in zip(sharp, inside, strict=True)])
+        for name in ("left", "change")
+    }
     late = _late(left, change)
     longest = max(pieces, key=lambda track: len(track.time))
+    raw = [one["left"] for one in sharp]
     long = [one for one in raw if len(one) >= SEGMENT] or [max(raw, key=len)]
     shaken = np.zeros_like(r.q) if rates is not None else shaken_efforts(r, longest, how, efforts)
     density = noise_of(long, shaken, period, how)
@@ -186,7 +193,7 @@ def compare(robot: Robot, r: Recording, bound: float = MAX_RESIDUAL) -> Compared
     greatest = np.array([size[units == unit].max() for unit in units])
     residual = left + late * change
     return Compared(
-        time, expected + residual, expected, residual, sharp + late * turn,
+        time, expected + residual, expected, residual, cut["left"] + late * cut["change"],
         density * np.sqrt(passed_band(how, 1.0 / period) / period),
         np.maximum(size, LIGHT * greatest), late, period,
         tuple(starts), tuple(pieces), tuple(inside), how, bound,

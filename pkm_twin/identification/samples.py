@@ -202,20 +202,20 @@ def tracks(
     return result, Filtering(width, tuple(noise.tolist()), cutoff if filtered else None, keep)
 
 
-def low_pass(values: Array, period: float, how: Filtering) -> Array:
-    """Signals along the first axis, filtered without phase, thinned out, ends left out.
+def kept_rows(count: int, period: float, how: Filtering) -> slice:
+    """The samples of so many that are left by :func:`low_pass`."""
+    # What the filter makes up at the ends dies out in a period of its cut-off.
+    edge = 0 if how.cutoff is None else min(int(1.0 / (how.cutoff * period)), count // 4)
+    return slice(edge, count - edge, how.keep_every)
 
-    With ``keep_every`` 0 all are kept, the ends too.
-    """
+
+def low_pass(values: Array, period: float, how: Filtering) -> Array:
+    """Signals along the first axis, filtered without phase, thinned out, ends left out."""
     if how.cutoff is None:
         return values
     sections = scipy.signal.butter(4, 2.0 * how.cutoff * period, output="sos")
     smooth = scipy.signal.sosfiltfilt(sections, values, axis=0)
-    if not how.keep_every:
-        return np.asarray(smooth, np.float64)
-    # What the filter makes up at the ends dies out in a period of its cut-off.
-    edge = min(int(1.0 / (how.cutoff * period)), len(values) // 4)
-    return np.asarray(smooth[edge : len(values) - edge : how.keep_every], np.float64)
+    return np.asarray(smooth[kept_rows(len(values), period, how)], np.float64)
 
 
 def filtered(
