@@ -9,7 +9,7 @@ import os
 import struct
 import zlib
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from enum import IntEnum
 from functools import cache
@@ -64,8 +64,24 @@ MESSAGE_HEAD = struct.Struct("<HIQQ")
 INDEX_ENTRY = struct.Struct("<QQ")
 FOOTER_BODY = struct.Struct("<QQI")
 CRC = struct.Struct("<I")
-CHUNK_HEAD = struct.Struct("<QQQI")
-STATISTICS_HEAD = struct.Struct("<QHIIIIQQ")
+_PAIR = struct.Struct("<HQ")
+LAYOUTS = {
+    Op.HEADER: "ss",
+    Op.FOOTER: "QQI",
+    Op.SCHEMA: "Hssb",
+    Op.CHANNEL: "HHsst",
+    Op.CHUNK: "QQQIsl",
+    Op.MESSAGE_INDEX: "Hb",
+    Op.CHUNK_INDEX: "QQQQpQsQQ",
+    Op.ATTACHMENT_INDEX: "QQQQQss",
+    Op.STATISTICS: "QHIIIIQQp",
+    Op.METADATA: "st",
+    Op.METADATA_INDEX: "QQs",
+    Op.SUMMARY_OFFSET: "BQQ",
+    Op.DATA_END: "I",
+}
+"""Fields of each kind of record: numbers as in struct; s a text, b bytes, l bytes with a 64-bit
+length, t a map of texts, p pairs of a channel and a 64-bit number."""
 
 TOTAL_CAP = "total_cap"
 """Reason of a file that is refused whole for what it would cost."""
@@ -225,29 +241,29 @@ class Fields:
         self._position += count
         return self._body[start : self._position]
 
-    def numbers(self, layout: str) -> tuple[int, ...]:
-        """Read little-endian numbers, ``layout`` as in struct."""
-        return struct.unpack(f"<{layout}", self.take(struct.calcsize(f"<{layout}")))
-
     def number(self, code: str) -> int:
-        """Read one number, ``code`` as in struct."""
-        return self.numbers(code)[0]
+        """Read one little-endian number, ``code`` as in struct."""
+        value: int = struct.unpack(f"<{code}", self.take(struct.calcsize(f"<{code}")))[0]
+        return value
 
-    def blob(self, code: str) -> bytes:
+    def blob(self, code: str = "I") -> bytes:
         """Read a length of type ``code`` and as many bytes."""
         return self.take(self.number(code))
 
     def text(self) -> str:
         """Read a length-prefixed text."""
-        return utf8(self.blob("I"), self._what, self._offset)
+        return utf8(self.blob(), self._what, self._offset)
 
-    def part(self) -> Fields:
-        """Read a length-prefixed block as fields of its own."""
-        return Fields(self.blob("I"), self._what, self._offset)
+    def pairs(self) -> list[tuple[int, int]]:
+        """Read a map of 64-bit numbers by channels."""
+        raw = self.blob()
+        if len(raw) % _PAIR.size:
+            raise FormatError(f"a map of the {self._what} record is cut short", self._offset)
+        return list(_PAIR.iter_unpack(raw))
 
     def texts(self) -> dict[str, str]:
         """Read a map of texts; a key given twice is an error."""
-        part = self.part()
+        part = Fields(self.blob(), self._what, self._offset)
         result: dict[str, str] = {}
         while part.left:
             key = part.text()
@@ -269,6 +285,43 @@ class Fields:
             raise FormatError(
                 f"the {self._what} record has {self.left} bytes too many", self._offset
             )
+
+
+_READ: dict[str, Callable[[Fields], Any]] = {
+    "s": Fields.text,
+    "b": Fields.blob,
+    "l": lambda fields: fields.blob("Q"),
+    "t": Fields.texts,
+    "p": Fields.pairs,
+}
+_WRITE: dict[str, Callable[[Any], bytes]] = {
+    "s": lambda text: packed_texts(text),
+    "b": lambda data: packed_texts(data),
+    "l": lambda data: struct.pack("<Q", len(data)) + data,
+    "t": lambda entries: packed_texts(packed_texts(*chain(*entries.items()))),
+    "p": lambda pairs: packed_texts(b"".join(_PAIR.pack(*pair) for pair in pairs)),
+}
+
+
+def unpack(opcode: int, body: bytes, offset: int) -> list[Any]:
+    """Return the fields of a record by :data:`LAYOUTS`, which it holds and nothing else."""
+    fields = Fields(body, opcode_name(opcode), offset)
+    values = [
+        _READ[code](fields) if code in _READ else fields.number(code)
+        for code in LAYOUTS[Op(opcode)]
+    ]
+    fields.done()
+    return values
+
+
+def pack(opcode: Op, *values: Any) -> bytes:
+    """Return the record of these fields."""
+    parts = [
+        _WRITE[code](value) if code in _WRITE else struct.pack(f"<{code}", value)
+        for code, value in zip(LAYOUTS[opcode], values, strict=True)
+    ]
+    body = b"".join(parts)
+    return FRAME.pack(opcode, len(body)) + body
 
 
 def iterate_records(
@@ -354,24 +407,19 @@ class Records:
 
     def add(self, opcode: int, body: bytes, offset: int) -> None:
         """Take in a schema or channel record."""
-        fields = Fields(body, opcode_name(opcode), offset)
-        number = fields.number("H")
+        number, *values = unpack(opcode, body, offset)
         if opcode == Op.SCHEMA:
-            self._add_schema(number, fields, offset)
+            self._add_schema(number, Schema(*values), offset)
         else:
-            self._add_channel(number, fields, offset)
+            self._add_channel(number, Channel(*values), offset)
 
-    def _add_schema(self, number: int, fields: Fields, offset: int) -> None:
-        schema = Schema(fields.text(), fields.text(), fields.blob("I"))
-        fields.done()
+    def _add_schema(self, number: int, schema: Schema, offset: int) -> None:
         if number == 0:
             raise FormatError("a schema has the number 0", offset)
         if self.schemas.setdefault(number, schema) != schema:
             raise FormatError(f"schema {number} is defined twice, differently", offset)
 
-    def _add_channel(self, number: int, fields: Fields, offset: int) -> None:
-        channel = Channel(fields.number("H"), fields.text(), fields.text(), fields.texts())
-        fields.done()
+    def _add_channel(self, number: int, channel: Channel, offset: int) -> None:
         schema = self.schemas.get(channel.schema_id)
         if channel.schema_id and schema is None:
             raise FormatError(
@@ -384,9 +432,7 @@ class Records:
 
 def metadata(body: bytes, offset: int) -> tuple[str, dict[str, str], bool]:
     """Return a metadata record's name and entries, and whether a CRC of its own confirms them."""
-    fields = Fields(body, "metadata", offset)
-    name, entries = fields.text(), fields.texts()
-    fields.done()
+    name, entries = unpack(Op.METADATA, body, offset)
     crc = entries.pop(METADATA_CRC, None)
     if crc is not None and crc != metadata_crc(name, entries):
         raise FormatError(f"metadata {name!r} does not match its CRC", offset, "crc")
@@ -470,11 +516,7 @@ class Chunk:
 
 def read_chunk(body: bytes, offset: int, budget: Budget) -> Chunk:
     """Unpack the chunk record at ``offset`` and compare its CRC, if it has one."""
-    fields = Fields(body, "chunk", offset)
-    start, end, size, crc = CHUNK_HEAD.unpack(fields.take(CHUNK_HEAD.size))
-    compression = fields.text()
-    packed = fields.blob("Q")
-    fields.done()
+    start, end, size, crc, compression, packed = unpack(Op.CHUNK, body, offset)
     data = _unpack(compression, packed, size, offset, budget)
     if crc and zlib.crc32(data) != crc:
         raise FormatError(

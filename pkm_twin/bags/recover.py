@@ -21,13 +21,13 @@ from pkm_twin.bags.format import (
     MAX_RECORD_BYTES,
     TOTAL_CAP,
     Chunk,
-    Fields,
     FormatError,
     Op,
     RecordReader,
     iterate_records,
     message_data,
     opcode_name,
+    unpack,
 )
 from pkm_twin.bags.storage import BagFile, files_by_name, find_storage
 from pkm_twin.bags.strict import Check, Walker
@@ -191,8 +191,7 @@ class Salvage(Walker):
             if opcode in (Op.SCHEMA, Op.CHANNEL):
                 self.records.add(opcode, summary[begin:end], start)
             elif opcode == Op.CHUNK_INDEX:
-                fields = Fields(summary[begin:end], opcode_name(opcode), start)
-                _, _, offset, length = fields.numbers("QQQQ")
+                _, _, offset, length, *_ = unpack(opcode, summary[begin:end], start)
                 if FRAME.size < length <= start - offset:
                     self._known[offset] = length
         self._data_end = start

@@ -11,19 +11,18 @@ import zlib
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 from pkm_twin.bags.definitions import parse_definition
 from pkm_twin.bags.format import (
     CRC,
     FIRST_UNKNOWN,
-    FOOTER_BODY,
     FRAME,
     INDEX_ENTRY,
     MAGIC,
     MESSAGE_HEAD,
     ZSTD_MAGIC,
     Chunk,
-    Fields,
     FormatError,
     Op,
     RecordReader,
@@ -35,6 +34,7 @@ from pkm_twin.bags.format import (
     read_attachment,
     read_chunk,
     read_magic,
+    unpack,
 )
 from pkm_twin.errors import BagError
 
@@ -163,7 +163,6 @@ class Walker:
             self._pass_over(at, opcode, length)
             return
         body = self._reader.body(opcode, length)
-        fields = Fields(body, opcode_name(opcode), at)
         if opcode == Op.CHUNK:
             self._take_chunk(at, read_chunk(body, at, self._reader.budget), FRAME.size + length)
         elif opcode == Op.MESSAGE:
@@ -173,12 +172,9 @@ class Walker:
         elif opcode == Op.METADATA:
             self._take_metadata(at, FRAME.size + length, *metadata(body, at))
         elif opcode == Op.MESSAGE_INDEX:
-            number, entries = fields.number("H"), fields.blob("I")
-            fields.done()
-            self._take_index(at, number, entries)
+            self._take_index(at, *unpack(opcode, body, at))
         elif opcode == Op.HEADER and at == len(MAGIC):
-            self._profile, self._library = fields.text(), fields.text()
-            fields.done()
+            self._profile, self._library = unpack(opcode, body, at)
         else:
             raise FormatError(f"a {opcode_name(opcode)} record stands in the data section", at)
 
@@ -344,9 +340,7 @@ class Check(Walker):
         self._metadata_places.add((at, length, name))
 
     def _read_data_end(self, at: int, length: int, crc: int) -> None:
-        fields = Fields(self._reader.body(Op.DATA_END, length), "data end", at)
-        stated = fields.number("I")
-        fields.done()
+        (stated,) = unpack(Op.DATA_END, self._reader.body(Op.DATA_END, length), at)
         if stated and stated != crc:
             raise FormatError(f"the data's CRC is {crc:08x}; the file says {stated:08x}", at, "crc")
         self._has_data_crc = stated != 0
@@ -377,7 +371,7 @@ class Check(Walker):
         if opcode in (Op.SCHEMA, Op.CHANNEL):
             self.records.add(opcode, body, at)
             return
-        readers: dict[int, Callable[[Fields, int], None]] = {
+        readers: dict[int, Callable[..., None]] = {
             Op.STATISTICS: self._read_statistics,
             Op.CHUNK_INDEX: self._read_chunk_index,
             Op.METADATA_INDEX: self._read_metadata_index,
@@ -390,50 +384,37 @@ class Check(Walker):
             raise FormatError(
                 f"a {opcode_name(opcode)} record stands among the summary offsets", at
             )
-        fields = Fields(body, opcode_name(opcode), at)
-        readers[opcode](fields, at)
-        fields.done()
+        readers[opcode](at, *unpack(opcode, body, at))
 
-    def _read_statistics(self, fields: Fields, at: int) -> None:
+    def _read_statistics(self, at: int, *facts: Any) -> None:
         if self._statistics:
             raise FormatError("the summary has two statistics records", at)
-        numbers = fields.numbers("QHIIIIQQ")
-        part = fields.part()
-        counts: dict[int, int] = {}
-        while part.left:
-            number, count = part.numbers("HQ")
-            if number in counts:
-                raise FormatError(f"the statistics count channel {number} twice", at)
-            counts[number] = count
-        self._statistics = (numbers, counts)
+        *numbers, pairs = facts
+        counts = dict(pairs)
+        if len(counts) < len(pairs):
+            raise FormatError("the statistics count a channel twice", at)
+        self._statistics = (tuple(numbers), counts)
 
-    def _read_chunk_index(self, fields: Fields, at: int) -> None:
-        start, end, offset, length = fields.numbers("QQQQ")
-        part = fields.part()
-        places = []
-        while part.left:
-            places.append(part.numbers("HQ"))
-        index_length = fields.number("Q")
-        sizes = (fields.text(), *fields.numbers("QQ"))
+    def _read_chunk_index(
+        self, at: int, start: int, end: int, offset: int, length: int,
+        places: list[tuple[int, int]], index_length: int, *sizes: Any,
+    ) -> None:  # fmt: skip
         stated = hash(((start, end, length), sizes, index_length, tuple(sorted(places))))
         if self._chunks.get(offset) != stated or offset in self._indexed:
             raise FormatError(f"a chunk index does not match the chunk at byte {offset}", at)
         self._indexed.add(offset)
 
-    def _read_metadata_index(self, fields: Fields, at: int) -> None:
-        offset, length = fields.numbers("QQ")
-        if (offset, length, fields.text()) not in self._metadata_places:
-            raise FormatError(f"a metadata index does not match the metadata at byte {offset}", at)
-
-    def _read_attachment_index(self, fields: Fields, at: int) -> None:
-        numbers = fields.numbers("QQQQQ")
-        if (*numbers, fields.text(), fields.text()) not in self._attachment_places:
+    def _read_metadata_index(self, at: int, *place: Any) -> None:
+        if place not in self._metadata_places:
             raise FormatError(
-                f"an attachment index does not match the one at byte {numbers[0]}", at
+                f"a metadata index does not match the metadata at byte {place[0]}", at
             )
 
-    def _read_summary_offset(self, fields: Fields, at: int) -> None:
-        opcode, start, length = fields.numbers("BQQ")
+    def _read_attachment_index(self, at: int, *place: Any) -> None:
+        if place not in self._attachment_places:
+            raise FormatError(f"an attachment index does not match the one at byte {place[0]}", at)
+
+    def _read_summary_offset(self, at: int, opcode: int, start: int, length: int) -> None:
         # Writers may list a group that has no records.
         if length and self._groups.get(opcode) != [start, start + length]:
             raise FormatError(
@@ -441,9 +422,7 @@ class Check(Walker):
             )
 
     def _read_footer(self, begin: int, at: int, body: bytes, crc: int) -> None:
-        fields = Fields(body, "footer", at)
-        start, offset_start, stated = FOOTER_BODY.unpack(fields.take(FOOTER_BODY.size))
-        fields.done()
+        start, offset_start, stated = unpack(Op.FOOTER, body, at)
         self._has_summary = at > begin
         if start != (begin if self._has_summary else 0) and (start, at) != (begin, begin):
             raise FormatError(f"the footer puts the summary at {start}; it is at {begin}", at)

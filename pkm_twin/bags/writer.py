@@ -8,14 +8,12 @@ import io
 import operator
 import os
 import queue
-import struct
 import threading
 import time
 import zlib
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
-from itertools import chain
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -23,9 +21,7 @@ from typing import Any, Self
 from pkm_twin.bags.cdr import MessageCodec
 from pkm_twin.bags.definitions import live_type_name, message_definition
 from pkm_twin.bags.format import (
-    CHUNK_HEAD,
     CRC,
-    FOOTER_BODY,
     FRAME,
     FREE_BYTES,
     INDEX_ENTRY,
@@ -33,14 +29,13 @@ from pkm_twin.bags.format import (
     MAX_CHUNK_BYTES,
     MESSAGE_HEAD,
     METADATA_CRC,
-    STATISTICS_HEAD,
     Channel,
     Head,
     Op,
     Schema,
     Span,
     metadata_crc,
-    packed_texts,
+    pack,
 )
 from pkm_twin.errors import BagError
 from pkm_twin.files import require_replaceable
@@ -117,7 +112,7 @@ class McapWriter:
         self._path = path
         self._chunk_size = chunk_size
         self._position = self._crc = 0
-        self._numbers: dict[Op, dict[bytes, int]] = {Op.SCHEMA: {}, Op.CHANNEL: {}}
+        self._numbers: dict[Op, dict[bytes, tuple[int, bytes]]] = {Op.SCHEMA: {}, Op.CHANNEL: {}}
         self._metadata: set[bytes] = set()
         self._counts: Counter[int] = Counter()
         self._total, self._span = Span(), Span()
@@ -128,37 +123,35 @@ class McapWriter:
     def start(self, profile: str) -> None:
         """Write the opening mark and the header, unless they are there."""
         if not self._position:
-            self._write(MAGIC + _record(Op.HEADER, packed_texts(profile, LIBRARY)))
+            self._write(MAGIC + pack(Op.HEADER, profile, LIBRARY))
 
     def add_metadata(self, name: str, entries: Mapping[str, str], verified: bool = True) -> None:
         """Write texts by name, once, with a CRC of their own where they are ``verified``."""
         crc = {METADATA_CRC: metadata_crc(name, entries)} if verified else {}
-        record = _record(Op.METADATA, packed_texts(name), _map({**entries, **crc}))
+        record = pack(Op.METADATA, name, {**entries, **crc})
         if record in self._metadata:
             return
         self._metadata.add(record)
-        place = struct.pack("<QQ", self._position, len(record))
-        self._indexes[Op.METADATA_INDEX].append(
-            _record(Op.METADATA_INDEX, place, packed_texts(name))
-        )
+        place = pack(Op.METADATA_INDEX, self._position, len(record), name)
+        self._indexes[Op.METADATA_INDEX].append(place)
         self._write(record)
 
     def channel(self, schema: Schema | None, channel: Channel) -> int:
         """Return the number of a channel, whose own ``schema_id`` does not count."""
         number = 0
         if schema is not None:
-            texts = packed_texts(schema.name, schema.encoding, schema.data)
-            number = self._number(Op.SCHEMA, texts)
-        texts = packed_texts(channel.topic, channel.encoding) + _map(channel.metadata)
-        return self._number(Op.CHANNEL, struct.pack("<H", number) + texts)
+            number = self._number(Op.SCHEMA, schema.name, schema.encoding, schema.data)
+        own = (channel.topic, channel.encoding, channel.metadata)
+        return self._number(Op.CHANNEL, number, *own)
 
-    def _number(self, kind: Op, body: bytes) -> int:
+    def _number(self, kind: Op, *fields: Any) -> int:
         """The number of a schema or channel, which is written when it is first asked for."""
-        numbers = self._numbers[kind]
-        if body not in numbers:
-            numbers[body] = len(numbers) + 1
-            self._gather(_numbered(kind, numbers[body], body))
-        return numbers[body]
+        numbers, key = self._numbers[kind], pack(kind, 0, *fields)
+        if key not in numbers:
+            record = pack(kind, len(numbers) + 1, *fields)
+            numbers[key] = len(numbers) + 1, record
+            self._gather(record)
+        return numbers[key][0]
 
     def add_message(self, head: Head, data: bytes) -> None:
         """Write a message of a channel that :meth:`channel` has numbered."""
@@ -167,7 +160,8 @@ class McapWriter:
         for span in (self._total, self._span):
             span.add(head.log_time)
         self._counts[head.channel] += 1
-        self._gather(_record(Op.MESSAGE, MESSAGE_HEAD.pack(*head), data))
+        frame = FRAME.pack(Op.MESSAGE, MESSAGE_HEAD.size + len(data))
+        self._gather(frame + MESSAGE_HEAD.pack(*head) + data)
 
     def _gather(self, record: bytes) -> None:
         self._chunk += record
@@ -181,48 +175,40 @@ class McapWriter:
         data, at = bytes(self._chunk), self._position
         compression, packed = ("zstd", zstandard.compress(data)) if zstandard else ("", data)
         times = self._span.start, self._span.end
-        head = CHUNK_HEAD.pack(*times, len(data), zlib.crc32(data)) + packed_texts(compression)
-        self._write(_record(Op.CHUNK, head, struct.pack("<Q", len(packed)), packed))
-        begin, places, indexes = self._position, b"", b""
+        crc = zlib.crc32(data)
+        self._write(pack(Op.CHUNK, *times, len(data), crc, compression, packed))
+        begin, places, indexes = self._position, [], b""
         for number, entries in self._entries.items():
-            places += struct.pack("<HQ", number, begin + len(indexes))
-            indexes += _numbered(Op.MESSAGE_INDEX, number, packed_texts(bytes(entries)))
+            places.append((number, begin + len(indexes)))
+            indexes += pack(Op.MESSAGE_INDEX, number, bytes(entries))
         self._write(indexes)
+        sizes = (compression, len(packed), len(data))
         self._indexes[Op.CHUNK_INDEX].append(
-            _record(
-                Op.CHUNK_INDEX,
-                struct.pack("<QQQQ", *times, at, begin - at),
-                packed_texts(places),
-                struct.pack("<Q", len(indexes)),
-                packed_texts(compression),
-                struct.pack("<QQ", len(packed), len(data)),
-            )
+            pack(Op.CHUNK_INDEX, *times, at, begin - at, places, len(indexes), *sizes)
         )
         self._chunk, self._entries, self._span = bytearray(), {}, Span()
 
     def finish(self) -> None:
         """Write what is left, the summary and the closing mark."""
         self.flush()
-        self._write(_record(Op.DATA_END, CRC.pack(self._crc)))
+        self._write(pack(Op.DATA_END, self._crc))
         start, summary, offsets = self._position, b"", b""
         for kind, records in self._summary():
             group = b"".join(records)
-            place = struct.pack("<BQQ", kind, start + len(summary), len(group))
-            offsets += _record(Op.SUMMARY_OFFSET, place)
+            offsets += pack(Op.SUMMARY_OFFSET, kind, start + len(summary), len(group))
             summary += group
-        footer = FRAME.pack(Op.FOOTER, FOOTER_BODY.size)
-        end = summary + offsets + footer + struct.pack("<QQ", start, start + len(summary))
+        footer = pack(Op.FOOTER, start, start + len(summary), 0)
+        end = summary + offsets + footer[: -CRC.size]
         self._write(end + CRC.pack(zlib.crc32(end)) + MAGIC)
 
     def _summary(self) -> Iterator[tuple[Op, list[bytes]]]:
         for kind, numbers in self._numbers.items():
-            yield kind, [_numbered(kind, number, body) for body, number in numbers.items()]
+            yield kind, [record for _, record in numbers.values()]
         places = [len(self._indexes[kind]) for kind in (Op.METADATA_INDEX, Op.CHUNK_INDEX)]
         kinds = [len(self._numbers[kind]) for kind in (Op.SCHEMA, Op.CHANNEL)]
         times = self._total.start, self._total.end
-        facts = STATISTICS_HEAD.pack(self._total.count, *kinds, 0, *places, *times)
-        counts = b"".join(struct.pack("<HQ", *item) for item in self._counts.items())
-        yield Op.STATISTICS, [_record(Op.STATISTICS, facts, packed_texts(counts))]
+        facts = (self._total.count, *kinds, 0, *places, *times, self._counts.items())
+        yield Op.STATISTICS, [pack(Op.STATISTICS, *facts)]
         yield Op.CHUNK_INDEX, self._indexes[Op.CHUNK_INDEX]
         yield Op.ATTACHMENT_INDEX, []
         yield Op.METADATA_INDEX, self._indexes[Op.METADATA_INDEX]
@@ -236,18 +222,6 @@ class McapWriter:
             raise write_error(error, self._path) from error
         self._crc = zlib.crc32(data, self._crc)
         self._position += len(data)
-
-
-def _record(kind: Op, *parts: bytes) -> bytes:
-    return b"".join((FRAME.pack(kind, sum(map(len, parts))), *parts))
-
-
-def _numbered(kind: Op, number: int, body: bytes) -> bytes:
-    return _record(kind, struct.pack("<H", number), body)
-
-
-def _map(entries: Mapping[str, str]) -> bytes:
-    return packed_texts(packed_texts(*chain(*entries.items())))
 
 
 class BagWriter:
