@@ -198,7 +198,7 @@ class Code:
         if status is not None:
             flat = [output.reshape(count, -1) for output in outputs]
             status = self._retried(prepared[None], _rows(arrays, count), flat, status, count)
-        if len(shape) != (count > 1):
+        if locked is None or len(shape) != (count > 1):
             outputs = [output.reshape(*shape, -1) for output in outputs]
         return outputs, None if status is None else status.reshape(*shape, 2)
 

@@ -7,6 +7,7 @@ results agree to rounding, not to the bit.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final
@@ -23,8 +24,8 @@ _LONGEST: Final = 200
 
 
 _NUMBERS: Final = {"inf": math.inf, "nan": math.nan}
-_ONE: Final = {op.name: op.one or op.numbers for op in OPERATIONS} | _NUMBERS
-_MANY: Final = {op.name: op.many or op.numbers for op in OPERATIONS} | _NUMBERS
+_ONE: Final[dict[str, Any]] = {op.name: op.one or op.numbers for op in OPERATIONS} | _NUMBERS
+_MANY: Final[dict[str, Any]] = {op.name: op.many or op.numbers for op in OPERATIONS} | _NUMBERS
 
 
 def source(
@@ -112,24 +113,28 @@ class PlainCode:
         """
         many = count > 1
         columns = [list(value.T) if many else value.ravel().tolist() for value in inputs]
-        named = dict(zip(self.program.inputs, columns, strict=True))
+        named: dict[str, Any] = dict(zip(self.program.inputs, columns, strict=True))
         named[PARAMETERS] = p.tolist()
+        good: Any = 1.0
+        reached: Any = 1.0
         with np.errstate(all="ignore"):
-            good, reached = 1.0, 1.0
             if self.program.equations is not None:
                 good, reached = self._solve(named, steps, many=many)
             values = self._call("results", named, many=many)
             if self.program.equations is not None:
                 good = good * values.pop()
-            table = _table(values, count).T
-            total = sum([np.abs(value).sum(-1) for value in (table, *inputs)])
-        finite = total < LARGE
+            total = sum(map(abs, [*values, *(x for column in columns for x in column)]))
+            own = _MANY if many else _ONE
+            finite = own["select"](own["less"](total, LARGE), 0.0, 2.0)
+            code = own["select"](good, finite, 1.0)
+        table = np.empty((count, len(values)))
+        for k, value in enumerate(values):
+            table[:, k] = value
         status = np.empty((count, 2))
-        status[:, 0] = np.where(np.greater(good, 0.0), np.where(finite, 0.0, 2.0), 1.0)
-        status[:, 1] = reached
+        status[:, 0], status[:, 1] = code, reached
         table[status[:, 0] != 0.0] = np.nan
-        ends = np.cumsum([len(row) for row in self.program.outputs.values()])[:-1]
-        return [np.ascontiguousarray(part) for part in np.split(table, ends, 1)], status
+        ends = itertools.accumulate(map(len, self.program.outputs.values()), initial=0)
+        return [table[:, a:b].copy() for a, b in itertools.pairwise(ends)], status
 
     def _call(self, part: str, named: dict[str, Any], *, many: bool) -> list[Any]:
         return list(self._parts[part][many](**(self._nothing | named)))
@@ -140,6 +145,7 @@ class PlainCode:
         assert q is not None  # noqa: S101
         named[STATE] = n = [0.0] * len(AT)
         n[AT.once], n[AT.alive] = float(steps == 1), 1.0
+        some: Callable[[Any], Any] = np.any if many else bool
         *named[UNKNOWNS], size = self._call("begin", named, many=many)
         for k in range(1, steps + 1):
             n[AT.part], n[AT.size], n[AT.before], n[AT.moving] = (
@@ -152,18 +158,10 @@ class PlainCode:
             for _ in range(TURNS):
                 after = self._call("correct", here, many=many)
                 here[UNKNOWNS], n[AT.size : AT.reached] = after[: len(q.home)], after[len(q.home) :]
-                if not np.any(n[AT.moving]):
+                if not some(n[AT.moving]):
                     break
             named[UNKNOWNS] = here[UNKNOWNS]
             n[AT.alive], n[AT.reached] = self._call("arrive", named, many=many)
-            if not np.any(n[AT.alive]):
+            if not some(n[AT.alive]):
                 break
         return n[AT.alive], n[AT.reached]
-
-
-def _table(values: Sequence[Any], count: int) -> Array:
-    """Numbers or arrays, a row each, shape (len(values), count); there may be none."""
-    table: Array = np.empty((len(values), count))
-    for row, value in zip(table, values, strict=True):
-        row[:] = value
-    return table

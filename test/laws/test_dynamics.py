@@ -230,7 +230,8 @@ for name, given in json.loads(sys.stdin.read()).items():
     robot, q = load(name), np.array(given)
     tau = inverse_dynamics(robot, q, 2 * q, 3 * q, np.ones(6))
     one = inverse_dynamics(robot, q[0], 2 * q[0], 3 * q[0], np.ones(6))
-    found[name] = {"tau": tau.tolist(), "one": one.tolist()}
+    joints = robot.inverse(robot.forward(q[0]))
+    found[name] = {"tau": tau.tolist(), "one": one.tolist(), "joints": joints.tolist()}
 print(json.dumps(found))
 """
 
