@@ -34,11 +34,12 @@ AXES: Final = "xyz"
 
 
 class Change(NamedTuple):
-    """A change of the numbers, (p,), what it is called, and what it happens to."""
+    """A change of the numbers, (p,): what it is called, what it happens to, along which axis."""
 
     kind: str
     item: str
     vector: Array
+    axis: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,7 +135,7 @@ def _changes(n: _Numbers) -> Iterator[Change]:
         label = " with ".join(dict.fromkeys(name for name, _ in limb))
         for k, axis in enumerate(AXES):
             moved = n.vector([(n.points[point], np.eye(3)[k]) for point in limb])
-            yield Change(f"limbs moved as a whole along {axis}: {{items}}", label, moved)
+            yield Change("limbs moved as a whole along {axes}: {items}", label, moved, axis)
     base, platform = n.side("base"), n.side(n.graph.platform)
     of_base, of_platform = "the base's joints", "the platform's joints"
     reference = "the reference point"
@@ -156,12 +157,12 @@ def _changes(n: _Numbers) -> Iterator[Change]:
         ]
         for k, axis in enumerate(AXES):
             moved = n.vector([(one, np.eye(3)[k]) for one in own])
-            yield Change("{items} moved together along " + axis, label, moved)
+            yield Change("{items} moved together along {axes}", label, moved, axis)
         for k, axis in enumerate(AXES):
             about = np.eye(3)[k]
             turns = [(one, np.cross(about, p)) for one, p in zip(own, at, strict=True)]
             turns += [(one, np.cross(about, d)) for one, d in directions]
-            yield Change("{items} turned together about " + axis, label, n.vector(turns))
+            yield Change("{items} turned together about {axes}", label, n.vector(turns), axis)
     lengths = [(n.points[point], n.point(point)) for point in n.points]
     whole = n.vector([*lengths, (n.origin, n.graph.origin)])
     yield Change("{items} in proportion", "all lengths", whole)
@@ -175,7 +176,7 @@ def undetermined(graph: Graph, names: Sequence[str], scales: Array, directions: 
     """
     n = _Numbers.of(graph, names, scales)
     left = directions
-    found: dict[str, list[str]] = {}
+    found: dict[tuple[str, str], list[str]] = {}
     for change in _changes(n):
         size = float(np.linalg.norm(change.vector))
         if not left.shape[1] or size == 0.0:
@@ -186,7 +187,7 @@ def undetermined(graph: Graph, names: Sequence[str], scales: Array, directions: 
         inner = left.T @ unit
         if inner @ inner < NEW:
             continue
-        found.setdefault(change.kind, []).append(change.item)
+        found.setdefault((change.kind, change.axis), []).append(change.item)
         # What is orthogonal to it, in the space that is left.
         left = left @ np.linalg.svd(inner[None])[2][1:].T
     told = list(_joined(found))
@@ -202,15 +203,11 @@ def undetermined(graph: Graph, names: Sequence[str], scales: Array, directions: 
     return [*told, *rest]
 
 
-def _joined(found: dict[str, list[str]]) -> Iterator[str]:
+def _joined(found: dict[tuple[str, str], list[str]]) -> Iterator[str]:
     """A sentence for each kind; such as differ by the axis alone are one."""
     merged: dict[tuple[str, tuple[str, ...]], list[str]] = {}
-    for kind, items in found.items():
-        axis = next((a for a in AXES if f" {a}:" in kind or kind.endswith(f" {a}")), "")
-        plain = kind.replace(f" {axis}:", " {axes}:") if f" {axis}:" in kind else kind
-        if axis and kind.endswith(f" {axis}"):
-            plain = kind[: -len(axis)] + "{axes}"
-        merged.setdefault((plain, tuple(dict.fromkeys(items))), []).append(axis)
+    for (kind, axis), items in found.items():
+        merged.setdefault((kind, tuple(dict.fromkeys(items))), []).append(axis)
     for (kind, names), axes in merged.items():
         yield kind.format(items=_listed(names), axes=_and(sorted(set(axes))))
 
