@@ -12,12 +12,11 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
 from typing import Any, Final, Literal
 
 import numpy as np
 
-from pkm_twin.codegen.arrays import Array, Indices, Mask
+from pkm_twin.codegen.arrays import Array, Indices
 from pkm_twin.machine.friction import all_keys, linear_keys
 from pkm_twin.machine.inertia import drive_units, matrix_of, ten_numbers, transport
 from pkm_twin.machine.places import Keys, path_of
@@ -87,7 +86,7 @@ def identifiable(robot: Robot) -> tuple[Identifiable, ...]:
     """
     # The engine's own graph may be that of a machine with other masses.
     robot.massive()
-    return (*of_drives(robot), *_Numbers(robot.spelled).groups())
+    return (*of_drives(robot), *of_masses(robot.spelled))
 
 
 def of_drives(robot: Robot) -> tuple[Identifiable, ...]:
@@ -132,150 +131,99 @@ def of_drives(robot: Robot) -> tuple[Identifiable, ...]:
 def _tens(robot: Robot) -> list[Any]:
     """Ten numbers of each body and of the payload about the base's origin, masses of rods."""
     graph, load = robot.make_graph(), robot.payload
-    bodies = [*graph.bodies.values()]
-    tens = [ten_numbers(body.mass, body.com, body.inertia) for body in bodies]
+    tens = [ten_numbers(body.mass, body.com, body.inertia) for body in graph.bodies.values()]
     tens.append(ten_numbers(load.mass, graph.origin + load.com, load.inertia))
     return [*(value for ten in tens for value in ten), *(rod.mass for rod in graph.rods.values())]
 
 
-@dataclass(frozen=True, eq=False)
-class _Numbers:
-    """Masses, centres and inertias of a file that gives all of them, k in all."""
+def of_masses(robot: Robot) -> Iterator[Identifiable]:
+    """Masses, centres and inertias of payload, bodies and rods, by what they move together.
 
-    robot: Robot
-
-    @cached_property
-    def keys(self) -> tuple[Keys, ...]:
-        """Where they stand; of an inertia matrix the upper half."""
-        load = [(LOAD, "mass"), *((LOAD, "com", i) for i in range(3))]
-        load += [(LOAD, "inertia", i, j) for i in range(3) for j in range(3)]
-        return tuple(
-            key
-            for key in (*load, *self.robot.mass_keys())
-            if not isinstance(key[-2], int) or int(key[-2]) <= int(key[-1])
+    :param robot: of a file that gives all of them.
+    """
+    graph, load = robot.graph, robot.payload
+    every: list[Keys] = [(LOAD, "mass"), *((LOAD, "com", i) for i in range(3))]
+    every += [*((LOAD, "inertia", *ij) for ij in np.ndindex(3, 3)), *robot.mass_keys()]
+    # Of an inertia matrix the upper half, for both.
+    keys = [key for key in every if key <= _mirrored(key)]
+    both = [dict.fromkeys((key, _mirrored(key))) for key in keys]
+    tie = np.repeat(np.eye(len(keys)), [len(pair) for pair in both], 0)
+    values = np.array([robot.number(path_of(key)) for key in keys])
+    # Masses above zero: as much as each may be off.
+    masses = [body.mass for body in graph.bodies.values()]
+    heavy = max(graph.bodies[graph.platform].mass, 0.1 * sum(masses))
+    reference = values.copy()
+    for k in _places(keys, "mass", "density"):
+        reference[k] = max(values[k], heavy if keys[k][0] == LOAD or not values[k] else 0.0)
+    made = FileNumbers(robot, [path_of(key) for pair in both for key in pair], _tens)
+    slopes = made.slopes_at((tie @ reference)[None])[0] @ tie
+    names = [*graph.bodies, LOAD]
+    tens = slopes[: 10 * len(names)].reshape(len(names), 10, -1)
+    rods = dict(zip(graph.rods, slopes[10 * len(names) :], strict=True))
+    coms = [*(body.com for body in graph.bodies.values()), graph.origin + load.com]
+    moved = zip(coms, tens, strict=True)
+    own = np.array([transport(np.eye(3), -com) @ ten for com, ten in moved])
+    own[np.abs(own) < EMPTY * np.abs(own).max((1, 2), keepdims=True, initial=1e-300)] = 0.0
+    touched = np.vstack([own.any(1), slopes[10 * len(names) :] != 0.0]).astype(float)
+    linked = np.linalg.matrix_power(touched.T @ touched > 0.0, 4)
+    for chosen in dict.fromkeys(tuple(np.flatnonzero(row).tolist()) for row in linked):
+        part = list(chosen)
+        inside = [b for b in range(len(names)) if own[b][:, part].any()]
+        if not touched[:, part].any():
+            continue
+        group = _Group(
+            [keys[k] for k in part], values[part], reference[part], own[inside][:, :, part]
         )
-
-    @cached_property
-    def words(self) -> list[str]:
-        """What each is: ``mass``, ``density``, ``com`` or ``inertia``."""
-        named = ([k for k in key if isinstance(k, str)][-1] for key in self.keys)
-        return [name.rpartition("_")[2] for name in named]
-
-    @cached_property
-    def places(self) -> dict[str, Indices]:
-        """Where masses and densities, centres and inertias are among them."""
-        masses = [word in ("mass", "density") for word in self.words]
-        others = {w: [word == w for word in self.words] for w in ("com", "inertia")}
-        return {w: np.flatnonzero(rows) for w, rows in {"mass": masses, **others}.items()}
-
-    @cached_property
-    def values(self) -> Array:
-        """The file's, shape (k,)."""
-        return np.array([self.robot.number(path_of(key)) for key in self.keys])
-
-    @cached_property
-    def reference(self) -> Array:
-        """The same with masses above zero, shape (k,): as much as each may be off."""
-        values, masses = self.values.copy(), self.places["mass"]
-        bodies = self.robot.graph.bodies
-        heavy = max(
-            bodies[self.robot.graph.platform].mass, 0.1 * sum(b.mass for b in bodies.values())
-        )
-        least = [heavy if self.keys[k][0] == LOAD else 0.0 for k in masses]
-        values[masses] = np.maximum(values[masses], least)
-        values[masses[values[masses] == 0.0]] = heavy
-        return values
-
-    @cached_property
-    def slopes(self) -> Array:
-        """Derivatives of :func:`_tens` at the reference, shape (rows, k)."""
-        paths, tied = [], []
-        for k, key in enumerate(self.keys):
-            mirrored = (*key[:-2], key[-1], key[-2]) if isinstance(key[-2], int) else key
-            for one in dict.fromkeys((key, mirrored)):
-                paths.append(path_of(one))
-                tied.append(np.eye(len(self.keys))[k])
-        made, tie = FileNumbers(self.robot, paths, _tens), np.array(tied)
-        return np.asarray(made.slopes_at((tie @ self.reference)[None])[0] @ tie, np.float64)
-
-    def groups(self) -> Iterator[Identifiable]:
-        """Numbers that move the same bodies, together."""
-        graph, load = self.robot.graph, self.robot.payload
-        coms = [body.com for body in graph.bodies.values()] + [graph.origin + load.com]
-        tens = self.slopes[: 10 * len(coms)].reshape(len(coms), 10, -1)
-        rods = self.slopes[10 * len(coms) :]
-        moved = [transport(np.eye(3), -com) @ ten for com, ten in zip(coms, tens, strict=True)]
-        own = np.array(moved)
-        own[np.abs(own) < EMPTY * np.abs(own).max((1, 2), keepdims=True, initial=1e-300)] = 0.0
-        touched = np.vstack([own.any(1), rods != 0.0]).astype(int)
-        linked = np.linalg.matrix_power((touched.T @ touched > 0).astype(float), 4) > 0.0
-        names = [*graph.bodies, LOAD]
-        for row in dict.fromkeys(tuple(np.flatnonzero(one).tolist()) for one in linked):
-            if row:
-                yield self._group(np.array(row), names, tens, own, rods)
-
-    def _group(
-        self, chosen: Indices, names: list[str], tens: Array, own: Array, rods: Array
-    ) -> Identifiable:
-        """One of them.
-
-        :param own: ten numbers of the bodies about the file's centres of mass, (bodies, 10, k).
-        """
-        graph, keys = self.robot.graph, [self.keys[k] for k in chosen]
-        inside = [b for b in range(len(names)) if own[b][:, chosen].any()]
-        places = {w: np.flatnonzero(np.isin(chosen, k)) for w, k in self.places.items()}
-        masses, coms = places["mass"], places["com"]
-        part = _Part(
-            tuple(keys), self.values[chosen], self.reference[chosen],
-            own[inside][:, :, chosen], masses, coms, places["inertia"],
-        )  # fmt: skip
-        values = part.values.copy()
-        values[coms] = 0.0
-        scales = part.reference.copy()
-        if inside:
-            far = [_length(self.robot, names[b]) for b in inside]
-            for k in (*coms, *places["inertia"]):
-                b = int(np.flatnonzero(part.own[:, :, k].any(1))[0])
-                mass = part.own[b, 0] @ part.reference
-                away = np.linalg.norm(part.own[b, 1:4, k]) / mass
-                scales[k] = far[b] / away if k in coms else mass * far[b] ** 2
-        units = [_unit(self.words[k], self.keys[k]) for k in chosen]
-        payload = keys[0][0] == LOAD
-        return Identifiable(
-            "payload" if payload else "inertia", tuple(map(path_of, keys)),
-            tuple(units), values, scales, part.numbers,
-            {graph.platform if payload else names[b]: tens[b][:, chosen] for b in inside},
-            {f"{rod}.mass": row[chosen] for rod, row in zip(graph.rods, rods, strict=True)
-             if row[chosen].any()},
-            tuple(part.cones()),
+        payload = keys[part[0]][0] == LOAD
+        yield Identifiable(
+            "payload" if payload else "inertia", tuple(map(path_of, group.keys)),
+            tuple(_unit(key) for key in group.keys), group.begin,
+            group.scales([_length(robot, names[b]) for b in inside]), group.numbers,
+            {graph.platform if payload else names[b]: tens[b][:, part] for b in inside},
+            {f"{rod}.mass": row[part] for rod, row in rods.items() if row[part].any()},
+            tuple(group.cones()),
         )  # fmt: skip
 
 
-@dataclass(frozen=True, eq=False)
-class _Part:
-    """Numbers that move the same bodies, and ten numbers of these by them, (bodies, 10, k)."""
+class _Group:
+    """Numbers that move the same bodies, and ten numbers of these by them, (bodies, 10, k).
 
-    keys: tuple[Keys, ...]
-    values: Array
-    reference: Array
-    own: Array
-    masses: Indices
-    coms: Indices
-    inertias: Indices
+    The ten are about the file's centres of mass.
+    """
+
+    def __init__(self, keys: list[Keys], values: Array, reference: Array, own: Array) -> None:
+        self.keys, self.values, self.reference, self.own = keys, values, reference, own
+        self.masses = _places(keys, "mass", "density")
+        self.coms, self.inertias = _places(keys, "com"), _places(keys, "inertia")
+        # Centres that are parts of a length, 0 to 1.
+        self.parts = np.array([not isinstance(keys[k][-1], int) for k in self.coms], bool)
+
+    @property
+    def begin(self) -> Array:
+        """The parameters of the file as it is: masses, inertias, and no change of centres."""
+        return np.where(np.isin(np.arange(len(self.keys)), self.coms), 0.0, self.values)
+
+    def scales(self, far: Sequence[float]) -> Array:
+        """How far each may be off; ``far``: extents of the bodies, m."""
+        result = self.reference.copy()
+        for k in (*self.coms, *self.inertias):
+            b = int(np.flatnonzero(self.own[:, :, k].any(1))[0])
+            mass = self.own[b, 0] @ self.reference
+            away = np.linalg.norm(self.own[b, 1:4, k]) / mass
+            result[k] = far[b] / away if k in self.coms else mass * far[b] ** 2
+        return result
 
     def numbers(self, new: Array) -> Mapping[Keys, float]:
         """The file's numbers by parameters: masses and inertias, and centres times the mass."""
-        result, change = new.copy(), new[self.coms]
-        whole = float(new[self.masses].sum())
+        result, whole = new.copy(), float(new[self.masses].sum())
         before = float(self.reference[self.masses].sum())
-        change = change * before / whole if whole > 0.0 else 0.0 * change
+        change = new[self.coms] * (before / whole if whole > 0.0 else 0.0)
         centres = self.values[self.coms] + change
         result[self.coms] = np.where(self.parts, np.clip(centres, 0.0, 1.0), centres)
         if len(self.coms) and len(self.inertias):
             change = result[self.coms] - self.values[self.coms]
-            usual, mass = (
-                self.own[:, 0, self.masses] @ v[self.masses] for v in (self.reference, new)
-            )
+            heavy = self.own[:, 0, self.masses]
+            usual, mass = (heavy @ v[self.masses] for v in (self.reference, new))
             away = self.own[:, 1:4, self.coms] @ change / usual[:, None]
             table, target = self.own[:, 4:, self.inertias], []
             for m, d, rows in zip(mass, away, table, strict=True):
@@ -286,25 +234,18 @@ class _Part:
             result[self.inertias] = _possible(found) if whole > 0.0 else 0.0
         return dict(zip(self.keys, result.tolist(), strict=True))
 
-    @property
-    def parts(self) -> Mask:
-        """Which centres are parts of a length, 0 to 1."""
-        return np.array([not isinstance(self.keys[k][-1], int) for k in self.coms], bool)
-
     def cones(self) -> Iterator[Array]:
         """Matrices that have to be positive semidefinite, (d, d, k) each."""
-        count, total = len(self.keys), np.zeros(len(self.keys))
-        total[self.masses] = 1.0
+        eye = np.eye(len(self.keys))
         if not len(self.coms):
-            yield from (above_zero(k, count) for k in self.masses)
+            yield from (above_zero(k, len(eye)) for k in self.masses)
             return
         for k in self.coms[self.parts]:
-            once = np.eye(count)[k] * float(self.reference[self.masses].sum())
+            total, once = eye[self.masses].sum(0), eye[k] * self.reference[self.masses].sum()
             yield (self.values[k] * total + once).reshape(1, 1, -1)
             yield ((1.0 - self.values[k]) * total - once).reshape(1, 1, -1)
         # Copies of a body depend on the same masses.
-        first = {tuple(ten[0].tolist()): ten for ten in self.own[::-1]}
-        for ten in first.values():
+        for ten in {tuple(ten[0].tolist()): ten for ten in self.own[::-1]}.values():
             cone = np.einsum("ijt,tk->ijk", pseudo_inertia(), ten)
             axes, sizes, _ = np.linalg.svd(cone.reshape(4, -1), full_matrices=False)
             axes = axes[:, sizes > EMPTY * sizes[0]]
@@ -335,6 +276,20 @@ def _length(robot: Robot, name: str) -> float:
     return far if far > 1e-3 * graph.size else LONG / 3.0 * graph.size
 
 
-def _unit(word: str, key: Keys) -> str:
+def _mirrored(key: Keys) -> Keys:
+    """The other entry of an inertia matrix that is the same; else the key."""
+    return (*key[:-2], key[-1], key[-2]) if isinstance(key[-2], int) else key
+
+
+def _word(key: Keys) -> str:
+    """``mass``, ``density``, ``com`` or ``inertia``."""
+    return [str(k) for k in key if not isinstance(k, int)][-1].rpartition("_")[2]
+
+
+def _places(keys: Sequence[Keys], *words: str) -> Indices:
+    return np.flatnonzero([_word(key) in words for key in keys])
+
+
+def _unit(key: Keys) -> str:
     units = {"mass": "kg", "density": "kg/m3", "inertia": "kg m2"}
-    return units.get(word, "m" if isinstance(key[-1], int) else "")
+    return units.get(_word(key), "m" if isinstance(key[-1], int) else "")
