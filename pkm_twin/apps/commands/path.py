@@ -134,13 +134,11 @@ def path(given: Motion) -> Report:
 
     machine = given.machine()
     if given.slow_where_soft:
-        for name, value, unit in (
-            ("tolerance", given.tolerance, "m"),
-            ("speed", given.speed, "m/s"),
-        ):
-            check_limit(name, math.nan if value is None else value, unit)
-        if given.force is None:
-            raise typer.BadParameter("--slow-where-soft needs --force")
+        missing = [n for n in ("force", "tolerance", "speed") if getattr(given, n) is None]
+        if missing:
+            raise typer.BadParameter(f"--slow-where-soft needs --{' and --'.join(missing)}")
+        for name, unit in (("tolerance", "m"), ("speed", "m/s")):
+            check_limit(name, getattr(given, name), unit)
     elif given.force is not None or given.tolerance is not None:
         raise typer.BadParameter("--force and --tolerance are for --slow-where-soft")
     bounds: dict[str, Any] = {
