@@ -199,10 +199,9 @@ class Function:
         side = f", align {align}" if align else ""
         return self.new(place.target, f"load {place.target}, {place.kind} {place.name}{side}")
 
-    def store(self, x: Value, place: Value, align: int = 0) -> None:
-        """Write x there, see :meth:`load`."""
-        side = f", align {align}" if align else ""
-        self._put(f"store {x.kind} {x.name}, {place.kind} {place.name}{side}")
+    def store(self, x: Value, place: Value) -> None:
+        """Write x there."""
+        self._put(f"store {x.kind} {x.name}, {place.kind} {place.name}")
 
     def extract_element(self, x: Value, lane: int) -> Value:
         """One entry of a vector."""

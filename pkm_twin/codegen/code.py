@@ -170,7 +170,7 @@ class Code:
             part of the way from home that was reached.
         :raises ValueError: an input that is no real numbers, or whose last axis has another size.
         """
-        arrays = self._checked(inputs)
+        arrays = self.checked(inputs)
         shape = max(arrays, key=_axes, default=_NO_INPUT).shape[:-1]
         if shape and not all([a.ndim == 1 or a.shape[:-1] == shape for a in arrays]):
             shape = np.broadcast_shapes(*(a.shape[:-1] for a in arrays))
@@ -231,7 +231,7 @@ class Code:
             (k or 1, 1, size) for all samples alike.
         :returns: outputs, shape (k, samples, size) each, and the status, None or (k, samples, 2).
         """
-        arrays = self._checked(inputs)
+        arrays = self.checked(inputs)
         machines, count = len(prepared), max(array.shape[1] for array in arrays)
         if machines * count == 0:
             return [np.empty((machines, count, size)) for size in self.sizes[1]], None
@@ -243,7 +243,8 @@ class Code:
         shaped = [output.reshape(machines, count, -1) for output in outputs]
         return shaped, None if status is None else status.reshape(machines, count, 2)
 
-    def _checked(self, inputs: Sequence[ArrayLike]) -> list[Array]:
+    def checked(self, inputs: Sequence[ArrayLike]) -> list[Array]:
+        """Inputs as arrays of doubles; errors as of :meth:`run`."""
         arrays = [doubles(value) for value in inputs]
         for array, size in zip(arrays, self.sizes[0], strict=True):
             if array.ndim == 0 or array.shape[-1] != size:

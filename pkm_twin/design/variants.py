@@ -349,10 +349,8 @@ class Variants:
     ) -> tuple[list[Array], tuple[int, ...]]:
         """Inputs as :meth:`Code.run_each` takes them, and the batch axes."""
         k = len(self)
-        arrays, shapes = [doubles(value) for value in inputs], []
-        for array, size in zip(arrays, code.sizes[0], strict=True):
-            if array.ndim == 0 or array.shape[-1] != size:
-                raise ValueError(f"the last axis has to be {size}, the shape is {array.shape}")
+        arrays, shapes = code.checked(inputs), []
+        for array in arrays:
             each = array.ndim > 1 and array.shape[0] == k
             # All machines are given the same k samples by a shape that begins with 1.
             shapes.append((each, array.shape[1 if each or array.shape[:2] == (1, k) else 0 : -1]))

@@ -10,7 +10,6 @@ from typing import Final
 import numpy as np
 
 from pkm_twin.codegen.arrays import Array
-from pkm_twin.codegen.kernels import Kernel
 from pkm_twin.errors import MessageError
 from pkm_twin.kinematics.stream import stream_kernel
 from pkm_twin.messages.stamps import SECOND
@@ -27,10 +26,6 @@ class _State:
 
     stamp: int
     numbers: Array
-
-
-def _kernel(robot: Robot) -> Kernel:
-    return stream_kernel(robot.engine)
 
 
 class Continuity:
@@ -53,7 +48,7 @@ class Continuity:
         n, m = len(robot.joint_names), len(self._scales)
         self._told = n + m + m * n
         self._nothing = np.zeros(self._told + m + 1)
-        self._call = robot.bound("stream", _kernel, self._scales)
+        self._call = robot.bound("stream", lambda robot: stream_kernel(robot.engine), self._scales)
         self.reset()
 
     def reset(self) -> None:
