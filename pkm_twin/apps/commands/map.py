@@ -223,6 +223,7 @@ def along_path(
             Fact("samples", len(found.time)),
             Fact("samples_that_do_not_count", beyond),
             Fact("worst", found.worst),
+            Fact("files", [str(path) for path in (given.out, given.drawing("")) if path]),
         ],
         figures={"": found.draw},
         notes=notes,
