@@ -466,24 +466,27 @@ def drives_of(graph: Graph, joints: Mapping[str, JointSpec]) -> dict[str, Any]:
     }
 
 
-def driven(joint: JointSpec, friction: Any, limits: Any, k: int) -> JointSpec:
-    """The entry of the actuated joint k with friction and limits as :func:`drives_of` gives them.
+def drive_numbers(friction: Any, limits: Any, k: int) -> tuple[dict[str, float], dict[str, Any]]:
+    """Friction and limits of the actuated joint k by key, of what :func:`drives_of` gives.
 
-    A limit may be one for all joints.
+    A limit may be one for all joints; one that is infinite is left out.
     """
     n = len(friction.viscous)
-    position = limits.position
-    velocity, effort = (
-        None if value is None else float(np.broadcast_to(value, n)[k])
-        for value in (limits.velocity, limits.effort)
-    )
-    bounds = LimitSpec(
-        position=None if position is None else array(np.broadcast_to(position, (n, 2))[k]),
-        velocity=velocity,
-        effort=effort,
-    )
-    rub = FrictionSpec(**{key: float(getattr(friction, key)[k]) for key in all_keys()})
-    return dataclasses.replace(joint, friction=rub, limits=bounds)
+    found: dict[str, Any] = {}
+    for key, shape in (("position", (n, 2)), ("velocity", (n,)), ("effort", (n,))):
+        values = getattr(limits, key)
+        if values is not None:
+            own = np.broadcast_to(values, shape)[k]
+            found |= {key: own.tolist()} if np.isfinite(own).any() else {}
+    return {key: float(getattr(friction, key)[k]) for key in all_keys()}, found
+
+
+def driven(joint: JointSpec, friction: Any, limits: Any, k: int) -> JointSpec:
+    """The entry of the actuated joint k with other friction and limits."""
+    rub, bounds = drive_numbers(friction, limits, k)
+    if "position" in bounds:
+        bounds["position"] = array(bounds["position"])
+    return dataclasses.replace(joint, friction=FrictionSpec(**rub), limits=LimitSpec(**bounds))
 
 
 def _together(values: list[Any], absent: Any) -> Array | None:

@@ -3,8 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Sequence
 from typing import Any, Final
 
 import numpy as np
@@ -12,15 +11,13 @@ import numpy as np
 from pkm_twin.errors import warn
 from pkm_twin.kinematics.passive import rod_axes
 from pkm_twin.machine import schema
-from pkm_twin.machine.friction import all_keys
-from pkm_twin.machine.graph import BASE, POSE, Body, Graph
-from pkm_twin.machine.graph_file import graph_description
+from pkm_twin.machine.graph import BASE, POSE
+from pkm_twin.machine.graph_file import drive_numbers, graph_description
 from pkm_twin.machine.loop_tree import Capsule, Joint, Link, LoopTree
 from pkm_twin.machine.mjcf_write import write_mjcf
 from pkm_twin.machine.places import has_entry
 from pkm_twin.machine.rotations import Pose
 from pkm_twin.machine.sdf_write import write_sdf
-from pkm_twin.machine.tree import Tree
 from pkm_twin.machine.urdf_control import Control, tree_names
 from pkm_twin.machine.urdf_write import GROUND, MOCK, PLATFORM, write_urdf
 from pkm_twin.machine.urdf_xml import plain_name
@@ -104,35 +101,22 @@ def _warn_of_laws(robot: Robot, where: str) -> None:
 
 
 def robot_tree(robot: Robot) -> LoopTree:
-    """The robot's links, joints and closures with all that description formats tell."""
-    name, load = robot.name or robot.mechanism, robot.payload
-    payload = Body(PAYLOAD, load.mass, load.com, load.inertia)
-    return graph_tree(robot.graph, robot.engine.tree, name, _drives(robot), payload)
-
-
-def graph_tree(
-    graph: Graph,
-    tree: Tree,
-    name: str,
-    drives: Mapping[str, Mapping[str, Any]],
-    payload: Body | None = None,
-) -> LoopTree:
-    """A graph as description formats have it, drawn at home, with bars to look at.
-
-    :param drives: limits and friction of the actuated joints, as :class:`Joint` has them.
-    :param payload: with its centre from the platform's reference point.
-    """
+    """The robot as description formats have it, drawn at home, with bars to look at."""
+    graph, tree, load = robot.graph, robot.engine.tree, robot.payload
     names = _link_names([BASE, *graph.bodies, *graph.rods])
     links, joints = {GROUND: Link(GROUND)}, dict[str, Joint]()
 
     def joint_of(source: str) -> Joint:
         one, at = graph.joints[source], Pose(position=graph.joints[source].at)
-        made = Joint(
+        rub = {"viscous": one.viscous, "coulomb": one.coulomb, "offset": 0.0}
+        limits: dict[str, Any] = {}
+        if one.actuated:
+            k = graph.actuated.index(source)
+            rub, limits = drive_numbers(robot.friction, robot.limits, k)
+        return Joint(
             one.name, one.kind, names[one.inner], names[one.outer], (at, at), one.axes, one.home,
-            viscous=one.viscous, coulomb=one.coulomb, rotor_inertia=one.rotor_inertia,
-            pitch=one.pitch,
+            limits, rub["viscous"], rub["coulomb"], one.rotor_inertia, rub["offset"], one.pitch,
         )  # fmt: skip
-        return replace(made, **drives.get(source, {}))
 
     for link in tree.links.values():
         body, at = graph.bodies[link.body], Pose(position=link.at)
@@ -155,17 +139,17 @@ def graph_tree(
         joints[rod.name] = Joint(rod.name, "universal", inner, own, (start, start), axes)
         closures.append(Joint(f"{rod.name}_end", "spherical", own, outer, (end, end)))
     platform = names[graph.platform]
-    if payload is not None and payload.mass > 0.0:
-        at = Pose(position=graph.origin + payload.com)
-        links[PAYLOAD] = Link(PAYLOAD, at, payload.mass, at.position, payload.inertia)
+    if load.mass > 0.0:
+        at = Pose(position=graph.origin + load.com)
+        links[PAYLOAD] = Link(PAYLOAD, at, load.mass, at.position, load.inertia)
         label = f"{PAYLOAD}_frame"
         joints[label] = Joint(label, "fixed", platform, PAYLOAD, (at, at))
     capsules = (
         Capsule(names[bar.part], bar.start[1], bar.end[1], bar.radius) for bar in bars(graph)
     )
     return LoopTree(
-        name, GROUND, links, joints, tuple(closures), graph.actuated, capsules=tuple(capsules),
-        platform=platform, origin=graph.origin,
+        robot.name or robot.mechanism, GROUND, links, joints, tuple(closures), graph.actuated,
+        capsules=tuple(capsules), platform=platform, origin=graph.origin,
     )  # fmt: skip
 
 
@@ -213,15 +197,13 @@ def robot_description(robot: Robot) -> dict[str, Any]:
             own = {key: value for key, value in schema.plain(gear).items() if value is not None}
             data["joints"][name].pop("rotor_inertia", None)
             data["joints"][name]["drive"] = own
-    for name, drive in _drives(robot).items():
-        joint = data["joints"][name]
-        if drive["limits"]:
-            joint["limits"] = drive["limits"]
-        k = robot.graph.actuated.index(name)
-        more = {key: float(getattr(robot.friction, key)[k]) for key in all_keys()}
-        if any(more.values()):
-            joint["friction"] = {
-                key: value for key, value in more.items() if value or key in ("viscous", "coulomb")
+    for k, name in enumerate(robot.graph.actuated):
+        rub, limits = drive_numbers(robot.friction, robot.limits, k)
+        if limits:
+            data["joints"][name]["limits"] = limits
+        if any(rub.values()):
+            data["joints"][name]["friction"] = {
+                key: value for key, value in rub.items() if value or key in ("viscous", "coulomb")
             }
     for key in ("joint_map", "uncertainty"):
         told = {
@@ -233,20 +215,3 @@ def robot_description(robot: Robot) -> dict[str, Any]:
         if told:
             data[key] = told
     return data
-
-
-def _drives(robot: Robot) -> dict[str, dict[str, Any]]:
-    """Limits and friction of the actuated joints, by the graph's names."""
-    stated, friction = robot.limits, robot.friction
-    drives = {}
-    for k, name in enumerate(robot.graph.actuated):
-        limits: dict[str, Any] = {}
-        if stated.position is not None:
-            limits["position"] = stated.position[k].tolist()
-        for key in ("velocity", "effort"):
-            values = getattr(stated, key)
-            if values is not None and np.isfinite(values[k]):
-                limits[key] = float(values[k])
-        rub = {key: float(getattr(friction, key)[k]) for key in ("viscous", "coulomb", "offset")}
-        drives[name] = {"limits": limits, **rub}
-    return drives
