@@ -96,6 +96,20 @@ class Checked:
         size = f"{100 * part[worst]:.2g} % of the peak effort of {r.robot.joint_names[worst]}"
         return f"the efforts agree with {r.robot.name}, largest residual {size}"
 
+    @property
+    def residuals(self) -> dict[str, dict[str, Any]]:
+        """By joint the RMS of residual and noise, its limit and the model's peak; may be empty."""
+        c, robot = self.compared, self.recording.robot
+        if c is None:
+            return {}
+        values = {"rms": c.rms, "limit": c.limit, "noise": c.noise, "peak": c.peak}
+        return {
+            joint: {name: float(each[j]) for name, each in values.items()} | {"unit": unit}
+            for j, (joint, unit) in enumerate(
+                zip(robot.joint_names, robot.effort_units, strict=True)
+            )
+        }
+
     def named(self, verdict: Verdict) -> list[str]:
         """What got this verdict."""
         return [str(item.text) for item in self.items if item.verdict is verdict]

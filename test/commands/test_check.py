@@ -122,6 +122,10 @@ def test_a_cut_out_part_is_good(twin, sample):
     data = json.loads(result.out)
     assert data["good"]
     assert data["robot"] == "delta_cu"
+    assert data["units"]["delay_s"] == "s"
+    for one in data["residuals"].values():
+        assert 0.0 < one["rms"] <= one["limit"] and one["limit"] >= 0.05 * one["peak"]
+        assert one["unit"] == "N m"
     assert {item["verdict"] for item in data["items"]} == {"good"}
     assert sum(item["what"].startswith("torque residual of arm_") for item in data["items"]) == 3
 
