@@ -6,6 +6,7 @@ from __future__ import annotations
 import importlib
 import sys
 from collections.abc import Sequence
+from functools import partial
 
 from pkm_twin.errors import install
 from pkm_twin.files import open_standard_streams
@@ -30,29 +31,19 @@ TOGETHER = tuple(name for name in MODULES if name != "command_gate")
 COMPOSED = f"Runs several nodes in one process and one executor: {', '.join(TOGETHER)}."
 
 
-def delta_dynamics() -> None:
-    """Entry point of ``ros2 run pkm_twin delta_dynamics``."""
-    _run("delta_dynamics")
+def _run(name: str) -> None:
+    leave_at_once()
+    open_standard_streams()
+    answer(name, SUMMARIES[name], sys.argv[1:])
+    _start(name, [name])
 
 
-def command_gate() -> None:
-    """Entry point of ``ros2 run pkm_twin command_gate``."""
-    _run("command_gate")
-
-
-def stiffness_monitor() -> None:
-    """Entry point of ``ros2 run pkm_twin stiffness_monitor``."""
-    _run("stiffness_monitor")
-
-
-def machine_state() -> None:
-    """Entry point of ``ros2 run pkm_twin machine_state``."""
-    _run("machine_state")
-
-
-def machine_sim() -> None:
-    """Entry point of ``ros2 run pkm_twin machine_sim``."""
-    _run("machine_sim")
+delta_dynamics = partial(_run, "delta_dynamics")
+command_gate = partial(_run, "command_gate")
+stiffness_monitor = partial(_run, "stiffness_monitor")
+machine_state = partial(_run, "machine_state")
+machine_sim = partial(_run, "machine_sim")
+"""Entry points of ``ros2 run pkm_twin NODE``."""
 
 
 def composed() -> None:
@@ -72,13 +63,6 @@ def composed() -> None:
         )
         sys.exit(2)
     _start("composed", names)
-
-
-def _run(name: str) -> None:
-    leave_at_once()
-    open_standard_streams()
-    answer(name, SUMMARIES[name], sys.argv[1:])
-    _start(name, [name])
 
 
 def _start(command: str, names: Sequence[str]) -> None:
