@@ -16,10 +16,15 @@ import llvmlite
 import llvmlite.binding as binding
 
 from pkm_twin.codegen.assembly import (
+    ALIGN,
     BIT,
     DOUBLE,
     INT64,
+    LANES,
+    TRUE,
+    VECTOR,
     Function,
+    Lanes,
     Value,
     module,
     real,
@@ -27,7 +32,6 @@ from pkm_twin.codegen.assembly import (
     whole,
 )
 from pkm_twin.codegen.expressions import GEOMETRY, PARAMETERS, Expression, ordered, uses
-from pkm_twin.codegen.lanes import ALIGN, LANES, TRUE, VECTOR, Lanes
 from pkm_twin.codegen.native import CPU, FEATURES, OPTIMISATION, PREPARE, QUICK, SYMBOL
 from pkm_twin.codegen.operations import fused, sub
 from pkm_twin.codegen.program import AT, LARGE, STATE, TURNS, UNKNOWNS, Equations, Program

@@ -17,8 +17,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 if TYPE_CHECKING:
-    from pkm_twin.codegen.assembly import Value
-    from pkm_twin.codegen.lanes import Lanes
+    from pkm_twin.codegen.assembly import Lanes, Value
 
 CONSTANT: Final = 0
 PARAMETER: Final = 1
