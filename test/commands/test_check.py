@@ -447,18 +447,15 @@ class TestCauses:
             assert word in text
 
     def test_a_saturated_sensor(self, rng):
-        robot = load("delta")
-        m = machine(robot, rng, 6.0, 250.0)
-        efforts = inverse_dynamics(robot, m.q, m.qd, m.qdd)
+        robot, m, efforts = drawn(rng, 6.0, 250.0)
         made, most = recording_of(robot, m, efforts), 0.7 * np.abs(efforts[:, 1]).max()
         made.effort[:, 1] = np.clip(made.effort[:, 1], -most, most)
         (text,) = self.cause(made)
         assert robot.joint_names[1] in text and f"{most:.4g}" in text
 
     def test_efforts_of_the_other_sign(self, rng):
-        robot = load("delta")
-        m = machine(robot, rng, 6.0, 250.0)
-        made = recording_of(robot, m, inverse_dynamics(robot, m.q, m.qd, m.qdd))
+        robot, m, efforts = drawn(rng, 6.0, 250.0)
+        made = recording_of(robot, m, efforts)
         made.effort[:, 2] *= -1.0
         (text,) = self.cause(made)
         assert [name in text for name in robot.joint_names] == [False, False, True]
@@ -466,9 +463,8 @@ class TestCauses:
     @pytest.mark.parametrize("joints", [[1], [0, 1, 2]])
     def test_efforts_that_are_stuck_are_named(self, rng, joints):
         """No payload of that time is: it would leave the stuck samples out."""
-        robot = load("delta")
-        m = machine(robot, rng, 8.0, 500.0)
-        made = recording_of(robot, m, inverse_dynamics(robot, m.q, m.qd, m.qdd))
+        robot, m, efforts = drawn(rng, 8.0, 500.0)
+        made = recording_of(robot, m, efforts)
         assert judged(made, thorough=False).answer == "good"
         begin = 1500
         while np.any(np.abs(made.effort[begin]) >= np.abs(made.effort).max(0)):
@@ -483,9 +479,8 @@ class TestCauses:
 
     @pytest.mark.parametrize("level", [0.0, 0.3])
     def test_efforts_that_never_change_were_not_measured(self, rng, level):
-        robot = load("delta")
-        m = machine(robot, rng, 4.0, 250.0)
-        made = recording_of(robot, m, inverse_dynamics(robot, m.q, m.qd, m.qdd))
+        robot, m, efforts = drawn(rng, 4.0, 250.0)
+        made = recording_of(robot, m, efforts)
         made.effort[:, 1] = level
         report = judged(made, thorough=False)
         assert report.answer == "bad" and report.causes == ()
@@ -493,18 +488,14 @@ class TestCauses:
         assert robot.joint_names[1] in found and "nothing was measured" in found
 
     def test_a_payload_that_only_leaves_bad_samples_out_explains_nothing(self, rng):
-        robot = load("delta")
-        m = machine(robot, rng, 8.0, 500.0)
-        efforts = inverse_dynamics(robot, m.q, m.qd, m.qdd)
+        robot, m, efforts = drawn(rng, 8.0, 500.0)
         short = (m.time > 4.0) & (m.time < 4.3)
         efforts = efforts + 0.3 * short[:, None] * np.abs(efforts).max(0)
         assert not any("payload" in text for text in self.cause(recording_of(robot, m, efforts)))
 
     @pytest.mark.long
     def test_what_fit_finds_is_no_explanation_where_the_efforts_do_not_agree(self, rng):
-        robot = load("delta")
-        m = machine(robot, rng, 8.0, 200.0)
-        efforts = inverse_dynamics(robot, m.q, m.qd, m.qdd)
+        robot, m, efforts = drawn(rng, 8.0, 200.0)
         noise = np.abs(efforts).max() * rng.normal(size=efforts.shape)
         spike = efforts + 10.0 * np.abs(efforts).max() * (np.arange(len(efforts)) == 700)[:, None]
         for wrong in (noise, spike):
@@ -522,11 +513,16 @@ class TestCauses:
         assert report.answer == "bad" and "friction" in report.causes[0]
 
     def test_what_nothing_explains_has_no_cause(self, rng):
-        robot = load("delta")
-        m = machine(robot, rng, 6.0, 250.0)
-        efforts = inverse_dynamics(robot, m.q, m.qd, m.qdd)
+        robot, m, efforts = drawn(rng, 6.0, 250.0)
         wave = np.abs(efforts).max(0) * np.sin(np.outer(m.time, [3.1, 4.3, 5.7]))
         assert self.cause(recording_of(robot, m, efforts + wave)) == ()
+
+
+def drawn(rng, seconds, rate):
+    """A Delta with a motion and the efforts that it needs."""
+    robot = load("delta")
+    m = machine(robot, rng, seconds, rate)
+    return robot, m, inverse_dynamics(robot, m.q, m.qd, m.qdd)
 
 
 def recording_of(robot, m, efforts):
