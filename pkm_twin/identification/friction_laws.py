@@ -16,8 +16,10 @@ from typing import Any, Final
 import numpy as np
 
 from pkm_twin.codegen.arrays import Array
-from pkm_twin.errors import PkmTwinError, UnknownNameError
-from pkm_twin.identification.fit import Fit, fit, fitted
+from pkm_twin.errors import ParameterError, PkmTwinError, UnknownNameError
+from pkm_twin.identification.check import recorded_of, step_fault
+from pkm_twin.identification.drives import FIT, fitted_constants, given_constants
+from pkm_twin.identification.fit import Fit, fit, fitted, refuse_faults
 from pkm_twin.identification.identifiable import KINDS, Kind, of_drives
 from pkm_twin.identification.judge import SIGMAS
 from pkm_twin.identification.noise import EXACT
@@ -147,6 +149,53 @@ def fit_with_laws(
         )
         best = replace(result, numbers=(*own, *more))
     return best, tuple(choices)
+
+
+def fit_recordings(
+    robot: Robot, recordings: Sequence[Recording], what: Sequence[Kind] = KINDS,
+    laws: Sequence[str] | None = None, *, constant: str | None = None, accept: bool = False,
+    progress: Callable[[int], None] | None = None,
+) -> tuple[Fit, tuple[Choice, ...], list[str]]:  # fmt: skip
+    """Fit recordings as they are read, as ``check`` takes them.
+
+    Where a payload is fitted, that of the recordings is the one to start from, and says when it is
+    held.
+
+    :param constant: of recordings of motor currents: N m or N per ampere, one number or one a joint
+        with commas, or ``fit``, by the file's masses. ``laws``, ``accept``, ``progress`` and errors
+        as of :func:`fit_with_laws`.
+    :returns: also notes: faults that were accepted, torque constants that were fitted.
+    """
+    found = ((r.name, step_fault(r)) for r in recordings)
+    faults = [
+        f"{name}: position steps that are no motion: {fault}" for name, fault in found if fault
+    ]
+    refuse_faults(faults, accept)
+    notes = [f"accepted by --accept: {fault}" for fault in faults]
+    made = [recorded_of(r) for r in recordings]
+    if "payload" in what:
+        loads = [r.load for r in made if r.load is not None]
+        # Two payloads are not one section of a file.
+        if len({(load.mass, load.com) for load in loads}) > 1:
+            masses = ", ".join(f"{load.mass:g}" for load in loads)
+            raise PkmTwinError(f"recordings with payloads of {masses} kg: fit one at a time")
+        robot = loads[0].on(robot) if loads else robot
+        made = [
+            r if r.load is None else replace(r, load=replace(r.load, sought=True)) for r in made
+        ]
+    if constant is not None:
+        if constant != FIT:
+            constants = given_constants(robot, constant)
+        elif {"payload", "inertia"} & set(what):
+            raise ParameterError(
+                "torque-constant",
+                FIT,
+                "--what friction,rotor: the masses of the file are its scale",
+            )
+        else:
+            constants = fitted_constants(robot, made)
+        made, notes = [constants.applied(r) for r in made], constants.lines(robot) + notes
+    return *fit_with_laws(robot, made, what, laws, accept=accept, progress=progress), notes
 
 
 def _unexplained(result: Fit) -> bool:

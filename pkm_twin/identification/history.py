@@ -8,7 +8,7 @@ import os
 import sqlite3
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final
@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import FileError, PkmTwinError
-from pkm_twin.identification.check import compared_of, idle_of, recorded_of
-from pkm_twin.identification.fit import fit
+from pkm_twin.identification.check import compared_of, idle_of
+from pkm_twin.identification.friction_laws import fit_recordings
 from pkm_twin.recordings import ReadOptions, Recording, read
 from pkm_twin.robot.plausibility import why_no_torques
 
@@ -104,14 +104,9 @@ def _efforts(r: Recording) -> list[Measured]:
     names, units = r.robot.joint_names, r.robot.effort_units
     residuals = zip(names, compared.rms.tolist(), units, strict=True)
     found = [Measured("residual", name, rms, np.nan, unit) for name, rms, unit in residuals]
-    loaded, known = r.robot, 0.0
-    if r.load is not None:
-        loaded, known = r.load.on(r.robot), r.load.mass
-    recorded = recorded_of(r, idle)
-    if r.load is not None:
-        recorded = replace(recorded, load=replace(r.load, sought=True))
+    known = 0.0 if r.load is None else r.load.mass
     try:
-        result = fit(loaded, [recorded], ("friction", "payload"), accept=True)
+        result, *_ = fit_recordings(r.robot, [r], ("friction", "payload"), (), accept=True)
     except (PkmTwinError, ValueError, np.linalg.LinAlgError):
         return found
     owners = {key: g.names[0] for g in result.problem.parameters.groups for key in g.keys(g.values)}

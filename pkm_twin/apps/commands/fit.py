@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -20,7 +20,7 @@ from pkm_twin.apps.options import (
     ReadsRecordings,
 )
 from pkm_twin.console import progress, refuse_existing, writing
-from pkm_twin.errors import BagError, ParameterError, PkmTwinError, one_line
+from pkm_twin.errors import BagError, ParameterError, one_line
 from pkm_twin.files import replace_file
 from pkm_twin.report import Fact, Report
 from pkm_twin.settings import setting
@@ -188,57 +188,18 @@ def _of_deflections(
 def _of_efforts(
     given: Fit, machine: Robot, update: Any
 ) -> tuple[Result, Sequence[Choice], list[str]]:
-    """The fit of efforts, read as ``check`` reads them."""
-    from pkm_twin.identification.check import recorded_of, step_fault
-    from pkm_twin.identification.fit import refuse_faults
-    from pkm_twin.identification.friction_laws import fit_with_laws, laws_of
+    """The fit of efforts."""
+    from pkm_twin.identification.friction_laws import fit_recordings, laws_of
     from pkm_twin.identification.parameters import kinds_of
 
     kinds, laws = kinds_of(given.what), laws_of(given.friction)
     read = [_read(given, path, machine) for path in given.recordings]
     beyond = _beyond(given, machine, [r.q for r in read])
-    faults = [
-        f"{one_line(path.name, 100)}: position steps that are no motion: {fault}"
-        for path, r in zip(given.recordings, read, strict=True)
-        if (fault := step_fault(r))
-    ]
-    refuse_faults(faults, given.accept)
-    beyond += [f"accepted by --accept: {fault}" for fault in faults]
-    made = [recorded_of(r) for r in read]
-    if "payload" in kinds:
-        loads = [r.load for r in read if r.load is not None]
-        # Two payloads are not one section of a file.
-        if len({(load.mass, load.com) for load in loads}) > 1:
-            masses = ", ".join(f"{load.mass:g}" for load in loads)
-            raise PkmTwinError(f"recordings with payloads of {masses} kg: fit one at a time")
-        machine = loads[0].on(machine) if loads else machine
-        made = [
-            r if r.load is None else replace(r, load=replace(r.load, sought=True)) for r in made
-        ]
-    if given.torque_constant is not None:
-        made, told = _with_efforts(machine, made, given.torque_constant, kinds)
-        beyond = [*told, *beyond]
-    result, choices = fit_with_laws(
-        machine, made, kinds, laws, accept=given.accept, progress=update
-    )
-    return result, choices, beyond
-
-
-def _with_efforts(
-    machine: Robot, recordings: Sequence[Recording], constant: str, kinds: Sequence[str]
-) -> tuple[list[Recording], list[str]]:
-    """Recordings of currents with efforts, and a line on each torque constant that was fitted."""
-    from pkm_twin.identification.drives import FIT, fitted_constants, given_constants
-
-    if constant != FIT:
-        found = given_constants(machine, constant)
-    elif {"payload", "inertia"} & set(kinds):
-        raise ParameterError(
-            "torque-constant", FIT, "--what friction,rotor: the masses of the file are its scale"
-        )
-    else:
-        found = fitted_constants(machine, recordings)
-    return [found.applied(one) for one in recordings], found.lines(machine)
+    result, choices, notes = fit_recordings(
+        machine, read, kinds, laws, constant=given.torque_constant, accept=given.accept,
+        progress=update,
+    )  # fmt: skip
+    return result, choices, [*notes, *beyond]
 
 
 def _read(given: Fit, path: Path, machine: Robot) -> Recording:
