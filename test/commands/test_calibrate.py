@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -16,14 +17,14 @@ from bags.recording.capture import machine_parameters
 from bags.recording.record_poses import NOISE, OFFSETS, SHIFTS, TURNS, record
 from pkm_twin import Robot
 from pkm_twin.apps.cli import app
-from pkm_twin.errors import ParameterError
+from pkm_twin.apps.commands.calibrate import Calibrate
+from pkm_twin.apps.commands.calibrate import calibrate as command
+from pkm_twin.errors import ParameterError, PkmTwinError
 from pkm_twin.identification.calibration import calibrate, geometric
 from pkm_twin.identification.calibration_state import Poses
 from pkm_twin.identification.pose_tables import read_poses
 from pkm_twin.robot.entries import entries, with_entries
 from test.support.robots import load, random_joints
-
-DELTA_LENGTHS = [f"geometry.{name}" for name in SHIFTS]
 
 
 def measured(path: Path, noise: float = NOISE, count: int = 60) -> None:
@@ -74,51 +75,33 @@ def test_a_machine_is_found_that_was_not_built_as_drawn(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("scale", "copies", "text"),
-    [(1e3, 1, "m per axis after"), (1.0, 40, "1 different ones")],
-)
-def test_poses_of_no_use_are_refused(scale: float, copies: int, text: str) -> None:
+    ("scale", "different", "text"),
+    [
+        (1e3, 40, "m per axis after"), (1.0, 1, "1 different ones"),
+        (1.0, 4, "enough for 10 numbers"),
+    ],
+)  # fmt: skip
+def test_poses_of_no_use_are_refused(scale: float, different: int, text: str) -> None:
     robot = load("delta_cu")
-    q = np.random.default_rng(1).uniform(-0.5, 0.9, (40 // copies, 3)).repeat(copies, 0)
+    q = np.random.default_rng(1).uniform(-0.5, 0.9, (different, 3)).repeat(40 // different, 0)
     with pytest.raises(ParameterError, match=text):
-        calibrate(robot, Poses(q, scale * robot.platform(q)[0]), DELTA_LENGTHS)
+        calibrate(robot, Poses(q, scale * robot.platform(q)[0]), geometric(robot, q))
 
 
 @pytest.mark.parametrize(
-    ("columns", "rows", "text"),
+    ("header", "text"),
     [
-        (["arm_1.position", "x", "y", "z"], [[0, 0, 0, 0]], "a column 'arm_2.position'"),
-        (
-            ["arm_1.position", "arm_2.position", "arm_3.position", "x", "y"],
-            [[0, 0, 0, 0, 0]],
-            "a column 'z'",
-        ),
-        (
-            ["arm_1.position", "arm_2.position", "arm_3.position", "x", "y", "z", "roll"],
-            [[0, 0, 0, 0, 0, 0, 0]],
-            "a column 'pitch'",
-        ),
-        (
-            ["arm_1.position", "arm_2.position", "arm_3.position", "arm_4.position", "x"],
-            [[0, 0, 0, 0, 0]],
-            "arm_4.position",
-        ),
-        (
-            ["arm_1.position", "arm_2.position", "arm_3.position", "x", "y", "z"],
-            [[0.1 * k, 0, 0, 0, 0, -0.36] for k in range(4)],
-            "enough for 10 numbers",
-        ),
+        ("arm_1.position,x,y,z", "a column 'arm_2.position'"),
+        ("arm_1.position,arm_2.position,arm_3.position,x,y", "a column 'z'"),
+        ("arm_1.position,arm_2.position,arm_3.position,x,y,z,roll", "a column 'pitch'"),
+        ("arm_1.position,arm_2.position,arm_3.position,arm_4.position,x", "arm_4.position"),
     ],
 )
-def test_what_cannot_work_is_refused_by_name(
-    tmp_path: Path, columns: list[str], rows: list[list[float]], text: str
-) -> None:
+def test_columns_that_are_missing_are_named(tmp_path: Path, header: str, text: str) -> None:
     path = tmp_path / "poses.csv"
-    path.write_text("\n".join([",".join(columns), *(",".join(map(str, row)) for row in rows)]))
-    result = run("delta_cu", str(path), "--out", str(tmp_path / "mine.yaml"))
-    assert result.exit_code != 0
-    assert text in str(result.exception) + result.output
-    assert not (tmp_path / "mine.yaml").exists()
+    path.write_text(header + "\n0" + ",0" * header.count(","))
+    with pytest.raises(PkmTwinError, match=text):
+        read_poses(path, load("delta_cu"))
 
 
 def crooked(seed: int, only: list[str], count: int) -> tuple[Robot, Poses]:
@@ -152,11 +135,9 @@ def test_others_settle_too(seed: int) -> None:
     settles(seed, [])
 
 
-def test_only_numbers_that_there_are_can_be_chosen(tmp_path: Path) -> None:
-    path = tmp_path / "poses.csv"
-    measured(path, count=12)
-    result = run("delta_cu", str(path), "--only", "inertia", "--out", str(tmp_path / "mine.yaml"))
-    assert "the beginning of a geometric number's path" in str(result.exception)
+def test_only_numbers_that_there_are_can_be_chosen() -> None:
+    with pytest.raises(ParameterError, match="the beginning of a geometric number's path"):
+        geometric(load("delta_cu"), np.zeros((1, 3)), ["inertia"])
 
 
 @pytest.mark.parametrize(
@@ -170,9 +151,9 @@ def test_only_numbers_that_there_are_can_be_chosen(tmp_path: Path) -> None:
         ("limb_1 limb_2 limb_3", lambda v: v - 0.12, "--beyond-limits"),
     ],
 )
-@pytest.mark.parametrize("frame", [(), ("--frame",)])
+@pytest.mark.parametrize("frame", [False, True])
 def test_numbers_that_are_no_poses_of_this_machine(
-    tmp_path: Path, names: str, how: Any, text: str, frame: tuple[str, ...]
+    tmp_path: Path, names: str, how: Any, text: str, frame: bool
 ) -> None:
     """With the instrument's frame free too, which may take up much, but no angles of another."""
     robot = load("upr_rpu")
@@ -189,7 +170,6 @@ def test_numbers_that_are_no_poses_of_this_machine(
     path, out = tmp_path / "poses.csv", tmp_path / "mine.yaml"
     table = np.stack(list(columns.values()), -1)
     np.savetxt(path, table, "%.17g", ",", header=",".join(columns), comments="")
-    result = CliRunner().invoke(app, ["calibrate", "upr_rpu", str(path), "--out", str(out), *frame])
-    assert result.exit_code == 1
-    assert text in str(result.exception)
+    with pytest.raises(PkmTwinError, match=re.escape(text)):
+        command(Calibrate(robot="upr_rpu", poses=path, out=out, frame=frame))
     assert not out.exists()

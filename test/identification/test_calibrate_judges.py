@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import json
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -11,10 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from typer.testing import CliRunner
 
 from pkm_twin import Robot
-from pkm_twin.apps.cli import app
+from pkm_twin.apps.commands.calibrate import Calibrate
+from pkm_twin.apps.commands.calibrate import calibrate as command
 from pkm_twin.errors import PkmTwinError
 from pkm_twin.identification.calibration import calibrate, geometric
 from pkm_twin.identification.calibration_state import Poses
@@ -83,31 +82,24 @@ def test_an_offset_that_no_number_takes_up_is_a_frame_too() -> None:
         calibrate(robot, moved, ["geometry.arm_length", "geometry.forearm_length"], offsets=True)
 
 
-def run(folder: Path, robot: str, poses: Poses, *options: str) -> Any:
-    names = [f"{j}.position" for j in load(robot).controller.names]
-    header = ",".join([*names, "x", "y", "z"])
-    table = np.hstack([poses.joints, poses.position])
-    np.savetxt(folder / "poses.csv", table, "%.17g", ",", header=header, comments="")
-    arguments = ["calibrate", robot, str(folder / "poses.csv"), "--out", str(folder / "mine.yaml")]
-    return CliRunner().invoke(app, [*arguments, *options])
-
-
 def test_changes_beyond_their_prior_are_rejected_or_marked(tmp_path: Path) -> None:
     robot, _, poses = sound(0)
     far = with_entries(robot, {"geometry.forearm_length": 0.1 + _forearm(robot)})
     there = Poses(poses.joints, far.platform(poses.joints)[0])
-    only = ("--only", "geometry.arm_length", "--only", "geometry.forearm_length", "--no-offsets")
-    rejected = run(tmp_path, "delta_cu", there, *only)
-    assert rejected.exit_code == 1
-    assert "geometry.forearm_length changes by 0.1 m" in str(rejected.exception)
-    assert not (tmp_path / "mine.yaml").exists()
-    accepted = run(tmp_path, "delta_cu", there, *only, "--accept", "--json")
-    assert accepted.exit_code == 0, accepted.output
-    (reason,) = json.loads(accepted.stdout)["accepted"]
+    only = ("geometry.arm_length", "geometry.forearm_length")
+    with pytest.raises(PkmTwinError, match=r"geometry.forearm_length changes by 0.1 m"):
+        calibrate(robot, there, only, offsets=False)
+    assert not calibrate(robot, there, only, offsets=False, prior=0.1).faults
+    names = [*(f"{j}.position" for j in robot.controller.names), "x", "y", "z"]
+    table, out = tmp_path / "poses.csv", tmp_path / "mine.yaml"
+    rows = np.hstack([there.joints, there.position])
+    np.savetxt(table, rows, "%.17g", ",", header=",".join(names), comments="")
+    given = Calibrate(
+        robot="delta_cu", poses=table, out=out, only=only, no_offsets=True, accept=True
+    )
+    (reason,) = command(given).data["accepted"]
     assert "geometry.forearm_length" in reason
-    assert "accepted anyway" in (tmp_path / "mine.yaml").read_text()
-    wider = run(tmp_path, "delta_cu", there, *only, "--prior", "0.1", "--overwrite", "--json")
-    assert wider.exit_code == 0 and json.loads(wider.stdout)["accepted"] == []
+    assert "accepted anyway" in out.read_text()
 
 
 def _forearm(robot: Robot) -> float:
