@@ -40,7 +40,7 @@ def source(
     counts = uses(results)
     text: dict[int, str] = dict(known or {})
     order = ordered(results, text)
-    lines = [f"def program({', '.join(inputs)}):"]
+    lines = [f"def program({', '.join(f'{name}=()' for name in inputs)}):"]
     read: dict[str, set[int]] = {}
     for e in order:
         if e.source is not None:
@@ -94,7 +94,6 @@ class PlainCode:
             parts |= {"correct": q.correct, "arrive": q.arrive}
         known = {e.number: f"{PARAMETERS}[{k}]" for k, e in enumerate(program.prepared)}
         self._parts = {name: functions(part, names, known) for name, part in parts.items()}
-        self._nothing: dict[str, Any] = dict.fromkeys(names, ())
         given = {PARAMETERS: program.parameters, GEOMETRY: program.geometry}
         self._prepare = functions([*program.prepared, program.missed], given)[0]
 
@@ -137,7 +136,7 @@ class PlainCode:
         return [table[:, a:b].copy() for a, b in itertools.pairwise(ends)], status
 
     def _call(self, part: str, named: dict[str, Any], *, many: bool) -> list[Any]:
-        return list(self._parts[part][many](**(self._nothing | named)))
+        return list(self._parts[part][many](**named))
 
     def _solve(self, named: dict[str, Any], steps: int, *, many: bool) -> tuple[Any, Any]:
         """Newton's method; ``named`` gets the unknowns. Which samples got there, and how far."""
