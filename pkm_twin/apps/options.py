@@ -347,9 +347,7 @@ class Seeded:
 class AwayFromSingular:
     """The singularity index below which a pose does not count."""
 
-    singularity: float = setting(
-        0.05, "least singularity index of a pose, 0 to 1", low=0.0, high=1.0
-    )
+    singularity: float = setting(0.05, "least singularity index of a pose", low=0.0, high=1.0)
 
 
 def payload_fact(carried: Load | None) -> Fact:

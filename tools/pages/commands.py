@@ -3,56 +3,117 @@
 
 from __future__ import annotations
 
-import re
-import subprocess
 import sys
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from typer.main import get_command
 
 from pkm_twin.apps.cli import app
-from pkm_twin.apps.groups import commands as loaded
+from pkm_twin.apps.groups import WIDE, commands
 
-WIDE = 200
+SEVERAL = 3
+"""Commands that an option has to have with one meaning to be explained once for all."""
+SHARED = "Options of several commands"
+
+
+@dataclass(frozen=True)
+class Word:
+    """An option or an argument, as help explains it."""
+
+    name: str
+    metavar: str
+    text: str
+    default: str
+    argument: bool
+
+    def __str__(self) -> str:
+        value = f" {self.metavar}" if self.metavar and not self.argument else ""
+        default = f" [default: {self.default}]" if self.default else ""
+        return f"* `{self.name}{value}`: {self.text}{default}"
+
+
+def words_of(command: Any) -> list[Word]:
+    """Options and arguments of a command, but for ``--json``."""
+    found = []
+    for one in command.params:
+        argument = one.param_type_name == "argument"
+        shown = one.show_default and one.default not in (None, False)
+        default = str(one.default) if shown else ""
+        name = one.metavar if argument else one.opts[0]
+        found.append(Word(name, one.metavar or "", one.help or "", default, argument))
+    return [word for word in found if word.name != "--json"]
+
+
+def leaves(name: str, command: Any) -> dict[str, Any]:
+    """The commands of a name, with their words."""
+    inner = getattr(command, "commands", None)
+    return {name: command} if inner is None else {f"{name} {k}": one for k, one in inner.items()}
 
 
 def page() -> str:
-    """The page, by typer's own writer, with the commands ordered by task."""
-    words = [sys.executable, "-m", "typer", "pkm_twin.apps.cli", "utils", "docs"]
-    written = subprocess.run(
-        [*words, "--name", "pkm-twin"], check=True, capture_output=True, text=True
-    ).stdout
-    head, *sections = re.split(r"^(?=## `pkm-twin )", written.rstrip() + "\n\n", flags=re.M)
-    head = head.replace("# `pkm-twin`", "# Commands", 1).partition("**Commands**:")[0]
-    commands = get_command(app).commands
-    by_name = {
-        name: whole(section, command)
-        for section in sections
-        for name, command in commands.items()
-        if section.startswith(f"## `pkm-twin {name}`")
-    }
-    tasks = loaded().tasks()
-    listed = [
-        f"**{task}**\n\n" + "".join(
-            f"* [`{name}`](#pkm-twin-{name}): {commands[name].get_short_help_str(WIDE)}\n"
-            for name in names
-        )
-        for task, names in tasks.items()
-    ]  # fmt: skip
-    ordered = [by_name[name] for names in tasks.values() for name in names]
-    return (head + "\n".join(listed) + "\n" + "".join(ordered)).rstrip() + "\n"
+    """The page, with the commands ordered by task."""
+    every, tasks = get_command(app), commands().tasks()
+    found = {name: leaves(name, command) for name, command in every.commands.items()}
+    users: dict[Word, list[str]] = defaultdict(list)
+    for inner in found.values():
+        for words, command in inner.items():
+            for word in words_of(command):
+                users[word].append(words)
+    often = [word for word, those in users.items() if len(those) >= SEVERAL]
+    shared = [w for w in often if len({words.split()[0] for words in users[w]}) > 1]
+    lines = ["# Commands", "", every.help, ""]
+    for task, listed in tasks.items():
+        lines += [f"**{task}**", ""]
+        for name in listed:
+            purpose = every.commands[name].get_short_help_str(WIDE)
+            lines.append(f"* [`{name}`](#pkm-twin-{name}): {purpose}")
+        lines.append("")
+    lines += [
+        f"## {SHARED}",
+        "",
+        "Every command has `--json`, which prints JSON, and `--help`.",
+        "",
+    ]
+    lines += [*map(str, sorted(shared, key=lambda word: word.name)), ""]
+    for listed in tasks.values():
+        for name in listed:
+            lines += section(name, every.commands[name], found[name], often, shared)
+    return "\n".join(lines).rstrip() + "\n"
 
 
-def whole(section: str, command: Any) -> str:
-    """A section whose list of commands has their one-line helps uncut."""
-    for name, inner in getattr(command, "commands", {}).items():
-        # The writer cuts them at 45 characters.
-        line = f"* `{name}`: {inner.get_short_help_str(WIDE)}"
-        section = re.sub(
-            rf"^\* `{name}`: .*$", lambda _, line=line: line, section, count=1, flags=re.M
-        )
-    return section
+def section(
+    name: str, command: Any, inner: dict[str, Any], often: Sequence[Word], shared: Sequence[Word]
+) -> list[str]:
+    """A command, or the commands of a group after what they have in common."""
+    lines, own, alone = [f"## `pkm-twin {name}`", ""], set[Word](), command in inner.values()
+    if not alone:
+        within = [word for one in inner.values() for word in words_of(one)]
+        most = len(inner) / 2
+        common = [w for w in often if within.count(w) > most and w not in shared]
+        own = set(common)
+        lines += [command.help, "", *map(str, common), *([""] if common else [])]
+        lines += [by_name(shared, within), ""]
+    for words, one in inner.items():
+        every = words_of(one)
+        usage = " ".join(word.name for word in every if word.argument)
+        lines += [] if alone else [f"### `pkm-twin {words}`", ""]
+        lines += [one.help, "", "```console", f"$ pkm-twin {words} [OPTIONS] {usage}".rstrip()]
+        lines += ["```", ""]
+        told = [str(word) for word in every if word not in shared and word not in own]
+        lines += [*told, ""] if told else []
+        lines += [by_name(shared, every), ""] if alone else []
+    return lines
+
+
+def by_name(shared: Sequence[Word], there: Sequence[Word]) -> str:
+    """The options that are explained once, by name."""
+    found = [f"`{word.name}`" for word in shared if word in there]
+    link = f"[options of several commands](#{SHARED.lower().replace(' ', '-')})"
+    return f"And of the {link}: {', '.join([*found, '`--json`'])}."
 
 
 if __name__ == "__main__":
