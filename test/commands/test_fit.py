@@ -10,6 +10,7 @@ import pytest
 import yaml
 
 from delta_dynamics import inverse_dynamics
+from pkm_twin.apps.commands.excite import LARGE, Excite, excite
 from pkm_twin.bags.reader import open_bag
 from pkm_twin.identification.identifiable import identifiable
 from pkm_twin.robot.entries import entries, robot_text, with_entries
@@ -130,6 +131,15 @@ def test_excite_writes_a_trajectory_within_the_limits_that_rests_at_both_ends(ca
     assert (robot.singularity(q) > 0.05 * 0.99).all()
     columns = np.genfromtxt(out.with_suffix(".csv"), delimiter=",", names=True)
     assert len(columns) == len(points)
+
+
+@pytest.mark.parametrize("trials", [10, 60])
+def test_excite_says_what_to_change_where_a_fit_would_know_little(tmp_path, trials):
+    """Ten slow tries in a second are no excitation; sixty in ten seconds are."""
+    short = {"duration": 1.0, "harmonics": 3, "acceleration": 0.1} if trials == 10 else {}
+    out = tmp_path / "excite.mcap"
+    report = excite(Excite(robot="five_bar", what="friction", trials=trials, out=out, **short))
+    assert bool(report.notes) == (report.data["condition"] > LARGE) == bool(short)
 
 
 def elastic_machine(path):
