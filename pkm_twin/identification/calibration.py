@@ -20,19 +20,22 @@ from pkm_twin.codegen.arrays import Array, Indices
 from pkm_twin.design import programs
 from pkm_twin.design.variants import Variants
 from pkm_twin.errors import ParameterError, PkmTwinError, UnreachableError
-from pkm_twin.identification.calibration_faults import (
+from pkm_twin.identification.calibration_fit import (
     HALF,
     MOVED,
     Fault,
+    Fitted,
     Outlier,
+    Parameter,
     RejectedPosesError,
+    UnsettledError,
     cost_of,
     faults_of,
+    fit,
     looks_placed,
     outliers_of,
     place_fault,
 )
-from pkm_twin.identification.calibration_fit import Fitted, Parameter, UnsettledError, fit
 from pkm_twin.identification.calibration_state import (
     BESIDE,
     FRAME,

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The fit of a calibration: damped steps of Gauss and Newton's method, robust weights, noise."""
+"""The fit of a calibration by damped steps of Gauss and Newton, and what speaks against it.
+
+Poses that no machine like the file's was in, and measurements that do not fit the others.
+"""
 
 from __future__ import annotations
 
@@ -10,9 +13,16 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from pkm_twin.codegen.arrays import Array
-from pkm_twin.errors import ParameterError, PkmTwinError
-from pkm_twin.identification.calibration_state import FRAME, State, moved, value_of
-from pkm_twin.identification.measurements import Measured, Weights
+from pkm_twin.errors import ParameterError, PkmTwinError, one_line
+from pkm_twin.identification.calibration_state import (
+    FRAME,
+    Instrument,
+    State,
+    moved,
+    value_of,
+)
+from pkm_twin.identification.measurements import Measured, Readings, Weights
+from pkm_twin.identification.noise import OUTLIER
 from pkm_twin.identification.parameters import OBSERVED
 from pkm_twin.robot.robot import Robot
 
@@ -33,6 +43,21 @@ CONVERGED: Final = 1e-3
 """Part of its deviation by which no parameter moves in the last step."""
 GAINED: Final = 1e-4
 """Or by which the sum of squares over the noise falls."""
+WRONG: Final = 0.02
+"""Part of the machine's size that no fit may leave over: such poses are not its own."""
+TWISTED: Final = 0.05
+"""Angle an axis that no fit may leave over, rad: those are other angles, or other units."""
+FAR: Final = 5.0
+"""Prior standard deviations by which no number changes."""
+MOVED: Final = 14.0
+"""Squares of prior standard deviations, summed over all numbers, that another place of the
+instrument must save: with sound priors six free numbers save so much in 3 of 100 cases."""
+HALF: Final = 0.5
+"""And the part of all squares below which they then are: an error of the model saves a few too."""
+EXPLAINED: Final = 0.8
+"""Part of the sum of squares below which another place of the instrument is tried."""
+MOST: Final = 0.25
+"""Part of the poses that may be outliers."""
 
 
 @dataclass(frozen=True)
@@ -153,3 +178,143 @@ def _stepped(
     turn = np.array([by.get(name, 0.0) for name in FRAME[3:]])
     new = dict(zip(names, (values + move).tolist(), strict=True))
     return moved(robot, state, measured.joints, new, turn)
+
+
+class Fault(NamedTuple):
+    """What is wrong with the poses, and what would be right."""
+
+    what: str
+    right: str
+
+    def __str__(self) -> str:
+        return f"poses: {self.what}; {self.right}"
+
+
+class RejectedPosesError(ParameterError):
+    """Poses that this machine was not in."""
+
+    def __init__(self, fault: Fault) -> None:
+        Exception.__init__(self, one_line(f"{fault}; --accept calibrates anyway", 2000))
+        self.field, self.value, self.bound = "poses", fault.what, fault.right
+
+
+class Away(NamedTuple):
+    """What a measurement is off by, m or rad, and over the noise."""
+
+    kind: str
+    unit: str
+    size: float
+    sigmas: float
+
+
+@dataclass(frozen=True)
+class Outlier:
+    """A line of a table, from 1, whose measurements do not fit the others."""
+
+    line: int
+    away: tuple[Away, ...]
+
+    @property
+    def worst(self) -> Away:
+        """Of its measurements the one that fits least."""
+        return max(self.away, key=lambda one: one.sigmas)
+
+    def size(self, unit: str) -> float | None:
+        """Greatest of one unit; None: there is none."""
+        return max((one.size for one in self.away if one.unit == unit), default=None)
+
+    def __str__(self) -> str:
+        sizes = ", ".join(f"{one.kind} by {1e3 * one.size:.3g} m{one.unit}" for one in self.away)
+        return f"line {self.line} is off: {sizes}; {self.worst.sigmas:.3g} sigma"
+
+
+def outliers_of(
+    readings: Sequence[Readings], parts: Sequence[Array], noise: Sequence[float]
+) -> tuple[Outlier, ...]:
+    """Outliers among residuals (m, a) of readings, the worst first."""
+    lines: dict[int, list[Away]] = {}
+    for one, part, sigma in zip(readings, parts, noise, strict=True):
+        sizes = np.linalg.norm(part, axis=1)
+        for line, size in zip(one.lines.tolist(), sizes.tolist(), strict=True):
+            over = size / sigma / part.shape[1] ** 0.5
+            lines.setdefault(line, []).append(Away(one.kind.name, one.kind.unit, size, over))
+    found = [Outlier(line, tuple(away)) for line, away in lines.items()]
+    bad = [one for one in found if one.worst.sigmas > OUTLIER]
+    return tuple(sorted(bad, key=lambda one: -one.worst.sigmas))
+
+
+def faults_of(
+    left: Sequence[tuple[str, float]], outliers: Sequence[Outlier], count: int,
+    changes: Sequence[Parameter], prior: float, size: float,
+) -> list[Fault]:  # fmt: skip
+    """Why a machine like the file's was not in so many poses.
+
+    :param left: unit and noise an axis of each kind of measurement. ``changes``: the
+        machine's numbers. ``prior``: of lengths, m. ``size``: of the machine, m.
+    """
+    faults = []
+    bounds = {
+        "m": (max(prior, WRONG * size), "poses of this machine in m and rad"),
+        "rad": (
+            max(prior / size, TWISTED),
+            "rotations of this machine from its home, in rad and in the order and axes of the "
+            "columns",
+        ),
+    }  # fmt: skip
+    for unit, (most, right) in bounds.items():
+        noise = max((one for its, one in left if its == unit), default=0.0)
+        if noise > most:
+            what = f"RMS residual {noise:.3g} {unit} per axis after the fit"
+            faults.append(Fault(what, f"expected at most {most:.3g} {unit} for {right}"))
+    if len(outliers) > MOST * count:
+        faults.append(
+            Fault(
+                f"{len(outliers)} of {count} do not fit the others ({outliers[0]})",
+                f"at most {100 * MOST:.0f} % may be outliers",
+            )
+        )
+    if changes:
+        worst = max(changes, key=lambda p: abs(p.value - p.before) / p.prior)
+        change = worst.value - worst.before
+        if abs(change) > FAR * worst.prior:
+            faults.append(
+                Fault(
+                    f"{worst.name} changes by {f'{change:.3g} {worst.unit}'.rstrip()}, "
+                    f"{abs(change) / worst.prior:.2g} times its prior standard deviation",
+                    f"at most {FAR:g} times is likely: are the poses in the base's axes and in "
+                    "the file's units? A greater --prior allows more",
+                )
+            )
+    return faults
+
+
+def cost_of(changes: Sequence[Parameter]) -> float:
+    """Squares of the machine's changes over their prior standard deviations, summed."""
+    return sum(((p.value - p.before) / p.prior) ** 2 for p in changes)
+
+
+def looks_placed(table: Array, columns: Array, target: Array) -> bool:
+    """Whether another place of the instrument would explain a part of what a fit leaves.
+
+    :param table: derivatives by the fitted numbers in units of their priors, (rows, p), and by the
+        instrument's place and turn, ``columns``, (rows, 6). ``target``: what is left, then what the
+        priors still ask for, (rows + p,).
+    """
+    p = table.shape[1]
+    own = np.vstack([table, np.eye(p)])
+    both = np.hstack([own, np.vstack([columns, np.zeros((p, columns.shape[1]))])])
+    left = [target - one @ np.linalg.lstsq(one, target, rcond=None)[0] for one in (own, both)]
+    return float(left[1] @ left[1]) < EXPLAINED * float(left[0] @ left[0])
+
+
+def place_fault(instrument: Instrument) -> Fault:
+    """The poses fit where the instrument stands elsewhere."""
+    shift, angles = (
+        ", ".join(f"{value + 0.0:.4f}" for value in np.round(one, 4))
+        for one in (instrument.place, instrument.frame.as_rotvec())
+    )
+    return Fault(
+        f"they fit in an instrument's frame at ({shift}) m, turned by ({angles}) rad, and not in "
+        "the base's",
+        "use --frame to fit the instrument's frame",
+    )
