@@ -253,5 +253,8 @@ def accuracy(words: Iterable[str]) -> float:
 def _decimals(word: str) -> int:
     """How many digits stand behind the point."""
     mantissa, _, exponent = word.lower().partition("e")
-    places = len(mantissa.partition(".")[2]) - int(exponent or 0)
+    try:
+        places = len(mantissa.partition(".")[2]) - int(exponent or 0)
+    except ValueError:
+        return 0  # No number: rejected where it is read, if it is.
     return min(max(places, 0), 18)

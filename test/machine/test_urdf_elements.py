@@ -227,3 +227,9 @@ def test_a_plugin_that_holds_another_model_is_left_out(tmp_path):
     )
     with pytest.warns(UserWarning, match="cube"):
         assert read_urdf(small(tmp_path, "</robot>", other)) == read_urdf(small(tmp_path))
+
+
+def test_a_word_in_a_place_that_nothing_reads_is_passed_over(tmp_path):
+    shown = '<link name="tool"><visual><origin xyz="velocity 0 0"/></visual></link>'
+    changed = read_urdf(small(tmp_path, '<link name="tool"/>', shown))
+    assert changed == read_urdf(small(tmp_path))
