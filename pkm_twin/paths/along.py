@@ -11,10 +11,10 @@ import numpy as np
 
 from delta_dynamics import dynamics_terms, inverse_dynamics, reactions, torque_deviation
 from delta_dynamics.rest import friction_reach, moving_rates
-from pkm_twin.codegen.arrays import Array, Mask
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError, PkmTwinError, SingularityError, UnreachableError
 from pkm_twin.recordings.payload import by_load, payload_columns
-from pkm_twin.recordings.recording import Recording, at_rest, differentiated
+from pkm_twin.recordings.recording import Recording
 from pkm_twin.recordings.tables import WRENCH
 from pkm_twin.robot.limits import beyond_limits
 from pkm_twin.robot.robot import Robot
@@ -62,30 +62,27 @@ def compared(motion: Recording, efforts: str = "file") -> Compared:
 
     :raises ParameterError: a robot without masses.
     """
-    model = np.empty_like(motion.q)
-    for robot, part in by_load(motion.robot, motion.load, motion.time, BLOCK):
-        model[part] = inverse_dynamics(robot, *(values[part] for values in motion.motion))
+    model = model_efforts(motion)
     if motion.effort is not None and efforts == "file":
         return Compared(motion, motion.effort, "the file's", model)
     return Compared(motion, model, "the model's", model)
 
 
-def predicted(r: Recording) -> tuple[Array, Mask]:
-    """Efforts that the model expects (samples, n), zero where its window is not full; and where.
+def model_efforts(m: Recording) -> Array:
+    """What the model needs along a motion with rates, shape (samples, n).
 
     Where a joint stands still dry friction has no direction, and the model none of it.
     """
-    if r.qd is not None and r.qdd is not None:
-        qd, qdd, used = r.qd, r.qdd, np.ones(len(r.time), np.bool_)
-    else:
-        qd, qdd, used = differentiated(r)
-    qd = moving_rates(qd, at_rest(r, qd), friction_reach(r.robot))
-    wrench = np.zeros((len(r.time), 6)) if r.wrench is None else r.wrench
-    efforts = np.zeros_like(r.q)
-    for robot, part in by_load(r.robot, r.load, r.time, BLOCK):
-        rows = np.arange(part.start, part.stop)[used[part]]
-        efforts[rows] = inverse_dynamics(robot, r.q[rows], qd[rows], qdd[rows], wrench[rows])
-    return efforts, used
+    (q, _, qdd, wrench), rates, made = m.motion, _moving(m), np.empty_like(m.q)
+    for robot, part in by_load(m.robot, m.load, m.time, BLOCK):
+        made[part] = inverse_dynamics(robot, q[part], rates[part], qdd[part], wrench[part])
+    return made
+
+
+def _moving(m: Recording) -> Array:
+    """The rates, without those that friction may not count."""
+    qd = m.motion[1]
+    return qd if m.still is None else moving_rates(qd, m.still, friction_reach(m.robot))
 
 
 def bend_per_feed(robot: Robot, force: float, q: Array, way: Array) -> Array:
@@ -120,7 +117,7 @@ def torque_table(m: Recording, progress: Callable[[int], None] | None = None) ->
 
     q, qd, qdd, wrench = m.motion
     outside, _ = beyond_limits(m.robot, q, qd)
-    rates = qd if m.still is None else moving_rates(qd, m.still, friction_reach(m.robot))
+    rates = _moving(m)
     for robot, part in by_load(m.robot, m.load, m.time, BLOCK):
         begin = part.start
         state = (robot, q[part], rates[part], qdd[part], wrench[part])

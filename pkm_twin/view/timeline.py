@@ -9,7 +9,8 @@ from typing import Final
 import numpy as np
 
 from pkm_twin.codegen.arrays import Array
-from pkm_twin.paths.along import predicted
+from pkm_twin.errors import PkmTwinError
+from pkm_twin.paths.along import model_efforts
 from pkm_twin.recordings import Recording
 from pkm_twin.robot.plausibility import why_no_torques
 
@@ -63,9 +64,13 @@ class Timeline:
         """
         why = why_no_torques(recording.robot)
         twin: Array | None = None
-        if not why:
-            efforts, known = predicted(recording)
-            twin = np.where(known[:, None], efforts, np.nan)
+        try:
+            motion = None if why else recording.with_rates()
+        except PkmTwinError as error:
+            motion, why = None, str(error)
+        if motion is not None:
+            twin = np.full_like(recording.q, np.nan)
+            twin[np.isin(recording.time, motion.time)] = model_efforts(motion)
         return cls(recording.time, recording.q, twin, recording.effort, recording.wrench, why)
 
     @property

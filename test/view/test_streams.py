@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from pkm_twin.paths.along import predicted
+from pkm_twin.paths.along import model_efforts
 from pkm_twin.recordings import read
 from pkm_twin.view import texts
 from pkm_twin.view.live import SPAN, Live
@@ -32,8 +32,10 @@ def milling(tmp_path_factory):
 
 def test_the_time_line_has_a_node_s_residual(recording):
     line = Timeline.of(recording)
-    efforts, used = predicted(recording)
-    residual = recording.effort - efforts
+    motion = recording.with_rates()
+    used = np.isin(recording.time, motion.time)
+    residual = np.full_like(recording.q, np.nan)
+    residual[used] = motion.effort - model_efforts(motion)
     assert line.end == recording.time[-1]
     for k in np.flatnonzero(used)[:: len(used) // 7]:
         at = line.at(line.time[k] + 1e-5)
