@@ -15,7 +15,7 @@ from pkm_twin.codegen.arrays import Array, Mask
 from pkm_twin.errors import MessageError, PkmTwinError, one_line
 from pkm_twin.recordings.payload import Load
 from pkm_twin.recordings.tables import PLAIN, Dialect
-from pkm_twin.recordings.topics import Topics
+from pkm_twin.recordings.topics import COLUMNS, Topics
 from pkm_twin.robot.robot import Robot
 from pkm_twin.streams.differentiator import Differentiator
 from pkm_twin.streams.rest import SIGMAS, fit_gain, gradient_gain, noise, rate_doubt
@@ -101,7 +101,7 @@ class Recording:
     """Stamp of the first sample, ns."""
     bag: Bag | None = None
     """None of a table."""
-    topics: Topics = field(default_factory=lambda: Topics("columns of the table"))
+    topics: Topics = Topics(COLUMNS)
     rejected: Counter[str] = field(default_factory=Counter)
     """Refused messages by reason."""
     first_reject: str = ""

@@ -30,6 +30,8 @@ TWIN_OUTPUTS: Final = (
 """Last names of the twin's own topics of these types, or a name before the last."""
 COMPUTED: Final = ["stiffness_monitor", "deflection"]
 """The end of the topic that the twin's own, computed, deflections come on."""
+COLUMNS: Final = "columns of the table"
+"""What a table has in place of topics."""
 TRUTHS: Final = ("ground_truth", "groundtruth")
 """Names in topics that a simulation publishes and no sensor does."""
 
@@ -87,6 +89,8 @@ class Topics:
     """Whether that frame turns with the platform."""
 
     def __str__(self) -> str:
+        if self.joint_states == COLUMNS:
+            return COLUMNS
         text = f"joint states {self.joint_states}, wrench {self.wrench or 'none'}"
         text += f" (frame {self.frame})" if self.frame else ""
         text += f", deflection {self.deflection}" if self.deflection else ""
