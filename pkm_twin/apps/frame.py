@@ -112,6 +112,10 @@ class Group:
         """The words after the group's name, the command's name first."""
         return words
 
+    def shown(self, name: str) -> str:
+        """A command's name as it is typed, with arguments that stand before it."""
+        return name
+
     def app(self, name: str) -> typer.Typer:
         """The group as a program."""
         cls = type("_Ordered", (_Ordered,), {"group": self})
@@ -133,7 +137,8 @@ class _Ordered(TyperGroup):
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         if args[0] not in self.commands:
             raise UnknownNameError(str(ctx.info_name), args[0], tuple(self.commands))
-        return super().resolve_command(ctx, args)
+        name, found, rest = super().resolve_command(ctx, args)
+        return self.group.shown(str(name)), found, rest
 
 
 def execute(command: Command, name: str, given: Any, as_json: bool) -> None:
@@ -330,6 +335,11 @@ class _Words(TyperCommand):
     """A command that takes negative numbers, older spellings, and a picture without a name."""
 
     older: dict[str, str]
+
+    def collect_usage_pieces(self, ctx: Any) -> list[str]:
+        # But for what stands before the command's name.
+        before = str(ctx.info_name).split()[:-1]
+        return [p for p in super().collect_usage_pieces(ctx) if p.strip("{}") not in before]
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         return super().parse_args(ctx, list(self._plain(args)))

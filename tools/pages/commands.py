@@ -99,9 +99,11 @@ def section(
         lines += [by_name(shared, within), ""]
     for words, one in inner.items():
         every = words_of(one)
-        usage = " ".join(word.name for word in every if word.argument)
+        group = commands().declared(name)
+        typed = words if alone else f"{name} {group.shown(words.split()[-1])}"
+        usage = " ".join(w.name for w in every if w.argument and w.name not in typed.split())
         lines += [] if alone else [f"### `pkm-twin {words}`", ""]
-        lines += [one.help, "", "```console", f"$ pkm-twin {words} [OPTIONS] {usage}".rstrip()]
+        lines += [one.help, "", "```console", f"$ pkm-twin {typed} [OPTIONS] {usage}".rstrip()]
         lines += ["```", ""]
         told = [str(word) for word in every if word not in shared and word not in own]
         lines += [*told, ""] if told else []

@@ -264,6 +264,10 @@ class AfterRobot(Group):
             return [word for word in words if word.startswith("-")]
         return [words[1], words[0], *words[2:]]
 
+    def shown(self, name: str) -> str:
+        """The robot comes first."""
+        return name if name == "show" else f"ROBOT {name}"
+
 
 COMMANDS: Final[Mapping[str, Command]] = {name: offered(kind) for name, kind in KINDS.items()}
 COMMAND = AfterRobot(
