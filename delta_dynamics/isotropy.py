@@ -346,7 +346,7 @@ def _peak(forms: Array) -> tuple[Array, Array, NDArray[np.int64]]:
     """Greatest absolute value of forms on the unit sphere, where, and of which."""
     values, vectors = np.linalg.eigh(forms)
     ends = np.abs(values[..., [0, -1]])
-    flat = ends.reshape(*ends.shape[:-2], -1)
+    flat = ends.reshape(*ends.shape[:-2], ends.shape[-2] * ends.shape[-1])
     best = flat.argmax(-1)[..., None]
     sides = vectors[..., [0, -1]].swapaxes(-1, -2)
     y = np.take_along_axis(sides.reshape(*flat.shape, forms.shape[-1]), best[..., None], -2)

@@ -99,13 +99,13 @@ def regressor(
     n, batch, graph = robot.joints_count, bodies.shape[:-1], robot.graph
     links = robot.engine.tree.links
     ten = _body_columns(bodies.reshape(*batch, len(links), 3 + 2 * n, 3), n)
-    other = others.reshape(*batch, n, -1)
+    other = others.reshape(*batch, n, others.shape[-1] // n)
     rods = len(graph.rods)
     platform = ten[..., list(links).index(graph.platform), :, :]
     lever = graph.origin - links[graph.platform].at
     rates, changes = (np.broadcast_to(np.asarray(v, np.float64), (*batch, n)) for v in (qd, qdd))
     parts = [
-        np.moveaxis(ten, -3, -2).reshape(*batch, n, -1),
+        np.moveaxis(ten, -3, -2).reshape(*batch, n, len(links) * ten.shape[-1]),
         other[..., :rods],
         platform @ transport(np.eye(3), lever),
         _drive_columns(rates, changes),
@@ -140,7 +140,7 @@ def law_columns(robot: Robot, q: Array, qd: Array, load: Array) -> Array:
         unit = values | {other: np.full(n, float(other == key)) for other in keys}
         own = taken(robot.laws, unit, q, qd, load)
         columns[..., np.arange(n), i, np.arange(n)] = own
-    return columns.reshape(*qd.shape, -1)
+    return columns.reshape(*qd.shape, len(keys) * n)
 
 
 def _body_columns(motion: Array, n: int) -> Array:
@@ -178,7 +178,7 @@ def _drive_columns(rates: Array, changes: Array) -> Array:
     for k in range(n):
         rate, change = rates[..., k], changes[..., k]
         columns[..., k, k, :] = np.stack([rate, np.sign(rate), np.ones_like(rate), change], -1)
-    return columns.reshape(*batch, n, -1)
+    return columns.reshape(*batch, n, n * len(DRIVE))
 
 
 def _columns(robot: Robot) -> list[tuple[str, str]]:

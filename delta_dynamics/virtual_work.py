@@ -73,7 +73,8 @@ def masses_kernel(robot: Robot) -> Kernel:
 
 
 def _square(robot: Robot, flat: Array) -> Array:
-    return flat.reshape(*flat.shape[:-1], robot.joints_count, -1)
+    n = robot.joints_count
+    return flat.reshape(*flat.shape[:-1], n, flat.shape[-1] // n)
 
 
 def body_mass_matrix(robot: Robot, q: ArrayLike, body: str) -> Array:

@@ -78,7 +78,7 @@ def setpoint_correction(
     with np.errstate(divide="ignore", invalid="ignore"):
         excess = np.where(given == 0.0, 0.0, np.abs(given) / limit).max(-1)
     share = 1.0 / np.maximum(excess, 1.0)
-    both = np.concatenate((place, turn), -2)
+    both = np.concatenate((place, np.broadcast_to(turn, place.shape)), -2)
     left = before + _times(both, offset * share[..., None])
     cause = "the deflection or the tool point"
     return Correction(

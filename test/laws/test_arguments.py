@@ -12,9 +12,11 @@ import pytest
 import delta_dynamics as dynamics
 import stiffness_monitor as elasticity
 from pkm_twin.codegen.arrays import doubles, later
+from pkm_twin.errors import ParameterError, SingularityError, UnreachableError
 from pkm_twin.robot.catalogue import robot_of_data
-from stiffness_monitor.modes import natural_frequencies
-from test.support.robots import load
+from stiffness_monitor.compliance import member_deflections
+from stiffness_monitor.modes import modes, natural_frequencies
+from test.support.robots import load, massless
 
 ROBOTS = ("delta_cu", "upr_rpu")
 """With elastic members: as a frame, and in closed form."""
@@ -57,11 +59,14 @@ def functions(robot):
         "tool": (lambda t: elasticity.setpoint_correction(robot, q, moved, tool=t), [moved[:3]]),
         "bound": (lambda b: elasticity.setpoint_correction(robot, q, moved, bound=b), [count]),
         "frequencies": (lambda p: natural_frequencies(robot, p, 2), [pose]),
+        "modes": (lambda p: modes(robot, p, 2), [pose]),
+        "members": (lambda p, w: member_deflections(robot, p, w), [q, WRENCH]),
+        "rotation": (robot.rotation, [pose]),
         "compliance_at": (response.compliance_at, [factors]),
         "deflection": (response.deflection, [WRENCH, factors]),
     }  # fmt: skip
     for name in (
-        "inverse_dynamics", "dynamics_terms", "least_norm_reactions", "regressor",
+        "inverse_dynamics", "dynamics_terms", "least_norm_reactions", "reactions", "regressor",
         "torque_deviation",
     ):  # fmt: skip
         table[name] = (bound(getattr(dynamics, name)), motion)
@@ -76,21 +81,27 @@ def functions(robot):
         "compliance": [pose], "stiffness": [pose], "strain_energy": [pose, WRENCH],
         "compliance_deviation": [pose], "clearance": [pose], "reachable": [pose],
         "setpoint_correction": [q, moved], "element_response": [pose],
+        "platform_response": [q, WRENCH],
     }.items():  # fmt: skip
         table[name] = (bound(getattr(elasticity, name)), arrays)
     return table
 
 
-def flat(result):
-    """All numbers of a result side by side."""
+def leaves(result):
+    """All arrays of a result, texts too."""
     if dataclasses.is_dataclass(result):
         result = [getattr(result, field.name) for field in dataclasses.fields(result)]
     if isinstance(result, dict):
         result = list(result.values())
     if isinstance(result, list | tuple):
-        return np.concatenate([np.zeros(0), *map(flat, result)])
-    array = np.asarray(result)
-    return np.ravel(array).astype(float) if array.dtype.kind in "fiub" else np.zeros(0)
+        return [leaf for part in result for leaf in leaves(part)]
+    return [np.asarray(result)]
+
+
+def flat(result):
+    """All numbers of a result side by side."""
+    found = [leaf.ravel() for leaf in leaves(result) if leaf.dtype.kind in "fiub"]
+    return np.concatenate([np.zeros(0), *found])
 
 
 def assert_same(found, right, name):
@@ -121,6 +132,10 @@ def wrong_ones(array):
     }
 
 
+ANSWERED = ("reachable", "try_forward", "try_inverse", "try_jacobian", "try_singularity")
+ONE_SAMPLE = ("spread", "tilted_pose", "element_response", "bound", "deflection", "compliance_at")
+"""Without batches of samples, or with arguments of any shape."""
+READ_ONLY = ("reactions", "least_norm_reactions", "modes", "strain_energy", "platform_response")
 SHAPELESS = {
     "spread": {"nothing"},  # of any number of values
     "tilted_pose": {"nothing"},  # of any shape
@@ -165,6 +180,10 @@ def test_what_is_not_finite_or_of_another_length_is_refused(name):
                     continue  # no bound
                 with pytest.raises(ValueError, match=r"\w"):
                     print(f"{function}, argument {k}, {wrong}:", ask(*given))
+                if wrong.shape == array.shape and function not in ONE_SAMPLE:
+                    given[k] = np.stack([array, wrong])
+                    with pytest.raises(ValueError, match="direction|" * (k == 1) + r"sample \(1,"):
+                        print(f"{function}, argument {k}, a batch:", ask(*given))
 
 
 @pytest.mark.parametrize("name", ROBOTS)
@@ -205,6 +224,48 @@ def test_real_numbers_of_any_kind_and_layout_are_those_numbers(name):
             for other in (np.repeat(array, 3)[::3], array[::-1].copy()[::-1], array[None]):
                 given = [*batch[:k], other, *batch[k + 1 :]]
                 assert_same(flat(ask(*given)), whole, function)
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_batches_are_their_samples_and_results_are_read_only(name, rng):
+    for function, (ask, arrays) in functions(load(name)).items():
+        if function in ONE_SAMPLE:
+            continue
+        batch = [array * (1.0 + 1e-3 * rng.normal(size=(2, 3, 1))) for array in arrays]
+        whole = ask(*batch)
+        if function in READ_ONLY:
+            assert not any(x.flags.writeable for x in leaves(whole) if x.ndim > 2), function
+        for k in np.ndindex(2, 3):
+            for one, many in zip(leaves(ask(*(b[k] for b in batch))), leaves(whole), strict=True):
+                right = many[k] if many.shape == (2, 3, *one.shape) else many
+                np.testing.assert_array_equal(one, right, function)
+        if function == "modes":
+            continue  # of a pose at least
+        none = leaves(ask(*(array[:0] for array in batch)))
+        for empty, many in zip(none, leaves(whole), strict=True):
+            assert empty.shape in ((0, *many.shape[1:]), many.shape), function
+
+
+@pytest.mark.parametrize(("name", "far"), [("delta_cu", [0.8, -1.4, -2.8]), ("upr_rpu", [0.1] * 3)])
+def test_states_without_an_assembly_are_refused_by_their_sample(name, far):
+    robot = load(name)
+    beyond = {"q": far, "pose": [9.0 if unit == "m" else 2.0 for unit in robot.pose_units]}
+    given = {"q": robot.inverse(robot.home()), "pose": robot.home()}
+    for function, (ask, (first, *others)) in functions(robot).items():
+        for kind, good in given.items():
+            if np.array_equal(first, good) and function not in ANSWERED:
+                batch = [np.stack([good, beyond[kind]]), *(np.stack([v, v]) for v in others)]
+                with pytest.raises((UnreachableError, SingularityError)) as caught:
+                    print(function, kind, ask(*batch))
+                assert caught.value.index[0] == 1
+
+
+def test_a_robot_without_masses_has_no_dynamics(tmp_path):
+    robot = load(massless(tmp_path / "light.yaml"))
+    q = robot.graph.home
+    for name in ("inverse_dynamics", "dynamics_terms", "reactions", "regressor"):
+        with pytest.raises(ParameterError, match="inertia"):
+            getattr(dynamics, name)(robot, q, q, q)
 
 
 def test_kinds_of_numbers():
