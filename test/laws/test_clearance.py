@@ -13,7 +13,7 @@ import yaml
 from scipy.optimize import lsq_linear
 
 from delta_dynamics.isotropy import tilted_pose
-from pkm_twin.errors import ParameterError, SingularityError, UnreachableError
+from pkm_twin.errors import ParameterError
 from pkm_twin.maps.search import workspace_box
 from pkm_twin.robot.clearance import clearance, distance, has_clearance
 from pkm_twin.robot.workspace import reachable, regular_workspace
@@ -326,30 +326,6 @@ def test_an_rcu_limb_without_its_rod_is_not_known(variant):
     assert not has_clearance(robot)
     assert reachable(robot, robot.home(), 1e3)
     assert has_clearance(load("delta"))
-
-
-@pytest.mark.parametrize("name", ROBOTS)
-def test_batches_are_their_samples(name, rng):
-    robot = load(name)
-    poses = random_poses(robot, rng, 24).reshape(4, 2, 3, -1)
-    gaps = clearance(robot, poses)
-    assert gaps.shape == (4, 2, 3)
-    for index in np.ndindex(4, 2, 3):
-        one = clearance(robot, poses[index].copy())
-        assert one.shape == ()
-        assert float(one) == pytest.approx(gaps[index], rel=1e-14)
-        assert float(clearance(robot, poses[index].tolist())) == float(one)
-
-
-@pytest.mark.parametrize("name", ROBOTS)
-def test_refused_poses_are_named(name):
-    robot = load(name)
-    far = [9.0 if unit == "m" else 2.0 for unit in robot.pose_units]
-    with pytest.raises((UnreachableError, SingularityError)) as caught:
-        clearance(robot, [robot.home(), far])
-    assert caught.value.index == (1,)
-    with pytest.raises(ValueError, match="not finite"):
-        clearance(robot, [math.nan, *robot.home()[1:]])
 
 
 PROGRAM = """

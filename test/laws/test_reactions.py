@@ -8,7 +8,7 @@ import pytest
 
 from delta_dynamics import inverse_dynamics, least_norm_reactions, reactions
 from delta_dynamics.reactions import loads_kernel, transmitters
-from pkm_twin.errors import ParameterError, SingularityError, UnreachableError
+from pkm_twin.errors import SingularityError
 from test.support.bodies import bodies, rubs
 from test.support.robots import (
     FREE,
@@ -17,7 +17,6 @@ from test.support.robots import (
     loaded,
     loaded_like,
     massive,
-    massless,
     random_motion,
 )
 
@@ -111,17 +110,6 @@ def test_what_is_determinate_is_a_matter_of_counting(name, rng):
 
 
 @massive
-def test_reactions_are_linear_in_the_wrench(name, rng):
-    robot = load(name)
-    q, qd, qdd, wrench = states(robot, rng, 50)
-    none, one, many = (
-        least_norm_reactions(robot, q, qd, qdd, k * wrench).wrenches for k in (0, 1, -3)
-    )
-    expected = none - 3 * (one - none)
-    np.testing.assert_allclose(many, expected, atol=1e-10 * np.abs(expected).max())
-
-
-@massive
 def test_no_joint_does_work_against_its_freedoms(name, rng):
     """Power of all constraint wrenches on the actual motion is that of the actuators."""
     robot = load(name).changed(friction=FREE)
@@ -144,23 +132,6 @@ def test_no_joint_does_work_against_its_freedoms(name, rng):
         f, m = result.wrenches[:, k, :3], result.wrenches[:, k, 3:]
         power += np.sum(f * (v + np.cross(w, result.points[:, k])) + m * w, -1)
     np.testing.assert_allclose(power, np.sum(result.efforts * qd, -1), rtol=1e-9, atol=1e-8)
-
-
-@massive
-@pytest.mark.parametrize("batch", [(), (3,), (3, 2), (0,)])
-def test_batches_equal_single_samples(name, rng, batch):
-    robot = loaded(name)
-    motion = [v[: int(np.prod(batch))].reshape(*batch, v.shape[-1]) for v in states(robot, rng, 6)]
-    result = reactions(robot, *motion)
-    assert result.wrenches.shape == (*batch, len(result.names), 6)
-    assert result.residual.shape == batch
-    for index in np.ndindex(batch):
-        single = reactions(robot, *(v[index] for v in motion))
-        size = np.nanmax(np.abs(single.wrenches))
-        np.testing.assert_allclose(result.wrenches[index], single.wrenches, atol=1e-12 * size)
-    still = np.zeros(len(robot.joint_names))
-    wide = reactions(robot, motion[0], still, still.tolist())
-    assert wide.values.shape == (*batch, len(wide.components))
 
 
 @massive
@@ -467,30 +438,3 @@ def test_a_parallelogram_rod_by_rod_gives_the_same(half_width, rng):
             np.testing.assert_allclose(
                 wrenches[joint], [*force, *couple], atol=1e-10 * np.abs(solution).max()
             )
-
-
-@massive
-def test_values_that_are_not_finite_or_of_a_wrong_size_are_refused(name, rng):
-    robot = load(name)
-    motion = [v[0] for v in states(robot, rng, 1)]
-    for k in range(4):
-        bad = [v.copy() for v in motion]
-        bad[k][1] = np.nan
-        with pytest.raises(ValueError, match="finite"):
-            reactions(robot, *bad)
-        bad[k] = motion[k][:-1]
-        with pytest.raises(ValueError, match="last axis"):
-            reactions(robot, *bad)
-
-
-def test_an_unreachable_state_is_named(variant):
-    robot, _ = variant("delta", geometry={"arm_length": 0.6})
-    with pytest.raises(UnreachableError) as caught:
-        reactions(robot, [[1.2] * 3, [0.0] * 3], np.zeros(3), np.zeros(3))
-    assert caught.value.index == (1,)
-
-
-def test_a_robot_without_masses_is_refused(tmp_path):
-    robot = load(massless(tmp_path / "light.yaml"))
-    with pytest.raises(ParameterError, match="inertia"):
-        reactions(robot, *np.ones((3, len(robot.joint_names))))

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import yaml
 
-from pkm_twin.errors import ParameterError, SingularityError, UnreachableError
+from pkm_twin.errors import ParameterError, SingularityError
 from pkm_twin.robot.entries import with_entries
 from stiffness_monitor import compliance, platform_response, stiffness, strain_energy
 from stiffness_monitor.compliance import kernels, member_deflections
@@ -67,25 +67,7 @@ class TestEveryRobot:
         alone = ~found.tie
         assert [found.elements[k] for k in best[alone]] == found.dominant[alone].tolist()
 
-    def test_one_sample_is_the_batch_s(self, name, rng):
-        robot = load(name)
-        poses, wrench = random_poses(robot, rng, 4), random_wrenches(rng, 1)[0]
-        many = strain_energy(robot, poses.reshape(2, 2, -1), wrench)
-        for k, pose in enumerate(poses):
-            one = strain_energy(robot, pose, wrench)
-            at = divmod(k, 2)
-            assert (one.factors == many.factors[at]).all()
-            assert (one.deflection == many.deflection[at]).all()
-            assert (one.total, one.dominant, one.tie) == (
-                many.total[at],
-                many.dominant[at],
-                many.tie[at],
-            )
-            assert isinstance(one.total, float)
-            assert type(one.dominant) is str
-            assert (compliance(robot, poses)[k] == compliance(robot, pose)).all()
-
-    @pytest.mark.parametrize("size", [1e-160, 1e-30, 1e6])
+    @pytest.mark.parametrize("size", [1e-160, 1e-30, 1e140])
     def test_factors_do_not_hang_on_the_wrench_s_size(self, name, size, rng):
         robot = load(name)
         pose, wrench = robot.home(), random_wrenches(rng, 1)[0]
@@ -103,6 +85,7 @@ class TestEveryRobot:
         assert not found.total.any()
         one = strain_energy(robot, robot.home(), np.zeros(6))
         assert (one.dominant, one.tie, one.total) == ("none", False, 0.0)
+        assert [type(value) for value in (one.dominant, one.tie, one.total)] == [str, bool, float]
 
     def test_poses_and_joints_are_answered_alike(self, name, rng):
         """And q has batch axes of its own, beside the wrench's."""
@@ -152,21 +135,6 @@ class TestEveryRobot:
         usual, stiffer = (strain_energy(r, pose, wrench) for r in (robot, other))
         assert stiffer.total == pytest.approx(usual.total / 2, rel=1e-9)
         assert stiffer.factors == pytest.approx(usual.factors, rel=1e-7)
-
-    def test_refusals(self, name, rng):
-        robot = load(name)
-        home = robot.home()
-        for pose, wrench in (
-            ([np.nan, *home[1:]], np.ones(6)),
-            (home, [np.inf, 0, 0, 0, 0, 0]),
-            (home, np.ones(5)),
-            (home[:-1], np.ones(6)),
-            (home, [1e300, 0, 0, 0, 0, 0]),
-        ):
-            with pytest.raises(ValueError, match=r"finite|shape|broadcast|axis"):
-                strain_energy(robot, pose, wrench)
-        with pytest.raises((UnreachableError, SingularityError)):
-            compliance(robot, [50.0 if unit == "m" else 2.0 for unit in robot.pose_units])
 
     def test_kernels_are_there_to_warm_up(self, name):
         made = kernels(load(name))

@@ -4,12 +4,10 @@
 from dataclasses import fields
 
 import numpy as np
-import pytest
 
 from delta_dynamics import Terms, dynamics_terms, inverse_dynamics, mass_matrix
-from pkm_twin.errors import ParameterError, UnreachableError
 from test.support.bodies import bodies, rubs
-from test.support.robots import FREE, load, loaded, massive, massless, random_motion
+from test.support.robots import FREE, load, loaded, massive, random_motion
 
 NAMES = tuple(field.name for field in fields(Terms))
 
@@ -70,43 +68,3 @@ def test_absent_causes_give_exact_zeros(name, rng):
     assert terms.friction.any() == bool(passive)
     still = dynamics_terms(robot.changed(gravity=[0, 0, 0]), q, 0 * qd, 0 * qd)
     assert not still.total.any()
-
-
-@massive
-def test_every_term_has_the_common_batch_shape(name, rng):
-    robot = loaded(name)
-    q, qd, qdd, wrench = (value[0] for value in random_motion(robot, rng, 1))
-    wide = np.tile(wrench, (4, 2, 1))
-    terms = dynamics_terms(robot, q, qd[None], qdd, wide)
-    single = dynamics_terms(robot, q.tolist(), qd.tolist(), qdd, wrench)
-    for n in NAMES:
-        assert getattr(terms, n).shape == (4, 2, len(robot.joint_names))
-        np.testing.assert_array_equal(getattr(terms, n)[3, 1], getattr(single, n))
-
-
-@massive
-def test_faults_are_those_of_inverse_dynamics(name, rng):
-    robot = load(name)
-    q, qd, qdd, wrench = (value[0] for value in random_motion(robot, rng, 1))
-    with pytest.raises(ValueError, match="last axis"):
-        dynamics_terms(robot, q, qd[:-1], qdd)
-    with pytest.raises(ValueError, match="last axis"):
-        dynamics_terms(robot, q, qd, qdd, wrench[:3])
-    for position in range(4):
-        values = [q.copy(), qd.copy(), qdd.copy(), wrench.copy()]
-        values[position][1] = np.nan
-        with pytest.raises(ValueError, match="finite"):
-            dynamics_terms(robot, *values)
-
-
-def test_an_unreachable_state_is_named(variant):
-    robot, _ = variant("delta", geometry={"arm_length": 0.6})
-    with pytest.raises(UnreachableError) as caught:
-        dynamics_terms(robot, [[1.2] * 3, [0.0] * 3], np.zeros(3), np.zeros(3))
-    assert caught.value.index == (1,)
-
-
-def test_a_robot_without_masses_is_refused(tmp_path):
-    robot = load(massless(tmp_path / "light.yaml"))
-    with pytest.raises(ParameterError, match="inertia"):
-        dynamics_terms(robot, *np.ones((3, len(robot.joint_names))))

@@ -163,37 +163,6 @@ def test_twists_move_the_limbs_and_nothing_else(size):
         assert np.cross(x, y) @ twist[3:] == pytest.approx(0, abs=1e-13 * scale)
 
 
-def test_batches_are_their_samples():
-    poses = branch_poses(ROBOT, 24, 9).reshape(4, 2, 3, 3)
-    q = ROBOT.inverse(poses)
-    assert q.shape == (4, 2, 3, 3)
-    assert ROBOT.jacobian(q).shape == (4, 2, 3, 3, 3)
-    assert ROBOT.platform_jacobian(q).shape == (4, 2, 3, 6, 3)
-    assert ROBOT.rotation(poses).shape == (4, 2, 3, 3, 3)
-    for index in np.ndindex(4, 2, 3):
-        one = np.ascontiguousarray(poses[index])
-        assert ROBOT.inverse(one) == pytest.approx(q[index], rel=1e-15)
-        assert ROBOT.forward(q[index].copy()) == pytest.approx(one, rel=1e-13, abs=1e-13)
-        assert ROBOT.jacobian(q[index].copy()) == pytest.approx(ROBOT.jacobian(q)[index], rel=1e-12)
-
-
-@pytest.mark.filterwarnings("ignore:.*encountered:RuntimeWarning")
-@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
-@pytest.mark.parametrize("entry", range(3))
-def test_not_finite_is_refused(bad, entry):
-    pose = [-0.6, 0.0, 0.0]
-    pose[entry] = bad
-    with pytest.raises(ValueError, match="not finite"):
-        ROBOT.inverse(pose)
-    with pytest.raises(ValueError, match=r"sample \(1,\) is not finite"):
-        ROBOT.inverse([[-0.6, 0, 0], pose])
-    q = [0.6, 0.6, 0.6]
-    q[entry] = bad
-    for call in (ROBOT.forward, ROBOT.jacobian, ROBOT.platform_jacobian):
-        with pytest.raises(ValueError, match="not finite"):
-            call(q)
-
-
 @pytest.mark.parametrize(
     "pose",
     [
