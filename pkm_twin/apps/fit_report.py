@@ -110,8 +110,8 @@ def _answer(result: Result, held: Mapping[str, tuple[float, float, float, str]])
     )
     return (
         f"{result.robot.name}: {result.verdict}; the worst held-out residual is "
-        f"{after:.3g} {unit} ({name}), {100 * after / peak:.2g} % of the peak, {before:.3g} {unit} "
-        "with the file's values"
+        f"{after:.3g} {unit} ({name}), {100 * after / peak:.2g} % of the peak ({before:.3g} {unit} "
+        "with the file's values)"
     )
 
 
@@ -224,12 +224,12 @@ def _elastic_facts(result: ElasticFit) -> list[Fact]:
 def _group_text(group: Group) -> str:
     """One line on elements that the loads do not distinguish."""
     told = "; ".join(map(_sum_text, group.known)) or "nothing"
-    return f"Loads do not distinguish {' and '.join(group.elements)}; they identify {told}"
+    return f"the loads do not distinguish {' and '.join(group.elements)}; they identify {told}"
 
 
 def _sum_text(one: Combination) -> str:
-    terms = " ".join(f"{w:+.2f} {name}" for name, w in one.weights.items())
-    return f"{terms.removeprefix('+')} = {one.value:.4g} +- {one.deviation:.2g}"
+    terms = " + ".join(f"{w:.2f} x {name}" for name, w in one.weights.items())
+    return f"{terms.replace('+ -', '- ')} = {one.value:.4g} +- {one.deviation:.2g}"
 
 
 def _residuals(judged: Judged, units: Mapping[str, str]) -> Any:

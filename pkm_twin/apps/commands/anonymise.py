@@ -68,12 +68,12 @@ def anonymise(given: Anonymise) -> Report:
     topics = _topics(bag, machine, given.keep_names, dropped)
     counts = _written(bag, topics, machine, given, metadata)
     return Report(
-        answer=f"{given.out}: before you publish it, check that its numbers do not identify the "
-        "product",
+        answer=f"{given.out}: {sum(counts.values())} messages without names and dates",
         facts=[Fact("messages", counts), Fact("left_out", dropped)],
         notes=[
             *(f"{topic}: {count} messages" for topic, count in counts.items()),
             *(f"left out: {topic} ({why})" for topic, why in dropped.items()),
+            "before you publish it, check that its numbers do not identify the product",
         ],
         files={"out": given.out},
     )

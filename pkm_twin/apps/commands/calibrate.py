@@ -236,7 +236,7 @@ def report_of(
     rows = {p.name: [p.before, p.value, p.deviation, p.unit, p.observed] for p in result.parameters}
     kinds = [Column("unit", text=None), Column("count")]
     kinds += [Column(name, text=None) for name in ("before", "after", "held_out", "noise")]
-    shown = ("before", "after", "held out before", "held out", "noise an axis", "unit")
+    shown = ("before", "after", "held out before", "held out after", "noise per axis", "unit")
     kinds += [Column("", text=name) for name in shown]
     agreements = {}
     for a in result.agreements:
@@ -251,7 +251,7 @@ def report_of(
     if len(result.outliers) > MOST_SHOWN:
         lines.append(f"{len(result.outliers) - MOST_SHOWN} more outliers: see --json")
     return Report(
-        f"{machine.name}, {source}: {first.name} off by {after} RMS where it was held out "
+        f"{machine.name}, {source}: held-out {first.name} error {after} RMS "
         f"({before} before); {found} of {len(rows)} numbers determined",
         facts,
         [Table("parameters", columns, rows, "calibrated parameters"),

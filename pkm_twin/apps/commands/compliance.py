@@ -89,7 +89,8 @@ def compliance(given: Compliance) -> Report:
         Fact("beyond_limits", {item.joint: item.value for item in beyond}),
     ]  # fmt: skip
     if machine.uncertainty:
-        doubts = _micro(deflection_deviation(machine, given.pose, given.wrench), ".2g")
+        doubt = deflection_deviation(machine, given.pose, given.wrench)
+        doubts = _micro(np.where(doubt > 1e-12 * doubt.max(), doubt, 0.0), ".2g")
         label = "standard deviation (from the robot file's uncertainty)"
         facts.insert(6, Fact("", doubts, text=label))
     size = np.sqrt(np.diag(c))

@@ -189,7 +189,7 @@ def path(given: Motion) -> Report:
         shaper = {
             "kind": motion.shaper, "added_s": motion.added, "lowest_hz": low, "highest_hz": high,
         }  # fmt: skip
-        words = f"{motion.shaper} for {low:.4g} to {high:.4g} Hz, takes {motion.added:.4g} s of it"
+        words = f"{motion.shaper} for {low:.4g} to {high:.4g} Hz, adds {motion.added:.4g} s"
         facts.append(Fact("shaper", shaper, text="shaper", shown=words))
     draw: Any = draw_limits
     if given.slow_where_soft:

@@ -119,8 +119,8 @@ def size(given: Size) -> Report:
         payload_fact(motion.load),
         Fact("difference_from_model", taken.difference),
         Fact("drives", {d.joint: d.as_json() for d in duties}),
-        Fact("energy_J", energy, "J", "net energy of all drives"),
-        Fact("regenerated_J", returned, "J", "regenerated"),
+        Fact("energy_J", energy),
+        Fact("regenerated_J", returned, "J", "regenerated energy"),
         Fact("mean_power_W", energy / duration, "W", "mean power"),
     ]  # fmt: skip
     notes = list(motion.notes)
@@ -166,7 +166,7 @@ def _tables(duties: Sequence[DriveDuty]) -> list[Table]:
         columns = [
             Column("", force, "effort peak"), Column("", force, "RMS"),
             Column("", rate, "speed peak"), Column("", rate, "mean"),
-            Column("", "W", "power peak"), Column("", "W", "regenerated"),
+            Column("", "W", "power peak"), Column("", "W", "regenerated peak"),
             Column("", "J", "net energy"), Column("", "J", "regenerated"), last,
         ]  # fmt: skip
         if rows:
@@ -219,7 +219,8 @@ def over_workspace(given: Size) -> Report:
         ):
             entry[f"{what}_{unit}"] = float(value)
             entry[f"{what.split('_')[0]}_pose"] = dict(zip(names, pose.tolist(), strict=True))
-            where = ", ".join(f"{n} {v:.4g}" for n, v in zip(names, pose, strict=True))
+            at = (pose.round(9) + 0.0).tolist()  # No rounding of a zero, nor its sign.
+            where = ", ".join(f"{n} {v:.4g}" for n, v in zip(names, at, strict=True))
             words = unit.replace("_m", " m").replace("m_s", "m/s").replace("rad_s", "rad/s")
             rows[f"{joint} {what.replace('_', ' ')}"] = [float(value), words, where]
     k = int(worst.effort.argmax())
