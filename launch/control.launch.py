@@ -197,7 +197,7 @@ def _description(given: dict[str, str]) -> str:
         return Path(given["description"]).read_text(encoding="utf-8")
     program = Path(get_package_prefix("pkm_twin"), "lib/pkm_twin/pkm-twin")
     written = subprocess.run(
-        [program, "urdf", given["robot"], "--hardware-plugin", given["hardware_plugin"]],
+        [program, "export", "urdf", given["robot"], "--hardware-plugin", given["hardware_plugin"]],
         capture_output=True,
         text=True,
         check=False,

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``pkm-twin guard-check`` over the real middleware, beside the node that it is for."""
+"""``pkm-twin monitor-torques`` over the real middleware, beside the node that it is for."""
 
 import json
 import signal
@@ -26,7 +26,7 @@ def check(domain):
     started = []
 
     def run(*words):
-        started.append(ForkedCommand(domain, "guard-check", *map(str, words)))
+        started.append(ForkedCommand(domain, "monitor-torques", *map(str, words)))
         return started[-1]
 
     yield run

@@ -173,14 +173,14 @@ def test_signals_end_a_node_whose_parent_ignores_them(domain, number):
         assert "Traceback" not in said(output)
 
 
-@pytest.mark.parametrize("command", ["node", "guard-check"])
+@pytest.mark.parametrize("command", ["node", "monitor-torques"])
 def test_a_home_that_cannot_be_written_costs_log_files_alone(domain, command):
     """The middleware itself would not start. In /proc not even root makes a folder."""
     environment = domain.environment() | {"ROS_LOG_DIR": "/proc/none/log"}
     program = {
         "node": [sys.executable, "-m", MODULE],
-        "guard-check": [
-            sys.executable, "-m", "pkm_twin.apps.cli", "guard-check", "--wait", "0.1", "/none"
+        "monitor-torques": [
+            sys.executable, "-m", "pkm_twin.apps.cli", "monitor-torques", "--wait", "0.1", "/none"
         ],
     }[command]  # fmt: skip
     with tempfile.TemporaryFile("w+") as output:

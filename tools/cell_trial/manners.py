@@ -123,7 +123,7 @@ def urdf(_: Peer, tell: Results) -> None:
         ("--prefix", "left_"),
         ("--no-ros2-control",),
     ):
-        code, text = output(program, "urdf", ROBOT, *words)
+        code, text = output(program, "export", "urdf", ROBOT, *words)
         tree = ElementTree.fromstring(text)
         control = tree.find("ros2_control")
         plugin = None if control is None else control.findtext("hardware/plugin")

@@ -199,14 +199,19 @@ def optimised(given: Design, path: Path) -> Report:
         }
         columns = [Column("", text=name, form=".5g") for name in names]
         tables.append(Table("", columns, rows, "Pareto front"))
+    changes = []
+    for name in found.minimise:
+        was, unit_of = before.quantities.get(name, np.nan), QUANTITIES[name].unit(robot)
+        words = f"{name} {best.quantities[name]:.4g} {unit_of}".rstrip()
+        changes.append(f"{words} ({was:.4g} before)" if np.isfinite(was) else words)
     notes = [f"{joint} leaves its position limits on the path" for joint in limits]
     if not before.feasible:
         notes.insert(
             0, "before: the file's machine cannot follow the path or does not keep the bounds"
         )
     return Report(
-        f"{robot.name}: least {' and '.join(found.minimise)} on a path of {way.duration:.4g} s, "
-        f"{len(way.time)} samples; {found.machines} machines computed",
+        f"{robot.name}: {' and '.join(changes)} on a path of {way.duration:.4g} s; "
+        f"{found.machines} machines computed",
         [
             Fact("robot", robot.name),
             Fact("minimise", list(found.minimise)),
@@ -421,7 +426,7 @@ def budget(given: Design) -> Report:
         Column("", text=" "),
     ]
     moves, turns = found.deviation[:, :3], found.deviation[:, 3:]
-    worst = robot.forward(q[int(np.linalg.norm(moves, axis=-1).argmax())])
+    worst = robot.forward(q[int(np.linalg.norm(moves, axis=-1).argmax())]).round(12) + 0.0
     at = ", ".join(f"{n} {value:.4g}" for n, value in zip(robot.pose_names, worst, strict=True))
     facts = [
         Fact("robot", robot.name),
