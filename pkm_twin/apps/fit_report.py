@@ -224,7 +224,7 @@ def _elastic_facts(result: ElasticFit) -> list[Fact]:
 def _group_text(group: Group) -> str:
     """One line on elements that the loads do not distinguish."""
     told = "; ".join(map(_sum_text, group.known)) or "nothing"
-    return f"the loads do not distinguish {' and '.join(group.elements)}; they identify {told}"
+    return f"Loads do not distinguish {' and '.join(group.elements)}; they identify {told}"
 
 
 def _sum_text(one: Combination) -> str:
