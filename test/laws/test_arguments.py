@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 from decimal import Decimal
 
 import numpy as np
@@ -16,18 +17,21 @@ from pkm_twin.errors import ParameterError, SingularityError, UnreachableError
 from pkm_twin.robot.catalogue import robot_of_data
 from stiffness_monitor.compliance import member_deflections
 from stiffness_monitor.modes import modes, natural_frequencies
-from test.support.robots import load, massless
+from test.support.robots import both_ways, load, massless
 
 ROBOTS = ("delta_cu", "upr_rpu")
 """With elastic members: as a frame, and in closed form."""
+FAR = {"delta_cu": [0.8, -1.4, -2.8], "upr_rpu": [0.1] * 3}
+"""Joints that cannot be assembled."""
 WRENCH = np.array([1.0, 2.0, 3.0, 0.1, 0.2, 0.3])
 
 
 def functions(robot):
     """Functions of a robot by name, each with arrays that it takes."""
     n = len(robot.joint_names)
-    pose, count = robot.home(), np.arange(1.0, n + 1)
-    q, qd, qdd = robot.inverse(pose), 0.1 * count, -0.3 * count
+    count = np.arange(1.0, n + 1)
+    q, qd, qdd = robot.graph.home + 0.02 * count, 0.1 * count, -0.3 * count
+    pose = robot.forward(q)
     tau = dynamics.inverse_dynamics(robot, q, qd, qdd, WRENCH)
     moved = 1e-5 * WRENCH
     response = elasticity.element_response(robot, pose)
@@ -246,18 +250,60 @@ def test_batches_are_their_samples_and_results_are_read_only(name, rng):
             assert empty.shape in ((0, *many.shape[1:]), many.shape), function
 
 
-@pytest.mark.parametrize(("name", "far"), [("delta_cu", [0.8, -1.4, -2.8]), ("upr_rpu", [0.1] * 3)])
+@pytest.mark.parametrize(("name", "far"), FAR.items())
 def test_states_without_an_assembly_are_refused_by_their_sample(name, far):
     robot = load(name)
     beyond = {"q": far, "pose": [9.0 if unit == "m" else 2.0 for unit in robot.pose_units]}
-    given = {"q": robot.inverse(robot.home()), "pose": robot.home()}
-    for function, (ask, (first, *others)) in functions(robot).items():
+    table = functions(robot)
+    given = {"q": table["forward"][1][0], "pose": table["inverse"][1][0]}
+    for function, (ask, (first, *others)) in table.items():
         for kind, good in given.items():
             if np.array_equal(first, good) and function not in ANSWERED:
                 batch = [np.stack([good, beyond[kind]]), *(np.stack([v, v]) for v in others)]
                 with pytest.raises((UnreachableError, SingularityError)) as caught:
                     print(function, kind, ask(*batch))
                 assert caught.value.index[0] == 1
+
+
+PROGRAM = """
+import json, sys
+from delta_dynamics import inverse_dynamics
+from pkm_twin.codegen.code import compiled
+from pkm_twin.errors import PkmTwinError
+from test.laws.test_arguments import functions, leaves
+from test.support.robots import MASSIVE, load
+found = {"compiled": compiled()}
+for name in MASSIVE:
+    q = load(name).graph.home + 0.01
+    found[name, "torques"] = [inverse_dynamics(load(name), q, 2 * q, 3 * q)]
+for name, far in json.loads(sys.stdin.read()).items():
+    for function, (ask, arrays) in functions(load(name)).items():
+        found[name, function] = leaves(ask(*arrays))
+    try:
+        load(name).forward(far)
+    except PkmTwinError as error:
+        found[name, "refusal"] = leaves(str(error))
+print(json.dumps({"compiled": found.pop("compiled")}
+    | {" ".join(key): [leaf.tolist() for leaf in value] for key, value in found.items()}))
+"""
+
+
+def test_without_a_compiler_the_numbers_are_the_same():
+    """The same formulas as plain Python, in a process of its own."""
+    fast, slow = both_ways(PROGRAM, json.dumps(FAR))
+    assert len(fast) > 80
+    for name in fast:
+        if name.endswith(("modes", "element_response")):
+            continue  # these have signs and bases of their own
+        for one, other in zip(fast[name], slow[name], strict=True):
+            right = np.asarray(one)
+            if right.dtype.kind in "US":
+                assert other == one, name
+            elif right.size:
+                # Reactions have a residual of rounding.
+                least = 1e-3 if "reactions" in name else 1e-12
+                limit = 1e-11 * max(np.nanmax(np.abs(right)), least)
+                np.testing.assert_allclose(other, right, rtol=0, atol=limit, err_msg=name)
 
 
 def test_a_robot_without_masses_has_no_dynamics(tmp_path):

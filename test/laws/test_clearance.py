@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from dataclasses import replace
 
@@ -18,7 +17,7 @@ from pkm_twin.maps.search import workspace_box
 from pkm_twin.robot.clearance import clearance, distance, has_clearance
 from pkm_twin.robot.workspace import reachable, regular_workspace
 from stiffness_monitor.structure import structural_model
-from test.support.robots import SHIPPED, both_ways, load, parameters_of, random_poses
+from test.support.robots import SHIPPED, load, parameters_of, random_poses
 
 ROBOTS = [
     name for name, robot in SHIPPED.items() if has_clearance(robot) and robot.mechanism != "machine"
@@ -326,36 +325,3 @@ def test_an_rcu_limb_without_its_rod_is_not_known(variant):
     assert not has_clearance(robot)
     assert reachable(robot, robot.home(), 1e3)
     assert has_clearance(load("delta"))
-
-
-PROGRAM = """
-import json, sys
-import numpy as np
-from pkm_twin import load
-from pkm_twin.codegen.code import compiled
-from pkm_twin.robot.clearance import clearance
-from pkm_twin.robot.workspace import reachable
-given = json.loads(sys.stdin.read())
-result = {"compiled": compiled()}
-for name, poses in given.items():
-    result[name] = clearance(load(name), poses).tolist()
-    result["one " + name] = float(clearance(load(name), poses[0]))
-    # Half-way, where no pose is: most of a Delta's have one clearance, that at the platform.
-    half = (min(result[name]) + max(result[name])) / 2
-    result["kept " + name] = reachable(load(name), poses, half).tolist()
-print(json.dumps(result))
-"""
-
-
-def test_compiled_and_plain():
-    given = {}
-    for name in ROBOTS:
-        poses = box(load(name), 9)
-        given[name] = poses[reachable(load(name), poses)].tolist()
-    fast, slow = both_ways(PROGRAM, json.dumps(given))
-    for name, values in fast.items():
-        if name.startswith("kept"):
-            assert values == slow[name]
-            assert 0 < sum(values) < len(values)
-        else:
-            assert values == pytest.approx(slow[name], rel=1e-12)

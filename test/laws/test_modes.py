@@ -246,9 +246,8 @@ def test_a_third_of_a_turn_changes_nothing_of_a_symmetric_delta(rng):
         assert found == pytest.approx(expected, rel=1e-8)
 
 
-@pytest.mark.parametrize("order", [(1, 2, 0), (0, 2, 1)])
-def test_the_order_of_the_limbs_does_not_matter(order, variant, rng):
-    robot = load("delta_cu")
+def test_the_order_of_the_limbs_does_not_matter(variant, rng):
+    robot, order = load("delta_cu"), (1, 2, 0)
     poses = random_poses(robot, rng, 3)
     geometry = parameters_of("delta_cu")["geometry"]
     changed = {key: [geometry[key][i] for i in order] for key in ("azimuths", "closures")}

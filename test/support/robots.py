@@ -66,14 +66,14 @@ MASSIVE = [name for name, robot in SHIPPED.items() if has(robot, "massive")]
 ELASTIC = [name for name, robot in SHIPPED.items() if has(robot, "structure")]
 
 every_robot = pytest.mark.parametrize("name", robot_names())
-massive = pytest.mark.parametrize("name", MASSIVE)
 some_elastic = partly_long(ELASTIC, "delta", "delta_cu", "prru", "upr_rpu")
 """All elastic robots, by default those whose mechanism has a file of its own."""
 elastic = pytest.mark.parametrize("name", some_elastic)
-some_robots = pytest.mark.parametrize(
-    "name", partly_long(robot_names(), "delta_cu", "five_bar", "rps3", "upr_rpu")
-)
-"""By default one of each kind: parallelograms, in a plane, turning platform, overconstrained."""
+KINDS = ("delta_cu", "five_bar", "rps3", "upr_rpu")
+"""One of each kind: parallelograms, in a plane, turning platform, overconstrained."""
+massive = pytest.mark.parametrize("name", partly_long(MASSIVE, *KINDS))
+some_robots = pytest.mark.parametrize("name", partly_long(robot_names(), *KINDS))
+"""By default one of each kind."""
 
 
 def parameters_of(name: str) -> dict[str, Any]:
