@@ -84,7 +84,8 @@ class Command:
         rows = [(field, row) for field, _, row, _ in fields]
         known = {_spelled(field, row): row.older for field, row in rows}
         older = {old: new for new, olds in known.items() for old in olds}
-        cls = type("_Words", (_Words,), {"older": older})
+        usual = {name.replace("--no-", "--") for name in known if name.startswith("--no-")}
+        cls = type("_Words", (_Words,), {"older": older, "usual": usual - known.keys()})
         app.command(
             name, cls=cls, help=inspect.cleandoc(self.given.__doc__ or ""), hidden=self.hidden
         )(call)
@@ -335,6 +336,8 @@ class _Words(TyperCommand):
     """A command that takes negative numbers, older spellings, and a picture without a name."""
 
     older: dict[str, str]
+    usual: set[str]
+    """What is so without a word: the opposites of options that begin with no."""
 
     def collect_usage_pieces(self, ctx: Any) -> list[str]:
         # But for what stands before the command's name.
@@ -349,6 +352,8 @@ class _Words(TyperCommand):
             if word == "--":
                 yield from args[k:]
                 return
+            if word in self.usual:
+                continue
             name, sign, value = word.partition("=")
             name = self.older.get(name, name)
             if _NEGATIVE.match(word):

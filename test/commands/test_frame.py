@@ -23,6 +23,7 @@ class Weigh(OfRobot, Writes, Draws):
     at: tuple[float, ...] | None = setting(None, "where", count=2)
     how: str = setting("fast", "how", choices=("fast", "slow"))
     bad: bool = setting(False, "what it finds is bad")
+    no_lid: bool = setting(False, "without its lid")
     out: Path | None = setting(None, "table", writes=True, endings=(".csv",))
 
 
@@ -112,3 +113,9 @@ def test_targets_are_checked_before_the_work(run, tmp_path):
 def test_judged_facts_are_items():
     report = Report(facts=[judged("rate", "900 Hz", "1 kHz", False), judged("gaps", "?", "", None)])
     assert [item["verdict"] for item in report.data["items"]] == ["bad", "unknown"]
+
+
+@pytest.mark.parametrize(("word", "without"), [("--lid", False), ("--no-lid", True)])
+def test_what_is_so_without_a_word_may_be_said(run, word, without):
+    run("cart", word)
+    assert SEEN[-1].no_lid is without
