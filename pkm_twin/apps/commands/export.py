@@ -32,7 +32,8 @@ class ToFolder(OfRobot, Overwrites):
             refuse_existing(path, self.overwrite)
         for path, text in zip(paths, files.values(), strict=True):
             replace_file(path, text.encode())
-        return Report(facts=[Fact("files", list(map(str, paths)))], notes=list(map(str, paths)))
+        written = list(map(str, paths))
+        return Report(f"{self.out}: {len(written)} files", [Fact("files", written)], notes=written)
 
 
 @dataclass(frozen=True, kw_only=True)
