@@ -108,8 +108,8 @@ class Tasks(TyperGroup):
             code = super().main(*args, **{**extra, "standalone_mode": False})
         except UsageError as error:
             text = error.format_message().rstrip(".").removeprefix("Invalid value: ")
-            context = getattr(error, "ctx", None)
-            if text == "Missing command" and isinstance(context.command, TyperGroup):
+            context: Any = getattr(error, "ctx", None)
+            if text == "Missing command" and context is not None:
                 text = f"give one of {', '.join(context.command.list_commands(context))}"
             where = f"; see {context.command_path} --help" if context is not None else ""
             tell(f"{text}{where}")
