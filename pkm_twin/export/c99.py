@@ -376,7 +376,8 @@ static int @_{name}(const double *{q.target}, int steps, double *h, double *x)
         verdict = f"status = @_judged(r, {len(wanted)});"
         if q is None:
             verdict = f"status = (@_finite(r, {len(wanted)}) != 0) ? 0 : 2;"
-        lines = [f"    double r[{len(wanted) + len(judged)}];"]
+        # Compilers do not see that a rejected result is never read.
+        lines = [f"    double r[{len(wanted) + len(judged)}] = {{0.0}};"]
         work = [f"        {call};", f"        {verdict}"]
         if q is not None and q.home:
             tables = f"h[{len(known) - len(self._known) or 1}], {UNKNOWNS}[{len(q.home)}]"

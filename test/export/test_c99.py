@@ -203,7 +203,10 @@ def test_nothing_undefined_happens(name, tmp_path):
         assert np.isfinite(found[status == 0.0]).all()
 
 
-LANGUAGES = "-std=c99 -fsyntax-only", "-x c++ -std=c++17 -fsyntax-only", "-std=c99 -O2 -mfma"
+LANGUAGES = (
+    "-std=c99 -fsyntax-only", "-x c++ -std=c++17 -fsyntax-only", "-std=c99 -O1",
+    "-std=c99 -O2 -mfma",
+)  # fmt: skip
 
 
 @pytest.mark.parametrize("compiler", COMPILERS)
