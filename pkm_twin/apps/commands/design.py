@@ -435,7 +435,7 @@ def budget(given: Design) -> Report:
         _length("rms_position_m", rms(moves)),
         _length("greatest_position_m", _most(moves), "largest position error", f" at {at}"),
         Fact("rms_angle_rad", rms(turns), "rad", "RMS rotation",
-             f"{1e3 * rms(turns):.4g} mrad"),
+             f"{1e3 * rms(turns.round(12)):.4g} mrad"),
         Fact("greatest_angle_rad", _most(turns), "rad"),
         Fact("worst_pose", worst),
     ]  # fmt: skip

@@ -196,7 +196,7 @@ def path(given: Motion) -> Report:
         more, draw = _cut(given, motion)
         facts += more
     return Report(
-        answer, facts, _tables(motion), {"": lambda: draw(motion, answer)},
+        answer, facts, _tables(motion, given.slow_where_soft), {"": lambda: draw(motion, answer)},
         files={"out": given.out},
     )  # fmt: skip
 
@@ -280,11 +280,15 @@ def _peaks(motion: TimedPath) -> dict[str, dict[str, dict[str, Any]]]:
     return peaks
 
 
-def _tables(motion: TimedPath) -> list[Table]:
-    """What the terminal shows of limits and peaks."""
+def _tables(motion: TimedPath, soft: bool) -> list[Table]:
+    """What the terminal shows of limits and peaks; ``soft``: the tolerance bounds the speed too."""
     rows: dict[str, list[Any]] = {}
+    words_of = {"speed": "speed or tolerance"} if soft else {}
     for bound in motion.bounds:
-        what = bound.what or f"none (largest fraction of a limit: {100 * bound.used:.0f} %)"
+        what = (
+            words_of.get(bound.what, bound.what)
+            or f"none (largest fraction of a limit: {100 * bound.used:.0f} %)"
+        )
         rows[f"{bound.begin:.4f} to {bound.end:.4f}"] = [what]
     peaks = {
         joint: [f"{one['value']:.4g} {one['unit']}" for one in values.values()]
@@ -292,7 +296,7 @@ def _tables(motion: TimedPath) -> list[Table]:
     }
     words = [Column("", "", word) for word in next(iter(_peaks(motion).values()))]
     worst = sorted(motion.worst.items(), key=lambda item: -item[1])[:6]
-    used = {name: [100.0 * value] for name, value in worst}
+    used = {words_of.get(name, name): [100.0 * value] for name, value in worst}
     tables = [
         Table("", [Column("", "", "limit that binds")], rows, head="time (s)"),
         Table("", words, peaks, head="peak"),
