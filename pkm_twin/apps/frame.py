@@ -137,7 +137,8 @@ class _Ordered(TyperGroup):
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         if args[0] not in self.commands:
-            raise UnknownNameError(str(ctx.info_name), args[0], tuple(self.commands))
+            unknown = UnknownNameError(str(ctx.info_name), args[0], tuple(self.commands))
+            raise typer.BadParameter(str(unknown), ctx)
         name, found, rest = super().resolve_command(ctx, args)
         return self.group.shown(str(name)), found, rest
 
