@@ -69,9 +69,9 @@ def numbers(text: str, count: int, expected: str = "") -> list[float]:
     return values
 
 
-def print_json(data: Any) -> None:
+def print_json(data: Any, *, err: bool = False) -> None:
     """JSON proper: a number that is not finite is a mistake here."""
-    typer.echo(json.dumps(data, indent=2, allow_nan=False))
+    typer.echo(json.dumps(data, indent=2, allow_nan=False), err=err)
 
 
 def refuse_existing(path: Path, overwrite: bool, source: Path | None = None) -> None:

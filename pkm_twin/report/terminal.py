@@ -9,6 +9,7 @@ from typing import Final
 import typer
 
 from pkm_twin.console import print_json, tell
+from pkm_twin.files import STANDARD
 from pkm_twin.report.report import Fact, Report, Table, Verdict
 
 COLOURS: Final = {Verdict.GOOD: "green", Verdict.BAD: "red", Verdict.UNKNOWN: "yellow"}
@@ -17,10 +18,10 @@ COLOURS: Final = {Verdict.GOOD: "green", Verdict.BAD: "red", Verdict.UNKNOWN: "y
 def present(report: Report, as_json: bool, *, piped: bool = False) -> None:
     """Print a report.
 
-    :param piped: stdout carries the file that the command writes; the text goes to stderr.
+    :param piped: stdout carries the file that the command writes; the report goes to stderr.
     """
     if as_json:
-        print_json(report.data)
+        print_json(report.data, err=piped)
     elif report.raw:
         typer.echo(report.raw, nl=False)
     else:
@@ -41,9 +42,11 @@ def text_of(report: Report) -> str:
         found += ["", *_judged(judged)] if found else _judged(judged)
     for table in report.tables:
         found += ["", *table_lines(table)] if found else table_lines(table)
-    if report.tables and (report.notes or any(report.files.values())):
+    written = [str(path) for path in report.files.values() if path is not None]
+    last = [*report.notes, *(path for path in written if path != STANDARD)]
+    if report.tables and last:
         found.append("")
-    found += [*report.notes, *(str(path) for path in report.files.values() if path is not None)]
+    found += last
     return "\n".join(found)
 
 

@@ -6,9 +6,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+import typer
 from typer.main import get_command
 
-from pkm_twin.apps.frame import command
+from pkm_twin.apps.frame import Group, command
 from pkm_twin.apps.options import Draws, OfRobot, Writes
 from pkm_twin.report import Column, Fact, Report, Table, Verdict, judged, plots
 from pkm_twin.settings import setting
@@ -108,6 +109,20 @@ def test_targets_are_checked_before_the_work(run, tmp_path):
         assert not SEEN
     run("cart", "--out", "t.csv", "--overwrite")
     assert SEEN and (tmp_path / "t.png").stat().st_size
+
+
+def test_a_table_on_stdout_has_its_report_on_stderr(capfd):
+    made = get_command(command(weigh, "Robots").app("weigh"))
+    made.main(["cart", "--out", "-", "--json"], prog_name="weigh", standalone_mode=False)
+    out, err = capfd.readouterr()
+    assert (out, json.loads(err)["mass"]) == ("", 2.0)
+
+
+def test_another_command_of_a_group_is_wrong_usage():
+    both = {"weigh": command(weigh), "tare": command(weigh)}
+    made = get_command(Group("Scales.", both).app("scales"))
+    with pytest.raises(typer.BadParameter, match="'weight'; did you mean 'weigh'"):
+        made.main(["weight"], standalone_mode=False)
 
 
 def test_judged_facts_are_items():
