@@ -316,7 +316,9 @@ def _one(name: str, kind: Any, row: Setting, word: Any) -> Any:
     if row.count is not None:
         return tuple(numbers(word, row.count, row.metavar or ""))
     if kind not in (int, float):
-        return word
+        # Without the blank before what looks like an option.
+        text = str(word)
+        return kind(text[1:]) if re.match(r" -\.?\d", text) else word
     try:
         value = decimal(word)
         value = int(word) if kind is int else value
@@ -358,7 +360,7 @@ class _Words(TyperCommand):
             name, sign, value = word.partition("=")
             name = self.older.get(name, name)
             if _NEGATIVE.match(word):
-                # A number is no option, and what reads it overlooks the blank.
+                # A number is no option; the blank goes when the word is taken.
                 yield f" {word}"
             elif word == "--picture" and (k + 1 == len(args) or args[k + 1].startswith("-")):
                 yield f"--picture={BESIDE}"

@@ -62,6 +62,8 @@ def test_words_become_values(run):
     assert given == Weigh(
         robot="cart", times=(-3, 4), scale=3.0, at=(-1.0, 0.002), how="slow"
     )  # fmt: skip
+    run("cart", "--out", "-1.csv", "--no-picture")
+    assert SEEN[0].out == Path("-1.csv")
     for wrong in (("--scale", "9"), ("--scale", "nan"), ("--at", "1"), ("--how", "well")):
         with pytest.raises(Exception, match=wrong[1]):
             run("cart", *wrong)
