@@ -203,11 +203,6 @@ class TestValues:
         robot = load_data(changed(DELTA, "limits.effort", [math.inf, 20.0, 20.0]))
         assert robot.limits.effort.tolist() == [math.inf, 20.0, 20.0]
 
-    @pytest.mark.parametrize("text", ["1e-3", "1E-3", "+1e-3", "0.001", "1.0e-3"])
-    def test_numbers_are_read_as_people_write_them(self, load_text, text):
-        given = yaml.safe_dump(changed(DELTA, "inertia.rotor_inertia", "HERE"))
-        assert load_text(given.replace("HERE", text)).inertia.rotor_inertia == 1e-3
-
 
 class TestInertia:
     @pytest.mark.parametrize(

@@ -141,13 +141,3 @@ def test_a_map_of_an_earlier_version_is_rejected(copy):
 
     for sealed in (True, False):
         assert "earlier version" in rejected(copy("workspace delta_cu", older, sealed=sealed))
-
-
-def test_show_rejects_a_damaged_map_in_one_line(twin, small_maps, tmp_path):
-    damaged = bytearray(small_maps["workspace delta_cu"].read_bytes())
-    damaged[len(damaged) // 2] ^= 4
-    (tmp_path / "a.nc").write_bytes(damaged)
-    result = twin("map", "show", tmp_path / "a.nc")
-    assert result.code == 1
-    assert "checksum" in result.one_line_error()
-    assert not list(tmp_path.glob("*.png"))
