@@ -15,20 +15,6 @@ from pkm_twin.mechanisms.prru import Prru
 from test.laws.prru_heads import LENGTHS, MACHINES, MASSES, TIMES, Motion, machine, place, sliders
 
 
-def test_slider_out_of_reach() -> None:
-    robot = machine("paper")
-    q = robot.inverse([0.7, 0.0, 0.0])
-    far = q + np.array([0.0, 1.2, 0.0])
-    with pytest.raises(UnreachableError, match="sample 1 is unreachable: limb II misses") as caught:
-        robot.forward([q, far])
-    assert caught.value.index == (1,)
-    for function in (robot.jacobian, robot.platform_jacobian):
-        with pytest.raises(UnreachableError):
-            function(far)
-    with pytest.raises(UnreachableError):
-        inverse_dynamics(robot, far, np.zeros(3), np.zeros(3))
-
-
 @pytest.mark.parametrize("away", [[0.5, -0.2, -0.3], [-0.4, 0.3, 0.1]])
 def test_miss_is_what_the_slider_has_to_come_back(away: list[float]) -> None:
     """Back by the miss (towards the mean height) the machine can be assembled, short of it not."""

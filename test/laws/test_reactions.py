@@ -340,27 +340,6 @@ def test_a_single_faulty_pose_in_a_batch_is_told_apart(rng):
     assert caught.value.index == (1,)
 
 
-VARIANTS = [
-    ("delta", {"inertia": {"arm_com": 0.3, "rotor_inertia": 0.002, "arm_inertia": 0.001}}),
-    ("delta", {"geometry": {"azimuths": [0.1, 2.0, 4.4], "closures": ["rcu", "rod", "rod"]}}),
-    ("prru", {"inertia": {"link_com": 0.0, "upper_link_inertia": [0.1, 0.02]}}),
-    ("prru", {"geometry": {"branch": "above", "azimuths": [0.1, 2.0, 4.4]}}),
-    ("prru", {"inertia": {"platform_com": [0.02, -0.05, 0.1], "link_com": 0.8}}),
-]
-
-
-@pytest.mark.parametrize(("name", "sections"), VARIANTS)
-def test_other_machines_are_balanced_too(variant, rng, name, sections):
-    robot = loaded_like(variant(name, **sections)[0])
-    q, qd, qdd, wrench = states(robot, rng, 100)
-    q = q.mean(-1, keepdims=True) + 0.5 * (q - q.mean(-1, keepdims=True))
-    result = reactions(robot, q, qd, qdd, wrench)
-    assert result.determinate.all()
-    assert imbalance(robot, result, q, qd, qdd, wrench) < 1e-10
-    tau = reaching(robot, q, qd, qdd, wrench)
-    assert (np.abs(result.efforts - tau).max(-1) <= 1e-9 * np.abs(tau).max(-1)).all()
-
-
 class RodByRod:
     """A Delta with every rod a body of its own; moments about the base's origin."""
 
