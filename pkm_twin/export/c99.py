@@ -376,12 +376,13 @@ static int @_{name}(const double *{q.target}, int steps, double *h, double *x)
         verdict = f"status = @_judged(r, {len(wanted)});"
         if q is None:
             verdict = f"status = (@_finite(r, {len(wanted)}) != 0) ? 0 : 2;"
-        # Compilers do not see that a rejected result is never read.
+        # Compilers do not see that nothing is read without a value.
         lines = [f"    double r[{len(wanted) + len(judged)}] = {{0.0}};"]
         work = [f"        {call};", f"        {verdict}"]
         if q is not None and q.home:
-            tables = f"h[{len(known) - len(self._known) or 1}], {UNKNOWNS}[{len(q.home)}]"
-            lines += [f"    double {tables};", "    int rung;"]
+            aheads, size = len(known) - len(self._known) or 1, len(q.home)
+            lines.append(f"    double h[{aheads}] = {{0.0}}, {UNKNOWNS}[{size}] = {{0.0}};")
+            lines.append("    int rung;")
             work = [
                 "        status = 1;",
                 "        for (rung = 0; (rung < PKM_ATTEMPTS) && (status == 1); rung++) {",
