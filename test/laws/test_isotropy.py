@@ -32,7 +32,9 @@ MASSIVE = [name for name in robots.MASSIVE if len(robots.SHIPPED[name].joint_nam
 THIRD = 2 * np.pi / 3
 TURN = np.array([[np.cos(THIRD), -np.sin(THIRD), 0], [np.sin(THIRD), np.cos(THIRD), 0], [0, 0, 1]])
 
-massive = pytest.mark.parametrize("name", MASSIVE)
+massive = pytest.mark.parametrize(
+    "name", partly_long(MASSIVE, "delta_cu", "prru", "rps3", "upr_rpu")
+)
 
 
 @pytest.fixture

@@ -11,15 +11,11 @@ from pkm_twin.errors import ParameterError, SingularityError
 from pkm_twin.robot.entries import with_entries
 from stiffness_monitor import compliance, platform_response, stiffness, strain_energy
 from stiffness_monitor.compliance import kernels, member_deflections
-from test.support.robots import ELASTIC, elastic, load, parameters_of, random_joints
+from test.support.robots import ELASTIC, elastic, load, parameters_of, random_joints, random_poses
 
 
 def random_wrenches(rng, *shape):
     return rng.normal(size=(*shape, 6)) * [50, 50, 50, 5, 5, 5]
-
-
-def random_poses(robot, rng, count):
-    return robot.forward(random_joints(robot, rng, count))
 
 
 def stiffened(data):
