@@ -106,10 +106,10 @@ def test_interrupted_and_resumed(call, tmp_path):
     ("words", "code", "text"),
     [
         (["delta", "pose-error"], 1, "uncertainty"),
-        (["delta", "weather"], 1, "workspace"),
+        (["delta", "weather"], 2, "workspace"),
         (["delta", "show", "a.nc"], 2, "a.nc"),
         (["upr_rpu", "strain-energy", "--wrench", "1,2"], 2, "six numbers"),
-        (["delta", "modess"], 1, "did you mean 'modes'"),
+        (["delta", "modess"], 2, "did you mean 'modes'"),
         (["delt", "modes"], 1, "did you mean"),
         (["delta", "workspace", "--wrench", "0,0,1,0,0,0"], 2, "--wrench"),
         (["upr_rpu", "strain-energy", "--energy", "3"], 2, "--energy"),
