@@ -122,6 +122,9 @@ def _of_table(path: Path, name: str | Robot | None, how: ReadOptions) -> Recordi
         return values if values is None or side is None else CONVERTED[word](side, values)
 
     q = stack("position")
+    if q is None and any(f"{joint}.position" in table for joint in robot.joint_names):
+        theirs = ", ".join(f"{joint}.position" for joint in joints)
+        raise ParameterError("--side", how.side, f"columns {theirs}, or no --side")
     pose = None
     if all(name in table for name in robot.pose_names):
         pose = table.stack(robot.pose_names)

@@ -193,6 +193,12 @@ def test_values_of_the_controller_and_of_the_motor_are_made_the_joints(name, tmp
             np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-12)
     with pytest.raises(ParameterError, match="side motor"):
         read(out, robot, ReadOptions(dialect=Dialect.of(units="percent"), side="controller"))
+    pose = robot.forward(q)
+    words = [*(f"{joint}.position" for joint in names), *robot.pose_names]
+    out.write_text(written(["time", *words], [time, *q.T, *pose.T]))
+    assert read(out, robot, ReadOptions()).q == pytest.approx(q)
+    with pytest.raises(ParameterError, match="no --side"):
+        read(out, robot, ReadOptions(side="controller"))
     out.write_text(written(["time", *header], [time, *np.hstack(motor).T]).replace("axis", "leg"))
     with pytest.raises(ParameterError, match=r"axis_0\.position"):
         read(out, robot, ReadOptions(side="motor"))
