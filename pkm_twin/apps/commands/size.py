@@ -262,6 +262,12 @@ def draw(taken: Compared, duties: Sequence[DriveDuty]) -> Any:
             side, speeds, torques = "joint", m.motion[1][:, k], taken.effort[:, k]
             unit = m.robot.joint_units[k]
             labels = f"speed of the joint ({unit}/s)", f"effort ({m.robot.effort_units[k]})"
+            own, dashed = m.robot.limits, {"color": "0.5", "ls": "--", "lw": 1}
+            for limits, draw in ((own.velocity, ax.axvline), (own.effort, ax.axhline)):
+                for sign in (1.0, -1.0):
+                    if limits is not None and np.isfinite(limits[k]):
+                        draw(sign * limits[k], **dashed)
+            side = "joint; dashed: limits of the file"
         ax.plot(speeds, torques, color="black", lw=1.5, label="motion")
         most = float(np.abs(torques).max())
         for colour, fit in zip(plots.COLOURS, near(d), strict=False):
