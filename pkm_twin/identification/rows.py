@@ -231,7 +231,9 @@ def rows_of(
     pieces, how = tracks(r.time, r.q, r.measured, r.wrench, r.held, window)
     if not pieces:
         raise PkmTwinError(f"{r.name}: too short to fit, no {LEAST // 2} samples without a gap")
-    model = Model(robot, parameters, r.carried)
+    # With the friction laws on trial, as the robot has them.
+    carried = None if r.carried is None else replace(robot, payload=r.carried.payload)
+    model = Model(robot, parameters, carried)
     parts = [_Piece.of(model, track, how) for track in pieces]
     if all(not part.moves.any() for part in parts):
         raise PkmTwinError(f"{r.name}: no excitation, the joints stand still")

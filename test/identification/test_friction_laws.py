@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Friction laws, torque constants and resonances of recordings; sweeps that show friction."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.signal import lfilter
@@ -13,6 +15,7 @@ from pkm_twin.identification.friction_laws import fit_with_laws, laws_of
 from pkm_twin.identification.noise import resonances_of
 from pkm_twin.identification.parameters import file_parameters
 from pkm_twin.identification.samples import Filtering
+from pkm_twin.recordings.payload import Load
 from test.identification.machines import machine, noisy
 from test.support.robots import load, partly_long
 
@@ -60,6 +63,17 @@ def test_the_law_of_a_drive_is_found_by_what_was_held_out(case):
     for key, rows in found.items():
         value, deviation = np.array(rows).T
         assert (np.abs(value - values[key]) < 4.0 * deviation + 0.05 * np.abs(values[key])).all()
+
+
+def test_laws_are_tried_with_a_known_payload():
+    rng = np.random.default_rng(3)
+    m = machine(load("five_bar"), rng, 8.0)
+    truth, _ = rubbing(m, "load-dependent")
+    payload = Load(0.4, (0.0, 0.0, 0.0))
+    effort = inverse_dynamics(payload.on(truth), m.q, m.qd, m.qdd)
+    record = replace(m.recorded(effort=effort), load=payload)
+    _, choices = fit_with_laws(m.robot, [noisy(record, rng, 0.005)], ("friction",))
+    assert [one.law for one in choices if one.taken] == ["load-dependent"]
 
 
 def test_names_of_laws():
