@@ -67,6 +67,8 @@ def beginning(tmp_path):
     return path
 
 
+# Long: stopped inside the middleware, a process can hold what others of the machine need.
+@pytest.mark.long
 def test_a_node_that_waits_for_its_turn_answers_everything(
     executor, beginning, tmp_path, monkeypatch
 ):
