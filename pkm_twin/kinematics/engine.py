@@ -105,14 +105,9 @@ class Engine(Scheme):
         """The closure that misses the most where all together miss the least, and by how much."""
         values = least_squares(x, partial(self._look, q), partial(self._moved, q), 20)
         if values is None:
-            return self._parts[0], math.inf
+            return self.parts[0], math.inf
         worst = int(np.abs(values).argmax())
-        return self._parts[worst], float(abs(values[worst])) * self.tree.size
-
-    @cached_property
-    def _parts(self) -> list[str]:
-        """The joint or rod of every closure."""
-        return [row.part for row in self.at(self.tree.home, self.graph.home)[1]]
+        return self.parts[worst], float(abs(values[worst])) * self.tree.size
 
     def shortest_pose(self, pose: Array) -> tuple[str, float, bool]:
         """The closure that misses the most where the platform is held in a pose.
@@ -135,7 +130,7 @@ class Engine(Scheme):
         values = least_squares(home, look, move, 40)
         if values is None:
             return self.graph.platform, math.inf, False
-        misses, names = np.abs(values), self._parts
+        misses, names = np.abs(values), self.parts
         if not names:
             # A serial chain: what falls short is the platform itself.
             return self.graph.platform, float(misses.max()) * self.tree.size / POSE_WEIGHT, False

@@ -9,7 +9,7 @@ has the other unknowns alone, and of each limb the distance of the two centres.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -42,23 +42,21 @@ class Limb:
     rows: tuple[int, ...]
 
 
-def find_limbs(tree: Tree, kept: Iterable[int]) -> tuple[Limb, ...]:
-    """The limbs of a tree whose closures are all among those that determine the unknowns."""
-    graph, links, kept = tree.graph, tree.links, set(kept)
+def find_limbs(tree: Tree, parts: Sequence[str], kept: Collection[int]) -> tuple[Limb, ...]:
+    """The limbs of a tree whose closures are all among those that determine the unknowns.
+
+    :param parts: the joint or rod of every closure. ``kept``: closures that determine the unknowns.
+    """
+    graph, links = tree.graph, tree.links
     ends = [(rod.inner, rod.outer) for rod in graph.rods.values()]
-    balls: dict[str, tuple[int, ...]] = {}
-    first = 0
+    ends += [(graph.joints[name].inner, graph.joints[name].outer) for name in tree.cut]
+    found: list[Limb] = []
     for name in tree.cut:
         joint = graph.joints[name]
+        rows = tuple(k for k, part in enumerate(parts) if part == name)
         kinds = [held.kind for held in joint.constraints]
-        count = sum(3 if kind == "point" else 1 for kind in kinds)
-        if kinds == ["point"] and kept.issuperset(range(first, first + 3)):
-            balls[name] = first, first + 1, first + 2
-        first += count
-        ends.append((joint.inner, joint.outer))
-    found: list[Limb] = []
-    for name, rows in balls.items():
-        joint = graph.joints[name]
+        if kinds != ["point"] or not set(rows) <= set(kept):
+            continue
         for tip, beyond in ((joint.inner, joint.outer), (joint.outer, joint.inner)):
             root = _root(links, tip)
             if root is None:
@@ -120,10 +118,8 @@ class LimbPose:
             Motion(tree, (), values, limb.bodies[1:], limb.root).point(limb.tip, at)
             for values in (q, motion.graph.home)
         )
-        self.parent = motion.rotation[self.link.parent]
-        self.centre = motion.origin[self.link.parent] + self.parent @ self.link.arm
         self.end = motion.point(limb.beyond, at)
-        self.apart = self.end - self.centre
+        self.apart = self.end - self.link.arm
 
     @property
     def steepness(self) -> Any:
@@ -136,7 +132,7 @@ class LimbPose:
 
     def _towards(self) -> Any:
         """``apart`` in axes of the first turn."""
-        return (self.parent @ self.link.steps[0].before).T @ self.apart
+        return self.link.steps[0].before.T @ self.apart
 
     def _second(self, d: Any) -> tuple[tuple[Any, Any], Any]:
         """Cosine and sine of the second turn, and the root that is zero where it is not unique."""
@@ -164,5 +160,5 @@ class LimbPose:
 
     def row(self) -> Row:
         """What the turns cannot meet: the distance of the centres is that which the limb has."""
-        start, end = (self.link.parent, self.centre), (self.limb.beyond, self.end)
+        start, end = (BASE, self.link.arm), (self.limb.beyond, self.end)
         return self.motion.distance(self.limb.ball, start, end, self.lever @ self.lever)

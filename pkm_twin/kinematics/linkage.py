@@ -118,6 +118,11 @@ class Linkage:
         pairs = [self._scaled(self.at(x, q)[1]) for x, q in self.samples]
         return np.array([a for a, _ in pairs]), np.array([b for _, b in pairs])
 
+    @cached_property
+    def parts(self) -> list[str]:
+        """The joint or rod of every closure."""
+        return [row.part for row in self.at(self.tree.home, self.graph.home)[1]]
+
     def scaled_at_home(self) -> tuple[Array, Array]:
         """Derivatives of the closures at home by u and by qd, every row and column of unit one."""
         return self._scaled(self.at(self.tree.home, self.graph.home)[1])

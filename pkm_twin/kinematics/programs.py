@@ -21,7 +21,8 @@ POSE_WEIGHT: Final = 100.0
 def walk_program(t: Traced) -> Program:
     """The closures where they do not hold, for telling why."""
     tree = t.tree
-    motion = Motion(tree, t.x, t.q)
+    x = t.tape.inputs(UNKNOWNS, len(tree.home))
+    motion = Motion(tree, x, t.q)
     rows = motion.closures()
     table, _ = matrices(tree, rows)
     move = t.tape.inputs("move", tree.unknown_rates)
@@ -34,7 +35,7 @@ def walk_program(t: Traced) -> Program:
     outputs = {
         "values": t.lift([row.scale * row.value for row in rows]),
         "table": t.lift(entries),
-        "moved": t.lift(motion.retracted(t.x, move / scales)),
+        "moved": t.lift(motion.retracted(x, move / scales)),
     }
     sizes = {UNKNOWNS: len(tree.home), "q": t.joints, "move": tree.unknown_rates}
     return Program(sizes, 0, outputs)

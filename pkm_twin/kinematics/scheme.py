@@ -91,7 +91,7 @@ class Scheme(Linkage):
     @cached_property
     def limbs(self) -> tuple[Limb, ...]:
         """Limbs whose turns follow in closed form."""
-        return find_limbs(self.tree, self.kept)
+        return find_limbs(self.tree, self.parts, self.kept)
 
     @cached_property
     def solved(self) -> tuple[list[int], list[int]]:

@@ -47,7 +47,6 @@ class Traced:
         self.more = given[end:]
         """Numbers beside the geometry's, see :meth:`.engine.Engine.kernel_with`."""
         self.tree, self.joints = Tree(self.graph), scheme.joints
-        self.x = self.tape.inputs(UNKNOWNS, len(self.tree.home))
         self.q = self.tape.inputs("q", self.joints)
 
     def solve(self) -> None:
@@ -70,7 +69,9 @@ class Traced:
         self.ju, self.jq = matrices(tree, self.rows)
         self.lu = SparseLU(self.ju[scheme.kept], scheme.pivots)
         self.solved = scheme.solved_rows(self.rows, self.limbs)
-        self.newton = SparseLU(self._table(self.solved), scheme.solved_pivots)
+        self.newton = self.lu
+        if self.limbs:
+            self.newton = SparseLU(self._table(self.solved), scheme.solved_pivots)
 
     def _table(self, solved: Sequence[Row]) -> Objects:
         """Derivatives of Newton's equations by the rates of its unknowns."""
@@ -112,8 +113,10 @@ class Traced:
         """Of all closures, over that at home: of Newton's equations and of the limbs' turns."""
         scheme, motion = self.scheme, self.home
         limbs = [LimbPose(motion, limb, self.graph.home) for limb in scheme.limbs]
-        table = self._table(scheme.solved_rows(motion.closures(), limbs))
-        lu = SparseLU(snapped_all(table), scheme.solved_pivots)
+        lu = self._at_home[2]
+        if limbs:
+            table = self._table(scheme.solved_rows(motion.closures(), limbs))
+            lu = SparseLU(snapped_all(table), scheme.solved_pivots)
         result = lu.inverse_determinant / self.newton.inverse_determinant
         for here, there in zip(self.limbs, limbs, strict=True):
             result = result * (here.steepness / there.steepness)
