@@ -52,13 +52,7 @@ def page(title: str, report: Report, more: Sequence[Table] = ()) -> str:
 
 
 def _table(table: Table) -> str:
-    shown = [k for k, column in enumerate(table.columns) if column.text is not None]
-    columns = [table.columns[k] for k in shown]
-    head = (table.head, *(column.heading for column in columns))
-    rows = [
-        (name, *(column.cell(values[k]) for k, column in zip(shown, columns, strict=True)))
-        for name, values in table.rows.items()
-    ]
+    head, *rows = table.cells
     lines = [_row("th", head), *(_row("td", row) for row in rows)]
     return f"<h2>{html.escape(table.title)}</h2>\n<table>{''.join(lines)}</table>"
 

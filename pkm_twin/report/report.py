@@ -92,6 +92,16 @@ class Table:
     head: str = ""
 
     @property
+    def cells(self) -> list[tuple[str, ...]]:
+        """Headings and rows as words, of the columns that have a text."""
+        shown = [(k, column) for k, column in enumerate(self.columns) if column.text is not None]
+        rows = self.rows.items()
+        return [
+            (self.head, *(column.heading for _, column in shown)),
+            *((name, *(c.cell(values[k]) for k, c in shown)) for name, values in rows),
+        ]
+
+    @property
     def data(self) -> dict[str, dict[str, Any]]:
         """As JSON has it."""
         return {

@@ -67,13 +67,8 @@ def _words(bound: object) -> str:
 
 def table_lines(table: Table) -> list[str]:
     """A table's title, headings and rows; columns of numbers end at the right."""
+    head, *rows = table.cells
     shown = [k for k, column in enumerate(table.columns) if column.text is not None]
-    columns = [table.columns[k] for k in shown]
-    head = (table.head, *(column.heading for column in columns))
-    rows = [
-        (name, *(column.cell(values[k]) for k, column in zip(shown, columns, strict=True)))
-        for name, values in table.rows.items()
-    ]
     words = [any(isinstance(row[k], str) for row in table.rows.values()) for k in shown]
     sides = "<" + "".join("<" if word else ">" for word in words)
     titled = [table.title] if table.title else []
