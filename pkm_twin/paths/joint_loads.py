@@ -13,15 +13,15 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-import yaml
 
 from delta_dynamics.elastic_reactions import elastic_reactions
 from pkm_twin.codegen.arrays import Array
-from pkm_twin.errors import FileError, ParameterError
+from pkm_twin.errors import ParameterError
 from pkm_twin.files import replacing
 from pkm_twin.machine import schema
 from pkm_twin.machine.graph import BASE
 from pkm_twin.paths.durability import Cycles, Life, Reversals, bearing_life, rainflow
+from pkm_twin.paths.sizing import read_entries
 from pkm_twin.recordings import Recording, by_load
 from pkm_twin.recordings.tables import WRENCH as AXES
 from pkm_twin.robot.robot import Robot
@@ -165,15 +165,8 @@ def read_bearings(path: Path, names: tuple[str, ...]) -> dict[str, BearingSpec]:
 
     :raises ParameterError: by the field; a name that no joint has.
     """
-    try:
-        data = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise FileError(path, error, "a YAML file of bearings") from None
-    entries = data.get("bearings") if isinstance(data, dict) else None
-    if not isinstance(entries, dict) or not entries:
-        raise ParameterError(str(path), None, "a mapping bearings of joints to data")
     found: dict[str, BearingSpec] = {}
-    for pattern, entry in entries.items():
+    for pattern, entry in read_entries(path, "bearings", "joints").items():
         fitting = fnmatch.filter(names, str(pattern))
         if not fitting:
             raise ParameterError(f"{path}: bearings", pattern, f"of {', '.join(names)}")

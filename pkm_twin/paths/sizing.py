@@ -167,6 +167,21 @@ def _curve(field: str, value: Any) -> Array:
     return rows
 
 
+def read_entries(path: Path, key: str, of: str) -> dict[Any, Any]:
+    """The mapping of a YAML under a key, from ``of`` to data.
+
+    :raises ParameterError: the file cannot be read or has no such mapping.
+    """
+    try:
+        data = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        raise FileError(path, error, f"a YAML file of {key}") from None
+    entries = data.get(key) if isinstance(data, dict) else None
+    if not isinstance(entries, dict) or not entries:
+        raise ParameterError(str(path), None, f"a mapping {key} of {of} to data")
+    return entries
+
+
 def read_motors(path: Path, names: Sequence[str] = ()) -> list[Motor]:
     """Motors of a YAML with a mapping ``drives`` of names to data.
 
@@ -174,13 +189,7 @@ def read_motors(path: Path, names: Sequence[str] = ()) -> list[Motor]:
     """
     if str(path) == SHIPPED:
         path = config_folder() / "drives" / "servos.yaml"
-    try:
-        data = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise FileError(path, error, "a YAML file of drives") from None
-    entries = data.get("drives") if isinstance(data, dict) else None
-    if not isinstance(entries, dict) or not entries:
-        raise ParameterError(str(path), None, "a mapping drives of names to data")
+    entries = read_entries(path, "drives", "names")
     for name in names:
         if name not in entries:
             raise UnknownNameError(f"{path}: motor", name, [str(n) for n in entries])
