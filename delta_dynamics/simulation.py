@@ -122,7 +122,7 @@ class Plant:
         return _lessened(here, end, law), span
 
     def _follow(self, here: Terms, law: Law, left: float, instant: float) -> tuple[Terms, float]:
-        """Go on under a law, until it changes or for what is left; the time that this took.
+        """Integrate under a law until it changes, at most ``left`` s; also the time that passed.
 
         :param instant: a time that is none.
         """

@@ -189,7 +189,7 @@ class McapWriter:
         self._chunk, self._entries, self._span = bytearray(), {}, Span()
 
     def finish(self) -> None:
-        """Write what is left, the summary and the closing mark."""
+        """Write the open chunk, the summary and the closing mark."""
         self.flush()
         self._write(pack(Op.DATA_END, self._crc))
         start, summary, offsets = self._position, b"", b""

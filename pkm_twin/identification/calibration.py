@@ -254,7 +254,7 @@ def unknowns(robot: Robot, measured: Measured, paths: Sequence[str], free: Free)
 
 
 def placed(robot: Robot, measured: Measured, paths: Sequence[str], frame: bool = False) -> State:
-    """The machine as it is at the measured poses, with a first guess of what is beside it."""
+    """The machine at the measured poses, with a first guess of the instrument and the target."""
     state = start_of(robot, measured.joints, paths)
     state.instrument.own = dict.fromkeys(measured.own, 0.0)
     for one in measured.readings:

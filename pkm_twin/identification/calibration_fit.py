@@ -297,8 +297,8 @@ def looks_placed(table: Array, columns: Array, target: Array) -> bool:
     """Whether another place of the instrument would explain a part of what a fit leaves.
 
     :param table: derivatives by the fitted numbers in units of their priors, (rows, p), and by the
-        instrument's place and turn, ``columns``, (rows, 6). ``target``: what is left, then what the
-        priors still ask for, (rows + p,).
+        instrument's position and rotation, ``columns``, (rows, 6). ``target``: residuals of the
+        measurements, then of the priors, (rows + p,).
     """
     p = table.shape[1]
     own = np.vstack([table, np.eye(p)])

@@ -242,7 +242,7 @@ def _determined(table: Array) -> bool:
 
 
 def _line(table: Array, values: Array) -> tuple[Array, Array]:
-    """Least squares: numbers, and their covariance by what is left."""
+    """Least squares: numbers, and their covariance from the residuals."""
     found, *_ = np.linalg.lstsq(table, values, rcond=None)
     left = values - table @ found
     freedoms = max(1, len(values) - table.shape[1])

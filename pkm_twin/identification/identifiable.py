@@ -3,8 +3,8 @@
 
 Efforts are linear in ten numbers of each body about a fixed point. About the centre of mass that
 the file has, these ten change in proportion to masses and inertias of the file, and to its centres
-times the mass; what is left, the inertia about the centre that has moved, is the parallel axis
-theorem. So the derivatives of the bodies by the file's numbers tell the parameters of any file.
+times the mass. The inertia about a centre that has moved follows by the parallel axis theorem.
+So the derivatives of the bodies by the file's numbers give the parameters of any file.
 """
 
 from __future__ import annotations

@@ -499,8 +499,8 @@ def _together(values: list[Any], absent: Any) -> Array | None:
 def graph_description(graph: Graph) -> dict[str, Any]:
     """Bodies, joints and rods of a graph.
 
-    Two rods that are taken as one are told as one: what they hold beside, a joint of the graph
-    holds already.
+    A pair of rods that the graph has as one rod is written as one: a joint of the graph has the
+    constraint that the pair adds.
     """
     data: dict[str, Any] = {
         "mechanism": "machine",

@@ -33,10 +33,10 @@ _ORDER, _WINDOW = 3, 9
 
 @dataclass(frozen=True)
 class ReadOptions:
-    """How a recording is read, as options of commands say it.
+    """How a recording is read, as options of commands give it.
 
-    ``topics``: of a bag, where names and joints do not tell. ``load``: the payload; None is the
-    one that the file tells of. ``follow``: ``joints`` or ``pose``: which columns of a table
+    ``topics``: of a bag, where names and joints do not decide. ``load``: the payload; None is the
+    one that the file names. ``follow``: ``joints`` or ``pose``: which columns of a table
     that has both are the motion; None: both, which have to agree. ``side``: whose values a
     table's joints have: of the ``joint``, the ``controller`` (joint_map) or the ``motor``
     (drive). ``wrench_frame``: of a bag's wrenches, as the node's parameter; None is the
