@@ -83,10 +83,13 @@ def test_the_page_of_commands_has_all():
     written = dict(re.findall(r"^## `pkm-twin ([\w-]+)`\n(.*?)(?=^## |\Z)", text, re.M | re.S))
     commands = get_command(app).commands
     assert set(written) == set(commands)
+    groups = re.findall(r"^\*\*(\w+ options)\*\*\n\n((?:\* .*\n)+)", text, re.M)
     for name, command in commands.items():
         inner = getattr(command, "commands", {}).values()
         options = {o for c in (command, *inner) for p in c.params for o in p.opts if o[:2] == "--"}
-        assert options <= set(re.findall(r"--[\w-]+", written[name])), name
+        told = written[name]
+        told += "".join(those for group, those in groups if re.search(group, told, re.I))
+        assert options <= set(re.findall(r"--[\w-]+", told)) | {"--json"}, name
 
 
 def anchor(title):

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import sys
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,8 @@ from pkm_twin.apps.groups import WIDE, commands
 SEVERAL = 3
 """Commands that an option has to have with one meaning to be explained once for all."""
 SHARED = "Options of several commands"
+GROUPS = {"--columns": "table", "--topic": "recording", "--picture": "picture"}
+"""An option, and the name of those that the same commands have."""
 
 
 @dataclass(frozen=True)
@@ -63,59 +65,95 @@ def page() -> str:
         for words, command in inner.items():
             for word in words_of(command):
                 users[word].append(words)
+    common = {
+        name: [w for w, those in users.items() if len(set(those) & set(inner)) > len(inner) / 2]
+        for name, inner in found.items()
+        if len(inner) > 1
+    }
     often = [word for word, those in users.items() if len(those) >= SEVERAL]
-    shared = [w for w in often if len({words.split()[0] for words in users[w]}) > 1]
+    shared = [
+        word
+        for word in often
+        if len({words.split()[0] for words in users[word]}) > 1
+        or not any(word in words for words in common.values())
+    ]
+    # One meaning a name.
+    names = [word.name for word in shared]
+    groups = Groups([word for word in shared if names.count(word.name) == 1], users)
     lines = ["# Commands", "", every.help, ""]
     for task, listed in tasks.items():
-        lines += [f"**{task}**", ""]
-        for name in listed:
-            purpose = every.commands[name].get_short_help_str(WIDE)
-            lines.append(f"* [`{name}`](#pkm-twin-{name}): {purpose}")
-        lines.append("")
+        links = ", ".join(f"[`{name}`](#pkm-twin-{name})" for name in listed)
+        lines += [f"* {task}: {links}"]
     lines += [
-        f"## {SHARED}",
         "",
-        "Every command has `--json`, which prints JSON, and `--help`.",
+        "Every command has `--json`, which prints JSON, and `--help`, which says more.",
         "",
     ]
-    lines += [*map(str, sorted(shared, key=lambda word: word.name)), ""]
+    lines += [f"## {SHARED}", ""]
+    lines += groups.lines()
     for listed in tasks.values():
         for name in listed:
-            lines += section(name, every.commands[name], found[name], often, shared)
+            own = [word for word in common.get(name, ()) if word not in groups.shared]
+            lines += section(name, every.commands[name], found[name], own, groups)
     return "\n".join(lines).rstrip() + "\n"
 
 
+class Groups:
+    """Options that are explained once; some of them under one name."""
+
+    def __init__(self, shared: Sequence[Word], users: Mapping[Word, Sequence[str]]) -> None:
+        self.shared = sorted(shared, key=lambda word: word.name)
+        named = {word.name: word for word in shared}
+        self.groups = {
+            name: [word for word in self.shared if users[word] == users[named[one]]]
+            for one, name in GROUPS.items()
+        }
+
+    def lines(self) -> list[str]:
+        """Explanations, the groups after the others."""
+        alone = [w for w in self.shared if not any(w in words for words in self.groups.values())]
+        lines = [*map(str, alone), ""]
+        for name, words in self.groups.items():
+            lines += [f"**{name.capitalize()} options**", "", *map(str, words), ""]
+        return lines
+
+    def named(self, there: Sequence[Word]) -> list[str]:
+        """The line of a command that has some of them."""
+        names = []
+        for word in [word for word in self.shared if word in there]:
+            group = [name for name, words in self.groups.items() if word in words]
+            name = f"{group[0]} options" if group else f"`{word.name}`"
+            if name not in names and word.name[0] == "-":
+                names.append(name)
+        return [f"Also {', '.join(names)}.", ""] if names else []
+
+
 def section(
-    name: str, command: Any, inner: dict[str, Any], often: Sequence[Word], shared: Sequence[Word]
+    name: str, command: Any, inner: dict[str, Any], own: Sequence[Word], groups: Groups
 ) -> list[str]:
     """A command, or the commands of a group after what they have in common."""
-    lines, own, alone = [f"## `pkm-twin {name}`", ""], set[Word](), command in inner.values()
+    lines, alone = [f"## `pkm-twin {name}`", ""], command in inner.values()
     if not alone:
         within = [word for one in inner.values() for word in words_of(one)]
-        most = len(inner) / 2
-        common = [w for w in often if within.count(w) > most and w not in shared]
-        own = set(common)
-        lines += [command.help, "", *map(str, common), *([""] if common else [])]
-        lines += [by_name(shared, within), ""]
+        often = [word for word in within if within.count(word) > len(inner) / 2]
+        lines += [first(command.help), "", *map(str, own), *([""] if own else [])]
+        lines += groups.named(often)
     for words, one in inner.items():
         every = words_of(one)
         group = commands().declared(name)
         typed = words if alone else f"{name} {group.shown(words.split()[-1])}"
         usage = " ".join(w.name for w in every if w.argument and w.name not in typed.split())
-        lines += [] if alone else [f"### `pkm-twin {words}`", ""]
-        lines += [one.help, "", "```console", f"$ pkm-twin {typed} [OPTIONS] {usage}".rstrip()]
-        lines += ["```", ""]
-        told = [str(word) for word in every if word not in shared and word not in own]
-        lines += [*told, ""] if told else []
-        lines += [by_name(shared, every), ""] if alone else []
+        lines += [f"`{f'pkm-twin {typed} {usage}'.rstrip()}`: {first(one.help)}", ""]
+        told = [word for word in every if word not in own and word not in groups.shared]
+        lines += [*map(str, told), ""] if told else []
+        lines += groups.named([word for word in every if alone or word not in often])
     return lines
 
 
-def by_name(shared: Sequence[Word], there: Sequence[Word]) -> str:
-    """The options that are explained once, by name."""
-    found = [f"`{word.name}`" for word in shared if word in there]
-    link = f"[options of several commands](#{SHARED.lower().replace(' ', '-')})"
-    return f"And of the {link}: {', '.join([*found, '`--json`'])}."
+def first(text: str) -> str:
+    """What help says first, and what exit codes mean."""
+    parts = text.split("\n\n")
+    return "\n\n".join([parts[0], *(p for p in parts[1:] if p.startswith("Exit code"))])
 
 
 if __name__ == "__main__":
