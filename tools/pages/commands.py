@@ -13,7 +13,7 @@ from typing import Any
 from typer.main import get_command
 
 from pkm_twin.apps.cli import app
-from pkm_twin.apps.groups import WIDE, commands
+from pkm_twin.apps.groups import commands
 
 SEVERAL = 3
 """Commands that an option has to have with one meaning to be explained once for all."""
