@@ -3,7 +3,7 @@ from glob import glob
 from pathlib import Path
 from xml.etree import ElementTree
 
-from setuptools import setup
+from setuptools import find_packages, setup
 
 NAME = "pkm_twin"
 # ROS tools read it there, so it is the only place.
@@ -18,33 +18,8 @@ setup(
     maintainer="pkm_twin maintainers",
     python_requires=">=3.11",
     packages=[
-        "pkm_twin",
-        "pkm_twin.apps",
-        "pkm_twin.certify",
-        "pkm_twin.apps.commands",
-        "pkm_twin.view",
-        "pkm_twin.maps",
-        "pkm_twin.maps.kinds",
-        "pkm_twin.bags",
-        "pkm_twin.codegen",
+        *find_packages(include=["pkm_twin*", "delta_dynamics*", "stiffness_monitor*"]),
         "pkm_twin.config",
-        "pkm_twin.demo",
-        "pkm_twin.design",
-        "pkm_twin.export",
-        "pkm_twin.identification",
-        "pkm_twin.kinematics",
-        "pkm_twin.machine",
-        "pkm_twin.mechanisms",
-        "pkm_twin.messages",
-        "pkm_twin.paths",
-        "pkm_twin.recordings",
-        "pkm_twin.report",
-        "pkm_twin.robot",
-        "pkm_twin.ros",
-        "pkm_twin.state",
-        "pkm_twin.streams",
-        "delta_dynamics",
-        "stiffness_monitor",
     ],
     # The parameter files stand at the top for people and inside the package for load().
     package_dir={"pkm_twin.config": "config"},

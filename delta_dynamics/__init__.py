@@ -1,12 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """Rigid-body dynamics of parallel kinematic machines."""
 
-from delta_dynamics.base_parameters import BaseParameters, base_parameters
-from delta_dynamics.contact import Contact, ContactMonitor
-from delta_dynamics.derivatives import TorqueDerivatives, torque_derivatives, torque_gradient
-from delta_dynamics.elastic_reactions import elastic_reactions
-from delta_dynamics.isolation import ContactPlace
-from delta_dynamics.isotropy import (
+from delta_dynamics.estimates.contact import Contact, ContactMonitor
+from delta_dynamics.estimates.isolation import ContactPlace
+from delta_dynamics.estimates.observer import MomentumObserver, platform_wrench
+from delta_dynamics.estimates.payload import PayloadEstimate, PayloadEstimator
+from delta_dynamics.torques.base_parameters import BaseParameters, base_parameters
+from delta_dynamics.torques.derivatives import (
+    TorqueDerivatives,
+    torque_derivatives,
+    torque_gradient,
+)
+from delta_dynamics.torques.elastic_reactions import elastic_reactions
+from delta_dynamics.torques.isotropy import (
     Extremes,
     JointMotion,
     energy_matrices,
@@ -19,18 +25,16 @@ from delta_dynamics.isotropy import (
     spread,
     tilted_pose,
 )
-from delta_dynamics.observer import MomentumObserver, platform_wrench
-from delta_dynamics.payload import PayloadEstimate, PayloadEstimator
-from delta_dynamics.reactions import Reactions, least_norm_reactions, reactions
-from delta_dynamics.regressor import (
+from delta_dynamics.torques.reactions import Reactions, least_norm_reactions, reactions
+from delta_dynamics.torques.regressor import (
     parameter_names,
     parameter_units,
     parameter_values,
     regressor,
 )
-from delta_dynamics.terms import Terms, dynamics_terms
-from delta_dynamics.uncertainty import torque_deviation
-from delta_dynamics.virtual_work import (
+from delta_dynamics.torques.torque_terms import Terms, dynamics_terms
+from delta_dynamics.torques.uncertainty import torque_deviation
+from delta_dynamics.torques.virtual_work import (
     Energy,
     energy,
     forward_dynamics,

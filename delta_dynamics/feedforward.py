@@ -11,9 +11,9 @@ from typing import Any, Final, NamedTuple, TypeVar, cast
 
 import numpy as np
 
-from delta_dynamics.rest import friction_reach, moving_rates
 from delta_dynamics.settings import LimitPolicy, Settings
-from delta_dynamics.virtual_work import inverse_dynamics
+from delta_dynamics.torques.stiction import friction_reach, moving_rates
+from delta_dynamics.torques.virtual_work import inverse_dynamics
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import MessageError
 from pkm_twin.machine.joint_map import ControllerNumbers

@@ -12,7 +12,7 @@ from typing import Any, Final, Literal
 
 import numpy as np
 
-from delta_dynamics.virtual_work import inverse_dynamics
+from delta_dynamics.torques.virtual_work import inverse_dynamics
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import MessageError, PkmTwinError
 from pkm_twin.machine.joint_map import ControllerNumbers

@@ -35,7 +35,7 @@ from launch.launch_description_entity import LaunchDescriptionEntity
 from launch.launch_description_sources import PythonLaunchDescriptionSource
 from launch_ros.actions import Node
 
-from delta_dynamics.simulation import tuned
+from delta_dynamics.simulation.machine import tuned
 from launch import LaunchDescription
 from pkm_twin import Robot, load
 from pkm_twin.errors import PkmTwinError

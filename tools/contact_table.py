@@ -18,7 +18,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from delta_dynamics import ContactMonitor
-from delta_dynamics.isolation import CLAMPING, PLATFORM, UNKNOWN
+from delta_dynamics.estimates.isolation import CLAMPING, PLATFORM, UNKNOWN
 from pkm_twin import Robot
 from test.laws.contacts import Stream, Strike, measured, moves, pushed, strike
 from test.support.robots import load
@@ -249,7 +249,7 @@ class, the body, and the standard deviation of the place along it. In Python:
 ```python
 import numpy as np
 from pkm_twin import load
-from delta_dynamics.isolation import ContactLocator
+from delta_dynamics.estimates.isolation import ContactLocator
 
 robot = load("delta_cu")
 q = robot.inverse(robot.home())

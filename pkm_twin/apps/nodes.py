@@ -14,11 +14,11 @@ from pkm_twin.ros.arguments import answer
 from pkm_twin.ros.signals import leave_at_once
 
 MODULES = {
-    "delta_dynamics": "delta_dynamics.node",
-    "command_gate": "delta_dynamics.gate_node",
+    "delta_dynamics": "delta_dynamics.nodes.twin",
+    "command_gate": "delta_dynamics.nodes.gate",
     "stiffness_monitor": "stiffness_monitor.node",
     "machine_state": "pkm_twin.state.node",
-    "machine_sim": "delta_dynamics.sim_node",
+    "machine_sim": "delta_dynamics.nodes.simulation",
 }
 SUMMARIES = {
     "delta_dynamics": "Computes feedforward torques from trajectories and joint states.",

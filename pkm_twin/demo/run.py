@@ -80,7 +80,7 @@ DYNAMICS_OUTPUTS = {
 STAGES = (
     Stage(
         "delta_cu_pick_and_place",
-        "delta_dynamics.node",
+        "delta_dynamics.nodes.twin",
         ("mechanism:=delta_cu", PATIENT),
         (JOINTS, "/delta_dynamics/joint_trajectory"),
         DYNAMICS_OUTPUTS,
@@ -89,7 +89,7 @@ STAGES = (
     ),
     Stage(
         "prru_milling",
-        "delta_dynamics.node",
+        "delta_dynamics.nodes.twin",
         ("mechanism:=prru", "use_wrench:=true", PATIENT),
         (JOINTS, "/wrench", "/delta_dynamics/joint_trajectory"),
         DYNAMICS_OUTPUTS,

@@ -93,9 +93,9 @@ def run(
     reset = node.create_client(Trigger, "/machine_sim/reset")
     module = [sys.executable, "-m"]
     # Trajectories alone are asked of the twin.
-    asked = [*module, "delta_dynamics.node", "--ros-args", "-p", f"mechanism:={ROBOT}"]
+    asked = [*module, "delta_dynamics.nodes.twin", "--ros-args", "-p", f"mechanism:={ROBOT}"]
     asked += ["-r", "joint_states:=/delta_dynamics/joint_states"]
-    moved = [*module, "delta_dynamics.sim_node", "--ros-args", "-p", f"mechanism:={ROBOT}"]
+    moved = [*module, "delta_dynamics.nodes.simulation", "--ros-args", "-p", f"mechanism:={ROBOT}"]
     moved += ["-p", "clock:=simulated", "-p", f"period:={PERIOD}"]
     # A loaded computer catches up in bursts.
     moved += ["-p", f"spread:={spread}", "-p", f"{QUEUE}:={DEPTH}"]

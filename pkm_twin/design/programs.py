@@ -9,10 +9,10 @@ from typing import Protocol
 
 import numpy as np
 
-from delta_dynamics.derivatives import motion_gradient, numbers_gradient
-from delta_dynamics.reactions import loads_kernel
-from delta_dynamics.virtual_work import masses_kernel
-from delta_dynamics.virtual_work import torques as torques_kernel
+from delta_dynamics.torques.derivatives import motion_gradient, numbers_gradient
+from delta_dynamics.torques.reactions import loads_kernel
+from delta_dynamics.torques.virtual_work import masses_kernel
+from delta_dynamics.torques.virtual_work import torques as torques_kernel
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.codegen.kernels import Kernel
 from pkm_twin.kinematics.gradients import free_forward, platform_gradient, pose_motion_gradient

@@ -19,7 +19,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from delta_dynamics.reactions import BALANCE_BOUND, Reactions, balanced, known_alone
+from delta_dynamics.torques.reactions import BALANCE_BOUND, Reactions, balanced, known_alone
 from pkm_twin.codegen.arrays import Array, doubles
 from pkm_twin.codegen.code import Code
 from pkm_twin.codegen.kernels import MISSED, Kernel

@@ -10,8 +10,13 @@ from typing import Any, Final
 
 import numpy as np
 
-from delta_dynamics.equations import motion_kernel
-from delta_dynamics.virtual_work import accelerations, inverse_dynamics, masses_kernel, torques
+from delta_dynamics.torques.equations import motion_kernel
+from delta_dynamics.torques.virtual_work import (
+    accelerations,
+    inverse_dynamics,
+    masses_kernel,
+    torques,
+)
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.codegen.expressions import GEOMETRY, PARAMETERS, Expression, edge
 from pkm_twin.codegen.kernels import Kernel
@@ -65,7 +70,7 @@ class Package:
     """A robot's header, source and the files beside them.
 
     :param names: of the functions, without ``terms`` all of them by default. ``terms``: those of
-        :class:`delta_dynamics.equations.Terms`, side by side.
+        :class:`delta_dynamics.torques.equations.Terms`, side by side.
     """
 
     def __init__(self, robot: Robot, names: Collection[str] = ()) -> None:

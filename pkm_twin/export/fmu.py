@@ -15,7 +15,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
-from delta_dynamics.virtual_work import MASSLESS
+from delta_dynamics.torques.virtual_work import MASSLESS
 from pkm_twin.errors import ParameterError
 from pkm_twin.export.c99 import table
 from pkm_twin.export.c_package import Package

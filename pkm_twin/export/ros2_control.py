@@ -19,7 +19,7 @@ from xml.sax.saxutils import escape
 import numpy as np
 import yaml
 
-from delta_dynamics.simulation import tuned
+from delta_dynamics.simulation.machine import tuned
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import check_limit
 from pkm_twin.export.c_package import c_package, identifier

@@ -12,8 +12,8 @@ from typing import Final
 
 import numpy as np
 
-from delta_dynamics.rest import beyond_friction, friction_reach, moving_rates
-from delta_dynamics.virtual_work import inverse_dynamics
+from delta_dynamics.torques.stiction import beyond_friction, friction_reach, moving_rates
+from delta_dynamics.torques.virtual_work import inverse_dynamics
 from pkm_twin.codegen.arrays import Array, Mask
 from pkm_twin.identification.judge import LOUD
 from pkm_twin.identification.noise import SEGMENT, huber, noise_of, passed_band, usual_size

@@ -12,8 +12,8 @@ from typing import Any, Final, Literal
 
 import numpy as np
 
-from delta_dynamics.regressor import TEN, parameter_names
-from delta_dynamics.virtual_work import mass_matrix
+from delta_dynamics.torques.regressor import TEN, parameter_names
+from delta_dynamics.torques.virtual_work import mass_matrix
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import PkmTwinError, UnknownNameError
 from pkm_twin.identification.identifiable import KINDS, Identifiable, Kind, identifiable

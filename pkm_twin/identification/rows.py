@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 import scipy  # type: ignore[import-untyped]  # its parts come when they are asked for
 
-from delta_dynamics.regressor import law_columns, law_keys, parameter_values, regressor
+from delta_dynamics.torques.regressor import law_columns, law_keys, parameter_values, regressor
 from pkm_twin.codegen.arrays import Array, Mask
 from pkm_twin.errors import PkmTwinError
 from pkm_twin.identification.estimation import estimate

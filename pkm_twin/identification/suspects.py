@@ -15,7 +15,7 @@ from typing import Final
 
 import numpy as np
 
-from delta_dynamics.derivatives import numbers_slopes, torques_by_numbers
+from delta_dynamics.torques.derivatives import numbers_slopes, torques_by_numbers
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError
 from pkm_twin.identification.judge import Suspect

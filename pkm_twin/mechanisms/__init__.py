@@ -15,6 +15,6 @@ class TwinRobot(Robot):
     def torque_loop(self, samples: int = 1) -> ControlLoop:
         """As :meth:`Robot.torque_loop`."""
         # Here: a command that needs no torques does not load them.
-        from delta_dynamics.virtual_work import TorqueLoop
+        from delta_dynamics.torques.virtual_work import TorqueLoop
 
         return TorqueLoop(self, samples)

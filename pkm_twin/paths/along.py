@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 
 from delta_dynamics import dynamics_terms, inverse_dynamics, reactions, torque_deviation
-from delta_dynamics.rest import friction_reach, moving_rates
+from delta_dynamics.torques.stiction import friction_reach, moving_rates
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError, PkmTwinError, SingularityError, UnreachableError
 from pkm_twin.recordings.payload import by_load, payload_columns

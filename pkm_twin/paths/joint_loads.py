@@ -14,7 +14,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from delta_dynamics.elastic_reactions import elastic_reactions
+from delta_dynamics.torques.elastic_reactions import elastic_reactions
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError
 from pkm_twin.files import replacing

@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 
 from delta_dynamics import inverse_dynamics
-from delta_dynamics.isotropy import sphere_directions
+from delta_dynamics.torques.isotropy import sphere_directions
 from pkm_twin.codegen.arrays import Array, Mask
 from pkm_twin.errors import ParameterError
 from pkm_twin.robot.robot import Robot

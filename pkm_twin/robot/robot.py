@@ -404,7 +404,7 @@ class Robot(Mechanism):
         """Inverse dynamics for a control loop, with preallocated arrays.
 
         Write ``q, qd, qdd, wrench``, call it, and read ``tau`` and the returned status; see
-        :class:`delta_dynamics.virtual_work.TorqueLoop`.
+        :class:`delta_dynamics.torques.virtual_work.TorqueLoop`.
         """
         raise NotImplementedError
 

@@ -75,7 +75,7 @@ def measure():
     from trajectory_msgs.msg import JointTrajectory
 
     from delta_dynamics import feedforward
-    from delta_dynamics.node import DeltaDynamics
+    from delta_dynamics.nodes.twin import DeltaDynamics
     from pkm_twin.messages.intake import RawTrajectory
     from pkm_twin.threads import one_blas_thread
 

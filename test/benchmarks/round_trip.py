@@ -18,7 +18,7 @@ PATIENCE = 0.02
 """How long an answer is waited for, s: the node's window fills, or the machine is elsewhere."""
 DEPTH = 1000
 """Of the client's subscriptions: what is lost is not lost here."""
-TWIN = ["-m", "delta_dynamics.node", "--ros-args", "-p", "mechanism:=delta_cu"]
+TWIN = ["-m", "delta_dynamics.nodes.twin", "--ros-args", "-p", "mechanism:=delta_cu"]
 
 
 def start(domain, name, command):

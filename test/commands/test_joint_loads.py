@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from delta_dynamics import elastic_reactions, least_norm_reactions, reactions
-from delta_dynamics.elastic_reactions import reaction_energies
-from delta_dynamics.reactions import balance
+from delta_dynamics.torques.elastic_reactions import reaction_energies
+from delta_dynamics.torques.reactions import balance
 from pkm_twin.paths.durability import Reversals, bearing_life, rainflow, turning_points
 from stiffness_monitor import platform_response
 from test.support.command import command

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from delta_dynamics.virtual_work import torques
+from delta_dynamics.torques.virtual_work import torques
 from pkm_twin import load, robot_names
 from pkm_twin.export.c_package import c_package
 from test.export.c_programs import Package

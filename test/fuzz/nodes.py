@@ -62,9 +62,9 @@ class Fuzzed:
             return launch(module, *parameters, arguments=(*words, "-r", f"__node:={name}"))
 
         self.nodes = {
-            "feeding": node("delta_dynamics.node", "feeding", *QUICK),
+            "feeding": node("delta_dynamics.nodes.twin", "feeding", *QUICK),
             "watching": node("stiffness_monitor.node", "watching", "mechanism:=delta_cu"),
-            "gating": node("delta_dynamics.gate_node", "gating", "use_sim_time:=true"),
+            "gating": node("delta_dynamics.nodes.gate", "gating", "use_sim_time:=true"),
         }
         kinds = {
             "/fuzz/states": (JointState, JOINT_STATE, self.source.joint_state),

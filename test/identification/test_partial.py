@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from delta_dynamics import inverse_dynamics
-from delta_dynamics.regressor import parameter_values, regressor
+from delta_dynamics.torques.regressor import parameter_values, regressor
 from pkm_twin import Robot
 from pkm_twin.identification.calibration import (
     Free,

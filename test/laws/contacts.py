@@ -9,8 +9,14 @@ from functools import lru_cache
 import numpy as np
 
 from delta_dynamics import ContactMonitor, inverse_dynamics
-from delta_dynamics.isolation import CLAMPING, PLATFORM, joined_bodies, limbs_of
-from delta_dynamics.regressor import PAYLOAD, TEN, parameter_names, parameter_values, regressor
+from delta_dynamics.estimates.isolation import CLAMPING, PLATFORM, joined_bodies, limbs_of
+from delta_dynamics.torques.regressor import (
+    PAYLOAD,
+    TEN,
+    parameter_names,
+    parameter_values,
+    regressor,
+)
 from pkm_twin import Robot
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.machine.graph import BASE

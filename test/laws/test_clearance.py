@@ -11,7 +11,7 @@ import pytest
 import yaml
 from scipy.optimize import lsq_linear
 
-from delta_dynamics.isotropy import tilted_pose
+from delta_dynamics.torques.isotropy import tilted_pose
 from pkm_twin.errors import ParameterError
 from pkm_twin.maps.search import workspace_box
 from pkm_twin.robot.clearance import clearance, distance, has_clearance

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from delta_dynamics import ContactMonitor, inverse_dynamics
-from delta_dynamics.isolation import (
+from delta_dynamics.estimates.isolation import (
     CLAMPING,
     PLATFORM,
     UNKNOWN,

@@ -22,7 +22,7 @@ from delta_dynamics import (
     spread,
     tilted_pose,
 )
-from delta_dynamics.isotropy import largest, least_direction
+from delta_dynamics.torques.isotropy import largest, least_direction
 from pkm_twin.errors import ParameterError, SingularityError
 from test.support import robots
 from test.support.robots import load, loaded, loaded_like, partly_long, random_joints

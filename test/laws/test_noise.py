@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from delta_dynamics.uncertainty import AVERAGED, Noise
+from delta_dynamics.torques.uncertainty import AVERAGED, Noise
 
 STEP = 1e-3
 

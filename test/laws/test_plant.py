@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from delta_dynamics import energy, inverse_dynamics, mass_matrix
-from delta_dynamics.complementarity import resisting
-from delta_dynamics.equations import Equations
-from delta_dynamics.simulation import Plant
+from delta_dynamics.simulation.complementarity import resisting
+from delta_dynamics.simulation.machine import Plant
+from delta_dynamics.torques.equations import Equations
 from pkm_twin.errors import PkmTwinError
 from pkm_twin.machine.inertia import loaded_joints
 from pkm_twin.robot.catalogue import robot_of_data

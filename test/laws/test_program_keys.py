@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from delta_dynamics.reactions import loads_kernel
-from delta_dynamics.virtual_work import torques
+from delta_dynamics.torques.reactions import loads_kernel
+from delta_dynamics.torques.virtual_work import torques
 from pkm_twin.codegen import key as keys
 from pkm_twin.codegen.key import EMPTY
 from stiffness_monitor.derivatives import compliance_gradient
@@ -95,11 +95,11 @@ def test_keys_follow_the_sources_that_write_a_program(tmp_path, monkeypatch, for
         assert changed(f"pkm_twin/{source}") == set(found)
     assert changed("pkm_twin/machine/joints.py") == set(found)
     assert changed("pkm_twin/mechanisms/delta.py") == set(found)
-    assert changed("delta_dynamics/virtual_work.py") == rigid
+    assert changed("delta_dynamics/torques/virtual_work.py") == rigid
     assert changed("stiffness_monitor/frame.py") == elastic
     for source in ("apps/cli.py", "apps/fit.py", "ros/node.py", "mechanisms/prru.py"):
         assert not changed(f"pkm_twin/{source}")
-    for source in ("delta_dynamics/node.py", "stiffness_monitor/node.py"):
+    for source in ("delta_dynamics/nodes/twin.py", "stiffness_monitor/node.py"):
         assert not changed(source)
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from delta_dynamics import inverse_dynamics, least_norm_reactions, reactions
-from delta_dynamics.reactions import loads_kernel, transmitters
+from delta_dynamics.torques.reactions import loads_kernel, transmitters
 from pkm_twin.errors import SingularityError
 from test.support.bodies import bodies, rubs
 from test.support.robots import (

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from delta_dynamics import inverse_dynamics, mass_matrix, torque_deviation
-from delta_dynamics.derivatives import torque_effects
-from delta_dynamics.uncertainty import effort_parts
+from delta_dynamics.torques.derivatives import torque_effects
+from delta_dynamics.torques.uncertainty import effort_parts
 from pkm_twin import Robot, variants
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.design.variants import Variants

@@ -237,9 +237,9 @@ def renamed(name, **topics):
 
 
 NODES = (
-    "delta_dynamics.node",
-    "delta_dynamics.gate_node",
-    "delta_dynamics.sim_node",
+    "delta_dynamics.nodes.twin",
+    "delta_dynamics.nodes.gate",
+    "delta_dynamics.nodes.simulation",
     "pkm_twin.state.node",
     "stiffness_monitor.node",
 )

@@ -14,7 +14,7 @@ import os
 import signal
 import time
 import numpy as np
-import delta_dynamics.node as node
+import delta_dynamics.nodes.twin as node
 from delta_dynamics import feedforward
 solve = feedforward.inverse_dynamics
 def late(robot, q, *rest):

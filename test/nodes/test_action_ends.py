@@ -165,8 +165,8 @@ def action(monkeypatch):
     module.FollowJointTrajectory = kind
     monkeypatch.setitem(sys.modules, "control_msgs", ModuleType("control_msgs"))
     monkeypatch.setitem(sys.modules, "control_msgs.action", module)
-    monkeypatch.delitem(sys.modules, "delta_dynamics.action_node", raising=False)
-    code = importlib.import_module("delta_dynamics.action_node")
+    monkeypatch.delitem(sys.modules, "delta_dynamics.nodes.action", raising=False)
+    code = importlib.import_module("delta_dynamics.nodes.action")
     monkeypatch.setattr(code, "ActionClient", Controller)
     monkeypatch.setattr(code, "ActionServer", lambda *_, **__: None)
     node = Node()
@@ -181,7 +181,7 @@ def action(monkeypatch):
     made.served = code.EffortAction(node, "/controller", efforts, lambda: made.place, True)
     made.controller = made.served._client
     yield made
-    sys.modules.pop("delta_dynamics.action_node", None)
+    sys.modules.pop("delta_dynamics.nodes.action", None)
 
 
 @pytest.mark.parametrize("answered", [False, True])

@@ -29,7 +29,7 @@ from std_msgs.msg import Float64MultiArray
 
 from test.nodes.twin import NAMES, ROBOT, Q, launched, state
 
-GATE = "delta_dynamics.gate_node"
+GATE = "delta_dynamics.nodes.gate"
 DEADLINE = 1.0
 """Longer than a loaded machine keeps a process waiting."""
 SETTINGS = (f"deadline:={DEADLINE}", "recovery_count:=2")

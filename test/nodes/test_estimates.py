@@ -17,8 +17,8 @@ from geometry_msgs.msg import InertiaStamped, PointStamped, WrenchStamped
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool, String
 
-from delta_dynamics.estimates_node import Estimates
 from delta_dynamics.feedforward import Torques
+from delta_dynamics.nodes.estimates import Estimates
 from pkm_twin.robot.catalogue import robot_of_data
 from test.support.robots import often, parameters_of
 
@@ -67,7 +67,7 @@ class Swing:
 
 
 def test_a_load_and_a_push_are_told(peer, launch):
-    launch("delta_dynamics.node", *PARAMETERS)
+    launch("delta_dynamics.nodes.twin", *PARAMETERS)
     peer.talk(JointState, "/joint_states", 1000)
     for topic, kind in OUTPUTS.items():
         peer.hear(kind, topic)
@@ -213,7 +213,7 @@ def test_a_file_that_says_nothing_of_its_efforts_is_warned_of():
     assert estimates.diagnose()["model uncertainty"] == "robot file"
 
 
-MODULE = "delta_dynamics.node"
+MODULE = "delta_dynamics.nodes.twin"
 Q = np.array([0.2, 0.3, 0.1])
 NAME = "reacting"
 
@@ -252,7 +252,7 @@ def test_every_joint_has_its_wrench_where_asked_for(peer, launch):
 
 
 SINGULAR = """
-import delta_dynamics.node as node
+import delta_dynamics.nodes.twin as node
 from pkm_twin.errors import SingularityError
 solve = node.reactions
 def singular(robot, q, *rest):
@@ -299,7 +299,7 @@ def test_torque_residual_and_stop(peer, launch):
     remap = ("joint_states:=/bearing/states", "wrench:=/bearing/wrench", "__node:=bearing")
     arguments = [word for pair in remap for word in ("-r", pair)]
     process = launch(
-        "delta_dynamics.node", "mechanism:=prru", "use_wrench:=true", "no_wrench:=stop",
+        "delta_dynamics.nodes.twin", "mechanism:=prru", "use_wrench:=true", "no_wrench:=stop",
         "max_wrench_age:=1.0", "stale_after:=5.0", "differentiator.window:=4", "recovery_count:=1",
         arguments=arguments,
     )  # fmt: skip

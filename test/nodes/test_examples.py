@@ -18,7 +18,7 @@ from test.support.mapped import sides
 from test.support.robots import load, parameters_of
 
 EXAMPLES = REPOSITORY / "examples"
-SIM = "delta_dynamics.sim_node"
+SIM = "delta_dynamics.nodes.simulation"
 ROBOT = load("delta_cu")
 PATIENCE = 120.0
 SIM_TIME = "use_sim_time:=true"
@@ -37,7 +37,7 @@ def twin_and_machine(launch):
     """Both nodes, until the module's end."""
     return (
         launch(SIM, "clock:=simulated", "real_time_factor:=5.0"),
-        launch("delta_dynamics.node"),
+        launch("delta_dynamics.nodes.twin"),
     )
 
 

@@ -8,6 +8,7 @@ numbers, and the same robot with a map on the controller's.
 from __future__ import annotations
 
 import ast
+import re
 from types import SimpleNamespace
 
 import numpy as np
@@ -16,9 +17,9 @@ import pytest
 from delta_dynamics import inverse_dynamics
 from delta_dynamics.feedforward import Feedforward
 from delta_dynamics.gate import Gate, GateSettings, effort_limits
+from delta_dynamics.nodes.topics import GATE, SIMULATION, TWIN
 from delta_dynamics.settings import Settings
-from delta_dynamics.simulation import MachineSettings, Simulation, tuned
-from delta_dynamics.topics import GATE, SIMULATION, TWIN
+from delta_dynamics.simulation.machine import MachineSettings, Simulation, tuned
 from pkm_twin.errors import MessageError
 from pkm_twin.messages.reading import JointReader
 from pkm_twin.messages.stamps import StampRules
@@ -288,7 +289,7 @@ def test_what_a_wrench_does(name):
 LEAVES = (JOINTS, TRAJECTORY, NUMBERS)
 """Messages that can carry joint numbers."""
 OTHERS = {
-    ("delta_dynamics/node.py", "~/joint_trajectory_ff"): "bytes, filled with ControllerNumbers",
+    ("delta_dynamics/nodes/twin.py", "~/joint_trajectory_ff"): "filled with ControllerNumbers",
     ("pkm_twin/state/node.py", "~/joint_states"): "joints of the URDF, which are the model's",
     ("stiffness_monitor/node.py", "~/compliance"): "no joints",
     ("stiffness_monitor/node.py", "~/compliance_stamped"): "no joints",
@@ -309,7 +310,8 @@ def test_joint_numbers_leave_through_the_publishers_that_ask_for_converted_ones(
     for package, own in tables.items():
         rows = [row for table in own for row in table.values()]
         topics = {row.name for row in rows if row.way == "out" and row.kind in LEAVES}
-        for path in (REPOSITORY / package).rglob("*node.py"):
+        paths = (REPOSITORY / package).rglob("*.py")
+        for path in (p for p in paths if re.search(r"node.py|nodes/(?!topics)", str(p))):
             tree = ast.parse(path.read_text(encoding="utf-8"))
             calls = [node for node in ast.walk(tree) if isinstance(node, ast.Call)]
             left = {

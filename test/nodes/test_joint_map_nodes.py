@@ -46,14 +46,14 @@ def cell(request, tmp_path_factory, peer, launch):
         peer.received(topic).clear()
     nodes = {
         "sim": launch(
-            "delta_dynamics.sim_node", robot, "period:=0.01",
+            "delta_dynamics.nodes.simulation", robot, "period:=0.01",
             arguments=("-r", "wrench:=/sim/wrench"),
         ),
         "twin": launch(
-            "delta_dynamics.node", robot, "differentiator.window:=4", "publish_commands:=true",
-            "on_stop:=gravity", f"stale_after:={LONG}",
+            "delta_dynamics.nodes.twin", robot, "differentiator.window:=4",
+            "publish_commands:=true", "on_stop:=gravity", f"stale_after:={LONG}",
         ),
-        "gate": launch("delta_dynamics.gate_node", robot, "on_stop:=gravity", "deadline:=600.0"),
+        "gate": launch("delta_dynamics.nodes.gate", robot, "on_stop:=gravity", "deadline:=600.0"),
         "state": launch("pkm_twin.state.node", robot, "publish_tf:=none"),
         "stiffness": launch(
             "stiffness_monitor.node", robot, "correct_setpoint:=true", "correction_bound:=1.0",

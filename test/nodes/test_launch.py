@@ -32,13 +32,13 @@ from test.support.robots import load
 LAUNCH = REPOSITORY / "launch"
 FILES = ("twin", "cell", "control", "view")
 NODES = {
-    "delta_dynamics": "delta_dynamics/node.py",
+    "delta_dynamics": "delta_dynamics/nodes/twin.py",
     "stiffness_monitor": "stiffness_monitor/node.py",
-    "command_gate": "delta_dynamics/gate_node.py",
+    "command_gate": "delta_dynamics/nodes/gate.py",
     "machine_state": "pkm_twin/state/node.py",
 }
 SHARED = (
-    "pkm_twin/ros/wrench.py", "pkm_twin/streams/wrench.py", "delta_dynamics/parameters_node.py",
+    "pkm_twin/ros/wrench.py", "pkm_twin/streams/wrench.py", "delta_dynamics/nodes/parameters.py",
     "delta_dynamics/settings.py",
 )  # fmt: skip
 """Where nodes declare what they share, and what their settings are."""

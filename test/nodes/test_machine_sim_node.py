@@ -17,13 +17,13 @@ from std_msgs.msg import Float64MultiArray
 from trajectory_msgs.msg import JointTrajectory
 
 from delta_dynamics import inverse_dynamics
-from delta_dynamics.sim_node import LOOK
-from delta_dynamics.simulation import MachineSettings, Simulation, WrenchSignal, tuned
+from delta_dynamics.nodes.simulation import LOOK
+from delta_dynamics.simulation.machine import MachineSettings, Simulation, WrenchSignal, tuned
 from pkm_twin.robot.variation import varied
 from test.nodes.harness import SECOND, counts_of, stamp_of
 from test.support.robots import load
 
-MODULE = "delta_dynamics.sim_node"
+MODULE = "delta_dynamics.nodes.simulation"
 ROBOT = load("delta_cu")
 HOME = ROBOT.inverse(ROBOT.home())
 KINDS = ("masses", "inertias")

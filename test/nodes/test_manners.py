@@ -103,7 +103,7 @@ def test_no_node_starts_with_a_parameter_whose_change_nothing_follows(launch):
 
 LATE = """
 from functools import cached_property
-import delta_dynamics.node as node
+import delta_dynamics.nodes.twin as node
 from pkm_twin.codegen.code import Code
 start, load = node.DeltaDynamics.start, Code.__dict__["_loaded"].func
 def late(code):

@@ -68,7 +68,7 @@ class TestProcess:
         code = f"""
 import os, time
 import numpy as np
-import delta_dynamics.node as node
+import delta_dynamics.nodes.twin as node
 original = node.DeltaDynamics.{callback}
 def interrupted(self, *arguments):
     os.kill(os.getpid(), {int(number)})
@@ -89,7 +89,7 @@ raise SystemExit(node.run(node.NODE))
 
     def test_an_exception_in_a_callback_stops_the_stream_and_not_the_node(self, peer, launch):
         code = """
-import delta_dynamics.node as node
+import delta_dynamics.nodes.twin as node
 solve = node.Feedforward._joint_state
 def broken(self, message, now):
     if message.position[0] == 0.125:
@@ -269,7 +269,7 @@ def test_requests_that_are_too_long_do_not_add_up(launch_alone, peer, monkeypatc
     if freed:
         monkeypatch.setenv("RMW_FASTRTPS_USE_QOS_FROM_XML", "1")
         monkeypatch.setenv("FASTRTPS_DEFAULT_PROFILES_FILE", str(PROFILE))
-    node = launch_alone("delta_dynamics.node", fresh=True)
+    node = launch_alone("delta_dynamics.nodes.twin", fresh=True)
     service = "/delta_dynamics/get_parameters"
     few = GetParameters.Request(names=["payload.mass"])
     assert len(peer.call(GetParameters, service, few).values) == 1
@@ -302,7 +302,7 @@ def locked(pid):
 
 
 def test_all_threads_are_real_time_and_memory_stays_or_the_node_warns(peer, launch_alone):
-    process = launch_alone("delta_dynamics.gate_node", f"thread_priority:={PRIORITY}", fresh=True)
+    process = launch_alone("delta_dynamics.nodes.gate", f"thread_priority:={PRIORITY}", fresh=True)
     peer.hear(DiagnosticArray, "/diagnostics")
     status = peer.diagnostics("/command_gate").status[0]
     warnings = [status.message, *(v.value for v in status.values if v.key == "other problems")]
@@ -314,7 +314,7 @@ def test_all_threads_are_real_time_and_memory_stays_or_the_node_warns(peer, laun
 
 
 def test_without_the_parameter_nothing_is_changed(peer, launch_alone):
-    process = launch_alone("delta_dynamics.gate_node", fresh=True)
+    process = launch_alone("delta_dynamics.nodes.gate", fresh=True)
     peer.hear(DiagnosticArray, "/diagnostics")
     peer.diagnostics("/command_gate")
     assert policies(process.process.pid) == {(os.SCHED_OTHER, 0)}

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from delta_dynamics import inverse_dynamics, mass_matrix
-from delta_dynamics.simulation import (
+from delta_dynamics.simulation.machine import (
     MachineSettings,
     PayloadEvent,
     Simulation,

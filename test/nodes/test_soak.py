@@ -44,10 +44,10 @@ def start(launch):
         return launch(module, *parameters, arguments=flags)
 
     return {
-        "feeding": node("delta_dynamics.node", "feeding", f"stale_after:={STALE}"),
+        "feeding": node("delta_dynamics.nodes.twin", "feeding", f"stale_after:={STALE}"),
         "watching": node("stiffness_monitor.node", "watching", "max_state_age:=1.0"),
-        "looping": node("delta_dynamics.node", "looping", "use_sim_time:=true"),
-        "gating": node("delta_dynamics.gate_node", "gating", f"deadline:={STALE}"),
+        "looping": node("delta_dynamics.nodes.twin", "looping", "use_sim_time:=true"),
+        "gating": node("delta_dynamics.nodes.gate", "gating", f"deadline:={STALE}"),
     }
 
 

@@ -20,7 +20,7 @@ def test_a_running_nodes_torques_and_residuals_are_heard(domain, peer, launch, m
     robot = load("delta_cu")
     monkeypatch.setenv("ROS_DOMAIN_ID", str(domain.number))
     node = launch(
-        "delta_dynamics.node",
+        "delta_dynamics.nodes.twin",
         "mechanism:=delta_cu",
         "acceleration:=differentiate",
         "differentiator.window:=4",

@@ -12,7 +12,7 @@ from trajectory_msgs.msg import JointTrajectory
 from test.nodes.harness import SECOND, Maker, Ros, renamed, stamp_of, values_of
 from test.support.robots import load
 
-MODULE = "delta_dynamics.node"
+MODULE = "delta_dynamics.nodes.twin"
 ROBOT = load("delta_cu")
 NAMES = ROBOT.joint_names
 STEP = SECOND // 1000

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import ast
+import re
 from functools import cache
 from pathlib import Path
 
@@ -57,7 +58,7 @@ def room(module: str) -> str:
     """The folder that a module belongs to; nodes apart from theirs, as pkm_twin's own modules."""
     first, *rest = module.split(".")
     if first != "pkm_twin":
-        return f"{first}.node" if rest and rest[0].endswith("node") else first
+        return f"{first}.node" if rest and re.search("nodes?$", rest[0]) else first
     if not rest or not (ROOT / first / rest[0]).is_dir():
         return module
     folder = f"{first}.{rest[0]}"

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from delta_dynamics import inverse_dynamics
-from delta_dynamics.virtual_work import energy
+from delta_dynamics.torques.virtual_work import energy
 from test.support.robots import partly_long
 
 pytest.importorskip("mpmath")

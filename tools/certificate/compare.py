@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from delta_dynamics import inverse_dynamics
-from delta_dynamics.reactions import reactions
-from delta_dynamics.virtual_work import energy
+from delta_dynamics.torques.reactions import reactions
+from delta_dynamics.torques.virtual_work import energy
 from tools.certificate.lagrange_machines import energies
 from tools.certificate.machines import Case, friction, random_case
 from tools.certificate.mujoco_models import tree

@@ -20,7 +20,7 @@ from bags.recording.pinocchio_delta import DeltaEngine
 from bags.recording.pinocchio_loops import LoopEngine
 from bags.recording.pinocchio_prru import PrruEngine
 from delta_dynamics import inverse_dynamics
-from delta_dynamics.virtual_work import forward_dynamics
+from delta_dynamics.torques.virtual_work import forward_dynamics
 from pkm_twin import Robot
 from test.support.robots import parameters_of
 from tools.certificate.lagrange_machines import energies

@@ -6,7 +6,7 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from delta_dynamics.virtual_work import torques
+from delta_dynamics.torques.virtual_work import torques
 from pkm_twin import load, robot_names
 
 

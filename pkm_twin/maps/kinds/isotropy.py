@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from delta_dynamics.isotropy import ENERGY, driving_force_peak, energy_transfer_range
+from delta_dynamics.torques.isotropy import ENERGY, driving_force_peak, energy_transfer_range
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError
 from pkm_twin.maps.kind import Case, Found, Kind

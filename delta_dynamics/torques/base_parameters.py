@@ -15,7 +15,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from delta_dynamics.regressor import (
+from delta_dynamics.torques.regressor import (
     DRIVE,
     PAYLOAD,
     TEN,

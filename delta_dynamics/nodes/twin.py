@@ -14,12 +14,12 @@ from geometry_msgs.msg import WrenchStamped
 from rclpy.duration import Duration
 from rclpy.time import Time
 
-from delta_dynamics.estimates_node import Estimates
 from delta_dynamics.feedforward import Feedforward, Torques, warm_up
-from delta_dynamics.parameters_node import CHANGES, changed, declare_changes
-from delta_dynamics.reactions import reactions
+from delta_dynamics.nodes.estimates import Estimates
+from delta_dynamics.nodes.parameters import CHANGES, changed, declare_changes
+from delta_dynamics.nodes.topics import TWIN
 from delta_dynamics.settings import Settings
-from delta_dynamics.topics import TWIN
+from delta_dynamics.torques.reactions import reactions
 from pkm_twin.errors import MessageError, ParameterError, PkmTwinError
 from pkm_twin.messages.intake import JointStateView, RawTrajectory
 from pkm_twin.messages.stamps import SECOND
@@ -227,7 +227,7 @@ class DeltaDynamics(TwinNode):
         if not controller:
             return None
         try:
-            from delta_dynamics.action_node import EffortAction
+            from delta_dynamics.nodes.action import EffortAction
         except ImportError as error:
             raise ParameterError(
                 "controller_action", controller, f"empty without control_msgs ({error})"

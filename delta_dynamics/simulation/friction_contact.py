@@ -13,9 +13,9 @@ from typing import Final
 import numpy as np
 from scipy.linalg.lapack import dposv  # type: ignore[import-untyped]
 
-from delta_dynamics.complementarity import States, first_fall, independent, resisting
-from delta_dynamics.equations import Equations, Terms
-from delta_dynamics.exponential import Stepper, damped, undamped
+from delta_dynamics.simulation.complementarity import States, first_fall, independent, resisting
+from delta_dynamics.simulation.exponential_integrator import Stepper, damped, undamped
+from delta_dynamics.torques.equations import Equations, Terms
 from pkm_twin.codegen.arrays import Array, Indices, Mask
 from pkm_twin.machine.friction import bounds, friction_values, parts, potential
 from pkm_twin.machine.inertia import loaded_joints

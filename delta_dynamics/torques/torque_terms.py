@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from delta_dynamics.virtual_work import torques
+from delta_dynamics.torques.virtual_work import torques
 from pkm_twin.codegen.arrays import Array, Indices, vectors
 from pkm_twin.machine.inertia import GRAVITY, Layout
 from pkm_twin.robot.robot import Robot

@@ -14,9 +14,9 @@ import numpy as np
 from rclpy.duration import Duration
 
 from delta_dynamics.gate import Gate, GateSettings
-from delta_dynamics.parameters_node import changed, declare_changes
-from delta_dynamics.topics import GATE
-from delta_dynamics.virtual_work import inverse_dynamics
+from delta_dynamics.nodes.parameters import changed, declare_changes
+from delta_dynamics.nodes.topics import GATE
+from delta_dynamics.torques.virtual_work import inverse_dynamics
 from pkm_twin.errors import MessageError
 from pkm_twin.machine.joint_map import ControllerNumbers
 from pkm_twin.messages.intake import JointStateView

@@ -19,9 +19,9 @@ from typing import Any, Final, Literal
 
 import numpy as np
 
-from delta_dynamics.equations import Terms
-from delta_dynamics.resistance import Law, Resistance
-from delta_dynamics.virtual_work import mass_matrix
+from delta_dynamics.simulation.friction_contact import Law, Resistance
+from delta_dynamics.torques.equations import Terms
+from delta_dynamics.torques.virtual_work import mass_matrix
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import MessageError, ParameterError, PkmTwinError
 from pkm_twin.messages.reading import MAX_RATE, JointReader, as_message_error, read_wrench

@@ -15,11 +15,11 @@ from rclpy.time import Time
 from std_msgs.msg import Bool, String
 from std_srvs.srv import Trigger
 
-from delta_dynamics.contact import SIGMAS, Contact, ContactMonitor
+from delta_dynamics.estimates.contact import SIGMAS, Contact, ContactMonitor
+from delta_dynamics.estimates.isolation import ContactPlace
+from delta_dynamics.estimates.payload import PayloadEstimator
 from delta_dynamics.feedforward import Torques
-from delta_dynamics.isolation import ContactPlace
-from delta_dynamics.payload import PayloadEstimator
-from delta_dynamics.uncertainty import FRICTION, MASSES
+from delta_dynamics.torques.uncertainty import FRICTION, MASSES
 from pkm_twin.messages.stamps import SECOND
 from pkm_twin.robot.robot import Robot
 from pkm_twin.ros.joints import JointPublisher

@@ -18,14 +18,14 @@ from std_msgs.msg import Float64MultiArray
 
 from delta_dynamics.feedforward import warm_up
 from delta_dynamics.gate import effort_limits
-from delta_dynamics.simulation import (
+from delta_dynamics.nodes.topics import SIMULATION
+from delta_dynamics.simulation.machine import (
     MachineSettings,
     PayloadEvent,
     Simulation,
     WrenchSignal,
     tuned,
 )
-from delta_dynamics.topics import SIMULATION
 from pkm_twin.bags.definitions import message_definition
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import MessageError, ParameterError, short

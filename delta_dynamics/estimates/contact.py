@@ -10,10 +10,10 @@ from typing import Any, Final
 
 import numpy as np
 
-from delta_dynamics.isolation import ContactLocator, ContactPlace
-from delta_dynamics.observer import MomentumObserver, platform_wrench
-from delta_dynamics.rest import LoadShare, friction_reach, moving_rates
-from delta_dynamics.uncertainty import (
+from delta_dynamics.estimates.isolation import ContactLocator, ContactPlace
+from delta_dynamics.estimates.observer import MomentumObserver, platform_wrench
+from delta_dynamics.torques.stiction import LoadShare, friction_reach, moving_rates
+from delta_dynamics.torques.uncertainty import (
     AVERAGED,
     EffortParts,
     Noise,
@@ -22,7 +22,7 @@ from delta_dynamics.uncertainty import (
     torque_deviation,
     usual_effort,
 )
-from delta_dynamics.virtual_work import mass_matrix
+from delta_dynamics.torques.virtual_work import mass_matrix
 from pkm_twin.codegen.arrays import Array, later, one_vector
 from pkm_twin.messages.stamps import SECOND
 from pkm_twin.robot.robot import Robot
@@ -110,10 +110,10 @@ class ContactMonitor:
     """The momentum observer with a contact bound from the uncertainty of the model and its input.
 
     The bound is ``sigmas`` standard deviations: those of the model's efforts, from the robot's file
-    or :meth:`~delta_dynamics.uncertainty.EffortParts.default_deviation`, and the noise of the
-    estimate without contact. Friction at rest (:class:`Drag`) and the effect of the rates'
-    uncertainty on the momentum are added. All parts except the noise pass the observer's low-pass
-    filter, so that the bound has the same delay as the estimate.
+    or :meth:`.EffortParts.default_deviation`, and the noise of the estimate without contact.
+    Friction at rest (:class:`Drag`) and the effect of the rates' uncertainty on the momentum are
+    added. All parts except the noise pass the observer's low-pass filter, so that the bound has the
+    same delay as the estimate.
     """
 
     def __init__(self, robot: Robot, bandwidth: float = 60.0, sigmas: float = SIGMAS) -> None:

@@ -11,7 +11,7 @@ from typing import Final
 
 import numpy as np
 
-from delta_dynamics.virtual_work import inverse_dynamics
+from delta_dynamics.torques.virtual_work import inverse_dynamics
 from pkm_twin.codegen.arrays import Array, Mask
 from pkm_twin.machine.friction import LoadDependent, friction_values, load_of, parts
 from pkm_twin.robot.robot import Robot

@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from delta_dynamics.virtual_work import torque_program
+from delta_dynamics.torques.virtual_work import torque_program
 from pkm_twin.codegen.arrays import Array, doubles, vectors
 from pkm_twin.codegen.expressions import PARAMETERS
 from pkm_twin.codegen.kernels import Kernel

@@ -8,8 +8,8 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from delta_dynamics.derivatives import torque_effects
-from delta_dynamics.virtual_work import inverse_dynamics, mass_matrix
+from delta_dynamics.torques.derivatives import torque_effects
+from delta_dynamics.torques.virtual_work import inverse_dynamics, mass_matrix
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.robot.robot import Robot
 

@@ -10,10 +10,10 @@ from typing import Final
 
 import numpy as np
 
-from delta_dynamics.regressor import PAYLOAD, parameter_names, regressor
-from delta_dynamics.rest import LoadShare, beyond_friction, friction_reach, moving_rates
-from delta_dynamics.uncertainty import Noise
-from delta_dynamics.virtual_work import inverse_dynamics
+from delta_dynamics.torques.regressor import PAYLOAD, parameter_names, regressor
+from delta_dynamics.torques.stiction import LoadShare, beyond_friction, friction_reach, moving_rates
+from delta_dynamics.torques.uncertainty import Noise
+from delta_dynamics.torques.virtual_work import inverse_dynamics
 from pkm_twin.codegen.arrays import Array, later, one_vector
 from pkm_twin.messages.stamps import SECOND
 from pkm_twin.robot.robot import Robot
@@ -59,10 +59,9 @@ class PayloadEstimate:
 class PayloadEstimator:
     """Recursive least squares on measured minus computed efforts, without inertia of the payload.
 
-    Efforts are linear in mass and first moments (:mod:`delta_dynamics.regressor`). A sample is
-    weighted by its time span, at most the correlation time of the errors, and its weight decays
-    slowly. A jump in the residual means that the load has changed: it resets the estimate, but not
-    the noise.
+    Efforts are linear in mass and first moments (:func:`.regressor`). A sample is weighted
+    by its time span, at most the correlation time of the errors, and its weight decays slowly. A
+    jump in the residual means that the load has changed: it resets the estimate, but not the noise.
 
     A joint with Coulomb friction at rest gives its effort only within the friction, once per stop.
     While the drives are off or braked, efforts contain no information.

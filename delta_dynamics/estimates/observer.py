@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from delta_dynamics.virtual_work import inverse_dynamics, mass_matrix
+from delta_dynamics.torques.virtual_work import inverse_dynamics, mass_matrix
 from pkm_twin.codegen.arrays import Array, finite, later, one_vector, vectors
 from pkm_twin.robot.robot import Robot
 

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from delta_dynamics.virtual_work import Forces, begun, mass_entries, potential
+from delta_dynamics.torques.virtual_work import Forces, begun, mass_entries, potential
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.codegen.kernels import Kernel
 from pkm_twin.codegen.program import Program

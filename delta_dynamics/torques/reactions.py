@@ -14,7 +14,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from delta_dynamics.virtual_work import Forces
+from delta_dynamics.torques.virtual_work import Forces
 from pkm_twin.codegen.arrays import Array, Mask, finite
 from pkm_twin.codegen.expressions import PARAMETERS
 from pkm_twin.codegen.kernels import Kernel

@@ -14,7 +14,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from delta_dynamics.reactions import Balance, Reactions, balance, known_alone
+from delta_dynamics.torques.reactions import Balance, Reactions, balance, known_alone
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError
 from pkm_twin.kinematics.motion import reaction_directions
@@ -32,7 +32,7 @@ _GAUSS: Final = np.polynomial.legendre.leggauss(3)
 def elastic_reactions(
     robot: Robot, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, wrench: ArrayLike | None = None
 ) -> Reactions:
-    """As :func:`~delta_dynamics.reactions.reactions`, indeterminate parts by the elastic model.
+    """As :func:`~delta_dynamics.reactions`, indeterminate parts by the elastic model.
 
     What stores no energy in members or joints stays NaN, as all that is indeterminate of a robot
     without elastic members. Not resolved are rods that stand for a pair.

@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Rigid-body torques, their parts, derivatives and reactions."""
