@@ -1,9 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Rigid-body dynamics of parallel kinematic machines."""
 
-from delta_dynamics.estimates.contact import Contact, ContactMonitor
+from delta_dynamics.estimates.contact import (
+    Contact,
+    ContactMonitor,
+    MomentumObserver,
+    platform_wrench,
+)
 from delta_dynamics.estimates.isolation import ContactPlace
-from delta_dynamics.estimates.observer import MomentumObserver, platform_wrench
 from delta_dynamics.estimates.payload import PayloadEstimate, PayloadEstimator
 from delta_dynamics.torques.base_parameters import BaseParameters, base_parameters
 from delta_dynamics.torques.derivatives import (

@@ -25,8 +25,8 @@ from launch.launch_context import LaunchContext
 from launch.launch_description_entity import LaunchDescriptionEntity
 from launch_ros.actions import Node
 
+from delta_dynamics.feedforward import Settings
 from delta_dynamics.gate import GateSettings
-from delta_dynamics.settings import Settings
 from launch import LaunchDescription
 from pkm_twin import load
 from pkm_twin.errors import PkmTwinError

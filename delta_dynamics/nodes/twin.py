@@ -14,11 +14,10 @@ from geometry_msgs.msg import WrenchStamped
 from rclpy.duration import Duration
 from rclpy.time import Time
 
-from delta_dynamics.feedforward import Feedforward, Torques, warm_up
+from delta_dynamics.feedforward import Feedforward, Settings, Torques, warm_up
 from delta_dynamics.nodes.estimates import Estimates
 from delta_dynamics.nodes.parameters import CHANGES, changed, declare_changes
 from delta_dynamics.nodes.topics import TWIN
-from delta_dynamics.settings import Settings
 from delta_dynamics.torques.reactions import reactions
 from pkm_twin.errors import MessageError, ParameterError, PkmTwinError
 from pkm_twin.messages.intake import JointStateView, RawTrajectory

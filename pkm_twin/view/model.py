@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from delta_dynamics import inverse_dynamics
-from delta_dynamics.settings import Settings
+from delta_dynamics.feedforward import Settings
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError, PkmTwinError, one_line
 from pkm_twin.robot.clearance import has_clearance, joint_clearance

@@ -18,9 +18,8 @@ from typing import Any
 import numpy as np
 
 from delta_dynamics import inverse_dynamics
-from delta_dynamics.feedforward import Feedforward
+from delta_dynamics.feedforward import Feedforward, Settings
 from delta_dynamics.gate import Gate, GateSettings
-from delta_dynamics.settings import Settings
 from pkm_twin import load
 from pkm_twin.bags.cdr import MessageCodec
 from pkm_twin.bags.definitions import message_definition

@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from delta_dynamics import inverse_dynamics
-from delta_dynamics.feedforward import Feedforward
-from delta_dynamics.settings import Settings
+from delta_dynamics.feedforward import Feedforward, Settings
 from delta_dynamics.torques.stiction import beyond_friction, friction_reach, moving_rates
 from pkm_twin import Robot
 from pkm_twin.codegen.arrays import Array

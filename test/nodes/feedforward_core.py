@@ -5,8 +5,7 @@ from itertools import permutations
 
 import numpy as np
 
-from delta_dynamics.feedforward import Feedforward
-from delta_dynamics.settings import Settings
+from delta_dynamics.feedforward import Feedforward, Settings
 from test.nodes.harness import SECOND
 from test.support.robots import load
 

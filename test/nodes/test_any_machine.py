@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from delta_dynamics import inverse_dynamics
-from delta_dynamics.feedforward import Feedforward
-from delta_dynamics.settings import Settings
+from delta_dynamics.feedforward import Feedforward, Settings
 from test.nodes.harness import REPOSITORY, SECOND, Maker, Plain
 from test.support.robots import load, partly_long
 

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from delta_dynamics import inverse_dynamics
-from delta_dynamics.feedforward import Feedforward
-from delta_dynamics.settings import Settings
+from delta_dynamics.feedforward import Feedforward, Settings
 from test.nodes.harness import SECOND, counts_of, silence_of, stamp_of, values_of
 
 pytest.importorskip("rclpy", exc_type=ImportError)

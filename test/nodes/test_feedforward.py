@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from delta_dynamics import feedforward, inverse_dynamics
-from delta_dynamics.feedforward import SLICE
-from delta_dynamics.settings import Settings
+from delta_dynamics.feedforward import SLICE, Settings
 from pkm_twin.errors import ParameterError, SingularityError
 from test.nodes.feedforward_core import (
     NAMES,

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import HealthCheck, assume, event, example, given, settings
 from hypothesis import strategies as st
 
-from delta_dynamics.settings import Settings
+from delta_dynamics.feedforward import Settings
 from pkm_twin.errors import MessageError, ParameterError
 from test.nodes.feedforward_core import (
     NAMES,

@@ -15,10 +15,9 @@ import numpy as np
 import pytest
 
 from delta_dynamics import inverse_dynamics
-from delta_dynamics.feedforward import Feedforward
+from delta_dynamics.feedforward import Feedforward, Settings
 from delta_dynamics.gate import Gate, GateSettings, effort_limits
 from delta_dynamics.nodes.topics import GATE, SIMULATION, TWIN
-from delta_dynamics.settings import Settings
 from delta_dynamics.simulation.machine import MachineSettings, Simulation, tuned
 from pkm_twin.errors import MessageError
 from pkm_twin.messages.reading import JointReader

@@ -39,7 +39,7 @@ NODES = {
 }
 SHARED = (
     "pkm_twin/ros/wrench.py", "pkm_twin/streams/wrench.py", "delta_dynamics/nodes/parameters.py",
-    "delta_dynamics/settings.py",
+    "delta_dynamics/feedforward.py",
 )  # fmt: skip
 """Where nodes declare what they share, and what their settings are."""
 

@@ -6,8 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from delta_dynamics.feedforward import Feedforward
-from delta_dynamics.settings import Settings
+from delta_dynamics.feedforward import Feedforward, Settings
 from pkm_twin.streams.monitor import Pace, TopicStatistics
 from pkm_twin.streams.rates import RateAgreement
 from test.nodes.harness import SECOND

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from delta_dynamics import inverse_dynamics
-from delta_dynamics.feedforward import Feedforward
-from delta_dynamics.settings import Settings
+from delta_dynamics.feedforward import Feedforward, Settings
 from pkm_twin.bags.reader import read_messages
 from pkm_twin.errors import MessageError, ParameterError
 from pkm_twin.machine import rotations
