@@ -43,6 +43,8 @@ from pkm_twin.identification.calibration_state import (
     Instrument,
     Poses,
     State,
+    Transmission,
+    numbers,
     place_frame,
     start_of,
 )
@@ -54,7 +56,6 @@ from pkm_twin.identification.measurements import (
     whole_of,
 )
 from pkm_twin.identification.parameters import OBSERVED
-from pkm_twin.identification.transmission import Transmission, numbers
 from pkm_twin.identification.undetermined import undetermined
 from pkm_twin.machine.joint_map import JointMap
 from pkm_twin.robot.derivatives import geometry_numbers

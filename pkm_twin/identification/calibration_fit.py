@@ -22,8 +22,8 @@ from pkm_twin.identification.calibration_state import (
     value_of,
 )
 from pkm_twin.identification.measurements import Measured, Readings, Weights
-from pkm_twin.identification.noise import OUTLIER
 from pkm_twin.identification.parameters import OBSERVED
+from pkm_twin.identification.samples import OUTLIER
 from pkm_twin.robot.robot import Robot
 
 STEPS: Final = 60

@@ -7,6 +7,7 @@ Nothing is fitted but how late the efforts are against the positions, as in a fi
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -15,22 +16,29 @@ import numpy as np
 from delta_dynamics.torques.stiction import beyond_friction, friction_reach, moving_rates
 from delta_dynamics.torques.virtual_work import inverse_dynamics
 from pkm_twin.codegen.arrays import Array, Mask
+from pkm_twin.errors import PkmTwinError
 from pkm_twin.identification.judge import LOUD
-from pkm_twin.identification.noise import SEGMENT, huber, noise_of, passed_band, usual_size
 from pkm_twin.identification.plausible import LATEST
 from pkm_twin.identification.rows import BLOCK, shaken_efforts
 from pkm_twin.identification.samples import (
+    SEGMENT,
     Filtering,
     Motion,
     Track,
     by_blocks,
     filtered,
+    huber,
     kept_rows,
+    noise_of,
+    passed_band,
     tracks,
+    usual_size,
 )
-from pkm_twin.recordings import Recording
+from pkm_twin.recordings import Recording, at_rest
 from pkm_twin.robot.robot import Robot
+from pkm_twin.streams.drives import idle_samples
 from pkm_twin.streams.rates import rms
+from pkm_twin.streams.steps import Steps, steps_of
 
 MAX_RESIDUAL: Final = 0.05
 """Largest good torque residual RMS, part of the joint's peak effort."""
@@ -44,6 +52,12 @@ MORE: Final = 3.0
 """And how many times the bound of the whole recording it may be there."""
 LIGHT: Final = 0.05
 """Part of the greatest peak effort of its unit that a joint's peak is taken for at least."""
+NEAR: Final = 0.5
+"""Around a pick or release the payload is neither held nor gone, s."""
+SHOWN: Final = 4
+"""Jumps that are listed."""
+CLEAR: Final = 4
+"""Samples on each side of a jump that are left out: a gap that divides the recording."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -213,3 +227,75 @@ def _late(left: Array, change: Array) -> float:
         late = float(np.clip(-np.sum(weight * left * change) / total, -LATEST, LATEST))
     # At the bound it is another error's.
     return late if abs(late) < LATEST else 0.0
+
+
+def steps_in(r: Recording) -> Steps:
+    """The steps by the measured velocities, or by the positions alone if these do not jump."""
+    limit = r.robot.limits.velocity
+    steps = steps_of(r.time, r.q, r.qd, limit)
+    if r.qd is None or not steps.jumps.any():
+        return steps
+    alone = steps_of(r.time, r.q, None, limit)
+    # What jumps by wrong velocities only is not the positions' fault.
+    return steps if alone.jumps.any() else alone
+
+
+def step_fault(r: Recording, steps: Steps | None = None) -> str:
+    """Jumps of the positions with their times; empty where there are none."""
+    steps = steps_in(r) if steps is None else steps
+    found = steps.first
+    if steps.publishers:
+        counts = " and ".join(map(str, steps.publishers))
+        jump = f"{len(found)} of {len(r.time) - 1} steps jump"
+        return f"two publishers interleaved, {counts} samples: {jump}"
+    texts = [
+        f"{r.robot.joint_names[j]} by {steps.sizes[k, j]:.3g} {r.robot.joint_units[j]} at "
+        f"{r.time[k + 1]:.3f} s"
+        for k, j in found[:SHOWN]
+    ]
+    more = f" and {len(found) - SHOWN} more" if len(found) > SHOWN else ""
+    return f"{len(found)} jumps: {', '.join(texts)}{more}" if found else ""
+
+
+def near_jumps(steps: Steps, count: int) -> Mask:
+    """Samples so near to a jump that no derivative holds there, shape (count,)."""
+    found = np.zeros(count, np.bool_)
+    for k in np.flatnonzero(steps.jumps.any(1)):
+        found[max(k - CLEAR, 0) : k + CLEAR + 2] = True
+    return found
+
+
+def recorded_of(r: Recording, leave_out: Mask | None = None) -> Recording:
+    """A recording without samples around a pick or release, near steps, and of idle drives.
+
+    :param leave_out: the latter two, (samples,), where they are known. A gap divides the recording.
+    """
+    if leave_out is None:
+        leave_out = near_jumps(steps_in(r), len(r.time))
+        # Currents are not compared with efforts, and what has no state is the fit's to reject.
+        with suppress(PkmTwinError, ValueError):
+            leave_out |= idle_of(r) & (r.efforts != "current")
+        # Where nothing would be left, the efforts themselves are the fault.
+        leave_out &= not leave_out.all()
+    keep = ~leave_out
+    return r.part(keep if r.load is None else keep & ~r.load.near_change(r.time, NEAR))
+
+
+def compared_of(r: Recording, idle: Mask, bound: float = MAX_RESIDUAL) -> Compared | None:
+    """The efforts in the band of the motion, without samples whose drives are idle."""
+    part = recorded_of(r, idle)
+    return None if len(part.time) < 3 else compare(r.robot, part, bound)
+
+
+def idle_of(r: Recording) -> Mask:
+    """Samples whose efforts are zero, or constant at standstill, against the model, (samples,)."""
+    assert r.effort is not None  # noqa: S101
+    still = np.zeros_like(r.q)
+    wrench = np.zeros((len(r.time), 6)) if r.wrench is None else r.wrench
+    held = np.zeros(len(r.time)) if r.held is None else r.held
+    motion = Motion(r.q, still, still, wrench, held)
+    needed = by_held(r.robot, r.carried, inverse_dynamics, motion)
+    rates = r.qd
+    if rates is None:
+        rates = np.gradient(r.q, r.time, axis=0) if len(r.time) > 1 else still
+    return idle_samples(r.time, at_rest(r, rates), r.effort, needed)

@@ -18,7 +18,7 @@ import numpy as np
 
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import PkmTwinError, install
-from pkm_twin.identification.noise import huber
+from pkm_twin.identification.samples import huber
 
 Cones = Sequence[tuple[slice, Array]]
 

@@ -9,13 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Final
 
 import numpy as np
 
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import PkmTwinError
 from pkm_twin.identification.estimation import Estimate, nearest, possible
-from pkm_twin.identification.fit_verdict import verdict_of
 from pkm_twin.identification.identifiable import KINDS, Kind
 from pkm_twin.identification.judge import Verdict
 from pkm_twin.identification.parameters import (
@@ -24,11 +24,16 @@ from pkm_twin.identification.parameters import (
     Status,
     numbers_of_group,
 )
-from pkm_twin.identification.problem import Problem
-from pkm_twin.identification.rows import next_window
-from pkm_twin.identification.samples import Filtering
+from pkm_twin.identification.plausible import recording_fault
+from pkm_twin.identification.rows import Problem, next_window
+from pkm_twin.identification.samples import EXACT, Filtering
+from pkm_twin.identification.suspects import verdict_of
 from pkm_twin.recordings import Recording
 from pkm_twin.robot.robot import Robot
+
+WORSE: Final = 1.2
+"""Held-out residual of a joint over that of the file's values that a machine like the file's does
+not leave."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,10 +131,10 @@ def fit(
         cannot have made.
     """
     problem = Problem.of(robot, recordings, what, progress=progress)
-    faults = problem.faults()
+    faults = faults_of(problem)
     refuse_faults(faults, accept)
     problem.check_count()
-    faults = faults or problem.worse()
+    faults = faults or _worse(problem)
     refuse_faults(faults, accept)
     return fitted(problem, tuple(faults), progress)
 
@@ -173,6 +178,30 @@ def fitted(
         numbers=tuple(numbers), judged=tuple(judged), verdict=verdict, accepted=accepted,
         samples=sum(made.held_from for made in problem.rows),
     )  # fmt: skip
+
+
+def faults_of(problem: Problem) -> list[str]:
+    """Recordings that this machine cannot have made, in words."""
+    found = ((made.recording.name, recording_fault(made)) for made in problem.whole)
+    return [f"{name}: {fault}" for name, fault in found if fault is not None]
+
+
+def _worse(problem: Problem) -> list[str]:
+    """Recordings whose held-out part the fitted values predict worse than the file's."""
+    robot, told = problem.robot, []
+    for made in problem.rows:
+        end, values = made.held_out, (problem.parameters.values, problem.estimate.values)
+        old, new = (
+            np.sqrt(np.mean(end.counts * (end.target - end.table @ v) ** 2, 0)) for v in values
+        )
+        j = int(np.argmax(new / np.maximum(old, 1e-300)))
+        if new[j] > WORSE * old[j] and new[j] > EXACT * np.std(end.effort[:, j]):
+            told.append(
+                f"{made.recording.name}: the fitted values leave {new[j]:.3g} "
+                f"{robot.effort_units[j]} of the held-out efforts of {robot.joint_names[j]}, the "
+                f"file's {old[j]:.3g} (another machine, or a motion that is too short or changes?)"
+            )
+    return told
 
 
 def refuse_faults(faults: Sequence[str], accept: bool) -> None:

@@ -17,16 +17,14 @@ import numpy as np
 
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError, PkmTwinError, UnknownNameError
-from pkm_twin.identification.check import recorded_of, step_fault
+from pkm_twin.identification.compare import recorded_of, step_fault
 from pkm_twin.identification.drives import FIT, fitted_constants, given_constants
 from pkm_twin.identification.fit import Fit, fit, fitted, refuse_faults
 from pkm_twin.identification.identifiable import KINDS, Kind, of_drives
 from pkm_twin.identification.judge import SIGMAS
-from pkm_twin.identification.noise import EXACT
 from pkm_twin.identification.parameters import Number
-from pkm_twin.identification.problem import Problem
-from pkm_twin.identification.rows import Rows
-from pkm_twin.identification.samples import Track, filtered
+from pkm_twin.identification.rows import Problem, Rows
+from pkm_twin.identification.samples import EXACT, Track, filtered
 from pkm_twin.identification.suspects import RESONANCE
 from pkm_twin.machine.friction import BASIC, LAWS, taken
 from pkm_twin.recordings import Recording

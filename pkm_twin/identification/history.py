@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import FileError, PkmTwinError
-from pkm_twin.identification.check import compared_of, idle_of
+from pkm_twin.identification.compare import compared_of, idle_of
 from pkm_twin.identification.friction_laws import fit_recordings
 from pkm_twin.recordings import ReadOptions, Recording, read
 from pkm_twin.robot.plausibility import why_no_torques

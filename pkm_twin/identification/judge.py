@@ -27,7 +27,7 @@ import numpy as np
 
 from pkm_twin.codegen.arrays import Array, Mask
 from pkm_twin.identification.estimation import WIDEN
-from pkm_twin.identification.noise import EXACT
+from pkm_twin.identification.samples import EXACT
 
 Answer = Literal["explains", "explains partly", "does not explain"]
 Deviations = Literal["as estimated", "widened", "withheld"]

@@ -13,7 +13,7 @@ import numpy as np
 from pkm_twin.codegen.arrays import Array, Indices
 from pkm_twin.errors import ParameterError, UnknownNameError
 from pkm_twin.identification.calibration_state import Poses, State, derivatives, rotations
-from pkm_twin.identification.noise import CLEAR, FINEST, huber
+from pkm_twin.identification.samples import CLEAR, FINEST, huber
 from pkm_twin.robot.robot import Robot
 
 BELIEVED: Final = 4.0

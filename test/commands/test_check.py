@@ -13,8 +13,7 @@ from mcap.writer import CompressionType, Writer
 
 from delta_dynamics import inverse_dynamics
 from pkm_twin.bags.reader import inspect, read_messages
-from pkm_twin.identification.causes import judged
-from pkm_twin.identification.check import MEASURED
+from pkm_twin.identification.check import MEASURED, check
 from pkm_twin.recordings import Recording
 from pkm_twin.recordings.topics import JOINT_STATE
 from test.bags.folders import make_folder
@@ -413,7 +412,7 @@ class TestCauses:
     """What explains a bad residual is said, and nothing else."""
 
     def cause(self, recording):
-        report = judged(recording, thorough=False)
+        report = check(recording, thorough=False)
         assert report.answer == "bad"
         return report.causes
 
@@ -441,7 +440,7 @@ class TestCauses:
             [np.einsum("kji,kj->ki", rotation, wrench[:, k : k + 3]) for k in (0, 3)], 1
         )
         made = recording_of(robot, m, efforts)
-        assert judged(replace(made, wrench=wrench)).answer == "good"
+        assert check(replace(made, wrench=wrench)).answer == "good"
         for given, word in ((-wrench, "opposite sign"), (wrong, "axes")):
             (text,) = self.cause(replace(made, wrench=given))
             assert word in text
@@ -465,12 +464,12 @@ class TestCauses:
         """No payload of that time is: it would leave the stuck samples out."""
         robot, m, efforts = drawn(rng, 8.0, 500.0)
         made = recording_of(robot, m, efforts)
-        assert judged(made, thorough=False).answer == "good"
+        assert check(made, thorough=False).answer == "good"
         begin = 1500
         while np.any(np.abs(made.effort[begin]) >= np.abs(made.effort).max(0)):
             begin += 1
         made.effort[begin : begin + 500, joints] = made.effort[begin, joints]
-        report = judged(made, thorough=False)
+        report = check(made, thorough=False)
         assert report.answer == "bad" and report.causes == ()
         (found,) = (item.value for item in report.items if item.text == MEASURED)
         named = [name in found for name in robot.joint_names]
@@ -482,7 +481,7 @@ class TestCauses:
         robot, m, efforts = drawn(rng, 4.0, 250.0)
         made = recording_of(robot, m, efforts)
         made.effort[:, 1] = level
-        report = judged(made, thorough=False)
+        report = check(made, thorough=False)
         assert report.answer == "bad" and report.causes == ()
         (found,) = (item.value for item in report.items if item.text == MEASURED)
         assert robot.joint_names[1] in found and "nothing was measured" in found
@@ -499,7 +498,7 @@ class TestCauses:
         noise = np.abs(efforts).max() * rng.normal(size=efforts.shape)
         spike = efforts + 10.0 * np.abs(efforts).max() * (np.arange(len(efforts)) == 700)[:, None]
         for wrong in (noise, spike):
-            report = judged(recording_of(robot, m, wrong))
+            report = check(recording_of(robot, m, wrong))
             assert report.answer == "bad" and report.causes == ()
             assert not any("-0." in text.partition("elastic")[2][:9] for text in report.findings)
 
@@ -509,7 +508,7 @@ class TestCauses:
         m = machine(robot, rng, 8.0, 200.0)
         true = robot.changed(friction={"viscous": [0.1] * 3, "coulomb": [0.2] * 3})
         efforts = inverse_dynamics(true, m.q, m.qd, m.qdd)
-        report = judged(recording_of(robot, m, efforts))
+        report = check(recording_of(robot, m, efforts))
         assert report.answer == "bad" and "friction" in report.causes[0]
 
     def test_what_nothing_explains_has_no_cause(self, rng):

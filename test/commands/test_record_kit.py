@@ -10,7 +10,7 @@ import pytest
 from pkm_twin.apps.commands.record_kit import readme
 from pkm_twin.bags.reader import BagWriter, open_bag
 from pkm_twin.recordings import read
-from pkm_twin.recordings.trajectories import read_trajectory
+from pkm_twin.recordings.bags import read_trajectory
 from test.commands.conftest import DELTA, MILLING
 from test.support.command import command
 from test.support.robots import load

@@ -17,7 +17,7 @@ from pkm_twin.bags.cdr import MessageCodec
 from pkm_twin.bags.qos import parse_qos, require_topic
 from pkm_twin.bags.reader import BagWriter, inspect, read_messages
 from pkm_twin.bags.recover import recover
-from pkm_twin.identification.causes import judged
+from pkm_twin.identification.check import check
 from pkm_twin.recordings import ReadOptions, read
 from test.bags.conftest import DEFINITIONS
 from test.bags.folders import write_split
@@ -231,5 +231,5 @@ class NonsenseBags(Kind):
         if self.turn % 2:
             refusal(lambda: recover(path, self.folder / "saved.mcap", overwrite=True))
         elif self.turn % 10 == 0:
-            refusal(lambda: judged(read(path, "prru", ReadOptions(limited=True))))
+            refusal(lambda: check(read(path, "prru", ReadOptions(limited=True))))
         return next((part for part in [refusal(decode), *parts] if part != "good"), "good")

@@ -10,8 +10,7 @@ import pytest
 
 from pkm_twin import Robot
 from pkm_twin.errors import PkmTwinError
-from pkm_twin.identification.causes import judged
-from pkm_twin.identification.check import recorded_of
+from pkm_twin.identification.check import check, recorded_of
 from pkm_twin.identification.compare import compare
 from pkm_twin.identification.fit import Fit, fit
 from pkm_twin.recordings import Recording
@@ -93,7 +92,7 @@ def test_drives_that_are_off_before_the_motion_are_left_out_of_both() -> None:
         q=np.concatenate([np.repeat(m.q[:1], count, 0), m.q]),
         effort=np.concatenate([np.zeros((count, 3)), sound.measured]),
     )  # fmt: skip
-    assert judged(recorded).answer == "good"
+    assert check(recorded).answer == "good"
     result = fit(m.robot, [recorded_of(recorded)], ("friction", "payload"))
     assert result.verdict.answer == "explains"
 

@@ -12,9 +12,8 @@ from pkm_twin.errors import ParameterError, PkmTwinError, UnknownNameError
 from pkm_twin.identification.drives import fitted_constants, given_constants
 from pkm_twin.identification.excitation import Bounds, Judge, sweeps
 from pkm_twin.identification.friction_laws import fit_with_laws, laws_of
-from pkm_twin.identification.noise import resonances_of
 from pkm_twin.identification.parameters import file_parameters
-from pkm_twin.identification.samples import Filtering
+from pkm_twin.identification.samples import Filtering, resonances_of
 from pkm_twin.recordings.payload import Load
 from test.identification.machines import machine, noisy
 from test.support.robots import load, partly_long

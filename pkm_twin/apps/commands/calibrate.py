@@ -19,12 +19,11 @@ from pkm_twin.files import replace_file
 from pkm_twin.identification.calibration import Calibration, Estimate, Scale, geometric
 from pkm_twin.identification.calibration import calibrate as calibrated
 from pkm_twin.identification.calibration_fit import STEPS
-from pkm_twin.identification.calibration_state import BESIDE, Poses
+from pkm_twin.identification.calibration_state import BESIDE, Poses, Transmission, written
 from pkm_twin.identification.measurements import KINDS, Kind, Measured, kinds_of
 from pkm_twin.identification.plan import MOST, Plan
 from pkm_twin.identification.plan import plan as plan_of
 from pkm_twin.identification.pose_tables import read_measured, read_poses
-from pkm_twin.identification.transmission import Transmission, written
 from pkm_twin.report import Column, Fact, Report, Table
 from pkm_twin.robot.entries import Fitted, edited_yaml, write_edited
 from pkm_twin.robot.limits import beyond_limits, refuse_beyond

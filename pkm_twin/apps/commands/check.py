@@ -77,7 +77,7 @@ def check(given: Check) -> Report:
 def check_one(given: Check, path: Path, update: Any = None, thorough: bool = True) -> Report:
     """Judge a recording, and append it to the history; errors as of ``recordings.read``."""
     from pkm_twin import load
-    from pkm_twin.identification.causes import judged
+    from pkm_twin.identification.check import check as checked
 
     robot: Any = given.robot
     if given.platform is not None:
@@ -85,7 +85,7 @@ def check_one(given: Check, path: Path, update: Any = None, thorough: bool = Tru
             raise ParameterError("--robot", None, "a file, for the platform that --platform names")
         robot = load(robot, platform=given.platform)
     r = given.read(path, robot, update, limited=True)
-    found = judged(r, given.residual, thorough)
+    found = checked(r, given.residual, thorough)
     good = found.answer == "good"
     if given.history is not None:
         from pkm_twin.identification.history import append, measure, recorded_at

@@ -124,7 +124,7 @@ def write_motion(
     from pkm_twin.identification.excitation import excite as design
     from pkm_twin.identification.excitation import sweeps
     from pkm_twin.recordings import Recording
-    from pkm_twin.recordings import trajectories as plans
+    from pkm_twin.recordings import bags as plans
 
     machine, table = judge.robot, out.with_suffix(".csv")
     best: Any

@@ -130,7 +130,7 @@ def path(given: Motion) -> Report:
     """The motion, and which limits it uses."""
     from pkm_twin.paths import ShapedPath, timed
     from pkm_twin.recordings import Recording
-    from pkm_twin.recordings.trajectories import write_motion
+    from pkm_twin.recordings.bags import write_motion
 
     machine = given.machine()
     if given.slow_where_soft:
