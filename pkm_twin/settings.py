@@ -1,11 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Settings as fields of a class: they declare a node's parameters and a command's options."""
+"""Settings as fields of a class: a node's parameters, a command's options, a robot file's keys."""
 
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Collection, Mapping
 from dataclasses import MISSING, dataclass, field
+from functools import cache
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 if TYPE_CHECKING:
@@ -16,10 +18,11 @@ S = TypeVar("S", bound="DataclassInstance")
 
 @dataclass(frozen=True)
 class Setting:
-    """The parameter or option of a field.
+    """The parameter, option or key of a field.
 
-    ``name``: of the parameter, by default the field's. ``choices``: the words that are allowed, or
-    the field's value for each. Of nodes alone: ``fixed``, not changeable while the node runs;
+    ``name``: of the parameter, by default the field's. ``low``, ``high``: its bounds, and
+    ``above``: one that it is not equal to. ``choices``: the words that are allowed, or the field's
+    value for each. Of nodes alone: ``fixed``, not changeable while the node runs;
     ``usual``, words for a default that depends on the robot. Of commands alone: ``argument``, given
     by its place; ``count``, this many numbers with commas between, 0 for any count; ``writes``, a
     file that the command writes, whose name ends in one of ``endings`` where there are any;
@@ -40,6 +43,27 @@ class Setting:
     endings: tuple[str, ...] = ()
     older: tuple[str, ...] = ()
     metavar: str | None = None
+    above: float | None = None
+
+    @property
+    def span(self) -> str:
+        """The bounds in words, to stand behind what they bound."""
+        words = "" if self.above is None else f" above {self.above:g}"
+        if self.high == math.inf:
+            return f"{words}{self._least}, or .inf"
+        if self.low is not None and self.high is not None:
+            return f", {self.low:g} to {self.high:g}"
+        return f"{words}{self._least}" + ("" if self.high is None else f", at most {self.high:g}")
+
+    @property
+    def _least(self) -> str:
+        return "" if self.low is None else f", {self.low:g} or more"
+
+    def allows(self, number: float) -> bool:
+        """Whether a number is within the bounds."""
+        low = -math.inf if self.low is None else self.low
+        high = math.inf if self.high is None else self.high
+        return low <= number <= high and (self.above is None or number > self.above)
 
     def value(self, given: Any) -> Any:
         """The field's value for a parameter's."""
@@ -75,8 +99,13 @@ def setting(default: Any, text: str, **more: Any) -> Any:
     return field(default=default, metadata={"setting": Setting(text, **more)})
 
 
-def settings_of(kind: type[DataclassInstance]) -> dict[str, tuple[str, Setting]]:
+def settings_of(kind: Any) -> Mapping[str, tuple[str, Any]]:
     """By the parameter's name: the field's name, and its setting."""
+    return _settings_of(kind)
+
+
+@cache
+def _settings_of(kind: Any) -> Mapping[str, tuple[str, Any]]:
     found = {f.name: f.metadata["setting"] for f in dataclasses.fields(kind) if f.metadata}
     return {row.name or name: (name, row) for name, row in found.items()}
 

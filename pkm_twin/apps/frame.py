@@ -324,14 +324,9 @@ def _one(name: str, kind: Any, row: Setting, word: Any) -> Any:
         value = int(word) if kind is int else value
     except ValueError:
         value = math.nan
-    low = -math.inf if row.low is None else row.low
-    high = math.inf if row.high is None else row.high
-    if not (low <= value <= high and math.isfinite(value)):
+    if not (row.allows(value) and math.isfinite(value)):
         what = "a whole number" if kind is int else "a number"
-        span = f", {row.low:g} or more" if row.low is not None else ""
-        if row.high is not None:
-            span = f", {row.low:g} to {row.high:g}" if span else f", at most {row.high:g}"
-        raise typer.BadParameter(f"{name}: {word.strip()!r}; expected {what}{span}")
+        raise typer.BadParameter(f"{name}: {word.strip()!r}; expected {what}{row.span}")
     return value
 
 

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -107,8 +106,8 @@ def tolerances(
         for path, part in parts.items()
     }
     for path, value in sigma.items():
-        most = {"m": LARGEST * robot.graph.size, "rad": LARGEST}.get(units[path], math.inf)
-        size = schema.number(at_least=0.0, at_most=most, unit=units[path])
+        most = {"m": LARGEST * robot.graph.size, "rad": LARGEST}.get(units[path])
+        size = schema.number(low=0.0, high=most, unit=units[path])
         schema.checked(size, f"tolerance {path}", value)
     for path in numbers:
         if states.size and not slopes[path].any():

@@ -391,7 +391,7 @@ class _Search:
             for g in range(len(grid)):
                 own = table[:, j, g] - basis @ (basis.T @ table[:, j, g])
                 size, *_ = np.linalg.lstsq(own, left, rcond=1e-9)
-                good = all(one.at_least is None or s >= 0.0
+                good = all(one.low is None or s >= 0.0
                            for s, (_, one) in zip(size, linear, strict=True))  # fmt: skip
                 sizes[g, j] = size
                 gains[g, j] = float(left @ (own @ size)) if good else 0.0

@@ -96,7 +96,7 @@ def of_drives(robot: Robot) -> tuple[Identifiable, ...]:
 
     def number(kind: Kind, name: str, value: float, key: Keys, joints: Sequence[str]) -> None:
         word = name.rpartition(".")[2]
-        signed = word in all_keys() and all_keys()[word].at_least is None
+        signed = word in all_keys() and all_keys()[word].low is None
         # Of a rotor behind a gear the file has the inertia at the motor.
         drive = dict(zip(robot.joint_names, robot.drives, strict=True)).get(joints[0])
         less = drive.turns**-2 if drive is not None and kind == "rotor" else 1.0

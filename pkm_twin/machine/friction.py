@@ -35,15 +35,9 @@ class Parameter:
     """
 
     unit: str
-    at_least: float | None = 0.0
-    at_most: float | None = None
+    low: float | None = 0.0
+    high: float | None = None
     linear: bool = True
-
-    @property
-    def bounds(self) -> dict[str, Any]:
-        """As the schema takes them."""
-        both = {"at_least": self.at_least, "at_most": self.at_most}
-        return {key: value for key, value in both.items() if value is not None}
 
     def in_units(self, *, slides: bool) -> str:
         """The unit of a drive that slides or turns."""
@@ -102,7 +96,7 @@ class ViscousCoulomb(FrictionLaw):
     parameters: ClassVar = {
         "viscous": Parameter("{effort} per {joint}/s"),
         "coulomb": Parameter("{effort}"),
-        "offset": Parameter("{effort}", at_least=None),
+        "offset": Parameter("{effort}", low=None),
     }
 
 
@@ -130,7 +124,7 @@ class LoadDependent(FrictionLaw):
     """Coulomb friction that grows with the load, of gears and screws."""
 
     name = "load-dependent"
-    parameters: ClassVar = {"load_dependent": Parameter("1", at_most=0.9)}
+    parameters: ClassVar = {"load_dependent": Parameter("1", high=0.9)}
 
     @staticmethod
     def share(values: Values, q: Any, speed: Any) -> Any:
@@ -148,8 +142,8 @@ class Periodic(FrictionLaw):
     name = "periodic"
     turns = False
     parameters: ClassVar = {
-        "cogging_cos": Parameter("{effort}", at_least=None),
-        "cogging_sin": Parameter("{effort}", at_least=None),
+        "cogging_cos": Parameter("{effort}", low=None),
+        "cogging_sin": Parameter("{effort}", low=None),
         "cogging_period": Parameter("{joint}", linear=False),
     }
 

@@ -6,7 +6,7 @@ from __future__ import annotations
 import copy
 import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final, TypeVar
 
@@ -30,11 +30,11 @@ from pkm_twin.machine.places import Keys, number_in, path_of, placed
 from pkm_twin.machine.sections import (
     DriveSpec,
     check_angles,
+    friction_fields,
     friction_of,
     length,
     limits_of,
     mass,
-    rare,
 )
 
 T = TypeVar("T")
@@ -47,8 +47,8 @@ class MemberSpec:
     ``section``: with the body's mass along the bar; without one the body is rigid.
     """
 
-    start: Array = schema.vector(3, key="from", unit="m")
-    end: Array = schema.vector(3, key="to", unit="m")
+    start: Array = schema.vector(3, name="from", unit="m")
+    end: Array = schema.vector(3, name="to", unit="m")
     section: Tube | None = schema.section(Tube, default=None)
     radius: float | None = length(default=None)
 
@@ -83,22 +83,16 @@ class BodySpec:
 
 
 _Laws: Any = dataclasses.make_dataclass(
-    "_Laws",
-    [
-        (key, float, rare(key, schema.number(unit=one.unit, default=0.0, **one.bounds)))
-        for key, one in all_keys().items()
-    ],
-    frozen=True,
-    eq=False,
+    "_Laws", friction_fields(schema.number, default=0.0), frozen=True, eq=False
 )
 
 
 @dataclass(frozen=True, eq=False)
 class FrictionSpec(_Laws):  # type: ignore[misc]  # its fields are those of the laws
-    """Friction of one joint: N m s/rad or N s/m, and N m or N.
+    """Friction of a joint, opposite to the rate; of a named mechanism one number, or one a joint.
 
-    ``offset``: what an actuated joint's drive needs beside, whatever the motion; the parameters of
-    other laws, of actuated joints too, are in :mod:`~pkm_twin.machine.friction`.
+    ``viscous``: per rate. ``coulomb``: by the rate's sign. ``offset``: a constant effort of the
+    drive. The other keys are of further laws of drives, see docs/fit.md.
     """
 
     def verify(self, path: str) -> None:
@@ -119,7 +113,7 @@ class LimitSpec:
     position: Array | None = schema.interval(unit="{joint}", default=None)
     velocity: float | None = schema.number(above=0.0, unit="{joint}/s", default=None)
     effort: float | None = schema.number(above=0.0, unit="{effort}", default=None)
-    swivel: float | None = schema.number(above=0.0, at_most=np.pi, unit="rad", default=None)
+    swivel: float | None = schema.number(above=0.0, high=np.pi, unit="rad", default=None)
     axis: Array | None = schema.vector(3, default=None)
 
     def verify(self, path: str) -> None:
@@ -151,14 +145,12 @@ class JointSpec:
     at: Array | None = schema.vector(3, unit="m", default=None)
     axis: Array | None = schema.vector(3, default=None)
     axes: Array | None = schema.matrix(2, 3, default=None)
-    lead: float | None = schema.number(
-        at_least=-10.0, at_most=10.0, unit="m per turn", default=None
-    )
+    lead: float | None = schema.number(low=-10.0, high=10.0, unit="m per turn", default=None)
     actuated: bool = schema.flag(default=False)
     home: float | None = schema.number(unit="{joint}", default=None)
     limits: LimitSpec | None = schema.section(LimitSpec, default=None)
     friction: FrictionSpec | None = schema.section(FrictionSpec, default=None)
-    rotor_inertia: float = schema.number(at_least=0.0, unit="{rotor}", default=0.0)
+    rotor_inertia: float = schema.number(low=0.0, unit="{rotor}", default=0.0)
     drive: DriveSpec | None = schema.section(DriveSpec, default=None)
     compliance: Array | None = compliances(default=None)
 
@@ -249,7 +241,7 @@ class RodSpec:
     mass: float = mass(default=0.0)
     section: Tube | None = schema.section(Tube, default=None)
     radius: float | None = length(default=None)
-    swivel: float | None = schema.number(above=0.0, at_most=np.pi, unit="rad", default=None)
+    swivel: float | None = schema.number(above=0.0, high=np.pi, unit="rad", default=None)
 
 
 @dataclass(frozen=True)
@@ -272,69 +264,84 @@ KINDS: Final[Mapping[str, type]] = {"bodies": BodySpec, "joints": JointSpec, "ro
 _TURNED: Final = ("com", "at", "axis", "axes", "ends")
 
 
-def _section(data: Mapping[str, Any], key: str, path: str) -> Mapping[str, Any]:
-    value = data.get(key) or {}
-    if not isinstance(value, Mapping):
-        raise ParameterError(f"{path}{key}", value, "a mapping of names to entries")
-    for name in value:
-        if not isinstance(name, str) or not name:
-            raise ParameterError(f"{path}{key}", name, "names as text")
-    return value
+def _raw() -> Any:
+    return schema.mapping(schema.key(lambda _, value: value, ""), default={})
 
 
-def written_out(
-    data: Mapping[str, Any],
-) -> tuple[dict[str, dict[str, Any]], dict[tuple[str, str], Source]]:
-    """All entries by name, checked, the limbs' copies turned about base z; where each stands."""
-    result: dict[str, dict[str, Any]] = {
-        kind: {
-            name: schema.build(spec, entry, f"{kind}.{name}")
-            for name, entry in _section(data, kind, "").items()
-        }
-        for kind, spec in KINDS.items()
-    }
-    sources = {(kind, n): Source((kind, n), n) for kind, all_ in result.items() for n in all_}
-    limbs = data.get("limbs") or []
-    sections = limbs if isinstance(limbs, list) else [limbs]
-    for k, section in enumerate(sections):
-        path = f"limbs[{k}]." if isinstance(limbs, list) else "limbs."
-        if not isinstance(section, Mapping):
-            raise ParameterError(path[:-1], section, "azimuths, bodies, joints and rods")
-        for key in section:
-            if key not in ("azimuths", *KINDS):
-                raise UnknownNameError(f"{path}{key}", key, ("azimuths", *KINDS))
-        azimuths = schema.checked(schema.vector(0), f"{path}azimuths", section.get("azimuths"))
-        for i, azimuth in enumerate(azimuths):
-            check_angles(float(azimuth), f"{path}azimuths[{i}]")
-        own = set(_section(section, "bodies", path))
-        count = len(azimuths)
-        checked: dict[str, dict[str, list[Any]]] = {
+@dataclass(frozen=True, eq=False)
+class LimbFile:
+    """Bodies, joints and rods at azimuth 0, copied and turned about base z by each azimuth.
+
+    The copies' names get _1, _2 and so on. A copy has its own copies of the section's bodies; other
+    bodies are shared.
+    """
+
+    azimuths: Array = schema.vector(0, unit="rad")
+    bodies: Mapping[str, Any] = _raw()
+    joints: Mapping[str, Any] = _raw()
+    rods: Mapping[str, Any] = _raw()
+
+    def verify(self, path: str) -> None:
+        """Azimuths are in rad."""
+        for i, azimuth in enumerate(self.azimuths.tolist()):
+            check_angles(azimuth, f"{path}.azimuths[{i}]")
+
+
+@dataclass(frozen=True, eq=False)
+class Limb:
+    """A limb of a file: the keys of its section, its azimuths, and each entry's copies by kind."""
+
+    place: Keys
+    azimuths: Array
+    entries: Mapping[str, Mapping[str, Sequence[Any]]]
+
+
+def limbs_of(field: str, value: Any) -> list[Limb]:
+    """One section or a list of them, checked."""
+    listed = isinstance(value, list)
+    limbs = []
+    for k, section in enumerate(value if listed else [value] if value else []):
+        place = (field, k) if listed else (field,)
+        path = path_of(place)
+        limb = schema.build(LimbFile, section, path)
+        entries: dict[str, Any] = {
             kind: {
                 name: [
-                    schema.build(spec, one, f"{path}{kind}.{name}")
-                    for one in _copies(entry, count, f"{path}{kind}.{name}")
+                    schema.build(spec, one, f"{path}.{kind}.{name}")
+                    for one in _copies(entry, len(limb.azimuths), f"{path}.{kind}.{name}")
                 ]
-                for name, entry in _section(section, kind, path).items()
+                for name, entry in getattr(limb, kind).items()
             }
             for kind, spec in KINDS.items()
         }
-        place: Keys = ("limbs", k) if isinstance(limbs, list) else ("limbs",)
-        for number, azimuth in enumerate(azimuths, 1):
-            for kind, entries in checked.items():
-                for name, entry in entries.items():
-                    full = f"{name}_{number}"
-                    if full in result[kind]:
-                        where = path_of(sources[kind, full].path)
-                        raise ParameterError(
-                            f"{path}{kind}.{name}", full,
-                            f"a name of its own for each copy: {full} stands for {where} "
-                            f"already, so rename one of the two, for example {name}_b",
-                        )  # fmt: skip
-                    copy = entry[number - 1]
-                    result[kind][full] = _turned(copy, float(azimuth), own, number)
-                    sources[kind, full] = Source(
-                        (*place, kind, name), name, number - 1, count, float(azimuth)
-                    )
+        limbs.append(Limb(place, limb.azimuths, entries))
+    return limbs
+
+
+def written_out(
+    kinds: Mapping[str, Mapping[str, Any]], limbs: Sequence[Limb]
+) -> tuple[dict[str, dict[str, Any]], dict[tuple[str, str], Source]]:
+    """All entries by kind and name, the limbs' copies turned about base z; where each stands."""
+    result = {kind: dict(entries) for kind, entries in kinds.items()}
+    sources = {(kind, n): Source((kind, n), n) for kind, all_ in result.items() for n in all_}
+    for limb in limbs:
+        own = set(limb.entries["bodies"])
+        rows = [
+            (number, azimuth, kind, name, copies[number])
+            for number, azimuth in enumerate(limb.azimuths.tolist())
+            for kind, entries in limb.entries.items()
+            for name, copies in entries.items()
+        ]
+        for number, azimuth, kind, name, entry in rows:
+            full, place = f"{name}_{number + 1}", (*limb.place, kind, name)
+            if full in result[kind]:
+                where = path_of(sources[kind, full].path)
+                raise ParameterError(
+                    path_of(place), full, f"a name of its own for each copy: {full} stands for "
+                    f"{where} already, so rename one of the two, for example {name}_b",
+                )  # fmt: skip
+            result[kind][full] = _turned(entry, azimuth, own, number + 1)
+            sources[kind, full] = Source(place, name, number, len(limb.azimuths), azimuth)
     return result, sources
 
 
@@ -423,29 +430,26 @@ def number_of_entry(entry: Any, keys: tuple[str | int, ...], azimuth: float, pat
     return number_in(schema.plain(entry), keys, path)
 
 
-def graph_of_entries(data: Mapping[str, Any], specs: Mapping[str, Mapping[str, Any]]) -> Graph:
-    """The graph of a file and its entries, as :func:`written_out` gives them.
+def graph_of_entries(
+    platform: str, specs: Mapping[str, Mapping[str, Any]], origin: Array | None = None
+) -> Graph:
+    """The graph of a file's entries, as :func:`written_out` gives them.
 
-    :raises ParameterError: no bodies, a platform that is none of them, or no place as origin.
+    :param origin: the platform's reference point, default its centre of mass.
+    :raises ParameterError: no bodies, or a platform that is none of them.
     """
     bodies = {
         name: Body(name, b.mass, array(np.zeros(3) if b.com is None else b.com), b.inertia)
         for name, b in specs["bodies"].items()
     }
-    platform = data.get("platform", "platform")
     if not bodies:
         raise ParameterError("bodies", None, "the machine's bodies, by name")
-    if not isinstance(platform, str) or platform not in bodies:
+    if platform not in bodies:
         raise UnknownNameError("platform", platform, bodies)
-    origin = data.get("origin")
-    place = (
-        bodies[platform].com
-        if origin is None
-        else schema.checked(schema.vector(3), "origin", origin)
-    )
     joints = {n: j.joint(n, f"joints.{n}") for n, j in specs["joints"].items()}
     rods = {n: Rod(n, r.between[0], r.between[1], r.ends, r.mass) for n, r in specs["rods"].items()}
-    return Graph(bodies, joints, rods, platform, array(place))
+    place = bodies[platform].com if origin is None else array(origin)
+    return Graph(bodies, joints, rods, platform, place)
 
 
 def drives_of(graph: Graph, joints: Mapping[str, JointSpec]) -> dict[str, Any]:

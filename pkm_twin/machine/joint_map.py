@@ -33,17 +33,24 @@ ControllerNumbers = NewType("ControllerNumbers", np.ndarray[Any, np.dtype[np.flo
 
 @dataclass(frozen=True, eq=False)
 class JointMapEntry:
-    """One joint: the controller's name for it, and its numbers."""
+    """From a joint's name and values in the model to those of the controller.
+
+    Positions: controller = offset + sign * ratio * model; velocities and accelerations without the
+    offset; efforts are divided by sign * ratio, so that power is the same. ``ratio_change``: the
+    ratio is ratio * (1 + ratio_change * (model - ratio_at)), as of a spool; only ``calibrate`` and
+    ``robot.controller.positions`` convert such a joint. ``unit``: the controller's, for tables.
+
+    Messages, bags and the table of poses for ``calibrate`` contain the controller's names and
+    values; everything else uses the model's.
+    """
 
     name: str | None = schema.text(default=None)
-    sign: float = schema.number(at_least=-1.0, at_most=1.0, default=1.0)
+    sign: float = schema.number(low=-1.0, high=1.0, default=1.0)
     offset: float = schema.number(unit="the controller's", default=0.0)
     ratio: float = schema.number(
-        at_least=1e-6, at_most=1e6, unit="the controller's per the model's", default=1.0
+        low=1e-6, high=1e6, unit="the controller's per the model's", default=1.0
     )
-    ratio_change: float = schema.number(
-        at_least=-1e3, at_most=1e3, unit="per the model's", default=0.0
-    )
+    ratio_change: float = schema.number(low=-1e3, high=1e3, unit="per the model's", default=0.0)
     ratio_at: float = schema.number(unit="the model's", default=0.0)
     unit: str | None = schema.text(default=None)
 

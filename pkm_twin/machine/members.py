@@ -70,12 +70,12 @@ def cowper(ratio: float) -> float:
 
 def modulus() -> Any:
     """Field: an elastic modulus, Pa."""
-    return schema.number(at_least=1e3, at_most=1e14, unit="Pa")
+    return schema.number(low=1e3, high=1e14, unit="Pa")
 
 
 def compliances(**options: Any) -> Any:
     """Field: compliance of a joint along its three axes and about them; .inf where it is free."""
-    return schema.vector(6, at_least=0.0, infinite=True, unit="m/N (3), rad/(N m) (3)", **options)
+    return schema.vector(6, low=0.0, high=math.inf, unit="m/N (3), rad/(N m) (3)", **options)
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,10 +89,10 @@ class Tube:
 
     youngs_modulus: float = modulus()
     shear_modulus: float = modulus()
-    outer_diameter: float = schema.number(at_least=1e-6, at_most=10.0, unit="m")
-    density: float | None = schema.number(above=0.0, at_most=1e5, unit="kg/m3", default=None)
-    inner_diameter: float | None = schema.number(at_least=0.0, at_most=10.0, unit="m", default=None)
-    shear_factor: float | None = schema.number(at_least=0.0, at_most=10.0, default=None)
+    outer_diameter: float = schema.number(low=1e-6, high=10.0, unit="m")
+    density: float | None = schema.number(above=0.0, high=1e5, unit="kg/m3", default=None)
+    inner_diameter: float | None = schema.number(low=0.0, high=10.0, unit="m", default=None)
+    shear_factor: float | None = schema.number(low=0.0, high=10.0, default=None)
 
     def verify(self, path: str) -> None:
         """One of the two ways to tell the wall."""

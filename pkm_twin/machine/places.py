@@ -15,6 +15,7 @@ import numpy as np
 from pkm_twin.codegen.expressions import Expression, plain
 from pkm_twin.errors import ParameterError
 from pkm_twin.machine import schema
+from pkm_twin.settings import settings_of
 
 T = TypeVar("T")
 _PART: Final = re.compile(r"([^.\[\]]+)|\[(\d+)\]")
@@ -90,8 +91,8 @@ def placed(section: T, changes: Mapping[tuple[Key, ...], Any], path: str = "") -
     names: dict[Any, Any] = {}
     whole = dataclasses.is_dataclass(section)
     if dataclasses.is_dataclass(section):
-        names = {f.metadata.get("key") or f.name: f.name for f in dataclasses.fields(section)}
-        held = {name: getattr(section, name) for name in names.values()}
+        names = {name: field for name, (field, _) in settings_of(type(section)).items()}
+        held = {f.name: getattr(section, f.name) for f in dataclasses.fields(section)}
     result: Any = list(held) if isinstance(held, tuple) else copy.copy(held)
     result = held.astype(object) if isinstance(held, np.ndarray) else result
     for key, deeper in below.items():
@@ -124,11 +125,10 @@ def check_number(section: Any, keys: Sequence[Key], path: str) -> None:
     inner, left = section, list(keys)
     while left:
         if dataclasses.is_dataclass(inner):
-            fields = {f.metadata.get("key") or f.name: f for f in dataclasses.fields(inner)}
-            field = fields[str(left[0])]
-            value = getattr(inner, field.name)
+            field, row = settings_of(type(inner))[str(left[0])]
+            value = getattr(inner, field)
             if not dataclasses.is_dataclass(value) and not isinstance(value, Mapping):
-                field.metadata["check"](path, schema.plain(value))
+                row.check(path, schema.plain(value))
                 verify = getattr(inner, "verify", None)
                 if verify is not None:
                     verify(path)

@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Parameter files: plain data to frozen dataclasses, each refusal naming field and bound.
 
-A mechanism declares its schema as frozen dataclasses whose fields are made by the functions below.
-A field's metadata hold its ``check``, its ``key`` in the file, its ``unit`` (``{joint}``,
-``{effort}`` and ``{rotor}`` stand for those of the actuated joints), its ``bound`` in words, its
-``default``, of a nested section its ``section``, and of names to sections that of the ``entries``.
+A mechanism declares its schema as frozen dataclasses whose fields are made by the functions below:
+settings with a check. In units ``{joint}``, ``{effort}`` and ``{rotor}`` stand for those of the
+actuated joints.
 """
 
 from __future__ import annotations
@@ -12,6 +11,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import MISSING, dataclass
 from functools import reduce
 from typing import Any, Final, TypeVar
 
@@ -20,6 +20,7 @@ import numpy as np
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.codegen.operations import absolute, maximum, minimum
 from pkm_twin.errors import ParameterError, UnknownNameError
+from pkm_twin.settings import Setting, settings_of
 
 MAX_SIZE: Final = 1e18
 """Beyond every quantity of a machine in SI units; products of such numbers stay finite."""
@@ -32,68 +33,67 @@ Check = Callable[[str, Any], Any]
 T = TypeVar("T")
 
 
-def number(
-    *,
-    above: float = -math.inf,
-    at_least: float = -math.inf,
-    at_most: float = math.inf,
-    unit: str = "",
-    default: Any = dataclasses.MISSING,
-) -> Any:
-    """Field: one finite number within bounds."""
+@dataclass(frozen=True, kw_only=True)
+class Key(Setting):
+    """A key of a file.
 
-    def check(field: str, value: Any) -> float:
-        return _number(field, value, above, at_least, at_most, unit=unit)
-
-    return _field(check, default, "number" + _bound(above, at_least, at_most), unit)
-
-
-def vector(
-    size: int,
-    *,
-    above: float = -math.inf,
-    at_least: float = -math.inf,
-    at_most: float = math.inf,
-    infinite: bool = False,
-    spread: bool = False,
-    key: str | None = None,
-    unit: str = "",
-    default: Any = dataclasses.MISSING,
-) -> Any:
-    """Field: ``size`` numbers, read-only array; with ``spread`` one number stands for all.
-
-    Of no size, any number of them, but none only where there is a default. ``key``: its name in the
-    file, where that is no name in Python.
+    ``check``: gives the field's value for the file's, by its path. ``bound``: the valid values in
+    words. ``section``: schema of a nested section. ``entries``: of each entry of a mapping.
+    ``rare``: left out of descriptions where it is zero.
     """
 
-    def check(field: str, value: Any) -> Array:
-        if spread and isinstance(value, (int, float)) and not isinstance(value, bool):
-            value = [value] * size
-        items = _sequence(field, value, size, "numbers", least=default is dataclasses.MISSING)
-        return frozen(
-            [
-                _number(f"{field}[{i}]", item, above, at_least, at_most, infinite)
-                for i, item in enumerate(items)
-            ]
-        )
-
-    bound = f"{size} numbers" if size else "one number or more"
-    bound += _bound(above, at_least, at_most, infinite)
-    if spread:
-        bound += "; one stands for all"
-    return _field(check, default, bound, unit, key=key)
+    text: str = ""
+    check: Check = lambda _, value: value
+    bound: str = ""
+    section: type | None = None
+    entries: type | None = None
+    rare: bool = False
 
 
-def matrix(rows: int, columns: int, *, unit: str = "", default: Any = dataclasses.MISSING) -> Any:
+def key(check: Check, bound: str, default: Any = MISSING, **more: Any) -> Any:
+    """Field: a key with a check of its own; ``more``: further attributes of :class:`Key`."""
+    metadata = {"setting": Key(check=check, bound=bound, **more)}
+    if isinstance(default, (list, dict)):
+        return dataclasses.field(metadata=metadata, default_factory=lambda: check("", default))
+    return dataclasses.field(metadata=metadata, default=default)
+
+
+def number(*, default: Any = MISSING, **more: Any) -> Any:
+    """Field: one finite number within bounds; ``more``: attributes of :class:`Key`."""
+    return _numbers((), "number", default, more)
+
+
+def vector(size: int, *, spread: bool = False, default: Any = MISSING, **more: Any) -> Any:
+    """Field: ``size`` numbers, read-only array; with ``spread`` one number stands for all.
+
+    Of no size, any number of them, but none only where there is a default.
+    """
+    words = f"{size} numbers" if size else "one number or more"
+    return _numbers((size,), words, default, more, spread)
+
+
+def matrix(rows: int, columns: int, *, default: Any = MISSING, **more: Any) -> Any:
     """Field: ``rows`` lists of ``columns`` numbers, read-only array."""
-
-    def check(field: str, value: Any) -> Array:
-        return frozen(_table(field, _sequence(field, value, rows), columns))
-
-    return _field(check, default, f"{rows} lists of {columns} numbers", unit)
+    return _numbers((rows, columns), f"{rows} lists of {columns} numbers", default, more)
 
 
-def text(*, default: Any = dataclasses.MISSING) -> Any:
+def _numbers(
+    shape: tuple[int, ...], words: str, default: Any, more: Mapping[str, Any], spread: bool = False
+) -> Any:
+    bounds = Key(**more)
+    least = int(default is MISSING)
+
+    def check(field: str, value: Any) -> Any:
+        if spread and _is_number(value):
+            value = [value] * shape[0]
+        found = _nested(field, value, shape, bounds, least)
+        return frozen(found) if shape else found
+
+    bound = words + bounds.span + ("; one stands for all" if spread else "")
+    return key(check, bound, default, **more)
+
+
+def text(*, default: Any = MISSING, **more: Any) -> Any:
     """Field: a non-empty text."""
 
     def check(field: str, value: Any) -> str:
@@ -101,29 +101,30 @@ def text(*, default: Any = dataclasses.MISSING) -> Any:
             raise ParameterError(field, value, "a non-empty text")
         return value
 
-    return _field(check, default, "a non-empty text")
+    return key(check, "a non-empty text", default, **more)
 
 
-def mapping(entry: Any, *, default: Any = dataclasses.MISSING) -> Any:
+def mapping(entry: Any, *, default: Any = MISSING, **more: Any) -> Any:
     """Field: names to sections with the schema of a dataclass, or to values of another field."""
     section = isinstance(entry, type)
     what = "entries" if section else "numbers"
 
     def check(field: str, value: Any) -> dict[str, Any]:
-        if not isinstance(value, Mapping) or not all(isinstance(k, str) and k for k in value):
+        named = isinstance(value, Mapping)
+        if not named or not all(isinstance(name, str) and name for name in value):
             raise ParameterError(field, value, f"a mapping of names to {what}")
-        judge = (
-            (lambda path, item: build(entry, item, path)) if section else entry.metadata["check"]
-        )
-        return {name: judge(_join(field, name), item) for name, item in value.items()}
+        paths = {name: _join(field, name) for name in value}
+        if section:
+            return {name: build(entry, item, paths[name]) for name, item in value.items()}
+        return {name: checked(entry, paths[name], item) for name, item in value.items()}
 
     bound = f"a mapping of names to {what}"
     if not section:
-        bound += entry.metadata["bound"].removeprefix("number")
-    return _field(check, default, bound, entries=entry if section else None)
+        bound += entry.metadata["setting"].span
+    return key(check, bound, default, entries=entry if section else None, **more)
 
 
-def flag(*, default: Any = dataclasses.MISSING) -> Any:
+def flag(*, default: Any = MISSING, **more: Any) -> Any:
     """Field: true or false."""
 
     def check(field: str, value: Any) -> bool:
@@ -131,11 +132,11 @@ def flag(*, default: Any = dataclasses.MISSING) -> Any:
             raise ParameterError(field, value, "true or false")
         return value
 
-    return _field(check, default, "true or false")
+    return key(check, "true or false", default, **more)
 
 
 def words(
-    *allowed: str, size: int = 0, distinct: bool = True, default: Any = dataclasses.MISSING
+    *allowed: str, size: int = 0, distinct: bool = True, default: Any = MISSING, **more: Any
 ) -> Any:
     """Field: ``size`` words, by default one or more, each of the allowed where there are any."""
 
@@ -153,27 +154,20 @@ def words(
     bound = f"different ones of {', '.join(allowed)}" if allowed else f"{size} different names"
     if not distinct:
         bound = f"{size} words, each {' or '.join(allowed)}"
-    return _field(check, default, bound)
+    return key(check, bound, default, **more)
 
 
 def checked(field: Any, path: str, value: Any) -> Any:
     """A value checked as the field of a schema is, by its path."""
-    return field.metadata["check"](path, value)
+    return field.metadata["setting"].check(path, value)
 
 
-def interval(
-    *,
-    above: float = -math.inf,
-    count: int = 0,
-    unit: str = "",
-    default: Any = dataclasses.MISSING,
-) -> Any:
+def interval(*, count: int = 0, default: Any = MISSING, **more: Any) -> Any:
     """Field: ``[min, max]``; with ``count`` one for all or one each, shape (count, 2)."""
+    bounds = Key(**more)
 
     def pair(field: str, value: Any) -> list[float]:
-        low, high = (
-            _number(f"{field}[{i}]", v, above) for i, v in enumerate(_sequence(field, value, 2))
-        )
+        low, high = _nested(field, value, (2,), bounds)
         if not low < high:
             raise ParameterError(field, value, "[min, max] with min below max")
         return [low, high]
@@ -184,22 +178,20 @@ def interval(
             return frozen([pair(f"{field}[{i}]", v) for i, v in enumerate(items)])
         return frozen([pair(field, value)] * count if count else pair(field, value))
 
-    bound = "[min, max]" + _bound(above)
-    return _field(check, default, f"{bound}, or {count} of them" if count else bound, unit)
+    bound = "[min, max]" + bounds.span
+    return key(check, f"{bound}, or {count} of them" if count else bound, default, **more)
 
 
-def inertia(*, positive: bool, default: Any = dataclasses.MISSING) -> Any:
+def inertia(*, positive: bool, default: Any = MISSING, **more: Any) -> Any:
     """Field: an inertia matrix about a centre of mass, 3x3 or its diagonal, kg m2.
 
     Symmetric, principal moments not negative (``positive``: above zero), triangle rule kept.
     """
 
     def check(field: str, value: Any) -> Array:
-        rows = _sequence(field, value, 3)
-        if all(isinstance(row, (int, float)) and not isinstance(row, bool) for row in rows):
-            matrix = np.diag([_number(f"{field}[{i}]", v) for i, v in enumerate(rows)])
-        else:
-            matrix = np.array(_table(field, rows, 3))
+        flat = all(map(_is_number, _sequence(field, value, 3)))
+        found = np.array(_nested(field, value, (3,) if flat else (3, 3), Key()))
+        matrix = np.diag(found) if flat else found
         with np.errstate(all="ignore"):
             size, symmetry, moments, triangle = inertia_margins(matrix.tolist())
         if not size >= 0.0:
@@ -218,7 +210,7 @@ def inertia(*, positive: bool, default: Any = dataclasses.MISSING) -> Any:
 
     least = "above zero" if positive else "zero or more"
     bound = f"3 numbers or 3x3, symmetric, principal moments {least}, triangle rule"
-    return _field(check, default, bound, "kg m2")
+    return key(check, bound, default, unit="kg m2", **more)
 
 
 def inertia_margins(matrix: Sequence[Sequence[Any]]) -> tuple[Any, Any, Any, Any]:
@@ -254,7 +246,7 @@ def _least_pivot(diagonal: Sequence[Any], products: Sequence[Any]) -> Any:
     return minimum(minimum(xx, middle), last)
 
 
-def choice(*allowed: str, default: Any = dataclasses.MISSING) -> Any:
+def choice(*allowed: str, default: Any = MISSING, **more: Any) -> Any:
     """Field: one of the allowed words."""
 
     def check(field: str, value: Any) -> str:
@@ -262,16 +254,16 @@ def choice(*allowed: str, default: Any = dataclasses.MISSING) -> Any:
             raise UnknownNameError(field, value, allowed)
         return str(value)
 
-    return _field(check, default, " or ".join(allowed))
+    return key(check, " or ".join(allowed), default, choices=allowed, **more)
 
 
-def section(kind: type, *, default: Any = dataclasses.MISSING) -> Any:
+def section(kind: type, *, default: Any = MISSING, **more: Any) -> Any:
     """Field: a nested mapping with the schema of the dataclass ``kind``."""
 
     def check(field: str, value: Any) -> Any:
         return build(kind, value, field)
 
-    return _field(check, default, "a section", kind=kind)
+    return key(check, "a section", default, section=kind, **more)
 
 
 def build(kind: type[T], data: object, path: str = "") -> T:
@@ -282,38 +274,39 @@ def build(kind: type[T], data: object, path: str = "") -> T:
     """
     if not isinstance(data, Mapping):
         raise ParameterError(path or "parameters", data, "a mapping of keys to values")
-    # A field without a check is no key of the file.
-    fields = {
-        f.metadata["key"] or f.name: f
+    required = {
+        f.name
         for f in dataclasses.fields(kind)  # type: ignore[arg-type]
-        if "check" in f.metadata
+        if f.default is MISSING and f.default_factory is MISSING
     }
-    for key in data:
-        if key not in fields:
-            raise UnknownNameError(_join(path, str(key)), key, fields)
-    values: dict[str, Any] = {}
-    for name, field in fields.items():
-        dotted = _join(path, name)
-        if name in data:
-            values[field.name] = field.metadata["check"](dotted, data[name])
-        elif field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING:
-            raise ParameterError(dotted, None, "a value")
-    result = kind(**values)
-    verify = getattr(result, "verify", None)
-    if verify is not None:
-        verify(path)
-    return result
+    values = _values(kind, data, path)
+    for name, (field, _) in settings_of(kind).items():
+        if field in required and field not in values:
+            raise ParameterError(_join(path, name), None, "a value")
+    return _verified(kind(**values), path)
 
 
 def replace(section_value: T, changes: Mapping[str, object], path: str) -> T:
     """A copy of a section with some keys set anew, every one checked; all or none."""
-    fields = {f.name: f for f in dataclasses.fields(section_value)}  # type: ignore[arg-type]
-    checked = {}
-    for key, value in changes.items():
-        if key not in fields:
-            raise UnknownNameError(_join(path, key), key, fields)
-        checked[key] = fields[key].metadata["check"](_join(path, key), value)
-    result: T = dataclasses.replace(section_value, **checked)  # type: ignore[type-var]
+    values = _values(type(section_value), changes, path)
+    made: T = dataclasses.replace(section_value, **values)  # type: ignore[type-var]
+    return _verified(made, path)
+
+
+def _values(kind: type, data: Mapping[str, Any], path: str) -> dict[str, Any]:
+    """Checked values of some keys, by the field's name, in the order of the schema."""
+    keys = settings_of(kind)
+    for name in data:
+        if name not in keys:
+            raise UnknownNameError(_join(path, str(name)), name, keys)
+    return {
+        field: row.check(_join(path, name), data[name])
+        for name, (field, row) in keys.items()
+        if name in data
+    }
+
+
+def _verified(result: T, path: str) -> T:
     verify = getattr(result, "verify", None)
     if verify is not None:
         verify(path)
@@ -326,9 +319,9 @@ def plain(value: Any) -> Any:
         return {name: plain(entry) for name, entry in value.items()}
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return {
-            f.metadata.get("key") or f.name: plain(getattr(value, f.name))
-            for f in dataclasses.fields(value)
-            if not f.metadata.get("rare") or np.any(getattr(value, f.name))
+            name: plain(getattr(value, field))
+            for name, (field, row) in settings_of(type(value)).items()
+            if not row.rare or np.any(getattr(value, field))
         }
     if isinstance(value, np.ndarray):
         return value.tolist()
@@ -341,19 +334,16 @@ def units(kind: type, data: Mapping[str, Any], words: Mapping[str, str]) -> dict
     :param kind: the section's schema.
     :param words: what stands for ``{joint}`` and ``{effort}`` in them.
     """
-    fields: dict[str, Mapping[Any, Any]] = {}
-    for f in dataclasses.fields(kind):
-        fields |= {f.name: f.metadata, f.metadata.get("key") or f.name: f.metadata}
+    keys = settings_of(kind)
     result: dict[str, Any] = {}
-    for key, value in data.items():
-        metadata = fields.get(key, {})
-        nested, entries = metadata.get("section"), metadata.get("entries")
-        if nested is not None and isinstance(value, Mapping):
-            result[key] = units(nested, value, words)
-        elif entries is not None:
-            result[key] = {name: units(entries, entry, words) for name, entry in value.items()}
+    for name, value in data.items():
+        row = keys[name][1] if name in keys else Key()
+        if row.section is not None and isinstance(value, Mapping):
+            result[name] = units(row.section, value, words)
+        elif row.entries is not None:
+            result[name] = {own: units(row.entries, entry, words) for own, entry in value.items()}
         else:
-            result[key] = metadata.get("unit", "").format_map(words)
+            result[name] = row.unit.format_map(words)
     return result
 
 
@@ -364,55 +354,24 @@ def frozen(values: object) -> Array:
     return array
 
 
-def _field(
-    check: Check,
-    default: Any,
-    bound: str,
-    unit: str = "",
-    *,
-    key: str | None = None,
-    kind: type | None = None,
-    entries: type | None = None,
-) -> Any:
-    metadata = {
-        "check": check, "key": key, "unit": unit, "bound": bound, "default": default,
-        "section": kind, "entries": entries,
-    }  # fmt: skip
-    if default is dataclasses.MISSING:
-        return dataclasses.field(metadata=metadata)
-    if isinstance(default, (list, dict)):
-        return dataclasses.field(metadata=metadata, default_factory=lambda: check("", default))
-    return dataclasses.field(metadata=metadata, default=default)
+def _is_number(value: Any) -> bool:
+    kinds = int, float, np.integer, np.floating
+    return isinstance(value, kinds) and not isinstance(value, bool)
 
 
-def _bound(
-    above: float = -math.inf,
-    at_least: float = -math.inf,
-    at_most: float = math.inf,
-    infinite: bool = False,
-) -> str:
-    """Bounds in words, to stand behind what they bound."""
-    words = f" above {above:g}" if above > -math.inf else ""
-    if at_least > -math.inf:
-        words += f", at least {at_least:g}"
-    if at_most < math.inf:
-        words += f", at most {at_most:g}"
-    return words + (", or .inf" if infinite else "")
+def _nested(field: str, value: Any, shape: Sequence[int], bounds: Key, least: int = 1) -> Any:
+    """A number, or lists of them of a shape."""
+    if not shape:
+        return _number(field, value, bounds)
+    items = _sequence(field, value, shape[0], "numbers", least)
+    return [_nested(f"{field}[{i}]", item, shape[1:], bounds) for i, item in enumerate(items)]
 
 
-def _number(
-    field: str,
-    value: Any,
-    above: float = -math.inf,
-    at_least: float = -math.inf,
-    at_most: float = math.inf,
-    infinite: bool = False,
-    unit: str = "",
-) -> float:
-    bound = "a finite number" + _bound(above, at_least, at_most, infinite)
-    if at_most < math.inf and "{" not in unit:
-        bound += f" {unit}".rstrip()
-    if isinstance(value, bool) or not isinstance(value, (int, float, np.integer, np.floating)):
+def _number(field: str, value: Any, bounds: Key) -> float:
+    bound = f"a finite number{bounds.span}"
+    if bounds.high is not None and "{" not in bounds.unit:
+        bound += f" {bounds.unit}".rstrip()
+    if not _is_number(value):
         raise ParameterError(field, value, bound)
     try:
         result = float(value)
@@ -420,20 +379,10 @@ def _number(
         raise ParameterError(field, "an integer too large for a float", bound) from None
     if math.isfinite(result) and abs(result) > MAX_SIZE:
         bound += f", at most {MAX_SIZE:g} in size"
-    finite = abs(result) <= MAX_SIZE or (infinite and result == math.inf)
-    if not finite or not result > above or result < at_least or result > at_most:
+    endless = result == math.inf and bounds.high == math.inf
+    if not (abs(result) <= MAX_SIZE or endless) or not bounds.allows(result):
         raise ParameterError(field, value, bound)
     return result
-
-
-def _table(field: str, rows: Sequence[Any], columns: int) -> list[list[float]]:
-    return [
-        [
-            _number(f"{field}[{i}][{j}]", v)
-            for j, v in enumerate(_sequence(f"{field}[{i}]", row, columns))
-        ]
-        for i, row in enumerate(rows)
-    ]
 
 
 def _sequence(field: str, value: Any, size: int, what: str = "", least: int = 1) -> Sequence[Any]:

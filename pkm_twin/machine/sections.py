@@ -23,12 +23,12 @@ MAX_MASS: Final = 1e5
 
 def length(**options: Any) -> Any:
     """Field: a length that may be divided by, m."""
-    return schema.number(at_least=MIN_LENGTH, at_most=MAX_LENGTH, unit="m", **options)
+    return schema.number(low=MIN_LENGTH, high=MAX_LENGTH, unit="m", **options)
 
 
 def mass(**options: Any) -> Any:
     """Field: a mass of zero or more, kg."""
-    return schema.number(at_least=0.0, at_most=MAX_MASS, unit="kg", **options)
+    return schema.number(low=0.0, high=MAX_MASS, unit="kg", **options)
 
 
 def check_azimuths(azimuths: Array, path: str) -> None:
@@ -56,9 +56,7 @@ class Payload:
     """A body fixed to the platform: com from its reference point, inertia about the com."""
 
     mass: float = mass(default=0.0)
-    com: Array = schema.vector(
-        3, at_least=-MAX_LENGTH, at_most=MAX_LENGTH, unit="m", default=[0, 0, 0]
-    )
+    com: Array = schema.vector(3, low=-MAX_LENGTH, high=MAX_LENGTH, unit="m", default=[0, 0, 0])
     inertia: Array = schema.inertia(positive=False, default=[0, 0, 0])
 
 
@@ -95,12 +93,10 @@ class DriveSpec:
     ``rated_torque``: the motor's (N m), for tables whose efforts are in per cent of it.
     """
 
-    inertia: float = schema.number(at_least=0.0, unit="kg m2")
-    ratio: float | None = schema.number(
-        at_least=1e-6, at_most=1e6, unit="turns per turn", default=None
-    )
-    lead: float | None = schema.number(at_least=1e-6, at_most=1e6, unit="m per turn", default=None)
-    efficiency: float = schema.number(above=0.0, at_most=1.0, default=1.0)
+    inertia: float = schema.number(low=0.0, unit="kg m2")
+    ratio: float | None = schema.number(low=1e-6, high=1e6, unit="turns per turn", default=None)
+    lead: float | None = schema.number(low=1e-6, high=1e6, unit="m per turn", default=None)
+    efficiency: float = schema.number(above=0.0, high=1.0, default=1.0)
     rated_torque: float | None = schema.number(above=0.0, unit="N m", default=None)
 
     def verify(self, path: str) -> None:
@@ -131,28 +127,23 @@ def friction_of(joints: int) -> Any:
     ``offset``: what the drive needs beside, whatever the motion; then the parameters of the other
     laws of :mod:`~pkm_twin.machine.friction`.
     """
-    field: dict[str, Any] = {"spread": True, "default": [0.0] * joints}
-    entries = [
-        (key, Array, rare(key, schema.vector(joints, unit=one.unit, **one.bounds, **field)))
+    fields = friction_fields(schema.vector, joints, spread=True, default=[0.0] * joints)
+    return _section("Friction", fields, joints, {"verify": check_laws})
+
+
+def friction_fields(kind: Any, *size: int, **options: Any) -> list[tuple[str, Any, Any]]:
+    """Keys of friction, types and fields; a description leaves zeros out but for the basic law."""
+    return [
+        (key, Any, kind(*size, unit=one.unit, low=one.low, high=one.high,
+                        rare=key not in BASIC.parameters, **options))
         for key, one in all_keys().items()
-    ]
-    return _section("Friction", entries, joints, {"verify": check_laws})
-
-
-def rare(key: str, field: Any) -> Any:
-    """A field of friction, which a description leaves out where it is zero, if not the basic law's.
-
-    :param field: as of ``dataclasses.field``.
-    """
-    if key not in BASIC.parameters:
-        field.metadata = {**field.metadata, "rare": True}
-    return field
+    ]  # fmt: skip
 
 
 @remembered
 def limits_of(joints: int) -> Any:
     """Schema of limits of so many actuated joints; absent is None, one value stands for all."""
-    above: dict[str, Any] = {"above": 0.0, "infinite": True, "spread": True, "default": None}
+    above: dict[str, Any] = {"above": 0.0, "high": math.inf, "spread": True, "default": None}
     entries = [
         ("position", Any, schema.interval(count=joints, unit="{joint}", default=None)),
         ("velocity", Any, schema.vector(joints, unit="{joint}/s", **above)),

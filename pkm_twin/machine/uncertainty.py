@@ -14,10 +14,14 @@ from pkm_twin.machine.places import unknown_number
 
 @dataclass(frozen=True, eq=False)
 class UncertaintyEntry:
-    """Standard deviation of one number, or the common relative one of all numbers below a name."""
+    """How sure a number is, by its dotted path in this file, or all numbers below a name together.
 
-    deviation: float | None = schema.number(at_least=0.0, unit="the number's", default=None)
-    relative: float | None = schema.number(at_least=0.0, at_most=1.0, default=None)
+    Each entry is an independent cause. ``deviation``: the standard deviation, in the number's unit;
+    or ``relative``: that of a common factor.
+    """
+
+    deviation: float | None = schema.number(low=0.0, unit="the number's", default=None)
+    relative: float | None = schema.number(low=0.0, high=1.0, default=None)
 
     def verify(self, path: str) -> None:
         """One of both."""

@@ -76,10 +76,10 @@ class Inertia:
     arm_mass: float = mass()
     forearm_mass: float = mass()
     arm_com: float = schema.number(
-        at_least=0.0, at_most=1.0, unit="of the arm, from its pivot", default=0.5
+        low=0.0, high=1.0, unit="of the arm, from its pivot", default=0.5
     )
-    arm_inertia: float | None = schema.number(at_least=0.0, unit="kg m2", default=None)
-    rotor_inertia: float = schema.number(at_least=0.0, unit="kg m2", default=0.0)
+    arm_inertia: float | None = schema.number(low=0.0, unit="kg m2", default=None)
+    rotor_inertia: float = schema.number(low=0.0, unit="kg m2", default=0.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,13 +101,9 @@ class Members:
     parallelogram_width: float = length()
     rcu_forearm: Tube | None = schema.section(Tube, default=None)
     platform_inertia: Array | None = schema.inertia(positive=True, default=None)
-    drive_compliance: float = schema.number(
-        at_least=0.0, at_most=1.0, unit="rad/(N m)", default=0.0
-    )
-    elbow_compliance: float = schema.number(at_least=0.0, at_most=1.0, unit="m/N", default=0.0)
-    platform_joint_compliance: float = schema.number(
-        at_least=0.0, at_most=1.0, unit="m/N", default=0.0
-    )
+    drive_compliance: float = schema.number(low=0.0, high=1.0, unit="rad/(N m)", default=0.0)
+    elbow_compliance: float = schema.number(low=0.0, high=1.0, unit="m/N", default=0.0)
+    platform_joint_compliance: float = schema.number(low=0.0, high=1.0, unit="m/N", default=0.0)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

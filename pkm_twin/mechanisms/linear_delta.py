@@ -59,7 +59,7 @@ class Inertia:
     platform_mass: float = mass()
     carriage_mass: float = mass()
     rod_mass: float = mass(default=0.0)
-    rotor_inertia: float = schema.number(at_least=0.0, unit="kg", default=0.0)
+    rotor_inertia: float = schema.number(low=0.0, unit="kg", default=0.0)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -18,7 +18,7 @@ import numpy as np
 
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.codegen.expressions import norm, plain
-from pkm_twin.errors import ParameterError, UnknownNameError
+from pkm_twin.errors import ParameterError
 from pkm_twin.kinematics.pose import COORDINATES, Coordinate
 from pkm_twin.kinematics.scheme import check_masses, choose_coordinates
 from pkm_twin.machine import schema
@@ -30,16 +30,20 @@ from pkm_twin.machine.graph import (
 from pkm_twin.machine.graph_file import (
     KINDS,
     PER_COPY,
+    BodySpec,
+    JointSpec,
+    Limb,
     LimitSpec,
+    RodSpec,
     Source,
     driven,
     drives_of,
     graph_of_entries,
+    limbs_of,
     number_of_entry,
     numbered_entry,
     written_out,
 )
-from pkm_twin.machine.joint_map import JointMapEntry
 from pkm_twin.machine.joints import unit
 from pkm_twin.machine.members import Beam, Structure
 from pkm_twin.machine.places import (
@@ -52,9 +56,9 @@ from pkm_twin.machine.places import (
     placed,
 )
 from pkm_twin.machine.reach import PassiveLimit
-from pkm_twin.machine.sections import DriveSpec, Payload
-from pkm_twin.machine.uncertainty import UncertaintyEntry
+from pkm_twin.machine.sections import DriveSpec
 from pkm_twin.mechanisms import TwinRobot
+from pkm_twin.robot.mechanism import Common
 from pkm_twin.robot.robot_urdf import robot_description
 
 M = TypeVar("M", bound="Machine")
@@ -63,16 +67,30 @@ MOST_JOINTS: Final = 6
 """Most actuated joints."""
 
 
-_KEYS: Final = (
-    "mechanism", "gravity", "platform", "origin", "pose", "payload", *KINDS, "limbs", "joint_map",
-    "uncertainty", "element_compliance", "modal_damping",
-)  # fmt: skip
 _ELASTIC: Final = (
     ("bodies", "member"), ("joints", "compliance"), ("rods", "section"), ("rods", "radius"),
 )  # fmt: skip
 """What a graph has no place for, by the kind of its entry."""
 _TURNING: Final = {"joint": "rad", "effort": "N m", "rotor": "kg m2"}
 _SLIDING: Final = {"joint": "m", "effort": "N", "rotor": "kg"}
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class MachineFile(Common):
+    """Any machine as a graph of bodies, joints and rods, every vector in base axes at home."""
+
+    mechanism: str = schema.choice("machine")
+    platform: str = schema.text(default="platform", text="the body that carries the tool")
+    origin: Array | None = schema.vector(
+        3, unit="m", text="the platform's reference point at home; by default its com", default=None
+    )
+    pose: tuple[str, ...] | None = schema.words(
+        *COORDINATES, text="as many as the mobility; by default the first valid", default=None
+    )
+    bodies: Mapping[str, BodySpec] = schema.mapping(BodySpec, default={})
+    joints: Mapping[str, JointSpec] = schema.mapping(JointSpec, default={})
+    rods: Mapping[str, RodSpec] = schema.mapping(RodSpec, default={})
+    limbs: Sequence[Limb] = schema.key(limbs_of, "a section or a list of them", default=[])
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -91,45 +109,20 @@ class Machine(TwinRobot):
 
         :raises ParameterError: by the field.
         """
-        for key in data:
-            if key not in _KEYS:
-                raise UnknownNameError(str(key), key, _KEYS)
-        specs, sources = written_out(data)
-        graph = graph_of_entries(data, specs)
+        file = schema.build(MachineFile, data)
+        specs, sources = written_out({kind: getattr(file, kind) for kind in KINDS}, file.limbs)
+        graph = graph_of_entries(file.platform, specs, file.origin)
         graph.check()
         if len(graph.actuated) > MOST_JOINTS:
             raise ParameterError(
                 "joints", len(graph.actuated), f"at most {MOST_JOINTS} actuated joints"
             )
-        names = data.get("pose")
-        if names is None:
-            names = choose_coordinates(graph)
-        coordinates = schema.checked(schema.words(*COORDINATES), "pose", names)
-        sections = drives_of(graph, specs["joints"]) | {
-            "payload": schema.build(Payload, data.get("payload") or {}, "payload"),
-            "joint_map": schema.checked(
-                schema.mapping(JointMapEntry), "joint_map", data.get("joint_map") or {}
-            ),
-            "uncertainty": schema.checked(
-                schema.mapping(UncertaintyEntry), "uncertainty", data.get("uncertainty") or {}
-            ),
-            "gravity": schema.checked(
-                schema.vector(3), "gravity", data.get("gravity", [0, 0, -9.81])
-            ),
-            **{
-                key: schema.checked(cls.__dataclass_fields__[key], key, data.get(key) or empty)
-                for key, empty in (("element_compliance", {}), ("modal_damping", []))
-            },
-        }
+        pose = tuple(file.pose or choose_coordinates(graph))
+        common = {field.name: getattr(file, field.name) for field in dataclasses.fields(Common)}
         robot = cls(
-            mechanism="machine",
-            name=name,
-            described=graph,
-            specs=specs,
-            sources=sources,
-            pose=coordinates,
-            **sections,
-        )
+            name=name, described=graph, specs=specs, sources=sources, pose=pose,
+            **common, **drives_of(graph, specs["joints"]),
+        )  # fmt: skip
         _ = robot.controller
         robot.engine.check()
         check_masses(robot.engine, robot.graph)
@@ -147,10 +140,7 @@ class Machine(TwinRobot):
         for k, name in enumerate(made.joint_names):
             joints[name] = driven(joints[name], made.friction, made.limits, k)
         specs = {**made.specs, "joints": joints}
-        described = dataclasses.replace(
-            graph_of_entries({"platform": made.described.platform}, specs),
-            origin=made.described.origin,
-        )
+        described = graph_of_entries(made.described.platform, specs, made.described.origin)
         return made._with(specs=specs, described=described)
 
     def numbered(self, values: Mapping[str, Any]) -> Machine:
@@ -176,9 +166,7 @@ class Machine(TwinRobot):
                 rest[path] = value
         for (kind, name, _, place, azimuth), new in sorted(changes.items(), key=lambda c: c[0][2]):
             specs[kind][name] = numbered_entry(specs[kind][name], new, azimuth, place)
-        described = dataclasses.replace(
-            graph_of_entries({"platform": self.described.platform}, specs), origin=origin
-        )
+        described = graph_of_entries(self.described.platform, specs, origin)
         made = super().numbered(rest)
         return made._with(described=described, specs=specs, **drives_of(described, specs["joints"]))
 
@@ -276,7 +264,8 @@ class Machine(TwinRobot):
     def parameter_units(self) -> dict[str, Any]:
         """Units of the same, of each joint by its own type."""
         sections = self.parameter_sections()
-        result = schema.units(type(self), sections, {}) | {"origin": "m"}
+        plain = {key: value for key, value in sections.items() if key not in KINDS}
+        result = schema.units(MachineFile, plain, {})
         for kind, spec in KINDS.items():
             result[kind] = {}
             for name, entry in sections.get(kind, {}).items():

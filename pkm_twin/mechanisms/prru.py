@@ -92,13 +92,13 @@ class Inertia:
     upper_link_mass: float = mass()
     platform_mass: float = mass()
     link_com: float = schema.number(
-        at_least=0.0, at_most=1.0, unit="of the link, from the slider's joint", default=0.5
+        low=0.0, high=1.0, unit="of the link, from the slider's joint", default=0.5
     )
-    lower_link_inertia: Array | None = schema.vector(2, at_least=0.0, unit="kg m2", default=None)
-    upper_link_inertia: Array | None = schema.vector(2, at_least=0.0, unit="kg m2", default=None)
+    lower_link_inertia: Array | None = schema.vector(2, low=0.0, unit="kg m2", default=None)
+    upper_link_inertia: Array | None = schema.vector(2, low=0.0, unit="kg m2", default=None)
     platform_com: Array = schema.vector(3, unit="m", default=[0, 0, 0])
     platform_inertia: Array | None = schema.inertia(positive=False, default=None)
-    rotor_inertia: float = schema.number(at_least=0.0, unit="kg", default=0.0)
+    rotor_inertia: float = schema.number(low=0.0, unit="kg", default=0.0)
 
     def verify(self, path: str) -> None:
         """Axial moments within the triangle rule."""

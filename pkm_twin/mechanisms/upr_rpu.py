@@ -84,8 +84,8 @@ class Members:
 
     youngs_modulus: float = modulus()
     shear_modulus: float = modulus()
-    diameter: Array = schema.vector(3, at_least=MIN_LENGTH, spread=True, unit="m")
-    shear_factor: float = schema.number(at_least=0.0, at_most=10.0, default=1.0)
+    diameter: Array = schema.vector(3, low=MIN_LENGTH, spread=True, unit="m")
+    shear_factor: float = schema.number(low=0.0, high=10.0, default=1.0)
 
     def verify(self, path: str) -> None:
         """Diameters whose fourth power is a number to compute with."""
@@ -133,11 +133,11 @@ class Inertia:
     axes; the default is a thin disc of the platform's radius about the reference point.
     """
 
-    density: float = schema.number(above=0.0, at_most=1e5, unit="kg/m3")
+    density: float = schema.number(above=0.0, high=1e5, unit="kg/m3")
     platform_mass: float = mass()
     platform_com: Array = schema.vector(3, unit="m", default=[0, 0, 0])
     platform_inertia: Array | None = schema.inertia(positive=False, default=None)
-    rotor_inertia: float = schema.number(at_least=0.0, unit="kg", default=0.0)
+    rotor_inertia: float = schema.number(low=0.0, unit="kg", default=0.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,7 +148,7 @@ class Limits:
     """
 
     limb_length: Array | None = schema.interval(above=0.0, count=3, unit="m", default=None)
-    joint_angle: float | None = schema.number(above=0.0, at_most=math.pi, unit="rad", default=None)
+    joint_angle: float | None = schema.number(above=0.0, high=math.pi, unit="rad", default=None)
 
     @property
     def position(self) -> Array | None:

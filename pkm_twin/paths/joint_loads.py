@@ -41,9 +41,9 @@ class BearingSpec:
     """
 
     C: float = schema.number(above=0.0, unit="N")
-    p: float = schema.number(at_least=1.0, at_most=20.0, default=3.0)
-    X: float = schema.number(at_least=0.0, at_most=100.0, default=1.0)
-    Y: float | None = schema.number(at_least=0.0, at_most=100.0, default=None)
+    p: float = schema.number(low=1.0, high=20.0, default=3.0)
+    X: float = schema.number(low=0.0, high=100.0, default=1.0)
+    Y: float | None = schema.number(low=0.0, high=100.0, default=None)
     axis: Array | None = schema.vector(3, default=None)
 
 

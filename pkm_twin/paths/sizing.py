@@ -116,14 +116,14 @@ class MotorSpec:
     then a straight line to the continuous torque at the greatest speed.
     """
 
-    inertia: float = schema.number(at_least=1e-10, at_most=1e4, unit="kg m2")
-    continuous_torque: float = schema.number(at_least=1e-6, at_most=1e7, unit="N m")
-    peak_torque: float = schema.number(at_least=1e-6, at_most=1e7, unit="N m")
-    rated_speed: float = schema.number(at_least=1e-3, at_most=1e7, unit="1/min")
-    max_speed: float = schema.number(at_least=1e-3, at_most=1e7, unit="1/min")
+    inertia: float = schema.number(low=1e-10, high=1e4, unit="kg m2")
+    continuous_torque: float = schema.number(low=1e-6, high=1e7, unit="N m")
+    peak_torque: float = schema.number(low=1e-6, high=1e7, unit="N m")
+    rated_speed: float = schema.number(low=1e-3, high=1e7, unit="1/min")
+    max_speed: float = schema.number(low=1e-3, high=1e7, unit="1/min")
     source: str = schema.text(default="")
-    curve: Any = dataclasses.field(
-        default=None, metadata={"check": lambda field, value: _curve(field, value), "key": None}
+    curve: Any = schema.key(
+        lambda field, value: _curve(field, value), "rows of speed and torque", default=None
     )
 
     def verify(self, path: str) -> None:

@@ -47,6 +47,7 @@ from pkm_twin.machine.uncertainty import (
     causes_of,
 )
 from pkm_twin.machine.urdf_file import Visual
+from pkm_twin.settings import settings_of
 
 R = TypeVar("R", bound="Mechanism")
 
@@ -66,33 +67,46 @@ class Inverse:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Mechanism:
+class Common:
+    """Keys of every robot file."""
+
+    mechanism: str
+    payload: Payload = schema.section(Payload, default={})
+    gravity: Array = schema.vector(
+        3, unit="m/s2", text="free fall, base axes", default=[0, 0, -9.81]
+    )
+    joint_map: Mapping[str, JointMapEntry] = schema.mapping(JointMapEntry, default={})
+    uncertainty: Mapping[str, UncertaintyEntry] = schema.mapping(UncertaintyEntry, default={})
+    element_compliance: Mapping[str, float] = schema.mapping(
+        schema.number(low=1e-6, high=1e6), default={},
+        text="factors on the compliance of elastic elements, by the names of `strain_energy`",
+    )  # fmt: skip
+    modal_damping: Array = schema.vector(
+        0, above=0.0, high=0.99, default=[],
+        text="damping ratios of the natural modes from the lowest on; the last is all others'",
+    )  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Mechanism(Common):
     """What a robot file says of a machine of n actuated joints and m pose coordinates.
 
     Frozen; :meth:`changed` gives a copy with other parameters.
     """
 
-    mechanism: str
     name: str = ""
     """The name that the robot was loaded by."""
     home_choice: str = ""
     """How the home was chosen, of a file that leaves it open."""
     visuals: tuple[Visual, ...] = ()
     """Meshes of a URDF's links."""
-    payload: Payload = schema.section(Payload, default={})
     friction: Coefficients = schema.section(friction_of(3), default={})
-    gravity: Array = schema.vector(3, unit="m/s2", default=[0, 0, -9.81])
-    limits: JointLimits = schema.section(limits_of(3), default={})
-    drive: DriveSpec | None = schema.section(DriveSpec, default=None)
-    """Rotor and gear of every actuated joint, in place of ``inertia.rotor_inertia``."""
-    joint_map: Mapping[str, JointMapEntry] = schema.mapping(JointMapEntry, default={})
-    uncertainty: Mapping[str, UncertaintyEntry] = schema.mapping(UncertaintyEntry, default={})
-    element_compliance: Mapping[str, float] = schema.mapping(
-        schema.number(at_least=1e-6, at_most=1e6), default={}
+    limits: JointLimits = schema.section(
+        limits_of(3), text="nodes and commands reject values beyond, or warn", default={}
     )
-    """Factors on the compliance of elastic elements, by name; 1 where left out."""
-    modal_damping: Array = schema.vector(0, above=0.0, at_most=0.99, default=[])
-    """Damping ratios of the natural modes from the lowest on; the last is that of all others."""
+    drive: DriveSpec | None = schema.section(
+        DriveSpec, text="of every actuated joint, in place of `inertia.rotor_inertia`", default=None
+    )
     home_joint: float | None = None
     """Value of every actuated joint at home, where a mechanism chooses it: kept by copies, so that
     other limits do not move the home."""
@@ -323,8 +337,7 @@ class Mechanism:
 
     def parameter_sections(self) -> dict[str, Any]:
         """The parameters by section, as plain data."""
-        fields = (f.name for f in dataclasses.fields(self) if "check" in f.metadata)
-        return {name: schema.plain(getattr(self, name)) for name in fields}
+        return {name: schema.plain(getattr(self, name)) for name in settings_of(type(self))}
 
     def parameter_units(self) -> dict[str, Any]:
         """Units of the same, by section; empty where a parameter has none."""
@@ -413,8 +426,7 @@ class Mechanism:
         :raises ParameterError: a path that there is not.
         """
         keys = full_keys(path)
-        sections = {f.name for f in dataclasses.fields(self) if "check" in f.metadata}
-        if not keys or keys[0] not in sections:
+        if not keys or keys[0] not in settings_of(type(self)):
             numbers = numbers_of(self.parameter_sections(), self.parameter_units())
             raise unknown_number(path, numbers)
         return number_in(schema.plain(getattr(self, str(keys[0]))), keys[1:], path)
@@ -481,8 +493,7 @@ class Mechanism:
             if isinstance(value, Mapping) and not isinstance(getattr(self, key), Mapping):
                 new[key] = schema.replace(getattr(self, key), value, key)
             else:
-                fields = {f.name: f for f in dataclasses.fields(self)}
-                new[key] = fields[key].metadata["check"](key, value)
+                new[key] = settings_of(type(self))[key][1].check(key, value)
         made = dataclasses.replace(self, **new)
         made.check_elements()
         return made

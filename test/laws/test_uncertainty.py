@@ -137,8 +137,8 @@ def test_what_scales_all_scales_the_answer() -> None:
         ({"inertia.mass": {"deviation": 0.1}}, r"uncertainty\.inertia\.mass"),
         ({"inertia": {"deviation": 0.1}}, "names several numbers"),
         ({"inertia.arm_mass": {}}, "expected either"),
-        ({"inertia.arm_mass": {"deviation": -1.0}}, "at least 0"),
-        ({"inertia.arm_mass": {"relative": 1.5}}, "at most 1"),
+        ({"inertia.arm_mass": {"deviation": -1.0}}, "0 or more"),
+        ({"inertia.arm_mass": {"relative": 1.5}}, "0 to 1"),
         ({"uncertainty": {"relative": 0.5}}, r"uncertainty\.uncertainty"),
     ],
 )

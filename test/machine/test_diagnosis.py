@@ -11,8 +11,9 @@ from pkm_twin.errors import MobilityError, ParameterError
 from pkm_twin.kinematics.conditions import Conditions
 from pkm_twin.kinematics.diagnosis import is_right, near_conditions
 from pkm_twin.kinematics.spins import without_spins
-from pkm_twin.machine.graph_file import graph_of_entries, written_out
-from pkm_twin.mechanisms.machine import Machine
+from pkm_twin.machine import schema
+from pkm_twin.machine.graph_file import KINDS, graph_of_entries, written_out
+from pkm_twin.mechanisms.machine import Machine, MachineFile
 from test.support.robots import partly_long
 
 from .random_machines import changed, plain
@@ -22,7 +23,9 @@ DEVIATIONS = partly_long((1e-7, 1e-5, 1e-3), 1e-5)
 
 
 def graph_of(data):
-    return graph_of_entries(data, written_out(data)[0])
+    file = schema.build(MachineFile, data)
+    kinds = {kind: getattr(file, kind) for kind in KINDS}
+    return graph_of_entries(file.platform, written_out(kinds, file.limbs)[0], file.origin)
 
 
 def tilted(axis, angle, rng):

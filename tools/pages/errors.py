@@ -26,7 +26,7 @@ Written by `make pages`.
 """
 ERRORS = {
     errors.ParameterError: (
-        errors.ParameterError("geometry.arm_length", -0.2, "a number, at least 1e-06"),
+        errors.ParameterError("geometry.arm_length", -0.2, "a finite number, 1e-06 to 100 m"),
         "correct the value; [robot files](parameters.md) lists all keys with their bounds",
     ),
     errors.FileError: (
