@@ -14,7 +14,7 @@ from pkm_twin import load
 from stiffness_monitor import strain_energy
 from stiffness_monitor.modes import modes, natural_frequencies
 from test.support.pages import assert_printed, numbers
-from test.support.robots import parameters_of
+from test.support.robots import parameters_of, partly_long
 from test.support.workspaces import even_samples, polar_samples
 from test.validation import test_delta_cu_paper as delta_cu
 from test.validation import test_upr_rpu_paper as upr_rpu
@@ -143,16 +143,20 @@ class TestTablesOfTheUprRpuPaper:
         assert worst("P1", rays) < on_rays
 
 
-def test_torques_of_random_machines():
+@pytest.mark.parametrize("machine", partly_long(range(6), 0, 1))
+@pytest.mark.parametrize("name", ["delta", "delta_cu", "prru"])
+def test_torques_of_random_machines(name, machine):
     """Some of the states that `make certificate` takes are within what the page says of all."""
-    pytest.importorskip("mujoco")
-    pytest.importorskip("pinocchio")
-    from tools.certificate.compare import compare
+    for library in ("mpmath", "mujoco", "pinocchio"):
+        pytest.importorskip(library)
+    from tools.certificate.compare import BALANCE_BOUNDS, PLACE_BOUND, ROUTES, compare
     from tools.certificate.machines import ROBOTS
 
     worst = numbers(PAGE, r"at 50 digits \(\d+ states\): worst relative difference (\S+)\. ")[0]
-    for k, name in enumerate(ROBOTS):
-        found = compare(name, (20261121, k, 0), states=10, exact=0).efforts
-        for route in ("Pinocchio", "MuJoCo"):
-            assert len(found[route]) == 10
-            assert max(found[route]) <= worst, (name, route)
+    found = compare(name, (20261121, ROBOTS.index(name), machine), states=20, exact=2)
+    for route in ROUTES:
+        assert len(found.efforts[route]) == (2 if route == "Lagrange" else 20)
+        assert max(found.efforts[route]) < 2.0 * worst, route
+        assert max(found.places[route]) < PLACE_BOUND, route
+    for what, bound in BALANCE_BOUNDS.items():
+        assert max(found.balances[what]) < bound, what

@@ -72,117 +72,6 @@ def loads(count, seed):
     return rng.normal(size=(count, 6)) * [50, 50, 50, 20, 20, 20]
 
 
-# --- The second route: minimum complementary energy, written from internal forces alone.
-
-
-def limb_frames(robot, pose):
-    """Per limb: unit wrenches at o (6, 3), its two ends, and its elements' axes."""
-    z, beta, _ = pose
-    o = np.array([0.0, -z * np.tan(beta), z])
-    rotation = robot.rotation(pose)
-    pattern = np.array([[-1.0, 0, 0], [1, 0, 0], [0, 1, 0]])
-    upper = o + robot.geometry.platform_radius * pattern @ rotation.T
-    lower = robot.geometry.base_radius * pattern
-    x, y = np.array([1.0, 0, 0]), rotation[:, 1]
-    tau = np.cross(x, y)
-    for i in range(3):
-        at, line = (lower[i], y) if i < 2 else (upper[i], x)
-        along = upper[i] - lower[i] if i < 2 else lower[i] - upper[i]
-        along = along / np.linalg.norm(along)
-        wrenches = np.zeros((6, 3))
-        wrenches[:3, 0], wrenches[3:, 0] = along, np.cross(upper[i] - o, along)
-        wrenches[:3, 1], wrenches[3:, 1] = line, np.cross(at - o, line)
-        wrenches[3:, 2] = tau
-        down = (lower[i] - upper[i]) / np.linalg.norm(lower[i] - upper[i])
-        universal = np.column_stack((x, y, tau))
-        if i < 2:
-            revolute = np.column_stack((np.cross(y, down), y, down))
-        else:
-            revolute = np.column_stack((x, np.cross(down, x), down))
-        yield o, wrenches, upper[i], lower[i], revolute, universal
-
-
-def joint_compliance(wrenches, o, centre, axes, diagonal):
-    """Energy of a joint under unit wrenches, moved to its centre and into its axes."""
-    force = axes.T @ wrenches[:3]
-    moment = axes.T @ (wrenches[3:] - np.cross(centre - o, wrenches[:3], axisb=0).T)
-    load = np.vstack((force, moment))
-    free = np.isinf(diagonal)
-    assert np.abs(load[free]).max() < 1e-12, "a free axis carries load"
-    return load.T @ np.diag(np.where(free, 0.0, diagonal)) @ load
-
-
-def bar_compliance(wrenches, o, upper, lower, members, diameter):
-    """Energy of a beam by Gauss quadrature of its internal forces."""
-    length = np.linalg.norm(lower - upper)
-    along = (lower - upper) / length
-    area, second = math.pi * diameter**2 / 4, math.pi * diameter**4 / 64
-    across = np.eye(3) - np.outer(along, along)
-    line = np.outer(along, along)
-    nodes, weights = np.polynomial.legendre.leggauss(4)
-    force = wrenches[:3]
-    result = np.zeros((3, 3))
-    for node, weight in zip(nodes, weights, strict=True):
-        point = upper + along * length * (node + 1) / 2
-        moment = wrenches[3:] - np.cross(point - o, force, axisb=0).T
-        dv = weight * length / 2
-        result += dv * force.T @ line @ force / (members.youngs_modulus * area)
-        result += (
-            dv * members.shear_factor * force.T @ across @ force / (members.shear_modulus * area)
-        )
-        result += dv * moment.T @ across @ moment / (members.youngs_modulus * second)
-        result += dv * moment.T @ line @ moment / (members.shear_modulus * 2 * second)
-    return result
-
-
-def second_route(robot, pose):
-    """Compliance and, per unit load, energy matrices of the nine elements, shape (9, 6, 6).
-
-    Of all internal forces with sum J_i W_i = P, those of least complementary energy: one linear
-    system in W and the multipliers, which are the deflection.
-    """
-    elements, wrenches = [], []
-    j = robot.joints_compliance
-    frames = limb_frames(robot, pose)
-    for i, (o, unit, upper, lower, revolute, universal) in enumerate(frames):
-        if i < 2:
-            r = joint_compliance(unit, o, upper, revolute, j.upr_revolute)
-            u = joint_compliance(unit, o, lower, universal, j.upr_universal)
-        else:
-            r = joint_compliance(unit, o, lower, revolute, j.rpu_revolute)
-            u = joint_compliance(unit, o, upper, universal, j.rpu_universal)
-        b = bar_compliance(unit, o, upper, lower, robot.members, robot.members.diameter[i])
-        wrenches.append(unit)
-        elements += [(i, r), (i, b), (i, u)]
-    statics = np.hstack(wrenches)
-    block = np.zeros((9, 9))
-    for i, matrix in elements:
-        block[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] += matrix
-    # Units of micrometres, so that the system's two halves are of one size.
-    system = np.block([[1e9 * block, statics.T], [statics, np.zeros((6, 6))]])
-    solution = np.linalg.solve(system, np.vstack((np.zeros((9, 6)), np.eye(6))))
-    forces, c = solution[:9], -solution[9:] / 1e9
-    parts = [
-        forces[3 * i : 3 * i + 3].T @ matrix @ forces[3 * i : 3 * i + 3] for i, matrix in elements
-    ]
-    return c, np.array(parts)
-
-
-@pytest.mark.parametrize(("robot", "poses"), EACH)
-def test_second_route(robot, poses):
-    wrench = loads(len(poses), 3)
-    c = compliance(robot, poses)
-    energy = strain_energy(robot, poses, wrench)
-    for k, pose in enumerate(poses):
-        expected, parts = second_route(robot, pose)
-        size = np.sqrt(np.diag(expected))
-        assert c[k] / np.outer(size, size) == pytest.approx(
-            expected / np.outer(size, size), abs=1e-9
-        )
-        energies = 0.5 * np.einsum("i,eij,j->e", wrench[k], parts, wrench[k])
-        assert energy.energies[k] == pytest.approx(energies, abs=1e-8 * energies.sum())
-
-
 @pytest.mark.parametrize(("robot", "poses"), EACH)
 def test_closed_form(robot, poses):
     """The frame against the paper's equations, element by element, with factors on some."""
@@ -195,9 +84,6 @@ def test_closed_form(robot, poses):
             size = np.sqrt(np.diag(expected))
             assert np.abs((found.compliance[k] - expected) / np.outer(size, size)).max() < 1e-10
             assert found.energies[k] == pytest.approx(energies, abs=1e-10 * energies.sum())
-
-
-# --- Laws of the matrices.
 
 
 def test_stiffer_parts_make_a_stiffer_machine():
@@ -217,9 +103,6 @@ def test_stiffer_parts_make_a_stiffer_machine():
         e = strain_energy(rigid, poses, loads(len(poses), 13))
         assert e.factors[:, [0, 2, 3, 5, 6, 8]] == pytest.approx(0, abs=0)
         assert e.factors[:, [1, 4, 7]].sum(-1) == pytest.approx(1, abs=1e-14)
-
-
-# --- Interface: shapes, ties, zero loads, refusals.
 
 
 def test_zero_wrench_has_no_dominant_element():
