@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 
 from delta_dynamics import energy, forward_dynamics, inverse_dynamics, mass_matrix
-from pkm_twin.errors import SingularityError, UnreachableError
 from test.support.bodies import bodies, rubs
 from test.support.robots import (
     FREE,
@@ -13,7 +12,6 @@ from test.support.robots import (
     loaded,
     massive,
     parameters_of,
-    random_joints,
     random_motion,
 )
 
@@ -106,30 +104,6 @@ def test_a_control_loop_fills_its_arrays_with_the_torques(name, robot, rng):
     )
     loop.qd[1] = np.inf
     assert loop() == 2 and np.isnan(loop.tau[1]).all()
-
-
-def test_refused_poses_name_sample_and_limb_or_measure(name, robot, rng):
-    """Poses far outside: by the machine's size along its lengths, nearly on edge by its angles."""
-    at = robot.forward(random_joints(robot, rng, 1)[0])
-    reach = np.array([5 * robot.engine.tree.size if u == "m" else 1.5 for u in robot.pose_units])
-    refused = 0
-    for far in at + reach * rng.uniform(-1.0, 1.0, (40, len(at))):
-        if robot.try_inverse(far)[1]:
-            continue
-        refused += 1
-        batch = np.tile(at, (2, 3, 1))
-        batch[1, 2] = far
-        with pytest.raises((UnreachableError, SingularityError)) as caught:
-            robot.inverse(batch)
-        error = caught.value
-        assert error.index == (1, 2)
-        if isinstance(error, UnreachableError):
-            assert error.limb in {*robot.limb_names, *robot.graph.joints, *robot.graph.rods}
-            assert error.miss > 0.0
-        else:
-            assert error.measure < error.bound
-    # Telescopes without an end reach nearly everywhere.
-    assert refused
 
 
 def heavier_sections(data, times):

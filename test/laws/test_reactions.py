@@ -15,7 +15,6 @@ from test.support.robots import (
     MASSIVE,
     load,
     loaded,
-    loaded_like,
     massive,
     random_motion,
 )
@@ -110,31 +109,6 @@ def test_what_is_determinate_is_a_matter_of_counting(name, rng):
 
 
 @massive
-def test_no_joint_does_work_against_its_freedoms(name, rng):
-    """Power of all constraint wrenches on the actual motion is that of the actuators."""
-    robot = load(name).changed(friction=FREE)
-    q, qd, qdd, wrench = states(robot, rng, 50)
-    result = least_norm_reactions(robot, q, qd, qdd, wrench)
-    all_ = bodies(robot, q, qd, qdd)
-
-    def motion_of(body):
-        """Velocity of the base's origin as a point of the body, and angular velocity."""
-        if body == "base":
-            return np.zeros((2, 50, 3))
-        k = robot.body_names.index(body)
-        v, w = (np.einsum("nij,nj->ni", part[:, k], qd) for part in (all_.linear, all_.angular))
-        return v - np.cross(w, all_.com[:, k]), w
-
-    power = np.zeros(50)
-    for k, (inner, outer) in enumerate(result.bodies):
-        (vi, wi), (vo, wo) = motion_of(inner), motion_of(outer)
-        v, w = vo - vi, wo - wi
-        f, m = result.wrenches[:, k, :3], result.wrenches[:, k, 3:]
-        power += np.sum(f * (v + np.cross(w, result.points[:, k])) + m * w, -1)
-    np.testing.assert_allclose(power, np.sum(result.efforts * qd, -1), rtol=1e-9, atol=1e-8)
-
-
-@massive
 def test_results_are_read_only_and_found_by_name(name, rng):
     robot = load(name)
     result = reactions(robot, *states(robot, rng, 2))
@@ -155,60 +129,6 @@ def test_a_hanging_delta_carries_its_weight():
         platform = result.wrench(f"platform joint {limb}")
         assert platform[2] == pytest.approx(inertia.platform_mass * 9.81 / 3, rel=1e-12)
         assert np.abs(platform[3:]).max() < 1e-14
-
-
-def test_a_moment_on_the_delta_platform_loads_the_parallelograms():
-    """Without weight the three couples alone balance a moment, each alike at both ends."""
-    robot = load("delta").changed(gravity=[0, 0, 0])
-    moment = np.array([0.0, 0.0, 0.0, 0.3, -0.2, 0.5])
-    result = reactions(robot, [0.2, 0.4, -0.1], np.zeros(3), np.zeros(3), moment)
-    platform = sum(result.wrench(f"platform joint {limb}") for limb in ("I", "II", "III"))
-    np.testing.assert_allclose(platform[3:], -moment[3:], atol=1e-14)
-    for limb in ("I", "II", "III"):
-        at_c, at_b = (result.wrench(f"{j} {limb}") for j in ("platform joint", "elbow"))
-        np.testing.assert_allclose(at_b, at_c, atol=1e-14)
-        assert np.abs(at_c[:3]).max() < 1e-14
-        assert np.abs(at_c[3:]).max() > 0.01
-    assert np.abs(result.efforts).max() < 1e-14
-
-
-def test_the_rcu_limb_transmits_what_its_joints_hold(rng):
-    robot = loaded("delta_cu")
-    result = reactions(robot, *states(robot, rng, 50))
-    azimuth = robot.geometry.azimuths[2]
-    t = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
-    elbow, corner = result.wrench("elbow III"), result.wrench("platform joint III")
-    size = np.abs(result.wrenches).max()
-    assert np.abs(elbow[:, :3] @ t).max() < 1e-14 * size
-    assert np.abs(elbow[:, 3:] @ t).max() < 1e-14 * size
-    assert np.abs(corner[:, 3:5]).max() < 1e-14 * size
-    assert np.abs(corner[:, 5]).max() > 1e-3
-
-
-def test_prru_joints_hold_no_moment_about_their_axes(rng, variant):
-    # Links with inertia about the limb: thin ones leave the universal joint without a moment.
-    robot = variant("prru", inertia={"upper_link_inertia": [0.1, 0.02]})[0]
-    robot = loaded_like(robot)
-    q, *rest = states(robot, rng, 50)
-    result = reactions(robot, q, *rest)
-    _, rotation = robot.platform(q)
-    size = np.abs(result.wrenches).max()
-    for i, limb in enumerate(("I", "II", "III")):
-        azimuth = robot.geometry.azimuths[i]
-        t = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
-        points = [result.points[:, result.names.index(f"{j} {limb}")]
-                  for j in ("slider joint", "platform joint")]  # fmt: skip
-        d = (points[1] - points[0]) / robot.geometry.limb_length
-        np.testing.assert_allclose(np.linalg.norm(d, axis=-1), 1.0, atol=1e-12)
-        assert np.abs(result.wrench(f"slider joint {limb}")[:, 3:] @ t).max() < 1e-13 * size
-        assert (
-            np.abs(np.sum(result.wrench(f"link joint {limb}")[:, 3:] * d, -1)).max() < 1e-13 * size
-        )
-        last = result.wrench(f"platform joint {limb}")[:, 3:]
-        h = rotation @ t
-        assert np.abs(last).min(-1).max() > 1e-5
-        assert np.abs(np.sum(last * h, -1)).max() < 1e-13 * size
-        assert np.abs(np.sum(last * np.cross(d, h), -1)).max() < 1e-13 * size
 
 
 OVERCONSTRAINED = [
