@@ -1,6 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
 import fcntl
-import functools
 import gc
 import os
 import signal
@@ -14,7 +13,7 @@ import numpy as np
 import pytest
 import yaml
 
-from test.support.command import command
+from test.support.command import Commands
 from test.support.robots import (  # noqa: F401
     LIMITED,
     both_ways,
@@ -79,7 +78,7 @@ def rng():
 @pytest.fixture
 def twin(capsys):
     """Run a command in this process: twin("info", "delta_cu")."""
-    return functools.partial(command, capsys)
+    return Commands(capsys)
 
 
 @pytest.fixture

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from pkm_twin.apps.commands.check import Check, check_one
 from pkm_twin.bags.reader import BagWriter, open_bag
 from pkm_twin.report import plots
 from test.support.command import Result
@@ -74,6 +75,16 @@ def rewrite(source, target, change=None, begin=0.0, seconds=1.2, metadata=None, 
             if message is not None:
                 writer.write(m.topic, message, m.log_time)
     return target
+
+
+def checked(bag, **options):
+    """The report of `check`, without what `fit` finds, which takes some seconds."""
+    return check_one(Check(bag=bag, **options), bag, thorough=False)
+
+
+def items_of(report):
+    """Judged items of a report's data by their names."""
+    return {item["what"]: item for item in report.data["items"]}
 
 
 @pytest.fixture(scope="session")

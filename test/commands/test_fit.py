@@ -2,7 +2,6 @@
 """`pkm-twin fit` and `pkm-twin excite` as a user runs them."""
 
 import functools
-import json
 from pathlib import Path
 
 import numpy as np
@@ -17,29 +16,22 @@ from pkm_twin.robot.entries import entries, robot_text, with_entries
 from stiffness_monitor import compliance
 from test.commands.conftest import DELTA, STIFFNESS, rewrite
 from test.laws.recordings import smooth_motion
-from test.support.command import command
 from test.support.robots import load, parameters_of
+from test.support.tables import of_joints, read_columns, write_columns
 
-HEAD = ("five_bar", "friction,payload")
 LONG = functools.partial(pytest.param, marks=pytest.mark.long)
 
 
 def table(path, robot, seconds=6.0, efforts=True):
     """A CSV of a motion, with what the robot needs for it."""
     time, q, qd, qdd = smooth_motion(robot, np.random.default_rng(1), seconds, 200.0)
-    columns = {"time": time}
-    columns |= {f"{j}.position": q[:, k] for k, j in enumerate(robot.joint_names)}
+    columns = {"time": time} | of_joints(robot, "position", q)
     if efforts:
-        tau = inverse_dynamics(robot, q, qd, qdd)
-        columns |= {f"{j}.effort": tau[:, k] for k, j in enumerate(robot.joint_names)}
-    np.savetxt(
-        path, np.stack(list(columns.values()), -1), "%.17g", ",", header=",".join(columns),
-        comments="",
-    )  # fmt: skip
-    return path
+        columns |= of_joints(robot, "effort", inverse_dynamics(robot, q, qd, qdd))
+    return write_columns(path, columns)
 
 
-def test_fit_of_a_table_writes_a_robot_with_deviations_and_a_report(capsys, tmp_path):
+def test_fit_of_a_table_writes_a_robot_with_deviations_and_a_report(twin, tmp_path):
     pytest.importorskip("cvxpy")
     true = load("five_bar").changed(
         friction={"viscous": [0.03, 0.05], "coulomb": [0.2, 0.15]},
@@ -47,9 +39,7 @@ def test_fit_of_a_table_writes_a_robot_with_deviations_and_a_report(capsys, tmp_
     )
     source = table(tmp_path / "motion.csv", true)
     out = tmp_path / "fitted.yaml"
-    done = command(capsys, "fit", *HEAD[:1], source, "--what", HEAD[1], "--out", out, "--json")
-    assert done.code == 0, done.err
-    data = json.loads(done.out)
+    data = twin.told("fit", "five_bar", source, "--what", "friction,payload", "--out", out)
     fitted = load(str(out))
     assert fitted.friction.viscous == pytest.approx([0.03, 0.05], rel=0.02)
     assert fitted.friction.coulomb == pytest.approx([0.2, 0.15], rel=0.02)
@@ -63,20 +53,17 @@ def test_fit_of_a_table_writes_a_robot_with_deviations_and_a_report(capsys, tmp_
     assert page.count("data:image/png;base64,") == 2
     (held,) = data["held_out"]
     assert max(held["residual_rms_after"]) < 0.01 * max(held["residual_rms_before"])
-    again = command(capsys, "fit", *HEAD[:1], source, "--out", out)
-    assert again.code == 1
-    assert "exists" in again.err
+    assert "exists" in twin.refused("fit", "five_bar", source, "--out", out)
 
 
-def test_fit_of_a_recorded_bag_finds_the_payload(capsys, tmp_path):
+def test_fit_of_a_recorded_bag_finds_the_payload(twin, tmp_path):
     bag = rewrite(DELTA, tmp_path / "held.mcap", seconds=8.0, begin=6.5)
     out = tmp_path / "fitted.yaml"
-    done = command(
-        capsys, "fit", "delta_cu", bag, "--what", "payload", "--payload", "0", "--load-times",
-        "1.775,8", "--out", out, "--no-report", "--json",
+    data = twin.told(
+        "fit", "delta_cu", bag, "--what", "payload", "--payload", "0", "--load-times", "1.775,8",
+        "--out", out, "--no-report",
     )  # fmt: skip
-    assert done.code == 0, done.err
-    found = {p["key"]: p for p in json.loads(done.out)["parameters"]}
+    found = {p["key"]: p for p in data["parameters"]}
     mass = found["payload.mass"]
     assert mass["value"] == pytest.approx(0.15, rel=0.01)
     assert abs(mass["value"] - 0.15) < 3 * mass["standard_deviation"] + 1e-3
@@ -93,25 +80,21 @@ def test_fit_of_a_recorded_bag_finds_the_payload(capsys, tmp_path):
         (("five_bar", "with.csv", "--out", "fitted.json"), ".yaml"),
     ],
 )
-def test_refusals(capsys, tmp_path, monkeypatch, arguments, text):
+def test_refusals(twin, tmp_path, monkeypatch, arguments, text):
     robot = load("five_bar")
     table(tmp_path / "with.csv", robot, 2.0)
     table(tmp_path / "without.csv", robot, 2.0, efforts=False)
     table(tmp_path / "short.csv", robot, 0.5)
     monkeypatch.chdir(tmp_path)
-    done = command(capsys, "fit", *arguments)
-    assert done.code == 1
-    assert text in done.one_line_error()
+    assert text in twin.refused("fit", *arguments)
 
 
-def test_excite_writes_a_trajectory_within_the_limits_that_rests_at_both_ends(capsys, tmp_path):
+def test_excite_writes_a_trajectory_within_the_limits_that_rests_at_both_ends(twin, tmp_path):
     out = tmp_path / "excite.mcap"
-    done = command(
-        capsys, "excite", "delta_cu", "--trials", "20", "--beside", DELTA, "--acceleration", "60",
-        "--out", out, "--json",
+    data = twin.told(
+        "excite", "delta_cu", "--trials", "20", "--beside", DELTA, "--acceleration", "60",
+        "--out", out,
     )  # fmt: skip
-    assert done.code == 0, done.err
-    data = json.loads(done.out)
     assert 1.0 < data["condition"] < data["condition_beside"]
     (message,) = open_bag(out).messages()
     points = message.message.points
@@ -129,8 +112,7 @@ def test_excite_writes_a_trajectory_within_the_limits_that_rests_at_both_ends(ca
     assert np.abs(qdd).max() <= 60.0
     assert (np.abs(inverse_dynamics(robot, q, qd, qdd)) <= robot.limits.effort).all()
     assert (robot.singularity(q) > 0.05 * 0.99).all()
-    columns = np.genfromtxt(out.with_suffix(".csv"), delimiter=",", names=True)
-    assert len(columns) == len(points)
+    assert len(read_columns(out.with_suffix(".csv"))["time"]) == len(points)
 
 
 @pytest.mark.parametrize("trials", [10, 60])
@@ -172,19 +154,16 @@ def test_copies_of_a_limb_keep_elastic_parts_and_the_joint_map(tmp_path):
     assert [beam.radius for beam in again.beams] == [beam.radius for beam in robot.beams]
 
 
-def test_copies_that_would_lose_elastic_members_are_refused_by_name(capsys, tmp_path):
+def test_copies_that_would_lose_elastic_members_are_refused_by_name(twin, tmp_path):
     data = parameters_of("delta")
     assert data.pop("members")
     data["joint_map"] = {load("delta").joint_names[0]: {"offset": 0.1}}
     rigid = tmp_path / "rigid.yaml"
     rigid.write_text(yaml.safe_dump(data))
     assert robot_text(str(rigid), per_copy=True)[1].controller.offsets[0] == pytest.approx(0.1)
-    done = command(
-        capsys, "fit", "delta_cu", DELTA, "--per-copy", "--out", tmp_path / "fitted.yaml"
-    )
-    assert done.code == 1
-    assert "members" in done.one_line_error()
-    assert not (tmp_path / "fitted.yaml").exists()
+    out = tmp_path / "fitted.yaml"
+    assert "members" in twin.refused("fit", "delta_cu", DELTA, "--per-copy", "--out", out)
+    assert not out.exists()
 
 
 @pytest.mark.parametrize(
@@ -201,42 +180,24 @@ def test_copies_that_would_lose_elastic_members_are_refused_by_name(capsys, tmp_
     ],
 )
 def test_numbers_that_are_no_recording_of_this_machine(
-    capsys, tmp_path, monkeypatch, column, how, text
+    twin, tmp_path, monkeypatch, column, how, text
 ):
     monkeypatch.chdir(tmp_path)
-    plain = table(tmp_path / "plain.csv", load("five_bar"), 3.0)
-    names = plain.read_text().splitlines()[0].split(",")
-    data = np.loadtxt(plain, delimiter=",", skiprows=1)
-    for k, name in enumerate(names):
+    columns = read_columns(table(tmp_path / "plain.csv", load("five_bar"), 3.0))
+    for name, values in columns.items():
         if name.rpartition(".")[2] == column:
-            data[:, k] = how(data[:, k])
-    np.savetxt("m.csv", data, "%.17g", ",", header=",".join(names), comments="")
-    done = command(capsys, "fit", "five_bar", "m.csv", "--what", "friction")
-    assert done.code == 1
-    assert text in done.one_line_error()
+            columns[name] = how(values)
+    line = ("fit", "five_bar", write_columns(Path("m.csv"), columns), "--what", "friction")
+    assert text in twin.refused(*line)
     assert not list(tmp_path.glob("fitted*"))
     if text.endswith("units?") and how(1.0) > 1.0:
-        done = command(
-            capsys, "fit", "five_bar", "m.csv", "--what", "friction", "--accept", "--json"
-        )
-        assert done.code == 0, done.err
-        data = json.loads(done.out)
+        data = twin.told(*line, "--accept")
         (reason,) = data["accepted"]
         for marked in (Path("fitted.yaml"), Path("fitted.html")):
             assert "accepted by --accept" in marked.read_text()
         assert "units?" in reason and data["verdict"]["model"] != "explains"
         assert {p["standard_deviation"] for p in data["parameters"]} == {None}
     if column == "position":
-        done = command(
-            capsys,
-            "fit",
-            "five_bar",
-            "m.csv",
-            "--what",
-            "friction",
-            "--beyond-limits",
-            "--accept",
-            "--json",
-        )
+        done = twin(*line, "--beyond-limits", "--accept", "--json")
         # Marked, or not reachable there at all: what moves so is no machine of this file.
         assert "beyond limits" in done.out or "unreachable" in done.err

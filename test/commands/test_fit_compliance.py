@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """`pkm-twin fit --what compliance` as a user runs it."""
 
-import json
-
 import numpy as np
 import pytest
 
@@ -10,8 +8,8 @@ from pkm_twin.bags.reader import BagWriter, open_bag
 from stiffness_monitor import compliance
 from test.bags.test_recordings import FOLDER
 from test.laws.deflections import SENSORS, noisy, twin_recording
-from test.support.command import command
 from test.support.robots import load, rigid
+from test.support.tables import of_joints, read_columns, write_columns
 
 SOFT = FOLDER / "upr_rpu_soft_joint.mcap"
 COLLISION = FOLDER / "delta_cu_collision.mcap"
@@ -22,23 +20,16 @@ DEFLECTION = ("dx", "dy", "dz", "rx", "ry", "rz")
 def table(path, *, wrench=WRENCH, deflection=DEFLECTION, rows=slice(None)):
     """A CSV of loads and deflections of a machine whose joint 3U is three times softer."""
     recording = noisy(twin_recording({"3U": 3.0}), np.random.default_rng(1), SENSORS)
-    columns = {"time": recording.time}
-    joints = load("upr_rpu").joint_names
-    columns |= {f"{name}.position": recording.q[:, k] for k, name in enumerate(joints)}
+    columns = {"time": recording.time} | of_joints(load("upr_rpu"), "position", recording.q)
     columns |= {name: recording.wrench[:, WRENCH.index(name)] for name in wrench}
     columns |= {name: recording.deflection[:, DEFLECTION.index(name)] for name in deflection}
-    np.savetxt(
-        path, np.stack(list(columns.values()), -1)[rows], "%.17g", ",", header=",".join(columns),
-        comments="",
-    )  # fmt: skip
-    return path
+    return write_columns(path, {name: values[rows] for name, values in columns.items()})
 
 
-def test_fit_of_the_recorded_bag_writes_a_robot_with_a_softer_joint_and_a_report(capsys, tmp_path):
+def test_fit_of_the_recorded_bag_writes_a_robot_with_a_softer_joint_and_a_report(twin, tmp_path):
     out = tmp_path / "fitted.yaml"
-    done = command(capsys, "fit", "upr_rpu", SOFT, "--what", "compliance", "--out", out, "--json")
-    assert done.code == 0, done.err
-    data = json.loads(done.out)
+    line = ("fit", "upr_rpu", SOFT, "--what", "compliance", "--out", out)
+    data = twin.told(*line)
     found = {p["element"]: p for p in data["parameters"]}
     for element, number in found.items():
         true = {"3U": 3.0}.get(element, 1.0)
@@ -67,16 +58,13 @@ def test_fit_of_the_recorded_bag_writes_a_robot_with_a_softer_joint_and_a_report
     page = (tmp_path / "fitted.html").read_text()
     assert page.count("data:image/png;base64,") == 2
     assert "Loads do not distinguish 3R and 3U" in page
-    again = command(capsys, "fit", "upr_rpu", SOFT, "--what", "compliance", "--out", out)
-    assert again.code == 1
-    assert "exists" in again.err
+    assert "exists" in twin.refused(*line)
 
 
-def test_fit_of_a_table_with_three_gauges_says_what_it_found(capsys, tmp_path, monkeypatch):
+def test_fit_of_a_table_with_three_gauges_says_what_it_found(twin, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     path = table(tmp_path / "static.csv", deflection=("dx", "dy", "dz"))
-    done = command(capsys, "fit", "upr_rpu", path, "--what", "compliance", "--no-report")
-    assert done.code == 0, done.err
+    done = twin.good("fit", "upr_rpu", path, "--what", "compliance", "--no-report")
     assert "do not distinguish" in done.out
     assert "static.csv, dz" in done.out and "static.csv, rx" not in done.out
     assert load(str(tmp_path / "fitted.yaml")).element_compliance["1B"] == pytest.approx(
@@ -97,7 +85,7 @@ def without_wrench(tmp_path):
     return path
 
 
-def test_refusals(capsys, tmp_path, monkeypatch, without_wrench):
+def test_refusals(twin, tmp_path, monkeypatch, without_wrench):
     monkeypatch.chdir(tmp_path)
     plain = table(tmp_path / "with.csv", rows=slice(0, 60))
     for arguments, text in (
@@ -109,100 +97,74 @@ def test_refusals(capsys, tmp_path, monkeypatch, without_wrench):
         (("upr_rpu", table(tmp_path / "b.csv", deflection=(), rows=slice(60))), "no deflection"),
         (("upr_rpu", table(tmp_path / "c.csv", rows=slice(0, 9))), "too short to fit"),
     ):
-        done = command(capsys, "fit", *arguments, "--what", "compliance")
-        assert done.code == 1, text
-        assert text in done.one_line_error()
-    done = command(capsys, "fit", "upr_rpu", plain, "--what", "compliance,friction")
-    assert "only compliance" in done.one_line_error()
-    done = command(capsys, "fit", "upr_rpu", plain, "--what", "compliance", "--payload", "1")
-    assert "no --per-copy, --payload" in done.one_line_error()
-    done = command(capsys, "fit", "upr_rpu", plain, "--what", "complience")
-    assert "did you mean 'compliance'" in done.one_line_error()
+        assert text in twin.refused("fit", *arguments, "--what", "compliance")
+    for what, text in (
+        (("compliance,friction",), "only compliance"),
+        (("compliance", "--payload", "1"), "no --per-copy, --payload"),
+        (("complience",), "did you mean 'compliance'"),
+    ):
+        assert text in twin("fit", "upr_rpu", plain, "--what", *what).one_line_error()
     assert [path.name for path in tmp_path.glob("*.yaml")] == ["rigid.yaml"]
-
-
-def changed(path, source, **columns):
-    """A table with columns put through functions."""
-    names = source.read_text().splitlines()[0].split(",")
-    data = np.loadtxt(source, delimiter=",", skiprows=1)
-    for name, how in columns.items():
-        name = name.replace("__", ".")
-        data[:, names.index(name)] = how(data[:, names.index(name)])
-    np.savetxt(path, data, "%.17g", ",", header=",".join(names), comments="")
-    return path
-
-
-def everywhere(names, how):
-    return dict.fromkeys(names, how)
 
 
 @pytest.mark.parametrize(
     ("columns", "text"),
     [
-        (everywhere(WRENCH, lambda v: v * 1e250), "line 2: fx"),
-        (everywhere(WRENCH, lambda v: v * 1e-311), "line 2: fx"),
-        (everywhere(DEFLECTION, lambda v: v * 1e300), "line 2: dx"),
-        ({"limb_2__position": lambda v: 0.0 * v}, "limb_2.position at sample 0"),
+        (dict.fromkeys(WRENCH, lambda v: v * 1e250), "line 2: fx"),
+        (dict.fromkeys(WRENCH, lambda v: v * 1e-311), "line 2: fx"),
+        (dict.fromkeys(DEFLECTION, lambda v: v * 1e300), "line 2: dx"),
+        ({"limb_2.position": lambda v: 0.0 * v}, "limb_2.position at sample 0"),
     ],
 )
-def test_numbers_that_are_no_recording_of_this_machine(
-    capsys, tmp_path, monkeypatch, columns, text
-):
+def test_numbers_that_are_no_recording_of_this_machine(twin, tmp_path, monkeypatch, columns, text):
     monkeypatch.chdir(tmp_path)
-    plain = table(tmp_path / "plain.csv", rows=slice(0, 90))
-    path = changed(tmp_path / "changed.csv", plain, **columns)
-    done = command(capsys, "fit", "upr_rpu", path, "--what", "compliance")
-    assert done.code == 1
-    assert text in done.one_line_error()
+    found = read_columns(table(tmp_path / "plain.csv", rows=slice(0, 90)))
+    found |= {name: how(found[name]) for name, how in columns.items()}
+    path = write_columns(tmp_path / "changed.csv", found)
+    assert text in twin.refused("fit", "upr_rpu", path, "--what", "compliance")
     assert not list(tmp_path.glob("fitted*"))
 
 
-def test_columns_and_topics_that_nothing_reads(capsys, tmp_path, monkeypatch):
+def test_columns_and_topics_that_nothing_reads(twin, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     plain = table(tmp_path / "plain.csv", rows=slice(0, 60))
     text = plain.read_text()
     for wrong, right in (("dX", "dx"), ("Fz", "fz"), ("limb_1.postion", "limb_1.position")):
         path = tmp_path / "misspelt.csv"
         path.write_text(text.replace(right, wrong, 1))
-        done = command(capsys, "fit", "upr_rpu", path, "--what", "compliance")
-        assert done.code == 1
-        assert right in done.one_line_error()
+        assert right in twin.refused("fit", "upr_rpu", path, "--what", "compliance")
     for what in ("compliance", "friction"):
-        done = command(capsys, "fit", "upr_rpu", plain, "--what", what, "--topic", "/wrench")
-        assert done.code == 2
-        assert "--topic is for bags" in done.err
+        line = ("fit", "upr_rpu", plain, "--what", what, "--topic", "/wrench")
+        assert "--topic is for bags" in twin.good(*line, code=2).err
 
 
-def test_beyond_limits_is_refused_or_marked_everywhere(capsys, tmp_path, monkeypatch):
+def test_beyond_limits_is_refused_or_marked_everywhere(twin, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     robot = tmp_path / "short.yaml"
     source = (FOLDER.parent / "config" / "upr_rpu.yaml").read_text()
     robot.write_text(source.replace("limb_length: [0.300, 1.000]", "limb_length: [0.62, 1.0]"))
     plain = table(tmp_path / "plain.csv", rows=slice(0, 90))
     arguments = ("fit", robot, plain, "--what", "compliance")
-    assert "--beyond-limits" in command(capsys, *arguments).one_line_error()
-    done = command(capsys, *arguments, "--beyond-limits", "--json")
-    assert done.code == 0, done.err
-    (line, *_) = json.loads(done.out)["beyond_limits"]
+    assert "--beyond-limits" in twin.refused(*arguments)
+    (line, *_) = twin.told(*arguments, "--beyond-limits")["beyond_limits"]
     assert line.startswith("beyond limits: plain.csv: limb_")
     assert f"# {line}" in (tmp_path / "fitted.yaml").read_text()
     assert line in (tmp_path / "fitted.html").read_text()
 
 
-def test_an_element_that_a_bound_holds_stays_a_compliance(capsys, tmp_path, monkeypatch):
+def test_an_element_that_a_bound_holds_stays_a_compliance(twin, tmp_path, monkeypatch):
     """The written file can be read: zero is no compliance."""
     monkeypatch.chdir(tmp_path)
     recording = noisy(twin_recording({"1B": 0.02, "2B": 0.02}), np.random.default_rng(3), SENSORS)
+    data = np.concatenate([recording.q, recording.wrench, recording.deflection], -1)[:150]
     names = [f"{name}.position" for name in load("upr_rpu").joint_names]
-    data = np.concatenate([recording.q, recording.wrench, recording.deflection], -1)
     names += [*WRENCH, *DEFLECTION]
-    np.savetxt("stiff.csv", data[:150], "%.17g", ",", header=",".join(names), comments="")
-    done = command(capsys, "fit", "upr_rpu", "stiff.csv", "--what", "compliance", "--no-report")
-    assert done.code == 0, done.err
+    write_columns(tmp_path / "stiff.csv", dict(zip(names, data.T, strict=True)))
+    twin.good("fit", "upr_rpu", "stiff.csv", "--what", "compliance", "--no-report")
     assert min(load("fitted.yaml").element_compliance.values()) > 0.0
 
 
-def test_a_deflection_type_without_its_fields(capsys, tmp_path, monkeypatch):
+def test_a_deflection_type_without_its_fields(twin, tmp_path, monkeypatch):
     """A definition of one's own below the right type's name, its messages sound."""
     monkeypatch.chdir(tmp_path)
     topics = {"/joint_states": "JointState", "/wrench": "WrenchStamped"}
@@ -218,13 +180,12 @@ def test_a_deflection_type_without_its_fields(capsys, tmp_path, monkeypatch):
                 break
             bag.write(message.topic, message.message, message.log_time)
             bag.write("/measured_deflection", {"x": 1.0}, message.log_time)
-    done = command(capsys, "fit", "upr_rpu", "bag.mcap", "--what", "compliance")
-    assert done.code == 1
-    assert "/measured_deflection: the bag's definition" in done.one_line_error()
-    assert "differs at the field 'header'" in done.err
+    error = twin.refused("fit", "upr_rpu", "bag.mcap", "--what", "compliance")
+    assert "/measured_deflection: the bag's definition" in error
+    assert "differs at the field 'header'" in error
 
 
-def test_wrenches_in_two_frames_have_no_middle(capsys, tmp_path, monkeypatch):
+def test_wrenches_in_two_frames_have_no_middle(twin, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with BagWriter("bag.mcap") as bag:
         bag.add_topic("/joint_states", "sensor_msgs/msg/JointState")
@@ -237,20 +198,18 @@ def test_wrenches_in_two_frames_have_no_middle(capsys, tmp_path, monkeypatch):
             if message.topic == "/wrench" and k > 150:
                 message.message.header.frame_id = "base_link"
             bag.write(message.topic, message.message, message.log_time)
-    done = command(capsys, "fit", "upr_rpu", "bag.mcap", "--what", "compliance")
-    assert "frame is 'base_link', expected 'platform'" in done.one_line_error()
+    error = twin.refused("fit", "upr_rpu", "bag.mcap", "--what", "compliance")
+    assert "frame is 'base_link', expected 'platform'" in error
 
 
-def test_a_robots_own_numbers_are_read_as_the_twin_reads_them(capsys, tmp_path, monkeypatch):
+def test_a_robots_own_numbers_are_read_as_the_twin_reads_them(twin, tmp_path, monkeypatch):
     """1e-01 is a word for other readers of YAML; below a millionth no element is elastic."""
     monkeypatch.chdir(tmp_path)
     source = (FOLDER.parent / "config" / "upr_rpu.yaml").read_text()
     plain = table(tmp_path / "plain.csv", rows=slice(0, 90))
     for value, code in (("9e-1", 0), ("1e-300", 1), ("1e7", 1)):
         (tmp_path / "mine.yaml").write_text(f"{source}element_compliance: {{3R: {value}}}\n")
-        done = command(
-            capsys, "fit", "mine.yaml", plain, "--what", "compliance", "--overwrite", "--no-report"
-        )
-        assert done.code == code, done.err
+        line = ("fit", "mine.yaml", plain, "--what", "compliance", "--overwrite", "--no-report")
+        done = twin.good(*line, code=code)
         if code:
             assert "element_compliance.3R" in done.one_line_error()

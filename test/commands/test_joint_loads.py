@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Joint loads: rainflow by the standard's example, life by hand, open reactions by elasticity."""
 
-import json
-
 import numpy as np
 import pytest
 
@@ -11,8 +9,8 @@ from delta_dynamics.torques.elastic_reactions import reaction_energies
 from delta_dynamics.torques.reactions import balance
 from pkm_twin.paths.durability import Reversals, bearing_life, rainflow, turning_points
 from stiffness_monitor import platform_response
-from test.support.command import command
 from test.support.robots import SHIPPED, load, partly_long, random_joints, rigid
+from test.support.tables import of_joints, read_columns, write_columns
 
 ASTM = [-2, 1, -3, 5, -1, 3, -4, 4, -2]
 """Load of ASTM E1049-85, figure 6."""
@@ -56,7 +54,7 @@ def test_reversals_of_blocks_are_those_of_the_whole(rng):
         np.testing.assert_array_equal(found.values, turning_points(values))
 
 
-def test_loads_in_blocks_are_those_of_the_whole(tmp_path, capsys, monkeypatch):
+def test_loads_in_blocks_are_those_of_the_whole(twin, tmp_path, monkeypatch):
     """Peaks, spectra, turning, life and the table do not depend on where blocks begin."""
     robot = load("five_bar")
     (tmp_path / "bearings.yaml").write_text("bearings: {elbow_right: {C: 5000, Y: 1.5}}")
@@ -64,13 +62,11 @@ def test_loads_in_blocks_are_those_of_the_whole(tmp_path, capsys, monkeypatch):
     for block in (512, 7):
         monkeypatch.setattr("pkm_twin.paths.joint_loads.BLOCK", block)
         out = tmp_path / f"{block}.csv"
-        done = command(
-            capsys, "loads", "five_bar", path(robot, tmp_path), "--bearings",
-            tmp_path / "bearings.yaml", "--json", "--out", out, "--payload", "0.2",
-            "--load-times", "0.2,0.5",
+        data = twin.told(
+            "loads", "five_bar", path(robot, tmp_path), "--bearings", tmp_path / "bearings.yaml",
+            "--out", out, "--payload", "0.2", "--load-times", "0.2,0.5",
         )  # fmt: skip
-        assert done.code == 0, done.err
-        results.append((json.loads(done.out)["joints"], out.read_text()))
+        results.append((data["joints"], out.read_text()))
     (whole, table), (parts, again) = results
     assert table == again
     for name, entry in whole.items():
@@ -116,28 +112,22 @@ def path(robot, folder):
     low, high = robot.limits.position.T
     wave = np.sin(2 * np.pi * np.outer(time, np.arange(1, len(low) + 1)))
     q = robot.graph.home + 0.05 * (high - low) * wave
-    header = ",".join(["time", *(f"{name}.position" for name in robot.joint_names)])
-    np.savetxt(folder / "path.csv", np.column_stack([time, q]), delimiter=",", header=header,
-               comments="")  # fmt: skip
-    return folder / "path.csv"
+    columns = {"time": time} | of_joints(robot, "position", q)
+    return write_columns(folder / "path.csv", columns)
 
 
 @pytest.mark.parametrize("name", partly_long(list(SHIPPED), "five_bar"))
-def test_loads_of_a_path(name, tmp_path, capsys, monkeypatch):
+def test_loads_of_a_path(name, twin, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     robot = load(name)
     joint = reactions(robot, robot.graph.home, *np.zeros((2, robot.joints_count))).names[-1]
     (tmp_path / "bearings.yaml").write_text(f"bearings: {{'{joint}': {{C: 5000}}}}")
-    done = command(
-        capsys, "loads", name, path(robot, tmp_path), "--bearings", "bearings.yaml", "--out",
-        "a.csv", "--spectrum", "s.csv", "--picture", "a.png", "--json",
+    data = twin.told(
+        "loads", name, path(robot, tmp_path), "--bearings", "bearings.yaml", "--out", "a.csv",
+        "--spectrum", "s.csv", "--picture", "a.png",
     )  # fmt: skip
-    assert done.code == 0, done.err
-    told = json.loads(done.out)["joints"]
-    rows = (tmp_path / "a.csv").read_text().splitlines()
-    table = np.array([row.split(",") for row in rows[1:]], float)
-    header = rows[0].split(",")
-    force = table[:, [header.index(f"{joint}.f{axis}") for axis in "xyz"]]
+    told, table = data["joints"], read_columns(tmp_path / "a.csv")
+    force = np.stack([table[f"{joint}.f{axis}"] for axis in "xyz"], -1)
     peak = np.linalg.norm(force, axis=1).max()
     assert told[joint]["force_peak_N"] == pytest.approx(peak)
     assert told[joint]["life"]["L10_hours"] > 0.0
@@ -147,11 +137,10 @@ def test_loads_of_a_path(name, tmp_path, capsys, monkeypatch):
     assert {line[0] for line in counted} <= set(told)
 
 
-def test_what_nothing_decides_is_named(tmp_path, capsys):
+def test_what_nothing_decides_is_named(twin, tmp_path):
     """The same machine without members: out of its plane statics is open."""
     robot = load(rigid("five_bar", tmp_path / "rigid.yaml"))
-    done = command(capsys, "loads", tmp_path / "rigid.yaml", path(robot, tmp_path), "--json")
-    told = json.loads(done.out)["joints"]
+    told = twin.told("loads", tmp_path / "rigid.yaml", path(robot, tmp_path))["joints"]
     assert "fy" in told["tip"]["undetermined"]
     assert "fx" not in told["tip"]["undetermined"]
     assert told["tip"]["force_peak_N"] is None

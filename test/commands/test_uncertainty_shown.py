@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Commands show how sure the model is, where the robot's file says it."""
 
-import json
-
 import numpy as np
 import pytest
 import yaml
@@ -11,8 +9,8 @@ from delta_dynamics import inverse_dynamics, torque_deviation
 from pkm_twin.identification.check import DEVIATIONS, compared_of
 from pkm_twin.recordings import read
 from test.commands.conftest import DELTA, rewrite
-from test.support.command import command
 from test.support.robots import load, parameters_of
+from test.support.tables import joined, of_joints, read_columns, write_columns
 
 UNCERTAINTY = {
     "inertia.platform_mass": {"deviation": 0.004},
@@ -32,10 +30,8 @@ def part(tmp_path):
     return rewrite(DELTA, tmp_path / "part.mcap", seconds=0.2)
 
 
-def test_check_counts_the_residuals_inside_the_model_s_band(capsys, unsure, part):
-    done = command(capsys, "check", part, "--robot", unsure, "--json")
-    assert done.code == 0, done.err
-    data = json.loads(done.out)
+def test_check_counts_the_residuals_inside_the_model_s_band(twin, unsure, part):
+    data = twin.told("check", part, "--robot", unsure)
     recording = read(part, str(unsure))
     compared = compared_of(recording, np.zeros(len(recording.time), bool))
     (track,) = compared.tracks
@@ -52,55 +48,36 @@ def test_check_counts_the_residuals_inside_the_model_s_band(capsys, unsure, part
         item = {item["what"]: item for item in data["items"]}[f"torque residual of {joint}"]
         size = f"(RMS {np.sqrt(np.mean(spread[:, i] ** 2)):.3g} N m)"
         assert f"% inside 1, 2, 3 standard deviations of the model {size}" in item["value"]
-    shown = command(capsys, "check", part, "--robot", unsure).out
-    assert "deviations" in shown
-    assert "gives none" not in shown
 
 
-def test_check_says_that_a_file_tells_of_no_uncertainty(capsys, part):
-    data = json.loads(command(capsys, "check", part, "--json").out)
+def test_check_says_that_a_file_tells_of_no_uncertainty(twin, part):
+    data = twin.told("check", part)
     assert data["uncertainty"] is None
     assert not any("deviation" in item["value"] for item in data["items"])
-    (line,) = [x for x in command(capsys, "check", part).out.splitlines() if "uncertainty" in x]
+    (line,) = [x for x in twin("check", part).out.splitlines() if "uncertainty" in x]
     assert line.startswith("uncertainty: none ")
 
 
-def test_torques_have_a_column_of_deviations(capsys, unsure, tmp_path):
+def test_torques_have_a_column_of_deviations(twin, unsure, tmp_path):
     robot = load(str(unsure))
-    rows = np.array([[0.0, 0.1, 0.2, 0.15], [0.1, 0.12, 0.2, 0.1], [0.2, 0.16, 0.2, 0.06]])
-    head = ",".join(["time", *(f"{joint}.position" for joint in robot.joint_names)])
-    np.savetxt(tmp_path / "motion.csv", rows, "%.17g", ",", header=head, comments="")
-    out = tmp_path / "table.csv"
-    done = command(
-        capsys, "torques", unsure, tmp_path / "motion.csv", "--out", out, "--no-picture",
-    )  # fmt: skip
-    assert done.code == 0, done.err
-    table = np.genfromtxt(out, delimiter=",", names=True, deletechars="")
-    q, qd, qdd = (
-        np.stack([table[f"{joint}.{what}"] for joint in robot.joint_names], -1)
-        for what in ("position", "velocity", "acceleration")
+    motion = np.array([[0.1, 0.2, 0.15], [0.12, 0.2, 0.1], [0.16, 0.2, 0.06]])
+    columns = {"time": np.array([0.0, 0.1, 0.2])} | of_joints(robot, "position", motion)
+    source, out = write_columns(tmp_path / "motion.csv", columns), tmp_path / "table.csv"
+    twin.good("torques", unsure, source, "--out", out, "--no-picture")
+    table = read_columns(out)
+    q, qd, qdd, told = (
+        joined(table, robot, what)
+        for what in ("position", "velocity", "acceleration", "effort_deviation")
     )
-    told = np.stack([table[f"{joint}.effort_deviation"] for joint in robot.joint_names], -1)
     np.testing.assert_allclose(told, torque_deviation(robot, q, qd, qdd), rtol=1e-9)
     assert (np.abs(told) < np.abs(inverse_dynamics(robot, q, qd, qdd))).all()
 
 
-def test_info_and_compliance_tell_it(capsys, unsure):
-    shown = " ".join(command(capsys, "info", unsure).out.split())
+def test_info_and_compliance_tell_it(twin, unsure):
+    shown = " ".join(twin("info", unsure).out.split())
     assert "uncertainty: inertia.platform_mass: deviation: 0.004" in shown
     assert "uncertainty: inertia.forearm_mass: relative: 0.05" in shown
-    stiff = (
-        "compliance",
-        "upr_rpu",
-        "--wrench",
-        "0,0,100,0,0,0",
-        "--json",
-        "--",
-        "-0.6",
-        "0.1",
-        "0",
-    )
-    data = json.loads(command(capsys, *stiff).out)
+    data = twin.told("compliance", "upr_rpu", "--wrench", "0,0,100,0,0,0", -0.6, 0.1, 0)
     matrix, spread = (np.array(data[k]) for k in ("compliance", "compliance_deviation"))
     part = np.diag(spread) / np.diag(matrix)
     # Three independent causes of 5 % each, and each a part of the compliance.

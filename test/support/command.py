@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import functools
+import json
 import multiprocessing
 import os
 import resource
@@ -45,13 +46,45 @@ class Result:
         return lines[0]
 
 
-def command(capture: Any, *arguments: Any) -> Result:
+class Commands:
+    """``pkm-twin`` in this process: the fixture ``twin``, which is called with a line's words."""
+
+    def __init__(self, capture: Any) -> None:
+        """``capture`` is the fixture capsys."""
+        self._capture = capture
+
+    def __call__(self, *words: Any) -> Result:
+        """What a command gives."""
+        self._capture.readouterr()
+        with pytest.raises(SystemExit) as end:
+            cli.main([str(word) for word in words])
+        captured = self._capture.readouterr()
+        return Result(int(end.value.code or 0), captured.out, captured.err)
+
+    def good(self, *words: Any, code: int = 0) -> Result:
+        """The same of a command that ends with this code."""
+        result = self(*words)
+        assert result.code == code, result.err
+        return result
+
+    def told(self, *words: Any, code: int = 0) -> Any:
+        """What ``--json`` tells with this exit code; NaN and Infinity are no JSON."""
+        return json.loads(self.good(*words, "--json", code=code).out, parse_constant=_refuse)
+
+    def refused(self, *words: Any, code: int = 1) -> str:
+        """The one line of a command that is refused with this code, and prints nothing else."""
+        result = self.good(*words, code=code)
+        assert result.out == ""
+        return result.one_line_error()
+
+
+def _refuse(token: str) -> None:
+    raise AssertionError(f"{token} is no JSON")
+
+
+def command(capture: Any, *words: Any) -> Result:
     """What a command gives, run in this process; ``capture`` is the fixture capsys."""
-    capture.readouterr()
-    with pytest.raises(SystemExit) as end:
-        cli.main([str(argument) for argument in arguments])
-    captured = capture.readouterr()
-    return Result(int(end.value.code or 0), captured.out, captured.err)
+    return Commands(capture)(*words)
 
 
 def typed_line(twin: Callable[..., Result], line: str) -> Result:
