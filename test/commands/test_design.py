@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """`pkm-twin design` as a user runs it."""
 
-import json
-
 import numpy as np
 import pytest
 
@@ -13,16 +11,11 @@ TOLERANCES = ("--tolerance", "geometry.arm_length=1e-4", "--tolerance", "geometr
 PARTS = ("--tolerance", "bodies.arm I.length=1e-4", "--tolerance", "joints.arm_2.offset=1e-4")
 
 
-def good(result):
-    assert result.code == 0, result.err
-    return result
-
-
 @pytest.fixture
 def pick(tmp_path, twin):
     out = tmp_path / "pick.csv"
     line = ("path", "delta", "--cycle", "25,200,25", "--duration", "0.5", "--rate", "100")
-    good(twin(*line, "--no-picture", "--out", out))
+    twin.good(*line, "--no-picture", "--out", out)
     return out
 
 
@@ -31,7 +24,7 @@ def test_a_better_robot_is_written_and_loads(twin, pick, tmp_path):
     line = ("design", "delta", *VARY, "--path", pick, "--minimise", "peak-effort")
     bound = ("--subject-to", "singularity>=0.2", "--starts", "8")
     files = ("--out", out, "--picture", picture)
-    data = json.loads(good(twin(*line, *bound, *files, "--json")).out)
+    data = twin.told(*line, *bound, *files)
     peak, index = data["quantities"]["peak-effort"], data["quantities"]["singularity"]
     assert peak["after"] < peak["before"] and peak["unit"] == "N m"
     assert index["after"] >= 0.2 - 1e-6
@@ -46,7 +39,7 @@ def test_a_sweep_is_a_file_with_the_variables_as_axes(twin, pick, tmp_path):
     xarray = pytest.importorskip("xarray")
     out = tmp_path / "box.nc"
     line = ("design", "delta", *VARY, "--path", pick, "--sweep", "grid", "--samples", "4")
-    assert json.loads(good(twin(*line, "--out", out, "--json")).out)["machines"] == 16
+    assert twin.told(*line, "--out", out)["machines"] == 16
     with xarray.open_dataset(out, engine="h5netcdf") as data:
         assert data["peak-effort"].shape == (4, 4)
         assert data["peak-effort"].attrs["units"] == "N m"
@@ -55,12 +48,8 @@ def test_a_sweep_is_a_file_with_the_variables_as_axes(twin, pick, tmp_path):
 
 
 def test_a_budget_names_each_contribution(twin, pick):
-    for errors, where in (
-        (TOLERANCES, ()),
-        (PARTS, ("--path", pick, "--monte-carlo", "400")),
-    ):
-        line = ("design", "delta", *errors, *where, "--json")
-        data = json.loads(good(twin(*line)).out)
+    for errors, where in ((TOLERANCES, ()), (PARTS, ("--path", pick, "--monte-carlo", "400"))):
+        data = twin.told("design", "delta", *errors, *where)
         parts = data["contributions"].values()
         assert sum(part["share"] for part in parts) == pytest.approx(1.0)
         squares = sum(part["rms_position_m"] ** 2 for part in parts)

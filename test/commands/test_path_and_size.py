@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """`pkm-twin path` and `pkm-twin size` as a user runs them."""
 
-import csv
-import json
 import re
 
 import numpy as np
@@ -17,26 +15,12 @@ from pkm_twin.machine.sections import DriveSpec
 from pkm_twin.paths import cycle, fastest, timed
 from pkm_twin.paths.sizing import read_motors
 from pkm_twin.recordings import write_table
+from test.commands.conftest import checked
 from test.support.robots import load, parameters_of
+from test.support.tables import joined, read_columns
 
 CYCLE = ("path", "delta", "--cycle", "25,305,25", "--fastest")
 GEAR = {"inertia": 1.73e-5, "ratio": 10.0, "efficiency": 0.9}
-
-
-def table(path):
-    with path.open(newline="") as file:
-        head, *rows = csv.reader(file)
-    values = np.array([[float(cell or "nan") for cell in row] for row in rows])
-    return dict(zip(head, values.T, strict=True))
-
-
-def of_joints(columns, robot, what):
-    return np.stack([columns[f"{joint}.{what}"] for joint in robot.joint_names], -1)
-
-
-def good(result):
-    assert result.code == 0, result.err
-    return result
 
 
 @pytest.fixture
@@ -50,7 +34,7 @@ def geared(tmp_path):
 
 def test_a_cycle_as_a_table_that_torques_reads(twin, tmp_path):
     out = tmp_path / "cycle.csv"
-    data = json.loads(good(twin(*CYCLE, "--out", out, "--json")).out)
+    data = twin.told(*CYCLE, "--out", out)
     assert out.with_suffix(".png").read_bytes()[:4] == b"\x89PNG"
     robot = load("delta")
     assert data["duration_s"] == pytest.approx(
@@ -61,44 +45,40 @@ def test_a_cycle_as_a_table_that_torques_reads(twin, tmp_path):
     assert ends == sorted(ends)
     assert {"effort arm_1", "velocity arm_1"} <= {limit["limit"] for limit in data["limits"]}
     assert max(data["used"].values()) == pytest.approx(1.0, abs=1e-3)
-    columns = table(out)
+    columns = read_columns(out)
     words = ("position", "velocity", "acceleration", "effort")
     joints = [f"{joint}.{word}" for joint in robot.joint_names for word in words]
     pose = [f"{name}{word}" for word in ("", ".velocity", ".acceleration") for name in "xyz"]
     assert list(columns) == ["time", *joints, *pose]
-    q, qd, qdd, effort = (of_joints(columns, robot, word) for word in words)
+    q, qd, qdd, effort = (joined(columns, robot, word) for word in words)
     assert (np.abs(effort) <= robot.limits.effort).all()
     np.testing.assert_allclose(robot.inverse(np.stack([columns[n] for n in "xyz"], -1)), q)
     again = tmp_path / "torques.csv"
-    good(twin("torques", "delta", out, "--out", again, "--no-picture"))
-    np.testing.assert_allclose(of_joints(table(again), robot, "effort"), effort, atol=1e-9)
+    twin.good("torques", "delta", out, "--out", again, "--no-picture")
+    np.testing.assert_allclose(joined(read_columns(again), robot, "effort"), effort, atol=1e-9)
     np.testing.assert_allclose(inverse_dynamics(robot, q, qd, qdd), effort, atol=1e-9)
 
 
 def test_a_planned_table_is_checked_and_one_with_other_efforts_is_bad(twin, tmp_path):
     out = tmp_path / "cycle.csv"
-    good(twin(*CYCLE, "--out", out, "--no-picture"))
-    good(twin("check", out, "--robot", "delta"))
-    assert twin("check", out, "--robot", "delta", "--payload", "1.0").code == 1
-    result = twin("check", out)
-    assert result.code == 1
-    result.one_line_error()
+    twin.good(*CYCLE, "--out", out, "--no-picture")
+    twin.good("check", out, "--robot", "delta")
+    assert checked(out, robot="delta", payload="1.0").code == 1
+    twin.refused("check", out)
 
 
 def test_the_table_of_another_machine_is_rejected_or_its_pose_planned_again(twin, tmp_path):
     """A table's pose and its joint positions have to be those of the machine."""
     motion, out = tmp_path / "motion.csv", tmp_path / "torques.csv"
     line = ("--cycle", "25,200,25", "--duration", "0.8", "--rate", "200", "--payload", "0.3")
-    good(twin("path", "delta", *line, "--no-picture", "--out", motion))
+    twin.good("path", "delta", *line, "--no-picture", "--out", motion)
     other = tmp_path / "other.yaml"
     data = parameters_of("delta")
     data["geometry"]["arm_length"] += 0.002
     other.write_text(yaml.safe_dump(data))
     for command in ("torques", "size", "loads"):
-        result = twin(command, other, motion)
-        assert result.code == 1
-        assert "mm" in result.one_line_error()
-    good(twin("torques", other, motion, "--follow", "pose", "--out", out, "--no-picture"))
+        assert "mm" in twin.refused(command, other, motion)
+    twin.good("torques", other, motion, "--follow", "pose", "--out", out, "--no-picture")
     # The same path of the platform, each machine by its own inverse kinematics.
     planned = timed(
         load(other).changed(payload={"mass": 0.3}),
@@ -106,16 +86,14 @@ def test_the_table_of_another_machine_is_rejected_or_its_pose_planned_again(twin
         "quintic",
         duration=0.8,
     ).uniform(200)
-    columns, robot = table(out), load(other)
-    np.testing.assert_allclose(of_joints(columns, robot, "position"), planned.q, atol=1e-9)
+    columns, robot = read_columns(out), load(other)
+    np.testing.assert_allclose(joined(columns, robot, "position"), planned.q, atol=1e-9)
     scale = np.abs(planned.effort).max()
-    np.testing.assert_allclose(
-        of_joints(columns, robot, "effort"), planned.effort, atol=1e-3 * scale
-    )
+    np.testing.assert_allclose(joined(columns, robot, "effort"), planned.effort, atol=1e-3 * scale)
     # The payload is that of the table.
     np.testing.assert_allclose(columns["payload.mass"], 0.3)
-    other_joints = good(twin("size", other, motion, "--follow", "joints", "--json"))
-    assert json.loads(other_joints.out)["payload"]["mass_kg"] == 0.3
+    other_joints = twin.told("size", other, motion, "--follow", "joints")
+    assert other_joints["payload"]["mass_kg"] == 0.3
 
 
 @pytest.mark.parametrize("payload", ["0.7", "0.7,0.01,0.0,-0.02"])
@@ -123,14 +101,12 @@ def test_the_table_of_another_machine_is_rejected_or_its_pose_planned_again(twin
 def test_a_planned_payload_is_read_again(twin, tmp_path, ending, payload):
     out = tmp_path / f"heavy.{ending}"
     line = ("path", "delta", "--circle", "0.04", "--duration", "1", "--rate", "100")
-    good(twin(*line, "--no-picture", "--payload", payload, "--out", out))
-    data = json.loads(good(twin("size", "delta", out, "--json")).out)
+    twin.good(*line, "--no-picture", "--payload", payload, "--out", out)
+    data = twin.told("size", "delta", out)
     assert max(data["difference_from_model"]) < 1e-6
     peak = max(drive["joint"]["peak_effort_N_m"] for drive in data["drives"].values())
     line = ("design", "delta", "--vary", "geometry.arm_length=0.18:0.2", "--path", out)
-    found = json.loads(
-        good(twin(*line, "--minimise", "peak-effort", "--starts", "2", "--json")).out
-    )
+    found = twin.told(*line, "--minimise", "peak-effort", "--starts", "2")
     assert found["quantities"]["peak-effort"]["before"] == pytest.approx(peak)
 
 
@@ -141,18 +117,16 @@ def test_torques_takes_the_pose_in_place_of_the_joints(twin, tmp_path):
     given, out = tmp_path / "poses.csv", tmp_path / "torques.csv"
     rows = np.column_stack([time, pose])
     given.write_text("time,x,y,z\n" + "\n".join(",".join(map(repr, r)) for r in rows.tolist()))
-    good(twin("torques", "delta", given, "--out", out, "--no-picture"))
-    columns = table(out)
-    np.testing.assert_allclose(of_joints(columns, robot, "position"), robot.inverse(pose))
+    twin.good("torques", "delta", given, "--out", out, "--no-picture")
+    columns = read_columns(out)
+    np.testing.assert_allclose(joined(columns, robot, "position"), robot.inverse(pose))
     given.write_text("time,x,y\n0,0,0\n1,0,0\n2,0,0\n")
-    result = twin("torques", "delta", given, "--out", tmp_path / "none.csv")
-    assert result.code == 1
-    result.one_line_error()
+    twin.refused("torques", "delta", given, "--out", tmp_path / "none.csv")
 
 
 def test_a_cycle_as_a_trajectory_that_size_reads(twin, tmp_path, geared):
     out = tmp_path / "cycle.mcap"
-    good(twin(*CYCLE, "--out", out, "--no-picture", "--payload", "0.4"))
+    twin.good(*CYCLE, "--out", out, "--no-picture", "--payload", "0.4")
     (message,) = (m.message for m in read_messages(out))
     robot = load("delta").changed(payload={"mass": 0.4})
     assert list(message.joint_names) == list(robot.joint_names)
@@ -166,32 +140,32 @@ def test_a_cycle_as_a_trajectory_that_size_reads(twin, tmp_path, geared):
     assert not any(message.points[-1].velocities)
     held = inverse_dynamics(robot, motion.q[-1], np.zeros(3), np.zeros(3))
     np.testing.assert_allclose(message.points[-1].effort, held)
-    result = json.loads(good(twin("size", "delta", out, "--json")).out)
+    result = twin.told("size", "delta", out)
     assert result["efforts"] == "the file's"
     assert result["payload"]["mass_kg"] == 0.4
     np.testing.assert_allclose(result["difference_from_model"], 0.0, atol=1e-6)
     # Planned without the rotors of another file.
-    other = json.loads(good(twin("size", geared, out, "--json")).out)
+    other = twin.told("size", geared, out)
     assert min(other["difference_from_model"]) > 0.05
     again = tmp_path / "torques.csv"
-    good(twin("torques", "delta", out, "--out", again, "--no-picture"))
-    np.testing.assert_allclose(of_joints(table(again), robot, "effort"), motion.effort, atol=1e-6)
+    twin.good("torques", "delta", out, "--out", again, "--no-picture")
+    np.testing.assert_allclose(
+        joined(read_columns(again), robot, "effort"), motion.effort, atol=1e-6
+    )
     peak = result["drives"]["arm_1"]["joint"]["peak_effort_N_m"]
     assert peak == pytest.approx(np.abs(motion.effort[:, 0]).max())
 
 
 def test_sizes_are_a_readers_own_sums(twin, tmp_path, geared):
     out = tmp_path / "cycle.csv"
-    good(twin("path", geared, *CYCLE[2:], "--out", out, "--no-picture"))
+    twin.good("path", geared, *CYCLE[2:], "--out", out, "--no-picture")
     picture = tmp_path / "speeds.png"
-    given = ("size", geared, out, "--drives", "shipped", "--picture", picture, "--json")
-    result = json.loads(good(twin(*given)).out)
+    result = twin.told("size", geared, out, "--drives", "shipped", "--picture", picture)
     assert picture.read_bytes()[:4] == b"\x89PNG"
-    robot, columns = load(geared), table(out)
+    robot, columns = load(geared), read_columns(out)
     t = columns["time"]
     q, qd, qdd, tau = (
-        of_joints(columns, robot, word)
-        for word in ("position", "velocity", "acceleration", "effort")
+        joined(columns, robot, word) for word in ("position", "velocity", "acceleration", "effort")
     )
     whole = t[-1] - t[0]
     for i, joint in enumerate(robot.joint_names):
@@ -239,12 +213,11 @@ def test_a_gear_on_the_command_line_is_the_files_drive(twin, tmp_path, name, mot
             joint["drive"] = {"inertia": rotor, "efficiency": share, **option}
     path, out = tmp_path / f"{name}.yaml", tmp_path / "cycle.csv"
     path.write_text(yaml.safe_dump(data))
-    good(twin("path", name, *motion, "--out", out, "--no-picture"))
+    twin.good("path", name, *motion, "--out", out, "--no-picture")
     ((key, value),) = option.items()
     given = (f"--{key}", value, "--efficiency", share)
-    compared = ("--drives", "shipped", "--json")
-    own = json.loads(good(twin("size", path, out, *compared)).out)["drives"]
-    same = json.loads(good(twin("size", name, out, *given, *compared)).out)["drives"]
+    own = twin.told("size", path, out, "--drives", "shipped")["drives"]
+    same = twin.told("size", name, out, *given, "--drives", "shipped")["drives"]
     assert own.keys() == same.keys()
     for joint, entry in own.items():
         assert same[joint]["motor"] == pytest.approx(entry["motor"])
@@ -259,17 +232,17 @@ def test_a_gear_on_the_command_line_is_the_files_drive(twin, tmp_path, name, mot
 
 def test_a_motor_is_limited_by_its_curve(twin, tmp_path, geared):
     out, drives = tmp_path / "cycle.csv", tmp_path / "drives.yaml"
-    good(twin("path", geared, "--cycle", "25,200", "--out", out, "--no-picture"))
+    twin.good("path", geared, "--cycle", "25,200", "--out", out, "--no-picture")
     motor = {"inertia": 1.73e-5, "continuous_torque": 9.0, "peak_torque": 9.0,
              "rated_speed": 3000.0, "max_speed": 5000.0}  # fmt: skip
     drives.write_text(yaml.safe_dump({"drives": {"flat": motor, "slow": {
         **motor, "curve": [[0.0, 9.0], [200.0, 9.0]]}}}))  # fmt: skip
-    result = json.loads(good(twin("size", geared, out, "--drives", drives, "--json")).out)
+    result = twin.told("size", geared, out, "--drives", drives)
     flat, slow = result["drives"]["arm_1"]["drives"]
     assert flat["good"]
     assert not slow["good"]
     assert slow["used_speed"] > 1.0
-    text = good(twin("size", geared, out, "--drives", drives)).out
+    text = twin.good("size", geared, out, "--drives", drives).out
     assert all(float(part) <= 1000.0 for part in re.findall(r"([\d.e+]+) %", text))
     drives.write_text("drives: {one: {inertia: 1.0}}")
     assert twin("size", geared, out, "--drives", drives).code == 1
@@ -307,22 +280,18 @@ def test_a_motor_that_cannot_be_is_rejected_by_its_field(tmp_path, change):
 @pytest.mark.parametrize("column", ["arm_2.effort", "fx"])
 def test_efforts_that_no_drive_has_are_rejected(twin, tmp_path, column):
     out = tmp_path / "cycle.csv"
-    good(twin(*CYCLE, "--out", out, "--no-picture"))
-    columns = table(out)
+    twin.good(*CYCLE, "--out", out, "--no-picture")
+    columns = read_columns(out)
     columns[column] = columns.get(column, 0.0 * columns["time"])
     columns[column][3] = 1e300
     write_table(columns, out)
     for command in ("size", "loads"):
-        result = twin(command, "delta", out)
-        assert result.code == 1
-        assert "line 5" in result.one_line_error()
+        assert "line 5" in twin.refused(command, "delta", out)
 
 
-def test_a_recording_is_sized_by_its_measured_efforts(twin):
-    bag = "bags/delta_cu_pick_and_place.mcap"
+def test_a_recording_is_sized_by_its_measured_efforts(twin, sample):
     measured, model = (
-        json.loads(good(twin("size", "delta_cu", bag, "--efforts", what, "--json")).out)
-        for what in ("file", "model")
+        twin.told("size", "delta_cu", sample, "--efforts", what) for what in ("file", "model")
     )
     for joint in measured["drives"]:
         one, other = (r["drives"][joint]["joint"]["rms_effort_N_m"] for r in (measured, model))
@@ -332,8 +301,7 @@ def test_a_recording_is_sized_by_its_measured_efforts(twin):
 @pytest.mark.parametrize("name", ["delta", "five_bar", "linear_delta"])
 def test_the_worst_of_the_workspace_is_that_of_many_tries(twin, name):
     speed, change = 0.8, 9.0
-    given = ("size", name, "--over-workspace", f"{speed},{change}", "--json")
-    result = json.loads(good(twin(*given)).out)
+    result = twin.told("size", name, "--over-workspace", f"{speed},{change}")
     robot = load(name)
     rng = np.random.default_rng(5)
     places = [i for i, n in enumerate(robot.pose_names) if n in "xyz"]
@@ -362,24 +330,24 @@ WAYPOINTS = "x,y,z,blend,dwell\n-0.05,0,-0.38,0,0\n-0.05,0,-0.35,0.02,0\n0.05,0,
 def test_way_points_are_lines_or_a_smooth_curve(twin, tmp_path):
     path = tmp_path / "points.csv"
     path.write_text(WAYPOINTS)
-    data = json.loads(good(twin("path", "delta", path, "--fastest", "--json")).out)
+    data = twin.told("path", "delta", path, "--fastest")
     assert data["path"] == "lines"
     assert [s["dwell_s"] for s in data["stretches"]] == [0.1]
     path.write_text("x,y,z\n-0.05,0,-0.38\n-0.05,0,-0.35\n0.05,0,-0.35\n")
-    data = json.loads(good(twin("path", "delta", path, "--fastest", "--json")).out)
+    data = twin.told("path", "delta", path, "--fastest")
     assert data["path"] == "smooth curve"
-    stops = json.loads(good(twin("path", "delta", path, "--blend", "0", "--json")).out)
+    stops = twin.told("path", "delta", path, "--blend", "0")
     assert len(stops["stretches"]) == 2
     joints = ",".join(f"{joint}.position" for joint in load("delta").joint_names)
     path.write_text(f"{joints}\n0.1,0.1,0.1\n0.2,0.3,0.1\n")
-    data = json.loads(good(twin("path", "delta", path, "--law", "s-curve", "--json")).out)
+    data = twin.told("path", "delta", path, "--law", "s-curve")
     assert data["law"] == "s-curve"
     # The table of a motion is a path too, whose payload is asked for.
     out = tmp_path / "circle.csv"
     line = ("path", "delta", "--circle", "0.04", "--duration", "1", "--payload", "0.2")
-    good(twin(*line, "--rate", "50", "--out", out, "--no-picture"))
-    assert "--payload" in good(twin("path", "delta", out, "--fastest")).err
-    assert not good(twin("path", "delta", out, "--fastest", "--payload", "0.2")).err
+    twin.good(*line, "--rate", "50", "--out", out, "--no-picture")
+    assert "--payload" in twin.good("path", "delta", out, "--fastest").err
+    assert not twin.good("path", "delta", out, "--fastest", "--payload", "0.2").err
 
 
 @pytest.mark.parametrize(
@@ -397,14 +365,12 @@ def test_way_points_are_lines_or_a_smooth_curve(twin, tmp_path):
 def test_what_is_no_path_is_one_line(twin, tmp_path, text, options):
     path = tmp_path / "points.csv"
     path.write_text(text)
-    result = twin("path", "delta", path, *options)
-    assert result.code == 1
-    result.one_line_error()
+    twin.refused("path", "delta", path, *options)
 
 
 def test_a_command_line_needs_one_path(twin, tmp_path):
-    assert twin("path", "delta").code == 2
-    assert twin("path", "delta", "--cycle", "0.025,0.305").code == 2
-    assert twin("path", "delta", "--cycle", "25,305", "--circle", "0.1").code == 2
-    assert twin("path", "delta", "--cycle", "25,305", "--effort", "1,2").code == 2
-    assert twin("size", "delta").code == 2
+    for words in (
+        "path delta", "path delta --cycle 0.025,0.305", "path delta --cycle 25,305 --circle 0.1",
+        "path delta --cycle 25,305 --effort 1,2", "size delta",
+    ):  # fmt: skip
+        twin.good(*words.split(), code=2)

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The kit for a recording, and a recording without names and dates."""
 
-import json
 import shlex
 
 import numpy as np
@@ -12,37 +11,35 @@ from pkm_twin.bags.reader import BagWriter, open_bag
 from pkm_twin.recordings import read
 from pkm_twin.recordings.bags import read_trajectory
 from test.commands.conftest import DELTA, MILLING
-from test.support.command import command
 from test.support.robots import load
+from test.support.tables import read_columns
 
 SECRET = "acme"
 
 
-def test_a_kit_has_motions_notes_and_commands(tmp_path, capsys):
+def test_a_kit_has_motions_notes_and_commands(twin, tmp_path):
     out = tmp_path / "kit"
     options = ("--duration", "4", "--friction-duration", "12", "--trials", "10")
-    done = command(capsys, "record-kit", "five_bar", "--out", out, *options)
-    assert done.code == 0
+    twin.good("record-kit", "five_bar", "--out", out, *options)
     robot = load("five_bar")
     lengths = {}
     for name in ("excitation", "friction"):
         motion = read_trajectory(open_bag(out / f"{name}.mcap"), robot)
         assert motion is not None
         lengths[name] = motion.time[-1]
-        table = np.genfromtxt(out / f"{name}.csv", delimiter=",", names=True)
+        table = read_columns(out / f"{name}.csv")
         np.testing.assert_allclose(table["time"], motion.time, atol=1e-6)
     assert lengths["friction"] > lengths["excitation"]
     for name in ("README.md", "NOTES.md"):
         text = (out / name).read_text()
         assert all(joint in text for joint in robot.joint_names)
-    again = command(capsys, "record-kit", "five_bar", "--out", out, *options)
-    assert again.code == 1
+    twin.refused("record-kit", "five_bar", "--out", out, *options)
 
 
-def test_a_robot_or_a_bag_is_needed(tmp_path, capsys):
-    assert command(capsys, "record-kit", "--out", tmp_path / "kit").code == 2
-    bad = command(capsys, "anonymise", DELTA, "--out", tmp_path / "kit")
-    assert bad.code == 1 and not (tmp_path / "kit").exists()
+def test_a_robot_or_a_bag_is_needed(twin, tmp_path):
+    twin.good("record-kit", "--out", tmp_path / "kit", code=2)
+    twin.refused("anonymise", DELTA, "--out", tmp_path / "kit")
+    assert not (tmp_path / "kit").exists()
 
 
 def private(source, target, robot, word=f"{SECRET}_"):
@@ -70,13 +67,11 @@ def private(source, target, robot, word=f"{SECRET}_"):
 
 
 @pytest.mark.parametrize(("source", "name"), [(DELTA, "delta_cu"), (MILLING, "prru")])
-def test_an_anonymised_bag_has_the_same_numbers_and_no_name(source, name, tmp_path, capsys):
+def test_an_anonymised_bag_has_the_same_numbers_and_no_name(source, name, twin, tmp_path):
     robot = load(name)
     given, out = tmp_path / f"{SECRET}.mcap", tmp_path / "out.mcap"
     private(source, given, robot)
-    done = command(capsys, "anonymise", given, "--out", out, "--json")
-    assert done.code == 0
-    told = json.loads(done.out)
+    told = twin.told("anonymise", given, "--out", out)
     assert f"/{SECRET}/diary" in told["left_out"]
     bag = open_bag(out)
     assert "/joint_states" in bag.report.topics
@@ -106,25 +101,24 @@ def test_an_anonymised_bag_has_the_same_numbers_and_no_name(source, name, tmp_pa
             assert repr(one.message.wrench) == repr(other.message.wrench)
 
 
-def test_kept_names_can_be_judged_and_other_joints_go(tmp_path, capsys):
+def test_kept_names_can_be_judged_and_other_joints_go(twin, tmp_path):
     robot, given, out = load("delta_cu"), tmp_path / "given.mcap", tmp_path / "out.mcap"
     private(DELTA, given, robot, word="")
     # The older spelling.
-    kept = command(capsys, "record-kit", "delta_cu", "--anonymise", given, "--out", out,
-                   "--keep-names")  # fmt: skip
-    assert kept.code == 0
+    older = ("record-kit", "delta_cu", "--anonymise", given)
+    twin.good(*older, "--out", out, "--keep-names")
     one, other = read(out), read(given, robot)
     assert one.robot.name == "delta_cu"
     np.testing.assert_array_equal(one.q, other.q)
     np.testing.assert_array_equal(one.effort, other.effort)
     np.testing.assert_array_equal(np.diff(one.stamps), np.diff(other.stamps))
     private(DELTA, tmp_path / "others.mcap", robot)
-    others = command(capsys, "anonymise", tmp_path / "others.mcap", "--robot", "delta_cu",
-                     "--out", tmp_path / "small.mcap")  # fmt: skip
-    assert others.code == 1 and not (tmp_path / "small.mcap").exists()
+    small = tmp_path / "small.mcap"
+    twin.refused("anonymise", tmp_path / "others.mcap", "--robot", "delta_cu", "--out", small)
+    assert not small.exists()
 
 
-def test_no_clock_keeps_a_date(tmp_path, capsys):
+def test_no_clock_keeps_a_date(twin, tmp_path):
     """A controller whose clock is set while it records, and a recorder in simulated time."""
     date, step = 1_700_000_000 * 10**9, 10**6
     bag = open_bag(DELTA)
@@ -137,7 +131,7 @@ def test_no_clock_keeps_a_date(tmp_path, capsys):
             time = k * step + (date if k >= 10 else 5 * 10**9)
             stamp.sec, stamp.nanosec = divmod(time, 10**9)
             writer.write("/states", message.message, 5 * 10**9 + k * step, date + k * step)
-    assert command(capsys, "anonymise", given, "--out", out).code == 0
+    twin.good("anonymise", given, "--out", out)
     found = list(open_bag(out).messages())
     stamps = [m.message.header.stamp.sec * 10**9 + m.message.header.stamp.nanosec for m in found]
     assert stamps == [1 + step * (k % 10) for k in range(20)]
@@ -151,11 +145,11 @@ def test_commands_of_a_kit_take_any_path_of_a_robot_file():
     assert shlex.split(line)[2] == "my machine's.yaml"
 
 
-def test_a_recording_does_not_replace_itself(tmp_path, capsys):
+def test_a_recording_does_not_replace_itself(twin, tmp_path):
     given, link = tmp_path / "given.mcap", tmp_path / "link.mcap"
     private(DELTA, given, load("delta_cu"))
     link.symlink_to(given)
     before = given.read_bytes()
     for out in (given, link):
-        done = command(capsys, "anonymise", given, "--out", out, "--overwrite")
-        assert done.code == 1 and given.read_bytes() == before
+        twin.refused("anonymise", given, "--out", out, "--overwrite")
+        assert given.read_bytes() == before

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Tables as other programs write them are the same motion, and what is not certain is refused."""
 
-import csv
 import json
 import math
 import os
@@ -21,8 +20,8 @@ from pkm_twin.errors import ParameterError
 from pkm_twin.recordings import Dialect, ReadOptions, read, write_table
 from pkm_twin.recordings.topics import DEFINITIONS, JOINT_STATE
 from test.bags.folders import make_folder
-from test.support.command import command
 from test.support.robots import load, parameters_of
+from test.support.tables import read_columns
 
 ROOT = Path(__file__).parents[2]
 
@@ -142,7 +141,7 @@ def test_an_ambiguous_table_is_refused(motion):
         read("a.csv", robot)
 
 
-def test_options_of_a_command_are_the_dialect(motion, capsys):
+def test_options_of_a_command_are_the_dialect(motion, twin):
     robot, time, q = motion
     Path("a.csv").write_text(plain(robot, time, q))
     Path("b.csv").write_text(written(["t", "q1", "q2"], [1e3 * time, *np.degrees(q.T)], ";", ","))
@@ -150,9 +149,7 @@ def test_options_of_a_command_are_the_dialect(motion, capsys):
     given = ("--time", "t", "--columns", names, "--units", "deg,ms", "--decimal", ",")
     told = []
     for words in (("a.csv",), ("b.csv", "--separator", ";", *given)):
-        done = command(capsys, "size", "five_bar", *words, "--json")
-        assert done.code == 0, done.err
-        told.append(json.loads(done.out)["energy_J"])
+        told.append(twin.told("size", "five_bar", *words)["energy_J"])
     assert told[1] == pytest.approx(told[0], rel=1e-6)
 
 
@@ -273,18 +270,15 @@ def test_a_pose_has_to_be_that_of_the_joints(name, tmp_path, rng):
             read(path, robot, how)
 
 
-def test_matlab_files_have_the_columns(motion, capsys):
+def test_matlab_files_have_the_columns(motion, twin):
     Path("a.csv").write_text(plain(*motion))
     for out in ("t.csv", "t.mat"):
-        done = command(capsys, "torques", "five_bar", "a.csv", "--out", out, "--no-picture")
-        assert done.code == 0, done.err
+        twin.good("torques", "five_bar", "a.csv", "--out", out, "--no-picture")
     found = {k: v for k, v in loadmat("t.mat").items() if not k.startswith("__")}
-    with Path("t.csv").open() as file:
-        rows = list(csv.DictReader(file))
-    assert list(found) == [re.sub(r"\W", "_", name) for name in rows[0]]
-    for name, values in zip(rows[0], found.values(), strict=True):
-        expected = [float(row[name] or "nan") for row in rows]
-        np.testing.assert_array_equal(values[:, 0], expected)
+    expected = read_columns(Path("t.csv"))
+    assert list(found) == [re.sub(r"\W", "_", name) for name in expected]
+    for values, column in zip(found.values(), expected.values(), strict=True):
+        np.testing.assert_array_equal(values[:, 0], column)
 
 
 def test_pipes(tmp_path, monkeypatch):

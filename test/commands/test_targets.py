@@ -15,7 +15,7 @@ from pkm_twin.errors import BagError
 from pkm_twin.files import replace_file, replacing
 from test.bags.test_recordings import FOLDER
 from test.commands.test_fit_compliance import SOFT, table
-from test.support.command import command, forked
+from test.support.command import forked
 from test.support.robots import load, partly_long
 
 REPOSITORY = FOLDER.parent
@@ -48,7 +48,7 @@ def commands(deflections, target):
     "ending", [".html", ".yaml", ".yml", ".mcap", ".csv", ".png", ".bag", ".nc"]
 )
 @pytest.mark.parametrize("kind", ["a FIFO", "a folder", "a character device"])
-def test_only_files_are_replaced(capsys, tmp_path, deflections, ending, kind):
+def test_only_files_are_replaced(twin, tmp_path, deflections, ending, kind):
     if ending == ".nc":
         pytest.importorskip("h5netcdf")
     target = tmp_path / f"target{ending}"
@@ -58,9 +58,8 @@ def test_only_files_are_replaced(capsys, tmp_path, deflections, ending, kind):
         "a character device": lambda path: path.symlink_to("/dev/null"),
     }[kind](target)
     before = os.lstat(target).st_ino
-    done = command(capsys, *commands(deflections, target)[ending], "--overwrite")
-    assert done.code == 1
-    assert str(target) in done.one_line_error() and "regular file" in done.err
+    error = twin.refused(*commands(deflections, target)[ending], "--overwrite")
+    assert str(target) in error and "regular file" in error
     assert os.lstat(target).st_ino == before
     assert stat.S_ISCHR(os.stat("/dev/null").st_mode)
     assert {p.name for p in tmp_path.iterdir()} == {target.name, deflections.name}
@@ -73,10 +72,9 @@ def test_a_folder_or_nothing_is_no_files_name(twin, tmp_path, monkeypatch, defle
     tried = 0
     for line in commands(deflections, tmp_path / "target").values():
         where = next(k for k, word in enumerate(line) if str(word).startswith(f"{tmp_path}/target"))
-        done = twin(*line[:where], name, *line[where + 1 :], "--overwrite")
-        assert done.code == 1 and "Traceback" not in done.err
+        error = twin.refused(*line[:where], name, *line[where + 1 :], "--overwrite")
         option = line[where - 1] if str(line[where - 1]).startswith("--") else "OUT"
-        assert done.one_line_error().startswith(f"pkm-twin: {option}: ")
+        assert error.startswith(f"pkm-twin: {option}: ")
         tried += 1
     for line in (("torques", "five_bar", "none.csv", "--out"), ("map", "show", "none.nc", "--out")):
         assert twin(*line, name).one_line_error().startswith("pkm-twin: --out: ")
@@ -94,12 +92,12 @@ def test_a_folder_that_is_not_there_is_told_before_the_work(twin, tmp_path, monk
         ("excite", "five_bar", "--out", "none/a.mcap"),
         ("info", "five_bar", "--picture", "none/a.png"),
     ):
-        error = twin(*line).one_line_error()
+        error = twin.refused(*line)
         assert line[-1] in error and "no folder none" in error
     assert not list(tmp_path.iterdir())
 
 
-def test_a_name_as_long_as_the_file_system_takes(capsys, tmp_path, deflections):
+def test_a_name_as_long_as_the_file_system_takes(twin, tmp_path, deflections):
     longest = "n" * 250
     for arguments in (
         ("fit", "upr_rpu", deflections, "--what", "compliance", "--out", f"{longest}.yaml"),
@@ -173,11 +171,11 @@ def test_a_full_disk_is_the_targets(tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["fitted.yaml"]
 
 
-def test_what_is_read_is_not_replaced(capsys, tmp_path, deflections):
+def test_what_is_read_is_not_replaced(twin, tmp_path, deflections):
     same = tmp_path / "same.yaml"
     shutil.copy(deflections, same)
-    done = command(capsys, "calibrate", "upr_rpu", same, "--out", same, "--overwrite")
-    assert "the same file" in done.one_line_error()
+    line = ("calibrate", "upr_rpu", same, "--out", same, "--overwrite")
+    assert "the same file" in twin.refused(*line)
     assert same.read_bytes() == deflections.read_bytes()
 
 

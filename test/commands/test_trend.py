@@ -1,17 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """History and trend: many writers, what a night's recording tells, and what drifts."""
 
-import json
 import multiprocessing
-import os
 import sqlite3
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from pkm_twin.identification.history import Measured, Series, append, judged, measure, read_history
 from pkm_twin.recordings import read
-from test.support.command import command
 from test.support.nights import night
 from test.support.robots import load, often
 
@@ -89,55 +87,53 @@ def test_a_recording_tells_friction_and_payload(tmp_path, rng):
     assert load_.deviation < 0.02
 
 
-def test_nights_of_a_folder_to_a_verdict(tmp_path, capsys, monkeypatch, rng):
+def test_nights_to_a_verdict(twin, tmp_path, monkeypatch, rng):
+    """Two recordings of a machine, and the noise of further nights by their deviations."""
     monkeypatch.chdir(tmp_path)
     robot = load("delta")
+    sound, worn = (
+        measure(read(night(tmp_path / f"{c}.csv", robot, rng, coulomb=[c, 0.1, 0.1]), robot))
+        for c in (0.1, 0.5)
+    )
     for k in range(8):
-        path = night(tmp_path / f"{k}.csv", robot, rng, coulomb=[0.1 + 0.4 * (k >= 6), 0.1, 0.1])
-        stamp = 1.7e9 + DAY * k
-        os.utime(path, (stamp, stamp))
-        options = ("--robot", "delta", "--residual", 0.9, "--history", "nights.db")
-        command(capsys, "check", path, *options)
+        numbers = [
+            replace(one, value=one.value + rng.normal() * np.nan_to_num(one.deviation))
+            for one in (worn if k >= 6 else sound)
+        ]
+        append("nights.db", "delta", "delta", f"{k}.csv", 1.7e9 + DAY * k, True, numbers)
         if k in (4, 5):
-            done = command(capsys, "trend", "nights.db", "--json")
-            told = json.loads(done.out)
-            assert done.code == 0
+            told = twin.told("trend", "nights.db")
             assert not told["drifts"]
             assert told["judged"] == (len(told["series"]) if k == 5 else 0)
-    done = command(capsys, "trend", "nights.db", "--json")
-    assert done.code == 1
-    told = {(s["quantity"], s["part"]): s for s in json.loads(done.out)["series"]}
+    told = {
+        (s["quantity"], s["part"]): s for s in twin.told("trend", "nights.db", code=1)["series"]
+    }
     worse = told["friction coulomb", robot.joint_names[0]]
     assert worse["drifts"]
     assert worse["changed"].startswith("2023-11-20")
     assert worse["after"] - worse["before"] == pytest.approx(0.4, abs=0.05)
     assert not told["friction coulomb", robot.joint_names[1]]["drifts"]
-    done = command(capsys, "trend", "nights.db", "--picture", "trend.png")
-    assert done.code == 1
+    twin.good("trend", "nights.db", "--picture", "trend.png", code=1)
     assert (tmp_path / "trend.png").stat().st_size
 
 
-def test_a_folder_is_judged_bag_by_bag(tmp_path, capsys, sample):
+def test_a_folder_is_judged_bag_by_bag(twin, tmp_path, sample):
     folder = tmp_path / "night"
     folder.mkdir()
     (folder / "good.mcap").write_bytes(sample.read_bytes())
     (folder / "bad.mcap").write_bytes(sample.read_bytes()[:5000])
-    done = command(
-        capsys, "check", folder, "--jobs", 2, "--history", tmp_path / "h.db", "--json"
-    )  # fmt: skip
-    assert done.code == 1
-    told = json.loads(done.out)
-    assert [(r["bag"].rpartition("/")[2], r["good"]) for r in told["recordings"]] == [
-        ("bad.mcap", False),
-        ("good.mcap", True),
-    ]
+    line = ("check", folder, "--jobs", 2, "--history", tmp_path / "h.db")
+    told = twin.told(*line, code=1)["recordings"]
+    assert [(r["bag"].rpartition("/")[2], r["good"]) for r in told] == [
+        ("bad.mcap", False), ("good.mcap", True)
+    ]  # fmt: skip
     (folder / "bad.mcap").unlink()
-    assert command(capsys, "check", folder).code == 0
+    twin.good("check", folder)
     assert {one.machine for one in read_history(tmp_path / "h.db")} == {"delta_cu"}
 
 
-def test_what_is_no_history(tmp_path, capsys):
+def test_what_is_no_history(twin, tmp_path):
     other = tmp_path / "other.db"
     other.write_text("nothing of that kind, but long enough to be read as a file of a data base")
     for path in (other, tmp_path / "none.db"):
-        assert command(capsys, "trend", path).code == 1
+        assert twin("trend", path).code == 1
