@@ -12,16 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import typer
-from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    TaskID,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
 
 from pkm_twin.errors import PkmTwinError, one_line
 from pkm_twin.files import STANDARD, parse_numbers, require_replaceable
@@ -34,6 +24,18 @@ def progress(what: str, total: int | None) -> Iterator[Callable[[int], None]]:
     It begins with the first count, so that the time left of work that is gone on with is that of
     the rest.
     """
+    # Here, as most commands show none.
+    from rich.console import Console
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TaskID,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
+
     columns = (
         TextColumn("{task.description}"),
         BarColumn(),

@@ -25,8 +25,6 @@ from pkm_twin.robot.robot import Robot
 
 SOFT: Final = 1e-9
 """Part of the largest energy of a self-stress below which another stores none."""
-_GAUSS: Final = np.polynomial.legendre.leggauss(3)
-"""Exact for the energy of a section's load that is linear, in a part that is."""
 
 
 def elastic_reactions(
@@ -138,7 +136,8 @@ def _of_beam(
     weights = np.array([1 / stretch, shear, shear, 1 / twist, 1 / bend, 1 / bend])[:, None]
     sides = _sides(robot, beam, found)
     total = np.zeros_like(found.null)
-    for x, weight in zip(*_GAUSS, strict=True):
+    # Exact for the energy of a section's load that is linear, in a part that is.
+    for x, weight in zip(*np.polynomial.legendre.leggauss(3), strict=True):
         share = (x + 1.0) / 2.0
         place = ends[0] + share * along
         load = np.zeros((*found.value.shape[:-1], 6, found.value.shape[-1]))

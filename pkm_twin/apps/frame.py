@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import dataclasses
+import gc
 import inspect
 import math
 import re
@@ -154,6 +155,8 @@ def execute(command: Command, name: str, given: Any, as_json: bool) -> None:
     drawing = given.drawing(name) if hasattr(given, "drawing") else None
     if drawing is not None:
         refuse_existing(drawing, getattr(given, "overwrite", True), _source(given))
+    gc.freeze()
+    gc.enable()
     report = command.run(given)
     if hasattr(given, "drawing"):
         report = _drawn(report, drawing)

@@ -266,8 +266,9 @@ def _extent(graph: Graph) -> float:
     points.append(graph.origin)
     extent = float(np.ptp(np.array(points), axis=0).max())
     about = [float(np.linalg.norm(b.com - graph.origin)) for b in graph.bodies.values() if b.mass]
-    # Half of the bodies may have a wrong place.
-    extent = max(extent, 2.0 * float(np.median(about)) if about else 0.0)
+    # The median, as half of the bodies may have a wrong place: numpy's loads masked arrays first.
+    middle = sorted(about)[(len(about) - 1) // 2 : len(about) // 2 + 1]
+    extent = max(extent, 2.0 * sum(middle) / len(middle) if middle else 0.0)
     return extent if extent > 1e-9 else 0.0
 
 
