@@ -355,7 +355,7 @@ def _header(program: Program, lanes: int) -> dict[str, Any]:
         "outputs": [len(row) for row in program.outputs.values()],
         "parameters": program.parameters + program.geometry,
         "prepared": lanes * (len(program.prepared) + 1),
-        "stepped": program.equations is not None,
+        "stepped": bool(program.equations),
     }
 
 

@@ -34,7 +34,7 @@ from pkm_twin.codegen.assembly import (
 from pkm_twin.codegen.expressions import GEOMETRY, PARAMETERS, Expression, ordered, uses
 from pkm_twin.codegen.native import CPU, FEATURES, OPTIMISATION, PREPARE, QUICK, SYMBOL
 from pkm_twin.codegen.operations import fused, sub
-from pkm_twin.codegen.program import AT, LARGE, STATE, TURNS, UNKNOWNS, Equations, Program
+from pkm_twin.codegen.program import AT, LARGE, STATE, TURNS, Equations, Program, holding
 
 STATUS: Final = " status"
 LONG: Final = 100
@@ -255,16 +255,17 @@ class _Writer:
             place = b.add(i, whole(lane))
             self.places.append(b.select(b.icmp("slt", place, last), place, last))
         values = {name: self._load(name, size) for name, size in program.inputs.items()}
-        if program.equations is None:
-            alive, reached = TRUE, self.emitter().number(1.0)
-        else:
-            values[UNKNOWNS], alive, reached = self._solve(program.equations, values)
+        good, reached = TRUE, self.emitter().number(1.0)
+        state: list[Value] = []
+        for q in program.equations:
+            values[q.unknowns] = self._solve(q, values, state)
+        if state:
+            good, reached = self._above(b.load(state[AT.alive])), b.load(state[AT.reached])
         out = self.emitter()
         names = list(program.outputs)
         rows = {name: out.run(list(program.outputs[name]), values) for name in names}
-        good = alive
-        if program.equations is not None:
-            good = b.and_(good, self._above(*out.run([program.equations.held], values)))
+        for value in out.run(holding(program.equations), values):
+            good = b.and_(good, self._above(value))
         total = out.number(0.0)
         for row in rows.values():
             for value in row:
@@ -285,15 +286,15 @@ class _Writer:
         b.store(b.or_(b.load(self.flags), bad), self.flags)
         samples.close()
 
-    def _solve(
-        self, q: Equations, values: Mapping[str, list[Value]]
-    ) -> tuple[list[Value], Value, Value]:
-        """Newton's method in steps; the unknowns, the lanes that got there, and how far."""
+    def _solve(self, q: Equations, values: dict[str, list[Value]], n: list[Value]) -> list[Value]:
+        """Newton's method in steps; the unknowns. The state is made by the first equations."""
         b, number = self.b, self.emitter().number
-        x, aim, n, (size,) = (
-            [b.alloca(VECTOR) for _ in range(count)]
-            for count in (len(q.home), len(q.origin), len(AT), 1)
-        )
+        first = not n
+        x, aim = ([b.alloca(VECTOR) for _ in row] for row in (q.home, q.origin))
+        n += [b.alloca(VECTOR) for _ in (AT if first else ())]
+        size = b.alloca(VECTOR)
+        if q.goal:
+            values[q.target] = self.emitter().run(q.goal, values)
 
         def run(
             results: Sequence[Expression],
@@ -312,9 +313,10 @@ class _Writer:
                 b.store(out.run([e], given)[0], place)
 
         once = b.icmp("eq", self.steps, ONE)
-        b.store(b.select(once, number(1.0), number(0.0)), n[AT.once])
-        b.store(number(1.0), n[AT.alive])
-        b.store(number(0.0), n[AT.reached])
+        if first:
+            b.store(b.select(once, number(1.0), number(0.0)), n[AT.once])
+            b.store(number(1.0), n[AT.alive])
+            b.store(number(0.0), n[AT.reached])
         # The same for all lanes: a jump, which is foreseen, instead of a choice by lane.
         uniform = {q.state[AT.once].number: once}
         run(q.begin, *x, size)
@@ -332,16 +334,13 @@ class _Writer:
         turns = _Counter(b, "turn", whole(TURNS))
         turns.begin()
         run(
-            q.correct, *x, *n[AT.size : AT.reached], first=q.results, **{UNKNOWNS: x, q.target: aim}
-        )
+            q.correct, *x, *n[AT.size : AT.reached], first=q.results,
+            **{q.unknowns: x, q.target: aim},
+        )  # fmt: skip
         turns.close(self._any(self._above(b.load(n[AT.moving]))))
         run(q.arrive, n[AT.alive], n[AT.reached])
         steps.close(self._any(self._above(b.load(n[AT.alive]))))
-        return (
-            [b.load(place) for place in x],
-            self._above(b.load(n[AT.alive])),
-            b.load(n[AT.reached]),
-        )
+        return [b.load(place) for place in x]
 
 
 def emit(program: Program) -> str:

@@ -17,8 +17,10 @@ import numpy as np
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.codegen.expressions import GEOMETRY, PARAMETERS, Expression, ordered, uses
 from pkm_twin.codegen.operations import OPERATIONS
-from pkm_twin.codegen.program import AT, LARGE, STATE, TURNS, UNKNOWNS, Program, progress
+from pkm_twin.codegen.program import AT, LARGE, STATE, TURNS, Equations, Program, holding, progress
 
+PARTS: Final = ("goal", "begin", "aim", "correct", "arrive")
+"""Of equations, what is called while they are solved."""
 _LONGEST: Final = 200
 """Characters of an expression that is written into another one."""
 
@@ -84,14 +86,13 @@ class PlainCode:
 
     def __init__(self, program: Program) -> None:
         self.program = program
-        q = program.equations
         names = {**program.inputs, PARAMETERS: len(program.prepared)}
         results = [e for row in program.outputs.values() for e in row]
-        parts: dict[str, Sequence[Expression]] = {"results": results}
-        if q is not None:
-            names |= {UNKNOWNS: len(q.home), STATE: len(AT)}
-            parts = {"results": [*results, q.held], "begin": q.begin, "aim": q.aim}
-            parts |= {"correct": q.correct, "arrive": q.arrive}
+        results += holding(program.equations)
+        parts: dict[Any, Sequence[Expression]] = {"results": results}
+        for q in program.equations:
+            names |= {q.unknowns: len(q.home), q.target: len(q.origin), STATE: len(AT)}
+            parts |= {(q, name): getattr(q, name) for name in PARTS}
         known = {e.number: f"{PARAMETERS}[{k}]" for k, e in enumerate(program.prepared)}
         self._parts = {name: functions(part, names, known) for name, part in parts.items()}
         given = {PARAMETERS: program.parameters, GEOMETRY: program.geometry}
@@ -114,14 +115,15 @@ class PlainCode:
         columns = [list(value.T) if many else value.ravel().tolist() for value in inputs]
         named: dict[str, Any] = dict(zip(self.program.inputs, columns, strict=True))
         named[PARAMETERS] = p.tolist()
-        good: Any = 1.0
-        reached: Any = 1.0
+        n: list[Any] = [0.0] * len(AT)
+        n[AT.once], n[AT.alive], n[AT.reached] = float(steps == 1), 1.0, 0.0
+        if not self.program.equations:
+            n[AT.reached] = 1.0
         with np.errstate(all="ignore"):
-            if self.program.equations is not None:
-                good, reached = self._solve(named, steps, many=many)
+            for q in self.program.equations:
+                self._solve(q, named, n, steps, many=many)
             values = self._call("results", named, many=many)
-            if self.program.equations is not None:
-                good = good * values.pop()
+            good: Any = n[AT.alive] * (values.pop() if self.program.equations else 1.0)
             total = sum(map(abs, [*values, *(x for column in columns for x in column)]))
             own = _MANY if many else _ONE
             finite = own["select"](own["less"](total, LARGE), 0.0, 2.0)
@@ -130,22 +132,27 @@ class PlainCode:
         for k, value in enumerate(values):
             table[:, k] = value
         status = np.empty((count, 2))
-        status[:, 0], status[:, 1] = code, reached
+        status[:, 0], status[:, 1] = code, n[AT.reached]
         table[status[:, 0] != 0.0] = np.nan
         ends = itertools.accumulate(map(len, self.program.outputs.values()), initial=0)
         return [table[:, a:b].copy() for a, b in itertools.pairwise(ends)], status
 
-    def _call(self, part: str, named: dict[str, Any], *, many: bool) -> list[Any]:
+    def _call(self, part: Any, named: dict[str, Any], *, many: bool) -> list[Any]:
         return list(self._parts[part][many](**named))
 
-    def _solve(self, named: dict[str, Any], steps: int, *, many: bool) -> tuple[Any, Any]:
-        """Newton's method; ``named`` gets the unknowns. Which samples got there, and how far."""
-        q = self.program.equations
-        assert q is not None  # noqa: S101
-        named[STATE] = n = [0.0] * len(AT)
-        n[AT.once], n[AT.alive] = float(steps == 1), 1.0
+    def _solve(
+        self, q: Equations, named: dict[str, Any], n: list[Any], steps: int, *, many: bool
+    ) -> None:
+        """Newton's method from the state n on; ``named`` gets the unknowns."""
+        named[STATE] = n
         some: Callable[[Any], Any] = np.any if many else bool
-        *named[UNKNOWNS], size = self._call("begin", named, many=many)
+
+        def call(part: str, given: dict[str, Any] = named) -> list[Any]:
+            return self._call((q, part), given, many=many)
+
+        if q.goal:
+            named[q.target] = call("goal")
+        *named[q.unknowns], size = call("begin")
         for k in range(1, steps + 1):
             n[AT.part], n[AT.size], n[AT.before], n[AT.moving] = (
                 progress(k / steps),
@@ -153,14 +160,14 @@ class PlainCode:
                 0.0,
                 n[AT.alive],
             )
-            here = named | {q.target: self._call("aim", named, many=many)}
+            here = named | {q.target: call("aim")}
             for _ in range(TURNS):
-                after = self._call("correct", here, many=many)
-                here[UNKNOWNS], n[AT.size : AT.reached] = after[: len(q.home)], after[len(q.home) :]
+                after = call("correct", here)
+                x, n[AT.size : AT.reached] = after[: len(q.home)], after[len(q.home) :]
+                here[q.unknowns] = x
                 if not some(n[AT.moving]):
                     break
-            named[UNKNOWNS] = here[UNKNOWNS]
-            n[AT.alive], n[AT.reached] = self._call("arrive", named, many=many)
+            named[q.unknowns] = here[q.unknowns]
+            n[AT.alive], n[AT.reached] = call("arrive")
             if not some(n[AT.alive]):
                 break
-        return n[AT.alive], n[AT.reached]

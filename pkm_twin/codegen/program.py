@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Final, NamedTuple
@@ -82,6 +82,9 @@ def progress(share: float) -> float:
 class Equations:
     """Unknowns x of the target q, found by Newton's method from a known state.
 
+    The target is an input of the program, or ``goal``: expressions of inputs and of the unknowns of
+    equations before these. ``stage``: how many those are.
+
     One step goes from ``start`` (expressions of q; None: from home) to the target at once. In more
     steps the target moves from ``origin`` to q, from the unknowns ``home``, by :func:`progress`.
 
@@ -106,6 +109,11 @@ class Equations:
     """Whether the start is a guess, that may be nearer to another root."""
     branch: Sequence[Expression] = ()
     """Above zero in the mechanism's own branch, at the target."""
+
+    unknowns: str = UNKNOWNS
+    """Name of the input that the method finds."""
+    goal: Sequence[Expression] = ()
+    stage: int = 0
 
     lone: bool = False
     """Whether a sample is solved alone: its state says nothing of whether it moves."""
@@ -158,7 +166,7 @@ class Equations:
         state, size, determinant = self.state, self.size, self.determinant
         once, before, moving = state[AT.once], state[AT.before], state[AT.moving]
         known = self.start is not None and not self.guessed
-        x = self.size.tape.inputs(UNKNOWNS, len(self.home))
+        x = self.size.tape.inputs(self.unknowns, len(self.home))
         new = (select(moving, a, b) for a, b in zip(self.corrected, x, strict=True))
         near = select(less(0.0, before), before, determinant)
         steady = both(less(near, CHANGE * determinant), less(determinant, CHANGE * near))
@@ -173,7 +181,7 @@ class Equations:
         """After a step: the state's alive and reached. What still moves is refused."""
         n = self.state
         alive = select(n[AT.moving], 0.0, n[AT.alive])
-        return self._lift(alive, select(alive, n[AT.part], n[AT.reached]))
+        return self._lift(alive, select(alive, n[AT.part] + float(self.stage), n[AT.reached]))
 
     @cached_property
     def held(self) -> Expression:
@@ -184,24 +192,33 @@ class Equations:
         return self._lift(held)[0]
 
 
+def holding(equations: Iterable[Equations]) -> list[Expression]:
+    """1 where all of these equations hold, else 0: in a list, empty where there are none."""
+    result: list[Expression] = []
+    for q in equations:
+        result = [both(result[0], q.held) if result else q.held]
+    return result
+
+
 @dataclass(frozen=True, eq=False)
 class Program:
     """Outputs by name as expressions of the inputs, of the parameters and of solved unknowns.
 
     ``inputs``: sizes by name, in the order of the call, without parameters and unknowns.
+    ``equations``: are solved one after the other.
     ``quick``: better compiled in a tenth of the time than run in two thirds of it.
     """
 
     inputs: Mapping[str, int]
     parameters: int
     outputs: Mapping[str, Sequence[Expression]]
-    equations: Equations | None = None
+    equations: Sequence[Equations] = ()
     quick: bool = False
 
     def __post_init__(self) -> None:
         known = {**self.inputs, PARAMETERS: self.parameters, GEOMETRY: self.geometry}
-        if self.equations is not None:
-            known |= {UNKNOWNS: len(self.equations.home), STATE: len(AT)}
+        for q in self.equations:
+            known |= {q.unknowns: len(q.home), q.target: len(q.origin), STATE: len(AT)}
         for e in ordered(self.results):
             name, index = e.source or ("", -1)
             if not index < known.get(name, 0):
@@ -216,10 +233,9 @@ class Program:
     def results(self) -> list[Expression]:
         """Every expression that is computed."""
         rows = [e for row in self.outputs.values() for e in row]
-        q = self.equations
-        if q is not None:
-            rows += [*q.begin, *q.aim, *q.correct, *q.arrive, q.held]
-        return rows
+        for q in self.equations:
+            rows += [*q.goal, *q.begin, *q.aim, *q.correct, *q.arrive]
+        return rows + holding(self.equations)
 
     @cached_property
     def prepared(self) -> list[Expression]:
@@ -240,6 +256,6 @@ class Program:
     @property
     def operations(self) -> tuple[int, int]:
         """Operations of one correction, and of the outputs."""
-        newton = [] if self.equations is None else self.equations.results
+        newton = [e for q in self.equations for e in q.results]
         rows = [e for row in self.outputs.values() for e in row]
         return count(newton), count(rows)

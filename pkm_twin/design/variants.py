@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 from delta_dynamics.torques.reactions import BALANCE_BOUND, Reactions, balanced, known_alone
 from pkm_twin.codegen.arrays import Array, doubles
 from pkm_twin.codegen.code import Code
-from pkm_twin.codegen.kernels import MISSED, Kernel
+from pkm_twin.codegen.kernels import MISSED
 from pkm_twin.design import programs
 from pkm_twin.errors import ParameterError, PkmTwinError
 from pkm_twin.machine.geometry import pattern_of
@@ -173,15 +173,7 @@ class Variants:
 
     def inverse(self, pose: ArrayLike) -> Array:
         """Joint positions, shape (k, ..., n), see :meth:`Robot.inverse`."""
-        names = {id(self.robot.engine.forward): programs.forward}
-
-        def run(kernel: Kernel, *inputs: ArrayLike) -> tuple[list[Array], Array | None]:
-            outputs, good = self.run(names.get(id(kernel), programs.inverse), *inputs)
-            status = np.where(good, 0.0, 1.0)
-            return outputs, None if good.all() else np.concatenate([status, status], -1)
-
-        q, codes = self.robot.judged_inverse(pose, run)
-        return q if codes is None else np.where(codes[..., :1] == 0.0, q, np.nan)
+        return self.run(programs.inverse, pose)[0][0]
 
     def jacobian(self, q: ArrayLike) -> Array:
         """Pose rates per joint rate, shape (k, ..., m, n), see :meth:`Robot.jacobian`."""

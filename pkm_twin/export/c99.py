@@ -9,7 +9,7 @@ as the other back ends.
 from __future__ import annotations
 
 from collections.abc import Container, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from textwrap import indent
 from typing import Any, Final
 
@@ -25,7 +25,7 @@ from pkm_twin.codegen.operations import (
     sin,
     sub,
 )
-from pkm_twin.codegen.program import AT, LARGE, STATE, TURNS, UNKNOWNS, Equations
+from pkm_twin.codegen.program import AT, LARGE, STATE, TURNS, UNKNOWNS, Equations, holding
 
 LADDER: Final = (1, *STEPS)
 """Steps of Newton's method, one attempt after the other."""
@@ -147,6 +147,11 @@ def _angles(
     return [groups[k] for k in sorted(groups)]
 
 
+ROWS: Final = ("home", "origin", "start", "corrected", "branch", "goal")
+NUMBERS: Final = ("size", "determinant", "residual")
+"""What equations have as expressions, in a row and alone."""
+
+
 class Folding:
     """Programs rewritten on one tape, with numbers in place of some inputs."""
 
@@ -171,12 +176,10 @@ class Folding:
 
     def equations(self, q: Equations, given: Mapping[str, Sequence[Any]]) -> Equations:
         """The same of equations; the known state is constant then."""
-        size, determinant, residual = self([q.size, q.determinant, q.residual], given)
-        return Equations(
-            q.target, self(q.home, given), self(q.origin, given),
-            None if q.start is None else self(q.start, given), self(q.corrected, given),
-            size, determinant, residual, q.guessed, self(q.branch, given), lone=True,
-        )  # fmt: skip
+        rows = {name: getattr(q, name) for name in ROWS}
+        folded: dict[str, Any] = {name: row and self(row, given) for name, row in rows.items()}
+        numbers = zip(NUMBERS, self([getattr(q, name) for name in NUMBERS], given), strict=True)
+        return replace(q, **folded | dict(numbers), lone=True)
 
 
 @dataclass(frozen=True)
@@ -184,15 +187,27 @@ class Routine:
     """One public function.
 
     ``outputs``: expressions by argument. ``gates``: above zero where a sample is rejected.
-    ``equations``: name of the solver, see :meth:`Unit.solver`; empty without.
+    ``equations``: are solved one after the other.
     """
 
     name: str
     inputs: Mapping[str, int]
     outputs: Mapping[str, Sequence[Expression]]
+    equations: Sequence[Equations]
+    summary: str
     gates: Sequence[Expression] = ()
-    solver: str = ""
-    summary: str = ""
+
+    @property
+    def results(self) -> list[Expression]:
+        """Outputs and gates."""
+        return [*(e for row in self.outputs.values() for e in row), *self.gates]
+
+    @property
+    def operations(self) -> tuple[str, int]:
+        """Operations of one correction, of each equations, and of all else."""
+        turns = [str(count(q.results)) for q in self.equations if q.home]
+        rest = [*self.results, *(e for q in self.equations for e in (*q.goal, q.held))]
+        return " + ".join(turns) or "-", count(rest)
 
 
 HOT: Final = "PKM_HOT "
@@ -246,8 +261,7 @@ class Unit:
         self._known = {e.number: f"p[{k}]" for k, e in enumerate(parameters)}
         self._needed: set[Operation] = set()
         self._parts: list[str] = []
-        self._solvers: dict[str, Equations] = {}
-        self._ahead: dict[str, dict[int, str]] = {}
+        self._ahead: dict[str, dict[int, int]] = {}
         self.doubles: dict[str, int] = {}
         """Local doubles of every function, by name."""
 
@@ -297,15 +311,22 @@ static const int @_steps[{len(LADDER)}] = {{{steps}}};
         self.doubles[name] = made.doubles
         return f"@_{name}({', '.join([*((called or {}).get(a, a) for a in arguments), '%s'])})"
 
-    def solver(self, name: str, q: Equations) -> None:
-        """Newton's method for the unknowns, in so many steps."""
-        self._solvers[name] = q
+    def solver(self, q: Equations) -> tuple[str, dict[int, int]]:
+        """Newton's method for the unknowns, in so many steps, written once.
+
+        :returns: its name, and places in its table ``h`` by the expression's number.
+        """
+        name = "reach" if q.unknowns != UNKNOWNS else "assembly"
+        if name not in self._ahead:
+            # What does not change in a step is computed once, and the last serves the results.
+            ahead = _without((q.unknowns, STATE), q.correct)
+            self._ahead[name] = {e.number: k for k, e in enumerate(ahead)}
+            self._write_solver(name, q, ahead)
+        return name, self._ahead[name]
+
+    def _write_solver(self, name: str, q: Equations, ahead: Sequence[Expression]) -> None:
         n, m = len(q.home), len(q.origin)
-        if not n:
-            return
-        # What does not change in a step is computed once, and the last of it serves the results.
-        ahead = _without((UNKNOWNS, STATE), q.correct)
-        known = self._ahead[name] = {e.number: f"h[{k}]" for k, e in enumerate(ahead)}
+        known = {e.number: f"h[{k}]" for k, e in enumerate(ahead)}
         aim = {q.target: "aim"}
         prepare = self.function(f"{name}_ahead", ahead, {}, aim) % "h" if ahead else "(void)h"
         begin = self.function(f"{name}_begin", q.begin, known, aim)
@@ -313,7 +334,7 @@ static const int @_steps[{len(LADDER)}] = {{{steps}}};
         target = self.function(f"{name}_aim", q.aim, {}) % "aim"
         self.add(f"""\
 /* Newton's method from the known assembly in so many steps; 0 where it does not get there. */
-static int @_{name}(const double *{q.target}, int steps, double *h, double *x)
+static int @_{name}(const double *{q.target}, int steps, double *h, double *{q.unknowns})
 {{
     double {STATE}[{AT.moving}], aim[{m}], next[{n + 4}], first = 0.0;
     int i, k;
@@ -327,7 +348,7 @@ static int @_{name}(const double *{q.target}, int steps, double *h, double *x)
         if (k == 1) {{
             {begin % "next"};
             for (i = 0; i < {n}; i++) {{
-                x[i] = next[i];
+                {q.unknowns}[i] = next[i];
             }}
             first = next[{n}];
         }}
@@ -336,7 +357,7 @@ static int @_{name}(const double *{q.target}, int steps, double *h, double *x)
         for (turn = 0; (turn < {TURNS}) && (moving != 0); turn++) {{
             {correct};
             for (i = 0; i < {n}; i++) {{
-                x[i] = next[i];
+                {q.unknowns}[i] = next[i];
             }}
             {STATE}[{AT.size}] = next[{n}];
             {STATE}[{AT.before}] = next[{n + 1}];
@@ -365,37 +386,37 @@ static int @_{name}(const double *{q.target}, int steps, double *h, double *x)
 
         :param kind: what stands before it: ``static`` or :data:`HOT`.
         """
-        q = self._solvers.get(routine.solver)
-        results = [e for row in routine.outputs.values() for e in row]
-        wanted = [*results, *routine.gates]
-        judged = [] if q is None else [q.held]
-        known = self._known | self._ahead.get(routine.solver, {})
-        given = {"p": "parameters"}
-        call = self.function(f"{routine.name}_of", [*wanted, *judged], known, given) % "r"
-        finite = [f"(@_finite({name}, {size}) != 0)" for name, size in routine.inputs.items()]
-        verdict = f"status = @_judged(r, {len(wanted)});"
-        if q is None:
-            verdict = f"status = (@_finite(r, {len(wanted)}) != 0) ? 0 : 2;"
+        wanted, held = routine.results, holding(routine.equations)
+        known, given = dict(self._known), {"p": "parameters"}
         # Compilers do not see that nothing is read without a value.
-        lines = [f"    double r[{len(wanted) + len(judged)}] = {{0.0}};"]
-        work = [f"        {call};", f"        {verdict}"]
-        if q is not None and q.home:
-            aheads, size = len(known) - len(self._known) or 1, len(q.home)
-            lines.append(f"    double h[{aheads}] = {{0.0}}, {UNKNOWNS}[{size}] = {{0.0}};")
+        rooms, solving = {"r": len(wanted) + len(held)}, []
+        for k, q in enumerate(routine.equations):
+            if q.goal:
+                rooms["goal"], given[q.target] = len(q.goal), "goal"
+                goal = self.function(f"{routine.name}_goal", q.goal, {}, given) % "goal"
+                solving.append(f"{goal};")
+            if q.home:
+                name, ahead = self.solver(q)
+                known |= {number: f"h{k}[{at}]" for number, at in ahead.items()}
+                rooms |= {f"h{k}": len(ahead) or 1, q.unknowns: len(q.home)}
+                to = f"{given.get(q.target, q.target)}, @_steps[rung], h{k}, {q.unknowns}"
+                solving += [f"if (@_{name}({to}) == 0) {{", "    continue;", "}"]
+        call = self.function(f"{routine.name}_of", [*wanted, *held], known, given) % "r"
+        verdict = f"@_judged(r, {len(wanted)})"
+        if not held:
+            verdict = f"(@_finite(r, {len(wanted)}) != 0) ? 0 : 2"
+        work = "\n".join([*solving, f"{call};", f"status = {verdict};"])
+        lines = [f"    double {name}[{size}] = {{0.0}};" for name, size in rooms.items()]
+        if any(q.home for q in routine.equations):
             lines.append("    int rung;")
-            work = [
-                "        status = 1;",
-                "        for (rung = 0; (rung < PKM_ATTEMPTS) && (status == 1); rung++) {",
-                f"            if (@_{routine.solver}({q.target}, @_steps[rung], h, x) != 0) {{",
-                *indent("\n".join(work), "        ").split("\n"), "            }", "        }",
-            ]  # fmt: skip
+            loop = "for (rung = 0; (rung < PKM_ATTEMPTS) && (status == 1); rung++) {"
+            work = f"status = 1;\n{loop}\n{indent(work, '    ')}\n}}"
+        finite = [f"(@_finite({name}, {size}) != 0)" for name, size in routine.inputs.items()]
         lines.append("    int status = 2;")
         if "parameters" not in call:
             lines.append("    (void)parameters;")
-        lines += [f"    if ({' && '.join(finite)}) {{", *work]
-        lines.append("    }")
-        for k in range(len(routine.gates)):
-            at = len(results) + k
+        lines += [f"    if ({' && '.join(finite)}) {{", indent(work, "        "), "    }"]
+        for at in range(len(wanted) - len(routine.gates), len(wanted)):
             lines += [
                 f"    if ((status == 0) && !(r[{at}] <= 0.0)) {{",
                 "        status = 1;",
@@ -407,7 +428,7 @@ static int @_{name}(const double *{q.target}, int steps, double *h, double *x)
             lines.append(f"    @_give(status, {source}, {name}, {len(row)});")
             at += len(row)
         lines.append("    return status;")
-        self.doubles[routine.name] = len(wanted) + len(judged)
+        self.doubles[routine.name] = sum(rooms.values())
         self.add(f"{kind}{self.signature(routine, given=True)}\n{{\n" + "\n".join(lines) + "\n}\n")
 
     def own(self, routine: Routine) -> None:
@@ -417,14 +438,6 @@ static int @_{name}(const double *{q.target}, int steps, double *h, double *x)
             f"{self.signature(routine, given=False)}\n{{\n"
             f"    return @_{routine.name}_with({names});\n}}\n"
         )
-
-    def operations(self, routine: Routine) -> tuple[int, int]:
-        """Operations of one correction, and of the results."""
-        q = self._solvers.get(routine.solver)
-        judged = [] if q is None else [q.held]
-        results = [e for row in routine.outputs.values() for e in row]
-        solving = count(q.results) if q is not None and q.home else 0
-        return solving, count([*results, *routine.gates, *judged])
 
 
 def _without(names: Container[str], results: Sequence[Expression]) -> list[Expression]:

@@ -6,7 +6,7 @@ from __future__ import annotations
 import re
 import textwrap
 from collections.abc import Callable, Collection, Mapping, Sequence
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 
@@ -20,7 +20,7 @@ from delta_dynamics.torques.virtual_work import (
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.codegen.expressions import GEOMETRY, PARAMETERS, Expression, edge
 from pkm_twin.codegen.kernels import Kernel
-from pkm_twin.codegen.program import TURNS
+from pkm_twin.codegen.program import TURNS, Equations
 from pkm_twin.errors import ParameterError
 from pkm_twin.export.c99 import CORRECTIONS, HEAD, HOT, LADDER, Folding, Routine, Unit, table
 from pkm_twin.export.c_templates import (
@@ -34,15 +34,9 @@ from pkm_twin.export.c_templates import (
 )
 from pkm_twin.machine.inertia import Layout
 from pkm_twin.machine.sections import MAX_LENGTH, MAX_MASS, payload_margins
-from pkm_twin.robot.robot import SAME_POSE, SINGULARITY_BOUND, Robot
+from pkm_twin.robot.robot import Robot
 from stiffness_monitor.compliance import HELD
 from stiffness_monitor.programs import Elastic, elastic_of
-
-SOLVER: Final = "assembly"
-"""Newton's method for the passive joints, of all functions of q."""
-POSED: Final = "reach"
-"""The same for the joints of a pose, where there is no closed form."""
-CANDIDATE: Final = "candidate"
 
 
 def identifier(name: str) -> str:
@@ -84,10 +78,6 @@ class Package:
         self.elastic: Elastic | None = elastic_of(robot) if has else None
         self.fold = Folding()
         self.payload = self.fold.tape.inputs(PARAMETERS, 13)
-        forward = self._read(robot.engine.forward)
-        equations = forward[0].program.equations
-        assert equations is not None  # noqa: S101
-        self.equations = self.fold.equations(equations, forward[1])
         self.routines = self._routines()
         rows = [[e for row in r.outputs.values() for e in row] for r in self.routines]
         # A table of no numbers is none in C.
@@ -100,14 +90,12 @@ class Package:
 
     def _read(
         self, kernel: Kernel, own: Sequence[Any] | Array = ()
-    ) -> tuple[Kernel, dict[str, Sequence[Any]]]:
-        """A kernel with what is given to its program."""
-        geometry = [float(value) for value in kernel.geometry]
-        return kernel, {GEOMETRY: geometry, PARAMETERS: list(own)}
-
-    def _rows(self, kernel: Kernel, own: Sequence[Any] | Array = ()) -> dict[str, list[Expression]]:
-        program, given = kernel.program, self._read(kernel, own)[1]
-        return {name: self.fold(row, given) for name, row in program.outputs.items()}
+    ) -> tuple[dict[str, list[Expression]], list[Equations]]:
+        """Outputs and equations of a kernel, with this machine's numbers in them."""
+        program = kernel.program
+        given = {GEOMETRY: kernel.geometry.tolist(), PARAMETERS: list(own)}
+        rows = {name: self.fold(row, given) for name, row in program.outputs.items()}
+        return rows, [self.fold.equations(q, given) for q in program.equations]
 
     def _routines(self) -> list[Routine]:
         robot, n = self.robot, self.n
@@ -125,9 +113,10 @@ class Package:
             if self._wants(name):
                 rows: dict[str, list[Expression]] = {}
                 for kernel in [kernels] if callable(kernels) else kernels:
-                    rows |= self._rows(kernel(), own)
+                    found, equations = self._read(kernel(), own)
+                    rows |= found
                 made = {key: rows[row] for key, row in outputs.items()}
-                result.append(Routine(name, inputs, made, (), SOLVER, summary))
+                result.append(Routine(name, inputs, made, equations, summary))
 
         engine, p = robot.engine, self._inertial() if self.massive else ()
         if self.massive:
@@ -143,6 +132,10 @@ class Package:
                 tau="efforts", index="measure",
             )  # fmt: skip
         add("forward", "Pose of joint positions.", q, lambda: engine.forward, pose="pose")
+        add(
+            "inverse", "Joint positions of a pose, accepted only if _forward of them is the pose.",
+            {"pose": self.m}, lambda: robot.inverse_kernel, q="q",
+        )  # fmt: skip
         add(
             "platform",
             "Position (m) of the platform's reference point in base axes, and the platform's "
@@ -189,20 +182,20 @@ class Package:
         return not self._names or name in self._names
 
     def _add_elastic(self, elastic: Elastic, result: list[Routine]) -> None:
-        (row,) = self._rows(elastic.response).values()
+        rows, equations = self._read(elastic.response)
+        (row,) = rows.values()
         k = len(elastic.names)
         mechanism = self.fold.tape.lift(HELD - row[-1])
         made = (
             Routine(
-                "compliance", {"q": self.n}, {"c": row[2 * k + 7 : 2 * k + 43]}, [mechanism],
-                SOLVER,
+                "compliance", {"q": self.n}, {"c": row[2 * k + 7 : 2 * k + 43]}, equations,
                 "Compliance of the platform at its reference point, joints locked: x y z rx ry rz, "
-                "base axes, row by row.",
+                "base axes, row by row.", [mechanism],
             ),
             Routine(
                 "strain_energy", {"q": self.n, "wrench": 6}, {"energies": row[k : 2 * k]},
-                [mechanism], SOLVER,
-                f"Strain energy (J) of each element: {', '.join(elastic.names)}.",
+                equations, f"Strain energy (J) of each element: {', '.join(elastic.names)}.",
+                [mechanism],
             ),
         )  # fmt: skip
         result += [routine for routine in made if self._wants(routine.name)]
@@ -223,62 +216,11 @@ class Package:
         unit = self.unit
         own = self.fold(self.parameters, {PARAMETERS: self._payload()})
         unit.add(table("@_own", [e.value for e in own]))
-        unit.solver(SOLVER, self.equations)
         if self.massive:
             self._write_parameters()
         for routine in self.routines:
             unit.routine(routine, HOT if routine.name == "torques_and_singularity" else "")
             unit.own(routine)
-        if self._wants("inverse"):
-            self._write_inverse()
-
-    def _write_inverse(self) -> None:
-        """Joints of a pose may belong to another assembly: ``forward`` decides."""
-        unit, robot, n, m = self.unit, self.robot, self.n, self.m
-        kernel = robot.inverse_kernel
-        given = self._read(kernel)[1]
-        outputs, gates, solver = self._rows(kernel), [], ""
-        if "faults" in outputs:
-            *misses, measure = outputs["faults"]
-            gates = [*misses, self.fold.tape.lift(SINGULARITY_BOUND - measure)]
-        if kernel.program.equations is not None:
-            solver = POSED
-            unit.solver(POSED, self.fold.equations(kernel.program.equations, given))
-        summary = "Joint positions of a pose, accepted only if _forward of them is the pose."
-        candidate = Routine(CANDIDATE, {"pose": self.m}, {"q": outputs["q"]}, gates, solver)
-        unit.routine(candidate, "static ")
-        self.inverse = Routine(
-            "inverse", {"pose": self.m}, {"q": outputs["q"]}, (), solver, summary
-        )
-        self.candidate = candidate
-        turns = [1.0 if turn else 0.0 for turn in robot.turn_mask]
-        test = "            double apart = there[i] - pose[i];\n"
-        if any(turns):
-            self.unit.add(table("@_full_turn", [turn * 2.0 * np.pi for turn in turns]))
-            test += (
-                "            if (@_full_turn[i] > 0.0) {\n"
-                "                apart = remainder(apart, @_full_turn[i]);\n            }\n"
-            )
-        self.unit.add(table("@_same", [SAME_POSE / float(unit) for unit in robot.unit_scales]))
-        self.unit.add(f"""\
-{self.unit.signature(self.inverse, given=True)}
-{{
-    double found[{n}], there[{m}];
-    int i;
-    int status = @_{CANDIDATE}_with(parameters, pose, found);
-    if (status == 0) {{
-        status = (@_forward_with(parameters, found, there) != 0) ? 1 : 0;
-        for (i = 0; (i < {m}) && (status == 0); i++) {{
-{test}            if (!(fabs(apart) <= @_same[i])) {{
-                status = 1;
-            }}
-        }}
-    }}
-    @_give(status, found, q, {n});
-    return status;
-}}
-""")
-        unit.own(self.inverse)
 
     def _write_parameters(self) -> None:
         unit, size = self.unit, len(self.parameters)
@@ -322,14 +264,6 @@ int @_parameters(double mass, const double *com, const double *inertia, double *
         name = self.prefix.removeprefix("pkm_")
         return f"{name}: written by pkm-twin export c, which overwrites changes."
 
-    @property
-    def public(self) -> list[Routine]:
-        """All functions, the inverse behind the forward."""
-        if not self._wants("inverse"):
-            return self.routines
-        at = [r.name for r in self.routines].index("forward") + 1
-        return [*self.routines[:at], self.inverse, *self.routines[at:]]
-
     def header(self) -> str:
         """Declarations, with what each function takes."""
         guard, size = f"{self.macro}_H", len(self.parameters)
@@ -343,7 +277,7 @@ int @_parameters(double mass, const double *com, const double *inertia, double *
         spelled = dict.fromkeys([self.macro, f"PKM_{self.prefix.removeprefix('pkm_')}"])
         lines = [f"#define {m}_{name} {count}" for m in spelled for name, count in sizes]
         parts = []
-        for routine in self.public:
+        for routine in self.routines:
             shape = ", ".join(f"{name}[{len(row)}]" for name, row in routine.outputs.items())
             takes = ", ".join(f"{name}[{count}]" for name, count in routine.inputs.items())
             parts.append(
@@ -404,11 +338,9 @@ int @_parameters(double mass, const double *com, const double *inertia, double *
     def readme(self) -> str:
         """What the functions are, and what they cost at most."""
         rows = []
-        newton = 0
-        for routine in self.public:
-            read = self.candidate if routine is self.inverse else routine
-            newton, results = self.unit.operations(read)
-            rows.append(f"| `{self.prefix}_{routine.name}` | {newton or '-'} | {results} |")
+        for routine in self.routines:
+            newton, results = routine.operations
+            rows.append(f"| `{self.prefix}_{routine.name}` | {newton} | {results} |")
         doubles = self.unit.doubles
         largest = max(doubles.values()) * 8
         names = list(self.robot.joint_names)

@@ -124,7 +124,8 @@ A call usually finds the passive joints with 2 to 4 corrections of Newton's meth
 fails, up to five more attempts approach the state in steps from the home pose. One call makes
 at most {corrections} corrections and computes the rest at most {attempts} times, whatever the
 input. The table counts additions, multiplications, divisions and functions of `math.h`; a sine
-and cosine are about 30 operations. `_inverse` also calls `_forward` once.
+and cosine are about 30 operations. `_inverse` solves for the joints first, where
+its row has two numbers of operations: twice as many corrections.
 
 The last attempts are the long ones. Compile with `-DPKM_ATTEMPTS=1` to make only the first one: at
 most {turns} corrections, but valid states far from home may be rejected with status 1.

@@ -3,12 +3,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, Final
 
 import numpy as np
 
-from pkm_twin.codegen.expressions import Numbers
+from pkm_twin.codegen.expressions import Numbers, Objects
 from pkm_twin.codegen.lu import SparseLU
+from pkm_twin.codegen.operations import absolute, cos, sin
 from pkm_twin.codegen.program import UNKNOWNS, Equations, Program
 from pkm_twin.kinematics import pose as poses
 from pkm_twin.kinematics.motion import Motion, Row, matrices
@@ -16,6 +18,11 @@ from pkm_twin.kinematics.traced import Traced
 
 POSE_WEIGHT: Final = 100.0
 """What the pose weighs against closures where not all can be met: so a closure falls short."""
+POSED: Final = "y"
+"""Unknowns and joints of a pose."""
+SAME_POSE: Final = 1e-7
+"""Largest difference of two poses that are one: rounding of the two solutions, of unit one. Another
+assembly is farther away unless a singularity is nearer than that."""
 
 
 def walk_program(t: Traced) -> Program:
@@ -121,13 +128,42 @@ def acceleration_program(t: Traced) -> Program:
     return Program(sizes, 0, {"acceleration": t.lift(second)}, t.equations())
 
 
-def inverse_program(t: Traced) -> Program:
-    """The program of :attr:`.engine.Engine.inverse`."""
+def inverse_program(
+    t: Traced, closed: Callable[[Objects], tuple[Numbers, Numbers]] | None = None
+) -> Program:
+    """Pose to joints, in closed form or by Newton's method: those of which ``forward`` is the pose.
+
+    The joints of a pose may belong to another assembly too, so the closures are solved of them.
+
+    :param closed: of the pose to q, and to numbers that are above zero where q is right.
+    """
+    coordinates = t.scheme.coordinates
+    pose = t.tape.inputs("pose", len(coordinates))
+    first = () if closed else (_posed(t, pose),)
+    q: Numbers = t.tape.inputs(POSED, len(t.tree.home) + t.joints)[-t.joints :]
+    gates: Numbers = ()
+    if closed is not None:
+        q, gates = closed(pose)
+    t.solve()
+    there = poses.values(coordinates, *t.motion.platform())
+    same = list(gates)
+    for c, scale, a, b in zip(coordinates, t.pose_scales, there, pose, strict=True):
+        apart = a - b
+        if len(c.entries) == 2:
+            # A full turn makes no difference.
+            same.append(cos(apart))
+            apart = sin(apart)
+        same.append(SAME_POSE - absolute(apart) * scale)
+    solved = t.equations(branch=t.lift(same), goal=t.lift(q), stage=len(first))
+    return Program({"pose": len(pose)}, 0, {"q": t.lift(q)}, first + solved)
+
+
+def _posed(t: Traced, goal: Objects) -> Equations:
+    """Newton's method for the unknowns and the joints of a pose, from home."""
     scheme, tree, tape = t.scheme, t.tree, t.tape
-    n, size, split = scheme.joints, len(tree.home), tree.unknown_rates
-    everything = tape.inputs(UNKNOWNS, size + n)
-    goal = tape.inputs("pose", len(scheme.coordinates))
+    size, split = len(tree.home), tree.unknown_rates
     home = [*tree.home, *t.graph.home]
+    everything = tape.inputs(POSED, len(home))
     origin = [0.0 if c.axis is None else t.graph.origin[c.axis] for c in scheme.coordinates]
 
     def system(state: Numbers, pose: Numbers) -> tuple[Motion, list[Row], list[Any], SparseLU]:
@@ -141,15 +177,12 @@ def inverse_program(t: Traced) -> Program:
 
     motion, rows, equations, lu = system(everything, goal)
     step = -lu.solve([rows[k].value for k in scheme.kept] + equations)
-    joints = everything[size:] + step[split:]
-    moved = [*motion.retracted(everything[:size], step[:split]), *joints]
-    at_home = system(home, origin)[3]
-    solved = Equations(
-        "pose", t.lift(home), t.lift(origin), None, t.lift(moved),
+    moved = motion.retracted(everything[:size], step[:split])
+    return Equations(
+        "pose", t.lift(home), t.lift(origin), None,
+        t.lift([*moved, *(everything[size:] + step[split:])]),
         t.square(step, [*tree.scales, *t.drive_scales]),
-        tape.lift(at_home.inverse_determinant / lu.inverse_determinant),
-        t.square(
-            [r.value for r in rows] + equations, [r.scale for r in rows] + t.pose_scales
-        ),
+        tape.lift(system(home, origin)[3].inverse_determinant / lu.inverse_determinant),
+        t.square([r.value for r in rows] + equations, [r.scale for r in rows] + t.pose_scales),
+        unknowns=POSED,
     )  # fmt: skip
-    return Program({"pose": len(goal)}, 0, {"q": t.lift(everything[size:])}, solved)

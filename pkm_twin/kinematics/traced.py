@@ -89,8 +89,11 @@ class Traced:
         size = self.tree.size
         return [1.0 if c.axis is None else 1.0 / size for c in self.scheme.coordinates]
 
-    def equations(self) -> Equations:
-        """Newton's method for the unknowns at q, from home or the mechanism's closed form."""
+    def equations(self, **more: Any) -> tuple[Equations, ...]:
+        """Newton's method for the unknowns at q, from home or the mechanism's closed form.
+
+        :param more: further fields of the equations; ``branch``: beside the mechanism's own.
+        """
         scheme, tree = self.scheme, self.tree
         places, rates = scheme.solved
         step = -self.newton.solve([row.value for row in self.solved])
@@ -100,14 +103,15 @@ class Traced:
         closed = scheme.closed.start
         start = self._along() if closed is None else self._ordered(closed(self.closed, self.q))
         moved = self.motion.retracted(self.x, rows)
-        return Equations(
+        branch = [] if scheme.branch is None else self.lift(scheme.branch(self.motion))
+        solved = Equations(
             "q", self.lift([tree.home[k] for k in places]), self.lift(self.graph.home),
             self.lift([start[k] for k in places]), self.lift([moved[k] for k in places]),
             self.square(step, [tree.scales[k] for k in rates]), self.tape.lift(self._determinant()),
             self.square([r.value for r in self.rows], [r.scale for r in self.rows]),
-            closed is None,
-            () if scheme.branch is None else self.lift(scheme.branch(self.motion)),
+            closed is None, [*branch, *more.pop("branch", ())], **more,
         )  # fmt: skip
+        return (solved,)
 
     def _determinant(self) -> Any:
         """Of all closures, over that at home: of Newton's equations and of the limbs' turns."""

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -14,8 +13,10 @@ from numpy.typing import ArrayLike
 
 from pkm_twin.codegen.arrays import Array, Mask
 from pkm_twin.codegen.code import NOT_FINITE
+from pkm_twin.codegen.expressions import Numbers, Objects
 from pkm_twin.codegen.kernels import Kernel
 from pkm_twin.codegen.key import EMPTY
+from pkm_twin.codegen.operations import less
 from pkm_twin.codegen.program import Program
 from pkm_twin.errors import ParameterError, SingularityError, UnreachableError
 from pkm_twin.kinematics.engine import Engine, engine_of
@@ -24,6 +25,7 @@ from pkm_twin.kinematics.passive import (
     passive_program,
     passive_rates_program,
 )
+from pkm_twin.kinematics.programs import inverse_program
 from pkm_twin.kinematics.scheme import Closed
 from pkm_twin.kinematics.singularity import singularity_kernel
 from pkm_twin.kinematics.traced import Traced
@@ -34,15 +36,8 @@ from pkm_twin.robot.mechanism import Mechanism
 
 SINGULARITY_BOUND: Final = 1e-9
 """Least singularity index (0 singular, 1 best) at which a Jacobian is inverted."""
-SAME_POSE: Final = 1e-7
-"""Largest difference of two poses that are one: rounding of the two solutions, of unit one. Another
-assembly is farther away unless a singularity is nearer than that."""
-BEYOND: Final = 3.0
-"""Code of a pose beyond a singularity, after those of programs."""
 
 _NONE: Final = np.zeros(0)
-
-Run = Callable[..., tuple[list[Array], Array | None]]
 
 
 class ControlLoop(Protocol):
@@ -62,12 +57,8 @@ def _forward(robot: Robot) -> Kernel:
     return robot.engine.forward
 
 
-def _undecided(*inputs: Any) -> None:
-    del inputs
-
-
-def _alone(kernel: Kernel, *inputs: ArrayLike) -> tuple[list[Array], Array | None]:
-    return kernel(_NONE, *inputs)
+def _inverse(robot: Robot) -> Kernel:
+    return robot.inverse_kernel
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -173,138 +164,63 @@ class Robot(Mechanism):
         :raises UnreachableError: naming limb, sample and miss.
         :raises SingularityError: a pose beyond a singularity, or in one.
         """
-        one = self._inverse_of_one(pose)
-        if one is not None:
-            return one
-        q, codes = self.judged_inverse(pose, _alone)
-        if codes is not None:
-            self._refuse_pose(codes, pose)
+        return self.bound("inverse", _inverse, otherwise=self._checked_inverse)(pose)
+
+    def _checked_inverse(self, pose: ArrayLike) -> Array:
+        (q,), status = self.inverse_kernel(_NONE, pose)
+        if status is not None:
+            self._refuse_pose(status, pose)
         return q
-
-    @cached_property
-    def _inverse_of_one(self) -> Callable[[Any], Array | None]:
-        """The inverse of one pose without numpy; None where another way has to decide."""
-        closed = self.has_inverse
-        joints = self.inverse_kernel.bound(_NONE, _undecided, outputs=1 + closed)
-        forward = self.engine.forward.bound(_NONE, _undecided)
-        checks = list(zip(self.unit_scales.tolist(), self.turn_mask.tolist(), strict=True))
-
-        def inverse(pose: Any) -> Array | None:
-            q = joints(pose)
-            if closed and q is not None:
-                q, faults = q
-                *misses, measure = faults.tolist()
-                if not measure > SINGULARITY_BOUND or any([miss > 0.0 for miss in misses]):
-                    return None
-            there = None if q is None else forward(q)
-            if there is None:
-                return None
-            for a, b, (scale, turn) in zip(there.tolist(), pose.tolist(), checks, strict=True):
-                apart = math.remainder(a - b, math.tau) if turn else a - b
-                if not abs(apart) * scale <= SAME_POSE:
-                    return None
-            found: Array = q
-            return found
-
-        return inverse
 
     def try_inverse(self, pose: ArrayLike) -> tuple[Array, Mask]:
         """Joint positions (..., n), NaN for an invalid pose; and which poses are valid, (...)."""
-        q, codes = self.judged_inverse(pose, _alone)
-        good = np.ones(q.shape[:-1], bool) if codes is None else np.asarray(codes[..., 0] == 0.0)
-        return np.where(good[..., None], q, np.nan), good
+        (q,), status = self.inverse_kernel(_NONE, pose)
+        good = np.ones(q.shape[:-1], bool) if status is None else status[..., 0] == 0.0
+        return q, np.asarray(good)
 
     @cached_property
     def inverse_kernel(self) -> Kernel:
-        """Pose to joints of some assembly, in closed form where there is one."""
+        """Pose to joints, in closed form where there is one, as ``forward`` confirms."""
         if not self.has_inverse:
             return self.engine.inverse
 
         def write(t: Traced) -> Program:
-            m = len(self.coordinates)
-            result = self.on(t.closed).solved(t.tape.inputs("pose", m))
-            measure = 1.0 if result.measure is None else result.measure
-            outputs = {"q": t.lift(result.q), "faults": t.lift([*result.misses, measure])}
-            return Program({"pose": m}, 0, outputs)
+            def closed(pose: Objects) -> tuple[Numbers, Numbers]:
+                found = self.on(t.closed).solved(pose)
+                gates = [1.0 - less(0.0, miss) for miss in found.misses]
+                if found.measure is not None:
+                    gates.append(found.measure - SINGULARITY_BOUND)
+                return found.q, gates
+
+            return inverse_program(t, closed)
 
         return self.engine.kernel("closed inverse", write)
 
-    def judged_inverse(self, pose: ArrayLike, run: Run) -> tuple[Array, Array | None]:
-        """Joints; and None or codes (1 unreachable, 2 not finite, BEYOND), limb, amount.
-
-        The joints of a pose may belong to another assembly too: ``forward`` decides.
-
-        :param run: evaluates a kernel on inputs, to outputs and status.
-        """
-        q, codes = self._candidates(pose, run)
-        tried = q
-        if codes is not None:
-            tried = np.where(codes[..., :1] == 0.0, q, self.graph.home)
-        (found, _, _), _ = run(self.engine.forward, tried)
-        # What is infinite or NaN is no pose.
-        with np.errstate(invalid="ignore"):
-            apart = found - np.asarray(pose, np.float64)
-            if self.turn_mask.any():
-                turned = np.remainder(apart + math.pi, math.tau) - math.pi
-                apart = np.where(self.turn_mask, turned, apart)
-            same = (np.abs(apart) * self.unit_scales <= SAME_POSE).all(-1)
-        if codes is None:
-            if same.all():
-                return q, None
-            codes = np.zeros((*q.shape[:-1], 3))
-        other = (codes[..., 0] == 0.0) & ~same
-        codes[other] = BEYOND, 0.0, 0.0
-        return q, codes
-
-    @cached_property
-    def turn_mask(self) -> Mask:
-        """Which pose coordinates are turns, that a full one does not change, shape (m,)."""
-        return np.array([len(c.entries) == 2 for c in self.coordinates])
-
-    @cached_property
-    def unit_scales(self) -> Array:
-        """What makes pose coordinates of unit one, shape (m,)."""
-        return np.array([1.0 if c.entries else 1.0 / self.graph.size for c in self.coordinates])
-
-    def _candidates(self, pose: ArrayLike, run: Run) -> tuple[Array, Array | None]:
-        """Joints that reach the pose in some assembly; and codes as :meth:`judged_inverse`."""
-        outputs, status = run(self.inverse_kernel, pose)
-        q = outputs[0]
-        if len(outputs) == 1:
-            if status is None:
-                return q, None
-            extra = np.zeros((*status.shape[:-1], 1))
-            return q, np.concatenate([status[..., :1], extra, status[..., 1:]], -1)
-        faults = outputs[1]
-        with np.errstate(invalid="ignore"):
-            missed = faults[..., :-1] > 0.0
-            singular = ~(faults[..., -1] > SINGULARITY_BOUND)
-        if status is None and not missed.any() and not singular.any():
-            return q, None
-        limb = missed.argmax(-1)
-        amount = np.take_along_axis(faults[..., :-1], limb[..., None], -1)[..., 0]
-        code = np.where(missed.any(-1), 1.0, np.where(singular, BEYOND, 0.0))
-        amount = np.where(code == BEYOND, faults[..., -1], amount)
-        if status is not None:
-            code = np.where(status[..., 0] != 0.0, status[..., 0], code)
-        return q, np.stack([code, limb.astype(float), amount], -1)
-
-    def _refuse_pose(self, codes: Array, pose: ArrayLike) -> None:
-        index = _first(codes[..., 0])
+    def _refuse_pose(self, status: Array, pose: ArrayLike) -> None:
+        index = _first(status[..., 0])
         if index is None:
             return
-        code, limb, amount = codes[index].tolist()
-        one = np.broadcast_to(np.asarray(pose, float), (*codes.shape[:-1], len(self.coordinates)))
-        if code == NOT_FINITE or not np.isfinite(one[index]).all():
+        code, reached = status[index].tolist()
+        place = np.asarray(pose, float)
+        one = np.broadcast_to(place, (*status.shape[:-1], place.shape[-1]))[index]
+        if code == NOT_FINITE or not np.isfinite(one).all():
             raise _not_finite("pose", index)
-        if code == BEYOND:
-            raise SingularityError("pose", index, max(amount, 0.0), SINGULARITY_BOUND, beyond=True)
+        measure = 0.0
         if self.has_inverse:
-            raise UnreachableError("pose", self.limb_names[int(limb)], index, amount)
-        part, miss, met = self.engine.shortest_pose(one[index])
-        if met:
-            raise SingularityError("pose", index, 0.0, SINGULARITY_BOUND, amount)
-        raise UnreachableError("pose", part, index, miss, amount)
+            with np.errstate(all="ignore"):
+                found = self.solved(one)
+            misses = [float(miss) for miss in found.misses]
+            limb = next((k for k, miss in enumerate(misses) if miss > 0.0), None)
+            if limb is not None:
+                raise UnreachableError("pose", self.limb_names[limb], index, misses[limb])
+            if found.measure is not None and not found.measure > SINGULARITY_BOUND:
+                measure = max(float(found.measure), 0.0)
+        elif reached < 1.0:
+            part, miss, met = self.engine.shortest_pose(one)
+            if not met:
+                raise UnreachableError("pose", part, index, miss, reached)
+            raise SingularityError("pose", index, 0.0, SINGULARITY_BOUND, reached)
+        raise SingularityError("pose", index, measure, SINGULARITY_BOUND, beyond=True)
 
     def forward(self, q: ArrayLike) -> Array:
         """Pose of joint positions q, shape (..., m), in the mechanism's documented assembly.
