@@ -11,7 +11,7 @@ import numpy as np
 
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.identification.deflections import ElasticFit
-from pkm_twin.identification.drives import DriveFriction
+from pkm_twin.identification.drives import DriveFriction, Law
 from pkm_twin.identification.fit import Fit, Judged, Result
 from pkm_twin.identification.parameters import Combination, Group, Number
 from pkm_twin.report import Column, Fact, Report, Table, plots
@@ -23,12 +23,10 @@ BY_AXIS: Final = "m_m_m_rad_rad_rad"
 """The end of a key in JSON: units of a deflection's directions."""
 
 
-def report_of(
-    result: Result, recordings: Sequence[str], marks: Sequence[str] = ()
-) -> tuple[Report, list[Table]]:
+def report_of(result: Result, marks: Sequence[str] = ()) -> tuple[Report, list[Table]]:
     """A fit's report, and tables for its page alone.
 
-    :param recordings: names of what it was fitted to. ``marks``: notes that come first.
+    :param marks: notes that come first.
     """
     verdict, e, elastic = result.verdict, result.estimate, isinstance(result, ElasticFit)
     label = _element if elastic else _name
@@ -40,7 +38,7 @@ def report_of(
     if isinstance(result, Fit):
         names, facts = result.problem.parameters.names, _effort_facts(result)
         blind = verdict.blind_lines(names, result.problem.parameters.units)
-        more = _delays(result, recordings)
+        more = _delays(result)
         more += [f"{result.outliers} efforts were outliers"] if result.outliers else []
     elif isinstance(result, ElasticFit):
         names = tuple(map(_element, result.numbers))
@@ -150,14 +148,15 @@ def _channels(result: Result, units: Sequence[str]) -> Table:
     return Table("", columns, rows, "verdict", "channel")
 
 
-def _delays(result: Fit, recordings: Sequence[str]) -> list[str]:
+def _delays(result: Fit) -> list[str]:
     """What was done to the signals, by recording."""
     lines = []
-    for name, how, delay in zip(recordings, result.filtering, result.delays, strict=True):
+    for judged, how, delay in zip(result.judged, result.filtering, result.delays, strict=True):
         cutoff = "no low-pass" if how.cutoff is None else f"low-pass at {how.cutoff:.3g} Hz"
         lines.append(
-            f"{name}: efforts are {1e3 * delay:.3g} ms later than the positions; differentiated "
-            f"over {how.window} samples, {cutoff}, one of {how.keep_every} samples kept"
+            f"{judged.name}: efforts are {1e3 * delay:.3g} ms later than the positions; "
+            f"differentiated over {how.window} samples, {cutoff}, one of {how.keep_every} samples "
+            "kept"
         )
     return lines
 
@@ -274,6 +273,15 @@ def _changes(shown: Mapping[str, Number]) -> Any:
     return figure
 
 
+def _terms(law: Law) -> str:
+    """A drive's friction law with its values."""
+    each = zip(law.terms, law.values, law.deviations, strict=True)
+    return ", ".join(
+        f"{term} {value:.3f} +- {deviation:.3f}" + (" A" if term != "load-dependent" else "")
+        for term, value, deviation in each
+    )
+
+
 def drive_report(found: DriveFriction) -> Report:
     """Of a drive's torque constant and friction law."""
     rows: dict[str, dict[str, Any]] = {}
@@ -286,11 +294,7 @@ def drive_report(found: DriveFriction) -> Report:
         }  # fmt: skip
     notes = []
     for law in found.laws:
-        terms = [
-            f"{term} {value:.3f} +- {deviation:.3f}" + (" A" if term != "load-dependent" else "")
-            for term, value, deviation in zip(law.terms, law.values, law.deviations, strict=True)
-        ]
-        line = f"{law.name}: {', '.join(terms)}; residual {law.residual:.3f} A"
+        line = f"{law.name}: {_terms(law)}; residual {law.residual:.3f} A"
         line += f", held-out runs {law.held_out:.3f} A"
         if np.isfinite(law.other_drives):
             line += f", held-out drives {law.other_drives:.3f} A"
@@ -304,7 +308,7 @@ def drive_report(found: DriveFriction) -> Report:
         notes.append(f"{simpler} alone: {verdict} (p = {found.chance:.2g})")
     return Report(
         f"torque constant {found.torque_constant:.4f} +- {found.torque_constant_deviation:.4f} "
-        f"N m/A; zero current {found.zero:.3f} A",
+        f"N m/A; friction {_terms(found.chosen)}; zero current {found.zero:.3f} A",
         [
             Fact("torque_constant_nm_per_a", found.torque_constant),
             Fact("torque_constant_deviation_nm_per_a", found.torque_constant_deviation),

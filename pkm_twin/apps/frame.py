@@ -7,6 +7,7 @@ import dataclasses
 import gc
 import inspect
 import math
+import os
 import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -20,7 +21,7 @@ from typer.core import TyperCommand, TyperGroup
 
 from pkm_twin.apps.options import BESIDE
 from pkm_twin.console import numbers, refuse_existing
-from pkm_twin.errors import ParameterError, PkmTwinError, UnknownNameError
+from pkm_twin.errors import FileError, ParameterError, PkmTwinError, UnknownNameError
 from pkm_twin.files import STANDARD, decimal
 from pkm_twin.report import Fact, Report
 from pkm_twin.report.terminal import present
@@ -184,10 +185,11 @@ def _drawn(report: Report, drawing: Path | None) -> Report:
 
 
 def _check_targets(given: Any) -> None:
-    """What a command will write may be written.
+    """What a command will write may be written: files of options, and its ``files``.
 
     :raises PkmTwinError: it may not.
     """
+    overwrite, source, more = getattr(given, "overwrite", True), _source(given), []
     for field, _, row, _ in _fields(type(given)):
         target = getattr(given, field)
         if not row.writes or target is None or str(target) == STANDARD:
@@ -199,7 +201,26 @@ def _check_targets(given: Any) -> None:
             raise ParameterError(
                 _spelled(field, row), str(target), f"a name that ends in {' or '.join(row.endings)}"
             )
-        refuse_existing(target, getattr(given, "overwrite", True), _source(given))
+        more.append(target)
+    more += getattr(given, "files", {}).values()
+    for target in dict.fromkeys(filter(None, more)):
+        if os.path.lexists(target) and not overwrite:
+            _check_inputs(given)
+        refuse_existing(target, overwrite, source)
+
+
+def _check_inputs(given: Any) -> None:
+    """What is wrong with words, files to read or the robot is told before a target that is there.
+
+    :raises PkmTwinError: something is.
+    """
+    for field, _, row, _ in _fields(type(given)):
+        value = getattr(given, field)
+        for path in value if isinstance(value, tuple) else (value,):
+            if row.argument and isinstance(path, Path) and not path.exists():
+                raise FileError(path, FileNotFoundError(), "a file to read")
+    for check in ("words", "machine"):
+        getattr(given, check, lambda: None)()
 
 
 def _source(given: Any) -> Path | None:

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,6 +18,7 @@ from pkm_twin.report import Fact
 from pkm_twin.settings import setting
 
 if TYPE_CHECKING:
+    from pkm_twin.codegen.arrays import Array
     from pkm_twin.recordings import Dialect, Load, ReadOptions, Recording
     from pkm_twin.robot.limits import Beyond
     from pkm_twin.robot.robot import Robot
@@ -200,16 +201,19 @@ class BeyondLimitsToo:
         False, "also compute outside the joint limits, and mark these results"
     )
 
-    def admitted(self, machine: Robot, pose: Sequence[float]) -> list[Beyond]:
-        """What a pose has beyond the joint limits.
+    def admitted(
+        self, machine: Robot, q: Array, qd: Array | None = None, where: str = ""
+    ) -> list[Beyond]:
+        """What joint states (..., n) have beyond the joint limits.
 
+        :param where: the recording, where there may be several.
         :raises ParameterError: something, and it is not allowed.
         """
         from pkm_twin.robot.limits import beyond_limits, refuse_beyond
 
-        _, found = beyond_limits(machine, machine.inverse(pose))
+        _, found = beyond_limits(machine, q, qd)
         if not self.beyond_limits:
-            refuse_beyond(found)
+            refuse_beyond(found, where)
         return found
 
 
@@ -228,7 +232,7 @@ class AtPose(Carries, BeyondLimitsToo):
         pose: list[float] = machine.home().tolist()
         if self.at is not None:
             pose = numbers(self.at, len(names), f"a pose: {', '.join(names)}")
-        for joint in self.admitted(machine, pose):
+        for joint in self.admitted(machine, machine.inverse(pose)):
             typer.echo(f"outside the limits: {joint}", err=True)
         return pose
 

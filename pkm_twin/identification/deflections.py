@@ -161,14 +161,14 @@ class _Part:
 def fit_elements(
     robot: Robot,
     recordings: Sequence[Recording],
-    update: Callable[[int], None] | None = None,
     *,
     accept: bool = False,
+    progress: Callable[[int], None] | None = None,
 ) -> ElasticFit:
     """Fit a factor on the compliance of every elastic element.
 
-    :param update: called with the number of recordings whose poses are solved.
     :param accept: fit recordings that this machine cannot have made, too.
+    :param progress: called with the number of recordings whose poses are solved.
     :raises ParameterError: a robot without elastic members.
     :raises PkmTwinError: recordings that are too short, whose loads identify nothing, or that this
         machine cannot have made.
@@ -176,8 +176,8 @@ def fit_elements(
     parts = []
     for i, recording in enumerate(recordings):
         parts.append(_Part.of(robot, recording))
-        if update is not None:
-            update(i + 1)
+        if progress is not None:
+            progress(i + 1)
     _check_loads(parts, robot)
     faults = _scale_faults(parts)
     refuse_faults(faults, accept)

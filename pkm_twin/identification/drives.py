@@ -28,10 +28,12 @@ from pkm_twin.errors import ParameterError, PkmTwinError
 from pkm_twin.identification.rows import next_window
 from pkm_twin.identification.samples import low_pass, tracks
 from pkm_twin.machine.friction import all_keys
-from pkm_twin.recordings import Recording
+from pkm_twin.recordings import Recording, Table
 from pkm_twin.robot.robot import Robot
 
 FIT: Final = "fit"
+GRAVITY: Final = 9.80665
+"""Standard gravity, m/s2."""
 KNOWN: Final = 0.1
 """Relative standard deviation from which on a constant is not known."""
 LEVEL: Final = 0.05
@@ -73,7 +75,7 @@ def given_constants(robot: Robot, words: str) -> TorqueConstants:
     except ValueError:
         values = np.zeros(0)
     if values.shape not in ((1,), (n,)) or not (np.isfinite(values) & (values != 0.0)).all():
-        raise ParameterError("torque-constant", words, f"{FIT}, one number, or {n} with commas")
+        raise ParameterError("--torque-constant", words, f"{FIT}, one number, or {n} with commas")
     return TorqueConstants(np.broadcast_to(values, (n,)).copy(), np.zeros(n))
 
 
@@ -173,6 +175,26 @@ class DriveFriction:
     chosen: Law
     chance: float
     viscous_told: bool
+
+
+Runs = tuple[Array, Array, Array, Array | None, Array | None]
+
+
+def runs_of(table: Table, lever: float | None = None) -> Runs:
+    """Torques, currents up and down, speeds and drives of a table, for :func:`drive_friction`.
+
+    :param lever: travel per radian of the motor, m, for masses.
+    :raises ParameterError: a column or the lever is missing.
+    """
+    table.require(["iq_up_A", "iq_down_A"])
+    torque = table.get("torque_nm")
+    if torque is None and "mass_kg" not in table:
+        raise ParameterError(str(table.path), ", ".join(table), "a column 'mass_kg' or 'torque_nm'")
+    if torque is None:
+        if lever is None:
+            raise ParameterError("--lever", None, "m per rad, above 0, for a column mass_kg")
+        torque = GRAVITY * lever * table["mass_kg"]
+    return torque, table["iq_up_A"], table["iq_down_A"], table.get("speed"), table.get("drive")
 
 
 def drive_friction(

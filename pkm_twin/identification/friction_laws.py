@@ -11,12 +11,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
 from pkm_twin.codegen.arrays import Array
-from pkm_twin.errors import ParameterError, PkmTwinError, UnknownNameError
+from pkm_twin.errors import BagError, ParameterError, PkmTwinError, UnknownNameError
 from pkm_twin.identification.compare import recorded_of, step_fault
 from pkm_twin.identification.drives import FIT, fitted_constants, given_constants
 from pkm_twin.identification.fit import Fit, fit, fitted, refuse_faults
@@ -91,7 +92,7 @@ def laws_of(words: str) -> tuple[str, ...] | None:
     names = [word.strip() for word in words.split(",")]
     for name in names:
         if name not in (AUTO, BASIC.name, *LAWS):
-            raise UnknownNameError("friction", name, (AUTO, BASIC.name, *LAWS))
+            raise UnknownNameError("--friction", name, (AUTO, BASIC.name, *LAWS))
     return None if AUTO in names else tuple(name for name in LAWS if name in names)
 
 
@@ -164,6 +165,12 @@ def fit_recordings(
         as of :func:`fit_with_laws`.
     :returns: also notes: faults that were accepted, torque constants that were fitted.
     """
+    for r in recordings:
+        if r.measured is not None and r.topics.wrench is not None and r.wrench is None:
+            raise BagError(
+                f"no wrench on {r.topics.wrench} is accepted: {r.first_reject}",
+                path=Path(r.source), reason="frames",
+            )  # fmt: skip
     found = ((r.name, step_fault(r)) for r in recordings)
     faults = [
         f"{name}: position steps that are no motion: {fault}" for name, fault in found if fault
@@ -186,7 +193,7 @@ def fit_recordings(
             constants = given_constants(robot, constant)
         elif {"payload", "inertia"} & set(what):
             raise ParameterError(
-                "torque-constant",
+                "--torque-constant",
                 FIT,
                 "--what friction,rotor: the masses of the file are its scale",
             )

@@ -124,7 +124,7 @@ def kinds_of(what: str) -> tuple[Kind, ...]:
     words = tuple(word.strip() for word in what.split(","))
     for word in words:
         if word not in KINDS:
-            raise UnknownNameError("what", word, (*KINDS, COMPLIANCE))
+            raise UnknownNameError("--what", word, (*KINDS, COMPLIANCE))
     return tuple(kind for kind in KINDS if kind in words)
 
 

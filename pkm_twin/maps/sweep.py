@@ -459,7 +459,7 @@ def map_of(
     total = kind.points if points is None else points
     least = kind.least if least_singularity is None else least_singularity
     if total < 50:
-        raise ParameterError("points", total, "50 or more")
+        raise ParameterError("--points", total, "50 or more")
     if not 0.0 <= least < 1.0:
         raise ParameterError("singularity", least, "0 to below 1")
     if not 0.0 <= least_clearance < math.inf:

@@ -178,7 +178,7 @@ def parse_payload(text: str) -> tuple[float, tuple[float, float, float] | None]:
     """
     numbers = parse_numbers(text)
     if len(numbers) not in (1, 4) or numbers[0] < 0:
-        raise ParameterError("payload", text, "MASS or MASS,x,y,z: kg, 0 or more, and m")
+        raise ParameterError("--payload", text, "MASS or MASS,x,y,z: kg, 0 or more, and m")
     return numbers[0], (numbers[1], numbers[2], numbers[3]) if len(numbers) == 4 else None
 
 
@@ -190,7 +190,7 @@ def parse_times(text: str) -> tuple[tuple[float, float], ...]:
     numbers = parse_numbers(text)
     rising = all(one < other for one, other in pairwise(numbers))
     if not numbers or len(numbers) % 2 or not rising:
-        raise ParameterError("load-times", text, "FROM,TO[,FROM,TO...] in s, rising")
+        raise ParameterError("--load-times", text, "FROM,TO[,FROM,TO...] in s, rising")
     return tuple(zip(numbers[::2], numbers[1::2], strict=True))
 
 

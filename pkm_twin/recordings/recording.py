@@ -12,7 +12,7 @@ import numpy as np
 
 from pkm_twin.bags.reader import Bag
 from pkm_twin.codegen.arrays import Array, Mask
-from pkm_twin.errors import MessageError, PkmTwinError, one_line
+from pkm_twin.errors import BagError, MessageError, ParameterError, PkmTwinError, one_line
 from pkm_twin.recordings.payload import Load
 from pkm_twin.recordings.tables import PLAIN, Dialect
 from pkm_twin.recordings.topics import COLUMNS, Topics
@@ -145,8 +145,17 @@ class Recording:
 
         :raises PkmTwinError: there are none.
         """
+        if self.effort is None and self.bag is None:
+            joint = self.robot.joint_names[0]
+            raise ParameterError(
+                self.source, "no efforts", f"columns {joint}.effort ... of the drives, or "
+                f"{joint}.current ... with --torque-constant"
+            )  # fmt: skip
         if self.effort is None:
-            raise PkmTwinError(f"{self.source}: no efforts")
+            raise BagError(
+                f"no efforts on {self.topics.joint_states}, which are those of the drives",
+                path=Path(self.source), reason="no efforts",
+            )  # fmt: skip
         return self.effort
 
     @property

@@ -97,6 +97,34 @@ def test_a_folder_that_is_not_there_is_told_before_the_work(twin, tmp_path, monk
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize(
+    ("line", "text"),
+    [
+        (("fit", "five_bar", "none.csv"), "none.csv: no such file"),
+        (("fit", "five_bar", "out.yaml", "--what", "nothing"), "--what: 'nothing'"),
+        (("fit", "nobody", "out.yaml"), "unknown robot 'nobody'"),
+        (("fit", "five_bar", "out.yaml", "--payload", "1,2"), "--payload: '1,2'"),
+        (("calibrate", "delta", "none.csv"), "none.csv: no such file"),
+        (("calibrate", "delta", "out.yaml", "--measure", "nothing"), "--measure: 'nothing'"),
+        (("calibrate", "delta", "out.yaml", "--noise", "height=1e-4"), "--noise: 'height'"),
+        (("calibrate", "delta"), "poses: missing"),
+        (("convert", "nofile"), "SOURCE: 'nofile'"),
+        (("record-kit", "--anonymise"), "needs a bag"),
+    ],
+)
+def test_a_wrong_input_is_told_before_a_target_that_is_there(
+    twin, tmp_path, monkeypatch, line, text
+):
+    monkeypatch.chdir(tmp_path)
+    names = ("out.yaml", "fitted.yaml", "calibrated.yaml")
+    for name in names:
+        (tmp_path / name).write_text("kept")
+    assert text in twin(*line).one_line_error()
+    if line[0] in ("fit", "calibrate"):
+        twin(*line, "--out", "out.yaml")
+    assert {(tmp_path / name).read_text() for name in names} == {"kept"}
+
+
 def test_a_name_as_long_as_the_file_system_takes(twin, tmp_path, deflections):
     longest = "n" * 250
     for arguments in (

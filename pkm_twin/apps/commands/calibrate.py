@@ -13,7 +13,7 @@ import numpy as np
 
 from pkm_twin.apps.frame import command
 from pkm_twin.apps.options import Accepts, BeyondLimitsToo, OfRobot, Overwrites, ReadsTables
-from pkm_twin.console import progress, refuse_existing
+from pkm_twin.console import progress
 from pkm_twin.errors import ParameterError, UnknownNameError, one_line
 from pkm_twin.files import replace_file
 from pkm_twin.identification.calibration import Calibration, Estimate, Scale, geometric
@@ -26,7 +26,6 @@ from pkm_twin.identification.plan import plan as plan_of
 from pkm_twin.identification.pose_tables import read_measured, read_poses
 from pkm_twin.report import Column, Fact, Report, Table
 from pkm_twin.robot.entries import Fitted, edited_yaml, write_edited
-from pkm_twin.robot.limits import beyond_limits, refuse_beyond
 from pkm_twin.settings import setting
 
 if TYPE_CHECKING:
@@ -107,6 +106,24 @@ class Calibrate(OfRobot, ReadsTables, BeyondLimitsToo, Accepts, Overwrites):
     )
 
     @property
+    def files(self) -> dict[str, Path]:
+        """What is written, but for a plan."""
+        read = self.plan is None and self.poses is not None
+        return {"out": self.out or Path("calibrated.yaml")} if read else {}
+
+    def words(self) -> tuple[tuple[Kind, ...], dict[str, float], dict[str, tuple[float, float]]]:
+        """Kinds of measurements, their known noise, and where a plan measures.
+
+        :raises ParameterError: other words, or the noise of what is not measured.
+        """
+        kinds = kinds_of(self.measure or (["position"] if self.plan else []))
+        noise = parse_noise(self.noise)
+        for name in noise.keys() - {kind.name for kind in kinds}:
+            measured = ", ".join(kind.name for kind in kinds) or "none: whole poses have their own"
+            raise ParameterError("--noise", name, f"a kind that --measure names ({measured})")
+        return kinds, noise, parse_within(self.within)
+
+    @property
     def free(self) -> dict[str, Any]:
         """What is fitted beside the file's numbers."""
         return {
@@ -121,25 +138,18 @@ def calibrate(given: Calibrate) -> Report:
     :raises ParameterError: poses of another machine, or too few; see
         :func:`pkm_twin.identification.calibration.calibrate`.
     """
-    out = given.out or Path("calibrated.yaml")
-    if given.plan is None:
-        refuse_existing(out, given.overwrite, given.poses)
-    machine = given.machine()
-    kinds = kinds_of(given.measure or (["position"] if given.plan else []))
-    known, measured = parse_noise(given.noise), None
+    kinds, known, within = given.words()
+    machine, measured = given.machine(), None
     if given.poses is not None:
         measured = _read(given, machine, kinds, known)
     notes = []
     if measured is not None:
         q = machine.controller.positions(measured.joints)
-        _, beyond = beyond_limits(machine, q)
-        if not given.beyond_limits:
-            refuse_beyond(beyond)
-        notes = [f"beyond limits: {item}" for item in beyond]
+        notes = [f"beyond limits: {item}" for item in given.admitted(machine, q)]
     if given.plan is not None:
         some = measured if isinstance(measured, Measured) else None
         chosen = plan_of(
-            machine, kinds, given.only, measured=some, within=parse_within(given.within),
+            machine, kinds, given.only, measured=some, within=within,
             count=given.count, accuracy=given.accuracy, noise=known, **given.free,
         )  # fmt: skip
         replace_file(given.plan, ("\n".join([*plan_table(machine, chosen), ""])).encode())
@@ -165,6 +175,7 @@ def calibrate(given: Calibrate) -> Report:
     head += [f"Measured: {', '.join(f'{a.count} {a.name}' for a in result.agreements)}."]
     head += [f"{scale_text(result.scale)}."] if result.scale is not None else []
     head += [f"Outlier, with a small weight: {one}." for one in result.outliers]
+    out = given.files["out"]
     write_edited(out, [*head, *marks], edited_yaml(machine, given.robot, values))
     return report_of(machine, source, result, notes, marks, out)
 

@@ -9,10 +9,10 @@ from pathlib import Path
 from pkm_twin.apps.frame import command
 from pkm_twin.apps.options import ROBOT_HELP, OfPlatform, Writes
 from pkm_twin.console import refuse_existing
-from pkm_twin.errors import FileError, one_line
+from pkm_twin.errors import FileError, UnknownNameError, one_line
 from pkm_twin.files import open_regular, replace_file
 from pkm_twin.report import Fact, Report
-from pkm_twin.robot.catalogue import TREES, load
+from pkm_twin.robot.catalogue import TREES, load, robot_names
 from pkm_twin.robot.printers import Firmware, read_printer
 from pkm_twin.settings import setting
 
@@ -62,6 +62,8 @@ def convert(given: Convert) -> Report:
     ending = Path(first).suffix
     if len(given.source) > 1 or (ending not in ROBOTS if ending else Path(first).is_file()):
         return _of_printer(given)
+    if not ending and first not in robot_names():
+        raise UnknownNameError("SOURCE", first, [*robot_names(), "a robot's or a printer's file"])
     from pkm_twin.machine.machine_yaml import describe_machine_yaml
     from pkm_twin.robot.robot_urdf import robot_description
     from pkm_twin.robot.urdf_read import read_urdf

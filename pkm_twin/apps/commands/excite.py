@@ -11,13 +11,14 @@ import numpy as np
 
 from pkm_twin.apps.frame import command
 from pkm_twin.apps.options import AwayFromSingular, OfRobot, Seeded, Writes
-from pkm_twin.console import progress, refuse_existing, writing
+from pkm_twin.console import progress, writing
 from pkm_twin.errors import BagError
 from pkm_twin.report import Fact, Report
 from pkm_twin.settings import setting
 
 if TYPE_CHECKING:
     from pkm_twin.identification.excitation import Bounds, Judge
+    from pkm_twin.robot.robot import Robot
 
 LARGE: Final = 1e3
 """Condition number from which on a fit knows some parameters badly."""
@@ -58,6 +59,11 @@ class Excite(OfRobot, AwayFromSingular, Seeded, Writes):
     )
     trials: int = setting(300, "number of trajectories to try", low=10, high=10**6)
 
+    @property
+    def files(self) -> dict[str, Path]:
+        """What is written."""
+        return {"out": self.out, "table": self.out.with_suffix(".csv")}
+
 
 def excite(given: Excite) -> Report:
     """The trajectory's condition number, and that of a bag.
@@ -67,8 +73,6 @@ def excite(given: Excite) -> Report:
     from pkm_twin.identification.excitation import Bounds, Judge
     from pkm_twin.identification.parameters import file_parameters, kinds_of
 
-    table = given.out.with_suffix(".csv")
-    refuse_existing(table, given.overwrite)
     machine = given.machine()
     judge = Judge.of(machine, file_parameters(machine, kinds_of(given.what)))
     other = None if given.beside is None else _condition_of(given.beside, judge)
@@ -92,17 +96,27 @@ def excite(given: Excite) -> Report:
         if given.friction
         else [Fact("frequencies_Hz", best.harmonics / best.duration)]
     )
+    size = f"{points} points in {best.duration:.4g} s"
     return Report(
+        f"{machine.name}: every joint alone moves up and down at {_span(machine, best.speeds)}, "
+        f"{size}" if given.friction else
         f"{machine.name}: condition number {best.condition:.4g} over {len(judge.columns)} base "
-        f"parameters, {points} points in {best.duration:.4g} s",
+        f"parameters, {size}",
         facts=[
             Fact("robot", machine.name), Fact("condition", best.condition),
             Fact("duration_s", best.duration, "s"), Fact("base_parameters", len(judge.columns)),
             *shape, Fact("beside", given.beside), Fact("condition_beside", other),
         ],
         notes=notes,
-        files={"out": given.out, "table": table},
+        files=given.files,
     )  # fmt: skip
+
+
+def _span(machine: Robot, speeds: Any) -> str:
+    """Lowest to highest speed (n, speeds) of joints that turn, and of those that slide."""
+    units = np.array(machine.joint_units)
+    rows = {unit: speeds[units == unit] for unit in machine.joint_units}
+    return " and ".join(f"{one.min():.2g} to {one.max():.2g} {u}/s" for u, one in rows.items())
 
 
 def write_motion(

@@ -7,7 +7,7 @@ import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING
 
 import typer
 
@@ -19,23 +19,16 @@ from pkm_twin.apps.options import (
     CarriesAtTimes,
     ReadsRecordings,
 )
-from pkm_twin.console import progress, refuse_existing, writing
-from pkm_twin.errors import BagError, ParameterError, one_line
+from pkm_twin.console import progress, writing
+from pkm_twin.errors import ParameterError
 from pkm_twin.files import replace_file
 from pkm_twin.report import Fact, Report
 from pkm_twin.settings import setting
 
 if TYPE_CHECKING:
-    from pkm_twin.codegen.arrays import Array
     from pkm_twin.identification.fit import Result
     from pkm_twin.identification.friction_laws import Choice
-    from pkm_twin.recordings import Recording
-    from pkm_twin.robot.robot import Robot
-
-COMPLIANCE: Final = "compliance"
-"""What is fitted to deflections, not to efforts."""
-GRAVITY: Final = 9.80665
-"""Standard gravity, m/s2."""
+    from pkm_twin.identification.identifiable import Kind
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -113,8 +106,29 @@ class Fit(CarriesAtTimes, ReadsRecordings, BeyondLimitsToo, Accepts):
     @property
     def files(self) -> dict[str, Path | None]:
         """What is written."""
+        if self.drive is not None or not self.robot or not self.recordings:
+            return {}
         out = self.out or Path("fitted.yaml")
         return {"out": out, "report": None if self.no_report else out.with_suffix(".html")}
+
+    def words(self) -> tuple[tuple[Kind, ...] | None, tuple[str, ...] | None]:
+        """Kinds of numbers, None: compliances; and friction laws, None: those that show.
+
+        :raises ParameterError: unknown words, or options that do not go together.
+        """
+        from pkm_twin.identification.friction_laws import laws_of
+        from pkm_twin.identification.parameters import COMPLIANCE, kinds_of
+
+        laws, _ = laws_of(self.friction), self.load
+        if COMPLIANCE not in [word.strip() for word in self.what.split(",")]:
+            return kinds_of(self.what), laws
+        if self.per_copy or self.payload is not None or self.load_times is not None:
+            rest = "no --per-copy, --payload or --load-times, which are for efforts"
+            raise ParameterError("--what", self.what, rest)
+        if self.what.strip() != COMPLIANCE:
+            rest = "only compliance, because it is fitted to other recordings"
+            raise ParameterError("--what", self.what, rest)
+        return None, laws
 
 
 def fit(given: Fit) -> Report:
@@ -122,130 +136,52 @@ def fit(given: Fit) -> Report:
 
     :raises PkmTwinError: recordings that show nothing, or that the machine cannot have made.
     """
-    from pkm_twin.robot.entries import robot_text
+    from pkm_twin.apps.fit_report import report_of
+    from pkm_twin.identification.deflections import fit_elements
+    from pkm_twin.identification.friction_laws import fit_recordings
+    from pkm_twin.identification.parameters import fitted_yaml
+    from pkm_twin.report.page import page
+    from pkm_twin.robot.entries import robot_text, write_edited
 
     if given.drive is not None:
         return _of_drive(given, given.drive)
     if not given.robot or not given.recordings:
         raise typer.BadParameter("a robot and recordings are missing; give both, or --drive TABLE")
-    for target in filter(None, given.files.values()):
-        refuse_existing(target, given.overwrite)
-    compliant = COMPLIANCE in [word.strip() for word in given.what.split(",")]
-    if compliant and (given.per_copy or given.payload is not None or given.load_times is not None):
-        raise ParameterError(
-            "what", given.what, "no --per-copy, --payload or --load-times, which are for efforts"
-        )
+    (kinds, laws), options = given.words(), {"accept": given.accept}
     text, machine = robot_text(given.robot, platform=given.platform, per_copy=given.per_copy)
+    elastic, currents = kinds is None, given.torque_constant is not None
+    if elastic:
+        _ = machine.elastic
     with progress("fit", 2 * len(given.recordings)) as update:
-        made = _of_deflections if compliant else _of_efforts
-        result, choices, beyond = made(given, machine, update)
-    marks = [
-        *(str(choice) for choice in choices),
-        *(f"accepted by --accept: {line}" for line in result.accepted),
-        *beyond,
-    ]
-    names = [one_line(path.name, 100) for path in given.recordings]
-    return _written(given, result, names, text, marks, choices, beyond)
-
-
-def _beyond(given: Fit, machine: Robot, recordings: Sequence[Array]) -> list[str]:
-    """What joints (k, n) of recordings have beyond the robot's limits.
-
-    :raises ParameterError: something, where that is refused.
-    """
-    from pkm_twin.robot.limits import beyond_limits, refuse_beyond
-
-    lines = []
-    for path, q in zip(given.recordings, recordings, strict=True):
-        name = one_line(path.name, 100)
-        _, found = beyond_limits(machine, q)
-        if not given.beyond_limits:
-            refuse_beyond(found, name)
-        lines += [f"beyond limits: {name}: {item}" for item in found]
-    return lines
-
-
-def _of_deflections(
-    given: Fit, machine: Robot, update: Any
-) -> tuple[Result, Sequence[Choice], list[str]]:
-    """The fit of elastic elements."""
-    from pkm_twin.identification.deflections import fit_elements
-
-    if given.what.strip() != COMPLIANCE:
-        raise ParameterError(
-            "what", given.what, "only compliance, because it is fitted to other recordings"
-        )
-    _ = machine.elastic
-    read = []
-    for path in given.recordings:
-        read.append(given.read(path, machine, deflected=True))
-        update(len(read))
-    beyond = _beyond(given, machine, [r.q for r in read])
-    result = fit_elements(machine, read, lambda k: update(len(read) + k), accept=given.accept)
-    return result, (), beyond
-
-
-def _of_efforts(
-    given: Fit, machine: Robot, update: Any
-) -> tuple[Result, Sequence[Choice], list[str]]:
-    """The fit of efforts."""
-    from pkm_twin.identification.friction_laws import fit_recordings, laws_of
-    from pkm_twin.identification.parameters import kinds_of
-
-    kinds, laws = kinds_of(given.what), laws_of(given.friction)
-    read = [_read(given, path, machine) for path in given.recordings]
-    beyond = _beyond(given, machine, [r.q for r in read])
-    result, choices, notes = fit_recordings(
-        machine, read, kinds, laws, constant=given.torque_constant, accept=given.accept,
-        progress=update,
-    )  # fmt: skip
-    return result, choices, [*notes, *beyond]
-
-
-def _read(given: Fit, path: Path, machine: Robot) -> Recording:
-    """A recording with efforts.
-
-    :raises PkmTwinError: there are none, or no wrench is accepted.
-    """
-    r = given.read(path, machine, currents=given.torque_constant is not None)
-    if r.effort is None and r.bag is None:
-        joint = machine.joint_names[0]
-        raise ParameterError(
-            str(path), "no efforts", f"columns {joint}.effort ... of the drives, or "
-            f"{joint}.current ... with --torque-constant"
-        )  # fmt: skip
-    if r.effort is None:
-        raise BagError(
-            f"no efforts on {r.topics.joint_states}: a fit needs the efforts of the drives",
-            path=path, reason="no efforts",
-        )  # fmt: skip
-    if r.topics.wrench is not None and r.wrench is None:
-        raise BagError(
-            f"no wrench on {r.topics.wrench} is accepted: {r.first_reject}", path=path,
-            reason="frames",
-        )  # fmt: skip
-    return r
-
-
-def _written(
-    given: Fit, result: Result, names: Sequence[str], text: str, marks: Sequence[str],
-    choices: Sequence[Choice], beyond: Sequence[str],
-) -> Report:  # fmt: skip
-    """The report, after the robot's file and the page are written.
-
-    :param names: of the recordings. ``text``: of the robot's file before.
-    """
-    from pkm_twin.apps.fit_report import report_of
-    from pkm_twin.identification.parameters import fitted_yaml
-    from pkm_twin.report.page import page
-    from pkm_twin.robot.entries import write_edited
-
-    report, more = report_of(result, names, marks)
+        read = [
+            given.read(path, machine, deflected=elastic, currents=currents)
+            for path in given.recordings
+        ]
+        beyond = [
+            f"beyond limits: {r.name}: {item}"
+            for r in read
+            for item in given.admitted(machine, r.q, where=r.name)
+        ]
+        result: Result
+        choices: Sequence[Choice] = ()
+        marks: list[str] = []
+        if kinds is None:
+            result = fit_elements(machine, read, progress=update, **options)
+        else:
+            result, choices, marks = fit_recordings(
+                machine, read, kinds, laws, constant=given.torque_constant, progress=update,
+                **options,
+            )  # fmt: skip
+    told = [note if len(read) == 1 else f"{r.name}: {note}" for r in read for note in r.notes]
+    accepted = [f"accepted by --accept: {line}" for line in result.accepted]
+    marks = [*map(str, choices), *accepted, *marks, *beyond, *told]
+    report, more = report_of(result, marks)
     facts = [
         Fact("beyond_limits", beyond),
         Fact("friction_laws", [dataclasses.asdict(choice) for choice in choices]),
+        Fact("topics", [dataclasses.asdict(r.topics) for r in read]),
     ]
-    out, html = given.files.values()
+    names, (out, html) = [r.name for r in read], given.files.values()
     assert out is not None  # noqa: S101
     fitted = fitted_yaml(text, result.numbers, names, out)
     head = [
@@ -267,25 +203,11 @@ def _written(
 def _of_drive(given: Fit, path: Path) -> Report:
     """A drive's torque constant and friction by weights."""
     from pkm_twin.apps.fit_report import drive_report
-    from pkm_twin.identification.drives import drive_friction
+    from pkm_twin.identification.drives import drive_friction, runs_of
     from pkm_twin.recordings import read_table
 
-    columns = read_table(path, dialect=given.dialect)
-    columns.require(["iq_up_A", "iq_down_A"])
-    if "torque_nm" in columns:
-        torque = columns["torque_nm"]
-    elif "mass_kg" in columns:
-        if given.lever is None:
-            raise ParameterError("--lever", None, "m per rad, above 0, for a column mass_kg")
-        torque = GRAVITY * given.lever * columns["mass_kg"]
-    else:
-        raise ParameterError(str(path), ", ".join(columns), "a column 'mass_kg' or 'torque_nm'")
-    return drive_report(
-        drive_friction(
-            torque, columns["iq_up_A"], columns["iq_down_A"], columns.get("speed"),
-            columns.get("drive"),
-        )
-    )  # fmt: skip
+    runs = runs_of(read_table(path, dialect=given.dialect), given.lever)
+    return drive_report(drive_friction(*runs))
 
 
 COMMAND = command(fit, "Identification and calibration")

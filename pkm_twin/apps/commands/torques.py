@@ -51,13 +51,10 @@ def torques(given: Torques) -> Report:
     """Peak and RMS effort of each joint, and the table."""
     from pkm_twin.paths.along import torque_table
     from pkm_twin.paths.sizing import integral
-    from pkm_twin.robot.limits import beyond_limits, refuse_beyond
 
     check_target(given.out)
     motion = given.read(given.motion, given.machine(), planned=True).with_rates()
-    _, beyond = beyond_limits(motion.robot, motion.q, motion.qd)
-    if not given.beyond_limits:
-        refuse_beyond(beyond)
+    beyond = given.admitted(motion.robot, motion.q, motion.qd)
     with progress("torques", len(motion.time)) as update:
         columns = torque_table(motion, update)
     with writing(given.out):
