@@ -7,7 +7,7 @@ MINUTES ?= 3
 SECONDS ?= 60
 SEED ?= 1
 # Tests that run for as long as they are told.
-ENDLESS := test/bags/test_fuzz.py test/fuzz/test_nodes.py test/nodes/test_soak.py
+ENDLESS := test/fuzz/test_nodes.py test/nodes/test_soak.py
 BIN := $(VENV)/bin
 
 .PHONY: demo test lint types unit long bags bench certificate fuzz faults soak audit scale reality contact-table pages docs clean help

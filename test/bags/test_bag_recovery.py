@@ -81,7 +81,7 @@ def test_flips_cost_no_more_than_their_chunk(bag: Path, tmp_path: Path, rows: Ro
     damaged, target = tmp_path / "flipped.mcap", tmp_path / "saved.mcap"
     chance = random.Random(11)
     most_lost = 0
-    for _ in range(150):
+    for _ in range(75):
         data = bytearray(sound)
         bit = chance.randrange(8 * len(sound))
         data[bit // 8] ^= 1 << bit % 8
