@@ -73,6 +73,13 @@ class UnknownNameError(ParameterError):
         self.args = (one_line(f"{what}; {hint}expected {self.bound}", 2000),)
 
 
+def unknown_number(path: str, names: Iterable[str]) -> ParameterError:
+    """The error of a path where the file has no number, with the closest of some paths."""
+    close = difflib.get_close_matches(path, list(names), 1)
+    hint = f"did you mean {close[0]!r}? see" if close else "see"
+    return ParameterError(path, None, f"a number of the robot's file; {hint} `pkm-twin info`")
+
+
 class MobilityError(ParameterError):
     """A machine whose number of actuated joints differs from its degrees of freedom.
 

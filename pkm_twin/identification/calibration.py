@@ -57,6 +57,7 @@ from pkm_twin.identification.measurements import (
 )
 from pkm_twin.identification.parameters import OBSERVED
 from pkm_twin.identification.undetermined import undetermined
+from pkm_twin.machine.formulas import PARAMETERS
 from pkm_twin.machine.joint_map import JointMap
 from pkm_twin.robot.derivatives import geometry_numbers
 from pkm_twin.robot.entries import entries, with_entries
@@ -212,7 +213,8 @@ def geometric(robot: Robot, q: Array, only: Sequence[str] = ()) -> tuple[str, ..
     paths = [
         path
         for path in entries(robot)
-        if not path.startswith(NOT_GEOMETRY) and (not only or path.startswith(tuple(only)))
+        if not path.startswith(NOT_GEOMETRY if only else (*NOT_GEOMETRY, f"{PARAMETERS}."))
+        and (not only or path.startswith(tuple(only)))
     ]
     slopes = file_numbers(robot, tuple(paths), geometry_numbers).slopes
     paths = [path for path, moves in zip(paths, np.abs(slopes).max(0) > 1e-9, strict=True) if moves]

@@ -15,6 +15,7 @@ import numpy as np
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError, UnknownNameError
 from pkm_twin.machine import schema
+from pkm_twin.machine.formulas import Written
 from pkm_twin.machine.friction import all_keys, check_laws
 from pkm_twin.machine.graph import (
     Body,
@@ -361,7 +362,9 @@ def _copies(entry: Any, count: int, path: str) -> list[Any]:
                 f"{path}.{'.'.join(keys)}", value, f"one number, or {count}, one per copy"
             )
         for k in range(count):
-            inner = {keys[-1]: value[k]}
+            one = value[k]
+            one = Written.of(one, one.book, f"[{k}]") if isinstance(one, Written) else one
+            inner = {keys[-1]: one}
             whole = inner if len(keys) == 1 else {keys[0]: {**result[k][keys[0]], **inner}}
             result[k] = {**result[k], **whole}
     return result

@@ -49,16 +49,19 @@ SECTIONS: Final = {
 """What stands above a section."""
 
 
-def describe_machine_yaml(data: Mapping[str, Any]) -> str:
+def describe_machine_yaml(data: Mapping[str, Any], parameters: Sequence[str] = ()) -> str:
     """The description as YAML with units and meanings in comments.
 
     Reading it gives the same numbers to the last bit.
 
     :param data: a description, limbs written out or not, in any order of keys.
+    :param parameters: in words, what the numbers were worked out with.
     """
     order = ("mechanism", *NOTES, *SECTIONS)
     keys = sorted(data, key=lambda key: order.index(key) if key in order else len(order))
     lines = [HEAD]
+    lines += ["# Written out for these parameters:\n"] if parameters else []
+    lines += [f"#   {one}\n" for one in parameters]
     for key in keys:
         if key in SECTIONS and data[key] and isinstance(data[key], Mapping):
             lines.append(f"\n{SECTIONS[key]}{key}:\n")

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import copy
 import dataclasses
-import difflib
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, Final, TypeVar
@@ -13,7 +12,7 @@ from typing import Any, Final, TypeVar
 import numpy as np
 
 from pkm_twin.codegen.expressions import Expression, plain
-from pkm_twin.errors import ParameterError
+from pkm_twin.errors import ParameterError, unknown_number
 from pkm_twin.machine import schema
 from pkm_twin.settings import settings_of
 
@@ -171,13 +170,6 @@ def number_in(data: Any, keys: Iterable[Key], path: str) -> float:
 
 def _places(values: Any) -> list[int]:
     return list(range(len(values))) if isinstance(values, list | tuple) else []
-
-
-def unknown_number(path: str, names: Iterable[str]) -> ParameterError:
-    """The error of a path where the file has no number, with the closest of some paths."""
-    close = difflib.get_close_matches(path, list(names), 1)
-    hint = f"did you mean {close[0]!r}? see" if close else "see"
-    return ParameterError(path, None, f"a number of the robot's file; {hint} `pkm-twin info`")
 
 
 def has_entry(data: Any, path: str) -> bool:

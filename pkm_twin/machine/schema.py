@@ -20,10 +20,9 @@ import numpy as np
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.codegen.operations import absolute, maximum, minimum
 from pkm_twin.errors import ParameterError, UnknownNameError
+from pkm_twin.machine.formulas import MAX_SIZE, Written
 from pkm_twin.settings import Setting, settings_of
 
-MAX_SIZE: Final = 1e18
-"""Beyond every quantity of a machine in SI units; products of such numbers stay finite."""
 MAX_INERTIA: Final = 1e12
 """Largest entry of an inertia matrix, kg m2."""
 _SLACK: Final = 1e-9
@@ -99,7 +98,7 @@ def text(*, default: Any = MISSING, **more: Any) -> Any:
     def check(field: str, value: Any) -> str:
         if not isinstance(value, str) or not value:
             raise ParameterError(field, value, "a non-empty text")
-        return value
+        return str(value)
 
     return key(check, "a non-empty text", default, **more)
 
@@ -149,7 +148,7 @@ def words(
                 raise ParameterError(f"{field}[{i}]", item, "a non-empty name")
         if distinct and len(set(items)) != len(items):
             raise ParameterError(field, list(value), "different names")
-        return tuple(items)
+        return tuple(map(str, items))
 
     bound = f"different ones of {', '.join(allowed)}" if allowed else f"{size} different names"
     if not distinct:
@@ -355,7 +354,7 @@ def frozen(values: object) -> Array:
 
 
 def _is_number(value: Any) -> bool:
-    kinds = int, float, np.integer, np.floating
+    kinds = int, float, np.integer, np.floating, Written
     return isinstance(value, kinds) and not isinstance(value, bool)
 
 
@@ -374,14 +373,15 @@ def _number(field: str, value: Any, bounds: Key) -> float:
     if not _is_number(value):
         raise ParameterError(field, value, bound)
     try:
-        result = float(value)
+        result = value.number(field) if isinstance(value, Written) else float(value)
     except OverflowError:
         raise ParameterError(field, "an integer too large for a float", bound) from None
     if math.isfinite(result) and abs(result) > MAX_SIZE:
         bound += f", at most {MAX_SIZE:g} in size"
     endless = result == math.inf and bounds.high == math.inf
     if not (abs(result) <= MAX_SIZE or endless) or not bounds.allows(result):
-        raise ParameterError(field, value, bound)
+        told = f"{value} = {result:g}" if isinstance(value, Written) else value
+        raise ParameterError(field, told, bound)
     return result
 
 

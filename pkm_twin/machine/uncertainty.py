@@ -7,9 +7,8 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from pkm_twin.errors import ParameterError
+from pkm_twin.errors import ParameterError, unknown_number
 from pkm_twin.machine import schema
-from pkm_twin.machine.places import unknown_number
 
 
 @dataclass(frozen=True, eq=False)

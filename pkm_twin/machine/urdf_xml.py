@@ -16,7 +16,7 @@ import numpy as np
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError, UnknownNameError
 from pkm_twin.files import decimal, read_bounded
-from pkm_twin.machine import schema
+from pkm_twin.machine.formulas import MAX_SIZE
 from pkm_twin.machine.rotations import Pose, from_quaternion, from_rpy
 
 MAX_FILE_SIZE: Final = 4 * 1024 * 1024
@@ -192,7 +192,7 @@ def number(text: str | None, where: str) -> float:
         value = decimal(text or "")
     except (TypeError, ValueError):
         raise ParameterError(where, text, "a number") from None
-    if not math.isfinite(value) or abs(value) > schema.MAX_SIZE:
+    if not math.isfinite(value) or abs(value) > MAX_SIZE:
         raise ParameterError(where, text, "a finite number")
     return value
 

@@ -8,10 +8,12 @@ where. ``inverse`` goes the straight way in the pose coordinates.
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, reduce
+from operator import getitem
 from typing import Any, Final, TypeVar
 
 import numpy as np
@@ -22,6 +24,7 @@ from pkm_twin.errors import ParameterError
 from pkm_twin.kinematics.pose import COORDINATES, Coordinate
 from pkm_twin.kinematics.scheme import check_masses, choose_coordinates
 from pkm_twin.machine import schema
+from pkm_twin.machine.formulas import PARAMETERS, Book
 from pkm_twin.machine.graph import (
     BASE,
     Graph,
@@ -51,6 +54,8 @@ from pkm_twin.machine.places import (
     check_number,
     full_keys,
     given,
+    has_entry,
+    keys_of,
     number_in,
     path_of,
     placed,
@@ -91,6 +96,10 @@ class MachineFile(Common):
     joints: Mapping[str, JointSpec] = schema.mapping(JointSpec, default={})
     rods: Mapping[str, RodSpec] = schema.mapping(RodSpec, default={})
     limbs: Sequence[Limb] = schema.key(limbs_of, "a section or a list of them", default=[])
+    parameters: Mapping[str, Any] = schema.key(
+        lambda _, value: value, "names to numbers or [expressions](new_machine.md#parameters)",
+        default={},
+    )  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -109,7 +118,8 @@ class Machine(TwinRobot):
 
         :raises ParameterError: by the field.
         """
-        file = schema.build(MachineFile, data)
+        book = Book.of(data)
+        file = schema.build(MachineFile, book.marked(data))
         specs, sources = written_out({kind: getattr(file, kind) for kind in KINDS}, file.limbs)
         graph = graph_of_entries(file.platform, specs, file.origin)
         graph.check()
@@ -120,7 +130,7 @@ class Machine(TwinRobot):
         pose = tuple(file.pose or choose_coordinates(graph))
         common = {field.name: getattr(file, field.name) for field in dataclasses.fields(Common)}
         robot = cls(
-            name=name, described=graph, specs=specs, sources=sources, pose=pose,
+            name=name, described=graph, specs=specs, sources=sources, pose=pose, book=book,
             **common, **drives_of(graph, specs["joints"]),
         )  # fmt: skip
         _ = robot.controller
@@ -132,7 +142,13 @@ class Machine(TwinRobot):
         return robot
 
     def changed(self: M, **sections: Mapping[str, object] | object) -> M:
-        """As of every robot; friction and limits are those of the joints' entries too."""
+        """As of every robot; friction and limits are those of the joints' entries too.
+
+        ``parameters`` stand for the numbers that follow from them.
+        """
+        parameters = sections.pop(PARAMETERS, {})
+        if isinstance(parameters, Mapping) and parameters:
+            self = self.filed({f"{PARAMETERS}.{name}": v for name, v in parameters.items()})
         made = super().changed(**sections)
         if not {"friction", "limits"} & set(sections):
             return made
@@ -149,6 +165,7 @@ class Machine(TwinRobot):
         A limb's number is that of all its copies, in the axes of azimuth zero; of an azimuth, the
         copy is turned on.
         """
+        book, values = self.book.moved(values)
         specs = {kind: dict(entries) for kind, entries in self.specs.items()}
         rest, origin = {}, self.described.origin
         # Of an entry: numbers of its limb, then its azimuth, then the copy's own, each at once.
@@ -168,21 +185,38 @@ class Machine(TwinRobot):
             specs[kind][name] = numbered_entry(specs[kind][name], new, azimuth, place)
         described = graph_of_entries(self.described.platform, specs, origin)
         made = super().numbered(rest)
-        return made._with(described=described, specs=specs, **drives_of(described, specs["joints"]))
+        return made._with(
+            described=described, specs=specs, book=book, **drives_of(described, specs["joints"])
+        )
+
+    def filed(self, values: Mapping[str, Any]) -> Any:
+        """As of every robot; parameters and expressions stay, but where a copy's number is new."""
+        data: Any = copy.deepcopy(self.book.data)
+        kept = self.book.values or self.book.formulas
+        if not kept or not all(has_entry(data, path) for path in values):
+            return super().filed(values)
+        for path, value in values.items():
+            *keys, last = keys_of(path)
+            reduce(getitem, keys, data)[last] = value
+        return type(self).from_data(data, self.name)
 
     def check_number(self, path: str) -> None:
         """As a file's, in each of the entries that have it."""
         keys = full_keys(path)
+        for moved in self.book.paths(str(keys[-1])) if keys[0] == PARAMETERS else ():
+            self.check_number(moved)
         named = list(self.named(keys))
         for kind, name, where, _ in named:
             if where != ("azimuth",):
                 check_number(self.specs[kind][name], where, path)
-        if not named and keys[0] != "origin":
+        if not named and keys[0] not in ("origin", PARAMETERS):
             super().check_number(path)
 
     def number(self, path: str) -> float:
         """Of a limb's numbers those of its first copy."""
         keys = full_keys(path)
+        if keys[0] == PARAMETERS:
+            return number_in(dict(self.book.values), keys[1:], path)
         if keys[0] == "origin":
             return number_in(self.described.origin.tolist(), keys[1:], path)
         for kind, name, where, azimuth in self.named(keys):
@@ -273,6 +307,24 @@ class Machine(TwinRobot):
                 words = _SLIDING if slides else _TURNING
                 result[kind][name] = schema.units(spec, entry, words)
         return result
+
+    def file_numbers(self) -> dict[str, tuple[float, str]]:
+        """As of every robot, and the parameters."""
+        units = self.parameter_units()
+        known = self.book.units({path: self._unit_of(path, units) for path in self.book.formulas})
+        own = {f"{PARAMETERS}.{n}": (v, known[n]) for n, v in self.book.values.items()}
+        return super().file_numbers() | own
+
+    def _unit_of(self, path: str, units: Any) -> str:
+        """Unit of a number of the file."""
+        keys = full_keys(path)
+        for kind, name, where, _ in self.named(keys):
+            keys = [kind, name, *where]
+            break
+        for key in keys:
+            units = "rad" if key == "azimuth" else units
+            units = units.get(key, "") if isinstance(units, Mapping) else units
+        return units if isinstance(units, str) else ""
 
     def friction_key(self, joint: str, what: str) -> Keys:
         """Of a limb's joint in a list, one number a copy."""

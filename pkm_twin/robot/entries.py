@@ -13,8 +13,9 @@ import yaml
 
 from pkm_twin.errors import ParameterError, PkmTwinError, one_line
 from pkm_twin.files import replace_file
+from pkm_twin.machine.formulas import PARAMETERS
 from pkm_twin.machine.machine_yaml import describe_machine_yaml, edit_yaml
-from pkm_twin.machine.places import given, has_entry, keys_of, numbers_of
+from pkm_twin.machine.places import given, has_entry, keys_of
 from pkm_twin.robot.catalogue import TREES, load, robot_of_data, robot_path
 from pkm_twin.robot.robot import Robot
 from pkm_twin.robot.robot_urdf import robot_description
@@ -25,16 +26,12 @@ R = TypeVar("R", bound=Robot)
 
 def entries(robot: Robot) -> dict[str, tuple[float, str]]:
     """Every number that the robot's file gives, by dotted path, with its unit."""
-    return numbers_of(robot.parameter_sections(), robot.parameter_units())
+    return robot.file_numbers()
 
 
-def data_of(robot: Robot, values: Mapping[str, float] | None = None) -> dict[str, Any]:
-    """What the robot's file gives, as plain data, with other numbers by dotted path.
-
-    :raises ParameterError: a path that there is not.
-    """
-    made = robot.numbered(values) if values else robot
-    data: dict[str, Any] = copy.deepcopy(given(made.parameter_sections()))
+def data_of(robot: Robot) -> dict[str, Any]:
+    """What the robot's file gives, as plain data, written out."""
+    data: dict[str, Any] = copy.deepcopy(given(robot.parameter_sections()))
     return data
 
 
@@ -43,7 +40,7 @@ def with_entries(robot: R, values: Mapping[str, float]) -> R:
 
     :raises ParameterError: a path that there is not, or a value that the file may not have.
     """
-    return type(robot).from_data(data_of(robot, values), robot.name)
+    return robot.filed(values)
 
 
 @dataclass(frozen=True)
@@ -86,7 +83,9 @@ def edited_yaml(robot: Robot, source: str, values: Mapping[str, Fitted | Chosen]
     data: Any = yaml.safe_load(text)
     plain = [name for name in values if not name.startswith("joint_map.")]
     if not all(has_entry(data, name) for name in plain):
-        sections = given(robot.parameter_sections())
+        moved = {name: values[name].value for name in plain if name.startswith(f"{PARAMETERS}.")}
+        values = {name: fit for name, fit in values.items() if name not in moved}
+        sections = given((robot.numbered(moved) if moved else robot).parameter_sections())
         told = {k: v for k, v in sections.items() if v or not isinstance(v, Mapping)}
         text = describe_machine_yaml({"mechanism": robot.mechanism, **told})
     keys = {name: tuple(keys_of(name)) for name in values}

@@ -18,10 +18,11 @@ from numpy.typing import ArrayLike
 
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.codegen.expressions import Numbers, Objects
-from pkm_twin.errors import ParameterError, UnknownNameError
+from pkm_twin.errors import ParameterError, UnknownNameError, unknown_number
 from pkm_twin.kinematics.motion import Motion
 from pkm_twin.kinematics.pose import Coordinate
 from pkm_twin.machine import schema
+from pkm_twin.machine.formulas import Book
 from pkm_twin.machine.friction import law_names
 from pkm_twin.machine.graph import Graph
 from pkm_twin.machine.inertia import Coefficients
@@ -37,7 +38,6 @@ from pkm_twin.machine.places import (
     number_in,
     numbers_of,
     placed,
-    unknown_number,
 )
 from pkm_twin.machine.pose_grid import PoseGrid
 from pkm_twin.machine.reach import PassiveLimit, position_box
@@ -110,6 +110,8 @@ class Mechanism(Common):
     home_joint: float | None = None
     """Value of every actuated joint at home, where a mechanism chooses it: kept by copies, so that
     other limits do not move the home."""
+    book: Book = dataclasses.field(default_factory=Book)
+    """The file's parameters, and its expressions."""
     open_laws: tuple[str, ...] = ()
     """Friction laws that a fit may find, although the file's parameters of them are zero."""
 
@@ -296,8 +298,7 @@ class Mechanism(Common):
     @cached_property
     def causes(self) -> Mapping[str, Mapping[str, float]]:
         """By cause of doubt: by path of a number, what one standard deviation adds to it."""
-        numbers = numbers_of(self.parameter_sections(), self.parameter_units())
-        return causes_of(self.uncertainty, numbers)
+        return causes_of(self.uncertainty, self.file_numbers())
 
     def __getstate__(self) -> dict[str, Any]:
         """What a copy in another process is made from: all but what is derived and kept."""
@@ -343,6 +344,10 @@ class Mechanism(Common):
         """Units of the same, by section; empty where a parameter has none."""
         words = {"joint": self.joint_unit, "effort": self.effort_unit}
         return schema.units(type(self), self.parameter_sections(), words)
+
+    def file_numbers(self) -> dict[str, tuple[float, str]]:
+        """Every number that the file gives, by dotted path, with its unit."""
+        return numbers_of(self.parameter_sections(), self.parameter_units())
 
     @cached_property
     def controller(self) -> JointMap:
@@ -427,9 +432,16 @@ class Mechanism(Common):
         """
         keys = full_keys(path)
         if not keys or keys[0] not in settings_of(type(self)):
-            numbers = numbers_of(self.parameter_sections(), self.parameter_units())
-            raise unknown_number(path, numbers)
+            raise unknown_number(path, self.file_numbers())
         return number_in(schema.plain(getattr(self, str(keys[0]))), keys[1:], path)
+
+    def filed(self: R, values: Mapping[str, Any]) -> R:
+        """The robot of the same file with other numbers at dotted paths.
+
+        :raises ParameterError: a path that there is not, or a value that the file may not have.
+        """
+        data = given(self.numbered(values).parameter_sections())
+        return type(self).from_data(data, self.name)
 
     def check_number(self, path: str) -> None:
         """Judge a number of :meth:`numbered` as a file's is.

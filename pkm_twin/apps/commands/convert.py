@@ -68,11 +68,13 @@ def convert(given: Convert) -> Report:
     from pkm_twin.robot.robot_urdf import robot_description
     from pkm_twin.robot.urdf_read import read_urdf
 
+    told: list[str] = []
     if ending in TREES:
         described = read_urdf(Path(first), platform=given.platform)
     else:
-        described = robot_description(load(first, platform=given.platform))
-    text = describe_machine_yaml(described)
+        robot = load(first, platform=given.platform)
+        described, told = robot_description(robot), robot.book.told()
+    text = describe_machine_yaml(described, told)
     if given.out is None:
         return Report(facts=[Fact("yaml", text)], raw=text)
     replace_file(given.out, text.encode())

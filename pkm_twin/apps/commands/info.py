@@ -13,6 +13,7 @@ import numpy as np
 from delta_dynamics import reactions
 from pkm_twin.apps.frame import command
 from pkm_twin.apps.options import Draws, OfRobot
+from pkm_twin.machine.formulas import PARAMETERS
 from pkm_twin.report import Fact, Report, number
 from pkm_twin.robot.clearance import clearance, has_clearance
 from pkm_twin.robot.plausibility import findings, why_no_torques
@@ -53,6 +54,11 @@ def info(given: Info) -> Report:
         equations += (
             f" in the model only, where joint {', '.join(assumed)} repeats constraints of the limbs"
         )
+    sections, units = robot.parameter_sections(), robot.parameter_units()
+    if robot.book.values:
+        numbers = robot.file_numbers()
+        sections[PARAMETERS] = dict(robot.book.values)
+        units[PARAMETERS] = {n: numbers[f"{PARAMETERS}.{n}"][1] for n in robot.book.values}
     facts = [
         Fact("name", robot.name),
         Fact("mechanism", robot.mechanism),
@@ -85,13 +91,14 @@ def info(given: Info) -> Report:
         Fact("plausibility", [dataclasses.asdict(finding) for finding in odd]),
         *(Fact("", text, text="plausibility")
           for text in [finding.text for finding in odd] or ["no implausible value"]),
-        Fact("parameters", robot.parameter_sections()),
-        Fact("parameter_units", robot.parameter_units()),
+        Fact("parameters", sections),
+        Fact("parameter_units", units),
+        *(Fact("", text, text="parameter") for text in robot.book.told(units.get(PARAMETERS))),
     ]  # fmt: skip
-    for section, value in robot.parameter_sections().items():
+    for section, value in sections.items():
         listed = section == "joints" and isinstance(value, list)
-        if section not in ("mechanism", "name") and not listed:
-            facts += _parameters(section, value, robot.parameter_units().get(section, ""))
+        if section not in ("mechanism", "name", PARAMETERS) and not listed:
+            facts += _parameters(section, value, units.get(section, ""))
     return Report(
         f"{robot.name}: {robot.description}", facts, figures={"": lambda: _picture(robot)}
     )

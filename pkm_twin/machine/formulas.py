@@ -1,0 +1,371 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Parameters of a machine file, and the expressions that stand for its numbers.
+
+An expression is a text of arithmetic: + - * / ** ( ), sqrt, sin, cos, tan, atan2, pi and the names
+of parameters. It is read as a syntax tree, of which only these parts are known; nothing is run.
+"""
+
+from __future__ import annotations
+
+import ast
+import difflib
+import keyword
+import math
+import operator
+import re
+import warnings
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from graphlib import CycleError, TopologicalSorter
+from typing import Any, Final
+
+from pkm_twin.codegen import operations
+from pkm_twin.codegen.expressions import reference
+from pkm_twin.errors import ParameterError, unknown_number
+
+PARAMETERS: Final = "parameters"
+"""The section of parameters, and the first key of their paths."""
+MAX_LENGTH: Final = 500
+"""Longest expression, characters."""
+MAX_DEPTH: Final = 40
+"""Deepest nesting of an expression."""
+MAX_SIZE: Final = 1e18
+"""Beyond every quantity of a machine in SI units; products of such numbers stay finite."""
+_NAME: Final = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
+_STRANGE: Final = re.compile(r"[^A-Za-z0-9_ \t.+\-*/(),]")
+_NUMBER: Final = re.compile(r"(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
+_ANGLES: Final = ("sin", "cos", "tan")
+"""Functions of an angle, whose values have no unit."""
+_SQUARE: Final = "^2"
+"""Behind the unit of what a root is taken of."""
+
+
+def _either(numbers: Callable[..., float], expressions: Callable[..., Any]) -> Callable[..., Any]:
+    """A function of numbers, or of expressions where one of its arguments is one."""
+
+    def call(*values: Any) -> Any:
+        if any(hasattr(value, "tape") for value in values):
+            return expressions(*values)
+        return numbers(*values)
+
+    return call
+
+
+def _power(base: Any, exponent: Any) -> Any:
+    """Of expressions: a whole exponent by products, any other by exp and log, base above zero."""
+    fixed = None if hasattr(exponent, "tape") else float(exponent)
+    if fixed is not None and fixed.is_integer() and abs(fixed) <= MAX_DEPTH:
+        product = base ** int(abs(fixed)) if fixed else 1.0
+        return product if fixed >= 0.0 else 1.0 / product
+    log = math.log(reference(base))
+    for _ in range(6):
+        # Halley's step for exp(log) = base.
+        power = operations.exp(log)
+        log = log + 2.0 * (base - power) / (base + power)
+    return operations.exp(exponent * log)
+
+
+FUNCTIONS: Final[Mapping[str, tuple[int, Callable[..., Any]]]] = {
+    "sqrt": (1, _either(math.sqrt, operations.sqrt)),
+    "sin": (1, _either(math.sin, operations.sin)),
+    "cos": (1, _either(math.cos, operations.cos)),
+    "tan": (1, _either(math.tan, lambda x: operations.sin(x) / operations.cos(x))),
+    "atan2": (2, _either(math.atan2, operations.atan2)),
+}
+"""How many arguments a function has, and what it gives."""
+_OPERATORS: Final[Mapping[type, Callable[..., Any]]] = {
+    ast.Add: operator.add, ast.Sub: operator.sub, ast.Mult: operator.mul, ast.Div: operator.truediv,
+    ast.Pow: _either(operator.pow, _power), ast.USub: operator.neg, ast.UAdd: lambda x: x,
+}  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class Formula:
+    """An expression, checked; ``path``: where it stands; ``names``: the parameters in it."""
+
+    path: str
+    text: str
+    tree: ast.expr
+    names: frozenset[str]
+
+    @classmethod
+    def of(cls, path: str, text: str) -> Formula:
+        """Read an expression.
+
+        :raises ParameterError: it is no arithmetic, or too long or too deep.
+        """
+        if len(text) > MAX_LENGTH:
+            raise ParameterError(path, text, f"at most {MAX_LENGTH} characters")
+        if strange := _STRANGE.search(text):
+            raise ParameterError(path, text, f"arithmetic; {strange[0]!r} is no part of it")
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                tree = ast.parse(text.strip(), mode="eval").body
+        except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
+            told = error.msg if isinstance(error, SyntaxError) else "too deep"
+            raise ParameterError(path, text, f"arithmetic; {told}") from None
+        names = set[str]()
+        for node, depth in _walk(tree, 1):
+            if depth > MAX_DEPTH:
+                raise ParameterError(path, text, f"a nesting of at most {MAX_DEPTH}")
+            if reason := _refused(node, text.strip()):
+                raise ParameterError(path, text, reason)
+            if isinstance(node, ast.Name) and node.id != "pi":
+                names.add(node.id)
+        return cls(path, text, tree, frozenset(names))
+
+    def value(self, given: Mapping[str, Any]) -> Any:
+        """Its value for values of the parameters: numbers, or expressions of programs.
+
+        :raises ParameterError: an unknown parameter, or no finite number.
+        """
+        for name in sorted(self.names - given.keys()):
+            close = difflib.get_close_matches(name, [*given, *FUNCTIONS, "pi"], 1)
+            hint = f"; did you mean {close[0]!r}?" if close else ""
+            raise self._error(f"names under `{PARAMETERS}`; {name!r} is none{hint}")
+        try:
+            found = _value(self.tree, given)
+        except ZeroDivisionError:
+            raise self._error("a finite number, not a division by zero") from None
+        except (ValueError, OverflowError, TypeError):
+            raise self._error("a finite real number") from None
+        if hasattr(found, "tape"):
+            return found
+        if isinstance(found, complex) or not abs(found) <= MAX_SIZE:
+            raise self._error("a finite real number")
+        return float(found)
+
+    def _error(self, reason: str) -> ParameterError:
+        return ParameterError(self.path, self.text, reason)
+
+    def units(self, unit: str) -> Iterator[tuple[str, str]]:
+        """Units of the parameters in it where they can be told, for the unit of its value."""
+        return _units(self.tree, unit)
+
+
+def _walk(node: ast.expr, depth: int) -> Iterator[tuple[ast.expr, int]]:
+    """All parts, and how deep they stand; none below one that is too deep."""
+    rows = [(node, depth)]
+    while rows:
+        node, depth = rows.pop()
+        yield node, depth
+        rows += [(part, depth + 1) for part in _parts(node)]
+
+
+def _parts(node: ast.expr) -> list[ast.expr]:
+    """What a part is made of."""
+    if isinstance(node, ast.BinOp):
+        return [node.left, node.right]
+    if isinstance(node, ast.UnaryOp):
+        return [node.operand]
+    return node.args if isinstance(node, ast.Call) else []
+
+
+def _refused(node: ast.expr, text: str) -> str:
+    """Why a part is none of an expression; empty where it is one."""
+    own = text[node.col_offset : node.end_col_offset]
+    if isinstance(node, ast.Name):
+        return f"{own}( )" if own in FUNCTIONS else ""
+    if isinstance(node, ast.Constant):
+        return "" if _NUMBER.fullmatch(own) else f"decimal numbers; {own!r} is none"
+    if isinstance(node, (ast.BinOp, ast.UnaryOp)) and type(node.op) in _OPERATORS:
+        return ""
+    if isinstance(node, ast.Call) and isinstance(node.func, ast.Name):
+        called = node.func.id
+        if called in FUNCTIONS and not node.keywords and len(node.args) == FUNCTIONS[called][0]:
+            return ""
+        if called in FUNCTIONS:
+            count = FUNCTIONS[called][0]
+            return f"{called} of {count} number{'s' * (count > 1)}"
+        return f"functions {', '.join(FUNCTIONS)}; {called!r} is none"
+    return f"+ - * / ** ( ) and {', '.join(FUNCTIONS)}, not {own!r}"
+
+
+def _value(node: ast.expr, given: Mapping[str, Any]) -> Any:
+    if isinstance(node, ast.Constant):
+        return float(node.value)  # type: ignore[arg-type]
+    if isinstance(node, ast.Name):
+        return math.pi if node.id == "pi" else given[node.id]
+    values = [_value(part, given) for part in _parts(node)]
+    if isinstance(node, ast.Call):
+        return FUNCTIONS[node.func.id][1](*values)  # type: ignore[attr-defined]
+    return _OPERATORS[type(node.op)](*values)  # type: ignore[attr-defined]
+
+
+def _units(node: ast.expr, unit: str) -> Iterator[tuple[str, str]]:
+    if isinstance(node, ast.Name) and node.id != "pi" and unit and not unit.endswith(_SQUARE):
+        yield node.id, unit
+    parts = _parts(node)
+    if isinstance(node, ast.Call):
+        called = node.func.id  # type: ignore[attr-defined]
+        inner = "rad" if called in _ANGLES else unit + _SQUARE if called == "sqrt" and unit else ""
+        for part in parts:
+            yield from _units(part, inner)
+    elif isinstance(node, ast.BinOp) and isinstance(node.op, ast.Pow):
+        squared = isinstance(parts[1], ast.Constant) and parts[1].value == 2
+        yield from _units(parts[0], unit.removesuffix(_SQUARE) if squared else "")
+    elif isinstance(node, ast.BinOp) and isinstance(node.op, (ast.Mult, ast.Div)):
+        # A factor has the unit of the product where the other one has none.
+        bare = [_has_no_unit(part) for part in parts]
+        yield from _units(parts[0], unit if bare[1] else "")
+        yield from _units(parts[1], unit if isinstance(node.op, ast.Mult) and bare[0] else "")
+    else:
+        for part in parts:
+            yield from _units(part, unit)
+
+
+def _has_no_unit(node: ast.expr) -> bool:
+    """Whether it is of numbers and sines alone."""
+    if isinstance(node, ast.Name):
+        return node.id == "pi"
+    if isinstance(node, ast.Call) and node.func.id in _ANGLES:  # type: ignore[attr-defined]
+        return True
+    return all(map(_has_no_unit, _parts(node)))
+
+
+class Written(str):
+    """A text of a machine file, which may stand for a number."""
+
+    book: Book
+    place: str
+
+    @classmethod
+    def of(cls, text: str, book: Book, place: str = "") -> Written:
+        """A text in a file with these parameters; ``place``: behind the path of its number."""
+        made = cls(text)
+        made.book, made.place = book, place
+        return made
+
+    def number(self, path: str) -> float:
+        """Its number, that stands at a path from now on.
+
+        :raises ParameterError: it is no arithmetic, or has no finite result.
+        """
+        formula = Formula.of(path + self.place, str(self))
+        self.book.formulas[formula.path] = formula
+        return float(formula.value(self.book.values))
+
+
+@dataclass(frozen=True, eq=False)
+class Book:
+    """Parameters by name, in the order in which they follow from each other, and expressions.
+
+    ``own``: the expressions of parameters, by name. ``formulas``: of the other numbers, by path.
+    ``data``: the file as it stands.
+    """
+
+    values: Mapping[str, Any] = field(default_factory=dict)
+    own: Mapping[str, Formula] = field(default_factory=dict)
+    formulas: dict[str, Formula] = field(default_factory=dict)
+    data: Mapping[str, Any] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, data: Mapping[str, Any]) -> Book:
+        """The parameters of a file.
+
+        :raises ParameterError: a name or value that is refused, or parameters in a circle.
+        """
+        given = data.get(PARAMETERS) or {}
+        if not isinstance(given, Mapping):
+            raise ParameterError(PARAMETERS, given, "a mapping of names to numbers")
+        own: dict[str, Formula] = {}
+        for name, value in given.items():
+            path = f"{PARAMETERS}.{name}"
+            taken = name in FUNCTIONS or name == "pi" or keyword.iskeyword(str(name))
+            if taken or not isinstance(name, str) or not _NAME.fullmatch(name):
+                raise ParameterError(path, name, "a name of letters, digits and _, not in use")
+            if isinstance(value, str):
+                own[name] = Formula.of(path, value)
+            elif isinstance(value, bool) or not isinstance(value, int | float):
+                raise ParameterError(path, value, "a number or an expression")
+            elif not abs(value) <= MAX_SIZE:
+                raise ParameterError(path, value, "a finite number")
+        graph = {name: own[name].names & given.keys() if name in own else () for name in given}
+        try:
+            order = tuple(TopologicalSorter(graph).static_order())
+        except CycleError as error:
+            circle = error.args[1][::-1]
+            path = f"{PARAMETERS}.{circle[0]}"
+            reason = f"no circle: {', '.join(circle)}"
+            raise ParameterError(path, own[circle[0]].text, reason) from None
+        numbers = {name: given[name] for name in order if name not in own}
+        return cls(dict.fromkeys(order, 0.0), own, {}, data)._with(numbers)
+
+    def marked(self, data: Any) -> Any:
+        """Data whose texts may stand for numbers."""
+        if isinstance(data, Mapping):
+            return {name: self.marked(value) for name, value in data.items()}
+        if isinstance(data, list):
+            return [self.marked(value) for value in data]
+        return Written.of(data, self) if isinstance(data, str) else data
+
+    def _with(self, numbers: Mapping[str, Any]) -> Book:
+        """The same with other values of some parameters; those are no expressions any more."""
+        own = {name: formula for name, formula in self.own.items() if name not in numbers}
+        values: dict[str, Any] = {}
+        for name, old in self.values.items():
+            new = numbers.get(name, old)
+            values[name] = own[name].value(values) if name in own else new
+            if not hasattr(values[name], "tape"):
+                values[name] = float(values[name])
+        return replace(self, values=values, own=own)
+
+    def moved(self, values: Mapping[str, Any]) -> tuple[Book, dict[str, Any]]:
+        """The book, and all numbers that change, for new values by path, of parameters too.
+
+        :raises ParameterError: a parameter that there is not, or no finite result.
+        """
+        start = f"{PARAMETERS}."
+        new = {path[len(start) :]: v for path, v in values.items() if path.startswith(start)}
+        rest = {path: v for path, v in values.items() if not path.startswith(start)}
+        kept = {path: one for path, one in self.formulas.items() if path not in rest}
+        for name in new.keys() - self.values.keys():
+            raise unknown_number(start + name, [start + known for known in self.values])
+        if not new and len(kept) == len(self.formulas):
+            return self, rest
+        book = replace(self._with(new), formulas=kept)
+        moving = self.following(new)
+        changes = {
+            path: one.value(book.values)
+            for path, one in kept.items()
+            if one.names & moving and not path.startswith("uncertainty.")
+        }
+        return book, {**changes, **rest}
+
+    def following(self, names: Any) -> set[str]:
+        """The parameters of some names, and those that follow from them."""
+        moving = set(names)
+        for name in self.values:
+            if name in self.own and self.own[name].names & moving:
+                moving.add(name)
+        return moving
+
+    def paths(self, name: str) -> list[str]:
+        """Where the numbers stand that a parameter moves."""
+        moving = self.following([name])
+        moved = (path for path, one in self.formulas.items() if one.names & moving)
+        return [path for path in moved if not path.startswith("uncertainty.")]
+
+    def told(self, units: Mapping[str, str] | None = None) -> list[str]:
+        """Each parameter with its value, unit and expression, in words."""
+        return [
+            f"{name} = {value:.12g} {(units or {}).get(name, '')}".strip()
+            + (f" = {self.own[name].text}" if name in self.own else "")
+            for name, value in self.values.items()
+        ]
+
+    def units(self, given: Mapping[str, str]) -> dict[str, str]:
+        """Units of the parameters, empty where they cannot be told or differ.
+
+        :param given: of numbers by path.
+        """
+        found: dict[str, set[str]] = {name: set() for name in self.values}
+        for path, formula in self.formulas.items():
+            for name, unit in formula.units(given.get(path, "")):
+                found[name].add(unit)
+        for name in reversed(list(self.values)):
+            if name in self.own and len(found[name]) == 1:
+                for other, unit in self.own[name].units(*found[name]):
+                    found[other].add(unit)
+        return {name: units.pop() if len(units) == 1 else "" for name, units in found.items()}

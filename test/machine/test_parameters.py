@@ -1,0 +1,271 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Files with parameters: the machine with the numbers written out, in all that varies it."""
+
+import math
+import pickle
+
+import numpy as np
+import pytest
+import yaml
+
+from delta_dynamics import inverse_dynamics, torque_derivatives
+from pkm_twin import load, variants
+from pkm_twin.design import tolerances
+from pkm_twin.errors import ParameterError
+from pkm_twin.machine.formulas import Formula
+from pkm_twin.robot.catalogue import config_folder, robot_of_data
+from pkm_twin.robot.entries import Chosen, edited_yaml, entries, with_entries
+
+SOURCE = """\
+mechanism: machine
+parameters:
+  arm: 0.2  # pivot to elbow
+  forearm: arm * 2 + 0.05
+  base: 0.1
+  plate: base / 2
+  drop: sqrt(forearm**2 - (base + arm - plate)**2)
+  m: 0.3
+origin: [0, 0, -drop]
+uncertainty: {parameters.arm: {deviation: 0.0001}}
+bodies:
+  platform: {mass: m + 0.05, com: [0, 0, -drop], inertia: [4e-4, 4e-4, 7e-4]}
+joints:
+  slide: {type: translation, between: [base, platform]}
+limbs:
+  azimuths: [pi/2, pi/2 + 2*pi/3, pi/2 - 2*pi/3]
+  bodies:
+    arm: {mass: m, com: [base + arm/2, 0, 0], inertia: [1e-5, m*arm**2/12, m*arm**2/12]}
+  joints:
+    motor:
+      type: revolute
+      between: [base, arm]
+      at: [base, 0, 0]
+      axis: [0, cos(0), -sin(0)]
+      actuated: true
+      friction: {viscous: [0.01, 0.02, tan(pi/8)**1.5]}
+  rods:
+    rod: {between: [arm, platform], ends: [[base + arm, 0, 0], [plate, 0, -drop]], mass: 0.05}
+"""
+Q, RATE, SECOND = np.array([0.1, 0.2, 0.3]), np.array([1.0, -0.5, 0.3]), np.array([4.0, 2.0, -3.0])
+NAMES = ("arm", "base", "m", "forearm", "drop")
+
+
+def data_with(**values):
+    data = yaml.safe_load(SOURCE)
+    data["parameters"] |= values
+    return data
+
+
+def robot_with(**values):
+    return robot_of_data(data_with(**values), "own")
+
+
+def written_out(data):
+    """The same data with numbers for expressions, by Python itself."""
+    known = {"pi": math.pi, "sqrt": math.sqrt, "cos": math.cos, "sin": math.sin, "tan": math.tan}
+    for name in ("arm", "base", "m", "forearm", "plate", "drop"):
+        value = data["parameters"][name]
+        known[name] = eval(value, {}, known) if isinstance(value, str) else value
+
+    def walk(value, key=""):
+        if isinstance(value, dict):
+            return {k: walk(v, k) for k, v in value.items()}
+        if isinstance(value, list):
+            return value if key == "between" else [walk(v) for v in value]
+        text = isinstance(value, str) and key not in ("mechanism", "type")
+        return eval(value, {}, known) if text else value
+
+    return {k: walk(v, k) for k, v in data.items() if k not in ("parameters", "uncertainty")}
+
+
+def torques(robot):
+    return inverse_dynamics(robot, Q, RATE, SECOND)
+
+
+def test_a_file_with_expressions_is_the_file_with_their_numbers_to_the_last_bit():
+    robot, plain = robot_with(), robot_of_data(written_out(data_with()), "own")
+    assert robot.graph.key == plain.graph.key
+    assert (robot.inertial == plain.inertial).all()
+    assert (torques(robot) == torques(plain)).all()
+    assert (torques(pickle.loads(pickle.dumps(robot))) == torques(plain)).all()
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_variants_over_a_parameter_are_the_files_one_by_one(name):
+    robot = robot_with()
+    value = robot.number(f"parameters.{name}")
+    values = value * np.array([0.97, 1.0, 1.02])
+    many = variants(robot, {f"parameters.{name}": values})
+    assert many.valid.all()
+    for k, found in enumerate(many.inverse_dynamics(Q, RATE, SECOND)):
+        own = robot_with(**{name: float(values[k])})
+        assert found == pytest.approx(torques(own), abs=1e-13)
+        assert torques(many[k]) == pytest.approx(found, abs=1e-13)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_derivative_by_a_parameter_is_that_of_differences(name):
+    robot, path, step = robot_with(), f"parameters.{name}", 1e-5
+    slope = torque_derivatives(robot, Q, RATE, SECOND, by=[path]).by[path]
+    ends = [torques(with_entries(robot, {path: robot.number(path) + s})) for s in (-step, step)]
+    assert slope == pytest.approx((ends[1] - ends[0]) / (2 * step), rel=1e-7, abs=1e-8)
+
+
+def test_a_power_that_is_no_whole_number_has_a_derivative():
+    robot = robot_with(plate="base**1.5 * arm**-0.5 / arm**(2*base)")
+    slope = torque_derivatives(robot, Q, RATE, SECOND, by=["parameters.arm"]).by["parameters.arm"]
+    step = 1e-5
+    ends = [torques(with_entries(robot, {"parameters.arm": 0.2 + s})) for s in (-step, step)]
+    assert slope == pytest.approx((ends[1] - ends[0]) / (2 * step), rel=1e-7)
+
+
+def test_a_parameter_of_tolerances_and_doubt():
+    robot, path = robot_with(), "parameters.arm"
+    moved = tolerances(robot, {path: 1e-4}, Q).sensitivity[path]
+    step = 1e-6
+    places = [with_entries(robot, {path: 0.2 + s}).platform(Q)[0] for s in (-step, step)]
+    assert moved[:3] == pytest.approx((places[1] - places[0]) / (2 * step), abs=1e-7)
+    assert robot.causes[path] == {path: 1e-4}
+
+
+def test_units_follow_from_where_a_parameter_stands():
+    units = {path: unit for path, (_, unit) in entries(robot_with()).items()}
+    assert {name: units[f"parameters.{name}"] for name in (*NAMES, "plate")} == {
+        "arm": "m", "base": "m", "m": "kg", "forearm": "m", "drop": "m", "plate": "m",
+    }  # fmt: skip
+
+
+def test_a_new_value_is_written_where_the_parameter_stands(tmp_path):
+    path = tmp_path / "own.yaml"
+    path.write_text(SOURCE)
+    robot, new = load(path), {"parameters.arm": Chosen(0.21, "longer")}
+    text = edited_yaml(robot, str(path), new)
+    old = SOURCE.splitlines()
+    assert [line for line in text.splitlines() if line not in old] == [
+        "  # parameters.arm: longer", "  arm: 0.21  # pivot to elbow",
+    ]  # fmt: skip
+    # A copy's own number needs the file written out, with the parameter's new value.
+    text = edited_yaml(robot, str(path), new | {"joints.motor_1.at[0]": Chosen(0.1, "moved")})
+    path.write_text(text)
+    numbers = {"parameters.arm": 0.21, "joints.motor_1.at[0]": 0.1}
+    assert torques(load(path)) == pytest.approx(torques(robot.numbered(numbers)), abs=1e-12)
+
+
+def test_changed_parameters_stay_parameters():
+    robot = robot_with().changed(parameters={"arm": 0.21})
+    assert robot.number("parameters.forearm") == pytest.approx(0.47)
+    assert torques(robot) == pytest.approx(torques(robot_with(arm=0.21)), abs=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("", "arithmetic"),
+        ("arm +", "invalid syntax"),
+        ("(arm", "never closed"),
+        ("armm", "did you mean 'arm'"),
+        ("arm arm", "invalid syntax"),
+        ("1 if arm else 2", "not '1 if arm else 2'"),
+        ("arm // 2", "not 'arm // 2'"),
+        ("arm % 2", "'%'"),
+        ("arm < 2", "'<'"),
+        ("__import__('os').getcwd()", "is no part of it"),
+        ("arm.real", "not 'arm.real'"),
+        ("(lambda: 1)()", "':'"),
+        ("exp(arm)", "'exp' is none"),
+        ("sin(arm, arm)", "sin of 1 number"),
+        ("atan2(arm)", "atan2 of 2 numbers"),
+        ("sin", "sin( )"),
+        ("1_000", "decimal numbers"),
+        ("0x10", "decimal numbers"),
+        ("1j", "decimal numbers"),
+        ("1/0", "division by zero"),
+        ("arm / (base - base)", "division by zero"),
+        ("sqrt(-arm)", "finite real number"),
+        ("(-arm)**0.5", "finite real number"),
+        ("9**9**9**9", "finite real number"),
+        ("1e300*1e300", "finite real number"),
+        ("1e400", "finite real number"),
+        ("(" * 230 + "1" + ")" * 230, "nested"),
+        ("-" * 200 + "1", "nesting of at most"),
+        ("1+" * 300 + "1", "at most 500 characters"),
+        ("arm\n+ 1", "'\\n'"),
+        ("arm, base", "not 'arm, base'"),
+        ("nan", "'nan' is none"),
+        ("\u0430rm", "'\u0430'"),
+    ],
+)
+def test_what_is_no_arithmetic_is_refused_with_its_place(text, reason):
+    data = data_with()
+    data["limbs"]["rods"]["rod"]["ends"][1][2] = text
+    with pytest.raises(ParameterError) as caught:
+        robot_of_data(data, "own")
+    message = str(caught.value)
+    assert caught.value.field == "limbs.rods.rod.ends[1][2]"
+    assert reason in message
+    assert "\n" not in message
+    assert text.split("\n")[0].split("'")[0] in message or len(text) > 100
+
+
+@pytest.mark.parametrize(
+    ("values", "field", "reason"),
+    [
+        ({"arm": "forearm"}, "parameters.", "no circle: "),
+        ({"arm": "arm"}, "parameters.arm", "no circle: arm, arm"),
+        ({"arm": "base", "base": "plate"}, "parameters.", "base, plate"),
+        ({"arm": "sqrt(0 - 1)"}, "parameters.arm", "real"),
+        ({"arm": "other"}, "parameters.arm", "'other' is none"),
+        ({"arm": math.nan}, "parameters.arm", "finite"),
+        ({"arm": True}, "parameters.arm", "a number"),
+        ({"arm": [1]}, "parameters.arm", "a number"),
+        ({"pi": 3}, "parameters.pi", "not in use"),
+        ({"sin": 3}, "parameters.sin", "not in use"),
+        ({"a b": 3}, "parameters.a b", "letters"),
+        ({"lambda": 3}, "parameters.lambda", "letters"),
+        ({"m": "-0.1"}, "bodies", "0 to 100000"),
+        ({"m": "-0.1"}, "", "m + 0.05 = -0.05"),
+    ],
+)
+def test_a_parameter_that_is_none_is_refused(values, field, reason):
+    with pytest.raises(ParameterError) as caught:
+        robot_with(**values)
+    assert caught.value.field.startswith(field)
+    assert reason in str(caught.value)
+
+
+def test_texts_stay_texts_where_no_number_stands():
+    data = data_with()
+    data["joints"]["slide"]["between"] = ["base", "pi"]
+    with pytest.raises(ParameterError, match="pi"):
+        robot_of_data(data, "own")
+
+
+def test_expressions_are_no_part_of_named_mechanisms():
+    data = yaml.safe_load((config_folder() / "delta.yaml").read_text())
+    data["geometry"]["arm_length"] = "0.1 + 0.1"
+    with pytest.raises(ParameterError, match=r"geometry\.arm_length"):
+        robot_of_data(data, "own")
+
+
+def test_random_expressions_are_those_of_python(rng):
+    """Sums, products, quotients and powers of random trees, to the last bit."""
+
+    def tree(depth):
+        if not depth or rng.random() < 0.2:
+            return rng.choice(["a", "b", "pi", f"{rng.uniform(0.1, 3):.3g}"])
+        left, right = tree(depth - 1), tree(depth - 1)
+        return rng.choice(
+            [f"({left} + {right})", f"{left} * {right}", f"({left}) / ({right})", f"-({left})",
+             f"({left}) ** 2", f"sin({left})", f"atan2({left}, {right})", f"({left} - {right})"]
+        )  # fmt: skip
+
+    given = {"a": 0.7, "b": 1.3}
+    known = vars(math) | given
+    for _ in range(200):
+        text = str(tree(4))
+        try:
+            expected = eval(text, {}, known)
+        except ArithmeticError:
+            continue
+        if abs(expected) < 1e17:
+            assert Formula.of("here", text).value(given) == expected
