@@ -4,7 +4,8 @@
 import pytest
 
 from test.fuzz.__main__ import KINDS
-from test.fuzz.tally import CORPUS, refusal
+from test.fuzz.messages import Messages
+from test.fuzz.tally import CORPUS, refusal, run
 
 FILES = sorted(path for path in CORPUS.rglob("*") if path.is_file())
 
@@ -27,6 +28,13 @@ def test_it_is_refused(made, kind):
     subject = made(kind)
     for name, example in subject.corpus():
         assert subject.check(example) != "good", name
+
+
+def test_messages_at_random(made):
+    """Refused, or answered as an independent rule and the model say, on every robot in turn."""
+    found = run(made(Messages), 1, count=1000)
+    assert not found.failures
+    assert found.good > 0.3 * found.examples and len(found.refused) > 15
 
 
 def test_every_file_is_of_a_kind():

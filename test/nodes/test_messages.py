@@ -6,10 +6,7 @@ from itertools import permutations, product
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
-from pkm_twin.errors import MessageError
 from pkm_twin.messages.reading import (
     MAX_ACCELERATION,
     MAX_EFFORT,
@@ -305,67 +302,6 @@ def test_a_wrench_keeps_its_values_frame_and_stamp(make):
     allowed = NOW, RULES, "platform", True
     assert read_wrench(make.wrench(WRENCH, NOW, ""), *allowed).frame == "platform"
     assert reject(read_wrench, make.wrench(WRENCH, NOW, "tool0"), *allowed)[0] == "frame"
-
-
-class TestAnything:
-    """Whatever comes: a MessageError, or finite data in the right shape and order."""
-
-    anything = st.one_of(
-        st.floats(-1.0, 1.0),
-        st.floats(allow_nan=True, allow_infinity=True, allow_subnormal=True),
-        st.sampled_from([*DAMAGED, 0.0, -0.0]),
-    )
-    names = st.one_of(
-        st.permutations(NAMES),
-        st.lists(st.one_of(st.sampled_from(NAMES), st.text(max_size=8)), max_size=5),
-    )
-
-    @settings(max_examples=150, deadline=None)
-    @given(
-        names=names,
-        arrays=st.tuples(*[st.lists(anything, max_size=4)] * 3),
-        time=st.tuples(st.integers(-(2**31), 2**31 - 1), st.integers(0, 2**32 - 1)),
-    )
-    def test_joint_states(self, names, arrays, time):
-        make = Maker(Plain())
-        message = make.joint_state(names, *arrays, stamp=NOW)
-        if arrays[0]:
-            message.header.stamp = make.kind.time(sec=time[0], nanosec=time[1])
-        try:
-            sample = JointReader(ROBOT).joint_state(message, NOW, StampRules(True))
-        except MessageError as error:
-            assert error.reason and str(error)
-            return
-        for values in (sample.q, sample.qd, sample.effort):
-            assert values is None or (values.shape == (3,) and np.isfinite(values).all())
-
-    @settings(max_examples=100, deadline=None)
-    @given(
-        order=st.permutations(range(3)),
-        rows=st.lists(
-            st.tuples(*[st.floats(-0.9, 1.3, allow_subnormal=False)] * 3), min_size=1, max_size=4
-        ),
-    )
-    def test_good_trajectories_in_any_order(self, order, rows):
-        make = Maker(Plain())
-        names = [NAMES[i] for i in order]
-        shuffled = [[row[i] for i in order] for row in rows]
-        message = make.trajectory(names, [i + 1 for i in range(len(rows))], shuffled)
-        t = JointReader(ROBOT).trajectory(message, NOW)
-        assert t.q.tolist() == [list(row) for row in rows]
-        assert [ROBOT.joint_names[i] for i in t.columns] == names
-
-    @settings(max_examples=100, deadline=None)
-    @given(values=st.tuples(*[anything] * 6), frame=st.sampled_from(["platform", "", "x"]))
-    def test_wrenches(self, values, frame):
-        try:
-            sample = read_wrench(
-                Maker(Plain()).wrench(values, NOW, frame), NOW, RULES, "platform", True
-            )
-        except MessageError as error:
-            assert error.reason and str(error)
-            return
-        assert sample.wrench.tolist() == list(values) and np.isfinite(sample.wrench).all()
 
 
 def test_names_are_remembered_only_for_a_few_orders(make):

@@ -46,13 +46,16 @@ class Sides:
         return path
 
 
-def sides(name: str, seed: int = 1) -> Sides:
-    """A shipped robot with a drawn sign, offset, ratio and name for each of its joints."""
-    plain, rng = load(name), np.random.default_rng(seed)
+def sides(robot: str | Path, seed: int = 1) -> Sides:
+    """A robot with a drawn sign, offset, ratio and name for each of its joints.
+
+    :param robot: a shipped robot's name, or a file.
+    """
+    plain, rng = load(robot), np.random.default_rng(seed)
     n = plain.joints_count
     signs = rng.choice([-1.0, 1.0], n)
     # Both signs are there, whatever is drawn.
-    signs[:2] = -1.0, 1.0
+    signs[:2] = (-1.0, 1.0)[:n]
     ratios, offsets = np.exp(rng.uniform(-3.0, 5.0, n)), rng.normal(0.0, 10.0, n)
     names = [f"axis_{k}" for k in rng.permutation(n).tolist()]
     rows = zip(names, signs.tolist(), ratios.tolist(), offsets.tolist(), strict=True)
@@ -60,6 +63,7 @@ def sides(name: str, seed: int = 1) -> Sides:
         joint: {"name": own, "sign": sign, "ratio": ratio, "offset": offset}
         for joint, (own, sign, ratio, offset) in zip(plain.joint_names, rows, strict=True)
     }
-    data = {**parameters_of(name), "joint_map": joint_map}
-    mapped = robot_of_data(data, f"{name}_mapped")
+    given = parameters_of(robot) if isinstance(robot, str) else yaml.safe_load(robot.read_text())
+    data = {**given, "joint_map": joint_map}
+    mapped = robot_of_data(data, f"{plain.name}_mapped")
     return Sides(plain, mapped, data, names, signs * ratios, offsets)

@@ -82,18 +82,17 @@ def parameters_of(name: str) -> dict[str, Any]:
     return data
 
 
+def without(entry: Any, *keys: str) -> Any:
+    """Plain data without these keys, wherever in it they are."""
+    if isinstance(entry, dict):
+        return {key: without(value, *keys) for key, value in entry.items() if key not in keys}
+    return [without(value, *keys) for value in entry] if isinstance(entry, list) else entry
+
+
 def rigid(name: str, path: Path) -> Path:
     """A shipped robot without members, sections and compliances, written there."""
-
-    def stripped(entry: Any) -> Any:
-        if isinstance(entry, dict):
-            left = {key: stripped(value) for key, value in entry.items()}
-            return {
-                key: left[key] for key in left if key not in ("member", "section", "compliance")
-            }
-        return [stripped(value) for value in entry] if isinstance(entry, list) else entry
-
-    path.write_text(yaml.safe_dump(stripped(parameters_of(name))))
+    data = without(parameters_of(name), "member", "section", "compliance")
+    path.write_text(yaml.safe_dump(data))
     return path
 
 
