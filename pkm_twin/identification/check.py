@@ -357,7 +357,7 @@ def _bands(r: Recording, c: Compared) -> dict[str, dict[str, Any]]:
         return {}
     parts = []
     for track, rows in zip(c.tracks, c.inner, strict=True):
-        made = by_held(r.robot, r.carried, torque_deviation, track)
+        made = by_held(r, torque_deviation, track)
         parts.append(made[rows])
     spread = np.concatenate(parts)
     inside = {str(k): np.mean(np.abs(c.residual) <= k * spread, 0) for k in DEVIATIONS}
@@ -467,7 +467,7 @@ def _payloads(r: Recording, c: Compared) -> Iterator[tuple[str, Recording]]:
         return inverse_dynamics(heavy, *motion) - inverse_dynamics(robot, *motion)
 
     try:
-        columns = [by_held(r.robot, None, more, track) for track in c.tracks]
+        columns = [by_held(r, more, track) for track in c.tracks]
     except PkmTwinError:
         return
     weight = 1.0 / c.limit**2

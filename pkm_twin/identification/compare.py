@@ -144,21 +144,19 @@ class Compared:
         return np.asarray((self.rms <= self.limit) & (self.local()[0] <= MORE * self.limit))
 
 
-def by_held(
-    robot: Robot, carried: Robot | None, function: Callable[..., Array], motion: Motion
-) -> Array:
-    """A function of robot, joints and wrench, with the payload while it is held, shape (k, n)."""
-    loaded = np.asarray((motion.held > 0.5) & (carried is not None), np.bool_)
-    made = np.zeros_like(motion.q)
-    for machine, some in ((robot, ~loaded), (carried, loaded)):
-        own = motion.part(some)
+def by_held(r: Recording, function: Callable[..., Array], motion: Motion) -> Array:
+    """A function of a recording's robot, joints and wrench, with what it carries, shape (k, n)."""
+    machines, made = r.machines, np.zeros_like(motion.q)
+    nearest = np.abs(motion.held[:, None] - np.array(list(machines))).argmin(1)
+    for k, machine in enumerate(machines.values()):
+        own = motion.part(np.asarray(nearest == k))
 
-        def block(rows: slice, machine: Robot | None = machine, own: Motion = own) -> Array:
+        def block(rows: slice, machine: Robot = machine, own: Motion = own) -> Array:
             part = own.part(rows)
             return function(machine, *part.joints, part.wrench)
 
-        if some.any():
-            made[some] = by_blocks(len(own.q), BLOCK, block)
+        if len(own.q):
+            made[nearest == k] = by_blocks(len(own.q), BLOCK, block)
     return made
 
 
@@ -169,7 +167,7 @@ def compare(robot: Robot, r: Recording, bound: float = MAX_RESIDUAL) -> Compared
 
     :param bound: of a good residual, RMS, as a part of the peak effort.
     """
-    reach = friction_reach(robot)
+    r, reach = replace(r, robot=robot), friction_reach(robot)
     rates = None if r.qd is None or r.qdd is None else (r.qd, r.qdd)
     held = None if r.carried is None else r.held
     pieces, how = tracks(r.time, r.q, r.measured, r.wrench, held, rates=rates, least=LEAST)
@@ -178,7 +176,7 @@ def compare(robot: Robot, r: Recording, bound: float = MAX_RESIDUAL) -> Compared
 
     def efforts(track: Track) -> Array:
         qd = moving_rates(track.qd, ~track.moves(how), reach)
-        return by_held(robot, r.carried, inverse_dynamics, replace(track, qd=qd))
+        return by_held(r, inverse_dynamics, replace(track, qd=qd))
 
     period, how = pieces[0].period, replace(how, keep_every=1)
     sharp: list[dict[str, Array]] = []
@@ -294,7 +292,7 @@ def idle_of(r: Recording) -> Mask:
     wrench = np.zeros((len(r.time), 6)) if r.wrench is None else r.wrench
     held = np.zeros(len(r.time)) if r.held is None else r.held
     motion = Motion(r.q, still, still, wrench, held)
-    needed = by_held(r.robot, r.carried, inverse_dynamics, motion)
+    needed = by_held(r, inverse_dynamics, motion)
     rates = r.qd
     if rates is None:
         rates = np.gradient(r.q, r.time, axis=0) if len(r.time) > 1 else still

@@ -155,4 +155,4 @@ def torque_table(m: Recording, progress: Callable[[int], None] | None = None) ->
         if progress is not None:
             progress(part.stop)
     whole = {name: np.concatenate(parts) for name, parts in columns.items()}
-    return whole | payload_columns(m.load, m.time)
+    return whole | payload_columns(m.robot, m.load, m.time)

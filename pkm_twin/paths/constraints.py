@@ -17,10 +17,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from delta_dynamics import inverse_dynamics
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError, check_limit
-from pkm_twin.paths.joint_path import JointPath, place_at
+from pkm_twin.paths.joint_path import Index, JointPath, place_at
 from pkm_twin.robot.robot import Robot
 
 NOTHING: Final = 1e-12
@@ -113,25 +112,28 @@ class Forces:
 
     @classmethod
     def of(
-        cls, robot: Robot, q: Array, first: Array, second: Array, wrench: Array | None = None
-    ) -> Forces:
+        cls, part: JointPath, points: Index, q: Array, first: Array, second: Array,
+        wrench: Array | None = None,
+    ) -> Forces:  # fmt: skip
         """From the inverse dynamics at joint positions with derivatives by s, (p, n) each.
 
+        :param points: of the stretch, whose payloads are carried, (p,).
         :param wrench: on the platform all the time, (6,); None: no wrench.
         :raises ParameterError: friction of a law that these five do not describe.
         """
-        if robot.laws:
+        if part.curve.robot.laws:
             raise ParameterError(
                 "friction",
-                robot.laws[0],
+                part.curve.robot.laws[0],
                 "only viscous, coulomb and offset friction for a fastest motion",
             )
         zero = np.zeros_like(q)
         rates = (zero, zero, first, -first, 2.0 * first)
         changes = (zero, first, second, second, 4.0 * second)
-        efforts = inverse_dynamics(
-            robot, np.tile(q, (5, 1)), np.concatenate(rates), np.concatenate(changes), wrench
-        )
+        efforts = part.efforts(
+            np.tile(points, 5), np.tile(q, (5, 1)), np.concatenate(rates),
+            np.concatenate(changes), wrench,
+        )  # fmt: skip
         g, a, ahead, back, twice = efforts.reshape(5, *q.shape)
         b = 0.5 * (ahead + back) - g
         odd = 0.5 * (ahead - back)
@@ -233,7 +235,7 @@ def shares(
     return np.concatenate([*parts, (np.asarray(speed) / limits.speed)[:, None]], 1)
 
 
-def check_rest(robot: Robot, part: JointPath, rows: Rows, limits: Limits) -> None:
+def check_rest(part: JointPath, rows: Rows, limits: Limits) -> None:
     """Reject a path on which the drives cannot hold the machine or creep.
 
     :raises ParameterError: by the place and joint.
@@ -242,6 +244,7 @@ def check_rest(robot: Robot, part: JointPath, rows: Rows, limits: Limits) -> Non
     if not size.size or (size < 1.0).all():
         return
     row, column = np.unravel_index(int(size.argmax()), size.shape)
+    robot = part.curve.robot
     where = place_at(robot, part.q[row], part.curve.begin + float(part.s[row]))
     bounded = np.flatnonzero(np.isfinite(limits.effort))
     name = robot.joint_names[bounded[column]]

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any, Final
 
 import numpy as np
@@ -11,11 +12,12 @@ from numpy.typing import ArrayLike
 
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError, UnknownNameError
+from pkm_twin.paths.carrying import carry
 from pkm_twin.paths.constraints import Forces, Limits, Rows, check_rest
 from pkm_twin.paths.geometry import Path, through
 from pkm_twin.paths.jerk import PROGRAMS, smooth_profile, smooth_run
 from pkm_twin.paths.joint_path import JointPath, Slowdown, joint_paths
-from pkm_twin.paths.laws import LAWS, Law, quintic, shortest
+from pkm_twin.paths.laws import LAWS, quintic, shortest
 from pkm_twin.paths.motion import Run, Timed, TimedPath, needs_forces, run_peaks
 from pkm_twin.paths.profile import fastest_profile
 from pkm_twin.robot.robot import Robot
@@ -65,6 +67,7 @@ def fastest(
     wrench: ArrayLike | None = None,
     points: int = POINTS,
     slowdown: Slowdown | None = None,
+    payload: Sequence[float | None] | None = None,
 ) -> TimedPath:
     """The shortest motion along a path, at rest at its ends, by the exact inverse dynamics.
 
@@ -86,26 +89,21 @@ def fastest(
     :param points: of the path, about; with a limit of jerk at most :data:`JERK_POINTS`.
     :param slowdown: divides ``speed`` at points of the path, by their joint positions (p, n) and
         the direction (p, 3) of the reference point, base axes: returns 1 or more, (p,).
+    :param payload: by waypoint, kg, from the moment on that it is reached: (waypoints,), None where
+        the robot's own is. Of ``lines``, a waypoint with a rounded corner is reached in its middle,
+        and one that is repeated after the rests of those before it. A cycle has 4 waypoints, with
+        the way back 7; a circle has its two ends. Default: the robot's throughout.
     :returns: the motion: ``.times``, ``.q``, ``.qd``, ``.qdd``, ``.effort`` and ``.pose`` at its
         points, the same of ``.uniform(rate)`` and ``.sample(times)``; ``.bounds``, which limit
         binds when; ``.duration``, s.
     :raises ParameterError: with the position: a pose out of reach, beyond a joint's limit or close
         to a singularity, or a drive that cannot hold the machine; or no limit bounds the speed.
     """
-    made = path if isinstance(path, Path) else through(robot, path)
-    limits = Limits.of(
-        robot, effort=effort, velocity=velocity, acceleration=acceleration, jerk=jerk,
-        speed=speed, share=share,
+    return timed(
+        robot, path, "fastest", effort=effort, velocity=velocity, acceleration=acceleration,
+        jerk=jerk, speed=speed, share=share, singularity=singularity, wrench=wrench, points=points,
+        slowdown=slowdown, payload=payload,
     )  # fmt: skip
-    limits.check()
-    load = None if wrench is None else np.asarray(wrench, float)
-    plan = _run
-    if np.isfinite(limits.jerk).any():
-        plan, points = _smooth, min(points, JERK_POINTS)
-    parts = joint_paths(robot, made, points, singularity, slowdown)
-    runs = [plan(robot, part, limits, load) for part in parts]
-    rests = (made.wait, *(stretch.dwell for stretch in made.stretches))
-    return TimedPath(robot, made, limits, tuple(runs), rests, "fastest", load)
 
 
 def timed(
@@ -117,6 +115,8 @@ def timed(
     singularity: float = SINGULARITY,
     wrench: ArrayLike | None = None,
     points: int = POINTS,
+    slowdown: Slowdown | None = None,
+    payload: Sequence[float | None] | None = None,
     **bounds: Any,
 ) -> TimedPath:
     """A motion along a path by a law, with a given duration or the shortest within the limits.
@@ -129,18 +129,25 @@ def timed(
     if law not in ("fastest", *LAWS):
         raise UnknownNameError("law", law, ("fastest", *LAWS))
     made = path if isinstance(path, Path) else through(robot, path)
-    shared: dict[str, Any] = {"singularity": singularity, "wrench": wrench, "points": points}
-    if law == "fastest":
-        result = fastest(robot, made, **shared, **bounds)
-    else:
-        limits = Limits.of(robot, **bounds)
-        if duration is None:
-            limits.check()
-        load = None if wrench is None else np.asarray(wrench, float)
-        parts = joint_paths(robot, made, points, singularity)
-        runs = tuple(_lawful(robot, part, LAWS[law], limits, load) for part in parts)
-        rests = (made.wait, *(stretch.dwell for stretch in made.stretches))
-        result = TimedPath(robot, made, limits, runs, rests, law, load)
+    made, carried = carry(robot, made, payload)
+    robot = carried[0].robot
+    limits = Limits.of(robot, **bounds)
+    if law == "fastest" or duration is None:
+        limits.check()
+    load = None if wrench is None else np.asarray(wrench, float)
+    jerks = law == "fastest" and np.isfinite(limits.jerk).any()
+    points = min(points, JERK_POINTS) if jerks else points
+
+    def plan(part: JointPath) -> Timed:
+        if law == "fastest":
+            return (_smooth if jerks else _run)(part, limits, load)
+        runs = (shortest(part, one, limits, load) for one in LAWS[law])
+        return kept(min(runs, key=lambda run: run.duration), limits, load)
+
+    parts = joint_paths(made, carried, points, singularity, slowdown)
+    rests = (made.wait, *(stretch.dwell for stretch in made.stretches))
+    result = TimedPath(robot, made, limits, tuple(map(plan, parts)), rests, law, carried, load)
+    result.check_rests()
     if duration is None:
         return result
     moving = sum(run.duration for run in result.runs)
@@ -148,8 +155,7 @@ def timed(
     if not (np.isfinite(duration) and duration >= least * (1.0 - 1e-9)):
         raise ParameterError("duration", duration, f"{least:.6g} s or more, within the limits")
     factor = (duration - sum(result.rests)) / moving
-    slower = tuple(run.slower(factor) for run in result.runs)
-    result = TimedPath(robot, made, result.limits, slower, result.rests, law, result.wrench)
+    result = replace(result, runs=tuple(run.slower(factor) for run in result.runs))
     over = max(result.worst.values(), default=0.0)
     if over > 1.0 + KEPT:
         # Speed can carry a load that the drives alone do not hold.
@@ -157,19 +163,19 @@ def timed(
     return result
 
 
-def _run(robot: Robot, part: JointPath, limits: Limits, wrench: Array | None) -> Timed:
+def _run(part: JointPath, limits: Limits, wrench: Array | None) -> Timed:
     """One stretch, its limits kept between the points too.
 
     Intervals within which a limit is passed are divided, and at last use less of the limits.
     """
     share = np.ones(len(part.left))
-    rows = _rows(robot, part, limits, wrench)
+    rows = _rows(part, limits, wrench)
     x: Array | None = None
     for count in range(DIVISIONS + ROUNDS):
         x = fastest_profile(rows, part.left, part.steps, share, x)
         run = Run(part, x)
         _check_moves(run)
-        used = run_peaks(robot, run, limits, wrench)
+        used = run_peaks(run, limits, wrench)
         over = used.max(1)
         bad = over > 1.0 + SMALL
         if not bad.any():
@@ -185,20 +191,20 @@ def _run(robot: Robot, part: JointPath, limits: Limits, wrench: Array | None) ->
         share[tight] /= over[tight]
         if (parts > 1).any():
             ends, part, share = part.ends, part.refined(parts), np.repeat(share, parts)
-            rows = _rows(robot, part, limits, wrench)
+            rows = _rows(part, limits, wrench)
             x = np.interp(part.ends, ends, x)
-    return kept(robot, run, limits, wrench, used.max(0))
+    return kept(run, limits, wrench, used.max(0))
 
 
-def _smooth(robot: Robot, part: JointPath, limits: Limits, wrench: Array | None) -> Timed:
+def _smooth(part: JointPath, limits: Limits, wrench: Array | None) -> Timed:
     """The same with limits of jerk: the best of several profiles, or a quintic."""
-    rows = _rows(robot, part, limits, wrench)
-    slow = shortest(robot, part, quintic, limits, wrench)
+    rows = _rows(part, limits, wrench)
+    slow = shortest(part, quintic, limits, wrench)
     best: Timed = slow
-    least = needed(run_peaks(robot, slow, limits, wrench).max(0)) * slow.duration
+    least = needed(run_peaks(slow, limits, wrench).max(0)) * slow.duration
     x = slow.profile() * (1.0 - KEPT)
     share, jerks = np.ones((2, len(part.left)))
-    n = robot.joints_count
+    n = len(limits.jerk)
     programs, improved = PROGRAMS, 0
     for count in range(JERK_DIVISIONS + ROUNDS):
         found = smooth_profile(part, rows, limits, x, share, jerks, programs)
@@ -208,7 +214,7 @@ def _smooth(robot: Robot, part: JointPath, limits: Limits, wrench: Array | None)
         run = smooth_run(part, x)
         if run is None:
             break
-        used = run_peaks(robot, run, limits, wrench)
+        used = run_peaks(run, limits, wrench)
         factor = needed(used.max(0))
         if factor * run.duration < (1.0 - COARSE) * least:
             improved = count
@@ -235,27 +241,20 @@ def _smooth(robot: Robot, part: JointPath, limits: Limits, wrench: Array | None)
         programs = PROGRAMS if divided else 1
         if divided:
             ends, part = part.ends, part.refined(parts)
-            rows = _rows(robot, part, limits, wrench)
+            rows = _rows(part, limits, wrench)
             x = np.interp(part.ends, ends, x**0.75) ** (4 / 3)
-    return kept(robot, best, limits, wrench)
+    return kept(best, limits, wrench)
 
 
-def _rows(robot: Robot, part: JointPath, limits: Limits, wrench: Array | None) -> Rows:
+def _rows(part: JointPath, limits: Limits, wrench: Array | None) -> Rows:
     """The limits at the points of a stretch, smaller by :data:`KEPT`."""
     forces = None
-    if needs_forces(robot, limits):
-        forces = Forces.of(robot, part.q, part.first, part.second, wrench)
+    if needs_forces(part, limits):
+        points = np.arange(len(part.s))
+        forces = Forces.of(part, points, part.q, part.first, part.second, wrench)
     rows = Rows.of(part, forces, limits.part(1.0 - KEPT))
-    check_rest(robot, part, rows, limits)
+    check_rest(part, rows, limits)
     return rows
-
-
-def _lawful(
-    robot: Robot, part: JointPath, laws: Sequence[Law], limits: Limits, wrench: Array | None
-) -> Timed:
-    """One stretch by the fastest of some laws."""
-    runs = (shortest(robot, part, law, limits, wrench) for law in laws)
-    return kept(robot, min(runs, key=lambda run: run.duration), limits, wrench)
 
 
 def _check_moves(run: Run) -> None:
@@ -279,9 +278,7 @@ def needed(used: Array) -> float:
     return float((used ** (1.0 / powers)).max())
 
 
-def kept(
-    robot: Robot, run: Timed, limits: Limits, wrench: Array | None, used: Array | None = None
-) -> Timed:
+def kept(run: Timed, limits: Limits, wrench: Array | None, used: Array | None = None) -> Timed:
     """A run, slower by as much as its limits need.
 
     :param used: greatest used part of each limit, where it is known, shape (4 n + 1,).
@@ -291,7 +288,7 @@ def kept(
     for more in LITTLE * 4.0 ** np.arange(SLOWER):
         slower = run if factor == 1.0 else run.slower(factor)
         if used is None:
-            used = run_peaks(robot, slower, limits, wrench).max(0)
+            used = run_peaks(slower, limits, wrench).max(0)
         if used.max() <= 1.0:
             return slower
         factor *= max(needed(used), 1.0) + more

@@ -9,8 +9,8 @@ radius, see :func:`scales_of`.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
-from typing import Final, Literal
+from dataclasses import dataclass, replace
+from typing import Final, Literal, NamedTuple
 
 import numpy as np
 import scipy  # type: ignore[import-untyped]  # its parts come when they are asked for
@@ -41,18 +41,31 @@ class Stretch:
     @property
     def length(self) -> float:
         """Range of s."""
-        return sum(piece.length for piece in self.pieces)
+        return _length(self.pieces)
+
+
+class Mark(NamedTuple):
+    """A place of a path: on a stretch (-1: the rest before the first) the way to it, m, and how
+    long the machine has then rested there, s.
+    """
+
+    stretch: int
+    way: float
+    rest: float = 0.0
 
 
 @dataclass(frozen=True)
 class Path:
-    """Stretches in pose or joint coordinates; ``wait`` is the rest before the first, s."""
+    """Stretches in pose or joint coordinates; ``wait`` is the rest before the first, s.
+
+    ``marks``: where each waypoint is; one whose corner is rounded is in the middle of the rounding.
+    """
 
     space: Space
     stretches: tuple[Stretch, ...]
     wait: float = 0.0
     kind: str = "path"
-    notes: tuple[str, ...] = field(default=())
+    marks: tuple[Mark, ...] = ()
 
     @property
     def length(self) -> float:
@@ -101,7 +114,8 @@ def through(robot: Robot, points: ArrayLike, *, space: Space = "pose") -> Path:
         piece: Piece = Line(values[0], (values[1] - values[0]) / knots[1], float(knots[1]))
     else:
         piece = Smooth(scipy.interpolate.CubicSpline(knots, values))
-    return Path(space, (Stretch((piece,)),), kind="smooth curve")
+    marks = tuple(Mark(0 if k else -1, float(knots[k])) for k in np.cumsum(new) - 1)
+    return Path(space, (Stretch((piece,)),), kind="smooth curve", marks=marks)
 
 
 def lines(
@@ -134,13 +148,16 @@ def lines(
             row = int(bad.argmax())
             raise ParameterError(f"waypoint {row}: {name}", numbers[row], "0 or more")
     # A waypoint that is repeated only adds its rest.
+    rested = np.zeros(count)
     for k in np.flatnonzero(np.logical_not(new)):
+        rested[k] = dwells[k - 1]
         dwells[k] += dwells[k - 1]
         keep = int(np.flatnonzero(new[:k])[-1])
         dwells[keep], arcs[keep] = dwells[k], arcs[keep] and arcs[k]
     values, blends, dwells, arcs = (v[new] for v in (values, blends, dwells, arcs))
-    builder = _Lines(robot, space, values, blends, dwells, arcs)
-    return builder.path()
+    made = _Lines(robot, space, values, blends, dwells, arcs).path()
+    places = zip(np.cumsum(new) - 1, rested.tolist(), strict=True)
+    return replace(made, marks=tuple(made.marks[k]._replace(rest=rest) for k, rest in places))
 
 
 class _Lines:
@@ -158,28 +175,28 @@ class _Lines:
         moves = list(self._moves())
         pieces: list[Piece] = []
         stretches: list[Stretch] = []
+        marks = [Mark(-1, 0.0)]
         last = len(moves) - 1
         cut = 0.0
         for k, (piece, end) in enumerate(moves):
-            if k == last:
-                pieces += _shortened(piece, cut, 0.0)
-                stretches.append(Stretch(tuple(pieces), float(self.dwells[end])))
-                break
-            following = moves[k + 1][0]
-            out, into = _end(piece), following.at(np.zeros(1))[1][0]
-            radius = self._radius(end, piece, following)
+            following = moves[k + 1][0] if k < last else None
+            radius = 0.0 if following is None else self._radius(end, piece, following)
+            if isinstance(piece, Arc):
+                middle = _length(pieces) + piece.to(self.points[end - 1])
+                marks.append(Mark(len(stretches), middle))
+            pieces += _shortened(piece, cut, radius)
+            marks.append(Mark(len(stretches), _length(pieces) + radius))
+            cut = radius
+            out = _end(piece)
+            into = out if following is None else following.at(np.zeros(1))[1][0]
             if radius > 0.0:
-                pieces += _shortened(piece, cut, radius)
                 pieces.append(Corner(self.points[end], out, into, radius))
-                cut = radius
                 continue
-            pieces += _shortened(piece, cut, 0.0)
-            cut = 0.0
             apart = float(np.linalg.norm((out - into) * self.scales))
-            if apart > TANGENT or self.dwells[end] > 0.0:
+            if k == last or apart > TANGENT or self.dwells[end] > 0.0:
                 stretches.append(Stretch(tuple(pieces), float(self.dwells[end])))
                 pieces = []
-        return Path(self.space, tuple(stretches), float(self.dwells[0]), "lines")
+        return Path(self.space, tuple(stretches), float(self.dwells[0]), "lines", tuple(marks))
 
     def _moves(self) -> Sequence[tuple[Piece, int]]:
         """Each line or arc, and the waypoint that it ends in."""
@@ -229,6 +246,10 @@ class _Lines:
         return arc_through(*self.points[k : k + 3], places=places, where=f"waypoint {k + 1}")
 
 
+def _length(pieces: Sequence[Piece]) -> float:
+    return sum(piece.length for piece in pieces)
+
+
 def _end(piece: Piece) -> Array:
     return np.asarray(piece.at(np.array([piece.length]))[1][0], np.float64)
 
@@ -261,7 +282,8 @@ def circle(robot: Robot, centre: ArrayLike, radius: float, *, turns: float = 1.0
     across[places[0]], along[places[1]] = 1.0, float(np.sign(turns))
     angle = 2 * np.pi * abs(turns)
     piece = Arc(middle, across, along, np.zeros(len(middle)), float(radius), angle)
-    return Path("pose", (Stretch((piece,)),), kind="circle")
+    marks = (Mark(-1, 0.0), Mark(0, piece.length))
+    return Path("pose", (Stretch((piece,)),), kind="circle", marks=marks)
 
 
 def cycle(
@@ -312,4 +334,4 @@ def cycle(
     rounded = [0.0, corner, corner, 0.0] + ([corner, corner, 0.0] if back else [])
     rests = [0.0, 0.0, 0.0, dwell] + ([0.0, 0.0, dwell] if back else [])
     made = lines(robot, points, blend=rounded, dwell=rests)
-    return Path(made.space, made.stretches, made.wait, "pick-and-place cycle")
+    return replace(made, kind="pick-and-place cycle")

@@ -66,7 +66,12 @@ class SmoothRun:
 
     @cached_property
     def times(self) -> Array:
-        """Times at which the jerk along the path or a derivative of the path jumps, (i + 1,), s."""
+        """Times at which the jerk along the path or a derivative of the path jumps, rising, s."""
+        return np.unique(np.concatenate([self.knots, self.ends]))
+
+    @cached_property
+    def ends(self) -> Array:
+        """Times of the intervals' ends, shape (i + 1,), s."""
         way = self.part.ends[1:-1]
         k = np.clip(np.searchsorted(self.way, way, side="right") - 1, 0, len(self.knots) - 2)
         low, high = self.knots[k], self.knots[k + 1]
@@ -74,7 +79,7 @@ class SmoothRun:
             middle = 0.5 * (low + high)
             before = self._moved(k, middle)[0] < way
             low, high = np.where(before, middle, low), np.where(before, high, middle)
-        return np.unique(np.concatenate([self.knots, high]))
+        return np.concatenate([self.knots[:1], high, self.knots[-1:]])
 
     def _moved(self, k: Index, time: Array) -> tuple[Array, Array, Array]:
         """Way, v and u at times after knots k."""

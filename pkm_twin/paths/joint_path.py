@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Final
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError, SingularityError, UnreachableError
+from pkm_twin.paths.carrying import Carried, efforts_of, robots_on
 from pkm_twin.paths.geometry import Path, Stretch
 from pkm_twin.robot.derivatives import joint_rates
 from pkm_twin.robot.robot import Robot
@@ -36,7 +37,8 @@ Slowdown = Callable[[Array, Array], Array]
 class Curve:
     """A stretch of a path of a robot, of which any points can be computed.
 
-    ``begin``: way up to the stretch, m. ``singularity``: least singularity index on it, 0 to 1.
+    ``robots``: with the payload of each piece. ``begin``: way up to the stretch, m.
+    ``singularity``: least singularity index on it, 0 to 1.
     """
 
     robot: Robot
@@ -44,6 +46,7 @@ class Curve:
     stretch: Stretch
     begin: float
     singularity: float
+    robots: tuple[Robot, ...]
     slowdown: Slowdown | None = None
 
     @property
@@ -122,6 +125,21 @@ class JointPath:
     def ends(self) -> Array:
         """The intervals' ends, shape (intervals + 1,), m."""
         return np.append(self.s[self.left], self.s[-1])
+
+    def first_of(self, piece: int) -> int:
+        """The first interval of a piece; their count where there is none."""
+        return sum(len(own) - 1 for own in self.grid[:piece])
+
+    @cached_property
+    def piece(self) -> Index:
+        """Which piece each point is of, shape (p,)."""
+        return np.repeat(np.arange(len(self.grid)), [len(own) for own in self.grid])
+
+    def efforts(
+        self, points: Index, q: Array, qd: Array, qdd: Array, wrench: Array | None
+    ) -> Array:
+        """Efforts with the payloads of the pieces that points (k,) are of, shape (k, n)."""
+        return efforts_of(self.curve.robots, self.piece[points], q, qd, qdd, wrench)
 
     @cached_property
     def _quintics(self) -> Array:
@@ -288,17 +306,20 @@ def check_positions(robot: Robot, s: Array, q: Array, begin: float, singularity:
 
 
 def joint_paths(
-    robot: Robot, path: Path, points: int, singularity: float, slowdown: Slowdown | None = None
-) -> list[JointPath]:
+    path: Path, carried: Sequence[Carried], points: int, singularity: float,
+    slowdown: Slowdown | None = None,
+) -> list[JointPath]:  # fmt: skip
     """All stretches of a path, checked; ``points`` shared by their lengths.
 
+    :param carried: by :func:`~pkm_twin.paths.carrying.carry`.
     :raises ParameterError: a place beyond a limit or too close to a singularity.
     """
     result = []
-    begin = 0.0
-    for stretch in path.stretches:
+    begin, robot = 0.0, carried[0].robot
+    for k, stretch in enumerate(path.stretches):
         share = max(2 * LEAST_POINTS, round(points * stretch.length / path.length))
-        curve = Curve(robot, path, stretch, begin, singularity, slowdown)
+        robots = robots_on(carried, k, len(stretch.pieces))
+        curve = Curve(robot, path, stretch, begin, singularity, robots, slowdown)
         try:
             result.append(curve.at(curve.grid(share)))
         except (UnreachableError, SingularityError) as error:

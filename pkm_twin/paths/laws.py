@@ -16,7 +16,6 @@ from pkm_twin.errors import ParameterError
 from pkm_twin.paths.constraints import Forces, Limits
 from pkm_twin.paths.joint_path import JointPath
 from pkm_twin.paths.motion import moving, needs_forces
-from pkm_twin.robot.robot import Robot
 
 Index = NDArray[np.int64]
 Law = Callable[[Array], tuple[Array, Array, Array]]
@@ -81,7 +80,7 @@ class LawRun:
     duration: float
 
     @cached_property
-    def times(self) -> Array:
+    def ends(self) -> Array:
         """Times of the intervals' ends, shape (i + 1,), s."""
         way = self.part.ends / self.part.ends[-1]
         low, high = np.zeros(len(way)), np.ones(len(way))
@@ -91,6 +90,11 @@ class LawRun:
             low, high = np.where(before, middle, low), np.where(before, high, middle)
         high[0], high[-1] = 0.0, 1.0
         return self.duration * high
+
+    @property
+    def times(self) -> Array:
+        """The same."""
+        return self.ends
 
     def profile(self) -> Array:
         """v^2 at the intervals' ends, shape (i + 1,)."""
@@ -111,24 +115,22 @@ class LawRun:
         return k, part, length * rate / self.duration, length * change / self.duration**2
 
 
-def shortest(
-    robot: Robot, part: JointPath, law: Law, limits: Limits, wrench: Array | None
-) -> LawRun:
+def shortest(part: JointPath, law: Law, limits: Limits, wrench: Array | None) -> LawRun:
     """A stretch by a law, the shortest within the limits at as many times as it has points."""
     run = LawRun(part, law, 1.0)
     time = np.linspace(0.0, 1.0, len(part.ends))
     interval, share, v, u = run.at(time)
     _, qd, qdd = part.motion(interval, share, v, u)
     jerk = np.gradient(qdd, time, axis=0)
-    travel = moving(robot, run, time)[4]
+    travel = moving(run, time).felt
     duration = max(
         float((np.abs(qd) / limits.velocity).max()),
         float((travel / limits.speed).max()),
         float((np.abs(qdd) / limits.acceleration).max()) ** (1 / 2),
         float((np.abs(jerk) / limits.jerk).max()) ** (1 / 3),
     )
-    if needs_forces(robot, limits):
-        forces = Forces.of(robot, *part.between(interval, share), wrench)
+    if needs_forces(part, limits):
+        forces = Forces.of(part, part.left[interval], *part.between(interval, share), wrench)
         square = forces.a * u[:, None] + forces.b * (v**2)[:, None]
         linear, fixed = forces.w * v[:, None], forces.g + forces.k
         for sign in (1.0, -1.0):
@@ -136,7 +138,7 @@ def shortest(
             if (rest <= 0.0).any():
                 row, column = np.argwhere(rest <= 0.0)[0]
                 raise ParameterError(
-                    f"path: effort of {robot.joint_names[column]} at rest",
+                    f"path: effort of {part.curve.robot.joint_names[column]} at rest",
                     float(fixed[row, column]), f"below {limits.effort[column]:g}",
                 )  # fmt: skip
             # square y^2 + linear y <= rest, y = 1 / duration.

@@ -7,17 +7,18 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
-from typing import Any, Final, Protocol
+from typing import Any, Final, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from delta_dynamics import inverse_dynamics
 from pkm_twin.codegen.arrays import Array, Mask
 from pkm_twin.errors import ParameterError
+from pkm_twin.paths.carrying import Carried, efforts_of
 from pkm_twin.paths.constraints import Limits, names_of, shares
 from pkm_twin.paths.geometry import Path
 from pkm_twin.paths.joint_path import JointPath, velocity_of
+from pkm_twin.recordings.payload import Load
 from pkm_twin.robot.robot import Robot
 
 Index = NDArray[np.int64]
@@ -69,6 +70,10 @@ class Timed(Protocol):
         """From 0 to its duration, s; between two neighbours the motion is smooth."""
 
     @property
+    def ends(self) -> Array:
+        """Times of the intervals' ends, among ``times``, (i + 1,), s."""
+
+    @property
     def duration(self) -> float:
         """From rest to rest, s."""
 
@@ -98,9 +103,14 @@ class Run:
         return np.asarray(np.diff(self.x) / (2.0 * self.part.steps), np.float64)
 
     @cached_property
-    def times(self) -> Array:
+    def ends(self) -> Array:
         """Times of the intervals' ends, shape (i + 1,), s."""
         return np.concatenate([[0.0], np.cumsum(self.steps)])
+
+    @property
+    def times(self) -> Array:
+        """The same."""
+        return self.ends
 
     @property
     def duration(self) -> float:
@@ -126,8 +136,8 @@ class Run:
 class TimedPath:
     """A motion along a path: runs from rest to rest, with the rests before and between (s).
 
-    ``limits``: those of the plan. ``singularity``: least singularity index on the path.
-    ``limited`` (stretches): how the limits bind. ``law``: how its speed was chosen.
+    ``robot``: with the payload that it begins with. ``limits``: those of the plan. ``law``: how its
+    speed was chosen. ``carried``: payloads, the first from the beginning on.
     """
 
     robot: Robot
@@ -136,12 +146,13 @@ class TimedPath:
     runs: tuple[Timed, ...]
     rests: tuple[float, ...]
     law: str
+    carried: tuple[Carried, ...]
     wrench: Array | None = None
 
     @property
     def duration(self) -> float:
         """From the first to the last moment, s."""
-        return sum(run.duration for run in self.runs) + sum(self.rests)
+        return self.begins[-1] + self.runs[-1].duration + self.rests[-1]
 
     @cached_property
     def begins(self) -> list[float]:
@@ -152,6 +163,37 @@ class TimedPath:
             result.append(clock)
             clock += run.duration
         return result
+
+    @cached_property
+    def switches(self) -> Array:
+        """Times from which on the payload is another, shape (changes,), s."""
+        result = []
+        for change in self.carried[1:]:
+            clock = change.rest
+            if change.stretch >= 0:
+                run = self.runs[change.stretch]
+                passed = float(run.ends[run.part.first_of(change.piece)])
+                clock = self.begins[change.stretch] + passed + change.rest
+            result.append(clock)
+        return np.array(result)
+
+    @property
+    def load(self) -> Load | None:
+        """The payloads of the path's waypoints over time; None: throughout that of the robot."""
+        edges = [0.0, *self.switches.tolist(), np.inf]
+        spans = [
+            (begin, end, change.mass)
+            for (begin, end), change in zip(pairwise(edges), self.carried, strict=True)
+            if change.mass is not None and end > begin
+        ]
+        return Load.of(spans, "path") if spans else None
+
+    def _efforts(self, t: Array, q: Array, qd: Array, qdd: Array) -> Array | None:
+        """At times (k,), with the payload then; None for a robot without masses."""
+        if not self.robot.has_masses:
+            return None
+        which = np.searchsorted(self.switches, t, side="right")
+        return efforts_of([one.robot for one in self.carried], which, q, qd, qdd, self.wrench)
 
     @cached_property
     def _points(self) -> Array:
@@ -174,12 +216,9 @@ class TimedPath:
             if len(mine):
                 # At its end the machine rests; at its beginning it has its friction already.
                 moves = (t[mine] >= begin) & (t[mine] - begin < run.duration * (1.0 - 1e-12))
-                own = moving(robot, run, t[mine] - begin, moves)
-                q[mine], qd[mine], qdd[mine], travel[mine], felt[mine] = own
-        effort = None
-        if robot.has_masses:
-            effort = inverse_dynamics(robot, q, qd, qdd, self.wrench)
-        return Samples(t, q, qd, qdd, effort, robot.forward(q), travel, felt)
+                own = moving(run, t[mine] - begin, moves)
+                q[mine], qd[mine], qdd[mine], travel[mine], felt[mine] = own[:5]
+        return Samples(t, q, qd, qdd, self._efforts(t, q, qd, qdd), robot.forward(q), travel, felt)
 
     def uniform(self, rate: float) -> Samples:
         """The motion at ``rate`` samples a second; the last is its end, half to three halves of a
@@ -249,14 +288,35 @@ class TimedPath:
         """Which limit binds when, in order."""
         return merged(self.fine.time, binding(self.used), names_of(self.robot), self.used)
 
+    def check_rests(self) -> None:
+        """Reject payloads that the drives cannot hold where the machine rests.
+
+        :raises ParameterError: by the joint and time.
+        """
+        times, used = self._held
+        row, column = np.unravel_index(int(used.argmax()), used.shape)
+        if used[row, column] > 1.0 and len(self.carried) > 1:
+            raise ParameterError(
+                f"path: {names_of(self.robot)[column]} at rest at {times[row]:.4g} s",
+                f"{100 * used[row, column]:.4g} % of its limit",
+                "a payload that the drives can hold there",
+            )  # fmt: skip
+
+    @property
+    def _held(self) -> tuple[Array, Array]:
+        """Times of rests, (k,), and the used part of each limit there, shape (k, 4 n + 1)."""
+        times = np.concatenate([np.nextafter(self.begins, -1.0), self.switches, [self.duration]])
+        rests = self.sample(times)
+        zero = np.zeros_like(rests.q)
+        resting = np.abs(rests.qd).max(1) == 0.0
+        used = np.abs(shares(self.limits, rests.effort, zero, zero, zero, rests.felt))
+        return times[resting], used[resting]
+
     @cached_property
     def _peaks(self) -> Array:
         """Greatest used part of each limit at all times, shape (4 n + 1,)."""
-        moved = [run_peaks(self.robot, run, self.limits, self.wrench).max(0) for run in self.runs]
-        rests = self.sample(np.append(np.nextafter(self.begins, -1.0), self.duration))
-        zero = np.zeros_like(rests.q)
-        held = shares(self.limits, rests.effort, zero, zero, zero, rests.felt)
-        return np.asarray(np.abs(np.concatenate([held, moved])).max(0), np.float64)
+        moved = [run_peaks(run, self.limits, self.wrench).max(0) for run in self.runs]
+        return np.asarray(np.concatenate([self._held[1], moved]).max(0), np.float64)
 
     @property
     def worst(self) -> dict[str, float]:
@@ -286,10 +346,21 @@ class Samples:
     felt: Array
 
 
-def moving(
-    robot: Robot, run: Timed, time: Array, moves: Mask | bool = True, tool: bool = True
-) -> tuple[Array, ...]:
-    """A run at times (k,): q, qd, qdd, the reference point's speed, and what its limit is for.
+class Moving(NamedTuple):
+    """A run at times: q, qd, qdd (k, n); the reference point's speed and what its limit is for,
+    (k,); the interval, (k,).
+    """
+
+    q: Array
+    qd: Array
+    qdd: Array
+    speed: Array
+    felt: Array
+    interval: Index
+
+
+def moving(run: Timed, time: Array, moves: Mask | bool = True, tool: bool = True) -> Moving:
+    """A run at times (k,).
 
     :param moves: at which times the machine moves; it rests at the others.
     :param tool: whether the speeds are asked for; otherwise they are zero.
@@ -298,8 +369,9 @@ def moving(
     creep = CREEP * run.part.ends[-1] / run.duration
     v, u = np.where(moves, np.maximum(v, creep), 0.0), np.where(moves, u, 0.0)
     q, qd, qdd = run.part.motion(interval, part, v, u)
+    robot = run.part.curve.robot
     speed = np.linalg.norm(velocity_of(robot, q, qd), axis=1) if tool else np.zeros(len(q))
-    return q, qd, qdd, speed, speed * run.part.slowed(interval, part)
+    return Moving(q, qd, qdd, speed, speed * run.part.slowed(interval, part), interval)
 
 
 Moments = tuple[Array | None, Array, Array, Array]
@@ -339,13 +411,15 @@ def peaks(limits: Limits, times: Array, sample: Callable[[Array], Moments]) -> A
     return result
 
 
-def run_peaks(robot: Robot, run: Timed, limits: Limits, wrench: Array | None) -> Array:
+def run_peaks(run: Timed, limits: Limits, wrench: Array | None) -> Array:
     """Greatest used part of each limit between neighbouring times of a run, (i, 4 n + 1)."""
-    needs = needs_forces(robot, limits)
+    part = run.part
+    needs = needs_forces(part, limits)
 
     def sample(time: Array) -> Moments:
-        q, qd, qdd, _, felt = moving(robot, run, time, tool=np.isfinite(limits.speed))
-        return inverse_dynamics(robot, q, qd, qdd, wrench) if needs else None, qd, qdd, felt
+        q, qd, qdd, _, felt, interval = moving(run, time, tool=np.isfinite(limits.speed))
+        effort = part.efforts(part.left[interval], q, qd, qdd, wrench) if needs else None
+        return effort, qd, qdd, felt
 
     return peaks(limits, run.times, sample)
 
@@ -394,12 +468,12 @@ def merged(time: Array, columns: list[int], names: list[str], used: Array) -> li
     ]  # fmt: skip
 
 
-def needs_forces(robot: Robot, limits: Limits) -> bool:
+def needs_forces(part: JointPath, limits: Limits) -> bool:
     """Whether efforts bound the motion.
 
     :raises ParameterError: they do, and the robot's file gives no masses.
     """
     if not np.isfinite(limits.effort).any():
         return False
-    robot.massive()
+    part.curve.robot.massive()
     return True

@@ -78,6 +78,30 @@ class Corner:
 
 
 @dataclass(frozen=True)
+class Cut:
+    """A part of another piece, from ``begin`` to ``end`` in its s."""
+
+    whole: Piece
+    begin: float
+    end: float
+
+    @property
+    def length(self) -> float:
+        """Range of s."""
+        return self.end - self.begin
+
+    @property
+    def knots(self) -> Array:
+        """Those of the whole that lie within."""
+        inner = (self.whole.knots > self.begin) & (self.whole.knots < self.end)
+        return np.asarray(self.whole.knots[inner] - self.begin)
+
+    def at(self, s: Array) -> tuple[Array, Array, Array]:
+        """See :class:`Piece`."""
+        return self.whole.at(self.begin + s)
+
+
+@dataclass(frozen=True)
 class Arc:
     """A circular arc of the position; the other coordinates change evenly along it.
 
@@ -97,6 +121,11 @@ class Arc:
     def length(self) -> float:
         """Range of s."""
         return self.radius * self.angle
+
+    def to(self, point: Array) -> float:
+        """S of a point of the arc."""
+        way = point - self.centre
+        return self.radius * float(np.arctan2(way @ self.along, way @ self.across) % (2 * np.pi))
 
     def at(self, s: Array) -> tuple[Array, Array, Array]:
         """See :class:`Piece`."""

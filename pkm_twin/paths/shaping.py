@@ -18,7 +18,6 @@ import numpy as np
 import scipy  # type: ignore[import-untyped]  # its parts come when they are asked for
 from numpy.typing import ArrayLike
 
-from delta_dynamics import inverse_dynamics
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError, UnknownNameError
 from pkm_twin.paths.joint_path import check_positions, velocity_of
@@ -131,9 +130,7 @@ class ShapedPath(TimedPath):
             change += amplitude * (own_change * (first**2)[:, None] + own_rate * second[:, None])
         q = robot.inverse(pose)
         qd, qdd = joint_rates(robot, q, rate, change)
-        effort = None
-        if robot.has_masses:
-            effort = inverse_dynamics(robot, q, qd, qdd, self.wrench)
+        effort = self._efforts(t, q, qd, qdd)
         speed = np.linalg.norm(velocity_of(robot, q, qd), axis=1)
         return Samples(t, q, qd, qdd, effort, pose, speed, speed)
 
@@ -159,6 +156,8 @@ def shaped(
     """
     if shaper not in DELAYS:
         raise UnknownNameError("shaper", shaper, tuple(DELAYS))
+    if len(motion.carried) > 1:
+        raise ParameterError("shaper", shaper, "one payload on the whole path")
     if not 0.0 <= damping < 1.0:
         raise ParameterError("damping", damping, "0 or above and below 1")
     root = float(np.sqrt(1.0 - damping**2))

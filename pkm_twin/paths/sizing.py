@@ -27,9 +27,12 @@ from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import FileError, ParameterError, UnknownNameError
 from pkm_twin.machine import schema
 from pkm_twin.machine.sections import DriveSpec
+from pkm_twin.recordings.payload import by_load
+from pkm_twin.recordings.recording import Recording
 from pkm_twin.robot.catalogue import config_folder
-from pkm_twin.robot.robot import Robot
 
+BLOCK: Final = 4096
+"""Samples computed at a time, so that memory stays flat."""
 LEAST: Final = 2
 """Samples of a motion."""
 SHIPPED: Final = "shipped"
@@ -289,26 +292,22 @@ class DriveDuty:
 
 
 def size_drives(
-    robot: Robot,
-    time: Array,
-    q: Array,
-    qd: Array,
-    qdd: Array,
-    effort: Array,
-    motors: Sequence[Motor] = (),
-    gear: Gear | None = None,
+    motion: Recording, effort: Array, motors: Sequence[Motor] = (), gear: Gear | None = None
 ) -> list[DriveDuty]:
     """What each drive must supply for a motion.
 
-    :param time: rising times (k,), s; q, qd, qdd and effort, shape (k, n).
+    :param motion: with rates and accelerations; ``effort``: the joints' efforts, shape (k, n).
     :param motors: candidates; each replaces the rotor of the robot's file.
     :param gear: of joints without a ``drive`` in the file; its ``rotor_inertia`` is behind it.
     :raises ParameterError: fewer than two samples; motors for a joint without a gear; a gear for a
         joint that has one, or of another type.
     """
+    robot, time, (q, qd, qdd, _) = motion.robot, motion.time, motion.motion
     if len(time) < LEAST:
         raise ParameterError("motion", f"{len(time)} samples", f"{LEAST} or more")
-    masses = np.diagonal(mass_matrix(robot, q), axis1=-2, axis2=-1)
+    loaded = by_load(robot, motion.load, time, BLOCK)
+    inertias = [mass_matrix(one, q[rows]) for one, rows in loaded]
+    masses = np.diagonal(np.concatenate(inertias), axis1=-2, axis2=-1)
     graph = robot.graph
     result = []
     for i, (joint, drive) in enumerate(zip(robot.joint_names, robot.drives, strict=True)):

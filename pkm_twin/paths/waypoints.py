@@ -3,20 +3,23 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Sequence
 from pathlib import Path as File
 from typing import Final
 
 import numpy as np
 
-from pkm_twin.errors import ParameterError, UnknownNameError, warn
+from pkm_twin.errors import ParameterError, UnknownNameError
+from pkm_twin.files import parse_numbers
 from pkm_twin.paths.geometry import Path, Space, lines, through
-from pkm_twin.recordings.payload import Load
 from pkm_twin.recordings.tables import (
     EFFORTS,
     PAYLOAD,
     PLAIN,
     WRENCH,
     Dialect,
+    Table,
     kinds_of,
     read_table,
 )
@@ -27,14 +30,19 @@ OPTIONS: Final = ("blend", "dwell", "arc")
 
 
 def read_waypoints(
-    file: File, robot: Robot, blend: float | None, carried: Load | None = None,
+    file: File,
+    robot: Robot,
+    blend: float | None,
     dialect: Dialect = PLAIN,
-) -> Path:  # fmt: skip
+    *,
+    carried: bool = False,
+) -> tuple[Path, list[float] | None]:
     """The path of a table of waypoints: the pose's coordinates, or JOINT.position of every joint.
 
     A smooth curve; with ``blend`` (m) or one of the columns :data:`OPTIONS`, lines and arcs.
 
-    :param carried: the payload of the motion; that of the table is not used.
+    :param carried: a column ``payload`` is not used.
+    :returns: the path, and the payload from each waypoint on, kg, where the table has it.
     :raises ParameterError: a column is missing, unknown, or a number is out of range.
     """
     kinds = kinds_of(robot)
@@ -49,12 +57,10 @@ def read_waypoints(
     for name in table:
         if name not in kinds or name in other:
             raise UnknownNameError(f"{file}: column", name, kinds.keys() - other)
-    planned = float(table.get(PAYLOAD[0], np.zeros(1)).max())
-    if planned > 0.0 and carried is None:
-        warn(file, f"its payload of {planned:g} kg is not used; give --payload")
+    masses = None if carried else _masses(table, robot)
     given = {name: table[name] for name in OPTIONS if name in table}
     if blend is None and not given:
-        return through(robot, points, space=space)
+        return through(robot, points, space=space), masses
     if "arc" in given and not np.isin(given["arc"], (0.0, 1.0)).all():
         raise ParameterError(f"{file}: arc", given["arc"].tolist(), "0 or 1")
     arc = given.get("arc", np.zeros(len(points))) == 1.0
@@ -64,8 +70,46 @@ def read_waypoints(
         near = arc | np.roll(arc, 1) | np.roll(arc, -1)
         rounded = np.where(near, 0.0, rounded)
     try:
-        return lines(
+        made = lines(
             robot, points, blend=rounded, dwell=given.get("dwell", 0.0), arc=arc, space=space
         )
     except ParameterError as error:
         raise ParameterError(f"{file}: {error.field}", error.value, error.bound) from None
+    return made, masses
+
+
+def _masses(table: Table, robot: Robot) -> list[float] | None:
+    """The payload from each waypoint on, kg, with the centre of mass of the robot's file."""
+    if PAYLOAD[0] not in table:
+        return None
+    masses, centre = table[PAYLOAD[0]], table.fill(PAYLOAD[1:])
+    if (masses < 0.0).any():
+        raise ParameterError(f"{table.path}: payload", float(masses.min()), "0 kg or more")
+    if centre is not None and (centre != robot.payload.com)[masses > 0.0].any():
+        raise ParameterError(
+            f"{table.path}: {', '.join(PAYLOAD[1:])}", "a centre of mass",
+            "that of the robot's file; --payload MASS,x,y,z carries another on the whole path",
+        )  # fmt: skip
+    return list(masses.tolist())
+
+
+def parse_loads(texts: Sequence[str], waypoints: int) -> list[float | None]:
+    """Payload from each waypoint on, kg, None the robot's own, of some ``MASS@FROM:TO``.
+
+    :raises ParameterError: no such text, waypoints that there are not, or two masses on one part.
+    """
+    result: list[float | None] = [None] * waypoints
+    for text in texts:
+        match = re.fullmatch(r"([^@]+)@(\d+):(\d+)", text.strip())
+        masses = parse_numbers(match[1]) if match else []
+        if match is None or len(masses) != 1 or masses[0] < 0.0:
+            raise ParameterError("load", text, "MASS@FROM:TO, kg and two waypoints, as in 0.5@2:4")
+        begin, end = int(match[2]), int(match[3])
+        if not begin < end < waypoints:
+            raise ParameterError(
+                "load", text, f"two waypoints of 0 to {waypoints - 1}, the second one later"
+            )
+        if any(mass is not None for mass in result[begin:end]):
+            raise ParameterError("load", text, "waypoints on which no other payload is carried")
+        result[begin:end] = masses * (end - begin)
+    return result

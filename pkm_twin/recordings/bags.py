@@ -271,7 +271,7 @@ def write_motion(
     :raises BagError: the bag exists or cannot be written.
     """
     if path.suffix != ".mcap":
-        write_table(_columns(r) | payload_columns(r.load, r.time), path)
+        write_table(_columns(r) | payload_columns(r.robot, r.load, r.time), path)
         return
     own = r.robot.controller
     q, qd, qdd, _ = r.motion
@@ -295,7 +295,7 @@ def write_motion(
         "joint_names": list(own.names),
         "points": points,
     }
-    told = {"robot": r.robot.name, **facts, **load_facts(r.load, float(r.time[-1]))}
+    told = {"robot": r.robot.name, **facts, **load_facts(r.load)}
     metadata = {"pkm_twin": {key: str(value) for key, value in told.items()}}
     with BagWriter(path, overwrite=overwrite, metadata=metadata, flush_period=None) as bag:
         bag.add_topic(TOPIC, TRAJECTORY, definition=DEFINITIONS[TRAJECTORY])

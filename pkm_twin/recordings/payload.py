@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
@@ -19,7 +19,7 @@ from pkm_twin.recordings.tables import PAYLOAD, Table
 from pkm_twin.robot.plausibility import payload_findings
 from pkm_twin.robot.robot import Robot
 
-SOURCES = {"bag": "recording", "table": "table"}
+SOURCES = {"bag": "recording", "table": "table", "path": "path's waypoints"}
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,9 @@ class Load:
     """A payload that is no part of the robot's file, and when it is on the platform.
 
     mass in kg, com in m from the platform's reference point; times in s since the first joint
-    state, empty where it is there all the time. ``source``: ``bag``, ``table`` or ``option``.
+    state, each from its begin until before its end, infinite where it never ends; empty where it is
+    there all the time. ``source``: ``bag``, ``table``, ``path`` or ``option``. ``masses``: by
+    interval, kg, where they differ; ``mass`` is then the greatest.
     """
 
     mass: float
@@ -36,13 +38,44 @@ class Load:
     source: str = "option"
     sought: bool = False
     """Whether it is fitted, and is the robot's own."""
+    masses: tuple[float, ...] = ()
+
+    @classmethod
+    def of(
+        cls, spans: Sequence[tuple[float, float, float]], source: str,
+        com: tuple[float, float, float] | None = None,
+    ) -> Load:  # fmt: skip
+        """Of intervals, each its begin, end (s) and mass (kg); beginning at 0 or before it is."""
+        masses = tuple(mass for *_, mass in spans)
+        alike = len(set(masses)) == 1
+        times = tuple((begin, end) for begin, end, _ in spans)
+        if alike and len(times) == 1 and times[0][0] <= 0.0 and times[0][1] == math.inf:
+            times = ()
+        return cls(max(masses), com, times, source, masses=() if alike else masses)
+
+    @property
+    def spans(self) -> list[tuple[float, float, float]]:
+        """Intervals as :meth:`of` takes them."""
+        times = self.times or ((0.0, math.inf),)
+        masses = self.masses or (self.mass,) * len(times)
+        return [(*span, mass) for span, mass in zip(times, masses, strict=True)]
+
+    def carried(self, time: Array) -> Array:
+        """Mass at times (n,), kg; NaN where the payload is that of the robot's file."""
+        if not self.times:
+            return np.full(len(time), self.mass)
+        found = np.full(len(time), np.nan)
+        for begin, end, mass in self.spans:
+            found[(time >= begin) & (time < end)] = mass
+        return found
 
     def held(self, time: Array) -> Mask:
         """When it is on the platform, shape (n,)."""
-        if not self.times:
-            return np.ones(len(time), np.bool_)
-        spans = [(time >= begin) & (time <= end) for begin, end in self.times]
-        return np.asarray(np.logical_or.reduce(spans), np.bool_)
+        return np.isfinite(self.carried(time))
+
+    def farthest(self, own: float) -> float:
+        """Of several masses the one that differs most from a robot's own, kg."""
+        return max(self.masses or (self.mass,), key=lambda mass: abs(mass - own))
 
     def near_change(self, time: Array, within: float) -> Mask:
         """Where a pick or release is less than ``within`` seconds away, shape (n,)."""
@@ -52,13 +85,14 @@ class Load:
         near = [np.abs(time - edge) < within for edge in edges]
         return np.asarray(np.logical_or.reduce(near), np.bool_)
 
-    def on(self, robot: Robot) -> Robot:
+    def on(self, robot: Robot, mass: float | None = None) -> Robot:
         """The robot with this payload.
 
+        :param mass: one of ``masses``, by default the greatest.
         :raises ParameterError: the robot takes none, or not such a one; a mass that is many times
             that of all that moves.
         """
-        changes: dict[str, Any] = {"mass": self.mass}
+        changes: dict[str, Any] = {"mass": self.mass if mass is None else mass}
         if self.com is not None:
             changes["com"] = list(self.com)
         loaded = robot.changed(payload=changes)
@@ -70,7 +104,8 @@ class Load:
 
     def as_json(self) -> dict[str, Any]:
         """Plain data, units in the keys; no times where it is held all the time."""
-        return {
+        several = {"masses_kg": list(self.masses)} if self.masses else {}
+        return several | {
             "mass_kg": self.mass,
             "com_m": None if self.com is None else list(self.com),
             "held_s": [list(span) for span in self.times] or None,
@@ -79,53 +114,76 @@ class Load:
 
     def __str__(self) -> str:
         at = "" if self.com is None else " at " + ", ".join(f"{v:g}" for v in self.com) + " m"
-        spans = ", ".join(f"{begin:g} to {end:g} s" for begin, end in self.times) or "throughout"
         told = "from --payload" if self.source == "option" else f"from the {SOURCES[self.source]}"
-        return f"{self.mass:g} kg{at}, {spans}, {told}"
+        words = [f"{b:g} s on" if e == math.inf else f"{b:g} to {e:g} s" for b, e in self.times]
+        if self.masses:
+            masses = zip(self.masses, words, strict=True)
+            return f"{', '.join(f'{mass:g} kg {word}' for mass, word in masses)}{at}, {told}"
+        return f"{self.mass:g} kg{at}, {', '.join(words) or 'throughout'}, {told}"
 
 
-def payload_columns(carried: Load | None, time: Array) -> dict[str, Array]:
-    """A table's columns of its payload; none without one."""
+def payload_columns(robot: Robot, carried: Load | None, time: Array) -> dict[str, Array]:
+    """A table's columns of its payload, the robot's own between; none without a load."""
     if carried is None:
         return {}
-    values = (carried.mass, *(carried.com or ()))
-    held = carried.held(time)
-    return {name: np.where(held, v, 0.0) for name, v in zip(PAYLOAD, values, strict=False)}
+    own, mass = robot.payload, carried.carried(time)
+    held = np.isfinite(mass)
+    centre = () if carried.com is None else zip(carried.com, own.com.tolist(), strict=True)
+    columns = (np.where(held, mass, own.mass), *(np.where(held, *pair) for pair in centre))
+    return dict(zip(PAYLOAD, columns, strict=False))
 
 
-def load_of_table(table: Table, time: Array) -> Load | None:
-    """The payload of a table's columns, None where there is none.
+def load_of_table(robot: Robot, table: Table, time: Array) -> Load | None:
+    """The payload of a table's columns; None where there is none beside the robot's own.
 
-    :raises ParameterError: a negative mass, several payloads, or a part of a centre.
+    :raises ParameterError: a negative mass, several centres, or a part of a centre.
     """
     mass = table.get(PAYLOAD[0])
-    if mass is None or not mass.any():
+    if mass is None:
         return None
-    held = mass > 0.0
     there = [name for name in PAYLOAD if name in table]
-    values = table.stack(there)[held]
-    if (mass < 0.0).any() or np.ptp(values, axis=0).any() or len(there) not in (1, 4):
+    centres, own = table.stack(there)[:, 1:], robot.payload
+    same = (centres == own.com).all(1) if len(there) == len(PAYLOAD) else True
+    held = np.asarray((mass != own.mass) | ((mass > 0.0) & np.logical_not(same)))
+    centred = centres[held & (mass > 0.0)]
+    if (mass < 0.0).any() or (centred != centred[:1]).any() or len(there) not in (1, 4):
         raise ParameterError(
             f"{table.path}: payload",
             f"columns {', '.join(there)}, {mass.min():g} to {mass.max():g} kg",
-            f"one payload of 0 kg or more, in {PAYLOAD[0]} or in all of {', '.join(PAYLOAD)}",
+            f"masses of 0 kg or more in {PAYLOAD[0]}, and one centre, in all of "
+            f"{', '.join(PAYLOAD[1:])}, or none",
         )
-    edges = [0, *(np.flatnonzero(np.diff(held)) + 1).tolist(), len(held)]
-    spans = [(float(time[b]), float(time[e - 1])) for b, e in pairwise(edges) if held[b]]
-    row = values[0].tolist()
-    com = (row[1], row[2], row[3]) if len(row) == 4 else None
-    return Load(row[0], com, () if held.all() else tuple(spans), "table")
+    if not held.any():
+        return None
+    step = (np.diff(held) != 0) | (np.diff(mass) != 0.0)
+    edges = [0, *(np.flatnonzero(step) + 1).tolist(), len(held)]
+    ends = [*time[edges[1:-1]].tolist(), math.inf]
+    spans = [
+        (float(time[b]), end, float(mass[b]))
+        for b, end in zip(edges[:-1], ends, strict=True)
+        if held[b]
+    ]
+    com = centred[0].tolist() if centred.size else None
+    return Load.of(spans, "table", None if com is None else (com[0], com[1], com[2]))
 
 
-def load_facts(carried: Load | None, end: float) -> dict[str, Any]:
-    """What a bag's metadata tell of its payload, that is there until after ``end``, s."""
+MASS, PICKED, RELEASED, CENTRE = (
+    "payload_mass_kg", "payload_picked_s", "payload_released_s", "payload_com_m"
+)  # fmt: skip
+"""What a bag's metadata tell of its payload; of several intervals with blanks between."""
+
+
+def load_facts(carried: Load | None) -> dict[str, Any]:
+    """What a bag's metadata tell of its payload; times as its stamps resolve them."""
     if carried is None:
         return {}
-    picked, released = carried.times[0] if carried.times else (0.0, end + 1.0)
-    facts = {
-        "payload_mass_kg": carried.mass, "payload_picked_s": picked, "payload_released_s": released,
-    }  # fmt: skip
-    com = {} if carried.com is None else {"payload_com_m": " ".join(map(repr, carried.com))}
+    rows = list(zip(*carried.spans, strict=True))
+    stamped = [[round(1e9 * t) / 1e9 if math.isfinite(t) else t for t in row] for row in rows[:2]]
+    values = [*stamped, [carried.mass] if not carried.masses else carried.masses]
+    facts = dict(
+        zip((PICKED, RELEASED, MASS), (" ".join(map(repr, v)) for v in values), strict=True)
+    )
+    com = {} if carried.com is None else {CENTRE: " ".join(map(repr, carried.com))}
     return facts | com
 
 
@@ -135,31 +193,39 @@ def told_load(bag: Bag) -> Load | None:
     :raises BagError: a value is missing or no number.
     """
     facts = bag.report.metadata.get("pkm_twin", {})
-    if "payload_picked_s" not in facts:
+    if PICKED not in facts:
         return None
-    names = ("payload_mass_kg", "payload_picked_s", "payload_released_s")
-    mass, picked, released = (_fact(bag, facts, name) for name in names)
-    if mass < 0:
-        raise metadata_error(bag, names[0], facts[names[0]], "0 or more")
-    if released < picked:
-        raise metadata_error(bag, names[2], facts[names[2]], f"{names[1]}, {picked:g}, or later")
+    masses, picked, released = (_fact(bag, facts, name) for name in (MASS, PICKED, RELEASED))
+    if min(masses) < 0.0:
+        raise metadata_error(bag, MASS, facts[MASS], "0 or more")
+    before = -math.inf
+    for begin, end in zip(picked, released, strict=False):
+        if not before <= begin <= end:
+            raise metadata_error(bag, RELEASED, facts[RELEASED], f"{PICKED}, {begin:g}, or later")
+        before = end
+    if not len(picked) == len(released) or len(masses) not in (1, len(picked)):
+        raise metadata_error(bag, RELEASED, facts[RELEASED], f"a time for each of {PICKED}")
     com = None
-    if "payload_com_m" in facts:
+    if CENTRE in facts:
         try:
-            com = parse_payload(",".join([repr(mass), *facts["payload_com_m"].split()]))[1]
+            com = parse_payload(",".join(["0", *facts[CENTRE].split()]))[1]
         except ParameterError:
-            raise metadata_error(bag, "payload_com_m", facts["payload_com_m"], "x y z") from None
-    return Load(mass, com, ((picked, released),), "bag")
+            raise metadata_error(bag, CENTRE, facts[CENTRE], "x y z") from None
+    each = masses * len(picked) if len(masses) == 1 else masses
+    return Load.of(list(zip(picked, released, each, strict=True)), "bag", com)
 
 
-def _fact(bag: Bag, facts: Mapping[str, str], name: str) -> float:
+def _fact(bag: Bag, facts: Mapping[str, str], name: str) -> list[float]:
+    """Numbers of a value; only a release may be infinite, which is never."""
     try:
-        value = float(facts[name])
+        values = [float(word) for word in facts[name].split()]
     except (KeyError, ValueError):
-        value = math.nan
-    if not math.isfinite(value):
+        values = []
+    if not values or not all(map(math.isfinite, values[: -1 if name == RELEASED else None])):
         raise metadata_error(bag, name, facts.get(name), "a finite number")
-    return value
+    if math.isnan(values[-1]) or values[-1] == -math.inf:
+        raise metadata_error(bag, name, facts.get(name), "a finite number")
+    return values
 
 
 def metadata_error(bag: Bag, name: str, value: str | None, expected: str) -> BagError:
@@ -198,10 +264,13 @@ def by_load(
     robot: Robot, carried: Load | None, time: Array, longest: int
 ) -> Iterator[tuple[Robot, slice]]:
     """The robot as it is loaded, and the samples in a row (at most ``longest``) for which."""
-    held = np.zeros(len(time), np.bool_) if carried is None else carried.held(time)
-    loaded = robot if carried is None else carried.on(robot)
-    edges = [0, *(np.flatnonzero(np.diff(held)) + 1).tolist(), len(time)]
+    mass = np.full(len(time), np.nan) if carried is None else carried.carried(time)
+    own = -1.0
+    mass = np.where(np.isfinite(mass), mass, own)
+    loaded = {own: robot}
+    if carried is not None:
+        loaded |= {one: carried.on(robot, one) for one in {*(carried.masses or (carried.mass,))}}
+    edges = [0, *(np.flatnonzero(np.diff(mass)) + 1).tolist(), len(time)]
     for begin, end in pairwise(edges):
         for start in range(begin, end, longest):
-            stop = min(start + longest, end)
-            yield (loaded if held[start] else robot), slice(start, stop)
+            yield loaded[float(mass[start])], slice(start, min(start + longest, end))

@@ -166,7 +166,7 @@ def _of_table(path: Path, name: str | Robot | None, how: ReadOptions) -> Recordi
                 )
     efforts = (f"{joint}.{what}" for joint in joints for what in EFFORTS)
     _check_sizes(table, SIZES | dict.fromkeys(efforts, MAX_EFFORT))
-    held = how.load or load_of_table(table, time)
+    held = how.load or load_of_table(robot, table, time)
     return Recording(
         robot, time, q, qd, qdd, effort, wrench, deflection, pose, held, efforts=word,
         source=str(path), notes=(

@@ -131,13 +131,32 @@ class Recording:
 
     @property
     def held(self) -> Array | None:
-        """1 where the payload is on the platform, else 0, shape (samples,)."""
-        return None if self.load is None else self.load.held(self.time).astype(np.float64)
+        """Which part of :attr:`carried` is on the platform, shape (samples,): 1, 0 where the robot
+        has its file's payload, and by the mass where there are several.
+        """
+        return None if self.load is None else self._part(self.load.carried(self.time))
+
+    def _part(self, mass: Array) -> Array:
+        assert self.load is not None  # noqa: S101  asked for with one
+        own = self.robot.payload.mass
+        if not self.load.masses:
+            return np.isfinite(mass).astype(np.float64)
+        return np.nan_to_num((mass - own) / (self.load.farthest(own) - own))
 
     @property
     def carried(self) -> Robot | None:
-        """The robot with the payload that is known."""
-        return None if self.load is None or self.load.sought else self.load.on(self.robot)
+        """The robot with the payload that is known; of several the one farthest from its own."""
+        return self.machines.get(1.0)
+
+    @property
+    def machines(self) -> dict[float, Robot]:
+        """The robot with its file's payload and with what is known of others, by ``held``."""
+        load, machines = self.load, {0.0: self.robot}
+        if load is not None and not load.sought:
+            masses = np.array(load.masses or (load.mass,))
+            for mass, part in zip(masses.tolist(), self._part(masses).tolist(), strict=True):
+                machines[part] = load.on(self.robot, mass)
+        return machines
 
     @property
     def measured(self) -> Array:

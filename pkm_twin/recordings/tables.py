@@ -49,6 +49,8 @@ WRENCH: Final = ("fx", "fy", "fz", "mx", "my", "mz")
 DEFLECTION: Final = ("dx", "dy", "dz", "rx", "ry", "rz")
 PAYLOAD: Final = ("payload.mass", "payload.x", "payload.y", "payload.z")
 """Mass (kg) and centre (m) of what the platform holds."""
+OTHERS: Final = {"payload": PAYLOAD[0]}
+"""Other names of columns."""
 _UNIT: Final = re.compile(
     r"(.*?)(?:\s*[\[(]\s*(\w+)(?:/s2?)?\s*[\])]|_(mm|cm|[uµ]m|deg|mrad|ms|us))"
 )
@@ -326,12 +328,13 @@ def _named(
     :raises ParameterError: a unit of another kind.
     :raises UnknownNameError: a name that no column has, or a header that is not there.
     """
-    ours: dict[str, tuple[str, str]] = {}
+    ours = {cell: (OTHERS[cell], "") for cell in header if OTHERS.get(cell) in kinds}
     for cell in header:
         match = _UNIT.fullmatch(cell)
         if match is not None and match[1] in kinds:
             ours[cell] = match[1], match[2] or match[3]
-    for name, text in dialect.columns.items():
+    for given, text in dialect.columns.items():
+        name = OTHERS.get(given, given)
         match = _UNIT.fullmatch(text) if text not in header else None
         stem, unit = (match[1], match[2] or match[3]) if match else (text, "")
         pattern = re.compile(re.escape(stem).replace(r"\*", "(.+)"))

@@ -342,12 +342,14 @@ def test_way_points_are_lines_or_a_smooth_curve(twin, tmp_path):
     path.write_text(f"{joints}\n0.1,0.1,0.1\n0.2,0.3,0.1\n")
     data = twin.told("path", "delta", path, "--law", "s-curve")
     assert data["law"] == "s-curve"
-    # The table of a motion is a path too, whose payload is asked for.
+    # The table of a motion is a path too, with its payload.
     out = tmp_path / "circle.csv"
     line = ("path", "delta", "--circle", "0.04", "--duration", "1", "--payload", "0.2")
     twin.good(*line, "--rate", "50", "--out", out, "--no-picture")
-    assert "--payload" in twin.good("path", "delta", out, "--fastest").err
-    assert not twin.good("path", "delta", out, "--fastest", "--payload", "0.2").err
+    line = ("path", "delta", out, "--fastest")
+    own, told = (twin.told(*line, *options) for options in ((), ("--payload", "0.2")))
+    assert own["payload"]["mass_kg"] == 0.2
+    assert own["duration_s"] == told["duration_s"]
 
 
 @pytest.mark.parametrize(
@@ -374,3 +376,51 @@ def test_a_command_line_needs_one_path(twin, tmp_path):
         "path delta --cycle 25,305 --effort 1,2", "size delta",
     ):  # fmt: skip
         twin.good(*words.split(), code=2)
+
+
+LOADED = (
+    "x,y,z,blend,dwell,payload\n-0.10,0,-0.42,0,0,0\n-0.10,0,-0.36,0.03,0,0.5\n"
+    "0.08,0.06,-0.36,0.03,0,0.5\n0.08,0.06,-0.42,0,0.1,0.2\n"
+    "0.08,0.06,-0.42,0,0.1,0\n0,0,-0.4,0,0,0\n"
+)
+
+
+@pytest.mark.parametrize("ending", ["csv", "mcap"])
+def test_payloads_of_waypoints_go_with_the_motion(twin, tmp_path, ending):
+    points, out = tmp_path / "points.csv", tmp_path / f"motion.{ending}"
+    points.write_text(LOADED)
+    line = ("path", "delta", points, "--duration", "4", "--no-picture")
+    plan = twin.told(*line, "--out", out)["payload"]
+    assert plan["masses_kg"] == [0.5, 0.2]
+    data = twin.told("size", "delta", out)
+    assert max(data["difference_from_model"]) < 1e-9
+    assert data["payload"]["masses_kg"] == [0.5, 0.2]
+    period = 1e-3 if ending == "csv" else 1e-9
+    np.testing.assert_allclose(data["payload"]["held_s"], plan["held_s"], atol=period)
+    inertia = data["drives"]["arm_1"]["load_inertia_kg_m2"]
+    assert inertia[1] > 1.5 * inertia[0]
+    twin.good("loads", "delta", out)
+    if ending == "csv":
+        twin.good("check", out, "--robot", "delta")
+        twin.good("check", out, "--robot", "delta", "--payload", "0", code=1)
+        # As waypoints again, and as poses alone under the short name.
+        rows = read_columns(out)
+        columns = {name: rows[name][::50] for name in ("x", "y", "z")}
+        columns["payload"] = rows["payload.mass"][::50]
+        write_table(columns, points)
+        again = twin.told("path", "delta", points)["payload"]
+        assert again["mass_kg"] == 0.5
+        write_table({"time": np.arange(len(columns["x"])) * 0.1} | columns, points)
+        posed = twin.told("size", "delta", points)["payload"]
+        assert posed["masses_kg"] == [0.5, 0.2]
+
+
+def test_a_payload_between_two_waypoints_of_a_cycle(twin):
+    line = ("path", "delta", "--cycle", "25,305,25")
+    data = twin.told(*line, "--load", "0.5@0:3")
+    ((begin, end),) = data["payload"]["held_s"]
+    assert (begin, end) == (0.0, pytest.approx(data["stretches"][1]["begin_s"], abs=1e-9))
+    for wrong in ("0.5@3:3", "0.5@0:7", "x@0:1", "0.5", "500@0:3"):
+        twin(*line, "--load", wrong).one_line_error()
+    twin.good(*line, "--load", "0.5@0:3", "--payload", "1", code=2)
+    twin.good(*line, "--load", "0.5@0:3", "--load", "0.5@2:4", code=1)

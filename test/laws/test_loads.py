@@ -1,11 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """When a payload is held, and what is too near to a pick or release to be judged."""
 
+import math
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from pkm_twin.errors import ParameterError
-from pkm_twin.recordings import Load
+from pkm_twin.recordings import Load, Recording
+from pkm_twin.recordings.payload import load_of_table, payload_columns
+from pkm_twin.recordings.tables import Table
 from test.support.robots import load as robot_of
 
 TIME = np.array([0.4, 0.6, 1.0, 1.4, 1.6, 2.0, 2.4, 2.6])
@@ -13,7 +18,7 @@ TIME = np.array([0.4, 0.6, 1.0, 1.4, 1.6, 2.0, 2.4, 2.6])
 
 def test_a_load_is_held_between_its_times():
     load = Load(0.2, None, ((1.0, 2.0),))
-    assert load.held(TIME).tolist() == [False, False, True, True, True, True, False, False]
+    assert load.held(TIME).tolist() == [False, False, True, True, True, False, False, False]
     assert Load(0.2).held(TIME).all()
 
 
@@ -35,3 +40,18 @@ def test_a_mass_in_grams_is_no_payload(name):
     with pytest.raises(ParameterError) as caught:
         Load(100.0 * moving).on(robot)
     assert (caught.value.field, caught.value.value) == ("payload.mass", 100.0 * moving)
+
+
+def test_several_payloads_follow_each_other_without_a_sample_of_both():
+    load = Load.of([(0.6, 1.0, 0.2), (1.0, 2.0, 0.5), (2.4, math.inf, 0.0)], "table")
+    expected = [math.nan, 0.2, 0.5, 0.5, 0.5, math.nan, 0.0, 0.0]
+    np.testing.assert_array_equal(load.carried(TIME), expected)
+    assert Load.of([(0.0, math.inf, 0.5)], "bag") == Load(0.5, source="bag")
+    robot = robot_of("delta").changed(payload={"mass": 0.1})
+    r = Recording(robot, TIME, np.zeros((8, 3)), load=load)
+    masses = r.held * (r.carried.payload.mass - 0.1) + 0.1
+    np.testing.assert_allclose(masses, np.where(np.isnan(expected), 0.1, expected), atol=1e-15)
+    assert sorted(machine.payload.mass for machine in r.machines.values()) == [0.0, 0.1, 0.2, 0.5]
+    table = Table(Path("x.csv"), payload_columns(robot, load, TIME))
+    again = load_of_table(robot, table, TIME)
+    np.testing.assert_array_equal(again.carried(TIME), expected)

@@ -7,6 +7,7 @@ import pytest
 from delta_dynamics import inverse_dynamics
 from pkm_twin.errors import ParameterError
 from pkm_twin.paths import circle, cycle, fastest, lines, through, timed
+from pkm_twin.paths.carrying import Carried
 from pkm_twin.paths.jerk import smooth_run
 from pkm_twin.paths.joint_path import joint_paths
 from pkm_twin.paths.laws import LAWS
@@ -275,7 +276,7 @@ def test_rates_with_limits_of_jerk_are_those_of_the_positions():
 def test_a_motion_never_goes_back_along_its_path():
     """Of any profile, with places where the machine nearly stops."""
     rng, robot = np.random.default_rng(2), load("five_bar")
-    [part] = joint_paths(robot, through(robot, points_of(robot)), 120, 1e-6)
+    [part] = joint_paths(through(robot, points_of(robot)), [Carried(robot)], 120, 1e-6)
     s = part.ends / part.ends[-1]
     for dip in 10.0 ** rng.uniform(-9.0, 0.0, 20):
         x = np.sin(np.pi * s) ** (4 / 3) * (1.0 - (1.0 - dip) * (rng.random(len(s)) < 0.05))
@@ -371,3 +372,92 @@ def test_a_path_of_joints_is_followed_in_joints():
     motion = fastest(robot, through(robot, q, space="joint"))
     ends = motion.sample([0.0, motion.duration])
     np.testing.assert_allclose(ends.q, q[[0, -1]], atol=1e-12)
+
+
+POSES = {
+    "cycle": lambda r: cycle(r, 0.02, 0.15, 0.03),
+    "curve": lambda r: through(r, points_of(r, 5)),
+    "corners": lambda r: lines(
+        r, [(-0.1, 0, -0.4), (-0.1, 0, -0.36), (0.1, 0, -0.36), (0.1, 0, -0.36),
+            (0.13, 0.05, -0.36), (0.1, 0.1, -0.36), (0.1, 0.1, -0.4)],
+        blend=[0, 0.02, 0, 0, 0, 0, 0], dwell=[0, 0, 0.05, 0.1, 0, 0, 0.02], arc=np.arange(7) == 4,
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("name", "kind", "law", "jerk"),
+    [
+        ("delta", "cycle", "fastest", None), ("delta", "corners", "fastest", None),
+        ("delta", "curve", "fastest", 2e4), ("delta", "corners", "s-curve", None),
+        ("five_bar", "curve", "fastest", None),
+    ],
+)  # fmt: skip
+def test_a_payload_changes_at_its_waypoint_and_the_limits_hold_with_it(name, kind, law, jerk):
+    robot = load(name)
+    path = POSES[kind](robot)
+    count, heavy = len(path.marks), 0.2 * robot.graph.bodies[robot.graph.platform].mass
+    masses = [(None, heavy, 0.4 * heavy)[k % 3] for k in range(count)]
+    m = timed(robot, path, law, jerk=jerk, payload=masses)
+    if kind == "curve":
+        at = m.sample(m.switches).pose
+        np.testing.assert_allclose(at, points_of(robot, 5)[1:], atol=1e-12)
+    edges = [0.0, *m.switches, np.inf]
+    assert m.load.spans == [
+        (begin, end, mass)
+        for begin, end, mass in zip(edges[:-1], edges[1:], masses, strict=True)
+        if mass is not None
+    ]
+    times = np.linspace(0.0, m.duration, 20_001)
+    s = m.sample(np.unique([*times, *m.switches, *np.nextafter(m.switches, 0.0)]))
+    part = np.searchsorted(m.switches, s.time, side="right")
+    for k, mass in enumerate(masses):
+        own = robot if mass is None else robot.changed(payload={"mass": mass})
+        rows = part == k
+        effort = inverse_dynamics(own, s.q[rows], s.qd[rows], s.qdd[rows])
+        np.testing.assert_allclose(
+            s.effort[rows], effort, rtol=0, atol=1e-12 * np.abs(effort).max()
+        )
+        assert (np.abs(effort) <= robot.limits.effort * (1.0 + 1e-9)).all()
+    if robot.limits.effort is not None and law == "fastest" and jerk is None:
+        assert max(m.worst.values()) > 0.999
+
+
+def test_one_payload_by_waypoints_is_the_robots_to_the_last_digit():
+    robot = load("delta")
+    path = cycle(robot, 0.025, 0.305, 0.025, dwell=0.1)
+    alike = fastest(robot, path, payload=[0.3] * 7)
+    plain = fastest(robot.changed(payload={"mass": 0.3}), path)
+    assert all(
+        map(
+            np.array_equal,
+            (alike.times, alike.q, alike.effort),
+            (plain.times, plain.q, plain.effort),
+        )
+    )
+    # Reached before the rest there, and after that of the same waypoint before it.
+    twice = lines(robot, [(0, 0, -0.4), (0, 0, -0.36), (0, 0, -0.36)], dwell=[0.1, 0.2, 0.3])
+    m = fastest(robot, twice, payload=[0.0, 0.1, 0.2])
+    assert np.diff([m.begins[0] + m.runs[0].duration, *m.switches, m.duration]) == pytest.approx(
+        [0.0, 0.2, 0.3]
+    )
+    one, other = (
+        fastest(robot, twice, payload=[mass, None, None]).duration for mass in (None, 0.5)
+    )
+    assert other > one
+
+
+@pytest.mark.parametrize("payload", [[0.1] * 6, [0.1] * 8, [-0.1] * 7, [np.nan] * 7, [500.0] * 7])
+def test_payloads_that_cannot_be_are_rejected(payload):
+    robot = load("delta")
+    with pytest.raises(ParameterError, match="payload"):
+        fastest(robot, cycle(robot, 0.025, 0.305, 0.025), payload=payload)
+
+
+def test_a_payload_that_the_drives_cannot_hold_at_the_end_is_rejected():
+    robot = load("delta")
+    still = np.abs(inverse_dynamics(robot.changed(payload={"mass": 5.0}), *np.zeros((3, 3)))).max()
+    path = cycle(robot, 0.025, 0.305, 0.025)
+    fastest(robot, path, effort=0.9 * still)
+    with pytest.raises(ParameterError, match="at rest"):
+        fastest(robot, path, effort=0.9 * still, payload=[0.0] * 6 + [5.0])

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -47,6 +48,11 @@ class Motion(Carries, ReadsTables, AwayFromSingular, Writes, Draws):
     straight lines and arcs, and stops where blend is 0. It does not stop between an arc and a
     tangent line.
 
+    A column payload (kg) or --load changes the payload at waypoints, from the moment on that the
+    platform reaches them. Waypoints count from 0, the start; a cycle has 0 to 6: the pick is 0, the
+    place is 3. The limits hold with the payload of each part, and the file that is written states
+    the times of the changes.
+
     --fastest finds the shortest time within effort, velocity, acceleration, jerk and speed limits.
     It uses the exact inverse dynamics with payload and friction. The command prints the duration,
     which limit binds when, and the largest fraction of each limit that the motion uses.
@@ -81,6 +87,11 @@ class Motion(Carries, ReadsTables, AwayFromSingular, Writes, Draws):
         "default: a smooth curve through the waypoints; in a cycle 0.8 of its rise", low=0.0,
     )  # fmt: skip
     dwell: float = setting(0.0, "dwell at pick and at place, s", low=0.0)
+    carries: tuple[str, ...] = setting(
+        (), "payload from one waypoint to another, in place of --payload: 0.5@2:4 is 0.5 kg from "
+        "waypoint 2 until waypoint 4 is reached; may be repeated", name="load",
+        metavar="MASS@FROM:TO",
+    )  # fmt: skip
     fastest: bool = setting(False, "plan the shortest motion within all limits")
     slow_where_soft: bool = setting(False, "plan the fastest cut within --tolerance")
     force: float | None = setting(
@@ -145,18 +156,20 @@ def path(given: Motion) -> Report:
         name: _limit(name, getattr(given, name), machine)
         for name in ("effort", "velocity", "acceleration", "jerk")
     }
+    way, payload = _way(given, machine)
     law = "fastest" if given.fastest or given.slow_where_soft else given.law
     motion = timed(
-        machine, _way(given, machine), law, duration=given.duration, speed=given.speed,
+        machine, way, law, payload=payload, duration=given.duration, speed=given.speed,
         share=given.share, singularity=given.singularity, **bounds, **_slower(given, machine),
     )  # fmt: skip
     if given.shaper is not None:
         motion = _shaped(given, motion)
     elif given.damping is not None:
         raise typer.BadParameter("--damping is for --shaper")
+    carried = motion.load or given.load
     if given.out is not None:
         s = motion.uniform(given.rate)
-        plan = Recording(machine, s.time, s.q, s.qd, s.qdd, s.effort, pose=s.pose, load=given.load)
+        plan = Recording(machine, s.time, s.q, s.qd, s.qdd, s.effort, pose=s.pose, load=carried)
         with writing(given.out):
             source = {"source": "pkm-twin path", "law": motion.law}
             write_motion(given.out, plan, source, given.overwrite)
@@ -178,7 +191,7 @@ def path(given: Motion) -> Report:
                 motion.begins, motion.runs, motion.path.stretches, strict=True
             )
         ], text="segments from stop to stop", shown=str(len(motion.runs))),
-        payload_fact(given.load),
+        payload_fact(carried),
         Fact("limits", [bound.as_json() for bound in motion.bounds]),
         Fact("used", motion.worst),
         Fact("peaks", _peaks(motion)),
@@ -201,8 +214,20 @@ def path(given: Motion) -> Report:
     )  # fmt: skip
 
 
-def _way(given: Motion, machine: Robot) -> Way:
-    """The path that a command line asks for."""
+def _way(given: Motion, machine: Robot) -> tuple[Way, Sequence[float | None] | None]:
+    """The path that a command line asks for, and the payload from each of its waypoints on."""
+    from pkm_twin.paths.waypoints import parse_loads
+
+    if given.carries and given.payload is not None:
+        raise typer.BadParameter("--payload is for the whole path; leave it out with --load")
+    way, masses = _unloaded(given, machine)
+    if given.carries and masses is not None:
+        raise typer.BadParameter("the waypoints have a column payload; leave out --load")
+    return way, parse_loads(given.carries, len(way.marks)) if given.carries else masses
+
+
+def _unloaded(given: Motion, machine: Robot) -> tuple[Way, list[float] | None]:
+    """The path, and the payload of a table's waypoints."""
     from pkm_twin import paths
     from pkm_twin.paths.waypoints import read_waypoints
 
@@ -211,13 +236,15 @@ def _way(given: Motion, machine: Robot) -> Way:
     if given.waypoints is not None:
         if given.at is not None or given.dwell or given.direction:
             raise typer.BadParameter("--at, --direction and --dwell are for --cycle and --circle")
-        return read_waypoints(given.waypoints, machine, given.blend, given.load, given.dialect)
+        return read_waypoints(
+            given.waypoints, machine, given.blend, given.dialect, carried=given.payload is not None
+        )
     if given.at is not None and len(given.at) != len(machine.pose_names):
         names = ", ".join(machine.pose_names)
         raise typer.BadParameter(f"--at has {len(given.at)} numbers; expected a pose: {names}")
     if given.circle is not None:
         home = machine.home() if given.at is None else np.array(given.at)
-        return paths.circle(machine, home, given.circle)
+        return paths.circle(machine, home, given.circle), None
     lengths = given.cycle or ()
     if len(lengths) not in (2, 3) or min(lengths) < LEAST_CYCLE:
         found = ",".join(f"{length:g}" for length in lengths)
@@ -225,10 +252,11 @@ def _way(given: Motion, machine: Robot) -> Way:
             f"--cycle {found}: HEIGHT,WIDTH[,LIFT] in millimetres, for example 25,305,25"
         )
     metres = [1e-3 * value for value in lengths]
-    return paths.cycle(
+    made = paths.cycle(
         machine, *metres, at=given.at, direction=math.radians(given.direction), blend=given.blend,
         dwell=given.dwell,
     )  # fmt: skip
+    return made, None
 
 
 def _limit(name: str, values: tuple[float, ...] | None, machine: Robot) -> list[float] | None:

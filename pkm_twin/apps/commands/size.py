@@ -99,9 +99,7 @@ def size(given: Size) -> Report:
     gear = Gear(given.ratio, given.lead, given.efficiency) if geared else None
     motion = given.read(given.motion, given.machine(), planned=True).with_rates()
     taken = compared(motion, given.efforts)
-    duties = size_drives(
-        motion.carried or motion.robot, motion.time, *motion.motion[:3], taken.effort, motors, gear
-    )
+    duties = size_drives(motion, taken.effort, motors, gear)
     duration = float(motion.time[-1] - motion.time[0])
     energy = sum(d.at_joint.energy for d in duties)
     returned = sum(d.at_joint.returned for d in duties)

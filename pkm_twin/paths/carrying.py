@@ -1,0 +1,101 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Payloads that change at waypoints of a path: the model's efforts with the payload of each part.
+
+A path is cut where its payload changes, so that no interval of its points has two.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from delta_dynamics import inverse_dynamics
+from pkm_twin.codegen.arrays import Array
+from pkm_twin.errors import ParameterError
+from pkm_twin.paths.geometry import SHORTEST, Path, Stretch
+from pkm_twin.paths.pieces import Cut
+from pkm_twin.recordings.payload import Load
+from pkm_twin.robot.robot import Robot
+
+
+@dataclass(frozen=True)
+class Carried:
+    """A payload from a place of a path on: the begin of a piece of a stretch (the stretch's end
+    where it has no such piece; stretch -1: the rest before the first), after a rest there, s.
+
+    ``mass``: kg, None as in the robot's file, or the same. ``robot``: with it.
+    """
+
+    robot: Robot
+    mass: float | None = None
+    stretch: int = -1
+    piece: int = 0
+    rest: float = 0.0
+
+
+def carry(
+    robot: Robot, path: Path, payload: Sequence[float | None] | None
+) -> tuple[Path, tuple[Carried, ...]]:
+    """A path with pieces that end where its payload changes, and what is carried from where on.
+
+    :param payload: from each waypoint on, kg, (waypoints,); None is the robot's own.
+    :raises ParameterError: not one for each waypoint, or a mass that the robot cannot carry.
+    """
+    if payload is None:
+        return path, (Carried(robot),)
+    own = robot.payload.mass
+    masses = [None if mass is None or mass == own else float(mass) for mass in payload]
+    if len(masses) != len(path.marks):
+        raise ParameterError(
+            "payload", f"{len(masses)} values", f"{len(path.marks)}, one for each waypoint"
+        )
+    robots = {m: robot if m is None else Load(m).on(robot) for m in dict.fromkeys(masses)}
+    result = [Carried(robots[masses[0]], masses[0])]
+    stretches = list(path.stretches)
+    for mark, mass in zip(path.marks[1:], masses[1:], strict=True):
+        if mass == result[-1].mass:
+            continue
+        piece = 0
+        if mark.stretch >= 0:
+            stretches[mark.stretch], piece = _cut(stretches[mark.stretch], mark.way)
+        result.append(Carried(robots[mass], mass, mark.stretch, piece, mark.rest))
+    return replace(path, stretches=tuple(stretches)), tuple(result)
+
+
+def _cut(stretch: Stretch, way: float) -> tuple[Stretch, int]:
+    """A stretch with a piece that begins there, and its number."""
+    for k, piece in enumerate(stretch.pieces):
+        if way <= SHORTEST:
+            return stretch, k
+        if way < piece.length - SHORTEST:
+            parts = Cut(piece, 0.0, way), Cut(piece, way, piece.length)
+            pieces = (*stretch.pieces[:k], *parts, *stretch.pieces[k + 1 :])
+            return replace(stretch, pieces=pieces), k + 1
+        way -= piece.length
+    return stretch, len(stretch.pieces)
+
+
+def robots_on(carried: Sequence[Carried], stretch: int, pieces: int) -> tuple[Robot, ...]:
+    """The robot with its payload on each piece of a stretch."""
+    return tuple(
+        next(c.robot for c in reversed(carried) if (c.stretch, c.piece) <= (stretch, k))
+        for k in range(pieces)
+    )
+
+
+def efforts_of(
+    robots: Sequence[Robot], which: NDArray[np.int64], q: Array, qd: Array, qdd: Array,
+    wrench: Array | None,
+) -> Array:  # fmt: skip
+    """Efforts of samples, shape (k, n), each of its own robot, by number ``which`` (k,)."""
+    if all(robot is robots[0] for robot in robots):
+        return inverse_dynamics(robots[0], q, qd, qdd, wrench)
+    made = np.empty_like(q)
+    for k, robot in enumerate(robots):
+        rows = which == k
+        if rows.any():
+            made[rows] = inverse_dynamics(robot, q[rows], qd[rows], qdd[rows], wrench)
+    return made
