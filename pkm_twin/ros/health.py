@@ -181,12 +181,6 @@ class Health:
             troubles.insert(0, (level, message))
         elif level != OK or not troubles or not active:
             troubles.append((level, message))
-        status = DiagnosticStatus(
-            level=max(level for level, _ in troubles),
-            name=self._node.get_fully_qualified_name(),
-            message=cut(troubles[0][1]),
-        )
-        status.hardware_id = str(values.pop("robot", ""))
         values |= self.seen
         # The message is the worst; what else there is stands here.
         values["other problems"] = "; ".join(text for _, text in troubles[1:])
@@ -195,7 +189,19 @@ class Health:
             values[f"lost: {topic}"] = statistics.missed
             values[f"overruns: {topic}"] = statistics.overruns
             values[f"longest callback (ms): {topic}"] = f"{1e3 * statistics.longest:.3f}"
-        status.values = [KeyValue(key=key, value=cut(str(value))) for key, value in values.items()]
+        return self.array(max(level for level, _ in troubles), troubles[0][1], **values)
+
+    def array(
+        self, level: bytes, message: str, *, robot: object = "", **values: object
+    ) -> DiagnosticArray:
+        """The node's status as a message, stamped now; ``robot`` is its hardware."""
+        status = DiagnosticStatus(
+            level=level,
+            name=self._node.get_fully_qualified_name(),
+            message=cut(message),
+            hardware_id=str(robot),
+            values=[KeyValue(key=key, value=cut(str(value))) for key, value in values.items()],
+        )
         array = DiagnosticArray(status=[status])
         array.header.stamp = self._node.get_clock().now().to_msg()
         return array

@@ -8,7 +8,9 @@ caught, counted and told.
 from __future__ import annotations
 
 import inspect
+import itertools
 import os
+import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping
@@ -30,7 +32,7 @@ from pkm_twin.bags.definitions import message_definition
 from pkm_twin.errors import MessageError, ParameterError
 from pkm_twin.messages.intake import JointStateDecoder
 from pkm_twin.messages.stamps import SECOND
-from pkm_twin.ros.health import QOS, RELIABILITY, Health, Misfit, cut
+from pkm_twin.ros.health import QOS, RELIABILITY, WARN, Health, Misfit, cut
 from pkm_twin.ros.parameters import ParameterNode
 from pkm_twin.ros.turns import SELDOM_PERIOD, SeldomGroup, Task, Tasks
 from pkm_twin.streams.monitor import TopicStatistics
@@ -342,6 +344,9 @@ class GuardedSubscription:
         )
 
 
+COMPILING: Final = "loading or compiling the robot's programs: the node does not answer yet"
+PATIENCE: Final = 0.5
+"""Time between two statements of a node that starts, s: of stored programs it needs less."""
 MAX_ASKED: Final = 1000
 """Entries of a request that only asks; one that sets has at most as many as the node has
 parameters. More take the stream's time."""
@@ -351,7 +356,8 @@ class TwinNode(GuardedNode):
     """A life-cycle node with guarded callbacks, diagnostics at 1 Hz and checked parameters.
 
     Everything is made and every parameter checked before the first state; a node that is not
-    active takes no message.
+    active takes no message. While a node is made, which compiles programs that are not stored, its
+    diagnostics say so.
     """
 
     def __init__(self, name: str) -> None:
@@ -359,13 +365,26 @@ class TwinNode(GuardedNode):
         super().__init__(name)
         self._tasks = Tasks(self.failed)
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", output_qos())
+        self._made = threading.Event()
+        threading.Thread(target=self._tell_start, daemon=True).start()
+
+    def _tell_start(self) -> None:
+        """Until the node is made, and where that takes long."""
+        for k in itertools.count():
+            # A constructor that fails leaves a context that ends.
+            if self._made.wait(PATIENCE) or not self.context.ok():
+                return
+            if k == 0:
+                self.get_logger().info(COMPILING)
+            self._diagnostics.publish(self.health.array(WARN, COMPILING))
 
     def start(self, leap: float | None = None) -> None:
-        """Refuse unknown parameters, begin the diagnostics, and say where the node listens.
+        """The node is made: refuse unknown parameters, begin the diagnostics, and tell its summary.
 
         :param leap: how far the ROS clock goes forward at once for :meth:`time_jumped_forward`, s.
         """
         self.close_declarations()
+        self._made.set()
         self.create_guarded_timer(1.0, self._publish_diagnostics)
         self.create_service(Trigger, "~/reset", self._on_reset)
         for service in self.services:

@@ -431,10 +431,12 @@ class Peer:
 def one_line_refusal(process):
     """The one line that a process which refuses to start says, after its exit with 1.
 
-    The middleware's own lines are not counted: other processes may hold its shared memory.
+    The middleware's own lines are not counted: other processes may hold its shared memory. Nor is
+    the one of a node that takes long to load its programs.
     """
     assert process.wait() == 1, process.output
     lines = [line for line in process.output.strip().splitlines() if "[RTPS_" not in line]
+    lines = [line for line in lines if "compiling the robot's programs" not in line]
     assert len(lines) == 1, process.output
     assert "Traceback" not in lines[0]
     return lines[0]

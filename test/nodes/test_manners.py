@@ -101,6 +101,37 @@ def test_no_node_starts_with_a_parameter_whose_change_nothing_follows(launch):
     assert line == "cannot start: nothing follows a change of volume"
 
 
+COMPILES = """
+import time
+from pathlib import Path
+from pkm_twin.ros import node
+from pkm_twin.ros.run import run
+class Slow(node.TwinNode):
+    def __init__(self):
+        super().__init__("slow_start")
+        while not Path({gate!r}).exists():
+            time.sleep(0.01)
+        self.start()
+    def summary(self):
+        return "started"
+    def diagnose(self):
+        return b"\\0", "running", {{}}
+raise SystemExit(run(Slow))
+"""
+
+
+def test_a_node_that_compiles_says_so_until_it_answers(peer, launch, tmp_path):
+    gate = tmp_path / "gate"
+    peer.hear(DiagnosticArray, "/diagnostics")
+    process = launch(MODULE, code=COMPILES.format(gate=str(gate)))
+    status = peer.diagnostics("/slow_start").status[0]
+    assert (status.level, "compiling" in status.message) == (b"\1", True)
+    assert "started" not in process.output
+    gate.touch()
+    peer.diagnostics("/slow_start", lambda a: a.status[0].message == "running")
+    assert "compiling" in process.output
+
+
 LATE = """
 from functools import cached_property
 import delta_dynamics.nodes.twin as node
@@ -298,7 +329,8 @@ def long(rows):
 
 SLOW = """
 import time
-from delta_dynamics import feedforward, node
+from delta_dynamics import feedforward
+from delta_dynamics.nodes import twin as node
 solve = feedforward.inverse_dynamics
 answered = 0
 def slowly(robot, q, *rates):
