@@ -28,6 +28,7 @@ from pkm_twin.identification.compare import (
     steps_in,
 )
 from pkm_twin.identification.plausible import held_payload
+from pkm_twin.identification.samples import usual_size
 from pkm_twin.recordings import Load, Recording
 from pkm_twin.report import Fact, Verdict, judged
 from pkm_twin.robot.entries import with_entries
@@ -357,7 +358,7 @@ def _bands(r: Recording, c: Compared) -> dict[str, dict[str, Any]]:
         return {}
     parts = []
     for track, rows in zip(c.tracks, c.inner, strict=True):
-        made = by_held(r, torque_deviation, track)
+        made = by_held(r, torque_deviation, track.time, *track.joints, track.wrench)
         parts.append(made[rows])
     spread = np.concatenate(parts)
     inside = {str(k): np.mean(np.abs(c.residual) <= k * spread, 0) for k in DEVIATIONS}
@@ -467,7 +468,7 @@ def _payloads(r: Recording, c: Compared) -> Iterator[tuple[str, Recording]]:
         return inverse_dynamics(heavy, *motion) - inverse_dynamics(robot, *motion)
 
     try:
-        columns = [by_held(r, more, track) for track in c.tracks]
+        columns = [by_held(r, more, t.time, *t.joints, t.wrench) for t in c.tracks]
     except PkmTwinError:
         return
     weight = 1.0 / c.limit**2
@@ -510,7 +511,7 @@ def _saturated(r: Recording, c: Compared) -> tuple[str, ...]:
         most = np.abs(measured[:, j]).max()
         full = np.abs(measured[:, j]) >= most * (1.0 - 1e-9)
         less = c.raw[~full, j]
-        usual = 1.4826 * float(np.median(np.abs(less))) if len(less) else 0.0
+        usual = float(usual_size(less)) if len(less) else 0.0
         slack = limit[j] + 4.0 * usual
         enough = (
             full.mean() > FULL

@@ -23,9 +23,7 @@ from pkm_twin.identification.rows import BLOCK, shaken_efforts
 from pkm_twin.identification.samples import (
     SEGMENT,
     Filtering,
-    Motion,
     Track,
-    by_blocks,
     filtered,
     huber,
     kept_rows,
@@ -34,8 +32,7 @@ from pkm_twin.identification.samples import (
     tracks,
     usual_size,
 )
-from pkm_twin.recordings import Recording, at_rest
-from pkm_twin.robot.robot import Robot
+from pkm_twin.recordings import Recording, at_rest, by_load
 from pkm_twin.streams.drives import idle_samples
 from pkm_twin.streams.rates import rms
 from pkm_twin.streams.steps import Steps, steps_of
@@ -144,39 +141,28 @@ class Compared:
         return np.asarray((self.rms <= self.limit) & (self.local()[0] <= MORE * self.limit))
 
 
-def by_held(r: Recording, function: Callable[..., Array], motion: Motion) -> Array:
-    """A function of a recording's robot, joints and wrench, with what it carries, shape (k, n)."""
-    machines, made = r.machines, np.zeros_like(motion.q)
-    nearest = np.abs(motion.held[:, None] - np.array(list(machines))).argmin(1)
-    for k, machine in enumerate(machines.values()):
-        own = motion.part(np.asarray(nearest == k))
-
-        def block(rows: slice, machine: Robot = machine, own: Motion = own) -> Array:
-            part = own.part(rows)
-            return function(machine, *part.joints, part.wrench)
-
-        if len(own.q):
-            made[nearest == k] = by_blocks(len(own.q), BLOCK, block)
-    return made
+def by_held(r: Recording, function: Callable[..., Array], time: Array, *motion: Array) -> Array:
+    """A function of the robot, with its payload while it is held, and of a motion, shape (k, n)."""
+    parts = by_load(r.robot, r.load, time, BLOCK)
+    return np.concatenate([function(robot, *(v[rows] for v in motion)) for robot, rows in parts])
 
 
-def compare(robot: Robot, r: Recording, bound: float = MAX_RESIDUAL) -> Compared | None:
+def compare(r: Recording, bound: float = MAX_RESIDUAL) -> Compared | None:
     """Compare a recording with the model; None where no piece of it is long enough.
 
     Velocities and accelerations of a recording that has both are used as they are.
 
     :param bound: of a good residual, RMS, as a part of the peak effort.
     """
-    r, reach = replace(r, robot=robot), friction_reach(robot)
+    robot, reach = r.robot, friction_reach(r.robot)
     rates = None if r.qd is None or r.qdd is None else (r.qd, r.qdd)
-    held = None if r.carried is None else r.held
-    pieces, how = tracks(r.time, r.q, r.measured, r.wrench, held, rates=rates, least=LEAST)
+    pieces, how = tracks(r.time, r.q, r.measured, r.wrench, rates=rates, least=LEAST)
     if not pieces:
         return None
 
     def efforts(track: Track) -> Array:
         qd = moving_rates(track.qd, ~track.moves(how), reach)
-        return by_held(r, inverse_dynamics, replace(track, qd=qd))
+        return by_held(r, inverse_dynamics, track.time, track.q, qd, track.qdd, track.wrench)
 
     period, how = pieces[0].period, replace(how, keep_every=1)
     sharp: list[dict[str, Array]] = []
@@ -282,7 +268,7 @@ def recorded_of(r: Recording, leave_out: Mask | None = None) -> Recording:
 def compared_of(r: Recording, idle: Mask, bound: float = MAX_RESIDUAL) -> Compared | None:
     """The efforts in the band of the motion, without samples whose drives are idle."""
     part = recorded_of(r, idle)
-    return None if len(part.time) < 3 else compare(r.robot, part, bound)
+    return None if len(part.time) < 3 else compare(part, bound)
 
 
 def idle_of(r: Recording) -> Mask:
@@ -290,9 +276,7 @@ def idle_of(r: Recording) -> Mask:
     assert r.effort is not None  # noqa: S101
     still = np.zeros_like(r.q)
     wrench = np.zeros((len(r.time), 6)) if r.wrench is None else r.wrench
-    held = np.zeros(len(r.time)) if r.held is None else r.held
-    motion = Motion(r.q, still, still, wrench, held)
-    needed = by_held(r, inverse_dynamics, motion)
+    needed = by_held(r, inverse_dynamics, r.time, r.q, still, still, wrench)
     rates = r.qd
     if rates is None:
         rates = np.gradient(r.q, r.time, axis=0) if len(r.time) > 1 else still

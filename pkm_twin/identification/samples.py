@@ -14,21 +14,19 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from math import comb
 from typing import Final
 
 import numpy as np
 import scipy  # type: ignore[import-untyped]  # its parts come when they are asked for
 
 from pkm_twin.codegen.arrays import Array, Mask
-from pkm_twin.streams.rest import SIGMAS
+from pkm_twin.streams.rest import ROBUST, SIGMAS
+from pkm_twin.streams.rest import noise as noise_of_samples
 
 DEGREE: Final = 4
 """Of the local polynomial."""
 WINDOWS: Final = (7, 9, 11, 15, 19, 25, 33, 43, 57, 75, 99, 131)
 """Samples that may be fitted."""
-DIFFERENCE: Final = 6
-"""Order of the difference that shows the noise of the positions."""
 GAP: Final = 5.0
 """Median periods without a sample that divide a recording."""
 UNEVEN: Final = 0.02
@@ -86,18 +84,6 @@ class Filtering:
     position_noise: tuple[float, ...]
     cutoff: float | None
     keep_every: int
-
-
-def position_noise(pieces: list[Array]) -> Array:
-    """Standard deviation of the positions' noise, shape (n,), by their sixth differences.
-
-    :param pieces: evenly sampled positions, shape (samples, n) each.
-    """
-    jumps = np.concatenate([np.diff(q, DIFFERENCE, axis=0) for q in pieces])
-    moving = np.abs(jumps).max(1) > 0.0
-    jumps = jumps[moving] if moving.any() else jumps
-    size = np.sqrt(comb(2 * DIFFERENCE, DIFFERENCE))
-    return np.asarray(1.4826 * np.median(np.abs(jumps), axis=0) / size, np.float64)
 
 
 def rate_noise(how: Filtering, period: float) -> Array:
@@ -176,7 +162,10 @@ def tracks(
     if not pieces:
         return [], Filtering(0, (), None, 1)
     positions = [own[0] for _, own in pieces]
-    noise = position_noise(positions)
+    # Each piece by its length.
+    noise = np.average(
+        [noise_of_samples(t, own[0]) for t, own in pieces], 0, [len(t) for t, _ in pieces]
+    )
     width = window or choose_window(positions, period, noise)
     result = []
     for t, (place, force, load, carried, *known) in pieces:
@@ -282,7 +271,7 @@ def passed_band(how: Filtering, rate: float) -> float:
 
 def usual_size(residual: Array) -> Array:
     """Standard deviation of normal residuals (k, n) by the median of their sizes, (n,)."""
-    return np.asarray(1.4826 * np.median(np.abs(residual), axis=0), np.float64)
+    return np.asarray(ROBUST * np.median(np.abs(residual), axis=0), np.float64)
 
 
 @dataclass(frozen=True)

@@ -263,7 +263,11 @@ def parse_times(text: str) -> tuple[tuple[float, float], ...]:
 def by_load(
     robot: Robot, carried: Load | None, time: Array, longest: int
 ) -> Iterator[tuple[Robot, slice]]:
-    """The robot as it is loaded, and the samples in a row (at most ``longest``) for which."""
+    """The robot as it is loaded, and the samples in a row (at most ``longest``) for which.
+
+    A payload that is sought is the robot's own.
+    """
+    carried = None if carried is None or carried.sought else carried
     mass = np.full(len(time), np.nan) if carried is None else carried.carried(time)
     own = -1.0
     mass = np.where(np.isfinite(mass), mass, own)

@@ -134,11 +134,9 @@ class Recording:
         """Which part of :attr:`carried` is on the platform, shape (samples,): 1, 0 where the robot
         has its file's payload, and by the mass where there are several.
         """
-        return None if self.load is None else self._part(self.load.carried(self.time))
-
-    def _part(self, mass: Array) -> Array:
-        assert self.load is not None  # noqa: S101  asked for with one
-        own = self.robot.payload.mass
+        if self.load is None:
+            return None
+        mass, own = self.load.carried(self.time), self.robot.payload.mass
         if not self.load.masses:
             return np.isfinite(mass).astype(np.float64)
         return np.nan_to_num((mass - own) / (self.load.farthest(own) - own))
@@ -146,17 +144,10 @@ class Recording:
     @property
     def carried(self) -> Robot | None:
         """The robot with the payload that is known; of several the one farthest from its own."""
-        return self.machines.get(1.0)
-
-    @property
-    def machines(self) -> dict[float, Robot]:
-        """The robot with its file's payload and with what is known of others, by ``held``."""
-        load, machines = self.load, {0.0: self.robot}
-        if load is not None and not load.sought:
-            masses = np.array(load.masses or (load.mass,))
-            for mass, part in zip(masses.tolist(), self._part(masses).tolist(), strict=True):
-                machines[part] = load.on(self.robot, mass)
-        return machines
+        load = self.load
+        if load is None or load.sought:
+            return None
+        return load.on(self.robot, load.farthest(self.robot.payload.mass))
 
     @property
     def measured(self) -> Array:

@@ -34,10 +34,10 @@ def agree(robot: Robot, recorded: Recording) -> str:
     try:
         result = fit(robot, [recorded], ("friction", "rotor"))
     except PkmTwinError:
-        found = compare(robot, recorded)
+        found = compare(replace(recorded, robot=robot))
         assert found is None or not found.good.all()
         return "rejected"
-    compared = compare(fitted(result), recorded)
+    compared = compare(replace(recorded, robot=fitted(result)))
     assert compared is not None
     good = bool(compared.good.all())
     if result.verdict.answer == "explains":
@@ -63,7 +63,7 @@ def test_an_encoder_s_noise_is_not_the_model_s_fault(name: str) -> None:
     assert result.verdict.answer == "explains"
     friction = {n.name: n.after for n in result.numbers if n.name.startswith("friction")}
     robot = with_entries(m.truth, friction)
-    compared = compare(robot, recorded)
+    compared = compare(replace(recorded, robot=robot))
     assert compared is not None and compared.good.all()
     held_out = result.judged[0]
     rms = held_out.rms(held_out.after)
@@ -76,7 +76,7 @@ def test_efforts_that_are_late_leave_noise_alone() -> None:
     m = machine(load("delta"), rng, 8.0, 500.0)
     for late in rng.uniform(-8e-3, 8e-3, 3):
         made = noisy(m.recorded(effort=shifted(m.efforts, m.time, late)), rng)
-        found = compare(m.truth, made)
+        found = compare(replace(made, robot=m.truth))
         assert found is not None
         assert found.late == pytest.approx(late, abs=2e-4)
         assert (found.rms < 2.0 * found.noise).all()
