@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pkm_twin.errors import ParameterError
-from pkm_twin.recordings import Load, Recording
+from pkm_twin.recordings import Load, Recording, by_load
 from pkm_twin.recordings.payload import load_of_table, payload_columns
 from pkm_twin.recordings.tables import Table
 from test.support.robots import load as robot_of
