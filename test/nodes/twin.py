@@ -1,9 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """A running delta_dynamics and its topics, seen from the other side; needs rclpy."""
 
+import contextlib
+
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
-from rcl_interfaces.srv import SetParametersAtomically
+from rcl_interfaces.msg import Parameter as ParameterMessage
+from rcl_interfaces.srv import GetParameters, SetParametersAtomically
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
@@ -136,15 +139,36 @@ class Twin:
         self.peer.until(lambda: any(stamp_of(m) == stamps[-1] for m in received))
         return [m for m in received if stamp_of(m) >= stamps[0]]
 
+    def call(self, kind, service, **fields):
+        """The answer of one of the node's services."""
+        return self.peer.call(kind, f"/{self.name}/{service}", kind.Request(**fields))
+
+    def _set(self, parameters):
+        service = "set_parameters_atomically"
+        return self.call(SetParametersAtomically, service, parameters=parameters).result
+
     def set(self, **values):
         """Set parameters atomically; dots are written as two underscores."""
-        request = SetParametersAtomically.Request()
-        request.parameters = [
+        return self._set([
             Parameter(key.replace("__", "."), value=value).to_parameter_msg()
             for key, value in values.items()
-        ]
-        service = f"/{self.name}/set_parameters_atomically"
-        return self.peer.call(SetParametersAtomically, service, request).result
+        ])  # fmt: skip
+
+    def get(self, *names):
+        """Values of parameters, as messages."""
+        return self.call(GetParameters, "get_parameters", names=names).values
+
+    @contextlib.contextmanager
+    def changed(self, **values):
+        """Parameters as long as the context lasts."""
+        names = [key.replace("__", ".") for key in values]
+        before = zip(names, self.get(*names), strict=True)
+        assert self.set(**values).successful
+        try:
+            yield
+        finally:
+            old = [ParameterMessage(name=name, value=value) for name, value in before]
+            assert self._set(old).successful
 
     def effort(self, q=Q):
         """What the node answers for holding still at q."""
