@@ -195,9 +195,9 @@ class Process:
 
 
 class Command(Process):
-    """A command in a new process."""
+    """A command in a new process; ``begin`` is called there before it."""
 
-    def __init__(self, domain, command):
+    def __init__(self, domain, command, begin=lambda: None):
         super().__init__(
             lambda output: subprocess.Popen(
                 command,
@@ -207,7 +207,7 @@ class Command(Process):
                 cwd=tempfile.gettempdir(),
                 env=domain.environment(),
                 start_new_session=True,
-                preexec_fn=end_with_parent,
+                preexec_fn=lambda: (end_with_parent(), begin()),
             )
         )
 
@@ -219,9 +219,9 @@ class NodeProcess(Command):
     a path and its own arguments.
     """
 
-    def __init__(self, domain, module, *parameters, arguments=(), code=None, script=None):
+    def __init__(self, domain, module, *parameters, arguments=(), code=None, script=None, **more):
         run = script or (["-m", module] if code is None else ["-c", code])
-        super().__init__(domain, [sys.executable, *run, *flags(parameters, arguments)])
+        super().__init__(domain, [sys.executable, *run, *flags(parameters, arguments)], **more)
 
 
 def flags(parameters, arguments):

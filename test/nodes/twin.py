@@ -30,13 +30,11 @@ COMMON = (
 Q = np.array([0.1, 0.2, 0.3])
 
 
-def launched(peer, launch, name, *parameters, code=None, fresh=False):
+def launched(peer, launch, name, *parameters, **options):
     """A node of this name in a process, its topics not yet connected."""
     peer.hear(DiagnosticArray, "/diagnostics")
-    process = launch(
-        MODULE, *COMMON, *parameters, arguments=renamed(name, joint_states="states"),
-        code=code, fresh=fresh,
-    )  # fmt: skip
+    remaps = renamed(name, joint_states="states")
+    process = launch(MODULE, *COMMON, *parameters, arguments=remaps, **options)
     return Twin(peer, process, name)
 
 
@@ -143,13 +141,14 @@ class Twin:
         """The answer of one of the node's services."""
         return self.peer.call(kind, f"/{self.name}/{service}", kind.Request(**fields))
 
-    def _set(self, parameters):
+    def set_to(self, parameters):
+        """Set parameters, given as messages, atomically."""
         service = "set_parameters_atomically"
         return self.call(SetParametersAtomically, service, parameters=parameters).result
 
     def set(self, **values):
         """Set parameters atomically; dots are written as two underscores."""
-        return self._set([
+        return self.set_to([
             Parameter(key.replace("__", "."), value=value).to_parameter_msg()
             for key, value in values.items()
         ])  # fmt: skip
@@ -168,7 +167,7 @@ class Twin:
             yield
         finally:
             old = [ParameterMessage(name=name, value=value) for name, value in before]
-            assert self._set(old).successful
+            assert self.set_to(old).successful
 
     def effort(self, q=Q):
         """What the node answers for holding still at q."""
