@@ -266,7 +266,7 @@ class _Planner:
         self.parts: list[Member | Carried] = []
 
     def plan(self) -> StructuralModel:
-        left = [joint for joint in self.graph.joints.values() if not joint.given]
+        left = [joint for joint in self.graph.joints.values() if not joint.virtual]
         rods = [beam for beam in self.structure.beams if beam.parts[0] in self.graph.rods]
         while True:
             # Bodies that one joint alone leads to come first, then whatever hangs.

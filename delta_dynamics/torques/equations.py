@@ -96,7 +96,7 @@ def _motion(t: Traced) -> Program:
         forces.pair(joint, passive[3 * k + 2] * second)
         drift.append(second)
     unknown, driven = forces.generalised()
-    bias = driven - t.jq[t.scheme.kept].T @ t.lu.solve_transposed(unknown)
+    bias = driven - t.jq[t.scheme.independent].T @ t.lu.solve_transposed(unknown)
     height = potential(t, bodies, rods, gravity)
     twists: list[Any] = []
     rows: list[Any] = []

@@ -50,7 +50,7 @@ def transmitters(graph: Graph, rods: Array, places: Array) -> list[Transmitter]:
     """All joints that transmit something, those of the graph first, then the rods' ends."""
     result = []
     for k, joint in enumerate(graph.joints.values()):
-        if not joint.given:
+        if not joint.virtual:
             here = places[..., 15 * k : 15 * k + 15]
             result.append(_graph_joint(joint, here.reshape(*here.shape[:-1], 5, 3)))
     for k, rod in enumerate(graph.rods.values()):

@@ -25,10 +25,10 @@ from pkm_twin.machine.graph import Joint, Rod
 from pkm_twin.machine.inertia import (
     TEN,
     TEN_UNITS,
+    change_of_frame,
     drive_units,
     loaded_joints,
-    ten_numbers,
-    transport,
+    standard_parameters,
 )
 from pkm_twin.robot.robot import Robot
 
@@ -65,10 +65,10 @@ def parameter_values(robot: Robot) -> Array:
     values: list[Any] = []
     for link in tree.links.values():
         body = graph.bodies[link.body]
-        values += [*ten_numbers(body.mass, body.com - link.at, body.inertia)]
+        values += [*standard_parameters(body.mass, body.com - link.at, body.inertia)]
     values += [rod.mass for rod in graph.rods.values()]
     load, friction = robot.payload, robot.friction
-    values += [*ten_numbers(load.mass, load.com, load.inertia)]
+    values += [*standard_parameters(load.mass, load.com, load.inertia)]
     for k, name in enumerate(graph.actuated):
         rub = [friction.viscous[k], friction.coulomb[k], friction.offset[k]]
         values += [*rub, graph.joints[name].rotor_inertia]
@@ -107,7 +107,7 @@ def regressor(
     parts = [
         np.moveaxis(ten, -3, -2).reshape(*batch, n, len(links) * ten.shape[-1]),
         other[..., :rods],
-        platform @ transport(np.eye(3), lever),
+        platform @ change_of_frame(np.eye(3), lever),
         _drive_columns(rates, changes),
     ]
     if not robot.laws:

@@ -346,7 +346,7 @@ def _loads(t: Traced, parts: list[Objects], qd: Objects, qdd: Objects) -> list[A
     forces.wrench(wrench)
     unknown, driven = forces.generalised()
     multipliers = t.lu.solve_transposed(unknown)
-    return list(driven - t.jq[t.scheme.kept].T @ multipliers)
+    return list(driven - t.jq[t.scheme.independent].T @ multipliers)
 
 
 def torque_program(t: Traced) -> Program:

@@ -119,7 +119,7 @@ def _effects(
             )  # fmt: skip
         case "joints", ("at" | "axis") as what, int(k) if k < (3 if what == "at" else 2):
             joint = graph.joints[name]
-            if joint.given:
+            if joint.virtual:
                 raise ParameterError(path, name, "a joint that does not stand for others")
             if what == "at":
                 moved = np.asarray(turn @ np.eye(3)[k])
@@ -136,7 +136,7 @@ def _effects(
 def _longer(robot: Robot, body: str, path: str) -> dict[Effect, Array]:
     """All points of a body but its joint towards the base, along the line to their mean."""
     graph = robot.graph
-    joints = [j for j in graph.joints.values() if not j.given]
+    joints = [j for j in graph.joints.values() if not j.virtual]
     far, ring = {BASE: 0}, [BASE]
     for near in ring:
         for joint in joints:
@@ -246,7 +246,7 @@ class Assembly:
         found: list[Row] = []
         names = list(self.graph.actuated)
         for joint in self.graph.joints.values():
-            if joint.given or (only is not None and joint.name not in only):
+            if joint.virtual or (only is not None and joint.name not in only):
                 continue
             value = q[..., names.index(joint.name)] if joint.actuated else None
             found += self._joint(joint, placed, value, errors)

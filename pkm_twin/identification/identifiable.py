@@ -18,7 +18,7 @@ import numpy as np
 
 from pkm_twin.codegen.arrays import Array, Indices
 from pkm_twin.machine.friction import all_keys, linear_keys
-from pkm_twin.machine.inertia import drive_units, matrix_of, ten_numbers, transport
+from pkm_twin.machine.inertia import change_of_frame, drive_units, matrix_of, standard_parameters
 from pkm_twin.machine.places import Keys, path_of
 from pkm_twin.robot.numbers import FileNumbers
 from pkm_twin.robot.robot import Robot
@@ -131,8 +131,10 @@ def of_drives(robot: Robot) -> tuple[Identifiable, ...]:
 def _tens(robot: Robot) -> list[Any]:
     """Ten numbers of each body and of the payload about the base's origin, masses of rods."""
     graph, load = robot.make_graph(), robot.payload
-    tens = [ten_numbers(body.mass, body.com, body.inertia) for body in graph.bodies.values()]
-    tens.append(ten_numbers(load.mass, graph.origin + load.com, load.inertia))
+    tens = [
+        standard_parameters(body.mass, body.com, body.inertia) for body in graph.bodies.values()
+    ]
+    tens.append(standard_parameters(load.mass, graph.origin + load.com, load.inertia))
     return [*(value for ten in tens for value in ten), *(rod.mass for rod in graph.rods.values())]
 
 
@@ -162,7 +164,7 @@ def of_masses(robot: Robot) -> Iterator[Identifiable]:
     rods = dict(zip(graph.rods, slopes[10 * len(names) :], strict=True))
     coms = [*(body.com for body in graph.bodies.values()), graph.origin + load.com]
     moved = zip(coms, tens, strict=True)
-    own = np.array([transport(np.eye(3), -com) @ ten for com, ten in moved])
+    own = np.array([change_of_frame(np.eye(3), -com) @ ten for com, ten in moved])
     own[np.abs(own) < EMPTY * np.abs(own).max((1, 2), keepdims=True, initial=1e-300)] = 0.0
     touched = np.vstack([own.any(1), slopes[10 * len(names) :] != 0.0]).astype(float)
     linked = np.linalg.matrix_power(touched.T @ touched > 0.0, 4)

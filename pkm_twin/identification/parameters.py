@@ -17,7 +17,7 @@ from delta_dynamics.torques.virtual_work import mass_matrix
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import PkmTwinError, UnknownNameError
 from pkm_twin.identification.identifiable import KINDS, Identifiable, Kind, identifiable
-from pkm_twin.machine.inertia import transport
+from pkm_twin.machine.inertia import change_of_frame
 from pkm_twin.machine.machine_yaml import edit_yaml
 from pkm_twin.machine.places import Keys, path_of
 from pkm_twin.machine.strict_yaml import parse_yaml
@@ -109,7 +109,7 @@ def file_parameters(robot: Robot, what: Sequence[Kind] = KINDS) -> FileParameter
         end = start + len(group.names)
         for body, ten in group.bodies.items():
             rows = [place[f"{body}.{word}"] for word in TEN]
-            mixing[rows, start:end] += transport(np.eye(3), -tree.at[body]) @ ten
+            mixing[rows, start:end] += change_of_frame(np.eye(3), -tree.at[body]) @ ten
         for name, row in group.others.items():
             mixing[place[name], start:end] += row
         start = end

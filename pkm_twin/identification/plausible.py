@@ -24,7 +24,7 @@ from pkm_twin.codegen.arrays import Array, Mask
 from pkm_twin.errors import PkmTwinError
 from pkm_twin.identification.rows import LARGEST, Rows, rows_of
 from pkm_twin.machine.friction import turning_keys
-from pkm_twin.machine.inertia import ten_numbers
+from pkm_twin.machine.inertia import standard_parameters
 
 OFFSET: Final = 0.1
 """Part of the efforts that a current sensor is off by."""
@@ -440,7 +440,7 @@ def _points(reach: float) -> Array:
         reach / np.sqrt(3.0) * np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T
     )
     places = [np.zeros(3), *(reach * np.eye(3)), *(-reach * np.eye(3)), *corners]
-    return np.stack([ten_numbers(1.0, place, np.zeros((3, 3))) for place in places], -1)
+    return np.stack([standard_parameters(1.0, place, np.zeros((3, 3))) for place in places], -1)
 
 
 def _efforts(case: Case, joints: Sequence[str]) -> Iterator[tuple[str, Case, float]]:

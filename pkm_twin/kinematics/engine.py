@@ -98,7 +98,7 @@ class Engine(Scheme):
 
     def _regularity(self, x: Array, q: Array) -> tuple[float, float]:
         """Sign of the determinant of the kept closures, and their reciprocal condition."""
-        matrix = self._look(q, x)[1][self.kept]
+        matrix = self._look(q, x)[1][self.independent]
         return float(np.linalg.slogdet(matrix)[0]), _reciprocal(matrix)
 
     def _shortest(self, x: Array, q: Array) -> tuple[str, float]:

@@ -161,7 +161,7 @@ class Motion:
 
     # Columns: velocity of a point of a body, and angular velocity, by rates.
 
-    def point_columns(self, body: str, at: Any) -> Columns:
+    def linear_jacobian(self, body: str, at: Any) -> Columns:
         """Velocity per rate of the point of a body that is at a place."""
         out: Columns = {}
         while body != BASE:
@@ -186,7 +186,7 @@ class Motion:
             body = link.parent
         return out
 
-    def turn_columns(self, body: str) -> Columns:
+    def angular_jacobian(self, body: str) -> Columns:
         """Angular velocity of a body per rate."""
         out: Columns = {}
         while body != BASE:
@@ -219,7 +219,7 @@ class Motion:
         """Both bodies' points are at one place."""
         a, b, at = joint.inner, joint.outer, joint.at
         xa, xb = self.point(a, at), self.point(b, at)
-        columns = difference(self.point_columns(b, xb), self.point_columns(a, xa))
+        columns = difference(self.linear_jacobian(b, xb), self.linear_jacobian(a, xa))
 
         def bias(i: int) -> Callable[[], Any]:
             return lambda: self.acceleration(b, at)[i] - self.acceleration(a, at)[i]
@@ -237,7 +237,7 @@ class Motion:
         a, b = joint.inner, joint.outer
         ea, ub = self.direction(a, held.inner), self.direction(b, held.outer)
         normal = cross(ub, ea)
-        columns = difference(self.turn_columns(b), self.turn_columns(a))
+        columns = difference(self.angular_jacobian(b), self.angular_jacobian(a))
 
         def bias() -> Any:
             wa, wb = self.omega[a], self.omega[b]
@@ -259,9 +259,9 @@ class Motion:
         ea, xa, xb = self.direction(a, held.inner), self.point(a, at), self.point(b, at)
         apart = xb - xa
         normal = cross(ea, apart)
-        linear = difference(self.point_columns(b, xb), self.point_columns(a, xa))
+        linear = difference(self.linear_jacobian(b, xb), self.linear_jacobian(a, xa))
         columns = {k: c @ ea for k, c in linear.items()}
-        for k, c in self.turn_columns(a).items():
+        for k, c in self.angular_jacobian(a).items():
             columns[k] = columns[k] + c @ normal if k in columns else c @ normal
 
         def bias() -> Any:
@@ -298,7 +298,7 @@ class Motion:
     def distance(self, part: str, a: BodyPoint, b: BodyPoint, square: Any) -> Row:
         """The points have a distance, m2; without a bias."""
         apart = b[1] - a[1]
-        columns = difference(self.point_columns(*b), self.point_columns(*a))
+        columns = difference(self.linear_jacobian(*b), self.linear_jacobian(*a))
         return Row(
             part, 0.5 * (apart @ apart - square), {k: c @ apart for k, c in columns.items()},
             _none, 1.0 / (self.tree.size * sqrt(square)), a[0], b[0], b[1], apart, np.zeros(3),

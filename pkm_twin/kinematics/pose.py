@@ -143,8 +143,8 @@ def rows(
     """Equations of a pose, zero where the platform is there, and their derivatives by rates."""
     body = motion.graph.platform
     position, rotation = motion.platform()
-    linear = motion.point_columns(body, position)
-    angular = motion.turn_columns(body)
+    linear = motion.linear_jacobian(body, position)
+    angular = motion.angular_jacobian(body)
     result: list[tuple[Any, Columns]] = []
     for c, goal in zip(coordinates, pose, strict=True):
         if c.axis is not None:

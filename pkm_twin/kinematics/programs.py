@@ -170,13 +170,13 @@ def _posed(t: Traced, goal: Objects) -> Equations:
         """Closures, pose equations, and the factors of their derivatives."""
         motion = Motion(tree, state[:size], state[size:])
         rows = motion.closures()
-        table = np.hstack(matrices(tree, rows))[scheme.kept]
+        table = np.hstack(matrices(tree, rows))[scheme.independent]
         matrix = np.vstack([table, scheme.pose_rows(motion, pose)])
         equations = [value for value, _ in poses.rows(scheme.coordinates, motion, pose)]
         return motion, rows, equations, SparseLU(matrix, scheme.inverse_pivots)
 
     motion, rows, equations, lu = system(everything, goal)
-    step = -lu.solve([rows[k].value for k in scheme.kept] + equations)
+    step = -lu.solve([rows[k].value for k in scheme.independent] + equations)
     moved = motion.retracted(everything[:size], step[:split])
     return Equations(
         "pose", t.lift(home), t.lift(origin), None,

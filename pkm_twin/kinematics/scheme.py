@@ -67,12 +67,12 @@ class Scheme(Linkage):
         """All that programs hang on: machines of one structure share them."""
         return self._mark.also(repr((
             self.graph.topology, pattern_of(self.tree), self.coordinates,
-            self.closed.start is not None, self.branch is not None, self.kept, self.pivots,
+            self.closed.start is not None, self.branch is not None, self.independent, self.pivots,
             self.limbs, self.solved_pivots,
         )))  # fmt: skip
 
     @cached_property
-    def kept(self) -> list[int]:
+    def independent(self) -> list[int]:
         """Closures that determine the unknowns; the others only judge.
 
         :raises ParameterError: something can move while the actuated joints are held.
@@ -85,13 +85,13 @@ class Scheme(Linkage):
 
     @cached_property
     def pivots(self) -> Order:
-        """Of the kept closures by the unknowns, good in states near home."""
-        return pivot_order(self._sampled[0][:, self.kept])
+        """Of the independent closures by the unknowns, good in states near home."""
+        return pivot_order(self._sampled[0][:, self.independent])
 
     @cached_property
     def limbs(self) -> tuple[Limb, ...]:
         """Limbs whose turns follow in closed form."""
-        return find_limbs(self.tree, self.parts, self.kept)
+        return find_limbs(self.tree, self.parts, self.independent)
 
     @cached_property
     def solved(self) -> tuple[list[int], list[int]]:
@@ -104,9 +104,11 @@ class Scheme(Linkage):
         return places, rates
 
     def solved_rows(self, rows: Sequence[Row], poses: Sequence[LimbPose]) -> list[Row]:
-        """Of the kept closures those of no limb; and what the limbs' turns cannot meet."""
+        """Of the independent closures those of no limb; and what the limbs' turns cannot meet."""
         limbs = {k for limb in self.limbs for k in limb.rows}
-        return [rows[k] for k in self.kept if k not in limbs] + [pose.row() for pose in poses]
+        return [rows[k] for k in self.independent if k not in limbs] + [
+            pose.row() for pose in poses
+        ]
 
     @cached_property
     def solved_pivots(self) -> Order:
@@ -123,7 +125,7 @@ class Scheme(Linkage):
 
     @cached_property
     def inverse_pivots(self) -> Order:
-        """The same of kept closures and pose by the unknowns and q."""
+        """The same of independent closures and pose by the unknowns and q."""
         samples = []
         for x, q in self.samples:
             there, closed = self.at(x, q)
@@ -142,7 +144,7 @@ class Scheme(Linkage):
             raise singular_home(self, near[0], min(near[1:]))
         if self.mobility.freedoms != self.joints:
             raise mobility_error(self)
-        _ = self.kept
+        _ = self.independent
         if len(self.coordinates) != self.joints:
             raise ParameterError(
                 "pose",
@@ -164,14 +166,14 @@ class Scheme(Linkage):
         return np.array([0.0 if c.axis is None else origin[c.axis] for c in self.coordinates])
 
     def _inverse_matrix(self, motion: Motion, rows: Sequence[Row], pose: Numbers) -> Array:
-        """Scaled derivatives of kept closures and pose equations by u and qd."""
+        """Scaled derivatives of independent closures and pose equations by u and qd."""
         ju, jq = self._scaled(rows)
         extra = self.pose_rows(motion, pose)
         table = np.array(self._pose_scales)[:, None] * numbers(extra)
         n = self.tree.unknown_rates
         drives = np.array([self._drive_scale(name) for name in self.graph.actuated])
         lower = np.hstack([table[:, :n] / np.array(self.tree.scales), table[:, n:] / drives])
-        return np.vstack([np.hstack([ju, jq])[self.kept], lower])
+        return np.vstack([np.hstack([ju, jq])[self.independent], lower])
 
     @property
     def _pose_scales(self) -> list[float]:
@@ -195,8 +197,8 @@ def choose_coordinates(graph: Graph) -> tuple[str, ...]:
     scheme = Scheme(graph, tuple(poses.COORDINATES.values()))
     motion, closed = scheme.at(scheme.tree.home, graph.home)
     ju, jq = (numbers(m) for m in matrices(scheme.tree, closed))
-    kept = scheme.kept
-    rates = np.vstack([-np.linalg.solve(ju[kept], jq[kept]), np.eye(scheme.joints)])
+    independent = scheme.independent
+    rates = np.vstack([-np.linalg.solve(ju[independent], jq[independent]), np.eye(scheme.joints)])
     chosen: list[str] = []
     table = np.zeros((0, scheme.joints))
     rows = numbers(scheme.pose_rows(motion, [0.0] * len(scheme.coordinates)))
@@ -216,7 +218,7 @@ def check_masses(scheme: Scheme, graph: Graph) -> None:
     """
     motion, rows = scheme.at(scheme.tree.home, graph.home)
     ju, jq = (numbers(m) for m in matrices(scheme.tree, rows))
-    moved = -np.linalg.solve(ju[scheme.kept], jq[scheme.kept])
+    moved = -np.linalg.solve(ju[scheme.independent], jq[scheme.independent])
     n = len(graph.actuated)
     table = []
     for j in range(n):

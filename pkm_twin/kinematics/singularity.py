@@ -73,7 +73,7 @@ class Placed(Motion):
 
     def __init__(self, motion: Motion) -> None:
         graph = motion.graph
-        true = {name: joint for name, joint in graph.joints.items() if not joint.given}
+        true = {name: joint for name, joint in graph.joints.items() if not joint.virtual}
         self.graph: Graph = replace(graph, joints=true)
         self.tree = Tree(self.graph)
         self._found = motion
@@ -105,7 +105,7 @@ class Placed(Motion):
         xa, xb = self.point(a, start), self.point(b, end)
         length = norm(plain(end - start))
         normal = cross(self.direction(b, np.asarray(rod.pair)), (xb - xa) * (1.0 / length))
-        columns = difference(self.turn_columns(b), self.turn_columns(a))
+        columns = difference(self.angular_jacobian(b), self.angular_jacobian(a))
 
         def bias() -> Any:
             raise NotImplementedError("the acceleration of a couple is not needed")
@@ -169,8 +169,8 @@ def _held(t: Traced | _AtHome) -> Any:
     bodies = []
     for name in placed.graph.bodies:
         middle, reach = placed.graph.frame(name)
-        linear = placed.point_columns(name, placed.point(name, middle))
-        turning = placed.turn_columns(name)
+        linear = placed.linear_jacobian(name, placed.point(name, middle))
+        turning = placed.angular_jacobian(name)
         bodies += [{k: v[i] for k, v in linear.items()} for i in range(3)]
         bodies += [{k: reach * v[i] for k, v in turning.items()} for i in range(3)]
     (response,) = traces_over([_gram(bodies, unknown)], _gram(errors, unknown))
@@ -212,8 +212,8 @@ class _Rates:
     def columns(self, name: str) -> dict[tuple[str, int], list[Any]]:
         """S: by rate the velocity of a body's middle, and its angular velocity times its reach."""
         middle, reach = self.graph.frame(name)
-        linear = self.motion.point_columns(name, self.motion.point(name, middle))
-        turning = self.motion.turn_columns(name)
+        linear = self.motion.linear_jacobian(name, self.motion.point(name, middle))
+        turning = self.motion.angular_jacobian(name)
         still = [0.0] * 3
         return {
             k: [*linear.get(k, still), *(reach * v for v in turning.get(k, still))]

@@ -129,8 +129,8 @@ def twist(motion: Motion, body: str, point: Array) -> Array:
     at = np.asarray(motion.point(body, point), float)
     table = np.zeros((6, tree.unknown_rates))
     for rows, columns in (
-        (slice(3), motion.point_columns(body, at)),
-        (slice(3, 6), motion.turn_columns(body)),
+        (slice(3), motion.linear_jacobian(body, at)),
+        (slice(3, 6), motion.angular_jacobian(body)),
     ):
         for (kind, k), vector in columns.items():
             if kind == "u":

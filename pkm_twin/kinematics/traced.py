@@ -67,7 +67,7 @@ class Traced:
         self.x, self.motion = np.array(x, dtype=object), motion
         self.rows = self.motion.closures()
         self.ju, self.jq = matrices(tree, self.rows)
-        self.lu = SparseLU(self.ju[scheme.kept], scheme.pivots)
+        self.lu = SparseLU(self.ju[scheme.independent], scheme.pivots)
         self.solved = scheme.solved_rows(self.rows, self.limbs)
         self.newton = self.lu
         if self.limbs:
@@ -135,7 +135,9 @@ class Traced:
     def _at_home(self) -> tuple[Motion, Objects, SparseLU]:
         """At home: the motion, derivatives of the kept closures by qd, factors of those by u."""
         motion = self.home
-        ju, jq = (snapped_all(m[self.scheme.kept]) for m in matrices(self.tree, motion.closures()))
+        ju, jq = (
+            snapped_all(m[self.scheme.independent]) for m in matrices(self.tree, motion.closures())
+        )
         return motion, jq, SparseLU(ju, self.scheme.pivots)
 
     def _along(self) -> list[Any]:
@@ -215,28 +217,28 @@ class Traced:
 
     def set_rates(self, qd: Numbers) -> Objects:
         """Rates of everything by qd; returns those of the unknowns."""
-        kept = self.scheme.kept
+        kept = self.scheme.independent
         u = self.lu.solve(-(self.jq[kept] @ np.asarray(qd, dtype=object)))
         self.motion.set_rates(u, qd)
         return u
 
     def set_accelerations(self, qdd: Numbers, gravity: Any | None = None) -> None:
         """Accelerations of everything by qdd, after the rates."""
-        kept = self.scheme.kept
+        kept = self.scheme.independent
         self.motion.set_accelerations(np.zeros(self.tree.unknown_rates), qdd)
         bias = [self.rows[k].bias() for k in kept]
         self.motion.set_accelerations(-self.lu.solve(bias), qdd, gravity)
 
     def rate_columns(self) -> list[Objects]:
         """Rates of the unknowns per joint rate."""
-        kept = self.scheme.kept
+        kept = self.scheme.independent
         return [self.lu.solve(-self.jq[kept][:, j]) for j in range(self.joints)]
 
     def twists(self) -> list[tuple[Any, Any]]:
         """Velocity of the reference point and angular velocity of the platform per joint rate."""
         motion, body = self.motion, self.graph.platform
         position, _ = motion.platform()
-        linear, angular = motion.point_columns(body, position), motion.turn_columns(body)
+        linear, angular = motion.linear_jacobian(body, position), motion.angular_jacobian(body)
         result = []
         for j, u in enumerate(self.rate_columns()):
             pair = []

@@ -70,7 +70,7 @@ class Joint:
     fixed in the inner body. ``pitch``: of a screw, m a rad.
     ``home``: the joint's value at home. ``viscous``, ``coulomb``: friction along its freedom;
     ``rotor_inertia``: against its acceleration, kg m2 or kg.
-    ``given``: a joint that stands for what other parts hold: it carries no load itself.
+    ``virtual``: a joint that stands for what other parts hold: it carries no load itself.
     ``directions``: of reactions; without them the joint's own axes. ``normal``: name of a universal
     joint's direction across both axes. ``label``: its name among the reactions, else its own.
     """
@@ -86,7 +86,7 @@ class Joint:
     viscous: float = 0.0
     coulomb: float = 0.0
     rotor_inertia: float = 0.0
-    given: bool = False
+    virtual: bool = False
     directions: tuple[Direction, ...] = ()
     label: str = ""
     normal: str = "n"
@@ -225,7 +225,7 @@ class Graph:
         """Text of what bodies, joints and rods there are, and how they meet: no number."""
         joints = [
             (
-                j.name, j.kind, j.inner, j.outer, j.actuated, j.given, j.loaded,
+                j.name, j.kind, j.inner, j.outer, j.actuated, j.virtual, j.loaded,
                 [d.body for d in j.directions],
             )
             for j in self.joints.values()

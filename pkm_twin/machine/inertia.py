@@ -33,7 +33,7 @@ ROTORS: Final = 7
 """Parts of the inputs, see :meth:`Layout.part`."""
 
 
-def ten_numbers(mass: float, com: Array, inertia: Array) -> Array:
+def standard_parameters(mass: float, com: Array, inertia: Array) -> Array:
     """Mass, first moments and inertia (xx yy zz xy xz yz) about the point that com starts at.
 
     :param com: centre of mass, shape (3,), m; ``inertia`` about it, shape (3, 3), kg m2.
@@ -42,7 +42,7 @@ def ten_numbers(mass: float, com: Array, inertia: Array) -> Array:
     return _numbers(mass, mass * com, about)
 
 
-def transport(axes: Array, lever: Array) -> Array:
+def change_of_frame(axes: Array, lever: Array) -> Array:
     """Takes ten numbers about one point to those about another and in other axes, shape (10, 10).
 
     :param axes: the new axes as columns in the old ones, shape (3, 3).
@@ -182,7 +182,7 @@ class Layout:
         bodies = []
         for link in self.tree.links.values():
             body = graph.bodies[link.body]
-            bodies.append(ten_numbers(body.mass, body.com - link.at, body.inertia))
+            bodies.append(standard_parameters(body.mass, body.com - link.at, body.inertia))
         drives = [graph.joints[name] for name in graph.actuated]
         return plain(
             np.concatenate(
@@ -210,5 +210,5 @@ class Layout:
         link = self.tree.links[graph.platform]
         result = np.zeros(self.size, dtype=object)
         lever = graph.origin + com - link.at
-        result[self.body(graph.platform)] = ten_numbers(mass, lever, inertia)
+        result[self.body(graph.platform)] = standard_parameters(mass, lever, inertia)
         return plain(result)

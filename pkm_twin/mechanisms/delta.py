@@ -380,7 +380,7 @@ class Delta(TwinRobot):
         bodies[PLATFORM] = Body(PLATFORM, m.platform_mass, array(platform), array(turning))
         # What the parallelograms hold is taken as given, so that three slides carry the platform.
         joints["translation"] = Joint(
-            "translation", "translation", BASE, PLATFORM, array(platform), given=True
+            "translation", "translation", BASE, PLATFORM, array(platform), virtual=True
         )
         return Graph(bodies, {**joints, **sliding}, rods, PLATFORM, array(platform))
 

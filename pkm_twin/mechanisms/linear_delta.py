@@ -123,6 +123,6 @@ class LinearDelta(TwinRobot):
         bodies[PLATFORM] = Body(PLATFORM, m.platform_mass, array(np.zeros(3)), array(turning))
         # What the rod pairs hold is taken as given, so that three slides carry the platform.
         joints["translation"] = Joint(
-            "translation", "translation", BASE, PLATFORM, array(np.zeros(3)), given=True
+            "translation", "translation", BASE, PLATFORM, array(np.zeros(3)), virtual=True
         )
         return Graph(bodies, joints, rods, PLATFORM, array(np.zeros(3)))

@@ -17,7 +17,7 @@ from pkm_twin.identification.estimation import estimate, possible
 from pkm_twin.identification.fit import Fit, fit
 from pkm_twin.identification.identifiable import pseudo_inertia
 from pkm_twin.identification.parameters import file_parameters
-from pkm_twin.machine.inertia import ten_numbers
+from pkm_twin.machine.inertia import standard_parameters
 from pkm_twin.recordings import Recording
 from pkm_twin.robot.catalogue import robot_of_data
 from pkm_twin.robot.entries import entries, with_entries
@@ -203,10 +203,10 @@ def test_the_nearest_possible_body_takes_an_impossible_one_s_place():
     pytest.importorskip("cvxpy")
     rng = np.random.default_rng(6)
     cone = ((slice(0, 10), pseudo_inertia()),)
-    true = ten_numbers(2.0, np.array([0.1, 0.0, 0.0]), np.diag([0.0, 0.02, 0.02]))
+    true = standard_parameters(2.0, np.array([0.1, 0.0, 0.0]), np.diag([0.0, 0.02, 0.02]))
     table = rng.normal(size=(60, 3, 10))
     target = table @ true + rng.normal(0.0, 0.3, (60, 3))
-    start = ten_numbers(1.0, np.zeros(3), 0.01 * np.eye(3))
+    start = standard_parameters(1.0, np.zeros(3), 0.01 * np.eye(3))
     alone = estimate(table, target, start, np.ones(10))
     held = estimate(table, target, start, np.ones(10), cone)
     assert not possible(alone.values, cone)

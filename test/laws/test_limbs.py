@@ -91,7 +91,7 @@ def test_the_determinant_is_that_of_all_closures(seed):
         motion, rows = engine.at(x, q)
         limbs = [LimbPose(motion, limb, q) for limb in engine.limbs]
         solved = numbers(matrices(engine.tree, engine.solved_rows(rows, limbs))[0])
-        whole = numbers(matrices(engine.tree, rows)[0])[engine.kept]
+        whole = numbers(matrices(engine.tree, rows)[0])[engine.independent]
         turns = np.prod([float(limb.steepness) for limb in limbs])
         part = np.linalg.det(solved[:, engine.solved[1]]) * turns
         ratios.append(np.linalg.det(whole) / part)

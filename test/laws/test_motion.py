@@ -44,7 +44,7 @@ def check_closures(robot, q, bound):
     size = robot.engine.tree.size
     for joint in robot.graph.joints.values():
         a, b = joint.inner, joint.outer
-        if joint.given:
+        if joint.virtual:
             continue
         apart = moved(pair, b, joint.at) - moved(pair, a, joint.at)
         ra, rb = (np.broadcast_to(pair[0][body], (len(q), 3, 3)) for body in (a, b))

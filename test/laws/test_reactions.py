@@ -94,7 +94,7 @@ def test_the_force_route_gives_the_power_routes_efforts(name, rng):
 def test_what_is_determinate_is_a_matter_of_counting(name, rng):
     robot = loaded(name)
     result = reactions(robot, *states(robot, rng, 100))
-    held = [joint for joint in robot.graph.joints.values() if not joint.given]
+    held = [joint for joint in robot.graph.joints.values() if not joint.virtual]
     count = len(held) + 2 * len(robot.graph.rods)
     # Six balances a body; a rod's spin about itself is nobody's. What is more is not determinate.
     balances = 6 * (len(robot.body_names) - 1) - len(robot.graph.rods)

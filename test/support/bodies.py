@@ -185,7 +185,7 @@ def _program(t: Traced, points: list[tuple[str, Array]]) -> Program:
         at = motion.point(body, point)
         rows += [*at, *motion.acceleration(body, point), *np.ravel(motion.turned(body))]
         rows += [*motion.omega[body], *motion.alpha[body]]
-        for columns in (motion.point_columns(body, at), motion.turn_columns(body)):
+        for columns in (motion.linear_jacobian(body, at), motion.angular_jacobian(body)):
             table: Any = np.zeros((3, n), dtype=object)
             for (kind, k), column in columns.items():
                 for j in range(n):

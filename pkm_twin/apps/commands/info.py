@@ -44,7 +44,7 @@ def info(given: Info) -> Report:
     home_pose = dict(zip(robot.pose_names, home.tolist(), strict=True))
     home_joints = dict(zip(robot.joint_names, q.tolist(), strict=True))
     bodies = list(robot.body_names[:-1])
-    assumed = [joint.name for joint in robot.graph.joints.values() if joint.given]
+    assumed = [joint.name for joint in robot.graph.joints.values() if joint.virtual]
     undetermined = overconstraint(robot)
     gap = float(clearance(robot, home)) if has_clearance(robot) else None
     odd = findings(robot)
