@@ -19,6 +19,7 @@ from test.nodes.harness import (
 
 pytest.importorskip("rclpy", exc_type=ImportError)
 
+from diagnostic_msgs.msg import DiagnosticArray
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 from rcl_interfaces.msg import Parameter as ParameterMessage
