@@ -150,10 +150,9 @@ def execute(command: Command, name: str, given: Any, as_json: bool) -> None:
 
     :raises PkmTwinError: what the command raises, or a file that may not be replaced.
     """
-    out = getattr(given, "out", None)
-    piped = isinstance(out, Path) and str(out) == STANDARD
     _check_targets(given)
     drawing = given.drawing(name) if hasattr(given, "drawing") else None
+    piped = any(str(path) == STANDARD for path in (getattr(given, "out", None), drawing))
     if drawing is not None:
         refuse_existing(drawing, getattr(given, "overwrite", True), _source(given))
     gc.freeze()
@@ -170,6 +169,9 @@ def _drawn(report: Report, drawing: Path | None) -> Report:
     """Write the pictures of a report; the first is its ``picture``, ``pictures`` are all."""
     from pkm_twin.report import plots
 
+    if drawing is not None and str(drawing) == STANDARD and len(report.figures) != 1:
+        what = f"a file's name, for {len(report.figures)} pictures"
+        raise ParameterError("--picture", STANDARD, what)
     written = []
     for suffix, figure in report.figures.items() if drawing is not None else ():
         assert drawing is not None  # noqa: S101  the loop is empty without
@@ -180,7 +182,7 @@ def _drawn(report: Report, drawing: Path | None) -> Report:
         report,
         facts=[*report.facts, Fact("picture", str(written[0]) if written else None),
                Fact("pictures", list(map(str, files)))],
-        notes=[*report.notes, *map(str, written)],
+        notes=[*report.notes, *(text for text in map(str, written) if text != STANDARD)],
     )  # fmt: skip
 
 
@@ -354,6 +356,11 @@ def _one(name: str, kind: Any, row: Setting, word: Any) -> Any:
     return value
 
 
+def _option(words: Sequence[str]) -> bool:
+    """Whether the next word is an option, or there is none."""
+    return not words or (words[0].startswith("-") and words[0] != STANDARD)
+
+
 class _Words(TyperCommand):
     """A command that takes negative numbers, older spellings, and a picture without a name."""
 
@@ -381,7 +388,7 @@ class _Words(TyperCommand):
             if _NEGATIVE.match(word):
                 # A number is no option; the blank goes when the word is taken.
                 yield f" {word}"
-            elif word == "--picture" and (k + 1 == len(args) or args[k + 1].startswith("-")):
+            elif word == "--picture" and _option(args[k + 1 : k + 2]):
                 yield f"--picture={BESIDE}"
             else:
                 yield f"{name}{sign}{value}"

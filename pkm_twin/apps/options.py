@@ -308,7 +308,9 @@ class Draws(Overwrites):
     """A picture of the result: asked for, or beside ``--out``."""
 
     picture: str | None = setting(
-        None, "draw the result: .png, .svg or .pdf; default: next to --out", metavar="[FILE]"
+        None,
+        "draw the result: .png, .svg or .pdf, or - for a PNG to stdout; default: next to --out",
+        metavar="[FILE]",
     )
     no_picture: bool = setting(False, "draw nothing next to --out")
 
@@ -318,6 +320,10 @@ class Draws(Overwrites):
         :raises ParameterError: another ending.
         """
         out = getattr(self, "out", None)
+        if self.picture == STANDARD:
+            if str(out) == STANDARD:
+                raise typer.BadParameter("--out - and --picture -: only one of them to stdout")
+            return Path(STANDARD)
         beside = None if out is None or str(out) == STANDARD else out.with_suffix(".png")
         if self.no_picture or (self.picture is None and beside is None):
             return None

@@ -78,11 +78,11 @@ def legend(ax: Any) -> None:
 
 
 def save(figure: Any, path: Path, dpi: int = DPI) -> Path:
-    """Write a figure as PNG, SVG or PDF, whole or not at all, and close it.
+    """Write a figure as PNG, SVG or PDF, to stdout as PNG, whole or not at all, and close it.
 
     :raises PkmTwinError: the file cannot be written.
     """
-    data = rendered(figure, dpi, path.suffix[1:])
+    data = rendered(figure, dpi, path.suffix[1:] or "png")
     with writing(path):
         replace_file(path, data)
     return path

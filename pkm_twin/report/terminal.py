@@ -3,6 +3,9 @@
 
 from __future__ import annotations
 
+import itertools
+import re
+import textwrap
 from collections.abc import Iterator, Sequence
 from typing import Final
 
@@ -12,6 +15,10 @@ from pkm_twin.console import print_json, tell
 from pkm_twin.files import STANDARD
 from pkm_twin.report.report import Fact, Report, Table, Verdict
 
+WIDTH: Final = 100
+"""Of a table, letters."""
+BLANK: Final = "\u00a0"
+"""Where no line breaks."""
 COLOURS: Final = {Verdict.GOOD: "green", Verdict.BAD: "red", Verdict.UNKNOWN: "yellow"}
 
 
@@ -57,8 +64,9 @@ def _judged(facts: Sequence[Fact]) -> Iterator[str]:
     yield next(lines)
     for fact, line in zip(facts, lines, strict=True):
         word = str(fact.verdict)
-        end = line.rstrip()[: -len(word)]
-        yield end + typer.style(word, fg=COLOURS[fact.verdict or Verdict.UNKNOWN])
+        first, *rest = line.split("\n")
+        shown = typer.style(word, fg=COLOURS[fact.verdict or Verdict.UNKNOWN])
+        yield "\n".join([first[: -len(word)] + shown, *rest])
 
 
 def _words(bound: object) -> str:
@@ -77,10 +85,34 @@ def table_lines(table: Table) -> list[str]:
 
 
 def aligned(rows: Sequence[Sequence[str]], sides: str) -> Iterator[str]:
-    """Lines with their cells below each other; ``sides`` has < or > for each column."""
+    """Rows with their cells below each other; ``sides`` has < or > for each column.
+
+    The first row is the headings. Where the whole is wider than :data:`WIDTH`, headings are on
+    several lines, and if that is not enough words of other cells too.
+    """
     if not any(row[0] for row in rows):
         rows, sides = [row[1:] for row in rows], sides[1:]
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    # What is in brackets, a unit, stays on one line.
+    rows = [[re.sub(r"\([^)]*\)", _glued, cell) for cell in row] for row in rows]
+    columns = list(zip(*rows, strict=True))
+    widths = [max(map(len, column)) for column in columns]
+    words = [[max(map(len, cell.split(" "))) for cell in column] for column in columns]
+    headings = [max([own[0], *map(len, c[1:])]) for own, c in zip(words, columns, strict=True)]
+    for least in (headings, list(map(max, words))):
+        while sum(widths) + 2 * (len(widths) - 1) > WIDTH:
+            spare = [width if width > low else 0 for width, low in zip(widths, least, strict=True)]
+            if not any(spare):
+                break
+            widths[spare.index(max(spare))] -= 1
     for row in rows:
-        cells = (f"{c:{s}{w}}" for c, s, w in zip(row, sides, widths, strict=True))
-        yield "  ".join(cells).rstrip()
+        pairs = zip(row, widths, strict=True)
+        cells = [[c] if len(c) <= w else textwrap.wrap(c, w) for c, w in pairs]
+        lines = itertools.zip_longest(*cells, fillvalue="")
+        yield "\n".join(
+            "  ".join(f"{c:{s}{w}}" for c, s, w in zip(line, sides, widths, strict=True)).rstrip()
+            for line in lines
+        ).replace(BLANK, " ")
+
+
+def _glued(match: re.Match[str]) -> str:
+    return match[0].replace(" ", BLANK)

@@ -12,6 +12,7 @@ from typer.main import get_command
 from pkm_twin.apps.frame import Group, command
 from pkm_twin.apps.options import Draws, OfRobot, Writes
 from pkm_twin.report import Column, Fact, Report, Table, Verdict, judged, plots
+from pkm_twin.report.terminal import WIDTH, text_of
 from pkm_twin.settings import setting
 
 
@@ -136,3 +137,26 @@ def test_judged_facts_are_items():
 def test_what_is_so_without_a_word_may_be_said(run, word, without):
     run("cart", word)
     assert SEEN[-1].no_lid is without
+
+
+def test_a_picture_goes_to_stdout_and_the_report_to_stderr(capsysbinary):
+    made = get_command(command(weigh, "Robots").app("weigh"))
+    made.main(["cart", "--picture", "-", "--json"], prog_name="weigh", standalone_mode=False)
+    out, err = capsysbinary.readouterr()
+    assert out[:4] == b"\x89PNG"
+    assert json.loads(err)["picture"] == "-"
+    with pytest.raises(typer.BadParameter):
+        made.main(["cart", "--picture", "-", "--out", "-"], standalone_mode=False)
+
+
+def test_a_wide_table_fits_the_terminal_and_loses_no_word():
+    columns = [Column("", "N m", f"greatest effort of joint {k}") for k in range(6)]
+    rows = {f"joint_{k}": [*map(float, range(6)), "words of a cell " * 6] for k in range(3)}
+    few = Table("", columns[:2], {"a": [1.0] * 2})
+    wide = Table("", [*columns, Column("", "", "what it is")], rows)
+    for table in (few, wide):
+        lines = text_of(Report("", tables=[table])).splitlines()
+        assert max(map(len, lines)) <= WIDTH
+        assert table is wide or len(lines) == 2
+        words = " ".join(cell for row in table.cells for cell in row).split()
+        assert sorted(" ".join(lines).split()) == sorted(words)
