@@ -7,6 +7,7 @@ parallelogram's rods move in pairs. FREE says it for each.
 """
 
 import copy
+import math
 from pathlib import Path
 
 import numpy as np
@@ -123,8 +124,30 @@ FREE = {
 
 
 def plain(name):
-    """The mapping of a machine's file."""
-    return read_yaml(FILES[name])
+    """The mapping of a machine's file, with numbers for expressions."""
+    return written_out(read_yaml(FILES[name]))
+
+
+def written_out(data):
+    """A file's data with the numbers of its expressions, by Python itself."""
+    known, left = vars(math).copy(), dict(data.get("parameters", {}))
+    while left:
+        name = next(iter(left))
+        value = left.pop(name)
+        try:
+            known[name] = eval(str(value), {}, known)
+        except NameError:
+            left[name] = value
+
+    def walk(value, key=""):
+        if isinstance(value, dict):
+            return {k: walk(v, k) for k, v in value.items()}
+        if isinstance(value, list) and key not in ("between", "pose"):
+            return [walk(v) for v in value]
+        text = isinstance(value, str) and key not in ("mechanism", "type", "platform")
+        return eval(value, {}, known) if text else value
+
+    return {k: walk(v, k) for k, v in data.items() if k not in ("parameters", "uncertainty")}
 
 
 def variant(name, rng):

@@ -6,25 +6,49 @@ import pytest
 
 from pkm_twin import load
 from pkm_twin.certify.certificate import certificate_of
+from pkm_twin.machine.strict_yaml import read_yaml
+from pkm_twin.robot.catalogue import robot_of_data
 from pkm_twin.robot.outline import base_face, platform_face
 from pkm_twin.robot.plausibility import findings
 from stiffness_monitor import compliance
 from test.docs.test_docs import DOCS
 from test.support.robots import partly_long
-from tools.pages.robots import GALLERY, MACHINES
+from tools.pages.robots import GALLERY, MACHINES, PICTURED
+
+from .random_machines import written_out
 
 pytestmark = pytest.mark.usefixtures("quickly_compiled")
 NAMES = [path.name for path in GALLERY]
 PAGE = (DOCS / "gallery.md").read_text(encoding="utf-8")
+TABLE = (DOCS / "new_machine.md").read_text(encoding="utf-8")
+TEMPLATES = [name for name in NAMES if f"`{name}`" in TABLE]
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_its_numbers_are_plausible_and_its_page_complete(name):
     robot = load(MACHINES / name)
     assert findings(robot) == ()
-    picture = f"robot_{robot.name}.png"
-    assert (DOCS / "gallery" / picture).stat().st_size and f"gallery/{picture}" in PAGE
-    assert f"pkm-twin view examples/machines/{name}\n" in PAGE
+    assert bool(robot.book.values) == (f"`{name}`" in TABLE)
+    if MACHINES / name in PICTURED:
+        picture = f"robot_{robot.name}.png"
+        assert (DOCS / "gallery" / picture).stat().st_size and f"gallery/{picture}" in PAGE
+        assert f"pkm-twin view examples/machines/{name}\n" in PAGE
+
+
+@pytest.mark.parametrize("name", partly_long(TEMPLATES, "prs3.yaml"))
+def test_each_number_of_a_template_moves_a_machine_that_assembles(name):
+    robot = load(MACHINES / name)
+    for parameter in robot.book.values.keys() - robot.book.own.keys():
+        path = f"parameters.{parameter}"
+        made = robot.filed({path: 1.01 * robot.number(path)})
+        assert made.graph.key != robot.graph.key or (made.inertial != robot.inertial).any()
+        assert made.singularity(made.inverse(made.home())) > 0.0
+
+
+@pytest.mark.parametrize("name", TEMPLATES)
+def test_its_expressions_are_those_of_python(name):
+    robot, data = load(MACHINES / name), written_out(read_yaml(MACHINES / name))
+    assert robot_of_data(data, "own").graph.key == robot.graph.key
 
 
 @pytest.mark.parametrize("name", partly_long(NAMES, "delta_1130.yaml"))

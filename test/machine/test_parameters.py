@@ -16,6 +16,8 @@ from pkm_twin.machine.formulas import Formula
 from pkm_twin.robot.catalogue import config_folder, robot_of_data
 from pkm_twin.robot.entries import Chosen, edited_yaml, entries, with_entries
 
+from .random_machines import written_out
+
 SOURCE = """\
 mechanism: machine
 parameters:
@@ -58,24 +60,6 @@ def data_with(**values):
 
 def robot_with(**values):
     return robot_of_data(data_with(**values), "own")
-
-
-def written_out(data):
-    """The same data with numbers for expressions, by Python itself."""
-    known = {"pi": math.pi, "sqrt": math.sqrt, "cos": math.cos, "sin": math.sin, "tan": math.tan}
-    for name in ("arm", "base", "m", "forearm", "plate", "drop"):
-        value = data["parameters"][name]
-        known[name] = eval(value, {}, known) if isinstance(value, str) else value
-
-    def walk(value, key=""):
-        if isinstance(value, dict):
-            return {k: walk(v, k) for k, v in value.items()}
-        if isinstance(value, list):
-            return value if key == "between" else [walk(v) for v in value]
-        text = isinstance(value, str) and key not in ("mechanism", "type")
-        return eval(value, {}, known) if text else value
-
-    return {k: walk(v, k) for k, v in data.items() if k not in ("parameters", "uncertainty")}
 
 
 def torques(robot):

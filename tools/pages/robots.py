@@ -12,10 +12,13 @@ from pkm_twin.view.drawing import DPI, draw
 
 MACHINES = Path(__file__).parents[2] / "examples/machines"
 GALLERY = sorted(path for path in MACHINES.iterdir() if path.suffix in (".yaml", ".urdf"))
-"""Files of the gallery of machines."""
+"""Files of example machines."""
+_PAGE = (MACHINES.parents[1] / "docs/gallery.md").read_text(encoding="utf-8")
+PICTURED = [path for path in GALLERY if path.name in _PAGE]
+"""Those of which the gallery has a picture."""
 
 
 if __name__ == "__main__":
-    for source in (*robot_names(), *GALLERY):
+    for source in (*robot_names(), *PICTURED):
         target = Path(sys.argv[1]) / f"robot_{Path(source).stem}.png"
         plots.save(draw(load(source)), target, DPI)
