@@ -20,12 +20,12 @@ help:
 	@echo "make bench        measure times, into docs/benchmarks.md"
 	@echo "make certificate  cross-check torques and compliance, into docs/certificate.md"
 	@echo "make fuzz         random bags, messages, files and command lines (SECONDS, SEED)"
-	@echo "make faults       run the tests of every row of docs/faults.md"
+	@echo "make faults       run the tests of every row of docs/errors.md"
 	@echo "make soak         ten million poses, and all nodes under load, with constant memory (MINUTES)"
 	@echo "make audit        known vulnerabilities of the installed packages"
 	@echo "make scale        measure the cost of workspace maps, into docs/benchmarks.md"
-	@echo "make reality      compare recordings of real machines with the models, into docs/reality.md"
-	@echo "make contact-table  simulate 1,000 contacts, into docs/contact.md (an hour)"
+	@echo "make reality      compare recordings of real machines with the models, into docs/validation.md"
+	@echo "make contact-table  simulate 1,000 contacts, into docs/nodes.md (an hour)"
 	@echo "make pages        write the generated pages and pictures of docs/"
 	@echo "make docs         build the site, in out/site"
 	@echo "make clean        remove .venv, out and caches"
@@ -98,10 +98,10 @@ scale: $(VENV)/test.stamp
 	OMP_NUM_THREADS=1 $(BIN)/python -m test.maps.scale docs/benchmarks.md
 
 reality: $(VENV)/test.stamp
-	$(BIN)/python -m tools.reality docs/reality.md
+	$(BIN)/python -m tools.reality docs/validation.md
 
 contact-table: $(VENV)/test.stamp
-	OMP_NUM_THREADS=1 $(BIN)/python -m tools.contact_table docs/contact.md
+	OMP_NUM_THREADS=1 $(BIN)/python -m tools.contact_table docs/nodes.md
 
 pages: $(VENV)/test.stamp
 	$(BIN)/python -m tools.pages.parameters docs/parameters.md

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""docs/reality.md: what pkm_twin makes of public recordings of real machines. ``make reality``."""
+"""A part of docs/validation.md: public recordings of real machines. ``make reality``."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ from pkm_twin.identification.drives import drive_friction
 from pkm_twin.identification.pose_tables import read_poses
 from pkm_twin.recordings import Dialect, read_table
 from pkm_twin.report.terminal import text_of
+from test.support.pages import write_section
 
 Array = NDArray[np.float64]
 
@@ -101,8 +102,8 @@ def recorded(robot: Robot) -> Poses:
     return Poses(poses.joints, poses.position + np.array([0.0, 0.0, HOME]), poses.rotation)
 
 
-def page() -> str:
-    """The whole page."""
+def section() -> str:
+    """The part of the page."""
     robot = load(DATA / "hexapod.yaml")
     poses = recorded(robot)
     count = len(poses.joints)
@@ -135,7 +136,7 @@ def page() -> str:
         GRAVITY * SPOOL * columns["mass_kg"], columns["iq_up_A"], columns["iq_down_A"]
     )
     told = text_of(drive_report(drive))
-    return PAGE.format(
+    return SECTION.format(
         count=count, table=table, ratios="\n".join(ratios), apart=apart, halves=halves, drive=told
     )
 
@@ -170,96 +171,42 @@ def _rms(values: Array) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
 
 
-PAGE = """# Real machines
+SECTION = """## Real machines
 
-What pkm_twin makes of public recordings. `make reality` writes this page; every figure is printed
-by the program. No public recording of the motor torques of a whole parallel machine is known to
-us: the torques are verified against other engines alone.
+No public recording of the motor torques of a whole parallel machine is known to us, so the torques are verified only against
+other engines. `make reality` prints this section from public recordings of Jugglebot, a 6-UPS hexapod with spools
+([source](https://github.com/Project-DeepBlue-Juggling/Jugglebot), MIT licence;
+[files](../examples/machines/hexapod)).
 
-## A hexapod by motion capture
-
-Jugglebot, a 6-UPS hexapod with spools ([source][jugglebot], MIT licence), {count} poses on a grid
-of one height: motor revolutions, and the platform by motion capture. Robot, recording and licence
-are in [examples/machines/hexapod](../examples/machines/hexapod). Every fourth pose is held out,
-beginning with the first, second, third and fourth: rms of each, and of all {count} poses.
+**Poses**: {count} poses on a grid of one height, by motion capture. Four fits: each leaves out every fourth pose, starting
+at pose 1, 2, 3 or 4. The table has the RMS error of the poses left out, and of all {count}.
 
 | held out | 1st, mm | 2nd, mm | 3rd, mm | 4th, mm | all, mm | worst, mm | all, mrad |
 |---|---|---|---|---|---|---|---|
 {table}
 
-The last row is an independent fit with scipy, one leg at a time: the centres of the leg's two outer
-joints, its length at zero and its transmission, by the residual of its length. Centres are known to
-10 mm as in `calibrate`. This fit knows no closed loop.
-
-Revolutions a metre, with standard deviations, where the fourth are held out. The two fits differ by
-up to {apart:.1f} of their standard deviations together:
+The last row is an independent fit with scipy, one leg at a time, that knows no closed loop. Revolutions per metre, where the
+fourth are left out; the two fits differ by up to {apart:.1f} of their standard deviations together:
 
 | leg | file | `calibrate` | leg by itself |
 |---|---|---|---|
 {ratios}
 
-Calibrated with the half of the grid at x < 0. Error of the leg lengths
-at the other half, without one offset per leg: {halves}.
+Calibrated with the half of the grid at x < 0, the leg lengths of the other half are off by {halves} (one offset per leg
+removed). It does not show other heights, tilts above 2 degrees, loads, or changes from day to day.
 
-It does not show: other heights, tilts above 2 degrees, loads, or how the machine changes from day
-to day. The standard deviations assume independent errors; the poses of a grid share some.
-
-## A drive that lifts weights
-
-One leg of the same machine, four weights at 0.6 revolutions a second, up and down: `pkm-twin
-fit --drive leg_currents.csv` with `--lever 0.011391` prints
+**A drive** that lifts four weights at one speed, `pkm-twin fit --drive leg_currents.csv --lever 0.011391`:
 
 ```text
 {drive}
 ```
 
-At one speed Coulomb and viscous friction are one number. That number alone is rejected: friction
-grows with the load. The owner has since weighed the masses (all within 10 g) and repeated the test
-with three of them: 0.0564 +- 0.0011 N m/A. Both together give 0.0570 +- 0.0008 N m/A. These two
-figures are the owner's.
-
-### What holding currents say of feedforward
-
-The owner also reports that the holding current of a leg at one pose differs by up to 1.5 A with the
-direction from which the pose was approached. Gravity needs 0.2 to 0.7 A there. Coulomb friction
-(0.88 to 1.22 A over 105 strokes) supports any load between its two limits at standstill, so the
-current depends on the motion before. No static model of pose and velocity can predict it:
-feedforward of gravity removes the mean, and the feedback controller compensates the rest. Compare a
-model with currents of slow motion in both directions, not with holding currents.
-
-## Send a recording
-
-We look for recordings of joint positions with motor efforts, of any parallel machine. `record-kit`
-prepares one:
-
-    pkm-twin record-kit delta_cu --out kit
-
-writes an exciting motion and slow friction sweeps inside the limits of the robot file, `NOTES.md`
-with what to note, and `README.md` with the commands to record and to judge. After the recording
-
-    pkm-twin anonymise bags/delta_cu_collision.mcap --robot delta_cu --out anonymous.mcap
-
-writes a bag of joint states, wrenches and trajectories alone. Joints are `joint_1`, `joint_2` and
-so on, in the order of the robot file. Topics and frames have neutral names, time begins at zero,
-and no metadata, definition or QoS of the original stays. The command lists the topics that it
-leaves out. `--keep-names` keeps names of joints and topics.
-
-Checklist:
-
-- [ ] a robot file with lengths and masses, and where they are from
-- [ ] `NOTES.md` filled in: payload, temperature, unit of the efforts, encoder side, frames
-- [ ] joint states at 200 Hz or more with position, velocity and effort, with the drives' own stamps
-- [ ] drives warm; `excitation` and `friction`, each without a payload and with a weighed one
-- [ ] `pkm-twin check` of each recording: complete, no gaps, the drives on
-- [ ] anonymised bags, and no name in `NOTES.md` that must not be published
-- [ ] a licence that allows publication
-
-Poses by an instrument are worth as much: a CSV of joint positions and poses as of
-[calibration](calibration.md), with the instrument's standard deviation.
-
-[jugglebot]: https://github.com/Project-DeepBlue-Juggling/Jugglebot
-"""
+A constant friction does not explain the data: friction grows with the load. The owner has repeated the test with weighed
+masses: 0.0564 +- 0.0011 N m/A, both together 0.0570 +- 0.0008 N m/A. The holding current at one pose differs by up to 1.5 A
+with the direction of approach, because dry friction supports any load between its limits. So compare a model with currents
+of slow motion in both directions, not with holding currents.
+"""  # noqa: E501
 
 
 if __name__ == "__main__":
-    Path(sys.argv[1]).write_text(page(), encoding="utf-8")
+    write_section("reality", section(), Path(sys.argv[1]))

@@ -159,11 +159,8 @@ def main(target):
         "Processor time of one thread of the node `delta_dynamics` with `delta_cu`, medians, no "
         "subscriber. The round trip above includes the middleware.",
         "",
-        "The node decodes a joint state from its bytes and encodes the answer to bytes, without "
-        "rclpy's conversion, which takes a large part of the time of a bare echo. Three compiled "
-        "programs do the computation: pose, rates, jump and singularity index; the fit over the "
-        "window; and the torques. The rest is Python. At 1 kHz the caches are cold, and a call "
-        "takes about twice as long as here.",
+        "The node decodes and encodes bytes itself; three compiled programs compute. At 1 kHz the "
+        "caches are cold, and a call takes about twice as long as here.",
         "",
         *table(stream, "us"),
         "",

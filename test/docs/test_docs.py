@@ -16,6 +16,7 @@ import pytest
 from pkm_twin import errors as module
 from pkm_twin import robot_names
 from test.support.command import typed_line
+from test.support.pages import read_section
 from tools.pages import architecture, engine, errors, parameters, trend
 
 DOCS = Path(__file__).parents[2] / "docs"
@@ -88,7 +89,7 @@ def test_the_blocks_of_the_simulators_page_run(tmp_path, twin, monkeypatch):
 
 def test_python_blocks_of_pages(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    for page in ("design.md", "fit.md", "contact.md"):
+    for page in ("design.md", "fit.md", "nodes.md"):
         space = {}
         for language, block, _ in blocks(page):
             if language == "python":
@@ -125,7 +126,7 @@ def test_the_parameters_page_is_that_of_the_schemas():
 
 def test_the_errors_page_has_every_error_and_reason():
     """Else `make pages` writes it."""
-    assert (DOCS / "errors.md").read_text(encoding="utf-8") == errors.page()
+    assert read_section("errors", DOCS / "errors.md") == errors.section()
     own = {kind for kind in vars(module).values() if inspect.isclass(kind)}
     assert {k for k in own if issubclass(k, module.PkmTwinError)} - {module.PkmTwinError} <= set(
         errors.ERRORS
@@ -161,4 +162,4 @@ def test_every_robot_has_its_picture():
     """Else `make pages` draws it."""
     for name in robot_names():
         assert (DOCS / "gallery" / f"robot_{name}.png").stat().st_size, name
-        assert f"robot_{name}.png" in (DOCS / "gallery.md").read_text(encoding="utf-8")
+        assert f"robot_{name}.png" in (DOCS / "index.md").read_text(encoding="utf-8")

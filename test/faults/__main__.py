@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Run what the catalogue names and print it row by row into docs/faults.md: ``make faults``.
+"""Run what the catalogue names and print it row by row into docs/errors.md: ``make faults``.
 
 ``python -m test.faults --again`` runs only the rows that did not pass the last time.
 """
@@ -16,7 +16,7 @@ from typing import Any
 
 import pytest
 
-from test.faults.catalogue import TESTS, Row, rows
+from test.faults.catalogue import TESTS, Row, line, rows
 from test.support.pages import FAULTS, write_section
 
 RESULTS = Path("out/faults.json")
@@ -24,10 +24,9 @@ RESULTS = Path("out/faults.json")
 PASS = "pass"
 INTRODUCTION = """Printed by `make faults`: {passed} of {total} rows passed.
 
-**R**: the message is rejected whole and counted; nothing is published from it, and `/diagnostics`
-reports it. **S**: as R, and the stream stops until accepted samples arrive. **F**: the node does
-not start, or the file does not load; the error names the field. **X**: the command ends with this
-exit code and prints one line. `test/faults/catalogue.yaml` lists the tests of each row.
+**R**: the message is rejected whole and counted in `/diagnostics`. **S**: as R, and the stream
+stops until accepted samples arrive. **F**: the node does not start, or the file does not load.
+**X**: the command ends with this exit code. `test/faults/catalogue.yaml` lists the tests of each.
 """
 
 
@@ -59,10 +58,9 @@ def section(results: dict[str, Any]) -> str:
     for row in found:
         if row.table != table:
             table = row.table
-            head = ["| # | fault | answer | cases | |", "|---|---|---|---|---|"]
-            text += ["", f"### {table}", "", *head]
-        cases, how = results[str(row.number)]
-        text.append(f"| {row.number} | {row.fault} | {row.answer} | {cases} | {how} |")
+            text += ["", f"### {table}", ""]
+        how = results[str(row.number)][1]
+        text.append(line(row) + ("" if how == PASS else f" {how}"))
         print(f"{row.number:3} {how:12} {row.fault}")
     passed = sum(results[str(row.number)][1] == PASS for row in found)
     return INTRODUCTION.format(passed=passed, total=len(found)) + "\n".join(text)

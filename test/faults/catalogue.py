@@ -34,6 +34,11 @@ def rows() -> list[Row]:
     ]
 
 
+def line(row: Row) -> str:
+    """A row on the page."""
+    return f"* {row.fault}: {row.answer}"
+
+
 @functools.cache
 def names_in(path: Path) -> set[str]:
     """Names of a file's tests as pytest has them, without its collecting them."""

@@ -7,7 +7,6 @@ import datetime
 import itertools
 import platform
 import sys
-import tempfile
 import time
 from pathlib import Path
 
@@ -30,8 +29,6 @@ MEASURED = (
 )
 SECONDS = 4.0
 """Processor time that a rate is measured over."""
-RUNS = ((10**6, 2), (10**7, 2), (10**6, 1), (10**7, 1))
-"""Poses and processes of the whole commands."""
 
 
 def rate(kind: str, robot: str, points: int) -> float:
@@ -90,29 +87,6 @@ def section() -> str:
     ]
     for kind, robot, points, what in MEASURED:
         lines.append(f"| {what} | {robot} | {power(rate(kind, robot, points))} |")
-    rows = []
-    with tempfile.TemporaryDirectory() as folder:
-        out = Path(folder) / "a.nc"
-        for points, processes in RUNS:
-            seconds, peak = command(points, processes, out)
-            who = f"{processes} and the parent" if processes > 1 else "1"
-            size = out.stat().st_size / 1e6
-            rows.append(
-                f"| {power(points)} | {who} | {seconds:.0f} s | {peak / 2**20:.0f} MiB | "
-                f"{size:.0f} MB |"
-            )
-    load = psutil.getloadavg()
-    lines += [
-        "",
-        "The whole command `pkm-twin map upr_rpu strain-energy --points N --no-picture`, from "
-        "start to the closed file. Memory is the peak of the proportional set sizes, summed over "
-        f"all processes. The load average was {load[0]:.1f} over the last minute and {load[1]:.1f} "
-        "over the last five, including the program itself.",
-        "",
-        "| poses | processes | time | peak memory | file |",
-        "|---|---|---|---|---|",
-        *rows,
-    ]
     return "\n".join(lines)
 
 

@@ -291,35 +291,29 @@ def write(folder, summary, watched, ages):
 
 TEXT = """## Long run
 
-Printed by `make soak MINUTES={minutes:g}`: two `delta_dynamics` (the player replays a looping bag
-to one of them), `stiffness_monitor` and `command_gate`, at 1 kHz or as fast as the computer
-allowed ({sent:,} joint states, one in a hundred invalid, and a fifth as many wrenches). Meanwhile
-there were {parameters:,} valid and invalid requests for parameters, {trajectory:,} trajectories of
-500 points, {suspend:,} suspensions of a node for {suspension:g} s (SIGSTOP, SIGCONT), and {kill:,}
-kills of the player. The first fifth is warm-up. `stale_after` and the gate's `deadline` were
-{stale:g} s.
+Printed by `make soak MINUTES={minutes:g}`: two `delta_dynamics` (a player replays a looping bag to
+one), `stiffness_monitor` and `command_gate`; {sent:,} joint states, one in a hundred invalid;
+{parameters:,} requests for parameters, {trajectory:,} trajectories of 500 points, {suspend:,}
+suspensions of a node, {kill:,} kills of the player. `stale_after` and `deadline` were {stale:g} s.
 
 ![Memory, descriptors, threads and ages of a long run](soak.png)
 
 {nodes}
 
-Ages from a joint state's stamp to the publication of the answer, on a computer whose two cores did
-much other work. Messages that wait in a queue are answered up to the bound of their age, not later.
+Ages of answers at their publication, on two cores that did much other work:
 
 {ages}
 
-The node checks the age just before it publishes a torque. It sends an older torque only if the
-computer delays the process between the check and the publication; the topic's deadline then reports
-it.
+The node checks the age just before it publishes a torque; an older one left a process that the
+computer delayed after the check, and the topic's deadline reports it.
 """
 
 
 def section(summary):
-    """The figures as a part of the page on faults."""
+    """The figures as a part of the page on errors."""
     nodes = [
-        "| node | memory, first third (MiB) | last third | slope (KiB an hour) "
-        "| descriptors | threads |",
-        "|---" * 6 + "|",
+        "| node | memory, first third (MiB) | last third | descriptors, threads |",
+        "|---" * 4 + "|",
     ]
     for name, node in summary["nodes"].items():
         memory = node["memory, bytes"]
@@ -329,8 +323,7 @@ def section(summary):
             for what in ("descriptors", "threads")
         ]
         nodes.append(
-            f"| {name} | {mebibytes[0]:.2f} | {mebibytes[1]:.2f} | "
-            f"{memory['per hour'] / 2**10:+.0f} | {counts[0]} | {counts[1]} |"
+            f"| {name} | {mebibytes[0]:.2f} | {mebibytes[1]:.2f} | {counts[0]}, {counts[1]} |"
         )
     ages = [
         f"| answers | count | {' | '.join(QUANTILES)} (ms) | older than {STALE:g} s |",
@@ -344,7 +337,6 @@ def section(summary):
     return TEXT.format(
         minutes=summary["minutes"],
         sent=summary["joint states sent"],
-        suspension=SUSPENSION,
         stale=STALE,
         nodes="\n".join(nodes),
         ages="\n".join(ages),
@@ -353,7 +345,7 @@ def section(summary):
 
 
 def main():
-    """Copy the picture of a run into the docs and its figures into the page on faults."""
+    """Copy the picture of a run into the docs and its figures into the page on errors."""
     folder = Path(sys.argv[1])
     summary = json.loads((folder / "soak.json").read_text())
     shutil.copy(folder / "soak.png", FAULTS.with_name("soak.png"))

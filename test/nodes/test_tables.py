@@ -26,10 +26,13 @@ TF = find_spec("tf2_msgs") is not None
 MIDDLEWARE = re.compile(r"qos_overrides\..*|use_sim_time|start_type_description_service")
 
 
+def section(node):
+    return PAGE.split(f"\n## {node}\n")[1].split("\n## ")[0]
+
+
 def rows(node):
     """Cells of the tables in the node's section."""
-    section = PAGE.split(f"\n## {node}\n")[1].split("\n## ")[0]
-    for line in section.splitlines():
+    for line in section(node).splitlines():
         cells = [cell.strip() for cell in line.split("|")]
         if len(cells) > 3:
             yield cells[1:-1]
@@ -109,8 +112,13 @@ def test_parameters(node, peer):
     request = ListParameters.Request()
     found = peer.call(ListParameters, f"/{node}/list_parameters", request).result.names
     known = {name for name in found if not MIDDLEWARE.fullmatch(name)}
-    table = [cells[0] for part in (node, "All nodes") for cells in rows(part) if len(cells) == 5]
-    assert {cell.strip("`") for cell in table} - {"parameter", "---"} == known
+    explained = {cells[0] for cells in rows("All nodes")} - {"parameter", "---"}
+    shared = set(
+        re.findall(r"`[\w.]+`", section(node).split("\nAs [all nodes]")[1].splitlines()[0])
+    )
+    assert shared <= explained
+    own = {cells[0] for cells in rows(node) if len(cells) == 3} - {"parameter", "---"}
+    assert {cell.strip("`") for cell in own | shared} == known
 
 
 def test_page_and_policy_are_those_of_the_nodes(tmp_path):

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
-FAULTS = ROOT / "docs" / "faults.md"
+FAULTS = ROOT / "docs" / "errors.md"
 
 
 def text_of(page: str) -> str:

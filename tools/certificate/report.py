@@ -18,7 +18,6 @@ from tools.certificate.compare import BALANCE_BOUNDS, BOUNDS, PLACE_BOUND, ROUTE
 from tools.certificate.lagrange import DIGITS
 from tools.certificate.links import (
     BOUND,
-    FACTORS,
     FINE,
     FINITE_ELEMENTS,
     MESH,
@@ -31,24 +30,23 @@ from tools.certificate.links import (
     round_bar,
     with_rigid_joints,
 )
-from tools.certificate.machines import AZIMUTH_ERROR, LEAST_MEASURE, THIN
-from tools.certificate.mujoco_models import SPECK
+from tools.certificate.machines import LEAST_MEASURE
 from tools.certificate.swing import (
-    DELTA_DEVIATION,
-    DELTA_REST,
     DURATION,
-    PRRU_RATES,
-    SAMPLES,
     STEP,
     TOLERANCE,
-    TOOL,
     Swing,
 )
 
 SWING_BOUNDS = {"drift": 1e-9, "closure": 1e-10, "DOP853": 1e-9, "its own step": 1e-7}
 """Greatest energy drift (relative), opening of a loop (m), and differences of the end states."""
 
-BALANCES = {"residual": "bodies", "efforts": "efforts", "power": "power", "energy": "energy"}
+BALANCES = {
+    "residual": ("bodies", "force and moment of every body, with reactions"),
+    "efforts": ("efforts", "from these balances, against virtual work"),
+    "power": ("power", "of efforts and wrench, against the rate of the Lagrange energy"),
+    "energy": ("energy", "kinetic and potential, against Lagrange"),
+}
 
 TITLES = {
     "delta": "Delta, three rods",
@@ -104,14 +102,11 @@ def _head(command: str, seed: int) -> str:
         versions += f", CalculiX {calculix_version()}"
     return f"""# Cross-checks of dynamics and static stiffness
 
-This page compares the torques, reactions, energies and free motion of pkm_twin with three
-independent methods, and the 2UPR-RPU's platform compliance with finite elements. A program writes
-the page; every number in the tables comes from its run of {today}. Write it again with
+pkm_twin compared with independent methods, as printed on {today} by
 
     make certificate
 
-which runs `{command}`. It takes some minutes and fails if a bound is
-exceeded. The seed of the random numbers is {seed}. Written with Python {platform.python_version()},
+(`{command}`, seed {seed}), which fails if a bound is exceeded. Python {platform.python_version()},
 {versions}.
 """
 
@@ -133,26 +128,15 @@ def _torques(figures: dict[str, Figures], judge: Judge) -> str:
     table = "\n".join(rows)
     return f"""## Torques
 
-Each machine has random dimensions, limb azimuths up to {AZIMUTH_ERROR} rad off, masses and
-inertias, a payload with its own centre of mass and full inertia matrix, gravity in any direction,
-and friction. Each state has random positions, rates, accelerations and a wrench on the platform.
-The R-C-U limb is any of the limbs. The 3-PRRU's sliders are above or below, and the links of
-{THIN:.0%} of its machines are rods without inertia about their axes. States whose Jacobian, as
-computed by pkm_twin, has a condition number above {1 / LEAST_MEASURE:.0f} are left out.
+Machines have random dimensions, azimuths, masses, inertias, payload, gravity and friction; states
+have random positions, rates, accelerations and a wrench. States with a condition number above
+{1 / LEAST_MEASURE:.0f} are left out.
 
-- **Pinocchio**: an open tree of bodies and loop constraints; tree motion by Newton's method and
-  the constraints' Jacobian, efforts from recursive Newton-Euler sweeps and the multipliers.
-- **MuJoCo**: another tree, an MJCF made from the same parameter mapping; loops closed by Newton's
-  method on MuJoCo's kinematics, rates and accelerations by its Jacobians and their derivatives,
-  `mj_inverse` on the tree, projected on the actuators. Rods have {SPECK:.0e} kg m2 about
-  their axes, because MuJoCo requires a positive inertia.
-- **Lagrange**: kinetic and potential energy as functions of points and their velocities, all
-  derivatives by central differences in {DIGITS} digits, the loops closed by Newton's method in the
-  same precision. The remaining difference is the rounding of pkm_twin.
+- **Pinocchio**: a tree with loop constraints; recursive Newton-Euler sweeps and multipliers.
+- **MuJoCo**: another tree; `mj_inverse`, projected on the actuators.
+- **Lagrange**: energies as functions of points, derived by central differences in {DIGITS} digits.
 
-A difference is the largest difference of the three efforts, divided by the largest effort of the
-other method. The last column is the largest difference of the platform's position by forward
-kinematics.
+Differences are relative to the largest effort. The last column is the platform's position.
 
 | robot | method | machines | states | worst | median | bound \
 | position, m (bound {PLACE_BOUND:.0e}) |
@@ -163,36 +147,21 @@ kinematics.
 
 def _balances(figures: dict[str, Figures], judge: Judge) -> str:
     rows = []
-    for key, title in BALANCES.items():
-        for name, found in figures.items():
-            values = np.array(found.balances[key])
-            if not len(values):
-                continue
-            worst = judge(
-                float(values.max()), BALANCE_BOUNDS[key], f"{TITLES[name]}, balance of {title}"
-            )
-            rows.append(
-                f"| {title} | {TITLES[name]} | {len(values)} | {worst} "
-                f"| {np.median(values):.1e} | {BALANCE_BOUNDS[key]:.0e} |"
-            )
+    for key, (title, text) in BALANCES.items():
+        found = [np.array(one.balances[key]) for one in figures.values()]
+        if not sum(map(len, found)):
+            continue
+        worst = judge(
+            max(float(v.max()) for v in found if len(v)), BALANCE_BOUNDS[key], f"balance of {title}"
+        )
+        rows.append(f"| {title} | {text} | {worst} | {BALANCE_BOUNDS[key]:.0e} |")
     table = "\n".join(rows)
     return f"""## Balances
 
-Computed for the same states; the last two for the states of the Lagrange method.
+The worst of all robots, relative, for the same states; the last two for those of Lagrange.
 
-- Bodies: force and moment balance of every body with the joints' reactions; the worst imbalance,
-  divided by the largest load.
-- Efforts: the actuators' efforts from these balances, compared with those by virtual work.
-- Power: the efforts and platform twist of pkm_twin, compared with the rate of the Lagrange method's
-  energy; the difference, divided by the sum of the absolute powers.
-- Energy: kinetic and potential energy of pkm_twin, compared with the Lagrange method.
-
-The first two compare reactions with pkm_twin's own inertia forces. A couple that does no work in
-any motion of the machine, such as the gyroscopic one of a 3-PRRU's upper link, occurs in the
-reactions but not in torques or energies; `test/validation/test_reactions_pinocchio.py` checks it.
-
-| balance | robot | states | worst | median | bound |
-|---|---|---|---|---|---|
+| balance | | worst | bound |
+|---|---|---|---|
 {table}
 """
 
@@ -219,24 +188,12 @@ def _swings(swings: list[Swing], judge: Judge) -> str:
     table = "\n".join(rows)
     return f"""## Free swing of {DURATION:.0f} s
 
-The robots are the shipped parameter files without friction. The actuators apply constant efforts
-that balance the weight at a stable equilibrium. Both Deltas have arms at {DELTA_REST} rad and
-start at rest {_list(DELTA_DEVIATION)} rad away from there. (Without efforts a Delta of these
-dimensions swings about stretched limbs, and most starts reach the edge of its workspace.) The
-sliders of the 3-PRRU are vertical, so without efforts it would fall. It hangs from its sliders
-(`branch: above`) with a tool of {TOOL["mass"]:.0f} kg, {-TOOL["com"][2]} m below the platform,
-which makes the tilt stable. It starts with slider rates of {_list(PRRU_RATES)} m/s; their mean is
-zero because its height is free.
-
-DOP853 integrates `forward_dynamics` of pkm_twin and of Pinocchio with tolerances of
-{TOLERANCE:.0e}, Pinocchio's whole tree without closing the loops again. Pinocchio's own step is
-RK4 at {1e3 * STEP:.0f} ms with the loops closed after each step. Energy: the Lagrange method's
-function at {SAMPLES} instants minus the work of the constant efforts; its largest change, divided
-by the largest kinetic energy. Closure: the limbs' lengths and planes between actuators and
-platform; pkm_twin solves its loops for each state. Travel of one actuator, and differences from
-pkm_twin at the end, in rad, rad/s (Delta) and m, m/s (3-PRRU). Bounds: energy
-{SWING_BOUNDS["drift"]:.0e}, closure {SWING_BOUNDS["closure"]:.0e} m, end states
-{SWING_BOUNDS["DOP853"]:.0e} with DOP853 and {SWING_BOUNDS["its own step"]:.0e} with the step.
+Shipped robots without friction, with constant efforts that balance the weight, start away from a
+stable equilibrium. DOP853 integrates `forward_dynamics` of both engines with tolerances of
+{TOLERANCE:.0e}; Pinocchio's own step is RK4 at {1e3 * STEP:.0f} ms. Energy is the Lagrange
+function, relative to the largest kinetic energy (bound {SWING_BOUNDS["drift"]:.0e}); closure has a
+bound of {SWING_BOUNDS["closure"]:.0e} m, the end state one of {SWING_BOUNDS["DOP853"]:.0e} with
+DOP853 and {SWING_BOUNDS["its own step"]:.0e} with the step (rad or m, and per second).
 
 | robot | engine | travel | kinetic energy, J | energy drift | closure, m \
 | difference of q | of q' |
@@ -267,25 +224,18 @@ def _compliance(links: dict[str, Links], judge: Judge) -> str:
     spans = _span(np.concatenate([found.shipped.diagonal for found in links.values()]))
     return f"""{title}
 
-The robot has the shipped parameters, locked drives, and joints that are rigid in all directions in
-which they are not free. The CalculiX model has solid bricks for the three bars (C3D20R; {FINE} per
-bar, section x length), no beam theory and no shear factor. Its joints constrain the mean
-displacement and mean rotation of a bar's end section, which can warp and contract, by equations
-between displacements; the platform is rigid.
-
-Differences are relative: those of all 36 entries to sqrt(C_ii C_jj), those of the diagonal entries
-each to its own value, and those of the six deflections under the load of the paper's table 1,
-{_wrench(LOAD)} in N and N m, each to its own value, however small. The bound is {BOUND:.0e}, for
-the mesh a quarter of it. Mesh: {MESH} bricks per bar compared with {FINE}.
+The shipped parameters with joints that are rigid where they are not free, against CalculiX with
+solid bricks for the bars (C3D20R; {FINE} per bar) and no beam theory. Differences are relative:
+of all entries to sqrt(C_ii C_jj), of the diagonal and of the deflections under
+{_wrench(LOAD)} N and N m each to its own value. Bound {BOUND:.0e}. Mesh: {MESH} bricks per bar.
 
 | pose | z (m), beta, gamma (deg) | entries | diagonal | deflections | Cowper | rigid ends | mesh |
 |---|---|---|---|---|---|---|---|
 {table}
 
-The diagonal of pkm_twin differs by {spans}; negative is stiffer. Its shear factor is
-{robot.members.shear_factor:g}, as in the paper. *Cowper* is the worst difference of entries and
-diagonal with {round_bar(robot):.3f}, the factor of a round bar (Cowper 1966). *Rigid ends* compares
-the diagonal with solids whose end sections are rigid and therefore cannot contract.
+The diagonal of pkm_twin differs by {spans} (negative is stiffer). *Cowper*: with the shear factor
+{round_bar(robot):.3f} in place of {robot.members.shear_factor:g}. *Rigid ends*: solids whose end
+sections cannot contract.
 """
 
 
@@ -305,39 +255,27 @@ def _paper_rows(rows: PaperRows, links: dict[str, Links], judge: Judge) -> str:
     beams = ""
     if links:
         apart = max(_worst(found.shipped.diagonal) for found in links.values())
-        beams = (
-            "Beam theory does not explain it either: solid bars are within "
-            f"{_percent(apart)} (above)."
-        )
+        beams = f"Solid bars are within {_percent(apart)} of beams (above)."
     # Where joints hardly matter.
     bent = (0, 5)
     joints = _worst(rows.rigid[:, bent] / rows.twin[:, bent] - 1)
-    softer = _filled(f"""
-        The finite elements are softer in {int((known > 0).sum())} of the {known.size} components
-        that are printed with three digits, by {_span(known)}. The worst difference relative to the
-        finite elements is {worst}; the paper states {PAPER_BOUND:g}.
-    """)
     cause = _filled(f"""
-        A common factor on the joints' printed compliances does not explain the difference: of all
-        factors from {FACTORS[0]:g} to {FACTORS[-1]:g} the best one, {rows.joints[0]:.2f}, leaves
-        {_percent(rows.joints[1])}. With rigid joints dx and rz of pkm_twin change by
-        {_percent(joints)} or less, but the finite elements are softer by
-        {_span(rows.excess[:, bent])}. {beams} A common factor on the compliance of all bars,
-        {rows.bars[0]:.2f}, would leave {_percent(rows.bars[1])}. Possible causes are bars that are
-        softer than round ones between the joints, single joints several times softer than printed,
-        or an elastic platform. The paper shows neither mesh nor contacts, so the cause cannot be
-        determined.
+        The finite elements are softer in {int((known > 0).sum())} of {known.size} components, by
+        {_span(known)}; the worst difference relative to them is {worst}, the paper states
+        {PAPER_BOUND:g}. A common factor on the joints' compliances
+        leaves {_percent(rows.joints[1])} (best: {rows.joints[0]:.2f}). With rigid joints dx and rz
+        change by {_percent(joints)} or less. {beams} A common factor on all bars,
+        {rows.bars[0]:.2f}, would leave {_percent(rows.bars[1])}. The paper shows neither mesh nor
+        contacts, so the cause cannot be determined.
     """)
     return f"""## The paper's finite elements
 
-Table 1 of the 2UPR-RPU paper compared with pkm_twin, with the shipped joint compliances. The
-percentages are the relative differences of the paper's finite elements from pkm_twin.
+Table 1 of the 2UPR-RPU paper compared with pkm_twin and the shipped joint compliances. Percentages
+are those of the paper's finite elements from pkm_twin.
 
 | | pkm_twin, 1 | finite elements, 1 | difference | pkm_twin, 2 | finite elements, 2 | difference |
 |---|---|---|---|---|---|---|
 {table}
-
-{softer}
 
 {cause}
 """

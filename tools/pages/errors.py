@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""docs/errors.md from the classes: ``python -m tools.pages.errors docs/errors.md``."""
+"""A part of docs/errors.md from the classes: ``python -m tools.pages.errors docs/errors.md``."""
 
 from __future__ import annotations
 
@@ -10,16 +10,12 @@ from pathlib import Path
 
 from pkm_twin import errors, robot_names
 from pkm_twin.bags.reader import DamagedBagError
+from test.support.pages import write_section
 
 ROOT = Path(__file__).parents[2]
-HEAD = """# Errors
-
-All errors are subclasses of `PkmTwinError`. An error is one line: what is wrong, where, and what is
+HEAD = """All errors are subclasses of `PkmTwinError`, one line each: what is wrong, where, what is
 expected. Commands print it on stderr and end with exit code 1, or 2 for wrong usage of an option.
-Nodes reject the message, count it by its reason and report it in `/diagnostics`
-([faults](faults.md)).
-
-Written by `make pages`.
+Nodes reject the message and count it by its reason in `/diagnostics`.
 
 | error | also a | meaning | example | what to do |
 |---|---|---|---|---|
@@ -53,7 +49,7 @@ ERRORS = {
     errors.SingularityError: (
         errors.SingularityError("joint state", (), 2e-9, 1e-6),
         "keep `robot.singularity(q)` above 0.05 or more "
-        "([singularity index](engine.md#singularities-kinematicssingularity))",
+        "([singularity index](concepts.md#singularity-index))",
     ),
     errors.MessageError: (
         errors.MessageError("not finite", "position of arm_1 is nan"),
@@ -127,8 +123,8 @@ def reasons() -> set[str]:
     return found
 
 
-def page() -> str:
-    """The whole page."""
+def section() -> str:
+    """The part of the page."""
     lines = []
     for kind, (example, hint) in ERRORS.items():
         bases = ", ".join(f"`{base.__name__}`" for base in kind.__bases__)
@@ -140,8 +136,8 @@ def page() -> str:
         "| reason | meaning | what to do |\n|---|---|---|\n"
     )
     rows = [f"| {reason} | {what} | {hint} |" for reason, (what, hint) in sorted(REASONS.items())]
-    return HEAD + "\n".join(lines) + text + "\n".join(rows) + "\n"
+    return HEAD + "\n".join(lines) + text + "\n".join(rows)
 
 
 if __name__ == "__main__":
-    Path(sys.argv[1]).write_text(page(), encoding="utf-8")
+    write_section("errors", section(), Path(sys.argv[1]))

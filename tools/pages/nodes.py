@@ -8,21 +8,19 @@ from __future__ import annotations
 
 import importlib
 import os
-import re
 import sys
-from collections.abc import Iterable
+from collections import Counter
 from pathlib import Path
 from typing import Any, Final
 
 from pkm_twin.apps.nodes import MODULES
 from pkm_twin.settings import Setting
 from pkm_twin.streams.topics import Topic
+from test.support.pages import write_section
 
-COMMON: Final = ("autostart", "executor", "queue_depth", "thread_priority")
-"""Parameters of every node, in a table of their own."""
 GIVEN: Final = {"command_gate": ("on_stop:=gravity",)}
 """Without it the gate has no payload."""
-HEAD: Final = "| parameter | default | unit, values | changeable | |\n|---|---|---|---|---|\n"
+HEAD: Final = "| parameter | default; unit, values | |\n|---|---|---|\n"
 GROUPS: Final = {"in": "topics subscribe", "out": "topics publish", "service": "services reply"}
 TOPICS: Final = "| | topic | type | |\n|---|---|---|---|\n"
 
@@ -61,11 +59,8 @@ def rows_of(node: str) -> dict[str, tuple[Any, Setting]]:
 
 def row(name: str, default: Any, setting: Setting) -> str:
     """A parameter's line of the table."""
-    cells = [
-        f"`{name}`", setting.usual or _value(default), _values(setting),
-        "" if setting.fixed else "yes", setting.text,
-    ]  # fmt: skip
-    return f"| {' | '.join(cells)} |\n"
+    values = [setting.usual or _value(default), _values(setting), "" if setting.fixed else "live"]
+    return f"| `{name}` | {'; '.join(filter(None, values))} | {setting.text} |\n"
 
 
 def topic_row(row: Topic) -> str:
@@ -98,21 +93,18 @@ def _values(setting: Setting) -> str:
     return f"{low} to {high} {setting.unit}".strip()
 
 
-def page(text: str) -> str:
-    """The page with today's tables."""
-    for node in MODULES:
-        found = rows_of(node)
-        common = [row(name, *found.pop(name)) for name in COMMON]
-        text = _replaced(text, node, HEAD, [row(name, *entry) for name, entry in found.items()])
-        text = _replaced(text, node, TOPICS, map(topic_row, class_of(node).topics.values()))
-    return _replaced(text, "All nodes", HEAD, common)
-
-
-def _replaced(text: str, section: str, head: str, rows: Iterable[str]) -> str:
-    begin = text.index(f"\n## {section}\n")
-    start = text.index("\n" + head, begin) + 1
-    end = re.compile(r"\n(?!\|)").search(text, start).end()
-    return text[:start] + head + "".join(rows) + text[end:]
+def parts() -> dict[str, str]:
+    """What the page has between the marks of each node, and of all nodes."""
+    rows = {node: {k: row(k, *v) for k, v in rows_of(node).items()} for node in MODULES}
+    times = Counter(line for own in rows.values() for line in own.values())
+    shared = sorted(line for line, count in times.items() if count > 1)
+    found = {"all nodes": HEAD + "".join(shared)}
+    for node, own in rows.items():
+        topics = TOPICS + "".join(map(topic_row, class_of(node).topics.values()))
+        lines = "".join(line for line in own.values() if line not in shared)
+        names = ", ".join(f"`{name}`" for name, line in own.items() if line in shared)
+        found[node] = f"{topics}\n{HEAD}{lines}\nAs [all nodes](#all-nodes): {names}."
+    return found
 
 
 def policy(text: str) -> str:
@@ -137,9 +129,10 @@ def _group(head: str, names: list[str]) -> str:
 
 def main() -> None:
     """Write the tables into the page, and the topics into the policy."""
-    for name, made in zip(sys.argv[1:], (page, policy), strict=True):
-        path = Path(name)
-        path.write_text(made(path.read_text(encoding="utf-8")), encoding="utf-8")
+    page, allowed = map(Path, sys.argv[1:])
+    for name, text in parts().items():
+        write_section(name, text, page)
+    allowed.write_text(policy(allowed.read_text(encoding="utf-8")), encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -276,7 +276,7 @@ COMMAND = AfterRobot(
     `pkm-twin map ROBOT KIND` computes a map, `pkm-twin map show FILE` plots a stored one again.
 
     Ctrl-C stops it. Finished parts stay in FILE.nc.parts, and the same command continues from there
-    with the same result. Only one run at a time can write a file. docs/scale.md has the cost.
+    with the same result. Only one run at a time can write a file.
 
     For the options of a kind use `pkm-twin map ROBOT KIND --help`.
     """,
