@@ -19,13 +19,9 @@ from .random_machines import written_out
 
 pytestmark = pytest.mark.usefixtures("quickly_compiled")
 NAMES = [path.name for path in GALLERY]
-<<<<<<< HEAD
-PAGE = (DOCS / "gallery.md").read_text(encoding="utf-8")
+PAGE = (DOCS / "index.md").read_text(encoding="utf-8")
 TABLE = (DOCS / "new_machine.md").read_text(encoding="utf-8")
 TEMPLATES = [name for name in NAMES if f"`{name}`" in TABLE]
-=======
-PAGE = (DOCS / "index.md").read_text(encoding="utf-8")
->>>>>>> 39bbc8c (The manual has 28 pages and two thirds of the words)
 
 
 @pytest.mark.parametrize("name", NAMES)
