@@ -10,7 +10,7 @@ SEED ?= 1
 ENDLESS := test/fuzz/test_nodes.py test/nodes/test_soak.py
 BIN := $(VENV)/bin
 
-.PHONY: demo test lint types unit long bags bench certificate fuzz faults soak audit scale reality contact-table pages docs clean help
+.PHONY: demo test lint types unit long bags bench certificate fuzz faults soak audit scale reality contact-table pages animation docs clean help
 
 help:
 	@echo "make demo         set up .venv, run the main nodes on the recorded bags, table and picture in out/"
@@ -27,6 +27,7 @@ help:
 	@echo "make reality      compare recordings of real machines with the models, into docs/validation.md"
 	@echo "make contact-table  simulate 1,000 contacts, into docs/nodes.md (an hour)"
 	@echo "make pages        write the generated pages and pictures of docs/"
+	@echo "make animation    draw the moving picture of the README, in a browser"
 	@echo "make docs         build the site, in out/site"
 	@echo "make clean        remove .venv, out and caches"
 
@@ -113,6 +114,10 @@ pages: $(VENV)/test.stamp
 	$(BIN)/python -m tools.pages.architecture docs/architecture.png
 	$(BIN)/python -m tools.pages.robots docs/gallery
 	$(BIN)/python -m tools.pages.view docs/gallery
+
+# Needs a browser.
+animation: $(VENV)/test.stamp
+	$(BIN)/python -m tools.pages.view docs/gallery load
 
 # Strict: a warning is an error.
 docs: $(VENV)/docs.stamp

@@ -90,7 +90,7 @@ _Laws: Any = dataclasses.make_dataclass(
 
 @dataclass(frozen=True, eq=False)
 class FrictionSpec(_Laws):  # type: ignore[misc]  # its fields are those of the laws
-    """Friction of a joint, opposite to the rate; of a named mechanism one number, or one a joint.
+    """Friction of a joint, opposite to the rate; of a named mechanism one number, or one per joint.
 
     ``viscous``: per rate. ``coulomb``: by the rate's sign. ``offset``: a constant effort of the
     drive. The other keys are of further laws of drives, see docs/fit.md.

@@ -92,8 +92,8 @@ def round_trip(trip):
     lines = [
         "",
         "Round trip over DDS at 1 kHz, `joint_states` to `~/joint_torques`, relative to a node "
-        f"that sends the same message back (echo) with the same executor: {trip['slices']} slices of "
-        f"each in turn, medians, {priority}, processor time of all threads.",
+        f"that sends the same message back (echo) with the same executor: {trip['slices']} slices "
+        f"of each in turn, medians, {priority}, processor time of all threads.",
         "",
         "| node | p50, p99, CPU over the echo's | p50 (us) | p99 (us) | CPU per message (us) |",
         "|---|---|---:|---:|---:|",

@@ -13,9 +13,10 @@ from typer.main import get_command
 from pkm_twin.apps.cli import app
 from test.commands.conftest import REPOSITORY
 from test.support.command import SHELL, typed_line
+from test.support.pages import assert_output
 
 NOT_RUN = {
-    r"pkm-twin .*\b(my_delta|converted)\..*": "of a file that the page writes: test/docs runs them",
+    r"pkm-twin .*\b(my_delta|converted|mine)\..*": "of a page's own file: test/docs",
     r"pkm-twin view .*": "serves until a signal: test/view runs it in a browser",
     r"pkm-twin play .*": "needs ROS: test_player runs it over the real middleware",
     r"pkm-twin map .* --scheduler .*": "needs a Dask cluster: test/maps/test_run.py has one",
@@ -59,15 +60,21 @@ def pages():
 
 
 def typed(text):
-    """Lines of a page's code blocks, indented or fenced, of these programs."""
-    fenced = re.findall(r"^```.*?\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
-    outside = re.sub(r"^```.*?^```", "", text, flags=re.MULTILINE | re.DOTALL)
-    blocks = "\n".join([*fenced, *re.findall(r"^ {4}.*$", outside, re.MULTILINE)])
-    # A line may be continued on the next.
-    for line in re.sub(r"\\\n\s*", " ", blocks).splitlines():
-        words = line.strip().removeprefix("$ ")
-        if words.startswith(PROGRAMS):
-            yield words.split("  #")[0].split(" # ")[0].strip()
+    """Lines of these programs in a page's code blocks, and the output that the page prints."""
+    lines = []
+    for block in re.finditer(r"^```(\w*).*?\n(.*?)^```|(?:^ {4}.*\n)+", text, re.M | re.S):
+        if block[1] == "text":
+            if lines and not lines[-1][1]:
+                lines[-1][1] = block[2]
+            continue
+        # A line may be continued on the next.
+        for line in re.sub(r"\\\n\s*", " ", block[2] or block[0]).splitlines():
+            words = line.strip().removeprefix("$ ")
+            if words.startswith(PROGRAMS):
+                lines.append([words.split("  #")[0].split(" # ")[0].strip(), ""])
+            else:
+                lines.append(["", "another's"])
+    return [(line, output) for line, output in lines if line]
 
 
 def quoted(text):
@@ -82,10 +89,10 @@ def commands():
     found = {}
     for page in pages():
         text = (REPOSITORY / page).read_text(encoding="utf-8")
-        for line in typed(text):
-            found.setdefault((page, line), True)
+        for line, output in typed(text):
+            found[page, line] = found.get((page, line), "") or output
         for line in quoted(text):
-            found.setdefault((page, line), False)
+            found.setdefault((page, line), None)
     return found
 
 
@@ -113,7 +120,7 @@ def test_it_parses_as_it_stands(tree, page, line):
     command = tree.get_command(None, words[0])
     assert command is not None
     # A command's name alone, in running text, is only named.
-    if "--help" not in words and (commands()[page, line] or len(words) > 1):
+    if "--help" not in words and (commands()[page, line] is not None or len(words) > 1):
         command.make_context(words[0], words[1:])
 
 
@@ -131,18 +138,18 @@ def folder(tmp_path_factory):
 def test_it_runs_as_it_stands(folder, slow, twin, monkeypatch):
     """In the order of the page, in one folder: a later line may use what an earlier one wrote."""
     monkeypatch.chdir(folder)
-    done = set()
-    for (page, line), block in commands().items():
-        if not block or line in done or reason(line):
+    done = {}
+    for (page, line), output in commands().items():
+        if output is None or reason(line) or (re.fullmatch(SLOW, line) and not slow):
             continue
-        if re.fullmatch(SLOW, line) and not slow:
-            continue
-        done.add(line)
-        result = typed_line(twin, line)
-        if missing := re.search(r"(\w+) is not installed; pip install", result.err):
-            pytest.importorskip(missing[1])
-        assert result.code == ENDS.get(line, 0), f"{page}: {line}\n{result.err}"
-        assert "Traceback" not in result.err
+        if line not in done:
+            done[line] = result = typed_line(twin, line)
+            if missing := re.search(r"(\w+) is not installed; pip install", result.err):
+                pytest.importorskip(missing[1])
+            assert result.code == ENDS.get(line, 0), f"{page}: {line}\n{result.err}"
+            assert "Traceback" not in result.err
+        if output:
+            assert_output(output, done[line].out)
     assert len(done) >= 8
 
 

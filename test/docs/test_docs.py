@@ -16,7 +16,7 @@ import pytest
 from pkm_twin import errors as module
 from pkm_twin import robot_names
 from test.support.command import typed_line
-from test.support.pages import read_section
+from test.support.pages import assert_output, read_section
 from tools.pages import architecture, engine, errors, parameters, trend
 
 DOCS = Path(__file__).parents[2] / "docs"
@@ -41,33 +41,44 @@ def run(language, block, twin):
     return printed.getvalue()
 
 
-@pytest.mark.timeout(900)
-def test_a_new_machine_from_an_empty_file_to_torques(tmp_path, twin, monkeypatch):
+@pytest.fixture
+def clone(tmp_path, monkeypatch):
+    """A folder to work in, as a clone is for what blocks read."""
+    for name in ("bags", "examples"):
+        (tmp_path / name).symlink_to(DOCS.parent / name)
     monkeypatch.chdir(tmp_path)
-    # For what the page has the reader write and import.
+    # For what a page has the reader write and import.
     monkeypatch.syspath_prepend(tmp_path)
+    return tmp_path
+
+
+@pytest.mark.timeout(900)
+@pytest.mark.parametrize(
+    ("page", "made"),
+    [
+        ("tutorial.md", ("pick.png", "pick_torques.csv", "mine.png")),
+        ("new_machine.md", ("my_delta.png", "torques.csv", "loaded.csv", "converted.yaml")),
+    ],
+)
+def test_a_page_from_its_first_block_to_its_last(page, made, clone, twin):
     printed, ran = "", 0
-    for language, block, name in blocks("new_machine.md"):
+    for language, block, name in blocks(page):
         if name:
-            (tmp_path / name).write_text(block)
+            (clone / name).write_text(block)
         elif language == "text":
-            assert printed.strip() == block.strip()
-        else:
+            assert_output(block, printed)
+        elif language in ("bash", "python"):
             printed = run(language, block, twin)
             ran += 1
     assert ran >= 7
-    lines = (tmp_path / "my_delta.yaml").read_text().splitlines()
-    assert len(lines) <= 30
-    for made in ("my_delta.png", "torques.csv", "loaded.csv", "converted.yaml"):
-        assert (tmp_path / made).stat().st_size
+    for path in made:
+        assert (clone / path).stat().st_size
 
 
 @pytest.mark.long
-def test_a_printer_from_its_configuration_to_the_next(tmp_path, twin, monkeypatch):
+def test_a_printer_from_its_configuration_to_the_next(clone, twin):
     """And the figures of the page are those that are printed."""
-    monkeypatch.chdir(tmp_path)
     page = (DOCS / "calibration.md").read_text(encoding="utf-8")
-    (tmp_path / "examples").symlink_to(DOCS.parent / "examples")
     (block,) = (block for language, block, _ in blocks("calibration.md") if "printer" in block)
     printed = run("bash", block, twin)
     for kind, before, after in zip(("height", "distance"), (1.02, 1.06), (2, 3), strict=True):
@@ -163,3 +174,8 @@ def test_every_robot_has_its_picture():
     for name in robot_names():
         assert (DOCS / "gallery" / f"robot_{name}.png").stat().st_size, name
         assert f"robot_{name}.png" in (DOCS / "index.md").read_text(encoding="utf-8")
+
+
+def test_the_animation_is_small():
+    """Else `make animation` draws it."""
+    assert 50e3 < (DOCS / "gallery" / "load.gif").stat().st_size < 1.5e6

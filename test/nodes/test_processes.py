@@ -203,7 +203,7 @@ def resident(process):
 @pytest.mark.long
 @pytest.mark.parametrize("freed", [False, True])
 def test_requests_that_are_too_long_do_not_add_up(launch_alone, peer, monkeypatch, freed):
-    """By default the middleware keeps one buffer; with the profile of docs/security.md none."""
+    """By default the middleware keeps one buffer; with the profile of docs/launch.md none."""
     if freed:
         monkeypatch.setenv("RMW_FASTRTPS_USE_QOS_FROM_XML", "1")
         monkeypatch.setenv("FASTRTPS_DEFAULT_PROFILES_FILE", str(PROFILE))

@@ -35,6 +35,56 @@ def _texts(page: str, pattern: str) -> tuple[str, ...]:
     return match.groups()
 
 
+NUMBER = r"[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?"
+
+
+def assert_output(printed: str, found: str) -> None:
+    """A program's output is what a page prints, to the precision there.
+
+    ``...`` stands for any text of a line, or alone for any lines. A number with decimals may differ
+    by one unit of its last digit.
+    """
+    lines = [line for line in found.splitlines() if line.strip()]
+    skipped = False
+    for line in filter(str.strip, printed.splitlines()):
+        if line.strip() == "...":
+            skipped = True
+            continue
+        while lines and not _like(line, lines[0]):
+            assert skipped, f"{line!r} is on the page, {lines[0]!r} was printed"
+            del lines[0]
+        assert lines, f"{line!r} was not printed:\n{found}"
+        del lines[0]
+        skipped = False
+    assert skipped or not lines, f"not on the page: {lines}"
+
+
+def _like(printed: str, found: str) -> bool:
+    """Whether two lines have the same words, and numbers that agree."""
+    parts = re.split(rf"({NUMBER}|\.\.\.|\s+)", printed.strip())
+    pattern, numbers_ = "", []
+    for part in filter(None, parts):
+        if re.fullmatch(NUMBER, part):
+            pattern += f"({NUMBER})"
+            numbers_.append(part)
+        elif part == "...":
+            pattern += ".*?"
+        else:
+            pattern += r"\s+" if part.isspace() else re.escape(part)
+    match = re.fullmatch(pattern, found.strip())
+    return match is not None and all(
+        abs(float(a) - float(b)) <= 1.01 * _unit(a)
+        for a, b in zip(numbers_, match.groups(), strict=True)
+    )
+
+
+def _unit(number: str) -> float:
+    """One unit of the last digit; of a whole number nothing."""
+    digits, _, exponent = number.partition("e")
+    decimals = len(digits.partition(".")[2])
+    return 0.0 if not decimals and not exponent else 10.0 ** (int(exponent or 0) - decimals)
+
+
 def read_section(name: str, page: Path) -> str:
     """What stands between the marks of a part.
 

@@ -6,12 +6,15 @@ Needs a browser; where there is none it says so and leaves the pictures as they 
 
 from __future__ import annotations
 
+import contextlib
+import io
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
+from PIL import Image
 
 from pkm_twin import load
 from pkm_twin.recordings import read
@@ -62,12 +65,14 @@ PICTURES: dict[str, tuple[str, Callable[[Page], str]]] = {
     "view_stewart": ("stewart", leaning),
     "view_upr_rpu": ("upr_rpu", milling),
 }
-SHOWN = ("view_load", "view_bag")
-"""Those of the gallery."""
+SHOWN = ("view_load", "view_bag", "load")
+"""Those of the pages; `load` is the animation."""
+FRAMES = 10
 
 
-def take(browser: Browser, name: str, path: Path) -> None:
-    """One picture of one page."""
+@contextlib.contextmanager
+def shown(browser: Browser, name: str) -> Iterator[Page]:
+    """A page in the browser, as it is drawn in the end."""
     robot, prepare = PICTURES[name]
     with (
         listen("127.0.0.1", 0) as listening,
@@ -84,7 +89,23 @@ def take(browser: Browser, name: str, path: Path) -> None:
             browser.run("document.activeElement.blur()")
         browser.run(CLOSE)
         time.sleep(SETTLED)
-        path.write_bytes(browser.picture())
+        yield page
+
+
+def animate(browser: Browser, path: Path) -> None:
+    """The load of a page grows and falls."""
+    frames = []
+    with shown(browser, "view_load") as page:
+        full = np.array(page.state.wrench)
+        for part in np.linspace(0.0, 1.0, FRAMES):
+            page.become(page.model.loaded(page.state, part * full))
+            time.sleep(SETTLED / 3)
+            frame = Image.open(io.BytesIO(browser.picture()))
+            frames.append(frame.convert("RGB").resize((SIZE[0] * 7 // 10, SIZE[1] * 7 // 10)))
+    palette = frames[-1].quantize(96)
+    frames = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
+    frames += frames[-2:0:-1]
+    frames[0].save(path, save_all=True, append_images=frames[1:], duration=120, loop=0)
 
 
 def main(folder: Path, names: tuple[str, ...]) -> None:
@@ -96,7 +117,11 @@ def main(folder: Path, names: tuple[str, ...]) -> None:
     with Browser(program, SIZE) as browser:
         browser.slow_down(0.5)
         for name in names:
-            take(browser, name, folder / f"{name}.png")
+            if name == "load":
+                animate(browser, folder / "load.gif")
+                continue
+            with shown(browser, name):
+                (folder / f"{name}.png").write_bytes(browser.picture())
 
 
 if __name__ == "__main__":
