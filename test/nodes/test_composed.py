@@ -17,6 +17,7 @@ from geometry_msgs.msg import PoseStamped
 from sensor_msgs.msg import JointState
 
 from test.nodes.twin import ROBOT, state
+from test.support.robots import partly_long
 
 COMPOSED = "from pkm_twin.apps.nodes import composed; composed()"
 
@@ -25,7 +26,7 @@ def program(*words):
     return [sys.executable, "-c", COMPOSED, *words]
 
 
-@pytest.mark.parametrize("executor", ["single", "events"])
+@pytest.mark.parametrize("executor", partly_long(["single", "events"], "events"))
 def test_nodes_of_one_process_answer_with_their_own_parameters_and_end_together(
     domain, peer, executor
 ):

@@ -36,7 +36,7 @@ from test.support.waiting import wait_until
 # Held as long as this process runs.
 OWN = Domain()
 DOMAIN = OWN.number
-COUNT = 200
+COUNT = 100
 PERIOD = 0.005
 FIRST = 1_700_000_000 * 10**9
 PROGRAM = (
@@ -47,7 +47,7 @@ PROGRAM = (
 
 @pytest.fixture(scope="module")
 def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """One second of joint states at 200 Hz, every tenth with a note, and a latched note."""
+    """Half a second of joint states at 200 Hz, every tenth with a note, and a latched note."""
     path = tmp_path_factory.mktemp("bags") / "second.mcap"
     with BagWriter(path) as writer:
         writer.add_topic("/joint_states", "sensor_msgs/msg/JointState")
@@ -131,10 +131,8 @@ def player() -> Iterator[Callable[..., subprocess.Popen[str]]]:
         process.communicate()
 
 
-@pytest.mark.parametrize("rate", [1.0, 4.0])
-def test_order_count_and_timing(
-    bag: Path, listener: Listener, player: Callable[..., Any], rate: float
-) -> None:
+def test_order_count_and_timing(bag: Path, listener: Listener, player: Callable[..., Any]) -> None:
+    rate = 2.0
     listener.listen(JointState, "joint_states")
     listener.listen(
         String, "note", QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
@@ -152,7 +150,7 @@ def test_order_count_and_timing(
     assert notes == sorted(set(notes)) and set(notes) <= set(range(0, COUNT, 10))
     # No message leaves before its time.
     assert float(re.findall(r"duration=([0-9.]+)", out)[0]) >= (COUNT - 1) * PERIOD / rate - 1e-6
-    assert f"PlayResult(messages={COUNT + 20}, loops=1" in out
+    assert f"PlayResult(messages={COUNT + COUNT // 10}, loops=1" in out
 
 
 def test_recorded_durability_is_offered(
@@ -177,7 +175,7 @@ def test_clock(bag: Path, listener: Listener, player: Callable[..., Any]) -> Non
     assert times[0] == FIRST
     steps = [after - before for before, after in pairwise(times)]
     assert all(abs(step - 40_000_000) <= 1 for step in steps)
-    assert len(times) == pytest.approx(25, abs=2)
+    assert len(times) == pytest.approx(13, abs=2)
 
 
 def test_loop_ends_by_sigint(bag: Path, listener: Listener, player: Callable[..., Any]) -> None:
@@ -223,7 +221,7 @@ def test_missing_subscribers_are_named(bag: Path, player: Callable[..., Any]) ->
     process = player(bag, rate=100.0, wait_for_subscribers=0.2, topics=["/note"], progress=False)
     out, err = process.communicate(timeout=DEADLINE)
     assert process.returncode == 0
-    assert err == "no subscriber after 0.2 s: /note\n" and "messages=20" in out
+    assert err == "no subscriber after 0.2 s: /note\n" and f"messages={COUNT // 10}" in out
 
 
 def test_refusals(bag: Path, tmp_path: Path) -> None:

@@ -19,7 +19,7 @@ from test.nodes.harness import (
     text_of,
     values_of,
 )
-from test.support.robots import load, massless
+from test.support.robots import load, massless, partly_long
 
 pytest.importorskip("rclpy", exc_type=ImportError)
 
@@ -137,10 +137,11 @@ class Monitor:
 
 
 @pytest.fixture(scope="module")
-def fleet(peer, launch):
-    """The node with its defaults, and one that takes wrenches in the base frame."""
+def fleet(peer, launch, tmp_path_factory):
+    """The node with its defaults; one without masses takes wrenches in the base frame."""
     heard = OUTPUTS | {"natural_frequencies": Float64MultiArray}
-    fixed = ("wrench_frame:=base_link", "accept_empty_frame:=true", "frequencies_rate:=0.0")
+    light = massless(tmp_path_factory.mktemp("light") / "upr_rpu.yaml")
+    fixed = (f"mechanism:={light}", "wrench_frame:=base_link", "accept_empty_frame:=true")
     options = {"defaults": (f"frequencies_rate:={RATE}",), "fixed": fixed}
     monitors = {
         name: Monitor(peer, launch, name, "max_state_age:=1.0", *given, heard=heard, fresh=True)
@@ -240,13 +241,8 @@ class TestRejects:
     def test_each_bad_wrench_is_counted_and_the_next_good_one_is_answered(self, platform):
         bad = [
             ("frame", {"frame": ""}),
-            ("frame", {"frame": "tool0"}),
-            ("frame", {"frame": "base_link"}),
             ("not finite", {"values": (math.nan, 0, 0, 0, 0, 0)}),
-            ("not finite", {"values": (0, 0, 0, 0, 0, math.inf)}),
-            ("bounds", {"values": (1e300, 0, 0, 0, 0, 0)}),
             ("bounds", {"values": (0, 5e-324, 0, 0, 0, 0)}),
-            ("zero stamp", {"stamp": 0}),
             ("future stamp", {"stamp": platform.peer.now() + 600 * SECOND}),
             ("no pose", {"stamp": platform.peer.now() - 600 * SECOND}),
         ]
@@ -272,27 +268,8 @@ class TestRejects:
         )
         assert counts_of(array, "wrenches rejected") == expected
         assert array.status[0].level == b"\x01"
-        assert "last reject: no pose" in text_of(array)
-
-    def test_no_pose_before_a_joint_state_and_too_far_from_one(self, peer, launch):
-        young = Monitor(peer, launch, "young")
-        peer.until(peer.matched)
-
-        def rejected(count):
-            return lambda a: counts_of(a, "wrenches rejected").get("no pose", 0) >= count
-
-        def until_rejected(count):
-            peer.until(lambda: young.process.output.count("no pose") >= 1, repeat=young.send_wrench)
-            return young.diagnostics(rejected(count))
-
-        array = until_rejected(1)
-        assert "last reject: no pose: no joint state has arrived" in text_of(array)
-        young.answer()
-        far = young.peer.now() - SECOND // 2
-        young.peer.send("/young/wrench", MAKE.wrench(WRENCH, far, "platform"))
-        array = young.diagnostics(lambda a: "is 0." in text_of(a))
-        assert "no pose: the nearest joint state" in text_of(array)
-        assert "allowed 0.1 s" in text_of(array)
+        assert "last reject: no pose: the nearest joint state" in text_of(array)
+        assert "allowed 1 s" in text_of(array)
 
 
 class TestFrequencies:
@@ -303,15 +280,15 @@ class TestFrequencies:
         assert (dim.label, dim.size, dim.stride) == ("frequency", 6, 6)
         assert np.allclose(told[-1].data, natural_frequencies(ROBOT, POSE), rtol=1e-9)
         told.clear()
-        platform.run(2.0)
-        assert 2 <= len(told) <= 2.0 * RATE + 2
+        platform.run(1.0)
+        assert 1 <= len(told) <= RATE + 2
         # No new pose, no new frequencies.
-        platform.run(1.0, send=False)
+        platform.run(0.5, send=False)
         told.clear()
-        platform.run(1.0, send=False)
+        platform.run(0.5, send=False)
         assert not told
 
-    @pytest.mark.parametrize("name", ["delta_cu", "prru"])
+    @pytest.mark.parametrize("name", partly_long(["delta_cu", "prru"], "delta_cu"))
     def test_a_machine_solved_as_a_frame(self, name, peer, launch):
         """Frequencies from joint states alone, every answer to a wrench, and what plots draw."""
         robot = load(name)
@@ -341,13 +318,7 @@ class TestFrequencies:
         assert np.allclose(message.position, energy.factors, rtol=1e-6, atol=1e-12)
         assert np.allclose(message.effort, energy.energies, rtol=1e-6, atol=1e-15)
 
-    def test_none_when_off_or_without_masses(self, fixed, peer, launch, tmp_path):
-        light = f"mechanism:={massless(tmp_path / 'light.yaml')}"
-        heard = {topic: ALL[topic] for topic in ("deflection", "natural_frequencies")}
-        still = Monitor(peer, launch, "still", light, "max_state_age:=1.0", heard=heard)
-        peer.until(lambda: len(still.received("deflection")) > 20, repeat=still.send)
-        still.run(0.5)
-        assert not still.received("natural_frequencies")
+    def test_none_without_masses(self, fixed):
         fixed.run(0.5)
         assert not fixed.received("natural_frequencies")
 
@@ -425,12 +396,15 @@ class TestCorrection:
         assert len(both) == 2
 
     def test_a_wrench_without_a_correction_has_its_compliance(self, peer, launch):
-        heard = {"compliance_stamped": JointState}
+        peer.hear(Float64MultiArray, "/loose/natural_frequencies")
         node = Monitor(
-            peer, launch, "loose", "correct_setpoint:=true", q=self.q, heard=heard, code=SINGULAR
-        ).ready()
+            peer, launch, "loose", "correct_setpoint:=true", "frequencies_rate:=0.0", q=self.q,
+            heard={"compliance_stamped": JointState}, code=SINGULAR,
+        ).ready()  # fmt: skip
         peer.until(lambda: "no correction or alarm: " in node.process.output)
         assert values_of(node.diagnostics())["exceptions"] == "0"
+        # Off by the parameter.
+        assert not node.received("natural_frequencies")
 
 
 class TestProcess:
