@@ -147,14 +147,14 @@ class Torques(NamedTuple):
 class Feedforward(Core):
     """Answers trajectories and a stream of joint states with feedforward efforts.
 
-    ``wrenches``: those that the stream's efforts bear; None bears none. ``doubted``: the doubt of
+    ``wrenches``: those that the stream's efforts bear; None bears none. ``uncertain``: the doubt of
     rates is told for every robot, else it is known of those with dry friction alone.
     """
 
     robot: Robot
     settings: Settings = field(default_factory=Settings)
     wrenches: WrenchWindow | None = None
-    doubted: bool = False
+    uncertain: bool = False
 
     def __post_init__(self) -> None:
         s = self.settings
@@ -424,7 +424,7 @@ class Feedforward(Core):
 
     def _doubt(self, sample: JointSample, rates: tuple[Array, Array] | None) -> Array | None:
         """How far the sample's rates may be off, where that makes a difference."""
-        if not (self.doubted or self._reach.any()):
+        if not (self.uncertain or self._reach.any()):
             return None
         rate = None if rates is None else rates[0]
         return self._rest.push(sample.stamp, sample.q, sample.qd, rate)

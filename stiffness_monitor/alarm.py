@@ -56,18 +56,18 @@ MOST_ALIKE: Final = 0.95
 class AlarmSettings:
     """Conditions of an alarm.
 
-    ``sigmas``: threshold in standard deviations of model and noise. ``least``: smallest difference
-    of a factor from 1. ``window``: time span of the samples that are evaluated together, s.
-    ``directions``: the measured ones of x y z rx ry rz.
+    ``sigmas``: threshold in standard deviations of model and noise. ``min_departure``:
+    smallest difference of a factor from 1. ``window``: time span of the samples that are evaluated
+    together, s. ``directions``: the measured ones of x y z rx ry rz.
     """
 
     sigmas: float = setting(
         6.0, "alarm threshold in standard deviations of model and noise together",
         name="alarm.sigmas", low=1.0, high=1e3,
     )  # fmt: skip
-    least: float = setting(
+    min_departure: float = setting(
         0.1, "smallest change of an element's compliance factor that raises an alarm",
-        name="alarm.least", low=0.0, high=10.0,
+        name="alarm.min_departure", low=0.0, high=10.0,
     )  # fmt: skip
     window: float = setting(
         20.0, "time span of the deflections that are evaluated together",
@@ -271,7 +271,9 @@ class StiffnessAlarm:
         """How far from 1 a factor is no departure."""
         s = self.settings
         doubts = self._doubts[list(elements)]
-        return np.asarray(np.maximum(s.least, s.sigmas * np.hypot(deviations, doubts)), np.float64)
+        return np.asarray(
+            np.maximum(s.min_departure, s.sigmas * np.hypot(deviations, doubts)), np.float64
+        )
 
     def _beyond(self, fit: _Explained, alike: float, elements: Sequence[int]) -> Array:
         """Departures from 1 over their bounds, (elements,)."""

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from pkm_twin.errors import MessageError, ParameterError
-from pkm_twin.messages.intake import JointStateView
+from pkm_twin.messages.fast_decoder import JointStateView
 from pkm_twin.messages.reading import JointReader
 from pkm_twin.messages.stamps import SECOND, StampRules
 from pkm_twin.robot.robot import Robot

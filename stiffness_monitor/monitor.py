@@ -13,7 +13,7 @@ from pkm_twin.errors import MessageError
 from pkm_twin.messages.reading import WrenchSample, as_message_error
 from pkm_twin.messages.stamps import SECOND
 from pkm_twin.streams.monitor import Pace
-from pkm_twin.streams.wrench import Mount, PairingCore, Recent, WrenchSettings
+from pkm_twin.streams.wrench import Mount, TimeCache, TimeSynchronizer, WrenchSettings
 from stiffness_monitor.compliance import PlatformResponse, platform_response
 
 Settings = WrenchSettings
@@ -42,12 +42,12 @@ class Answer:
 
 
 @dataclass
-class Monitor(PairingCore):
+class Monitor(TimeSynchronizer):
     """Pairs each wrench with the joint state nearest to it in time."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self._recent: Recent[Array] = Recent()
+        self._recent: TimeCache[Array] = TimeCache()
         self.pace = Pace(0.0)
 
     @property

@@ -104,7 +104,7 @@ class StiffnessMonitor(TwinNode):
             "joint_states",
             lambda message: self._monitor.joint_state(message, self.now()),
             refuse=partial(self._monitor.refuse, self._monitor.states),
-            awaited=True,
+            expected=True,
         )
         self.create_guarded_subscription("wrench", self._on_wrench)
         self.follow(

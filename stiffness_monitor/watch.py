@@ -13,7 +13,7 @@ from pkm_twin.messages.reading import DeflectionSample, in_base_axes, read_defle
 from pkm_twin.messages.stamps import SECOND, StampRules
 from pkm_twin.robot.robot import Robot
 from pkm_twin.streams.monitor import Core, counting
-from pkm_twin.streams.wrench import Recent, check_order
+from pkm_twin.streams.wrench import TimeCache, check_order
 from stiffness_monitor.alarm import AlarmSettings, Departure, StiffnessAlarm
 from stiffness_monitor.monitor import Answer
 
@@ -44,7 +44,7 @@ class StiffnessWatch(Core):
         self.departures: tuple[Departure, ...] | None = None
         """What the last judgement found; None before there was one."""
         self._alarm = StiffnessAlarm(self.robot, self.settings)
-        self._answers: Recent[Answer] = Recent(1024)
+        self._answers: TimeCache[Answer] = TimeCache(1024)
         self._waiting: list[DeflectionSample] = []
         """By their stamps: what is never paired does not stand before what is."""
         self._last = self._due = self._judged = 0

@@ -139,7 +139,7 @@ class EffortAction:
         """Another trajectory went to the controller: no hold point may end it."""
         self._settling = None
 
-    def farewell(self) -> None:
+    def shutdown(self) -> None:
         """The node ends, and with it every goal: the machine is stopped where it is."""
         moving = [goal for goal in self._goals.values() if goal.sent]
         if moving:
@@ -148,8 +148,8 @@ class EffortAction:
             self._abort(goal, "delta_dynamics is shutting down")
 
     @property
-    def parting(self) -> bool:
-        """Whether clients or the controller still wait for what :meth:`farewell` has sent."""
+    def shutting_down(self) -> bool:
+        """Whether clients or the controller still wait for what :meth:`shutdown` has sent."""
         if self._ending or self._holding:
             self._turns = TURNS
         else:

@@ -19,7 +19,7 @@ from delta_dynamics.nodes.topics import GATE
 from delta_dynamics.torques.virtual_work import inverse_dynamics
 from pkm_twin.errors import MessageError
 from pkm_twin.machine.joint_map import ControllerNumbers
-from pkm_twin.messages.intake import JointStateView
+from pkm_twin.messages.fast_decoder import JointStateView
 from pkm_twin.messages.stamps import SECOND
 from pkm_twin.ros import health
 from pkm_twin.ros.joints import CommandPublisher, JointPublisher
@@ -57,7 +57,7 @@ class CommandGate(TwinNode):
             TORQUES,
             self._on_torques,
             refuse=self._refuse_torques,
-            awaited=True,
+            expected=True,
             expires=lambda: settings.deadline,
             expiry=settings.deadline,
         )
@@ -66,7 +66,7 @@ class CommandGate(TwinNode):
                 "joint_states",
                 lambda m: self._gate.joint_state(m, self.now(), time.monotonic_ns()),
                 refuse=partial(self._gate.refuse, self._gate.states),
-                awaited=True,
+                expected=True,
             )
         self.follow(
             ["effort_limits", *PAYLOAD],
@@ -102,9 +102,9 @@ class CommandGate(TwinNode):
         self._tell()
         self._send(self._gate.stop_command(time.monotonic_ns()))
 
-    def farewell(self) -> None:
+    def shutdown(self) -> None:
         """As deactivated; and the controller has it before the process ends."""
-        super().farewell()
+        super().shutdown()
         self._commands.publisher.wait_for_all_acked(Duration(seconds=LAST_WORD))
 
     def reset_stop(self) -> str:

@@ -29,7 +29,7 @@ from delta_dynamics.simulation.machine import (
 from pkm_twin.bags.definitions import message_definition
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import MessageError, ParameterError, short
-from pkm_twin.messages.intake import DoublesTemplate, RawTrajectory
+from pkm_twin.messages.fast_decoder import DoublesTemplate, RawTrajectory
 from pkm_twin.messages.stamps import SECOND
 from pkm_twin.robot.robot import Robot
 from pkm_twin.robot.variation import KINDS, MAX_SPREAD, Variation, varied

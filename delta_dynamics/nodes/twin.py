@@ -20,7 +20,7 @@ from delta_dynamics.nodes.parameters import CHANGES, changed, declare_changes
 from delta_dynamics.nodes.topics import TWIN
 from delta_dynamics.torques.reactions import reactions
 from pkm_twin.errors import MessageError, ParameterError, PkmTwinError
-from pkm_twin.messages.intake import JointStateView, RawTrajectory
+from pkm_twin.messages.fast_decoder import JointStateView, RawTrajectory
 from pkm_twin.messages.stamps import SECOND
 from pkm_twin.robot.robot import Robot
 from pkm_twin.ros import health
@@ -71,7 +71,7 @@ class DeltaDynamics(TwinNode):
         self._estimates = Estimates(
             self, lambda: self._feedforward.robot, (self._base_frame, "platform")
         )
-        self._feedforward.doubted = self._estimates.wanted
+        self._feedforward.uncertain = self._estimates.wanted
         if self._estimates.warning():
             self.get_logger().warning(self._estimates.warning())
         self.create_guarded_subscription("~/joint_trajectory", self._on_trajectory, raw=True)
@@ -79,7 +79,7 @@ class DeltaDynamics(TwinNode):
             "joint_states",
             self._on_joint_state,
             refuse=self._refuse_joint_state,
-            awaited=True,
+            expected=True,
             expires=lambda: self._feedforward.settings.stale_after,
         )
         self._action = self._create_action()
@@ -88,7 +88,7 @@ class DeltaDynamics(TwinNode):
             self._prepare,
             self._take,
         )
-        self._told_window = 0
+        self._reported_window = 0
         self._accepted: tuple[int, Any] | None = None
         """The last accepted joint state, and when it came by the steady clock, ns."""
         self._watchdog: Any = None
@@ -129,18 +129,18 @@ class DeltaDynamics(TwinNode):
         if self._accepted is not None:
             self._stop("inactive", "the node was deactivated")
 
-    def farewell(self) -> None:
+    def shutdown(self) -> None:
         """What has to be the last: goals are ended, the machine held, a stop's torque sent."""
         if self._action is not None:
-            self._action.farewell()
-        super().farewell()
+            self._action.shutdown()
+        super().shutdown()
         if self._commands is not None:
             self._commands.publisher.wait_for_all_acked(Duration(seconds=LAST_WORD))
 
     @property
-    def parting(self) -> bool:
+    def shutting_down(self) -> bool:
         """Whether the ends of goals still wait for turns of the executor."""
-        return self._action is not None and self._action.parting
+        return self._action is not None and self._action.shutting_down
 
     def reset_stop(self) -> str:
         """End a stop without waiting for good samples."""
@@ -203,8 +203,8 @@ class DeltaDynamics(TwinNode):
             f"{fit.window} samples, {1e3 * length:.3g} ms: error for a sine of 1 Hz {error:.2g} % "
             "of the peak acceleration"
         )
-        if fit.window != self._told_window:
-            self._told_window = fit.window
+        if fit.window != self._reported_window:
+            self._reported_window = fit.window
             self.get_logger().info(f"joint states at {1.0 / fit.period:.4g} Hz, window {text}")
         return text
 
@@ -263,8 +263,8 @@ class DeltaDynamics(TwinNode):
             "max_wrench_age", 0.1, "largest time between a joint state and its wrench", **SECONDS
         )
         policy = self.declare(
-            "no_wrench", "ignore", "without a fresh wrench: ignore computes without one, stop "
-            "stops the stream",
+            "missing_wrench_policy", "ignore", "without a fresh wrench: ignore computes without "
+            "one, stop stops the stream",
             choices=("ignore", "stop")
         )  # fmt: skip
         wrench = self.declare_settings(
@@ -278,7 +278,7 @@ class DeltaDynamics(TwinNode):
         mounts = declare_mounts(self)
         if not wanted:
             return None
-        self.create_guarded_subscription("wrench", self._on_wrench, awaited=True)
+        self.create_guarded_subscription("wrench", self._on_wrench, expected=True)
         return WrenchWindow(
             WrenchReader(wrench, mounts),
             round(age * SECOND),

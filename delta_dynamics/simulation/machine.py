@@ -201,7 +201,7 @@ def _lessened(here: Terms, end: Terms, law: Law, work: float = 0.0) -> Terms:
     return end._replace(qd=math.sqrt(left) * end.qd, kinetic=left * end.kinetic)
 
 
-OnSilence = Literal["zeros", "hold"]
+TimeoutAction = Literal["zeros", "hold"]
 
 SINGULAR: Final = 1e-3
 """Singularity measure below which a machine has left what rigid bodies describe."""
@@ -276,7 +276,7 @@ class MachineSettings:
     deadline: float = setting(
         0.1, "longest gap between effort commands", unit="s", low=1e-3, high=10.0
     )
-    on_silence: OnSilence = setting(
+    timeout_action: TimeoutAction = setting(
         "zeros",
         "efforts of the drives after that gap: zeros, or hold, the last effort, as most "
         "effort controllers do",
@@ -490,7 +490,7 @@ class Simulation(Core):
             self._send(control)
         while self._coming and self._coming[0][0] <= self.now:
             self._apply(self._coming.popleft()[1])
-        if self._commanded is not None and self._silent() and s.on_silence == "zeros":
+        if self._commanded is not None and self._silent() and s.timeout_action == "zeros":
             self._apply(np.zeros_like(self._effort))
         self._load()
         if not self.failure and not self.braked:

@@ -51,7 +51,7 @@ def largest(forms: Array, y: Array) -> Array:
     return np.asarray(np.abs(np.einsum("...i,...aij,...j->...a", y, forms, y)).max(-1), np.float64)
 
 
-def least_direction(forms: Array) -> Array:
+def minimax_direction(forms: Array) -> Array:
     """Unit y, shape (m,), with the least max_a |y' G_a y| of symmetric forms G, shape (n, m, m).
 
     For m up to 3. At a minimum one form is stationary, or two are equal but for their sign and one
@@ -287,7 +287,7 @@ def max_driving_force_range(
 
     On the ellipsoid of Xdot with that energy, scaled to the unit sphere, every F_d is a
     quadratic form y' G y. The greatest |F_d| is an eigenvalue, exact. The least F_max is the
-    minimum of the largest of these forms (:func:`least_direction`), exact too.
+    minimum of the largest of these forms (:func:`minimax_direction`), exact too.
 
     :param pose: shape (..., m).
     :param acceleration: Xddot, a number or shape (..., m).
@@ -298,7 +298,7 @@ def max_driving_force_range(
     back, forms = _driving_forms(robot, pose, energy, acceleration)
     greatest, high, _ = _peak(forms)
     flat = forms.reshape(-1, *forms.shape[-3:])
-    low = np.array([least_direction(form) for form in flat]).reshape(high.shape)
+    low = np.array([minimax_direction(form) for form in flat]).reshape(high.shape)
     least = largest(forms, low)
     y = np.stack([low, high], -2)
     return Extremes(least, greatest, _directions(np.einsum("...ij,...kj->...ki", back, y)))

@@ -33,7 +33,7 @@ QOS: Final = "QoS"
 RELIABILITY: Final = "reliability"
 
 
-class Misfit(NamedTuple):
+class Incompatibility(NamedTuple):
     """Why a publisher and a subscriber exchange nothing: the policy of a QoS, or the types."""
 
     kind: str
@@ -56,7 +56,7 @@ class Health:
             ("messages", "exceptions", "requests rejected", "clock messages rejected"), 0
         )
         self.statistics: dict[str, TopicStatistics] = {}
-        self.awaited: list[str] = []
+        self.expected: list[str] = []
         """Topics of which the diagnostics warn until the first message."""
         self.limitations: list[str] = []
         """What the node was asked for at start and could not have."""
@@ -64,8 +64,8 @@ class Health:
         self._last_exception = ""
         self._last_kind = ""
         self._reported = (0, 0, 0, 0)
-        self._watched: dict[str, list[Callable[[Misfit], None]]] = {}
-        self._unfit: dict[str, dict[bytes, Misfit]] = {}
+        self._watched: dict[str, list[Callable[[Incompatibility], None]]] = {}
+        self._incompatible_ends: dict[str, dict[bytes, Incompatibility]] = {}
         self._incompatible = 0
         self._last_clock = 0
 
@@ -87,7 +87,7 @@ class Health:
             self._logged[reason] = now
             self._node.get_logger().warning(cut(text))
 
-    def watch(self, topic: str, tell: Callable[[Misfit], None] | None = None) -> None:
+    def watch(self, topic: str, tell: Callable[[Incompatibility], None] | None = None) -> None:
         """Tell of other nodes with which this one cannot exchange messages on a topic.
 
         :param tell: called with what does not fit, once a publisher or subscriber.
@@ -97,8 +97,8 @@ class Health:
     def _look(self) -> None:
         """Find those nodes in the graph, which costs less than the middleware's events."""
         for topic, listeners in self._watched.items():
-            before, now = self._unfit.get(topic, {}), self._misfits(topic)
-            self._unfit[topic] = now
+            before, now = self._incompatible_ends.get(topic, {}), self._incompatibilities(topic)
+            self._incompatible_ends[topic] = now
             for end in now.keys() - before.keys():
                 self._incompatible += now[end].kind == QOS
                 self.log_throttled(
@@ -107,7 +107,7 @@ class Health:
                 for tell in listeners:
                     tell(now[end])
 
-    def _misfits(self, topic: str) -> dict[bytes, Misfit]:
+    def _incompatibilities(self, topic: str) -> dict[bytes, Incompatibility]:
         """What does not fit at other nodes' publishers and subscribers, by their identity."""
         # The name as it was given: both calls remap it.
         speakers = self._node.get_publishers_info_by_topic(topic)
@@ -117,7 +117,7 @@ class Health:
         # Every node's own are few: the others are looked at once, however many there are.
         pairs = [(s, r, r) for s, r in product(speaking, listeners)]
         pairs += [(s, r, s) for s, r in product(strangers, listening)]
-        found = {bytes(end.endpoint_gid): misfit(s, r) for s, r, end in pairs}
+        found = {bytes(end.endpoint_gid): incompatibility(s, r) for s, r, end in pairs}
         return {end: what for end, what in found.items() if what}
 
     def _is_own(self, end: TopicEndpointInfo) -> bool:
@@ -133,7 +133,7 @@ class Health:
         self._look()
         found += [
             (WARN, f"another node on {topic} has an incompatible {text}")
-            for topic, unfit in self._unfit.items()
+            for topic, unfit in self._incompatible_ends.items()
             for text in sorted(map(str, set(unfit.values())))
         ]
         if self._node.get_parameter("use_sim_time").value:
@@ -171,7 +171,7 @@ class Health:
 
         :param values: the node's own, which are added to.
         """
-        waiting = [topic for topic in self.awaited if not self.statistics[topic].messages]
+        waiting = [topic for topic in self.expected if not self.statistics[topic].messages]
         if not active:
             level, message = OK, "inactive"
         elif level == OK and waiting:
@@ -207,10 +207,12 @@ class Health:
         return array
 
 
-def misfit(speaker: TopicEndpointInfo, listener: TopicEndpointInfo) -> Misfit | None:
+def incompatibility(
+    speaker: TopicEndpointInfo, listener: TopicEndpointInfo
+) -> Incompatibility | None:
     """Why a publisher's messages do not reach a subscriber; None if they do."""
     if speaker.topic_type != listener.topic_type:
-        return Misfit("message type", f"{speaker.topic_type} for {listener.topic_type}")
+        return Incompatibility("message type", f"{speaker.topic_type} for {listener.topic_type}")
     offered, requested = speaker.qos_profile, listener.qos_profile
     if qos_check_compatible(offered, requested)[0] != QoSCompatibility.ERROR:
         return None
@@ -218,8 +220,8 @@ def misfit(speaker: TopicEndpointInfo, listener: TopicEndpointInfo) -> Misfit | 
         alike = copy(offered)
         setattr(alike, policy, getattr(requested, policy))
         if qos_check_compatible(offered, alike)[0] == QoSCompatibility.ERROR:
-            return Misfit(QOS, policy)
-    return Misfit(QOS, "liveliness")
+            return Incompatibility(QOS, policy)
+    return Incompatibility(QOS, "liveliness")
 
 
 def node_of(end: TopicEndpointInfo) -> str:

@@ -14,7 +14,7 @@ import numpy as np
 
 from pkm_twin.bags.definitions import message_definition
 from pkm_twin.machine.joint_map import ControllerNumbers
-from pkm_twin.messages.intake import DoublesTemplate
+from pkm_twin.messages.fast_decoder import DoublesTemplate
 from pkm_twin.messages.stamps import SECOND
 from pkm_twin.robot.robot import Robot
 

@@ -30,11 +30,11 @@ from std_srvs.srv import Trigger
 
 from pkm_twin.bags.definitions import message_definition
 from pkm_twin.errors import MessageError, ParameterError
-from pkm_twin.messages.intake import JointStateDecoder
+from pkm_twin.messages.fast_decoder import JointStateDecoder
 from pkm_twin.messages.stamps import SECOND
-from pkm_twin.ros.health import QOS, RELIABILITY, WARN, Health, Misfit, cut
+from pkm_twin.ros.health import QOS, RELIABILITY, WARN, Health, Incompatibility, cut
 from pkm_twin.ros.parameters import ParameterNode
-from pkm_twin.ros.turns import SELDOM_PERIOD, SeldomGroup, Task, Tasks
+from pkm_twin.ros.turns import LOW_RATE_PERIOD, LowRateGroup, Task, Tasks
 from pkm_twin.streams.monitor import TopicStatistics
 from pkm_twin.streams.topics import JOINTS, Topic
 
@@ -89,7 +89,7 @@ class GuardedNode(ParameterNode):
         self.health = Health(self, self.now)
         self.active = False
         self.active_since = 0
-        self.seldom = SeldomGroup()
+        self.low_rate = LowRateGroup()
         super().__init__(name)
         self.autostart: bool = self.declare(
             "autostart", True, "configure and activate the node at start"
@@ -163,7 +163,7 @@ class GuardedNode(ParameterNode):
         *,
         refuse: Callable[[MessageError], None] | None = None,
         raw: bool = False,
-        awaited: bool = False,
+        expected: bool = False,
         expires: Callable[[], float] | None = None,
         expiry: float | None = None,
     ) -> None:
@@ -176,12 +176,12 @@ class GuardedNode(ParameterNode):
 
         :param refuse: takes what is wrong with bytes that are no joint state.
         :param raw: the callback takes the message's bytes.
-        :param awaited: the diagnostics warn until the first message.
+        :param expected: the diagnostics warn until the first message.
         :param expires: how long a message may wait for the node, s; older ones count as lost.
         :param expiry: lifespan and deadline that publishers have to offer, s; None is any.
         """
-        if awaited:
-            self.health.awaited.append(topic)
+        if expected:
+            self.health.expected.append(topic)
         row = self.topics[topic]
         GuardedSubscription(
             self, row, topic, callback, refuse,
@@ -273,7 +273,7 @@ class GuardedSubscription:
         self._given = f"qos_overrides.{self._name}.subscription.reliability" in node.given
         self._relaxed = False
         self._subscription = self._subscribe()
-        node.health.watch(topic, self._misfit)
+        node.health.watch(topic, self._incompatible_with)
 
     def _subscribe(self) -> Any:
         relaxed, best_effort = self._relaxed, self._best_effort or self._relaxed
@@ -332,7 +332,7 @@ class GuardedSubscription:
                 self._refuse(error)
             raise
 
-    def _misfit(self, what: Misfit) -> None:
+    def _incompatible_with(self, what: Incompatibility) -> None:
         """From there on publishers of both kinds are taken."""
         if what != (QOS, RELIABILITY) or self._best_effort or self._given or self._relaxed:
             return
@@ -391,10 +391,10 @@ class TwinNode(GuardedNode):
             service.callback = guarded_service(
                 service.srv_type, service.callback, self.health, lambda: len(self.declared)
             )
-            service.callback_group = self.seldom
-            self.seldom.add_entity(service)
+            service.callback_group = self.low_rate
+            self.low_rate.add_entity(service)
         if self.executor_kind == "single":
-            self.create_guarded_timer(SELDOM_PERIOD, self.seldom.open)
+            self.create_guarded_timer(LOW_RATE_PERIOD, self.low_rate.open)
         # Kept: the middleware calls the handle without holding it.
         self._jump_handle = self.get_clock().create_jump_callback(
             JumpThreshold(
@@ -426,12 +426,12 @@ class TwinNode(GuardedNode):
         """The ROS clock went forward by more than a stream's messages may be apart."""
         self.time_jumped_backward()
 
-    def farewell(self) -> None:
+    def shutdown(self) -> None:
         """The end: nothing is answered from here on, while the topics are still there."""
         self._quit()
 
     @property
-    def parting(self) -> bool:
+    def shutting_down(self) -> bool:
         """Whether something of the end still waits for turns of the executor."""
         return False
 
@@ -483,7 +483,7 @@ class TwinNode(GuardedNode):
 
     def turned(self) -> None:
         """A turn of the executor is over: one step of what waits."""
-        self.seldom.turned()
+        self.low_rate.turned()
         self._tasks.step()
 
     def _on_reset(self, request: Any, response: Any) -> Any:

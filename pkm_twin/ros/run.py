@@ -54,7 +54,7 @@ def set_priority(priority: int) -> None:
 
 LOOK: Final = 0.5
 """How often the events executor looks whether it has to end, s."""
-PARTING: Final = 1.0
+SHUTDOWN_TIME: Final = 1.0
 """How long a node may take to end what others wait for, s: a launcher gives five."""
 TEARDOWN: Final = 3.0
 """How long rclpy and the middleware may take to end, s: their threads can wait for each other."""
@@ -109,7 +109,7 @@ def run(*factories: Callable[[], TwinNode], arguments: Sequence[str] | None = No
     """Run a node, or several in one executor, until SIGINT, SIGTERM or SIGHUP.
 
     Signals are not the middleware's, which would close the topics at once: a signal ends the
-    spinning at its next event, and :meth:`TwinNode.farewell` is called while the topics are there.
+    spinning at its next event, and :meth:`TwinNode.shutdown` is called while the topics are there.
     The process has to end after it, within ``TEARDOWN``.
 
     :returns: 0 after a signal, 1 if a node rejects its configuration.
@@ -153,10 +153,12 @@ def run(*factories: Callable[[], TwinNode], arguments: Sequence[str] | None = No
     finally:
         ignore_signals()
         for node in nodes:
-            node.farewell()
-        end = time.monotonic() + PARTING
+            node.shutdown()
+        end = time.monotonic() + SHUTDOWN_TIME
         if executor is not None:
-            executor.spin(lambda: not any([n.parting for n in nodes]) or time.monotonic() > end)
+            executor.spin(
+                lambda: not any([n.shutting_down for n in nodes]) or time.monotonic() > end
+            )
         # A thread without Python's lock ends what hangs from here on, and says where.
         faulthandler.dump_traceback_later(TEARDOWN, exit=True)
         if executor is not None:

@@ -13,14 +13,14 @@ from pkm_twin.errors import MessageError
 
 MAX_TASKS: Final = 10
 """How much work may wait beside the callbacks."""
-SELDOM_PERIOD: Final = 0.1
-SELDOM_TURNS: Final = 3
+LOW_RATE_PERIOD: Final = 0.1
+LOW_RATE_TURNS: Final = 3
 """How often requests are looked for, s, and how many at a time at least."""
 
 Task = Generator[None, None, None]
 
 
-class SeldomGroup(MutuallyExclusiveCallbackGroup):
+class LowRateGroup(MutuallyExclusiveCallbackGroup):
     """What is not asked for a thousand times a second: requests.
 
     rclpy makes a wait set anew for every message, and each entity in it costs time; these are
@@ -33,7 +33,7 @@ class SeldomGroup(MutuallyExclusiveCallbackGroup):
 
     def open(self) -> None:
         """Let the next turns of the executor look at them."""
-        self._turns = SELDOM_TURNS
+        self._turns = LOW_RATE_TURNS
 
     def turned(self) -> None:
         """A turn of the executor is over."""

@@ -29,7 +29,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from pkm_twin.errors import ParameterError, PkmTwinError
 from pkm_twin.machine import rotations
-from pkm_twin.messages.intake import JointStateView
+from pkm_twin.messages.fast_decoder import JointStateView
 from pkm_twin.messages.stamps import SECOND
 from pkm_twin.robot.robot import Robot
 from pkm_twin.robot.robot_urdf import joint_names, robot_urdf
@@ -235,7 +235,7 @@ class MachineStateNode(TwinNode):
             "joint_states",
             self._on_joint_state,
             refuse=partial(self._core.refuse, self._core.states),
-            awaited=True,
+            expected=True,
         )
         self.create_guarded_subscription("wrench", lambda m: self._core.wrench(m, self.now()))
         self.follow(

@@ -17,7 +17,7 @@ from pkm_twin.messages.stamps import SECOND
 from pkm_twin.robot.robot import Robot
 from pkm_twin.streams.monitor import Pace
 from pkm_twin.streams.topics import JOINTS, TEXT, WRENCH, Topic, table
-from pkm_twin.streams.wrench import Mount, PairingCore, Recent, check_order
+from pkm_twin.streams.wrench import Mount, TimeCache, TimeSynchronizer, check_order
 
 _TRANSFORMS: Final = "tf2_msgs/TFMessage"
 
@@ -77,7 +77,7 @@ def moving_state_kernel(robot: Robot) -> Kernel:
 
 
 @dataclass
-class MachineState(PairingCore):
+class MachineState(TimeSynchronizer):
     """Answers joint states with the machine's state, and keeps wrenches to pair with it."""
 
     def __post_init__(self) -> None:
@@ -86,7 +86,7 @@ class MachineState(PairingCore):
         self.latest: State | None = None
         self.pace = Pace(0.0)
         self._last_stamp = 0
-        self._recent: Recent[tuple[WrenchSample, Mount]] = Recent()
+        self._recent: TimeCache[tuple[WrenchSample, Mount]] = TimeCache()
 
     def reset(self) -> None:
         """Forget the past, as when the clock jumps."""

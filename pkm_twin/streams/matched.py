@@ -23,9 +23,9 @@ from pkm_twin.errors import MessageError
 from pkm_twin.messages.reading import JointSample, WrenchSample
 from pkm_twin.messages.stamps import SECOND
 from pkm_twin.streams.monitor import Core, StreamMonitor, counting
-from pkm_twin.streams.wrench import Mount, Recent, WrenchReader
+from pkm_twin.streams.wrench import Mount, TimeCache, WrenchReader
 
-NoWrench = Literal["ignore", "stop"]
+MissingWrench = Literal["ignore", "stop"]
 
 
 def window_weights(stamps: Array, order: int, carries_velocity: bool) -> Array:
@@ -71,14 +71,14 @@ class _Row:
 class WrenchWindow(Core):
     """Wrenches for a stream of joint states.
 
-    ``max_age``: between a joint state and its wrench, ns. ``no_wrench``: without one the joint
-    state counts as one without load (``ignore``), or is refused (``stop``). ``order``,
-    ``window``: the differentiator's.
+    ``max_age``: between a joint state and its wrench, ns. ``missing_wrench_policy``: without
+    one the joint state counts as one without load (``ignore``), or is refused (``stop``).
+    ``order``, ``window``: the differentiator's.
     """
 
     reader: WrenchReader
     max_age: int
-    no_wrench: NoWrench = "ignore"
+    missing_wrench_policy: MissingWrench = "ignore"
     order: int = 2
     window: int = 25
     without: int = 0
@@ -86,7 +86,7 @@ class WrenchWindow(Core):
     stream: StreamMonitor = field(default_factory=counting)
 
     def __post_init__(self) -> None:
-        self._recent: Recent[tuple[WrenchSample, Mount]] = Recent()
+        self._recent: TimeCache[tuple[WrenchSample, Mount]] = TimeCache()
         # One more, so that the newest can be taken back.
         self._rows: deque[_Row] = deque(maxlen=self.window + 1)
         self._carries: bool | None = None
@@ -141,7 +141,7 @@ class WrenchWindow(Core):
         if found is not None and age is not None and age <= self.max_age:
             return found[1]
         self.without += 1
-        if self.no_wrench == "ignore":
+        if self.missing_wrench_policy == "ignore":
             return None
         far = (
             "no wrench has arrived"

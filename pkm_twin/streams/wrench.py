@@ -168,7 +168,7 @@ def check_order(stamp: int, last: int) -> None:
 
 
 @dataclass
-class Recent(Generic[V]):
+class TimeCache(Generic[V]):
     """The newest values of a stream whose stamps do not fall, by stamp, ns."""
 
     length: int = 256
@@ -224,7 +224,7 @@ class Recent(Generic[V]):
 
 
 @dataclass
-class PairingCore(Core):
+class TimeSynchronizer(Core):
     """Settings that may change between two messages, and counts of what is taken and refused.
 
     ``mounts``: tells where a wrench's frame stands; None is the settings' fixed mount.

@@ -76,7 +76,7 @@ def measure():
 
     from delta_dynamics import feedforward
     from delta_dynamics.nodes.twin import DeltaDynamics
-    from pkm_twin.messages.intake import RawTrajectory
+    from pkm_twin.messages.fast_decoder import RawTrajectory
     from pkm_twin.threads import one_blas_thread
 
     rclpy.init(args=[])

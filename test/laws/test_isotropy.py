@@ -20,7 +20,7 @@ from delta_dynamics import (
     spread,
     tilted_pose,
 )
-from delta_dynamics.torques.isotropy import largest, least_direction
+from delta_dynamics.torques.isotropy import largest, minimax_direction
 from pkm_twin.errors import ParameterError
 from test.support import robots
 from test.support.robots import load, loaded, loaded_like, partly_long, random_joints
@@ -168,7 +168,7 @@ def test_the_least_direction_is_global(shift, scales):
         forms = np.random.default_rng(seed).normal(size=(3, 3, 3))
         forms = forms + forms.swapaxes(-1, -2) + shift * np.eye(3)
         forms = forms * np.array(scales)[:, None, None]
-        y = least_direction(forms)
+        y = minimax_direction(forms)
         value = largest(forms, y)
         assert np.linalg.norm(y) == pytest.approx(1, abs=1e-14)
         sampled = largest(forms, dense)
@@ -189,7 +189,7 @@ def test_the_least_direction_of_mirrored_limbs():
         a, b = np.random.default_rng(seed).normal(size=(2, 3, 3))
         a, b = a + a.T, b + b.T
         forms = np.array([a, mirror @ a @ mirror, b + mirror @ b @ mirror])
-        value = largest(forms, least_direction(forms))
+        value = largest(forms, minimax_direction(forms))
         sampled = largest(forms, dense)
         best = dense[np.argsort(sampled)[:4]]
         assert value <= min(descended(forms, x) for x in best) + 1e-9 * value
@@ -201,7 +201,7 @@ def test_the_least_direction_of_any_number_of_forms_and_coordinates(count, size)
     rng = np.random.default_rng(count)
     forms = rng.normal(size=(count, size, size))
     forms = forms + forms.swapaxes(-1, -2)
-    y = least_direction(forms)
+    y = minimax_direction(forms)
     assert np.linalg.norm(y) == pytest.approx(1, abs=1e-14)
     dense = rng.normal(size=(6_000, size))
     dense /= np.linalg.norm(dense, axis=-1, keepdims=True)

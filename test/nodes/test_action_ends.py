@@ -344,14 +344,14 @@ def test_a_trajectory_that_was_forwarded_is_not_ended_by_a_hold_point(action):
 def test_goals_end_and_the_machine_is_held_when_the_node_ends(action):
     moving = action.accept(Goal(1))
     handle = action.controller.take()
-    action.served.farewell()
+    action.served.shutdown()
     assert moving.how == ABORTED and "shutting down" in moving.ends[0].error_string
     assert len(action.holds) == 1
-    assert action.served.parting
+    assert action.served.shutting_down
     action.controller.take()
     assert handle.cancelled == 1
     turns = 0
-    while action.served.parting:
+    while action.served.shutting_down:
         turns += 1
     assert 0 < turns < 20
 

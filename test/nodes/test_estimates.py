@@ -299,8 +299,9 @@ def test_torque_residual_and_stop(peer, launch):
     remap = ("joint_states:=/bearing/states", "wrench:=/bearing/wrench", "__node:=bearing")
     arguments = [word for pair in remap for word in ("-r", pair)]
     process = launch(
-        "delta_dynamics.nodes.twin", "mechanism:=prru", "use_wrench:=true", "no_wrench:=stop",
-        "max_wrench_age:=1.0", "stale_after:=5.0", "differentiator.window:=4", "recovery_count:=1",
+        "delta_dynamics.nodes.twin", "mechanism:=prru", "use_wrench:=true",
+        "missing_wrench_policy:=stop", "max_wrench_age:=1.0", "stale_after:=5.0",
+        "differentiator.window:=4", "recovery_count:=1",
         arguments=arguments,
     )  # fmt: skip
     peer.hear(DiagnosticArray, "/diagnostics")

@@ -30,10 +30,10 @@ signal.signal(signal.SIGHUP, signal.SIG_DFL)
 TRACED = {m.__file__ for m in (nodes, run, signals)}
 
 class Node:
-    made, parting, thread_priority = 0, False, 0
+    made, shutting_down, thread_priority = 0, False, 0
     def __init__(self):
         os.write(OUT, b"made ")
-    def farewell(self):
+    def shutdown(self):
         os.write(OUT, b"zeros ")
     def destroy_node(self):
         pass

@@ -102,13 +102,13 @@ def test_a_command_that_is_no_effort_is_refused_and_changes_nothing():
         assert (go(machine, 1)[0].effort == WEIGHT).all()
 
 
-@pytest.mark.parametrize("on_silence", ["zeros", "hold"])
-def test_silence(on_silence):
-    machine = simulation(deadline=0.01, on_silence=on_silence)
+@pytest.mark.parametrize("timeout_action", ["zeros", "hold"])
+def test_silence(timeout_action):
+    machine = simulation(deadline=0.01, timeout_action=timeout_action)
     go(machine, 1, WEIGHT)
     efforts = np.array([s.effort for s in go(machine, 20)])
     held = int((efforts == WEIGHT).all(1).sum())
-    assert held == (20 if on_silence == "hold" else 10)
+    assert held == (20 if timeout_action == "hold" else 10)
     assert (efforts[held:] == 0.0).all()
 
 

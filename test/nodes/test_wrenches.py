@@ -14,7 +14,7 @@ from pkm_twin.errors import MessageError, ParameterError
 from pkm_twin.machine import rotations
 from pkm_twin.streams.differentiator import Differentiator
 from pkm_twin.streams.matched import WrenchWindow, window_weights
-from pkm_twin.streams.wrench import Mount, Recent, WrenchReader, WrenchSettings
+from pkm_twin.streams.wrench import Mount, TimeCache, WrenchReader, WrenchSettings
 from stiffness_monitor.monitor import Monitor
 from test.nodes.harness import REPOSITORY, SECOND, Maker, Plain
 from test.support.robots import load
@@ -116,7 +116,7 @@ class TestMounts:
 
 def test_the_nearest_of_recent_values_is_that_of_all():
     rng = np.random.default_rng(4)
-    recent = Recent(16)
+    recent = TimeCache(16)
     assert recent.nearest(5) is None and recent.held(5) is None and recent.latest is None
     stamps = np.sort(rng.integers(0, 1000, 40)).tolist()
     for k, stamp in enumerate(stamps):
@@ -155,10 +155,10 @@ class TestTorques:
     ROBOT = load("prru")
     WINDOW = 5
 
-    def core(self, no_wrench="ignore", max_age=STEP * 20, **settings):
+    def core(self, missing_wrench_policy="ignore", max_age=STEP * 20, **settings):
         rules = Settings(window=self.WINDOW, recovery_count=2, **settings)
         reader = WrenchReader(WrenchSettings())
-        wrenches = WrenchWindow(reader, max_age, no_wrench, rules.order, rules.window)
+        wrenches = WrenchWindow(reader, max_age, missing_wrench_policy, rules.order, rules.window)
         return Feedforward(self.ROBOT, rules, wrenches)
 
     def state(self, i, effort=()):

@@ -17,7 +17,7 @@ from trajectory_msgs.msg import JointTrajectory
 
 from pkm_twin.bags.definitions import message_definition
 from pkm_twin.errors import MessageError
-from pkm_twin.messages.intake import DoublesTemplate, JointStateDecoder, RawTrajectory
+from pkm_twin.messages.fast_decoder import DoublesTemplate, JointStateDecoder, RawTrajectory
 from pkm_twin.messages.reading import COLUMNS, TrajectoryFields
 from test.nodes.harness import Maker, Ros
 
