@@ -13,9 +13,9 @@ from pkm_twin.view.drawing import DPI, draw
 MACHINES = Path(__file__).parents[2] / "examples/machines"
 GALLERY = sorted(path for path in MACHINES.iterdir() if path.suffix in (".yaml", ".urdf"))
 """Files of example machines."""
-_PAGE = (MACHINES.parents[1] / "docs/gallery.md").read_text(encoding="utf-8")
+_PAGE = (MACHINES.parents[1] / "docs/index.md").read_text(encoding="utf-8")
 PICTURED = [path for path in GALLERY if path.name in _PAGE]
-"""Those of which the gallery has a picture."""
+"""Those of which the page of machines has a picture."""
 
 
 if __name__ == "__main__":
