@@ -148,6 +148,26 @@ def torques(path, motion):
     return inverse_dynamics(load(path), *motion)
 
 
+def same(found, right):
+    """Whether two machines are one, by their places and efforts."""
+    motion = random_motion(right, np.random.default_rng(8), 5)
+    np.testing.assert_allclose(found.platform(motion[0])[0], right.platform(motion[0])[0], 1e-9)
+    np.testing.assert_allclose(
+        inverse_dynamics(found, *motion), inverse_dynamics(right, *motion), 1e-8, 1e-10
+    )
+
+
+def edited(tmp_path, changes, **options):
+    """The five-bar's file with all that is old replaced."""
+    path = five_bar(tmp_path, **options)
+    text = path.read_text()
+    for old, new in changes.items():
+        assert old in text
+        text = text.replace(old, new)
+    path.write_text(text)
+    return path
+
+
 @pytest.mark.parametrize("name", ["five_bar", *(pytest.param(n, marks=pytest.mark.long) for n in (
     "rps3", "delta_cu", "stewart", "random prru3", "random bolted"))])  # fmt: skip
 def test_every_way_to_write_a_drawing_is_the_same_machine(name, tmp_path):
@@ -182,7 +202,7 @@ def test_a_model_in_a_world_with_a_loop(tmp_path):
 
 @pytest.mark.parametrize("way", ["placement_frame", "pose"])
 def test_a_limb_in_a_nested_model_is_the_same_machine(way, tmp_path):
-    robot = load(five_bar(tmp_path))
+    robot = load(five_bar(tmp_path), platform="tool")
     path = five_bar(tmp_path)
     head, _, tail = path.read_text().partition('<link name="arm_1">')
     limb, joint, tail = tail.partition('<link name="arm_2">')
@@ -198,10 +218,7 @@ def test_a_limb_in_a_nested_model_is_the_same_machine(way, tmp_path):
     path.write_text(head + model + limb.replace(pose[0], inner) + "</model>" + joint + tail)
     nested = load(path, platform="tool")
     assert nested.joint_names == ("m2", "limb::m1")
-    motion = random_motion(robot, np.random.default_rng(8), 5)
-    np.testing.assert_allclose(
-        inverse_dynamics(nested, *motion), inverse_dynamics(robot, *motion), rtol=1e-8, atol=1e-10
-    )
+    same(nested, robot)
 
 
 def test_a_joint_may_have_a_link_s_name_until_1_6(tmp_path):
@@ -251,21 +268,13 @@ def test_a_screw_there_and_back(lead, tag, tmp_path):
 def test_a_weld_of_a_plugin_closes_a_loop_as_a_joint_does(tmp_path):
     found = load(five_bar(tmp_path, tip=PIN), platform="tool")
     # The same with the pin as a part of the forearm.
-    own = (
-        PIN[: PIN.index("<plugin")]
-        + """<joint name="weld" type="fixed">
-      <parent>fore_1</parent><child>pin</child></joint>"""
-    )
-    right = load(five_bar(tmp_path, tip=own), platform="tool")
-    motion = random_motion(found, np.random.default_rng(2), 5)
-    np.testing.assert_allclose(
-        inverse_dynamics(found, *motion), inverse_dynamics(right, *motion), rtol=1e-9
-    )
+    weld = '<joint name="weld" type="fixed"><parent>fore_1</parent><child>pin</child></joint>'
+    own = PIN[: PIN.index("<plugin")] + weld
+    same(found, load(five_bar(tmp_path, tip=own), platform="tool"))
 
 
 def test_links_without_weight_are_a_machine_without_gravity_and_said(tmp_path):
-    path = five_bar(tmp_path)
-    path.write_text(path.read_text().replace("<inertial>", "<gravity>0</gravity><inertial>"))
+    path = edited(tmp_path, {"<inertial>": "<gravity>0</gravity><inertial>"})
     with pytest.warns(UserWarning, match="gravity is switched off"):
         assert read_urdf(path)["gravity"] == [0.0, 0.0, 0.0]
 
@@ -342,39 +351,27 @@ def test_what_stands_in_the_world_is_the_same_machine(way, tmp_path):
     turn = frames[0] * frames[1]
     at = frames[0].apply([0, 2, 0]) + turn.apply([0, 0, 3])
     angles = (turn * Rotation.from_euler("xyz", [0, 0, 0.2])).as_euler("xyz")
-    robots = []
-    for changes in SAME[way]:
-        path = five_bar(tmp_path)
-        text = path.read_text()
-        for old, new in changes.items():
-            assert old in text
-            text = text.replace(old, new.format(text_of([at[0] + 1, *at[1:], *angles])))
-        path.write_text(text)
-        robots.append(load(path, platform="tool"))
-    found, right = robots
-    motion = random_motion(right, np.random.default_rng(8), 5)
-    np.testing.assert_allclose(found.platform(motion[0])[0], right.platform(motion[0])[0], 1e-9)
-    np.testing.assert_allclose(
-        inverse_dynamics(found, *motion), inverse_dynamics(right, *motion), 1e-8, 1e-10
-    )
+    there = text_of([at[0] + 1, *at[1:], *angles])
+    robots = [
+        load(edited(tmp_path, {k: v.replace("{}", there) for k, v in one.items()}), platform="tool")
+        for one in SAME[way]
+    ]
+    same(*robots)
 
 
 def test_a_joint_of_the_world_may_be_called_as_one_of_the_model(tmp_path):
     right = load(five_bar(tmp_path), platform="tool")
-    limit = "<xyz>0 0 1</xyz><limit><effort>5</effort></limit></axis></joint>"
-    path = five_bar(tmp_path, motors="")
-    text = path.read_text().replace("<xyz>0 0 1</xyz></axis></joint>", limit)
-    own = M1.replace("<xyz>0 0 1</xyz></axis></joint>", limit)
-    assert own in text
-    text = text.replace(own, "").replace("<static>1</static>", '<static>1</static><link name="g"/>')
-    own = own.replace("m1", "e1").replace("world", "ground::g").replace(">arm", ">five_bar::arm")
-    path.write_text(text.replace(MODEL, own + MODEL))
-    found = load(path, platform="tool")
+    old, new = "<xyz>0 0 1</xyz></axis></joint>", "<xyz>0 0 1</xyz>{}</axis></joint>"
+    new = new.format("<limit><effort>5</effort></limit>")
+    own = M1.replace(old, new).replace("m1", "e1")
+    own = own.replace("world", "ground::g").replace(">arm", ">five_bar::arm")
+    changes = {
+        M1: "", old: new, "<static>1</static>": '<static>1</static><link name="g"/>',
+        MODEL: own + MODEL,
+    }  # fmt: skip
+    found = load(edited(tmp_path, changes, motors=""), platform="tool")
     assert found.joint_names == ("m2", "e1_of_world")
-    motion = random_motion(right, np.random.default_rng(8), 3)
-    np.testing.assert_allclose(
-        inverse_dynamics(found, *motion), inverse_dynamics(right, *motion), 1e-8, 1e-10
-    )
+    same(found, right)
 
 
 @pytest.mark.parametrize(("limit", "right"), [

@@ -11,7 +11,7 @@ import pytest
 from delta_dynamics import inverse_dynamics
 from pkm_twin.mechanisms.machine import Machine
 from pkm_twin.robot.urdf_read import read_urdf
-from test.support.robots import load, partly_long
+from test.support.robots import partly_long
 
 pytest.importorskip("pinocchio")
 
@@ -151,8 +151,3 @@ def sketch_home(robot, model, data, ends):
     kept = data.copy()
     closure_rows(model, kept, ends, np.array([known[name] for name in model.names[1:]]))
     return kept.oMf[model.getFrameId("platform")]
-
-
-def test_load_takes_a_urdf(sketch, tmp_path):
-    robot = load(str(sketch.save(tmp_path)), platform="platform")
-    assert list(robot.joint_names) == sketch.actuated
