@@ -260,7 +260,7 @@ def write_robot(robot: Robot, source: str, found: Found, path: Path, out: Path) 
 
     kept = "".join(f", {bound}" for bound in found.constraints)
     values = {
-        name: Chosen(float(f"{value:.{FILE_DIGITS}g}"), f"{name}: was {robot.number(name):.6g}")
+        name: Chosen(float(f"{value:.{FILE_DIGITS}g}"), f"was {robot.number(name):.6g}")
         for name, value in found.best.numbers.items()
     }
     aim = " and ".join(found.minimise)
