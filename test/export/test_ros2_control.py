@@ -10,7 +10,6 @@ import os
 import re
 import shutil
 import subprocess
-import sys
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -20,7 +19,6 @@ import yaml
 
 from delta_dynamics import inverse_dynamics, mass_matrix
 from pkm_twin import robot_names
-from pkm_twin.apps.cli import main
 from pkm_twin.errors import ParameterError
 from pkm_twin.export.c_package import c_package
 from pkm_twin.export.ros2_control import package_name, ros2_control_package
@@ -339,23 +337,6 @@ def test_what_a_robot_lacks_is_reported(tmp_path, capsys):
     for bandwidth in (-1.0, np.nan, np.inf):
         with pytest.raises(ParameterError):
             ros2_control_package(load("five_bar"), bandwidth)
-
-
-def test_the_command_writes_the_same_bytes_in_every_process(files, tmp_path):
-    """The exported C inside is tested beside."""
-    command = [sys.executable, "-m", "pkm_twin.apps.cli", "export", "ros2-control", "five_bar"]
-    out = tmp_path / "out"
-    subprocess.run(
-        [*command, "--bandwidth", "5", "--out", str(out)],
-        env=os.environ | {"PYTHONHASHSEED": "3"},
-        check=True,
-        capture_output=True,
-    )
-    written = {str(p.relative_to(out)): p.read_text() for p in out.rglob("*") if p.is_file()}
-    assert written == files
-    with pytest.raises(SystemExit) as ended:
-        main(["export", "ros2-control", "five_bar", "--out", str(out)])
-    assert ended.value.code
 
 
 @needs_ros2_control

@@ -4,8 +4,10 @@
 from __future__ import annotations
 
 import functools
+import os
 import shutil
 import subprocess
+import sys
 import xml.etree.ElementTree as ET
 
 import numpy as np
@@ -170,17 +172,33 @@ def test_libsdformat_reads_every_robot(tmp_path):
         assert not done.returncode, done.stdout
 
 
-@pytest.mark.parametrize("kind", ["mjcf", "sdf"])
-def test_the_commands_write_the_same_bytes_each_time(kind, tmp_path):
-    out = tmp_path / f"robot.{kind}"
-    words = ["export", kind, "five_bar", "--out", str(out)]
-    texts = []
-    for more in ([], ["--overwrite"]):
+FORMATS = ("c", "mjcf", "ros2-control", "sdf")
+
+
+def written(folder):
+    """The bytes of what the commands write, by format and file."""
+    folder.mkdir()
+    for kind in FORMATS:
         with pytest.raises(SystemExit) as ended:
-            main([*words, *more])
+            main(["export", kind, "five_bar", "--out", str(folder / kind)])
         assert not ended.value.code
-        texts.append(out.read_bytes())
-    assert texts[0] == texts[1]
-    with pytest.raises(SystemExit) as ended:
-        main(words)
-    assert ended.value.code
+    return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+
+
+def test_the_commands_write_the_same_bytes_in_every_process(tmp_path):
+    """Also where sets have an order of their own; never over what is there."""
+    here = written(tmp_path / "here")
+    program = (
+        "import sys, pathlib\n"
+        "from test.export.test_simulators import written\n"
+        "written(pathlib.Path(sys.argv[1]))"
+    )
+    environment = os.environ | {"PYTHONHASHSEED": "3", "PYTHONPATH": os.pathsep.join(sys.path)}
+    command = [sys.executable, "-c", program, str(tmp_path / "there")]
+    subprocess.run(command, env=environment, check=True, capture_output=True)
+    there = {name: (tmp_path / "there" / name).read_bytes() for name in here}
+    assert there == here and {name.split("/")[0] for name in here} == set(FORMATS)
+    for kind in FORMATS:
+        with pytest.raises(SystemExit) as ended:
+            main(["export", kind, "five_bar", "--out", str(tmp_path / "here" / kind)])
+        assert ended.value.code
