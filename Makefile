@@ -76,7 +76,6 @@ bench: $(VENV)/bench.stamp
 
 certificate: $(VENV)/certificate.stamp
 	$(BIN)/python -m tools.certificate
-	$(BIN)/python -m tools.certificate.own_machines
 
 # Every bit of a bag; then at random in this process, at real nodes, and the figures.
 fuzz: $(VENV)/test.stamp

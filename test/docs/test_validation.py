@@ -9,40 +9,15 @@ import numpy as np
 import pytest
 import yaml
 
-from delta_dynamics import inverse_dynamics
 from pkm_twin import load
 from stiffness_monitor import strain_energy
 from stiffness_monitor.modes import modes, natural_frequencies
 from test.support.pages import assert_printed, numbers
 from test.support.robots import parameters_of, partly_long
-from test.support.workspaces import even_samples, polar_samples
 from test.validation import test_delta_cu_paper as delta_cu
 from test.validation import test_upr_rpu_paper as upr_rpu
 
 PAGE = "docs/validation.md"
-
-
-def test_tables_of_the_delta_cu_paper():
-    robot = load("delta")
-    phase = delta_cu.RATE * delta_cu.TIME[:, None]
-    q = delta_cu.HOME_ANGLE + delta_cu.SIGNS * np.cos(phase)
-    qd = -delta_cu.SIGNS * delta_cu.RATE * np.sin(phase)
-    qdd = -delta_cu.SIGNS * delta_cu.RATE**2 * np.cos(phase)
-    velocity = np.einsum("nij,nj->ni", robot.jacobian(q), qd) * delta_cu.DOWN * 1e3
-    printed = np.stack(
-        [
-            -sign * np.array(table) @ np.array(axis) / np.dot(axis, axis) * 1e-3
-            for sign, table, axis in zip([1, -1, -1], delta_cu.TORQUES, delta_cu.AXES, strict=True)
-        ],
-        -1,
-    )
-    speed = delta_cu.differences(velocity, delta_cu.VELOCITY)[0]
-    rms, worst = delta_cu.differences(inverse_dynamics(robot, q, qd, qdd, delta_cu.LOAD), printed)
-    pattern = r"velocity rms (\S+) mm/s of (\d+), torque rms (\S+) N m of (\S+), worst (\d+\.\d+)"
-    greatest = np.abs(delta_cu.VELOCITY).max(), np.abs(printed).max()
-    assert_printed(PAGE, pattern, speed, greatest[0], rms, greatest[1], worst)
-    pattern = r"the home angle (\S+) rad and a platform load of (\d+) N"
-    assert_printed(PAGE, pattern, delta_cu.HOME_ANGLE, -delta_cu.LOAD[2])
 
 
 class TestFrequenciesOfTheDeltaCu:
@@ -106,13 +81,6 @@ class TestFrequenciesOfTheDeltaCu:
 
 
 class TestTablesOfTheUprRpuPaper:
-    def test_deflections(self):
-        (share,) = numbers(PAGE, r"table 1\*\* \(deflections, both rows\): within (\S+) %")
-        for pose, theory, _ in upr_rpu.TABLE_1:
-            found = 1e6 * strain_energy(upr_rpu.ROBOT, pose, upr_rpu.LOAD).deflection
-            allowed = np.maximum(share / 100 * np.abs(theory), upr_rpu.UNIT)
-            assert (np.abs(found - theory) <= allowed).all()
-
     def test_finite_elements(self):
         shares = []
         for pose, _, solid in upr_rpu.TABLE_1:
@@ -122,28 +90,8 @@ class TestTablesOfTheUprRpuPaper:
         pattern = r"finite elements are (\d+) to (\d+) % softer"
         assert_printed(PAGE, pattern, softer.min(), softer.max())
 
-    @pytest.mark.long
-    def test_global_factors(self):
-        most, evenly, on_rays = numbers(
-            PAGE,
-            r"P2 and P3 within (\S+); P1 within (\S+) when poses are spread evenly over the "
-            r"workspace, within (\S+) on polar rays",
-        )
-        workspace = upr_rpu.regular_workspace(upr_rpu.ROBOT, upr_rpu.HEIGHTS)
-        even, rays = even_samples(workspace), polar_samples(workspace)
 
-        def worst(name, poses):
-            wrench, expected = upr_rpu.TABLE_2[name]
-            mean = strain_energy(upr_rpu.ROBOT, poses, wrench).factors.mean(0)
-            return np.abs(mean - expected).max()
-
-        others = [worst(name, poses) for name in ("P2", "P3") for poses in (even, rays)]
-        assert max(others) < most
-        assert worst("P1", even) < evenly
-        assert worst("P1", rays) < on_rays
-
-
-@pytest.mark.parametrize("machine", partly_long(range(6), 0, 1))
+@pytest.mark.parametrize("machine", partly_long(range(6), 0))
 @pytest.mark.parametrize("name", ["delta", "delta_cu", "prru"])
 def test_torques_of_random_machines(name, machine):
     """Some of the states that `make certificate` takes are within what the page says of all."""
@@ -152,11 +100,14 @@ def test_torques_of_random_machines(name, machine):
     from tools.certificate.compare import BALANCE_BOUNDS, PLACE_BOUND, ROUTES, compare
     from tools.certificate.machines import ROBOTS
 
-    worst = numbers(PAGE, r"at 50 digits \(\d+ states\): worst relative difference (\S+)\. ")[0]
+    pattern = (
+        r"digits \(\d+ states\): worst relative difference (\S+)\. MuJoCo \(\d+ states\): (\S+)\. "
+    )
+    worst, mujoco = numbers(PAGE, pattern)
     found = compare(name, (20261121, ROBOTS.index(name), machine), states=20, exact=2)
     for route in ROUTES:
-        assert len(found.efforts[route]) == (2 if route == "Lagrange" else 20)
-        assert max(found.efforts[route]) < 2.0 * worst, route
+        assert len(found.efforts[route]) == (20 if route == "Pinocchio" else 2)
+        assert max(found.efforts[route]) < 2.0 * (mujoco if route == "MuJoCo" else worst), route
         assert max(found.places[route]) < PLACE_BOUND, route
     for what, bound in BALANCE_BOUNDS.items():
         assert max(found.balances[what]) < bound, what

@@ -12,7 +12,7 @@ from pkm_twin.paths.jerk import smooth_run
 from pkm_twin.paths.joint_path import joint_paths
 from pkm_twin.paths.laws import LAWS
 from pkm_twin.paths.pieces import Arc, Corner, arc_through
-from test.support.robots import FREE, load, partly_long
+from test.support.robots import load, partly_long
 
 SOME = partly_long(
     ["delta", "prru", "five_bar", "stewart", "linear_delta", "rps3"], "delta", "five_bar", "stewart"
@@ -205,37 +205,6 @@ def test_rates_are_those_of_the_positions_and_efforts_those_of_the_model(name):
     end = motion.sample([motion.duration, motion.duration + 1.0])
     assert not end.qd.any()
     assert not end.qdd.any()
-
-
-def test_the_way_back_takes_as_long_without_friction():
-    robot = load("stewart")
-    robot = robot.changed(friction=FREE)
-    points = points_of(robot)
-    there, back = fastest(robot, points), fastest(robot, points[::-1])
-    assert there.duration == pytest.approx(back.duration, rel=3e-4)
-
-
-def test_time_is_scaled_with_limits_and_gravity():
-    """Of all efforts k^2 times and rates k times as great a motion takes 1 / k of the time."""
-    robot, k = load("delta"), 1.7
-    stronger = robot.changed(
-        gravity=(k**2 * robot.gravity).tolist(),
-        limits={"effort": (k**2 * robot.limits.effort).tolist(),
-                "velocity": (k * robot.limits.velocity).tolist()},
-    )  # fmt: skip
-    points = points_of(robot)
-    assert fastest(stronger, points).duration * k == pytest.approx(
-        fastest(robot, points).duration, rel=1e-6
-    )
-
-
-def test_more_to_carry_takes_longer_and_more_force_shorter():
-    robot = load("delta")
-    path = cycle(robot, 0.025, 0.2)
-    times = [fastest(robot.changed(payload={"mass": m}), path).duration for m in (0.0, 0.3, 1.0)]
-    assert times == sorted(times)
-    assert times[0] < times[2]
-    assert fastest(robot, path, effort=30.0).duration < times[0]
 
 
 @pytest.mark.parametrize("name", ["delta", "five_bar"])

@@ -105,6 +105,7 @@ def test_the_rest_is_the_shear_factor(name, rigid, solids):
 
 
 @needs_calculix
+@pytest.mark.long
 def test_rigid_ends_are_on_the_other_side(rigid, tmp_path):
     pose = POSES["configuration 2"]
     theirs = solid_compliance(
@@ -147,8 +148,8 @@ def test_the_comparison_tells_a_held_joint_apart(end, entry, rigid, tmp_path):
 @needs_calculix
 @pytest.mark.parametrize(
     "meshes",
-    partly_long([(SHORT, MESH), (MESH, Mesh(4, 1, 8))], (SHORT, MESH)),
-    ids=lambda meshes: f"{meshes[0]} and {meshes[1]}",
+    partly_long([(SHORT,), (SHORT, MESH), (MESH, Mesh(4, 1, 8))], (SHORT,)),
+    ids=lambda meshes: " and ".join(map(str, meshes)),
 )
 def test_cantilever_and_a_finer_mesh(meshes, rigid, tmp_path):
     """One clamped bar, askew, against Timoshenko's beam; and two meshes against each other."""
@@ -171,11 +172,11 @@ def test_cantilever_and_a_finer_mesh(meshes, rigid, tmp_path):
         closed[move, turn] = closed[turn, move] = sign * length**2 / (2 * modulus * second)
     world = np.kron(np.eye(2), axes)
     closed = world @ closed @ world.T
-    coarse, fine = (solid_compliance(frame, tmp_path, mesh) for mesh in meshes)
+    found = [solid_compliance(frame, tmp_path, mesh) for mesh in meshes]
     # Seen: 0.03 % on the circle of the coarse mesh, 0.05 % from ends that shear evenly.
-    assert difference(closed, coarse).worst < 0.001
-    assert difference(closed, fine).worst < 0.001
-    assert difference(coarse, fine).worst < 0.0005
+    for one in found:
+        assert difference(closed, one).worst < 0.001
+        assert difference(found[0], one).worst < 0.0005
 
 
 def test_section_follows_a_rigid_body():

@@ -11,7 +11,10 @@ import numpy as np
 import pytest
 
 from delta_dynamics import inverse_dynamics
+from test.support.pages import assert_printed
 from test.support.robots import load
+
+PAGE = "docs/validation.md"
 
 HOME_ANGLE = 0.22  # rad, inferred
 LOAD = np.array([0.0, 0.0, -25.0, 0.0, 0.0, 0.0])  # N, inferred
@@ -85,6 +88,10 @@ def test_table_2_velocity(motion):
     rms, worst = differences(velocity, VELOCITY)
     assert rms < 2.3
     assert worst < 4.9
+    pattern = r"velocity rms (\S+) mm/s of (\d+), torque"
+    assert_printed(PAGE, pattern, rms, np.abs(VELOCITY).max())
+    pattern = r"the home angle (\S+) rad and a platform load of (\d+) N"
+    assert_printed(PAGE, pattern, HOME_ANGLE, -LOAD[2])
 
 
 def test_table_3_acceleration(motion):
@@ -113,6 +120,8 @@ def test_tables_4_to_6_torques(motion):
     rms, worst = differences(inverse_dynamics(robot, q, qd, qdd, LOAD), printed)
     assert rms < 0.175
     assert worst < 0.37
+    pattern = r"torque rms (\S+) N m of (\S+), worst (\d+\.\d+)"
+    assert_printed(PAGE, pattern, rms, np.abs(printed).max(), worst)
 
 
 def test_both_inferred_numbers_matter(motion):

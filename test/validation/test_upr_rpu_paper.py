@@ -87,7 +87,7 @@ def test_table_1_does_not_hang_on_the_lost_entry(last):
         assert (error <= np.maximum(0.003 * np.abs(expected), UNIT)).all()
 
 
-@pytest.mark.parametrize(("load_name", "tolerance"), [("P1", 0.01), ("P2", 0.01), ("P3", 0.01)])
+@pytest.mark.parametrize(("load_name", "tolerance"), [("P1", 0.006), ("P2", 0.01), ("P3", 0.01)])
 def test_table_2_over_points_on_rays(workspace, load_name, tolerance):
     """The paper averages over N points of a search; on rays from the axis all three come out."""
     wrench, expected = TABLE_2[load_name]
@@ -95,7 +95,7 @@ def test_table_2_over_points_on_rays(workspace, load_name, tolerance):
     assert mean == pytest.approx(np.array(expected), abs=tolerance)
 
 
-@pytest.mark.parametrize(("load_name", "tolerance"), [("P1", 0.05), ("P2", 0.01), ("P3", 0.01)])
+@pytest.mark.parametrize(("load_name", "tolerance"), [("P1", 0.04), ("P2", 0.01), ("P3", 0.01)])
 def test_table_2_over_the_volume(workspace, load_name, tolerance):
     """An even mean over the volume: P1 hangs on how the workspace is sampled."""
     wrench, expected = TABLE_2[load_name]

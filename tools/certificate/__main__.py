@@ -27,7 +27,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m tools.certificate", description=__doc__)
     parser.add_argument("--machines", type=int, default=50, help="random machines a robot")
     parser.add_argument("--states", type=int, default=20, help="random states a machine")
-    parser.add_argument("--exact", type=int, default=10, help="of these by the Lagrange route")
+    parser.add_argument("--exact", type=int, default=10, help="of these by the slow routes too")
     parser.add_argument("--seed", type=int, default=20261121)
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--no-swing", action="store_true", help="leave the free swings out")

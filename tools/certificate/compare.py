@@ -10,9 +10,10 @@ import numpy as np
 from delta_dynamics import inverse_dynamics
 from delta_dynamics.torques.reactions import reactions
 from delta_dynamics.torques.virtual_work import energy
+from pkm_twin.certify.mujoco_tree import MujocoTree
+from pkm_twin.robot.robot_urdf import robot_description
 from tools.certificate.lagrange_machines import energies
 from tools.certificate.machines import Case, friction, random_case
-from tools.certificate.mujoco_models import tree
 from tools.certificate.swing import engine_of
 
 ROUTES = ("Pinocchio", "MuJoCo", "Lagrange")
@@ -52,7 +53,7 @@ def difference(got: np.ndarray, expected: np.ndarray) -> float:
 
 
 def compare(name: str, seed: tuple[int, ...], states: int, exact: int) -> Figures:
-    """All routes over one random machine; the first ``exact`` states by the Lagrange route."""
+    """All routes over one random machine; the slow ones for the first ``exact`` states."""
     return compare_case(random_case(name, np.random.default_rng(seed), states), exact)
 
 
@@ -72,7 +73,8 @@ def compare_case(case: Case, exact: int) -> Figures:
         difference(one, other) for one, other in zip(joint.efforts, reaching, strict=True)
     ]
 
-    engine, mechanics, source = engine_of(data), tree(data), energies(data)
+    engine, source = engine_of(data), energies(data)
+    mechanics = MujocoTree(robot_description(robot))
     stored = energy(robot, case.q, case.qd).total
     for k in range(len(case.q)):
         state = case.q[k], case.qd[k], case.qdd[k]
@@ -81,11 +83,10 @@ def compare_case(case: Case, exact: int) -> Figures:
         place = engine.platform_placement(full.q).translation
         _note(figures, "Pinocchio", got[k], effort, place_of[k], place)
 
-        effort = mechanics.inverse_dynamics(*state, case.wrench[k]) + drag[k]
-        _note(figures, "MuJoCo", got[k], effort, place_of[k], mechanics.platform()[0])
-
         if k >= exact:
             continue
+        effort = mechanics.inverse_dynamics(*state, case.wrench[k])
+        _note(figures, "MuJoCo", got[k], effort, place_of[k], mechanics.platform(case.q[k])[0])
         result = source.solve(*state, case.wrench[k])
         effort = result.effort + drag[k]
         _note(figures, "Lagrange", got[k], effort, place_of[k], result.platform)

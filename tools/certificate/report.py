@@ -133,7 +133,7 @@ have random positions, rates, accelerations and a wrench. States with a conditio
 {1 / LEAST_MEASURE:.0f} are left out.
 
 - **Pinocchio**: a tree with loop constraints; recursive Newton-Euler sweeps and multipliers.
-- **MuJoCo**: another tree; `mj_inverse`, projected on the actuators.
+- **MuJoCo**: another tree, as in `pkm-twin certify`; `mj_inverse`, projected on the actuators.
 - **Lagrange**: energies as functions of points, derived by central differences in {DIGITS} digits.
 
 Differences are relative to the largest effort. The last column is the platform's position.
