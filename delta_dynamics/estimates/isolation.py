@@ -31,7 +31,7 @@ UNKNOWN: Final = "unknown"
 """Efforts that no single force and no clamping explains better, or that several explain."""
 PRIOR: Final = {PLATFORM: 0.4, "limbs": 0.4, CLAMPING: 0.15, UNKNOWN: 0.05}
 """Probabilities before a contact; the limbs share theirs."""
-SURE: Final = 0.5
+NAMED: Final = 0.5
 """Least posterior probability of a class that is named."""
 PLACES: Final = 5
 """Places along a bar that are compared."""
@@ -60,7 +60,7 @@ class ContactPlace:
     """The class of a contact, with its posterior probability, and the place.
 
     ``where``: ``platform``, a limb's name, ``clamping A and B`` (opposite forces on two bodies), or
-    ``unknown`` where no class has the probability ``SURE``. ``confidence``: of the most likely
+    ``unknown`` where no class has the probability ``NAMED``. ``confidence``: of the most likely
     class. ``classes``: of all, by name; clamping is one. ``body``: the most likely body,
     or two. ``point``: where on it, base axes, (3,), m, of clamping between both. ``deviation``:
     standard deviation along the body, m; that of an even distribution, 0.29 of the length, where
@@ -351,7 +351,12 @@ class ContactLocator:
             where = best
         confidence = classes[best]
         return ContactPlace(
-            where if confidence >= SURE else UNKNOWN, confidence, classes, body, point, deviation
+            where if confidence >= NAMED else UNKNOWN,
+            confidence,
+            classes,
+            body,
+            point,
+            deviation,
         )
 
     def _one(self, likely: Array) -> tuple[str, Array, float]:

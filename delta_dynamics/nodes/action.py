@@ -43,7 +43,7 @@ REST = 1e-3
 """Joint velocity below which the machine rests, rad/s or m/s."""
 APART = 1e-4
 """How far from the hold point it may rest without another one, rad or m."""
-TURNS = 5
+LAST_TURNS = 5
 """Turns of the executor that the last results take on their way."""
 
 
@@ -151,7 +151,7 @@ class EffortAction:
     def shutting_down(self) -> bool:
         """Whether clients or the controller still wait for what :meth:`shutdown` has sent."""
         if self._ending or self._holding:
-            self._turns = TURNS
+            self._turns = LAST_TURNS
         else:
             self._turns -= 1
         return self._turns > 0

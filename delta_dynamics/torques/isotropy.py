@@ -42,7 +42,7 @@ def sphere_directions(count: int) -> Array:
     return np.stack([out * np.cos(turn), out * np.sin(turn), z], -1)
 
 
-MOST: Final = 3
+MAX_SIZE: Final = 3
 """Coordinates of which every minimum is known."""
 
 
@@ -293,8 +293,8 @@ def max_driving_force_range(
     :param acceleration: Xddot, a number or shape (..., m).
     :raises ParameterError: more than three pose coordinates.
     """
-    if len(robot.pose_names) > MOST:
-        raise ParameterError("pose", len(robot.pose_names), f"at most {MOST} pose coordinates")
+    if len(robot.pose_names) > MAX_SIZE:
+        raise ParameterError("pose", len(robot.pose_names), f"at most {MAX_SIZE} pose coordinates")
     back, forms = _driving_forms(robot, pose, energy, acceleration)
     greatest, high, _ = _peak(forms)
     flat = forms.reshape(-1, *forms.shape[-3:])

@@ -29,7 +29,7 @@ from pkm_twin.settings import Setting
 
 G = TypeVar("G")
 
-MOST: Final = 1e5
+LARGEST_SHOWN: Final = 1e5
 """A bound of more is there to catch slips, and not told in the help."""
 _NEGATIVE: Final = re.compile(r"-\.?\d")
 _JSON: Final = inspect.Parameter(
@@ -315,7 +315,7 @@ def _written(default: Any) -> str:
 
 def _bounds(row: Setting) -> str:
     """The range of a number, where the help does not have it anyway."""
-    if row.low is None or row.high is None or row.high >= MOST:
+    if row.low is None or row.high is None or row.high >= LARGEST_SHOWN:
         return ""
     return f" [{row.low:g} to {row.high:g}]"
 

@@ -29,7 +29,7 @@ from pkm_twin.certify.rows import SINGULAR, Frame, Moving, skewed
 FIRST_STEP: Final = 1.0 / 16.0
 """Part of the way home to goal that the first step goes."""
 LEAST_STEP: Final = 1e-5
-FAR: Final = 0.02
+MAX_STEP: Final = 0.02
 """Longest first correction of a good step, relative to the motion's own size."""
 KEPT: Final = 64
 """Assemblies that are kept: the way from home takes far longer than what is asked for there."""
@@ -148,7 +148,7 @@ class Maximal(Moving):
             size = float(np.abs(state.velocity).max())
             guess = self._moved(state, step * state.velocity.ravel() + step**2 / 2 * change)
             goal = 1.0 if step >= 1.0 - gone else gone + step
-            trial, condition = self._close(guess, goal * way, FAR * max(size * step, 1e-9))
+            trial, condition = self._close(guess, goal * way, MAX_STEP * max(size * step, 1e-9))
             if trial is None:
                 step /= 2
                 if step < LEAST_STEP:

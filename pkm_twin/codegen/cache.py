@@ -25,7 +25,7 @@ _MARK: Final = b"pkm_twin compiled program 2\n"
 _ELF: Final = struct.Struct("<4s36xQ10xHH2x")
 """Magic bytes, then where the table of sections begins, the size of an entry, their number."""
 _LARGEST: Final = 64 * 1024 * 1024
-MOST: Final = 512 * 1024 * 1024
+MAX_BYTES: Final = 512 * 1024 * 1024
 """Bytes of all programs above which those that were not used for the longest time are deleted."""
 LOCK_TIMEOUT: Final = 60.0
 """Seconds to wait for another process that compiles the same program; it may be suspended."""
@@ -177,7 +177,7 @@ def alone(name: str) -> Iterator[None]:
 
 
 def _shrink(place: Path) -> None:
-    """Delete what was not used for the longest time, down to half of :data:`MOST`."""
+    """Delete what was not used for the longest time, down to half of :data:`MAX_BYTES`."""
     files = []
     with os.scandir(place) as entries:
         for entry in entries:
@@ -185,10 +185,10 @@ def _shrink(place: Path) -> None:
                 status = entry.stat(follow_symlinks=False)
                 files.append((status.st_mtime_ns, status.st_size, entry.path))
     left = sum(size for _, size, _ in files)
-    if left <= MOST:
+    if left <= MAX_BYTES:
         return
     for _, size, path in sorted(files):
-        if left <= MOST // 2:
+        if left <= MAX_BYTES // 2:
             return
         # Another process may have been faster.
         with suppress(OSError):

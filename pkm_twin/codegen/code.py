@@ -36,7 +36,7 @@ REFUSED: Final = 1.0
 NOT_FINITE: Final = 2.0
 
 
-MOST: Final = 1_000_000
+MAX_NUMBERS: Final = 1_000_000
 """Upper limit of the numbers in an input, an output or the parameters."""
 SMALL: Final = 4096
 """Samples of a batch that is copied into a room of its own."""
@@ -377,7 +377,7 @@ def _sound(header: dict[str, Any]) -> bool:
             "stepped": s,
         }:
             sizes = (*taken, *given, p, k)
-            return type(s) is bool and all(type(n) is int and 0 <= n < MOST for n in sizes)
+            return type(s) is bool and all(type(n) is int and 0 <= n < MAX_NUMBERS for n in sizes)
     return False
 
 

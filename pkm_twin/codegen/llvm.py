@@ -34,7 +34,7 @@ from pkm_twin.codegen.assembly import (
 from pkm_twin.codegen.expressions import GEOMETRY, PARAMETERS, Expression, ordered, uses
 from pkm_twin.codegen.native import CPU, FEATURES, OPTIMISATION, PREPARE, QUICK, SYMBOL
 from pkm_twin.codegen.operations import fused, sub
-from pkm_twin.codegen.program import AT, LARGE, STATE, TURNS, Equations, Program, holding
+from pkm_twin.codegen.program import AT, LARGE, MAX_ITERATIONS, STATE, Equations, Program, holding
 
 STATUS: Final = " status"
 LONG: Final = 100
@@ -331,7 +331,7 @@ class _Writer:
         b.store(number(0.0), n[AT.before])
         b.store(b.load(n[AT.alive]), n[AT.moving])
         run(q.aim, *aim)
-        turns = _Counter(b, "turn", whole(TURNS))
+        turns = _Counter(b, "turn", whole(MAX_ITERATIONS))
         turns.begin()
         run(
             q.correct, *x, *n[AT.size : AT.reached], first=q.results,

@@ -17,7 +17,16 @@ import numpy as np
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.codegen.expressions import GEOMETRY, PARAMETERS, Expression, ordered, uses
 from pkm_twin.codegen.operations import OPERATIONS
-from pkm_twin.codegen.program import AT, LARGE, STATE, TURNS, Equations, Program, holding, progress
+from pkm_twin.codegen.program import (
+    AT,
+    LARGE,
+    MAX_ITERATIONS,
+    STATE,
+    Equations,
+    Program,
+    holding,
+    progress,
+)
 
 PARTS: Final = ("goal", "begin", "aim", "correct", "arrive")
 """Of equations, what is called while they are solved."""
@@ -161,7 +170,7 @@ class PlainCode:
                 n[AT.alive],
             )
             here = named | {q.target: call("aim")}
-            for _ in range(TURNS):
+            for _ in range(MAX_ITERATIONS):
                 after = call("correct", here)
                 x, n[AT.size : AT.reached] = after[: len(q.home)], after[len(q.home) :]
                 here[q.unknowns] = x

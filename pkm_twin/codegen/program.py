@@ -26,7 +26,7 @@ UNKNOWNS: Final = "x"
 CLOSED: Final = 1e-9
 """Newton's method ends with a correction below this: it converges quadratically, so what is left
 is below rounding."""
-TURNS: Final = 12
+MAX_ITERATIONS: Final = 12
 """Most corrections a step."""
 CONTRACTION: Final = 0.25
 """Most that a correction may be of the one before it."""

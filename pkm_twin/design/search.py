@@ -31,7 +31,7 @@ ROUNDS: Final = 20
 SHRINKS: Final = 12
 NEAR: Final = 0.7
 """Part of the greatest piece above which pieces are looked at."""
-MOST: Final = 40
+MAX_PIECES: Final = 40
 """Pieces of a quantity that are looked at at a time."""
 KEPT: Final = 1e-6
 """Miss of a bound, over it, that counts as none."""
@@ -193,7 +193,7 @@ class Search:
         reach = worst - (1.0 - NEAR) * max(abs(worst), 0.3 if quantity.least else 0.0)
         flat = table.ravel()
         order = np.flatnonzero(peaks.ravel() & (flat >= reach))
-        return order[np.argsort(-flat[order], kind="stable")][:MOST]
+        return order[np.argsort(-flat[order], kind="stable")][:MAX_PIECES]
 
 
 def better(aim: float, miss: float, old_aim: float, old_miss: float) -> bool:

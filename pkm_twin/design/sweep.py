@@ -21,7 +21,7 @@ from pkm_twin.errors import ParameterError
 from pkm_twin.robot.entries import entries
 from pkm_twin.robot.robot import Robot
 
-MOST: Final = 10_000_000
+MAX_MACHINES: Final = 10_000_000
 """Machines of a sweep."""
 STEP: Final = 256
 """Machines that are computed together, between two reports of progress."""
@@ -117,8 +117,10 @@ def sweep(
     variables = box.problem.variables
     d = len(variables)
     count = samples**d if kind == "grid" else samples
-    if samples < 1 or count > MOST:
-        raise ParameterError("samples", samples, f"1 or more, at most {MOST} machines in all")
+    if samples < 1 or count > MAX_MACHINES:
+        raise ParameterError(
+            "samples", samples, f"1 or more, at most {MAX_MACHINES} machines in all"
+        )
     if kind == "grid":
         axes = np.meshgrid(*[np.linspace(0.0, 1.0, samples)] * d, indexing="ij")
         shape: tuple[int, ...] = (samples,) * d

@@ -25,11 +25,11 @@ from pkm_twin.codegen.operations import (
     sin,
     sub,
 )
-from pkm_twin.codegen.program import AT, LARGE, STATE, TURNS, UNKNOWNS, Equations, holding
+from pkm_twin.codegen.program import AT, LARGE, MAX_ITERATIONS, STATE, UNKNOWNS, Equations, holding
 
 LADDER: Final = (1, *STEPS)
 """Steps of Newton's method, one attempt after the other."""
-CORRECTIONS: Final = TURNS * sum(LADDER)
+CORRECTIONS: Final = MAX_ITERATIONS * sum(LADDER)
 """Most corrections of a call."""
 
 
@@ -354,7 +354,7 @@ static int @_{name}(const double *{q.target}, int steps, double *h, double *{q.u
         }}
         {STATE}[{AT.size}] = first;
         {STATE}[{AT.before}] = 0.0;
-        for (turn = 0; (turn < {TURNS}) && (moving != 0); turn++) {{
+        for (turn = 0; (turn < {MAX_ITERATIONS}) && (moving != 0); turn++) {{
             {correct};
             for (i = 0; i < {n}; i++) {{
                 {q.unknowns}[i] = next[i];

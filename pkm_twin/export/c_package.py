@@ -20,7 +20,7 @@ from delta_dynamics.torques.virtual_work import (
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.codegen.expressions import GEOMETRY, PARAMETERS, Expression, edge
 from pkm_twin.codegen.kernels import Kernel
-from pkm_twin.codegen.program import TURNS, Equations
+from pkm_twin.codegen.program import MAX_ITERATIONS, Equations
 from pkm_twin.errors import ParameterError
 from pkm_twin.export.c99 import CORRECTIONS, HEAD, HOT, LADDER, Folding, Routine, Unit, table
 from pkm_twin.export.c_templates import (
@@ -346,8 +346,8 @@ int @_parameters(double mass, const double *com, const double *inertia, double *
         names = list(self.robot.joint_names)
         return README.format(
             name=self.prefix, robot=self.prefix.removeprefix("pkm_"), joints=", ".join(names),
-            rows="\n".join(rows), corrections=f"{CORRECTIONS:,}", attempts=len(LADDER), turns=TURNS,
-            stack=largest // 1000 + 3,
+            rows="\n".join(rows), corrections=f"{CORRECTIONS:,}", attempts=len(LADDER),
+            turns=MAX_ITERATIONS, stack=largest // 1000 + 3,
             dynamics="" if self.massive else MASSLESS,
             payload=PAYLOAD.format(name=self.prefix, macro=self.macro) if self.massive else "",
         )  # fmt: skip

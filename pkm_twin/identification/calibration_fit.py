@@ -47,7 +47,7 @@ WRONG: Final = 0.02
 """Part of the machine's size that no fit may leave over: such poses are not its own."""
 TWISTED: Final = 0.05
 """Angle an axis that no fit may leave over, rad: those are other angles, or other units."""
-FAR: Final = 5.0
+MAX_CHANGE: Final = 5.0
 """Prior standard deviations by which no number changes."""
 MOVED: Final = 14.0
 """Squares of prior standard deviations, summed over all numbers, that another place of the
@@ -56,7 +56,7 @@ HALF: Final = 0.5
 """And the part of all squares below which they then are: an error of the model saves a few too."""
 EXPLAINED: Final = 0.8
 """Part of the sum of squares below which another place of the instrument is tried."""
-MOST: Final = 0.25
+MAX_OUTLIERS: Final = 0.25
 """Part of the poses that may be outliers."""
 
 
@@ -266,23 +266,23 @@ def faults_of(
         if noise > most:
             what = f"RMS residual {noise:.3g} {unit} per axis after the fit"
             faults.append(Fault(what, f"expected at most {most:.3g} {unit} for {right}"))
-    if len(outliers) > MOST * count:
+    if len(outliers) > MAX_OUTLIERS * count:
         faults.append(
             Fault(
                 f"{len(outliers)} of {count} do not fit the others ({outliers[0]})",
-                f"at most {100 * MOST:.0f} % may be outliers",
+                f"at most {100 * MAX_OUTLIERS:.0f} % may be outliers",
             )
         )
     if changes:
         worst = max(changes, key=lambda p: abs(p.value - p.before) / p.prior)
         change = worst.value - worst.before
-        if abs(change) > FAR * worst.prior:
+        if abs(change) > MAX_CHANGE * worst.prior:
             faults.append(
                 Fault(
                     f"{worst.name} changes by {f'{change:.3g} {worst.unit}'.rstrip()}, "
                     f"{abs(change) / worst.prior:.2g} times its prior standard deviation",
-                    f"at most {FAR:g} times is likely: are the poses in the base's axes and in "
-                    "the file's units? A greater --prior allows more",
+                    f"at most {MAX_CHANGE:g} times is likely: are the poses in the base's axes and "
+                    "in the file's units? A greater --prior allows more",
                 )
             )
     return faults

@@ -186,7 +186,7 @@ def derivatives(robot: Robot, state: State, names: Sequence[str]) -> Array:
 
 
 SHARED: Final = "joint_map.*.ratio"
-SURE: Final = 0.05
+RATIO_DEVIATION: Final = 0.05
 """Standard deviation of a ratio without the poses, part of it; and of its change over the travel
 of the poses."""
 CONTROLLER: Final = "controller units"
@@ -246,19 +246,19 @@ def numbers(
         path, unit, ratio = f"joint_map.{joint}", unit_of(robot, i), float(abs(own.factors[i]))
         # An offset is what the controller reads at zero: a ratio that is not sure moves it.
         size = prior if sliding[i] else angle
-        size = float(np.hypot(size, SURE * farthest[i] if fitted[i] else 0.0))
+        size = float(np.hypot(size, RATIO_DEVIATION * farthest[i] if fitted[i] else 0.0))
         if offsets:
             found.append(Number(f"{path}.offset", unit, float(own.offsets[i]), size * ratio))
         if fitted[i] and how is not Transmission.SHARED:
             its = per(unit, robot.joint_units[i])
-            found.append(Number(f"{path}.ratio", its, ratio, SURE * ratio))
+            found.append(Number(f"{path}.ratio", its, ratio, RATIO_DEVIATION * ratio))
         if how is Transmission.TRAVEL:
-            change, prior_change = float(own.changes[i]), 2.0 * SURE / float(travel[i])
+            change, prior_change = float(own.changes[i]), 2.0 * RATIO_DEVIATION / float(travel[i])
             found.append(
                 Number(f"{path}.ratio_change", f"1/{robot.joint_units[i]}", change, prior_change)
             )
     if how is Transmission.SHARED:
-        found.append(Number(SHARED, "", 1.0, SURE))
+        found.append(Number(SHARED, "", 1.0, RATIO_DEVIATION))
     return found
 
 

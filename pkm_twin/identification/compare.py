@@ -41,7 +41,7 @@ MAX_RESIDUAL: Final = 0.05
 """Largest good torque residual RMS, part of the joint's peak effort."""
 LEAST: Final = 40
 """Samples that a piece needs: fewer than for a fit, as nothing is fitted."""
-TURNS: Final = 5
+ROBUST_PASSES: Final = 5
 """Robust passes for how late the efforts are."""
 LOCAL: Final = 0.25
 """Time over which a residual is judged by itself, s: a collision is shorter than a recording."""
@@ -201,7 +201,7 @@ def compare(r: Recording, bound: float = MAX_RESIDUAL) -> Compared | None:
 def _late(left: Array, change: Array) -> float:
     """How late the efforts are, s, by residuals and the efforts' change (k, n) each."""
     late, size = 0.0, np.maximum(np.sqrt(np.mean(change**2, 0)), 1e-300)
-    for _ in range(TURNS):
+    for _ in range(ROBUST_PASSES):
         away = left + late * change
         usual = np.maximum(usual_size(away), 1e-12 * size)
         weight = huber(np.abs(away) / usual) / usual**2

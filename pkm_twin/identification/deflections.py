@@ -24,7 +24,7 @@ from pkm_twin.identification.estimation import Estimate, estimate
 from pkm_twin.identification.fit import Judged, Result, refuse_faults
 from pkm_twin.identification.identifiable import above_zero
 from pkm_twin.identification.judge import Evidence, Suspect, Verdict, judge
-from pkm_twin.identification.parameters import SURE, Group, Number, groups_of, number_of
+from pkm_twin.identification.parameters import FITTED_RATIO, Group, Number, groups_of, number_of
 from pkm_twin.identification.rows import HELD_OUT
 from pkm_twin.messages.reading import in_base_axes
 from pkm_twin.recordings import Recording
@@ -209,7 +209,8 @@ def fit_elements(
         groups=groups_of(names, factors, plain, own),
         measured=np.array([part.measured for part in parts]),
         samples=sum(part.split for part in parts),
-        told=int(np.sum(np.linalg.eigvalsh(plain / PRIOR**2) < SURE**2)), accepted=tuple(faults),
+        told=int(np.sum(np.linalg.eigvalsh(plain / PRIOR**2) < FITTED_RATIO**2)),
+        accepted=tuple(faults),
     )  # fmt: skip
 
 

@@ -23,8 +23,8 @@ from pkm_twin.streams.rest import ROBUST
 
 Cones = Sequence[tuple[slice, Array]]
 
-TURNS: Final = 15
-TOLD: Final = 5.0
+MAX_ITERATIONS: Final = 15
+DATA_RATIO: Final = 5.0
 """A direction is the data's where they tell it by this much better than the prior."""
 MODEL: Final = 1e-5
 """Part of the efforts that no model is better than: a direction that shows less is not seen."""
@@ -99,12 +99,12 @@ def estimate(
     weights = counts.copy()
     told: Any = None
     z = np.zeros(k)
-    for _ in range(TURNS):
+    for _ in range(MAX_ITERATIONS):
         root = np.sqrt(weights) / noise
         rows = (scaled * root[..., None]).reshape(-1, k)
         gram, side = rows.T @ rows, rows.T @ (change * root).ravel()
         least = MODEL**2 * samples * float(np.sum((size / noise) ** 2))
-        told = _directions(gram, side, max(TOLD**2, least))
+        told = _directions(gram, side, max(DATA_RATIO**2, least))
         before, z = z, told[0]
         residual = change - scaled @ z
         new = np.array([_robust(residual[used[:, j], j], floor) for j in range(n)])

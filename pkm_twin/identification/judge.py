@@ -53,7 +53,7 @@ MISSED: Final = 0.5
 """Part of what the differentiation misses that a finding has to exceed."""
 LOUD: Final = 1.5
 """Residual over noise, in the band of the motion, from which more than noise is left."""
-MOST: Final = 0.2
+MAX_UNEXPLAINED: Final = 0.2
 """Part of a channel's measured variation that may stay unexplained."""
 ABSURD: Final = 10.0
 """Times its usual size from which an error, beyond doubt, is another model's."""
@@ -345,7 +345,7 @@ def judge(
         one for one in clear
         if abs(one.size) - SIGMAS * one.deviation > ABSURD * (one.suspect.usual or np.inf)
     ]  # fmt: skip
-    if absurd or max(channel.left for channel in told) > MOST:
+    if absurd or max(channel.left for channel in told) > MAX_UNEXPLAINED:
         answer = "does not explain"
     elif clear or loud or any(channel.held_out > LOUD for channel in told):
         answer = "explains partly"

@@ -20,13 +20,13 @@ BELIEVED: Final = 4.0
 """Measurements that the usual noise of a kind counts for against the residuals."""
 MEDIANS: Final = {1: 0.6745, 3: 0.888}
 """Median, by the number of axes, of the root mean square of normal variables of deviation one."""
-TURNS: Final = 5
+MAX_ITERATIONS: Final = 5
 SPANS: Final = 24
 """Poses between which distances stand for the scale."""
 SHORT: Final = 0.3
 """Part of the longest of them from which on a distance counts."""
 COORDINATES: Final = ("x", "y", "z", "roll", "pitch", "yaw")
-FAR: Final = 10.0
+UNKNOWN_DEVIATION: Final = 10.0
 """Standard deviation of a place, m, and a slope that nothing is known of."""
 
 
@@ -210,16 +210,16 @@ KINDS: Final = {
         Kind("height", "m", 3e-5, (2,)),
         _Plane(
             "plane", "m", 3e-5,
-            own={f"plane.{name}": (unit, FAR) for name, unit in
+            own={f"plane.{name}": (unit, UNKNOWN_DEVIATION) for name, unit in
                  (("z", "m"), ("slope_x", "rad"), ("slope_y", "rad"))},
         ),
         _Ball(
             "radius", "m", 1e-5, length=True,
-            own={f"ball.{axis}": ("m", FAR) for axis in "xyz"},
+            own={f"ball.{axis}": ("m", UNKNOWN_DEVIATION) for axis in "xyz"},
         ),
         _Range(
             "range", "m", 1e-5, length=True,
-            own={f"range.{name}": ("m", FAR) for name in ("x", "y", "z", "zero")},
+            own={f"range.{name}": ("m", UNKNOWN_DEVIATION) for name in ("x", "y", "z", "zero")},
         ),
         _Distance("distance", "m", 6e-5, length=True, pair=True),
     )
@@ -333,7 +333,7 @@ class Measured:
             for kind, s, size, part in zip(kinds, usual, sizes, parts, strict=True)
         ]
         weights = [np.ones(len(part)) for part in parts]
-        for _ in range(TURNS):
+        for _ in range(MAX_ITERATIONS):
             away = [size / s for size, s in zip(sizes, noise, strict=True)]
             weights = [huber(one) for one in away]
             left = left_over(slopes, noise, prior)

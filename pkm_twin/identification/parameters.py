@@ -28,14 +28,14 @@ Status = Literal["fitted", "combination", "not excited"]
 
 COMPLIANCE: Final = "compliance"
 """What is fitted to deflections, not to efforts."""
-SURE: Final = 0.2
+FITTED_RATIO: Final = 0.2
 """A number that is known this much better than before is fitted."""
 OBSERVED: Final = 0.5
 """One that is known this much better is observed: the measurements, not the prior, say most of it.
 """
 UNSURE: Final = 0.98
 """One that is known no better than this is not excited."""
-STAYS: Final = 1e-3
+NO_CHANGE: Final = 1e-3
 """Change over the standard deviation before that says nothing."""
 SHOWN: Final = 0.1
 """Part of the greatest weight below which an element is no part of a combination."""
@@ -167,9 +167,9 @@ def number_of(
     """
     plain, wide = deviations
     share = plain / prior if prior > 0.0 else 1.0
-    if share > UNSURE and abs(value - before) <= STAYS * prior:
+    if share > UNSURE and abs(value - before) <= NO_CHANGE * prior:
         return Number(key, unit, before, before, plain, share, "not excited")
-    status: Status = "fitted" if share < SURE else "combination"
+    status: Status = "fitted" if share < FITTED_RATIO else "combination"
     return Number(key, unit, before, value, wide, share, status)
 
 
@@ -224,7 +224,7 @@ def groups_of(
     own = covariance[:count, :count]
     full = own if wide is None else wide[:count, :count]
     values, vectors = np.linalg.eigh(own)
-    unknown = vectors[:, values > SURE**2]
+    unknown = vectors[:, values > FITTED_RATIO**2]
     shared = np.abs(unknown @ unknown.T)
     left, groups = set(np.flatnonzero(np.diag(shared) > SHOWN**2).tolist()), []
     while left:
@@ -245,7 +245,7 @@ def _group(
     values, vectors = np.linalg.eigh(own[np.ix_(members, members)])
     told = []
     for value, vector in zip(values, vectors.T, strict=True):
-        if value > SURE**2:
+        if value > FITTED_RATIO**2:
             continue
         weights = vector * np.sign(vector[np.argmax(np.abs(vector))])
         weights[np.abs(weights) < SHOWN * np.abs(weights).max()] = 0.0

@@ -21,7 +21,7 @@ from pkm_twin.robot.workspace import within_limits
 CANDIDATES: Final = 300
 DRAWN: Final = 20
 """Times as many are drawn, at most, where few can be reached."""
-MOST: Final = 150
+MAX_MEASUREMENTS: Final = 150
 """Measurements of a plan."""
 USUAL: Final = 12
 
@@ -110,7 +110,7 @@ def plan(
     span = np.zeros(len(names)) if scaled is None else scaled * prior
     order: list[int] = []
     told: list[tuple[float, float, Array]] = []
-    most = min(count or (MOST if accuracy else USUAL), MOST, len(q))
+    most = min(count or (MAX_MEASUREMENTS if accuracy else USUAL), MAX_MEASUREMENTS, len(q))
     while True:
         axes = np.sqrt(np.mean(_variances(places, covariance), 0))
         seen = np.sqrt(np.mean(_variances(rows, covariance), 0))

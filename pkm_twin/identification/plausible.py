@@ -55,7 +55,7 @@ POOR: Final = 0.3
 """Part of the variation, beside noise, that no recording of the machine leaves."""
 NAMED: Final = 0.8
 """A fault is named if without it no more than this part is left."""
-FAR: Final = 0.1
+LARGE_REST: Final = 0.1
 """What is left from which other positions and times are tried, which costs more."""
 BESIDE_NOISE: Final = 0.03
 """What a recording leaves beside noise once its fault is put right: of more the cause is unknown.
@@ -80,7 +80,7 @@ UNITS: Final = {
 """Units that efforts come in, by how many are a newton or a newton metre."""
 SCALES: Final = tuple(2.0 ** (k / 4.0) for k in range(-6, 7))
 """Around the scale of least squares."""
-TURNS: Final = 4
+MAX_SOLUTIONS: Final = 4
 """Most solutions for one recording, each with what the one before has left."""
 RATES: Final = (2.0, 0.5, 3.0, 1.0 / 3.0, 4.0, 0.25, 5.0, 0.2, 10.0, 0.1)
 """Of time steps that were taken for others'."""
@@ -256,7 +256,7 @@ class Case:
         norm = np.linalg.norm(reduced[:, :width], axis=0)
         norm = np.where(norm > 0.0, norm, 1.0)
         left, x = GOOD, np.zeros(width)
-        for _ in range(TURNS):
+        for _ in range(MAX_SOLUTIONS):
             root = np.sqrt(INDEPENDENT / (left**2 + GOOD**2))
             rows = np.concatenate([root * reduced[:, :width], prior]) / norm
             aim = np.concatenate([root * reduced[:, width], self.usual])
@@ -310,7 +310,7 @@ def recording_fault(rows: Rows) -> str | None:
     first = int(np.searchsorted(time, _worst(case, SOME * period)))
     first = max(0, min(first, len(time) - SOME))
     some = slice(first, first + SOME)
-    here = _again(rows, some) if unclear or best.left > FAR else None
+    here = _again(rows, some) if unclear or best.left > LARGE_REST else None
     if here is not None:
         # All of them by the same samples: how much better than as recorded?
         gain, own = told.cost - best.cost, here.judged()

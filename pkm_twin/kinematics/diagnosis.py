@@ -23,7 +23,7 @@ from pkm_twin.machine.graph import Graph
 
 TOLERANCES: Final = (1e-8, 1e-7, 1e-6, 1e-5, 1e-4, 1e-3, 3e-3, 1e-2)
 """Deviations up to which conditions are made to hold, rad and parts of the machine's size."""
-MOST: Final = 5
+MAX_CAUSES: Final = 5
 """Most causes that an error names."""
 _TRIED: Final = 40
 """Most conditions that are tried one by one."""
@@ -38,9 +38,9 @@ def mobility_error(linkage: Linkage) -> MobilityError:
     # What nearly holds takes freedoms away; where there are too many, none is lost.
     lost = linkage.mobility.freedoms < linkage.joints
     causes = near_conditions(linkage.graph) if lost else []
-    texts = [c.text for c in causes[:MOST]]
-    if len(causes) > MOST:
-        texts.append(f"and {len(causes) - MOST} deviations more")
+    texts = [c.text for c in causes[:MAX_CAUSES]]
+    if len(causes) > MAX_CAUSES:
+        texts.append(f"and {len(causes) - MAX_CAUSES} deviations more")
     if not causes:
         texts = [*_loose(linkage), *_locked(linkage)]
     return MobilityError(linkage.joints, linkage.mobility.freedoms, texts)

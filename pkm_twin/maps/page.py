@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from xarray import Dataset
 
 
-MOST: Final = (15, 61)
+MAX_SAMPLES: Final = (15, 61)
 """Layers, and samples along the sides of a layer."""
 STAR: Final = {"color": "red", "line": {"color": "white", "width": 1}}
 HELP: Final = (
@@ -102,7 +102,10 @@ def _layers(data: Dataset) -> Any:
     dims = list(units)
     upwards = data.attrs["height"] or dims[2]
     flat = [name for name in dims if name != upwards]
-    steps = {n: math.ceil(data.sizes[n] / (MOST[0] if n == upwards else MOST[1])) for n in dims}
+    steps = {
+        n: math.ceil(data.sizes[n] / (MAX_SAMPLES[0] if n == upwards else MAX_SAMPLES[1]))
+        for n in dims
+    }
     part = data.value.isel({n: slice(None, None, step) for n, step in steps.items()})
     values = part.transpose("case", upwards, *flat).values
     turns = {n: figures.scale_of(1.0, u) if u == "rad" else (1.0, u) for n, u in units.items()}

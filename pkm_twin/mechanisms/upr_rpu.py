@@ -47,7 +47,7 @@ from pkm_twin.machine.sections import length, mass, shared_middle
 from pkm_twin.mechanisms import TwinRobot
 from pkm_twin.robot.mechanism import Inverse
 
-FAR: Final = 1e5
+MAX_LIMB_RATIO: Final = 1e5
 """Longest limb over the machine's size; beyond, rounding would lose the pose, or overflow."""
 LEVEL: Final = 1e-2
 """Least that a limb at home is longer than it is wide, as a part: else limbs lie in the base."""
@@ -263,7 +263,7 @@ class UprRpu(TwinRobot):
         for i in range(3):
             along, up = self._limb(i, rho, beta, gamma)
             q.append(sqrt(minimum(along * along + up * up, 1e300)))
-        far = -rho - FAR * (a + b)
+        far = -rho - MAX_LIMB_RATIO * (a + b)
         # At z = 0 the platform is in the base.
         flat = -1.0 * (1.0 - maximum(minimum(-1e300 * z, 1.0), 0.0))
         return Inverse(q, [0.0 * z, 0.0 * z, maximum(maximum(low, far), -flat)])
@@ -319,8 +319,8 @@ class UprRpu(TwinRobot):
         for i in range(3):
             if not q[i] > 0.0:
                 return i, float(-q[i])
-            if q[i] > FAR * (a + b):
-                return i, float(q[i]) - FAR * (a + b)
+            if q[i] > MAX_LIMB_RATIO * (a + b):
+                return i, float(q[i]) - MAX_LIMB_RATIO * (a + b)
         if not self._meets(q[0], q[1]):
             return self._wrong_pair(float(q[0]), float(q[1]))
         rho, _, _ = (float(v) for v in self._found(q))

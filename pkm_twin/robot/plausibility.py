@@ -31,9 +31,9 @@ DENSEST: Final = 4000.0
 """All masses over the cube of the extent at most, kg/m3: between solid aluminium and steel."""
 LIGHTEST: Final = 0.01
 """The same at least, kg/m3."""
-FAR: Final = 2.0
+MAX_COM_DISTANCE: Final = 2.0
 """How far a centre of mass is from the body's joints at most, in parts of the extent."""
-TURNS: Final = 4.0 * math.pi
+MAX_TURN_LIMIT: Final = 4.0 * math.pi
 """Limits of a joint that turns at most, rad."""
 GRAVITY: Final = (1.0, 25.0)
 """Gravity between that of the Moon and that of Jupiter, m/s2; or none."""
@@ -171,13 +171,13 @@ def _bodies(robot: Robot, graph: Graph) -> Iterator[Finding]:
                 "m",
                 f"inertia in {squares}?",
             )
-        if far > FAR * extent:
+        if far > MAX_COM_DISTANCE * extent:
             what = "its joints" if name != "payload" else "the reference point"
             yield Finding(
                 f"{name}: com",
                 f"distance of the centre of mass from {what}",
                 far,
-                FAR * extent,
+                MAX_COM_DISTANCE * extent,
                 "m",
                 "a place in millimetres, or in other axes?",
             )
@@ -193,12 +193,12 @@ def _drives(robot: Robot, graph: Graph) -> Iterator[Finding]:
         if positions is not None:
             low, high = (float(v) for v in positions[k])
             widest = max((abs(v) for v in (low, high) if math.isfinite(v)), default=0.0)
-            if turns and widest > TURNS:
+            if turns and widest > MAX_TURN_LIMIT:
                 yield Finding(
                     f"{name}: limits.position",
                     "limit",
                     widest,
-                    TURNS,
+                    MAX_TURN_LIMIT,
                     "rad",
                     f"{widest / (2 * math.pi):.3g} turns; degrees?",
                 )

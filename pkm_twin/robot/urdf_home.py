@@ -36,7 +36,7 @@ STEP: Final = 0.5
 """Largest change of a joint in one correction, rad or m."""
 RANKS: Final = (1e-4, 1e-6, 1e-8)
 """Singular values below this share of the greatest are none; where that does not close, less."""
-FAR: Final = 1e-2
+MAX_MISS: Final = 1e-2
 """A miss that no choice of directions makes good, m or rad."""
 EXACT: Final = 1e-9
 """Loops that miss by less are closed for all purposes, m or rad."""
@@ -200,7 +200,7 @@ class Assembly:
             new, left = self._close(best, rank, held)
             if left < 0.5 * miss:
                 best, miss = new, left
-            if miss < 1e-14 or miss > FAR:
+            if miss < 1e-14 or miss > MAX_MISS:
                 break
         self.place(best)
         return best, miss

@@ -45,9 +45,9 @@ LEAST: Final = 0.1
 """Part of the second differences that are of one publisher's samples and no jump of its own,"""
 OF_NOISE: Final = 0.1257 * 6.0**0.5
 """and their quantile of it, over the noise's standard deviation."""
-TURNS: Final = 16
+ALTERNATING: Final = 16
 """Samples in a row that alternate between two publishers,"""
-MOST: Final = 0.75
+ALTERNATING_PART: Final = 0.75
 """and part of them that must."""
 APART: Final = 0.25
 """By how much of a period a gap may miss a whole number of periods, where samples are missing."""
@@ -178,21 +178,21 @@ def _alternating(time: Array, q: Array) -> Array:
     leaves half of its move over two samples.
     """
     found = np.zeros_like(q)
-    blocks = (len(q) - 2) // TURNS
+    blocks = (len(q) - 2) // ALTERNATING
     if blocks < 1:
         return found
     size = np.maximum(noise(time[::2], q[::2]), noise(time[1::2], q[1::2]))
     span = np.diff(time)[:, None]
     line = (q[:-2] * span[1:] + q[2:] * span[:-1]) / (span[1:] + span[:-1])
     signs = np.where(np.arange(len(line)) % 2, -1.0, 1.0)[:, None]
-    shape = (blocks, TURNS, q.shape[1])
-    bent = (signs * (q[1:-1] - line))[: blocks * TURNS].reshape(shape)
+    shape = (blocks, ALTERNATING, q.shape[1])
+    bent = (signs * (q[1:-1] - line))[: blocks * ALTERNATING].reshape(shape)
     twice = np.abs(q[2:] - q[:-2])
-    moved = twice[: blocks * TURNS].reshape(shape).mean(1)
+    moved = twice[: blocks * ALTERNATING].reshape(shape).mean(1)
     bent *= np.sign(bent.sum(1, keepdims=True))
     clear = bent > np.maximum(moved + SIGMAS * size, 2.0 * _tick(twice))[:, None]
-    apart = np.where(clear.mean(1) > MOST, bent.mean(1), 0.0)
-    found[1 : blocks * TURNS + 1] = np.repeat(apart, TURNS, 0)
+    apart = np.where(clear.mean(1) > ALTERNATING_PART, bent.mean(1), 0.0)
+    found[1 : blocks * ALTERNATING + 1] = np.repeat(apart, ALTERNATING, 0)
     return found
 
 

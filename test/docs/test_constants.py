@@ -21,7 +21,7 @@ def word(pattern):
 def test_newtons_judgement():
     assert numbers(ENGINE, r"until one is below (\S+) \(unit one; .*?\), at most (\d+)\.") == [
         program.CLOSED,
-        program.TURNS,
+        program.MAX_ITERATIONS,
     ]
     assert word("at most a **{}** of the one before it") == program.CONTRACTION
     assert word("changes at most **{}** in a correction") == program.CHANGE

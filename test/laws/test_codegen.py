@@ -373,7 +373,7 @@ def test_the_cache_has_a_limit(tmp_path, monkeypatch):
     """Programs that were not used for the longest time go first."""
     monkeypatch.setenv("PKM_TWIN_CACHE", str(tmp_path))
     code = bytes(1000)
-    monkeypatch.setattr(cache, "MOST", 12 * 1200)
+    monkeypatch.setattr(cache, "MAX_BYTES", 12 * 1200)
     names = [f"{k:064x}" for k in range(30)]
     for k, name in enumerate(names):
         cache.write(name, {}, code)
@@ -381,7 +381,7 @@ def test_the_cache_has_a_limit(tmp_path, monkeypatch):
         # Used again and again: the newest, whenever it was written.
         assert cache.read(names[0]) == ({}, code)
     left = sorted(path.name for path in tmp_path.iterdir())
-    assert sum(path.stat().st_size for path in tmp_path.iterdir()) <= cache.MOST
+    assert sum(path.stat().st_size for path in tmp_path.iterdir()) <= cache.MAX_BYTES
     assert names[0] in left and names[-1] in left and names[1] not in left
 
 

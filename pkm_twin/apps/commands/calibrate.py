@@ -21,7 +21,7 @@ from pkm_twin.identification.calibration import calibrate as calibrated
 from pkm_twin.identification.calibration_fit import STEPS
 from pkm_twin.identification.calibration_state import BESIDE, Poses, Transmission, written
 from pkm_twin.identification.measurements import KINDS, Kind, Measured, kinds_of
-from pkm_twin.identification.plan import MOST, Plan
+from pkm_twin.identification.plan import MAX_MEASUREMENTS, Plan
 from pkm_twin.identification.plan import plan as plan_of
 from pkm_twin.identification.pose_tables import read_measured, read_poses
 from pkm_twin.report import Column, Fact, Report, Table
@@ -97,7 +97,7 @@ class Calibrate(OfRobot, ReadsTables, BeyondLimitsToo, Accepts, Overwrites):
         writes=True,
         endings=(".csv",),
     )
-    count: int | None = setting(None, "poses of a plan", low=1, high=MOST)
+    count: int | None = setting(None, "poses of a plan", low=1, high=MAX_MEASUREMENTS)
     accuracy: float | None = setting(
         None, "position's standard deviation that a plan is to reach, m", low=1e-9
     )

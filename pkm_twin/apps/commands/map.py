@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from pkm_twin.maps.kind import Case, Kind
     from pkm_twin.robot.robot import Robot
 
-MOST: Final = 10**11
+MAX_POSES: Final = 10**11
 """Poses beyond which a number is a slip."""
 SIX: Final = "six numbers separated by commas, N and N m; or NAME=six numbers"
 
@@ -46,7 +46,7 @@ class OfMap(Carries, Pages, Writes, Draws, Parallel):
 
     kind: str = ""
     points: int | None = setting(
-        None, "approximate number of poses; default: by kind", low=1, high=MOST
+        None, "approximate number of poses; default: by kind", low=1, high=MAX_POSES
     )
     at: str | None = setting(
         None, "pose that the planes go through: numbers separated by commas; default: the worst"
