@@ -207,8 +207,7 @@ def inertia(*, positive: bool, default: Any = MISSING, **more: Any) -> Any:
             )
         return frozen((matrix + matrix.T) / 2)
 
-    least = "above zero" if positive else "zero or more"
-    bound = f"3 numbers or 3x3, symmetric, principal moments {least}, triangle rule"
+    bound = "3 numbers or 3x3" + (", moments above zero" if positive else "")
     return key(check, bound, default, unit="kg m2", **more)
 
 

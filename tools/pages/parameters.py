@@ -26,6 +26,8 @@ HEAD = """# Robot files
 The keys of a robot's YAML with their valid values and defaults. SI units, angles in rad, z up.
 Anything else is rejected, with the name of the key. Of two units, the first is for joints that
 rotate, the second for joints that slide; `pkm-twin info ROBOT` prints a robot's values and units.
+An inertia is three principal moments or a symmetric 3x3 matrix whose moments are not negative and
+keep the triangle rule.
 
 Written by `make pages`.
 """
@@ -36,7 +38,7 @@ UNITS = {
     "{effort}": "N m or N",
     "{rotor}": "kg m2 or kg",
 }
-TABLE = "| key | unit | values | default |\n|---|---|---|---|"
+TABLE = "| key | unit: values | default |\n|---|---|---|"
 ROBOTS = {
     "delta": delta.Delta, "linear_delta": linear_delta.LinearDelta, "prru": prru.Prru,
     "upr_rpu": upr_rpu.UprRpu,
@@ -82,7 +84,8 @@ def rows(kind, without=(), prefix=""):
             bound = re.sub("^number(, | )", "", row.bound)
         unit, values = UNITS.get(row.unit, row.unit), "; ".join(filter(None, (bound, row.text)))
         if values != "a section":
-            yield f"| `{prefix}{name}` | {unit} | {values} | {default(fields[own])} |"
+            told = f"{unit}: {values}" if unit else values
+            yield f"| `{prefix}{name}` | {told} | {default(fields[own])} |"
         inner = row.section or row.entries
         if inner and not other:
             yield from rows(inner, (), f"{prefix}{name}.")
