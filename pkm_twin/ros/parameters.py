@@ -70,27 +70,15 @@ class ParameterNode(LifecycleNode):
         return found
 
     def declare(
-        self,
-        name: str,
-        default: Any,
-        description: str,
-        *,
-        unit: str = "",
-        low: float | None = None,
-        high: float | None = None,
-        choices: Sequence[str] = (),
-        usual: str = "",
-        changeable: bool = False,
+        self, name: str, default: Any, description: str, *, changeable: bool = False, **more: Any
     ) -> Any:
         """Declare a parameter and return its value; a whole number is taken for a float.
 
-        :param low: least value, ``high``: greatest; ``choices``: the words that are allowed.
-        :param usual: words for a default that depends on the robot.
         :param changeable: whether it may change while the node runs.
+        :param more: further attributes of :class:`pkm_twin.settings.Setting`.
         :raises ParameterError: the given value has another type or is out of range, naming both.
         """
-        row = Setting(description, name, unit, low, high, tuple(choices), not changeable, usual)
-        return self._declare(default, row)
+        return self._declare(default, Setting(description, name, fixed=not changeable, **more))
 
     def declare_robot(self, default: str = "delta_cu") -> Robot:
         """Declare the parameter ``mechanism`` and load its robot.
@@ -147,14 +135,12 @@ class ParameterNode(LifecycleNode):
 
         :raises ParameterError: out of range, not a number, or not one of the words.
         """
-        descriptor = self.describe_parameter(name)
-        for limits in (*descriptor.floating_point_range, *descriptor.integer_range):
-            # rclpy lets a value that is not a number pass.
-            if not limits.from_value <= value <= limits.to_value:
-                raise ParameterError(name, value, f"{limits.from_value:g} to {limits.to_value:g}")
-        words = descriptor.additional_constraints.removeprefix("one of ").split(", ")
-        if words != [""] and value not in words:
-            raise UnknownNameError(name, value, words)
+        _, row = self.rows.get(name, (None, Setting("")))
+        # rclpy lets a value that is not a number pass.
+        if row.low is not None and not row.allows(value):
+            raise ParameterError(name, value, row.span.removeprefix(", "))
+        if row.choices and value not in row.choices:
+            raise UnknownNameError(name, value, row.choices)
 
     def follow(
         self,
