@@ -3,41 +3,34 @@
 
 from __future__ import annotations
 
-import html
 import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import require
 from pkm_twin.files import replace_file
 from pkm_twin.maps import figures
-from pkm_twin.maps.pages import (
-    CAMERA,
-    CONFIG,
-    FIT,
-    LEAST,
-    LIT,
-    MARGIN,
-    MENU,
-    SHELL,
-    TITLE,
-    button,
-    few,
-    narrow,
-    short,
-    slider,
-    span,
-    triangles,
-)
 from pkm_twin.maps.store import reading, source, writing
+from pkm_twin.report import Report
+from pkm_twin.report.page import page as of_report
 
 if TYPE_CHECKING:
     from xarray import Dataset
 
 
+CAMERA: Final = {"eye": {"x": 1.3, "y": -1.5, "z": 0.95}, "center": {"x": 0, "y": 0, "z": -0.1}}
+LIT: Final = {"ambient": 1.0, "diffuse": 0.0, "specular": 0.0, "fresnel": 0.0}
+"""Light that leaves colours as the bar has them."""
+CONFIG: Final = {"displaylogo": False, "responsive": True, "showSendToCloud": False}
+"""No buttons that lead into the network."""
+MENU: Final = {"x": 0.0, "y": 1.0, "xanchor": "left", "yanchor": "bottom", "pad": {"b": 8}}
+BAR: Final = {"len": 0.8, "thickness": 12, "title": {"side": "right"}}
+"""A bar of colours with its title along it, which narrow windows have room for."""
+MARGIN: Final = {"l": 20, "r": 20, "t": 60, "b": 20}
 MAX_SAMPLES: Final = (15, 61)
 """Layers, and samples along the sides of a layer."""
 STAR: Final = {"color": "red", "line": {"color": "white", "width": 1}}
@@ -55,22 +48,18 @@ def write_page(data: Dataset, path: Path) -> Path:
     require("plotly", "atlas")
     kind = figures.kind_of(data)
     with reading(source(data)):
-        drawn = page(data).update_layout(title=TITLE)
-        more = kind.page(data)
+        first, *rest = figures.lines(data)
+        drawn, more = page(data), kind.page(data)
     parts = [drawn, *([] if more is None else [more])]
-    plots = [
+    shown = [
         one.to_html(
             include_plotlyjs=k == 0, full_html=False, config=CONFIG, default_width="100%",
-            default_height="100%", auto_play=False, post_script=FIT,
+            default_height="100%", auto_play=False,
         )
         for k, one in enumerate(parts)
     ]  # fmt: skip
-    text = SHELL.format(
-        title=html.escape(str(data.attrs["title"])),
-        plot="".join(f"<div>{plot}</div>" for plot in plots),
-        help=html.escape(" ".join([HELP, kind.page_help]).strip()),
-        width=LEAST,
-    )
+    report = Report(first, notes=[*rest, HELP, *([kind.page_help] if kind.page_help else [])])
+    text = of_report(str(data.attrs["title"]), report, figures=shown)
     with writing(path):
         replace_file(path, text.encode())
     return path
@@ -82,7 +71,7 @@ def page(data: Dataset) -> Any:
 
 
 def _case(data: Dataset, case: int, values: Array) -> tuple[float, str, dict[str, Any]]:
-    """Scale, unit, and layout of a case: its title, and one scale of colours with the worst."""
+    """Scale, unit, and layout of a case: one scale of colours with the worst."""
     part = data.isel(case=case)
     low, high = figures.limits(values, float(part.worst_value))
     scale, unit = figures.scale_of(max(abs(low), abs(high)), str(part.case_unit.values))
@@ -91,7 +80,6 @@ def _case(data: Dataset, case: int, values: Array) -> tuple[float, str, dict[str
         "coloraxis.cmin": float(few(np.array(scale * low))),
         "coloraxis.cmax": float(few(np.array(scale * high))),
         "coloraxis.colorbar.title.text": label,
-        "title.text": " ".join(figures.title(data, case)),
     }
     return scale, unit, layout
 
@@ -116,7 +104,7 @@ def _layers(data: Dataset) -> Any:
     figure = graph.Figure()
     for z, seen in zip(heights.tolist(), kept, strict=True):
         figure.add_mesh3d(
-            x=short(x[seen]), y=short(y[seen]), z=short(np.full(seen.sum(), z)),
+            x=np.float32(x[seen]), y=np.float32(y[seen]), z=np.float32(np.full(seen.sum(), z)),
             **triangles(seen), coloraxis="coloraxis", flatshading=True, lighting=LIT,
         )  # fmt: skip
     figure.add_scatter3d(mode="markers", marker=STAR | {"size": 7, "symbol": "diamond"})
@@ -150,8 +138,9 @@ def _layers(data: Dataset) -> Any:
                for axis, name, ends in zip("xyz", names, (x, y, heights), strict=True)},
             "aspectmode": "cube", "camera": CAMERA,
         },
-        margin=MARGIN, meta=narrow(farther=1.8),
-        sliders=[slider([every, *slices], f"{names[2]}: ")],
+        margin=MARGIN,
+        sliders=[{"steps": [every, *slices], "currentvalue": {"prefix": f"{names[2]}: "},
+                  "len": 0.9, "x": 0.05, "pad": {"t": 10, "b": 10}}],
     )  # fmt: skip
     return _chosen(figure, buttons)
 
@@ -188,7 +177,7 @@ def _planes(data: Dataset) -> Any:
     visible = [[n // 2 == k for n in range(len(figure.data))] for k in range(len(buttons))]
     for trace, seen in zip(figure.data, visible[0], strict=True):
         trace.visible = seen
-    figure.update_layout(margin={**MARGIN, "l": 70, "b": 60}, meta=narrow())
+    figure.update_layout(margin={**MARGIN, "l": 70, "b": 60})
     return _chosen(figure, [
         button(text, {"visible": seen}, layout)
         for (text, layout), seen in zip(buttons, visible, strict=True)
@@ -198,7 +187,7 @@ def _planes(data: Dataset) -> Any:
 def _chosen(figure: Any, buttons: list[dict[str, Any]]) -> Any:
     """A figure as its menu's first entry shows it."""
     figure.update_layout(
-        coloraxis={"colorscale": "Viridis", "colorbar": {"len": 0.8, "title.side": "right"}},
+        coloraxis={"colorscale": "Viridis", "colorbar": BAR},
         updatemenus=[{"buttons": buttons, **MENU}],
     )
     first, layout = buttons[0]["args"]
@@ -208,3 +197,48 @@ def _chosen(figure: Any, buttons: list[dict[str, Any]]) -> Any:
                 trace[name] = value
     figure.update_layout(layout)
     return figure
+
+
+def button(
+    label: str, data: dict[str, Any], layout: dict[str, Any], traces: list[int] | None = None
+) -> dict[str, Any]:
+    """An entry of a menu that changes data and layout."""
+    args: list[Any] = [data, layout]
+    return {"label": label, "method": "update", "args": args if traces is None else [*args, traces]}
+
+
+def few(values: NDArray[Any]) -> Array:
+    """Five digits: what a button changes stands in the page as text."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        power = np.floor(np.log10(np.abs(values)))
+    unit = 10.0 ** (4.0 - np.where(np.isfinite(power), power, 0.0))
+    return np.asarray(np.round(np.asarray(values, np.float64) * unit) / unit, np.float64)
+
+
+def triangles(shown: NDArray[np.bool_]) -> dict[str, NDArray[np.int64]]:
+    """Corners i, j, k of the triangles between those points of a grid that are shown.
+
+    Points that are not shown are not counted. A mesh of triangles says of a place under the cursor
+    which point it is; plotly's surfaces mix up rows and columns there.
+
+    :param shown: shape (rows, columns).
+    """
+    number = np.full(shown.shape, -1)
+    number[shown] = np.arange(shown.sum())
+    a, b, c, d = number[:-1, :-1], number[:-1, 1:], number[1:, 1:], number[1:, :-1]
+    corners = np.concatenate(
+        [np.stack(three, -1).reshape(-1, 3) for three in ((a, b, c), (a, c, d))]
+    )
+    whole = (corners >= 0).all(1)
+    # Where one corner of a cell is missing, the other three make a triangle.
+    three = np.concatenate([np.stack(t, -1).reshape(-1, 3) for t in ((a, b, d), (b, c, d))])
+    missing = (np.stack([a, b, c, d], -1).reshape(-1, 4) < 0).sum(1) == 1
+    three = three[np.tile(missing, 2) & (three >= 0).all(1)]
+    corners = np.concatenate([corners[whole], three])
+    return dict(zip("ijk", np.unique(corners, axis=0).T, strict=True))
+
+
+def span(values: Array) -> list[float]:
+    """Ends of an axis a little beyond the values: it stays when some are hidden."""
+    low, high = float(np.nanmin(values)), float(np.nanmax(values))
+    return [low - 0.05 * (high - low), high + 0.05 * (high - low)]

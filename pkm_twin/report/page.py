@@ -22,6 +22,7 @@ table {{ border-collapse: collapse; margin: 1em 0; }}
 td, th {{ border-bottom: 1px solid #ccc; padding: 0.2em 0.8em; text-align: right; }}
 td:first-child, th:first-child {{ text-align: left; }}
 img {{ max-width: 100%; }}
+.plot {{ height: min(40em, 85vw); margin: 1em 0; }}
 </style>
 </head>
 <body>
@@ -34,16 +35,20 @@ DPI: Final = 100
 """Of its pictures: 900 pixels wide."""
 
 
-def page(title: str, report: Report, more: Sequence[Table] = ()) -> str:
+def page(
+    title: str, report: Report, more: Sequence[Table] = (), figures: Sequence[str] = ()
+) -> str:
     """The whole page.
 
     :param more: tables that the terminal does not show.
+    :param figures: interactive ones, as HTML.
     """
     notes = "".join(f"<li>{html.escape(note)}</li>" for note in report.notes)
     parts = [f"<p>{html.escape(report.answer)}</p>", f"<ul>{notes}</ul>"]
     for fact in report.facts:
         if fact.text is not None:
             parts.append(f"<p>{html.escape(f'{fact.text}: {fact.words}')}</p>")
+    parts += [f'<div class="plot">{figure}</div>' for figure in figures]
     parts += [_table(table) for table in (*report.tables, *more) if table.rows]
     for draw in report.figures.values():
         data = base64.b64encode(plots.rendered(draw(), DPI)).decode()

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-import json
+import html
 from dataclasses import replace
 from html.parser import HTMLParser
 
@@ -165,10 +165,10 @@ def test_pages_hold_all_they_need(stored, tmp_path):
     assert "Plotly.newPlot" in text
     links = Links()
     links.feed(text)
-    assert links.tags >= {"html", "main", "script"}
+    assert links.tags >= {"html", "h1", "script"}
     assert links.found == []
     assert '"showSendToCloud": false' in text
     assert 1_000_000 < len(text) < 9_000_000
     units = figures.units_of(stored)
     for answer in figures.answers(stored):
-        assert json.dumps(figures.sentence(answer, units))[1:-1].replace("/", r"\u002f") in text
+        assert html.escape(figures.sentence(answer, units)) in text

@@ -111,7 +111,7 @@ class Modes(Frequency):
     def page(cls, data: Dataset) -> Any:
         """The frame at rest and in a mode that a menu chooses and buttons swing and hold."""
         graph = require("plotly.graph_objects", "atlas")
-        from pkm_twin.maps.pages import CAMERA, MARGIN, MENU, button, narrow
+        from pkm_twin.maps.page import BAR, CAMERA, MARGIN, MENU, button
 
         rest, path = data.position.values, _path(data.line.values)
         low, high = _ends(rest)
@@ -135,15 +135,16 @@ class Modes(Frequency):
             head = _head(data, mode)
             change = {axis: [values] for axis, values in _points(moved, path).items()}
             change["line"] = [line]
-            layout = {"title.text": "; ".join(head), "updatemenus[1].buttons": _players(mode)}
-            buttons.append(button(head[0], change, layout, [2]))
+            buttons.append(
+                button("; ".join(head), change, {"updatemenus[1].buttons": _players(mode)}, [2])
+            )
         figure.frames = frames
-        first, layout = buttons[0]["args"][:2]
+        first = buttons[0]["args"][0]
         figure.data[2].update({name: values[0] for name, values in first.items()})
-        bar = {"title": {"text": "displacement over<br>the mode's largest"}, "len": 0.7}
+        title = {"text": "displacement over the mode's largest", "side": "right"}
         figure.update_layout(
-            title={"y": 1.0, "yanchor": "top", "pad": {"t": 36}, "text": layout["title.text"]},
-            coloraxis={"colorscale": "Viridis", "cmin": 0.0, "cmax": 1.0, "colorbar": bar},
+            coloraxis={"colorscale": "Viridis", "cmin": 0.0, "cmax": 1.0,
+                       "colorbar": {**BAR, "title": title}},
             scene={
                 "aspectmode": "manual",
                 "aspectratio": dict(zip("xyz", (1.3 * (high - low) / (high - low).max()).tolist(),
@@ -152,7 +153,7 @@ class Modes(Frequency):
                 **{f"{axis}axis": {"title": f"{axis} (m)", "range": [a, b], "nticks": 6}
                    for axis, a, b in zip("xyz", low.tolist(), high.tolist(), strict=True)},
             },
-            margin=MARGIN, meta=narrow(), uirevision="modes",
+            margin=MARGIN, uirevision="modes",
             updatemenus=[
                 {"buttons": buttons, **MENU},
                 {"type": "buttons", "direction": "left", "showactive": False,
