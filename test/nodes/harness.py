@@ -330,8 +330,8 @@ class Peer:
         self.context = rclpy.Context()
         rclpy.init(context=self.context, domain_id=domain.number)
         self.node = rclpy.create_node("peer", context=self.context)
-        self._executor = SingleThreadedExecutor(context=self.context)
-        self._executor.add_node(self.node)
+        self.executor = SingleThreadedExecutor(context=self.context)
+        self.executor.add_node(self.node)
         self._publishers = {}
         self._received = {}
         self._since = {}
@@ -342,7 +342,7 @@ class Peer:
     def talk(self, kind, topic, qos=10):
         self._publishers[topic] = self.node.create_publisher(kind, topic, qos)
 
-    def hear(self, kind, topic):
+    def hear(self, kind, topic, qos=100):
         if topic in self._received:
             self.clear_topic(topic)
             return
@@ -352,7 +352,7 @@ class Peer:
             if info["source_timestamp"] >= self._since.get(topic, 0):
                 received.append(message)
 
-        self.node.create_subscription(kind, topic, take, 100)
+        self.node.create_subscription(kind, topic, take, qos)
 
     def send(self, topic, message):
         self._publishers[topic].publish(message)
@@ -398,13 +398,13 @@ class Peer:
             if repeat is not None and now >= due:
                 repeat()
                 due = now + every
-            self._executor.spin_once(timeout_sec=0.05)
+            self.executor.spin_once(timeout_sec=0.05)
 
         return wait_until(condition, spin, timeout, "what this test waits for")
 
     def spin(self):
         """Take one message, if one comes within a millisecond."""
-        self._executor.spin_once(timeout_sec=0.001)
+        self.executor.spin_once(timeout_sec=0.001)
 
     def call(self, kind, service, request):
         """The answer of a service; after each five seconds without one it is asked again.
@@ -423,7 +423,7 @@ class Peer:
         return done.result()
 
     def close(self):
-        self._executor.shutdown()
+        self.executor.shutdown()
         self.node.destroy_node()
         rclpy.try_shutdown(context=self.context)
 

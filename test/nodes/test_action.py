@@ -105,13 +105,6 @@ def test_a_goal_reaches_the_controller_with_effort_and_nothing_else_changed(clie
     assert result.error_string == "as told"
 
 
-def test_what_the_controller_aborts_is_aborted(client, controller):
-    client.send(trajectory())
-    client.peer.until(lambda: controller.open)
-    controller.end("abort")
-    assert client.ended()[0] == GoalStatus.STATUS_ABORTED
-
-
 def test_a_cancelled_goal_is_cancelled_at_the_controller(client, controller):
     client.send(trajectory())
     client.peer.until(lambda: controller.open)
@@ -156,13 +149,3 @@ def test_goals_that_wait_for_their_efforts_end_with_the_node_s_activity(client, 
     assert status == GoalStatus.STATUS_ABORTED
     assert result.error_string == "the node was deactivated"
     assert len(controller.goals) == before
-
-
-def test_a_controller_that_is_not_there_is_named(peer, launch):
-    remap = ("-r", "__node:=alone", "-r", "joint_states:=/alone/states")
-    launch(MODULE, "controller_action:=/nobody/follow_joint_trajectory", arguments=remap)
-    client = Client(peer, "/alone/follow_joint_trajectory")
-    client.send(trajectory())
-    status, result = client.ended()
-    assert status == GoalStatus.STATUS_ABORTED
-    assert result.error_string == "no action server at /nobody/follow_joint_trajectory"

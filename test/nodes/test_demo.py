@@ -10,13 +10,10 @@ from contextlib import contextmanager
 
 import pytest
 
-from test.nodes.harness import REPOSITORY, Domain
+from test.nodes.harness import REPOSITORY
 
 pytest.importorskip("rclpy", exc_type=ImportError)
 
-import rclpy
-from rclpy.context import Context
-from rclpy.executors import SingleThreadedExecutor
 from rich.console import Console
 
 from pkm_twin.bags.reader import BagWriter, inspect, read_messages
@@ -31,22 +28,10 @@ FILLING = 30
 
 
 @pytest.fixture
-def executor(monkeypatch):
-    """Of a node in a domain of its own, which the demonstration's processes join."""
-    domain = Domain()
+def executor(peer, domain, monkeypatch):
+    """Of a node in a domain which the demonstration's processes join."""
     monkeypatch.setenv("ROS_DOMAIN_ID", str(domain.number))
-    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-    context = Context()
-    rclpy.init(context=context, domain_id=domain.number)
-    executor = SingleThreadedExecutor(context=context)
-    node = rclpy.create_node("demo_recorder", context=context)
-    executor.add_node(node)
-    yield executor
-    # Else the node stays in the domain, which another test's nodes may be the next in.
-    executor.shutdown()
-    node.destroy_node()
-    rclpy.try_shutdown(context=context)
-    domain.close()
+    return peer.executor
 
 
 @pytest.fixture

@@ -40,16 +40,17 @@ def told(robot, q, qd=(), stamp=NOW):
     return core.joint_state(MAKE.joint_state(robot.joint_names, q, qd, stamp=stamp), stamp)
 
 
-def loaded(robot, state, wrench=WRENCH):
-    pose = robot.forward(state.q)
+def loaded(robot, q, wrench=WRENCH):
+    """What a load does to a machine at these joint positions."""
+    pose = robot.forward(q)
     energy = strain_energy(robot, pose, wrench)
     return Load(
-        wrench,
+        np.asarray(wrench, float),
         compliance(robot, pose),
         energy.deflection,
         dict(zip(energy.elements, energy.factors.tolist(), strict=True)),
         str(energy.dominant),
-        member_deflections(robot, state.q, wrench),
+        member_deflections(robot, q, wrench),
     )
 
 
@@ -170,7 +171,7 @@ class TestScene:
         scales = Scales(deflection=500.0, force=0.002, moment=0.03, ellipsoid_force=50.0)
         scene = Scene(robot, scales)
         state = told(robot, poses(robot, 1)[0])
-        load = loaded(robot, state)
+        load = loaded(robot, state.q)
         groups = by_group(scene.shapes(state, load))
         # Colours: the hottest is the dominant element, wherever it is.
         shown = {
@@ -204,7 +205,7 @@ class TestScene:
     @each_elastic
     def test_members_are_straight_and_bend_in_proportion(self, robot):
         state = told(robot, poses(robot, 1)[0])
-        load = loaded(robot, state)
+        load = loaded(robot, state.q)
         assert load.members
         for points, moved in load.members.values():
             assert points.shape == moved.shape == (5, 3)
@@ -218,7 +219,7 @@ class TestScene:
     def test_a_zero_wrench_has_neither_name_nor_arrow(self):
         robot = load("upr_rpu")
         state = told(robot, poses(robot, 1)[0])
-        groups = by_group(Scene(robot).shapes(state, loaded(robot, state, np.zeros(6))))
+        groups = by_group(Scene(robot).shapes(state, loaded(robot, state.q, np.zeros(6))))
         assert not {"dominant", "wrench"} & set(groups)
         assert "compliance" in groups
 
@@ -226,7 +227,7 @@ class TestScene:
 def test_members_move_with_the_platform_where_they_meet_it():
     robot = load("prru")
     state = told(robot, poses(robot, 1)[0])
-    given = loaded(robot, state)
+    given = loaded(robot, state.q)
     for limb in ("limb I", "limb II", "limb III"):
         points, moved = given.members[limb]
         end = int(np.argmin(np.linalg.norm(points - state.position, axis=1)))

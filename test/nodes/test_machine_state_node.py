@@ -8,11 +8,10 @@ import pytest
 
 from pkm_twin.machine import rotations
 from pkm_twin.robot.robot_urdf import robot_urdf
-from pkm_twin.state.scene import Load, Scales, Scene
+from pkm_twin.state.scene import Scales, Scene
 from pkm_twin.state.state import MachineState
-from stiffness_monitor import compliance, strain_energy
-from stiffness_monitor.compliance import member_deflections
 from test.nodes.harness import SECOND, Maker, Ros, counts_of, stamp_of, values_of
+from test.nodes.test_machine_state import loaded
 from test.support.robots import load
 
 pytest.importorskip("rclpy", exc_type=ImportError)
@@ -100,15 +99,7 @@ def expected():
     force = state.rotation @ WRENCH[:3]
     moment = state.rotation @ WRENCH[3:] + np.cross(state.rotation @ XYZ, force)
     wrench = np.concatenate((force, moment))
-    energy = strain_energy(ROBOT, POSE, wrench)
-    load = Load(
-        wrench,
-        compliance(ROBOT, POSE),
-        energy.deflection,
-        dict(zip(energy.elements, energy.factors.tolist(), strict=True)),
-        str(energy.dominant),
-        member_deflections(ROBOT, state.q, wrench),
-    )
+    load = loaded(ROBOT, state.q, wrench)
     return state, Scene(ROBOT, Scales(deflection=500.0)).shapes(state, load)
 
 

@@ -1,9 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The stiffness core: a wrench and the pose beside it, to compliance and strain energy."""
 
-import math
 from dataclasses import replace
-from itertools import permutations
 
 import numpy as np
 import pytest
@@ -21,7 +19,6 @@ NAMES = ROBOT.joint_names
 POSE = np.array([-0.7, 0.2, -0.15])
 Q = ROBOT.inverse(POSE)
 WRENCH = np.array([30.0, -20.0, -100.0, 3.0, -2.0, 1.0])
-DAMAGED = [math.nan, math.inf, -math.inf, 1e308, 5e-324]
 
 pytestmark = pytest.mark.filterwarnings("error")
 
@@ -67,14 +64,6 @@ class TestAnswers:
         options = {"wrench_frame": "world", "base_frame": "world"}
         answer = watching(make, **options).wrench(make.wrench(WRENCH, NOW, "world"), NOW)
         assert (answer.wrench == WRENCH).all()
-
-    def test_permuted_limbs_give_the_same_bits(self, make):
-        expected = watching(make).wrench(make.wrench(WRENCH, NOW), NOW)
-        for order in permutations(range(3)):
-            twin = Monitor(ROBOT)
-            twin.joint_state(state(make, Q[list(order)], NOW, [NAMES[i] for i in order]), NOW)
-            answer = twin.wrench(make.wrench(WRENCH, NOW), NOW)
-            assert (answer.compliance == expected.compliance).all()
 
     def test_a_zero_wrench_has_no_dominant_element(self, make):
         answer = watching(make).wrench(make.wrench([0.0] * 6, NOW), NOW)
@@ -165,13 +154,6 @@ class TestRejects:
         twin = watching(make)
         assert reject(twin.wrench, make.wrench(WRENCH, NOW, frame), NOW)[0] == "frame"
         assert twin.wrenches.rejected == {"frame": 1}
-
-    @pytest.mark.parametrize("value", DAMAGED)
-    def test_damaged_values(self, make, value):
-        twin = watching(make)
-        assert reject(twin.wrench, make.wrench([0, 0, value, 0, 0, 0], NOW), NOW)
-        assert reject(twin.joint_state, state(make, [Q[0], value, Q[2]]), NOW)
-        assert twin.wrench(make.wrench(WRENCH, NOW), NOW)
 
     def test_lengths_without_an_assembly_name_the_limb(self, make):
         twin = Monitor(ROBOT)

@@ -5,21 +5,15 @@ from __future__ import annotations
 
 import re
 import signal
-import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 pytest.importorskip("rclpy")
 
-import rclpy
-from rclpy.executors import SingleThreadedExecutor
-from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
@@ -30,12 +24,8 @@ from pkm_twin.errors import BagError, ParameterError
 from pkm_twin.ros import player as player_module
 from pkm_twin.ros.player import play
 from test.bags.folders import make_folder
-from test.nodes.harness import DEADLINE, Domain, end_with_parent
-from test.support.waiting import wait_until
+from test.nodes.harness import DEADLINE, Command, Domain, Peer
 
-# Held as long as this process runs.
-OWN = Domain()
-DOMAIN = OWN.number
 COUNT = 100
 PERIOD = 0.005
 FIRST = 1_700_000_000 * 10**9
@@ -43,6 +33,7 @@ PROGRAM = (
     "import sys; from pkm_twin.ros.player import play; "
     "print(play(sys.argv[1], **eval(sys.argv[2])))"
 )
+MANY = QoSProfile(depth=1000)
 
 
 @pytest.fixture(scope="module")
@@ -62,166 +53,114 @@ def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-class Listener:
-    """Collects arrival time, topic and message in a ROS domain of this test's own."""
-
-    def __init__(self, node: Node, executor: SingleThreadedExecutor) -> None:
-        self.node = node
-        self.executor = executor
-        self.heard: list[tuple[float, str, Any]] = []
-
-    def listen(self, kind: Any, topic: str, qos: QoSProfile | int = 1000) -> None:
-        def take(message: Any) -> None:
-            self.heard.append((time.monotonic(), topic, message))
-
-        self.node.create_subscription(kind, topic, take, qos)
-
-    def of(self, topic: str) -> list[Any]:
-        return [message for _, name, message in self.heard if name == topic]
-
-    def spin(self, done: Callable[[], bool], seconds: float = DEADLINE) -> None:
-        """Take in messages until ``done``; then a little longer, for what should not come."""
-        wait_until(
-            done,
-            lambda: self.executor.spin_once(timeout_sec=0.05),
-            seconds,
-            "the player's messages",
-        )
-        give_up = time.monotonic() + 0.1
-        while time.monotonic() < give_up:
-            self.executor.spin_once(timeout_sec=0.01)
-
-
 @pytest.fixture
-def listener(monkeypatch: pytest.MonkeyPatch) -> Iterator[Listener]:
-    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-    monkeypatch.setenv("ROS_DOMAIN_ID", str(DOMAIN))
-    context = rclpy.Context()
-    rclpy.init(context=context, domain_id=DOMAIN)
-    node = Node("listener", context=context)
-    executor = SingleThreadedExecutor(context=context)
-    executor.add_node(node)
-    yield Listener(node, executor)
-    executor.shutdown()
-    node.destroy_node()
-    context.try_shutdown()
+def player(domain: Domain) -> Iterator[Callable[..., Command]]:
+    """Start players; whatever still runs at the end of the test is ended."""
+    started: list[Command] = []
 
-
-@pytest.fixture
-def player() -> Iterator[Callable[..., subprocess.Popen[str]]]:
-    """Start players; whatever still runs at the end of the test is killed."""
-    started: list[subprocess.Popen[str]] = []
-
-    def start(path: Path, **options: object) -> subprocess.Popen[str]:
+    def start(path: Path, **options: object) -> Command:
         options = {"wait_for_subscribers": DEADLINE, **options}
-        command = [sys.executable, "-c", PROGRAM, str(path), repr(options)]
-        process = subprocess.Popen(
-            command,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-            preexec_fn=end_with_parent,
-        )
-        started.append(process)
-        return process
+        words = [sys.executable, "-c", PROGRAM, str(path), repr(options)]
+        started.append(Command(domain, words))
+        return started[-1]
 
     yield start
     for process in started:
-        process.kill()
-        process.communicate()
+        process.close()
 
 
-def test_order_count_and_timing(bag: Path, listener: Listener, player: Callable[..., Any]) -> None:
+def clocks(peer: Peer) -> list[int]:
+    """Times of /clock, ns."""
+    return [m.clock.sec * 10**9 + m.clock.nanosec for m in peer.received("/clock")]
+
+
+def positions(peer: Peer) -> list[float]:
+    return [message.position[0] for message in peer.received("/joint_states")]
+
+
+def test_order_count_and_timing(bag: Path, peer: Peer, player: Callable[..., Command]) -> None:
     rate = 2.0
-    listener.listen(JointState, "joint_states")
-    listener.listen(
-        String, "note", QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
-    )
-    topics = ["/joint_states", "/note"]
-    process = player(bag, rate=rate, topics=topics)
-    listener.spin(lambda: process.poll() is not None)
-    out, err = process.communicate()
-    assert process.returncode == 0, err
-    assert "Traceback" not in err
-    positions = [message.position[0] for message in listener.of("joint_states")]
-    assert positions == [float(index) for index in range(COUNT)]
+    peer.hear(JointState, "/joint_states", MANY)
+    peer.hear(String, "/note", QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT))
+    process = player(bag, rate=rate, topics=["/joint_states", "/note"])
+    peer.until(lambda: not process.alive() and len(positions(peer)) == COUNT)
+    assert process.wait() == 0, process.output
+    assert "Traceback" not in process.output
+    assert positions(peer) == [float(index) for index in range(COUNT)]
     # Best effort: some may be lost, none comes twice or late.
-    notes = [int(m.data) for m in listener.of("note")]
+    notes = [int(m.data) for m in peer.received("/note")]
     assert notes == sorted(set(notes)) and set(notes) <= set(range(0, COUNT, 10))
     # No message leaves before its time.
-    assert float(re.findall(r"duration=([0-9.]+)", out)[0]) >= (COUNT - 1) * PERIOD / rate - 1e-6
-    assert f"PlayResult(messages={COUNT + COUNT // 10}, loops=1" in out
+    took = float(re.findall(r"duration=([0-9.]+)", process.output)[0])
+    assert took >= (COUNT - 1) * PERIOD / rate - 1e-6
+    assert f"PlayResult(messages={COUNT + COUNT // 10}, loops=1" in process.output
 
 
 def test_recorded_durability_is_offered(
-    bag: Path, listener: Listener, player: Callable[..., Any]
+    bag: Path, peer: Peer, player: Callable[..., Command]
 ) -> None:
     """A subscriber that asks for latched messages matches, which a volatile offer would not."""
     latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-    listener.listen(String, "elsewhere", latched)
+    peer.hear(String, "/elsewhere", latched)
     process = player(bag, remap={"/latched": "/elsewhere"}, topics=["/latched"])
-    listener.spin(lambda: len(listener.of("elsewhere")) == 1)
-    assert process.wait(DEADLINE) == 0
+    peer.until(lambda: len(peer.received("/elsewhere")) == 1)
+    assert process.wait() == 0
 
 
-def test_clock(bag: Path, listener: Listener, player: Callable[..., Any]) -> None:
+def test_clock(bag: Path, peer: Peer, player: Callable[..., Command]) -> None:
     """/clock runs at its rate in bag time and is there before the first message."""
-    listener.listen(Clock, "clock")
-    listener.listen(JointState, "joint_states")
+    peer.hear(Clock, "/clock", MANY)
+    peer.hear(JointState, "/joint_states", MANY)
     process = player(bag, clock=50.0, rate=2.0, topics=["/joint_states"])
-    listener.spin(lambda: process.poll() is not None)
-    assert process.returncode == 0, process.communicate()[1]
-    times = [m.clock.sec * 10**9 + m.clock.nanosec for m in listener.of("clock")]
+    peer.until(lambda: not process.alive() and len(positions(peer)) == COUNT)
+    assert process.wait() == 0, process.output
+    times = clocks(peer)
     assert times[0] == FIRST
-    steps = [after - before for before, after in pairwise(times)]
-    assert all(abs(step - 40_000_000) <= 1 for step in steps)
+    assert all(abs(after - before - 40_000_000) <= 1 for before, after in pairwise(times))
     assert len(times) == pytest.approx(13, abs=2)
 
 
-def test_loop_ends_by_sigint(bag: Path, listener: Listener, player: Callable[..., Any]) -> None:
-    listener.listen(JointState, "joint_states")
-    listener.listen(Clock, "clock")
+def test_loop_ends_by_sigint(bag: Path, peer: Peer, player: Callable[..., Command]) -> None:
+    peer.hear(JointState, "/joint_states", MANY)
+    peer.hear(Clock, "/clock", MANY)
     process = player(bag, loop=True, rate=4.0, clock=100.0, topics=["/joint_states"])
-    listener.spin(lambda: len(listener.of("joint_states")) > 2 * COUNT + 10)
-    process.send_signal(signal.SIGINT)
-    out, err = process.communicate(timeout=DEADLINE)
-    assert (process.returncode, "Traceback" in err) == (0, False), err
-    assert "interrupted=True" in out
+    peer.until(lambda: len(positions(peer)) > 2 * COUNT + 10)
+    assert process.stop() == 0
+    out = process.output
+    assert "interrupted=True" in out and "Traceback" not in out
     # A busy machine has the signal some loops later.
     loops = int(out.partition("loops=")[2].partition(",")[0])
     assert loops >= 2
-    positions = [message.position[0] for message in listener.of("joint_states")]
     # A listener that is held up misses some; what it has is in order, loop by loop.
-    assert set(positions) <= set(map(float, range(COUNT)))
-    assert 1 <= sum(after <= before for before, after in pairwise(positions)) <= loops
-    times = [m.clock.sec * 10**9 + m.clock.nanosec for m in listener.of("clock")]
-    assert 3 <= times.count(FIRST) <= loops + 1
+    found = positions(peer)
+    assert set(found) <= set(map(float, range(COUNT)))
+    assert 1 <= sum(after <= before for before, after in pairwise(found)) <= loops
+    assert 3 <= clocks(peer).count(FIRST) <= loops + 1
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_signal_during_a_long_pause(
-    tmp_path: Path, listener: Listener, player: Callable[..., Any], number: signal.Signals
+    tmp_path: Path, peer: Peer, player: Callable[..., Command], number: signal.Signals
 ) -> None:
     path = tmp_path / "pause.mcap"
     with BagWriter(path) as writer:
-        writer.add_topic("/note", "std_msgs/msg/String")
-        writer.write("/note", String(data="first"), FIRST)
-        writer.write("/note", String(data="an hour later"), FIRST + 3600 * 10**9)
-    listener.listen(String, "note")
+        writer.add_topic("/pause", "std_msgs/msg/String")
+        writer.write("/pause", String(data="first"), FIRST)
+        writer.write("/pause", String(data="an hour later"), FIRST + 3600 * 10**9)
+    peer.hear(String, "/pause")
     process = player(path)
-    listener.spin(lambda: len(listener.heard) == 1)
+    peer.until(lambda: peer.received("/pause"))
     # An impatient person, or a terminal and a launcher both: handlers interrupt each other.
-    for _ in range(5):
-        process.send_signal(number)
-    _, err = process.communicate(timeout=DEADLINE)
-    assert (process.returncode, "Traceback" in err) == (0, False), err
+    assert process.stop(number, times=5) == 0
+    assert "Traceback" not in process.output
 
 
-def test_missing_subscribers_are_named(bag: Path, player: Callable[..., Any]) -> None:
-    process = player(bag, rate=100.0, wait_for_subscribers=0.2, topics=["/note"], progress=False)
-    out, err = process.communicate(timeout=DEADLINE)
-    assert process.returncode == 0
-    assert err == "no subscriber after 0.2 s: /note\n" and f"messages={COUNT // 10}" in out
+def test_missing_subscribers_are_named(bag: Path, player: Callable[..., Command]) -> None:
+    process = player(bag, rate=100.0, wait_for_subscribers=0.2, topics=["/note"], progress=False,
+                     remap={"/note": "/nobody"})  # fmt: skip
+    assert process.wait() == 0, process.output
+    assert "no subscriber after 0.2 s: /nobody\n" in process.output
+    assert f"messages={COUNT // 10}" in process.output
 
 
 def test_refusals(bag: Path, tmp_path: Path) -> None:
@@ -260,9 +199,9 @@ def test_log_times_that_no_clock_can_tell_are_refused(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("mode", ["", "MESSAGE", "FILE"])
 def test_a_folder_is_played_whole(
-    bag: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, mode: str
+    bag: Path, tmp_path: Path, domain: Domain, monkeypatch: pytest.MonkeyPatch, mode: str
 ) -> None:
-    monkeypatch.setenv("ROS_DOMAIN_ID", str(DOMAIN))
+    monkeypatch.setenv("ROS_DOMAIN_ID", str(domain.number))
     monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
     folder = make_folder(tmp_path / "rec", bag, mode=mode)
     found = play(folder, rate=100.0, wait_for_subscribers=0.0, progress=False)

@@ -9,11 +9,10 @@ import pytest
 import yaml
 
 from pkm_twin.apps.nodes import MODULES
-from pkm_twin.state.scene import Load, Scene
+from pkm_twin.state.scene import Scene
 from pkm_twin.state.state import MachineState
-from stiffness_monitor import compliance, strain_energy
-from stiffness_monitor.compliance import member_deflections
 from test.nodes.harness import REPOSITORY, SECOND, Maker, Plain
+from test.nodes.test_machine_state import loaded
 from test.nodes.test_tables import rows
 from test.support.robots import load
 
@@ -67,19 +66,8 @@ def test_rviz_knows_every_kind_of_marker():
     robot = load("upr_rpu")
     q, now = robot.inverse(robot.home()), 1_000 * SECOND
     message = Maker(Plain()).joint_state(robot.joint_names, q, stamp=now)
-    wrench = [30.0, -20.0, -100.0, 3.0, -2.0, 1.0]
-    energy = strain_energy(robot, robot.home(), wrench)
-    shapes = Scene(robot).shapes(
-        MachineState(robot).joint_state(message, now),
-        Load(
-            energy.deflection * 0.0 + wrench,
-            compliance(robot, robot.home()),
-            energy.deflection,
-            dict(zip(energy.elements, energy.factors.tolist(), strict=True)),
-            str(energy.dominant),
-            member_deflections(robot, robot.graph.home, wrench),
-        ),
-    )
+    state = MachineState(robot).joint_state(message, now)
+    shapes = Scene(robot).shapes(state, loaded(robot, q))
     assert set(markers["Namespaces"]) == {shape.group for shape in shapes}
 
 

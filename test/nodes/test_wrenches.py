@@ -15,7 +15,6 @@ from pkm_twin.machine import rotations
 from pkm_twin.streams.differentiator import Differentiator
 from pkm_twin.streams.matched import WrenchWindow, window_weights
 from pkm_twin.streams.wrench import Mount, TimeCache, WrenchReader, WrenchSettings
-from stiffness_monitor.monitor import Monitor
 from test.nodes.harness import REPOSITORY, SECOND, Maker, Plain
 from test.support.robots import load
 
@@ -94,25 +93,6 @@ class TestMounts:
         with pytest.raises(ParameterError, match=named):
             WrenchSettings(**options)
 
-    def test_the_monitor_answers_as_for_the_moved_wrench(self):
-        robot = load("upr_rpu")
-        q = robot.inverse([-0.7, 0.2, -0.15])
-
-        def answer(wrench, **settings):
-            twin = Monitor(robot, WrenchSettings(**settings))
-            twin.joint_state(MAKE.joint_state(robot.joint_names, q, stamp=NOW), NOW)
-            frame = settings["wrench_frame"]
-            return twin.wrench(MAKE.wrench(wrench, NOW, frame), NOW)
-
-        there = answer(WRENCH, wrench_frame="ft", sensor_xyz=XYZ, sensor_rpy=RPY)
-        turn = robot.platform(q)[1]
-        axes = turn @ rotations.from_rpy(np.array(RPY))
-        force = axes @ WRENCH[:3]
-        moment = axes @ WRENCH[3:] + np.cross(turn @ XYZ, force)
-        here = answer([*force, *moment], wrench_frame="base_link")
-        assert np.allclose(there.wrench, here.wrench, rtol=1e-12)
-        assert np.allclose(there.energy.deflection, here.energy.deflection, rtol=1e-11)
-
 
 def test_the_nearest_of_recent_values_is_that_of_all():
     rng = np.random.default_rng(4)
@@ -181,19 +161,6 @@ class TestTorques:
         turn = self.ROBOT.platform(q)[1]
         fixed = np.concatenate((turn @ wrench[:3], turn @ wrench[3:]))
         return inverse_dynamics(self.ROBOT, q, qd, qdd, fixed)
-
-    def test_torque_and_residual_bear_the_wrench(self):
-        core = self.core()
-        for i in range(12):
-            self.push(core, i)
-            result = self.answer(core, i, effort=[1.0, 2.0, 3.0])
-        exact = self.expected(result, WRENCH)
-        free = self.expected(result, np.zeros(6))
-        assert np.abs(exact - free).max() > 10.0
-        # The platform hardly turns within the window.
-        assert np.allclose(result.effort, exact, atol=0.02 * np.abs(exact - free).max())
-        assert np.allclose(result.residual, [1.0, 2.0, 3.0] - result.effort, atol=1e-9)
-        assert (core.wrenches.stream.accepted, core.wrenches.without) == (12, 0)
 
     def test_a_wrench_that_comes_after_its_joint_state_is_the_same(self):
         first, second = self.core(), self.core()
