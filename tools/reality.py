@@ -202,9 +202,8 @@ removed). It does not show other heights, tilts above 2 degrees, loads, or chang
 ```
 
 A constant friction does not explain the data: friction grows with the load. The owner has repeated the test with weighed
-masses: 0.0564 +- 0.0011 N m/A, both together 0.0570 +- 0.0008 N m/A. The holding current at one pose differs by up to 1.5 A
-with the direction of approach, because dry friction supports any load between its limits. So compare a model with currents
-of slow motion in both directions, not with holding currents.
+masses: 0.0564 +- 0.0011 N m/A, both together 0.0570 +- 0.0008 N m/A. Holding currents differ by up to 1.5 A with the
+direction of approach: compare a model with currents of slow motion in both directions.
 """  # noqa: E501
 
 

@@ -187,8 +187,8 @@ class ReadsMotions(ReadsRecordings):
 
     follow: str | None = setting(
         None,
-        "which columns of a table with joint positions and pose are the motion: joints, or pose, "
-        "which plans it again for this robot; default: both, which have to agree",
+        "columns of a table that are the motion: joints, or pose, which plans it again for this "
+        "robot; default: both, which have to agree",
         choices=("joints", "pose"),
     )
 
@@ -247,8 +247,8 @@ class OfTool:
     )  # fmt: skip
     damping: tuple[float, ...] | None = setting(
         None,
-        "damping ratio of all modes, or one per mode from the lowest on; the last one also holds "
-        "for all higher modes; default: `modal_damping` of the robot file",
+        "damping ratio of each mode from the lowest on; the last one holds for all others; "
+        "default: the robot file's",
         count=0,
     )
 

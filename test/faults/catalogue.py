@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import ast
 import functools
+import re
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -35,8 +36,8 @@ def rows() -> list[Row]:
 
 
 def line(row: Row) -> str:
-    """A row on the page."""
-    return f"* {row.fault}: {row.answer}"
+    """A row on the page, without what stands in parentheses."""
+    return re.sub(r" \([^()]*\)(?!`)", "", f"* {row.fault}: {row.answer}")
 
 
 @functools.cache

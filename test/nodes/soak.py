@@ -298,7 +298,8 @@ suspensions of a node, {kill:,} kills of the player. `stale_after` and `deadline
 
 ![Memory, descriptors, threads and ages of a long run](soak.png)
 
-{nodes}
+Memory grew by {grown:.1f} MiB at most from the first to the last third of the time, descriptors and
+threads by {more:g}.
 
 Ages of answers at their publication, on two cores that did much other work:
 
@@ -311,20 +312,9 @@ computer delayed after the check, and the topic's deadline reports it.
 
 def section(summary):
     """The figures as a part of the page on errors."""
-    nodes = [
-        "| node | memory, first third (MiB) | last third | descriptors, threads |",
-        "|---" * 4 + "|",
-    ]
-    for name, node in summary["nodes"].items():
-        memory = node["memory, bytes"]
-        mebibytes = [memory[part] / 2**20 for part in ("first", "last")]
-        counts = [
-            f"{node[what]['first']:g} to {node[what]['last']:g}"
-            for what in ("descriptors", "threads")
-        ]
-        nodes.append(
-            f"| {name} | {mebibytes[0]:.2f} | {mebibytes[1]:.2f} | {counts[0]}, {counts[1]} |"
-        )
+    parts = [(node["memory, bytes"], node["descriptors"], node["threads"])
+             for node in summary["nodes"].values()]  # fmt: skip
+    grown, *more = (max(part[k]["last"] - part[k]["first"] for part in parts) for k in range(3))
     ages = [
         f"| answers | count | {' | '.join(QUANTILES)} (ms) | older than {STALE:g} s |",
         "|---" * (3 + len(QUANTILES)) + "|",
@@ -338,7 +328,8 @@ def section(summary):
         minutes=summary["minutes"],
         sent=summary["joint states sent"],
         stale=STALE,
-        nodes="\n".join(nodes),
+        grown=grown / 2**20,
+        more=max(more),
         ages="\n".join(ages),
         **summary["happened"],
     )

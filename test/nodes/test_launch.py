@@ -69,9 +69,9 @@ class TestText:
     @pytest.mark.parametrize("name", FILES)
     def test_the_page_lists_every_argument_with_its_default(self, name):
         page = (REPOSITORY / "docs" / "launch.md").read_text(encoding="utf-8")
-        table = page.split(f"| `{name}.launch.py` |")[1].split("\n\n")[0]
-        rows = re.findall(r"^\| `(\w+)` \|(.*?)\|", table, re.MULTILINE)
-        listed = {argument: default.strip("` ") for argument, default in rows}
+        listing = page.split(f"**`{name}.launch.py`**")[1].split("\n\n")[1]
+        rows = re.findall(r"^\* `(\w+)`(?: \(`(.*?)`\))?:", listing, re.MULTILINE)
+        listed = dict(rows)
         assert listed == {key: default for key, (default, _) in literal(name, "ARGUMENTS").items()}
 
     def test_every_node_has_its_switch_and_knows_its_parameters(self):

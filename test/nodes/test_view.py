@@ -23,10 +23,9 @@ def topics():
     """Absolute names of all topics, and their types; docs/nodes.md's tables are the nodes'."""
     found = {"/diagnostics": "diagnostic_msgs/DiagnosticArray"}
     for node in MODULES:
-        for cells in rows(node):
-            if cells[0] in ("in", "out"):
-                name = cells[1].strip("`").replace("~", f"/{node}")
-                found["/" + name.lstrip("/")] = cells[2]
+        for way, name, kind in rows(node):
+            if way != "service":
+                found["/" + name.replace("~", f"/{node}").lstrip("/")] = kind
     return found
 
 

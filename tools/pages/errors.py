@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import ast
-import inspect
 import sys
 from pathlib import Path
 
@@ -15,10 +14,9 @@ from test.support.pages import write_section
 ROOT = Path(__file__).parents[2]
 HEAD = """All errors are subclasses of `PkmTwinError`, one line each: what is wrong, where, what is
 expected. Commands print it on stderr and end with exit code 1, or 2 for wrong usage of an option.
-Nodes reject the message and count it by its reason in `/diagnostics`.
+Nodes reject the message and count it by its reason in `/diagnostics`. [Python](api.md#errors) has
+their attributes. Examples, and what to do:
 
-| error | also a | meaning | example | what to do |
-|---|---|---|---|---|
 """
 ERRORS = {
     errors.ParameterError: (
@@ -127,15 +125,9 @@ def section() -> str:
     """The part of the page."""
     lines = []
     for kind, (example, hint) in ERRORS.items():
-        bases = ", ".join(f"`{base.__name__}`" for base in kind.__bases__)
-        meaning = inspect.cleandoc(kind.__doc__ or "").replace("``", "`").replace("\n\n", " ")
-        cells = [f"`{kind.__name__}`", bases, " ".join(meaning.split()), f"`{example}`", hint]
-        lines.append("| " + " | ".join(cells) + " |")
-    text = (
-        "\n\n## Reasons of rejected messages: stale, lost, invalid\n\n"
-        "| reason | meaning | what to do |\n|---|---|---|\n"
-    )
-    rows = [f"| {reason} | {what} | {hint} |" for reason, (what, hint) in sorted(REASONS.items())]
+        lines.append(f"* **`{kind.__name__}`**: `{example}`: {hint}.")
+    text = "\n\n## Reasons of rejected messages: stale, lost, invalid\n\n"
+    rows = [f"* {reason}: {what}; {hint}" for reason, (what, hint) in sorted(REASONS.items())]
     return HEAD + "\n".join(lines) + text + "\n".join(rows)
 
 

@@ -20,9 +20,7 @@ from test.support.pages import write_section
 
 GIVEN: Final = {"command_gate": ("on_stop:=gravity",)}
 """Without it the gate has no payload."""
-HEAD: Final = "| parameter | default; unit, values | |\n|---|---|---|\n"
 GROUPS: Final = {"in": "topics subscribe", "out": "topics publish", "service": "services reply"}
-TOPICS: Final = "| | topic | type | |\n|---|---|---|---|\n"
 
 
 def class_of(node: str) -> Any:
@@ -58,16 +56,16 @@ def rows_of(node: str) -> dict[str, tuple[Any, Setting]]:
 
 
 def row(name: str, default: Any, setting: Setting) -> str:
-    """A parameter's line of the table."""
+    """A parameter's line."""
     values = [setting.usual or _value(default), _values(setting), "" if setting.fixed else "live"]
-    return f"| `{name}` | {'; '.join(filter(None, values))} | {setting.text} |\n"
+    return f"* `{name}` ({'; '.join(filter(None, values))}): {setting.text}\n"
 
 
 def topic_row(row: Topic) -> str:
-    """A topic's line of the table."""
+    """A topic's line."""
     when = f"only with {row.when}: " if row.when else ""
     kept = "; transient local" if row.latched else ""
-    return f"| {row.way} | `{row.name}` | {row.kind} | {when}{row.text}{kept} |\n"
+    return f"* {row.way} `{row.name}` ({row.kind}): {when}{row.text}{kept}\n"
 
 
 def _value(value: Any) -> str:
@@ -98,12 +96,12 @@ def parts() -> dict[str, str]:
     rows = {node: {k: row(k, *v) for k, v in rows_of(node).items()} for node in MODULES}
     times = Counter(line for own in rows.values() for line in own.values())
     shared = sorted(line for line, count in times.items() if count > 1)
-    found = {"all nodes": HEAD + "".join(shared)}
+    found = {"all nodes": "".join(shared)}
     for node, own in rows.items():
-        topics = TOPICS + "".join(map(topic_row, class_of(node).topics.values()))
+        topics = "".join(map(topic_row, class_of(node).topics.values()))
         lines = "".join(line for line in own.values() if line not in shared)
         names = ", ".join(f"`{name}`" for name, line in own.items() if line in shared)
-        found[node] = f"{topics}\n{HEAD}{lines}\nAs [all nodes](#all-nodes): {names}."
+        found[node] = f"{topics}\nParameters:\n\n{lines}\nAs [all nodes](#all-nodes): {names}."
     return found
 
 

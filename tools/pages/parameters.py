@@ -24,8 +24,8 @@ from pkm_twin.settings import settings_of
 HEAD = """# Robot files
 
 The keys of a robot's YAML with their valid values and defaults. SI units, angles in rad, z up.
-Anything else is rejected, with the name of the key. Of two units, the first is for joints that
-rotate, the second for joints that slide; `pkm-twin info ROBOT` prints a robot's values and units.
+Anything else is rejected, with the name of the key. Of two units, joints that turn have the first,
+those that slide the second. Defaults stand in brackets; `pkm-twin info ROBOT` prints all values.
 An inertia is three principal moments or a symmetric 3x3 matrix whose moments are not negative and
 keep the triangle rule.
 
@@ -38,7 +38,6 @@ UNITS = {
     "{effort}": "N m or N",
     "{rotor}": "kg m2 or kg",
 }
-TABLE = "| key | unit: values | default |\n|---|---|---|"
 ROBOTS = {
     "delta": delta.Delta, "linear_delta": linear_delta.LinearDelta, "prru": prru.Prru,
     "upr_rpu": upr_rpu.UprRpu,
@@ -71,7 +70,7 @@ def default(field):
 
 
 def rows(kind, without=(), prefix=""):
-    """A row a key, nested sections behind the key that holds them."""
+    """A line a key, nested sections behind the key that holds them."""
     fields = {field.name: field for field in dataclasses.fields(kind)}
     for name, (own, row) in settings_of(kind).items():
         if name in without:
@@ -84,8 +83,9 @@ def rows(kind, without=(), prefix=""):
             bound = re.sub("^number(, | )", "", row.bound)
         unit, values = UNITS.get(row.unit, row.unit), "; ".join(filter(None, (bound, row.text)))
         if values != "a section":
-            told = f"{unit}: {values}" if unit else values
-            yield f"| `{prefix}{name}` | {told} | {default(fields[own])} |"
+            given = default(fields[own])
+            given = f"; {given}" if given == "required" else f" [{given}]" if given else ""
+            yield f"* `{prefix}{name}`{f' ({unit})' if unit else ''}: {values}{given}"
         inner = row.section or row.entries
         if inner and not other:
             yield from rows(inner, (), f"{prefix}{name}.")
@@ -94,20 +94,20 @@ def rows(kind, without=(), prefix=""):
 def table(kind, without=(), prefix=""):
     """What a class says about its keys, and the keys."""
     said = inspect.cleandoc(kind.__doc__).replace("``", "`")
-    return f"{said}\n\n{TABLE}\n" + "\n".join(rows(kind, without, prefix))
+    return f"{said}\n\n" + "\n".join(rows(kind, without, prefix))
 
 
 def page():
     """The whole page."""
     common, shared = set(settings_of(Common)), set(settings_of(Mechanism))
-    parts = [HEAD.rstrip(), f"## Every file\n\n{TABLE}\n" + "\n".join(rows(Common))]
+    parts = [HEAD.rstrip(), "## Every file\n\n" + "\n".join(rows(Common))]
     listed = "\n".join(rows(Mechanism, common))
-    parts.append(f"## Every mechanism but `machine`\n\n{TABLE}\n{listed}")
+    parts.append(f"## Every mechanism but `machine`\n\n{listed}")
     for name, kind in ROBOTS.items():
         own = shared - {"limits"} if name == "upr_rpu" else shared
         flat = {key for key, (_, row) in settings_of(kind).items() if row.section is None}
         keep = set(settings_of(kind)) - (flat - own)
-        parts.append(f"## `mechanism: {name}`\n\n{TABLE}\n" + "\n".join(rows(kind, keep)))
+        parts.append(f"## `mechanism: {name}`\n\n" + "\n".join(rows(kind, keep)))
         for key, (_, row) in settings_of(kind).items():
             if row.section is not None and key not in own:
                 parts.append(f"### `{key}`\n\n{table(row.section)}")

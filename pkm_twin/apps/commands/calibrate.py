@@ -77,15 +77,14 @@ class Calibrate(OfRobot, ReadsTables, BeyondLimitsToo, Accepts, Overwrites):
     )
     transmission: Transmission = setting(
         Transmission.AUTO,
-        "ratios of joint_map to fit: each joint's, one factor shared by all, each and its change "
-        "with travel (a spool), or none (file); auto: each of sliding joints that have a ratio",
+        "ratios of joint_map to fit: each, one shared factor, each with its change over travel, "
+        "none (file); auto: of sliding joints that have one",
         choices={str(how): how for how in Transmission},
     )
     measure: tuple[str, ...] = setting(
         (),
-        "what was measured, where not whole poses, separated by commas: height, distance (of two "
-        "poses), radius (ball bar), range (laser tracker), plane (contact), tilt (roll, pitch), or "
-        "of x, y, z, roll, pitch, yaw",
+        "what was measured, where not whole poses: height, distance, radius, range, plane, tilt, "
+        "or of x, y, z, roll, pitch, yaw; separated by commas",
     )
     noise: tuple[str, ...] = setting(
         (), "KIND=VALUE: known standard deviation of a measurement, m or rad"

@@ -84,7 +84,7 @@ class Motion(Carries, ReadsTables, AwayFromSingular, Writes, Draws):
     )
     blend: float | None = setting(
         None, "distance from a corner at which rounding begins, m; 0 stops at every waypoint; "
-        "default: a smooth curve through the waypoints; in a cycle 0.8 of its rise", low=0.0,
+        "default: a smooth curve", low=0.0,
     )  # fmt: skip
     dwell: float = setting(0.0, "dwell at pick and at place, s", low=0.0)
     carries: tuple[str, ...] = setting(
@@ -123,9 +123,8 @@ class Motion(Carries, ReadsTables, AwayFromSingular, Writes, Draws):
     )  # fmt: skip
     share: float = setting(1.0, "fraction of the file's effort and velocity limits to use")
     shaper: str | None = setting(
-        None, "input shaper for the first natural frequency, which depends on the pose: zv, or "
-        "zvd, which tolerates more error of the frequency; costs half or one vibration at each "
-        "stop",
+        None, "input shaper for the first natural frequency: zv, or zvd, which tolerates more "
+        "error of the frequency",
     )  # fmt: skip
     damping: float | None = setting(
         None, "damping ratio of that mode; default: `modal_damping` of the robot file"

@@ -43,8 +43,7 @@ class View(CarriesAtTimes, ReadsRecordings):
     port: int = setting(8080, "port to listen on; 0: any free port")
     token: str | None = setting(
         None,
-        "access token, at least 16 characters; prefer the environment variable PKM_TWIN_TOKEN, "
-        "because other users can see the command line",
+        "access token, at least 16 characters; safer in the environment variable PKM_TWIN_TOKEN",
     )
 
 
