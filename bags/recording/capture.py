@@ -78,11 +78,6 @@ def require_within(values: Array, limits: Any, what: str) -> None:
         raise ValueError(f"{what} goes from {reached}, outside {limits}")
 
 
-def engine_version(distribution: str) -> str:
-    """Return the version of the engine that is installed."""
-    return importlib.metadata.version(distribution)
-
-
 def stamp(time_ns: int) -> dict[str, int]:
     """Return a builtin_interfaces/Time for nanoseconds since the recording began."""
     total = EPOCH_NS + time_ns
@@ -105,54 +100,6 @@ def steps(value: Array, step: float | Array) -> Array:
     return rounded
 
 
-def joint_state(
-    time_ns: int,
-    names: Sequence[str],
-    position: Array,
-    velocity: Array | None = None,
-    effort: Array | None = None,
-) -> dict[str, Any]:
-    """Return a sensor_msgs/JointState; what is not measured stays empty."""
-    return {
-        "header": header(time_ns, "base_link"),
-        "name": list(names),
-        "position": position.tolist(),
-        "velocity": [] if velocity is None else velocity.tolist(),
-        "effort": [] if effort is None else effort.tolist(),
-    }
-
-
-def joint_trajectory(
-    start_ns: int, step_ns: int, names: Sequence[str], motion: Sequence[Array]
-) -> dict[str, Any]:
-    """Return a trajectory_msgs/JointTrajectory.
-
-    :param motion: positions, velocities and accelerations, each of shape (points, 3).
-    """
-    points = [
-        {
-            "positions": position.tolist(),
-            "velocities": velocity.tolist(),
-            "accelerations": acceleration.tolist(),
-            "effort": [],
-            "time_from_start": {
-                "sec": k * step_ns // 1_000_000_000,
-                "nanosec": k * step_ns % 1_000_000_000,
-            },
-        }
-        for k, (position, velocity, acceleration) in enumerate(zip(*motion, strict=True))
-    ]
-    return {"header": header(start_ns, "base_link"), "joint_names": list(names), "points": points}
-
-
-def wrench_stamped(time_ns: int, frame: str, wrench: Array) -> dict[str, Any]:
-    """Return a geometry_msgs/WrenchStamped for force and moment, shape (6,), N and N m."""
-    return {
-        "header": header(time_ns, frame),
-        "wrench": {"force": vector3(wrench[:3]), "torque": vector3(wrench[3:])},
-    }
-
-
 def smooth(fraction: float) -> tuple[float, float, float]:
     """Rise from 0 to 1 by a quintic; value, first and second derivative to ``fraction``."""
     u = min(1.0, max(0.0, fraction))
@@ -163,24 +110,125 @@ def smooth(fraction: float) -> tuple[float, float, float]:
     )
 
 
+class WrenchSensor:
+    """What measures the load on a platform: noise and steps, N and N m."""
+
+    noise: Final = np.repeat((0.5, 0.02), 3)
+    step: Final = np.repeat((0.05, 0.001), 3)
+
+    def facts(self) -> dict[str, float]:
+        """Return what the metadata say of it."""
+        found = {}
+        for kind, unit, k in (("force", "N", 0), ("moment", "N_m", 3)):
+            found[f"{kind}_noise_{unit}"] = float(self.noise[k])
+            found[f"{kind}_step_{unit}"] = float(self.step[k])
+        return found
+
+    def read(self, wrench: Array, rng: np.random.Generator) -> Array:
+        """Return what it reads of a wrench, shape (6,)."""
+        return steps(wrench + self.noise * rng.normal(size=6), self.step)
+
+
 class Capture:
     """Messages of one recording, kept in memory and written in order of their log times.
 
-    :param facts: what the metadata record "pkm_twin" says, one text each.
+    :param name: of the recorder in this package.
+    :param parameters: of the machine that is simulated.
+    :param engine: what simulates it, and the distribution that it comes from.
+    :param facts: what else the metadata record "pkm_twin" says, one text each.
     """
 
-    def __init__(self, facts: Mapping[str, Any]) -> None:
-        self.facts: Final = {name: str(value) for name, value in facts.items()}
-        self._topics: dict[str, str] = {}
+    TOPICS: Final = {
+        "/joint_states": ("sensor_msgs/msg/JointState", 200_000),
+        "/wrench": ("geometry_msgs/msg/WrenchStamped", 300_000),
+        "/delta_dynamics/joint_trajectory": ("trajectory_msgs/msg/JointTrajectory", -50_000_000),
+        "/ground_truth/deflection": ("geometry_msgs/msg/TransformStamped", 400_000),
+        "/ground_truth/strain_energy": ("diagnostic_msgs/msg/DiagnosticArray", 400_000),
+        "/ground_truth/wrench": ("geometry_msgs/msg/WrenchStamped", 400_000),
+        "/measured_deflection": ("geometry_msgs/msg/TransformStamped", 400_000),
+    }
+    """Types of topics, and how much later than its stamp a message is logged, ns."""
+
+    def __init__(
+        self,
+        name: str,
+        robot: str,
+        parameters: Mapping[str, Any],
+        engine: tuple[str, str],
+        seed: int,
+        duration: float,
+        topics: Sequence[str],
+        facts: Mapping[str, Any],
+    ) -> None:
+        common = {
+            "robot": robot,
+            "source": "simulated",
+            "engine": engine[0],
+            "engine_version": importlib.metadata.version(engine[1]),
+            "recorder": f"bags.recording.{name}",
+            "parameters_sha256": parameters_digest(parameters),
+            "seed": seed,
+            "duration_s": duration,
+        }
+        self.names: Final = list(parameters["joints"])
+        self.facts: Final = {key: str(value) for key, value in {**common, **facts}.items()}
+        self._topics = topics
         self._messages: list[tuple[int, int, str, dict[str, Any]]] = []
 
-    def add_topic(self, topic: str, message_type: str) -> None:
-        """Declare a topic, reliable and volatile, ten messages deep."""
-        self._topics[topic] = message_type
+    def write(self, topic: str, time_ns: int, message: dict[str, Any]) -> None:
+        """Keep a message that is stamped ``time_ns`` after the recording's beginning."""
+        log_time = EPOCH_NS + time_ns + self.TOPICS[topic][1]
+        self._messages.append((log_time, len(self._messages), topic, message))
 
-    def write(self, topic: str, message: dict[str, Any], log_time_ns: int) -> None:
-        """Keep a message; ``log_time_ns`` counts from the recording's beginning."""
-        self._messages.append((EPOCH_NS + log_time_ns, len(self._messages), topic, message))
+    def joint_state(
+        self,
+        time_ns: int,
+        position: Array,
+        velocity: Array | None = None,
+        effort: Array | None = None,
+    ) -> None:
+        """Keep a sensor_msgs/JointState; what is not measured stays empty."""
+        message = {
+            "header": header(time_ns, "base_link"),
+            "name": self.names,
+            "position": position.tolist(),
+            "velocity": [] if velocity is None else velocity.tolist(),
+            "effort": [] if effort is None else effort.tolist(),
+        }
+        self.write("/joint_states", time_ns, message)
+
+    def wrench(self, topic: str, time_ns: int, frame: str, wrench: Array) -> None:
+        """Keep a geometry_msgs/WrenchStamped of force and moment, shape (6,), N and N m."""
+        message = {
+            "header": header(time_ns, frame),
+            "wrench": {"force": vector3(wrench[:3]), "torque": vector3(wrench[3:])},
+        }
+        self.write(topic, time_ns, message)
+
+    def trajectory(self, start_ns: int, step_ns: int, motion: Sequence[Array]) -> None:
+        """Keep a trajectory_msgs/JointTrajectory.
+
+        :param motion: positions, velocities and accelerations, each of shape (points, 3).
+        """
+        points = [
+            {
+                "positions": position.tolist(),
+                "velocities": velocity.tolist(),
+                "accelerations": acceleration.tolist(),
+                "effort": [],
+                "time_from_start": {
+                    "sec": k * step_ns // 1_000_000_000,
+                    "nanosec": k * step_ns % 1_000_000_000,
+                },
+            }
+            for k, (position, velocity, acceleration) in enumerate(zip(*motion, strict=True))
+        ]
+        message = {
+            "header": header(start_ns, "base_link"),
+            "joint_names": self.names,
+            "points": points,
+        }
+        self.write("/delta_dynamics/joint_trajectory", start_ns, message)
 
     def save(self, path: Path) -> None:
         """Write the bag, replacing an older one of the same name."""
@@ -192,8 +240,8 @@ class Capture:
             metadata={"pkm_twin": self.facts},
             flush_period=None,
         ) as bag:
-            for topic, message_type in self._topics.items():
-                bag.add_topic(topic, message_type)
+            for topic in self._topics:
+                bag.add_topic(topic, self.TOPICS[topic][0])
             for log_time, _, topic, message in sorted(self._messages, key=lambda entry: entry[:2]):
                 bag.write(topic, message, log_time)
         part.replace(path)

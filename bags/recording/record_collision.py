@@ -15,30 +15,23 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from bags.recording.capture import (
-    Capture,
-    Progress,
-    engine_version,
-    machine_parameters,
-    parameters_digest,
-    require_within,
-    wrench_stamped,
-)
+from bags.recording.capture import Capture, Progress, machine_parameters, require_within
+from bags.recording.control import ENGINE, PERIOD_NS, simulate
 from bags.recording.pinocchio_delta import DeltaEngine
 from bags.recording.record_delta_cu import (
     APPROACH,
+    DRIVES,
     DWELL,
     HOME,
     LEVEL,
     LIFT,
     MOVE,
-    PERIOD_NS,
     PICK_X,
     PLACE_X,
+    SENSORS,
     Move,
+    known,
     reference,
-    sensors,
-    simulate,
 )
 
 Array = NDArray[np.float64]
@@ -73,42 +66,27 @@ def plan() -> list[Move]:
 
 
 class Obstacle:
-    """The wall: what it does to the platform, world axes."""
+    """The wall, which writes into a bag what it does to the platform every few periods."""
 
-    def __init__(self, engine: DeltaEngine) -> None:
-        self._engine = engine
-
-    def __call__(self, time: float, configuration: Array, velocity: Array) -> Array | None:
-        """Force against the way in, (6,), None where they do not touch."""
-        if not APPEARS <= time < VANISHES:
-            return None
-        places = self._engine.pose_places
-        depth = configuration[places][0] - WALL
-        if depth <= 0.0:
-            return None
-        push = HARDNESS * depth + SOFTNESS * velocity[places][0]
-        return np.array([-max(push, 0.0), 0.0, 0.0, 0.0, 0.0, 0.0])
-
-
-class _Noting:
-    """An obstacle that writes into a bag what it did, every few periods."""
-
-    def __init__(self, obstacle: Obstacle, capture: Capture) -> None:
-        self._obstacle, self._capture, self._next = obstacle, capture, 0
+    def __init__(self, engine: DeltaEngine, capture: Capture) -> None:
+        self._places, self._capture, self._next = engine.pose_places, capture, 0
         self.first: float | None = None
         self.greatest = 0.0
 
     def __call__(self, time: float, configuration: Array, velocity: Array) -> Array | None:
-        wrench = self._obstacle(time, configuration, velocity)
-        if wrench is not None:
+        """Force against the way in, world axes, (6,), None where they do not touch."""
+        wrench = None
+        depth = configuration[self._places][0] - WALL
+        if APPEARS <= time < VANISHES and depth > 0.0:
+            push = HARDNESS * depth + SOFTNESS * velocity[self._places][0]
+            wrench = np.array([-max(push, 0.0), 0.0, 0.0, 0.0, 0.0, 0.0])
             self.first = time if self.first is None else self.first
             self.greatest = max(self.greatest, float(np.abs(wrench).max()))
         now = round(time * 1e9)
         if now >= self._next:
             self._next = now + WRENCH_STRIDE * PERIOD_NS
             load = np.zeros(6) if wrench is None else wrench
-            message = wrench_stamped(now, "base_link", load)
-            self._capture.write("/ground_truth/wrench", message, now + 400_000)
+            self._capture.wrench("/ground_truth/wrench", now, "base_link", load)
         return wrench
 
 
@@ -120,26 +98,17 @@ def record(path: Path, seed: int = 20250104, progress: Progress | None = None) -
     motion = reference(engine, plan(), DURATION)
     limits = parameters.get("limits") or {}
     require_within(motion[0], limits.get("position"), "the arms' path")
-    capture = Capture({})
-    capture.add_topic("/joint_states", "sensor_msgs/msg/JointState")
-    capture.add_topic("/ground_truth/wrench", "geometry_msgs/msg/WrenchStamped")
-    wall = _Noting(Obstacle(engine), capture)
-    rng = np.random.default_rng(seed)
-    simulate(capture, motion, lambda _: engine, rng, push=wall, progress=progress)
+    topics = ("/joint_states", "/ground_truth/wrench")
+    capture = Capture(
+        "record_collision", "delta_cu", parameters, ENGINE, seed, DURATION, topics, {}
+    )
+    wall, rng = Obstacle(engine, capture), np.random.default_rng(seed)
+    simulate(capture, motion, lambda _: engine, DRIVES, known, rng, wall, progress)
     facts = {
-        "robot": "delta_cu",
-        "source": "simulated",
-        "engine": "pinocchio constrained forward dynamics",
-        "engine_version": engine_version("pin"),
-        "recorder": "bags.recording.record_collision",
-        "parameters_sha256": parameters_digest(parameters),
-        "seed": seed,
-        "duration_s": DURATION,
         "contact_begins_s": f"{wall.first:.4f}",
         "contact_force_N": f"{wall.greatest:.1f}",
         "contact_stiffness_N_m": HARDNESS,
         "contact_damping_N_s_m": SOFTNESS,
-        **sensors(),
     }
-    capture.facts.update({name: str(value) for name, value in facts.items()})
+    capture.facts.update({name: str(value) for name, value in (facts | SENSORS).items()})
     capture.save(path)

@@ -11,25 +11,14 @@ May import: numpy, the standard library, its neighbours in this package.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bags.recording.capture import (
-    Capture,
-    Progress,
-    engine_version,
-    joint_state,
-    joint_trajectory,
-    machine_parameters,
-    parameters_digest,
-    require_within,
-    smooth,
-    steps,
-)
+from bags.recording.capture import Capture, Progress, machine_parameters, require_within, smooth
+from bags.recording.control import ENGINE, PERIOD_NS, Drives, simulate
 from bags.recording.pinocchio_delta import DeltaEngine
 
 Array = NDArray[np.float64]
@@ -37,15 +26,8 @@ Array = NDArray[np.float64]
 NAME: Final = "delta_cu_pick_and_place"
 DURATION: Final = 20.0
 """Length of the recording, s."""
-PERIOD_NS: Final = 1_000_000
-"""Control and measurement period."""
-SUBSTEPS: Final = 2
-"""Runge-Kutta steps of the plant in one period."""
 TRAJECTORY_STRIDE: Final = 10
 """Control periods between two points of a commanded trajectory."""
-JOINT_STATE_LATENCY_NS: Final = 200_000
-TRAJECTORY_LEAD_NS: Final = 50_000_000
-"""How long before its start a trajectory is sent."""
 
 PAYLOAD_MASS: Final = 0.15
 PAYLOAD_COM: Final = (0.0, 0.0, -0.02)
@@ -66,19 +48,31 @@ APPROACH: Final = 0.60
 
 ENCODER_COUNTS: Final = 1 << 20
 """Encoder counts a revolution of the arm."""
-VELOCITY_NOISE: Final = 0.002
-VELOCITY_STEP: Final = 1e-4
-EFFORT_NOISE: Final = 0.006
-EFFORT_STEP: Final = 1e-3
-"""Standard deviations and resolutions of the drive's signals, rad/s and N m."""
-
-STIFFNESS: Final = 130.0
-DAMPING: Final = 1.7
-INTEGRAL: Final = 1500.0
+DRIVES: Final = Drives(
+    position_step=2.0 * math.pi / ENCODER_COUNTS,
+    velocity_noise=0.002,
+    velocity_step=1e-4,
+    effort_noise=0.006,
+    effort_step=1e-3,
+    stiffness=130.0,
+    damping=1.7,
+    integral=1500.0,
+)
+SENSORS: Final = {
+    "encoder_counts_per_revolution": ENCODER_COUNTS,
+    **DRIVES.facts("rad_s", "N_m"),
+}
+"""What the metadata say of the drives' signals."""
 NOMINAL_INERTIA: Final = 0.0085
 NOMINAL_WEIGHT: Final = 0.42
-"""The controller's gains, N m/rad, N m s/rad and N m/(rad s), and its idea of the machine:
-inertia at an arm, kg m2, and the torque that holds a level arm up, N m."""
+"""The controller's idea of the machine: inertia at an arm, kg m2, and the torque that holds a
+level arm up, N m."""
+
+
+def known(q: Array, qdd: Array) -> Array:
+    """Return the torques that the controller expects, N m."""
+    torques: Array = NOMINAL_INERTIA * qdd - NOMINAL_WEIGHT * np.cos(q)
+    return torques
 
 
 class Move(NamedTuple):
@@ -154,18 +148,6 @@ def reference(
     return q, qd, qdd
 
 
-def trajectory(
-    move: Move, names: list[str], motion: tuple[Array, Array, Array]
-) -> tuple[int, dict[str, Any]]:
-    """Return a movement's start, ns, and its trajectory_msgs/JointTrajectory."""
-    first = round(move.start * 1e9) // PERIOD_NS
-    length = round(move.duration * 1e9) // PERIOD_NS
-    picked = slice(first, first + length + 1, TRAJECTORY_STRIDE)
-    samples = tuple(part[picked] for part in motion)
-    start = first * PERIOD_NS
-    return start, joint_trajectory(start, TRAJECTORY_STRIDE * PERIOD_NS, names, samples)
-
-
 def standstill(moves: list[Move], after: float, *, picks: bool) -> float:
     """Return the middle of the first standstill at a pick or place point from a time on, s."""
     for move in moves:
@@ -175,72 +157,9 @@ def standstill(moves: list[Move], after: float, *, picks: bool) -> float:
     raise ValueError(f"no standstill after {after} s")
 
 
-def sensors() -> dict[str, float]:
-    """Return what the metadata say of the drives' signals."""
-    return {
-        "encoder_counts_per_revolution": ENCODER_COUNTS,
-        "velocity_noise_rad_s": VELOCITY_NOISE,
-        "velocity_step_rad_s": VELOCITY_STEP,
-        "effort_noise_N_m": EFFORT_NOISE,
-        "effort_step_N_m": EFFORT_STEP,
-    }
-
-
-def simulate(
-    capture: Capture,
-    motion: tuple[Array, Array, Array],
-    plant: Callable[[float], DeltaEngine],
-    rng: np.random.Generator,
-    *,
-    push: Callable[[float, Array, Array], Array | None] = lambda *_: None,
-    progress: Progress | None = None,
-) -> None:
-    """Run the machine along a reference under its controller and keep its joint states.
-
-    :param motion: of :func:`reference`.
-    :param plant: the machine as it is at a time, s.
-    :param push: wrench on the platform, world axes, at a time and a state of the tree.
-    """
-    begin = plant(0.0)
-    names: list[str] = list(begin.params["joints"])
-    limits = begin.params.get("limits") or {}
-    peak = np.asarray(limits.get("effort", np.inf), dtype=float)
-    configuration = begin.assemble(motion[0][0])
-    velocity = np.zeros_like(configuration)
-    torque = begin.inverse_dynamics(motion[0][0], np.zeros(3), np.zeros(3))
-    integral = torque - NOMINAL_WEIGHT * -np.cos(motion[0][0])
-    count = len(motion[0])
-    period = PERIOD_NS * 1e-9
-    for k in range(count):
-        engine = plant(k * period)
-        q = steps(configuration[engine.actuated], 2.0 * math.pi / ENCODER_COUNTS)
-        noise = rng.normal(size=(2, 3))
-        qd = steps(velocity[engine.actuated] + VELOCITY_NOISE * noise[0], VELOCITY_STEP)
-        effort = steps(torque + EFFORT_NOISE * noise[1], EFFORT_STEP)
-        time = k * PERIOD_NS
-        capture.write(
-            "/joint_states",
-            joint_state(time, names, q, qd, effort),
-            time + JOINT_STATE_LATENCY_NS,
-        )
-        error = motion[0][k] - q
-        integral = integral + INTEGRAL * error * period
-        feedforward = NOMINAL_INERTIA * motion[2][k] - NOMINAL_WEIGHT * np.cos(motion[0][k])
-        torque = feedforward + STIFFNESS * error + DAMPING * (motion[1][k] - qd) + integral
-        torque = np.clip(torque, -peak, peak)
-        for _ in range(SUBSTEPS):
-            wrench = push(k * period, configuration, velocity)
-            configuration, velocity = engine.step(
-                configuration, velocity, torque, wrench, period / SUBSTEPS
-            )
-        if progress is not None and k % 100 == 99:
-            progress((k + 1) / count)
-
-
 def record(path: Path, seed: int = 20250101, progress: Progress | None = None) -> None:
     """Simulate and write the bag."""
     parameters = machine_parameters("delta_cu")
-    names: list[str] = parameters["joints"]
     payload = {"mass": PAYLOAD_MASS, "com": PAYLOAD_COM}
     empty = DeltaEngine(parameters)
     laden = DeltaEngine({**parameters, "payload": payload})
@@ -253,33 +172,27 @@ def record(path: Path, seed: int = 20250101, progress: Progress | None = None) -
     require_within(motion[0], limits.get("position"), "the arms' path")
     pick = standstill(moves, PICK_AFTER, picks=True)
     release = standstill(moves, RELEASE_AFTER, picks=False)
+    facts = {
+        "payload_mass_kg": PAYLOAD_MASS,
+        "payload_com_m": " ".join(map(str, PAYLOAD_COM)),
+        "payload_picked_s": f"{pick:.3f}",
+        "payload_released_s": f"{release:.3f}",
+    }
+    topics = ("/joint_states", "/delta_dynamics/joint_trajectory")
     capture = Capture(
-        {
-            "robot": "delta_cu",
-            "source": "simulated",
-            "engine": "pinocchio constrained forward dynamics",
-            "engine_version": engine_version("pin"),
-            "recorder": "bags.recording.record_delta_cu",
-            "parameters_sha256": parameters_digest(parameters),
-            "seed": seed,
-            "duration_s": DURATION,
-            "payload_mass_kg": PAYLOAD_MASS,
-            "payload_com_m": " ".join(map(str, PAYLOAD_COM)),
-            "payload_picked_s": f"{pick:.3f}",
-            "payload_released_s": f"{release:.3f}",
-            **sensors(),
-        }
+        "record_delta_cu", "delta_cu", parameters, ENGINE, seed, DURATION, topics, facts | SENSORS
     )
-    capture.add_topic("/joint_states", "sensor_msgs/msg/JointState")
-    capture.add_topic("/delta_dynamics/joint_trajectory", "trajectory_msgs/msg/JointTrajectory")
     for move in moves:
-        start, message = trajectory(move, names, motion)
-        capture.write("/delta_dynamics/joint_trajectory", message, start - TRAJECTORY_LEAD_NS)
-
+        first, length = (round(t * 1e9) // PERIOD_NS for t in (move.start, move.duration))
+        picked = slice(first, first + length + 1, TRAJECTORY_STRIDE)
+        samples = [part[picked] for part in motion]
+        capture.trajectory(first * PERIOD_NS, TRAJECTORY_STRIDE * PERIOD_NS, samples)
     simulate(
         capture,
         motion,
         lambda time: laden if pick <= time < release else empty,
+        DRIVES,
+        known,
         np.random.default_rng(seed),
         progress=progress,
     )

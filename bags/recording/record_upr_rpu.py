@@ -10,6 +10,7 @@ May import: numpy, the standard library, its neighbours in this package.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Final
 
@@ -19,16 +20,13 @@ from numpy.typing import NDArray
 from bags.recording.capture import (
     Capture,
     Progress,
-    engine_version,
+    WrenchSensor,
     header,
-    joint_state,
     machine_parameters,
-    parameters_digest,
     require_within,
     smooth,
     steps,
     vector3,
-    wrench_stamped,
 )
 from bags.recording.frame_model import FrameSolution, UprRpuFrame
 from bags.recording.milling import Milling
@@ -42,9 +40,6 @@ PERIOD_NS: Final = 2_000_000
 """Measurement period of wrench and limb lengths."""
 TRUTH_STRIDE: Final = 25
 """Measurement periods between two solutions of the frame."""
-JOINT_STATE_LATENCY_NS: Final = 200_000
-WRENCH_LATENCY_NS: Final = 300_000
-TRUTH_LATENCY_NS: Final = 400_000
 
 CUTTER: Final = Milling(
     spindle_hz=47.0,
@@ -58,11 +53,7 @@ CUTTER: Final = Milling(
 
 LENGTH_STEP: Final = 1e-6
 LENGTH_NOISE: Final = 0.5e-6
-FORCE_NOISE: Final = 0.5
-FORCE_STEP: Final = 0.05
-MOMENT_NOISE: Final = 0.02
-MOMENT_STEP: Final = 0.001
-"""Standard deviations and resolutions of the sensors, m, N and N m."""
+"""Resolution and standard deviation of the limbs' lengths, m."""
 
 
 def pose(time: float) -> Array:
@@ -111,69 +102,67 @@ def energy_message(time_ns: int, solution: FrameSolution) -> dict[str, Any]:
     return {"header": header(time_ns, "base_link"), "status": [status]}
 
 
-def record(path: Path, seed: int = 20250102, progress: Progress | None = None) -> None:
-    """Simulate and write the bag."""
+def mill(
+    name: str,
+    topics: tuple[str, ...],
+    seed: int,
+    period_ns: int,
+    stride: int,
+    tell: Callable[[Capture, int, FrameSolution, np.random.Generator], None],
+    softer: Mapping[str, float],
+    before: Mapping[str, Any],
+    after: Mapping[str, Any],
+    progress: Progress | None,
+) -> Capture:
+    """Return a recording of the cut: lengths and wrenches, and what the frame does now and then.
+
+    :param tell: writes a solution of the frame, every ``stride`` periods.
+    :param softer: factors on the compliance of elements.
+    :param before, after: what the metadata say before and after the sensors.
+    """
     parameters = machine_parameters("upr_rpu")
-    names: list[str] = parameters.get("joints") or ["limb_1", "limb_2", "limb_3"]
-    frame = UprRpuFrame(parameters)
-    count = round(DURATION * 1e9) // PERIOD_NS
-    path_lengths = np.array([frame.limb_lengths(pose(k * PERIOD_NS * 1e-9)) for k in range(count)])
+    frame = UprRpuFrame({**parameters, "element_compliance": softer} if softer else parameters)
+    count = round(DURATION * 1e9) // period_ns
+    path_lengths = np.array([frame.limb_lengths(pose(k * period_ns * 1e-9)) for k in range(count)])
     limits = parameters.get("limits") or {}
     require_within(path_lengths, limits.get("limb_length"), "the limbs' length")
-    capture = Capture(
-        {
-            "robot": "upr_rpu",
-            "source": "simulated",
-            "engine": "PyNite 3D frame, linear static",
-            "engine_version": engine_version("PyNiteFEA"),
-            "recorder": "bags.recording.record_upr_rpu",
-            "parameters_sha256": parameters_digest(parameters),
-            "seed": seed,
-            "duration_s": DURATION,
-            "spindle_Hz": CUTTER.spindle_hz,
-            "tooth_passing_Hz": CUTTER.tooth_hz,
-            "limb_length_step_m": LENGTH_STEP,
-            "limb_length_noise_m": LENGTH_NOISE,
-            "force_noise_N": FORCE_NOISE,
-            "force_step_N": FORCE_STEP,
-            "moment_noise_N_m": MOMENT_NOISE,
-            "moment_step_N_m": MOMENT_STEP,
-        }
-    )
-    capture.add_topic("/joint_states", "sensor_msgs/msg/JointState")
-    capture.add_topic("/wrench", "geometry_msgs/msg/WrenchStamped")
-    capture.add_topic("/ground_truth/deflection", "geometry_msgs/msg/TransformStamped")
-    capture.add_topic("/ground_truth/strain_energy", "diagnostic_msgs/msg/DiagnosticArray")
-
-    rng = np.random.default_rng(seed)
-    spread = np.repeat((FORCE_NOISE, MOMENT_NOISE), 3)
-    grain = np.repeat((FORCE_STEP, MOMENT_STEP), 3)
+    sensor, rng = WrenchSensor(), np.random.default_rng(seed)
+    facts = {
+        **before,
+        "limb_length_step_m": LENGTH_STEP,
+        "limb_length_noise_m": LENGTH_NOISE,
+        **sensor.facts(),
+        **after,
+    }
+    engine = ("PyNite 3D frame, linear static", "PyNiteFEA")
+    topics = ("/joint_states", "/wrench", *topics)
+    capture = Capture(name, "upr_rpu", parameters, engine, seed, DURATION, topics, facts)
     for k in range(count):
-        time_ns = k * PERIOD_NS
-        time = time_ns * 1e-9
-        here, wrench = pose(time), CUTTER.wrench(time)
+        now = k * period_ns
+        here, wrench = pose(now * 1e-9), CUTTER.wrench(now * 1e-9)
         noise = LENGTH_NOISE * rng.normal(size=3)
-        lengths = steps(path_lengths[k] + noise, LENGTH_STEP)
-        measured = steps(wrench + spread * rng.normal(size=6), grain)
-        capture.write(
-            "/joint_states",
-            joint_state(time_ns, names, lengths),
-            time_ns + JOINT_STATE_LATENCY_NS,
-        )
-        capture.write(
-            "/wrench",
-            wrench_stamped(time_ns, "platform", measured),
-            time_ns + WRENCH_LATENCY_NS,
-        )
-        if k % TRUTH_STRIDE == 0:
+        capture.joint_state(now, steps(path_lengths[k] + noise, LENGTH_STEP))
+        capture.wrench("/wrench", now, "platform", sensor.read(wrench, rng))
+        if k % stride == 0:
             axes = frame.placement(here)[1]
             fixed = np.concatenate((axes @ wrench[:3], axes @ wrench[3:]))
-            solution = frame.solve(here, fixed)
-            for topic, message in (
-                ("/ground_truth/deflection", deflection_message(time_ns, solution)),
-                ("/ground_truth/strain_energy", energy_message(time_ns, solution)),
-            ):
-                capture.write(topic, message, time_ns + TRUTH_LATENCY_NS)
+            tell(capture, now, frame.solve(here, fixed), rng)
         if progress is not None and k % 100 == 99:
             progress((k + 1) / count)
+    return capture
+
+
+def truth(capture: Capture, now: int, solution: FrameSolution, _: np.random.Generator) -> None:
+    """Write a solution of the frame as it is."""
+    capture.write("/ground_truth/deflection", now, deflection_message(now, solution))
+    capture.write("/ground_truth/strain_energy", now, energy_message(now, solution))
+
+
+def record(path: Path, seed: int = 20250102, progress: Progress | None = None) -> None:
+    """Simulate and write the bag."""
+    topics = ("/ground_truth/deflection", "/ground_truth/strain_energy")
+    facts = {"spindle_Hz": CUTTER.spindle_hz, "tooth_passing_Hz": CUTTER.tooth_hz}
+    capture = mill(
+        "record_upr_rpu", topics, seed, PERIOD_NS, TRUTH_STRIDE, truth, {}, facts, {}, progress
+    )
     capture.save(path)
