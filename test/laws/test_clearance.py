@@ -11,7 +11,6 @@ import pytest
 import yaml
 from scipy.optimize import lsq_linear
 
-from delta_dynamics.torques.isotropy import tilted_pose
 from pkm_twin.errors import ParameterError
 from pkm_twin.maps.search import workspace_box
 from pkm_twin.robot.clearance import clearance, distance, has_clearance
@@ -63,35 +62,6 @@ def test_distance_is_the_least_over_both_segments(rng):
         assert segments(*points) == pytest.approx(bounded(*points), abs=1e-9), k % 7
 
 
-def test_no_two_points_are_nearer(rng):
-    along = np.linspace(0, 1, 201)
-    for a, b, c, d in pairs(rng, 70):
-        one, other = (p + along[:, None] * (q - p) for p, q in ((a, b), (c, d)))
-        sampled = np.linalg.norm(one[:, None] - other, axis=-1).min()
-        step = (np.linalg.norm(b - a) + np.linalg.norm(d - c)) / 400
-        assert sampled - step - 1e-12 <= segments(a, b, c, d) <= sampled + 1e-12
-
-
-def test_distances_that_are_known():
-    o, x, y, z = np.zeros(3), *np.eye(3)
-    known = [
-        ((-x, x, -y, y), 0.0),  # crossing
-        ((-x, x, z - y, z + y), 1.0),  # crossing above
-        ((o, x, x, x + y), 0.0),  # a common end
-        ((o, x, o, x), 0.0),  # the same
-        ((o, x, 3 * x, 2 * x), 1.0),  # on one line, apart
-        ((o, 2 * x, x, 3 * x), 0.0),  # on one line, overlapping
-        ((o, 2 * x, x + y, 3 * x + y), 1.0),  # parallel, side by side
-        ((o, x, 4 * x + 4 * y, 5 * x + 4 * y), 5.0),  # parallel, one after the other
-        ((o, x, 2 * x + y, 2 * x + 3 * y), math.sqrt(2)),
-        ((o, o, 3 * x, 3 * x), 3.0),  # points
-        ((o, o, y - x, y + x), 1.0),
-        ((y - x, y + x, o, o), 1.0),
-    ]
-    for points, expected in known:
-        assert segments(*points) == pytest.approx(expected, abs=1e-15)
-
-
 @pytest.mark.parametrize("angle", [1e-2, 1e-5, 1e-8, 1e-11])
 def test_nearly_parallel_segments_that_cross(angle):
     """They cross at a third of both, so their distance is their offset."""
@@ -101,16 +71,6 @@ def test_nearly_parallel_segments_that_cross(angle):
         assert segments(-u / 3, 2 * u / 3, up - v / 3, up + 2 * v / 3) == pytest.approx(
             offset, abs=1e-15
         )
-
-
-def test_motions_and_names_change_no_distance(rng):
-    for points in pairs(rng, 140):
-        expected = segments(*points)
-        turn, _ = np.linalg.qr(rng.normal(size=(3, 3)))
-        a, b, c, d = points @ turn + rng.normal(size=3)
-        for order in ((a, b, c, d), (c, d, a, b), (b, a, c, d), (a, b, d, c), (d, c, b, a)):
-            assert segments(*order) == pytest.approx(expected, abs=1e-12)
-        assert segments(*(3 * points)) == pytest.approx(3 * expected, abs=1e-12)
 
 
 def tube(diameter):
@@ -175,53 +135,6 @@ def test_members_are_those_of_the_frame(name, sections, variant, rng):
             if limbs[i] != limbs[j]
         ]
         assert float(clearance(robot, pose)) == pytest.approx(min(gaps), abs=1e-9)
-
-
-def test_machines_have_the_symmetry_of_their_limbs(rng):
-    third = 2 * np.pi / 3
-    turn, shift = rng.uniform(0, 2 * np.pi, 200), third * np.arange(3)[:, None]
-
-    delta = load("delta")
-    out, z = rng.uniform(0, 0.25, 200), rng.uniform(-0.5, -0.3, 200)
-    around = np.stack(
-        np.broadcast_arrays(out * np.cos(turn + shift), out * np.sin(turn + shift), z), -1
-    )
-    gaps = clearance(delta, around)
-    assert np.ptp(gaps[0]) > 1e-4
-    assert gaps[1:] == pytest.approx(np.broadcast_to(gaps[0], (2, 200)), abs=1e-12)
-
-    prru = load("prru")
-    gaps = clearance(prru, tilted_pose(0.83, turn + shift, rng.uniform(0, 0.4, 200)))
-    assert np.ptp(gaps[0]) > 1e-2
-    assert gaps[1:] == pytest.approx(np.broadcast_to(gaps[0], (2, 200)), abs=1e-12)
-
-    # Two limbs alike, on either side of a plane.
-    upr_rpu = load("upr_rpu")
-    poses = random_poses(upr_rpu, rng, 200)
-    gaps = clearance(upr_rpu, poses)
-    assert np.ptp(gaps) > 1e-3
-    assert clearance(upr_rpu, poses * (1, 1, -1)) == pytest.approx(gaps, abs=1e-12)
-
-    delta_cu = load("delta_cu")
-    c, s = np.cos(2 * delta_cu.geometry.azimuths[2]), np.sin(2 * delta_cu.geometry.azimuths[2])
-    mirror = np.array([[c, s, 0], [s, -c, 0], [0, 0, 1]])
-    assert clearance(delta_cu, around @ mirror) == pytest.approx(
-        clearance(delta_cu, around), abs=1e-12
-    )
-
-
-def test_thicker_members_leave_that_much_less(variant, rng):
-    for name, times in (("prru", 2), ("upr_rpu", 3)):
-        thin = load(name)
-        poses = random_poses(thin, rng, 50)
-        diameter = 2 * float(max(beam.radius for beam in thin.beams))
-        section = (
-            {"limb": tube(times * diameter)} if name == "prru" else {"diameter": times * diameter}
-        )
-        thick, _ = variant(name, members=section)
-        assert clearance(thick, poses) == pytest.approx(
-            clearance(thin, poses) - (times - 1) * diameter, abs=1e-12
-        )
 
 
 def box(robot, count=25):

@@ -11,7 +11,7 @@ from pkm_twin.errors import SingularityError, UnreachableError
 from pkm_twin.robot.catalogue import robot_of_data
 from pkm_twin.robot.robot_urdf import robot_description
 from test.machine.random_machines import FILES
-from test.support.robots import every_robot, load, often, partly_long, random_joints
+from test.support.robots import every_robot, load, often, partly_long
 
 SIZES = (0.15, 0.5, 1.2)
 """Parts of the machine's size by which poses are away from home; angles as many times 2 rad."""
@@ -69,15 +69,6 @@ def test_no_pose_is_answered_with_joints_of_another(name, count, rng):
         assert caught.value.index == (1,)
         # What can be met is a singularity's doing, not a limb's.
         assert getattr(caught.value, "miss", 1.0) > 1e-9 * robot.graph.size
-
-
-@every_robot
-def test_poses_that_forward_gives_are_answered(name, rng):
-    robot = load(name)
-    pose = robot.forward(random_joints(robot, rng, 200))
-    q, good = robot.try_inverse(pose)
-    assert good.mean() > 0.99
-    np.testing.assert_allclose(robot.forward(q[good]), pose[good], atol=1e-9)
 
 
 def test_a_hexapod_tilted_beyond_its_singularity():

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import json
-from typing import Any
 
 import numpy as np
 import pytest
@@ -12,7 +11,7 @@ import yaml
 from scipy.optimize import minimize_scalar
 
 from delta_dynamics import reactions
-from pkm_twin import Robot, robot_names
+from pkm_twin import robot_names
 from pkm_twin.certify.maximal import Maximal
 from pkm_twin.certify.rows import stacked
 from pkm_twin.errors import SingularityError
@@ -191,46 +190,6 @@ class TestConstraintSingularity:
             load_ = np.inf
         # What lies within rounding of the surface bears 1e6 times what a good pose does.
         assert load_ > 1e6
-
-
-def scaled(robot: Robot, factor: float) -> Any:
-    """A robot's description, limbs written out, with every length times a factor."""
-    data = robot_description(robot)
-
-    def times(values: Any) -> Any:
-        return (factor * np.asarray(values)).tolist()
-
-    data["origin"] = times(data["origin"])
-    for body in data["bodies"].values():
-        body["com"] = times(body["com"])
-    for joint in data["joints"].values():
-        joint.pop("limits", None)
-        joint["at"] = times(joint["at"])
-        if joint["type"] == "prismatic":
-            joint["home"] = factor * joint.get("home", 0.0)
-    for rod in data.get("rods", {}).values():
-        rod["ends"] = times(rod["ends"])
-    return data
-
-
-@pytest.mark.parametrize("name", ["linear_delta", "five_bar"])
-@pytest.mark.parametrize("factor", [0.01, 7.0])
-def test_no_scale_counts(name, factor, tmp_path):
-    here = load(name)
-    there = built(scaled(here, factor), tmp_path)
-    q = random_joints(here, np.random.default_rng(5), 20)
-    grown = np.where([unit == "m" for unit in here.joint_units], factor, 1.0)
-    assert there.singularity(q * grown) == pytest.approx(here.singularity(q), rel=1e-9)
-
-
-@pytest.mark.parametrize("name", ["five_bar", "linear_delta"])
-def test_no_order_of_bodies_counts(name, tmp_path):
-    robot = load(name)
-    data = robot_description(robot)
-    data["bodies"] = dict(reversed(data["bodies"].items()))
-    other = built(data, tmp_path)
-    q = random_joints(robot, np.random.default_rng(6), 20)
-    assert other.singularity(q) == pytest.approx(robot.singularity(q), rel=1e-9)
 
 
 class TestWays:
