@@ -27,7 +27,7 @@ from pkm_twin.identification.compare import (
     step_fault,
     steps_in,
 )
-from pkm_twin.identification.plausible import held_payload
+from pkm_twin.identification.plausible import held_payload, wrenches
 from pkm_twin.identification.samples import usual_size
 from pkm_twin.recordings import Load, Recording
 from pkm_twin.report import Fact, Verdict, judged
@@ -443,19 +443,8 @@ def _retold(r: Recording, c: Compared) -> Iterator[tuple[str, Recording]]:
         names = ", ".join(np.array(r.robot.joint_names)[turned].tolist())
         effort = r.effort * np.where(turned, -1.0, 1.0)
         yield f"efforts of {names} have the opposite sign", replace(r, effort=effort)
-    if r.wrench is not None and r.wrench.any():
-        rotation, axes = r.robot.rotation(r.robot.forward(r.q)), "platform"
-        if r.topics.turns:
-            rotation, axes = rotation.swapaxes(-1, -2), "base"
-        both = r.wrench.reshape(-1, 2, 3)
-        moved = np.einsum("nij,nkj->nki", rotation, both).reshape(-1, 6)
-        yield f"the wrench has {axes} axes", replace(r, wrench=moved)
-        text = (
-            "the wrench has the opposite sign: it is what the platform applies to its surroundings"
-        )
-        yield text, replace(r, wrench=-r.wrench)
-        text = "without the wrench the efforts agree: it does not act on the platform"
-        yield text, replace(r, wrench=None)
+    for text, wrench in wrenches(r):
+        yield text, replace(r, wrench=wrench)
     if r.load is None:
         yield from _payloads(r, c)
 

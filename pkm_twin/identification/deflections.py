@@ -25,6 +25,7 @@ from pkm_twin.identification.fit import Judged, Result, refuse_faults
 from pkm_twin.identification.identifiable import above_zero
 from pkm_twin.identification.judge import Evidence, Suspect, Verdict, judge
 from pkm_twin.identification.parameters import FITTED_RATIO, Group, Number, groups_of, number_of
+from pkm_twin.identification.plausible import UNIT, Score, likeliest
 from pkm_twin.identification.rows import HELD_OUT
 from pkm_twin.messages.reading import in_base_axes
 from pkm_twin.recordings import Recording
@@ -59,8 +60,6 @@ UNEXPLAINED: Final = 0.9
 """Part of the deflections' variation: a fit that leaves more explains nothing."""
 UNLIKE: Final = 0.3
 """Part of it from which a fault of the recording is looked for."""
-BETTER: Final = 0.85
-"""A recording has a fault if without it so much less is left."""
 SMOOTH: Final = 0.2
 """Of neighbours' difference over the signal: below, what differs between neighbours is noise."""
 
@@ -145,6 +144,16 @@ class _Part:
     def split(self) -> int:
         return round((1.0 - HELD_OUT) * len(self.time))
 
+    def judged(self) -> Score:
+        """How well the compliances that are fitted to it alone explain it."""
+        count = len(self.response.names)
+        try:
+            found, _ = _solve([self], count)
+        except (PkmTwinError, np.linalg.LinAlgError):
+            return Score.of(np.inf)
+        factors = np.maximum(found.values[:count], STIFFEST)
+        return Score.of(_part_left(self, factors, found.values[count:]))
+
     def moved(self, factors: Array) -> tuple[Array, Array]:
         """Deflections by the model (k, 6), and their derivatives by the factors (k, 6, e)."""
         return self.response.deflection(self.wrench, factors)
@@ -185,7 +194,7 @@ def fit_elements(
     try:
         found, table = _solve(parts, len(names))
     except PkmTwinError as error:
-        cause, _ = _best_repair(robot, parts[0], len(names), np.inf)
+        cause, _ = _best_repair(robot, parts[0], np.inf)
         raise PkmTwinError(f"{error}" + (f" ({cause}?)" if cause else "")) from None
     # What a bound holds at zero would be no compliance, and no file's.
     factors = np.maximum(found.values[: len(names)], STIFFEST)
@@ -315,8 +324,8 @@ def _unexplained(
         left = _part_left(part, factors, zero)
         if left < UNLIKE and not odd:
             continue
-        cause, best = _best_repair(robot, part, len(factors), left)
-        if cause and best < BETTER * left:
+        cause, best = _best_repair(robot, part, left)
+        if cause:
             faults.append(
                 f"{part.name}: {cause}: put right, elastic elements leave "
                 f"{100 * best:.2g} % of the deflections' variation, as recorded {100 * left:.2g} %"
@@ -329,19 +338,11 @@ def _unexplained(
     return faults
 
 
-def _best_repair(robot: Robot, part: _Part, count: int, most: float) -> tuple[str, float]:
-    """The fault without which the least is left of a recording, and how much; at most ``most``."""
-    best, cause = most, ""
-    for text, other in _repairs(robot, part):
-        try:
-            found, _ = _solve([other], count)
-        except (PkmTwinError, np.linalg.LinAlgError):
-            continue
-        factors = np.maximum(found.values[:count], STIFFEST)
-        left = _part_left(other, factors, found.values[count:])
-        if left < best:
-            best, cause = left, text
-    return cause, best
+def _best_repair(robot: Robot, part: _Part, most: float) -> tuple[str, float]:
+    """The fault without which a recording is the likeliest, and how much is left of it then."""
+    repairs = ((text, other.judged, UNIT) for text, other in _repairs(robot, part))
+    cause, best, _ = likeliest(Score.of(most), repairs)
+    return cause, best.left
 
 
 def _solve(parts: Sequence[_Part], count: int) -> tuple[Estimate, Array]:

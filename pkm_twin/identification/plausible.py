@@ -10,7 +10,7 @@ these explains as well as a sound one has that fault; of others no cause is name
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import combinations, product
@@ -25,6 +25,8 @@ from pkm_twin.errors import PkmTwinError
 from pkm_twin.identification.rows import LARGEST, Rows, rows_of
 from pkm_twin.machine.friction import turning_keys
 from pkm_twin.machine.inertia import standard_parameters
+from pkm_twin.messages.reading import in_base_axes
+from pkm_twin.recordings import Recording
 
 OFFSET: Final = 0.1
 """Part of the efforts that a current sensor is off by."""
@@ -271,13 +273,51 @@ class Case:
 
 @dataclass(frozen=True)
 class Score:
-    """The part of the efforts' variation that is left, and what the machine costs.
+    """The part of the measurements' variation that is left, and what the machine costs.
 
     Minus twice a logarithm of its probability: of what is left, and of numbers far from the file's.
     """
 
     left: float
     cost: float
+
+    @classmethod
+    def of(cls, left: float) -> Score:
+        """Of what is left alone."""
+        return cls(left, float(INDEPENDENT * np.log(left**2 + GOOD**2)))
+
+
+Repair = tuple[str, Callable[[], Score] | None, float]
+"""A fault in words, how well a machine explains the recording without it (None: no machine can have
+made that), and the fault's price."""
+
+
+def likeliest(told: Score, repairs: Iterable[Repair]) -> tuple[str, Score, float]:
+    """Put each fault right and see: the fault without which a recording is the likeliest.
+
+    :param told: of the recording as it is.
+    :returns: also how well the rest is explained and what is gained; no words where nothing is.
+    """
+    cause, best, most = "", told, 0.0
+    for text, other, price in repairs:
+        found = told if other is None else other()
+        gain = told.cost - found.cost - price
+        if gain > most:
+            cause, best, most = text, found, gain
+    return cause, best, most
+
+
+def wrenches(r: Recording) -> Iterator[tuple[str, Array | None]]:
+    """Faults of a recording's wrenches, and the wrenches without each."""
+    if r.wrench is None or not r.wrench.any():
+        return
+    rotation, axes = r.robot.rotation(r.robot.forward(r.q)), "platform"
+    if r.topics.turns:
+        rotation, axes = rotation.swapaxes(-1, -2), "base"
+    yield f"the wrench has {axes} axes", in_base_axes(r.wrench, rotation)
+    text = "the wrench has the opposite sign: it is what the platform applies to its surroundings"
+    yield text, -r.wrench
+    yield "without the wrench the efforts agree: it does not act on the platform", None
 
 
 def recording_fault(rows: Rows) -> str | None:
@@ -297,28 +337,30 @@ def recording_fault(rows: Rows) -> str | None:
     told = case.judged()
     if told.left < GOOD and told.cost < INDEPENDENT * np.log(2.0 * GOOD**2):
         return None
-    best, cause = told, ""
-    others = [*_efforts(case, joints), ("time runs backwards", case.backwards(), RARE)]
     loaded = (case.loaded_in_part(),) if case.payload.any() else ()
+    others = [*_efforts(case, joints), ("time runs backwards", case.backwards(), RARE)]
     others += [(*one, UNIT) for one in loaded]
-    for text, other, price in others:
-        found = other.judged()
-        if found.cost + price < best.cost:
-            best, cause = Score(found.left, found.cost + price), text
+    cause, best, gain = likeliest(told, ((t, other.judged, price) for t, other, price in others))
     known = min(float(np.hypot(BESIDE_NOISE, case.noisy)), 2.0 * POOR)
     unclear = bool(cause) and best.left > known
     first = int(np.searchsorted(time, _worst(case, SOME * period)))
     first = max(0, min(first, len(time) - SOME))
     some = slice(first, first + SOME)
-    here = _again(rows, some) if unclear or best.left > LARGE_REST else None
+    wide = unclear or best.left > LARGE_REST
+    pushed = rows.recording.wrench is not None and rows.recording.wrench.any()
+    here = _again(rows, some) if wide or pushed else None
     if here is not None:
         # All of them by the same samples: how much better than as recorded?
-        gain, own = told.cost - best.cost, here.judged()
-        for text, made in _repaired(rows, some):
-            found = own if made is None else made.judged()
-            if own.cost - found.cost - RARE > gain:
-                gain, told, cause = own.cost - found.cost - RARE, own, text
-                best = found
+        own = here.judged()
+        again = likeliest(
+            own,
+            (
+                (t, None if made is None else made.judged, RARE)
+                for t, made in _repaired(rows, some, wide)
+            ),
+        )
+        if again[2] > gain:
+            told, (cause, best, _) = own, again
     known = max(known, HELD) if cause in dict(loaded) else known
     if cause and best.left <= known:
         if best.left < NAMED * told.left:
@@ -336,13 +378,17 @@ def recording_fault(rows: Rows) -> str | None:
     return None
 
 
-def _repaired(rows: Rows, some: slice) -> Iterator[tuple[str, Case | None]]:
-    """Faults of positions and times, and some samples without each.
+def _repaired(rows: Rows, some: slice, wide: bool) -> Iterator[tuple[str, Case | None]]:
+    """Faults of wrenches and, where ``wide``, of positions and times; some samples without each.
 
     None where the machine cannot move so.
     """
     r, robot = rows.recording, rows.model.robot
     names, eye = robot.joint_names, np.eye(robot.joints_count)
+    for text, wrench in wrenches(r):
+        yield text, _again(rows, some, wrench=wrench)
+    if not wide:
+        return
     for text, scale in TIMES.items():
         yield text, _again(rows, some, time=r.time * scale)
     for text, scale in ANGLES.items():

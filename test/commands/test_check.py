@@ -13,6 +13,9 @@ from mcap.writer import CompressionType, Writer
 from delta_dynamics import inverse_dynamics
 from pkm_twin.bags.reader import inspect, read_messages
 from pkm_twin.identification.check import MEASURED, check
+from pkm_twin.identification.parameters import file_parameters
+from pkm_twin.identification.plausible import recording_fault
+from pkm_twin.identification.rows import rows_of
 from pkm_twin.recordings import Recording
 from pkm_twin.recordings.topics import JOINT_STATE
 from test.bags.folders import make_folder
@@ -368,14 +371,18 @@ class TestCauses:
         wrench[:, 3:] *= 0.1
         efforts = inverse_dynamics(robot, m.q, m.qd, m.qdd, wrench)
         rotation = robot.rotation(robot.forward(m.q))
-        wrong = np.concatenate(
+        turned = np.concatenate(
             [np.einsum("kji,kj->ki", rotation, wrench[:, k : k + 3]) for k in (0, 3)], 1
         )
         made = recording_of(robot, m, efforts)
         assert check(replace(made, wrench=wrench)).answer == "good"
-        for given, word in ((-wrench, "opposite sign"), (wrong, "axes")):
-            (text,) = self.cause(replace(made, wrench=given))
+        for given, word in ((-wrench, "opposite sign"), (turned, "axes")):
+            wrong = replace(made, wrench=given)
+            (text,) = self.cause(wrong)
             assert word in text
+        # So does a fit.
+        fault = recording_fault(rows_of(robot, file_parameters(robot), wrong))
+        assert fault is not None and word in fault
 
     def test_a_saturated_sensor(self, rng):
         robot, m, efforts = drawn(rng, 6.0, 250.0)
