@@ -17,8 +17,8 @@ from pkm_twin.paths.constraints import Forces, Limits, Rows, check_rest
 from pkm_twin.paths.geometry import Path, through
 from pkm_twin.paths.jerk import PROGRAMS, smooth_profile, smooth_run
 from pkm_twin.paths.joint_path import JointPath, Slowdown, joint_paths
-from pkm_twin.paths.laws import LAWS, quintic, shortest
-from pkm_twin.paths.motion import Run, Timed, TimedPath, needs_forces, run_peaks
+from pkm_twin.paths.laws import LAWS, QUINTIC, shortest
+from pkm_twin.paths.motion import Run, TimedPath, needs_forces, run_peaks
 from pkm_twin.paths.profile import fastest_profile
 from pkm_twin.robot.robot import Robot
 
@@ -138,7 +138,7 @@ def timed(
     jerks = law == "fastest" and np.isfinite(limits.jerk).any()
     points = min(points, JERK_POINTS) if jerks else points
 
-    def plan(part: JointPath) -> Timed:
+    def plan(part: JointPath) -> Run:
         if law == "fastest":
             return (_smooth if jerks else _run)(part, limits, load)
         runs = (shortest(part, one, limits, load) for one in LAWS[law])
@@ -163,7 +163,7 @@ def timed(
     return result
 
 
-def _run(part: JointPath, limits: Limits, wrench: Array | None) -> Timed:
+def _run(part: JointPath, limits: Limits, wrench: Array | None) -> Run:
     """One stretch, its limits kept between the points too.
 
     Intervals within which a limit is passed are divided, and at last use less of the limits.
@@ -173,8 +173,8 @@ def _run(part: JointPath, limits: Limits, wrench: Array | None) -> Timed:
     x: Array | None = None
     for count in range(DIVISIONS + ROUNDS):
         x = fastest_profile(rows, part.left, part.steps, share, x)
-        run = Run(part, x)
-        _check_moves(run)
+        _check_moves(part, x)
+        run = Run.of(part, x)
         used = run_peaks(run, limits, wrench)
         over = used.max(1)
         bad = over > 1.0 + SMALL
@@ -196,11 +196,11 @@ def _run(part: JointPath, limits: Limits, wrench: Array | None) -> Timed:
     return kept(run, limits, wrench, used.max(0))
 
 
-def _smooth(part: JointPath, limits: Limits, wrench: Array | None) -> Timed:
+def _smooth(part: JointPath, limits: Limits, wrench: Array | None) -> Run:
     """The same with limits of jerk: the best of several profiles, or a quintic."""
     rows = _rows(part, limits, wrench)
-    slow = shortest(part, quintic, limits, wrench)
-    best: Timed = slow
+    slow = shortest(part, QUINTIC, limits, wrench)
+    best: Run = slow
     least = needed(run_peaks(slow, limits, wrench).max(0)) * slow.duration
     x = slow.profile() * (1.0 - KEPT)
     share, jerks = np.ones((2, len(part.left)))
@@ -257,11 +257,11 @@ def _rows(part: JointPath, limits: Limits, wrench: Array | None) -> Rows:
     return rows
 
 
-def _check_moves(run: Run) -> None:
+def _check_moves(part: JointPath, x: Array) -> None:
     """Reject a profile that stands still on its way."""
-    slow = (run.x[:-1] + run.x[1:]) <= 0.0
+    slow = (x[:-1] + x[1:]) <= 0.0
     if slow.any():
-        way = run.part.curve.begin + float(run.part.s[run.part.left[int(slow.argmax())]])
+        way = part.curve.begin + float(part.s[part.left[int(slow.argmax())]])
         raise ParameterError(
             "path", f"no motion after {way:.4g} m", "limits that let the machine pass"
         )
@@ -278,7 +278,7 @@ def needed(used: Array) -> float:
     return float((used ** (1.0 / powers)).max())
 
 
-def kept(run: Timed, limits: Limits, wrench: Array | None, used: Array | None = None) -> Timed:
+def kept(run: Run, limits: Limits, wrench: Array | None, used: Array | None = None) -> Run:
     """A run, slower by as much as its limits need.
 
     :param used: greatest used part of each limit, where it is known, shape (4 n + 1,).

@@ -9,8 +9,6 @@ before. It starts from a quintic.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import cached_property
 from itertools import product
 from typing import Any, Final
 
@@ -21,6 +19,7 @@ from numpy.typing import NDArray
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.paths.constraints import Limits, Rows
 from pkm_twin.paths.joint_path import JointPath
+from pkm_twin.paths.motion import Run
 
 Index = NDArray[np.int64]
 
@@ -36,77 +35,15 @@ RAISED: Final = 20
 """How often a profile is raised where it would go back."""
 ROUNDED: Final = 1e-12
 """Part of the greatest speed below rest that is rounding."""
-HALVINGS: Final = 50
-"""Steps of the search for the time of a place."""
 
 
-@dataclass(frozen=True)
-class SmoothRun:
-    """One stretch of a path in time, its acceleration linear between times.
-
-    ``knots``: those times, shape (k,), s; way, speed and acceleration along the path there, (k,).
-    """
-
-    part: JointPath
-    knots: Array
-    way: Array
-    v: Array
-    u: Array
-
-    @property
-    def duration(self) -> float:
-        """From rest to rest, s."""
-        return float(self.knots[-1])
-
-    def slower(self, factor: float) -> SmoothRun:
-        """The same with ``factor`` times the duration."""
-        return SmoothRun(
-            self.part, factor * self.knots, self.way, self.v / factor, self.u / factor**2
-        )
-
-    @cached_property
-    def times(self) -> Array:
-        """Times at which the jerk along the path or a derivative of the path jumps, rising, s."""
-        return np.unique(np.concatenate([self.knots, self.ends]))
-
-    @cached_property
-    def ends(self) -> Array:
-        """Times of the intervals' ends, shape (i + 1,), s."""
-        way = self.part.ends[1:-1]
-        k = np.clip(np.searchsorted(self.way, way, side="right") - 1, 0, len(self.knots) - 2)
-        low, high = self.knots[k], self.knots[k + 1]
-        for _ in range(HALVINGS):
-            middle = 0.5 * (low + high)
-            before = self._moved(k, middle)[0] < way
-            low, high = np.where(before, middle, low), np.where(before, high, middle)
-        return np.concatenate([self.knots[:1], high, self.knots[-1:]])
-
-    def _moved(self, k: Index, time: Array) -> tuple[Array, Array, Array]:
-        """Way, v and u at times after knots k."""
-        span = self.knots[k + 1] - self.knots[k]
-        t = np.clip(time - self.knots[k], 0.0, span)
-        u, v = self.u[k], self.v[k]
-        jerk = (self.u[k + 1] - u) / span
-        way = self.way[k] + t * (v + t * (u / 2 + t * jerk / 6))
-        return way, v + t * (u + t * jerk / 2), u + t * jerk
-
-    @property
-    def least(self) -> Array:
-        """Least speed along the path between two knots, where it turns too, (k - 1,), m/s."""
-        u, span = self.u[:-1], np.diff(self.knots)
-        change = np.diff(self.u)
-        rises = (u < 0.0) & (self.u[1:] > 0.0)
-        # From there to the turn the acceleration goes to zero.
-        dip = np.where(rises, 0.5 * u * span * -u / np.where(rises, change, 1.0), 0.0)
-        return np.minimum(np.minimum(self.v[:-1], self.v[1:]), self.v[:-1] + dip)
-
-    def at(self, time: Array) -> tuple[Index, Array, Array, Array]:
-        """Interval, part of it, v and u at times (k,)."""
-        k = np.clip(np.searchsorted(self.knots, time, side="right") - 1, 0, len(self.knots) - 2)
-        way, v, u = self._moved(k, time)
-        s = self.part.ends
-        j = np.clip(np.searchsorted(s, way, side="right") - 1, 0, len(s) - 2)
-        return j, np.clip((way - s[j]) / (s[j + 1] - s[j]), 0.0, 1.0), v, u
+def _least(knots: Array, v: Array, u: Array) -> Array:
+    """Least speed between knots, where it turns too, by v and u there, (k,); shape (k - 1,)."""
+    span, change = np.diff(knots), np.diff(u)
+    rises = (u[:-1] < 0.0) & (u[1:] > 0.0)
+    # From there to the turn the acceleration goes to zero.
+    dip = np.where(rises, -0.5 * u[:-1] ** 2 * span / np.where(rises, change, 1.0), 0.0)
+    return np.minimum(np.minimum(v[:-1], v[1:]), v[:-1] + dip)
 
 
 def _sides(part: JointPath) -> tuple[Array, Array, tuple[Array, Array]]:
@@ -275,7 +212,7 @@ def _jerk_rows(
     return _triplets(made, (at, len(x))), np.tile(bound, 4)
 
 
-def smooth_run(part: JointPath, x: Array) -> SmoothRun | None:
+def smooth_run(part: JointPath, x: Array) -> Run | None:
     """A profile in time that never goes back along the path; None where none is found.
 
     Where a machine nearly stops on its way, lines between the accelerations may go below rest: the
@@ -283,19 +220,20 @@ def smooth_run(part: JointPath, x: Array) -> SmoothRun | None:
     """
     x = x.copy()
     for count in range(RAISED):
-        run = _joined(part, x)
-        below = -run.least
+        knots, way, v, u = _joined(part, x)
+        below = -_least(knots, v, u)
         # Between two middles of intervals lies the point of their common end.
-        low = np.flatnonzero(below > ROUNDED * run.v.max())
+        low = np.flatnonzero(below > ROUNDED * v.max())
         if not len(low):
-            return run
+            jerk = np.diff(u) / np.diff(knots)
+            return Run(part, knots, np.stack([way[:-1], v[:-1], u[:-1] / 2, jerk / 6]))
         at = np.clip(low, 1, len(x) - 2)
         np.maximum.at(x, at, (np.sqrt(x[at]) + 1.5**count * below[low]) ** 2)
     return None
 
 
-def _joined(part: JointPath, x: Array) -> SmoothRun:
-    """A profile in time: its mean accelerations, joined by lines in time.
+def _joined(part: JointPath, x: Array) -> tuple[Array, Array, Array, Array]:
+    """A profile in time: its mean accelerations, joined by lines in time; times, way, v and u.
 
     Between points y = x^(3/4) is linear in s, as it is from rest with even jerk. What the lines
     miss of the way's end and of rest there, a smooth change over the whole makes good.
@@ -321,4 +259,4 @@ def _joined(part: JointPath, x: Array) -> SmoothRun:
     jerk = np.diff(u) / step
     way = np.cumsum(step * (v[:-1] + step * (u[:-1] / 2 + step * jerk / 6)))
     scale = float(part.s[-1]) / way[-1]
-    return SmoothRun(part, times, scale * np.append(0.0, way), scale * v, scale * u)
+    return times, scale * np.append(0.0, way), scale * v, scale * u

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
-from typing import Any, Final, NamedTuple, Protocol
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -25,6 +25,8 @@ Index = NDArray[np.int64]
 
 BINDS: Final = 0.98
 """Used part of a limit from which on it binds."""
+HALVINGS: Final = 60
+"""Steps of the search for the time of a place."""
 CREEP: Final = 1e-9
 """Least speed along the path of a machine that moves, of its mean speed."""
 MOST_SAMPLES: Final = 10_000_000
@@ -58,78 +60,78 @@ class Bound:
         }  # fmt: skip
 
 
-class Timed(Protocol):
-    """One stretch of a path in time."""
+@dataclass(frozen=True)
+class Run:
+    """One stretch of a path in time: its way a polynomial of the time since each of some knots.
 
-    @property
-    def part(self) -> JointPath:
-        """The stretch."""
+    ``knots``: rising from 0, the last one the end, shape (k + 1,), s. ``way``: coefficients by
+    rising powers, shape (powers, k), m, m/s, ...
+    """
 
-    @property
-    def times(self) -> Array:
-        """From 0 to its duration, s; between two neighbours the motion is smooth."""
+    part: JointPath
+    knots: Array
+    way: Array
 
-    @property
-    def ends(self) -> Array:
-        """Times of the intervals' ends, among ``times``, (i + 1,), s."""
+    @classmethod
+    def of(cls, part: JointPath, x: Array) -> Run:
+        """By x = v^2 at the intervals' ends, linear in the way between them, shape (i + 1,)."""
+        v = np.sqrt(x)
+        knots = np.concatenate([[0.0], np.cumsum(2.0 * part.steps / (v[:-1] + v[1:]))])
+        return cls(part, knots, np.stack([part.ends[:-1], v[:-1], np.diff(x) / (4.0 * part.steps)]))
 
     @property
     def duration(self) -> float:
         """From rest to rest, s."""
+        return float(self.knots[-1])
 
-    def slower(self, factor: float) -> Timed:
+    def slower(self, factor: float) -> Run:
         """The same with ``factor`` times the duration."""
+        powers = np.arange(len(self.way))[:, None]
+        return Run(self.part, factor * self.knots, self.way / factor**powers)
 
-    def at(self, time: Array) -> tuple[Index, Array, Array, Array]:
-        """Interval, part of it, v and u at times (k,)."""
+    def moved(self, k: Index, time: Array) -> tuple[Array, Array, Array]:
+        """Way, v and u at times after knots k."""
+        t = np.clip(time - self.knots[k], 0.0, self.knots[k + 1] - self.knots[k])
+        way, v, u = np.zeros((3, len(t)))
+        for row in self.way[::-1, k]:
+            way, v, u = way * t + row, v * t + way, u * t + 2.0 * v
+        return way, v, u
 
-
-@dataclass(frozen=True)
-class Run:
-    """One stretch of a path in time: x = v^2 at its intervals' ends, linear between, (i + 1,)."""
-
-    part: JointPath
-    x: Array
-
-    @cached_property
-    def steps(self) -> Array:
-        """Times that the intervals take, shape (i,), s."""
-        v = np.sqrt(self.x)
-        return np.asarray(2.0 * self.part.steps / (v[:-1] + v[1:]), np.float64)
-
-    @cached_property
-    def changes(self) -> Array:
-        """Accelerations along the path in the intervals, shape (i,), m/s2."""
-        return np.asarray(np.diff(self.x) / (2.0 * self.part.steps), np.float64)
+    def _since(self, time: Array) -> Index:
+        """The last knot before times (k,)."""
+        last = len(self.knots) - 2
+        return np.clip(np.searchsorted(self.knots, time, side="right") - 1, 0, last)
 
     @cached_property
     def ends(self) -> Array:
         """Times of the intervals' ends, shape (i + 1,), s."""
-        return np.concatenate([[0.0], np.cumsum(self.steps)])
+        way, begins = self.part.ends[1:-1], self.way[0]
+        k = np.clip(np.searchsorted(begins, way, side="right") - 1, 0, len(begins) - 1)
+        low, high = self.knots[k], self.knots[k + 1]
+        for _ in range(HALVINGS):
+            middle = 0.5 * (low + high)
+            before = self.moved(k, middle)[0] < way
+            low, high = np.where(before, middle, low), np.where(before, high, middle)
+        inner = np.where(begins[k] == way, self.knots[k], high)
+        return np.concatenate([self.knots[:1], inner, self.knots[-1:]])
 
-    @property
+    @cached_property
     def times(self) -> Array:
-        """The same."""
-        return self.ends
+        """Knots and intervals' ends, rising, s: between two of them the motion is smooth."""
+        return np.unique(np.concatenate([self.knots, self.ends]))
 
-    @property
-    def duration(self) -> float:
-        """From rest to rest, s."""
-        return float(self.times[-1])
-
-    def slower(self, factor: float) -> Run:
-        """The same with ``factor`` times the duration."""
-        return Run(self.part, self.x / factor**2)
+    def profile(self) -> Array:
+        """v^2 at the intervals' ends, shape (i + 1,)."""
+        x = self.moved(self._since(self.ends), self.ends)[1] ** 2
+        x[[0, -1]] = 0.0
+        return x
 
     def at(self, time: Array) -> tuple[Index, Array, Array, Array]:
         """Interval, part of it, v and u at times (k,)."""
-        last = len(self.steps) - 1
-        k = np.clip(np.searchsorted(self.times, time, side="right") - 1, 0, last)
-        passed = np.clip(time - self.times[k], 0.0, self.steps[k])
-        begin, u, h = np.sqrt(self.x[k]), self.changes[k], self.part.steps[k]
-        part = np.clip((begin * passed + 0.5 * u * passed**2) / h, 0.0, 1.0)
-        v = np.sqrt(np.maximum(self.x[k] + 2.0 * u * part * h, 0.0))
-        return k, part, v, u
+        way, v, u = self.moved(self._since(time), time)
+        s = self.part.ends
+        j = np.clip(np.searchsorted(s, way, side="right") - 1, 0, len(s) - 2)
+        return j, np.clip((way - s[j]) / (s[j + 1] - s[j]), 0.0, 1.0), v, u
 
 
 @dataclass(frozen=True)
@@ -143,7 +145,7 @@ class TimedPath:
     robot: Robot
     path: Path
     limits: Limits
-    runs: tuple[Timed, ...]
+    runs: tuple[Run, ...]
     rests: tuple[float, ...]
     law: str
     carried: tuple[Carried, ...]
@@ -359,7 +361,7 @@ class Moving(NamedTuple):
     interval: Index
 
 
-def moving(run: Timed, time: Array, moves: Mask | bool = True, tool: bool = True) -> Moving:
+def moving(run: Run, time: Array, moves: Mask | bool = True, tool: bool = True) -> Moving:
     """A run at times (k,).
 
     :param moves: at which times the machine moves; it rests at the others.
@@ -411,7 +413,7 @@ def peaks(limits: Limits, times: Array, sample: Callable[[Array], Moments]) -> A
     return result
 
 
-def run_peaks(run: Timed, limits: Limits, wrench: Array | None) -> Array:
+def run_peaks(run: Run, limits: Limits, wrench: Array | None) -> Array:
     """Greatest used part of each limit between neighbouring times of a run, (i, 4 n + 1)."""
     part = run.part
     needs = needs_forces(part, limits)

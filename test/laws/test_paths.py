@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Paths and motions along them: what they go through, and laws of the fastest motion."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -285,7 +287,10 @@ def test_every_limit_is_plausible_or_rejected(name):
 @pytest.mark.parametrize("law", [law for laws in LAWS.values() for law in laws])
 def test_laws_go_from_rest_to_rest(law):
     t = np.linspace(0.0, 1.0, 20001)
-    way, rate, change = law(t)
+    part = SimpleNamespace(ends=np.linspace(0.0, 1.0, 11))
+    run = law.on(part, 1.0)
+    way, rate, change = run.moved(np.searchsorted(run.knots[1:-1], t, side="right"), t)
+    np.testing.assert_allclose(np.interp(run.ends, t, way), part.ends, atol=1e-6)
     for values, ends in ((way, (0.0, 1.0)), (rate, (0.0, 0.0)), (change, (0.0, 0.0))):
         np.testing.assert_allclose(values[[0, -1]], ends, atol=1e-9)
     np.testing.assert_allclose(np.gradient(way, t)[1:-1], rate[1:-1], atol=1e-6)
