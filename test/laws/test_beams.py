@@ -339,29 +339,6 @@ def test_columns_add_up_to_the_stiffness(rng):
         assert np.abs(found - expected).max() < 1e-12 * np.abs(expected).max()
 
 
-def loads(frame):
-    """Bodies of a frame by their place from its origin."""
-    return tuple(replace(body, at=body.at - frame.origin) for body in frame.bodies)
-
-
-def test_mass_of_a_frame_is_that_of_its_bodies(rng):
-    frame = random_frame(rng)
-    loose = Support("x", BASE, np.eye(3), (FREE,) * 6)
-    free = [Member(m.name, m.body, m.section, m.start, m.end, loose, None) for m in frame.parts]
-    system = assemble(frame_of(frame.origin, tuple(free), loads(frame)), 2)
-    bars = sum(m.section.mass_per_length * np.linalg.norm(m.end - m.start) for m in frame.parts)
-    for k in range(3):
-        push = np.zeros(len(system.mass))
-        push[k] = 1.0
-        # Starts, loose along the base's axes; ends and then what is inside along the member's own.
-        for i, member in enumerate(frame.members):
-            push[6 + 12 * i + k] = 1.0
-            for at in (12 + 12 * i, 6 + 12 * len(frame.members) + 6 * i):
-                push[at : at + 3] = member.axes[k]
-        assert push @ system.mass @ push == pytest.approx(bars + 3.0)
-        assert push @ system.stiffness @ push == pytest.approx(0.0, abs=1e-3)
-
-
 def test_a_member_on_nothing_is_refused():
     bar = Member(
         "bar", "bar", TUBE, np.zeros(3), np.ones(3), Support("j", "arm", np.eye(3)), None

@@ -7,7 +7,6 @@ import pytest
 from delta_dynamics import energy, forward_dynamics, inverse_dynamics, mass_matrix
 from test.support.bodies import bodies, rubs
 from test.support.robots import (
-    FREE,
     load,
     loaded,
     massive,
@@ -25,25 +24,6 @@ def states(robot, rng, count):
 @pytest.fixture
 def robot(name):
     return loaded(name)
-
-
-def test_power_is_the_rate_of_energy(name, robot, rng):
-    """tau . qd = dE/dt along random motions q(t), by a five-point stencil in t."""
-    robot = robot.changed(friction=FREE)
-    q, qd, qdd = states(robot, rng, 100)
-    jerk = rng.normal(0.0, 10.0, q.shape)
-
-    def total(t):
-        return energy(
-            robot, q + t * qd + t**2 / 2 * qdd + t**3 / 6 * jerk, qd + t * qdd + t**2 / 2 * jerk
-        ).total
-
-    h = 1e-4
-    rate = (8 * (total(h) - total(-h)) - (total(2 * h) - total(-2 * h))) / (12 * h)
-    tau = inverse_dynamics(robot, q, qd, qdd)
-    tau -= sum(rub.efforts for rub in rubs(robot, bodies(robot, q, qd, qdd), q, qd))
-    power = np.sum(tau * qd, -1)
-    np.testing.assert_allclose(power, rate, rtol=1e-7, atol=1e-8 * np.abs(rate).max())
 
 
 def test_efforts_are_the_virtual_work_of_all_bodies(name, robot, rng):

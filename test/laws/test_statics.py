@@ -18,20 +18,6 @@ def random_wrenches(rng, *shape):
     return rng.normal(size=(*shape, 6)) * [50, 50, 50, 5, 5, 5]
 
 
-def stiffened(data):
-    """Parameters with every modulus doubled and every compliance halved."""
-    if isinstance(data, list):
-        return [stiffened(value) for value in data]
-    if not isinstance(data, dict):
-        return data
-    times = {"youngs_modulus": 2.0, "shear_modulus": 2.0, "drive_compliance": 0.5}
-    times |= dict.fromkeys(parameters_of("upr_rpu")["joints_compliance"], 0.5)
-    return {
-        k: (times[k] * np.asarray(v)).tolist() if k in times else stiffened(v)
-        for k, v in data.items()
-    }
-
-
 @elastic
 class TestEveryRobot:
     def test_compliance_is_symmetric_positive_definite_and_the_deflection_of_unit_wrenches(
@@ -121,16 +107,6 @@ class TestEveryRobot:
             one = member_deflections(robot, q[1], wrench[1])[member]
             assert (points[1] == one[0]).all()
             assert (shifts[1] == one[1]).all()
-
-    def test_a_stiffer_material_takes_less_energy_at_the_same_shares(self, name, tmp_path):
-        """All moduli doubled: half the compliance."""
-        path = tmp_path / "stiffer.yaml"
-        path.write_text(yaml.safe_dump(stiffened(parameters_of(name)), sort_keys=False))
-        robot, other = load(name), load(path)
-        pose, wrench = robot.home(), [3.0, -2.0, 5.0, 0.1, 0.2, -0.3]
-        usual, stiffer = (strain_energy(r, pose, wrench) for r in (robot, other))
-        assert stiffer.total == pytest.approx(usual.total / 2, rel=1e-9)
-        assert stiffer.factors == pytest.approx(usual.factors, rel=1e-7)
 
     def test_kernels_are_there_to_warm_up(self, name):
         made = kernels(load(name))

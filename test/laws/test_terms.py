@@ -28,20 +28,6 @@ def test_the_terms_sum_to_inverse_dynamics(name, rng):
 
 
 @massive
-def test_each_term_has_its_own_cause_and_power(name, rng):
-    robot = loaded(name)
-    q, qd, qdd, wrench = random_motion(robot, rng, 50)
-    one = dynamics_terms(robot, q, qd, qdd, wrench)
-    two = dynamics_terms(robot, q, 2 * qd, 3 * qdd, 5 * wrench)
-    close(two.gravity, one.gravity)
-    close(two.inertia, 3 * one.inertia)
-    close(two.velocity, 4 * one.velocity)
-    close(two.external, 5 * one.external)
-    up = robot.changed(gravity=-2 * robot.gravity)
-    close(dynamics_terms(up, q, qd, qdd).gravity, -2 * one.gravity)
-
-
-@massive
 def test_terms_against_what_they_stand_for(name, rng):
     robot = loaded(name)
     q, qd, qdd, wrench = random_motion(robot, rng, 50)

@@ -3,7 +3,7 @@
 
 The paper prints no numbers, so its equations themselves are the reference: written here in numpy in
 the paper's own variables, differentiated by complex steps, and solved for the driving forces in the
-paper's way (equation 41) and by Lagrange's equations.
+paper's way (equation 41).
 """
 
 from __future__ import annotations
@@ -266,63 +266,6 @@ def test_driving_forces_with_the_links_at_the_sliders(branch: str, count: int) -
         force = -np.linalg.solve(j.slider.T, total) - q_s
         twin = inverse_dynamics(robot, q, qd, qdd, wrench)
         np.testing.assert_allclose(twin, force, rtol=1e-10, atol=1e-9 * np.abs(force).max())
-
-
-def energies(robot: Prru, pose: Array) -> tuple[Array, Any]:
-    """Mass matrix on the pose rates, shape (3, 3), and the gradient of the potential, (3,)."""
-    g, m = robot.geometry, robot.inertia
-    payload = robot.payload
-
-    def points(x: Array) -> Array:
-        here = paper(robot, x)
-        result = []
-        for i, phi in enumerate(g.azimuths):
-            flat = -g.base_radius * np.array([math.cos(phi), math.sin(phi)])
-            slider = np.array([*flat, here.q[i]])
-            com = slider + m.link_com * g.limb_length * here.links[i][0][:, 2]
-            result += [slider, com, com]
-        result.append(here.centre + here.rotation @ m.platform_com)
-        result.append(here.centre + here.rotation @ payload.com)
-        return np.array(result)
-
-    weights = np.array(
-        [m.slider_mass, m.lower_link_mass, m.upper_link_mass] * 3 + [m.platform_mass, payload.mass]
-    )
-    moved = columns(points, pose)
-    matrix = np.einsum("b,bij,bik->jk", weights, moved, moved)
-    here = paper(robot, pose)
-    for i in range(3):
-        for level, (across, axial) in enumerate((LOWER, UPPER)):
-            spin = spins(lambda x, i=i, level=level: paper(robot, x).links[i][level], pose)
-            local = here.links[i][level].T @ spin
-            matrix += local.T @ np.diag([across, across, axial]) @ local
-    local = here.rotation.T @ spins(lambda x: paper(robot, x).rotation, pose)
-    matrix += local.T @ (np.array(INERTIA) + payload.inertia) @ local
-    return matrix, -np.einsum("b,i,bij->j", weights, robot.gravity, moved)
-
-
-@pytest.mark.parametrize("branch", ["below", "above"])
-@pytest.mark.parametrize("link_com", [0.0, 0.4, 1.0])
-@pytest.mark.parametrize("count", partly_long([1, 6], 1))
-def test_lagrange(branch: str, link_com: float, count: int) -> None:
-    """d/dt dT/dXd - dT/dX + dV/dX = J' F, with exact centres of mass, an own payload included."""
-    robot = machine(branch, link_com, (0.02, -0.03, 0.05)).changed(
-        payload={"mass": 3.0, "com": [0.05, 0.02, 0.1], "inertia": [0.02, 0.03, 0.04]}
-    )
-    for pose, rate, twice in states(count, 4):
-        q, qd, qdd = sliders(robot, pose, rate, twice)
-        matrix, gradient = energies(robot, pose)
-
-        def mass(x: Array) -> Array:
-            return energies(robot, x)[0]
-
-        slope = np.stack([along(mass, pose, unit) for unit in np.eye(3)], axis=-1)
-        momentum_rate = matrix @ twice + np.einsum("ijk,k,j->i", slope, rate, rate)
-        kinetic = 0.5 * np.einsum("ijk,i,j->k", slope, rate, rate)
-        j = columns(lambda x: paper(robot, x).q, pose)
-        force = np.linalg.solve(j.T, momentum_rate - kinetic + gradient)
-        twin = inverse_dynamics(robot, q, qd, qdd)
-        np.testing.assert_allclose(twin, force, rtol=1e-9, atol=1e-9 * np.abs(force).max())
 
 
 def test_forces_do_not_depend_on_the_height() -> None:
