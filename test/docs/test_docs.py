@@ -13,8 +13,10 @@ from pathlib import Path
 
 import pytest
 
+import delta_dynamics
+import stiffness_monitor
+from pkm_twin import design, paths, robot_names
 from pkm_twin import errors as module
-from pkm_twin import robot_names
 from test.support.command import typed_line
 from test.support.pages import assert_output, read_section
 from tools.pages import architecture, engine, errors, parameters, trend
@@ -100,7 +102,7 @@ def test_the_blocks_of_the_simulators_page_run(tmp_path, twin, monkeypatch):
 
 def test_python_blocks_of_pages(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    for page in ("design.md", "fit.md", "nodes.md"):
+    for page in ("design.md", "fit.md", "nodes.md", "api.md"):
         space = {}
         for language, block, _ in blocks(page):
             if language == "python":
@@ -167,6 +169,13 @@ def test_the_output_of_the_trend_page_is_todays(tmp_path):
 
 def test_the_picture_of_imports_has_every_folder():
     assert {name for pair in architecture.arrows() for name in pair} == set(architecture.PLACES)
+
+
+@pytest.mark.parametrize("package", [delta_dynamics, stiffness_monitor, paths, design])
+def test_the_python_page_has_each_public_name(package):
+    page = (DOCS / "api.md").read_text(encoding="utf-8")
+    listed = re.search(rf"::: {package.__name__}\n.*?members: \[(.*?)\]", page, re.DOTALL)[1]
+    assert sorted(re.split(r",\s+", listed)) == sorted(package.__all__)
 
 
 def test_every_robot_has_its_picture():
