@@ -11,12 +11,11 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from pkm_twin import Robot, load
-from pkm_twin.apps.commands.fit import GRAVITY
 from pkm_twin.apps.fit_report import drive_report
 from pkm_twin.identification.calibration import HELD_OUT, Calibration, Errors, calibrate, geometric
 from pkm_twin.identification.calibration_state import Poses, rotations
-from pkm_twin.identification.drives import drive_friction
-from pkm_twin.identification.pose_tables import read_poses
+from pkm_twin.identification.drives import GRAVITY, drive_friction
+from pkm_twin.identification.measurements import read_poses
 from pkm_twin.recordings import Dialect, read_table
 from pkm_twin.report.terminal import text_of
 from test.support.pages import write_section

@@ -47,6 +47,7 @@ from pkm_twin.identification.calibration_state import (
     numbers,
     place_frame,
     start_of,
+    written,
 )
 from pkm_twin.identification.measurements import (
     PLACE,
@@ -60,6 +61,7 @@ from pkm_twin.identification.undetermined import undetermined
 from pkm_twin.machine.formulas import PARAMETERS
 from pkm_twin.machine.joint_map import JointMap
 from pkm_twin.robot.derivatives import geometry_numbers
+from pkm_twin.robot.entries import Fitted as FittedNumber
 from pkm_twin.robot.entries import entries, with_entries
 from pkm_twin.robot.numbers import file_numbers
 from pkm_twin.robot.robot import Robot
@@ -175,6 +177,16 @@ class Scale(NamedTuple):
     after: float
     determined: bool
 
+    def __str__(self) -> str:
+        ends = f"{100.0 * self.after:.2g} mm in 100 mm"
+        if self.determined:
+            return f"scale: determined; distances are known to {ends} (standard deviation)"
+        return (
+            f"the scale is not determined: distances may be wrong by {ends} (standard deviation, "
+            f"{100.0 * self.before:.2g} mm before). Numbers that depend on it are marked no, and "
+            "stay near the file's values. Measure distances as well (--measure height,distance)"
+        )
+
 
 @dataclass(frozen=True, kw_only=True)
 class Calibration(Estimate):
@@ -200,6 +212,21 @@ class Calibration(Estimate):
     def joint_map(self) -> JointMap:
         """With the fitted numbers."""
         return self.instrument.map
+
+    def fitted(self, robot: Robot, source: str) -> dict[str, FittedNumber]:
+        """Numbers of the file by path.
+
+        :param robot: before. ``source``: what they are from, in words.
+        """
+        unknown = f"{source}; not determined by these measurements"
+        values = {
+            p.name: FittedNumber(p.value, p.deviation, p.unit, source if p.observed else unknown)
+            for p in self.parameters
+            if not p.name.startswith(BESIDE) and p.name not in self.instrument.own
+        }
+        mapped = {p.name: (p.value, p.deviation) for p in self.parameters}
+        own = written(robot, self.joint_map, mapped)
+        return values | {path: FittedNumber(*number, source) for path, number in own.items()}
 
 
 def geometric(robot: Robot, q: Array, only: Sequence[str] = ()) -> tuple[str, ...]:

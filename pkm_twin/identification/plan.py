@@ -13,7 +13,14 @@ from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError
 from pkm_twin.identification.calibration import Estimate, Free, geometric, placed, unknowns
 from pkm_twin.identification.calibration_state import derivatives
-from pkm_twin.identification.measurements import KINDS, Kind, Measured, Readings, scale_slopes
+from pkm_twin.identification.measurements import (
+    KINDS,
+    Kind,
+    Measured,
+    Readings,
+    named_numbers,
+    scale_slopes,
+)
 from pkm_twin.machine.rotations import skew
 from pkm_twin.robot.robot import Robot
 from pkm_twin.robot.workspace import within_limits
@@ -24,6 +31,19 @@ DRAWN: Final = 20
 MAX_MEASUREMENTS: Final = 150
 """Measurements of a plan."""
 USUAL: Final = 12
+
+
+def parse_within(text: str | None) -> dict[str, tuple[float, float]]:
+    """Of ``x=-0.1:0.1, z=0``: least and greatest values, m or rad.
+
+    :raises ParameterError: anything else.
+    """
+    right = "COORDINATE=LEAST:GREATEST, as x=-0.1:0.1"
+    found = named_numbers("--within", text or "", right)
+    for name, ends in found.items():
+        if len(ends) > 2 or ends[0] > ends[-1]:
+            raise ParameterError("--within", f"{name}={':'.join(map(str, ends))}", right)
+    return {name: (ends[0], ends[-1]) for name, ends in found.items()}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,6 +64,21 @@ class Plan:
     quantity: Mapping[str, Array]
     scale: Array
     known: Estimate
+
+    def table(self, robot: Robot) -> str:
+        """A CSV of joints, poses and an empty column for each quantity."""
+        names = [f"{name}.position" for name in robot.controller.names]
+        columns = [self.joints]
+        if self.second is not None:
+            names += [f"{name}_2" for name in names]
+            columns.append(self.second)
+        poses = [name for name in robot.pose_names if name not in self.quantity]
+        shown = [robot.pose_names.index(name) for name in poses]
+        rows = np.hstack([*columns, self.poses[:, shown]])
+        lines = [[*names, *(f"planned_{name}" for name in poses), *self.quantity]]
+        empty = [""] * len(self.quantity)
+        lines += [[*(f"{v:.9g}" for v in row), *empty] for row in rows]
+        return "".join(",".join(line) + "\n" for line in lines)
 
     def needed(self, accuracy: float) -> int | None:
         """Measurements after which the position is known so well, m; None: not by this plan."""

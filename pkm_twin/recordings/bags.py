@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pkm_twin.bags.reader import Bag, BagWriter, open_bag
+from pkm_twin.bags.storage import METADATA_FILE
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import BagError, MessageError, one_line
 from pkm_twin.messages.reading import (
@@ -93,6 +94,21 @@ def read_bag(
     if topics.turns:
         wrench = in_base_axes(wrench, machine.rotation(machine.forward(r.q)))
     return replace(r, wrench=wrench)
+
+
+def bags_of(folder: Path) -> list[Path]:
+    """Recordings in a folder and below: MCAP files and rosbag2 folders, by name."""
+    whole = {path.parent for path in folder.rglob(METADATA_FILE)}
+    files = [p for p in folder.rglob("*.mcap") if not whole & set(p.parents)]
+    return sorted([*whole, *files])
+
+
+def is_collection(path: Path) -> bool:
+    """Whether a path is a folder of recordings, not a rosbag2 bag itself."""
+    if not path.is_dir() or (path / METADATA_FILE).exists():
+        return False
+    # A bag whose metadata is lost has its files side by side.
+    return bool(bags_of(path)) and not any(path.glob("*.db3"))
 
 
 def _robot_of(bag: Bag, name: str | Robot | None) -> Robot:

@@ -22,7 +22,7 @@ from pkm_twin.apps.commands.calibrate import calibrate as command
 from pkm_twin.errors import ParameterError, PkmTwinError
 from pkm_twin.identification.calibration import calibrate, geometric
 from pkm_twin.identification.calibration_state import Poses
-from pkm_twin.identification.pose_tables import read_poses
+from pkm_twin.identification.measurements import read_poses
 from pkm_twin.robot.entries import entries, with_entries
 from test.support.robots import load, random_joints
 

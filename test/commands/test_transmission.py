@@ -19,7 +19,7 @@ from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError
 from pkm_twin.identification.calibration import HELD_OUT, calibrate, geometric
 from pkm_twin.identification.calibration_state import Poses, Transmission
-from pkm_twin.identification.pose_tables import read_poses
+from pkm_twin.identification.measurements import read_poses
 from pkm_twin.machine.joint_map import JointMap, JointMapEntry
 from pkm_twin.messages.reading import JointReader
 from pkm_twin.recordings import Dialect

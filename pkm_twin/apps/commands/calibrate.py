@@ -3,29 +3,35 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from textwrap import fill
 from typing import TYPE_CHECKING, Any, Final
 
-import numpy as np
-
 from pkm_twin.apps.frame import command
 from pkm_twin.apps.options import Accepts, BeyondLimitsToo, OfRobot, Overwrites, ReadsTables
 from pkm_twin.console import progress
-from pkm_twin.errors import ParameterError, UnknownNameError, one_line
+from pkm_twin.errors import ParameterError, one_line
 from pkm_twin.files import replace_file
-from pkm_twin.identification.calibration import Calibration, Estimate, Scale, geometric
+from pkm_twin.identification.calibration import Calibration, Estimate, geometric
 from pkm_twin.identification.calibration import calibrate as calibrated
 from pkm_twin.identification.calibration_fit import STEPS
-from pkm_twin.identification.calibration_state import BESIDE, Poses, Transmission, written
-from pkm_twin.identification.measurements import KINDS, Kind, Measured, kinds_of
-from pkm_twin.identification.plan import MAX_MEASUREMENTS, Plan
+from pkm_twin.identification.calibration_state import Transmission
+from pkm_twin.identification.measurements import (
+    KINDS,
+    Kind,
+    Measured,
+    kinds_of,
+    parse_noise,
+    read_measured,
+    read_poses,
+)
+from pkm_twin.identification.plan import MAX_MEASUREMENTS, Plan, parse_within
 from pkm_twin.identification.plan import plan as plan_of
-from pkm_twin.identification.pose_tables import read_measured, read_poses
 from pkm_twin.report import Column, Fact, Report, Table
-from pkm_twin.robot.entries import Fitted, edited_yaml, write_edited
+from pkm_twin.robot.entries import edited_yaml, write_edited
 from pkm_twin.settings import setting
 
 if TYPE_CHECKING:
@@ -140,7 +146,8 @@ def calibrate(given: Calibrate) -> Report:
     kinds, known, within = given.words()
     machine, measured = given.machine(), None
     if given.poses is not None:
-        measured = _read(given, machine, kinds, known)
+        read = partial(read_measured, kinds=kinds, noise=known) if kinds else read_poses
+        measured = read(given.poses, machine, dialect=given.dialect)
     notes = []
     if measured is not None:
         q = machine.controller.positions(measured.joints)
@@ -151,7 +158,7 @@ def calibrate(given: Calibrate) -> Report:
             machine, kinds, given.only, measured=some, within=within,
             count=given.count, accuracy=given.accuracy, noise=known, **given.free,
         )  # fmt: skip
-        replace_file(given.plan, ("\n".join([*plan_table(machine, chosen), ""])).encode())
+        replace_file(given.plan, chosen.table(machine).encode())
         return planned(machine, chosen, given.accuracy, given.plan)
     if given.poses is None or measured is None:
         raise ParameterError("poses", None, "a CSV of measured poses, or --plan FILE.csv")
@@ -169,36 +176,15 @@ def calibrate(given: Calibrate) -> Report:
         )
     source = f"calibrated with {one_line(given.poses.name, 100)}"
     marks = [*(f"accepted anyway: {fault}" for fault in result.faults), *notes]
-    values = _fitted(machine, result, source)
     head = [f"{machine.name}, {source}: {len(measured.joints)} poses."]
     head += [f"Measured: {', '.join(f'{a.count} {a.name}' for a in result.agreements)}."]
-    head += [f"{scale_text(result.scale)}."] if result.scale is not None else []
+    head += [f"{result.scale}."] if result.scale is not None else []
     head += [f"Outlier, with a small weight: {one}." for one in result.outliers]
     out = given.files["out"]
-    write_edited(out, [*head, *marks], edited_yaml(machine, given.robot, values))
+    write_edited(
+        out, [*head, *marks], edited_yaml(machine, given.robot, result.fitted(machine, source))
+    )
     return report_of(machine, source, result, notes, marks, out)
-
-
-def _read(
-    given: Calibrate, machine: Robot, kinds: Sequence[Kind], noise: Mapping[str, float]
-) -> Poses | Measured:
-    assert given.poses is not None  # noqa: S101  the caller asks
-    if kinds:
-        return read_measured(given.poses, machine, kinds, noise, given.dialect)
-    return read_poses(given.poses, machine, given.dialect)
-
-
-def _fitted(machine: Robot, result: Calibration, source: str) -> dict[str, Fitted]:
-    """Numbers of the file by path."""
-    unknown = f"{source}; not determined by these measurements"
-    values = {
-        p.name: Fitted(p.value, p.deviation, p.unit, source if p.observed else unknown)
-        for p in result.parameters
-        if not p.name.startswith(BESIDE) and p.name not in result.instrument.own
-    }
-    mapped = {p.name: (p.value, p.deviation) for p in result.parameters}
-    own = written(machine, result.joint_map, mapped)
-    return values | {path: Fitted(*number, source) for path, number in own.items()}
 
 
 def report_of(
@@ -255,7 +241,7 @@ def report_of(
         last = f"{1e3 * a.noise:.4f}", f"m{a.unit}"
         agreements[a.name] = [a.unit, a.count, *stored, *told, *last]
     found = sum(p.observed for p in result.parameters)
-    lines = [] if scale is None else [fill(scale_text(scale), WIDTH)]
+    lines = [] if scale is None else [fill(str(scale), WIDTH)]
     lines += [f"outlier, with a small weight: {one}" for one in result.outliers[:MOST_SHOWN]]
     if len(result.outliers) > MOST_SHOWN:
         lines.append(f"{len(result.outliers) - MOST_SHOWN} more outliers: see --json")
@@ -279,33 +265,6 @@ def _open(result: Estimate) -> list[str]:
     ]
     told = "the poses do not determine these changes, and the calibration makes none of them; a "
     return [f"{told}number in one may still change with others:", *lines] if lines else []
-
-
-def scale_text(scale: Scale) -> str:
-    """How well distances are known, in a sentence."""
-    ends = f"{100.0 * scale.after:.2g} mm in 100 mm"
-    if scale.determined:
-        return f"scale: determined; distances are known to {ends} (standard deviation)"
-    return (
-        f"the scale is not determined: distances may be wrong by {ends} (standard deviation, "
-        f"{100.0 * scale.before:.2g} mm before). Numbers that depend on it are marked no, and "
-        "stay near the file's values. Measure distances as well (--measure height,distance)"
-    )
-
-
-def plan_table(robot: Robot, plan: Plan) -> list[str]:
-    """The CSV of a plan: joints, poses and an empty column for each quantity."""
-    names = [f"{name}.position" for name in robot.controller.names]
-    columns = [plan.joints]
-    if plan.second is not None:
-        names += [f"{name}_2" for name in names]
-        columns.append(plan.second)
-    poses = [name for name in robot.pose_names if name not in plan.quantity]
-    shown = [robot.pose_names.index(name) for name in poses]
-    rows = np.hstack([*columns, plan.poses[:, shown]])
-    head = [*names, *(f"planned_{name}" for name in poses), *plan.quantity]
-    empty = [""] * len(plan.quantity)
-    return [",".join(head), *(",".join([*(f"{v:.9g}" for v in row), *empty]) for row in rows)]
 
 
 def planned(robot: Robot, plan: Plan, accuracy: float | None, out: Path) -> Report:
@@ -352,43 +311,6 @@ def planned(robot: Robot, plan: Plan, accuracy: float | None, out: Path) -> Repo
         notes=["* apart from a rigid motion of the whole workspace", *_open(plan.known)],
         files={"out": out},
     )  # fmt: skip
-
-
-def parse_noise(texts: Sequence[str]) -> dict[str, float]:
-    """Of ``KIND=VALUE`` separated by commas, m or rad.
-
-    :raises ParameterError: no number above zero, or no such kind.
-    """
-    found = {}
-    for text in ",".join(texts).split(",") if texts else ():
-        name, _, value = (part.strip() for part in text.partition("="))
-        if name not in KINDS:
-            raise UnknownNameError("--noise", name, list(KINDS))
-        try:
-            found[name] = float(value)
-        except ValueError:
-            found[name] = np.nan
-        if not 0.0 < found[name] < 1.0:
-            raise ParameterError("--noise", text, "KIND=VALUE, m or rad, as height=0.00002")
-    return found
-
-
-def parse_within(text: str | None) -> dict[str, tuple[float, float]]:
-    """Of ``x=-0.1:0.1, z=0``: least and greatest values, m or rad.
-
-    :raises ParameterError: anything else.
-    """
-    found = {}
-    for part in (text or "").split(",") if text else ():
-        name, _, ends = (one.strip() for one in part.partition("="))
-        try:
-            values = [float(end) for end in ends.split(":")]
-        except ValueError:
-            values = []
-        if len(values) not in (1, 2) or not np.isfinite(values).all() or values[0] > values[-1]:
-            raise ParameterError("--within", part, "COORDINATE=LEAST:GREATEST, as x=-0.1:0.1")
-        found[name] = values[0], values[-1]
-    return found
 
 
 COMMAND = command(calibrate, "Identification and calibration")

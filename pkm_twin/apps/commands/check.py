@@ -9,7 +9,7 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 from pkm_twin.apps.frame import command
 from pkm_twin.apps.options import REFUSED, SALVAGED, CarriesAtTimes, ReadsRecordings, payload_fact
@@ -18,9 +18,6 @@ from pkm_twin.errors import ParameterError, PkmTwinError, one_line
 from pkm_twin.report import Fact, Report, Verdict
 from pkm_twin.settings import setting
 from pkm_twin.threads import one_blas_thread_for_children
-
-METADATA: Final = "metadata.yaml"
-"""What makes a folder a rosbag2 bag."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,6 +59,7 @@ class Check(CarriesAtTimes, ReadsRecordings):
 def check(given: Check) -> Report:
     """Judge a recording, or all of a folder."""
     from pkm_twin.bags.reader import DamagedBagError
+    from pkm_twin.recordings.bags import is_collection
 
     if is_collection(given.bag):
         return _of_folder(given)
@@ -118,21 +116,6 @@ def check_one(given: Check, path: Path, update: Any = None, thorough: bool = Tru
     )  # fmt: skip
 
 
-def bags_of(folder: Path) -> list[Path]:
-    """Recordings in a folder and below: MCAP files and rosbag2 folders, by name."""
-    whole = {path.parent for path in folder.rglob(METADATA)}
-    files = [p for p in folder.rglob("*.mcap") if not whole & set(p.parents)]
-    return sorted([*whole, *files])
-
-
-def is_collection(path: Path) -> bool:
-    """Whether a path is a folder of recordings, not a rosbag2 bag itself."""
-    if not path.is_dir() or (path / METADATA).exists():
-        return False
-    # A bag whose metadata is lost has its files side by side.
-    return bool(bags_of(path)) and not any(path.glob("*.db3"))
-
-
 def _facts(given: Check, path: Path) -> dict[str, Any]:
     """One recording of many, as plain data; a damaged one too."""
     try:
@@ -154,6 +137,8 @@ def _judged_all(given: Check, paths: Sequence[Path]) -> Iterator[dict[str, Any]]
 
 def _of_folder(given: Check) -> Report:
     """Judge all recordings of a folder."""
+    from pkm_twin.recordings.bags import bags_of
+
     paths, results = bags_of(given.bag), list[dict[str, Any]]()
     with progress("checking", len(paths)) as update:
         for result in _judged_all(given, paths):
