@@ -4,18 +4,17 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from delta_dynamics import inverse_dynamics
 from pkm_twin import load
 from pkm_twin.bags.reader import inspect, read_messages
-from pkm_twin.codegen.arrays import Array
+from pkm_twin.codegen.arrays import Array, Indices, Mask
 from pkm_twin.messages.stamps import stamp_of
 from pkm_twin.recordings import ReadOptions, Recording, read
 from pkm_twin.recordings.recording import differentiated
@@ -38,83 +37,38 @@ makes 0.4 %; a wrench left unturned, 8 %."""
 
 
 @dataclass(frozen=True)
-class DynamicsSeries:
-    """A recorded joint-state stream and the twin's answer, on common times."""
+class Panel:
+    """A panel of the picture over time, s; ``lines``: times, values and the line's style each."""
 
     title: str
-    joints: tuple[str, ...]
-    unit: str
-    time: Array
-    measured: Array
-    predicted: Array
-    residual: Array
-    free: NDArray[np.bool_]
-    """Where neither payload nor cutting force is on the platform."""
-    loaded: tuple[float, float] | None
-
-    def draw(self, ax: Any) -> None:
-        """Recorded and predicted effort of the first joint over two seconds."""
-        middle = float(self.time[len(self.time) // 8]) if len(self.time) else 0.0
-        near = (self.time >= middle) & (self.time <= middle + 2.0)
-        ax.plot(self.time[near], self.measured[near, 0], color="0.6", lw=2.5, label="recorded")
-        ax.plot(
-            self.time[near], self.predicted[near, 0], color=plots.COLOURS[1], lw=1, label="twin"
-        )
-        ax.set_title(f"{self.title}: effort of {self.joints[0]}")
-        ax.set_ylabel(f"effort ({self.unit})")
+    upright: str
+    lines: list[tuple[Array, Array, dict[str, Any]]]
 
 
-@dataclass(frozen=True)
-class StiffnessSeries:
-    """Deflection over time, and the frame's ground truth."""
-
-    title: str
-    time: Array
-    deflection: Array
-    truth_time: Array
-    truth: Array
-
-    def draw(self, ax: Any) -> None:
-        """Deflection of the platform and that of a finite-element frame over 0.6 seconds."""
-        begin = float(self.time[len(self.time) // 8]) if len(self.time) else 0.0
-        part, true = (
-            (time >= begin) & (time <= begin + 0.6) for time in (self.time, self.truth_time)
-        )
-        for i, axis in enumerate("xyz"):
-            ax.plot(
-                self.time[part], 1e6 * self.deflection[part, i],
-                color=plots.COLOURS[i], lw=0.8, label=axis,
-            )  # fmt: skip
-            ax.plot(
-                self.truth_time[true], 1e6 * self.truth[true, i], "o",
-                color=plots.COLOURS[i], ms=4, mec="black", mew=0.4,
-            )  # fmt: skip
-        ax.set_title(f"{self.title}: deflection (dots: finite elements)")
-        ax.set_ylabel("deflection (µm)")
+def _window(time: Array, seconds: float, whole: Array) -> Mask:
+    """What is drawn: some seconds from an eighth of all rising times on."""
+    begin = float(whole[len(whole) // 8]) if len(whole) else 0.0
+    return (time >= begin) & (time <= begin + seconds)
 
 
-def report_dynamics(bag: Path, recording: Path, prefix: str) -> tuple[list[Fact], DynamicsSeries]:
+def report_dynamics(bag: Path, recording: Path, prefix: str) -> tuple[list[Fact], Panel]:
     """Compare recorded efforts with the answered ones."""
     r = read(bag, how=ReadOptions(limited=True))
     robot, unit = r.robot, " or ".join(dict.fromkeys(r.robot.effort_units))
     torques = _by_stamp(recording, f"/{prefix}/delta_dynamics/joint_torques")
     residuals = _by_stamp(recording, f"/{prefix}/delta_dynamics/torque_residual")
     answered = [i for i, s in enumerate(r.stamps.tolist()) if s in torques and s in residuals]
-    stamps = r.stamps[answered].tolist()
-    measured = (
-        np.zeros((len(stamps), len(robot.joint_names))) if r.effort is None else r.effort[answered]
-    )
-    series = DynamicsSeries(
-        prefix,
-        robot.joint_names,
-        unit,
-        r.time[answered],
-        measured,
-        _efforts(torques, stamps, robot),
-        _efforts(residuals, stamps, robot),
-        _free(r)[answered],
-        _loaded(r),
-    )
+    stamps, time = r.stamps[answered].tolist(), r.time[answered]
+    predicted, residual = (_efforts(found, stamps, robot) for found in (torques, residuals))
+    measured = np.zeros_like(predicted) if r.effort is None else r.effort[answered]
+    near = _window(time, 2.0, time)
+    panel = Panel(
+        f"{prefix}: effort of {robot.joint_names[0]}", f"effort ({unit})",
+        [
+            (time[near], measured[near, 0], {"color": "0.6", "lw": 2.5, "label": "recorded"}),
+            (time[near], predicted[near, 0], {"color": plots.COLOURS[1], "lw": 1, "label": "twin"}),
+        ],
+    )  # fmt: skip
     sent = sum(1 for _ in read_messages(bag, ["/delta_dynamics/joint_trajectory"]))
     filled = read_messages(recording, [f"/{prefix}/delta_dynamics/joint_trajectory_ff"])
     findings = [
@@ -122,46 +76,37 @@ def report_dynamics(bag: Path, recording: Path, prefix: str) -> tuple[list[Fact]
         share(prefix, "trajectories answered", sum(1 for _ in filled), sent),
     ]
     if not stamps:
-        return findings, series
-    peak = np.abs(series.predicted).max(0)
-    findings.append(told(prefix, "peak effort", _listed(peak, unit)))
-    rms = np.sqrt(np.mean(series.predicted**2, 0))
-    findings.append(told(prefix, "RMS effort", _listed(rms, unit)))
-    free = series.free
-    part = np.sqrt(np.mean(series.residual[free] ** 2, 0)) / np.abs(series.measured).max(0)
-    findings.append(
-        judge(
-            f"{prefix}: residual RMS without load",
-            _listed(100 * part, "% of peak"),
-            f"below {100 * MAX_RESIDUAL:g} %",
-            bool((part < MAX_RESIDUAL).all()),
-        )
-    )
+        return findings, panel
+
+    def left(what: str, rows: Mask, bound: float) -> Fact:
+        part = _rms(residual[rows]) / np.abs(measured).max(0)
+        return judge(
+            f"{prefix}: residual RMS {what}", _listed(100 * part, "% of peak"),
+            f"below {100 * bound:g} %", bool((part < bound).all()),
+        )  # fmt: skip
+
+    free = _free(r)[answered]
+    findings += [
+        told(prefix, "peak effort", _listed(np.abs(predicted).max(0), unit)),
+        told(prefix, "RMS effort", _listed(_rms(predicted), unit)),
+        left("without load", free, MAX_RESIDUAL),
+    ]
     if r.wrench is not None:
-        findings.append(_cutting(prefix, series))
-    if series.loaded is not None:
-        findings += _payload(prefix, r, answered, series)
-    return findings, series
+        # Where a force acts, which the node was given.
+        findings.append(left("while cutting", ~free, MAX_CUTTING_RESIDUAL))
+    if r.load is not None and r.load.times:
+        begin, end = r.load.times[0]
+        held = (time > begin + 0.5) & (time < end - 0.5)
+        findings += _payload(prefix, r, residual, free, np.array(answered), held)
+    return findings, panel
 
 
-def _cutting(prefix: str, series: DynamicsSeries) -> Fact:
-    """The residual where a force acts, which the node was told."""
-    cut = series.residual[~series.free]
-    part = np.sqrt(np.mean(cut**2, 0)) / np.abs(series.measured).max(0)
-    return judge(
-        f"{prefix}: residual RMS while cutting",
-        _listed(100 * part, "% of peak"),
-        f"below {100 * MAX_CUTTING_RESIDUAL:g} %",
-        bool((part < MAX_CUTTING_RESIDUAL).all()),
-    )
+def _rms(values: Array) -> Array:
+    """Root mean square over the samples, by joint."""
+    return np.asarray(np.sqrt(np.mean(values**2, 0)), np.float64)
 
 
-def _loaded(r: Recording) -> tuple[float, float] | None:
-    """From when to when a payload is held, s: one span in these recordings."""
-    return r.load.times[0] if r.load is not None and r.load.times else None
-
-
-def _free(r: Recording) -> NDArray[np.bool_]:
+def _free(r: Recording) -> Mask:
     """Where nothing is held and nothing cut; half a second around either counts for neither."""
     if r.load is not None:
         loaded = r.load.held(r.time)
@@ -179,24 +124,25 @@ def _free(r: Recording) -> NDArray[np.bool_]:
     return np.asarray(nearest > 0.5, np.bool_)
 
 
-def _payload(prefix: str, r: Recording, answered: list[int], series: DynamicsSeries) -> list[Fact]:
+def _payload(
+    prefix: str, r: Recording, residual: Array, free: Mask, answered: Indices, held: Mask
+) -> list[Fact]:
     """The step that the payload makes in the residual, and the mass that it means."""
-    assert series.loaded is not None and r.load is not None  # noqa: S101
-    free = series.free
-    held = (series.time > series.loaded[0] + 0.5) & (series.time < series.loaded[1] - 0.5)
-    step = np.linalg.norm(series.residual[held].mean(0) - series.residual[free].mean(0))
-    scatter = np.linalg.norm(np.std(series.residual[free], 0))
+    assert r.load is not None  # noqa: S101
+    change = residual[held] - residual[free].mean(0)
+    step = np.linalg.norm(change.mean(0))
+    scatter = np.linalg.norm(np.std(residual[free], 0))
     # What one kilogram would need, along the recorded motion.
     qd, qdd, _ = differentiated(r)
-    state = [values[answered][held] for values in (r.q, qd, qdd)]
+    state = [values[answered[held]] for values in (r.q, qd, qdd)]
     kilogram = inverse_dynamics(r.robot.changed(payload={"mass": 1.0}), *state)
     kilogram -= inverse_dynamics(r.robot, *state)
-    change = series.residual[held] - series.residual[free].mean(0)
     mass = float(np.sum(kilogram * change) / np.sum(kilogram**2))
     return [
         judge(
             f"{prefix}: step of the residual at the pick",
-            f"{step:.3f} {series.unit}, {step / scatter:.1f} times its scatter",
+            f"{step:.3f} {' or '.join(dict.fromkeys(r.robot.effort_units))}, "
+            f"{step / scatter:.1f} times its scatter",
             "above 3 times",
             bool(step > 3 * scatter),
         ),
@@ -209,7 +155,7 @@ def _payload(prefix: str, r: Recording, answered: list[int], series: DynamicsSer
     ]
 
 
-def report_stiffness(bag: Path, recording: Path, prefix: str) -> tuple[list[Fact], StiffnessSeries]:
+def report_stiffness(bag: Path, recording: Path, prefix: str) -> tuple[list[Fact], Panel]:
     """Compare answered deflections with the frame's, and say what dominated."""
     wrenches = _by_stamp(bag, "/wrench")
     energies = _by_stamp(recording, f"/{prefix}/stiffness_monitor/strain_energy")
@@ -224,16 +170,19 @@ def report_stiffness(bag: Path, recording: Path, prefix: str) -> tuple[list[Fact
     fixed = np.einsum("nij,nj->ni", robot.rotation(pose.reshape(-1, len(robot.pose_names))), local)
     judged = [s for s in common if s in truth]
     true = np.array([_xyz(truth[s].transform.translation) for s in judged]).reshape(-1, 3)
-    series = StiffnessSeries(
-        prefix,
-        (np.array(common) - start) / 1e9,
-        fixed,
-        (np.array(judged) - start) / 1e9,
-        true,
-    )
+    panel = Panel(f"{prefix}: deflection (dots: finite elements)", "deflection (µm)", [])
+    times = [(np.array(stamps) - start) / 1e9 for stamps in (common, judged)]
+    curves: dict[str, Any] = {"lw": 0.8}
+    dots = {"marker": "o", "ls": "", "ms": 4, "mec": "black", "mew": 0.4}
+    for time, moves, style in zip(times, (fixed, true), (curves, dots), strict=True):
+        part = _window(time, 0.6, times[0])
+        for i, axis in enumerate("xyz"):
+            name = {} if style is dots else {"label": axis}
+            line = (time[part], 1e6 * moves[part, i], {"color": plots.COLOURS[i], **style, **name})
+            panel.lines.append(line)
     findings = [share(prefix, "wrenches answered", len(common), len(wrenches))]
     if not common:
-        return findings, series
+        return findings, panel
     dominant = Counter(energies[s].status[0].message for s in common)
     findings.append(
         told(
@@ -259,10 +208,10 @@ def report_stiffness(bag: Path, recording: Path, prefix: str) -> tuple[list[Fact
                 bool(error < MAX_DEFLECTION_ERROR),
             )
         )
-    return findings, series
+    return findings, panel
 
 
-Reports = Callable[[Path, Path, str], tuple[list[Fact], Any]]
+Reports = Callable[[Path, Path, str], tuple[list[Fact], Panel]]
 REPORTS: dict[str, Reports] = {
     "delta_cu_pick_and_place": report_dynamics,
     "prru_milling": report_dynamics,
@@ -303,15 +252,15 @@ def _xyz(vector: Any) -> list[float]:
     return [vector.x, vector.y, vector.z]
 
 
-def draw(series: Mapping[str, Any], path: Path) -> Path:
+def draw(panels: Sequence[Panel], path: Path) -> Path:
     """One picture of all stages: a panel each."""
     figure, columns = plots.columns(2, 2)
-    panels = [columns[k % 2][k // 2] for k in range(4)]
-    for ax, data in zip(panels, series.values(), strict=False):
-        data.draw(ax)
-        ax.set_xlabel("time (s)")
+    axes = [columns[k % 2][k // 2] for k in range(4)]
+    for ax, panel in zip(axes, panels, strict=False):
+        for time, values, style in panel.lines:
+            ax.plot(time, values, **style)
+        plots.label(ax, "time (s)", panel.upright, panel.title)
         ax.legend(loc="best")
-        ax.grid(alpha=0.3)
-    for ax in panels[len(series) :]:
+    for ax in axes[len(panels) :]:
         ax.set_visible(False)
     return plots.save(figure, path)

@@ -216,16 +216,10 @@ def run(bags: Path, out: Path, console: Console) -> Report:
         executor.shutdown()
         node.destroy_node()
         rclpy.try_shutdown(context=context)
-    findings: list[Fact] = []
-    series = {}
-    for stage in STAGES:
-        found, series[stage.bag] = REPORTS[stage.bag](
-            bags / f"{stage.bag}.mcap", recording, stage.bag
-        )
-        findings += found
-    found, series["machine_sim"] = tracking.report(recording)
-    findings += found
-    picture = draw(series, out / "demo.png")
+    parts = [REPORTS[s.bag](bags / f"{s.bag}.mcap", recording, s.bag) for s in STAGES]
+    parts.append(tracking.report(recording))
+    findings: list[Fact] = [fact for found, _ in parts for fact in found]
+    picture = draw([panel for _, panel in parts], out / "demo.png")
     bad = any(fact.verdict is Verdict.BAD for fact in findings)
     return Report(
         f"{'OFF' if bad else 'good'}: recorded bags and a simulated machine through the nodes",

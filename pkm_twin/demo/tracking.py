@@ -8,10 +8,10 @@ trajectory by itself, with the brakes on before. So the result does not depend o
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from rclpy.executors import SingleThreadedExecutor
@@ -33,7 +33,7 @@ from pkm_twin.demo.recorder import (
     process,
     wait_for,
 )
-from pkm_twin.demo.report import share, told
+from pkm_twin.demo.report import Panel, share, told
 from pkm_twin.errors import BagError
 from pkm_twin.messages.reading import JointReader
 from pkm_twin.messages.stamps import SECOND, stamp_of
@@ -173,41 +173,26 @@ class Run:
         return float(np.sqrt(np.mean(self.error**2)))
 
 
-@dataclass(frozen=True)
-class TrackingSeries:
-    """By spread the run by PD alone and the one with feedforward."""
-
-    joints: tuple[str, ...]
-    runs: Mapping[float, tuple[Run, Run]]
-
-    def draw(self, ax: Any) -> None:
-        """Tracking errors of PD alone and with feedforward, by the error of the model."""
-        for i, (perturbation, runs) in enumerate(self.runs.items()):
-            for run, what, line in zip(runs, ("PD", "with feedforward"), ("-", "--"), strict=True):
-                size = 1e3 * np.linalg.norm(run.error, axis=1)
-                label = f"{what}, {100 * perturbation:g} %"
-                ax.plot(run.time, size, line, color=plots.COLOURS[i], lw=1.2, label=label)
-        ax.set_title("machine_sim: tracking error by model error")
-        ax.set_ylabel("error, all joints (mrad)")
-
-
 def prefix(spread: float) -> str:
     """Under what a spread's topics stand in the recording."""
     return f"machine_sim_{100 * spread:g}_percent"
 
 
-def report(recording: Path) -> tuple[list[Fact], TrackingSeries]:
+def report(recording: Path) -> tuple[list[Fact], Panel]:
     """Tracking error and torque of both runs of every model error."""
     findings: list[Fact] = []
-    runs = {}
+    panel = Panel("machine_sim: tracking error by model error", "error, all joints (mrad)", [])
     robot = load(ROBOT)
-    for spread in SPREADS:
+    for i, spread in enumerate(SPREADS):
         name = prefix(spread)
-        plain, ahead = runs[spread] = _runs(recording, name)
+        plain, ahead = _runs(recording, name)
         there = sum(len(run.time) for run in (plain, ahead))
         all_in_all = sum(round(run.duration / PERIOD) for run in (plain, ahead))
         findings.append(share(name, "joint states recorded", there, all_in_all))
-        for what, way in (("PD", plain), ("PD and feedforward", ahead)):
+        for what, line, way in (("PD", "-", plain), ("PD and feedforward", "--", ahead)):
+            size = 1e3 * np.linalg.norm(way.error, axis=1)
+            style = {"ls": line, "color": plots.COLOURS[i], "lw": 1.2}
+            panel.lines.append((way.time, size, {**style, "label": f"{what}, {100 * spread:g} %"}))
             peaks = ", ".join(f"{peak:.3g}" for peak in np.abs(way.effort).max(0))
             value = f"{1e3 * way.rms:.3f} mrad RMS, {1e3 * np.abs(way.error).max():.3f} worst"
             findings.append(told(name, f"tracking error, {what}", value))
@@ -217,7 +202,7 @@ def report(recording: Path) -> tuple[list[Fact], TrackingSeries]:
         bound = f"{TIMES_BETTER:g} or more" if spread == min(SPREADS) else ""
         value = f"{ratio:.1f} times better"
         findings.append(judged(f"{name}: {what}", value, bound, bool(ratio >= TIMES_BETTER)))
-    return findings, TrackingSeries(robot.joint_names, runs)
+    return findings, panel
 
 
 def _runs(recording: Path, name: str) -> tuple[Run, Run]:
