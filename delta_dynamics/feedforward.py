@@ -148,7 +148,7 @@ class Feedforward(Core):
     """Answers trajectories and a stream of joint states with feedforward efforts.
 
     ``wrenches``: those that the stream's efforts bear; None bears none. ``uncertain``: the doubt of
-    rates is told for every robot, else it is known of those with dry friction alone.
+    rates is computed for every robot, else it is known of those with dry friction alone.
     """
 
     robot: Robot
@@ -254,7 +254,7 @@ class Feedforward(Core):
         return torques
 
     def refuse(self, counts: StreamMonitor, error: MessageError) -> None:
-        """Count a message that is refused; several joint states in a row stop the stream.
+        """Count a message that is rejected; several joint states in a row stop the stream.
 
         A trajectory stops it where its input was finite: the model cannot be trusted then.
         """
@@ -263,7 +263,7 @@ class Feedforward(Core):
             self.stream.stop(error.reason, str(error))
 
     def check_age(self, torques: Torques, now: int) -> None:
-        """Refuse efforts that come too late, as after the process stood still.
+        """Reject efforts that come too late, as after the process stood still.
 
         :raises MessageError: the state is older than ``stale_after`` by now; counted.
         """

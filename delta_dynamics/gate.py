@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """What an effort controller gets: stamped torques while they come, zeros or gravity when not.
 
-A command of plain numbers has no stamp, so a controller that takes it cannot tell a live torque
-from the last word of a dead process. This is the last place that can. Pure: times are arguments.
+A command of plain numbers has no stamp, so a controller that takes it cannot distinguish a live
+torque from the last word of a dead process. This is the last place that can. Pure: times are
+arguments.
 """
 
 from __future__ import annotations
@@ -96,7 +97,7 @@ class Gate(Core):
         :param message: sensor_msgs/JointState with an effort a joint, in any order of names.
         :param now: the ROS clock, ns; stamps are judged by it.
         :param steady: the steady clock, ns; silences are judged by it.
-        :raises MessageError: the message is refused, and counted.
+        :raises MessageError: the message is rejected, and counted.
         """
         self.watch(steady)
         with self.refusing(self.stream):
@@ -109,7 +110,7 @@ class Gate(Core):
     def joint_state(self, message: Any, now: int, steady: int) -> None:
         """Keep where the robot stands: gravity is that of a measured state, never of a guess.
 
-        :raises MessageError: the message is refused, and counted.
+        :raises MessageError: the message is rejected, and counted.
         """
         with self.taking(self.states):
             q = self._reader.joint_state(message, now, self._rules).q

@@ -2,12 +2,12 @@
 """Which elastic element has departed from the file, by measured deflections under measured loads.
 
 A measured deflection is C(s) w + F u + z and noise: s multiplies the elements' compliances
-(:mod:`stiffness_monitor.response`), F u is what the causes of the file's ``uncertainty`` make of
-C w, u of deviation 1, and z a zero of the instrument. The fewest elements are looked for whose
-factors explain a window of samples: always one more, the one that leaves the least sum of squares.
-It has departed where its factor is farther from 1 than a number of deviations, of the measured
-noise and of what the file's uncertainty says of that element. Elements that would explain the same
-nearly as well are named with it.
+(:mod:`stiffness_monitor.response`), F u is what the causes of the file's ``uncertainty`` make of C
+w, u of standard deviation 1, and z a zero of the instrument. The fewest elements are looked for
+whose factors explain a window of samples: always one more, the one that leaves the least sum of
+squares. It has departed where its factor is farther from 1 than a number of standard deviations, of
+the measured noise and of what the file's uncertainty says of that element. Elements that would
+explain the same nearly as well are named with it.
 """
 
 from __future__ import annotations
@@ -152,7 +152,7 @@ class _Window:
         return added[..., 0], (columns * amounts[:, None]) @ mine
 
     def alone(self, count: int) -> tuple[Array, Array]:
-        """Each element's factor by itself, to first order, and its deviation, (elements,)."""
+        """Each element's factor by itself, to first order, and its standard deviation, (elements,)."""
         _, slopes = self.added(range(count), np.ones(count))
         rows, columns = slopes.reshape(-1, count), self.common.reshape(-1, len(self.prior))
         columns = np.concatenate([columns, np.diag(np.sqrt(self.prior))])

@@ -29,7 +29,7 @@ DIRECTIONS = ("x", "y", "z", "rx", "ry", "rz")
 
 
 class StiffnessAlarmTopics:
-    """``measured_deflection`` beside the wrenches; ``~/stiffness_alarm`` says what has departed."""
+    """``measured_deflection`` in; ``~/stiffness_alarm`` says which elements have departed."""
 
     def __init__(
         self, node: TwinNode, robot: Robot, rules: StampRules, frames: tuple[str, str]

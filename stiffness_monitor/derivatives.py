@@ -129,7 +129,7 @@ def _gradient(write: Write, chosen: Chosen, s: Solved) -> Program:
 def compliance_deviation(robot: Robot, pose: ArrayLike) -> Array:
     """Standard deviation of :func:`compliance`, propagated from ``uncertainty``, (..., 6, 6).
 
-    To first order in the deviations, independent causes. Zero for a file that names none.
+    To first order in the standard deviations, independent causes. Zero for a file that names none.
 
     :param pose: shape (..., m), the mechanism's pose coordinates, m and rad.
     """

@@ -4,8 +4,8 @@
 The robot is linear about the pose: elastic beams, joints with free and elastic directions, a rigid
 platform (Delta-CU paper, modal analysis). K x = (2 pi f)^2 M x.
 
-A member's inner nodes can be replaced by its lowest modes with held ends, beside the static shapes
-of its ends (Craig and Bampton 1968): statics stay exact, and a pose costs much less.
+A member's inner nodes can be replaced by its lowest modes with held ends, in addition to the static
+shapes of its ends (Craig and Bampton 1968): statics stay exact, and a pose costs much less.
 Displacements of a node are in the order x y z rx ry rz (m, rad).
 """
 
@@ -251,9 +251,9 @@ class Modes:
     """Natural modes of a robot, lowest first; arrays are read-only.
 
     ``frequencies``: shape (..., count), Hz. ``nodes``: names of the points whose motion is given,
-    the platform's origin first, then each member's points from its inner to its outer end.
-    ``positions``: shape (..., nodes, 3), fixed axes, m. ``shapes``: displacements and small
-    rotations of the nodes along fixed axes, shape (..., count, nodes, 6), of unit generalised mass
+    the platform's reference point first, then each member's points from its inner to its outer end.
+    ``positions``: shape (..., nodes, 3), base axes, m. ``shapes``: displacements and small
+    rotations of the nodes along base axes, shape (..., count, nodes, 6), of unit generalised mass
     (1/sqrt(kg) and rad/(m sqrt(kg))), the largest displacement positive.
     """
 
@@ -379,7 +379,7 @@ def solve_modes(
     """Frequencies (count,), Hz, and vectors (n, count) of unit generalised mass.
 
     Of the inverse problem L^-1 M L^-T y = y / omega^2 with K = L L': its largest values are
-    the lowest frequencies, so these have all digits beside stiff joints.
+    the lowest frequencies, so these have all digits next to stiff joints.
     """
     size = len(system.mass)
     if not 1 <= count <= size:

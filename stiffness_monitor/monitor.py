@@ -24,8 +24,8 @@ Settings = WrenchSettings
 class Answer:
     """What one wrench did to the platform.
 
-    ``energy`` and ``wrench`` (6,) in fixed axes at the platform's origin; ``rotation`` (3, 3) turns
-    platform axes into fixed ones.
+    ``energy`` and ``wrench`` (6,) in base axes at the platform's reference point; ``rotation`` (3,
+    3) turns platform axes into fixed ones.
     """
 
     stamp: int
@@ -72,7 +72,7 @@ class Monitor(TimeSynchronizer):
     def wrench(self, message: Any, now: int) -> Answer | None:
         """Answer a wrench; None where ``pace`` leaves it out.
 
-        A wrench in the base frame has fixed axes; one in any other frame has the platform's, as a
+        A wrench in the base frame has base axes; one in any other frame has the platform's, as a
         force-torque sensor mounted there measures it. From where the settings, or transforms, say
         that it was measured it is moved to the platform's reference point.
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The node ``stiffness_monitor``: wrenches in, compliance and dominant element out.
 
-With measured deflections, the elements that have departed from the file. Beside them the natural
+With measured deflections, the elements that have departed from the file. In addition, the natural
 frequencies of the pose, which need joint states alone.
 """
 

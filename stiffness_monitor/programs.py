@@ -269,7 +269,7 @@ class Solved:
 
 def followed(frame: Frame, chosen: Followers) -> tuple[dict[int, Row], Any, list[Any]]:
     """Of chosen coordinates, their rows of the others; the reciprocal determinant of what
-    determines them; and what other closures hold beside, which is zero.
+    determines them; and what other closures hold in addition, which is zero.
     """
     table = frame.table()[list(chosen.rows)]
     lu = SparseLU(table[:, list(chosen.chosen)], chosen.pivots)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How the platform's compliance hangs on the compliance of each elastic element, exactly.
+"""How the platform's compliance depends on the compliance of each elastic element, exactly.
 
 Element e gives by s_e times what the robot's file says. With K = sum of G_e G_e' / s_e over the
 elements (columns G of their own stiffness on the frame's coordinates) and the platform's E,

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """The structural model of a robot: elastic beams, joints, rigid bodies, locked actuators.
 
-It follows from the graph: every beam and every body that is no beam hangs on its parent through
-the joint between them, whose freedoms let go and whose compliances give; the platform keeps its six
-displacements, and what closes a loop between bodies that hang already is a closure.
+It follows from the graph: every beam and every body that is no beam is carried by its parent
+through the joint between them, whose freedoms let go and whose compliances give; the platform keeps
+its six displacements, and what closes a loop between bodies that hang already is a closure.
 
-What hangs on what is decided once, at home: that is the plan. In it a point or direction is a pair
+What carries what is decided once, at home: that is the plan. In it a point or direction is a pair
 of its body and its vector at home, a section is its beam's name, and a compliance is 0, infinite or
 the joint's name and the entry. :func:`posed` puts numbers, or expressions, in their place. A plan
 of a geometry on expressions is that of its known case.
@@ -252,7 +252,7 @@ def _axes(given: Sequence[tuple[str, Array]], turn: Turn) -> Any:
 
 
 def plan_of(graph: Graph, structure: Structure) -> StructuralModel:
-    """What hangs on what, by the graph at home."""
+    """What carries what, by the graph at home."""
     return _Planner(graph, structure).plan()
 
 

@@ -63,7 +63,7 @@ class ToolModes:
         """Where the tool point moves most per force, between the first and last frequency.
 
         Returns the frequency, Hz, the displacement per force, m/N, and its direction (3,), base
-        axes. Peaks are looked at too: they may be narrower than the steps of the frequencies.
+        axes. Peaks are checked too: they may be narrower than the steps of the frequencies.
         """
         grid = doubles(frequencies, "frequencies")
         peaks = self.frequencies * np.sqrt(np.maximum(1.0 - 2.0 * self.damping**2, 0.0))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Measured deflections beside the wrenches that made them: messages in, departures out. Pure."""
+"""Measured deflections and the wrenches that made them: messages in, departures out. Pure."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether something pushes: external efforts beyond what model and noise leave open."""
+"""Whether there is a contact: external efforts beyond what model and noise leave open."""
 
 from __future__ import annotations
 
@@ -220,7 +220,7 @@ class ContactMonitor:
     def __init__(self, robot: Robot, bandwidth: float = 60.0, sigmas: float = SIGMAS) -> None:
         """Begin without a past.
 
-        :raises ValueError: a bandwidth or a number of deviations that is not positive.
+        :raises ValueError: a bandwidth or a number of standard deviations that is not positive.
         """
         if not sigmas > 0.0:
             raise ValueError(f"sigmas is {sigmas:g}; expected more than 0")
@@ -260,7 +260,8 @@ class ContactMonitor:
         """Take a sample; None until the noise is known.
 
         :param time: of the sample, s, later than the last one's.
-        :param motion: q, qd and qdd, shape (n,) each; qdd counts for the model's deviation alone.
+        :param motion: q, qd and qdd, shape (n,) each; qdd is used for the standard deviation of the
+            model alone.
         :param effort: measured, shape (n,).
         :param wrench: on the platform, known otherwise, base axes at its reference point, (6,).
         :param doubt: how far the rates may be off, (n,); by default by their own noise.

@@ -70,7 +70,7 @@ class PayloadEstimator:
     def __init__(self, robot: Robot, *, mass_range: float = 5.0, reach: float = 0.2) -> None:
         """Begin with the robot's own payload.
 
-        :param mass_range: deviation that a load's mass has before anything is known, kg.
+        :param mass_range: standard deviation of a load's mass before anything is known, kg.
         :param reach: the same of its centre, m.
         """
         self._share = LoadShare(robot)

@@ -120,7 +120,7 @@ class Estimates:
         )
 
     def reset(self) -> None:
-        """A stream begins anew: the load stays, time does not."""
+        """A stream begins again: the load stays, time does not."""
         self._last = 0
         self._pace.reset()
         if self._contact is not None:
@@ -136,7 +136,7 @@ class Estimates:
             self._contact.change_robot(robot)
 
     def take(self, torques: Torques) -> None:
-        """A sample whose torques were published; without measured efforts it tells nothing."""
+        """A sample whose torques were published; without measured efforts it gives nothing."""
         effort = torques.measured
         if effort is None:
             return

@@ -97,7 +97,7 @@ class CommandGate(TwinNode):
         self._send(self._gate.stop_command(time.monotonic_ns()))
 
     def deactivated(self) -> None:
-        """The last command, which the controller holds for ever, must not be a torque."""
+        """The last command, which the controller holds indefinitely, must not be a torque."""
         self._gate.stream.stop("inactive", "the node was deactivated")
         self._tell()
         self._send(self._gate.stop_command(time.monotonic_ns()))

@@ -37,7 +37,7 @@ CHANGES: Final = {
 def declare_changes(
     node: TwinNode, robot: Robot, names: Collection[str] = CHANGES
 ) -> dict[str, Any]:
-    """Declare these parameters; what is given beside the robot's file."""
+    """Declare these parameters; what is given in addition to the robot's file."""
     changes = {}
     for name in names:
         section, key, unit, text = CHANGES[name]

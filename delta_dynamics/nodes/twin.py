@@ -102,7 +102,7 @@ class DeltaDynamics(TwinNode):
         return f"robot {robot.name} ({robot.mechanism}), joints {', '.join(robot.joint_names)}"
 
     def time_jumped_backward(self) -> None:
-        """No torque across the seam: the stream starts anew."""
+        """No torque across the seam: the stream starts again."""
         self._feedforward.reset()
         self._estimates.reset()
         self._reactions_pace.reset()
@@ -118,7 +118,7 @@ class DeltaDynamics(TwinNode):
         self._stop("exception", f"{where} raised an exception")
 
     def activated(self) -> None:
-        """A stream begins anew."""
+        """A stream begins again."""
         self.time_jumped_backward()
         self._accepted = None
 

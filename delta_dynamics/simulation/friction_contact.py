@@ -411,8 +411,8 @@ class Resistance:
     def crawl(self, here: Terms, law: Law, span: float) -> Terms:
         """A part of a step by Moreau's implicit time stepping, of order one.
 
-        For what changes faster than can be told: friction so stiff that its transients have passed.
-        It needs no law to last, always has a result, and takes energy away.
+        For what changes faster than can be resolved: friction so stiff that its transients have
+        passed. It needs no law to last, always has a result, and takes energy away.
         """
         n = len(here.q)
         inverse = _inverse(here.mass + span * self._damping(here))

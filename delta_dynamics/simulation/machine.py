@@ -357,7 +357,7 @@ def error_growth(
 
 @dataclass(frozen=True)
 class Measured:
-    """What the sensors tell, shape (n,) each: rad or m, their rates, N m or N."""
+    """What the sensors measure, shape (n,) each: rad or m, their rates, N m or N."""
 
     stamp: int
     q: Array
@@ -421,14 +421,14 @@ class Simulation(Core):
         return (self.now - self._begun) / SECOND
 
     def skip(self, nanoseconds: int) -> None:
-        """The clock goes on and the machine does not: whoever runs it stood still."""
+        """The clock goes on and the machine does not: the process that runs it stood still."""
         self.now += nanoseconds
         self._begun += nanoseconds
 
     def commands(self, message: Any) -> None:
         """Efforts as std_msgs/Float64MultiArray, the controller's, in the robot's order.
 
-        :raises MessageError: refused whole, and counted; what was commanded before stays.
+        :raises MessageError: rejected whole, and counted; what was commanded before stays.
         """
         with self.taking(self.stream):
             effort = self._reader.commands(message.data)
@@ -443,7 +443,7 @@ class Simulation(Core):
         A zero stamp starts it now. Before its first point the way leads there from here.
 
         :param message: the message or its TrajectoryFields.
-        :raises MessageError: refused whole, and counted; what was commanded before stays.
+        :raises MessageError: rejected whole, and counted; what was commanded before stays.
         """
         with self.taking(self.trajectories):
             t = self._reader.trajectory(message, self.now)
@@ -466,14 +466,14 @@ class Simulation(Core):
     def push(self, message: Any, frame: str) -> None:
         """A geometry_msgs/WrenchStamped in the base frame, which stays until the next.
 
-        :raises MessageError: it is refused, and counted.
+        :raises MessageError: it is rejected, and counted.
         """
         rules = StampRules(accept_zero=True, future_tolerance=SECOND)
         with self.taking(self.wrenches):
             self._pushed = read_wrench(message, self.now, rules, frame, False).wrench
 
     def measured(self) -> Measured:
-        """What the sensors tell now."""
+        """What the sensors measure now."""
         force = self._wrench()
         rotation = self.robot.platform(self.plant.q)[1]
         turned = np.concatenate([force[:3] @ rotation, force[3:] @ rotation])

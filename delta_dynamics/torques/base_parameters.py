@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which combinations of the parameters the efforts tell apart, found on random states.
+"""Which combinations of the parameters the efforts distinguish, found on random states.
 
-The base parameters of a closed chain hang on its loops: they are found numerically, by a pivoted
+The base parameters of a closed chain depend on its loops: they are found numerically, by a pivoted
 QR factorisation of the regressor (Gautier, Numerical calculation of the base inertial parameters
 of robots, 1991, doi:10.1002/rob.4620080405).
 """

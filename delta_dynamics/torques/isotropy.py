@@ -7,7 +7,7 @@ Two indices of the 3-PRRU paper, for every robot with masses, over the pose rate
 - F_max = max |F_d| at a given E_M and Xddot (equations 47 and 48).
 
 A payload counts as part of the platform. Directions are unit vectors of pose rates in SI
-units (m/s beside rad/s for the 3-PRRU), as in the paper; eta's extremes do not depend on
+units (m/s and rad/s for the 3-PRRU), as in the paper; eta's extremes do not depend on
 that choice. Xddot = 0 is meant in the pose's own coordinates, so F_max does depend on them:
 turned by a third of a turn, the same motion has another Xddot in alpha and beta.
 """

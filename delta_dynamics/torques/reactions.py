@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Joint reactions by d'Alembert's principle: the force route beside the power route.
+"""Joint reactions by d'Alembert's principle: the force route in addition to the power route.
 
 Every body's force and moment balance, A lambda = b, over what the joints can transmit; the
 actuators' efforts come out as components of lambda, independently of virtual work.

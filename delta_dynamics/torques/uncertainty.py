@@ -79,7 +79,7 @@ def torque_deviation(
 ) -> Array:
     """Standard deviation of :func:`inverse_dynamics`, propagated from the file's ``uncertainty``.
 
-    To first order in the deviations, independent causes. Zero for a file that names none.
+    To first order in the standard deviations, independent causes. Zero for a file that names none.
 
     :param q: joint positions, shape (..., n), rad or m; rates ``qd``, accelerations ``qdd``.
     :param wrench: as in ``inverse_dynamics``, shape (..., 6); None: no wrench.

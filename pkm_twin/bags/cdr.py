@@ -4,7 +4,7 @@
 Decoded messages have the attributes of live ones (``msg.header.stamp.sec``, ``msg.position``), so
 code that reads attributes takes both. Numeric arrays are ``array.array``, an octet is one byte.
 
-Written here rather than taken from a library because a bag reader must refuse a truncated buffer:
+Written here rather than taken from a library because a bag reader must reject a truncated buffer:
 a string or byte array cut short has to be an error, never a shorter value.
 """
 
@@ -195,7 +195,7 @@ class _Source:
         return BagError(f"{self._type_name}: {text}", reason="cdr")
 
     def require(self, count: int) -> None:
-        """Refuse to go on unless ``count`` bytes are left."""
+        """Raise an error unless ``count`` bytes are left."""
         left = self._end - self.position
         if count > left:
             raise self.error(f"needs {count} bytes at {self.position}, {max(left, 0)} are left")

@@ -129,7 +129,7 @@ class Budget:
         self._spent = 0
 
     def spend(self, count: int, offset: int | None) -> None:
-        """Take ``count`` bytes; once they are used up the file is refused."""
+        """Take ``count`` bytes; once they are used up the file is rejected."""
         self._spent += count
         if self._spent > self.limit:
             raise FormatError(
@@ -280,7 +280,7 @@ class Fields:
         return len(self._body) - self._position
 
     def done(self) -> None:
-        """Refuse bytes after the last field."""
+        """Reject bytes after the last field."""
         if self.left:
             raise FormatError(
                 f"the {self._what} record has {self.left} bytes too many", self._offset
@@ -583,7 +583,8 @@ def message_data(
 ) -> bytes:
     """Return a message record's payload, unpacked where rosbag2 has packed each message.
 
-    No plain CDR begins as a zstd frame does, so the bytes tell; rosbag2 says it only beside them.
+    No plain CDR begins as a zstd frame does, so the bytes decide; rosbag2 says it only outside
+    them.
     """
     start += MESSAGE_HEAD.size
     if data[start : start + len(ZSTD_MAGIC)] != ZSTD_MAGIC or encoding != "cdr":

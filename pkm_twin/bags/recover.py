@@ -41,7 +41,7 @@ class RecoverResult:
     """What :func:`recover` saved and what it could not.
 
     ``bytes_lost`` counts damaged and incomplete records of the source's data section; indexes and
-    summary are made anew. ``unverified`` messages were whole, but no CRC covered them. ``reason``
+    summary are made again. ``unverified`` messages were whole, but no CRC covered them. ``reason``
     is the first fault found, empty for a sound bag.
     """
 
@@ -65,7 +65,7 @@ class Salvage(Walker):
     """A forward scan that keeps what is whole and goes on behind what is not.
 
     Where the summary is there and its CRC holds, its channels stand in for lost ones, and its list
-    of chunks tells where to go on after a record whose length is damaged.
+    of chunks says where to go on after a record whose length is damaged.
     """
 
     def __init__(self, reader: RecordReader) -> None:

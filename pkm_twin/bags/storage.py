@@ -37,7 +37,7 @@ class BagFile:
 
     @contextmanager
     def open(self) -> Iterator[RecordReader]:
-        """Open it for reading; whatever the system refuses becomes a BagError."""
+        """Open it for reading; an error of the system becomes a BagError."""
         try:
             with open_regular(self.path) as file:
                 size = os.fstat(file.fileno()).st_size

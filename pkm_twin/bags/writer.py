@@ -56,7 +56,7 @@ _QUEUE_LIMIT = 20_000
 
 
 def refuse_existing(path: Path, overwrite: bool) -> None:
-    """Refuse a target that is there, a dangling link too, unless it may be overwritten."""
+    """Reject a target that is there, a dangling link too, unless it may be overwritten."""
     if not overwrite and os.path.lexists(path):
         raise BagError("exists already", path=path, reason="exists")
 
@@ -71,7 +71,7 @@ _REASONS = {
 
 
 def write_error(error: OSError, path: Path) -> BagError:
-    """Return what a caller is told when the system refuses to write ``path``."""
+    """Return the caller's error where the system cannot write ``path``."""
     reason = _REASONS.get(error.errno or 0, "io")
     return BagError(f"cannot be written: {error.strerror or error}", path=path, reason=reason)
 
@@ -104,7 +104,7 @@ class McapWriter:
     Messages are gathered into chunks of ``chunk_size`` bytes. ``file`` is unbuffered: what has been
     written, the system has. Without the package zstandard chunks are not packed.
 
-    :raises BagError: by each method, where the system refuses to write ``path``.
+    :raises BagError: by each method, where the system cannot write ``path``.
     """
 
     def __init__(self, file: io.FileIO, path: Path, chunk_size: int) -> None:

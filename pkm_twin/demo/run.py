@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The demonstration: every recorded bag through the real nodes over the real middleware.
 
-For each bag a node runs as a process of its own, then the twin beside a simulated machine. This
+For each bag a node runs as a process of its own, then the twin with a simulated machine. This
 process plays the bags in lockstep with the answers, records what the nodes publish into one MCAP,
 reads that back, and ends with a table, a picture and a verdict. Time is simulated everywhere, so a
 loaded machine takes longer and finds the same.

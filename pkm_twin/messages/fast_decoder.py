@@ -331,7 +331,7 @@ class _Points:
             view[...] = values[which]
 
     def check_lengths(self, data: bytes, order: str) -> None:
-        """Refuse points whose arrays are not as long as the first one's."""
+        """Reject points whose arrays are not as long as the first one's."""
         fitting = self
         while fitting.end > len(data) and fitting.points > 1:
             fitting = _Points(self._groups[0][1], (fitting.points + 1) // 2, self.lengths)

@@ -149,7 +149,7 @@ class Trajectory:
 class JointReader:
     """Reads joint numbers of one robot: the controller's come in, the model's go out.
 
-    ``limited``: positions and velocities beyond the robot's limits are refused, else only those
+    ``limited``: positions and velocities beyond the robot's limits are rejected, else only those
     beyond all machines. ``extra_joints``: a trajectory's joints that the model lacks, such as a
     Delta's telescopic fourth axis: ``refuse`` the trajectory, or answer them with effort ``zero``.
     ``with_effort``: a trajectory's efforts are read too, else whatever it brings is left alone.
@@ -203,7 +203,7 @@ class JointReader:
         return JointSample(stamp, q, qd, effort)
 
     def positions(self, message: Any, now: int, rules: StampRules) -> JointSample:
-        """As :meth:`joint_state`, whatever the message carries beside positions."""
+        """As :meth:`joint_state`, whatever the message carries in addition to positions."""
         stamp, _, q = self._positions(message, now, rules)
         return JointSample(stamp, q, None, None)
 
@@ -229,7 +229,7 @@ class JointReader:
         return EffortSample(stamp, effort, ControllerNumbers(given))
 
     def commands(self, values: Sequence[float]) -> Array:
-        """Efforts without names, as std_msgs/Float64MultiArray carries them: one a joint."""
+        """Efforts without names, as std_msgs/Float64MultiArray carries them: one per joint."""
         count = len(self._names)
         if len(values) != count:
             raise MessageError("length", f"{len(values)} efforts for {count} joints")
@@ -397,7 +397,7 @@ def shown(name: str) -> str:
 
 
 def as_message_error(call: Callable[..., Any], *arguments: Any) -> Any:
-    """What the model answers to a message, its refusals as those of the message."""
+    """What the model answers to a message, its rejections as those of the message."""
     try:
         return call(*arguments)
     except MessageError:

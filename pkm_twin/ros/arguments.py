@@ -45,7 +45,7 @@ def answer(name: str, summary: str, arguments: Sequence[str], others: str = "") 
 def check_launch_arguments(file: str, given: Iterable[str], declared: Iterable[str]) -> None:
     """Reject arguments of ``ros2 launch`` that the launch file on its command line lacks.
 
-    A file that includes it has arguments of its own, which launch does not tell apart.
+    A file that includes it has arguments of its own, which launch does not distinguish.
 
     :param file: path of the launch file; ``given``: words ``NAME:=VALUE``.
     :raises UnknownNameError: one is not declared.

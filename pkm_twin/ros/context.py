@@ -18,7 +18,7 @@ from pkm_twin.errors import PkmTwinError, install
 def middleware_arguments(arguments: Sequence[str]) -> list[str]:
     """Arguments for rclpy: without log files, said once, where there can be no folder for them.
 
-    The middleware would refuse to start. What it logs goes to the terminal and /rosout as ever.
+    The middleware would not start. What it logs goes to the terminal and /rosout as ever.
     """
     given = list(arguments)
     try:
@@ -41,7 +41,7 @@ def own_node(
 
     It has no parameter services.
 
-    :param needs: what needs it, for the refusal.
+    :param needs: what needs it, for the error.
     :param sim_time: its clock is that of ``/clock``.
     :raises PkmTwinError: there is no ROS here, or the namespace is none.
     """

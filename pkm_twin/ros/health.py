@@ -88,7 +88,7 @@ class Health:
             self._node.get_logger().warning(cut(text))
 
     def watch(self, topic: str, tell: Callable[[Incompatibility], None] | None = None) -> None:
-        """Tell of other nodes with which this one cannot exchange messages on a topic.
+        """Report other nodes with which this one cannot exchange messages on a topic.
 
         :param tell: called with what does not fit, once a publisher or subscriber.
         """

@@ -2,7 +2,7 @@
 """What every node of the suite shares: life cycle, parameters, guards, diagnostics.
 
 Nothing that runs while a node spins can end it: what a message, a request or a clock breaks is
-caught, counted and told.
+caught, counted and reported.
 """
 
 from __future__ import annotations
@@ -379,7 +379,7 @@ class TwinNode(GuardedNode):
             self._diagnostics.publish(self.health.array(WARN, COMPILING))
 
     def start(self, leap: float | None = None) -> None:
-        """The node is made: refuse unknown parameters, begin the diagnostics, and tell its summary.
+        """The node is made: reject unknown parameters, begin the diagnostics, and log its summary.
 
         :param leap: how far the ROS clock goes forward at once for :meth:`time_jumped_forward`, s.
         """
@@ -471,7 +471,7 @@ class TwinNode(GuardedNode):
 
     @property
     def busy(self) -> bool:
-        """Whether work waits beside the callbacks."""
+        """Whether work waits between the callbacks."""
         return bool(self._tasks)
 
     def defer(self, where: str, task: Task) -> None:
@@ -511,7 +511,7 @@ class TwinNode(GuardedNode):
 def guarded_service(
     kind: Any, callback: Callable[[Any, Any], Any], health: Health, parameters: Callable[[], int]
 ) -> Any:
-    """A service callback, rclpy's own ones too, that refuses what it cannot take.
+    """A service callback, rclpy's own ones too, that rejects what it cannot take.
 
     :param parameters: how many the node has.
     """

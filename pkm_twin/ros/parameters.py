@@ -49,7 +49,7 @@ class UnknownParametersError(PkmTwinError):
 
 
 class ParameterNode(LifecycleNode):
-    """A life-cycle node that refuses parameters and values that no declaration allows."""
+    """A life-cycle node that rejects parameters and values that no declaration allows."""
 
     def __init__(self, name: str) -> None:
         self.followed: set[str] = set()
@@ -131,7 +131,7 @@ class ParameterNode(LifecycleNode):
         return kind(**given)
 
     def check_parameter(self, name: str, value: Any) -> None:
-        """Refuse what a parameter's declaration does not allow.
+        """Reject what a parameter's declaration does not allow.
 
         :raises ParameterError: out of range, not a number, or not one of the words.
         """
@@ -148,11 +148,11 @@ class ParameterNode(LifecycleNode):
         prepare: Callable[[dict[str, Any]], V],
         take: Callable[[V], object],
     ) -> None:
-        """A set of parameters is taken or refused whole, between two messages.
+        """A set of parameters is taken or rejected whole, between two messages.
 
         :param names: of all parameters that ``prepare`` knows.
-        :param prepare: makes what the new values, by name, come to; nothing else hangs on it yet. A
-            PkmTwinError refuses the set.
+        :param prepare: makes what the new values, by name, come to; nothing else depends on it yet.
+            A PkmTwinError rejects the set.
         :param take: goes on with that, once the parameters have their values.
         """
         prepared: list[V] = []
@@ -179,7 +179,7 @@ class ParameterNode(LifecycleNode):
         self.add_post_set_parameters_callback(follow)
 
     def close_declarations(self) -> None:
-        """All parameters are declared: from here on others are refused, now and when set.
+        """All parameters are declared: from here on others are rejected, now and when set.
 
         :raises UnknownParametersError: some were given already; a misspelling, it names each.
         """

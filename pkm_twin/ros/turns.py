@@ -23,7 +23,7 @@ Task = Generator[None, None, None]
 class LowRateGroup(MutuallyExclusiveCallbackGroup):
     """What is not asked for a thousand times a second: requests.
 
-    rclpy makes a wait set anew for every message, and each entity in it costs time; these are
+    rclpy makes a new wait set for every message, and each entity in it costs time; these are
     in it now and then only. The events executor has no wait set and does not ask.
     """
 

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 def declare_mounts(node: TwinNode, platform_frame: str = PLATFORM) -> Mounts | None:
-    """The transforms that tell where a sensor stands; None where the parameters tell it.
+    """The transforms that give a sensor's place; None where the parameters give it.
 
     :raises ParameterError: transforms are asked for and tf2_ros is not installed.
     """

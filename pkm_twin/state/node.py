@@ -262,7 +262,7 @@ class MachineStateNode(TwinNode):
         self._drawn = 0
 
     def activated(self) -> None:
-        """What does not change is told once; nothing from before is."""
+        """What does not change is published once; nothing from before is."""
         self.time_jumped_backward()
         self._description.publish(String(data=self._urdf))
         if self._transforms is not None:

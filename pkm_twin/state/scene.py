@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Shapes of a machine and of what a load does to it, for whoever draws. Pure.
+"""Shapes of a machine and of what a load does to it, to be drawn elsewhere. Pure.
 
-Shapes are in base axes, m. What elasticity tells comes as numbers, from whoever computes them.
+Shapes are in base axes, m. Results of elasticity come as numbers.
 """
 
 from __future__ import annotations
@@ -81,10 +81,10 @@ class Scales:
 class Shape:
     """One thing to draw, as a visualization_msgs/Marker has it.
 
-    ``group`` and ``number`` tell it apart. ``position`` (3,), ``quaternion`` x y z w. ``size``: of
+    ``group`` and ``number`` identify it. ``position`` (3,), ``quaternion`` x y z w. ``size``: of
     a cylinder (along z) or sphere its diameters and length, of an arrow the diameters of shaft and
     head and the head's length, of a line its width, of a text its height last. ``points``: of a
-    line or an arrow, (k, 3). ``lasting``: drawn until it is drawn anew.
+    line or an arrow, (k, 3). ``lasting``: drawn until it is drawn again.
     """
 
     kind: Kind
@@ -120,7 +120,7 @@ class Scene:
         }
 
     def shapes(self, state: State, load: Load | None = None) -> list[Shape]:
-        """The machine, and beside it what the load does to it."""
+        """The machine, and what the load does to it."""
         places = self.placed(state.q)
         shares = _shares(load)
         shapes = self._bars(places, shares)

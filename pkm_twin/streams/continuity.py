@@ -32,11 +32,11 @@ class Continuity:
     """Checks samples one after the other.
 
     The edge of reach is a singularity too, so one measure (see :meth:`Robot.singularity`) warns
-    of both. Joint positions alone do not tell the assembly mode: modes meet in singularities,
+    of both. Joint positions alone do not determine the assembly mode: modes meet in singularities,
     where the stream is stopped, and what skips over one shows as a jump of a joint or of the pose.
 
     :param warn: measure below which a sample is near a singularity; ``stop``: too near.
-    :param velocity: bounds of the joints' rates, one a joint, rad/s or m/s.
+    :param velocity: bounds of the joints' rates, one per joint, rad/s or m/s.
     """
 
     def __init__(self, robot: Robot, warn: float, stop: float, velocity: Sequence[float]) -> None:

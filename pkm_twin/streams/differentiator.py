@@ -138,7 +138,7 @@ class Differentiator:
         :param q: joint positions, ``qd`` their rates or None, shape (n,).
         :returns: qd and qdd at this stamp (the middle one's, if so set), shape (n,) each, or
             None while samples are missing.
-        :raises MessageError: stamps so uneven that they do not tell a polynomial.
+        :raises MessageError: stamps so uneven that they do not determine a polynomial.
         """
         carries = qd is not None
         values = q if qd is None else qd

@@ -3,8 +3,9 @@
 
 A differentiated acceleration is a weighted mean of the accelerations in its window: fast parts of
 the motion are damped and late in it. A cutter's force makes such parts, and so does the effort that
-bears it; beside a damped acceleration neither fits. Through the same weights both do: the equations
-of motion are linear in acceleration, wrench and effort, and the pose hardly changes in a window.
+bears it; next to a damped acceleration neither fits. Through the same weights both do: the
+equations of motion are linear in acceleration, wrench and effort, and the pose hardly changes in a
+window.
 
 Pure.
 """
@@ -72,7 +73,7 @@ class WrenchWindow(Core):
     """Wrenches for a stream of joint states.
 
     ``max_age``: between a joint state and its wrench, ns. ``missing_wrench_policy``: without
-    one the joint state counts as one without load (``ignore``), or is refused (``stop``).
+    one the joint state counts as one without load (``ignore``), or is rejected (``stop``).
     ``order``, ``window``: the differentiator's.
     """
 
@@ -93,7 +94,7 @@ class WrenchWindow(Core):
         self._weights: tuple[bytes, Array] = (b"", np.zeros(0))
 
     def change_fit(self, order: int, window: int) -> None:
-        """Another differentiator: the window begins anew."""
+        """Another differentiator: the window begins again."""
         self.order, self.window = order, window
         self._weights = (b"", np.zeros(0))
         self._rows = deque(maxlen=window + 1)
@@ -113,13 +114,13 @@ class WrenchWindow(Core):
         self._rows.clear()
 
     def restart(self) -> None:
-        """Forget the joint states: the differentiator begins anew."""
+        """Forget the joint states: the differentiator begins again."""
         self._rows.clear()
 
     def take(self, message: object, now: int) -> None:
         """Take a geometry_msgs/WrenchStamped; joint states that it is nearer to get it too.
 
-        :raises MessageError: it is refused, and counted.
+        :raises MessageError: it is rejected, and counted.
         """
         with self.taking(self.stream):
             sample, mount = self.reader.read(message, now)

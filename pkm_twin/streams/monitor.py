@@ -94,21 +94,21 @@ def counting() -> StreamMonitor:
 
 
 class Core:
-    """What takes messages, and counts those that it refuses.
+    """What takes messages, and counts those that it rejects.
 
-    ``last_reject``: why the last one was refused, of whichever stream; empty before the first.
+    ``last_reject``: why the last one was rejected, of any stream; empty before the first.
     """
 
     last_reject = ""
 
     def refuse(self, counts: StreamMonitor, error: MessageError) -> None:
-        """Count a message that is refused."""
+        """Count a message that is rejected."""
         counts.reject(error.reason, str(error))
         self.last_reject = str(error)
 
     @contextmanager
     def refusing(self, counts: StreamMonitor) -> Iterator[None]:
-        """Count the message that is refused in here."""
+        """Count the message that is rejected in here."""
         try:
             yield
         except MessageError as error:
@@ -117,7 +117,7 @@ class Core:
 
     @contextmanager
     def taking(self, counts: StreamMonitor) -> Iterator[None]:
-        """Count the message that is read in here, as taken or as refused."""
+        """Count the message that is read in here, as taken or as rejected."""
         with self.refusing(counts):
             yield
         counts.accept()

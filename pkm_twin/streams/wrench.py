@@ -103,7 +103,7 @@ class WrenchSettings:
 
     @property
     def platform_frame(self) -> str:
-        """The frame that turns with the platform, as far as the wrench tells it."""
+        """The frame that turns with the platform, as far as the wrench identifies it."""
         moved = any(self.sensor_xyz) or any(self.sensor_rpy)
         return PLATFORM if moved or self.wrench_frame == self.base_frame else self.wrench_frame
 
@@ -117,7 +117,7 @@ class WrenchSettings:
 class WrenchReader:
     """Reads wrenches and moves them to the platform's reference point.
 
-    ``mounts``: tells where a frame stands; None is the settings' fixed mount.
+    ``mounts``: gives where a frame stands; None is the settings' fixed mount.
     """
 
     settings: WrenchSettings
@@ -131,7 +131,7 @@ class WrenchReader:
     def read(self, message: Any, now: int) -> tuple[WrenchSample, Mount]:
         """A geometry_msgs/WrenchStamped as it came, and where it was measured.
 
-        :raises MessageError: it is refused.
+        :raises MessageError: it is rejected.
         """
         s = self.settings
         sample = read_wrench(message, now, self._rules, s.wrench_frame, s.accept_empty_frame)
@@ -158,7 +158,7 @@ class WrenchReader:
 
 
 def check_order(stamp: int, last: int) -> None:
-    """Refuse a stamp that is older than the one before, ns.
+    """Reject a stamp that is older than the one before, ns.
 
     :raises MessageError: it is.
     """
@@ -225,9 +225,9 @@ class TimeCache(Generic[V]):
 
 @dataclass
 class TimeSynchronizer(Core):
-    """Settings that may change between two messages, and counts of what is taken and refused.
+    """Settings that may change between two messages, and counts of what is taken and rejected.
 
-    ``mounts``: tells where a wrench's frame stands; None is the settings' fixed mount.
+    ``mounts``: gives where a wrench's frame stands; None is the settings' fixed mount.
     """
 
     robot: Robot
