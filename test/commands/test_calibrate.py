@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from pathlib import Path
 from typing import Any
@@ -11,12 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from typer.testing import CliRunner
 
 from bags.recording.capture import machine_parameters
 from bags.recording.record_poses import NOISE, OFFSETS, SHIFTS, TURNS, record
 from pkm_twin import Robot
-from pkm_twin.apps.cli import app
 from pkm_twin.apps.commands.calibrate import Calibrate
 from pkm_twin.apps.commands.calibrate import calibrate as command
 from pkm_twin.errors import ParameterError, PkmTwinError
@@ -24,6 +21,7 @@ from pkm_twin.identification.calibration import calibrate, geometric
 from pkm_twin.identification.calibration_state import Poses
 from pkm_twin.identification.measurements import read_poses
 from pkm_twin.robot.entries import entries, with_entries
+from test.support.command import Commands
 from test.support.robots import load, random_joints
 
 
@@ -33,16 +31,10 @@ def measured(path: Path, noise: float = NOISE, count: int = 60) -> None:
     record(path, noise=noise, count=count)
 
 
-def run(*arguments: str) -> Any:
-    return CliRunner().invoke(app, ["calibrate", *arguments])
-
-
-def test_a_machine_is_found_that_was_not_built_as_drawn(tmp_path: Path) -> None:
+def test_a_machine_is_found_that_was_not_built_as_drawn(twin: Commands, tmp_path: Path) -> None:
     poses, out = tmp_path / "poses.csv", tmp_path / "mine.yaml"
     measured(poses)
-    result = run("delta_cu", str(poses), "--out", str(out), "--json")
-    assert result.exit_code == 0, result.output
-    data = json.loads(result.stdout)
+    data = twin.told("calibrate", "delta_cu", poses, "--out", out)
     held = data["held_out"]
     assert held["before"]["rms_m"] > 4e-3
     # The measurement's own noise along three axes is in it.

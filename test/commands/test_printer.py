@@ -3,19 +3,16 @@
 
 from __future__ import annotations
 
-import json
 import re
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
-from pkm_twin.apps.cli import app
 from pkm_twin.errors import ParameterError
 from pkm_twin.robot.printers import read_printer
 from test.identification.partial_cases import Towers
+from test.support.command import Commands
 from test.support.robots import partly_long
 
 STEP = 40.0 / (200 * 16)
@@ -27,12 +24,6 @@ GUESS = Towers(
     112.0, np.radians([210.0, 330.0, 90.0]), np.full(3, 215.0),
     155.0 + np.full(3, np.sqrt(215.0**2 - 112.0**2)),
 )  # fmt: skip
-
-
-def run(*words: object, code: int = 0) -> Any:
-    result = CliRunner().invoke(app, [str(word) for word in words])
-    assert result.exit_code == code, result.output
-    return result
 
 
 def contacts(spots: np.ndarray) -> np.ndarray:
@@ -87,18 +78,16 @@ def deltas(text: str) -> dict[str, dict[str, float]]:
     return found
 
 
-def test_klipper_end_to_end(tmp_path: Path) -> None:
+def test_klipper_end_to_end(twin: Commands, tmp_path: Path) -> None:
     """Heights and distances of a printer find its numbers, and its own configuration has them."""
     config, robot, data, out = (tmp_path / n for n in ("p.cfg", "p.yaml", "p.csv", "o.yaml"))
     config.write_text(klipper(distances=8))
-    run("printer", config, "--out", robot, "--data", data)
-    told = json.loads(
-        run("calibrate", robot, data, "--measure", "height,distance", "--out", out, "--json").stdout
-    )
+    twin.good("printer", config, "--out", robot, "--data", data)
+    told = twin.told("calibrate", robot, data, "--measure", "height,distance", "--out", out)
     assert told["scale"]["determined"]
     assert told["measurements"]["height"]["count"] == len(SPOTS)
     assert told["measurements"]["height"]["after"]["rms"] < 2e-6
-    found = deltas(run("export", "printer", out, "--firmware", "klipper").stdout)
+    found = deltas(twin.good("export", "printer", out, "--firmware", "klipper").out)
     assert found["printer"]["delta_radius"] == pytest.approx(REAL.radius, abs=0.05)
     arms = np.array([found[f"stepper_{k}"]["arm_length"] for k in "abc"])
     angles = np.radians([found[f"stepper_{k}"]["angle"] for k in "abc"])
@@ -111,16 +100,16 @@ def test_klipper_end_to_end(tmp_path: Path) -> None:
     assert np.abs(there.nozzle(contacts(SPOTS))[:, 2]).max() < 5e-3
 
 
-def test_heights_alone_leave_the_scale(tmp_path: Path) -> None:
+def test_heights_alone_leave_the_scale(twin: Commands, tmp_path: Path) -> None:
     config, robot, data, out = (tmp_path / n for n in ("p.cfg", "p.yaml", "p.csv", "o.yaml"))
     config.write_text(klipper())
-    run("printer", config, "--out", robot, "--data", data)
+    twin.good("printer", config, "--out", robot, "--data", data)
     words = ("calibrate", robot, data, "--measure", "height", "--out", out)
-    told = json.loads(run(*words, "--json").stdout)
+    told = twin.told(*words)
     assert told["scale"]["determined"] is False
     numbers = told["parameters"]
     assert not any(numbers[f"geometry.arm_lengths[{k}]"]["observed"] for k in range(3))
-    printed = run(*words, "--overwrite").stdout
+    printed = twin.good(*words, "--overwrite").out
     assert "scale is not determined" in " ".join(printed.split())
     assert max(map(len, printed.splitlines())) < 400
 
@@ -146,11 +135,11 @@ def logs() -> dict[str, str]:
 
 
 @pytest.mark.parametrize("firmware", ["marlin", "reprapfirmware", "smoothieware"])
-def test_probe_tables_of_other_firmware(firmware: str, tmp_path: Path) -> None:
+def test_probe_tables_of_other_firmware(firmware: str, twin: Commands, tmp_path: Path) -> None:
     """They give the carriages at contact."""
     log, robot, data = (tmp_path / n for n in ("log.txt", "p.yaml", "p.csv"))
     log.write_text(logs()[firmware])
-    run("printer", log, "--out", robot, "--data", data, "--probe-radius", "70")
+    twin.good("printer", log, "--out", robot, "--data", data, "--probe-radius", "70")
     table = np.genfromtxt(data, delimiter=",", names=True)
     rows = np.array([list(row) for row in table])
     places = REAL.nozzle(-1e3 * rows[:, :3])
@@ -158,7 +147,7 @@ def test_probe_tables_of_other_firmware(firmware: str, tmp_path: Path) -> None:
     assert np.abs(places[:, 2] - 1e3 * rows[:, 3]).max() < 1e-3
 
 
-def test_a_height_map(tmp_path: Path) -> None:
+def test_a_height_map(twin: Commands, tmp_path: Path) -> None:
     """Rows are from the least y, columns from the least x; a bare 0 was not probed."""
     text = (
         "M665 L215 R112 H155\nM666 X0 Y0 Z0\n"
@@ -168,7 +157,9 @@ def test_a_height_map(tmp_path: Path) -> None:
         "0, 0.010, 0\n0.020, 0.030, 0.040\n0, 0.050, 0\n"
     )
     (tmp_path / "h.csv").write_text(text)
-    run("printer", tmp_path / "h.csv", "--out", tmp_path / "p.yaml", "--data", tmp_path / "p.csv")
+    twin.good(
+        "printer", tmp_path / "h.csv", "--out", tmp_path / "p.yaml", "--data", tmp_path / "p.csv"
+    )
     rows = np.genfromtxt(tmp_path / "p.csv", delimiter=",", skip_header=1)
     places = GUESS.nozzle(-1e3 * rows[:, :3])
     expected = [[0, -40, 0.01], [-40, 0, 0.02], [0, 0, 0.03], [40, 0, 0.04], [0, 40, 0.05]]
@@ -176,13 +167,13 @@ def test_a_height_map(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("firmware", partly_long(["marlin", "reprapfirmware", "klipper"], "marlin"))
-def test_configurations_are_read_back(firmware: str, tmp_path: Path) -> None:
+def test_configurations_are_read_back(firmware: str, twin: Commands, tmp_path: Path) -> None:
     config, robot, data = (tmp_path / n for n in ("p.cfg", "p.yaml", "p.csv"))
     config.write_text(klipper())
-    run("printer", config, "--out", robot, "--data", data)
+    twin.good("printer", config, "--out", robot, "--data", data)
     text = robot.read_text().replace("arm_lengths: [0.215,", "arm_lengths: [0.2163,")
     robot.write_text(text.replace("{offset: -0.338", "{offset: -0.3391"))
-    written = run("export", "printer", robot, "--firmware", firmware).stdout
+    written = twin.good("export", "printer", robot, "--firmware", firmware).out
     again = tmp_path / "again.yaml"
     if firmware == "klipper":
         full = written + "\n".join(klipper().splitlines()[3:]).replace("position_endstop", "#")
@@ -191,7 +182,7 @@ def test_configurations_are_read_back(firmware: str, tmp_path: Path) -> None:
         full = written + logs()[firmware].split("\n", 2)[2]
     config.write_text(full)
     options = ["--probe-radius", "70", "--firmware", firmware]
-    run("printer", config, "--out", again, "--data", data, "--overwrite", *options)
+    twin.good("printer", config, "--out", again, "--data", data, "--overwrite", *options)
     numbers = [
         np.array(re.findall(r"-?\d+\.\d+", path.read_text().split("geometry:")[1]), float)
         for path in (robot, again)
@@ -205,21 +196,21 @@ def test_configurations_are_read_back(firmware: str, tmp_path: Path) -> None:
      ("M665 L215 R112 H155\nM666 X0 Y0 Z0\n", "probe table"),
      ("M665 R112\nX:0 Y:0 Z:0\n", "M665 L")],
 )  # fmt: skip
-def test_what_is_missing_is_named(text: str, field: str, tmp_path: Path) -> None:
+def test_what_is_missing_is_named(text: str, field: str, twin: Commands, tmp_path: Path) -> None:
     (tmp_path / "a.txt").write_text(text)
     words = ("printer", tmp_path / "a.txt", "--out", tmp_path / "b.yaml", "--data",
              tmp_path / "c.csv")  # fmt: skip
-    assert field in str(run(*words, code=1).exception)
+    assert field in twin.refused(*words)
     assert not (tmp_path / "b.yaml").exists()
 
 
-def test_tables_of_pairs_and_units(tmp_path: Path) -> None:
+def test_tables_of_pairs_and_units(twin: Commands, tmp_path: Path) -> None:
     """A distance's other pose in its own columns, or by its row; lengths in mm."""
     robot = tmp_path / "p.yaml"
     config = tmp_path / "p.cfg"
     config.write_text(klipper(distances=6))
     data = tmp_path / "p.csv"
-    run("printer", config, "--out", robot, "--data", data)
+    twin.good("printer", config, "--out", robot, "--data", data)
     results = []
     rows = [line.split(",") for line in data.read_text().splitlines()[1:]]
     joints = [f"stepper_{k}.position" for k in "abc"]
@@ -233,28 +224,28 @@ def test_tables_of_pairs_and_units(tmp_path: Path) -> None:
     other = tmp_path / "q.csv"
     other.write_text("\n".join(lines))
     for path in (data, other):
-        words = ("calibrate", robot, path, "--measure", "height,distance", "--json", "--overwrite")
-        results.append(json.loads(run(*words, "--out", tmp_path / "o.yaml").stdout)["parameters"])
+        words = ("calibrate", robot, path, "--measure", "height,distance", "--overwrite")
+        results.append(twin.told(*words, "--out", tmp_path / "o.yaml")["parameters"])
     for name, number in results[0].items():
         assert results[1][name]["value"] == pytest.approx(number["value"], abs=1e-6), name
 
 
-def test_a_plan_is_a_table_to_fill_in(tmp_path: Path) -> None:
+def test_a_plan_is_a_table_to_fill_in(twin: Commands, tmp_path: Path) -> None:
     config, robot, data = (tmp_path / n for n in ("p.cfg", "p.yaml", "p.csv"))
     config.write_text(klipper())
-    run("printer", config, "--out", robot, "--data", data)
+    twin.good("printer", config, "--out", robot, "--data", data)
     plan = tmp_path / "plan.csv"
     words = ("calibrate", robot, data, "--measure", "height", "--plan", plan)
-    told = json.loads(run(*words, "--count", 3, "--json").stdout)
+    told = twin.told(*words, "--count", 3)
     assert told["count"] == 3 and len(told["position_deviation_m"]) == 4
     head, *rows = plan.read_text().splitlines()
     assert head.split(",")[-1] == "height" and len(rows) == 3
     # In the data's range: on the bed.
     places = GUESS.nozzle(-1e3 * np.array([row.split(",")[:3] for row in rows], float))
     assert np.abs(places[:, 2]).max() < 2.0
-    run("calibrate", robot, "--measure", "distance", "--plan", tmp_path / "d.csv", code=1)
-    run("calibrate", robot, "--measure", "length", "--plan", tmp_path / "d.csv", code=1)
-    run("calibrate", robot, code=1)
+    for what in ("distance", "length"):
+        twin.refused("calibrate", robot, "--measure", what, "--plan", tmp_path / "d.csv")
+    twin.refused("calibrate", robot)
 
 
 NAMED = {

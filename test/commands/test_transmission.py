@@ -11,10 +11,8 @@ import numpy as np
 import pytest
 import yaml
 from scipy.spatial.transform import Rotation
-from typer.testing import CliRunner
 
 from pkm_twin import Robot
-from pkm_twin.apps.cli import app
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError
 from pkm_twin.identification.calibration import HELD_OUT, calibrate, geometric
@@ -24,7 +22,9 @@ from pkm_twin.machine.joint_map import JointMap, JointMapEntry
 from pkm_twin.messages.reading import JointReader
 from pkm_twin.recordings import Dialect
 from pkm_twin.robot.entries import data_of, with_entries
+from test.support.command import Commands
 from test.support.robots import load, partly_long, random_joints
+from test.support.tables import write_columns
 from tools.reality import BALL, FOOT, fit_a_leg, leg_poses
 
 NOISE = 2e-5
@@ -181,21 +181,23 @@ def test_columns_that_there_are_not_are_rejected(tmp_path: Path, columns: list[s
 
 
 @pytest.mark.parametrize("how", ["shared", "travel"])
-def test_the_written_file_converts_the_controllers_numbers(tmp_path: Path, how: str) -> None:
+def test_the_written_file_converts_the_controllers_numbers(
+    twin: Commands, tmp_path: Path, how: str
+) -> None:
     robot, _ = spools()
     text = (EXAMPLES.parents[2] / "config/linear_delta.yaml").read_text()
     entries = yaml.safe_dump({"joint_map": data_of(robot)["joint_map"]})
     (tmp_path / "mine.yaml").write_text(text + entries)
     changes = np.array([0.3, -0.2, 0.1]) if how == "travel" else np.zeros(3)
     poses = measured(changes, np.full(3, 1.02))
-    header = ",".join([*(f"{name}.position" for name in robot.controller.names), "x", "y", "z"])
-    table = np.hstack([poses.joints, poses.position])
-    np.savetxt(tmp_path / "poses.csv", table, "%.17g", ",", header=header, comments="")
-    arguments = ["mine.yaml", "poses.csv", "--out", "out.yaml", "--transmission", how]
-    paths = [str(tmp_path / one) if "." in one else one for one in arguments]
-    result = CliRunner().invoke(app, ["calibrate", *paths, "--only", "rods.left_1.ends[0]"])
-    assert result.exit_code == 0, result.output
-    assert max(map(len, result.output.splitlines())) < 400 and "rev" in result.output
+    names = [*(f"{name}.position" for name in robot.controller.names), "x", "y", "z"]
+    columns = dict(zip(names, np.hstack([poses.joints, poses.position]).T, strict=True))
+    source = write_columns(tmp_path / "poses.csv", columns)
+    result = twin.good(
+        "calibrate", tmp_path / "mine.yaml", source, "--out", tmp_path / "out.yaml",
+        "--transmission", how, "--only", "rods.left_1.ends[0]",
+    )  # fmt: skip
+    assert max(map(len, result.out.splitlines())) < 400 and "rev" in result.out
     found = load(tmp_path / "out.yaml")
     seen = found.platform(found.controller.positions(poses.joints))[0]
     assert np.sqrt(np.mean((seen - poses.position) ** 2)) < 1.5 * NOISE

@@ -463,7 +463,7 @@ def silence_of(array):
 
 def text_of(array):
     """The status message and what else is told: a busy machine's own lines may come first."""
-    return f"{array.status[0].message}; {values_of(array)['other problems']}"
+    return f"{array.status[0].message}; {values_of(array).get('other problems', '')}"
 
 
 def counts_of(array, what):

@@ -15,6 +15,7 @@ from delta_dynamics import inverse_dynamics
 from stiffness_monitor import setpoint_correction, strain_energy
 from test.nodes.harness import SECOND, Maker, Ros
 from test.support.mapped import sides
+from test.support.robots import partly_long
 
 MAKE = Maker(Ros())
 FORCE = np.array([15.0, -10.0, 20.0])
@@ -35,7 +36,7 @@ LONG = 600.0
 """Longer than a loaded machine keeps a message waiting, s."""
 
 
-@pytest.fixture(scope="module", params=["delta_cu", "upr_rpu"])
+@pytest.fixture(scope="module", params=partly_long(["delta_cu", "upr_rpu"], "upr_rpu"))
 def cell(request, tmp_path_factory, peer, launch):
     """A machine that stands at home under its brakes, and every node beside it."""
     both = sides(request.param)

@@ -15,7 +15,7 @@ from pkm_twin.streams.wrench import WrenchSettings
 from stiffness_monitor import compliance, strain_energy
 from stiffness_monitor.compliance import member_deflections
 from test.nodes.harness import SECOND, Maker, Plain
-from test.support.robots import load, some_elastic
+from test.support.robots import KINDS, load, partly_long, some_elastic
 
 MAKE = Maker(Plain())
 NOW = 1_000 * SECOND
@@ -23,7 +23,7 @@ STEP = SECOND // 1000
 WRENCH = np.array([30.0, -20.0, -100.0, 3.0, -2.0, 1.0])
 
 
-@pytest.fixture(scope="module", params=robot_names())
+@pytest.fixture(scope="module", params=partly_long(robot_names(), *KINDS, "prru"))
 def robot(request):
     return load(request.param)
 
