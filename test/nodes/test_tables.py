@@ -17,6 +17,7 @@ from tools.pages.nodes import GROUPS, class_of
 
 pytest.importorskip("rclpy", exc_type=ImportError)
 
+from rcl_interfaces.srv import ListParameters
 
 PAGE = (REPOSITORY / "docs" / "nodes.md").read_text(encoding="utf-8")
 OPTIONAL = ("clock", "parameter_events")
