@@ -152,7 +152,7 @@ class _Window:
         return added[..., 0], (columns * amounts[:, None]) @ mine
 
     def alone(self, count: int) -> tuple[Array, Array]:
-        """Each element's factor by itself, to first order, and its standard deviation, (elements,)."""
+        """Each element's factor alone, to first order, and its standard deviation, (elements,)."""
         _, slopes = self.added(range(count), np.ones(count))
         rows, columns = slopes.reshape(-1, count), self.common.reshape(-1, len(self.prior))
         columns = np.concatenate([columns, np.diag(np.sqrt(self.prior))])
