@@ -6,6 +6,7 @@
 
 from __future__ import annotations
 
+import functools
 import re
 from pathlib import Path
 from textwrap import fill
@@ -28,6 +29,12 @@ AROUND: Final = 0.5
 """Seconds around a pick, a release and a cut that count for neither side."""
 SLOW: Final = 20.0
 """Hz; what is slower is no line of the teeth."""
+
+
+@functools.cache
+def recorded(name: str) -> Recording:
+    """A recording by its name."""
+    return read(BAGS / f"{name}.mcap")
 
 
 def accelerations(qd: Array, period: float, window: int, newest: bool) -> Array:
@@ -61,7 +68,7 @@ def share(values: Array, peak: float) -> float:
 
 def pick_and_place() -> str:
     """The table of the Delta's recording."""
-    r = read(BAGS / "delta_cu_pick_and_place.mcap")
+    r = recorded("delta_cu_pick_and_place")
     assert r.load is not None and r.qd is not None and r.effort is not None
     near = r.load.near_change(r.time, AROUND)
     held = r.load.held(r.time) & ~near
@@ -84,7 +91,7 @@ def pick_and_place() -> str:
 
 def lifts() -> str:
     """How many of the commanded moves go up on their way."""
-    r = read(BAGS / "delta_cu_pick_and_place.mcap")
+    r = recorded("delta_cu_pick_and_place")
     moves = read_messages(
         BAGS / "delta_cu_pick_and_place.mcap", ["/delta_dynamics/joint_trajectory"]
     )
@@ -102,7 +109,7 @@ def lifts() -> str:
 
 def milling() -> str:
     """The table of the 3-PRRU's recording."""
-    r = read(BAGS / "prru_milling.mcap")
+    r = recorded("prru_milling")
     assert r.qd is not None and r.effort is not None
     passes = ((2.0, 9.4), (11.5, 18.9))
     cut = np.logical_or.reduce([(r.time > a) & (r.time < b) for a, b in passes])

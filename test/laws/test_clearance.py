@@ -16,7 +16,7 @@ from pkm_twin.maps.search import workspace_box
 from pkm_twin.robot.clearance import clearance, distance, has_clearance
 from pkm_twin.robot.workspace import reachable, regular_workspace
 from stiffness_monitor.structure import structural_model
-from test.support.robots import SHIPPED, load, parameters_of, random_poses
+from test.support.robots import SHIPPED, load, parameters_of, partly_long, random_poses
 
 ROBOTS = [
     name for name, robot in SHIPPED.items() if has_clearance(robot) and robot.mechanism != "machine"
@@ -150,7 +150,7 @@ def thicker(robot, much):
     return other
 
 
-@pytest.mark.parametrize("name", ROBOTS)
+@pytest.mark.parametrize("name", partly_long(ROBOTS, "delta_cu", "upr_rpu"))
 def test_poses_where_limbs_meet_are_refused(name):
     shipped = load(name)
     poses = box(shipped)
