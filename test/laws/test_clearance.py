@@ -153,7 +153,7 @@ def thicker(robot, much):
 @pytest.mark.parametrize("name", partly_long(ROBOTS, "delta_cu", "upr_rpu"))
 def test_poses_where_limbs_meet_are_refused(name):
     shipped = load(name)
-    poses = box(shipped)
+    poses = box(shipped, 17)
     free = clearance(shipped, poses[reachable(shipped, poses, -math.inf)])
     robot = thicker(shipped, float(np.median(free)) / 2)
     otherwise = reachable(robot, poses, -math.inf)
