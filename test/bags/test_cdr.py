@@ -155,20 +155,6 @@ class TestAgainstOtherReaders:
         compare(codec.decode(codec.encode(VALUES[kind])), live(kind, VALUES[kind]))
 
 
-@settings(max_examples=150, deadline=None)
-@given(data=st.binary(max_size=80), big=st.booleans())
-def test_any_bytes_give_a_message_or_a_bag_error(data: bytes, big: bool) -> None:
-    text = (
-        "string[] s\nbool b\nuint8[] u\nfloat64[2] d\nP p\n"
-        "===\nMSG: a/P\nP2[<=2] q\n===\nMSG: a/P2\n"
-    )
-    codec = MessageCodec("a/msg/T", text)
-    try:
-        codec.decode(b"\x00" + bytes((not big,)) + b"\x00\x00" + data)
-    except BagError as error:
-        assert error.reason == "cdr"
-
-
 numbers = st.integers(0, 2**32 - 1)
 
 

@@ -4,6 +4,9 @@
 import pytest
 
 from test.fuzz.__main__ import KINDS
+from test.fuzz.bags import NonsenseBags
+from test.fuzz.definitions import Cdr
+from test.fuzz.files import Csv, Metadata, Yaml
 from test.fuzz.messages import Messages
 from test.fuzz.tally import CORPUS, Tally, batch, refusal
 
@@ -37,6 +40,18 @@ def test_messages_at_random(made):
         batch(made(Messages), found, seed, 100)
     assert not found.failures
     assert found.good > 0.3 * found.examples and len(found.refused) > 15
+
+
+SOME = {Yaml: 80, Csv: 20, Metadata: 40, Cdr: 500, NonsenseBags: 30}
+"""Examples by default; `make fuzz` draws for as long as it is told, of all kinds."""
+
+
+@pytest.mark.parametrize("kind", SOME, ids=lambda kind: kind.__name__)
+def test_examples_at_random(made, kind):
+    found = Tally(kind.name)
+    batch(made(kind), found, 1, SOME[kind])
+    assert not found.failures
+    assert found.examples >= SOME[kind] and found.refused
 
 
 def test_every_file_is_of_a_kind():
