@@ -20,6 +20,7 @@ from pkm_twin.codegen.arrays import Array
 from pkm_twin.paths.constraints import Limits, Rows
 from pkm_twin.paths.joint_path import JointPath
 from pkm_twin.paths.motion import Run
+from pkm_twin.paths.profile import interval_rows
 
 Index = NDArray[np.int64]
 
@@ -78,13 +79,12 @@ def smooth_profile(
         rows.most / unit,
     )  # fmt: skip
     h = part.steps
-    fixed, bound = _rows(part, rows, h, share)
-    most = _most(part, rows, jerk, share)
     best, x = np.inf, start / unit
     count = slower = 0
     while count < programs:
+        *table, most = interval_rows(rows, part.left, h, x, share)
+        own, bound = _rows(*table)
         more, top = _jerk_rows(part, jerk, h, x, jerks)
-        drag, rest = _drag_rows(rows, part, x)
         v = np.sqrt(np.maximum(x, 1e-12 * x.max()))
         weight = np.zeros(len(x))
         way = h / (v[:-1] + v[1:]) ** 2
@@ -92,9 +92,9 @@ def smooth_profile(
         weight[1:] += way / v[1:]
         answer = scipy.optimize.linprog(
             -weight / weight[1:-1].max(),
-            A_ub=scipy.sparse.vstack([fixed + drag, more]).tocsr(),
-            b_ub=np.concatenate([bound - rest, top]),
-            bounds=np.stack([np.zeros(len(x)), most], 1), method="highs",
+            A_ub=scipy.sparse.vstack([own, more]).tocsr(), b_ub=np.concatenate([bound, top]),
+            bounds=np.stack([np.zeros(len(x)), _from_rest(part, jerk, most)], 1),
+            method="highs",
         )  # fmt: skip
         if answer.status != 0 and count == 0 and slower < SLOWER:
             # A slower motion has smaller jerks, so that the bounds' tangents there leave room.
@@ -115,13 +115,9 @@ def smooth_profile(
     return unit * x
 
 
-def _most(part: JointPath, rows: Rows, jerk: Array, share: Array) -> Array:
-    """Greatest x at the intervals' ends: by speeds, and at the first by the jerk from rest."""
-    left = part.left
-    most = np.append(rows.most[left], rows.most[left[-1] + 1])
-    most[1:] = np.minimum(most[1:], rows.most[left + 1])
-    most[1:] *= share**2
-    most[:-1] *= share**2
+def _from_rest(part: JointPath, jerk: Array, most: Array) -> Array:
+    """Greatest x at the intervals' ends, (i + 1,), also by the jerk from rest and to it."""
+    most = most.copy()
     most[0] = most[-1] = 0.0
     for k, step, at in ((1, part.steps[0], 0), (-2, part.steps[-1], -1)):
         rates = np.abs(part.first[at])
@@ -138,42 +134,13 @@ def _triplets(rows: list[tuple[Any, Any, Any]], shape: tuple[int, int]) -> scipy
 
 
 def _rows(
-    part: JointPath, rows: Rows, h: Array, share: Array
+    p: Array, q: Array, least: Array, greatest: Array
 ) -> tuple[scipy.sparse.csr_matrix, Array]:
-    """Efforts and accelerations at both ends of all intervals, without viscous friction."""
-    count, width = len(h), rows.alpha.shape[1]
-    made: list[tuple[Any, Any, Any]] = []
-    bounds = []
-    at = 0
-    column = np.repeat(np.arange(count), width)
-    for k, own in ((part.left, 0), (part.left + 1, 1)):
-        lever = rows.alpha[k] / (2.0 * h[:, None])
-        beta, fixed = rows.beta[k], rows.fixed[k] + rows.dry[k]
-        for sign in (1.0, -1.0):
-            number = at + np.arange(count * width)
-            made.append((sign * (-lever + (beta if own == 0 else 0.0)), number, column))
-            made.append((sign * (lever + (beta if own == 1 else 0.0)), number, column + 1))
-            bounds.append(np.ravel(np.maximum(share[:, None] - sign * fixed, 0.0)))
-            at += count * width
-    return _triplets(made, (at, count + 1)), np.concatenate(bounds)
-
-
-def _drag_rows(rows: Rows, part: JointPath, x: Array) -> tuple[scipy.sparse.csr_matrix, Array]:
-    """Viscous friction about a profile, in the order of :func:`_rows`."""
-    count, width = len(part.left), rows.drag.shape[1]
-    v = np.maximum(np.sqrt(x), 0.01 * np.sqrt(x.max()))
-    made: list[tuple[Any, Any, Any]] = []
-    rests = []
-    at = 0
-    for k, own in ((part.left, 0), (part.left + 1, 1)):
-        about = v[own : own + count][:, None]
-        column = np.repeat(np.arange(count) + own, width)
-        for sign in (1.0, -1.0):
-            number = at + np.arange(count * width)
-            made.append((sign * rows.drag[k] / (2.0 * about), number, column))
-            rests.append(np.ravel(sign * 0.5 * rows.drag[k] * about))
-            at += count * width
-    return _triplets(made, (at, count + 1)), np.concatenate(rests)
+    """Rows least <= p x + q x' <= greatest of all intervals, (i, r), as a program has them."""
+    count, width = p.shape
+    number, column = np.arange(p.size), np.repeat(np.arange(count), width)
+    made = _triplets([(p, number, column), (q, number, column + 1)], (p.size, count + 1))
+    return scipy.sparse.vstack([made, -made]), np.concatenate([greatest.ravel(), -least.ravel()])
 
 
 def _jerk_rows(

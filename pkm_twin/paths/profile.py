@@ -111,8 +111,12 @@ def _before(low: Numbers, high: Numbers, slopes: Numbers, x: float, after: float
     return x
 
 
-def programs_of(rows: Rows, left: Index, steps: Array, x: Array | None, part: Array) -> Programs:
-    """Rows of the intervals; viscous friction linear in x about a profile.
+def interval_rows(
+    rows: Rows, left: Index, steps: Array, x: Array | None, part: Array
+) -> tuple[Array, Array, Array, Array, Array]:
+    """Limits at both ends of the intervals as :meth:`Programs.of` takes them.
+
+    Viscous friction is linear in x about a profile.
 
     :param x: at the intervals' ends, shape (i + 1,); None leaves viscous friction out.
     :param part: of each interval's limits that is used, shape (i,).
@@ -142,7 +146,7 @@ def programs_of(rows: Rows, left: Index, steps: Array, x: Array | None, part: Ar
     most[:-1] *= part**2
     most[1:] *= part**2
     (a, a2), (b, b2) = alphas, betas
-    return Programs.of(
+    return (
         np.concatenate([b - a, -a2], 1), np.concatenate([a, b2 + a2], 1),
         np.concatenate(lows, 1), np.concatenate(highs, 1), most,
     )  # fmt: skip
@@ -158,7 +162,7 @@ def fastest_profile(
     """
     x = about if rows.drag.any() else None
     for _ in range(ROUNDS):
-        new = programs_of(rows, left, steps, x, part).passes()
+        new = Programs.of(*interval_rows(rows, left, steps, x, part)).passes()
         if not rows.drag.any():
             return new
         before, x = x, new
