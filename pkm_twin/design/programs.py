@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import cached_property
-from typing import Protocol
+from typing import Final, Protocol
 
 import numpy as np
 
@@ -90,81 +90,40 @@ def of_elasticity(many: Rows) -> Array:
     return np.concatenate([many.geometry, many.elasticity], 1)
 
 
-def forward(robot: Robot) -> Asked:
-    """Of q to pose, position and rotation."""
-    return robot.engine.forward, of_geometry
+def asks(kernel: Callable[[Robot], Kernel], numbers: Callable[[Rows], Array] = of_geometry) -> Ask:
+    """A program of a robot, by default one that takes the geometry alone."""
+    return lambda robot: (kernel(robot), numbers)
 
 
-def anywhere(robot: Robot) -> Asked:
-    """As :func:`forward`, one program for machines of every structure."""
-    return free_forward(robot.engine), of_geometry
-
-
-def inverse(robot: Robot) -> Asked:
-    """Of the pose to q of some assembly."""
-    return robot.inverse_kernel, of_geometry
-
-
-def jacobian(robot: Robot) -> Asked:
-    """Of q to pose rates per joint rate."""
-    return robot.engine.jacobian, of_geometry
-
-
-def acceleration(robot: Robot) -> Asked:
-    """Of q, qd, qdd to the pose's second derivative."""
-    return robot.engine.acceleration, of_geometry
-
-
-def singularity(robot: Robot) -> Asked:
-    """Of q to the index."""
-    return robot.singularity_kernel(), of_geometry
-
-
-def torques(robot: Robot) -> Asked:
-    """Of q, qd, qdd and wrench to efforts."""
-    return torques_kernel(robot), of_masses
-
-
-def loads(robot: Robot) -> Asked:
-    """Of q, qd, qdd and wrench to what joints have to bear, and where they are."""
-    return loads_kernel(robot), of_masses
-
-
-def masses(robot: Robot) -> Asked:
-    """Of q to the mass matrix."""
-    return masses_kernel(robot), of_masses
-
-
-def compliance(robot: Robot) -> Asked:
-    """Of q to the compliance and the measure of its frame."""
-    return elastic_of(robot).compliance, of_elasticity
-
-
-def torque_gradient(robot: Robot) -> Asked:
-    """Of the torques, by q, qd and qdd."""
-    return motion_gradient(robot), of_masses
-
-
-def torque_numbers(robot: Robot) -> Asked:
-    """Of the torques, by geometry and masses."""
-    return numbers_gradient(robot), of_masses
-
-
-def platform_slopes(robot: Robot) -> Asked:
-    """Of pose, position and rotation, by geometry."""
-    return platform_gradient(robot.engine), of_geometry
-
-
-def pose_motion(robot: Robot) -> Asked:
-    """Of pose, rate and acceleration, by q, qd and geometry."""
-    return pose_motion_gradient(robot.engine), of_geometry
-
-
-def singularity_slopes(robot: Robot) -> Asked:
-    """Of the index, by q and geometry."""
-    return singularity_gradient(robot.engine), of_geometry
-
-
-def compliance_slopes(robot: Robot) -> Asked:
-    """Of the compliance, by q and all numbers."""
-    return compliance_gradient(elastic_of(robot)), of_elasticity
+forward: Final = asks(lambda robot: robot.engine.forward)
+"""Of q to pose, position and rotation."""
+anywhere: Final = asks(lambda robot: free_forward(robot.engine))
+"""As :func:`forward`, one program for machines of every structure."""
+inverse: Final = asks(lambda robot: robot.inverse_kernel)
+"""Of the pose to q of some assembly."""
+jacobian: Final = asks(lambda robot: robot.engine.jacobian)
+"""Of q to pose rates per joint rate."""
+acceleration: Final = asks(lambda robot: robot.engine.acceleration)
+"""Of q, qd, qdd to the pose's second derivative."""
+singularity: Final = asks(lambda robot: robot.singularity_kernel())
+"""Of q to the index."""
+torques: Final = asks(torques_kernel, of_masses)
+"""Of q, qd, qdd and wrench to efforts."""
+loads: Final = asks(loads_kernel, of_masses)
+"""Of q, qd, qdd and wrench to what joints have to bear, and where they are."""
+masses: Final = asks(masses_kernel, of_masses)
+"""Of q to the mass matrix."""
+compliance: Final = asks(lambda robot: elastic_of(robot).compliance, of_elasticity)
+"""Of q to the compliance and the measure of its frame."""
+torque_gradient: Final = asks(motion_gradient, of_masses)
+"""Of the torques, by q, qd and qdd."""
+torque_numbers: Final = asks(numbers_gradient, of_masses)
+"""Of the torques, by geometry and masses."""
+platform_slopes: Final = asks(lambda robot: platform_gradient(robot.engine))
+"""Of pose, position and rotation, by geometry."""
+pose_motion: Final = asks(lambda robot: pose_motion_gradient(robot.engine))
+"""Of pose, rate and acceleration, by q, qd and geometry."""
+singularity_slopes: Final = asks(lambda robot: singularity_gradient(robot.engine))
+"""Of the index, by q and geometry."""
+compliance_slopes: Final = asks(lambda robot: compliance_gradient(elastic_of(robot)), of_elasticity)
+"""Of the compliance, by q and all numbers."""

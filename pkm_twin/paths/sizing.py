@@ -14,8 +14,9 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Final
 
@@ -90,29 +91,8 @@ def integral(time: Array, values: Array) -> float:
     return float(np.sum(0.5 * np.diff(time) * (values[:-1] + values[1:])))
 
 
-@dataclass(frozen=True)
-class Motor:
-    """A motor of a drives file: torques in N m, speeds in rad/s, inertia in kg m2.
-
-    ``curve``: its greatest torque by speed, shape (k, 2) of speed and torque, rising speeds;
-    ``continuous``: torque that it may give all the time.
-    """
-
-    name: str
-    inertia: float
-    continuous: float
-    curve: Array
-    source: str = ""
-
-    def most(self, speed: Array) -> Array:
-        """Greatest torque at speeds (k,), rad/s; 0 beyond the curve."""
-        amount = np.abs(speed)
-        inside = np.interp(amount, self.curve[:, 0], self.curve[:, 1])
-        return np.where(amount > self.curve[-1, 0], 0.0, inside)
-
-
 @dataclass(frozen=True, eq=False)
-class MotorSpec:
+class Motor:
     """A motor as its data sheet has it: torques in N m, speeds in 1/min, inertia in kg m2.
 
     ``curve``: rows of speed and greatest torque; without it the peak torque up to the rated speed,
@@ -141,17 +121,21 @@ class MotorSpec:
             if value > bound:
                 raise ParameterError(f"{path}.{name}", value, f"at most {what}, {bound:g}")
 
-    def motor(self, name: str) -> Motor:
-        """In SI units."""
+    @cached_property
+    def limits(self) -> tuple[Array, Array]:
+        """Rising speeds (k,), rad/s, and the greatest torque at them, N m."""
         rows = self.curve
         if rows is None:
             rows = np.array(
                 [[0.0, self.peak_torque], [self.rated_speed, self.peak_torque],
                  [self.max_speed, self.continuous_torque]]
             )  # fmt: skip
-        return Motor(
-            name, self.inertia, self.continuous_torque, rows * np.array([RPM, 1.0]), self.source
-        )
+        return RPM * rows[:, 0], rows[:, 1]
+
+    def most(self, speed: Array) -> Array:
+        """Greatest torque at speeds (k,), rad/s; 0 beyond the curve."""
+        amount, (speeds, torques) = np.abs(speed), self.limits
+        return np.where(amount > speeds[-1], 0.0, np.interp(amount, speeds, torques))
 
 
 def _curve(field: str, value: Any) -> Array:
@@ -185,8 +169,8 @@ def read_entries(path: Path, key: str, of: str) -> dict[Any, Any]:
     return entries
 
 
-def read_motors(path: Path, names: Sequence[str] = ()) -> list[Motor]:
-    """Motors of a YAML with a mapping ``drives`` of names to data.
+def read_motors(path: Path, names: Sequence[str] = ()) -> dict[str, Motor]:
+    """Motors by name, of a YAML with a mapping ``drives`` of names to data.
 
     :raises ParameterError: by the field.
     """
@@ -196,11 +180,11 @@ def read_motors(path: Path, names: Sequence[str] = ()) -> list[Motor]:
     for name in names:
         if name not in entries:
             raise UnknownNameError(f"{path}: motor", name, [str(n) for n in entries])
-    return [
-        schema.build(MotorSpec, entry, f"{path}: drives.{name}").motor(str(name))
+    return {
+        str(name): schema.build(Motor, entry, f"{path}: drives.{name}")
         for name, entry in entries.items()
         if not names or name in names
-    ]
+    }
 
 
 @dataclass(frozen=True)
@@ -211,6 +195,7 @@ class Fit:
     at the bound.
     """
 
+    name: str
     motor: Motor
     torque: float
     thermal: float
@@ -225,7 +210,7 @@ class Fit:
     def as_json(self) -> dict[str, Any]:
         """Plain data; parts are 1 at the bound."""
         return {
-            "motor": self.motor.name, "good": self.good, "used_torque": _finite(self.torque),
+            "motor": self.name, "good": self.good, "used_torque": _finite(self.torque),
             "used_continuous_torque": self.thermal, "used_speed": self.speed,
             "inertia_ratio": _finite(self.inertia_ratio), "source": self.motor.source,
         }  # fmt: skip
@@ -292,12 +277,13 @@ class DriveDuty:
 
 
 def size_drives(
-    motion: Recording, effort: Array, motors: Sequence[Motor] = (), gear: Gear | None = None
-) -> list[DriveDuty]:
+    motion: Recording, effort: Array, motors: Mapping[str, Motor] | None = None,
+    gear: Gear | None = None,
+) -> list[DriveDuty]:  # fmt: skip
     """What each drive must supply for a motion.
 
     :param motion: with rates and accelerations; ``effort``: the joints' efforts, shape (k, n).
-    :param motors: candidates; each replaces the rotor of the robot's file.
+    :param motors: candidates by name; each replaces the rotor of the robot's file.
     :param gear: of joints without a ``drive`` in the file; its ``rotor_inertia`` is behind it.
     :raises ParameterError: fewer than two samples; motors for a joint without a gear; a gear for a
         joint that has one, or of another type.
@@ -332,9 +318,9 @@ def size_drives(
         speeds = turns * qd[:, i]
         torques = motor_torque(through, qd[:, i], qdd[:, i], drive.inertia, turns, share)
         fits = []
-        for motor in motors:
+        for name, motor in (motors or {}).items():
             own = motor_torque(through, qd[:, i], qdd[:, i], motor.inertia, turns, share)
-            fits.append(_fit(motor, time, own, speeds, span[1] / turns**2))
+            fits.append(_fit(name, motor, time, own, speeds, span[1] / turns**2))
         ratio = span[1] / turns**2 / drive.inertia if drive.inertia > 0.0 else None
         result.append(
             DriveDuty(
@@ -357,14 +343,20 @@ def motor_torque(
     return inertia * turns * qdd + through * losses / turns
 
 
-def _fit(motor: Motor, time: Array, torques: Array, speeds: Array, load: float) -> Fit:
+def _fit(name: str, motor: Motor, time: Array, torques: Array, speeds: Array, load: float) -> Fit:
     most = motor.most(speeds)
     with np.errstate(divide="ignore", invalid="ignore"):
         parts = np.where(most > 0.0, np.abs(torques) / most, np.where(torques == 0.0, 0.0, np.inf))
     rms = math.sqrt(integral(time, torques**2) / float(time[-1] - time[0]))
-    ratio = load / motor.inertia if motor.inertia > 0.0 else math.inf
-    fastest = float(np.abs(speeds).max()) / float(motor.curve[-1, 0])
-    return Fit(motor, float(parts.max()), rms / motor.continuous, fastest, ratio)
+    fastest = float(np.abs(speeds).max()) / float(motor.limits[0][-1])
+    return Fit(
+        name,
+        motor,
+        float(parts.max()),
+        rms / motor.continuous_torque,
+        fastest,
+        load / motor.inertia,
+    )
 
 
 def _finite(value: float) -> float | None:

@@ -137,7 +137,7 @@ def read_path(given: Design, path: Path) -> tuple[Robot, PosePath]:
     robot = given.machine()
     motion = given.read(path, robot, planned=True).with_rates()
     if motion.load is not None:
-        if not motion.load.held(motion.time).all():
+        if motion.load.masses or not motion.load.held(motion.time).all():
             bound = "one that is held throughout"
             raise ParameterError(f"{path}: payload", str(motion.load), bound)
         robot = motion.load.on(robot)

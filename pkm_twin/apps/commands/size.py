@@ -95,7 +95,7 @@ def size(given: Size) -> Report:
         )
     if given.motion is None:
         return over_workspace(given)
-    motors = [] if given.drives is None else read_motors(given.drives, given.motor)
+    motors = {} if given.drives is None else read_motors(given.drives, given.motor)
     gear = Gear(given.ratio, given.lead, given.efficiency) if geared else None
     motion = given.read(given.motion, given.machine(), planned=True).with_rates()
     taken = compared(motion, given.efforts)
@@ -135,11 +135,9 @@ def size(given: Size) -> Report:
 
 def smallest(duties: Sequence[DriveDuty]) -> str | None:
     """The motor of the least continuous torque that fits all drives."""
-    good = [fit.motor for fit in duties[0].fits]
-    for duty in duties:
-        named = {fit.motor.name for fit in duty.fits if fit.good}
-        good = [motor for motor in good if motor.name in named]
-    best = min(good, key=lambda motor: motor.continuous, default=None)
+    fitting = [{fit.name for fit in duty.fits if fit.good} for duty in duties]
+    good = [fit for fit in duties[0].fits if all(fit.name in names for names in fitting)]
+    best = min(good, key=lambda fit: fit.motor.continuous_torque, default=None)
     return None if best is None else best.name
 
 
@@ -170,13 +168,13 @@ def _tables(duties: Sequence[DriveDuty]) -> list[Table]:
         if rows:
             tables.append(Table("", columns, rows, head=side))
     for d in duties:
-        fits = sorted(d.fits, key=lambda fit: (not fit.good, fit.motor.continuous))
+        fits = sorted(d.fits, key=lambda fit: (not fit.good, fit.motor.continuous_torque))
         columns = [
             Column("", "", name) for name in ("", "peak torque", "RMS torque", "speed")
         ]  # fmt: skip
         columns.append(Column("", "", "inertia ratio", form=".3g"))
         rows = {
-            fit.motor.name: [
+            fit.name: [
                 "fits" if fit.good else "too small", *map(_percent, (fit.torque, fit.thermal,
                 fit.speed)), fit.inertia_ratio,
             ]
@@ -240,7 +238,7 @@ def over_workspace(given: Size) -> Report:
 
 def near(duty: DriveDuty) -> list[Fit]:
     """The motors to draw: the smallest that fits, or the largest, and the three below it."""
-    fits = sorted(duty.fits, key=lambda fit: fit.motor.continuous)
+    fits = sorted(duty.fits, key=lambda fit: fit.motor.continuous_torque)
     first = next((k for k, fit in enumerate(fits) if fit.good), len(fits) - 1)
     return fits[max(first - 3, 0) : first + 1]
 
@@ -269,11 +267,11 @@ def draw(taken: Compared, duties: Sequence[DriveDuty]) -> Any:
         ax.plot(speeds, torques, color="black", lw=1.5, label="motion")
         most = float(np.abs(torques).max())
         for colour, fit in zip(plots.COLOURS, near(d), strict=False):
-            most = max(most, float(fit.motor.curve[:, 1].max()))
-            speed, torque = fit.motor.curve.T
+            speed, torque = fit.motor.limits
+            most = max(most, float(torque.max()))
             for sign in (1.0, -1.0):
                 for way in (1.0, -1.0):
-                    label = fit.motor.name if sign == way == 1.0 else None
+                    label = fit.name if sign == way == 1.0 else None
                     ax.plot(way * speed / RPM, sign * torque, color=colour, lw=1, label=label)
         if d.fits:
             fastest = 1.3 * float(np.abs(speeds).max())
