@@ -252,7 +252,7 @@ class Book:
     """Parameters by name, in the order in which they follow from each other, and expressions.
 
     ``own``: the expressions of parameters, by name. ``formulas``: of the other numbers, by path.
-    ``data``: the file as it stands.
+    ``data``: the file as it stands; empty where numbers are not the file's any more.
     """
 
     values: Mapping[str, Any] = field(default_factory=dict)
@@ -322,9 +322,9 @@ class Book:
         kept = {path: one for path, one in self.formulas.items() if path not in rest}
         for name in new.keys() - self.values.keys():
             raise unknown_number(start + name, [start + known for known in self.values])
-        if not new and len(kept) == len(self.formulas):
+        if not values:
             return self, rest
-        book = replace(self._with(new), formulas=kept)
+        book = replace(self._with(new), formulas=kept, data={})
         moving = self.following(new)
         changes = {
             path: one.value(book.values)
@@ -332,6 +332,12 @@ class Book:
             if one.names & moving and not path.startswith("uncertainty.")
         }
         return book, {**changes, **rest}
+
+    def told_anew(self, sections: Mapping[str, Any]) -> Book:
+        """The book of a file with other sections; of none, where the file does not tell them."""
+        kept = {path: f for path, f in self.formulas.items() if path.split(".")[0] not in sections}
+        data = {**self.data, **sections} if sections and self.data else {}
+        return replace(self, formulas=kept, data=data)
 
     def following(self, names: Any) -> set[str]:
         """The parameters of some names, and those that follow from them."""

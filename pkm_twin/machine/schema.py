@@ -104,11 +104,15 @@ def text(*, default: Any = MISSING, **more: Any) -> Any:
 
 
 def mapping(entry: Any, *, default: Any = MISSING, **more: Any) -> Any:
-    """Field: names to sections with the schema of a dataclass, or to values of another field."""
+    """Field: names to sections with the schema of a dataclass, or to values of another field.
+
+    Where there is a default, a key without a value is an empty mapping.
+    """
     section = isinstance(entry, type)
     what = "entries" if section else "numbers"
 
     def check(field: str, value: Any) -> dict[str, Any]:
+        value = {} if value is None and default is not MISSING else value
         named = isinstance(value, Mapping)
         if not named or not all(isinstance(name, str) and name for name in value):
             raise ParameterError(field, value, f"a mapping of names to {what}")

@@ -19,7 +19,7 @@ from typing import Any, Final, TypeVar
 import numpy as np
 
 from pkm_twin.codegen.arrays import Array
-from pkm_twin.codegen.expressions import norm, plain
+from pkm_twin.codegen.expressions import norm, plain, reference
 from pkm_twin.errors import ParameterError
 from pkm_twin.kinematics.pose import COORDINATES, Coordinate
 from pkm_twin.kinematics.scheme import check_masses, choose_coordinates
@@ -150,7 +150,12 @@ class Machine(TwinRobot):
         if isinstance(parameters, Mapping) and parameters:
             self = self.filed({f"{PARAMETERS}.{name}": v for name, v in parameters.items()})
         made = super().changed(**sections)
-        if not {"friction", "limits"} & set(sections):
+        if not sections or not set(sections) <= set(self.changeable):
+            return made
+        drives = not {"friction", "limits"}.isdisjoint(sections)
+        told = {key: schema.plain(getattr(made, key)) for key in sections if not drives}
+        made = made._with(book=made.book.told_anew(told))
+        if not drives:
             return made
         joints = dict(made.specs["joints"])
         for k, name in enumerate(made.joint_names):
@@ -166,6 +171,7 @@ class Machine(TwinRobot):
         copy is turned on.
         """
         book, values = self.book.moved(values)
+        sources = dict(self.sources)
         specs = {kind: dict(entries) for kind, entries in self.specs.items()}
         rest, origin = {}, self.described.origin
         # Of an entry: numbers of its limb, then its azimuth, then the copy's own, each at once.
@@ -183,16 +189,20 @@ class Machine(TwinRobot):
                 rest[path] = value
         for (kind, name, _, place, azimuth), new in sorted(changes.items(), key=lambda c: c[0][2]):
             specs[kind][name] = numbered_entry(specs[kind][name], new, azimuth, place)
+            if ("azimuth",) in new:
+                turned = reference(new["azimuth",])
+                sources[kind, name] = dataclasses.replace(sources[kind, name], azimuth=turned)
         described = graph_of_entries(self.described.platform, specs, origin)
         made = super().numbered(rest)
         return made._with(
-            described=described, specs=specs, book=book, **drives_of(described, specs["joints"])
-        )
+            described=described, specs=specs, sources=sources, book=book,
+            **drives_of(described, specs["joints"]),
+        )  # fmt: skip
 
     def filed(self, values: Mapping[str, Any]) -> Any:
         """As of every robot; parameters and expressions stay, but where a copy's number is new."""
         data: Any = copy.deepcopy(self.book.data)
-        kept = self.book.values or self.book.formulas
+        kept = data and (self.book.values or self.book.formulas)
         if not kept or not all(has_entry(data, path) for path in values):
             return super().filed(values)
         for path, value in values.items():

@@ -142,6 +142,27 @@ def test_changed_parameters_stay_parameters():
 
 
 @pytest.mark.parametrize(
+    "sections",
+    [{"payload": {"mass": 0.7}}, {"friction": {"viscous": 0.4}}, {"gravity": [1.0, 0.0, -3.0]}],
+)
+def test_what_is_changed_stays_when_a_parameter_moves(sections):
+    robot, new = robot_with().changed(**sections), {"parameters.arm": 0.21}
+    expected = torques(robot_with(arm=0.21).changed(**sections))
+    assert torques(with_entries(robot, new)) == pytest.approx(expected, abs=1e-13)
+    assert torques(robot.numbered(new)) == pytest.approx(expected, abs=1e-13)
+
+
+def test_numbers_that_are_set_one_after_another_are_those_set_at_once():
+    first = {"payload.mass": 0.7, "limbs.azimuths[0]": 1.6, "parameters.base": 0.11}
+    second = {"limbs.joints.motor.axis[2]": 0.01, "parameters.m": 0.2}
+    expected = torques(robot_with().numbered(first | second))
+    assert torques(robot_with().numbered(first).numbered(second)) == pytest.approx(expected)
+    assert torques(with_entries(robot_with().numbered(first), {})) == pytest.approx(
+        torques(robot_with().numbered(first))
+    )
+
+
+@pytest.mark.parametrize(
     ("text", "reason"),
     [
         ("", "arithmetic"),
