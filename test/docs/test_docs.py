@@ -119,8 +119,9 @@ def test_commands_of_the_design_page(tmp_path, twin, monkeypatch):
     assert {path.name for path in tmp_path.iterdir()} >= {"better.yaml", "better.png", "box.nc"}
 
 
-def test_the_example_of_design():
-    runpy.run_path(str(DOCS.parent / "examples/design_a_delta.py"), run_name="__main__")
+@pytest.mark.parametrize("name", ["design_a_delta", "rail_delta"])
+def test_the_example_runs(name):
+    runpy.run_path(str(DOCS.parent / f"examples/{name}.py"), run_name="__main__")
 
 
 def test_the_notebook_runs():

@@ -38,10 +38,8 @@ the independent rules of `test/fuzz/messages.py`) and equals that of the model.
 HEAD = "| kind | examples | accepted | failed | 99.9 % (ms) |\n" + "|---" * 5 + "|"
 NODES_TEXT = """
 
-Real nodes over DDS, seed {seed}, {seconds:.0f} s:
-{sent}. All nodes alive, no exception;
-{torques:,} torques were received, each finite and with the stamp of a valid message; {requests:,}
-requests and {clocks:,} clocks were rejected and counted.
+Real nodes over DDS, {seconds:.0f} s of random messages, requests and clocks ({sent:,}): all nodes
+alive; {torques:,} torques received, each finite and with the stamp of a valid message.
 """
 
 
@@ -61,8 +59,7 @@ def section(figures: list[dict[str, Any]], nodes: dict[str, Any] | None, before:
     total = sum(int(line.split("|")[2].replace(",", "")) for line in rows)
     text = f"{INTRODUCTION.format(total=total)}\n{HEAD}\n" + "\n".join(rows)
     if nodes is not None:
-        sent = ", ".join(f"{what} {n:,}" for what, n in nodes["sent"].items())
-        return text + NODES_TEXT.format(**nodes | {"sent": sent})
+        return text + NODES_TEXT.format(**nodes | {"sent": sum(nodes["sent"].values())})
     _, begin, rest = before.partition(NODES_TEXT.strip().partition(",")[0])
     return f"{text}\n\n{begin}{rest}"
 

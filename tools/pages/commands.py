@@ -15,10 +15,12 @@ from typer.main import get_command
 from pkm_twin.apps.cli import app
 from pkm_twin.apps.groups import commands
 
-SEVERAL = 3
+SEVERAL = 2
 """Commands that an option has to have with one meaning to be explained once for all."""
 SHARED = "Options of several commands"
-GROUPS = {"--columns": "table", "--topic": "recording", "--picture": "picture"}
+GROUPS = {
+    "--columns": "table", "--topic": "recording", "--picture": "picture", "--teeth": "milling",
+}  # fmt: skip
 """An option, and the name of those that the same commands have."""
 
 

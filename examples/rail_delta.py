@@ -1,0 +1,157 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A mechanism with a closed form: a Delta on three vertical rails, from a few lengths.
+
+    python examples/rail_delta.py
+
+Write one if a few lengths describe a family of machines, or if the kinematics have a closed form.
+The file has a schema, a function from its parameters to a graph, and the closed forms; everything
+else comes from the graph. ``solved`` operates on expressions: it uses the functions of
+``pkm_twin.codegen.operations``, without branches on values. For use in robot files add one line to
+``pkm_twin/robot/catalogue.py``.
+"""
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from pkm_twin.codegen.operations import maximum, sqrt
+from pkm_twin.kinematics.pose import COORDINATES
+from pkm_twin.machine import schema
+from pkm_twin.machine.graph import BASE, Body, Graph, Joint, Rod, array
+from pkm_twin.machine.sections import check_azimuths, length, mass
+from pkm_twin.robot.mechanism import Inverse
+from pkm_twin.robot.robot import Robot
+
+UP = np.array([0.0, 0.0, 1.0])
+
+
+@dataclass(frozen=True, eq=False)
+class Geometry:
+    """Radii of the carriages' and the platform's ball joints, rod length, width of a pair (m)."""
+
+    carriage_radius: float = length()
+    platform_radius: float = length()
+    rod_length: float = length()
+    width: float = length()
+    azimuths: np.ndarray = schema.vector(3, unit="rad")
+
+    def verify(self, path):
+        """Limbs apart."""
+        check_azimuths(self.azimuths, f"{path}.azimuths")
+
+
+@dataclass(frozen=True, eq=False)
+class Inertia:
+    """Masses (kg) and the platform's inertia; a carriage only slides, so it needs no inertia."""
+
+    carriage_mass: float = mass()
+    platform_mass: float = mass()
+    rod_mass: float = mass()
+    platform_inertia: np.ndarray = schema.inertia(positive=False)
+    rotor_inertia: float = schema.number(low=0.0, unit="kg", default=0.0)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class RailDelta(Robot):
+    """A Delta on three vertical rails."""
+
+    mechanism: str = schema.choice("rail_delta")
+    geometry: Geometry = schema.section(Geometry)
+    inertia: Inertia = schema.section(Inertia)
+
+    description: ClassVar[str] = "Delta on three vertical rails"
+    mobility: ClassVar[str] = "3: translations x, y, z"
+    coordinates: ClassVar = tuple(COORDINATES[name] for name in "xyz")
+    limb_names: ClassVar = ("limb 1", "limb 2", "limb 3")
+    has_inverse: ClassVar[bool] = True
+
+    @property
+    def size(self):
+        """The platform's radius, m."""
+        return self.geometry.platform_radius
+
+    @property
+    def closed_key(self):
+        """What the closed form depends on in addition to the graph."""
+        return repr(schema.plain(self.geometry))
+
+    def limbs(self):
+        """For each limb: the outward direction, and that of the pair's width."""
+        for azimuth in self.geometry.azimuths:
+            out = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
+            yield out, np.cross(UP, out)
+
+    def solved(self, pose):
+        """Carriage heights above the platform: a right triangle in each limb."""
+        g, q, misses = self.geometry, [], []
+        for out, _ in self.limbs():
+            x, y, _ = pose + (g.platform_radius - g.carriage_radius) * out
+            rest = g.rod_length**2 - x * x - y * y
+            q.append(pose[2] + sqrt(maximum(rest, 0.0)))
+            misses.append(sqrt(x * x + y * y) - g.rod_length)
+        return Inverse(q, misses)
+
+    def make_graph(self):
+        """At home the carriages are at zero and the platform is below the origin."""
+        g, m = self.geometry, self.inertia
+        drop = np.sqrt(g.rod_length**2 - (g.carriage_radius - g.platform_radius) ** 2)
+        platform = -drop * UP
+        bodies = {
+            "platform": Body("platform", m.platform_mass, array(platform), m.platform_inertia)
+        }
+        joints, rods = {}, {}
+        for i, (out, along) in enumerate(self.limbs(), 1):
+            ball = g.carriage_radius * out
+            carriage, rail = f"carriage_{i}", f"rail_{i}"
+            bodies[carriage] = Body(carriage, m.carriage_mass, array(ball))
+            joints[rail] = Joint(
+                rail,
+                "prismatic",
+                BASE,
+                carriage,
+                array(ball),
+                array([UP]),
+                actuated=True,
+                rotor_inertia=m.rotor_inertia,
+            )
+            for name, side in (("left", 0.5), ("right", -0.5)):
+                shift = side * g.width * along
+                ends = array([ball + shift, platform + g.platform_radius * out + shift])
+                rods[f"{name}_{i}"] = Rod(f"{name}_{i}", carriage, "platform", ends, m.rod_mass)
+        return Graph(bodies, joints, rods, "platform", array(platform))
+
+
+def main():
+    """The closed form against the engine, which follows the closures from home."""
+    own = RailDelta.from_data(
+        {
+            "mechanism": "rail_delta",
+            "geometry": {
+                "carriage_radius": 0.17,
+                "platform_radius": 0.05,
+                "rod_length": 0.37,
+                "width": 0.06,
+                "azimuths": [1.5707963, 3.6651914, 5.7595865],
+            },
+            "inertia": {
+                "carriage_mass": 0.5,
+                "platform_mass": 0.4,
+                "rod_mass": 0.03,
+                "platform_inertia": [3.0e-4, 3.0e-4, 5.0e-4],
+                "rotor_inertia": 0.13,
+            },
+            "friction": {"viscous": 4.0, "coulomb": 1.5},
+        },
+        "own",
+    )
+    pose = np.random.default_rng(1).uniform(-0.05, 0.05, (100, 3)) - [0, 0, 0.3]
+    q = own.inverse(pose)
+    miss = np.abs(own.forward(q) - pose).max()
+    if miss > 1e-12:
+        raise SystemExit(f"closed form and engine differ by {miss:.0e} m")
+    print(f"closed form and engine differ by {miss:.0e} m at most")
+
+
+if __name__ == "__main__":
+    main()
