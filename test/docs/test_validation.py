@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import yaml
 
+from delta_dynamics import inverse_dynamics
 from pkm_twin import load
 from stiffness_monitor import strain_energy
 from stiffness_monitor.modes import modes, natural_frequencies
@@ -16,6 +17,7 @@ from test.support.pages import assert_printed, numbers
 from test.support.robots import parameters_of, partly_long
 from test.validation import test_delta_cu_paper as delta_cu
 from test.validation import test_upr_rpu_paper as upr_rpu
+from test.validation.test_prru_paper import paper, turn
 
 PAGE = "docs/validation.md"
 
@@ -111,3 +113,126 @@ def test_torques_of_random_machines(name, machine):
         assert max(found.places[route]) < PLACE_BOUND, route
     for what, bound in BALANCE_BOUNDS.items():
         assert max(found.balances[what]) < bound, what
+
+
+class TestErrataOfTheDeltaCu:
+    robot = load("delta")
+    phase = delta_cu.RATE * delta_cu.TIME[:, None]
+
+    def motion(self, signs):
+        cosine, sine = np.cos(self.phase), np.sin(self.phase)
+        q = delta_cu.HOME_ANGLE + signs * cosine
+        return q, -signs * delta_cu.RATE * sine, -signs * delta_cu.RATE**2 * cosine
+
+    def velocity(self, signs=delta_cu.SIGNS):
+        """In the paper's axes, mm/s."""
+        q, qd, _ = self.motion(signs)
+        return np.einsum("nij,nj->ni", self.robot.jacobian(q), qd) * delta_cu.DOWN * 1e3
+
+    def test_the_sign_is_that_of_arm_one(self):
+        ours = delta_cu.differences(self.velocity(), delta_cu.VELOCITY)[0]
+        theirs = self.velocity(np.array([1.0, -1.0, 1.0]))
+        pattern = r"velocity rms (\S+) mm/s instead of (\d+) mm/s"
+        assert_printed(PAGE, pattern, ours, delta_cu.differences(theirs, delta_cu.VELOCITY)[0])
+
+    def test_a_digit_of_table_2_is_lost(self):
+        found = self.velocity()
+        source = np.array(delta_cu.VELOCITY, float)
+        rms = [delta_cu.differences(found, source)[0]]
+        used, source[3, 2] = source[3, 2], -10.80
+        rms.append(delta_cu.differences(found, source)[0])
+        pattern = (
+            r"(-10\.80) mm/s \| (\S+) mm/s, a digit is lost \| the model gives (\S+); "
+            r"velocity rms (\S+) instead of (\S+) mm/s"
+        )
+        assert_printed(PAGE, pattern, -10.80, used, found[3, 2], *rms)
+
+    def test_two_digits_of_table_3_are_exchanged(self):
+        q, qd, qdd = self.motion(delta_cu.SIGNS)
+        found = self.robot.pose_acceleration(q, qd, qdd) * delta_cu.DOWN * 1e3
+        source = np.array(delta_cu.ACCELERATION, float)
+        rms = [delta_cu.differences(found, source)[0]]
+        used, source[4, 2] = source[4, 2], 17.20
+        rms.append(delta_cu.differences(found, source)[0])
+        pattern = (
+            r"(17\.20) mm/s2 \| (\S+) mm/s2, two digits are exchanged \| the model gives (\S+); "
+            r"acceleration rms (\S+) instead of (\S+) mm/s2"
+        )
+        assert_printed(PAGE, pattern, 17.20, used, found[4, 2], *rms)
+
+    def test_symmetry(self):
+        """Of arms II and III in the tables, and of the platform's motion in arm I's plane."""
+        efforts = inverse_dynamics(self.robot, *self.motion(delta_cu.SIGNS), delta_cu.LOAD)
+        np.testing.assert_allclose(efforts[:, 1], efforts[:, 2], atol=1e-12)
+        second, third = (
+            np.array(table) @ axis / np.dot(axis, axis) * 1e-3
+            for table, axis in zip(delta_cu.TORQUES[1:], delta_cu.AXES[1:], strict=True)
+        )
+        across = np.array([0.5, np.sqrt(0.75), 0.0])
+        away = [np.abs(np.array(t) @ across).max()
+                for t in (delta_cu.VELOCITY, delta_cu.ACCELERATION)]  # fmt: skip
+        pattern = (
+            r"differ by up to (\S+) N m; at t = 0 they give (\S+) and (\S+) N m, where the model "
+            r"gives (\S+) N m for both\. .* leave the plane by up to (\S+) mm/s and (\S+) mm/s2"
+        )
+        most = np.abs(second - third).max()
+        assert_printed(PAGE, pattern, most, second[0], third[0], efforts[0, 1], *away)
+
+
+class TestErrataOfThePrru:
+    robot = load("prru")
+
+    def test_equation_4_is_a_rotation_once_its_entry_is_corrected(self):
+        f, t, p = 0.3, -0.4, 0.7
+        c, s = np.cos, np.sin
+        right = turn(2, f) @ turn(1, t) @ turn(2, p)
+        assert right[0, 1] == pytest.approx(-c(f) * c(t) * s(p) - s(f) * c(p))
+        printed = right.copy()
+        printed[0, 1] = -c(f) * c(t) * c(p) - s(f) * c(p)
+        assert np.abs(right @ right.T - np.eye(3)).max() < 1e-15
+        assert np.abs(printed @ printed.T - np.eye(3)).max() > 0.1
+
+    def test_equation_11_holds_as_it_is_printed(self):
+        """Every joint U is in its limb's vertical plane (equation 10); with y halved it is not."""
+        g = self.robot.geometry
+        for pose in ((-0.5, 0.3, -0.4), (-0.5, 0.5, 0.45), (-0.4, -0.2, 0.6)):
+            here = paper(self.robot, np.array(pose))
+            for half, most in ((1.0, 1e-15), (0.5, np.inf)):
+                centre = here.centre * [1.0, half, 1.0]
+                off = [
+                    np.array([-np.sin(phi), np.cos(phi), 0.0])
+                    @ (centre - here.rotation @ (g.platform_radius * turn(2, phi)[:, 0]))
+                    for phi in g.azimuths
+                ]
+                assert np.abs(off).max() < most
+                assert half == 1.0 or np.abs(off).max() > 1e-3
+
+    def test_the_vector_of_equation_17_is_the_tangential_one(self):
+        """At the level pose a limb does not turn about itself."""
+        level = paper(self.robot, np.array([-0.5, 0.0, 0.0]))
+        np.testing.assert_allclose(level.spin, 0.0, atol=1e-15)
+        for phi, swing in zip(self.robot.geometry.azimuths, level.swing, strict=True):
+            radial = (turn(2, phi) @ turn(1, swing)).T @ -turn(2, phi)[:, 0]
+            assert abs(np.arctan2(-radial[0], radial[1])) == pytest.approx(np.pi / 2)
+
+
+class TestErrataOfTheUprRpu:
+    pose, theory, _ = upr_rpu.TABLE_1[1]
+
+    def deflection(self, pose, robot=upr_rpu.ROBOT):
+        return 1e6 * strain_energy(robot, pose, upr_rpu.LOAD).deflection
+
+    def test_z_is_the_coordinate(self):
+        z, beta, gamma = self.pose
+        along = self.deflection((z * np.cos(beta), beta, gamma))
+        found = [
+            100 * np.abs(d / self.theory - 1).max() for d in (along, self.deflection(self.pose))
+        ]
+        pattern = r"within (\S+) % with the distance along Oo, within (\S+) % \((\d) units"
+        units = np.abs(self.deflection(self.pose) - self.theory).max() / upr_rpu.UNIT
+        assert_printed(PAGE, pattern, *found, units)
+
+    def test_the_shear_factor(self):
+        round_bar = upr_rpu.ROBOT.changed(members={"shear_factor": 1.127})
+        change = self.deflection(self.pose, round_bar) / self.deflection(self.pose) - 1
+        assert_printed(PAGE, r"changes it by up to (\S+) %", 100 * np.abs(change).max())

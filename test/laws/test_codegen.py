@@ -25,7 +25,7 @@ from pkm_twin.codegen.key import ProgramKey
 from pkm_twin.codegen.lu import SparseLU, independent_rows, pivot_order
 from pkm_twin.codegen.program import Program
 from pkm_twin.errors import ParameterError, UnreachableError
-from test.support.plain import PlainKernel
+from test.support.bodies import PlainKernel
 from test.support.robots import every_robot, load, random_joints
 
 NONE = np.zeros(0)

@@ -9,8 +9,7 @@ import pytest
 from pkm_twin.errors import PkmTwinError
 from pkm_twin.kinematics.passive import passive_program
 from pkm_twin.machine.graph import BASE
-from test.support.bodies import bodies
-from test.support.plain import PlainKernel
+from test.support.bodies import PlainKernel, bodies
 from test.support.robots import (
     every_robot,
     finite_difference,

@@ -17,11 +17,27 @@ from numpy.typing import ArrayLike
 from pkm_twin import Robot
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.codegen.code import STEPS
+from pkm_twin.codegen.plain import PlainCode
 from pkm_twin.codegen.program import Program
 from pkm_twin.kinematics.engine import Engine
 from pkm_twin.kinematics.traced import Traced
 from pkm_twin.machine.graph import BASE, Joint
-from test.support.plain import PlainKernel
+
+
+class PlainKernel:
+    """A program with the numbers of one machine's geometry, as plain Python.
+
+    It has no other parameters.
+    """
+
+    def __init__(self, program: Program, geometry: Array | None = None) -> None:
+        self._code = PlainCode(program)
+        numbers = np.zeros(0) if geometry is None else geometry
+        self._prepared = self._code.prepare(numbers[None])[0]
+
+    def run(self, inputs: list[Array], steps: int = 1) -> tuple[list[Array], Array]:
+        """Outputs (k, size) of inputs (k, size), and the status (k, 2)."""
+        return self._code.run(self._prepared, inputs, len(inputs[0]), steps)
 
 
 @dataclass(frozen=True)

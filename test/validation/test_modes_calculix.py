@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Natural frequencies against CalculiX, whose beams are solids with a round hole.
+"""Natural frequencies and a response against CalculiX, whose beams are solids with a round hole.
 
 CalculiX expands a B32R beam into quadratic bricks: no beam theory, no shear factor, another mass
 matrix and another solver. One brick spans the whole section, which cannot warp as a thin tube's
@@ -15,9 +15,10 @@ import pytest
 
 from stiffness_monitor.modes import natural_frequencies
 from stiffness_monitor.structure import structural_model
+from stiffness_monitor.vibration import frequency_response, tool_modes
 from test.support.pages import numbers
 from test.support.robots import parameters_of, partly_long
-from tools.calculix import ABSENT, CCX, frequencies
+from tools.calculix import ABSENT, CCX, frequencies, harmonic
 
 CLOSE, CONTRACTED = numbers(
     "docs/validation.md",
@@ -73,3 +74,17 @@ def test_the_deck_tells_other_robots_apart(isotropic, tmp_path):
         ).max()
         > 0.5
     )
+
+
+def test_the_tool_s_response_is_calculix_up_to_the_third_mode(isotropic, tmp_path):
+    """At frequencies that are apart as the natural ones are, which differ by up to 0.3 %."""
+    robot, damping = isotropic("delta_cu", 0.0), 0.03
+    pose = robot.forward([0.5, -0.2, 0.1])
+    ours = tool_modes(robot, pose, damping=damping).frequencies
+    model = structural_model(robot, robot.inverse(pose))
+    own, at, theirs = harmonic(model, damping, 1.1 * ours[2], tmp_path, modes=16, divisions=4)
+    same = np.interp(at, [0.0, *own[:4]], [0.0, *ours[:4]])
+    found = frequency_response(robot, pose, same, damping=damping)[:, :3, 0]
+    apart = np.linalg.norm(found - theirs, axis=1) / np.linalg.norm(theirs, axis=1)
+    assert apart.max() < 0.02
+    assert (np.abs(at[:, None] / own[:3] - 1.0).min(0) < 1e-6).all()
