@@ -111,11 +111,7 @@ class StiffnessAlarmTopics:
         core = self._core
         if core is None or not (core.taken.accepted or core.taken.rejected):
             return {}
-        values: dict[str, object] = {
-            "deflections accepted": core.taken.accepted,
-            "deflections in the window": core.count,
-        }
-        return values | {f"deflections rejected: {k}": v for k, v in core.taken.rejected.items()}
+        return {"deflections in the window": core.count, **core.taken.counts("deflections")}
 
     def _on_deflection(self, message: TransformStamped) -> None:
         if self._core is not None:

@@ -132,13 +132,10 @@ class SetpointCorrection(Core):
         """Values of the node's diagnostic status."""
         if not self.wanted:
             return {}
-        values: dict[str, object] = {
-            "corrections at their bound": self.bounded,
-            "set points corrected": self.setpoints.accepted,
-        }
+        values: dict[str, object] = {"corrections at their bound": self.bounded}
         if self._paired:
             values["set points and torques without a pair"] = self.unpaired
-        return values | {f"set points rejected: {k}": v for k, v in self.setpoints.rejected.items()}
+        return values | self.setpoints.counts("set points", "corrected")
 
     def _on_setpoint(self, message: JointStateView) -> None:
         with self.taking(self.setpoints):

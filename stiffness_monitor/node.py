@@ -61,8 +61,8 @@ class StiffnessMonitor(TwinNode):
         )
         mounts = declare_mounts(self, given or PLATFORM)
         self._platform_frame = given or ("" if mounts is None else PLATFORM)
-        self._monitor = Monitor(robot, settings, mounts)
-        self._monitor.pace = Pace(
+        self.core = Monitor(robot, settings, mounts)
+        self.core.pace = Pace(
             self.declare(
                 "rate", 0.0, "largest rate of answers, by the stamps of the wrenches; 0: every "
                 "wrench",
@@ -102,66 +102,60 @@ class StiffnessMonitor(TwinNode):
             self.create_guarded_timer(1.0 / rate, self._publish_frequencies)
         self.create_guarded_subscription(
             "joint_states",
-            lambda message: self._monitor.joint_state(message, self.now()),
-            refuse=partial(self._monitor.refuse, self._monitor.states),
+            lambda message: self.core.joint_state(message, self.now()),
+            refuse=partial(self.core.refuse, self.core.states),
             expected=True,
         )
         self.create_guarded_subscription("wrench", self._on_wrench)
         self.follow(
             changeable(Settings),
-            lambda values: with_parameters(self._monitor.settings, values),
+            lambda values: with_parameters(self.core.settings, values),
             self._change_settings,
         )
         self.start()
 
-    def summary(self) -> str:
-        """One line that says what the node runs."""
-        robot, settings = self._monitor.robot, self._monitor.settings
-        return (
-            f"robot {robot.name} ({robot.mechanism}), joints {', '.join(robot.joint_names)}, "
-            f"wrench in {settings.wrench_frame}"
-        )
+    def details(self) -> str:
+        """Where the wrench is measured."""
+        return f", wrench in {self.core.settings.wrench_frame}"
 
     def time_jumped_backward(self) -> None:
         """No pose across the seam."""
-        self._monitor.reset()
+        self.core.reset()
         self._correction.reset()
         self._alarm.reset()
         self._known = 0
 
-    def diagnose(self) -> tuple[bytes, str, dict[str, object]]:
-        """Level, message and values of the node's diagnostic status."""
-        core = self._monitor
-        level, message = health.OK, "running"
-        if core.last_reject:
-            level, message = health.WARN, f"last reject: {core.last_reject}"
+    def judge(self) -> tuple[bytes, str]:
+        """Level and message of the node's diagnostic status."""
         if self._alarm.departures:
-            level, message = health.WARN, self._alarm.warning()
-        values: dict[str, object] = {
-            "robot": core.robot.name,
-            "joint states accepted": core.states.accepted,
-            "wrenches answered": core.wrenches.accepted,
+            return health.WARN, self._alarm.warning()
+        return super().judge()
+
+    def values(self) -> dict[str, object]:
+        """Values of the node's diagnostic status."""
+        core = self.core
+        return {
             "older stamps dropped": core.dropped,
+            **core.states.counts("joint states"),
+            **core.wrenches.counts("wrenches", "answered"),
+            **self._correction.diagnose(),
+            **self._alarm.diagnose(),
         }
-        values |= self._correction.diagnose() | self._alarm.diagnose()
-        values |= {f"joint states rejected: {k}": v for k, v in core.states.rejected.items()}
-        values |= {f"wrenches rejected: {k}": v for k, v in core.wrenches.rejected.items()}
-        return level, message, values
 
     def activated(self) -> None:
         """No pose from before."""
-        self._monitor.reset()
+        self.core.reset()
         self._alarm.reset()
 
     def _change_settings(self, settings: Settings) -> None:
         """What the stamps of set points and deflections have to keep to, too."""
-        self._monitor.change_settings(settings)
+        self.core.change_settings(settings)
         self._correction.change_rules(settings.stamp_rules)
         platform = self._platform_frame or settings.platform_frame
         self._alarm.change_rules(settings.stamp_rules, (settings.base_frame, platform))
 
     def _on_wrench(self, message: WrenchStamped) -> None:
-        answer = self._monitor.wrench(message, self.now())
+        answer = self.core.wrench(message, self.now())
         if answer is None:
             return
         for publisher, make in self._outputs:
@@ -177,14 +171,14 @@ class StiffnessMonitor(TwinNode):
 
     def _publish_frequencies(self) -> None:
         """Of the latest joint state: a pose costs milliseconds, so not of every one."""
-        latest = self._monitor.latest
+        latest = self.core.latest
         if not self.active or latest is None or latest[0] == self._known:
             return
         listeners = (self._frequencies, self._frequencies_stamped)
         if not any(publisher.get_subscription_count() for publisher in listeners):
             return
         self._known, q = latest
-        robot = self._monitor.robot
+        robot = self.core.robot
         try:
             values = natural_frequencies(robot, robot.forward(q))
         except (PkmTwinError, ValueError) as error:
@@ -199,7 +193,7 @@ class StiffnessMonitor(TwinNode):
         self._frequencies_stamped.publish(_named(_header(self._known, ""), names, values.tolist()))
 
     def _in_base(self, answer: Answer) -> Header:
-        return _header(answer.stamp, self._monitor.settings.base_frame)
+        return _header(answer.stamp, self.core.settings.base_frame)
 
     def _entries(self, answer: Answer) -> JointState:
         return _named(self._in_base(answer), ENTRIES, answer.compliance[UPPER].tolist())
@@ -211,7 +205,7 @@ class StiffnessMonitor(TwinNode):
 
     def _energies(self, answer: Answer) -> DiagnosticArray:
         """Factors, energy, pose and frame; factors are absent where no load makes energy."""
-        robot, energy = self._monitor.robot, answer.energy
+        robot, energy = self.core.robot, answer.energy
         pairs: dict[str, str] = {}
         if energy.dominant != "none":
             factors = energy.factors.tolist()
@@ -220,7 +214,7 @@ class StiffnessMonitor(TwinNode):
         pairs["tie"] = str(bool(energy.tie)).lower()
         pose = answer.pose.tolist()
         pairs |= {name: repr(x) for name, x in zip(robot.pose_names, pose, strict=True)}
-        pairs["frame"] = self._monitor.settings.base_frame
+        pairs["frame"] = self.core.settings.base_frame
         status = DiagnosticStatus(
             level=health.OK,
             name=f"{self.get_name()}: strain energy",
@@ -237,7 +231,7 @@ class StiffnessMonitor(TwinNode):
         angle = math.sqrt(float(turn @ turn))
         # sin(x/2)/x goes to 1/2: deflections are so small that the quotient would lose digits.
         scale = 0.5 if angle < 1e-6 else math.sin(angle / 2) / angle
-        frame = self._platform_frame or self._monitor.settings.platform_frame
+        frame = self._platform_frame or self.core.settings.platform_frame
         message = TransformStamped(
             header=_header(answer.stamp, frame), child_frame_id=f"{frame}_deflected"
         )

@@ -47,7 +47,7 @@ class CommandGate(TwinNode):
         super().__init__("command_gate")
         robot = self.declare_robot()
         settings = self.declare_settings(GateSettings, fixed=True)
-        self._gate = Gate(robot, settings)
+        self.core = Gate(robot, settings)
         self._closed = True
         self._commands = CommandPublisher(self, robot, "~/commands")
         # The same with names and a stamp, for recordings and plots.
@@ -64,43 +64,40 @@ class CommandGate(TwinNode):
         if settings.on_stop == "gravity":
             self.create_guarded_subscription(
                 "joint_states",
-                lambda m: self._gate.joint_state(m, self.now(), time.monotonic_ns()),
-                refuse=partial(self._gate.refuse, self._gate.states),
+                lambda m: self.core.joint_state(m, self.now(), time.monotonic_ns()),
+                refuse=partial(self.core.refuse, self.core.states),
                 expected=True,
             )
         self.follow(
             ["effort_limits", *PAYLOAD],
-            lambda values: changed(self._gate.robot, values),
-            self._gate.change_robot,
+            lambda values: changed(self.core.robot, values),
+            self.core.change_robot,
         )
         self.create_guarded_timer(min(0.25 * settings.deadline, 0.1), self._watch)
         self.start(leap=settings.deadline + settings.future_tolerance)
 
-    def summary(self) -> str:
-        """One line that says what the node runs."""
-        robot, settings = self._gate.robot, self._gate.settings
-        return (
-            f"robot {robot.name} ({robot.mechanism}), joints {', '.join(robot.joint_names)}, "
-            f"{settings.on_stop} after {settings.deadline:g} s without a torque"
-        )
+    def details(self) -> str:
+        """What is sent without torques."""
+        settings = self.core.settings
+        return f", {settings.on_stop} after {settings.deadline:g} s without a torque"
 
     def time_jumped_backward(self) -> None:
         """Closed until torques by the new clock come."""
-        self._gate.reset()
+        self.core.reset()
 
     def stream_broken(self, where: str) -> None:
         """Whatever failed: the gate is closed."""
-        self._gate.stream.stop("exception", f"{where} raised an exception")
+        self.core.stream.stop("exception", f"{where} raised an exception")
 
     def activated(self) -> None:
         """At once: the controller may still hold what a gate before this one has sent."""
-        self._send(self._gate.stop_command(time.monotonic_ns()))
+        self._send(self.core.stop_command(time.monotonic_ns()))
 
     def deactivated(self) -> None:
         """The last command, which the controller holds indefinitely, must not be a torque."""
-        self._gate.stream.stop("inactive", "the node was deactivated")
+        self.core.stream.stop("inactive", "the node was deactivated")
         self._tell()
-        self._send(self._gate.stop_command(time.monotonic_ns()))
+        self._send(self.core.stop_command(time.monotonic_ns()))
 
     def shutdown(self) -> None:
         """As deactivated; and the controller has it before the process ends."""
@@ -109,32 +106,31 @@ class CommandGate(TwinNode):
 
     def reset_stop(self) -> str:
         """Open without waiting for good torques."""
-        stream = self._gate.stream
+        stream = self.core.stream
         return stream.status if stream.resume() else ""
 
-    def diagnose(self) -> tuple[bytes, str, dict[str, object]]:
-        """Level, message and values of the node's diagnostic status."""
-        stream = self._gate.stream
-        level, message = health.OK, "open"
-        if self._gate.last_reject:
-            level, message = health.WARN, f"last reject: {self._gate.last_reject}"
+    def judge(self) -> tuple[bytes, str]:
+        """Level and message of the node's diagnostic status."""
+        stream = self.core.stream
         if stream.stopped:
-            late = self._promised_too_late()
-            level, message = health.ERROR, f"closed: {late or stream.status}"
-        values: dict[str, object] = {
-            "robot": self._gate.robot.name,
+            return health.ERROR, f"closed: {self._promised_too_late() or stream.status}"
+        level, message = super().judge()
+        return level, "open" if level == health.OK else message
+
+    def values(self) -> dict[str, object]:
+        """Values of the node's diagnostic status."""
+        stream = self.core.stream
+        return {
             "open": not stream.stopped,
-            "torques forwarded": stream.accepted,
             "controllers": self._commands.publisher.get_subscription_count(),
+            **stream.counts("torques", "forwarded"),
+            **self.core.states.counts("joint states"),
+            **{f"closed: {k}": v for k, v in stream.stops.items()},
         }
-        values |= {f"torques rejected: {k}": v for k, v in stream.rejected.items()}
-        values |= {f"joint states rejected: {k}": v for k, v in self._gate.states.rejected.items()}
-        values |= {f"closed: {k}": v for k, v in stream.stops.items()}
-        return level, message, values
 
     def _promised_too_late(self) -> str:
         """Whose torques the middleware keeps from the gate, as they promise a longer deadline."""
-        deadline = self._gate.settings.deadline
+        deadline = self.core.settings.deadline
         for publisher in self.get_publishers_info_by_topic(self.resolve_topic_name(TORQUES)):
             promised = publisher.qos_profile.deadline.nanoseconds / SECOND
             if promised > deadline:
@@ -149,7 +145,7 @@ class CommandGate(TwinNode):
 
     def _declare_robot(self, settings: GateSettings) -> None:
         """Effort limits of every robot; the payload where its weight is borne."""
-        robot = self._gate.robot
+        robot = self.core.robot
         names = ["effort_limits", *(PAYLOAD if settings.on_stop == "gravity" else ())]
         # Not every robot's file has a place for what is not given.
         robot = changed(robot, declare_changes(self, robot, names))
@@ -157,25 +153,25 @@ class CommandGate(TwinNode):
             # Refused here where the robot has no masses; and compiled before it is needed.
             zeros = np.zeros(len(robot.joint_names))
             inverse_dynamics(robot, robot.inverse(robot.home()), zeros, zeros)
-        self._gate.change_robot(robot)
+        self.core.change_robot(robot)
 
     @contextmanager
     def _watching(self) -> Iterator[None]:
         """Where torques close the gate, its command is sent at once."""
-        running = not self._gate.stream.stopped
+        running = not self.core.stream.stopped
         try:
             yield
         finally:
-            if running and self._gate.stream.stopped:
+            if running and self.core.stream.stopped:
                 self._watch()
 
     def _refuse_torques(self, error: MessageError) -> None:
         with self._watching():
-            self._gate.refuse(self._gate.stream, error)
+            self.core.refuse(self.core.stream, error)
 
     def _on_torques(self, message: JointStateView) -> None:
         with self._watching():
-            command = self._gate.torques(message, self.now(), time.monotonic_ns())
+            command = self.core.torques(message, self.now(), time.monotonic_ns())
         if command is not None:
             self._send(command)
 
@@ -184,14 +180,14 @@ class CommandGate(TwinNode):
         if not self.active:
             return
         steady = time.monotonic_ns()
-        self._gate.watch(steady)
+        self.core.watch(steady)
         self._tell()
-        if self._gate.stream.stopped:
-            self._send(self._gate.stop_command(steady))
+        if self.core.stream.stopped:
+            self._send(self.core.stop_command(steady))
 
     def _tell(self) -> None:
         """One line each time that the gate opens or closes."""
-        stream = self._gate.stream
+        stream = self.core.stream
         if stream.stopped is self._closed:
             return
         self._closed = stream.stopped

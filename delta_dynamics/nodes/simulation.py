@@ -70,15 +70,15 @@ class MachineSim(TwinNode):
         self._declare_clock()
         settings = self._declare_settings(robot)
         begin = BEGIN if self._simulated else self.now()
-        self._simulation = Simulation(self._variation.robot, settings, begin)
+        self.core = Simulation(self._variation.robot, settings, begin)
         self._check_control()
         self._skipped = 0
         # Compiled before there is a topic to be found by.
         warm_up(self._variation.robot)
-        self._simulation.plant.advance(
+        self.core.plant.advance(
             np.zeros_like(settings.start), np.zeros(6), settings.period / settings.substeps
         )
-        self._simulation.restart()
+        self.core.restart()
         self._frame = self.declare("wrench_frame", "platform", "frame id of ~/wrench")
         self._base = self.declare("base_frame", "base_link", "frame of ~/applied_wrench")
         self._create_topics()
@@ -94,47 +94,44 @@ class MachineSim(TwinNode):
         self.start()
         self._publish_drawn()
 
-    def summary(self) -> str:
-        """One line that says what the node runs."""
-        robot, drawn = self._simulation.robot, self._variation.drawn
+    def details(self) -> str:
+        """What was drawn, and the clock."""
+        drawn = self._variation.drawn
         spread = f", {len(drawn)} parameters drawn" if drawn else ""
-        return (
-            f"robot {robot.name} ({robot.mechanism}), joints {', '.join(robot.joint_names)}"
-            f"{spread}, clock {self._clock_kind}"
-        )
+        return f"{spread}, clock {self._clock_kind}"
 
     def activated(self) -> None:
         """The machine goes on; on the wall's clock, from now."""
         self._due = self._heard = time.monotonic()
         if not self._simulated:
-            self._simulation.skip(max(0, self.now() - self._simulation.now))
+            self.core.skip(max(0, self.now() - self.core.now))
         self._publish()
 
     def reset_stop(self) -> str:
         """Back to the start, braked."""
-        text = self._simulation.failure
-        self._simulation.restart()
+        text = self.core.failure
+        self.core.restart()
         return text or "the machine is at its start"
 
-    def diagnose(self) -> tuple[bytes, str, dict[str, object]]:
-        """Level, message and values of the node's diagnostic status."""
-        sim = self._simulation
-        level, message = health.OK, "braked: no command yet" if sim.braked else "moving freely"
+    def judge(self) -> tuple[bytes, str]:
+        """Level and message of the node's diagnostic status."""
+        sim = self.core
         if sim.failure:
-            level, message = health.ERROR, f"the machine has failed: {sim.failure}"
-        values: dict[str, object] = {
-            "robot": sim.robot.name,
+            return health.ERROR, f"the machine has failed: {sim.failure}"
+        return health.OK, "braked: no command yet" if sim.braked else "moving freely"
+
+    def values(self) -> dict[str, object]:
+        """Values of the node's diagnostic status."""
+        sim = self.core
+        return {
             "time (s)": f"{sim.time:.3f}",
-            "effort commands accepted": sim.stream.accepted,
-            "trajectories accepted": sim.trajectories.accepted,
             "effort limit exceeded": sim.saturations,
             "payload mass": sim.plant.robot.payload.mass,
             "delays skipped": self._skipped,
+            **sim.stream.counts("effort commands"),
+            **sim.trajectories.counts("trajectories"),
+            **sim.wrenches.counts("applied wrenches"),
         }
-        values |= {f"effort commands rejected: {k}": v for k, v in sim.stream.rejected.items()}
-        values |= {f"trajectories rejected: {k}": v for k, v in sim.trajectories.rejected.items()}
-        values |= {f"applied wrenches rejected: {k}": v for k, v in sim.wrenches.rejected.items()}
-        return level, message, values
 
     def _declare_spread(self, robot: Robot) -> Variation:
         size = self.declare(
@@ -213,7 +210,7 @@ class MachineSim(TwinNode):
 
         :raises ParameterError: gains that were given are unstable at the period.
         """
-        sim = self._simulation
+        sim = self.core
         if sim.stable_share == 1.0:
             return
         bandwidth = sim.stable_share * self.get_parameter("bandwidth").value
@@ -278,7 +275,7 @@ class MachineSim(TwinNode):
         return np.broadcast_to(values, default.shape).copy()
 
     def _create_topics(self) -> None:
-        self._states = JointPublisher(self, self._simulation.robot, "joint_states", FIELDS)
+        self._states = JointPublisher(self, self.core.robot, "joint_states", FIELDS)
         self._wrenches = self.create_guarded_publisher("wrench")
         self._wrench = DoublesTemplate(
             WRENCH,
@@ -295,11 +292,11 @@ class MachineSim(TwinNode):
         self.create_guarded_subscription("~/commands", self._on_commands)
         self.create_guarded_subscription("~/joint_trajectory", self._on_trajectory, raw=True)
         self.create_guarded_subscription(
-            "~/applied_wrench", lambda m: self._simulation.push(m, self._base)
+            "~/applied_wrench", lambda m: self.core.push(m, self._base)
         )
 
     def _on_commands(self, message: Float64MultiArray) -> None:
-        self._simulation.commands(message)
+        self.core.commands(message)
         self._heard = time.monotonic()
         if self._lockstep:
             # Answers to states that went out alone are no steps: one state is on its way at a time.
@@ -308,15 +305,15 @@ class MachineSim(TwinNode):
                 self._advance()
 
     def _on_trajectory(self, data: bytes) -> None:
-        with self._simulation.refusing(self._simulation.trajectories):
+        with self.core.refusing(self.core.trajectories):
             raw = RawTrajectory.of(data)
-        self._simulation.trajectory(raw.fields)
+        self.core.trajectory(raw.fields)
 
     def _catch_up(self) -> None:
         """As many periods as are due, by the steady clock."""
         if not self.active:
             return
-        period = self._simulation.settings.period
+        period = self.core.settings.period
         begun = time.monotonic()
         if self._factor == 0.0:
             self._due = begun - BUDGET
@@ -332,7 +329,7 @@ class MachineSim(TwinNode):
             self._skipped += 1
             self._due += behind
             if not self._simulated:
-                self._simulation.skip(round(behind * SECOND))
+                self.core.skip(round(behind * SECOND))
 
     def _go_alone(self) -> None:
         """Time goes on where nobody commands: before the first command, and without an answer."""
@@ -342,24 +339,24 @@ class MachineSim(TwinNode):
         if silent:
             # What has no answer by now has nobody who answers.
             self._flying = 0
-        if self._simulation.braked or silent:
+        if self.core.braked or silent:
             self._advance()
 
     def _advance(self) -> None:
         try:
-            self._simulation.advance()
+            self.core.advance()
         except MessageError as error:
             self.log_throttled(error.reason, f"the machine has failed: {error.reason}: {error}")
         self._publish()
 
     def _publish(self) -> None:
-        measured = self._simulation.measured()
+        measured = self.core.measured()
         if self._clock_topic is not None and measured.stamp >= self._clock_due:
             self._clock_due = measured.stamp + CLOCK_PERIOD
             self._clock_topic.publish(Clock(clock=Time(nanoseconds=measured.stamp).to_msg()))
         stamped = divmod(measured.stamp, SECOND)
         self._wrenches.publish(self._wrench.fill(measured.wrench, stamped))
-        own = self._simulation.robot.controller
+        own = self.core.robot.controller
         self._flying += 1
         # Last: who answers it has all else.
         self._states.publish(
@@ -375,7 +372,7 @@ class MachineSim(TwinNode):
         values = [KeyValue(key=name, value=short(value)) for name, value in drawn.items()]
         status = DiagnosticStatus(name=self.get_fully_qualified_name(), values=values)
         status.message = f"{len(drawn)} parameters drawn"
-        status.hardware_id = self._simulation.robot.name
+        status.hardware_id = self.core.robot.name
         message = DiagnosticArray(status=[status])
         message.header.stamp = self.get_clock().now().to_msg()
         self._drawn.publish(message)

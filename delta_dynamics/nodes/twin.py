@@ -50,7 +50,7 @@ class DeltaDynamics(TwinNode):
         warm_up(robot)
         robot = changed(robot, declare_changes(self, robot))
         settings = self.declare_settings(Settings)
-        self._feedforward = Feedforward(robot, settings, self._create_wrenches(settings))
+        self.core = Feedforward(robot, settings, self._create_wrenches(settings))
         commands = self.declare("publish_commands", False, "publish ~/commands")
         if commands and "on_stop" not in self.given:
             # A controller of plain commands holds the last one for ever.
@@ -61,17 +61,15 @@ class DeltaDynamics(TwinNode):
             )
         self._trajectory = self.create_guarded_publisher("~/joint_trajectory_ff")
         # A torque is worth nothing once the stream that it answers would be stale.
-        stale_after = self._feedforward.settings.stale_after
+        stale_after = self.core.settings.stale_after
         self._torques = JointPublisher(self, robot, "~/joint_torques", expiry=stale_after)
         self._residual = JointPublisher(self, robot, "~/torque_residual")
         self._commands = (
             CommandPublisher(self, robot, "~/commands", stale_after) if commands else None
         )
         self._reactions = self._create_reaction_publishers(robot)
-        self._estimates = Estimates(
-            self, lambda: self._feedforward.robot, (self._base_frame, "platform")
-        )
-        self._feedforward.uncertain = self._estimates.wanted
+        self._estimates = Estimates(self, lambda: self.core.robot, (self._base_frame, "platform"))
+        self.core.uncertain = self._estimates.wanted
         if self._estimates.warning():
             self.get_logger().warning(self._estimates.warning())
         self.create_guarded_subscription("~/joint_trajectory", self._on_trajectory, raw=True)
@@ -80,7 +78,7 @@ class DeltaDynamics(TwinNode):
             self._on_joint_state,
             refuse=self._refuse_joint_state,
             expected=True,
-            expires=lambda: self._feedforward.settings.stale_after,
+            expires=lambda: self.core.settings.stale_after,
         )
         self._action = self._create_action()
         self.follow(
@@ -94,23 +92,18 @@ class DeltaDynamics(TwinNode):
         self._watchdog: Any = None
         self._watch_every(stale_after)
         # A step after which no stamp that was good before is good now.
-        self.start(leap=stale_after + self._feedforward.settings.future_tolerance)
-
-    def summary(self) -> str:
-        """One line that says what the node runs."""
-        robot = self._feedforward.robot
-        return f"robot {robot.name} ({robot.mechanism}), joints {', '.join(robot.joint_names)}"
+        self.start(leap=stale_after + self.core.settings.future_tolerance)
 
     def time_jumped_backward(self) -> None:
         """No torque across the seam: the stream starts again."""
-        self._feedforward.reset()
+        self.core.reset()
         self._estimates.reset()
         self._reactions_pace.reset()
 
     def time_jumped_forward(self) -> None:
         """What was fresh is stale now: a running stream stops."""
         with self._telling_stop():
-            self._feedforward.time_jumped_forward()
+            self.core.time_jumped_forward()
         self._estimates.reset()
 
     def stream_broken(self, where: str) -> None:
@@ -144,31 +137,41 @@ class DeltaDynamics(TwinNode):
 
     def reset_stop(self) -> str:
         """End a stop without waiting for good samples."""
-        stream = self._feedforward.stream
+        stream = self.core.stream
         return stream.status if stream.resume() else ""
 
-    def diagnose(self) -> tuple[bytes, str, dict[str, object]]:
-        """Level, message and values of the node's diagnostic status."""
-        core = self._feedforward
-        level, message = health.OK, "running"
-        measure = core.singularity()
-        if core.last_reject or core.saturations or core.near_singular:
-            level = health.WARN
-            message = "an effort exceeded its limit"
-        if core.last_reject:
-            message = f"last reject: {core.last_reject}"
+    def judge(self) -> tuple[bytes, str]:
+        """Level and message of the node's diagnostic status: the worst that there is."""
+        core, estimates = self.core, self._estimates
         if core.rates.fault:
-            level, message = health.WARN, core.rates.fault
             self.log_throttled("rates", core.rates.fault)
-        if core.near_singular:
-            message = f"close to a singularity or the edge of the workspace: index {measure:.3g}"
         if core.stream.stopped:
-            level, message = health.ERROR, f"stopped: {core.stream.status}"
+            return health.ERROR, f"stopped: {core.stream.status}"
+        if core.near_singular:
+            measure = core.singularity()
+            index = "" if measure is None else f": index {measure:.3g}"
+            return health.WARN, f"close to a singularity or the edge of the workspace{index}"
+        level, message = super().judge()
+        if core.rates.fault:
+            return health.WARN, core.rates.fault
+        if level != health.OK:
+            return level, message
+        if core.saturations:
+            return health.WARN, "an effort exceeded its limit"
+        if estimates.touching and not estimates.idle:
+            return health.WARN, "contact detected: an external effort is beyond its bound"
+        if core.wrenches is not None and core.wrenches.last_reject:
+            return health.WARN, f"last reject: {core.wrenches.last_reject}"
+        if estimates.idle:
+            message = "the drives are off or braked: their efforts are ignored"
+        return level, message
+
+    def values(self) -> dict[str, object]:
+        """Values of the node's diagnostic status."""
+        core = self.core
+        measure = core.singularity()
         values: dict[str, object] = {
-            "robot": core.robot.name,
             "payload mass": core.robot.payload.mass,
-            "joint states answered": core.stream.accepted,
-            "trajectories answered": core.trajectories.accepted,
             "effort limit exceeded": core.saturations,
             "older stamps dropped": core.dropped,
             "close to a singularity": core.near_singularities,
@@ -176,26 +179,18 @@ class DeltaDynamics(TwinNode):
             "acceleration delay (samples)": core.differentiator.delay,
             "acceleration window": self._window_text(),
         }
-        values |= {f"joint states rejected: {k}": v for k, v in core.stream.rejected.items()}
-        values |= {f"trajectories rejected: {k}": v for k, v in core.trajectories.rejected.items()}
+        values |= core.stream.counts("joint states", "answered")
+        values |= core.trajectories.counts("trajectories", "answered")
         values |= {f"stopped: {k}": v for k, v in core.stream.stops.items()}
         values |= self._estimates.diagnose()
-        if self._estimates.idle and level == health.OK:
-            message = "the drives are off or braked: their efforts are ignored"
-        elif self._estimates.touching and level == health.OK:
-            level, message = health.WARN, "contact detected: an external effort is beyond its bound"
         if core.wrenches is not None:
-            taken = core.wrenches.stream
-            values["wrenches accepted"] = taken.accepted
             values["joint states without a wrench"] = core.wrenches.without
-            values |= {f"wrenches rejected: {k}": v for k, v in taken.rejected.items()}
-            if level == health.OK and core.wrenches.last_reject:
-                level, message = health.WARN, f"last reject: {core.wrenches.last_reject}"
-        return level, message, values
+            values |= core.wrenches.stream.counts("wrenches")
+        return values
 
     def _window_text(self) -> str:
         """How long the differentiator's window is and what it costs; a new length is logged."""
-        fit = self._feedforward.differentiator
+        fit = self.core.differentiator
         if fit.period == 0.0:
             return ""
         length, error = fit.period * (fit.window - 1), 100.0 * fit.sine_error(1.0)
@@ -234,14 +229,14 @@ class DeltaDynamics(TwinNode):
         return EffortAction(
             self,
             controller,
-            lambda trajectory: self._feedforward.trajectory_steps(trajectory, self.now()),
+            lambda trajectory: self.core.trajectory_steps(trajectory, self.now()),
             self._place,
             hold == "hold",
         )
 
     def _place(self) -> dict[str, float] | None:
         """Where the joints are, by the controller's names and numbers; None where not measured."""
-        if self._accepted is None or self._silence() > self._feedforward.settings.stale_after:
+        if self._accepted is None or self._silence() > self.core.settings.stale_after:
             return None
         state = self._accepted[1]
         return dict(zip(state.name, map(float, state.position), strict=True))
@@ -288,7 +283,7 @@ class DeltaDynamics(TwinNode):
         )
 
     def _on_wrench(self, message: WrenchStamped) -> None:
-        wrenches = self._feedforward.wrenches
+        wrenches = self.core.wrenches
         if wrenches is not None:
             wrenches.take(message, self.now())
 
@@ -310,7 +305,7 @@ class DeltaDynamics(TwinNode):
     @contextmanager
     def _telling_stop(self) -> Iterator[None]:
         """Where the core stops the stream in here: log it, and send what ``on_stop`` says."""
-        stream = self._feedforward.stream
+        stream = self.core.stream
         running = not stream.stopped
         try:
             yield
@@ -319,14 +314,14 @@ class DeltaDynamics(TwinNode):
                 self._send_stop()
 
     def _on_trajectory(self, data: bytes) -> None:
-        with self._feedforward.refusing(self._feedforward.trajectories):
+        with self.core.refusing(self.core.trajectories):
             self.defer("~/joint_trajectory", self._answer_trajectory(data))
 
     def _answer_trajectory(self, data: bytes) -> Task:
         """In steps, so that the stream is answered meanwhile."""
-        with self._feedforward.refusing(self._feedforward.trajectories):
+        with self.core.refusing(self.core.trajectories):
             raw = RawTrajectory.of(data)
-        steps = self._feedforward.trajectory_steps(raw.fields, self.now())
+        steps = self.core.trajectory_steps(raw.fields, self.now())
         while True:
             yield
             try:
@@ -342,10 +337,10 @@ class DeltaDynamics(TwinNode):
 
     def _refuse_joint_state(self, error: MessageError) -> None:
         with self._telling_stop():
-            self._feedforward.refuse(self._feedforward.stream, error)
+            self.core.refuse(self.core.stream, error)
 
     def _on_joint_state(self, message: JointStateView) -> None:
-        core, came = self._feedforward, time.monotonic_ns()
+        core, came = self.core, time.monotonic_ns()
         with self._telling_stop():
             torques = core.joint_state(message, self.now())
             if torques is not None:
@@ -377,7 +372,7 @@ class DeltaDynamics(TwinNode):
 
     def _publish_reactions(self, stamp: Any, torques: Torques) -> None:
         """Every joint's wrench that rigid bodies determine, world axes, at the joint's point."""
-        result = reactions(self._feedforward.robot, *torques.motion, torques.wrench)
+        result = reactions(self.core.robot, *torques.motion, torques.wrench)
         for k, name in enumerate(result.names):
             if not result.determinate[k].all():
                 continue
@@ -395,17 +390,17 @@ class DeltaDynamics(TwinNode):
 
     def _watch(self) -> None:
         """Stop a stream that has gone silent; runs on the steady clock."""
-        core, silent = self._feedforward, self._silence()
+        core, silent = self.core, self._silence()
         if not core.stream.stopped and silent > core.settings.stale_after:
             self._stop("stale input", f"no accepted joint state for {silent:.3f} s")
 
     def _stop(self, reason: str, text: str) -> None:
         with self._telling_stop():
-            if self._feedforward.stream.stop(reason, text):
-                self._feedforward.reset()
+            if self.core.stream.stop(reason, text):
+                self.core.reset()
 
     def _send_stop(self) -> None:
-        core = self._feedforward
+        core = self.core
         self.log_throttled("stop", f"stopped: {core.stream.status}")
         model = core.stop_effort()
         if model is None:
@@ -417,13 +412,13 @@ class DeltaDynamics(TwinNode):
 
     def _prepare(self, values: dict[str, Any]) -> tuple[Robot, Settings]:
         """The robot and the settings with new values of parameters."""
-        core, own = self._feedforward, {k: v for k, v in values.items() if k in CHANGES}
+        core, own = self.core, {k: v for k, v in values.items() if k in CHANGES}
         robot = changed(core.robot, own) if own else core.robot
         return robot, with_parameters(core.settings, values)
 
     def _take(self, prepared: tuple[Robot, Settings]) -> None:
         robot, settings = prepared
-        core = self._feedforward
+        core = self.core
         before = core.settings
         if robot is not core.robot:
             core.change_robot(robot)

@@ -32,7 +32,7 @@ from pkm_twin.bags.definitions import message_definition
 from pkm_twin.errors import MessageError, ParameterError
 from pkm_twin.messages.fast_decoder import JointStateDecoder
 from pkm_twin.messages.stamps import SECOND
-from pkm_twin.ros.health import QOS, RELIABILITY, WARN, Health, Incompatibility, cut
+from pkm_twin.ros.health import OK, QOS, RELIABILITY, WARN, Health, Incompatibility, cut
 from pkm_twin.ros.parameters import ParameterNode
 from pkm_twin.ros.turns import LOW_RATE_PERIOD, LowRateGroup, Task, Tasks
 from pkm_twin.streams.monitor import TopicStatistics
@@ -360,6 +360,9 @@ class TwinNode(GuardedNode):
     diagnostics say so.
     """
 
+    core: Any
+    """What answers messages, a :class:`~pkm_twin.streams.monitor.Core` with its robot."""
+
     def __init__(self, name: str) -> None:
         """Declare what all nodes have."""
         super().__init__(name)
@@ -411,13 +414,28 @@ class TwinNode(GuardedNode):
             self.trigger_configure()
             self.trigger_activate()
 
+    def details(self) -> str:
+        """What the summary says of more than the robot."""
+        return ""
+
     def summary(self) -> str:
         """One line that says what the node runs."""
+        robot = self.core.robot
+        joints = ", ".join(robot.joint_names)
+        return f"robot {robot.name} ({robot.mechanism}), joints {joints}{self.details()}"
+
+    def judge(self) -> tuple[bytes, str]:
+        """Level and message of the node's diagnostic status."""
+        rejected = self.core.last_reject
+        return (WARN, f"last reject: {rejected}") if rejected else (OK, "running")
+
+    def values(self) -> dict[str, object]:
+        """Values of the node's diagnostic status."""
         raise NotImplementedError
 
     def diagnose(self) -> tuple[bytes, str, dict[str, object]]:
         """Level, message and values of the node's diagnostic status."""
-        raise NotImplementedError
+        return (*self.judge(), {"robot": self.core.robot.name, **self.values()})
 
     def time_jumped_backward(self) -> None:
         """The ROS clock went back or changed: forget everything that depends on time."""

@@ -33,7 +33,6 @@ from pkm_twin.messages.fast_decoder import JointStateView
 from pkm_twin.messages.stamps import SECOND
 from pkm_twin.robot.robot import Robot
 from pkm_twin.robot.robot_urdf import joint_names, robot_urdf
-from pkm_twin.ros import health
 from pkm_twin.ros.node import TwinNode
 from pkm_twin.ros.run import run
 from pkm_twin.ros.wrench import declare_mounts, triple
@@ -204,8 +203,8 @@ class MachineStateNode(TwinNode):
             ),
         )
         mounts = declare_mounts(self, self._frames["platform"])
-        self._core = MachineState(robot, settings, mounts)
-        self._core.pace = Pace(
+        self.core = MachineState(robot, settings, mounts)
+        self.core.pace = Pace(
             self.declare(
                 "rate", 100.0, "largest rate of ~/joint_states, ~/pose and ~/twist; 0: every "
                 "sample",
@@ -234,30 +233,26 @@ class MachineStateNode(TwinNode):
         self.create_guarded_subscription(
             "joint_states",
             self._on_joint_state,
-            refuse=partial(self._core.refuse, self._core.states),
+            refuse=partial(self.core.refuse, self.core.states),
             expected=True,
         )
-        self.create_guarded_subscription("wrench", lambda m: self._core.wrench(m, self.now()))
+        self.create_guarded_subscription("wrench", lambda m: self.core.wrench(m, self.now()))
         self.follow(
             changeable(WrenchSettings),
-            lambda values: with_parameters(self._core.settings, values),
-            self._core.change_settings,
+            lambda values: with_parameters(self.core.settings, values),
+            self.core.change_settings,
         )
         self.start()
 
-    def summary(self) -> str:
-        """One line that says what the node runs."""
-        robot = self._core.robot
+    def details(self) -> str:
+        """Passive joints, members and transforms."""
         members = "elastic" if self._elastic else "rigid"
         transforms = "" if self._transforms else "; no transforms"
-        return (
-            f"robot {robot.name} ({robot.mechanism}), joints {', '.join(robot.joint_names)} and "
-            f"{len(robot.passive_joints)} passive, {members} members{transforms}"
-        )
+        return f" and {len(self.core.robot.passive_joints)} passive, {members} members{transforms}"
 
     def time_jumped_backward(self) -> None:
         """No state across the seam."""
-        self._core.reset()
+        self.core.reset()
         self._transforms_pace.reset()
         self._drawn = 0
 
@@ -268,22 +263,15 @@ class MachineStateNode(TwinNode):
         if self._transforms is not None:
             self._transforms.send_tool(self.now())
 
-    def diagnose(self) -> tuple[bytes, str, dict[str, object]]:
-        """Level, message and values of the node's diagnostic status."""
-        core = self._core
-        level, message = health.OK, "running"
-        if core.last_reject:
-            level, message = health.WARN, f"last reject: {core.last_reject}"
-        values: dict[str, object] = {
-            "robot": core.robot.name,
-            "joint states answered": core.states.accepted,
-            "wrenches accepted": core.wrenches.accepted,
+    def values(self) -> dict[str, object]:
+        """Values of the node's diagnostic status."""
+        core = self.core
+        return {
             "older stamps dropped": core.dropped,
             "velocities": "" if core.latest is None else str(core.latest.twist is not None).lower(),
+            **core.states.counts("joint states", "answered"),
+            **core.wrenches.counts("wrenches"),
         }
-        values |= {f"joint states rejected: {k}": v for k, v in core.states.rejected.items()}
-        values |= {f"wrenches rejected: {k}": v for k, v in core.wrenches.rejected.items()}
-        return level, message, values
 
     def _declare_frame(self, name: str, default: str, text: str) -> str:
         frame: str = self.declare(name, default, f"frame id {text}")
@@ -309,7 +297,7 @@ class MachineStateNode(TwinNode):
             return None
         try:
             return Transforms(
-                self, self._core.settings.base_frame, self._frames, self._tool, wanted == "all"
+                self, self.core.settings.base_frame, self._frames, self._tool, wanted == "all"
             )
         except ImportError as error:
             self.get_logger().warning(
@@ -327,11 +315,11 @@ class MachineStateNode(TwinNode):
             self.create_guarded_timer(1.0 / rate, self._publish_markers)
 
     def _on_joint_state(self, message: JointStateView) -> None:
-        state = self._core.joint_state(message, self.now())
+        state = self.core.joint_state(message, self.now())
         if state is None:
             return
         stamp = Time(nanoseconds=state.stamp).to_msg()
-        base = self._core.settings.base_frame
+        base = self.core.settings.base_frame
         quaternion = rotations.to_quaternion(state.rotation)
         self._joints.publish(joint_state(stamp, self._names, state.joints, state.rates))
         self._pose.publish(pose(stamp, base, state.position, quaternion))
@@ -345,24 +333,24 @@ class MachineStateNode(TwinNode):
 
     def _publish_markers(self) -> None:
         """Of the latest state: shapes are for the eye, and elasticity takes its milliseconds."""
-        state = self._core.latest
+        state = self.core.latest
         if not self.active or state is None or state.stamp == self._drawn:
             return
         if not self._markers.get_subscription_count():
             return
         self._drawn = state.stamp
         shapes = self._scene.shapes(state, self._load(state))
-        base = self._core.settings.base_frame
+        base = self.core.settings.base_frame
         stamp = Time(nanoseconds=state.stamp).to_msg()
         lifetime = Duration(seconds=LIFETIME).to_msg()
         self._markers.publish(markers(stamp, base, shapes, lifetime))
 
     def _load(self, state: State) -> Load | None:
         """What the wrench does to the machine, None where it is not known."""
-        wrench = self._core.load(state) if self._elastic else None
+        wrench = self.core.load(state) if self._elastic else None
         if wrench is None:
             return None
-        robot = self._core.robot
+        robot = self.core.robot
         try:
             found = platform_response(robot, state.q, wrench)
             return Load(

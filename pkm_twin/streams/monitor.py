@@ -81,6 +81,11 @@ class StreamMonitor:
         self.accepted += 1
         return True
 
+    def counts(self, what: str, taken: str = "accepted") -> dict[str, object]:
+        """Values of a node's diagnostics: how many were taken, and rejected by reason."""
+        rejected = {f"{what} rejected: {k}": v for k, v in self.rejected.items()}
+        return {f"{what} {taken}": self.accepted, **rejected}
+
     def resume(self) -> bool:
         """End a stop by hand, however few good samples came; True where there was one."""
         stopped, self.stopped = self.stopped, False
@@ -94,7 +99,7 @@ def counting() -> StreamMonitor:
 
 
 class Core:
-    """What takes messages, and counts those that it rejects.
+    """What takes messages for a robot, and counts those that it rejects.
 
     ``last_reject``: why the last one was rejected, of any stream; empty before the first.
     """
