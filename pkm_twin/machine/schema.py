@@ -276,39 +276,18 @@ def build(kind: type[T], data: object, path: str = "") -> T:
     """
     if not isinstance(data, Mapping):
         raise ParameterError(path or "parameters", data, "a mapping of keys to values")
-    required = {
-        f.name
-        for f in dataclasses.fields(kind)  # type: ignore[arg-type]
-        if f.default is MISSING and f.default_factory is MISSING
-    }
-    values = _values(kind, data, path)
-    for name, (field, _) in settings_of(kind).items():
-        if field in required and field not in values:
-            raise ParameterError(_join(path, name), None, "a value")
-    return _verified(kind(**values), path)
-
-
-def replace(section_value: T, changes: Mapping[str, object], path: str) -> T:
-    """A copy of a section with some keys set anew, every one checked; all or none."""
-    values = _values(type(section_value), changes, path)
-    made: T = dataclasses.replace(section_value, **values)  # type: ignore[type-var]
-    return _verified(made, path)
-
-
-def _values(kind: type, data: Mapping[str, Any], path: str) -> dict[str, Any]:
-    """Checked values of some keys, by the field's name, in the order of the schema."""
     keys = settings_of(kind)
     for name in data:
         if name not in keys:
             raise UnknownNameError(_join(path, str(name)), name, keys)
-    return {
-        field: row.check(_join(path, name), data[name])
-        for name, (field, row) in keys.items()
-        if name in data
-    }
-
-
-def _verified(result: T, path: str) -> T:
+    fields = {field.name: field for field in dataclasses.fields(kind)}  # type: ignore[arg-type]
+    values: dict[str, Any] = {}
+    for name, (field, row) in keys.items():
+        if name in data:
+            values[field] = row.check(_join(path, name), data[name])
+        elif fields[field].default is MISSING and fields[field].default_factory is MISSING:
+            raise ParameterError(_join(path, name), None, "a value")
+    result = kind(**values)
     verify = getattr(result, "verify", None)
     if verify is not None:
         verify(path)

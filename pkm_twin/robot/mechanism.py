@@ -502,8 +502,9 @@ class Mechanism(Common):
             return type(self).from_data(merged(given(known), sections), self.name)
         new: dict[str, Any] = {}
         for key, value in sections.items():
-            if isinstance(value, Mapping) and not isinstance(getattr(self, key), Mapping):
-                new[key] = schema.replace(getattr(self, key), value, key)
+            old = getattr(self, key)
+            if isinstance(value, Mapping) and not isinstance(old, Mapping):
+                new[key] = schema.build(type(old), {**given(schema.plain(old)), **value}, key)
             else:
                 new[key] = settings_of(type(self))[key][1].check(key, value)
         made = dataclasses.replace(self, **new)
