@@ -106,6 +106,12 @@ def _outside(
         yield Finding(field, quantity, value, bounds[0], unit, likely[0])
 
 
+def _above(
+    field: str, quantity: str, value: float, most: float, unit: str, likely: str
+) -> Iterator[Finding]:
+    yield from _outside(field, quantity, value, (0.0, most), unit, ("", likely))
+
+
 def _size(graph: Graph) -> Iterator[Finding]:
     yield from _outside(
         "geometry", "extent of the machine", _extent(graph), (SMALLEST, LARGEST), "m",
@@ -143,11 +149,9 @@ def _masses(robot: Robot, graph: Graph) -> Iterator[Finding]:
 def payload_findings(robot: Robot) -> Iterator[Finding]:
     """A payload that is too heavy for the machine that moves it."""
     total, mass = _total(robot.graph), robot.payload.mass
-    if 0.0 < LOADED * total < mass:
-        yield Finding(
-            "payload.mass", "payload", mass, LOADED * total, "kg",
-            f"{total:.4g} kg move it; a mass in grams?",
-        )  # fmt: skip
+    if total > 0.0:
+        likely = f"{total:.4g} kg move it; a mass in grams?"
+        yield from _above("payload.mass", "payload", mass, LOADED * total, "kg", likely)
 
 
 def _bodies(robot: Robot, graph: Graph) -> Iterator[Finding]:
@@ -161,26 +165,13 @@ def _bodies(robot: Robot, graph: Graph) -> Iterator[Finding]:
         if not mass > 0.0:
             continue
         radius = math.sqrt(max(float(np.linalg.eigvalsh(inertia)[-1]), 0.0) / mass)
-        if radius > GYRATION * extent:
-            squares = "g mm2" if radius > 3e3 * extent else "kg mm2"
-            yield Finding(
-                f"{name}: inertia",
-                "radius of gyration",
-                radius,
-                GYRATION * extent,
-                "m",
-                f"inertia in {squares}?",
-            )
-        if far > MAX_COM_DISTANCE * extent:
-            what = "its joints" if name != "payload" else "the reference point"
-            yield Finding(
-                f"{name}: com",
-                f"distance of the centre of mass from {what}",
-                far,
-                MAX_COM_DISTANCE * extent,
-                "m",
-                "a place in millimetres, or in other axes?",
-            )
+        likely = f"inertia in {'g mm2' if radius > 3e3 * extent else 'kg mm2'}?"
+        most = GYRATION * extent
+        yield from _above(f"{name}: inertia", "radius of gyration", radius, most, "m", likely)
+        what = "its joints" if name != "payload" else "the reference point"
+        what = f"distance of the centre of mass from {what}"
+        likely = "a place in millimetres, or in other axes?"
+        yield from _above(f"{name}: com", what, far, MAX_COM_DISTANCE * extent, "m", likely)
 
 
 def _drives(robot: Robot, graph: Graph) -> Iterator[Finding]:
@@ -224,15 +215,12 @@ def _drives(robot: Robot, graph: Graph) -> Iterator[Finding]:
                     "home left out? without it the joint counts from home",
                 )
         weight = joint.rotor_inertia / (graph.size**2 if turns else 1.0)
-        if total > 0.0 and weight > ROTOR * total:
-            yield Finding(
-                f"{name}: rotor_inertia",
+        if total > 0.0:
+            what, likely = (
                 "rotor as a mass at the machine's extent",
-                weight,
-                ROTOR * total,
-                "kg",
                 "an inertia in kg mm2 or g cm2?",
             )
+            yield from _above(f"{name}: rotor_inertia", what, weight, ROTOR * total, "kg", likely)
 
 
 def _gravity(robot: Robot) -> Iterator[Finding]:
