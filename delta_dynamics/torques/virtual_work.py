@@ -17,6 +17,7 @@ from pkm_twin.codegen.kernels import BoundCall, Kernel
 from pkm_twin.codegen.operations import absolute, maximum, minimum, sign
 from pkm_twin.codegen.program import Program
 from pkm_twin.kinematics.motion import Motion, cross
+from pkm_twin.kinematics.stream import following
 from pkm_twin.kinematics.traced import Traced
 from pkm_twin.machine import friction
 from pkm_twin.machine.graph import BASE, Joint, Rod
@@ -59,6 +60,11 @@ def torques(robot: Robot) -> Kernel:
     :raises ParameterError: a robot whose file gives no masses.
     """
     return robot.massive().kernel("torques", torque_program)
+
+
+def stream_torques(robot: Robot) -> Kernel:
+    """The same of a stream, see :func:`pkm_twin.kinematics.stream.following`."""
+    return robot.massive().kernel("stream torques", _stream_torques)
 
 
 def mass_matrix(robot: Robot, q: ArrayLike) -> Array:
@@ -356,6 +362,10 @@ def torque_program(t: Traced) -> Program:
     tau = _efforts(t, parts, t.tape.inputs("qd", n), t.tape.inputs("qdd", n))
     sizes = {"q": n, "qd": n, "qdd": n, "wrench": 6}
     return Program(sizes, layout.size, {"efforts": t.lift(tau)}, t.equations())
+
+
+def _stream_torques(t: Traced) -> Program:
+    return following(t, torque_program(t))
 
 
 def _accelerations(t: Traced) -> Program:

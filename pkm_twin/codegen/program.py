@@ -32,6 +32,8 @@ CONTRACTION: Final = 0.25
 """Most that a correction may be of the one before it."""
 FIRST: Final = 0.3
 """Most that the first correction of a guess may be, of unit one: a longer one may go elsewhere."""
+NEXT: Final = 0.01
+"""Most that the first correction of a stream's sample may be, which starts from the one before."""
 CHANGE: Final = 3.0
 """Most that the determinant may change by, as a factor, in one correction."""
 DIRECT: Final = 1e-3
@@ -46,6 +48,10 @@ RESIDUAL: Final = 1e-10
 
 STATE: Final = "n"
 """Name of the input that Newton's method keeps between corrections, see :class:`Places`."""
+
+
+LAST: Final = "last"
+"""Name of the input that one sample of a stream leaves to the next; zeros before the first one."""
 
 
 class Places(NamedTuple):
@@ -114,6 +120,9 @@ class Equations:
     """Name of the input that the method finds."""
     goal: Sequence[Expression] = ()
     stage: int = 0
+    near: Expression | None = None
+    """1 where a single step starts from ``foreseen``: of another sample's unknowns."""
+    foreseen: Sequence[Expression] = ()
 
     lone: bool = False
     """Whether a sample is solved alone: its state says nothing of whether it moves."""
@@ -139,8 +148,13 @@ class Equations:
         """Unknowns to begin with, and the square that the first correction contracts from."""
         once, known = self.state[AT.once], self.start is not None and not self.guessed
         starts = zip(self.start or self.home, self.home, strict=True)
+        first = [select(once, start, home) for start, home in starts]
         size = 1e300 if known else select(once, (FIRST / CONTRACTION) ** 2, 1e300)
-        return self._lift(*(select(once, start, home) for start, home in starts), size)
+        if self.near is not None:
+            pairs = zip(self.foreseen, first, strict=True)
+            first = [select(self.near, a, b) for a, b in pairs]
+            size = select(self.near, (NEXT / CONTRACTION) ** 2, size)
+        return self._lift(*first, size)
 
     @cached_property
     def underway(self) -> Expression:

@@ -25,7 +25,16 @@ from pkm_twin.codegen.operations import (
     sin,
     sub,
 )
-from pkm_twin.codegen.program import AT, LARGE, MAX_ITERATIONS, STATE, UNKNOWNS, Equations, holding
+from pkm_twin.codegen.program import (
+    AT,
+    LARGE,
+    LAST,
+    MAX_ITERATIONS,
+    STATE,
+    UNKNOWNS,
+    Equations,
+    holding,
+)
 
 LADDER: Final = (1, *STEPS)
 """Steps of Newton's method, one attempt after the other."""
@@ -147,8 +156,8 @@ def _angles(
     return [groups[k] for k in sorted(groups)]
 
 
-ROWS: Final = ("home", "origin", "start", "corrected", "branch", "goal")
-NUMBERS: Final = ("size", "determinant", "residual")
+ROWS: Final = ("home", "origin", "start", "corrected", "branch", "goal", "foreseen")
+NUMBERS: Final = ("size", "determinant", "residual", "near")
 """What equations have as expressions, in a row and alone."""
 
 
@@ -178,8 +187,10 @@ class Folding:
         """The same of equations; the known state is constant then."""
         rows = {name: getattr(q, name) for name in ROWS}
         folded: dict[str, Any] = {name: row and self(row, given) for name, row in rows.items()}
-        numbers = zip(NUMBERS, self([getattr(q, name) for name in NUMBERS], given), strict=True)
-        return replace(q, **folded | dict(numbers), lone=True)
+        for name in NUMBERS:
+            value = getattr(q, name)
+            folded[name] = value and self([value], given)[0]
+        return replace(q, **folded, lone=True)
 
 
 @dataclass(frozen=True)
@@ -187,7 +198,8 @@ class Routine:
     """One public function.
 
     ``outputs``: expressions by argument. ``gates``: above zero where a sample is rejected.
-    ``equations``: are solved one after the other.
+    ``equations``: are solved one after the other. ``state``: what it leaves to its next call, by
+    the input ``last``.
     """
 
     name: str
@@ -196,11 +208,17 @@ class Routine:
     equations: Sequence[Equations]
     summary: str
     gates: Sequence[Expression] = ()
+    state: Sequence[Expression] = ()
+
+    @property
+    def given(self) -> dict[str, Sequence[Expression]]:
+        """All that it writes."""
+        return {**self.outputs, **({"state": self.state} if self.state else {})}
 
     @property
     def results(self) -> list[Expression]:
-        """Outputs and gates."""
-        return [*(e for row in self.outputs.values() for e in row), *self.gates]
+        """Outputs, state and gates."""
+        return [*(e for row in self.given.values() for e in row), *self.gates]
 
     @property
     def operations(self) -> tuple[str, int]:
@@ -211,7 +229,7 @@ class Routine:
 
 
 HOT: Final = "PKM_HOT "
-"""Before the function that a control loop calls."""
+"""Before the functions that a control loop calls."""
 _FIXED: Final = f"""\
 /* Where the compiler can, one form for this processor family's vector units, chosen at load. */
 #ifdef PKM_CLONES
@@ -262,6 +280,7 @@ class Unit:
         self._needed: set[Operation] = set()
         self._parts: list[str] = []
         self._ahead: dict[str, dict[int, int]] = {}
+        self._functions: dict[str, str] = {}
         self.doubles: dict[str, int] = {}
         """Local doubles of every function, by name."""
 
@@ -295,6 +314,8 @@ static const int @_steps[{len(LADDER)}] = {{{steps}}};
     ) -> str:
         """A static function of what the results hang on; how to call it, ``%s`` for its target.
 
+        Of two functions with the same text the first one serves.
+
         :param known: texts of expressions that stand in tables of its arguments.
         :param called: what callers give for an argument of another name.
         """
@@ -307,7 +328,10 @@ static const int @_steps[{len(LADDER)}] = {{{steps}}};
         self._needed |= made.needed
         lines = made.lines + [f"    r[{k}] = {bare(text)};" for k, text in enumerate(made.results)]
         head = ", ".join([*(f"const double *{a}" for a in arguments), "double *r"])
-        self._parts.append(f"static void @_{name}({head})\n{{\n" + "\n".join(lines) + "\n}\n")
+        text = f"({head})\n{{\n" + "\n".join(lines) + "\n}\n"
+        if self._functions.setdefault(text, name) == name:
+            self._parts.append(f"static void @_{name}{text}")
+        name = self._functions[text]
         self.doubles[name] = made.doubles
         return f"@_{name}({', '.join([*((called or {}).get(a, a) for a in arguments), '%s'])})"
 
@@ -316,7 +340,7 @@ static const int @_steps[{len(LADDER)}] = {{{steps}}};
 
         :returns: its name, and places in its table ``h`` by the expression's number.
         """
-        name = "reach" if q.unknowns != UNKNOWNS else "assembly"
+        name = "reach" if q.unknowns != UNKNOWNS else "assembly" if q.near is None else "beside"
         if name not in self._ahead:
             # What does not change in a step is computed once, and the last serves the results.
             ahead = _without((q.unknowns, STATE), q.correct)
@@ -332,9 +356,10 @@ static const int @_steps[{len(LADDER)}] = {{{steps}}};
         begin = self.function(f"{name}_begin", q.begin, known, aim)
         correct = self.function(f"{name}_correct", q.correct, known, aim) % "next"
         target = self.function(f"{name}_aim", q.aim, {}) % "aim"
+        more = "" if q.near is None else "const double *qd, const double *last, "
         self.add(f"""\
 /* Newton's method from the known assembly in so many steps; 0 where it does not get there. */
-static int @_{name}(const double *{q.target}, int steps, double *h, double *{q.unknowns})
+static int @_{name}({more}const double *{q.target}, int steps, double *h, double *{q.unknowns})
 {{
     double {STATE}[{AT.moving}], aim[{m}], next[{n + 4}], first = 0.0;
     int i, k;
@@ -379,6 +404,7 @@ static int @_{name}(const double *{q.target}, int steps, double *h, double *{q.u
         arguments = [f"const double *{name}" for name in routine.inputs]
         arguments += [f"double *{name}" for name in routine.outputs]
         first = ["const double *parameters"] if given else []
+        first += ["double *state"] if routine.state else []
         return f"int @_{routine.name}{'_with' if given else ''}({', '.join(first + arguments)})"
 
     def routine(self, routine: Routine, kind: str = "") -> None:
@@ -400,6 +426,10 @@ static int @_{name}(const double *{q.target}, int steps, double *h, double *{q.u
                 known |= {number: f"h{k}[{at}]" for number, at in ahead.items()}
                 rooms |= {f"h{k}": len(ahead) or 1, q.unknowns: len(q.home)}
                 to = f"{given.get(q.target, q.target)}, @_steps[rung], h{k}, {q.unknowns}"
+                if q.near is not None:
+                    to = f"qd, {LAST}, {to.replace('[rung]', '[(rung < 0) ? 0 : rung]')}"
+                    rooms["none"] = len(routine.state)
+                    solving.append(f"const double *{LAST} = (rung < 0) ? state : none;")
                 solving += [f"if (@_{name}({to}) == 0) {{", "    continue;", "}"]
         call = self.function(f"{routine.name}_of", [*wanted, *held], known, given) % "r"
         verdict = f"@_judged(r, {len(wanted)})"
@@ -409,7 +439,8 @@ static int @_{name}(const double *{q.target}, int steps, double *h, double *{q.u
         lines = [f"    double {name}[{size}] = {{0.0}};" for name, size in rooms.items()]
         if any(q.home for q in routine.equations):
             lines.append("    int rung;")
-            loop = "for (rung = 0; (rung < PKM_ATTEMPTS) && (status == 1); rung++) {"
+            first = "(state[0] > 0.0) ? -1 : 0" if "none" in rooms else "0"
+            loop = f"for (rung = {first}; (rung < PKM_ATTEMPTS) && (status == 1); rung++) {{"
             work = f"status = 1;\n{loop}\n{indent(work, '    ')}\n}}"
         finite = [f"(@_finite({name}, {size}) != 0)" for name, size in routine.inputs.items()]
         lines.append("    int status = 2;")
@@ -423,7 +454,7 @@ static int @_{name}(const double *{q.target}, int steps, double *h, double *{q.u
                 "    }",
             ]
         at = 0
-        for name, row in routine.outputs.items():
+        for name, row in routine.given.items():
             source = f"&r[{at}]" if at else "r"
             lines.append(f"    @_give(status, {source}, {name}, {len(row)});")
             at += len(row)
@@ -433,7 +464,8 @@ static int @_{name}(const double *{q.target}, int steps, double *h, double *{q.u
 
     def own(self, routine: Routine) -> None:
         """The same function with this machine's own parameters."""
-        names = ", ".join(["@_own", *routine.inputs, *routine.outputs])
+        first = ["@_own", "state"] if routine.state else ["@_own"]
+        names = ", ".join([*first, *routine.inputs, *routine.outputs])
         self.add(
             f"{self.signature(routine, given=False)}\n{{\n"
             f"    return @_{routine.name}_with({names});\n}}\n"

@@ -15,16 +15,18 @@ from delta_dynamics.torques.virtual_work import (
     accelerations,
     inverse_dynamics,
     masses_kernel,
+    stream_torques,
     torques,
 )
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.codegen.expressions import GEOMETRY, PARAMETERS, Expression, edge
 from pkm_twin.codegen.kernels import Kernel
-from pkm_twin.codegen.program import MAX_ITERATIONS, Equations
+from pkm_twin.codegen.program import LAST, MAX_ITERATIONS, Equations
 from pkm_twin.errors import ParameterError
 from pkm_twin.export.c99 import CORRECTIONS, HEAD, HOT, LADDER, Folding, Routine, Unit, table
 from pkm_twin.export.c_templates import (
     ABOUT,
+    BESIDE,
     CMAKE,
     EXAMPLE,
     MASSLESS,
@@ -112,11 +114,12 @@ class Package:
         ) -> None:
             if self._wants(name):
                 rows: dict[str, list[Expression]] = {}
-                for kernel in [kernels] if callable(kernels) else kernels:
+                for kernel in reversed([kernels] if callable(kernels) else kernels):
                     found, equations = self._read(kernel(), own)
                     rows |= found
                 made = {key: rows[row] for key, row in outputs.items()}
-                result.append(Routine(name, inputs, made, equations, summary))
+                last = rows.get(LAST, ())
+                result.append(Routine(name, inputs, made, equations, summary, state=last))
 
         engine, p = robot.engine, self._inertial() if self.massive else ()
         if self.massive:
@@ -129,6 +132,16 @@ class Package:
                 "Both for the time of one: actuator efforts tau, and the singularity index.",
                 rates | {"qdd": n} | wrench,
                 [lambda: torques(robot), robot.singularity_kernel], p,
+                tau="efforts", index="measure",
+            )  # fmt: skip
+            add(
+                "torques_next", "The efforts of _torques",
+                rates | {"qdd": n} | wrench, lambda: stream_torques(robot), p, tau="efforts",
+            )  # fmt: skip
+            add(
+                "torques_and_singularity_next", "The results of _torques_and_singularity",
+                rates | {"qdd": n} | wrench,
+                [lambda: stream_torques(robot), robot.singularity_kernel], p,
                 tau="efforts", index="measure",
             )  # fmt: skip
         add("forward", "Pose of joint positions.", q, lambda: engine.forward, pose="pose")
@@ -219,7 +232,7 @@ class Package:
         if self.massive:
             self._write_parameters()
         for routine in self.routines:
-            unit.routine(routine, HOT if routine.name == "torques_and_singularity" else "")
+            unit.routine(routine, HOT if routine.name.startswith("torques_and_s") else "")
             unit.own(routine)
 
     def _write_parameters(self) -> None:
@@ -271,6 +284,7 @@ int @_parameters(double mass, const double *com, const double *inertia, double *
         joints = _listed(zip(robot.joint_names, robot.joint_units, strict=True))
         pose = _listed(zip(robot.pose_names, robot.pose_units, strict=True))
         sizes = [("JOINTS", self.n), ("POSE", self.m), ("PARAMETERS", size)]
+        sizes += [("STATE", len(routine.state)) for routine in self.routines if routine.state][:1]
         if self.elastic is not None:
             sizes.append(("ELEMENTS", len(self.elastic.names)))
         # In capitals as macros are, and with the robot's own spelling as the functions have it.
@@ -280,8 +294,11 @@ int @_parameters(double mass, const double *com, const double *inertia, double *
         for routine in self.routines:
             shape = ", ".join(f"{name}[{len(row)}]" for name, row in routine.outputs.items())
             takes = ", ".join(f"{name}[{count}]" for name, count in routine.inputs.items())
+            what = f"{routine.summary} {takes} -> {shape}."
+            if routine.state:
+                what = f"{routine.summary}{BESIDE.format(size=len(routine.state))}"
             parts.append(
-                _comment(f"{routine.summary} {takes} -> {shape}.")
+                _comment(what)
                 + f"\n{self.unit.signature(routine, given=False)};\n"
                 + f"{self.unit.signature(routine, given=True)};\n"
             )

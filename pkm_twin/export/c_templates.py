@@ -11,6 +11,10 @@ that the surroundings apply to the platform at its reference point. Every functi
 valid; 1: no assembly, or a singularity; 2: an input or a result is NaN or infinite. If it is not
 0, all outputs are NaN. The forms _with take parameters for another payload.
 """
+BESIDE: Final = """, found from the assembly of the sample before instead of from home: in less
+time. state[{size}] is the caller's, one of each stream. Fill it with zeros before the first sample;
+each call writes it. A sample that does not follow the one before is solved from home.
+"""
 PARAMETERS_OF: Final = """\
 The parameters, out[{size}], for another payload: mass (kg), com[3] (m) from the platform's
 reference point and inertia[9] (kg m2) about the com, in axes fixed to the platform that are the

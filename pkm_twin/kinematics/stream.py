@@ -1,20 +1,26 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One sample of a stream next to the last: pose, rates, unexplained motion, singularity."""
+"""One sample of a stream next to the last: programs that are given what the last one left."""
 
 from __future__ import annotations
 
-from typing import Any
+from dataclasses import replace
+from typing import Any, Final
 
 import numpy as np
 
 from pkm_twin.codegen.expressions import PARAMETERS
 from pkm_twin.codegen.kernels import Kernel
-from pkm_twin.codegen.operations import absolute
-from pkm_twin.codegen.program import Program
+from pkm_twin.codegen.operations import absolute, both, less, maximum, minimum, select
+from pkm_twin.codegen.program import LAST, Program
 from pkm_twin.kinematics import pose as poses
 from pkm_twin.kinematics.engine import Engine
 from pkm_twin.kinematics.singularity import singularity_measure
 from pkm_twin.kinematics.traced import Traced
+
+REACH: Final = 0.02
+"""How far joints go, unit one, before the closures are solved from home again."""
+LONGEST: Final = 0.02
+"""Most time between samples, s, over which motion is foreseen."""
 
 
 def stream_kernel(engine: Engine) -> Kernel:
@@ -49,6 +55,48 @@ def _stream(t: Traced) -> Program:
     beyond = error - 0.5 * _sizes(predicted) - bend
     row = t.lift([*t.q, *pose, *rates.ravel(), *beyond, singularity_measure(t)])
     return Program({"q": n, "before": len(before)}, m, {"sample": row}, t.equations())
+
+
+def following(t: Traced, program: Program) -> Program:
+    """A program of motion that starts from the sample before: input and output ``last``.
+
+    The row has 1 where it is valid, the joints that were solved from home last, q, qd, and of the
+    unknowns the values, rates, accelerations and their change. Newton's method starts from the
+    unknowns moved on by these. Results are those of ``program``.
+    """
+    (q,) = program.equations
+    n, (places, rates) = t.joints, t.scheme.solved
+    if not q.guessed or not places:
+        last, more = t.tape.inputs(LAST, 1), [1.0]
+        return replace(
+            program,
+            inputs={**program.inputs, LAST: 1},
+            outputs={**program.outputs, LAST: t.lift(more)},
+        )
+    k = len(rates)
+    sizes = (1, n, n, n, len(places), k, k, k)
+    last = t.tape.inputs(LAST, sum(sizes))
+    (holds,), anchor, before, speed, x, u, du, change = np.split(last, np.cumsum(sizes)[:-1])
+    qd, scales = t.tape.inputs("qd", n), np.array(t.drive_scales, dtype=object)
+    away, move = (t.q - anchor) * scales, (t.q - before) * scales
+    mean = (0.5 * (qd + speed)) * scales
+    near = both(less(0.0, holds), less(away @ away, REACH * REACH))
+    # Of the mean of both speeds: what is left grows with the third power of the time.
+    time = (move @ mean) / maximum(mean @ mean, 1e-300)
+    time = minimum(maximum(time, 0.0), LONGEST)
+    there, way = np.array(t.tree.home, object), np.zeros(t.tree.unknown_rates, object)
+    there[places], way[rates] = x, time * (u + (0.5 * time) * (du + change * (1.0 / 3.0)))
+    foreseen = t.motion.retracted(there, way)
+    solved = (select(near, a, b) for a, b in zip(anchor, t.q, strict=True))
+    changed = (select(near, a - b, 0.0) for a, b in zip(t.du[rates], du, strict=True))
+    kept = [1.0, *solved, *t.q, *qd, *t.unknowns, *t.u[rates], *t.du[rates], *changed]
+    equations = replace(q, near=near, foreseen=t.lift([foreseen[k] for k in places]))
+    return replace(
+        program,
+        inputs={**program.inputs, LAST: len(last)},
+        outputs={**program.outputs, LAST: t.lift(kept)},
+        equations=(equations,),
+    )
 
 
 def _sizes(values: Any) -> Any:

@@ -218,16 +218,17 @@ class Traced:
     def set_rates(self, qd: Numbers) -> Objects:
         """Rates of everything by qd; returns those of the unknowns."""
         kept = self.scheme.independent
-        u = self.lu.solve(-(self.jq[kept] @ np.asarray(qd, dtype=object)))
-        self.motion.set_rates(u, qd)
-        return u
+        self.u = self.lu.solve(-(self.jq[kept] @ np.asarray(qd, dtype=object)))
+        self.motion.set_rates(self.u, qd)
+        return self.u
 
     def set_accelerations(self, qdd: Numbers, gravity: Any | None = None) -> None:
         """Accelerations of everything by qdd, after the rates."""
         kept = self.scheme.independent
         self.motion.set_accelerations(np.zeros(self.tree.unknown_rates), qdd)
         bias = [self.rows[k].bias() for k in kept]
-        self.motion.set_accelerations(-self.lu.solve(bias), qdd, gravity)
+        self.du = -self.lu.solve(bias)
+        self.motion.set_accelerations(self.du, qdd, gravity)
 
     def rate_columns(self) -> list[Objects]:
         """Rates of the unknowns per joint rate."""

@@ -10,6 +10,7 @@ import subprocess
 import numpy as np
 import pytest
 
+from delta_dynamics import inverse_dynamics
 from pkm_twin import robot_names
 from pkm_twin.apps.cli import main
 from pkm_twin.errors import ParameterError
@@ -200,6 +201,64 @@ def test_nothing_undefined_happens(name, tmp_path):
         status, found = package.run(program, name, *rows)
         assert np.isnan(found[status != 0.0]).all()
         assert np.isfinite(found[status == 0.0]).all()
+
+
+STREAM = r"""
+#include <stdio.h>
+#include "@.h"
+int main(void)
+{
+    double row[3 * JOINTS + 6 + STATE], state[STATE] = {0.0}, tau[JOINTS], status;
+    double *const last = row + 3 * JOINTS + 6;
+    while (fread(row, sizeof row, 1, stdin) == 1) {
+        int k;
+        /* What a caller has spoilt. */
+        for (k = 0; k < STATE; k++) { state[k] += last[k]; }
+        status = @_torques_next(state, row, row + JOINTS, row + 2 * JOINTS, row + 3 * JOINTS, tau);
+        fwrite(&status, sizeof status, 1, stdout);
+        fwrite(tau, sizeof tau, 1, stdout);
+        fwrite(state, sizeof state, 1, stdout);
+    }
+    return 0;
+}
+"""
+
+
+def test_a_stream_has_the_results_of_its_samples(exported, rng):
+    """Smooth, then with jumps, without an assembly, not finite, and with a spoilt state."""
+    robot, package = exported
+    n = robot.joints_count
+    size = int(re.search(r"_STATE (\d+)", package.header).group(1))
+    text = STREAM.replace("@", package.prefix).replace("STATE", str(size))
+    (package.folder / "stream.c").write_text(text.replace("JOINTS", str(n)))
+    command = [COMPILERS[0], "-std=c99", *PLAIN, f"{package.prefix}.c", "stream.c", "-o", "stream"]
+    subprocess.run([*command, "-lm"], cwd=package.folder, check=True)
+    middle, half = joint_range(robot)
+    time, pace = np.arange(0.0, 0.6, 1e-3)[:, None], rng.uniform(1.0, 4.0, n)
+    q = middle + 0.3 * half * np.sin(pace * time)
+    qd = 0.3 * half * pace * np.cos(pace * time)
+    rows = np.hstack([q, qd, -(pace**2) * (q - middle), rng.normal(size=(len(q), 6))])
+    rows = np.hstack([rows, np.zeros((len(q), size))])
+    rows[200:400:3, :n] = wild(robot, rng, 67)
+    rows[410, rng.integers(0, 3 * n + 6)] = np.nan
+    rows[430:600:7, 3 * n + 6 :] = rng.normal(size=(25, size)) * 10.0 ** rng.integers(
+        -9, 9, (25, 1)
+    )
+    done = subprocess.run(
+        ["./stream"], cwd=package.folder, input=rows.tobytes(), capture_output=True, check=True
+    )
+    found = np.frombuffer(done.stdout).reshape(len(rows), 1 + n + size)
+    status, tau, state = found[:, 0], found[:, 1 : 1 + n], found[:, 1 + n :]
+    good = robot.try_forward(rows[:, :n])[1] & np.isfinite(rows).all(1)
+    np.testing.assert_array_equal(status == 0.0, good)
+    assert np.isnan(found[~good, 1:]).all() and np.isfinite(found[good]).all()
+    given = np.split(rows[good, : 3 * n + 6], (n, 2 * n, 3 * n), 1)
+    right = inverse_dynamics(robot, *given)
+    clear = robot.singularity(given[0]) > 0.1
+    assert np.abs(tau[good] - right)[clear].max() <= 1e-12 * np.abs(right[clear]).max()
+    if size > 1:
+        # Where the closures were solved from home last.
+        assert (state[1:200, 1 : 1 + n] == state[:199, 1 : 1 + n]).all(1).mean() > 0.5
 
 
 LANGUAGES = (

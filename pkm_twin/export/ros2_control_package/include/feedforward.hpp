@@ -73,13 +73,14 @@ public:
   Rejection verdict() const {return verdict_;}
 
 private:
-  Rejection compute(const Motion & motion, Vector & effort) const;
-  Rejection judge(const Motion & reference, Vector & effort) const;
+  Rejection compute(const Motion & motion, Vector & effort);
+  Rejection judge(const Motion & reference, Vector & effort);
   void hold();
 
   Settings settings_;
   Counters counters_;
   Motion target_;
+  State state_{};
   Vector feedforward_{}, effort_{};
   Rejection verdict_ = REJECTIONS;
   bool resting_ = true;

@@ -38,21 +38,22 @@ void Feedforward::change(const Settings & settings)
   resting_ = false;
 }
 
-Rejection Feedforward::compute(const Motion & motion, Vector & effort) const
+Rejection Feedforward::compute(const Motion & motion, Vector & effort)
 {
   if (!finite(motion.position) || !finite(motion.velocity) || !finite(motion.acceleration)) {
     return NOT_FINITE;
   }
   double index;
   const int status = efforts(
-    settings_.parameters, motion.position, motion.velocity, motion.acceleration, effort, index);
+    settings_.parameters, state_, motion.position, motion.velocity, motion.acceleration, effort,
+    index);
   if (status != 0) {
     return status == 1 ? NO_ASSEMBLY : NOT_FINITE;
   }
   return index < settings_.singularity_stop ? SINGULAR : REJECTIONS;
 }
 
-Rejection Feedforward::judge(const Motion & reference, Vector & effort) const
+Rejection Feedforward::judge(const Motion & reference, Vector & effort)
 {
   for (std::size_t i = 0; i < JOINTS; ++i) {
     const double position = reference.position[i];
