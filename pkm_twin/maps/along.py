@@ -14,10 +14,11 @@ from numpy.typing import NDArray
 
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.maps import figures
-from pkm_twin.maps.kind import Case, Found, Kind, counts, found_of
+from pkm_twin.maps.kind import Case, Found, Kind, found_of
 from pkm_twin.maps.sweep import check
 from pkm_twin.report import plots
 from pkm_twin.robot.robot import Robot
+from pkm_twin.robot.workspace import counts
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError, PkmTwinError
 from pkm_twin.robot.robot import Robot
-from pkm_twin.robot.workspace import keeps_limits
+from pkm_twin.robot.workspace import counts
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -269,15 +269,6 @@ class Space:
         if self.at is not None or worst is None:
             return self.robot.home() if self.at is None else self.at
         return worst.pose
-
-
-def counts(
-    robot: Robot, q: Array, pose: Array, known: Mask, least: float, least_clearance: float
-) -> Mask:
-    """Which joint positions (k, n) and poses (k, m) count, of those that are known, shape (k,)."""
-    inside = keeps_limits(robot, q, pose, least_clearance, known)
-    inside[inside] = robot.try_singularity(q[inside])[0] >= least
-    return inside
 
 
 def found_of(kind: Kind, robot: Robot, q: Array, cases: Sequence[Case]) -> list[Found]:

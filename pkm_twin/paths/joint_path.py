@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Final
@@ -17,6 +17,7 @@ from pkm_twin.paths.carrying import Carried, efforts_of, robots_on
 from pkm_twin.paths.geometry import Path, Stretch
 from pkm_twin.robot.derivatives import joint_rates
 from pkm_twin.robot.robot import Robot
+from pkm_twin.robot.workspace import passive_values
 
 Index = NDArray[np.int64]
 
@@ -206,7 +207,7 @@ def _joints(robot: Robot, places: Array, way: Array) -> Array:
     if good.all():
         return q
     row = int(np.argmin(good))
-    where = Place(float(way[row]), tuple(places[row].tolist()), robot.pose_names)
+    where = _place(robot, places[row], float(way[row]))
     try:
         robot.inverse(places[row])
     except (UnreachableError, SingularityError) as error:
@@ -243,58 +244,51 @@ def _graded(count: int, *, begins: bool, ends: bool) -> Array:
     return np.asarray(1.0 - (1.0 - t) ** GRADE if ends else t)
 
 
-@dataclass(frozen=True)
-class Place:
-    """Where on a path something is: way from the beginning (m), pose and what is wrong there."""
-
-    way: float
-    pose: tuple[float, ...]
-    names: tuple[str, ...]
-
-    def __str__(self) -> str:
-        numbers = ", ".join(
-            f"{n} {round(v, 12) + 0.0:.4g}" for n, v in zip(self.names, self.pose, strict=True)
-        )
-        return f"{self.way:.4g} m after the start ({numbers})"
+def place_at(robot: Robot, q: Array, way: float) -> str:
+    """A place of a path by its joint positions (n,): the way to it, m, and the pose."""
+    return _place(robot, robot.forward(q), way)
 
 
-def place_at(robot: Robot, q: Array, way: float) -> Place:
-    """A place of a path by its joint positions (n,)."""
-    pose = tuple(float(v) for v in robot.forward(q))
-    return Place(way, pose, robot.pose_names)
+def _place(robot: Robot, pose: Array, way: float) -> str:
+    pairs = zip(robot.pose_names, (np.round(pose, 12) + 0.0).tolist(), strict=True)
+    numbers = ", ".join(f"{name} {value:.4g}" for name, value in pairs)
+    return f"{way:.4g} m after the start ({numbers})"
+
+
+def _bounded(robot: Robot, q: Array) -> Iterator[tuple[Sequence[str], Array, Array, Sequence[str]]]:
+    """What a file bounds at joint positions (p, n): names, values (p, k), bounds (k, 2), units."""
+    if robot.limits.position is not None:
+        yield robot.joint_names, q, robot.limits.position, robot.joint_units
+    most = getattr(robot.limits, "joint_angle", None)
+    angles = None if most is None else robot.limit_angles(robot.forward(q))
+    if angles is not None:
+        yield ["joint angle"], np.abs(angles).max(1)[:, None], np.array([[0.0, most]]), ["rad"]
+    if passive := robot.passive_limits:
+        bounds = np.array([[one.low, one.high] for one in passive])
+        units = ["m" if one.kind == "slide" else "rad" for one in passive]
+        yield [one.joint for one in passive], passive_values(robot, q), bounds, units
 
 
 def check_positions(robot: Robot, s: Array, q: Array, begin: float, singularity: float) -> None:
-    """Check that a path keeps joint limits, passive joints' angles and away from singularities.
+    """Check that a path keeps the limits of joints, passive ones too, and away from singularities.
 
     :param s: way within the stretch, shape (p,), m; ``q``: joint positions there, (p, n).
     :param begin: way up to the stretch, m.
     :param singularity: least singularity index, 0 to 1.
     :raises ParameterError: by the first joint and place.
     """
-    limits = robot.limits.position
-    if limits is not None:
-        excess = np.maximum(q - limits[:, 1], limits[:, 0] - q)
-        bad = excess > ROUNDING * np.maximum(1.0, np.abs(q))
+    for names, values, bounds, units in _bounded(robot, q):
+        excess = np.maximum(values - bounds[:, 1], bounds[:, 0] - values)
+        bad = excess > ROUNDING * np.maximum(1.0, np.abs(values))
         if bad.any():
             row = int(bad.any(1).argmax())
             joint = int(excess[row].argmax())
-            unit, name = robot.joint_units[joint], robot.joint_names[joint]
-            low, high = limits[joint]
             where = place_at(robot, q[row], begin + float(s[row]))
+            low, high = bounds[joint]
             raise ParameterError(
-                f"path: {name} {where}", round(float(q[row, joint]), 6),
-                f"{low:g} to {high:g} {unit}",
+                f"path: {names[joint]} {where}", round(float(values[row, joint]), 6),
+                f"{low:g} to {high:g} {units[joint]}",
             )  # fmt: skip
-    most = getattr(robot.limits, "joint_angle", None)
-    angles = None if most is None else robot.limit_angles(robot.forward(q))
-    if angles is not None and most is not None:
-        over = np.abs(angles).max(1) > most + ROUNDING
-        if over.any():
-            row = int(over.argmax())
-            where = place_at(robot, q[row], begin + float(s[row]))
-            value = float(np.abs(angles[row]).max())
-            raise ParameterError(f"path: joint angle {where}", round(value, 6), f"to {most:g} rad")
     index = robot.singularity(q)
     row = int(index.argmin())
     if index[row] < singularity:

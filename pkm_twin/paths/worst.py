@@ -13,7 +13,7 @@ from delta_dynamics.torques.isotropy import sphere_directions
 from pkm_twin.codegen.arrays import Array, Mask
 from pkm_twin.errors import ParameterError
 from pkm_twin.robot.robot import Robot
-from pkm_twin.robot.workspace import within_limits
+from pkm_twin.robot.workspace import counts, try_inverse
 
 RAYS: Final = 1000
 """Rays from home on which poses of the workspace are taken."""
@@ -77,11 +77,8 @@ def workspace_poses(robot: Robot, rays: int = RAYS, singularity: float = SINGULA
 
 def _inside(robot: Robot, poses: Array, singularity: float) -> Mask:
     """Which poses (k, m) are of the workspace."""
-    q, good = robot.try_inverse(poses)
-    good &= within_limits(robot, q)
-    if good.any():
-        good[good] = robot.singularity(q[good]) >= singularity
-    return good
+    q, known = try_inverse(robot, poses)
+    return counts(robot, q, poses, known, singularity, -np.inf)
 
 
 def worst_over_workspace(

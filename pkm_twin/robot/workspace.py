@@ -165,6 +165,19 @@ def keeps_limits(
     return inside
 
 
+def counts(
+    robot: Robot, q: Array, pose: Array, known: Mask, least: float, least_clearance: float
+) -> Mask:
+    """Which joint positions (k, n) and poses (k, m) count in a workspace, shape (k,).
+
+    :param known: where there is an assembly.
+    :param least: singularity index, and ``least_clearance``: clearance (m), that are too little.
+    """
+    inside = keeps_limits(robot, q, pose, least_clearance, known)
+    inside[inside] = robot.try_singularity(q[inside])[0] >= least
+    return inside
+
+
 def distance_unit(robot: Robot) -> str:
     """Unit of the distance from the axis of a cylinder of poses: ``m`` or ``rad``."""
     return robot.pose_units[robot.pose_names.index(robot.grid().lateral[0])]

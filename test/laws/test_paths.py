@@ -14,7 +14,8 @@ from pkm_twin.paths.jerk import smooth_run
 from pkm_twin.paths.joint_path import joint_paths
 from pkm_twin.paths.laws import LAWS
 from pkm_twin.paths.pieces import Arc, Corner, arc_through
-from test.support.robots import load, partly_long
+from pkm_twin.robot.catalogue import robot_of_data
+from test.support.robots import load, parameters_of, partly_long
 
 SOME = partly_long(
     ["delta", "prru", "five_bar", "stewart", "linear_delta", "rps3"], "delta", "five_bar", "stewart"
@@ -330,6 +331,18 @@ def test_what_cannot_be_is_rejected_by_its_place():
     with pytest.raises(ParameterError):
         fastest(load("upr_rpu"), points_of(load("upr_rpu")))
     assert fastest(load("upr_rpu"), points_of(load("upr_rpu")), velocity=0.3).duration > 0.0
+
+
+def test_a_path_keeps_the_ranges_of_passive_joints():
+    data = parameters_of("linear_delta")
+    data["limbs"]["rods"]["left"]["swivel"] = 0.1
+    tight, free = robot_of_data(data, "tight"), load("linear_delta")
+    points = free.home() + np.array([[0.0, 0.0, 0.0], [0.06, 0.0, 0.0]])
+    fastest(free, points)
+    with pytest.raises(ParameterError) as error:
+        fastest(tight, points)
+    assert "left_" in error.value.field
+    assert error.value.bound == "0 to 0.1 rad"
 
 
 def test_a_given_duration_needs_no_limits():
