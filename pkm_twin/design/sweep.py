@@ -88,6 +88,16 @@ class Box:
         return {key: value for key, value in vars(self).items() if key != "problem"}
 
 
+def known_quantities(robot: Robot, path: PosePath) -> list[str]:
+    """Quantities that the robot's file and the path have data for."""
+    try:
+        elastic = bool(robot.element_names)
+    except ParameterError:
+        elastic = False
+    bends = elastic and path.wrench.any()
+    return [name for name in QUANTITIES if bends or name != "deflection"]
+
+
 Work = Sequence[tuple[int, Array]]
 """Numbered points."""
 
@@ -100,19 +110,21 @@ def here(box: Box, work: Work) -> Iterator[tuple[int, dict[str, Array]]]:
 
 def sweep(
     robot: Robot, vary: Mapping[str, tuple[float, float]], path: PosePath,
-    quantities: Sequence[str], samples: int, kind: Literal["grid", "sobol"] = "grid", *,
+    quantities: Sequence[str] | None, samples: int, kind: Literal["grid", "sobol"] = "grid", *,
     seed: int = 0, progress: Callable[[int], None] = lambda _: None,
     compute: Callable[[Box, Work], Iterable[tuple[int, Mapping[str, Array]]]] = here,
 ) -> Sweep:  # fmt: skip
     """Quantities of machines of a box.
 
     :param vary: as of :func:`pkm_twin.design.design`; also of the path.
+    :param quantities: names; None: all that the robot's file and the path have data for.
     :param samples: machines along each variable of a grid, or in all.
     :param progress: called with how many machines are done.
     :param compute: evaluates the parts, in any order.
     :raises ParameterError: a path, a quantity or a count that there is not.
     """
-    names = tuple(quantity_of(name, "quantities").name for name in quantities)
+    wanted = known_quantities(robot, path) if quantities is None else quantities
+    names = tuple(quantity_of(name, "quantities").name for name in wanted)
     box = Box(robot, vary, path, names)
     variables = box.problem.variables
     d = len(variables)

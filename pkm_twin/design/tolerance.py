@@ -56,6 +56,13 @@ class Tolerances:
         return np.asarray(np.sqrt(sum(self.part(path) ** 2 for path in self.sigma)), np.float64)
 
     @cached_property
+    def variance(self) -> dict[str, float]:
+        """Part of the variance of the position over all states that is each error's, 0 to 1."""
+        own = {path: float((self.part(path)[..., :3] ** 2).sum()) for path in self.sigma}
+        whole = sum(own.values())
+        return {path: value / whole if whole > 0.0 else 0.0 for path, value in own.items()}
+
+    @cached_property
     def share(self) -> dict[str, Array]:
         """Part of the variance that is each error's, 0 to 1, shape (..., 6); 0 where none is."""
         whole = np.where(self.deviation > 0.0, self.deviation, 1.0) ** 2
@@ -200,3 +207,13 @@ def workspace_states(robot: Robot, count: int, seed: int = 0) -> Array:
     if not len(kept):
         raise ParameterError("limits.position", None, "limits inside which states are regular")
     return np.asarray(kept, np.float64)
+
+
+def rms(vectors: Array) -> float:
+    """Root mean square length of vectors (..., 3)."""
+    return float(np.sqrt((vectors**2).sum(-1).mean()))
+
+
+def greatest(vectors: Array) -> float:
+    """The greatest length of vectors (..., 3)."""
+    return float(np.linalg.norm(vectors, axis=-1).max())

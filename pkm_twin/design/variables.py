@@ -83,15 +83,33 @@ def parse_vary(texts: Sequence[str]) -> dict[str, tuple[float, float]]:
 
     :raises ParameterError: another form.
     """
-    found: dict[str, tuple[float, float]] = {}
+    found = _parsed("vary", texts, "PATH=LOW:HIGH, each path once", 2)
+    return {name: (low, high) for name, (low, high) in found.items()}
+
+
+def parse_tolerances(texts: Sequence[str]) -> dict[str, float]:
+    """Standard deviations by path of ``PATH=SIGMA`` texts.
+
+    :raises ParameterError: another form, or a path that is given twice.
+    """
+    form = "PATH=SIGMA, each path once, a standard deviation of 0 or more"
+    found = {name: value for name, (value,) in _parsed("tolerance", texts, form, 1).items()}
+    for name, value in found.items():
+        if not 0.0 <= value < math.inf:
+            raise ParameterError("tolerance", f"{name}={value:g}", form)
+    return found
+
+
+def _parsed(field: str, texts: Sequence[str], form: str, count: int) -> dict[str, list[float]]:
+    """Numbers with colons between by the path before them."""
+    found: dict[str, list[float]] = {}
     for text in texts:
-        name, _, bounds = text.rpartition("=")
-        low, _, high = bounds.partition(":")
+        name, _, words = text.rpartition("=")
         try:
-            pair = float(low), float(high)
+            values = list(map(float, words.split(":")))
         except ValueError:
-            raise ParameterError("vary", text, "PATH=LOW:HIGH") from None
-        if not name or name in found:
-            raise ParameterError("vary", text, "PATH=LOW:HIGH, each path once")
-        found[name] = pair
+            values = []
+        if not name or name in found or len(values) != count:
+            raise ParameterError(field, text, form)
+        found[name] = values
     return found

@@ -9,6 +9,7 @@ does not grow with the sweep.
 from __future__ import annotations
 
 import functools
+import itertools
 import logging
 import multiprocessing
 import os
@@ -228,24 +229,12 @@ def on_cluster(sweep: Task, work: Work, scheduler: str) -> Iterator[tuple[int, V
 def _from_workers(
     sweep: Task, work: Work, distributed: Any, client: Any, threads: int
 ) -> Iterator[tuple[int, Values]]:
-    queue = iter(work)
+    def submit(index: int, chunk: Any) -> Any:
+        key = f"map-{sweep.fingerprint[:16]}-{index}"
+        return client.submit(compute, sweep, chunk, pkm_twin.__version__, key=key, pure=False)
 
-    def submit() -> list[Any]:
-        return [
-            client.submit(
-                compute,
-                sweep,
-                chunk,
-                pkm_twin.__version__,
-                key=f"map-{sweep.fingerprint[:16]}-{index}",
-                pure=False,
-            )
-            for index, chunk in _some(queue, 1)
-        ]
-
-    flying: list[Any] = []
-    for _ in range(IN_FLIGHT * threads):
-        flying += submit()
+    queue = itertools.starmap(submit, work)
+    flying = list(itertools.islice(queue, IN_FLIGHT * threads))
     finished = distributed.as_completed(flying, loop=client.loop)
     del flying
     for future in finished:
@@ -253,7 +242,7 @@ def _from_workers(
         index = int(future.key.rpartition("-")[2])
         del future
         yield index, values
-        for following in submit():
+        for following in itertools.islice(queue, 1):
             finished.add(following)
 
 
@@ -281,11 +270,6 @@ def _unpacked(packed: bytes) -> Map:
     # Once a process: what the robot derives for its first chunk serves all.
     sweep: Map = pickle.loads(packed)  # noqa: S301  from the parent
     return sweep
-
-
-def _some(queue: Iterator[tuple[int, Any]], count: int) -> Iterator[tuple[int, Any]]:
-    for _, item in zip(range(count), queue, strict=False):
-        yield item
 
 
 @contextmanager

@@ -3,8 +3,7 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -155,6 +154,7 @@ def optimised(given: Design, path: Path) -> Report:
     from pkm_twin.design.optimise import searches
     from pkm_twin.design.variables import parse_vary
     from pkm_twin.robot.entries import entries
+    from pkm_twin.robot.limits import beyond_limits
 
     robot, way = read_path(given, path)
     box = parse_vary(given.vary)
@@ -168,7 +168,8 @@ def optimised(given: Design, path: Path) -> Report:
     before, best = found.before, found.best
     units = {name: entries(robot).get(name, (0.0, ""))[1] for name in best.numbers}
     bounds = dict(zip(best.variables, box.values(), strict=True))
-    limits = beyond_position(found.robot, way)
+    _, beyond = beyond_limits(found.robot, found.robot.inverse(way.pose))
+    limits = [one.joint for one in beyond]
     both = [Column("before", form=".5g"), Column("after", form=".5g")]
     unit = Column("unit", text=" ")
     tables = [
@@ -239,16 +240,6 @@ def at_bound(value: float, bound: tuple[float, float]) -> str:
 
 def _point(point: DesignPoint) -> dict[str, Any]:
     return {"variables": dict(point.variables), "quantities": dict(point.quantities)}
-
-
-def beyond_position(robot: Robot, path: PosePath) -> list[str]:
-    """Joints whose limits of position the robot leaves on the path."""
-    limits = robot.limits.position
-    if limits is None:
-        return []
-    q = robot.inverse(path.pose)
-    beyond = np.asarray(((q < limits[:, 0]) | (q > limits[:, 1])).any(0))
-    return [name for name, out in zip(robot.joint_names, beyond, strict=True) if out]
 
 
 def write_robot(robot: Robot, source: str, found: Found, path: Path, out: Path) -> None:
@@ -333,7 +324,7 @@ def swept(given: Design, path: Path, kind: str) -> Report:
     compute = here if given.scheduler is None else partial(on_cluster, scheduler=given.scheduler)
     with progress("machines", given.samples ** len(box) if grid else given.samples) as update:
         table = sweep_box(
-            robot, box, way, known_quantities(robot, way), given.samples,
+            robot, box, way, None, given.samples,
             "grid" if grid else "sobol", seed=given.seed, progress=update, compute=compute,
         )  # fmt: skip
     with writing(out):
@@ -346,56 +337,14 @@ def swept(given: Design, path: Path, kind: str) -> Report:
     )
 
 
-def known_quantities(robot: Robot, path: PosePath) -> list[str]:
-    """Quantities that the robot's file and the path have data for."""
-    from pkm_twin.design import QUANTITIES
-
-    names = list(QUANTITIES)
-    try:
-        elastic = bool(robot.element_names)
-    except ParameterError:
-        elastic = False
-    if not (path.wrench.any() and elastic):
-        names.remove("deflection")
-    return names
-
-
-def parse_tolerances(texts: Sequence[str]) -> dict[str, float]:
-    """Standard deviations by path of ``PATH=SIGMA`` texts.
-
-    :raises ParameterError: another form, or a path that is given twice.
-    """
-    found: dict[str, float] = {}
-    for text in texts:
-        path, _, value = text.rpartition("=")
-        try:
-            sigma = float(value)
-        except ValueError:
-            sigma = math.nan
-        if not path or path in found or not 0.0 <= sigma < math.inf:
-            raise ParameterError(
-                "tolerance", text, "PATH=SIGMA, each path once, a standard deviation of 0 or more"
-            )
-        found[path] = sigma
-    return found
-
-
-def rms(vectors: Any) -> float:
-    """Root mean square length of vectors (..., 3)."""
-    return float(np.sqrt((vectors**2).sum(-1).mean()))
-
-
-def _most(vectors: Any) -> float:
-    return float(np.linalg.norm(vectors, axis=-1).max())
-
-
 def budget(given: Design) -> Report:
     """The pose error budget over a path, or over the workspace without one.
 
     :raises ParameterError: as :func:`~pkm_twin.design.tolerances`, or a file without limits.
     """
     from pkm_twin.design import drawn, tolerances
-    from pkm_twin.design.tolerance import workspace_states
+    from pkm_twin.design.tolerance import greatest, rms, workspace_states
+    from pkm_twin.design.variables import parse_tolerances
 
     sigma, robot, where = parse_tolerances(given.tolerance), given.machine(), "the workspace"
     if given.path is None:
@@ -403,15 +352,13 @@ def budget(given: Design) -> Report:
     else:
         q, where = robot.inverse(read_path(given, given.path)[1].pose), given.path.name
     found = tolerances(robot, sigma, q, given.wrench)
-    variance = {name: float((found.part(name)[..., :3] ** 2).sum()) for name in sigma}
-    whole = sum(variance.values())
     rows: dict[str, list[Any]] = {}
-    for name in sorted(sigma, key=lambda name: -variance[name]):
+    for name in sorted(sigma, key=lambda name: -found.variance[name]):
         moves, turns = np.split(found.part(name), 2, -1)
         still = not np.any(np.abs(found.sensitivity[name]) > 1e-9)
         rows[name] = [
-            sigma[name], found.units[name], rms(moves), _most(moves), rms(turns), _most(turns),
-            variance[name] / whole if whole > 0.0 else 0.0, found.texts[name],
+            sigma[name], found.units[name], rms(moves), greatest(moves), rms(turns),
+            greatest(turns), found.variance[name], found.texts[name],
             "moves nothing" if still else "",
         ]  # fmt: skip
     columns = [
@@ -433,10 +380,10 @@ def budget(given: Design) -> Report:
         Fact("states", len(q)),
         Fact("path", None if given.path is None else str(given.path)),
         _length("rms_position_m", rms(moves)),
-        _length("greatest_position_m", _most(moves), "largest position error", f" at {at}"),
+        _length("greatest_position_m", greatest(moves), "largest position error", f" at {at}"),
         Fact("rms_angle_rad", rms(turns), "rad", "RMS rotation",
              f"{1e3 * rms(turns.round(12)):.4g} mrad"),
-        Fact("greatest_angle_rad", _most(turns), "rad"),
+        Fact("greatest_angle_rad", greatest(turns), "rad"),
         Fact("worst_pose", worst),
     ]  # fmt: skip
     if given.monte_carlo:
@@ -444,7 +391,8 @@ def budget(given: Design) -> Report:
         errors = drawn(robot, sigma, q[chosen], given.monte_carlo, given.seed)
         exact = {
             "machines": given.monte_carlo, "states": len(chosen),
-            "rms_position_m": rms(errors[..., :3]), "greatest_position_m": _most(errors[..., :3]),
+            "rms_position_m": rms(errors[..., :3]),
+            "greatest_position_m": greatest(errors[..., :3]),
             "rms_angle_rad": rms(errors[..., 3:]), "first_order_rms_position_m": rms(moves[chosen]),
         }  # fmt: skip
         words = (
