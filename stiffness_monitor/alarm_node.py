@@ -11,13 +11,13 @@ from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import TransformStamped
-from rclpy.time import Time
 from std_srvs.srv import Trigger
 
 from pkm_twin.errors import ParameterError, UnknownNameError
 from pkm_twin.messages.stamps import StampRules
 from pkm_twin.robot.robot import Robot
 from pkm_twin.ros import health
+from pkm_twin.ros.joints import header
 from pkm_twin.ros.node import TwinNode
 from pkm_twin.ros.turns import Task
 from pkm_twin.settings import SECONDS
@@ -137,10 +137,8 @@ class StiffnessAlarmTopics:
         if not told and self._told == ():
             return
         self._told = told
-        message = DiagnosticArray(status=self._statuses(found))
-        message.header.stamp = Time(nanoseconds=core.stamp).to_msg()
-        message.header.frame_id = self._base
-        self._alarm.publish(message)
+        own = header(core.stamp, self._base)
+        self._alarm.publish(DiagnosticArray(header=own, status=self._statuses(found)))
 
     def _statuses(self, found: Sequence[Departure]) -> list[DiagnosticStatus]:
         """One an element that has departed; where none has, one that says so."""

@@ -10,19 +10,18 @@ from __future__ import annotations
 import math
 import sys
 from array import array
-from collections.abc import Sequence
 from functools import partial
 from typing import Final
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from geometry_msgs.msg import TransformStamped, WrenchStamped
-from rclpy.time import Time
+from geometry_msgs.msg import Quaternion, TransformStamped, Vector3, WrenchStamped
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray, Header, MultiArrayDimension, String
 
 from pkm_twin.errors import PkmTwinError
 from pkm_twin.ros import health
+from pkm_twin.ros.joints import header, named, xyz
 from pkm_twin.ros.node import TwinNode
 from pkm_twin.ros.run import run
 from pkm_twin.ros.wrench import declare_mounts
@@ -190,18 +189,18 @@ class StiffnessMonitor(TwinNode):
         ]
         self._frequencies.publish(message)
         names = [f"mode_{k + 1}" for k in range(len(values))]
-        self._frequencies_stamped.publish(_named(_header(self._known, ""), names, values.tolist()))
+        self._frequencies_stamped.publish(named(header(self._known, ""), names, values.tolist()))
 
     def _in_base(self, answer: Answer) -> Header:
-        return _header(answer.stamp, self.core.settings.base_frame)
+        return header(answer.stamp, self.core.settings.base_frame)
 
     def _entries(self, answer: Answer) -> JointState:
-        return _named(self._in_base(answer), ENTRIES, answer.compliance[UPPER].tolist())
+        return named(self._in_base(answer), ENTRIES, answer.compliance[UPPER].tolist())
 
     def _factors(self, answer: Answer) -> JointState:
         found = answer.energy
         factors, energies = found.factors.tolist(), found.energies.tolist()
-        return _named(self._in_base(answer), found.elements, factors, energies)
+        return named(self._in_base(answer), found.elements, factors, efforts=energies)
 
     def _energies(self, answer: Answer) -> DiagnosticArray:
         """Factors, energy, pose and frame; factors are absent where no load makes energy."""
@@ -233,26 +232,11 @@ class StiffnessMonitor(TwinNode):
         scale = 0.5 if angle < 1e-6 else math.sin(angle / 2) / angle
         frame = self._platform_frame or self.core.settings.platform_frame
         message = TransformStamped(
-            header=_header(answer.stamp, frame), child_frame_id=f"{frame}_deflected"
+            header=header(answer.stamp, frame), child_frame_id=f"{frame}_deflected"
         )
-        move, rotation = message.transform.translation, message.transform.rotation
-        move.x, move.y, move.z = shift.tolist()
-        rotation.x, rotation.y, rotation.z = (scale * turn).tolist()
-        rotation.w = math.cos(angle / 2)
+        message.transform.translation = xyz(Vector3, shift)
+        message.transform.rotation = xyz(Quaternion, (*(scale * turn), math.cos(angle / 2)))
         return message
-
-
-def _header(stamp: int, frame: str) -> Header:
-    return Header(stamp=Time(nanoseconds=stamp).to_msg(), frame_id=frame)
-
-
-def _named(
-    header: Header, names: Sequence[str], values: Sequence[float], efforts: Sequence[float] = ()
-) -> JointState:
-    """Numbers by name, stamped: the message of names and numbers that plots know."""
-    return JointState(
-        header=header, name=list(names), position=array("d", values), effort=array("d", efforts)
-    )
 
 
 def _matrix(answer: Answer) -> Float64MultiArray:

@@ -10,8 +10,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from geometry_msgs.msg import InertiaStamped, PointStamped, WrenchStamped
-from rclpy.time import Time
+from geometry_msgs.msg import Inertia, InertiaStamped, Point, PointStamped, Vector3
 from std_msgs.msg import Bool, String
 from std_srvs.srv import Trigger
 
@@ -22,7 +21,7 @@ from delta_dynamics.feedforward import Torques
 from delta_dynamics.torques.uncertainty import FRICTION, MASSES
 from pkm_twin.messages.stamps import SECOND
 from pkm_twin.robot.robot import Robot
-from pkm_twin.ros.joints import JointPublisher
+from pkm_twin.ros.joints import JointPublisher, header, wrench_stamped, xyz
 from pkm_twin.ros.node import TwinNode
 from pkm_twin.streams.monitor import Pace
 
@@ -202,19 +201,11 @@ class Estimates:
         if where != ("" if before is None else before.where):
             self._body.publish(String(data=where))
         if place is not None:
-            message = PointStamped()
-            message.header.stamp = Time(nanoseconds=stamp).to_msg()
-            message.header.frame_id = self._frames[0]
-            message.point.x, message.point.y, message.point.z = place.point.tolist()
-            self._point.publish(message)
+            own = header(stamp, self._frames[0])
+            self._point.publish(PointStamped(header=own, point=xyz(Point, place.point)))
 
     def _publish_contact(self, stamp: int, found: Contact) -> None:
-        message = WrenchStamped()
-        message.header.stamp = Time(nanoseconds=stamp).to_msg()
-        message.header.frame_id = self._frames[0]
-        force, torque = message.wrench.force, message.wrench.torque
-        force.x, force.y, force.z, torque.x, torque.y, torque.z = found.wrench.tolist()
-        self._wrench.publish(message)
+        self._wrench.publish(wrench_stamped(stamp, self._frames[0], found.wrench))
         own = self._robot().controller
         self._effort.publish(stamp, own.controller_efforts(found.external))
 
@@ -229,13 +220,9 @@ class Estimates:
             (self._load_deviation, found.mass_deviation, found.com_deviation),
         )
         for publisher, mass, com in pairs:
-            message = InertiaStamped()
-            message.header.stamp = Time(nanoseconds=torques.stamp).to_msg()
-            message.header.frame_id = self._frames[1]
-            message.inertia.m = mass
-            place = message.inertia.com
-            place.x, place.y, place.z = np.asarray(com, float).tolist()
-            publisher.publish(message)
+            inertia = Inertia(m=mass, com=xyz(Vector3, com))
+            own = header(torques.stamp, self._frames[1])
+            publisher.publish(InertiaStamped(header=own, inertia=inertia))
 
     def _reset_payload(self, _request: Any, response: Any) -> Any:
         if self._payload is not None:

@@ -12,7 +12,6 @@ from typing import Any, Final
 import numpy as np
 from geometry_msgs.msg import WrenchStamped
 from rclpy.duration import Duration
-from rclpy.time import Time
 
 from delta_dynamics.feedforward import Feedforward, Settings, Torques, warm_up
 from delta_dynamics.nodes.estimates import Estimates
@@ -24,7 +23,7 @@ from pkm_twin.messages.fast_decoder import JointStateView, RawTrajectory
 from pkm_twin.messages.stamps import SECOND
 from pkm_twin.robot.robot import Robot
 from pkm_twin.ros import health
-from pkm_twin.ros.joints import CommandPublisher, JointPublisher
+from pkm_twin.ros.joints import CommandPublisher, JointPublisher, wrench_stamped
 from pkm_twin.ros.node import TwinNode
 from pkm_twin.ros.run import run
 from pkm_twin.ros.turns import Task
@@ -365,23 +364,18 @@ class DeltaDynamics(TwinNode):
                 self.log_throttled("beside", f"no reactions or estimates: {error}")
 
     def _tell_reactions(self, torques: Torques) -> None:
-        """At a rate of their own: a dense solve a sample is too much for the stream's."""
-        if self._reactions and self._reactions_pace.due(torques.stamp):
-            self._reactions_pace.answered(torques.stamp)
-            self._publish_reactions(Time(nanoseconds=torques.stamp).to_msg(), torques)
+        """Every joint's wrench that rigid bodies determine, world axes, at the joint's point.
 
-    def _publish_reactions(self, stamp: Any, torques: Torques) -> None:
-        """Every joint's wrench that rigid bodies determine, world axes, at the joint's point."""
+        At a rate of their own: a dense solve a sample is too much for the stream's.
+        """
+        if not (self._reactions and self._reactions_pace.due(torques.stamp)):
+            return
+        self._reactions_pace.answered(torques.stamp)
         result = reactions(self.core.robot, *torques.motion, torques.wrench)
         for k, name in enumerate(result.names):
-            if not result.determinate[k].all():
-                continue
-            message = WrenchStamped()
-            message.header.stamp = stamp
-            message.header.frame_id = self._base_frame
-            force, torque = message.wrench.force, message.wrench.torque
-            force.x, force.y, force.z, torque.x, torque.y, torque.z = result.wrenches[k].tolist()
-            self._reactions[name].publish(message)
+            if result.determinate[k].all():
+                message = wrench_stamped(torques.stamp, self._base_frame, result.wrenches[k])
+                self._reactions[name].publish(message)
 
     def _watch_every(self, stale_after: float) -> None:
         if self._watchdog is not None:

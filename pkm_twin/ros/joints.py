@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Publishers of joint numbers: in the controller's names, order and numbers.
+"""What nodes publish: messages with a header, and joint numbers as the controller has them.
 
 A node publishes numbers of the actuated joints through these alone. They take
 :data:`~pkm_twin.machine.joint_map.ControllerNumbers`, which only a robot's joint map makes: the
@@ -8,11 +8,18 @@ type checker finds a conversion that was forgotten.
 
 from __future__ import annotations
 
+from array import array
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
+from geometry_msgs.msg import Vector3, Wrench, WrenchStamped
+from rclpy.time import Time
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Header
 
 from pkm_twin.bags.definitions import message_definition
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.machine.joint_map import ControllerNumbers
 from pkm_twin.messages.fast_decoder import DoublesTemplate
 from pkm_twin.messages.stamps import SECOND
@@ -24,6 +31,36 @@ if TYPE_CHECKING:
 JOINT_STATE: Final = "sensor_msgs/msg/JointState"
 NUMBERS: Final = "std_msgs/msg/Float64MultiArray"
 FIELDS: Final = ("position", "velocity", "effort")
+
+
+def header(stamp: int, frame: str = "") -> Header:
+    """A header with a stamp, ns."""
+    return Header(stamp=Time(nanoseconds=stamp).to_msg(), frame_id=frame)
+
+
+def xyz(kind: Any, values: Iterable[float]) -> Any:
+    """A message of numbers x, y, z and, where there are four, w."""
+    return kind(**dict(zip("xyzw", map(float, values), strict=False)))
+
+
+def wrench_stamped(stamp: int, frame: str, wrench: Array) -> WrenchStamped:
+    """A wrench, shape (6,), N and N m, along the axes of a frame."""
+    force, torque = xyz(Vector3, wrench[:3]), xyz(Vector3, wrench[3:])
+    return WrenchStamped(header=header(stamp, frame), wrench=Wrench(force=force, torque=torque))
+
+
+def named(
+    header: Header,
+    names: Sequence[str],
+    values: Sequence[float],
+    rates: Sequence[float] = (),
+    efforts: Sequence[float] = (),
+) -> JointState:
+    """Numbers by name: the message of names and numbers that plots know."""
+    position, velocity, effort = (array("d", row) for row in (values, rates, efforts))
+    return JointState(
+        header=header, name=list(names), position=position, velocity=velocity, effort=effort
+    )
 
 
 class JointPublisher:

@@ -4,35 +4,34 @@
 from __future__ import annotations
 
 import sys
-from array import array
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from functools import partial
 from typing import Any, Final
 
 import numpy as np
 from builtin_interfaces.msg import Duration as DurationMessage
-from builtin_interfaces.msg import Time as TimeMessage
 from geometry_msgs.msg import (
     Point,
+    Pose,
     PoseStamped,
     Quaternion,
+    Transform,
     TransformStamped,
+    Twist,
     TwistStamped,
     Vector3,
 )
 from numpy.typing import NDArray
 from rclpy.duration import Duration
-from rclpy.time import Time
-from sensor_msgs.msg import JointState
-from std_msgs.msg import ColorRGBA, String
+from std_msgs.msg import ColorRGBA, Header, String
 from visualization_msgs.msg import Marker, MarkerArray
 
 from pkm_twin.errors import ParameterError, PkmTwinError
 from pkm_twin.machine import rotations
 from pkm_twin.messages.fast_decoder import JointStateView
-from pkm_twin.messages.stamps import SECOND
 from pkm_twin.robot.robot import Robot
 from pkm_twin.robot.robot_urdf import joint_names, robot_urdf
+from pkm_twin.ros.joints import header, named, xyz
 from pkm_twin.ros.node import TwinNode
 from pkm_twin.ros.run import run
 from pkm_twin.ros.wrench import declare_mounts, triple
@@ -52,61 +51,25 @@ KINDS: Final = {
 }
 
 
-def joint_state(
-    stamp: TimeMessage,
-    names: Sequence[str],
-    values: NDArray[Any],
-    rates: NDArray[Any] | None = None,
-) -> JointState:
-    """Positions, and velocities where there are any, by name."""
-    message = JointState(name=list(names), position=array("d", values))
-    if rates is not None:
-        message.velocity = array("d", rates)
-    message.header.stamp = stamp
-    return message
-
-
-def pose(stamp: TimeMessage, frame: str, position: NDArray[Any], turn: NDArray[Any]) -> PoseStamped:
-    """A place (3,) and a quaternion x y z w."""
-    message = PoseStamped()
-    message.header.stamp, message.header.frame_id = stamp, frame
-    message.pose.position, message.pose.orientation = _point(position), _quaternion(turn)
-    return message
-
-
-def twist(stamp: TimeMessage, frame: str, values: NDArray[Any]) -> TwistStamped:
-    """Velocity and angular velocity, shape (6,)."""
-    message = TwistStamped()
-    message.header.stamp, message.header.frame_id = stamp, frame
-    message.twist.linear, message.twist.angular = _vector(values[:3]), _vector(values[3:])
-    return message
-
-
 def transform(
-    stamp: TimeMessage, frame: str, child: str, position: NDArray[Any], turn: NDArray[Any]
+    stamp: int, frame: str, child: str, position: NDArray[Any], turn: NDArray[Any]
 ) -> TransformStamped:
-    """From a frame to its child."""
-    message = TransformStamped(child_frame_id=child)
-    message.header.stamp, message.header.frame_id = stamp, frame
-    message.transform.translation = _vector(position)
-    message.transform.rotation = _quaternion(turn)
-    return message
+    """From a frame to its child, by a place (3,) and a quaternion x y z w."""
+    moved = Transform(translation=xyz(Vector3, position), rotation=xyz(Quaternion, turn))
+    return TransformStamped(header=header(stamp, frame), child_frame_id=child, transform=moved)
 
 
-def markers(
-    stamp: TimeMessage, frame: str, shapes: Iterable[Shape], lifetime: DurationMessage
-) -> MarkerArray:
+def markers(own: Header, shapes: Iterable[Shape], lifetime: DurationMessage) -> MarkerArray:
     """Shapes as markers; those that do not last are drawn for ``lifetime``."""
     array_of = MarkerArray()
     for shape in shapes:
-        marker = Marker(ns=shape.group, id=shape.number, type=KINDS[shape.kind], text=shape.text)
-        marker.header.stamp, marker.header.frame_id = stamp, frame
-        marker.pose.position = _point(shape.position)
-        marker.pose.orientation = _quaternion(shape.quaternion)
-        marker.scale = _vector(shape.size)
-        marker.points = [_point(point) for point in shape.points]
-        r, g, b, a = shape.colour
-        marker.color = ColorRGBA(r=r, g=g, b=b, a=a)
+        marker = Marker(header=own, ns=shape.group, id=shape.number, type=KINDS[shape.kind])
+        marker.text = shape.text
+        marker.pose.position = xyz(Point, shape.position)
+        marker.pose.orientation = xyz(Quaternion, shape.quaternion)
+        marker.scale = xyz(Vector3, shape.size)
+        marker.points = [xyz(Point, point) for point in shape.points]
+        marker.color = ColorRGBA(**dict(zip("rgba", shape.colour, strict=True)))
         if not shape.lasting:
             marker.lifetime = lifetime
         array_of.markers.append(marker)
@@ -134,42 +97,16 @@ class Transforms:
 
     def send_tool(self, now: int) -> None:
         """Platform to tool, once and for all; ``now`` in ns."""
-        sec, nanosec = divmod(now, SECOND)
         turn = rotations.to_quaternion(self._tool.rotation)
-        self._static.publish(
-            self._message(
-                transforms=[
-                    transform(
-                        TimeMessage(sec=sec, nanosec=nanosec),
-                        self._frames["platform"],
-                        self._frames["tool"],
-                        self._tool.position,
-                        turn,
-                    )
-                ]
-            )
-        )
+        names = self._frames["platform"], self._frames["tool"]
+        found = transform(now, *names, self._tool.position, turn)
+        self._static.publish(self._message(transforms=[found]))
 
-    def send_platform(self, stamp: TimeMessage, position: NDArray[Any], turn: NDArray[Any]) -> None:
+    def send_platform(self, stamp: int, position: NDArray[Any], turn: NDArray[Any]) -> None:
         """Base to platform."""
         if self._moving is not None:
             found = transform(stamp, self._base, self._frames["platform"], position, turn)
             self._moving.publish(self._message(transforms=[found]))
-
-
-def _point(values: Sequence[float] | NDArray[Any]) -> Point:
-    x, y, z = map(float, values)
-    return Point(x=x, y=y, z=z)
-
-
-def _vector(values: Sequence[float] | NDArray[Any]) -> Vector3:
-    x, y, z = map(float, values)
-    return Vector3(x=x, y=y, z=z)
-
-
-def _quaternion(values: Sequence[float] | NDArray[Any]) -> Quaternion:
-    x, y, z, w = map(float, values)
-    return Quaternion(x=x, y=y, z=z, w=w)
 
 
 LIFETIME = 1.0
@@ -318,18 +255,21 @@ class MachineStateNode(TwinNode):
         state = self.core.joint_state(message, self.now())
         if state is None:
             return
-        stamp = Time(nanoseconds=state.stamp).to_msg()
-        base = self.core.settings.base_frame
+        own = header(state.stamp, self.core.settings.base_frame)
         quaternion = rotations.to_quaternion(state.rotation)
-        self._joints.publish(joint_state(stamp, self._names, state.joints, state.rates))
-        self._pose.publish(pose(stamp, base, state.position, quaternion))
+        rates = () if state.rates is None else state.rates
+        self._joints.publish(named(header(state.stamp), self._names, state.joints, rates))
+        place = Pose(position=xyz(Point, state.position), orientation=xyz(Quaternion, quaternion))
+        self._pose.publish(PoseStamped(header=own, pose=place))
         if state.twist is not None:
-            self._twist.publish(twist(stamp, base, state.twist))
+            linear, angular = xyz(Vector3, state.twist[:3]), xyz(Vector3, state.twist[3:])
+            twist = Twist(linear=linear, angular=angular)
+            self._twist.publish(TwistStamped(header=own, twist=twist))
         if self._transforms is None or not self._transforms.platform:
             return
         if self._transforms_pace.due(state.stamp):
             self._transforms_pace.answered(state.stamp)
-            self._transforms.send_platform(stamp, state.position, quaternion)
+            self._transforms.send_platform(state.stamp, state.position, quaternion)
 
     def _publish_markers(self) -> None:
         """Of the latest state: shapes are for the eye, and elasticity takes its milliseconds."""
@@ -340,10 +280,8 @@ class MachineStateNode(TwinNode):
             return
         self._drawn = state.stamp
         shapes = self._scene.shapes(state, self._load(state))
-        base = self.core.settings.base_frame
-        stamp = Time(nanoseconds=state.stamp).to_msg()
-        lifetime = Duration(seconds=LIFETIME).to_msg()
-        self._markers.publish(markers(stamp, base, shapes, lifetime))
+        own = header(state.stamp, self.core.settings.base_frame)
+        self._markers.publish(markers(own, shapes, Duration(seconds=LIFETIME).to_msg()))
 
     def _load(self, state: State) -> Load | None:
         """What the wrench does to the machine, None where it is not known."""
