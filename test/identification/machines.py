@@ -192,152 +192,64 @@ WRONG: dict[str, Callable[[Drawn, np.random.Generator], Recording]] = {
 # What no machine of this file makes ------------------------------------------------------------
 
 
-def _but(rec: Recording, rng: np.random.Generator, effort: bool) -> tuple[Array, int]:
-    values = (rec.effort if effort else rec.q).copy()
-    return values, int(rng.integers(values.shape[1]))
-
-
-def efforts_negated(r: Recording, rng: np.random.Generator) -> Recording:
-    return replace(r, effort=-r.effort)
-
-
-def one_effort_negated(r: Recording, rng: np.random.Generator) -> Recording:
-    effort, j = _but(r, rng, effort=True)
-    effort[:, j] *= -1.0
+def one_effort(r: Recording, rng: np.random.Generator, how: Callable[[Array], Array]) -> Recording:
+    """One joint's efforts put through a function."""
+    effort, j = r.effort.copy(), int(rng.integers(r.q.shape[1]))
+    effort[:, j] = how(effort[:, j])
     return replace(r, effort=effort)
 
 
-def positions_negated(r: Recording, rng: np.random.Generator) -> Recording:
-    return replace(r, q=-r.q)
-
-
-def one_position_negated(r: Recording, rng: np.random.Generator) -> Recording:
-    q, j = _but(r, rng, effort=False)
+def mirrored(r: Recording, rng: np.random.Generator, *, efforts: bool) -> Recording:
+    """One joint's positions about their middle, so that the machine can take them."""
+    j = int(rng.integers(r.q.shape[1]))
+    q, effort = r.q.copy(), r.effort.copy()
     q[:, j] = 2.0 * q[:, j].mean() - q[:, j]
-    return replace(r, q=q)
-
-
-def one_joint_negated(r: Recording, rng: np.random.Generator) -> Recording:
-    """Positions about their middle, so that the machine can take them."""
-    q, j = _but(r, rng, effort=False)
-    q[:, j] = 2.0 * q[:, j].mean() - q[:, j]
-    effort = r.effort.copy()
-    effort[:, j] *= -1.0
+    effort[:, j] *= -1.0 if efforts else 1.0
     return replace(r, q=q, effort=effort)
 
 
-def time_reversed(r: Recording, rng: np.random.Generator) -> Recording:
-    return replace(r, q=r.q[::-1], effort=r.effort[::-1])
-
-
-def efforts_reversed(r: Recording, rng: np.random.Generator) -> Recording:
-    return replace(r, effort=r.effort[::-1])
-
-
-def effort_columns_swapped(r: Recording, rng: np.random.Generator) -> Recording:
-    n = r.q.shape[1]
-    i, k = rng.permutation(n)[:2]
-    order = np.arange(n)
+def swapped(values: Array, rng: np.random.Generator) -> Array:
+    """Two columns exchanged."""
+    order = np.arange(values.shape[1])
+    i, k = rng.permutation(len(order))[:2]
     order[[i, k]] = k, i
-    return replace(r, effort=r.effort[:, order])
+    return values[:, order]
 
 
-def effort_columns_rolled(r: Recording, rng: np.random.Generator) -> Recording:
-    return replace(r, effort=np.roll(r.effort, 1, 1))
-
-
-def position_columns_swapped(r: Recording, rng: np.random.Generator) -> Recording:
-    n = r.q.shape[1]
-    i, k = rng.permutation(n)[:2]
-    order = np.arange(n)
-    order[[i, k]] = k, i
-    return replace(r, q=r.q[:, order])
-
-
-def columns_taken_for_each_other(r: Recording, rng: np.random.Generator) -> Recording:
-    """Positions as efforts and efforts as positions."""
-    return replace(r, q=r.effort, effort=r.q)
-
-
-def milliseconds(r: Recording, rng: np.random.Generator) -> Recording:
-    return replace(r, time=1e3 * r.time)
-
-
-def seconds_for_milliseconds(r: Recording, rng: np.random.Generator) -> Recording:
-    return replace(r, time=1e-3 * r.time)
-
-
-def half_speed(r: Recording, rng: np.random.Generator) -> Recording:
-    return replace(r, time=2.0 * r.time)
-
-
-def kgf_cm(r: Recording, rng: np.random.Generator) -> Recording:
-    return replace(r, effort=r.effort * 100.0 / 9.80665)
-
-
-def newton_millimetres(r: Recording, rng: np.random.Generator) -> Recording:
-    return replace(r, effort=1e3 * r.effort)
-
-
-def kilogram_force(r: Recording, rng: np.random.Generator) -> Recording:
-    return replace(r, effort=r.effort / 9.80665)
-
-
-def three_times(r: Recording, rng: np.random.Generator) -> Recording:
-    return replace(r, effort=3.0 * r.effort)
-
-
-def a_third(r: Recording, rng: np.random.Generator) -> Recording:
-    return replace(r, effort=r.effort / 3.0)
-
-
-def motor_side(r: Recording, rng: np.random.Generator) -> Recording:
-    """Of one joint the torque before its gear."""
-    effort, j = _but(r, rng, effort=True)
-    effort[:, j] /= 20.0
-    return replace(r, effort=effort)
-
-
-def degrees(r: Recording, rng: np.random.Generator) -> Recording:
-    return replace(r, q=np.degrees(r.q))
-
-
-def radians_for_degrees(r: Recording, rng: np.random.Generator) -> Recording:
-    return replace(r, q=np.radians(r.q))
-
-
-def millimetres(r: Recording, rng: np.random.Generator) -> Recording:
-    return replace(r, q=1e3 * r.q)
-
-
-def efforts_late(r: Recording, rng: np.random.Generator) -> Recording:
-    by = 0.3 * rng.choice([-1.0, 1.0])
-    return replace(r, effort=shifted(r.effort, r.time, by))
-
-
-def one_effort_late(r: Recording, rng: np.random.Generator) -> Recording:
-    effort, j = _but(r, rng, effort=True)
-    effort[:, j] = shifted(r.effort, r.time, 0.3)[:, j]
-    return replace(r, effort=effort)
-
-
-def efforts_shuffled(r: Recording, rng: np.random.Generator) -> Recording:
-    return replace(r, effort=rng.permutation(r.effort))
-
-
-def noise_for_efforts(r: Recording, rng: np.random.Generator) -> Recording:
-    return replace(r, effort=r.effort.mean(0) + r.effort.std(0) * rng.normal(size=r.effort.shape))
-
-
-_ALL = (
-    efforts_negated, one_effort_negated, positions_negated, one_position_negated,
-    one_joint_negated, time_reversed, efforts_reversed, effort_columns_swapped,
-    effort_columns_rolled, position_columns_swapped, columns_taken_for_each_other, milliseconds,
-    seconds_for_milliseconds, half_speed, kgf_cm, newton_millimetres, kilogram_force, three_times,
-    a_third, motor_side, degrees, radians_for_degrees, millimetres, efforts_late, one_effort_late,
-    efforts_shuffled, noise_for_efforts,
-)  # fmt: skip
 IMPOSSIBLE: dict[str, Callable[[Recording, np.random.Generator], Recording]] = {
-    f.__name__: f for f in _ALL
+    "efforts_negated": lambda r, _: replace(r, effort=-r.effort),
+    "one_effort_negated": lambda r, rng: one_effort(r, rng, np.negative),
+    "positions_negated": lambda r, _: replace(r, q=-r.q),
+    "one_position_negated": lambda r, rng: mirrored(r, rng, efforts=False),
+    "one_joint_negated": lambda r, rng: mirrored(r, rng, efforts=True),
+    "time_reversed": lambda r, _: replace(r, q=r.q[::-1], effort=r.effort[::-1]),
+    "efforts_reversed": lambda r, _: replace(r, effort=r.effort[::-1]),
+    "effort_columns_swapped": lambda r, rng: replace(r, effort=swapped(r.effort, rng)),
+    "effort_columns_rolled": lambda r, _: replace(r, effort=np.roll(r.effort, 1, 1)),
+    "position_columns_swapped": lambda r, rng: replace(r, q=swapped(r.q, rng)),
+    "columns_taken_for_each_other": lambda r, _: replace(r, q=r.effort, effort=r.q),
+    "milliseconds": lambda r, _: replace(r, time=1e3 * r.time),
+    "seconds_for_milliseconds": lambda r, _: replace(r, time=1e-3 * r.time),
+    "half_speed": lambda r, _: replace(r, time=2.0 * r.time),
+    "kgf_cm": lambda r, _: replace(r, effort=r.effort * 100.0 / 9.80665),
+    "newton_millimetres": lambda r, _: replace(r, effort=1e3 * r.effort),
+    "kilogram_force": lambda r, _: replace(r, effort=r.effort / 9.80665),
+    "three_times": lambda r, _: replace(r, effort=3.0 * r.effort),
+    "a_third": lambda r, _: replace(r, effort=r.effort / 3.0),
+    # Of one joint the torque before its gear.
+    "motor_side": lambda r, rng: one_effort(r, rng, lambda v: v / 20.0),
+    "degrees": lambda r, _: replace(r, q=np.degrees(r.q)),
+    "radians_for_degrees": lambda r, _: replace(r, q=np.radians(r.q)),
+    "millimetres": lambda r, _: replace(r, q=1e3 * r.q),
+    "efforts_late": lambda r, rng: replace(
+        r, effort=shifted(r.effort, r.time, 0.3 * rng.choice([-1.0, 1.0]))
+    ),
+    "one_effort_late": lambda r, rng: one_effort(
+        r, rng, lambda v: np.interp(r.time - 0.3, r.time, v)
+    ),
+    "efforts_shuffled": lambda r, rng: replace(r, effort=rng.permutation(r.effort)),
+    "noise_for_efforts": lambda r, rng: replace(
+        r, effort=r.effort.mean(0) + r.effort.std(0) * rng.normal(size=r.effort.shape)
+    ),
 }
 """Recordings that no machine of the file can have made."""
