@@ -56,7 +56,7 @@ from pkm_twin.identification.measurements import (
     scale_slopes,
     whole_of,
 )
-from pkm_twin.identification.parameters import OBSERVED
+from pkm_twin.identification.parameters import OBSERVED, weights_of
 from pkm_twin.identification.undetermined import undetermined
 from pkm_twin.machine.formulas import PARAMETERS
 from pkm_twin.machine.joint_map import JointMap
@@ -74,8 +74,6 @@ STEP: Final = 1e-6
 """By which a number is moved to see whether the machine can be assembled with another one."""
 SAME: Final = 1e-4
 """Difference of joints that makes another pose, rad or m."""
-SHOWN: Final = 0.1
-"""Part of the greatest weight below which a number is not named in a combination."""
 NOT_GEOMETRY: Final = ("limits.", "gravity", "payload.", "joint_map.")
 SCALED: Final = 0.5
 """Part of its deviation before below which a scale is known; part of a number's variance from
@@ -132,18 +130,8 @@ class Estimate:
         What the file says stays along them; a number that is not observed may be in one whose
         other combinations are.
         """
-        found = []
-        for column in self._unknown.T:
-            vector = column * np.sign(column[np.argmax(np.abs(column))])
-            shown = np.abs(vector) > SHOWN * np.abs(vector).max()
-            found.append(
-                {
-                    p.name: float(w)
-                    for p, w, s in zip(self.parameters, vector, shown, strict=True)
-                    if s
-                }
-            )
-        return tuple(found)
+        names = [p.name for p in self.parameters]
+        return tuple(weights_of(names, column) for column in self._unknown.T)
 
 
 class Errors(NamedTuple):

@@ -6,24 +6,23 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import pairwise
-from pathlib import Path
-from typing import Any, Final, Literal
+from itertools import combinations, pairwise
+from typing import Any, Final, Literal, TypeVar
 
 import numpy as np
 
 from delta_dynamics.torques.regressor import TEN, parameter_names
 from delta_dynamics.torques.virtual_work import mass_matrix
 from pkm_twin.codegen.arrays import Array
-from pkm_twin.errors import PkmTwinError, UnknownNameError
+from pkm_twin.errors import UnknownNameError
 from pkm_twin.identification.identifiable import KINDS, Identifiable, Kind, identifiable
+from pkm_twin.machine.graph import groups
 from pkm_twin.machine.inertia import change_of_frame
 from pkm_twin.machine.machine_yaml import edit_yaml
 from pkm_twin.machine.places import Keys, path_of
-from pkm_twin.machine.strict_yaml import parse_yaml
-from pkm_twin.robot.catalogue import robot_of_data
 from pkm_twin.robot.robot import Robot
 
+T = TypeVar("T")
 Status = Literal["fitted", "combination", "not excited"]
 
 COMPLIANCE: Final = "compliance"
@@ -226,16 +225,17 @@ def groups_of(
     values, vectors = np.linalg.eigh(own)
     unknown = vectors[:, values > FITTED_RATIO**2]
     shared = np.abs(unknown @ unknown.T)
-    left, groups = set(np.flatnonzero(np.diag(shared) > SHOWN**2).tolist()), []
-    while left:
-        group, edge = set(), {min(left)}
-        while edge:
-            group |= edge
-            edge = {j for i in edge for j in left - group if shared[i, j] > SHOWN}
-        left -= group
-        if len(group) > 1:
-            groups.append(_group(sorted(group), names, factors, (own, full)))
-    return tuple(groups)
+    open_ = np.flatnonzero(np.diag(shared) > SHOWN**2).tolist()
+    pairs = ((i, j) for i, j in combinations(open_, 2) if shared[i, j] > SHOWN)
+    found = [sorted(members) for members in groups(open_, pairs)]
+    return tuple(_group(one, names, factors, (own, full)) for one in found if len(one) > 1)
+
+
+def weights_of(names: Sequence[T], vector: Array) -> dict[T, float]:
+    """Weights of a direction by name, the greatest above zero, without those that hardly count."""
+    vector = vector * np.sign(vector[np.argmax(np.abs(vector))])
+    least = SHOWN * float(np.abs(vector).max())
+    return {n: w for n, w in zip(names, vector.tolist(), strict=True) if abs(w) > least}
 
 
 def _group(
@@ -247,24 +247,20 @@ def _group(
     for value, vector in zip(values, vectors.T, strict=True):
         if value > FITTED_RATIO**2:
             continue
-        weights = vector * np.sign(vector[np.argmax(np.abs(vector))])
-        weights[np.abs(weights) < SHOWN * np.abs(weights).max()] = 0.0
+        named = weights_of(range(len(members)), vector)
+        weights = np.zeros(len(members))
+        weights[list(named)] = list(named.values())
         weights /= np.linalg.norm(weights)
         deviation = float(np.sqrt(weights @ wide[np.ix_(members, members)] @ weights))
-        told.append(
-            Combination(
-                {names[k]: float(w) for k, w in zip(members, weights, strict=True) if w},
-                float(weights @ factors[members]), deviation,
-            )
-        )  # fmt: skip
+        each = {names[members[k]]: float(weights[k]) for k in named}
+        told.append(Combination(each, float(weights @ factors[members]), deviation))
     return Group(tuple(names[k] for k in members), tuple(told))
 
 
-def fitted_yaml(text: str, fitted: Sequence[Number], recordings: Sequence[str], out: Path) -> str:
+def fitted_yaml(text: str, fitted: Sequence[Number], recordings: Sequence[str]) -> str:
     """The robot's file with what was fitted, each number's deviation and source in a comment.
 
-    :param text: of the file before. ``out``: the file that it will be.
-    :raises PkmTwinError: numbers that no file may have: it could not be read again.
+    :param text: of the file before.
     """
     groups: dict[Keys, list[Number]] = {}
     for number in fitted:
@@ -290,14 +286,7 @@ def fitted_yaml(text: str, fitted: Sequence[Number], recordings: Sequence[str], 
             f"{'.'.join(str(k) for k in base[-2:])}: fitted from {source}, +- {spread}{unit} "
             f"(one standard deviation), was {was}{how}"
         )
-    made = edit_yaml(text, values, notes)
-    try:
-        robot_of_data(parse_yaml(made, str(out)), out.stem)
-    except ValueError as error:
-        raise PkmTwinError(
-            f"the fitted values are not a valid robot, so {out} is not written: {error}"
-        ) from None
-    return made
+    return edit_yaml(text, values, notes)
 
 
 def _value(base: Keys, numbers: Sequence[Number]) -> Any:

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pkm_twin.codegen.arrays import Array
-from pkm_twin.machine.graph import Graph
+from pkm_twin.machine.graph import Graph, limbs
 from pkm_twin.machine.places import keys_of
 
 LINES: Final = 10
@@ -95,15 +95,10 @@ class _Numbers:
 
     def limbs(self) -> list[list[tuple[str, int]]]:
         """Points by the limb they are on: what hangs together without base and platform."""
-        ends = {self.graph.platform, "base"}
-        group = {point: {b for b in self.bodies(point) if b not in ends} for point in self.points}
-        links = [{joint.inner, joint.outer} - ends for joint in self.graph.joints.values()]
-        links += [{rod.inner, rod.outer, rod.name} - ends for rod in self.graph.rods.values()]
-        merged: list[set[str]] = []
-        for link in links:
-            own = [one for one in merged if one & link]
-            merged = [one for one in merged if not one & link] + [set().union(link, *own)]
-        found = [[p for p, bodies in group.items() if bodies & one] for one in merged]
+        found = [
+            [point for point in self.points if set(self.bodies(point)) & set(limb)]
+            for limb in limbs(self.graph)
+        ]
         return [one for one in found if one]
 
     def point(self, point: tuple[str, int]) -> Array:

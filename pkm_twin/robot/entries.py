@@ -16,6 +16,7 @@ from pkm_twin.files import replace_file
 from pkm_twin.machine.formulas import PARAMETERS
 from pkm_twin.machine.machine_yaml import describe_machine_yaml, edit_yaml
 from pkm_twin.machine.places import given, has_entry, keys_of
+from pkm_twin.machine.strict_yaml import parse_yaml
 from pkm_twin.robot.catalogue import TREES, load, robot_of_data, robot_path
 from pkm_twin.robot.robot import Robot
 from pkm_twin.robot.robot_urdf import robot_description
@@ -97,10 +98,16 @@ def edited_yaml(robot: Robot, source: str, values: Mapping[str, Fitted | Chosen]
 
 
 def write_edited(path: Path, head: Sequence[str], text: str) -> None:
-    """Write a file with lines of comment at its head, whole or not at all.
+    """Write a robot's file with lines of comment at its head, whole or not at all.
 
-    :raises PkmTwinError: not writable.
+    :raises PkmTwinError: not writable, or numbers that no robot may have.
     """
+    try:
+        robot_of_data(parse_yaml(text, str(path)), path.stem)
+    except ValueError as error:
+        raise PkmTwinError(
+            f"the values are not a valid robot, so {path} is not written: {error}"
+        ) from None
     # A name in it may have anything in it, a new line too.
     whole = "".join(f"# {one_line(line, 2000)}\n" for line in head) + text
     try:

@@ -183,7 +183,7 @@ def fit(given: Fit) -> Report:
     ]
     names, (out, html) = [r.name for r in read], given.files.values()
     assert out is not None  # noqa: S101
-    fitted = fitted_yaml(text, result.numbers, names, out)
+    fitted = fitted_yaml(text, result.numbers, names)
     head = [
         *marks, f"{report.answer}.", f"Fitted from {', '.join(names)}.",
         *(f"{note}." for note in report.notes[len(marks) :]),
