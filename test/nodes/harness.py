@@ -23,6 +23,7 @@ from test.support.waiting import wait_until
 
 try:
     import rclpy
+    from diagnostic_msgs.msg import DiagnosticArray
     from rclpy.executors import SingleThreadedExecutor
 except ImportError:  # The tests of the pure cores run without ROS.
     rclpy = None
@@ -426,6 +427,55 @@ class Peer:
         self.executor.shutdown()
         self.node.destroy_node()
         rclpy.try_shutdown(context=self.context)
+
+
+class Running:
+    """A node in a process, and its topics below its name, seen from this side.
+
+    ``remaps``: what other topics of the node are called below that name; ``talk`` and ``hear``:
+    types of topics that this side sends and collects; ``options`` are those of the process.
+    """
+
+    def __init__(
+        self, peer, launch, module, name, *parameters, remaps, talk=None, hear=None, **options
+    ):
+        self.peer, self.name, self._last = peer, name, 0
+        peer.hear(DiagnosticArray, "/diagnostics")
+        for topic, kind in (hear or {}).items():
+            peer.hear(kind, f"/{name}/{topic}")
+        for topic, kind in (talk or {}).items():
+            peer.talk(kind, f"/{name}/{topic}")
+        self._start = lambda: launch(
+            module, *parameters, arguments=renamed(name, **remaps), **options
+        )
+        self.process = self._start()
+
+    def received(self, topic):
+        return self.peer.received(f"/{self.name}/{topic}")
+
+    def send(self, topic, message):
+        self.peer.send(f"/{self.name}/{topic}", message)
+
+    def stamp(self, step=SECOND // 1000):
+        """The present, and later than every stamp before by a step, ns."""
+        self._last = max(self.peer.now(), self._last + step)
+        return self._last
+
+    def until(self, condition, repeat=None, **options):
+        """As the peer's, as long as the process lives."""
+
+        def again():
+            assert self.process.alive(), self.process.output
+            repeat()
+
+        return self.peer.until(condition, repeat=repeat and again, **options)
+
+    def diagnostics(self, condition=lambda array: True):
+        return self.peer.diagnostics(f"/{self.name}", condition)
+
+    def call(self, kind, service, **fields):
+        """The answer of one of the node's services."""
+        return self.peer.call(kind, f"/{self.name}/{service}", kind.Request(**fields))
 
 
 def one_line_refusal(process):

@@ -9,7 +9,7 @@ import pytest
 from delta_dynamics import inverse_dynamics
 from pkm_twin import robot_names
 from test.nodes.harness import (
-    SECOND,
+    Running,
     counts_of,
     stamp_of,
     text_of,
@@ -27,7 +27,7 @@ from rclpy.qos import QoSProfile
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
-from test.nodes.twin import NAMES, ROBOT, Q, launched, state
+from test.nodes.twin import MAKE, NAMES, ROBOT, Q, launched, state
 
 GATE = "delta_dynamics.nodes.gate"
 DEADLINE = 1.0
@@ -36,45 +36,36 @@ SETTINGS = (f"deadline:={DEADLINE}", "recovery_count:=2")
 ZEROS = [0.0, 0.0, 0.0]
 
 
-class Gated:
+class Gated(Running):
     """A running gate, its commands, and a source of torques of this process."""
 
     def __init__(self, peer, launch, name, *parameters):
-        self.peer, self.name, self._launch = peer, name, launch
-        self._parameters = (*SETTINGS, *parameters)
-        peer.hear(Float64MultiArray, f"/{name}/commands")
-        peer.hear(JointState, f"/{name}/commands_stamped")
+        remaps = {"joint_states": "states", "delta_dynamics/joint_torques": "torques"}
+        hear = {"commands": Float64MultiArray, "commands_stamped": JointState}
+        super().__init__(
+            peer, launch, GATE, name, *SETTINGS, *parameters, remaps=remaps, hear=hear, fresh=True
+        )
         offered = QoSProfile(depth=10)
         offered.deadline = offered.lifespan = Duration(seconds=DEADLINE)
         self._torques = peer.node.create_publisher(JointState, f"/{name}/torques", offered)
-        self._last = 0
-        self.start()
 
     def start(self):
-        remap = ("-r", f"__node:={self.name}", "-r", f"joint_states:=/{self.name}/states")
-        remap += ("-r", f"delta_dynamics/joint_torques:=/{self.name}/torques")
-        self.process = self._launch(GATE, *self._parameters, arguments=remap, fresh=True)
+        self.process = self._start()
 
     @property
     def commands(self):
-        return [list(m.data) for m in self.peer.received(f"/{self.name}/commands")]
+        return [list(m.data) for m in self.received("commands")]
 
-    def send(self, effort):
-        self._last = max(self.peer.now(), self._last + 1)
-        message = JointState(name=list(NAMES), effort=list(effort))
-        message.header.stamp.sec, message.header.stamp.nanosec = divmod(self._last, SECOND)
-        self._torques.publish(message)
+    def torque(self, effort):
+        stamp = self.stamp(1)
+        self._torques.publish(MAKE.joint_state(NAMES, (), effort=list(effort), stamp=stamp))
 
     def until_last(self, command, repeat=None):
         """Wait until the newest command is this one."""
         self.peer.until(lambda: self.commands[-1:] == [list(command)], repeat=repeat)
 
-    def diagnostics(self, condition=lambda array: True):
-        return self.peer.diagnostics(f"/{self.name}", condition)
-
     def change(self, transition):
-        request = ChangeState.Request(transition=Transition(id=transition))
-        assert self.peer.call(ChangeState, f"/{self.name}/change_state", request).success
+        assert self.call(ChangeState, "change_state", transition=Transition(id=transition)).success
 
 
 @pytest.fixture(scope="module")
@@ -99,7 +90,7 @@ def test_zeros_come_before_the_first_torque(gated):
 
 def test_torques_are_forwarded_and_silence_makes_them_zeros(gated):
     effort = (0.5, -0.25, 1.0)
-    gated.until_last(effort, lambda: gated.send(effort))
+    gated.until_last(effort, lambda: gated.torque(effort))
     gated.diagnostics(lambda a: values_of(a)["controllers"] == "1")
     told = gated.peer.received(f"/{gated.name}/commands_stamped")
     gated.peer.until(lambda: effort in [tuple(message.effort) for message in told])
@@ -111,8 +102,8 @@ def test_torques_are_forwarded_and_silence_makes_them_zeros(gated):
 
 def test_a_bad_torque_closes_the_gate(gated):
     effort = (0.5, 0.5, 0.5)
-    gated.until_last(effort, lambda: gated.send(effort))
-    gated.send((np.nan, 0.0, 0.0))
+    gated.until_last(effort, lambda: gated.torque(effort))
+    gated.torque((np.nan, 0.0, 0.0))
     gated.until_last(ZEROS)
     array = gated.diagnostics(lambda a: "not finite" in counts_of(a, "closed"))
     assert counts_of(array, "torques rejected")["not finite"] == 1
@@ -121,20 +112,20 @@ def test_a_bad_torque_closes_the_gate(gated):
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_the_last_word_of_a_gate_that_is_ended_is_not_a_torque(gated, number):
     effort = (1.0, 2.0, 3.0)
-    gated.until_last(effort, lambda: gated.send(effort))
+    gated.until_last(effort, lambda: gated.torque(effort))
     # Torques go on, so that nothing but the end itself sends the zeros.
     gated.process.process.send_signal(number)
-    gated.peer.until(lambda: not gated.process.alive(), repeat=lambda: gated.send(effort))
+    gated.peer.until(lambda: not gated.process.alive(), repeat=lambda: gated.torque(effort))
     assert gated.process.wait() == 0, gated.process.output
     assert "Traceback" not in gated.process.output
     gated.until_last(ZEROS)
     gated.start()
-    gated.until_last(effort, lambda: gated.send(effort))
+    gated.until_last(effort, lambda: gated.torque(effort))
 
 
 def test_a_new_gate_takes_back_what_a_killed_one_has_left(gated):
     effort = (1.0, 2.0, 3.0)
-    gated.until_last(effort, lambda: gated.send(effort))
+    gated.until_last(effort, lambda: gated.torque(effort))
     gated.process.process.kill()
     gated.process.process.wait()
     gated.peer.spin()
@@ -145,16 +136,16 @@ def test_a_new_gate_takes_back_what_a_killed_one_has_left(gated):
 
 def test_an_inactive_gate_has_said_zeros_and_is_silent(gated):
     effort = (1.0, 2.0, 3.0)
-    gated.until_last(effort, lambda: gated.send(effort))
+    gated.until_last(effort, lambda: gated.torque(effort))
     gated.change(Transition.TRANSITION_DEACTIVATE)
     gated.until_last(ZEROS)
     gated.peer.received("/gate/commands").clear()
-    gated.send(effort)
+    gated.torque(effort)
     assert "inactive" in text_of(gated.diagnostics())
     assert gated.commands == []
     gated.change(Transition.TRANSITION_ACTIVATE)
     gated.until_last(ZEROS)
-    gated.until_last(effort, lambda: gated.send(effort))
+    gated.until_last(effort, lambda: gated.torque(effort))
 
 
 def test_a_killed_twin_leaves_zeros(heard, launch):

@@ -51,9 +51,9 @@ def twin(running):
 
 
 def test_the_start_line_names_robot_domain_and_range(twin, domain):
-    first = twin.process.output.splitlines()[0]
-    assert "robot delta_cu (delta), joints arm_1, arm_2, arm_3" in first
-    assert f"domain {domain.number}, discovery LOCALHOST" in first
+    joints = "robot delta_cu (delta), joints arm_1, arm_2, arm_3"
+    (line,) = [line for line in twin.process.output.splitlines() if joints in line]
+    assert f"domain {domain.number}, discovery LOCALHOST" in line
 
 
 class TestTrajectories:

@@ -7,12 +7,11 @@ import numpy as np
 import pytest
 
 from delta_dynamics import inverse_dynamics, reactions
-from test.nodes.harness import SECOND, Maker, Ros, counts_of, stamp_of, values_of
+from test.nodes.harness import SECOND, Maker, Ros, Running, counts_of, stamp_of, values_of
 from test.support.robots import load
 
 pytest.importorskip("rclpy")
 
-from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import InertiaStamped, PointStamped, WrenchStamped
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool, String
@@ -25,6 +24,7 @@ from test.support.robots import often, parameters_of
 ROBOT = load("delta_cu")
 PARAMETERS = ("estimate_payload:=true", "observe_wrench:=true", "stale_after:=600.0")
 MAKE = Maker(Ros())
+REST = np.zeros(3)
 OUTPUTS = {
     "/delta_dynamics/payload": InertiaStamped,
     "/delta_dynamics/payload_deviation": InertiaStamped,
@@ -200,44 +200,7 @@ def test_a_file_that_says_nothing_of_its_efforts_is_warned_of():
     assert estimates.diagnose()["model uncertainty"] == "robot file"
 
 
-MODULE = "delta_dynamics.nodes.twin"
-Q = np.array([0.2, 0.3, 0.1])
-NAME = "reacting"
-
-
-def test_every_joint_has_its_wrench_where_asked_for(peer, launch):
-    """A machine that stands still: the wrenches of statics, under each joint's name."""
-    make = Maker(Ros())
-    names = reactions(ROBOT, Q, np.zeros(3), np.zeros(3)).names
-    topics = {name: f"/{NAME}/reactions/{name.replace(' ', '_')}" for name in names}
-    peer.talk(JointState, f"/{NAME}/states")
-    for topic in topics.values():
-        peer.hear(WrenchStamped, topic)
-    launch(
-        MODULE,
-        "publish_reactions:=true",
-        "reactions_rate:=20.0",
-        "base_frame:=floor",
-        arguments=["-r", f"__node:={NAME}", "-r", f"joint_states:=/{NAME}/states"],
-    )
-
-    def send():
-        state = make.joint_state(ROBOT.joint_names, Q.tolist(), [0.0] * 3, stamp=peer.now())
-        peer.send(f"/{NAME}/states", state)
-
-    peer.until(lambda: all(peer.received(t) for t in topics.values()), repeat=send)
-    expected = reactions(ROBOT, Q, np.zeros(3), np.zeros(3))
-    stamps = set()
-    for k, name in enumerate(names):
-        message = peer.received(topics[name])[-1]
-        assert message.header.frame_id == "floor"
-        stamps.add(stamp_of(message))
-        force, torque = message.wrench.force, message.wrench.torque
-        got = [force.x, force.y, force.z, torque.x, torque.y, torque.z]
-        np.testing.assert_allclose(got, expected.wrenches[k], atol=1e-9)
-    assert stamps
-
-
+Q = [0.2, 0.3, 0.1]
 SINGULAR = """
 import delta_dynamics.nodes.twin as node
 from pkm_twin.errors import SingularityError
@@ -251,63 +214,65 @@ raise SystemExit(node.run(node.NODE))
 """
 
 
-def test_a_state_without_reactions_has_its_torque(peer, launch):
-    """In a constraint singularity, where the parameters let the stream pass, reactions are none."""
-    make, name = Maker(Ros()), "loose"
-    peer.talk(JointState, f"/{name}/states")
-    peer.hear(JointState, f"/{name}/joint_torques")
-    peer.hear(DiagnosticArray, "/diagnostics")
-    parameters = ("publish_reactions:=true", "reactions_rate:=1000.0", "recovery_count:=1")
-    remap = ["-r", f"__node:={name}", "-r", f"joint_states:=/{name}/states"]
-    process = launch(None, *parameters, code=SINGULAR, arguments=remap)
-    q = [0.125, 0.3, 0.1]
+def test_every_joint_has_its_wrench_and_a_state_without_one_has_its_torque(peer, launch):
+    """Of statics, under each joint's name; in a constraint singularity reactions are none."""
+    expected = reactions(ROBOT, Q, REST, REST)
+    topics = [f"reactions/{name.replace(' ', '_')}" for name in expected.names]
+    node = Running(
+        peer, launch, None, "reacting", "publish_reactions:=true", "reactions_rate:=1000.0",
+        "recovery_count:=1", "base_frame:=floor", code=SINGULAR, remaps={"joint_states": "states"},
+        talk={"states": JointState},
+        hear=dict.fromkeys(topics, WrenchStamped) | {"joint_torques": JointState},
+    )  # fmt: skip
 
-    def send():
+    def send(q):
         for _ in range(30):
-            state = make.joint_state(ROBOT.joint_names, q, [0.0] * 3, stamp=peer.now())
-            peer.send(f"/{name}/states", state)
+            node.send("states", MAKE.joint_state(ROBOT.joint_names, q, REST, stamp=node.stamp()))
 
-    peer.until(lambda: len(peer.received(f"/{name}/joint_torques")) > 5, repeat=send)
-    peer.until(lambda: "no reactions or estimates: " in process.output)
-    values = values_of(peer.diagnostics(f"/{name}"))
+    node.until(lambda: all(map(node.received, topics)), repeat=lambda: send(Q))
+    for topic, wrench in zip(topics, expected.wrenches, strict=True):
+        message = node.received(topic)[-1]
+        assert message.header.frame_id == "floor" and stamp_of(message)
+        force, torque = message.wrench.force, message.wrench.torque
+        got = [force.x, force.y, force.z, torque.x, torque.y, torque.z]
+        np.testing.assert_allclose(got, wrench, atol=1e-9)
+    torques = node.received("joint_torques")
+    node.until(
+        lambda: "no reactions or estimates: " in node.process.output,
+        repeat=lambda: send([0.125, *Q[1:]]),
+    )
+    torques.clear()
+    node.until(lambda: len(torques) > 5, repeat=lambda: send([0.125, *Q[1:]]))
+    values = values_of(node.diagnostics())
     assert values["exceptions"] == "0"
     assert "stopped: exception" not in values
 
 
 HEAD = load("prru")
 HEAD_Q = HEAD.inverse(HEAD.home())
-REST = np.zeros(3)
 WRENCH = [30.0, -20.0, -100.0, 3.0, -2.0, 1.0]
 MEASURED = [100.0, 110.0, 120.0]
 
 
 def test_torque_residual_and_stop(peer, launch):
     """At rest the wrench is borne exactly; without it the stream stops."""
-    remap = ("joint_states:=/bearing/states", "wrench:=/bearing/wrench", "__node:=bearing")
-    arguments = [word for pair in remap for word in ("-r", pair)]
-    process = launch(
-        "delta_dynamics.nodes.twin", "mechanism:=prru", "use_wrench:=true",
+    node = Running(
+        peer, launch, "delta_dynamics.nodes.twin", "bearing", "mechanism:=prru", "use_wrench:=true",
         "missing_wrench_policy:=stop", "max_wrench_age:=1.0", "stale_after:=5.0",
         "differentiator.window:=4", "recovery_count:=1",
-        arguments=arguments,
+        remaps={"joint_states": "states", "wrench": "wrench"},
+        talk={"states": JointState, "wrench": WrenchStamped},
+        hear=dict.fromkeys(("joint_torques", "torque_residual"), JointState),
     )  # fmt: skip
-    peer.hear(DiagnosticArray, "/diagnostics")
-    for topic in ("joint_torques", "torque_residual"):
-        peer.hear(JointState, f"/bearing/{topic}")
-    peer.talk(JointState, "/bearing/states")
-    peer.talk(WrenchStamped, "/bearing/wrench")
     peer.until(peer.matched)
-    torques, residuals = (
-        peer.received(f"/bearing/{name}") for name in ("joint_torques", "torque_residual")
-    )
+    torques, residuals = map(node.received, ("joint_torques", "torque_residual"))
 
     def send(wrench=True):
-        assert process.alive(), process.output
         stamp = peer.now()
         if wrench:
-            peer.send("/bearing/wrench", MAKE.wrench(WRENCH, stamp))
+            node.send("wrench", MAKE.wrench(WRENCH, stamp))
         names = HEAD.joint_names
-        peer.send("/bearing/states", MAKE.joint_state(names, HEAD_Q, REST, MEASURED, stamp))
+        node.send("states", MAKE.joint_state(names, HEAD_Q, REST, MEASURED, stamp))
 
     rotation = HEAD.platform(HEAD_Q)[1]
     fixed = np.concatenate((rotation @ WRENCH[:3], rotation @ WRENCH[3:]))
@@ -319,22 +284,22 @@ def test_torque_residual_and_stop(peer, launch):
         right = {stamp_of(m) for m in torques if np.allclose(m.effort, exact, atol=1e-6)}
         return next((m for m in residuals if stamp_of(m) in right), None)
 
-    residual = peer.until(borne, repeat=send)
+    residual = node.until(borne, repeat=send)
     assert np.allclose(residual.effort, MEASURED - exact, atol=1e-6)
 
     def stopped():
         # A state that was heard before the first wrench is a warning of the same name.
-        array = peer.diagnostics("/bearing")
+        array = node.diagnostics()
         status = array.status[0]
         return array if status.level == b"\x02" and "no wrench" in status.message else None
 
-    array = peer.until(stopped, repeat=lambda: send(wrench=False))
+    array = node.until(stopped, repeat=lambda: send(wrench=False))
     assert counts_of(array, "stopped")["no wrench"] >= 1
     assert int(values_of(array)["wrenches accepted"]) > 3
     # What is refused is counted, and no wrench.
-    peer.until(
-        lambda: counts_of(peer.diagnostics("/bearing"), "wrenches rejected").get("future stamp"),
-        repeat=lambda: peer.send("/bearing/wrench", MAKE.wrench(WRENCH, peer.now() + 600 * SECOND)),
+    node.until(
+        lambda: counts_of(node.diagnostics(), "wrenches rejected").get("future stamp"),
+        repeat=lambda: node.send("wrench", MAKE.wrench(WRENCH, peer.now() + 600 * SECOND)),
     )
     torques.clear()
-    peer.until(lambda: torques, repeat=send)
+    node.until(lambda: torques, repeat=send)

@@ -10,7 +10,7 @@ from pkm_twin.machine import rotations
 from pkm_twin.robot.robot_urdf import robot_urdf
 from pkm_twin.state.scene import Scales, Scene
 from pkm_twin.state.state import MachineState
-from test.nodes.harness import SECOND, Maker, Ros, counts_of, stamp_of, values_of
+from test.nodes.harness import SECOND, Maker, Ros, Running, counts_of, stamp_of, values_of
 from test.nodes.test_machine_state import loaded
 from test.support.robots import load
 
@@ -200,23 +200,20 @@ def test_bad_messages_are_counted_and_publish_nothing(answers, node, peer):
 
 def test_a_rigid_robot(launch, peer):
     """Geometry alone where nothing is elastic."""
-    remap = ("-r", "__node:=rigid", "-r", "joint_states:=/rigid/states", "-r", "wrench:=/rigid/w")
-    rigid = launch(MODULE, "mechanism:=five_bar", arguments=remap)
     robot = load("five_bar")
     q = robot.inverse(robot.home())
-    peer.talk(JointState, "/rigid/states")
-    peer.hear(MarkerArray, "/rigid/markers")
-    peer.hear(TwistStamped, "/rigid/twist")
-    peer.hear(JointState, "/rigid/joint_states")
-    received = peer.received("/rigid/markers")
+    node = Running(
+        peer, launch, MODULE, "rigid", "mechanism:=five_bar", talk={"states": JointState},
+        remaps={"joint_states": "states", "wrench": "w"},
+        hear={"markers": MarkerArray, "twist": TwistStamped, "joint_states": JointState},
+    )  # fmt: skip
 
     def ask():
-        assert rigid.alive(), rigid.output
-        peer.send("/rigid/states", MAKE.joint_state(robot.joint_names, q, stamp=peer.now()))
+        node.send("states", MAKE.joint_state(robot.joint_names, q, stamp=peer.now()))
 
-    peer.until(lambda: received, repeat=ask)
-    assert {marker.ns for marker in received[-1].markers} == {"bars"}
+    markers = node.until(lambda: node.received("markers"), repeat=ask)[-1].markers
+    assert {marker.ns for marker in markers} == {"bars"}
     # Without velocities there are none, never zeros.
-    assert not peer.received("/rigid/twist")
-    joints = peer.until(lambda: peer.received("/rigid/joint_states"), repeat=ask)[-1]
+    assert not node.received("twist")
+    joints = node.until(lambda: node.received("joint_states"), repeat=ask)[-1]
     assert len(joints.position) == len(joints.name) and not joints.velocity

@@ -9,14 +9,13 @@ import pytest
 from pkm_twin.machine import rotations
 from pkm_twin.streams.wrench import WrenchSettings
 from stiffness_monitor.monitor import Monitor
-from test.nodes.harness import SECOND, Maker, Plain, Ros, counts_of
+from test.nodes.harness import SECOND, Maker, Plain, Ros, Running, counts_of
 from test.support.robots import load
 
 pytest.importorskip("rclpy", exc_type=ImportError)
 if find_spec("tf2_ros") is None:
     pytest.skip("tf2_ros is not installed", allow_module_level=True)
 
-from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import TransformStamped, WrenchStamped
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import JointState
@@ -39,29 +38,22 @@ def answer(message):
 
 
 def test_the_transform_is_the_fixed_mount(peer, launch):
-    remap = ("joint_states:=/found/states", "wrench:=/found/wrench", "__node:=found")
-    arguments = [word for pair in remap for word in ("-r", pair)]
-    process = launch(
-        "stiffness_monitor.node", "mechanism:=upr_rpu", "wrench_frame:=ft_sensor", "use_tf:=true",
-        "max_state_age:=1.0", arguments=arguments,
+    node = Running(
+        peer, launch, "stiffness_monitor.node", "found", "mechanism:=upr_rpu",
+        "wrench_frame:=ft_sensor", "use_tf:=true", "max_state_age:=1.0",
+        remaps={"joint_states": "states", "wrench": "wrench"},
+        talk={"states": JointState, "wrench": WrenchStamped}, hear={"deflection": TransformStamped},
     )  # fmt: skip
-    make = Maker(Ros())
-    peer.hear(DiagnosticArray, "/diagnostics")
-    peer.hear(TransformStamped, "/found/deflection")
-    peer.talk(JointState, "/found/states")
-    peer.talk(WrenchStamped, "/found/wrench")
-    received = peer.received("/found/deflection")
+    make, received = Maker(Ros()), node.received("deflection")
 
     def send():
-        assert process.alive(), process.output
         stamp = peer.now()
-        peer.send("/found/states", make.joint_state(ROBOT.joint_names, Q, stamp=stamp))
-        peer.send("/found/wrench", make.wrench(WRENCH, stamp, "ft_sensor"))
+        node.send("states", make.joint_state(ROBOT.joint_names, Q, stamp=stamp))
+        node.send("wrench", make.wrench(WRENCH, stamp, "ft_sensor"))
 
     # Without a transform every wrench is refused, and counted.
-    peer.until(
-        lambda: counts_of(peer.diagnostics("/found"), "wrenches rejected").get("transform"),
-        repeat=send,
+    node.until(
+        lambda: counts_of(node.diagnostics(), "wrenches rejected").get("transform"), repeat=send
     )
     assert not received
     latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -69,7 +61,7 @@ def test_the_transform_is_the_fixed_mount(peer, launch):
     turn = rotations.to_quaternion(rotations.from_rpy(np.array(RPY)))
     mount = transform(peer.now(), "platform", "ft_sensor", np.array(XYZ), turn)
     static.publish(TFMessage(transforms=[mount]))
-    peer.until(lambda: received, repeat=send)
+    node.until(lambda: received, repeat=send)
     peer.node.destroy_publisher(static)
     message = received[-1]
     assert (message.header.frame_id, message.child_frame_id) == ("platform", "platform_deflected")

@@ -13,8 +13,8 @@ from test.nodes.harness import (
     SECOND,
     Maker,
     Ros,
+    Running,
     counts_of,
-    renamed,
     stamp_of,
     text_of,
     values_of,
@@ -49,28 +49,17 @@ STAMPED = ("compliance_stamped", "strain_energy_stamped", "natural_frequencies_s
 ALL = OUTPUTS | {"natural_frequencies": Float64MultiArray} | dict.fromkeys(STAMPED, JointState)
 
 
-class Monitor:
+class Monitor(Running):
     """A running node and its topics, seen from this side."""
 
     def __init__(self, peer, launch, name, *parameters, robot=ROBOT, q=Q, heard=OUTPUTS, **options):
-        self.peer, self.name, self.robot, self.q, self._heard = peer, name, robot, q, heard
         own = {"joint_states": "states", "wrench": "wrench"}
         own |= {topic: topic for topic in ("setpoint", "torques")}
-        self.process = launch(MODULE, *parameters, arguments=renamed(name, **own), **options)
-        peer.hear(DiagnosticArray, "/diagnostics")
-        peer.talk(JointState, f"/{name}/states")
-        peer.talk(WrenchStamped, f"/{name}/wrench")
-        for topic, kind in heard.items():
-            peer.hear(kind, f"/{name}/{topic}")
-        self._last = 0
-
-    def received(self, topic):
-        return self.peer.received(f"/{self.name}/{topic}")
-
-    def stamp(self):
-        """The present, and later than every stamp before."""
-        self._last = max(self.peer.now(), self._last + STEP)
-        return self._last
+        talk = {"states": JointState, "wrench": WrenchStamped}
+        super().__init__(
+            peer, launch, MODULE, name, *parameters, remaps=own, talk=talk, hear=heard, **options
+        )
+        self.robot, self.q, self._heard = robot, q, heard
 
     def joints(self, q, stamp=None, **fields):
         """A joint state in another order than the robot's."""
@@ -81,24 +70,24 @@ class Monitor:
 
     def send_state(self, stamp=None):
         assert self.process.alive(), self.process.output
-        self.peer.send(f"/{self.name}/states", self.joints(self.q, stamp))
+        self.send("states", self.joints(self.q, stamp))
 
     def send_wrench(self, values=WRENCH, frame="platform", stamp=None):
         stamp = self.stamp() if stamp is None else stamp
-        self.peer.send(f"/{self.name}/wrench", MAKE.wrench(map(float, values), stamp, frame))
+        self.send("wrench", MAKE.wrench(map(float, values), stamp, frame))
         return stamp
 
-    def send(self):
+    def send_both(self):
         self.send_state()
         self.send_wrench()
 
     def run(self, seconds, send=True):
         end = self.peer.now() + round(seconds * SECOND)
-        repeat = self.send if send else None
+        repeat = self.send_both if send else None
         self.peer.until(lambda: self.peer.now() > end, seconds + 30.0, repeat)
 
     def ready(self):
-        self.peer.until(lambda: all(map(self.received, self._heard)), repeat=self.send)
+        self.peer.until(lambda: all(map(self.received, self._heard)), repeat=self.send_both)
         return self
 
     def last(self, topic):
@@ -128,9 +117,6 @@ class Monitor:
 
         stamps = []
         return self.peer.until(answered, repeat=ask)
-
-    def diagnostics(self, condition=lambda array: True):
-        return self.peer.diagnostics(f"/{self.name}", condition)
 
     def rejects(self):
         return counts_of(self.diagnostics(), "wrenches rejected")
@@ -275,7 +261,7 @@ class TestRejects:
 class TestFrequencies:
     def test_of_the_latest_pose_at_most_at_their_rate(self, platform):
         told = platform.received("natural_frequencies")
-        platform.peer.until(lambda: told, repeat=platform.send)
+        platform.peer.until(lambda: told, repeat=platform.send_both)
         (dim,) = told[-1].layout.dim
         assert (dim.label, dim.size, dim.stride) == ("frequency", 6, 6)
         assert np.allclose(told[-1].data, natural_frequencies(ROBOT, POSE), rtol=1e-9)

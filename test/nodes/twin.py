@@ -4,7 +4,6 @@
 import contextlib
 
 import numpy as np
-from diagnostic_msgs.msg import DiagnosticArray
 from rcl_interfaces.msg import Parameter as ParameterMessage
 from rcl_interfaces.srv import GetParameters, SetParametersAtomically
 from rclpy.parameter import Parameter
@@ -12,7 +11,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 from trajectory_msgs.msg import JointTrajectory
 
-from test.nodes.harness import SECOND, Maker, Ros, renamed, stamp_of, values_of
+from test.nodes.harness import SECOND, Maker, Ros, Running, stamp_of, values_of
 from test.support.robots import load
 
 MODULE = "delta_dynamics.nodes.twin"
@@ -28,36 +27,23 @@ COMMON = (
     "on_stop:=nothing",
 )
 Q = np.array([0.1, 0.2, 0.3])
+TALK = {"joint_trajectory": JointTrajectory, "states": JointState}
+HEAR = {
+    "joint_trajectory_ff": JointTrajectory, "joint_torques": JointState,
+    "torque_residual": JointState, "commands": Float64MultiArray,
+}  # fmt: skip
 
 
 def launched(peer, launch, name, *parameters, **options):
     """A node of this name in a process, its topics not yet connected."""
-    peer.hear(DiagnosticArray, "/diagnostics")
-    remaps = renamed(name, joint_states="states")
-    process = launch(MODULE, *COMMON, *parameters, arguments=remaps, **options)
-    return Twin(peer, process, name)
+    return Twin(
+        peer, launch, MODULE, name, *COMMON, *parameters,
+        remaps={"joint_states": "states"}, talk=TALK, hear=HEAR, **options,
+    )  # fmt: skip
 
 
-class Twin:
-    """A running node and its topics, seen from this side."""
-
-    def __init__(self, peer, process, name):
-        self.peer, self.process, self.name = peer, process, name
-        peer.talk(JointTrajectory, f"/{name}/joint_trajectory")
-        peer.talk(JointState, f"/{name}/states")
-        peer.hear(JointTrajectory, f"/{name}/joint_trajectory_ff")
-        for topic in ("joint_torques", "torque_residual"):
-            peer.hear(JointState, f"/{name}/{topic}")
-        peer.hear(Float64MultiArray, f"/{name}/commands")
-        self._last = 0
-
-    def received(self, topic):
-        return self.peer.received(f"/{self.name}/{topic}")
-
-    def stamp(self, step=STEP):
-        """The present, and later than every stamp before by a step, ns."""
-        self._last = max(self.peer.now(), self._last + step)
-        return self._last
+class Twin(Running):
+    """A running node delta_dynamics."""
 
     def begin(self):
         """A stamp for a trajectory: so late that none is over before it is looked at, ns."""
@@ -66,14 +52,14 @@ class Twin:
     def ask(self, message):
         """Send a trajectory and wait for its answer: all answers up to it."""
         received = self.received("joint_trajectory_ff")
-        self.peer.send(f"/{self.name}/joint_trajectory", message)
+        self.send("joint_trajectory", message)
         self.peer.until(lambda: any(stamp_of(m) == stamp_of(message) for m in received))
         answers = list(received)
         received.clear()
         return answers
 
     def send_state(self, message):
-        self.peer.send(f"/{self.name}/states", message)
+        self.send("states", message)
 
     def ask_anew(self):
         """Wait for the answer to a trajectory; after each second without one a new one is sent.
@@ -86,7 +72,7 @@ class Twin:
         def ask():
             message = trajectory(stamp=self.begin())
             sent.append(stamp_of(message))
-            self.peer.send(f"/{self.name}/joint_trajectory", message)
+            self.send("joint_trajectory", message)
 
         self.peer.until(
             lambda: any(stamp_of(m) in sent[-1:] for m in received), repeat=ask, every=1.0
@@ -97,12 +83,11 @@ class Twin:
         """Wait until all topics are connected both ways."""
 
         def repeat():
-            assert self.process.alive(), self.process.output
-            self.peer.send(f"/{self.name}/joint_trajectory", trajectory(stamp=self.begin()))
+            self.send("joint_trajectory", trajectory(stamp=self.begin()))
             self.send_state(state(stamp=self.stamp(), effort=(0.0, 0.0, 0.0)))
 
         topics = ("joint_trajectory_ff", "joint_torques", "torque_residual", "commands")
-        self.peer.until(lambda: all(self.received(t) for t in topics), repeat=repeat)
+        self.until(lambda: all(self.received(t) for t in topics), repeat=repeat)
         self.settle()
         return self
 
@@ -136,10 +121,6 @@ class Twin:
         received = self.received(topic)
         self.peer.until(lambda: any(stamp_of(m) == stamps[-1] for m in received))
         return [m for m in received if stamp_of(m) >= stamps[0]]
-
-    def call(self, kind, service, **fields):
-        """The answer of one of the node's services."""
-        return self.peer.call(kind, f"/{self.name}/{service}", kind.Request(**fields))
 
     def set_to(self, parameters):
         """Set parameters, given as messages, atomically."""
@@ -175,9 +156,6 @@ class Twin:
         zero = [(0.0, 0.0, 0.0)]
         (answer,) = self.ask(MAKE.trajectory(NAMES, [SECOND], rows, zero, zero, self.begin()))
         return np.array(answer.points[0].effort)
-
-    def diagnostics(self, condition=lambda array: True):
-        return self.peer.diagnostics(f"/{self.name}", condition)
 
     def at_rest(self):
         """Diagnostics after which nothing more waits: two seconds of them with the same count.
