@@ -322,6 +322,11 @@ class _Fork:
         self.send_signal(signal.SIGKILL)
 
 
+def answers(array):
+    """Whether a node's diagnostics are of one that has loaded its programs."""
+    return not array.status[0].message.startswith("loading or compiling")
+
+
 class Peer:
     """The other side of the topics: a node of this process that sends and collects."""
 
@@ -374,7 +379,7 @@ class Peer:
         """Every publisher has a subscriber."""
         return all(p.get_subscription_count() >= 1 for p in self._publishers.values())
 
-    def diagnostics(self, node, condition=lambda array: True):
+    def diagnostics(self, node, condition=answers):
         """The first diagnostics that a node, by its full name, sends from now on and that meet
         the condition.
         """
@@ -470,7 +475,7 @@ class Running:
 
         return self.peer.until(condition, repeat=repeat and again, **options)
 
-    def diagnostics(self, condition=lambda array: True):
+    def diagnostics(self, condition=answers):
         return self.peer.diagnostics(f"/{self.name}", condition)
 
     def call(self, kind, service, **fields):
