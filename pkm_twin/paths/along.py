@@ -85,17 +85,33 @@ def _moving(m: Recording) -> Array:
     return qd if m.still is None else moving_rates(qd, m.still, friction_reach(m.robot))
 
 
-def bend_per_feed(robot: Robot, force: float, q: Array, way: Array) -> Array:
-    """Deflection of the reference point per feed, m per m/s, shape (p,).
+@dataclass(frozen=True)
+class SoftCut:
+    """A cut whose force is proportional to the feed and against the motion.
 
-    :param force: of the cut per feed, against the motion, N per m/s.
-    :param q: joint positions (p, n); ``way``: directions of the motion (p, 3), base axes.
-    :raises ParameterError: a robot without elastic members.
+    ``force``: N per m/s; ``tolerance``: most deflection of the reference point, m; ``feed``:
+    programmed, m/s.
     """
-    from stiffness_monitor import platform_response
 
-    matrix = platform_response(robot, q, np.zeros(6)).compliance[..., :3, :3]
-    return np.asarray(force * np.linalg.norm(matrix @ way[..., None], axis=(-2, -1)))
+    robot: Robot
+    force: float
+    tolerance: float
+    feed: float
+
+    def bends(self, q: Array, way: Array) -> Array:
+        """Deflection of the reference point per feed, m per m/s, shape (p,).
+
+        :param q: joint positions (p, n); ``way``: directions of the motion (p, 3), base axes.
+        :raises ParameterError: a robot without elastic members.
+        """
+        from stiffness_monitor import platform_response
+
+        matrix = platform_response(self.robot, q, np.zeros(6)).compliance[..., :3, :3]
+        return np.asarray(self.force * np.linalg.norm(matrix @ way[..., None], axis=(-2, -1)))
+
+    def slowdown(self, q: Array, way: Array) -> Array:
+        """What divides the feed so that the deflection stays within the tolerance, (p,)."""
+        return np.maximum(1.0, self.feed / self.tolerance * self.bends(q, way))
 
 
 def torque_table(m: Recording, progress: Callable[[int], None] | None = None) -> dict[str, Array]:

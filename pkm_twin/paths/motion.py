@@ -277,6 +277,20 @@ class TimedPath:
         return self.sample(self._points)
 
     @cached_property
+    def peaks(self) -> dict[str, dict[str, dict[str, Any]]]:
+        """Largest amounts of each joint: velocity, acceleration, effort, with their units."""
+        robot, fine, peaks = self.robot, self.fine, {}
+        for i, joint in enumerate(robot.joint_names):
+            unit = robot.joint_units[i]
+            values = [("velocity", fine.qd, f"{unit}/s"), ("acceleration", fine.qdd, f"{unit}/s2")]
+            if fine.effort is not None:
+                values.append(("effort", fine.effort, robot.effort_units[i]))
+            peaks[joint] = {
+                word: {"value": float(np.abs(v[:, i]).max()), "unit": u} for word, v, u in values
+            }
+        return peaks
+
+    @cached_property
     def used(self) -> Array:
         """Used part of every limit at the points of ``fine``, shape (k, 4 n + 1)."""
         s = self.fine

@@ -23,6 +23,8 @@ from pkm_twin.errors import ParameterError, UnknownNameError
 from pkm_twin.paths.joint_path import check_positions, velocity_of
 from pkm_twin.paths.motion import Moments, Samples, TimedPath, peaks
 from pkm_twin.robot.derivatives import joint_rates
+from stiffness_monitor.modes import natural_frequencies
+from stiffness_monitor.vibration import damping_ratios
 
 DELAYS: Final = {"zv": 1, "zvd": 2}
 """Half vibrations that each shaper takes."""
@@ -138,8 +140,8 @@ class ShapedPath(TimedPath):
 def shaped(
     motion: TimedPath,
     shaper: str,
-    frequency: Callable[[Array], Array],
-    damping: float,
+    frequency: Callable[[Array], Array] | None = None,
+    damping: float | None = None,
     *,
     singularity: float = 0.01,
 ) -> ShapedPath:
@@ -149,8 +151,9 @@ def shaped(
     error of the frequency. Corners that are not stops become a little rounder. Where the shaped
     motion would pass a limit, the whole is slowed down.
 
-    :param frequency: natural frequencies (k,), Hz, of poses (k, m).
-    :param damping: ratio of the mode, 0 or above and below 1.
+    :param frequency: natural frequencies (k,), Hz, of poses (k, m); default the robot's first,
+        actuators locked.
+    :param damping: ratio of the mode, 0 or above and below 1; default by the robot's file.
     :param singularity: least singularity index of the shaped motion, 0 to 1.
     :raises ParameterError: no such shaper, damping or frequency, or limits that cannot be kept.
     """
@@ -158,6 +161,13 @@ def shaped(
         raise UnknownNameError("shaper", shaper, tuple(DELAYS))
     if len(motion.carried) > 1:
         raise ParameterError("shaper", shaper, "one payload on the whole path")
+    robot = motion.robot
+    if frequency is None:
+
+        def frequency(poses: Array) -> Array:
+            return natural_frequencies(robot, poses, 1)[..., 0]
+
+    damping = float(damping_ratios(robot, damping, 1)[0]) if damping is None else damping
     if not 0.0 <= damping < 1.0:
         raise ParameterError("damping", damping, "0 or above and below 1")
     root = float(np.sqrt(1.0 - damping**2))

@@ -30,6 +30,7 @@ from pkm_twin.settings import setting
 if TYPE_CHECKING:
     from pkm_twin.paths import Path as Way
     from pkm_twin.paths import TimedPath
+    from pkm_twin.paths.along import SoftCut
     from pkm_twin.robot.robot import Robot
 
 LEAST_CYCLE: Final = 1.0
@@ -138,7 +139,8 @@ class Motion(Carries, ReadsTables, AwayFromSingular, Writes, Draws):
 
 def path(given: Motion) -> Report:
     """The motion, and which limits it uses."""
-    from pkm_twin.paths import ShapedPath, timed
+    from pkm_twin.paths import ShapedPath, shaped, timed
+    from pkm_twin.paths.along import SoftCut
     from pkm_twin.recordings import Recording
     from pkm_twin.recordings.bags import write_motion
 
@@ -151,6 +153,9 @@ def path(given: Motion) -> Report:
             check_limit(name, getattr(given, name), unit)
     elif given.force is not None or given.tolerance is not None:
         raise typer.BadParameter("--force and --tolerance are for --slow-where-soft")
+    cut = None
+    if given.slow_where_soft:
+        cut = SoftCut(machine, given.force or 0.0, given.tolerance or 0.0, given.speed or 0.0)
     bounds: dict[str, Any] = {
         name: _limit(name, getattr(given, name), machine)
         for name in ("effort", "velocity", "acceleration", "jerk")
@@ -159,10 +164,11 @@ def path(given: Motion) -> Report:
     law = "fastest" if given.fastest or given.slow_where_soft else given.law
     motion = timed(
         machine, way, law, payload=payload, duration=given.duration, speed=given.speed,
-        share=given.share, singularity=given.singularity, **bounds, **_slower(given, machine),
+        share=given.share, singularity=given.singularity,
+        slowdown=None if cut is None else cut.slowdown, **bounds,
     )  # fmt: skip
     if given.shaper is not None:
-        motion = _shaped(given, motion)
+        motion = shaped(motion, given.shaper, None, given.damping, singularity=given.singularity)
     elif given.damping is not None:
         raise typer.BadParameter("--damping is for --shaper")
     carried = motion.load or given.load
@@ -193,7 +199,7 @@ def path(given: Motion) -> Report:
         payload_fact(carried),
         Fact("limits", [bound.as_json() for bound in motion.bounds]),
         Fact("used", motion.worst),
-        Fact("peaks", _peaks(motion)),
+        Fact("peaks", motion.peaks),
         Fact("greatest_speed_m_s", float(fine.speed.max()), "m/s"),
     ]  # fmt: skip
     if isinstance(motion, ShapedPath):
@@ -204,8 +210,8 @@ def path(given: Motion) -> Report:
         words = f"{motion.shaper} for {low:.4g} to {high:.4g} Hz, adds {motion.added:.4g} s"
         facts.append(Fact("shaper", shaper, text="shaper", shown=words))
     draw: Any = draw_limits
-    if given.slow_where_soft:
-        more, draw = _cut(given, motion)
+    if cut is not None:
+        more, draw = _cut(cut, motion)
         facts += more
     return Report(
         answer, facts, _tables(motion, given.slow_where_soft), {"": lambda: draw(motion, answer)},
@@ -268,45 +274,6 @@ def _limit(name: str, values: tuple[float, ...] | None, machine: Robot) -> list[
     return None if values is None else list(values)
 
 
-def _slower(given: Motion, machine: Robot) -> dict[str, Any]:
-    """What slows a cut down where the machine is soft."""
-    from pkm_twin.paths.along import bend_per_feed
-
-    if not given.slow_where_soft or given.speed is None or given.tolerance is None:
-        return {}
-    ratio, force = given.speed / given.tolerance, given.force or 0.0
-    return {"slowdown": lambda q, way: np.maximum(
-        1.0, ratio * bend_per_feed(machine, force, q, way)
-    )}  # fmt: skip
-
-
-def _shaped(given: Motion, motion: TimedPath) -> TimedPath:
-    """The motion with an input shaper for the first mode of its robot, actuators locked."""
-    from pkm_twin.paths import shaped
-    from stiffness_monitor.modes import natural_frequencies
-    from stiffness_monitor.vibration import damping_ratios
-
-    robot = motion.robot
-    return shaped(
-        motion, str(given.shaper), lambda poses: natural_frequencies(robot, poses, 1)[..., 0],
-        float(damping_ratios(robot, given.damping, 1)[0]), singularity=given.singularity,
-    )  # fmt: skip
-
-
-def _peaks(motion: TimedPath) -> dict[str, dict[str, dict[str, Any]]]:
-    """Largest amounts of each joint."""
-    robot, fine, peaks = motion.robot, motion.fine, {}
-    for i, joint in enumerate(robot.joint_names):
-        unit = robot.joint_units[i]
-        values = [("velocity", fine.qd, f"{unit}/s"), ("acceleration", fine.qdd, f"{unit}/s2")]
-        if fine.effort is not None:
-            values.append(("effort", fine.effort, robot.effort_units[i]))
-        peaks[joint] = {
-            word: {"value": float(np.abs(v[:, i]).max()), "unit": unit} for word, v, unit in values
-        }
-    return peaks
-
-
 def _tables(motion: TimedPath, soft: bool) -> list[Table]:
     """What the terminal shows of limits and peaks; ``soft``: the tolerance bounds the speed too."""
     rows: dict[str, list[Any]] = {}
@@ -319,9 +286,9 @@ def _tables(motion: TimedPath, soft: bool) -> list[Table]:
         rows[f"{bound.begin:.4f} to {bound.end:.4f}"] = [what]
     peaks = {
         joint: [f"{one['value']:.4g} {one['unit']}" for one in values.values()]
-        for joint, values in _peaks(motion).items()
+        for joint, values in motion.peaks.items()
     }
-    words = [Column("", "", word) for word in next(iter(_peaks(motion).values()))]
+    words = [Column("", "", word) for word in next(iter(motion.peaks.values()))]
     worst = sorted(motion.worst.items(), key=lambda item: -item[1])[:6]
     used = {words_of.get(name, name): [100.0 * value] for name, value in worst}
     tables = [
@@ -366,15 +333,13 @@ def draw_limits(motion: TimedPath, title: str) -> Any:
     return figure
 
 
-def _cut(given: Motion, motion: TimedPath) -> tuple[list[Fact], Any]:
+def _cut(cut: SoftCut, motion: TimedPath) -> tuple[list[Fact], Any]:
     """What a cut is beside a motion, and its picture: feed and deflection with their bounds."""
-    from pkm_twin.paths.along import bend_per_feed
+    from pkm_twin.paths.joint_path import velocity_of
 
-    s, robot, speed, tolerance = motion.fine, motion.robot, given.speed, given.tolerance
-    assert speed is not None and tolerance is not None  # noqa: S101  checked before
-    moved = (robot.platform_jacobian(s.q)[:, :3] @ s.qd[..., None])[..., 0]
-    way = moved / np.maximum(s.speed, 1e-300)[:, None]
-    bend = bend_per_feed(robot, given.force or 0.0, s.q, way)
+    s, speed, tolerance = motion.fine, cut.feed, cut.tolerance
+    way = velocity_of(motion.robot, s.q, s.qd) / np.maximum(s.speed, 1e-300)[:, None]
+    bend = cut.bends(s.q, way)
     soft, most = float(bend.max()), float((bend * s.speed).max())
     # The largest constant feed within the tolerance.
     even = min(speed, tolerance / soft) if soft > 0.0 else speed
