@@ -9,7 +9,6 @@ from delta_dynamics.estimates.contact import (
 )
 from delta_dynamics.estimates.isolation import ContactPlace
 from delta_dynamics.estimates.payload import PayloadEstimate, PayloadEstimator
-from delta_dynamics.torques.base_parameters import BaseParameters, base_parameters
 from delta_dynamics.torques.derivatives import (
     TorqueDerivatives,
     torque_derivatives,
@@ -31,15 +30,18 @@ from delta_dynamics.torques.isotropy import (
 )
 from delta_dynamics.torques.reactions import Reactions, least_norm_reactions, reactions
 from delta_dynamics.torques.regressor import (
+    BaseParameters,
+    base_parameters,
     parameter_names,
     parameter_units,
     parameter_values,
     regressor,
 )
-from delta_dynamics.torques.torque_terms import Terms, dynamics_terms
 from delta_dynamics.torques.uncertainty import torque_deviation
 from delta_dynamics.torques.virtual_work import (
     Energy,
+    Terms,
+    dynamics_terms,
     energy,
     forward_dynamics,
     inverse_dynamics,

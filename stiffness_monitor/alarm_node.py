@@ -21,9 +21,8 @@ from pkm_twin.ros.joints import header
 from pkm_twin.ros.node import TwinNode
 from pkm_twin.ros.turns import Task
 from pkm_twin.settings import SECONDS
-from stiffness_monitor.alarm import AlarmSettings, Departure
+from stiffness_monitor.alarm import AlarmSettings, Departure, StiffnessWatch
 from stiffness_monitor.monitor import Answer
-from stiffness_monitor.watch import StiffnessWatch
 
 DIRECTIONS = ("x", "y", "z", "rx", "ry", "rz")
 

@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike
 from pkm_twin.codegen.arrays import Array, Mask
 from pkm_twin.errors import ParameterError, check_limit
 from pkm_twin.robot.robot import Robot
-from stiffness_monitor.vibration import ToolModes, tool_modes
+from stiffness_monitor.vibration import Complex, ToolModes, responses, tool_modes
 
 SHARE: Final = 0.01
 """Least peak of a mode in the cutting plane, of the greatest, to count."""
@@ -206,12 +206,15 @@ class _Plane:
         far = np.geomspace(4.0, 100.0, 16)
         near = np.concatenate([-far, np.linspace(-4.0, 4.0, 65), far])
         at = (self.turn[:, None] * (1.0 + self.damping[:, None] * near)).ravel()
-        at = at[at > 0.0][:, None]
-        gain = 1.0 / (self.turn**2 - at**2 + 2j * self.damping * self.turn * at)
-        response = np.einsum("km,mi,mj->kij", gain, self.shapes, self.shapes)
-        real = np.linalg.eigvals(milling.mean() @ response).real.min(1)
+        at = at[at > 0.0]
+        real = self._values(milling, at).real.min(1)
         k = int(real.argmin())
-        return (-0.5 / float(real[k]) if real[k] < 0.0 else np.inf), float(at[k, 0])
+        return (-0.5 / float(real[k]) if real[k] < 0.0 else np.inf), float(at[k])
+
+    def _values(self, milling: Milling, at: Array) -> Complex:
+        """Eigenvalues of the mean cutting stiffness times the response at rad/s (k,), (k, 2)."""
+        response = responses(at, self.turn, self.damping, self.shapes)
+        return np.asarray(np.linalg.eigvals(milling.mean() @ response))
 
     def lobes(self, milling: Milling, low: float, high: float) -> Array:
         """Speeds in a range at which lobes are lowest by the zero-order approximation, rpm, (k,).
@@ -223,11 +226,7 @@ class _Plane:
         found: list[float] = []
         for w, z in zip(self.turn, self.damping, strict=True):
             at = w * (1.0 + z * np.linspace(-3.0, 3.0, 61))
-            gain = 1.0 / (
-                self.turn**2 - at[:, None] ** 2 + 2j * self.damping * self.turn * at[:, None]
-            )
-            response = np.einsum("km,mi,mj->kij", gain, self.shapes, self.shapes)
-            values = np.linalg.eigvals(milling.mean() @ response)
+            values = self._values(milling, at)
             k, i = np.unravel_index(int(values.real.argmin()), values.shape)
             phase = np.pi - 2.0 * float(np.angle(-1.0 / values[k, i]))
             flips = [(w * (1.0 + part * z), np.pi) for part in (-1.0, 0.0, 1.0)]

@@ -32,6 +32,17 @@ DAMPING: Final = (1e-5, 0.99)
 """Damping ratios of modes that may be given."""
 
 
+def responses(at: Array, turn: Array, damping: Array, shapes: Array) -> Complex:
+    """Sum of the modes' responses p p' / (w^2 - W^2 + 2 i z w W), shape (k, d, d).
+
+    :param at: W, shape (k,), and ``turn``, w, shape (m,), rad/s. ``damping``: z, shape (m,).
+    :param shapes: p of unit generalised mass, shape (m, d).
+    """
+    at = at[:, None]
+    gain = 1.0 / (turn**2 - at**2 + 2j * damping * turn * at)
+    return np.asarray(np.einsum("km,mi,mj->kij", gain, shapes, shapes))
+
+
 @dataclass(frozen=True, eq=False)
 class ToolModes:
     """Modes of a robot in a pose at its tool point, lowest first.
@@ -54,10 +65,8 @@ class ToolModes:
             raise ParameterError("frequencies", at.shape, "one frequency after another")
         for frequency in (at.min(), at.max()) if at.size else ():
             check_limit("frequencies", float(frequency), "Hz", 0.0, FASTEST)
-        turn = 2.0 * np.pi * at[:, None]
         own = 2.0 * np.pi * self.frequencies
-        gain = 1.0 / (own**2 - turn**2 + 2j * self.damping * own * turn)
-        return np.asarray(np.einsum("km,mi,mj->kij", gain, self.shapes, self.shapes) + self.rest)
+        return responses(2.0 * np.pi * at, own, self.damping, self.shapes) + self.rest
 
     def strongest(self, frequencies: ArrayLike) -> tuple[float, float, Array]:
         """Where the tool point moves most per force, between the first and last frequency.

@@ -19,8 +19,7 @@ from typing import Final
 
 import numpy as np
 
-from delta_dynamics.torques.base_parameters import independent, random_states
-from delta_dynamics.torques.regressor import regressor
+from delta_dynamics.torques.regressor import independent, random_states, regressor
 from delta_dynamics.torques.virtual_work import inverse_dynamics
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import PkmTwinError, check_limit

@@ -157,36 +157,10 @@ class GuardedNode(ParameterNode):
         return super().create_publisher(*arguments, **options)
 
     def create_guarded_subscription(
-        self,
-        topic: str,
-        callback: Callable[[Any], None],
-        *,
-        refuse: Callable[[MessageError], None] | None = None,
-        raw: bool = False,
-        expected: bool = False,
-        expires: Callable[[], float] | None = None,
-        expiry: float | None = None,
+        self, topic: str, callback: Callable[[Any], None], **options: Any
     ) -> None:
-        """Subscribe to a topic of the node's table, with a callback that cannot end the node.
-
-        QoS overrides are parameters. By default messages may be lost for the newest, and publishers
-        of both kinds match. Of a topic that is ``whole`` none is lost, as long messages need it,
-        until a best-effort publisher comes: from there on as others. Joint states are read from
-        their bytes.
-
-        :param refuse: takes what is wrong with bytes that are no joint state.
-        :param raw: the callback takes the message's bytes.
-        :param expected: the diagnostics warn until the first message.
-        :param expires: how long a message may wait for the node, s; older ones count as lost.
-        :param expiry: lifespan and deadline that publishers have to offer, s; None is any.
-        """
-        if expected:
-            self.health.expected.append(topic)
-        row = self.topics[topic]
-        GuardedSubscription(
-            self, row, topic, callback, refuse,
-            raw=raw, best_effort=not row.whole, expires=expires, expiry=expiry,
-        )  # fmt: skip
+        """Subscribe to a topic of the node's table; arguments as :class:`GuardedSubscription`."""
+        GuardedSubscription(self, topic, callback, **options)
 
     def create_guarded_publisher(
         self, topic: str, expiry: float | None = None, *, joint: str = ""
@@ -244,29 +218,39 @@ class GuardedNode(ParameterNode):
 
 
 class GuardedSubscription:
-    """A subscription of :meth:`GuardedNode.create_guarded_subscription`, which has the arguments.
+    """A subscription with a callback that cannot end its node, which holds it.
 
-    It lives with its node, which holds its callbacks.
+    QoS overrides are parameters. By default messages may be lost for the newest, and publishers
+    of both kinds match. Of a topic that is ``whole`` none is lost, as long messages need it, until
+    a best-effort publisher comes: from there on as others. Joint states are read from their bytes.
+
+    :param refuse: takes what is wrong with bytes that are no joint state.
+    :param raw: the callback takes the message's bytes.
+    :param expected: the diagnostics warn until the first message.
+    :param expires: how long a message may wait for the node, s; older ones count as lost.
+    :param expiry: lifespan and deadline that publishers have to offer, s; None is any.
     """
 
     def __init__(
         self,
         node: GuardedNode,
-        row: Topic,
         topic: str,
         callback: Callable[[Any], None],
-        refuse: Callable[[MessageError], None] | None,
         *,
-        raw: bool,
-        best_effort: bool,
-        expires: Callable[[], float] | None,
-        expiry: float | None,
+        refuse: Callable[[MessageError], None] | None = None,
+        raw: bool = False,
+        expected: bool = False,
+        expires: Callable[[], float] | None = None,
+        expiry: float | None = None,
     ) -> None:
+        row = node.topics[topic]
+        if expected:
+            node.health.expected.append(topic)
         self._node, self._kind, self._topic, self._callback = node, row.message, topic, callback
         self._refuse, self._decode = refuse, None
         if row.kind == JOINTS:
             self._decode = JointStateDecoder(message_definition("sensor_msgs/msg/JointState"))
-        self._raw, self._best_effort = raw or self._decode is not None, best_effort
+        self._raw, self._best_effort = raw or self._decode is not None, not row.whole
         self._expires, self._expiry = expires, expiry
         self._statistics = node.health.statistics[topic] = TopicStatistics()
         self._name = node.resolve_topic_name(topic)

@@ -70,15 +70,16 @@ class ParameterNode(LifecycleNode):
         return found
 
     def declare(
-        self, name: str, default: Any, description: str, *, changeable: bool = False, **more: Any
+        self, name: str, default: Any, text: str, *, changeable: bool = False, **row: Any
     ) -> Any:
         """Declare a parameter and return its value; a whole number is taken for a float.
 
+        :param row: of a :class:`~pkm_twin.settings.Setting`: ``unit``, ``low``, ``high``,
+            ``choices``, and words for a ``usual`` default that depends on the robot.
         :param changeable: whether it may change while the node runs.
-        :param more: further attributes of :class:`pkm_twin.settings.Setting`.
         :raises ParameterError: the given value has another type or is out of range, naming both.
         """
-        return self._declare(default, Setting(description, name, fixed=not changeable, **more))
+        return self._declare(default, Setting(text, name, fixed=not changeable, **row))
 
     def declare_robot(self, default: str = "delta_cu") -> Robot:
         """Declare the parameter ``mechanism`` and load its robot.

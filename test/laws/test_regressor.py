@@ -14,7 +14,7 @@ from delta_dynamics import (
     parameter_values,
     regressor,
 )
-from delta_dynamics.torques.base_parameters import random_states
+from delta_dynamics.torques.regressor import random_states
 from pkm_twin import Robot
 from pkm_twin.identification.estimation import possible
 from pkm_twin.identification.parameters import file_parameters

@@ -10,9 +10,8 @@ from pkm_twin.bags.reader import open_bag
 from pkm_twin.errors import MessageError
 from pkm_twin.messages.reading import in_base_axes, read_deflection
 from pkm_twin.messages.stamps import SECOND, StampRules
-from stiffness_monitor.alarm import AlarmSettings, StiffnessAlarm
+from stiffness_monitor.alarm import WAITING, AlarmSettings, StiffnessAlarm, StiffnessWatch
 from stiffness_monitor.monitor import Monitor
-from stiffness_monitor.watch import WAITING, StiffnessWatch
 from test.bags.test_recordings import FOLDER
 from test.laws.deflections import SENSORS, noisy, twin_recording
 from test.nodes.harness import Maker, Plain
