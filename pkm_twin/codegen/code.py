@@ -252,9 +252,16 @@ class Code:
         return arrays
 
     def bound(
-        self, prepared: Array, otherwise: Callable[..., Any], outputs: int
+        self, prepared: Array, otherwise: Callable[..., Any], outputs: int = 0
     ) -> Callable[..., Any]:
-        """The program of one machine as a function of its inputs, see :meth:`.Kernel.bound`."""
+        """The program of one machine as a function of its inputs.
+
+        One sample that is good at once takes the fastest way: arrays of doubles of exactly the
+        inputs' shapes, (size,) each. ``otherwise`` answers in any other case.
+
+        :param outputs: how many outputs there are, for all of them as of :meth:`run`; by default
+            it gives the first one alone.
+        """
         code = self._loaded[3]
         if code is None:
             return otherwise
@@ -263,7 +270,7 @@ class Code:
         def room() -> tuple[Any, ...]:
             space = Space(*sizes)
             space.point_at(prepared)
-            copies = (view.copy for view in space.outputs[:outputs])
+            copies = (view.copy for view in space.outputs[: outputs or 1])
             return (*space.takers(), *copies, space.address, space)
 
         make = caller(len(sizes[0]), outputs)

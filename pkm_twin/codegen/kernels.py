@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, Final
 
 import numpy as np
@@ -24,7 +25,7 @@ class Kernel:
 
     def __init__(self, code: Code, geometry: Array = _NO_GEOMETRY) -> None:
         self.code, self.geometry = code, geometry
-        self._last: tuple[Array | None, Array] = None, geometry
+        self._last: tuple[Array | None, Callable[..., Any]] = None, self.code.run
 
     @property
     def program(self) -> Program:
@@ -44,11 +45,7 @@ class Kernel:
 
     def prepared(self, p: Array) -> Array:
         """What samples need of the program's own parameters and the geometry."""
-        last, prepared = self._last
-        if last is not p:
-            prepared = self.code.prepare(np.concatenate([p, self.geometry]))
-            self._last = p, prepared
-        return prepared
+        return self.code.prepare(np.concatenate([p, self.geometry]))
 
     def warm_up(self) -> None:
         """Compile, or load what is stored, before the first sample is due."""
@@ -56,31 +53,28 @@ class Kernel:
         self(p, *[np.zeros(n) for n in self.sizes[0]])
 
     def __call__(self, p: Array, *inputs: ArrayLike) -> tuple[list[Array], Array | None]:
-        """Evaluate over leading batch axes, see :meth:`Code.run`.
+        """Evaluate over leading batch axes, see :meth:`Code.run`; one sample by :meth:`Code.bound`.
 
         :param p: the program's own parameters, shape (k,); not changed afterwards.
         """
-        return self.code.run(self.prepared(p), *inputs)
+        last, call = self._last
+        if last is not p:
+            prepared = self.prepared(p)
+            run = partial(self.code.run, prepared)
+            call = self.code.bound(prepared, run, len(self.sizes[1]))
+            self._last = p, call
+        result: tuple[list[Array], Array | None] = call(*inputs)
+        return result
 
-    def bound(
-        self, p: Array, otherwise: Callable[..., Any] | None = None, *, outputs: int = 1
-    ) -> Callable[..., Any]:
-        """The program on a machine's parameters, as a function of its inputs.
-
-        One sample that is good at once takes the fastest way: arrays of doubles of exactly the
-        inputs' shapes, (size,) each.
+    def bound(self, p: Array, otherwise: Callable[..., Any] | None = None) -> Callable[..., Any]:
+        """The program on a machine's parameters, see :meth:`Code.bound`: inputs to first output.
 
         :param p: the program's own parameters, shape (k,); not changed afterwards.
-        :param otherwise: function of the inputs that answers in any other case, by default the
-            program, whatever its status.
-        :param outputs: how many of the first outputs it gives: one as it is, more as a tuple.
+        :param otherwise: by default the program, whatever its status.
         """
-
-        def whole(*inputs: ArrayLike) -> Any:
-            found, _ = self(p, *inputs)
-            return found[0] if outputs == 1 else tuple(found[:outputs])
-
-        return self.code.bound(self.prepared(p), otherwise or whole, outputs)
+        return self.code.bound(
+            self.prepared(p), otherwise or (lambda *inputs: self(p, *inputs)[0][0])
+        )
 
 
 class BoundCall:

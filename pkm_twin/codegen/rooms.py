@@ -52,11 +52,14 @@ class Space:
 def caller(inputs: int, outputs: int) -> Callable[..., Any]:
     """Makes the fast call of a number of inputs, without a loop over them.
 
+    It gives the first output, or of ``outputs`` above zero a list of all, and None for the status.
+
     A call takes its room from those that are free, so that threads do not share one.
     """
     names = [f"a{k}" for k in range(inputs)]
     given, takers = ", ".join(names), ", ".join(f"t{k}" for k in range(inputs))
-    copies = [f"c{k}" for k in range(outputs)]
+    copies = [f"c{k}" for k in range(outputs or 1)]
+    results = ", ".join(f"{copy}()" for copy in copies)
     lines = [
         "def make(code, room, array, otherwise):",
         "    free = []",
@@ -79,7 +82,7 @@ def caller(inputs: int, outputs: int) -> Callable[..., Any]:
         "        if code(address):",
         "            give(place)",
         f"            return otherwise({given})",
-        f"        result = {', '.join(f'{copy}()' for copy in copies)}",
+        f"        result = {f'[{results}], None' if outputs else results}",
         "        give(place)",
         "        return result",
         "    return call",
