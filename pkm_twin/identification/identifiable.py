@@ -233,7 +233,7 @@ class _Group:
                 target.append(rows @ new[self.inertias] - [about[i, j] for i, j in UPPER])
             flat = table.reshape(-1, len(self.inertias))
             found = np.linalg.lstsq(flat, np.concatenate(target), rcond=None)[0]
-            result[self.inertias] = _possible(found) if whole > 0.0 else 0.0
+            result[self.inertias] = possible_inertia(found) if whole > 0.0 else 0.0
         return dict(zip(self.keys, result.tolist(), strict=True))
 
     def cones(self) -> Iterator[Array]:
@@ -254,8 +254,11 @@ class _Group:
             yield np.einsum("ia,ijk,jb->abk", axes, cone, axes)
 
 
-def _possible(inertia: Array) -> Array:
-    """A solver stops beside the edge of what a body can be: second moments are not negative."""
+def possible_inertia(inertia: Array) -> Array:
+    """The inertia (6,) without second moments below zero, or principal ones (k,) not below it.
+
+    A solver stops beside the edge of what a body can be.
+    """
     upper = np.triu_indices(3)
     if len(inertia) != len(upper[0]):
         return np.maximum(inertia, 0.0)

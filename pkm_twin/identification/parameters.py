@@ -15,7 +15,13 @@ from delta_dynamics.torques.regressor import TEN, parameter_names
 from delta_dynamics.torques.virtual_work import mass_matrix
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import UnknownNameError
-from pkm_twin.identification.identifiable import KINDS, Identifiable, Kind, identifiable
+from pkm_twin.identification.identifiable import (
+    KINDS,
+    Identifiable,
+    Kind,
+    identifiable,
+    possible_inertia,
+)
 from pkm_twin.machine.graph import groups
 from pkm_twin.machine.inertia import change_of_frame
 from pkm_twin.machine.machine_yaml import edit_yaml
@@ -296,8 +302,14 @@ def _value(base: Keys, numbers: Sequence[Number]) -> Any:
         return tails[()]
     if len(next(iter(tails))) == 1:
         return [tails[k,] for k in range(len(tails))]
-    matrix = [[tails.get((i, j), tails.get((j, i))) for j in range(3)] for i in range(3)]
-    apart = max(abs(matrix[i][j] or 0.0) for i in range(3) for j in range(3) if i != j)
-    if apart == 0.0:
-        return [matrix[i][i] for i in range(3)]
-    return matrix
+    upper = np.triu_indices(3)
+    inertia = np.array([tails.get((i, j), np.nan) for i, j in np.transpose(upper).tolist()])
+    near = possible_inertia(inertia) if np.isfinite(inertia).all() else inertia
+    # What keeps the file's value may leave the edge of what a body can be by a little.
+    if np.abs(near - inertia).max() <= NO_CHANGE * np.abs(inertia).max():
+        inertia = near
+    matrix = np.zeros((3, 3))
+    matrix[upper] = matrix[upper[::-1]] = inertia
+    if not np.any(matrix - np.diag(np.diag(matrix))):
+        return np.diag(matrix).tolist()
+    return matrix.tolist()

@@ -4,7 +4,9 @@
 from __future__ import annotations
 
 import dataclasses
+from contextlib import nullcontext
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,11 +18,11 @@ from pkm_twin.errors import PkmTwinError
 from pkm_twin.identification.estimation import estimate, possible
 from pkm_twin.identification.fit import Fit, fit
 from pkm_twin.identification.identifiable import pseudo_inertia
-from pkm_twin.identification.parameters import file_parameters
+from pkm_twin.identification.parameters import Number, file_parameters, fitted_yaml
 from pkm_twin.machine.inertia import standard_parameters
 from pkm_twin.recordings import Recording
 from pkm_twin.robot.catalogue import robot_of_data
-from pkm_twin.robot.entries import entries, with_entries
+from pkm_twin.robot.entries import entries, with_entries, write_edited
 from test.laws.recordings import smooth_motion
 from test.support.robots import load, massive, parameters_of, random_motion
 
@@ -215,3 +217,21 @@ def test_the_nearest_possible_body_takes_an_impossible_one_s_place():
     measure = np.linalg.inv(alone.covariance)
     apart = [v - true for v in (alone.values, held.values)]
     assert apart[1] @ measure @ apart[1] <= apart[0] @ measure @ apart[0] * 1.2
+
+
+@pytest.mark.parametrize(("beyond", "written"), [(1e-6, True), (0.1, False)])
+def test_an_inertia_beyond_what_a_body_can_be_is_written_only_if_by_a_little(
+    tmp_path, beyond, written
+):
+    """As where one of its numbers keeps the file's value."""
+    entries = zip(*np.triu_indices(3), [1.0 + beyond, 0.0, 0.0, 0.0, 0.0, 1.0], strict=True)
+    numbers = [
+        Number(("payload", "inertia", int(i), int(j)), "kg m2", 0.0, value, 0.1, 0.5, "combination")
+        for i, j, value in entries
+    ]
+    numbers.append(Number(("payload", "mass"), "kg", 0.0, 0.5, 0.1, 0.5, "fitted"))
+    text = Path("config/five_bar.yaml").read_text()
+    out = tmp_path / "fitted.yaml"
+    with nullcontext() if written else pytest.raises(PkmTwinError, match="not a valid robot"):
+        write_edited(out, [], fitted_yaml(text, numbers, ["drawn"]))
+    assert out.exists() == written
