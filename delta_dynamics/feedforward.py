@@ -7,7 +7,7 @@ import math
 from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass, field
 from operator import gt
-from typing import Any, Final, Literal, NamedTuple, TypeVar, cast
+from typing import Any, Final, Literal, NamedTuple
 
 import numpy as np
 
@@ -29,7 +29,7 @@ from pkm_twin.settings import COUNT, FUTURE, LATE, SECONDS, SHARE, ZERO_STAMP, s
 from pkm_twin.streams.continuity import Continuity
 from pkm_twin.streams.differentiator import Differentiator
 from pkm_twin.streams.matched import WrenchWindow
-from pkm_twin.streams.monitor import Core, StreamMonitor, counting
+from pkm_twin.streams.monitor import Core, StreamMonitor, counting, finished
 from pkm_twin.streams.rates import RateAgreement
 from pkm_twin.streams.rest import RestWatch, fit_gain, gradient_gain, rate_doubt
 
@@ -116,9 +116,6 @@ STOPPING: Final = (OVERFLOW, "singular", "jump", "no wrench")
 """Reasons for which one sample stops the stream: it is none that the model describes."""
 SLICE: Final = 256
 """Points of a trajectory that are answered in one go."""
-
-
-V = TypeVar("V")
 
 
 class Torques(NamedTuple):
@@ -428,15 +425,6 @@ class Feedforward(Core):
             return None
         rate = None if rates is None else rates[0]
         return self._rest.push(sample.stamp, sample.q, sample.qd, rate)
-
-
-def finished(steps: Generator[None, None, V]) -> V:
-    """What a generator returns, its steps taken at once."""
-    while True:
-        try:
-            next(steps)
-        except StopIteration as end:
-            return cast(V, end.value)
 
 
 def _differentiator(s: Settings, robot: Robot) -> Differentiator:

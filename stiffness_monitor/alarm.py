@@ -27,7 +27,7 @@ from pkm_twin.messages.reading import DeflectionSample, in_base_axes, read_defle
 from pkm_twin.messages.stamps import SECOND, StampRules
 from pkm_twin.robot.robot import Robot
 from pkm_twin.settings import setting
-from pkm_twin.streams.monitor import Core, counting
+from pkm_twin.streams.monitor import Core, counting, finished
 from pkm_twin.streams.wrench import TimeCache, check_order
 from stiffness_monitor.compliance import strain_energy
 from stiffness_monitor.derivatives import compliance_effects, energy_effects
@@ -246,13 +246,7 @@ class StiffnessAlarm:
 
     def judge(self) -> tuple[Departure, ...] | None:
         """The elements with an alarm, the most certain first; None if too little is loaded."""
-        work = self.judging()
-        while True:
-            try:
-                next(work)
-            except StopIteration as done:
-                found: tuple[Departure, ...] | None = done.value
-                return found
+        return finished(self.judging())
 
     def judging(self) -> Generator[None, None, tuple[Departure, ...] | None]:
         """The same in slices, of the samples that there are at the first."""

@@ -20,10 +20,11 @@ from control_msgs.action import FollowJointTrajectory
 from rclpy.action import ActionClient, ActionServer, CancelResponse, GoalResponse
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-from delta_dynamics.feedforward import SLICE, finished
+from delta_dynamics.feedforward import SLICE
 from pkm_twin.errors import MessageError
 from pkm_twin.ros.node import TwinNode
 from pkm_twin.ros.turns import Task
+from pkm_twin.streams.monitor import finished
 
 Efforts = Callable[[Any], Generator[None, None, "np.ndarray[Any, Any]"]]
 Place = Callable[[], "Mapping[str, float] | None"]

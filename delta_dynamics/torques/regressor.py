@@ -256,18 +256,6 @@ def _joint(joint: Joint, three: Array, forces: Forces) -> None:
     forces.joint(joint, three)
 
 
-__all__ = [
-    "DRIVE",
-    "PAYLOAD",
-    "TEN",
-    "WRENCH",
-    "parameter_names",
-    "parameter_units",
-    "parameter_values",
-    "regressor",
-]
-
-
 RANK: Final = 1e-8
 """Least pivot, of columns of norm one, that counts."""
 ABSENT: Final = 1e-10

@@ -11,7 +11,7 @@ from typing import Any, Final, Literal, TypeVar
 
 import numpy as np
 
-from delta_dynamics.torques.regressor import TEN, parameter_names
+from delta_dynamics.torques.regressor import parameter_names
 from delta_dynamics.torques.virtual_work import mass_matrix
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import UnknownNameError
@@ -23,7 +23,7 @@ from pkm_twin.identification.identifiable import (
     possible_inertia,
 )
 from pkm_twin.machine.graph import groups
-from pkm_twin.machine.inertia import change_of_frame
+from pkm_twin.machine.inertia import TEN, change_of_frame
 from pkm_twin.machine.machine_yaml import edit_yaml
 from pkm_twin.machine.places import Keys, path_of
 from pkm_twin.robot.robot import Robot

@@ -31,7 +31,7 @@ MAX_JOINT_STATE: Final = 2**18
 """Bytes of a joint state, and of a trajectory at most so many names: far beyond all robots, and
 little enough that a stranger's message takes no time of the stream."""
 MAX_NAMES: Final = 1000
-POINT_ARRAYS: Final = ("positions", "velocities", "accelerations", "effort")
+POINT_ARRAYS: Final = tuple(COLUMNS)
 TIME: Final = len(POINT_ARRAYS)
 """Place of a point's time behind its arrays."""
 
@@ -256,7 +256,6 @@ class RawTrajectory:
         columns: dict[str, Array | Ragged | None] = {
             what: table.read(data, i, f"{order}f8", lengths[i]) if lengths[i] else None
             for i, what in enumerate(POINT_ARRAYS)
-            if what in COLUMNS
         }
         seconds = np.stack([times[:, 0].astype(np.int32), times[:, 1]]).astype(np.int64)
         fields = TrajectoryFields(header, tuple(names), seconds, columns)

@@ -439,8 +439,8 @@ def _times_from_start(times: NDArray[np.int64]) -> NDArray[np.int64]:
     return nanoseconds
 
 
-MAX_FORCE: Final = 1e7
-MAX_MOMENT: Final = 1e7
+MAX_LOAD: Final = 1e7
+"""Greatest force or moment, N or N m."""
 
 
 @dataclass(frozen=True)
@@ -450,6 +450,17 @@ class WrenchSample:
     stamp: int
     frame: str
     wrench: Array
+
+
+def _check_numbers(labels: Sequence[str], values: Sequence[float], bound: float) -> None:
+    """Reject values that are not finite, beyond a bound, or denormal."""
+    for label, value in zip(labels, values, strict=True):
+        if not math.isfinite(value):
+            raise MessageError("not finite", f"{label} is {value}")
+        if abs(value) > bound:
+            raise MessageError("bounds", f"{label} is {value:g}, allowed up to {bound:g}")
+        if 0.0 < abs(value) < TINY:
+            raise MessageError("bounds", f"{label} is {value:g}, a denormal number")
 
 
 def read_wrench(
@@ -464,12 +475,7 @@ def read_wrench(
     force, torque = message.wrench.force, message.wrench.torque
     values = [force.x, force.y, force.z, torque.x, torque.y, torque.z]
     labels = ("force.x", "force.y", "force.z", "torque.x", "torque.y", "torque.z")
-    for i, (label, value) in enumerate(zip(labels, values, strict=True)):
-        bound = MAX_FORCE if i < 3 else MAX_MOMENT
-        if not math.isfinite(value):
-            raise MessageError("not finite", f"{label} is {value}")
-        if abs(value) > bound or 0.0 < abs(value) < TINY:
-            raise MessageError("bounds", f"{label} is {value:g}, allowed up to {bound:g}")
+    _check_numbers(labels, values, MAX_LOAD)
     return WrenchSample(stamp, given or frame, np.array(values, np.float64))
 
 
@@ -501,11 +507,7 @@ def read_deflection(message: Any, now: int, rules: StampRules) -> DeflectionSamp
     move, turn = message.transform.translation, message.transform.rotation
     labels = ("translation.x", "translation.y", "translation.z", *"xyzw")
     values = (move.x, move.y, move.z, turn.x, turn.y, turn.z, turn.w)
-    for label, value in zip(labels, values, strict=True):
-        if not math.isfinite(value):
-            raise MessageError("not finite", f"{label} is {value}")
-        if 0.0 < abs(value) < TINY:
-            raise MessageError("bounds", f"{label} is {value:g}, too small for a measurement")
+    _check_numbers(labels, values, math.inf)
     far = max(abs(value) for value in values[:3])
     if far > MAX_SHIFT:
         raise MessageError("bounds", f"translation is {far:g} m, allowed up to {MAX_SHIFT:g}")

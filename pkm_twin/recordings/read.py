@@ -15,7 +15,7 @@ from pkm_twin.codegen.arrays import Array, Mask
 from pkm_twin.errors import FileError, ParameterError, UnknownNameError, one_line, warn
 from pkm_twin.machine.joint_map import JointMap
 from pkm_twin.machine.sections import DriveSpec
-from pkm_twin.messages.reading import MAX_EFFORT, MAX_FORCE, MAX_MOMENT, MAX_SHIFT, MAX_TURN, TINY
+from pkm_twin.messages.reading import MAX_EFFORT, MAX_LOAD, MAX_SHIFT, MAX_TURN, TINY
 from pkm_twin.recordings.bags import read_bag
 from pkm_twin.recordings.payload import load_of_table
 from pkm_twin.recordings.recording import MAPPED, ReadOptions, Recording
@@ -55,7 +55,7 @@ BLOCK: Final = 4096
 SIZES: Final = dict(
     zip(
         (*WRENCH, *DEFLECTION),
-        np.repeat([MAX_FORCE, MAX_MOMENT, MAX_SHIFT, MAX_TURN], 3).tolist(),
+        np.repeat([MAX_LOAD, MAX_LOAD, MAX_SHIFT, MAX_TURN], 3).tolist(),
         strict=True,
     )
 )

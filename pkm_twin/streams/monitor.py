@@ -4,12 +4,15 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import Final
+from typing import Final, TypeVar, cast
 
 from pkm_twin.errors import MessageError
+from pkm_twin.messages.stamps import SECOND
+
+V = TypeVar("V")
 
 MANY: Final = 5
 """Rejects since a stop from which the status has their reason."""
@@ -93,6 +96,15 @@ class StreamMonitor:
         return stopped
 
 
+def finished(steps: Generator[None, None, V]) -> V:
+    """What a generator returns, its steps taken at once."""
+    while True:
+        try:
+            next(steps)
+        except StopIteration as end:
+            return cast(V, end.value)
+
+
 def counting() -> StreamMonitor:
     """Counts messages that each stand for themselves: nothing stops them."""
     return StreamMonitor(trip_count=2**62, recovery_count=1)
@@ -173,9 +185,6 @@ class TopicStatistics:
         """The newest message took so long to handle, s."""
         self.longest = max(self.longest, took)
         self.overruns += 0.0 < self._period < took
-
-
-SECOND = 10**9
 
 
 class Pace:

@@ -10,16 +10,11 @@ import numpy as np
 
 from delta_dynamics import ContactMonitor, inverse_dynamics
 from delta_dynamics.estimates.isolation import CLAMPING, PLATFORM, joined_bodies, limbs_of
-from delta_dynamics.torques.regressor import (
-    PAYLOAD,
-    TEN,
-    parameter_names,
-    parameter_values,
-    regressor,
-)
+from delta_dynamics.torques.regressor import PAYLOAD, parameter_names, parameter_values, regressor
 from pkm_twin import Robot
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.machine.graph import BASE
+from pkm_twin.machine.inertia import TEN
 from pkm_twin.machine.members import Place
 from pkm_twin.robot.outline import Bar, body_points, robot_bars
 from test.support.robots import joint_range

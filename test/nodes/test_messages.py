@@ -10,7 +10,7 @@ import pytest
 from pkm_twin.messages.reading import (
     MAX_ACCELERATION,
     MAX_EFFORT,
-    MAX_FORCE,
+    MAX_LOAD,
     MAX_POINTS,
     JointReader,
     read_wrench,
@@ -166,7 +166,7 @@ def at(values, joint, value):
             ("wrench", {"frame": frame}, "frame", [repr(frame), "'platform'"])
             for frame in ("", "tool0", "Platform", "/platform")
         ),
-        *(("wrench", {"values": at(WRENCH, k, 1.01 * MAX_FORCE)}, "bounds", []) for k in range(6)),
+        *(("wrench", {"values": at(WRENCH, k, 1.01 * MAX_LOAD)}, "bounds", []) for k in range(6)),
         ("wrench", {"stamp": 0}, "zero stamp", []),
         ("wrench", {"stamp": NOW + SECOND}, "future stamp", []),
         ("wrench", {"stamp": NOW - SECOND}, "stale stamp", []),
