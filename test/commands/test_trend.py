@@ -2,6 +2,7 @@
 """History and trend: many writers, what a night's recording tells, and what drifts."""
 
 import multiprocessing
+import runpy
 import sqlite3
 from dataclasses import replace
 
@@ -10,10 +11,12 @@ import pytest
 
 from pkm_twin.identification.history import Measured, Series, append, judged, measure, read_history
 from pkm_twin.recordings import read
-from test.support.nights import night
+from test.commands.conftest import REPOSITORY
 from test.support.robots import load, often
 
 DAY = 86400.0
+night = runpy.run_path(str(REPOSITORY / "examples/nights.py"))["night"]
+"""A recording of one motion, as the example makes it."""
 
 
 def series(values):

@@ -19,6 +19,9 @@ import time
 from pathlib import Path
 from types import SimpleNamespace
 
+import pytest
+
+from pkm_twin.errors import MessageError
 from test.support.waiting import wait_until
 
 try:
@@ -143,6 +146,13 @@ class Domain:
 
     def close(self):
         self._lock.close()
+
+
+def reject(call, *arguments):
+    """The reason and the text of the error that a call raises."""
+    with pytest.raises(MessageError) as caught:
+        call(*arguments)
+    return caught.value.reason, str(caught.value)
 
 
 def end_with_parent():

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the node delta_dynamics does about clocks, silence, bursts, and nodes that do not fit."""
 
+import contextlib
 import itertools
 import re
 import signal
 import time
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -28,14 +28,11 @@ pytest.importorskip("rclpy", exc_type=ImportError)
 import rclpy
 from rclpy.duration import Duration
 from rclpy.qos import QoSProfile, ReliabilityPolicy
-from rclpy.topic_endpoint_info import TopicEndpointInfo
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool
 from trajectory_msgs.msg import JointTrajectory
 
-from pkm_twin.ros.health import Health
-from test.nodes.paced import QUICK, at_pace, count_at_rest, is_zeros, running, started
 from test.nodes.twin import (
     MAKE,
     MODULE,
@@ -45,9 +42,83 @@ from test.nodes.twin import (
     WINDOW,
     Q,
     count_of,
+    launched,
     state,
     trajectory,
 )
+
+QUICK = 0.015
+"""stale_after of a node that has to stop within 20 ms, s."""
+STRICT = "qos_overrides./strict/states.subscription.reliability:=reliable"
+OFFER = "qos_overrides./late/joint_torques.publisher.deadline:=7000000000"
+LATE = """
+import os
+import signal
+import time
+import numpy as np
+import delta_dynamics.nodes.twin as node
+from delta_dynamics import feedforward
+solve = feedforward.inverse_dynamics
+def late(robot, q, *rest):
+    if q.ndim > 1:
+        return np.full(q.shape, np.inf)
+    if q[0] == 0.125:
+        time.sleep(0.02)
+    if q[0] == 0.1125:
+        os.kill(os.getpid(), signal.SIGSTOP)
+    return solve(robot, q, *rest)
+feedforward.inverse_dynamics = late
+raise SystemExit(node.run(node.NODE))
+"""
+SETTINGS = {
+    "quick": (f"stale_after:={QUICK}", "on_stop:=zeros"),
+    "timed": ("use_sim_time:=true", "stale_after:=5.0", "on_stop:=zeros"),
+    "late": ("stale_after:=5.0", "on_stop:=zeros", "acceleration:=differentiate", OFFER),
+    "strict": ("stale_after:=1.0", "queue_depth:=10", STRICT),
+}
+
+
+def started(peer, launch, *names):
+    """Nodes by name, started at once, each with settings of its own."""
+    codes = dict.fromkeys(("late", "strict"), LATE)
+    return {
+        name: launched(peer, launch, name, *SETTINGS[name], code=codes.get(name)) for name in names
+    }
+
+
+def at_pace(twin, count, period=1e-3, **fields):
+    """Send joint states one period apart, on time: the stamp of the last, and when it left."""
+    begin = time.perf_counter()
+    for i in range(count):
+        while time.perf_counter() < begin + i * period:
+            pass
+        stamp = twin.stamp(1)
+        twin.send_state(state(stamp, **fields))
+    return stamp, time.monotonic()
+
+
+def is_zeros(message):
+    return list(message.effort) == [0.0, 0.0, 0.0]
+
+
+def running(twin):
+    """Wait until a stream of this node is answered."""
+    torques = twin.received("joint_torques")
+    torques.clear()
+
+    def send():
+        assert twin.process.alive(), twin.process.output
+        at_pace(twin, 12)
+
+    twin.peer.until(lambda: any(not is_zeros(m) for m in torques), repeat=send)
+    return twin
+
+
+def count_at_rest(quick):
+    """The count once the stream has stopped, and nothing more waits."""
+    quick.peer.until(lambda: is_zeros(quick.received("joint_torques")[-1]))
+    return count_of(quick.at_rest())
+
 
 AGAIN = WINDOW + 1
 """Samples of a stopped stream that are not answered: the window, then recovery_count is 2."""
@@ -378,38 +449,35 @@ class TestNeighbours:
         """Wait until the diagnostics' message is so."""
         quick.diagnostics(lambda a: condition(text_of(a)))
 
-    @pytest.mark.parametrize("reliability", ["BEST_EFFORT", "RELIABLE"])
-    def test_publishers_of_both_kinds_are_answered(self, fleet, reliability):
-        twin = fleet["late"]
-        topic = "/late/states"
+    @contextlib.contextmanager
+    def offering(self, twin, kind, topic, reliability):
+        """This side's publisher is of that reliability for a while."""
         before = twin.peer._publishers[topic]
-        qos = QoSProfile(depth=10, reliability=ReliabilityPolicy[reliability])
-        twin.peer.talk(JointState, topic, qos)
+        twin.peer.talk(kind, topic, QoSProfile(depth=10, reliability=reliability))
         try:
-            running(twin)
+            yield
         finally:
             twin.peer.node.destroy_publisher(twin.peer._publishers[topic])
             twin.peer._publishers[topic] = before
 
+    @pytest.mark.parametrize(
+        "reliability", [ReliabilityPolicy.RELIABLE, ReliabilityPolicy.BEST_EFFORT]
+    )
+    def test_publishers_of_both_kinds_are_answered(self, fleet, reliability):
+        with self.offering(fleet["late"], JointState, "/late/states", reliability):
+            running(fleet["late"])
+
     def test_trajectories_of_a_best_effort_publisher_are_answered(self, fleet):
-        twin = fleet["quick"]
-        topic = "/quick/joint_trajectory"
-        before = twin.peer._publishers[topic]
-        qos = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
-        twin.peer.talk(JointTrajectory, topic, qos)
+        twin, topic = fleet["quick"], "/quick/joint_trajectory"
         answers = twin.received("joint_trajectory_ff")
         answers.clear()
-        try:
-            twin.peer.until(
+        with self.offering(twin, JointTrajectory, topic, ReliabilityPolicy.BEST_EFFORT):
+            twin.until(
                 lambda: answers,
-                repeat=lambda: twin.peer.send(topic, trajectory(stamp=twin.begin())),
+                repeat=lambda: twin.send("joint_trajectory", trajectory(stamp=twin.begin())),
             )
-            twin.peer.node.destroy_publisher(twin.peer._publishers[topic])
-            twin.peer._publishers[topic] = before
-            # The reliable one as before.
-            assert twin.ask(trajectory(stamp=twin.begin()))
-        finally:
-            twin.peer._publishers[topic] = before
+        # The reliable one as before.
+        assert twin.ask(trajectory(stamp=twin.begin()))
 
     def test_a_publisher_that_does_not_fit_is_told_while_it_is_there(self, fleet):
         strict = fleet["strict"]
@@ -438,45 +506,6 @@ class TestNeighbours:
             stranger.destroy_node()
             rclpy.try_shutdown(context=context)
         self.told(strict, lambda text: line not in text)
-
-    def test_the_graph_is_asked_once_however_many_are_there(self):
-        """And of the others' only what concerns this node is compared."""
-        asked, told = [], []
-        fits, unfit = (
-            QoSProfile(depth=1, reliability=ReliabilityPolicy[kind])
-            for kind in ("RELIABLE", "BEST_EFFORT")
-        )
-
-        def end(number, name, qos, kind="a/msg/A"):
-            return TopicEndpointInfo(
-                node_name=name, node_namespace="/", topic_type=kind, qos_profile=qos,
-                endpoint_gid=[number],
-            )  # fmt: skip
-
-        speakers = [end(k, "other", fits) for k in range(200)]
-        speakers += [end(200, "other", unfit), end(201, "other", unfit, "a/msg/B")]
-        listeners = [end(k, "third", fits) for k in range(202, 255)] + [end(255, "own", fits)]
-
-        def ask(topic, ends):
-            asked.append(topic)
-            return ends
-
-        node = SimpleNamespace(
-            get_name=lambda: "own",
-            get_namespace=lambda: "/",
-            get_publishers_info_by_topic=lambda topic: ask(topic, speakers),
-            get_subscriptions_info_by_topic=lambda topic: ask(topic, listeners),
-            get_logger=lambda: SimpleNamespace(warning=lambda text: None),
-        )
-        own = Health(node, lambda: 0)
-        own.watch("~/x", told.append)
-        # A publisher on the same topic takes nothing from the subscription.
-        own.watch("~/x")
-        for _ in range(2):
-            own._look()
-        # The graph's calls expand and remap a name: one that has been would be twice.
-        assert asked == ["~/x"] * 4
-        assert sorted(told) == [("QoS", "reliability"), ("message type", "a/msg/B for a/msg/A")]
 
     def test_a_subscriber_that_does_not_fit_is_told(self, quick):
         node = quick.peer.node

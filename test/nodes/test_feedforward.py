@@ -24,8 +24,7 @@ from test.nodes.feedforward_core import (
     sample,
     trajectory,
 )
-from test.nodes.harness import SECOND
-from test.support.rejects import reject
+from test.nodes.harness import SECOND, reject
 
 pytestmark = pytest.mark.filterwarnings("error")
 

@@ -21,8 +21,7 @@ from test.nodes.feedforward_core import (
     sample,
     trajectory,
 )
-from test.nodes.harness import SECOND, Maker, Plain
-from test.support.rejects import reject
+from test.nodes.harness import SECOND, Maker, Plain, reject
 from test.support.robots import load
 
 pytestmark = pytest.mark.filterwarnings("error")

@@ -13,7 +13,7 @@ from delta_dynamics import inverse_dynamics
 from delta_dynamics.gate import Gate, GateSettings
 from pkm_twin import robot_names
 from pkm_twin.errors import MessageError
-from test.nodes.harness import SECOND, Maker, Plain
+from test.nodes.harness import SECOND, Maker, Plain, reject
 from test.support.robots import load
 
 NOW = 1_000 * SECOND
@@ -51,9 +51,7 @@ def opened(make, **changes):
 
 
 def refused(core, make, time, **changes):
-    with pytest.raises(MessageError) as caught:
-        send(core, make, time, **changes)
-    return caught.value.reason
+    return reject(lambda: send(core, make, time, **changes))[0]
 
 
 @pytest.mark.parametrize("name", robot_names())

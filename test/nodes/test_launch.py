@@ -109,30 +109,17 @@ class TestText:
         assert set(literal("cell", "ARGUMENTS")) - {"machines"} <= set(literal("twin", "ARGUMENTS"))
 
 
-def why_not():
-    """Why nothing can be launched here, or None."""
+def why_not(package="pkm_twin"):
+    """Why nothing of a package can be launched here, or None."""
     if find_spec("launch_ros") is None or find_spec("ros2launch") is None:
         return "ros2 launch is not installed"
     from ament_index_python.packages import PackageNotFoundError, get_package_prefix
 
     try:
-        get_package_prefix("pkm_twin")
-    except PackageNotFoundError:
-        return "pkm_twin is in no sourced workspace"
-    return None
-
-
-def installed(package):
-    """Whether a package is in a sourced workspace."""
-    if why_not() is not None:
-        return False
-    from ament_index_python.packages import PackageNotFoundError, get_package_prefix
-
-    try:
         get_package_prefix(package)
     except PackageNotFoundError:
-        return False
-    return True
+        return f"{package} is in no sourced workspace"
+    return None
 
 
 class Launched(Command):
@@ -288,7 +275,7 @@ class TestRunning:
         assert self.parameter(peer, "/b/stiffness_monitor", "mechanism") == "prru"
 
     @pytest.mark.skipif(
-        not installed("robot_state_publisher"), reason="robot_state_publisher is not installed"
+        why_not("robot_state_publisher") is not None, reason="robot_state_publisher is missing"
     )
     @pytest.mark.parametrize("space", ["", "left"])
     @pytest.mark.parametrize("robot", robot_names())
@@ -332,7 +319,7 @@ class TestRunning:
         assert np.allclose(turned, rotation, atol=1e-9)
         listener.unregister()
 
-    @pytest.mark.skipif(not installed("controller_manager"), reason="ros2_control is not installed")
+    @pytest.mark.skipif(why_not("controller_manager") is not None, reason="no ros2_control")
     @pytest.mark.parametrize(("space", "mapped"), [("", False), ("left", True)])
     def test_a_controller_gets_the_efforts_of_a_goal(self, launched, peer, tmp_path, space, mapped):
         """Through the twin's action to joint_trajectory_controller on mock hardware.

@@ -14,7 +14,7 @@ from pkm_twin.state.state import MachineState
 from pkm_twin.streams.wrench import WrenchSettings
 from stiffness_monitor import compliance, strain_energy
 from stiffness_monitor.compliance import member_deflections
-from test.nodes.harness import SECOND, Maker, Plain
+from test.nodes.harness import SECOND, Maker, Plain, reject
 from test.support.robots import KINDS, load, partly_long, some_elastic
 
 MAKE = Maker(Plain())
@@ -104,9 +104,7 @@ class TestState:
             ("limit", MAKE.joint_state(names, [0.1, 9.0, 0.3], stamp=NOW)),
         ]
         for reason, message in bad:
-            with pytest.raises(MessageError) as caught:
-                core.joint_state(message, NOW)
-            assert caught.value.reason == reason
+            assert reject(core.joint_state, message, NOW)[0] == reason
         assert core.states.rejected == {reason: 1 for reason, _ in bad}
         assert core.states.accepted == 1 and core.latest.stamp == NOW
         core.reset()

@@ -3,6 +3,7 @@
 
 import math
 import re
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -31,8 +32,11 @@ from rcl_interfaces.srv import (
     SetParameters,
 )
 from rclpy.parameter import Parameter
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.topic_endpoint_info import TopicEndpointInfo
 from std_srvs.srv import Trigger
 
+from pkm_twin.ros.health import Health
 from test.nodes.twin import (
     MAKE,
     MODULE,
@@ -148,6 +152,46 @@ def test_a_node_compiles_nothing_once_it_is_active(peer, launch):
     for velocity in ((), (0.0, 0.0, 0.0)):
         twin.since(twin.stream(WINDOW + 2, velocity=velocity, effort=(0.1, 0.2, 0.3)))
     assert "loaded late" not in twin.process.output
+
+
+def test_the_graph_is_asked_once_however_many_are_there():
+    """And of the others' only what concerns this node is compared."""
+    asked, told = [], []
+    fits, unfit = (
+        QoSProfile(depth=1, reliability=ReliabilityPolicy[kind])
+        for kind in ("RELIABLE", "BEST_EFFORT")
+    )
+
+    def end(number, name, qos, kind="a/msg/A"):
+        return TopicEndpointInfo(
+            node_name=name, node_namespace="/", topic_type=kind, qos_profile=qos,
+            endpoint_gid=[number],
+        )  # fmt: skip
+
+    speakers = [end(k, "other", fits) for k in range(200)]
+    speakers += [end(200, "other", unfit), end(201, "other", unfit, "a/msg/B")]
+    listeners = [end(k, "third", fits) for k in range(202, 255)] + [end(255, "own", fits)]
+
+    def ask(topic, ends):
+        asked.append(topic)
+        return ends
+
+    node = SimpleNamespace(
+        get_name=lambda: "own",
+        get_namespace=lambda: "/",
+        get_publishers_info_by_topic=lambda topic: ask(topic, speakers),
+        get_subscriptions_info_by_topic=lambda topic: ask(topic, listeners),
+        get_logger=lambda: SimpleNamespace(warning=lambda text: None),
+    )
+    own = Health(node, lambda: 0)
+    own.watch("~/x", told.append)
+    # A publisher on the same topic takes nothing from the subscription.
+    own.watch("~/x")
+    for _ in range(2):
+        own._look()
+    # The graph's calls expand and remap a name: one that has been would be twice.
+    assert asked == ["~/x"] * 4
+    assert sorted(told) == [("QoS", "reliability"), ("message type", "a/msg/B for a/msg/A")]
 
 
 class TestRequests:

@@ -16,8 +16,7 @@ from pkm_twin.messages.reading import (
     read_wrench,
 )
 from pkm_twin.messages.stamps import MAX_DURATION, StampRules, stamp_of
-from test.nodes.harness import SECOND, Maker, Plain
-from test.support.rejects import reject
+from test.nodes.harness import SECOND, Maker, Plain, reject
 from test.support.robots import load
 
 NOW = 1_000 * SECOND

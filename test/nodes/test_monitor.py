@@ -9,8 +9,7 @@ import pytest
 from pkm_twin.errors import SingularityError
 from stiffness_monitor import compliance, monitor, platform_response
 from stiffness_monitor.monitor import Monitor, Settings
-from test.nodes.harness import SECOND
-from test.support.rejects import reject
+from test.nodes.harness import SECOND, reject
 from test.support.robots import load
 
 NOW = 1_000 * SECOND
