@@ -132,14 +132,6 @@ def test_what_is_said_of_joints_and_gravity(tmp_path):
     assert data["joints"]["m2"]["limits"] == {"effort": 4.0}
 
 
-def test_a_body_on_a_free_joint_is_held_by_closures_alone(tmp_path):
-    data = read_urdf(save(tmp_path, hexapod()), platform="platform")
-    assert "float" not in data["joints"]
-    held = [n for n, j in data["joints"].items() if "platform" in j["between"]]
-    assert held == [f"h{i}" for i in range(6)]
-    assert {data["joints"][n]["type"] for n in held} == {"spherical"}
-
-
 def test_a_weld_and_a_lock_hold(tmp_path):
     weld = '<weld name="tip" body1="fore_1" body2="fore_2" relpose="0.3 0 0 0.6 0 0 0.8"/>'
     # Two bars that are welded at an angle of their own: one motor must go.

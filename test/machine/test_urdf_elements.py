@@ -68,34 +68,6 @@ def test_a_moving_link_may_be_called_like_the_ground(tmp_path):
     assert data["platform"] == "base_" and list(data["bodies"]) == ["base_"]
 
 
-def spinning(tmp_path):
-    """A five-bar whose tip is a pin between two hinges of one axis."""
-    path = five_bar().save(tmp_path)
-    pin_link = (
-        '<link name="pin"><inertial><mass value="0.1"/>'
-        '<inertia ixx="1e-4" iyy="1e-4" izz="1e-4"/></inertial></link>'
-        '<joint name="pin_joint" type="continuous"><parent link="fore_1"/><child link="pin"/>'
-    )
-    content = path.read_text()
-    start = content.index("<parent_origin", content.index("<constraint"))
-    origin = content[start : content.index("/>", start)]
-    axis_at = content.index('<parent_axis xyz="') + len('<parent_axis xyz="')
-    axis = content[axis_at : content.index('"', axis_at)]
-    pin_link += f'{origin.replace("parent_origin", "origin")}/><axis xyz="{axis}"/></joint>'
-    head, tail = content.split("<constraint", 1)
-    tail = tail.replace('<parent link="fore_1"/>', '<parent link="pin"/>', 1)
-    tail = tail.replace(origin + "/>", "", 1)
-    path.write_text(head + pin_link + "<constraint" + tail)
-    return path
-
-
-def test_a_pin_that_only_spins_about_itself_is_held(tmp_path):
-    with pytest.warns(UserWarning, match="held, .* spin about itself: pin_joint"):
-        data = read_urdf(spinning(tmp_path))
-    assert data["joints"]["pin_joint"]["type"] == "fixed"
-    assert [j["type"] for j in data["joints"].values()].count("revolute") == 5
-
-
 def test_what_hangs_loose_is_no_spin(tmp_path):
     path = five_bar().save(tmp_path)
     loose = (

@@ -290,6 +290,7 @@ def test_a_part_that_only_spins_is_held_at_zero_and_its_imbalance_is_said(start,
     reading = read_tree(path)
     data = reading.description
     assert data["joints"]["c"]["type"] == "fixed"
+    assert any("spin about itself: c" in note for note in reading.notes)
     # At zero, the centre is off the rod's axis along the pitch joint's, and nowhere else.
     ends = [np.array(data["joints"][name]["at"]) for name in ("a", "pin")]
     along = (ends[1] - ends[0]) / 0.3
