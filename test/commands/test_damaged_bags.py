@@ -3,7 +3,6 @@
 
 import json
 import os
-import random
 import re
 
 import pytest
@@ -14,27 +13,9 @@ from test.support.robots import often
 
 
 class TestDamage:
-    @pytest.mark.parametrize("count", often(24, 200))
-    def test_flips_never_pass(self, twin, tiny, tmp_path, count):
-        whole = tiny.read_bytes()
-        assert twin("check", tiny).code == 0
-        draw = random.Random(20240229)
-        path = tmp_path / "flipped.mcap"
-        codes = []
-        for _ in range(count):
-            data = bytearray(whole)
-            bit = draw.randrange(8 * len(data))
-            data[bit // 8] ^= 1 << bit % 8
-            path.write_bytes(data)
-            result = twin("check", path, "--json")
-            assert not json.loads(result.out)["good"]
-            result.one_line_error()
-            codes.append(result.code)
-        assert set(codes) <= {1, 3}
-        assert codes.count(3) > count / 4
-
     @pytest.mark.parametrize("step", often(503, 37))
     def test_cuts_never_pass(self, twin, tiny, tmp_path, step):
+        twin.good("check", tiny)
         whole = tiny.read_bytes()
         path = tmp_path / "cut.mcap"
         codes = set()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A maker of messages of both kinds, and per module a domain, a peer and processes."""
+"""A maker of messages, and per module a domain, a peer and processes."""
 
 import os
 
@@ -9,16 +9,13 @@ import yaml
 
 from delta_dynamics import inverse_dynamics
 from stiffness_monitor import compliance, strain_energy
-from test.nodes.harness import Domain, ForkedNode, Maker, NodeProcess, Peer, Plain, Ros
+from test.nodes.harness import Domain, ForkedNode, Maker, NodeProcess, Peer, Plain
 from test.support.robots import load, parameters_of
 
 
-@pytest.fixture(scope="session", params=["plain", "ros"])
-def make(request):
-    """Builds messages as plain attribute objects, then as real ROS messages."""
-    if request.param == "ros":
-        pytest.importorskip("trajectory_msgs.msg", exc_type=ImportError)
-        return Maker(Ros())
+@pytest.fixture(scope="session")
+def make():
+    """Builds messages as plain attribute objects, which test_messages reads as the real ones."""
     return Maker(Plain())
 
 

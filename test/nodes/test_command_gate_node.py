@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from delta_dynamics import inverse_dynamics
-from pkm_twin import robot_names
 from test.nodes.harness import (
     Running,
     counts_of,
@@ -15,7 +14,6 @@ from test.nodes.harness import (
     text_of,
     values_of,
 )
-from test.support.robots import load, partly_long
 
 pytest.importorskip("rclpy", exc_type=ImportError)
 
@@ -187,14 +185,3 @@ def test_a_publisher_that_promises_no_deadline_is_told_of(heard, launch):
     )
     assert all(command == ZEROS for command in gated.commands)
     gated.process.stop()
-
-
-@pytest.mark.parametrize("name", partly_long(robot_names(), "stewart"))
-def test_every_robot_has_a_gate(heard, launch, name):
-    process = launch(GATE, f"mechanism:={name}", arguments=("-r", f"__node:=of_{name}"))
-    count = len(load(name).joint_names)
-    topic = f"/of_{name}/commands"
-    heard.hear(Float64MultiArray, topic)
-    heard.until(lambda: heard.received(topic))
-    assert list(heard.received(topic)[0].data) == [0.0] * count
-    process.stop()

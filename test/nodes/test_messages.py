@@ -16,7 +16,7 @@ from pkm_twin.messages.reading import (
     read_wrench,
 )
 from pkm_twin.messages.stamps import MAX_DURATION, StampRules, stamp_of
-from test.nodes.harness import SECOND, Maker, Plain, reject
+from test.nodes.harness import SECOND, Maker, Plain, Ros, reject
 from test.support.robots import load
 
 NOW = 1_000 * SECOND
@@ -30,6 +30,15 @@ RULES = StampRules(max_age=SECOND // 10)
 ROBOT = load("delta_cu")
 
 pytestmark = pytest.mark.filterwarnings("error")
+
+
+@pytest.fixture(scope="session", params=["plain", "ros"])
+def make(request):
+    """Builds messages as plain attribute objects, then as real ROS messages."""
+    if request.param == "ros":
+        pytest.importorskip("trajectory_msgs.msg", exc_type=ImportError)
+        return Maker(Ros())
+    return Maker(Plain())
 
 
 @pytest.fixture
