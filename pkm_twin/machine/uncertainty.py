@@ -15,8 +15,9 @@ from pkm_twin.machine import schema
 class UncertaintyEntry:
     """How sure a number is, by its dotted path in this file, or all numbers below a name together.
 
-    Each entry is an independent cause. ``deviation``: the standard deviation, in the number's unit;
-    or ``relative``: that of a common factor.
+    Each entry is an independent cause, for ``torque_deviation`` and ``compliance_deviation``.
+    ``deviation``: the standard deviation, in the number's unit; or ``relative``: that of a common
+    factor.
     """
 
     deviation: float | None = schema.number(low=0.0, unit="the number's", default=None)

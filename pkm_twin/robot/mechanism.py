@@ -79,11 +79,11 @@ class Common:
     uncertainty: Mapping[str, UncertaintyEntry] = schema.mapping(UncertaintyEntry, default={})
     element_compliance: Mapping[str, float] = schema.mapping(
         schema.number(low=1e-6, high=1e6), default={},
-        text="factors on the compliance of elastic elements, by the names of `strain_energy`",
+        text="factors on the compliance of elements, by the names of `strain_energy`; else 1",
     )  # fmt: skip
     modal_damping: Array = schema.vector(
         0, above=0.0, high=0.99, default=[],
-        text="damping ratios of the natural modes from the lowest on; the last is all others'",
+        text="damping ratios of modes from the lowest, for `frf`, `lobes`; the last: all others'",
     )  # fmt: skip
 
 
