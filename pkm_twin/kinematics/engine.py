@@ -30,7 +30,6 @@ from pkm_twin.kinematics.programs import (
     inverse_program,
     jacobian_program,
     placement_program,
-    pose_walk_program,
     walk_program,
 )
 from pkm_twin.kinematics.scheme import Branch, Closed, Scheme
@@ -49,16 +48,21 @@ class Engine(Scheme):
     def _kernels(self) -> dict[str, Kernel]:
         return {}
 
+    def _walk(self, pose: Array, state: Array, step: Array) -> list[Array]:
+        """Of unknowns and q: closures and pose equations, their derivatives, the state moved on."""
+        return self.kernel("walk", walk_program)(_NO_PARAMETERS, state, pose, step)[0]
+
     def _look(self, q: Array, x: Array) -> tuple[Array, Array]:
         """Closures and their derivatives by the unknowns, of unit one."""
-        walk = self.kernel("walk", walk_program)
-        (values, table, _), _ = walk(_NO_PARAMETERS, x, q, np.zeros(self.tree.unknown_rates))
-        return values, table.reshape(len(values), -1)
+        still = np.zeros(self.tree.unknown_rates + self.joints)
+        values, table, _ = self._walk(self.home_pose, np.concatenate([x, q]), still)
+        k = len(self.parts)
+        return values[:k], table.reshape(len(values), -1)[:k, : self.tree.unknown_rates]
 
     def _moved(self, q: Array, x: Array, step: Array) -> Array:
         """The unknowns after a step of their rates, of unit one."""
-        moved: Array = self.kernel("walk", walk_program)(_NO_PARAMETERS, x, q, step)[0][2]
-        return moved
+        steps = np.concatenate([step, np.zeros(self.joints)])
+        return self._walk(self.home_pose, np.concatenate([x, q]), steps)[2][: len(x)]
 
     def reach(
         self, q: Array, limit: float = 1.0, precision: float = 1e-4
@@ -115,16 +119,14 @@ class Engine(Scheme):
         :returns: its joint or rod, by how much it misses, m, and whether all closures are met in
             the pose: then a singularity ends the path from home to it.
         """
-        walk = self.kernel("pose walk", pose_walk_program)
         still = np.zeros(self.tree.unknown_rates + self.joints)
 
-        def look(x: Array) -> tuple[Array, Array]:
-            (values, table, _), _ = walk(_NO_PARAMETERS, x, pose, still)
+        def look(state: Array) -> tuple[Array, Array]:
+            values, table, _ = self._walk(pose, state, still)
             return values, table.reshape(len(values), -1)
 
-        def move(x: Array, step: Array) -> Array:
-            moved: Array = walk(_NO_PARAMETERS, x, pose, step)[0][2]
-            return moved
+        def move(state: Array, step: Array) -> Array:
+            return self._walk(pose, state, step)[2]
 
         home = np.array([*self.tree.home, *self.graph.home], float)
         values = least_squares(home, look, move, 40)

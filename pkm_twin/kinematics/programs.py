@@ -26,30 +26,7 @@ assembly is farther away unless a singularity is nearer than that."""
 
 
 def walk_program(t: Traced) -> Program:
-    """The closures where they do not hold, for telling why."""
-    tree = t.tree
-    x = t.tape.inputs(UNKNOWNS, len(tree.home))
-    motion = Motion(tree, x, t.q)
-    rows = motion.closures()
-    table, _ = matrices(tree, rows)
-    move = t.tape.inputs("move", tree.unknown_rates)
-    scales = np.array(tree.scales)
-    entries = [
-        row.scale * e / c
-        for row, line in zip(rows, table, strict=True)
-        for e, c in zip(line, scales, strict=True)
-    ]
-    outputs = {
-        "values": t.lift([row.scale * row.value for row in rows]),
-        "table": t.lift(entries),
-        "moved": t.lift(motion.retracted(x, move / scales)),
-    }
-    sizes = {UNKNOWNS: len(tree.home), "q": t.joints, "move": tree.unknown_rates}
-    return Program(sizes, 0, outputs)
-
-
-def pose_walk_program(t: Traced) -> Program:
-    """The same of a pose, the actuated joints unknown too."""
+    """Closures, then pose equations, where they do not hold; the actuated joints unknown too."""
     scheme, tree, tape = t.scheme, t.tree, t.tape
     size, free = len(tree.home), tree.unknown_rates
     everything = tape.inputs(UNKNOWNS, size + t.joints)

@@ -174,9 +174,7 @@ class Robot(Mechanism):
 
     def try_inverse(self, pose: ArrayLike) -> tuple[Array, Mask]:
         """Joint positions (..., n), NaN for an invalid pose; and which poses are valid, (...)."""
-        (q,), status = self.inverse_kernel(_NONE, pose)
-        good = np.ones(q.shape[:-1], bool) if status is None else status[..., 0] == 0.0
-        return q, np.asarray(good)
+        return _tried(self.inverse_kernel, pose)
 
     @cached_property
     def inverse_kernel(self) -> Kernel:
@@ -232,9 +230,7 @@ class Robot(Mechanism):
 
     def try_forward(self, q: ArrayLike) -> tuple[Array, Mask]:
         """Poses (..., m), NaN where there is no assembly; and which q are valid, (...)."""
-        (pose, _, _), status = self.engine.forward(_NONE, q)
-        good = np.ones(pose.shape[:-1], bool) if status is None else status[..., 0] == 0.0
-        return pose, np.asarray(good)
+        return _tried(self.engine.forward, q)
 
     def platform(self, q: ArrayLike) -> tuple[Array, Array]:
         """Position (..., 3) of the platform's reference point, and its rotation (..., 3, 3).
@@ -287,10 +283,9 @@ class Robot(Mechanism):
 
     def try_jacobian(self, q: ArrayLike) -> tuple[Array, Mask]:
         """Pose rates per joint rate (..., m, n), NaN where there is no assembly; which are good."""
-        (rates, _), status = self.engine.jacobian(_NONE, q)
-        good = np.ones(rates.shape[:-1], bool) if status is None else status[..., 0] == 0.0
+        rates, good = _tried(self.engine.jacobian, q)
         n = self.joints_count
-        return rates.reshape(*rates.shape[:-1], rates.shape[-1] // n, n), np.asarray(good)
+        return rates.reshape(*rates.shape[:-1], rates.shape[-1] // n, n), good
 
     def pose_acceleration(self, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike) -> Array:
         """Second derivative of the pose in time, shape (..., m)."""
@@ -312,9 +307,8 @@ class Robot(Mechanism):
 
     def try_singularity(self, q: ArrayLike) -> tuple[Array, Mask]:
         """The measure (...), 0 where there is no assembly; which joint states have one."""
-        (measure,), status = self.singularity_kernel()(_NONE, q)
-        good = np.ones(measure.shape[:-1], bool) if status is None else status[..., 0] == 0.0
-        return np.where(good, measure[..., 0], 0.0), np.asarray(good)
+        measure, good = _tried(self.singularity_kernel(), q)
+        return np.where(good, measure[..., 0], 0.0), good
 
     def torque_loop(self, samples: int = 1) -> ControlLoop:
         """Inverse dynamics for a control loop, with preallocated arrays.
@@ -370,6 +364,13 @@ class Robot(Mechanism):
         if measure is not None:
             raise SingularityError("joint state", index, measure, SINGULARITY_BOUND, reached)
         raise UnreachableError("joint state", part, index, miss, reached)
+
+
+def _tried(kernel: Kernel, given: ArrayLike) -> tuple[Array, Mask]:
+    """First output of a program, NaN where a sample is rejected; and which are not, (...)."""
+    (result, *_), status = kernel(_NONE, given)
+    good = np.ones(result.shape[:-1], bool) if status is None else status[..., 0] == 0.0
+    return result, np.asarray(good)
 
 
 def _first(codes: Array) -> tuple[int, ...] | None:
