@@ -11,9 +11,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from pkm_twin.codegen.arrays import Array
-from pkm_twin.codegen.code import NOT_FINITE, Code
+from pkm_twin.codegen.code import NOT_FINITE, Code, Space
 from pkm_twin.codegen.program import Program
-from pkm_twin.codegen.rooms import Space
 
 MISSED: Final = 1e-24
 """Sum of squares by which a geometry may miss what a program takes for constant: rounding."""
