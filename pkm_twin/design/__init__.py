@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The machine as a function of its file's numbers: variants, design for a path, tolerances."""
 
-from pkm_twin.design.optimise import Design, design
 from pkm_twin.design.pose_path import PosePath
 from pkm_twin.design.quantities import QUANTITIES
-from pkm_twin.design.search import DesignPoint
+from pkm_twin.design.search import Design, DesignPoint, design
 from pkm_twin.design.sweep import Sweep, sweep
 from pkm_twin.design.tolerance import Tolerances, drawn, tolerances
 

@@ -12,10 +12,9 @@ from uuid import uuid4
 import numpy as np
 
 from pkm_twin.codegen.arrays import Array
-from pkm_twin.design.optimise import sobol
 from pkm_twin.design.pose_path import PosePath
 from pkm_twin.design.quantities import QUANTITIES, quantity_of
-from pkm_twin.design.search import Problem
+from pkm_twin.design.search import Problem, sobol
 from pkm_twin.design.variables import Variables
 from pkm_twin.errors import ParameterError
 from pkm_twin.robot.entries import entries

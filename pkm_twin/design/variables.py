@@ -35,7 +35,7 @@ class Variables:
 
     @classmethod
     def of(cls, robot: Robot, vary: Mapping[str, tuple[float, float]]) -> Variables:
-        """Of names (see :func:`pkm_twin.design.optimise.design`) and their bounds.
+        """Of names (see :func:`pkm_twin.design.search.design`) and their bounds.
 
         :raises ParameterError: a path that there is not, one that is given twice, or bounds that
             are none.

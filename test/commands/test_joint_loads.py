@@ -7,7 +7,7 @@ import pytest
 from delta_dynamics import elastic_reactions, least_norm_reactions, reactions
 from delta_dynamics.torques.elastic_reactions import reaction_energies
 from delta_dynamics.torques.reactions import balance
-from pkm_twin.paths.durability import Reversals, bearing_life, rainflow, turning_points
+from pkm_twin.paths.joint_loads import Reversals, bearing_life, rainflow, turning_points
 from stiffness_monitor import platform_response
 from test.support.robots import SHIPPED, load, partly_long, random_joints, rigid
 from test.support.tables import of_joints, read_columns, write_columns

@@ -10,9 +10,9 @@ from delta_dynamics import inverse_dynamics
 from pkm_twin.errors import ParameterError
 from pkm_twin.paths import circle, cycle, fastest, lines, through, timed
 from pkm_twin.paths.carrying import Carried
+from pkm_twin.paths.fastest import LAWS
 from pkm_twin.paths.jerk import smooth_run
 from pkm_twin.paths.joint_path import joint_paths
-from pkm_twin.paths.laws import LAWS
 from pkm_twin.paths.pieces import Arc, Corner, arc_through
 from pkm_twin.robot.catalogue import robot_of_data
 from test.support.robots import load, parameters_of, partly_long

@@ -151,7 +151,7 @@ def optimised(given: Design, path: Path) -> Report:
     """The machine that is best for a path."""
     from pkm_twin.design import QUANTITIES
     from pkm_twin.design import design as find
-    from pkm_twin.design.optimise import searches
+    from pkm_twin.design.search import searches
     from pkm_twin.design.variables import parse_vary
     from pkm_twin.robot.entries import entries
     from pkm_twin.robot.limits import beyond_limits
