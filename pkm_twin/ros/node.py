@@ -8,12 +8,12 @@ caught, counted and reported.
 from __future__ import annotations
 
 import inspect
-import itertools
 import os
 import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from typing import Any, ClassVar, Final
 
 from diagnostic_msgs.msg import DiagnosticArray
@@ -357,13 +357,12 @@ class TwinNode(GuardedNode):
 
     def _tell_start(self) -> None:
         """Until the node is made, and where that takes long."""
-        for k in itertools.count():
-            # A constructor that fails leaves a context that ends.
-            if self._made.wait(PATIENCE) or not self.context.ok():
-                return
-            if k == 0:
-                self.get_logger().info(COMPILING)
-            self._diagnostics.publish(self.health.array(WARN, COMPILING))
+        logger = self.get_logger()
+        # Where a constructor fails, the context ends meanwhile.
+        with suppress(Exception):
+            while not self._made.wait(PATIENCE) and self.context.ok():
+                logger.info(COMPILING, once=True)
+                self._diagnostics.publish(self.health.array(WARN, COMPILING))
 
     def start(self, leap: float | None = None) -> None:
         """The node is made: reject unknown parameters, begin the diagnostics, and log its summary.
