@@ -14,7 +14,7 @@ import math
 import operator
 import re
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from graphlib import CycleError, TopologicalSorter
 from typing import Any, Final
@@ -325,13 +325,7 @@ class Book:
         if not values:
             return self, rest
         book = replace(self._with(new), formulas=kept, data={})
-        moving = self.following(new)
-        changes = {
-            path: one.value(book.values)
-            for path, one in kept.items()
-            if one.names & moving and not path.startswith("uncertainty.")
-        }
-        return book, {**changes, **rest}
+        return book, {**{one.path: one.value(book.values) for one in book.moving(new)}, **rest}
 
     def told_anew(self, sections: Mapping[str, Any]) -> Book:
         """The book of a file with other sections; of none, where the file does not tell them."""
@@ -339,19 +333,15 @@ class Book:
         data = {**self.data, **sections} if sections and self.data else {}
         return replace(self, formulas=kept, data=data)
 
-    def following(self, names: Any) -> set[str]:
-        """The parameters of some names, and those that follow from them."""
+    def moving(self, names: Iterable[str]) -> list[Formula]:
+        """The numbers that move with some parameters, or with those that follow from them."""
         moving = set(names)
         for name in self.values:
             if name in self.own and self.own[name].names & moving:
                 moving.add(name)
-        return moving
-
-    def paths(self, name: str) -> list[str]:
-        """Where the numbers stand that a parameter moves."""
-        moving = self.following([name])
-        moved = (path for path, one in self.formulas.items() if one.names & moving)
-        return [path for path in moved if not path.startswith("uncertainty.")]
+        # How sure a number is stays as the file has it.
+        moved = (one for one in self.formulas.values() if one.names & moving)
+        return [one for one in moved if not one.path.startswith("uncertainty.")]
 
     def told(self, units: Mapping[str, str] | None = None) -> list[str]:
         """Each parameter with its value, unit and expression, in words."""

@@ -213,8 +213,8 @@ class Machine(TwinRobot):
     def check_number(self, path: str) -> None:
         """As a file's, in each of the entries that have it."""
         keys = full_keys(path)
-        for moved in self.book.paths(str(keys[-1])) if keys[0] == PARAMETERS else ():
-            self.check_number(moved)
+        for moved in self.book.moving([str(keys[-1])]) if keys[0] == PARAMETERS else ():
+            self.check_number(moved.path)
         named = list(self.named(keys))
         for kind, name, where, _ in named:
             if where != ("azimuth",):
