@@ -62,7 +62,7 @@ def pages():
 def typed(text):
     """Lines of these programs in a page's code blocks, and the output that the page prints."""
     lines = []
-    for block in re.finditer(r"^```(\w*).*?\n(.*?)^```|(?:^ {4}.*\n)+", text, re.M | re.S):
+    for block in re.finditer(r"^```(\w*)[^\n]*\n(.*?)^```|(?:^ {4}[^\n]*\n)+", text, re.M | re.S):
         if block[1] == "text":
             if lines and not lines[-1][1]:
                 lines[-1][1] = block[2]
@@ -151,6 +151,7 @@ def test_it_runs_as_it_stands(folder, slow, twin, monkeypatch):
         if output:
             assert_output(output, done[line].out)
     assert len(done) >= 8
+    assert sum(bool(output) for output in commands().values()) >= 20
 
 
 def test_the_list_of_what_is_not_run_is_of_use():
