@@ -25,6 +25,7 @@ from numpy.typing import ArrayLike, NDArray
 from delta_dynamics import inverse_dynamics
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError, PkmTwinError
+from pkm_twin.identification.compare import by_held
 from pkm_twin.identification.rows import next_window
 from pkm_twin.identification.samples import low_pass, tracks
 from pkm_twin.machine.friction import all_keys
@@ -103,10 +104,10 @@ def _constants(
         window = None if windows is None else windows[i]
         pieces, how = tracks(r.time, r.q, r.measured, r.wrench, window=window)
         used.append(how.window)
-        model = robot if r.carried is None else r.carried
-        model = model.changed(friction=dict.fromkeys(all_keys(), 0.0))
+        smooth = replace(r, robot=robot.changed(friction=dict.fromkeys(all_keys(), 0.0)))
         for track in pieces:
-            load = inverse_dynamics(model, track.q, track.qd, track.qdd, track.wrench)
+            motion = track.q, track.qd, track.qdd, track.wrench
+            load = by_held(smooth, inverse_dynamics, track.time, *motion)
             way = np.sign(track.qd)
             columns = [load, track.qd, way, np.ones_like(load), np.abs(load) * way, track.effort]
             flat = low_pass(np.concatenate(columns, 1), track.period, how)
