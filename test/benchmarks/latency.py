@@ -162,7 +162,7 @@ def main(target):
         "The node decodes and encodes bytes itself; three compiled programs compute. At 1 kHz the "
         "caches are cold, and a call takes about twice as long as here.",
         "",
-        *table(stream, "us"),
+        *table(stream, "µs"),
         "",
         f"A trajectory of {POINTS} points, computed in slices between the samples of the stream:",
         "",
