@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 pytest.importorskip("mcap")
-from mcap.writer import CompressionType, Writer
+from mcap.writer import Writer
 
 from delta_dynamics import inverse_dynamics
 from pkm_twin.bags.reader import inspect, read_messages
@@ -18,7 +18,7 @@ from pkm_twin.identification.plausible import recording_fault
 from pkm_twin.identification.rows import rows_of
 from pkm_twin.recordings import Recording
 from pkm_twin.recordings.topics import JOINT_STATE
-from test.bags.folders import make_folder
+from test.bags.folders import make_folder, write_split
 from test.commands.conftest import (
     COLLISION,
     DELTA,
@@ -229,7 +229,9 @@ class TestNoEvidence:
         assert twin("check", bag).out.startswith("not judged")
 
     def test_no_crc(self, tmp_path, sample):
-        report = checked(without_crcs(sample, tmp_path / "plain.mcap"), robot="delta_cu")
+        plain = tmp_path / "plain.mcap"
+        write_split(plain, sample, list(read_messages(sample)))
+        report = checked(plain, robot="delta_cu")
         item = items_of(report)["file"]
         assert (report.code, item["verdict"]) == (0, "unknown")
         assert "no CRC" in item["value"]
@@ -240,21 +242,6 @@ class TestNoEvidence:
         error = twin("check", bag).one_line_error()
         assert "no joint states" in error
         assert ("planned trajectory" in error) == bool(topics)
-
-
-def without_crcs(source, target):
-    """The same messages as rosbag2's default storage settings write them."""
-    with target.open("wb") as file:
-        writer = Writer(file, compression=CompressionType.ZSTD, enable_crcs=False)
-        writer.start(profile="ros2", library="test")
-        channels = {}
-        for topic, info in inspect(source).topics.items():
-            schema = writer.register_schema(info.type, "ros2msg", info.definition.encode())
-            channels[topic] = writer.register_channel(topic, "cdr", schema)
-        for m in read_messages(source):
-            writer.add_message(channels[m.topic], m.log_time, m.data, m.publish_time)
-        writer.finish()
-    return target
 
 
 class TestPayload:

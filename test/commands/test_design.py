@@ -5,18 +5,19 @@ import numpy as np
 import pytest
 
 from pkm_twin.robot.catalogue import load
+from test.support.command import forked
 
 VARY = ("--vary", "geometry.arm_length=0.15:0.3", "--vary", "geometry.forearm_length=0.3:0.6")
 TOLERANCES = ("--tolerance", "geometry.arm_length=1e-4", "--tolerance", "geometry.base_radius=5e-5")
 PARTS = ("--tolerance", "bodies.arm I.length=1e-4", "--tolerance", "joints.arm_2.offset=1e-4")
 
 
-@pytest.fixture
-def pick(tmp_path, twin):
-    out = tmp_path / "pick.csv"
-    line = ("path", "delta", "--cycle", "25,200,25", "--duration", "0.5", "--rate", "100")
-    twin.good(*line, "--no-picture", "--out", out)
-    return out
+@pytest.fixture(scope="module")
+def pick(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("pick")
+    line = "path delta --cycle 25,200,25 --duration 0.5 --rate 100 --no-picture --out pick.csv"
+    assert forked(folder, *line.split()).code == 0
+    return folder / "pick.csv"
 
 
 def test_a_better_robot_is_written_and_loads(twin, pick, tmp_path):

@@ -81,7 +81,9 @@ raise SystemExit(node.run(node.NODE))
         assert twin.process.output.count("Traceback") == 1
         stamps = twin.stream(WINDOW + 3)
         assert [stamp_of(m) for m in twin.since(stamps)] == stamps[WINDOW:]
-        assert twin.process.alive()
+        # Without thread_priority no thread is real-time and no memory stays.
+        assert policies(twin.process.process.pid) == {(os.SCHED_OTHER, 0)}
+        assert locked(twin.process.process.pid) == 0
 
     def test_a_clock_that_never_comes_is_told(self, peer, launch):
         peer.hear(DiagnosticArray, "/diagnostics")
@@ -249,14 +251,6 @@ def test_all_threads_are_real_time_and_memory_stays_or_the_node_warns(peer, laun
     else:
         assert policies(process.process.pid) == {(os.SCHED_FIFO, PRIORITY)}
         assert locked(process.process.pid) > 10_000
-
-
-def test_without_the_parameter_nothing_is_changed(peer, launch_alone):
-    process = launch_alone("delta_dynamics.nodes.gate", fresh=True)
-    peer.hear(DiagnosticArray, "/diagnostics")
-    peer.diagnostics("/command_gate")
-    assert policies(process.process.pid) == {(os.SCHED_OTHER, 0)}
-    assert locked(process.process.pid) == 0
 
 
 def test_a_refusal_of_the_system_is_told(monkeypatch):
