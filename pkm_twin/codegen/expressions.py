@@ -263,7 +263,7 @@ def snapped(value: Any) -> Any:
 
 
 def ordered(results: Iterable[Expression], known: Iterable[int] = ()) -> list[Expression]:
-    """Everything that the results hang on, arguments first; nothing below what is known."""
+    """Everything that the results depend on, arguments first; nothing below what is known."""
     seen: set[int] = set(known)
     order: list[Expression] = []
     for result in results:

@@ -50,7 +50,7 @@ class NumberFunctions:
 
     @cached_property
     def elastic(self) -> FileNumbers:
-        """What elasticity takes beside the geometry."""
+        """Inputs of elasticity in addition to the geometry."""
         return FileNumbers(self.robot, self.paths, lambda made: numbers_of(made.elastic))
 
 

@@ -336,7 +336,7 @@ def design(
     :param minimise: one of :data:`QUANTITIES`, or two: then the Pareto front is found, and the
         machine in its middle is the one returned.
     :param subject_to: bounds, as ``singularity>=0.1`` or ``mass<=3``.
-    :param starts: of the Sobol sequence; the file's own numbers beside.
+    :param starts: of the Sobol sequence, in addition to the file's own numbers.
     :param points: of the front, 3 or more.
     :param progress: called with the number of searches done, of at most :func:`searches`.
     :raises ParameterError: a path, a quantity or a bound that there is not.

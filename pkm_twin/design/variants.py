@@ -106,7 +106,7 @@ class Variants:
 
     @cached_property
     def valid(self) -> Mask:
-        """Which machines can be assembled at home and beside it, shape (k,)."""
+        """Which machines can be assembled at home and near it, shape (k,)."""
         home, graph = self.robot.graph.home, self.robot.graph
         reach = [graph.size if graph.joints[name].slides else 1.0 for name in graph.actuated]
         steps = np.linspace(-1.0, 1.0, len(home)) + 0.3
@@ -259,7 +259,7 @@ class Variants:
 
     @cached_property
     def elasticity(self) -> Array:
-        """What elasticity takes beside the geometry, shape (k, size)."""
+        """Inputs of elasticity in addition to the geometry, shape (k, size)."""
         return self.functions.elastic(self.values)
 
     @cached_property

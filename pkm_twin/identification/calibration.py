@@ -456,7 +456,7 @@ def _looks_placed(
 def _scaled(
     robot: Robot, state: State, measured: Measured, told: list[Parameter], covariance: Array
 ) -> tuple[Scale | None, list[Parameter]]:
-    """How well the scale is known, and the numbers with those marked that hang on it alone."""
+    """How well the scale is known, and the numbers with those marked that depend on it alone."""
     row = scale_slopes(robot, state, [p.name for p in told])
     if row is None:
         return None, told

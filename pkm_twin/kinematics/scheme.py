@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What programs of a graph hang on: closures that are solved, their pivots, pose coordinates."""
+"""What programs of a graph depend on: closures that are solved, their pivots, pose coordinates."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from pkm_twin.machine.graph import BASE, Graph
 
 @dataclass(frozen=True, eq=False)
 class Closed:
-    """What a mechanism's closed forms hang on beside the graph.
+    """What a mechanism's closed forms need in addition to the graph.
 
     ``numbers``: shape (k,). ``start``: where there is one, of such numbers and q to the values of
     passive tree joints beside home, by name, from the inner to the outer body.
@@ -64,7 +64,7 @@ class Scheme(Linkage):
 
     @cached_property
     def structure(self) -> ProgramKey:
-        """All that programs hang on: machines of one structure share them."""
+        """All that programs depend on: machines of one structure share them."""
         return self._mark.also(repr((
             self.graph.topology, pattern_of(self.tree), self.coordinates,
             self.closed.start is not None, self.branch is not None, self.independent, self.pivots,

@@ -249,7 +249,7 @@ class Graph:
 
     @property
     def key(self) -> str:
-        """Text of the geometry: all that compiled programs hang on."""
+        """Text of the geometry: all that compiled programs depend on."""
         return f"{self.topology} {array(self.numbers).tolist()}"
 
     def check(self) -> None:

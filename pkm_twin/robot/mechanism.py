@@ -171,7 +171,7 @@ class Mechanism(Common):
     def start(self, q: Objects) -> Mapping[str, Sequence[Any]]:
         """Values of passive tree joints by q in closed form, where ``has_start``.
 
-        By joint, from its inner to its outer body, beside those at home.
+        By joint, from its inner to its outer body, relative to home.
         """
         raise NotImplementedError
 
@@ -288,7 +288,7 @@ class Mechanism(Common):
 
     @cached_property
     def laws(self) -> tuple[str, ...]:
-        """Friction laws of the drives beside the basic one, see ``machine.friction``."""
+        """Friction laws of the drives in addition to the basic one, see ``machine.friction``."""
         return law_names(self.friction, self.open_laws)
 
     def with_laws(self, graph: Graph) -> Graph:
@@ -353,7 +353,7 @@ class Mechanism(Common):
     def controller(self) -> JointMap:
         """Between the controller's joints and the model's.
 
-        :raises ParameterError: a map of joints that there are not.
+        :raises ParameterError: ``joint_map`` names an unknown joint.
         """
         return JointMap.of(self.joint_names, self.joint_map)
 
@@ -371,7 +371,7 @@ class Mechanism(Common):
         return self.structure().elements
 
     def check_elements(self) -> None:
-        """Refuse factors of elements that there are not.
+        """Reject factors of unknown elements.
 
         :raises ParameterError: by the name, or nothing is elastic.
         """
@@ -401,12 +401,12 @@ class Mechanism(Common):
 
     @property
     def closed_key(self) -> str:
-        """Text of what closed forms and branch rules hang on and no number tells."""
+        """Cache key of the parameters of closed forms that are not numbers."""
         return ""
 
     @property
     def closed_numbers(self) -> Sequence[float]:
-        """Numbers of the geometry that closed forms hang on."""
+        """Numbers of the geometry that closed forms depend on."""
         return ()
 
     def on(self: R, numbers: Numbers) -> R:

@@ -100,7 +100,7 @@ def body_points(graph: Graph) -> dict[str, list[Array]]:
 
 
 def bars(graph: Graph) -> tuple[Bar, ...]:
-    """Rods, both of a pair with what they hang on; a body as bars from one point to the others."""
+    """Rods, both of a pair with what holds them; a body as bars from one point to the others."""
     radius = BAR * graph.size
     result = []
     for body, found in body_points(graph).items():

@@ -86,7 +86,7 @@ class Robot(Mechanism):
 
     @cached_property
     def calls(self) -> dict[str, Any]:
-        """What is made once a robot, by name: functions for one sample, tables, maps' bounds."""
+        """Cache of objects that are built once per robot, by name."""
         return {}
 
     def bound(

@@ -4,14 +4,19 @@
 from __future__ import annotations
 
 import ast
+import inspect
 import re
 from pathlib import Path
 
 import pytest
 from typer.main import get_command
 
+import delta_dynamics
+import stiffness_monitor
+from pkm_twin import Robot, design, load, paths, robot_names
 from pkm_twin.apps.cli import app
 
+PACKAGES = (delta_dynamics, stiffness_monitor, paths, design)
 ROOT = Path(__file__).parents[2]
 BANNED = {
     r"refus(e|es|ed|ing|als?)": "reject (a message); invalid (a value)",
@@ -158,6 +163,23 @@ def test_errors_are_described():
     texts = [text for node in classes for text in strings(node)]
     assert len(classes) > 5
     assert [line for text in texts for line in banned(text)] == []
+
+
+def test_docstrings_of_the_python_page():
+    """Of the functions and classes that packages export, and of Robot."""
+    public = [getattr(package, name) for package in PACKAGES for name in package.__all__]
+    public += [inner for one in (*public, Robot) if inspect.isclass(one) for inner in _members(one)]
+    texts = {inspect.getdoc(one) or "" for one in (*public, Robot, load, robot_names)}
+    plain = [re.sub(r"``.*?``", "", text) for text in sorted(texts)]
+    assert [line for text in plain for line in banned(text)] == []
+
+
+def _members(kind):
+    """Methods and properties with names of their own."""
+    for name in dir(kind):
+        if not name.startswith("_"):
+            one = inspect.getattr_static(kind, name)
+            yield getattr(one, "func", None) or getattr(one, "fget", None) or one
 
 
 @pytest.mark.parametrize(
