@@ -6,7 +6,6 @@ import pytest
 
 from delta_dynamics import (
     dynamics_terms,
-    energy,
     forward_dynamics,
     inverse_dynamics,
     parameter_values,
@@ -25,9 +24,7 @@ from test.support.robots import (
     finite_difference,
     joint_units_of_size,
     load,
-    often,
     partly_long,
-    random_joints,
     random_motion,
 )
 
@@ -98,44 +95,6 @@ def test_efforts_and_all_that_follows_from_them_have_the_laws(name, rng):
     by_qd = finite_difference(lambda x: inverse_dynamics(robot, q[0], x, qdd[0], wrench[0]), qd[0])
     assert np.abs(found.q - by_q).max() < 1e-5 * np.abs(by_q).max()
     assert np.abs(found.qd - by_qd).max() < 1e-5 * np.abs(by_qd).max()
-
-
-@ROBOTS
-@pytest.mark.parametrize("trials", often(2, 20))
-def test_the_plant_never_gains_energy(name, trials):
-    moved = 0.0
-    for trial in range(trials):
-        rng = np.random.default_rng([trial, len(name)])
-        keys = list(all_keys())
-        robot = rubbing(name, rng, *(keys if trial else keys[:6]))
-        f, unit = robot.friction, joint_units_of_size(robot)
-        q = random_joints(robot, rng, 1)[0]
-        plant = Plant(robot, q)
-        plant.qd = rng.normal(0.0, 0.5, len(q)) * unit
-        rest = inverse_dynamics(robot, q, 0.0 * q, 0.0 * q)
-        effort = rest + rng.normal(0.0, 0.3, len(q)) * np.abs(rest).max()
-        step = rng.choice([2e-4, 1e-3])
-
-        def stored(plant=plant, f=f, effort=effort):
-            """Bodies' energy and that of the cogging, less the work of the efforts."""
-            own = energy(plant.robot, plant.q, plant.qd)
-            wave = 2.0 * np.pi / np.where(f.cogging_period > 0.0, f.cogging_period, 1.0)
-            angle = wave * plant.q
-            cogging = (f.cogging_cos * np.sin(angle) - f.cogging_sin * np.cos(angle)) / wave
-            parts = [float(own.kinetic), float(own.potential), float(cogging.sum()),
-                     -float((effort - f.offset) @ plant.q)]  # fmt: skip
-            return sum(parts), sum(map(abs, parts)) + np.abs(effort) @ np.abs(plant.q)
-
-        before, _ = stored()
-        for _ in range(40):
-            last = plant.q
-            plant.advance(effort, np.zeros(6), step)
-            if robot.singularity(plant.q) < 1e-2:
-                break
-            now, size = stored()
-            assert now <= before + 1e-12 * size, (trial, step)
-            before, moved = now, moved + np.abs(plant.q - last).max()
-    assert moved > 0.0
 
 
 @pytest.mark.parametrize("way", [1.0, -1.0])

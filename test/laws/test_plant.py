@@ -236,13 +236,20 @@ def every_machine(*kept):
     return pytest.mark.parametrize("name", partly_long(names, *kept))
 
 
-def rubbing(robot, rng, q):
-    """The robot with friction from none to a locked drive, and stops about q."""
+def rubbing(robot, rng, q, laws):
+    """The robot with friction from none to a locked drive, or of all laws, and stops about q."""
     n, scale = robot.joints_count, joint_units_of_size(robot)
     friction = {
         "viscous": rng.choice([0.0, 0.0, 1e-3, 0.1, 1.0, 28.0, 1e3, 1e6], n).tolist(),
         "coulomb": rng.choice([0.0, 0.0, 0.01, 1.0, 30.0], n).tolist(),
     }
+    if laws:
+        friction |= {
+            "stribeck": rng.uniform(0.0, 1.0, n).tolist(), "stribeck_speed": (0.3 * scale).tolist(),
+            "load_dependent": rng.uniform(0.0, 0.3, n).tolist(),
+            "cogging_cos": rng.normal(size=n).tolist(), "cogging_sin": rng.normal(size=n).tolist(),
+            "cogging_period": (0.05 * scale).tolist(), "offset": rng.normal(size=n).tolist(),
+        }  # fmt: skip
     room = rng.choice([0.01, 0.1]) * scale
     stops = np.stack([q - room * rng.random(n), q + room * rng.random(n)], 1)
     return stopped_at(robot.changed(friction=friction), stops)
@@ -255,9 +262,14 @@ def stopped_at(robot, stops):
 
 
 def balance(plant, effort):
-    """Mechanical energy less the work of constant efforts, J; and what it is a sum of."""
-    both = energy(plant.robot, plant.q, plant.qd)
-    parts = [float(both.kinetic), float(both.potential), -float(effort @ plant.q)]
+    """Energy, that of cogging too, less the work of constant efforts, J; and its parts' size."""
+    both, f = energy(plant.robot, plant.q, plant.qd), plant.robot.friction
+    wave = 2.0 * np.pi / np.where(f.cogging_period > 0.0, f.cogging_period, 1.0)
+    cogging = f.cogging_cos * np.sin(wave * plant.q) - f.cogging_sin * np.cos(wave * plant.q)
+    parts = [
+        float(both.kinetic), float(both.potential), float((cogging / wave).sum()),
+        -float((effort - f.offset) @ plant.q),
+    ]  # fmt: skip
     return sum(parts), sum(map(abs, parts))
 
 
@@ -270,7 +282,7 @@ def test_energy_never_grows_without_input(name, trials, machine):
     for trial in range(trials):
         rng = np.random.default_rng([11, trial, n, len(name)])
         q = random_joints(robot, rng, 1)[0]
-        plant = Plant(rubbing(robot, rng, q), q)
+        plant = Plant(rubbing(robot, rng, q, trial % 3 == 2), q)
         plant.qd = rng.normal(0.0, rng.choice([0.0, 0.1, 1.0, 5.0]), n) * scale
         effort = rng.normal(0.0, 1.0, n) * rng.choice([0.0, 1.0, 10.0])
         step = rng.choice([1e-4, 1e-3, 5e-3])
