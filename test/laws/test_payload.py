@@ -32,6 +32,14 @@ def moved(robot: Robot, seconds: float) -> tuple[Array, Array, Array, Array]:
     )  # fmt: skip
 
 
+def fed(robot: Robot, *rows: Array, known: Array | None = None) -> PayloadEstimator:
+    """An estimator after times, states and efforts."""
+    estimator = PayloadEstimator(robot)
+    for sample in zip(*rows, strict=True):
+        estimator.push(*sample, known)
+    return estimator
+
+
 @pytest.mark.parametrize(
     ("name", "feels"), [("stewart", True), ("rps3", True), ("delta_cu", False)]
 )
@@ -44,10 +52,7 @@ def test_a_load_is_found_with_what_the_machine_feels_of_it(name: str, feels: boo
     effort = inverse_dynamics(laden, q, qd, qdd)
     rng = np.random.default_rng(5)
     effort = effort + 1e-3 * np.abs(effort).max(0) * rng.normal(size=effort.shape)
-    estimator = PayloadEstimator(robot)
-    for sample in zip(time, q, qd, qdd, effort, strict=True):
-        found = estimator.push(*sample)
-    assert found is not None
+    found = fed(robot, time, q, qd, qdd, effort).estimate()
     assert abs(found.mass - mass) < max(0.01 * mass, 4.0 * found.mass_deviation)
     assert found.mass_deviation < 0.05 * mass
     assert (np.isfinite(found.com_deviation) == feels).all()
@@ -85,9 +90,7 @@ def test_a_reset_forgets_the_load_alone() -> None:
     robot = load("delta_cu")
     time, q, qd, qdd = moved(robot, 0.5)
     effort = inverse_dynamics(robot.changed(payload={"mass": 1.0}), q, qd, qdd)
-    estimator = PayloadEstimator(robot)
-    for sample in zip(time, q, qd, qdd, effort, strict=True):
-        estimator.push(*sample)
+    estimator = fed(robot, time, q, qd, qdd, effort)
     assert estimator.estimate().mass == pytest.approx(1.0, rel=0.01)
     estimator.reset()
     found = estimator.estimate()
@@ -104,11 +107,8 @@ def test_a_stream_four_times_as_fast_is_not_surer() -> None:
     effort = inverse_dynamics(laden, q, qd, qdd)
     found = []
     for step in (1, 4):
-        estimator = PayloadEstimator(robot)
         rows = (array[::step] for array in (time, q, qd, qdd, effort))
-        for sample in zip(*rows, strict=True):
-            estimator.push(*sample)
-        found.append(estimator.estimate().mass_deviation)
+        found.append(fed(robot, *rows).estimate().mass_deviation)
     assert found[0] == pytest.approx(found[1], rel=0.1)
 
 
@@ -118,12 +118,8 @@ def test_what_is_known_of_a_wrench_is_not_taken_for_a_load() -> None:
     time, q, qd, qdd = moved(robot, 1.0)
     wrench = np.array([20.0, -10.0, 30.0, 1.0, 2.0, -1.0])
     effort = inverse_dynamics(laden, q, qd, qdd, wrench)
-    masses = []
-    for known in (wrench, None):
-        estimator = PayloadEstimator(robot)
-        for sample in zip(time, q, qd, qdd, effort, strict=True):
-            estimator.push(*sample, known)
-        masses.append(estimator.estimate().mass)
+    rows = (time, q, qd, qdd, effort)
+    masses = [fed(robot, *rows, known=known).estimate().mass for known in (wrench, None)]
     assert masses[0] == pytest.approx(1.3, rel=0.01)
     assert abs(masses[1] - 1.3) > 1.0
 
@@ -224,8 +220,5 @@ def test_friction_that_grows_with_the_load_is_no_load() -> None:
     robot = load("delta_cu").changed(payload={"mass": 0.0}, friction=laws)
     time, q, qd, qdd = moved(robot, 1.5)
     effort = inverse_dynamics(robot.changed(payload={"mass": 1.3}), q, qd, qdd)
-    estimator = PayloadEstimator(robot)
-    for sample in zip(time, q, qd, qdd, effort, strict=True):
-        found = estimator.push(*sample)
-    assert found is not None
+    found = fed(robot, time, q, qd, qdd, effort).estimate()
     assert found.mass == pytest.approx(1.3, rel=2e-3)
