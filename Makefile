@@ -73,6 +73,7 @@ bench: $(VENV)/bench.stamp
 	$(BIN)/python -m test.benchmarks.report out/benchmarks.json docs/benchmarks.md
 	OMP_NUM_THREADS=1 $(BIN)/python -m test.benchmarks.latency docs/benchmarks.md
 	OMP_NUM_THREADS=1 $(BIN)/python -m test.benchmarks.pinocchio_c docs/export_c.md
+	OMP_NUM_THREADS=1 $(BIN)/python -m test.export.c_table docs/export_c.md
 
 certificate: $(VENV)/certificate.stamp
 	$(BIN)/python -m tools.certificate

@@ -12,7 +12,6 @@ import pytest
 
 from delta_dynamics import inverse_dynamics
 from pkm_twin import robot_names
-from pkm_twin.apps.cli import main
 from pkm_twin.errors import ParameterError
 from pkm_twin.export.c_package import c_package, identifier
 from test.machine.random_machines import FILES
@@ -398,10 +397,8 @@ int main(void)
     assert min(right.count("0"), right.count("2")) > count / 20
 
 
-def test_the_command_s_example_agrees_with_python(tmp_path, small):
-    with pytest.raises(SystemExit) as ended:
-        main(["export", "c", "five_bar", "--out", str(tmp_path / "out")])
-    assert not ended.value.code
+def test_the_command_s_example_agrees_with_python(twin, tmp_path, small):
+    assert twin("export", "c", "five_bar", "--out", tmp_path / "out").code == 0
     command = [COMPILERS[0], "-std=c99", "example.c", "pkm_five_bar.c", "-o", "example", "-lm"]
     subprocess.run(command, cwd=tmp_path / "out", check=True)
     done = subprocess.run(["./example"], cwd=tmp_path / "out", check=False, capture_output=True)

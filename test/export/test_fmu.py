@@ -14,7 +14,6 @@ import pytest
 
 from delta_dynamics import inverse_dynamics
 from delta_dynamics.simulation.machine import Plant
-from pkm_twin.apps.cli import main
 from pkm_twin.export.fmu import KINDS, VERSIONS, Fmu, found_compiler
 from pkm_twin.mechanisms.machine import Machine
 from test.machine.random_machines import variant
@@ -238,17 +237,13 @@ def test_an_importer_compiles_the_sources(version, kind, tmp_path):
     assert fmpy.simulate_fmu(str(tmp_path / "out"), stop_time=0.01)["status"][-1] == 0
 
 
-def test_the_command_writes_a_unit_that_has_its_units(tmp_path):
+def test_the_command_writes_a_unit_that_has_its_units(twin, tmp_path):
     out = tmp_path / "five_bar.fmu"
     words = ["export", "fmu", "five_bar", "--out", str(out), "--fmi", "2", "--kind", "torques"]
-    with pytest.raises(SystemExit) as ended:
-        main(words)
-    assert not ended.value.code
+    assert twin(*words).code == 0
     with zipfile.ZipFile(out) as archive:
         top = ET.fromstring(archive.read("modelDescription.xml"))
         assert [name for name in archive.namelist() if name.startswith("binaries/")]
     units = {v.get("name"): v[0].get("unit") for v in top.iter("ScalarVariable")}
     assert units["tau.left"] == "N.m" and units["qdd.left"] == "rad/s2"
-    with pytest.raises(SystemExit) as ended:
-        main([*words[:-4], "--overwrite", "--fmi", "4"])
-    assert ended.value.code
+    assert twin(*words[:-4], "--overwrite", "--fmi", "4").code

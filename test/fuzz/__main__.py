@@ -27,7 +27,7 @@ KINDS: tuple[type[Kind], ...] = (
     Messages, DamagedBags, DamagedSplits, NonsenseBags, Cdr, Metadata, Yaml, Urdf, Csv, Commands,
 )  # fmt: skip
 NODES = "nodes.json"
-"""What test_fuzz.py leaves there."""
+"""What test_nodes.py leaves there."""
 INTRODUCTION = """## Fuzzing
 
 Printed by `make fuzz`: {total:,} random examples, after the inputs that failed in the past
