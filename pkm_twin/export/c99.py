@@ -197,9 +197,8 @@ class Folding:
 class Routine:
     """One public function.
 
-    ``outputs``: expressions by argument. ``gates``: above zero where a sample is rejected.
-    ``equations``: are solved one after the other. ``state``: what it leaves to its next call, by
-    the input ``last``.
+    ``outputs``: expressions by argument. ``equations``: are solved one after the other.
+    ``state``: what it leaves to its next call, by the input ``last``.
     """
 
     name: str
@@ -207,7 +206,6 @@ class Routine:
     outputs: Mapping[str, Sequence[Expression]]
     equations: Sequence[Equations]
     summary: str
-    gates: Sequence[Expression] = ()
     state: Sequence[Expression] = ()
 
     @property
@@ -217,8 +215,8 @@ class Routine:
 
     @property
     def results(self) -> list[Expression]:
-        """Outputs, state and gates."""
-        return [*(e for row in self.given.values() for e in row), *self.gates]
+        """Outputs, then the state."""
+        return [e for row in self.given.values() for e in row]
 
     @property
     def operations(self) -> tuple[str, int]:
@@ -432,10 +430,7 @@ static int @_{name}({more}const double *{q.target}, int steps, double *h, double
                     solving.append(f"const double *{LAST} = (rung < 0) ? state : none;")
                 solving += [f"if (@_{name}({to}) == 0) {{", "    continue;", "}"]
         call = self.function(f"{routine.name}_of", [*wanted, *held], known, given) % "r"
-        verdict = f"@_judged(r, {len(wanted)})"
-        if not held:
-            verdict = f"(@_finite(r, {len(wanted)}) != 0) ? 0 : 2"
-        work = "\n".join([*solving, f"{call};", f"status = {verdict};"])
+        work = "\n".join([*solving, f"{call};", f"status = @_judged(r, {len(wanted)});"])
         lines = [f"    double {name}[{size}] = {{0.0}};" for name, size in rooms.items()]
         if any(q.home for q in routine.equations):
             lines.append("    int rung;")
@@ -447,12 +442,6 @@ static int @_{name}({more}const double *{q.target}, int steps, double *h, double
         if "parameters" not in call:
             lines.append("    (void)parameters;")
         lines += [f"    if ({' && '.join(finite)}) {{", indent(work, "        "), "    }"]
-        for at in range(len(wanted) - len(routine.gates), len(wanted)):
-            lines += [
-                f"    if ((status == 0) && !(r[{at}] <= 0.0)) {{",
-                "        status = 1;",
-                "    }",
-            ]
         at = 0
         for name, row in routine.given.items():
             source = f"&r[{at}]" if at else "r"

@@ -6,6 +6,7 @@ from __future__ import annotations
 import re
 import textwrap
 from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -198,17 +199,18 @@ class Package:
         rows, equations = self._read(elastic.response)
         (row,) = rows.values()
         k = len(elastic.names)
-        mechanism = self.fold.tape.lift(HELD - row[-1])
+        # No frame that is a mechanism.
+        sound = self.fold.tape.lift(row[-1] - HELD)
+        equations = [replace(q, branch=[*q.branch, sound]) for q in equations]
         made = (
             Routine(
                 "compliance", {"q": self.n}, {"c": row[2 * k + 7 : 2 * k + 43]}, equations,
                 "Compliance of the platform at its reference point, joints locked: x y z rx ry rz, "
-                "base axes, row by row.", [mechanism],
+                "base axes, row by row.",
             ),
             Routine(
                 "strain_energy", {"q": self.n, "wrench": 6}, {"energies": row[k : 2 * k]},
                 equations, f"Strain energy (J) of each element: {', '.join(elastic.names)}.",
-                [mechanism],
             ),
         )  # fmt: skip
         result += [routine for routine in made if self._wants(routine.name)]
