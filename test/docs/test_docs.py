@@ -84,7 +84,7 @@ def test_a_printer_from_its_configuration_to_the_next(clone, twin):
     (block,) = (block for language, block, _ in blocks("calibration.md") if "printer" in block)
     printed = run("bash", block, twin)
     for kind, before, after in zip(("height", "distance"), (1.02, 1.06), (2, 3), strict=True):
-        (row,) = re.findall(rf"^\W+{kind}\W+\d+\W+([\d.]+)\W+([\d.]+)", printed, re.M)
+        (row,) = re.findall(rf"^{kind} +\d+ +([\d.]+) \(.*?\) +([\d.]+)", printed, re.M)
         assert [float(x) for x in row] == pytest.approx([before, after / 1e3], abs=5e-3 * before)
         assert re.search(rf"{kind}s (agree )?to {after} µm[^()]*\({before} mm before\)", page)
     known = r"known\s+to ([\d.]+) mm in 100 mm"
