@@ -17,6 +17,7 @@ from delta_dynamics.torques.stiction import beyond_friction, friction_reach, mov
 from delta_dynamics.torques.virtual_work import inverse_dynamics
 from pkm_twin.codegen.arrays import Array, Mask
 from pkm_twin.errors import PkmTwinError
+from pkm_twin.identification.estimation import estimate
 from pkm_twin.identification.judge import LOUD
 from pkm_twin.identification.plausible import LATEST
 from pkm_twin.identification.rows import BLOCK, shaken_efforts
@@ -25,7 +26,6 @@ from pkm_twin.identification.samples import (
     Filtering,
     Track,
     filtered,
-    huber,
     kept_rows,
     noise_of,
     passed_band,
@@ -41,8 +41,6 @@ MAX_RESIDUAL: Final = 0.05
 """Largest good torque residual RMS, part of the joint's peak effort."""
 LEAST: Final = 40
 """Samples that a piece needs: fewer than for a fit, as nothing is fitted."""
-ROBUST_PASSES: Final = 5
-"""Robust passes for how late the efforts are."""
 LOCAL: Final = 0.25
 """Time over which a residual is judged by itself, s: a collision is shorter than a recording."""
 MORE: Final = 3.0
@@ -200,17 +198,9 @@ def compare(r: Recording, bound: float = MAX_RESIDUAL) -> Compared | None:
 
 def _late(left: Array, change: Array) -> float:
     """How late the efforts are, s, by residuals and the efforts' change (k, n) each."""
-    late, size = 0.0, np.maximum(np.sqrt(np.mean(change**2, 0)), 1e-300)
-    for _ in range(ROBUST_PASSES):
-        away = left + late * change
-        usual = np.maximum(usual_size(away), 1e-12 * size)
-        weight = huber(np.abs(away) / usual) / usual**2
-        total = float(np.sum(weight * change**2))
-        if not total > 0.0:
-            return 0.0
-        late = float(np.clip(-np.sum(weight * left * change) / total, -LATEST, LATEST))
+    found = estimate(-change[..., None], left, np.zeros(1), np.full(1, LATEST)).values[0]
     # At the bound it is another error's.
-    return late if abs(late) < LATEST else 0.0
+    return float(found) if abs(found) < LATEST else 0.0
 
 
 def steps_in(r: Recording) -> Steps:
