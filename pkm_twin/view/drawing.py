@@ -160,7 +160,7 @@ def draw(robot: Robot) -> Any:
     ax.axis("off")
     halo = patheffects.withStroke(linewidth=3, foreground="w")
     style: dict[str, Any] = {"fontsize": 9, "path_effects": [halo], "ha": "center"}
-    for name, place in scene.drive_places(q).items():
+    for name, place in shapes.drives.items():
         right, up, _ = camera.see(place)
         ax.annotate(name, (right, up), (0, 9), textcoords="offset points", **style)
     _corners(ax, camera, style)

@@ -64,7 +64,7 @@ class Shapes:
 
     ``*_at``: (k, 3) m; ``cylinder_turns``: (k, 4) quaternions, w first; ``*_sizes``: (k, 3)
     scales in own axes; ``*_colours``: (k, 3) of 0 to 255. ``platform_at``, ``platform_turn``: of
-    the plate, deflected; ``places``: (name, (3,)) of elements, for a label.
+    the plate, deflected; ``places`` of elements and ``drives``: (3,) m by name, for labels.
     """
 
     cylinder_at: Array
@@ -77,6 +77,7 @@ class Shapes:
     platform_at: Array
     platform_turn: Array
     places: dict[str, Array]
+    drives: dict[str, Array]
 
 
 class Scene:
@@ -91,9 +92,9 @@ class Scene:
         self._thin = BAR * graph.size
         self._elements = {bar.element for bar in self.bars if bar.element}
         self._joints = [j for j in graph.joints.values() if j.kind not in ("translation", "fixed")]
-        self._drives = [j for j in self._joints if j.actuated]
+        self._drives = {j.name: self._motor(j) for j in self._joints if j.actuated}
         self._balls = self._ball_places()
-        self._held = [[self._on_platform(end) for end in (b.start, b.end)] for b in self.bars]
+        self._legs = self._telescopes()
 
     def _ball_places(self) -> list[tuple[str, Place]]:
         """Where balls stand: joints that turn, and the ends of rods, by the joint's label."""
@@ -108,6 +109,17 @@ class Scene:
                 ends = zip(rod.joint_names, (rod.inner, rod.outer), rod.ends, strict=True)
                 found += [(name, (body, end + aside)) for name, body, end in ends]
         return found
+
+    def _telescopes(self) -> dict[str, tuple[Place, Place]]:
+        """Foot of the tube and tip of the ram of each telescope on the platform, by body."""
+        graph, legs = self.robot.graph, {}
+        for joint in filter(telescope, self._joints):
+            foot = joint.inner, tube_start(graph, joint)
+            ends = (spot for bar in self.bars for spot in (bar.start, bar.end))
+            held = (spot for spot in ends if spot[0] == joint.outer and self._on_platform(spot))
+            if (tip := next(held, None)) is not None:
+                legs |= dict.fromkeys((joint.inner, joint.outer), (foot, tip))
+        return legs
 
     def _on_platform(self, place: Place) -> bool:
         """Whether a point moves with the platform: one of it, or of a joint with it."""
@@ -147,25 +159,27 @@ class Scene:
         moved = np.zeros(6) if deflection is None else np.array(deflection)
         turn = Rotation.from_rotvec(moved[3:])
 
-        def place(spot: Place, held: bool) -> Array:
+        def place(spot: Place) -> Array:
             point = posture.place(*spot)
-            if not held or deflection is None:
+            if not moved.any():
                 return point
-            return np.asarray(origin + moved[:3] + turn.apply(point - origin), np.float64)
+            if self._on_platform(spot):
+                return np.asarray(origin + moved[:3] + turn.apply(point - origin), np.float64)
+            if spot[0] not in self._legs:
+                return point
+            # A leg turns about its foot, so that its tip stays on the platform.
+            foot, tip = (posture.place(*end) for end in self._legs[spot[0]])
+            part = np.clip((point - foot) @ (tip - foot) / ((tip - foot) @ (tip - foot)), 0.0, 1.0)
+            return np.asarray(point + part * (place(self._legs[spot[0]][1]) - tip), np.float64)
 
-        ends = np.array(
-            [
-                [place(spot, on) for spot, on in zip((bar.start, bar.end), held, strict=True)]
-                for bar, held in zip(self.bars, self._held, strict=True)
-            ]
-        ).reshape(-1, 2, 3)
-        radii = np.array([bar.radius for bar in self.bars])
-        motors = [self._motor(joint, posture) for joint in self._drives]
-        ends = np.concatenate([ends, np.array([m[0] for m in motors]).reshape(-1, 2, 3)])
-        radii = np.concatenate([radii, [m[1] for m in motors]])
+        motors = list(self._drives.values())
+        cylinders = [*self.bars, *motors]
+        ends = np.array([[place(bar.start), place(bar.end)] for bar in cylinders])
+        ends = ends.reshape(-1, 2, 3)
+        radii = np.array([bar.radius for bar in cylinders])
         bar_colours = [self._colour(bar, colours) for bar in self.bars]
         at, turns, sizes = _cylinders(ends, radii)
-        balls = [place(spot, self._on_platform(spot)) for _, spot in self._balls]
+        balls = [place(spot) for _, spot in self._balls]
         ball_radii = np.array([1.25 * self._radius(spot) for _, spot in self._balls])
         # Round ends, so that bars of one body meet without gaps.
         tips = ends[: len(self.bars)].reshape(-1, 3)
@@ -186,6 +200,7 @@ class Scene:
             origin + moved[:3],
             _quaternions(turn * whole),
             places,
+            dict(zip(self._drives, ends[len(self.bars) :].mean(1), strict=True)),
         )
 
     def frames(self, q: Array, deflection: Array) -> dict[str, tuple[Array, Array]]:
@@ -217,28 +232,20 @@ class Scene:
             return PLATFORM
         return ROD if bar.part in graph.rods else BODY
 
-    def _motor(self, joint: Joint, posture: Posture) -> tuple[Array, float]:
-        """Both ends and the radius of the cylinder that stands for a drive, along its axis."""
-        axis = posture.rotations[joint.inner] @ joint.axes[0]
+    def _motor(self, joint: Joint) -> Bar:
+        """The cylinder that stands for a drive, along its axis."""
+        axis, body, middle = joint.axes[0], joint.inner, joint.at
         radius = self._radius((joint.outer, joint.at))
         if telescope(joint):
             parts = {joint.inner, joint.outer}
             radius = max((bar.radius for bar in self.bars if bar.part in parts), default=radius)
-            foot = tube_start(self.robot.graph, joint)
-            middle = posture.place(joint.inner, foot + joint.home * joint.axes[0] / 2)
+            middle = tube_start(self.robot.graph, joint) + joint.home * axis / 2
             half, radius = 1.5 * radius, 1.5 * radius
         elif joint.kind == "prismatic":
-            middle = posture.place(joint.outer, joint.at)
-            half, radius = 3.0 * self._thin, 2.5 * self._thin
+            body, half, radius = joint.outer, 3.0 * self._thin, 2.5 * self._thin
         else:
-            middle = posture.place(joint.inner, joint.at)
             half, radius = 2.0 * radius, 1.6 * radius
-        return np.array([middle - half * axis, middle + half * axis]), radius
-
-    def drive_places(self, q: Array) -> dict[str, Array]:
-        """Where the drives stand, (3,) m, by joint name: for their labels."""
-        posture = Posture(self.robot, q)
-        return {j.name: self._motor(j, posture)[0].mean(0) for j in self._drives}
+        return Bar(joint.name, (body, middle - half * axis), (body, middle + half * axis), radius)
 
     def box(self) -> tuple[Array, Array]:
         """Least and greatest coordinates of the machine at home, (3,) m."""

@@ -56,7 +56,7 @@ class Stage:
         size, draw = scene.size, server.scene
         self._names = {
             name: draw.add_label(f"/names/{k}", name, anchor="bottom-center", position=place)
-            for k, (name, place) in enumerate(scene.drive_places(q).items())
+            for k, (name, place) in enumerate(scene.shapes(q).drives.items())
         }
         self._element = draw.add_label("/element", "", anchor="bottom-center", visible=False)
         self._arrows = draw.add_arrows(
@@ -192,7 +192,7 @@ class Stage:
             for body, (at, turn) in self._scene.frames(q, deflection).items():
                 if body in self._meshes:
                     self._meshes[body].position, self._meshes[body].wxyz = at, turn
-        for name, place in self._scene.drive_places(q).items():
+        for name, place in shapes.drives.items():
             self._names[name].position = place
         self._rest.visible = moved
         if moved:

@@ -187,9 +187,26 @@ def test_bars_keep_their_lengths_and_the_platform_carries_what_is_on_it(name, rn
         for (_, spot), before, after in zip(
             scene._balls, shapes.ball_at, moved.ball_at, strict=False
         ):
-            expected = shift[:3] if scene._on_platform(spot) else np.zeros(3)
+            on, leg = scene._on_platform(spot), spot[0] in scene._legs
+            expected = shift[:3] if on else (after - before) * leg
             np.testing.assert_allclose(after - before, expected, atol=1e-12)
         np.testing.assert_allclose(np.linalg.norm(shapes.cylinder_turns, axis=1), 1.0)
+
+
+@pytest.mark.parametrize("name", ["stewart", "upr_rpu"])
+def test_a_deflected_leg_stays_straight_and_keeps_its_drive(name):
+    """The drive stays on the line from the foot of its leg to the platform."""
+    model = model_of(name)
+    scene = Scene(model.robot)
+    shift = scene.size * np.array([0.02, -0.03, 0.01, 0.0, 0.0, 0.0])
+    rest, moved = scene.shapes(model.start.q), scene.shapes(model.start.q, shift)
+    assert set(moved.drives) == set(model.robot.joint_names)
+    for name, at in moved.drives.items():
+        foot, tip = (spot[1] for spot in scene._legs[model.robot.graph.joints[name].inner])
+        along, way = tip + shift[:3] - foot, at - foot
+        assert np.linalg.norm(np.cross(way, along)) < 1e-6 * np.linalg.norm(along) ** 2
+        assert 0.0 < way @ along < along @ along
+        assert np.linalg.norm(at - rest.drives[name]) > 1e-3 * scene.size
 
 
 def test_every_element_has_a_place_and_its_colour():
