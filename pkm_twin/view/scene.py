@@ -112,7 +112,8 @@ class Scene:
 
     def _telescopes(self) -> dict[str, tuple[Place, Place]]:
         """Foot of the tube and tip of the ram of each telescope on the platform, by body."""
-        graph, legs = self.robot.graph, {}
+        graph = self.robot.graph
+        legs: dict[str, tuple[Place, Place]] = {}
         for joint in filter(telescope, self._joints):
             foot = joint.inner, tube_start(graph, joint)
             ends = (spot for bar in self.bars for spot in (bar.start, bar.end))
