@@ -19,7 +19,7 @@ from pkm_twin.errors import ParameterError, PkmTwinError, one_line
 from pkm_twin.robot.clearance import has_clearance, joint_clearance
 from pkm_twin.robot.limits import beyond_limits
 from pkm_twin.robot.robot import Robot
-from pkm_twin.robot.workspace import has_joint_angles
+from pkm_twin.robot.workspace import has_joint_angles, passive_values
 from stiffness_monitor import PlatformResponse, platform_response
 
 Grade = Literal["good", "warn", "bad"]
@@ -130,16 +130,22 @@ class Model:
         lows, highs = (np.array([getattr(r, end) for r in self.joint_ranges]) for end in _ENDS)
         random = np.random.default_rng(0).random((SAMPLES, robot.joints_count))
         corners = np.array(list(itertools.product((0.0, 1.0), repeat=robot.joints_count)))
-        poses, good = robot.try_forward(lows + (highs - lows) * np.concatenate([corners, random]))
-        kept = [pose for pose in poses[good] if not self._angle_beyond(pose)]
+        parts = np.concatenate([corners, random])
+        poses, good = robot.try_forward(lows + (highs - lows) * parts)
+        rows = (lows + (highs - lows) * parts)[good]
+        kept = [
+            pose
+            for q, pose in zip(rows, poses[good], strict=True)
+            if not self._passive_beyond(q, pose)
+        ]
         found = np.array([*kept, self.start.pose])
-        rows = []
+        ranges = []
         for k, (name, unit) in enumerate(zip(robot.pose_names, robot.pose_units, strict=True)):
             least, most = float(found[:, k].min()), float(found[:, k].max())
             step = _step(most - least)
             low, high = (round(end * step, 12) for end in (least // step, -(-most // step)))
-            rows.append(Range(name, unit, low, high, step))
-        return tuple(rows)
+            ranges.append(Range(name, unit, low, high, step))
+        return tuple(ranges)
 
     @cached_property
     def wrench_ranges(self) -> tuple[Range, ...]:
@@ -195,19 +201,26 @@ class Model:
             if (np.abs(pose - asked) > SAME * (1.0 + np.abs(asked))).any():
                 return _refused(state, "the pose is in another assembly mode than home")
             pose = asked
-        angle = self._angle_beyond(pose)
-        return _refused(state, angle) if angle else replace(state, q=q, pose=pose, refusal="")
+        beyond = self._passive_beyond(q, pose)
+        return _refused(state, beyond) if beyond else replace(state, q=q, pose=pose, refusal="")
 
-    def _angle_beyond(self, pose: Array) -> str:
-        """What passive joint is beyond its bound at a pose, in words; empty where none is."""
-        bound = getattr(self.robot.limits, "joint_angle", None)
-        if bound is None or not self._angles:
-            return ""
-        angles = self.robot.limit_angles(pose)
-        most = 0.0 if angles is None else float(angles.max())
-        if most <= bound:
-            return ""
-        return f"a passive joint stands at {most:.6g} rad, limit {float(bound):g}"
+    def _passive_beyond(self, q: Array, pose: Array) -> str:
+        """What passive joint is beyond its limits, in words; empty where none is."""
+        robot, graph = self.robot, self.robot.graph
+        bound = getattr(robot.limits, "joint_angle", None)
+        angles = robot.limit_angles(pose) if self._angles else None
+        if bound is not None and angles is not None and angles.max() > bound:
+            # The angles are those of the passive joints, in the order of the graph.
+            names = [joint.name for joint in graph.joints.values() if not joint.actuated]
+            worst = int(angles.argmax())
+            return f"{names[worst]} is at {angles[worst]:.6g} rad, limit {float(bound):g}"
+        if robot.passive_limits:
+            for limit, value in zip(robot.passive_limits, passive_values(robot, q), strict=True):
+                if not limit.low <= value <= limit.high:
+                    unit = "m" if limit.kind == "slide" else "rad"
+                    limits = f"limits {limit.low:g} to {limit.high:g}"
+                    return f"{limit.joint} is at {value:.6g} {unit}, {limits}"
+        return ""
 
     def loaded(self, state: State, wrench: ArrayLike) -> State:
         """The state under another wrench, shape (6,), N and N m; the old one where that is none."""

@@ -69,7 +69,8 @@ class Moving(Protocol):
 class Page:
     """One robot on a server; all who look at it see and move the same."""
 
-    def __init__(self, server: Any, model: Model) -> None:
+    def __init__(self, server: Any, model: Model, first: str = "") -> None:
+        """:param first: name of a tab before the others, ``self.first``, for a bag or nodes."""
         self.server, self.model, self.state = server, model, model.start
         lowest = min((r.low for r in model.pose_ranges if r.name == "z"), default=0.0)
         self.stage = Stage(server, Scene(model.robot), model.start.q, lowest)
@@ -87,7 +88,7 @@ class Page:
         # On a narrow screen the browser shows it as a sheet at the bottom instead.
         server.gui.main_panel.dock_right()
         server.gui.set_panel_label(f"pkm-twin view {model.robot.name}")
-        self._build_panel()
+        self._build_panel(first)
         self._show()
 
     def ask(self, react: Any, what: str, call: Callable[[], None]) -> None:
@@ -135,11 +136,13 @@ class Page:
         self.state = state
         self._show()
 
-    def _build_panel(self) -> None:
+    def _build_panel(self, first: str) -> None:
         gui, model = self.server.gui, self.model
         gui.add_html(SHEET)
         self._status = gui.add_html("")
         tabs = gui.add_tab_group()
+        if first:
+            self.first = tabs.add_tab(first)
         with tabs.add_tab("Move"):
             with gui.add_folder("Joints"):
                 self._joints = self._sliders(model.joint_ranges, "joint", self._move_joint)

@@ -18,8 +18,6 @@ from pkm_twin.view.timeline import Timeline
 COLOURS: Final = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 """Of the joints' curves (Okabe and Ito 2008)."""
 SPEEDS: Final = ("0.25", "0.5", "1", "2", "4")
-WIDTH: Final = 330
-"""Of the panel, pixels."""
 _MEASURED: Final = "measured"
 """A wide curve, on which the model's is seen."""
 MARKED: Final = 0.25
@@ -34,8 +32,7 @@ class BagPanel:
         self._since: tuple[float, float] | None = None
         self._marked = -np.inf
         gui = page.server.gui
-        panel = gui.add_panel()
-        with panel.add_tab("Bag"):
+        with page.first:
             self._time = gui.add_slider("time, s", 0.0, max(timeline.end, 0.01), 0.001, 0.0)
             self._play = gui.add_button("Play")
             self._speed = gui.add_dropdown("speed factor", SPEEDS, initial_value="1")
@@ -59,8 +56,6 @@ class BagPanel:
         page.ask(self._time.on_update, "time", self._go)
         page.ask(self._play.on_click, "play", self._play_or_pause)
         page.ask(self._speed.on_update, "speed", self._restart)
-        panel.dock_left()
-        panel.set_width(WIDTH)
         page.moving.append(self)
         self._go()
 
@@ -143,8 +138,7 @@ class LivePanel:
         self._page, self._live = page, live
         self._seen: tuple[dict[str, int], int] | None = None
         gui = page.server.gui
-        panel = gui.add_panel()
-        with panel.add_tab("Live"):
+        with page.first:
             self._heard = gui.add_html("")
             joints = _coloured(page.model.robot.joint_names)
             nothing = np.zeros((2, len(joints)))
@@ -154,8 +148,6 @@ class LivePanel:
                 )
                 for name in TRACES
             }
-        panel.dock_left()
-        panel.set_width(WIDTH)
         page.moving.append(self)
 
     def step(self) -> None:

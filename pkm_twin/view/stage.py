@@ -26,6 +26,8 @@ LOOK: Final = np.array([0.62, -0.95, 0.42])
 SMALLEST: Final = 100
 """Width and height of a scene below which it is being laid out, and nothing is fitted, pixels."""
 SHEET: Final = """<style>
+.mantine-Slider-markLabel { font-size: 0.7rem !important; color: #343a40 !important; }
+.mantine-Flex-root > .mantine-NumberInput-root { width: 4.4rem !important; }
 @media (max-width: 36em) {
   div:has(> div canvas[data-engine]):has(+ .mantine-Paper-root) { height: 45% !important; }
   .mantine-Paper-root:has([role=tab]) { width: 100% !important; max-height: 55% !important; }
@@ -39,8 +41,7 @@ window, and the scene ends above it."""
 
 def farther(width: float, height: float) -> float:
     """How much farther away the camera is in a window that is narrower than high, as a factor."""
-    aspect = height / width
-    return max(1.0, aspect, min(1.3 * aspect, 2.0))
+    return max(1.0, height / width)
 
 
 class Stage:

@@ -10,6 +10,7 @@ import pytest
 from delta_dynamics import inverse_dynamics
 from pkm_twin import robot_names
 from pkm_twin.robot.clearance import clearance, has_clearance
+from pkm_twin.robot.outline import Posture
 from pkm_twin.view import texts
 from pkm_twin.view.model import Model, _round, _step
 from pkm_twin.view.scene import SCALE, Scene, plate, round_mesh, share_colours
@@ -112,6 +113,23 @@ def test_beyond_a_limit_is_told_with_joint_value_and_range(name):
     joint, unit = model.robot.joint_names[0], model.robot.joint_units[0]
     assert told.startswith(f"{joint}.position is {q[0]:.6g} {unit}, limits ")
     assert "--" not in told
+
+
+def test_beyond_a_passive_limit_names_the_joint():
+    """The angle is that between the joint's leg and the platform's normal, drawn by the scene."""
+    model = model_of("upr_rpu")
+    graph = model.robot.graph
+    beta = model.start.pose.copy()
+    beta[2] = model.pose_ranges[2].high
+    told = model.to_pose(model.start, beta).refusal
+    name, value = told.split(" rad, limit ")[0].split(" is at ")
+    assert name == "R joint 1"
+    posture = Posture(model.robot, model.robot.inverse(beta))
+    foot, tip = (graph.joints[joint] for joint in ("U joint 1", name))
+    leg = foot.at - posture.place(tip.outer, tip.at)
+    normal = posture.turn(graph.platform, np.array([0.0, 0.0, 1.0]))
+    angle = np.arccos(leg @ normal / np.linalg.norm(leg))
+    assert float(value) == pytest.approx(angle, abs=1e-5)
 
 
 @every_model

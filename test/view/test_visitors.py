@@ -61,7 +61,7 @@ def page():
     rows = q + np.linspace(0.0, 0.1, 11)[:, None]
     line = Timeline(np.linspace(0.0, 1.0, 11), rows, None, None, None, "no masses")
     with listen("127.0.0.1", 0) as socket, serving(Door("127.0.0.1"), socket) as server:
-        page = Page(server, Model(robot))
+        page = Page(server, Model(robot), "Bag")
         page.bag = BagPanel(page, line)
         page.port = socket.getsockname()[1]
         yield page

@@ -77,7 +77,7 @@ def view(given: View) -> Report:
         timeline = None if bag is None else _timeline(bag, given)
         model = Model(machine)
         server = stack.enter_context(serving(door, door_socket))
-        page = Page(server, model)
+        page = Page(server, model, "Bag" if timeline is not None else "Live" if given.live else "")
         if timeline is not None:
             BagPanel(page, timeline)
         if given.live:
