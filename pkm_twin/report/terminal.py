@@ -88,7 +88,8 @@ def aligned(rows: Sequence[Sequence[str]], sides: str) -> Iterator[str]:
     """Rows with their cells below each other; ``sides`` has < or > for each column.
 
     The first row is the headings. Where the whole is wider than :data:`WIDTH`, headings are on
-    several lines, and if that is not enough words of other cells too.
+    several lines, and if that is not enough words of other cells too. A list of names, each with a
+    sentence, keeps one line a name.
     """
     if not any(row[0] for row in rows):
         rows, sides = [row[1:] for row in rows], sides[1:]
@@ -99,7 +100,7 @@ def aligned(rows: Sequence[Sequence[str]], sides: str) -> Iterator[str]:
     words = [[max(map(len, cell.split(" "))) for cell in column] for column in columns]
     headings = [max([own[0], *map(len, c[1:])]) for own, c in zip(words, columns, strict=True)]
     for least in (headings, list(map(max, words))):
-        while sum(widths) + 2 * (len(widths) - 1) > WIDTH:
+        while len(widths) > 2 and sum(widths) + 2 * (len(widths) - 1) > WIDTH:
             spare = [width if width > low else 0 for width, low in zip(widths, least, strict=True)]
             if not any(spare):
                 break

@@ -23,9 +23,7 @@ WRENCH = (30.0, -50.0, -40.0, 10.0, -20.0, 50.0)
 def test_processes(process):
     listed = process("robots")
     assert (listed.code, listed.err) == (0, "")
-    # A long description goes on in the next line.
-    lines = [line for line in listed.out.splitlines() if not line.startswith(" ")]
-    assert [line.split()[0] for line in lines] == robot_names()
+    assert [line.split()[0] for line in listed.out.splitlines()] == robot_names()
     unknown = process("info", "delta_kuh")
     assert unknown.code == 1
     assert "did you mean 'delta_cu'" in unknown.one_line_error()
