@@ -8,6 +8,7 @@ import math
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Final, Literal
+from urllib.parse import parse_qs, urlencode
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -229,6 +230,52 @@ class Model:
             return _refused(state, "the wrench is not finite")
         return replace(state, wrench=values, refusal="")
 
+    def link(self, state: State) -> str:
+        """The fragment of an address that carries robot, pose and load."""
+        parts = {"robot": self.robot.name, "pose": _listed(state.pose)}
+        if state.wrench.any():
+            parts["load"] = _listed(state.wrench)
+        return f"#{urlencode(parts, safe=',')}"
+
+    def linked(self, state: State, link: str) -> State:
+        """The state of an address with such a fragment, or the old one with the reason why not."""
+        parts = {name: given[-1] for name, given in parse_qs(link.rpartition("#")[2]).items()}
+        if parts.get("robot") != self.robot.name:
+            return _refused(state, f"the link is not of the robot {self.robot.name}")
+        rows = []
+        for name, count in (("pose", len(state.pose)), ("load", 6)):
+            try:
+                row = [float(v) for v in parts.get(name, ",".join("0" * count)).split(",")]
+            except ValueError:
+                row = []
+            if len(row) != count or not np.isfinite(row).all() or "pose" not in parts:
+                return _refused(state, f"the link's {name} has not {count} numbers")
+            rows.append(row)
+        moved = self.to_pose(state, rows[0])
+        return moved if moved.refusal else self.loaded(moved, rows[1])
+
+    def softest(self, state: State) -> tuple[State, str]:
+        """The softest pose of the workspace, or the one that the state's wrench moves most.
+
+        The second part is the answer in words, with its units. The search is that of
+        ``pkm-twin atlas``.
+
+        :raises PkmTwinError: no elasticity in the robot's file, or no pose that counts.
+        """
+        from pkm_twin.maps.kinds.compliance import Compliance
+        from pkm_twin.maps.search import worst_of
+        from pkm_twin.maps.sweep import map_of
+
+        robot, kind = self.robot, Compliance()
+        cases = [kind.loaded(robot, "load", state.wrench.tolist())] if state.wrench.any() else ()
+        space = map_of(robot, kind, cases=cases)
+        worst = worst_of(space, space.cases[0], self.start.pose[None])
+        what = "largest deflection {:.4g} µm" if cases else "softest: {:.4g} µm/N"
+        direction = np.zeros(3) if worst.found.direction is None else worst.found.direction
+        along = ", ".join(f"{part:.2f}" for part in np.round(direction.reshape(-1), 2) + 0.0)
+        told = what.format(1e6 * worst.found.value.item())
+        return self.to_joints(state, worst.q), f"{told} along ({along})"
+
     def numbers(self, state: State) -> Numbers:
         """All that is known of a state; what fails at this place is said in ``why``."""
         robot, why = self.robot, dict(self._why)
@@ -263,6 +310,10 @@ class Model:
 
 
 _ENDS: Final = ("low", "high")
+
+
+def _listed(values: Array) -> str:
+    return ",".join(f"{value:.9g}" for value in np.round(values, 12) + 0.0)
 
 
 def _refused(state: State, reason: str) -> State:

@@ -19,12 +19,12 @@ from typing import Any, Final, Protocol
 import numpy as np
 
 from pkm_twin.codegen.arrays import Array
-from pkm_twin.errors import one_line
+from pkm_twin.errors import PkmTwinError, one_line
 from pkm_twin.view import texts
 from pkm_twin.view.door import Door, behind
 from pkm_twin.view.model import Model, Range, State
 from pkm_twin.view.scene import DRIVE, Scene
-from pkm_twin.view.stage import SHEET, Stage
+from pkm_twin.view.stage import Stage
 from pkm_twin.view.visitors import guard
 
 _LOG: Final = logging.getLogger("pkm_twin")
@@ -138,7 +138,7 @@ class Page:
 
     def _build_panel(self, first: str) -> None:
         gui, model = self.server.gui, self.model
-        gui.add_html(SHEET)
+        gui.add_html(texts.SHEET)
         self._status = gui.add_html("")
         tabs = gui.add_tab_group()
         if first:
@@ -149,11 +149,10 @@ class Page:
             with gui.add_folder("Pose of the platform"):
                 self._pose = self._sliders(model.pose_ranges, "pose", self._move_pose)
             self.ask(gui.add_button("Home").on_click, "home", self._go_home)
-            named = gui.add_checkbox("names of drives", True)
-            self.ask(named.on_update, "names", lambda: self.stage.name_drives(named.value))
+            self._check("names of drives", True, self.stage.name_drives)
+            self._check("trail of the tool", False, self.stage.leave_trail)
             if self.stage.has_meshes:
-                meshes = gui.add_checkbox("meshes of the URDF", True)
-                self.ask(meshes.on_update, "meshes", lambda: self.stage.show_meshes(meshes.value))
+                self._check("meshes of the URDF", True, self.stage.show_meshes)
         with tabs.add_tab("Load"):
             with gui.add_folder("Wrench on the platform, base axes"):
                 self._wrench = self._sliders(model.wrench_ranges, "wrench", self._load)
@@ -164,6 +163,16 @@ class Page:
             )
             self.ask(self._enlarge.on_update, "enlarge", self._show)
             self._loads = gui.add_html("")
+            if "energy" not in model.numbers(self.state).why:
+                self.ask(gui.add_button("Go to the softest pose").on_click, "soft", self._soften)
+                self._softest = gui.add_html("")
+        self._link = gui.add_text("link", model.link(self.state))
+        self.ask(self._link.on_update, "link", self._follow)
+        gui.add_html(texts.buttons(model.robot.name))
+
+    def _check(self, label: str, value: bool, call: Callable[[bool], None]) -> None:
+        box = self.server.gui.add_checkbox(label, value)
+        self.ask(box.on_update, label, lambda: call(box.value))
 
     def _sliders(
         self, ranges: Sequence[Range], kind: str, move: Callable[[int], None]
@@ -193,6 +202,19 @@ class Page:
     def _unload(self) -> None:
         self.become(self.model.loaded(self.state, np.zeros(6)))
 
+    def _follow(self) -> None:
+        self.become(self.model.linked(self.state, self._link.value))
+
+    def _soften(self) -> None:
+        self._softest.content = texts.note("searching the workspace ...")
+        try:
+            state, told = self.model.softest(self.state)
+        except PkmTwinError as error:
+            self._softest.content = texts.note(str(error))
+            return
+        self.become(state)
+        self._softest.content = texts.note(told)
+
     def _go_home(self) -> None:
         self.become(self.model.to_joints(self.state, self.model.start.q))
 
@@ -204,6 +226,7 @@ class Page:
                 _put(self._joints, state.q)
                 _put(self._pose, state.pose)
                 _put(self._wrench, state.wrench)
+                self._link.value = self.model.link(state)
             self._status.content = texts.status(self.model, state, numbers)
             self._loads.content = texts.load(numbers)
             if energy is None or energy.dominant == "none":
@@ -213,6 +236,7 @@ class Page:
                 shares = dict(zip(energy.elements, factors, strict=True))
                 self.draw_deflected(np.asarray(energy.deflection), shares, str(energy.dominant))
             self.stage.draw_wrench(numbers.position, state.wrench / self._tops)
+            self.stage.extend_trail(numbers.position)
 
     def draw_deflected(self, deflection: Array, shares: dict[str, float], dominant: str) -> None:
         """The state with a deflection (6,), m and rad, base axes, enlarged as the slider says."""

@@ -17,26 +17,17 @@ from pkm_twin.machine.graph import BASE
 from pkm_twin.view.meshes import body_meshes
 from pkm_twin.view.scene import BODY, GROUND, PLATFORM, Scene, plate, round_mesh
 
+FLOOR: Final = (150, 156, 164)
 FORCE: Final = (0, 158, 115)
 MOMENT: Final = (204, 121, 167)
 ARROW: Final = 0.4
 """Length of the greatest wrench's arrow, per size of the machine."""
+TRAIL: Final = 1000
+"""Places of the reference point that are kept."""
 LOOK: Final = np.array([0.62, -0.95, 0.42])
 """From where the machine is looked at, in its greatest extents from its middle."""
 SMALLEST: Final = 100
 """Width and height of a scene below which it is being laid out, and nothing is fitted, pixels."""
-SHEET: Final = """<style>
-.mantine-Slider-markLabel { font-size: 0.7rem !important; color: #343a40 !important; }
-.mantine-Flex-root > .mantine-NumberInput-root { width: 4.4rem !important; }
-@media (max-width: 36em) {
-  div:has(> div canvas[data-engine]):has(+ .mantine-Paper-root) { height: 45% !important; }
-  .mantine-Paper-root:has([role=tab]) { width: 100% !important; max-height: 55% !important; }
-  .mantine-Paper-root:has([role=tab]) > *,
-  .mantine-Paper-root:has([role=tab]) .mantine-ScrollArea-content > * { width: 100% !important; }
-}
-</style>"""
-"""In a narrow window the browser shows the sliders as a sheet at the bottom: it is as wide as the
-window, and the scene ends above it."""
 
 
 def farther(width: float, height: float) -> float:
@@ -54,6 +45,10 @@ class Stage:
         self._plates()
         self._machine(q)
         self._meshes = self._bodies()
+        self._passed: list[Array] = []
+        self._trail = server.scene.add_line_segments(
+            "/trail", np.zeros((1, 2, 3)), colors=FORCE, thickness=0.006 * scene.size, visible=False
+        )
         size, draw = scene.size, server.scene
         self._names = {
             name: draw.add_label(f"/names/{k}", name, anchor="bottom-center", position=place)
@@ -73,7 +68,7 @@ class Stage:
         draw.configure_default_lights(False)
         draw.configure_environment_map(None)
         draw.add_light_ambient("/lights/all", intensity=1.5)
-        for name, place in (("key", LOOK + np.array([-0.4, 0.0, 0.6])), ("back", -LOOK)):
+        for name, place in (("key", LOOK * [-0.3, 0.5, 3.0]), ("back", -LOOK)):
             bright = 1.7 if name == "key" else 0.4
             draw.add_light_directional(
                 f"/lights/{name}", intensity=bright, position=tuple(place.tolist()),
@@ -86,7 +81,7 @@ class Stage:
             "/grid", width=6 * reach, height=6 * reach, cell_size=cell / 2, section_size=cell,
             cell_color=(222, 225, 229), section_color=(186, 192, 200), fade_distance=7 * reach,
             position=(0.0, 0.0, float(min(low[2], 0.0, lowest)) - 0.06 * size),
-            plane_color=(248, 249, 250), plane_opacity=1.0,
+            plane_color=(248, 249, 250), plane_opacity=1.0, shadow_opacity=0.35,
         )  # fmt: skip
         self._server.on_client_connect(self._frame)
         camera = self._server.initial_camera
@@ -128,15 +123,26 @@ class Stage:
         draw, scene, size = self._server.scene, self._scene, self._scene.size
         if len(scene.base):
             draw.add_mesh_simple(
-                "/base_plate", *plate(scene.base, 0.012 * size), color=GROUND, opacity=0.6
+                "/base_plate", *plate(scene.base, 0.03 * size), color=FLOOR, flat_shading=True
             )
         self._platform = draw.add_frame("/platform", **_axes(0.1 * size, size))
+        self._tool(size)
         self._rest = draw.add_frame("/at_rest", show_axes=False, visible=False)
         if len(scene.platform):
             moving = plate(scene.platform, 0.016 * size)
-            draw.add_mesh_simple("/platform/plate", *moving, color=PLATFORM)
+            draw.add_mesh_simple("/platform/plate", *moving, color=PLATFORM, flat_shading=True)
             still = plate(scene.platform, 0.01 * size)
             draw.add_mesh_simple("/at_rest/plate", *still, color=(110, 110, 110), opacity=0.35)
+
+    def _tool(self, size: float) -> None:
+        """A flange and its axis on the platform, away from the base."""
+        graph = self._scene.robot.graph
+        feet = [j.at for j in graph.joints.values() if BASE in (j.inner, j.outer)]
+        away = np.sign((graph.origin - np.mean(feet, axis=0))[2]) or 1.0
+        (round_, faces), _ = round_mesh()
+        for name, radius, length in (("flange", 0.05, 0.03), ("tool", 0.012, 0.2)):
+            shape = size * (round_ * [radius, radius, length] + [0.0, 0.0, away * length / 2])
+            self._server.scene.add_mesh_simple(f"/platform/{name}", shape, faces, color=BODY)
 
     def _machine(self, q: Array) -> None:
         draw, shapes = self._server.scene, self._scene.shapes(q)
@@ -212,6 +218,22 @@ class Stage:
         self._arrows.visible = bool(part.any())
         force, moment = ARROW * self._scene.size * part.reshape(2, 3)
         self._arrows.points = np.array([[at - force, at], [at, at + moment]])
+
+    def leave_trail(self, shown: bool) -> None:
+        """Whether the reference point draws a line; a new one begins now."""
+        self._trail.visible, self._passed = shown, []
+
+    def extend_trail(self, at: Array) -> None:
+        """The reference point is here now, (3,) m."""
+        passed = self._passed
+        if not self._trail.visible or (
+            passed and np.linalg.norm(at - passed[-1]) < 1e-3 * self._scene.size
+        ):
+            return
+        passed.append(at)
+        del passed[:-TRAIL]
+        if len(passed) > 1:
+            self._trail.points = np.stack([passed[:-1], passed[1:]], axis=1)
 
     def name_drives(self, shown: bool) -> None:
         """Whether the drives have their names beside them."""

@@ -19,6 +19,51 @@ GRADES: Final[Mapping[Grade, str]] = {"good": "#009E73", "warn": "#B87800", "bad
 """Colours of Okabe and Ito; the middle one darker, so that text in it is read on white."""
 SHOWN: Final = 8
 """Elements that are listed; the rest is summed."""
+SHEET: Final = """<style>
+.mantine-Slider-markLabel { font-size: 0.7rem !important; color: #343a40 !important; }
+.mantine-Flex-root > .mantine-NumberInput-root { width: 4.4rem !important; }
+@media (max-width: 36em) {
+  div:has(> div canvas[data-engine]):has(+ .mantine-Paper-root) { height: 45% !important; }
+  .mantine-Paper-root:has([role=tab]) { width: 100% !important; max-height: 55% !important; }
+  .mantine-Paper-root:has([role=tab]) > *,
+  .mantine-Paper-root:has([role=tab]) .mantine-ScrollArea-content > * { width: 100% !important; }
+}
+</style>
+<img hidden src="data:," onerror="
+  const link = location.hash, tries = setInterval(() => {
+    const label = [...document.querySelectorAll('label')].find(l => l.innerText === 'link');
+    const input = label && label.closest('.mantine-Flex-root').querySelector('input');
+    if (link && !input) return;
+    clearInterval(tries);
+    if (!link) return;
+    history.replaceState(null, '', location.pathname + location.search);
+    Object.getOwnPropertyDescriptor(HTMLInputElement.prototype, 'value').set.call(input, link);
+    input.dispatchEvent(new Event('input', {bubbles: true}));
+  }, 100)">"""
+"""An address with a link's fragment is handed to the text of the link, once.
+
+In a narrow window the browser shows the sliders as a sheet at the bottom: it is as wide as the
+window, and the scene ends above it."""
+
+_BUTTON: Final = (
+    "font:inherit;color:#fff;background:rgb(0,114,178);border:0;border-radius:4px;"
+    "padding:0.3em 0.8em;margin-right:0.5em;cursor:pointer"
+)
+_COPY: Final = """
+const label = [...document.querySelectorAll('label')].find(l => l.innerText === 'link');
+const input = label.closest('.mantine-Flex-root').querySelector('input'), button = this;
+const whole = location.origin + location.pathname + input.value;
+const done = () => { button.innerText = 'Copied'; setTimeout(() => {
+  button.innerText = 'Copy link' }, 1500) };
+if (navigator.clipboard) navigator.clipboard.writeText(whole).then(done);
+else { input.select(); document.execCommand('copy'); done() }"""
+_SAVE: Final = """
+const scene = document.querySelector('canvas[data-engine]'), sheet = scene.cloneNode();
+sheet.width = scene.width; sheet.height = scene.height;
+const pen = sheet.getContext('2d'), link = document.createElement('a');
+pen.fillStyle = '#fff'; pen.fillRect(0, 0, sheet.width, sheet.height);
+pen.drawImage(scene, 0, 0);
+link.href = sheet.toDataURL('image/png'); link.download = this.dataset.name; link.click()"""
 _MISSING: Final = "&ndash;"
 _STYLE: Final = "font-size:0.82em;line-height:1.5;padding:0.15em 0.9em 0.4em"
 
@@ -26,6 +71,21 @@ _STYLE: Final = "font-size:0.82em;line-height:1.5;padding:0.15em 0.9em 0.4em"
 def number(value: float) -> str:
     """Four digits, as the page shows a number; what is zero but for rounding is 0."""
     return f"{value:.4g}" if abs(value) > 1e-12 else "0"
+
+
+def buttons(name: str) -> str:
+    """Buttons that the browser itself obeys: copy the link, save the scene as a PNG."""
+    return (
+        f'<div style="{_STYLE}">'
+        f'<button id="copy" style="{_BUTTON}" onclick="{escape(_COPY)}">Copy link</button>'
+        f'<button id="save" style="{_BUTTON}" data-name="{escape(name)}.png" '
+        f'onclick="{escape(_SAVE)}">Save picture</button></div>'
+    )
+
+
+def note(text: str) -> str:
+    """A line of plain text."""
+    return f'<div id="note" style="{_STYLE}">{escape(text)}</div>'
 
 
 def status(model: Model, state: State, numbers: Numbers) -> str:

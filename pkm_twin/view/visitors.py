@@ -8,10 +8,13 @@ message of a browser but its camera's is dropped here: the page has no use for o
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, Final
 
 from pkm_twin.errors import PkmTwinError
 from pkm_twin.view.door import UNKNOWN
+
+LONGEST: Final = 1000
+"""Characters of a text."""
 
 
 def guard(server: Any) -> None:
@@ -42,14 +45,16 @@ def guard(server: Any) -> None:
 def acceptable(handle: Any, value: Any) -> Any:
     """The value that an input takes for one that a browser sends, or None.
 
-    Sliders take finite numbers, limited to their ends; menus one of their options; checkboxes and
-    buttons true or false.
+    Sliders take finite numbers, limited to their ends; menus one of their options; texts up to
+    LONGEST characters; checkboxes and buttons true or false.
     """
     now = handle.value
     if isinstance(now, bool) or isinstance(value, bool):
         return value if type(value) is type(now) else None
     if isinstance(now, str):
-        return value if value in getattr(handle, "options", ()) else None
+        options = getattr(handle, "options", None)
+        text = isinstance(value, str) and len(value) <= LONGEST
+        return value if text and (options is None or value in options) else None
     if not isinstance(value, (int, float)) or not math.isfinite(value):
         return None
     return float(min(max(value, handle.min), handle.max))

@@ -103,6 +103,51 @@ def test_no_slider_leads_to_an_exception(name, rng):
 
 
 @every_model
+def test_a_link_carries_pose_and_load(name, rng):
+    model = model_of(name)
+    wrench = np.array([3.0, -2.0, 5.0, 0.1, 0.0, -0.3])
+    state = model.loaded(model.to_pose(model.start, states(model, 8, rng)[0].pose), wrench)
+    for given in (state, model.loaded(state, np.zeros(6))):
+        opened = model.linked(model.start, f"http://127.0.0.1:8080/{model.link(given)}")
+        assert opened.refusal == ""
+        np.testing.assert_allclose(opened.pose, given.pose, rtol=1e-8, atol=1e-12)
+        np.testing.assert_array_equal(opened.wrench, given.wrench)
+        assert model.link(opened) == model.link(given)
+
+
+def test_a_link_that_says_something_else_changes_nothing():
+    model = model_of("five_bar")
+    good = model.link(model.start)
+    for link in ("", "#", "#pose=0,0.4", "#robot=delta&pose=0,0.4", "#robot=five_bar",
+                 good + ",1", good + "&load=1", good + "&load=1,2,3,4,5,nan",
+                 "#robot=five_bar&pose=0,x", "#robot=five_bar&pose=9,9"):  # fmt: skip
+        state = model.linked(model.start, link)
+        assert state.refusal, link
+        assert state.q is model.start.q
+        assert not state.wrench.any()
+
+
+def test_the_softest_pose_is_softer_than_all_others(rng):
+    """Without a load by the compliance, under one by the deflection; the answer has its unit."""
+    model = model_of("five_bar")
+    others = states(model, 40, rng)
+    for wrench, unit in (np.zeros(6), "µm/N"), (np.array([5.0, 0.0, 0.0, 0.0, 0.0, 0.0]), "µm"):
+
+        def moves(state, wrench=wrench):
+            block = compliance(model.robot, state.pose)
+            if wrench.any():
+                return np.linalg.norm((block @ wrench)[:3])
+            return np.linalg.eigvalsh(block[:3, :3])[-1]
+
+        found, told = model.softest(model.loaded(model.start, wrench))
+        assert found.refusal == ""
+        number, told_unit = told.split(" along ")[0].split()[-2:]
+        assert told_unit == unit
+        assert float(number) == pytest.approx(1e6 * moves(found), rel=1e-3)
+        assert moves(found) >= max(map(moves, others))
+
+
+@every_model
 def test_beyond_a_limit_is_told_with_joint_value_and_range(name):
     model = model_of(name)
     if model.robot.limits.position is None:
