@@ -4,82 +4,98 @@
 from __future__ import annotations
 
 import sys
+from functools import cache
+from itertools import pairwise
 from pathlib import Path
 
+import numpy as np
+
+from pkm_twin.report import plots
 from test.support import sources
 
 CORE = "pkm_twin"
-"""Name of the modules beside pkm_twin's folders: errors and the like, that all may import."""
-PLACES = {
-    "apps": (2.0, 5.2),
-    "delta_dynamics.node": (0.0, 4.2),
-    "stiffness_monitor.node": (4.0, 4.2),
-    "state.node": (6.6, 4.2),
-    "maps": (2.0, 4.2),
-    "export": (-1.2, 4.9),
-    "design": (4.0, 4.7),
-    "identification": (5.6, 4.9),
-    "paths": (-1.0, 3.4),
-    "ros": (5.6, 3.3),
-    "delta_dynamics": (0.6, 3.0),
-    "stiffness_monitor": (3.4, 3.0),
-    "state": (6.8, 2.9),
-    "streams": (4.6, 2.5),
-    "messages": (5.6, 2.05),
-    "mechanisms": (0.6, 2.1),
-    "robot": (2.4, 1.75),
-    "kinematics": (3.2, 1.15),
-    "machine": (1.2, 0.6),
-    "bags": (-1.2, 0.7),
-    "codegen": (2.0, 0.0),
-}
-"""Where each folder stands; arrows go down."""
+"""Its own modules, errors and the like, are left out: all folders import them."""
 
 
-def name_of(room):
-    """As the picture has it."""
-    return room.removeprefix(f"{CORE}.")
+def is_folder(room):
+    """Whether a room is a folder, or the nodes of one."""
+    parts = room.removesuffix(".node").split(".")
+    return room != CORE and sources.ROOT.joinpath(*parts).is_dir()
+
+
+@cache
+def below():
+    """What each folder imports."""
+    pairs = [pair for pair in sources.arrows() if all(map(is_folder, pair))]
+    names = sorted({name for pair in pairs for name in pair})
+    return {n: frozenset(there for here, there in pairs if here == n) for n in names}
+
+
+@cache
+def reached(name):
+    """What a folder imports, and what that imports in turn."""
+    return below()[name].union(*map(reached, below()[name]))
+
+
+@cache
+def level(name):
+    """Longest chain of imports below a folder; one that goes round is an error."""
+    return 1 + max(map(level, below()[name]), default=-1)
+
+
+@cache
+def row_of(name):
+    """Its row: close below all that import it; 0 is the lowest."""
+    above = [row_of(n) for n, found in below().items() if name in found]
+    return min(above) - 1 if above else level(name)
 
 
 def arrows():
-    """Pairs of folders, who imports and what, without those to the core's own modules."""
-    rooms = {f"{CORE}.{name}" for name in PLACES} | set(PLACES)
-    return sorted(
-        (name_of(here), name_of(there))
-        for here, there in sources.arrows()
-        if {here, there} <= rooms
-    )
+    """Pairs of folders, who imports and what, without those that a longer chain has."""
+    return [
+        (here, there)
+        for here, found in below().items()
+        for there in sorted(found)
+        if not any(there in reached(other) for other in found)
+    ]
+
+
+def places():
+    """Where each folder stands: a row for each level, near what it has arrows to and from."""
+    rows = [[n for n in below() if row_of(n) == k] for k in range(max(map(row_of, below())) + 1)]
+    x = {name: k - (len(row) - 1) / 2 for row in rows for k, name in enumerate(row)}
+    for _ in range(50):
+        for row in rows:
+            near = {
+                n: np.mean([x[b if a == n else a] for a, b in arrows() if n in (a, b)]) for n in row
+            }
+            row.sort(key=near.__getitem__)
+            for k, name in enumerate(row):
+                x[name] = 0.5 * near[name] + 0.5 * (k - (len(row) - 1) / 2)
+            for left, right in pairwise(row):
+                x[right] = max(x[right], x[left] + 1.0)
+    return {name: (x[name], row_of(name)) for name in below()}
 
 
 def draw(path):
     """Folders as boxes, an arrow from who imports to what."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
-
-    figure, ax = pyplot.subplots(figsize=(10, 8), layout="constrained")
-    for here, there in arrows():
-        (x, y), (u, v) = PLACES[here], PLACES[there]
-        ax.annotate(
-            "",
-            (u, v),
-            (x, y),
-            arrowprops={
-                "arrowstyle": "-|>",
-                "color": "#D55E00" if v >= y else "#0072B2",
-                "alpha": 0.55,
-                "shrinkA": 22,
-                "shrinkB": 22,
-                "connectionstyle": "arc3,rad=0.08",
-            },
-        )
-    for name, (x, y) in PLACES.items():
-        box = {"boxstyle": "round,pad=0.5", "facecolor": "white", "edgecolor": "black"}
-        ax.text(x, y, name, ha="center", va="center", bbox=box, fontsize=11)
-    ax.set(xlim=(-2, 7.5), ylim=(-0.5, 5.5))
+    figure, ((ax,),) = plots.columns(1, 1, 8)
+    at = places()
+    ends, boxes = np.array(list(at.values())), {}
+    for name, place in at.items():
+        box = {"boxstyle": "round,pad=0.4", "facecolor": "white", "edgecolor": "black"}
+        words = name.removeprefix(f"{CORE}.").replace("_", "\n", 1).replace(".", "\n")
+        text = ax.text(*place, words, ha="center", va="center", bbox=box, fontsize=9)
+        boxes[name] = text.get_bbox_patch()
+    ax.set_xlim(ends[:, 0].min() - 0.6, ends[:, 0].max() + 0.6)
+    ax.set_ylim(ends[:, 1].min() - 0.5, ends[:, 1].max() + 0.5)
     ax.axis("off")
-    figure.savefig(path, dpi=90)
+    figure.canvas.draw()  # Boxes have their sizes then.
+    for here, there in arrows():
+        style = {"arrowstyle": "-|>", "color": plots.COLOURS[0], "shrinkA": 0, "shrinkB": 1}
+        style |= {"patchA": boxes[here], "patchB": boxes[there]}
+        ax.annotate("", at[there], at[here], arrowprops=style, zorder=2)
+    plots.save(figure, path, 100)
 
 
 if __name__ == "__main__":
