@@ -106,7 +106,7 @@ class Along:
             plots.label(ax, "time (s)", f"{case.what} ({unit})", text, 9)
             if blamed:
                 plots.legend(ax)
-        figure.suptitle(f"{self.robot.name}: {self.kind.question}", fontsize=10)
+        plots.head(figure, f"{self.robot.name}: {self.kind.question}", 10)
         return figure
 
 

@@ -26,8 +26,6 @@ MAP: Final = "viridis"
 PREFIXES: Final = {-12: "p", -9: "n", -6: "µ", -3: "m", 0: "", 3: "k", 6: "M"}
 PANELS: Final = 3
 """Most planes in a picture."""
-LETTERS: Final = 105
-"""In a line of a picture's title."""
 
 
 def scale_of(greatest: float, unit: str) -> tuple[float, str]:
@@ -203,13 +201,12 @@ def planes(data: Dataset, case: int) -> Figure:
     values = np.concatenate([one["values"].ravel() for one in drawn])
     low, high = limits(values, worst)
     scale, unit = scale_of(max(abs(low), abs(high)), str(part.case_unit.values))
-    label = f"{part.case_what.values} ({unit or 'dimensionless'})"
-    words = [row for text in title(data, case) for row in textwrap.wrap(text, LETTERS)]
+    label = textwrap.fill(f"{part.case_what.values} ({unit or 'dimensionless'})", 48)
     with plots.pyplot().rc_context({"font.size": 9}):
-        high_of = 0.5 * plots.WIDTH if count < PANELS else plots.WIDTH / PANELS + 0.9
+        high_of = plots.WIDTH / PANELS + 0.9 if count == PANELS else _height(drawn[0], count)
         figure: Figure
         figure, columns = plots.columns(
-            count, 1, high_of + 0.2 * len(words), gridspec_kw={"width_ratios": _widths(drawn)}
+            count, 1, high_of, gridspec_kw={"width_ratios": _widths(drawn)}
         )
         axes = [column[0] for column in columns]
         for one, ax in zip(drawn, axes, strict=True):
@@ -221,9 +218,18 @@ def planes(data: Dataset, case: int) -> Figure:
         if len(drawn[0]["names"]) > 1:
             bar = figure.colorbar(mesh, ax=axes, aspect=25, pad=0.01)
             bar.set_label(label)
-        figure.suptitle("\n".join(words), fontsize=10)
+        rows = plots.head(figure, "\n".join(title(data, case)), 10)
+        figure.set_figheight(high_of + 0.2 * rows)
         figure.supxlabel(_caption(data, drawn), fontsize=8.5, color="0.3")
     return figure
+
+
+def _height(one: dict[str, Any], count: int) -> float:
+    """Of one or two panels, inches: one of equal scales fills the width."""
+    if count > 1 or len(set(one["units"])) != 1 or len(one["names"]) == 1:
+        return 0.5 * plots.WIDTH
+    across, up = map(np.ptp, one["ticks"])
+    return float(np.clip(0.8 * plots.WIDTH * up / across, 3.0, 0.7 * plots.WIDTH) + 0.6)
 
 
 def _widths(drawn: list[dict[str, Any]]) -> list[float]:

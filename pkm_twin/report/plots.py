@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import io
+import textwrap
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
@@ -15,6 +16,13 @@ from pkm_twin.files import replace_file
 
 # Okabe and Ito's colours, told apart by colour-blind readers too.
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#F0E442", "#000000")
+WINE: Final = "#882255"
+TERMS: Final = ("gravity", "inertia", "velocity", "payload", "friction", "external")
+"""Of an effort."""
+LONG: Final = 5.0
+"""A motion that lasts longer, s, has a picture of its largest effort beside the whole."""
+DASHES: Final = ("-", "--", ":", "-.")
+"""Styles of lines that can lie on one another."""
 WIDTH: Final = 9.0
 """Of every figure, inches: letters of 8 points are 11 pixels high where it is 900 pixels wide."""
 DPI: Final = 200
@@ -72,6 +80,13 @@ def rendered(figure: Any, dpi: int, form: str = "png") -> bytes:
     return data.getvalue()
 
 
+def head(figure: Any, text: str, size: float = STYLE["figure.titlesize"]) -> int:
+    """A title in as many lines as its letters need; returns how many."""
+    rows = [row for line in text.splitlines() for row in textwrap.wrap(line, int(1050 / size))]
+    figure.suptitle("\n".join(rows), fontsize=size)
+    return len(rows)
+
+
 def legend(ax: Any) -> None:
     """A legend beside the data, where it hides none."""
     ax.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
@@ -88,34 +103,46 @@ def save(figure: Any, path: Path, dpi: int = DPI) -> Path:
     return path
 
 
-def torques(motion: Any, table: Mapping[str, Any]) -> Any:
-    """Efforts and their terms, an axes for each actuated joint; grey where beyond the limits."""
-    robot = motion.robot
-    figure, axes = columns(1, len(robot.joint_names))
-    terms = ("gravity", "inertia", "velocity", "payload", "friction", "external")
-    for ax, joint, unit in zip(axes[0], robot.joint_names, robot.effort_units, strict=True):
-        if f"{joint}.measured" in table:
-            ax.plot(table["time"], table[f"{joint}.measured"], color="0.7", lw=2, label="measured")
-        ax.plot(table["time"], table[f"{joint}.effort"], color="black", lw=1, label="sum")
-        if f"{joint}.effort_deviation" in table:
-            band = 2.0 * table[f"{joint}.effort_deviation"]
-            low, high = (table[f"{joint}.effort"] + sign * band for sign in (-1.0, 1.0))
-            style: dict[str, Any] = {"color": "0.3", "alpha": 0.25, "lw": 0}
-            ax.fill_between(table["time"], low, high, label="two deviations", **style)
-        for colour, term in zip(COLOURS, terms, strict=False):
-            values = table[f"{joint}.effort_{term}"]
-            if np.any(values != 0.0):
-                ax.plot(table["time"], values, color=colour, lw=0.8, label=term)
-        if "beyond_limits" in table:
-            ax.fill_between(
-                table["time"],
-                *(0, 1),
-                where=np.asarray(table["beyond_limits"]) > 0,
-                transform=ax.get_xaxis_transform(),
-                color="0.85",
-                zorder=0,
-                label="beyond limits",
-            )
-        label(ax, "time (s)", f"effort ({unit})", f"{robot.name}: effort of {joint}")
-        legend(ax)
+def torques(motion: Any, table: Mapping[str, Any], title: str) -> Any:
+    """Efforts and their terms, a row for each actuated joint; grey where beyond the limits.
+
+    Of a long motion the terms are those of the seconds about the largest effort, beside the whole.
+    """
+    robot, time = motion.robot, np.asarray(table["time"])
+    whole = time[-1] - time[0] <= LONG
+    figure, columns_ = columns(1 if whole else 2, len(robot.joint_names), sharey="row")
+    efforts = np.array([table[f"{joint}.effort"] for joint in robot.joint_names])
+    for k, (joint, unit) in enumerate(zip(robot.joint_names, robot.effort_units, strict=True)):
+        peak = int(np.abs(efforts[k]).argmax())
+        for axes in columns_:
+            _efforts(axes[k], joint, table, terms=axes is columns_[-1])
+            label(axes[k], "time (s)", f"effort ({unit})")
+        axes[k].set_title(f"{joint}: {efforts[k, peak]:.4g} {unit} at {time[peak]:.4g} s")
+        if not whole:
+            axes[k].set_xlim(time[peak] - 1.0, time[peak] + 1.0)
+        legend(axes[k])
+    head(figure, title)
     return figure
+
+
+def _efforts(ax: Any, joint: str, table: Mapping[str, Any], terms: bool) -> None:
+    """A joint's efforts over time, and what they consist of."""
+    time, effort = table["time"], table[f"{joint}.effort"]
+    measured = table.get(f"{joint}.measured")
+    if measured is not None:
+        ax.plot(time, measured, color="0.7", lw=3, label="measured")
+        ax.plot(time, measured - effort, color=WINE, lw=1, label="measured - sum")
+    ax.plot(time, effort, color="black", lw=1, label="sum")
+    if f"{joint}.effort_deviation" in table:
+        band = 2.0 * table[f"{joint}.effort_deviation"]
+        style: dict[str, Any] = {"color": "0.3", "alpha": 0.25, "lw": 0}
+        ax.fill_between(time, effort - band, effort + band, label="two deviations", **style)
+    for colour, term in zip(COLOURS, TERMS, strict=False):
+        values = table[f"{joint}.effort_{term}"]
+        if terms and np.any(values != 0.0):
+            ax.plot(time, values, color=colour, lw=0.8, label=term)
+    if "beyond_limits" in table:
+        ax.fill_between(
+            time, 0, 1, where=np.asarray(table["beyond_limits"]) > 0, color="0.85", zorder=0,
+            transform=ax.get_xaxis_transform(), label="beyond limits",
+        )  # fmt: skip

@@ -210,9 +210,9 @@ def optimised(given: Design, path: Path) -> Report:
         notes.insert(
             0, "before: the file's machine cannot follow the path or does not keep the bounds"
         )
+    answer = f"{robot.name}: {' and '.join(changes)} on a path of {way.duration:.4g} s"
     return Report(
-        f"{robot.name}: {' and '.join(changes)} on a path of {way.duration:.4g} s; "
-        f"{found.machines} machines computed",
+        f"{answer}; {found.machines} machines computed",
         [
             Fact("robot", robot.name),
             Fact("minimise", list(found.minimise)),
@@ -225,7 +225,7 @@ def optimised(given: Design, path: Path) -> Report:
             Fact("beyond_position_limits", limits),
         ],
         tables,
-        {"": lambda: draw(robot, found, way)},
+        {"": lambda: draw(robot, found, way, answer)},
         notes,
         {"out": given.out},
     )
@@ -259,7 +259,7 @@ def write_robot(robot: Robot, source: str, found: Found, path: Path, out: Path) 
     write_edited(out, head, edited_yaml(robot, source, values))
 
 
-def draw(robot: Robot, found: Found, path: PosePath) -> Any:
+def draw(robot: Robot, found: Found, path: PosePath, answer: str) -> Any:
     """The Pareto front, or the efforts before and after."""
     from pkm_twin.design import QUANTITIES
     from pkm_twin.design.pose_path import Followed
@@ -275,8 +275,9 @@ def draw(robot: Robot, found: Found, path: PosePath) -> Any:
         if found.before.feasible:
             ax.plot(old[first], old[second], "s", color=plots.COLOURS[1], label="before")
         x, y = (f"{aim} ({QUANTITIES[aim].unit(robot)})" for aim in found.minimise)
-        plots.label(ax, x, y, f"{robot.name}: {first} against {second}")
+        plots.label(ax, x, y)
         plots.legend(ax)
+        plots.head(figure, answer)
         return figure
     numbers = found.best.numbers
     both = [{n: [robot.number(n)] for n in numbers}, {n: [v] for n, v in numbers.items()}]
@@ -288,11 +289,11 @@ def draw(robot: Robot, found: Found, path: PosePath) -> Any:
             colour = plots.COLOURS[k % len(plots.COLOURS)]
             ax.plot(path.time, table[:, k], color=colour, lw=1.2, label=joint)
         unit = " or ".join(sorted(set(robot.effort_units)))
-        plots.label(
-            ax, "time (s)", f"effort ({unit})", f"{robot.name} {title}: efforts on the path"
-        )
+        words = f"{title}: up to {np.nanmax(np.abs(table)):.4g} {unit}"
+        plots.label(ax, "time (s)", f"effort ({unit})", words)
         ax.set_ylim(-most, most)
     plots.legend(axes[0])
+    plots.head(figure, answer)
     return figure
 
 

@@ -103,12 +103,12 @@ def draw(grid: Any, response: Any, modes: ToolModes, title: str) -> Any:
     figure, axes = plots.columns(1, 2)
     size, phase = axes[0]
     for k, name in enumerate(AXES):
-        one = response[:, k, k]
-        size.semilogy(grid, 1e6 * np.abs(one), color=plots.COLOURS[k], label=f"along {name}")
-        phase.plot(grid, np.degrees(np.angle(one)), color=plots.COLOURS[k])
+        one, style = response[:, k, k], {"color": plots.COLOURS[k], "ls": plots.DASHES[k]}
+        size.semilogy(grid, 1e6 * np.abs(one), label=f"along {name}", **style)
+        phase.plot(grid, np.degrees(np.angle(one)), **style)
     for frequency in modes.frequencies[modes.frequencies <= grid[-1]]:
         size.axvline(frequency, color="0.8", lw=0.8, zorder=0)
-    figure.suptitle(title.replace("): ", "):\n"))
+    plots.head(figure, title)
     plots.label(size, "frequency (Hz)", "displacement per force (µm/N)")
     plots.legend(size)
     plots.label(phase, "frequency (Hz)", "phase (deg)")

@@ -139,22 +139,27 @@ def draw(motion: Recording, loads: Sequence[Summary], title: str) -> Any:
     shown = sorted((load for load in loads if load.known), key=lambda load: -load.peaks[0])[:SHOWN]
     figure, axes = plots.columns(2, 1)
     (force,), (counted,) = axes
-    for colour, load in zip(plots.COLOURS, shown, strict=False):
-        force.plot(motion.clock, np.concatenate(load.sizes), color=colour, lw=1, label=load.name)
+    for k, load in enumerate(shown):
+        style = {"color": plots.COLOURS[k], "ls": plots.DASHES[k % 3], "lw": 1.2}
+        label = f"{load.name}: {load.peaks[0]:.4g} N"
+        force.plot(motion.clock, np.concatenate(load.sizes), label=label, **style)
         axis = max(range(3), key=lambda k: float(np.ptp(load.reversals[k].values)))
         cycles = load.cycles(axis)
         down = np.argsort(-cycles.ranges)
         label = f"{load.name}, {WRENCH[axis]}"
         reached = np.cumsum(cycles.counts[down])
-        counted.step(reached, cycles.ranges[down], color=colour, where="pre", label=label)
-    plots.label(force, "time (s)", "force (N)", "force in the joints")
+        counted.step(reached, cycles.ranges[down], where="pre", label=label, **style)
+    counted.set(xscale="log", xlim=(0.4, max(10.0, 1.2 * counted.get_xlim()[1])))
+    counted.xaxis.set_major_formatter("{x:g}")
+    counted.xaxis.set_minor_formatter("")
+    plots.label(force, "time (s)", "force (N)", "force in the joints, and its peak")
     x = "cycles of at least this range"
     plots.label(counted, x, "range (N)", "load cycles of one component")
     for ax in (force, counted):
         if shown:
             # Below: beside curves that fill their axes there is no room.
             ax.legend(ncol=2, loc="upper center", bbox_to_anchor=(0.5, -0.16))
-    figure.suptitle(title)
+    plots.head(figure, title)
     return figure
 
 

@@ -104,8 +104,9 @@ def draw(found: Limits, milling: Milling, title: str) -> Any:
     speed, safe, _ = found.steady()
     ax.plot(speed, 1e3 * safe, "*", color="red", mec="white", ms=13)
     way = "slot" if milling.immersion == 1.0 else "up-milling" if milling.up else "down-milling"
-    head = f"{title.replace('; ', chr(10))}\n{milling.teeth} teeth, {way}; chatter above the line"
-    plots.label(ax, "spindle speed (rpm)", "axial depth of cut (mm)", head, 10)
+    words = f"{milling.teeth} teeth, {way}; chatter above the line; star: the best speed"
+    plots.label(ax, "spindle speed (rpm)", "axial depth of cut (mm)", words)
+    plots.head(figure, title)
     ax.set_ylim(0.0, 1.05 * depth.max())
     ax.margins(x=0.0)
     return figure

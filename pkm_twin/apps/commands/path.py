@@ -317,18 +317,20 @@ def draw_limits(motion: TimedPath, title: str) -> Any:
         if colour is not None:
             for ax in (top, low):
                 ax.axvspan(bound.begin, bound.end, color=colour, alpha=0.15, lw=0)
-    figure.suptitle(f"{title}: which limit binds when ({motion.law})")
-    plots.label(top, "time (s)", "fraction of the limit (%)")
+    plots.head(figure, title)
+    most = max(motion.worst.items(), key=lambda item: item[1], default=None)
+    binds = any(bound.what in colours for bound in motion.bounds)
+    words = ""
+    if binds:
+        words = "background: colour of the limit that binds"
+    elif most is not None:
+        words = f"no limit binds: {most[0]} uses {100 * most[1]:.0f} %"
+    plots.label(top, "time (s)", "fraction of the limit (%)", words)
     top.set_ylim(0, 105)
     if shown:
         plots.legend(top)
     low.plot(time, motion.fine.speed, color="black", lw=1.2)
-    plots.label(
-        low,
-        "time (s)",
-        "speed of the tool point (m/s)",
-        "colours are those of the limit that binds",
-    )
+    plots.label(low, "time (s)", "speed of the tool point (m/s)")
     low.set_ylim(bottom=0)
     return figure
 
@@ -358,9 +360,10 @@ def _cut(cut: SoftCut, motion: TimedPath) -> tuple[list[Fact], Any]:
         for ax, (values, label, limit) in zip(axes[0], curves, strict=True):
             ax.plot(s.time, values, color=plots.COLOURS[0], lw=1.2)
             ax.axhline(limit, color=plots.COLOURS[1], lw=1.0)
-            plots.label(ax, "time (s)", label)
-            ax.set_ylim(bottom=0.0)
-        figure.suptitle(title)
+            words = f"{label}: up to {values.max():.4g}, limit {limit:.4g}"
+            plots.label(ax, "time (s)", label, words)
+            ax.set_ylim(0.0, 1.1 * limit)
+        plots.head(figure, title)
         return figure
 
     return facts, draw

@@ -103,11 +103,12 @@ def size(given: Size) -> Report:
     duration = float(motion.time[-1] - motion.time[0])
     energy = sum(d.at_joint.energy for d in duties)
     returned = sum(d.at_joint.returned for d in duties)
+    net = round(energy, 9) + 0.0  # A cycle gives back all but rounding.
     worst = max(duties, key=lambda d: (d.slides == duties[0].slides, d.at_joint.peak))
     unit = "N" if worst.slides else "N m"
     answer = (
         f"{motion.robot.name}: largest effort {worst.at_joint.peak:.4g} {unit} on {worst.joint}, "
-        f"RMS {worst.at_joint.rms:.4g} {unit}; net energy of all drives {energy:.4g} J"
+        f"RMS {worst.at_joint.rms:.4g} {unit}; net energy of all drives {net:.4g} J"
     )
     facts = [
         Fact("robot", motion.robot.name),
@@ -121,15 +122,16 @@ def size(given: Size) -> Report:
         Fact("regenerated_J", returned, "J", "regenerated energy"),
         Fact("mean_power_W", energy / duration, "W", "mean power"),
     ]  # fmt: skip
-    notes = list(motion.notes)
+    notes, title = list(motion.notes), answer
     if taken.unlike:
         notes.append(f"{taken.unlike}; --efforts model uses the model's")
     if motors:
         best = smallest(duties)
         facts.append(Fact("smallest_motor", best))
         notes.append(f"smallest motor for all drives: {best or f'none of {len(motors)}'}")
+        title += f"; {notes[-1]}"
     return Report(
-        answer, facts, _tables(duties), {"": lambda: draw(taken, duties)}, notes,
+        answer, facts, _tables(duties), {"": lambda: draw(taken, duties, title)}, notes,
     )  # fmt: skip
 
 
@@ -243,8 +245,8 @@ def near(duty: DriveDuty) -> list[Fit]:
     return fits[max(first - 3, 0) : first + 1]
 
 
-def draw(taken: Compared, duties: Sequence[DriveDuty]) -> Any:
-    """Torque against speed, an axes for each drive, with the curves of motors."""
+def draw(taken: Compared, duties: Sequence[DriveDuty], answer: str) -> Any:
+    """Torque against speed, an axes for each drive, with the curves of motors or the limits."""
     from pkm_twin.paths.sizing import RPM
 
     shown = duties[:DRAWN]
@@ -252,18 +254,23 @@ def draw(taken: Compared, duties: Sequence[DriveDuty]) -> Any:
     m = taken.motion
     for k, (ax, d) in enumerate(zip(axes[0], shown, strict=True)):
         if d.torques is not None and d.speeds is not None:
-            side, speeds, torques = "motor", d.speeds / RPM, d.torques
+            speeds, torques, words = d.speeds / RPM, d.torques, "motor"
             labels = "speed of the motor (1/min)", "torque (N m)"
         else:
-            side, speeds, torques = "joint", m.motion[1][:, k], taken.effort[:, k]
+            speeds, torques = m.motion[1][:, k], taken.effort[:, k]
             unit = m.robot.joint_units[k]
             labels = f"speed of the joint ({unit}/s)", f"effort ({m.robot.effort_units[k]})"
             own, dashed = m.robot.limits, {"color": "0.5", "ls": "--", "lw": 1}
-            for limits, draw in ((own.velocity, ax.axvline), (own.effort, ax.axhline)):
-                for sign in (1.0, -1.0):
-                    if limits is not None and np.isfinite(limits[k]):
+            used = []
+            for what, limits, draw, values in (
+                ("speed", own.velocity, ax.axvline, speeds),
+                ("effort", own.effort, ax.axhline, torques),
+            ):
+                if limits is not None and np.isfinite(limits[k]):
+                    used.append(f"{_percent(np.abs(values).max() / limits[k])} of {what}")
+                    for sign in (1.0, -1.0):
                         draw(sign * limits[k], **dashed)
-            side = "joint; dashed: limits of the file"
+            words = f"uses {', '.join(used)} (dashed: limits of the file)" if used else "no limits"
         ax.plot(speeds, torques, color="black", lw=1.5, label="motion")
         most = float(np.abs(torques).max())
         for colour, fit in zip(plots.COLOURS, near(d), strict=False):
@@ -274,11 +281,17 @@ def draw(taken: Compared, duties: Sequence[DriveDuty]) -> Any:
                     label = fit.name if sign == way == 1.0 else None
                     ax.plot(way * speed / RPM, sign * torque, color=colour, lw=1, label=label)
         if d.fits:
+            fit = near(d)[-1]
+            parts = tuple(map(_percent, (fit.torque, fit.thermal, fit.speed)))
+            words = (
+                f"{fit.name} {'fits' if fit.good else 'is too small'}: "
+                "torque {}, RMS torque {}, speed {}".format(*parts)
+            )
             fastest = 1.3 * float(np.abs(speeds).max())
             ax.set(xlim=(-fastest, fastest), ylim=(-1.1 * most, 1.1 * most))
-        title = f"{m.robot.name}: is the drive of {d.joint} strong enough? ({side})"
-        plots.label(ax, *labels, title)
+        plots.label(ax, *labels, f"{d.joint}: {words}")
         plots.legend(ax)
+    plots.head(figure, answer)
     return figure
 
 

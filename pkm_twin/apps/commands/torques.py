@@ -72,9 +72,12 @@ def torques(given: Torques) -> Report:
     alike = [name for name in rows if units[name] == robot.effort_units[0]]
     worst = max(alike, key=lambda name: rows[name][0])
     peak, rms, unit, when = rows[worst]
-    return Report(
+    answer = (
         f"{robot.name}: largest effort {peak:.4g} {unit} on {worst} at {when:.4g} s, RMS {rms:.4g} "
-        f"{unit}",
+        f"{unit}"
+    )
+    return Report(
+        answer,
         [
             Fact("robot", robot.name),
             Fact("samples", len(time)),
@@ -90,7 +93,7 @@ def torques(given: Torques) -> Report:
                 rows, head="joint",
             )
         ],
-        figures={"": lambda: plots.torques(motion, columns)},
+        figures={"": lambda: plots.torques(motion, columns, answer)},
         notes=[
             f"table: {len(time)} rows, {len(columns)} columns", *motion.notes,
             *(f"beyond limits: {item}" for item in beyond),

@@ -101,7 +101,7 @@ def draw(results: Sequence[Judged], answer: str) -> Any:
         plots.label(ax, "", s.unit, s.label)
         ax.tick_params(axis="x", labelrotation=30)
     shown = "" if len(order) == len(results) else f"; {len(order)} shown"
-    figure.suptitle(f"Is it getting worse? {answer}{shown}")
+    plots.head(figure, f"Is it getting worse? {answer}{shown}")
     return figure
 
 

@@ -100,10 +100,11 @@ class Modes(Frequency):
         figure.colorbar(drawn, ax=axes, aspect=25, pad=0.01).set_label(
             "displacement over the mode's largest (dimensionless)", fontsize=9
         )
-        figure.suptitle(
+        plots.head(
+            figure,
             f"{data.attrs['robot']}: lowest modes where it rings lowest, actuators locked\n"
             "grey: at rest; coloured: deformed, magnified; below: the parts with most energy",
-            fontsize=10,
+            10,
         )
         return {"shapes": figure}
 

@@ -42,7 +42,7 @@ class Workspace(Kind):
     """Reach, singularities, limb interference, largest inscribed cylinder."""
 
     name = "workspace"
-    question = "where does it reach?"
+    question = "where can it move?"
     least = 0.0
     signed = True
     points = 200_000
