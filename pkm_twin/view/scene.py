@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -271,6 +271,47 @@ def _cylinders(ends: Array, radii: Array) -> tuple[Array, Array, Array]:
 def _quaternions(turns: Rotation) -> Array:
     """Quaternions with w first, shape (..., 4)."""
     return np.asarray(np.roll(turns.as_quat(), 1, axis=-1), np.float64)
+
+
+ANCHORS: Final = {
+    "bottom-center": (0, -1), "top-center": (0, 1), "center-left": (1, 0), "center-right": (-1, 0),
+    "bottom-left": (1, -1), "bottom-right": (-1, -1), "top-left": (1, 1), "top-right": (-1, 1),
+}  # fmt: skip
+"""Where a label is from the place that it names, right and down, in half its size."""
+
+
+def anchors(spots: Array, sizes: Array, window: tuple[float, float]) -> list[str]:
+    """An anchor for each label, so that none covers an earlier one; empty where none is free.
+
+    :param spots: places named in the picture, (k, 2) pixels, right and down; ``sizes``: (k, 2).
+    :param window: width and height; a label outside of it is not placed.
+    """
+    taken: list[tuple[Array, Array]] = []
+    result = []
+    for spot, half in zip(spots, sizes / 2, strict=True):
+        for name, aside in ANCHORS.items():
+            middle = spot + half * aside
+            within = (middle >= half).all() and (middle + half <= window).all()
+            if within and all((np.abs(middle - m) >= half + h).any() for m, h in taken):
+                taken.append((middle, half))
+                result.append(name)
+                break
+        else:
+            result.append("")
+    return result
+
+
+def seen(points: Array, camera: Any) -> tuple[Array, Array]:
+    """Pixels (k, 2), right and down, and distances (k,) along the view, of points (k, 3).
+
+    :param camera: ``position``, ``wxyz`` (z ahead, y down), ``fov`` of the height in rad,
+        ``image_width`` and ``image_height``.
+    """
+    turn = Rotation.from_quat(np.roll(camera.wxyz, -1))
+    right, down, ahead = turn.inv().apply(points - camera.position).T
+    size = np.array([camera.image_width, camera.image_height])
+    pixels = np.column_stack([right, down]) / np.maximum(ahead, 1e-9)[:, None]
+    return pixels * size[1] / 2 / np.tan(camera.fov / 2) + size / 2, ahead
 
 
 def round_mesh(sides: int = 24, rings: int = 12) -> tuple[tuple[Array, Array], tuple[Array, Array]]:

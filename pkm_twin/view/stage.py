@@ -6,7 +6,8 @@ from __future__ import annotations
 import contextlib
 import math
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from itertools import zip_longest
 from typing import Any, Final
 
 import numpy as np
@@ -15,13 +16,24 @@ from numpy.typing import NDArray
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.machine.graph import BASE
 from pkm_twin.view.meshes import body_meshes
-from pkm_twin.view.scene import BODY, GROUND, PLATFORM, Scene, plate, round_mesh
+from pkm_twin.view.scene import (
+    BODY,
+    GROUND,
+    PLATFORM,
+    Scene,
+    anchors,
+    plate,
+    round_mesh,
+    seen,
+)
 
 FLOOR: Final = (150, 156, 164)
 FORCE: Final = (0, 158, 115)
 MOMENT: Final = (204, 121, 167)
 ARROW: Final = 0.4
 """Length of the greatest wrench's arrow, per size of the machine."""
+LETTER: Final = (7.4, 19.0)
+"""Width and height of a label's letter, at the most, pixels."""
 TRAIL: Final = 1000
 """Places of the reference point that are kept."""
 LOOK: Final = np.array([0.62, -0.95, 0.42])
@@ -50,11 +62,10 @@ class Stage:
             "/trail", np.zeros((1, 2, 3)), colors=FORCE, thickness=0.006 * scene.size, visible=False
         )
         size, draw = scene.size, server.scene
-        self._names = {
-            name: draw.add_label(f"/names/{k}", name, anchor="bottom-center", position=place)
-            for k, (name, place) in enumerate(scene.shapes(q).drives.items())
-        }
-        self._element = draw.add_label("/element", "", anchor="bottom-center", visible=False)
+        self._named, self._element = True, ""
+        self._places: dict[str, Array] = scene.shapes(q).drives
+        self._labels: dict[int, tuple[Any, list[Any]]] = {}
+        server.on_client_disconnect(lambda client: self._labels.pop(client.client_id, None))
         self._arrows = draw.add_arrows(
             "/wrench", np.zeros((2, 2, 3)), _linear(np.array([FORCE, MOMENT])),
             shaft_radius=0.008 * size, head_radius=0.02 * size, head_length=0.05 * size,
@@ -99,10 +110,14 @@ class Stage:
         middle = np.array(start.look_at)
         begin = np.array(start.position) - middle
         placed: deque[float] = deque(maxlen=16)
+        count = len(self._places) + 1
+        labels = [client.scene.add_label(f"/names/{k}", "", visible=False) for k in range(count)]
+        self._labels[client.client_id] = client.camera, labels
 
         async def fit(camera: Any) -> None:
             # A browser may send any numbers: those of no window change nothing.
             with contextlib.suppress(ArithmeticError, TypeError, ValueError):
+                self._arrange(camera, labels)
                 width, height = camera.image_width, camera.image_height
                 if not min(width, height) >= SMALLEST:
                     return
@@ -199,16 +214,35 @@ class Stage:
             for body, (at, turn) in self._scene.frames(q, deflection).items():
                 if body in self._meshes:
                     self._meshes[body].position, self._meshes[body].wxyz = at, turn
-        for name, place in shapes.drives.items():
-            self._names[name].position = place
+        self._places, self._element = dict(shapes.drives), ""
         self._rest.visible = moved
         if moved:
             rest = self._scene.shapes(q)
             self._rest.position, self._rest.wxyz = rest.platform_at, rest.platform_turn
-        self._element.visible = dominant in shapes.places
         if dominant in shapes.places:
-            self._element.text = f"{dominant}: {100 * shares[dominant]:.0f} % of the strain energy"
-            self._element.position = shapes.places[dominant]
+            self._element = f"{dominant}: {100 * shares[dominant]:.0f} % of the strain energy"
+            self._places = {self._element: shapes.places[dominant]} | self._places
+        self._arrange_all()
+
+    def _arrange_all(self) -> None:
+        for camera, labels in list(self._labels.values()):
+            with contextlib.suppress(ArithmeticError, TypeError, ValueError):
+                self._arrange(camera, labels)
+
+    def _arrange(self, camera: Any, labels: Sequence[Any]) -> None:
+        """Put labels beside what they name, so that none covers another in this window."""
+        texts = [text for text in self._places if self._named or text == self._element]
+        points = np.array([self._places[text] for text in texts]).reshape(-1, 3)
+        pixels, ahead = seen(points, camera)
+        # The element first, then what is nearest.
+        order = sorted(range(len(texts)), key=lambda k: (texts[k] != self._element, ahead[k]))
+        sizes = np.array([[LETTER[0] * len(texts[k]) + 8.0, LETTER[1]] for k in order])
+        window = camera.image_width, camera.image_height
+        found = anchors(pixels[order], sizes.reshape(-1, 2), window)
+        for label, k, anchor in zip_longest(labels, order, found):
+            label.visible = bool(anchor)
+            if anchor:
+                label.text, label.anchor, label.position = texts[k], anchor, points[k]
 
     def draw_wrench(self, at: Array, part: Array) -> None:
         """Arrows of a wrench at the reference point: the force ends there, the moment begins.
@@ -237,8 +271,8 @@ class Stage:
 
     def name_drives(self, shown: bool) -> None:
         """Whether the drives have their names beside them."""
-        for label in self._names.values():
-            label.visible = shown
+        self._named = shown
+        self._arrange_all()
 
 
 def _axes(length: float, size: float) -> dict[str, float]:

@@ -13,7 +13,7 @@ from pkm_twin.robot.clearance import clearance, has_clearance
 from pkm_twin.robot.outline import Posture
 from pkm_twin.view import texts
 from pkm_twin.view.model import Model, _round, _step
-from pkm_twin.view.scene import SCALE, Scene, plate, round_mesh, share_colours
+from pkm_twin.view.scene import ANCHORS, SCALE, Scene, anchors, plate, round_mesh, share_colours
 from stiffness_monitor import compliance
 from test.support.robots import has, load, rigid
 
@@ -283,6 +283,23 @@ def test_every_element_has_a_place_and_its_colour():
         assert last in {tuple(c) for c in [*shapes.cylinder_colours, *shapes.ball_colours]}
         assert share_colours(shares)[energy.dominant] == last
     assert share_colours({"a": 0.0}) == {}
+
+
+def test_labels_do_not_cover_each_other(rng):
+    """In any window; and where there is room, all of them are shown."""
+    offsets = {name: np.array(aside) for name, aside in ANCHORS.items()}
+    for window in (300, 300), (500, 400), (1400, 900):
+        spots = rng.random((12, 2)) * window
+        sizes = np.column_stack([rng.uniform(30, 240, 12), np.full(12, 19.0)])
+        found = anchors(spots, sizes, window)
+        shown = [
+            (s + h * offsets[a], h) for s, h, a in zip(spots, sizes / 2, found, strict=True) if a
+        ]
+        assert len(shown) >= (3 if window[0] < 1000 else 10)
+        for k, (middle, half) in enumerate(shown):
+            assert (middle - half >= 0).all() and (middle + half <= window).all()
+            for other, size in shown[:k]:
+                assert (np.abs(middle - other) >= half + size).any()
 
 
 def test_meshes_are_closed():

@@ -243,8 +243,10 @@ def placed(page, states):
     start = page.server.initial_camera
     middle, begin = np.array(start.look_at), np.array(start.position) - np.array(start.look_at)
     calls = []
-    camera = SimpleNamespace(on_update=calls.append)
-    client = SimpleNamespace(camera=camera, atomic=contextlib.nullcontext)
+    camera = SimpleNamespace(on_update=calls.append, wxyz=np.eye(4)[0], fov=1.0)
+    client = SimpleNamespace(
+        camera=camera, atomic=contextlib.nullcontext, client_id=-1, scene=page.server.scene
+    )
     asyncio.run(page.stage._frame(client))
     for width, height, distance in states:
         camera.image_width, camera.image_height = width, height
