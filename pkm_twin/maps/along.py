@@ -58,10 +58,9 @@ class Along:
     @property
     def sentences(self) -> list[str]:
         """The worst of each case in words."""
-        units = dict(zip(self.robot.pose_names, self.robot.pose_units, strict=True))
         return [
             ("" if len(self.cases) == 1 else f"{one['case']}: ")
-            + f"{figures.sentence(one, units)}; at {one['time_s']:.4g} s"
+            + f"{figures.sentence(one)}; at {one['time_s']:.4g} s"
             for one in self.worst
         ]
 
@@ -77,7 +76,7 @@ class Along:
             header.append(f"{before}value")
             columns.append(one.value.tolist())
             if one.direction is not None and one.direction.shape[-1] == 3:
-                header += [f"{before}{axis}" for axis in "xyz"]
+                header += [f"{before}direction.{axis}" for axis in "xyz"]
                 columns += one.direction.T.tolist()
             if one.element is not None and elements:
                 header.append(f"{before}element")

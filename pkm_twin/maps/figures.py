@@ -31,11 +31,9 @@ PANELS: Final = 3
 def scale_of(greatest: float, unit: str) -> tuple[float, str]:
     """Factor and unit with a prefix that leave values up to a greatest below 1000.
 
-    Angles are in degrees. Prefixes stand where they exist: kg has g and t, and what starts with
-    another power or an angle has none.
+    Prefixes stand where they exist: kg has g and t, and what starts with another power or an angle
+    has none.
     """
-    if unit == "rad":
-        return 180.0 / math.pi, "deg"
     power = 3 * math.floor(math.log10(abs(greatest) or 1.0) / 3) if math.isfinite(greatest) else 0
     if unit == "kg":
         power = min(max(power, -3), 3)
@@ -88,15 +86,12 @@ def answers(data: Dataset) -> list[dict[str, Any]]:
     return found
 
 
-def sentence(answer: dict[str, Any], units: dict[str, str]) -> str:
+def sentence(answer: dict[str, Any]) -> str:
     """The worst of a case in words: "softest: 32.8 µm/N along y at (0, -0.16, -0.35), arm III".
 
-    :param units: of the pose coordinates.
+    The pose is in m and rad, as commands read it.
     """
-    pose = ", ".join(
-        f"{round(math.degrees(v), 2) + 0.0:g}°" if units[k] == "rad" else f"{_plain(v):.4g}"
-        for k, v in answer["pose"].items()
-    )
+    pose = ", ".join(f"{_plain(v):.4g}" for v in answer["pose"].values())
     text = f"{answer['answer']}: {shown(answer['value'], answer['unit'])}"
     way = np.array(answer.get("direction", []))
     if len(way) and np.isfinite(way).all() and way.any():
@@ -119,9 +114,9 @@ def units_of(data: Dataset) -> dict[str, str]:
 
 def lines(data: Dataset) -> list[str]:
     """What a map answers: a line for each case, then what its kind says of the workspace."""
-    found, units = answers(data), units_of(data)
+    found = answers(data)
     alone = len(found) == 1
-    texts = [("" if alone else f"{a['case']}: ") + sentence(a, units) for a in found]
+    texts = [("" if alone else f"{a['case']}: ") + sentence(a) for a in found]
     facts = kind_of(data).facts(data)
     searched = bool(np.isfinite(data.worst_value.values[0]))
     return [*texts, *facts] if searched else [*facts, *texts]
@@ -130,8 +125,7 @@ def lines(data: Dataset) -> list[str]:
 def title(data: Dataset, case: int) -> list[str]:
     """Question and answer of a case."""
     name = str(data.case.values[case])
-    units = units_of(data)
-    own = [sentence(a, units) for a in answers(data) if a["case"] == name]
+    own = [sentence(a) for a in answers(data) if a["case"] == name]
     label = "" if len(data.case) == 1 else f", {name.replace('-', ' ')}"
     head = f"{data.attrs['robot']}{label}: {data.attrs['question']}"
     return [head, *(own or ["; ".join(kind_of(data).facts(data))])]
@@ -155,29 +149,24 @@ def limits(values: Array, worst: float) -> tuple[float, float]:
 
 
 def plane_of(data: Dataset, case: int, plane: int) -> dict[str, Any]:
-    """A plane for drawing: names, units and ticks of its sides, values; angles in degrees.
+    """A plane for drawing: names, units and ticks of its sides, values.
 
     ``star``: where the worst pose is in it; None where it is not. ``held``: the other coordinates.
     """
     part, units = data.isel(case=case, plane=plane), units_of(data)
     names = tuple(n for n in (str(part.row_name.values), str(part.column_name.values)) if n)
-    scales = [scale_of(1.0, units[n]) if units[n] == "rad" else (1.0, units[n]) for n in names]
     sides = [part.row_value.values, part.column_value.values]
     pose, through = part.worst_pose.values, part.through.values
     every = [str(name) for name in data.coordinate.values]
     at = {n: through[every.index(n)] for n in every}
-    held = [
-        f"{n} = {round(math.degrees(at[n]), 2) + 0.0:g} deg" if units[n] == "rad"
-        else f"{n} = {_plain(at[n]):.4g} {units[n]}"
-        for n in every if n not in names
-    ]  # fmt: skip
+    held = [f"{n} = {_plain(at[n]):.4g} {units[n]}" for n in every if n not in names]
     star = None
     if np.isfinite(pose).all() and np.allclose(pose, through, rtol=0.0, atol=1e-12):
-        star = [s * at[n] for n, (s, _) in zip(names, scales, strict=True)]
+        star = [at[n] for n in names]
     return {
         "names": names,
-        "units": [unit for _, unit in scales],
-        "ticks": [s * side for side, (s, _) in zip(sides, scales, strict=False)],
+        "units": [units[n] for n in names],
+        "ticks": sides[: len(names)],
         "values": part.plane_value.values,
         "reach": part.plane_reach.values,
         "star": star,

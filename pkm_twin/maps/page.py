@@ -96,9 +96,8 @@ def _layers(data: Dataset) -> Any:
     }
     part = data.value.isel({n: slice(None, None, step) for n, step in steps.items()})
     values = part.transpose("case", upwards, *flat).values
-    turns = {n: figures.scale_of(1.0, u) if u == "rad" else (1.0, u) for n, u in units.items()}
-    x, y, heights = (turns[n][0] * part[n].values for n in (*flat, upwards))
-    names = [f"{name} ({turns[name][1]})" for name in (*flat, upwards)]
+    x, y, heights = (part[n].values for n in (*flat, upwards))
+    names = [f"{name} ({units[name]})" for name in (*flat, upwards)]
     x, y = np.meshgrid(x, y, indexing="ij")
     kept = np.isfinite(values).any(0)
     figure = graph.Figure()
@@ -116,7 +115,7 @@ def _layers(data: Dataset) -> Any:
         said = f"{where}{name} %{{intensity:.4~g}} {unit}<extra></extra>"
         pose = dict(zip(units, data.worst_pose.values[k].tolist(), strict=True))
         known = math.isfinite(float(data.worst_value[k]))
-        star = [few(np.array([turns[n][0] * pose[n]] * known)).tolist() for n in (*flat, upwards)]
+        star = [few(np.array([pose[n]] * known)).tolist() for n in (*flat, upwards)]
         worst = figures.shown(float(data.worst_value[k]), str(data.case_unit.values[k]))
         change = {
             "intensity": [*(few(scale * v[s]) for v, s in zip(values[k], kept, strict=True)), None],

@@ -246,13 +246,24 @@ def test_along_a_path_and_as_numbers(capsys, tmp_path, monkeypatch):
     told = json.loads(done.out)
     robot = load("five_bar")
     q = robot.inverse(np.stack([0.002 * np.arange(20), np.full(20, 0.36)], -1))
-    values = found(robot, "acceleration", q).value
+    least = found(robot, "acceleration", q)
+    values = least.value
     assert told["worst"][0]["value"] == pytest.approx(values.min())
     assert told["worst"][0]["time_s"] == pytest.approx(0.01 * values.argmin())
     assert told["worst"][0]["unit"] == "m/s2"
     rows = (tmp_path / "a.csv").read_text().splitlines()
     assert [float(row.split(",")[4]) for row in rows[1:]] == pytest.approx(values.tolist())
+    header = rows[0].split(",")
+    ways = [header.index(f"direction.{axis}") for axis in "xyz"]
+    assert len(set(header)) == len(header)
+    table = [[float(row.split(",")[k]) for k in ways] for row in rows[1:]]
+    np.testing.assert_allclose(table, least.direction)
     assert (tmp_path / "a.png").stat().st_size
+
+
+def test_a_pose_in_a_sentence_is_as_commands_read_it():
+    answer = {"answer": "softest", "value": 1e-5, "unit": "m/N", "pose": {"x": 0.7235, "b": 0.4552}}
+    assert figures.sentence(answer).endswith("(0.7235, 0.4552)")
 
 
 def test_milling_depths_are_those_of_each_pose(capsys, tmp_path, monkeypatch):
@@ -436,7 +447,7 @@ def test_a_workspace_in_which_nothing_counts_names_the_cause(name):
     [
         (7.276, "kg", "7.276 kg"), (7276.0, "kg", "7.276 t"), (0.0123, "kg", "12.3 g"),
         (3.277e-5, "m/N", "32.77 µm/N"), (2.5e-4, "m", "250 µm"), (1234.0, "m/s2", "1234 m/s2"),
-        (1.23e4, "J", "12.3 kJ"), (0.5, "rad", "28.65 deg"), (12.0, "rad/s2", "12 rad/s2"),
+        (1.23e4, "J", "12.3 kJ"), (0.5, "rad", "0.5 rad"), (12.0, "rad/s2", "12 rad/s2"),
         (0.05, "", "0.05"), (4.4e4, "Hz", "44 kHz"), (0.0, "N m", "0 N m"),
     ],
 )  # fmt: skip

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import functools
-import math
 import re
 
 import numpy as np
@@ -119,7 +118,7 @@ def labels(browser, points):
 
 
 def number(line):
-    """Name, number and unit of a line like "gamma -4.5 deg"."""
+    """Name, number and unit of a line like "gamma -0.0785 rad"."""
     match = re.fullmatch(r"(.*) ([-−]?[\d.]+(?:e[-+−]?\d+)?(?:[kmµnp]?)) ?(.*)", line.strip())
     assert match, line
     name, text, unit = match.groups()
@@ -138,12 +137,12 @@ def test_layers(browser, points, robot, small_maps, tmp_path):
                 where = {}
                 for name, shown in (line.split(") ") for line in place):
                     name, unit = name.split(" (")
-                    number_of = float(shown.replace("−", "-"))
-                    where[name] = math.radians(number_of) if unit == "deg" else number_of
+                    assert unit == data.unit.sel(coordinate=name)
+                    where[name] = float(shown.replace("−", "-"))
                 point = data.sel(where, method="nearest").sel(case=case)
                 for name, shown in where.items():
                     assert float(point[name]) == pytest.approx(shown, abs=1e-4)
-                scale = {"mm": 1e3, "deg": 180 / math.pi}.get(number(value)[2], 1.0)
+                scale = {"mm": 1e3}.get(number(value)[2], 1.0)
                 stored = scale * float(point.value)
                 assert number(value)[1] == pytest.approx(stored, rel=1e-3, abs=1e-4)
 

@@ -94,8 +94,7 @@ class Workspace(Kind):
         if "interference" in data and (lost := float(data.interference)) > 0.0:
             facts.append(f"limbs interfere in {100 * lost:.3g} % of otherwise reachable poses")
         if "cylinder_radius" in data and (radius := float(data.cylinder_radius)) > 0.0:
-            angle = data.cylinder_radius.attrs["units"] == "rad"
-            wide = f"{math.degrees(radius):.1f} deg" if angle else f"{radius:.3f} m"
+            wide = f"{radius:.3f} {data.cylinder_radius.attrs['units']}"
             low, high = float(data.cylinder_low), float(data.cylinder_high)
             name = data.attrs["height"]
             facts.append(f"largest cylinder: {name} {low:.3f} to {high:.3f} m, radius {wide}")
@@ -106,15 +105,14 @@ class Workspace(Kind):
         """The circles about the axis and the cylinder, in planes that they lie in."""
         if "circle" not in data or len(names) != 2:
             return
-        scale = 180 / math.pi if data.circle.attrs["units"] == "rad" else 1.0
-        radius, height = scale * float(data.cylinder_radius), data.attrs["height"]
+        radius, height = float(data.cylinder_radius), data.attrs["height"]
         if height not in names:
             turn = np.linspace(0.0, 2 * np.pi, 181)
             ax.plot(radius * np.cos(turn), radius * np.sin(turn), "--", color="white", lw=1.2)
             return
         low, high = float(data.cylinder_low), float(data.cylinder_high)
         outline = [radius, radius, -radius, -radius, radius], [low, high, high, low, low]
-        circle = scale * np.where(data.circle.values > 0.0, data.circle.values, np.nan)
+        circle = np.where(data.circle.values > 0.0, data.circle.values, np.nan)
         sides = np.concatenate([circle, [np.nan], -circle])
         heights = np.concatenate([data.height.values, [np.nan], data.height.values])
         for style, (x, y) in (("-", (sides, heights)), ("--", outline)):
