@@ -12,6 +12,7 @@ from urllib.parse import parse_qs, urlencode
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation  # type: ignore[import-untyped]
 
 from delta_dynamics import inverse_dynamics
 from delta_dynamics.feedforward import Settings
@@ -32,6 +33,8 @@ SAMPLES: Final = 1000
 """Joint states of which the ranges of the pose sliders are made."""
 SAME: Final = 1e-6
 """By how much a pose may miss itself, there and back, per 1 and its size; m and rad."""
+STEPS: Final = 6
+"""Steps of Newton from one place of the platform to the next that is asked for."""
 VISIBLE: Final = 0.15
 """Size that the greatest deflection may be enlarged to, per size of the machine."""
 
@@ -188,6 +191,25 @@ class Model:
         except ValueError as error:
             return _refused(state, str(error))
         return self._moved(state, q, asked)
+
+    def to_platform(self, state: State, position: Array, rotation: Array) -> State:
+        """The state whose platform is nearest to a place (3,) m and a rotation (3, 3).
+
+        What the machine cannot do is left out; angles count by the size of the platform. Errors as
+        :meth:`to_pose`.
+        """
+        robot, q = self.robot, state.q
+        weights = np.repeat([1.0, robot.size], 3)
+        try:
+            for _ in range(STEPS):
+                at, turn = robot.platform(q)
+                turned = Rotation.from_matrix(rotation @ turn.T).as_rotvec()
+                missing = weights * np.concatenate([position - at, turned])
+                twists = weights[:, None] * robot.platform_jacobian(q)
+                q = q + np.linalg.lstsq(twists, missing, rcond=1e-9)[0]
+        except ValueError as error:
+            return _refused(state, str(error))
+        return self._moved(state, q, None)
 
     def _moved(self, state: State, q: Array, asked: Array | None) -> State:
         _, found = beyond_limits(self.robot, q)

@@ -17,6 +17,7 @@ from functools import partial
 from typing import Any, Final, Protocol
 
 import numpy as np
+from scipy.spatial.transform import Rotation  # type: ignore[import-untyped]
 
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import PkmTwinError, one_line
@@ -77,6 +78,7 @@ class Page:
         self.moving: list[Moving] = []
         self._asked: dict[str, Callable[[], None]] = {}
         self._failures: set[str] = set()
+        self._dragged = False
         self._wake = threading.Event()
         self._tops = np.array([r.high for r in model.wrench_ranges])
         server.gui.configure_theme(
@@ -100,6 +102,7 @@ class Page:
 
         def noted(event: Any) -> None:
             if event.client is not None:  # else the page itself moved it
+                self._dragged = getattr(event, "phase", "end") != "end"
                 self._asked[what] = call
                 self._wake.set()
 
@@ -150,10 +153,13 @@ class Page:
                 self._pose = self._sliders(model.pose_ranges, "pose", self._move_pose)
             self.ask(gui.add_button("Home").on_click, "home", self._go_home)
             self._check("names of drives", True, self.stage.name_drives)
+            self._check("drag platform", False, self.stage.show_gizmo)
+            self.ask(self.stage.gizmo.on_update, "drag", self._drag)
             self._check("trail of the tool", False, self.stage.leave_trail)
             if self.stage.has_meshes:
                 self._check("meshes of the URDF", True, self.stage.show_meshes)
-        with tabs.add_tab("Load"):
+        self.load_tab = tabs.add_tab("Load")
+        with self.load_tab:
             with gui.add_folder("Wrench on the platform, base axes"):
                 self._wrench = self._sliders(model.wrench_ranges, "wrench", self._load)
                 self.ask(gui.add_button("No wrench").on_click, "unload", self._unload)
@@ -202,6 +208,11 @@ class Page:
     def _unload(self) -> None:
         self.become(self.model.loaded(self.state, np.zeros(6)))
 
+    def _drag(self) -> None:
+        gizmo = self.stage.gizmo
+        rotation = Rotation.from_quat(np.roll(gizmo.wxyz, -1)).as_matrix()
+        self.become(self.model.to_platform(self.state, gizmo.position, rotation))
+
     def _follow(self) -> None:
         self.become(self.model.linked(self.state, self._link.value))
 
@@ -237,6 +248,10 @@ class Page:
                 self.draw_deflected(np.asarray(energy.deflection), shares, str(energy.dominant))
             self.stage.draw_wrench(numbers.position, state.wrench / self._tops)
             self.stage.extend_trail(numbers.position)
+            if not self._dragged:
+                turn = Rotation.from_matrix(numbers.rotation).as_quat()
+                self.stage.gizmo.position = numbers.position
+                self.stage.gizmo.wxyz = np.roll(turn, 1)
 
     def draw_deflected(self, deflection: Array, shares: dict[str, float], dominant: str) -> None:
         """The state with a deflection (6,), m and rad, base axes, enlarged as the slider says."""

@@ -10,14 +10,21 @@ from typing import Any, Final
 import numpy as np
 
 from pkm_twin.codegen.arrays import Array
+from pkm_twin.errors import PkmTwinError, one_line
 from pkm_twin.view import texts
 from pkm_twin.view.live import SPAN, TOPICS, TRACES, Live
+from pkm_twin.view.model import VISIBLE, State
 from pkm_twin.view.page import Page
 from pkm_twin.view.timeline import Timeline
+from stiffness_monitor.modes import Modes, modes
 
 COLOURS: Final = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 """Of the joints' curves (Okabe and Ito 2008)."""
 SPEEDS: Final = ("0.25", "0.5", "1", "2", "4")
+MODES: Final = 6
+"""Natural modes to choose from."""
+SLOWLY: Final = 1.5
+"""Period of an animated mode, s."""
 _MEASURED: Final = "measured"
 """A wide curve, on which the model's is seen."""
 MARKED: Final = 0.25
@@ -127,6 +134,61 @@ class BagPanel:
             self._since = None
             self._play.label = "Play"
         self._go()
+
+
+class ModePanel:
+    """A natural mode of the present pose as a slow vibration of the platform and its legs."""
+
+    def __init__(self, page: Page) -> None:
+        self._page = page
+        self._modes: Modes | None = None
+        self._state: State | None = None
+        gui = page.server.gui
+        with page.load_tab:
+            still = ("none", *map(str, range(1, MODES + 1)))
+            self._choice = gui.add_dropdown("animated mode", still, initial_value=still[0])
+            self._told = gui.add_html("")
+        page.ask(self._choice.on_update, "mode", self._choose)
+        page.moving.append(self)
+
+    @property
+    def busy(self) -> bool:
+        """Whether a mode is chosen."""
+        return bool(self._choice.value != "none")
+
+    def _choose(self) -> None:
+        self._state = None
+        if not self.busy:
+            self._told.content = ""
+            self._page.become(self._page.state)
+
+    def _solve(self, state: State) -> None:
+        self._state, self._modes = state, None
+        k = int(self._choice.value) - 1
+        try:
+            self._modes = modes(self._page.model.robot, state.pose, MODES)
+        except (PkmTwinError, ValueError) as error:
+            self._told.content = texts.note(one_line(str(error)))
+            return
+        shape, names = self._modes.shapes[k], self._modes.nodes
+        sizes = np.linalg.norm(shape[:, :3], axis=1)
+        told = f"{texts.number(float(self._modes.frequencies[k]))} Hz, drives locked"
+        if sizes[0] < 0.1 * sizes.max():
+            told += f"; {names[int(sizes.argmax())]} moves most, the platform hardly"
+        self._told.content = texts.note(told)
+        self._shift = VISIBLE / 2 * self._page.model.robot.graph.size * shape[0] / sizes.max()
+        strain = self._modes.energies.strain[k].tolist()
+        self._shares = dict(zip(self._modes.energies.elements, strain, strict=True))
+
+    def step(self) -> None:
+        """Draw the mode at this instant."""
+        state = self._page.state
+        if self._state is None or not np.array_equal(self._state.pose, state.pose):
+            self._solve(state)
+        if self._modes is not None:
+            swing = float(np.sin(2 * np.pi * time.monotonic() / SLOWLY))
+            most = max(self._shares, key=lambda name: self._shares[name])
+            self._page.stage.draw(state.q, swing * self._shift, self._shares, most)
 
 
 class LivePanel:

@@ -58,6 +58,14 @@ class Stage:
         self._machine(q)
         self._meshes = self._bodies()
         self._passed: list[Array] = []
+        rotates = any(unit == "rad" for unit in scene.robot.pose_units)
+        self.gizmo = server.scene.add_transform_controls(
+            "/drag",
+            0.3 * scene.size,
+            disable_rotations=not rotates,
+            depth_test=False,
+            visible=False,
+        )
         self._trail = server.scene.add_line_segments(
             "/trail", np.zeros((1, 2, 3)), colors=FORCE, thickness=0.006 * scene.size, visible=False
         )
@@ -136,12 +144,18 @@ class Stage:
 
     def _plates(self) -> None:
         draw, scene, size = self._server.scene, self._scene, self._scene.size
+        graph = scene.robot.graph
+        feet = [j.at for j in graph.joints.values() if BASE in (j.inner, j.outer)]
+        away = float(np.sign((graph.origin - np.mean(feet, axis=0))[2])) or 1.0
         if len(scene.base):
             draw.add_mesh_simple(
-                "/base_plate", *plate(scene.base, 0.03 * size), color=FLOOR, flat_shading=True
+                "/base_plate",
+                *plate(scene.base - [0.0, 0.0, 0.02 * away * size], 0.03 * size),
+                color=FLOOR,
+                flat_shading=True,
             )
         self._platform = draw.add_frame("/platform", **_axes(0.1 * size, size))
-        self._tool(size)
+        self._tool(away)
         self._rest = draw.add_frame("/at_rest", show_axes=False, visible=False)
         if len(scene.platform):
             moving = plate(scene.platform, 0.016 * size)
@@ -149,12 +163,10 @@ class Stage:
             still = plate(scene.platform, 0.01 * size)
             draw.add_mesh_simple("/at_rest/plate", *still, color=(110, 110, 110), opacity=0.35)
 
-    def _tool(self, size: float) -> None:
-        """A flange and its axis on the platform, away from the base."""
-        graph = self._scene.robot.graph
-        feet = [j.at for j in graph.joints.values() if BASE in (j.inner, j.outer)]
-        away = np.sign((graph.origin - np.mean(feet, axis=0))[2]) or 1.0
+    def _tool(self, away: float) -> None:
+        """A flange and its axis on the platform; ``away``: the base is below, 1, or above, -1."""
         (round_, faces), _ = round_mesh()
+        size = self._scene.size
         for name, radius, length in (("flange", 0.05, 0.03), ("tool", 0.012, 0.2)):
             shape = size * (round_ * [radius, radius, length] + [0.0, 0.0, away * length / 2])
             self._server.scene.add_mesh_simple(f"/platform/{name}", shape, faces, color=BODY)
@@ -252,6 +264,10 @@ class Stage:
         self._arrows.visible = bool(part.any())
         force, moment = ARROW * self._scene.size * part.reshape(2, 3)
         self._arrows.points = np.array([[at - force, at], [at, at + moment]])
+
+    def show_gizmo(self, shown: bool) -> None:
+        """Whether the platform can be dragged."""
+        self.gizmo.visible = shown
 
     def leave_trail(self, shown: bool) -> None:
         """Whether the reference point draws a line; a new one begins now."""

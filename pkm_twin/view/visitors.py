@@ -1,13 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a browser may change on the page: the values of its inputs, within what each can take.
 
-All browsers share one page, and viser writes whatever property a message names. Every other
-message of a browser but its camera's is dropped here: the page has no use for one.
+All browsers share one page, and viser writes whatever property a message names. Of the others,
+a browser's messages on its camera and on the platform that it drags are taken, and no more.
 """
 
 from __future__ import annotations
 
 import math
+from functools import partial
 from typing import Any, Final
 
 from pkm_twin.errors import PkmTwinError
@@ -26,6 +27,8 @@ def guard(server: Any) -> None:
 
     try:
         handlers = server._websock_server._incoming_handlers
+        gizmo = server.scene._handle_transform_controls_updates
+        released = server.scene._handle_transform_controls_drag_end
         take, inputs = server.gui._handle_gui_updates, server.gui._gui_input_handle_from_uuid
     except AttributeError:
         raise PkmTwinError(UNKNOWN) from None
@@ -39,7 +42,17 @@ def guard(server: Any) -> None:
                     message.updates = {"value": taken}
                     await take(client, message)
 
-    server._websock_server.register_handler(messages.GuiUpdateMessage, update)
+    async def drag(take: Any, client: int, message: Any) -> None:
+        turn = getattr(message, "wxyz", (1.0,))
+        place = [*turn, *getattr(message, "position", ())]
+        known = all(isinstance(v, (int, float)) and math.isfinite(v) for v in place)
+        if known and any(turn) and not message.owner:
+            await take(client, message)
+
+    register = server._websock_server.register_handler
+    register(messages.GuiUpdateMessage, update)
+    register(messages.TransformControlsUpdateMessage, partial(drag, gizmo))
+    register(messages.TransformControlsDragEndMessage, partial(drag, released))
 
 
 def acceptable(handle: Any, value: Any) -> Any:

@@ -115,6 +115,24 @@ def test_a_link_carries_pose_and_load(name, rng):
         assert model.link(opened) == model.link(given)
 
 
+@every_model
+def test_a_dragged_platform_goes_where_it_can(name, rng):
+    """To a place that it reaches exactly; out of reach, as far as its joints' limits refuse it."""
+    model = model_of(name)
+    for state in states(model, 8, rng)[:3]:
+        near = model.to_joints(state, 0.9 * state.q + 0.1 * model.start.q)
+        if near.refusal:
+            continue
+        moved = model.to_platform(state, *model.robot.platform(near.q))
+        assert moved.refusal == ""
+        for got, asked in zip(
+            model.robot.platform(moved.q), model.robot.platform(near.q), strict=True
+        ):
+            np.testing.assert_allclose(got, asked, atol=1e-6)
+        position, rotation = model.robot.platform(state.q)
+        assert model.to_platform(state, position + 100.0, rotation).q is state.q
+
+
 def test_a_link_that_says_something_else_changes_nothing():
     model = model_of("five_bar")
     good = model.link(model.start)

@@ -18,11 +18,13 @@ from websockets.asyncio.client import connect
 from websockets.exceptions import ConnectionClosed
 
 from pkm_twin.view.door import Door, listen
-from pkm_twin.view.model import Model
+from pkm_twin.view.model import VISIBLE, Model
 from pkm_twin.view.page import Page, serving
-from pkm_twin.view.panels import BagPanel
+from pkm_twin.view.panels import BagPanel, ModePanel
 from pkm_twin.view.stage import farther
+from pkm_twin.view.texts import number
 from pkm_twin.view.timeline import Timeline
+from stiffness_monitor.modes import modes
 from test.support.robots import load
 
 CAMERA = {
@@ -178,6 +180,58 @@ def test_buttons_and_menus_do_what_they_are_for(page):
 
     asyncio.run(talk())
     assert bag._speed.value == "4"
+
+
+def test_the_platform_is_dragged_by_finite_numbers_alone(page, caplog):
+    start = page.model.robot.platform(page.model.start.q)[0]
+    place = start + np.array([0.0, 0.0, 0.01])
+    drag = {
+        "type": "TransformControlsUpdateMessage", "name": "/drag", "owner": "",
+        "wxyz": [1.0, 0.0, 0.0, 0.0], "position": place.tolist(),
+    }  # fmt: skip
+    bad = [
+        {**drag, "position": [math.nan, 0.0, 0.0]},
+        {**drag, "position": [math.inf, 0.0, 0.0]},
+        {**drag, "wxyz": [0.0, 0.0, 0.0, 0.0]},
+        {**drag, "name": "/other"},
+    ]
+
+    async def talk():
+        async with open_socket(page) as socket:
+            for message in (CAMERA, *bad):
+                await socket.send(msgspec.msgpack.encode(message))
+            await press(page, socket, 1, 0.21)
+            before = page.state.pose
+            await socket.send(msgspec.msgpack.encode(drag))
+            await until(page, lambda: page.state.pose is not before)
+            np.testing.assert_allclose(page.state.pose, place, atol=1e-9)
+            end = {"type": "TransformControlsDragEndMessage", "name": "/drag", "owner": ""}
+            await socket.send(msgspec.msgpack.encode(end))
+            await until(page, lambda: not page._dragged)
+            page.step()
+            np.testing.assert_allclose(page.stage.gizmo.position, place, atol=1e-9)
+
+    asyncio.run(talk())
+    assert not caplog.records
+    page._go_home()
+
+
+def test_a_mode_is_animated_at_the_pose_that_is_shown(page, monkeypatch):
+    drawn = []
+    monkeypatch.setattr(page.stage, "draw", lambda *given: drawn.append(given))
+    panel = ModePanel(page)
+    panel._choice.value = "2"
+    for _ in range(3):
+        panel.step()
+    found = modes(page.model.robot, page.state.pose, 6)
+    assert number(float(found.frequencies[1])) in panel._told.content
+    shape = found.shapes[1, 0]
+    for _, deflection, shares, most in drawn:
+        np.testing.assert_allclose(np.outer(deflection, shape), np.outer(shape, deflection))
+        assert np.linalg.norm(deflection[:3]) <= VISIBLE * page.model.robot.graph.size
+        assert shares[most] == found.energies.strain[1].max()
+    panel._choice.value = "none"
+    assert not panel.busy
 
 
 def test_a_value_beyond_the_ends_is_the_end(page):

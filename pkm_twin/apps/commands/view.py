@@ -69,7 +69,8 @@ def view(given: View) -> Report:
     from pkm_twin.view.live import Live
     from pkm_twin.view.model import Model
     from pkm_twin.view.page import Page, serving
-    from pkm_twin.view.panels import BagPanel, LivePanel
+    from pkm_twin.view.panels import BagPanel, LivePanel, ModePanel
+    from stiffness_monitor.modes import has_modes
 
     with ExitStack() as stack:
         door_socket = stack.enter_context(listen(given.host, given.port))
@@ -78,6 +79,8 @@ def view(given: View) -> Report:
         model = Model(machine)
         server = stack.enter_context(serving(door, door_socket))
         page = Page(server, model, "Bag" if timeline is not None else "Live" if given.live else "")
+        if has_modes(machine):
+            ModePanel(page)
         if timeline is not None:
             BagPanel(page, timeline)
         if given.live:
