@@ -18,6 +18,10 @@ from pkm_twin.report import Column, Fact, Report, Table, plots
 
 MOST_SAMPLES: Final = 4000
 """Drawn of each recording."""
+MOST_NUMBERS: Final = 20
+"""In the picture of changes."""
+FAR: Final = 30.0
+"""Standard deviations beyond which that picture's scale is logarithmic."""
 COMBINED: Final = "known only in combination with others"
 BY_AXIS: Final = "m_m_m_rad_rad_rad"
 """The end of a key in JSON: units of a deflection's directions."""
@@ -240,36 +244,53 @@ def _residuals(judged: Judged, units: Mapping[str, str]) -> Any:
         if np.isfinite(judged.measured[:, k]).any():
             rows[name] = [one[::step, k] for one in series]
     time = judged.time[::step]
+    # No line over what was left out.
+    gaps = 1 + np.flatnonzero(np.diff(time) > 5.0 * np.median(np.diff(time)))
     figure, ((*axes,),) = plots.columns(1, len(rows))
     for ax, (name, (before, now, deviation)) in zip(axes, rows.items(), strict=True):
-        ax.plot(time, before, color=plots.COLOURS[1], lw=0.8, label="before")
-        ax.plot(time, now, color=plots.COLOURS[0], lw=0.8, label="now")
+        for values, colour, width, word in ((before, 1, 1.6, "before"), (now, 0, 0.8, "now")):
+            broken = np.where(np.isin(np.arange(len(time)), gaps), np.nan, values)
+            ax.plot(time, broken, color=plots.COLOURS[colour], lw=width, label=word)
         style: dict[str, Any] = {"color": plots.COLOURS[0], "alpha": 0.25, "lw": 0}
         band = 2.0 * deviation
         ax.fill_between(time, -band, band, label="of the model: two\nstandard deviations", **style)
-        title = f"{judged.name}, {name}: measured minus predicted, held out"
-        plots.label(ax, "time (s)", f"residual ({units[name]})", title)
+        was, left = (float(np.sqrt(np.nanmean(one**2))) for one in (before, now))
+        words = f"{name}: RMS {left:.3g} {units[name]} now, {was:.3g} {units[name]} before"
+        plots.label(ax, "time (s)", f"residual ({units[name]})", words)
         plots.legend(ax)
+    plots.head(figure, f"{judged.name}: measured minus predicted, held out")
     return figure
 
 
 def _changes(shown: Mapping[str, Number]) -> Any:
-    """By how many deviations each number moved, and how sure it is."""
-    figure, ((ax,),) = plots.columns(1, 1)
-    figure.set_size_inches(plots.WIDTH, 1 + 0.25 * len(shown))
-    places = np.arange(len(shown))[::-1]
-    for place, n in zip(places, shown.values(), strict=True):
-        deviation = n.deviation if np.isfinite(n.deviation) else 0.0
-        size = max(abs(n.before), abs(n.after), 3 * deviation, 1e-300)
-        colour = plots.COLOURS[0] if n.status == "fitted" else plots.COLOURS[4]
-        ax.errorbar(n.after / size, place, xerr=3 * deviation / size, fmt="o", color=colour)
-        ax.plot(n.before / size, place, "x", color="0.4")
-    ax.set_yticks(places, list(shown), fontsize=8)
-    ax.set_xlim(-2, 2)
-    ax.set_xlabel(
-        "relative to the larger value; cross: before, dot: now, bar: 3 standard deviations"
-    )
-    ax.grid(alpha=0.3)
+    """How far numbers moved, the furthest first; over standard deviations where known."""
+    known = all(np.isfinite(n.deviation) and n.deviation > 0.0 for n in shown.values())
+    moved = {
+        name: (n.after - n.before)
+        / (n.deviation if known else max(abs(n.before), abs(n.after), 1e-300))
+        for name, n in shown.items()
+    }
+    order = sorted(moved, key=lambda name: -abs(moved[name]))[:MOST_NUMBERS]
+    figure, ((ax,),) = plots.columns(1, 1, 1.6 + 0.28 * len(order))
+    places = np.arange(len(order))[::-1]
+    colours = [plots.COLOURS[0 if shown[name].status == "fitted" else 4] for name in order]
+    ax.barh(places, [moved[name] for name in order], 0.6, color=colours)
+    texts = [
+        f"{name}: {shown[name].before:.3g} to {shown[name].after:.3g} {shown[name].unit}"
+        for name in order
+    ]
+    ax.set_yticks(places, texts, fontsize=9)
+    if known:
+        ax.axvspan(-2.0, 2.0, color="0.9", zorder=0)
+        far = sum(abs(value) > 2.0 for value in moved.values())
+        title = f"{far} of {len(moved)} numbers moved by more than two standard deviations (grey)"
+    else:
+        title = "What changed most; standard deviations are withheld"
+    if max(map(abs, moved.values()), default=0.0) > FAR:
+        ax.set_xscale("symlog", linthresh=2.0)
+    over = "standard deviation" if known else "larger value"
+    plots.label(ax, f"change over the {over}; orange: {COMBINED}", "")
+    plots.head(figure, title)
     return figure
 
 
