@@ -93,8 +93,8 @@ def aligned(rows: Sequence[Sequence[str]], sides: str) -> Iterator[str]:
     """
     if not any(row[0] for row in rows):
         rows, sides = [row[1:] for row in rows], sides[1:]
-    # What is in brackets, a unit, stays on one line.
-    rows = [[re.sub(r"\([^)]*\)", _glued, cell) for cell in row] for row in rows]
+    # What is in brackets, a unit, stays on one line. A blank cell has no width to wrap to.
+    rows = [[re.sub(r"\([^)]*\)", _glued, c) if c.strip() else "" for c in row] for row in rows]
     columns = list(zip(*rows, strict=True))
     widths = [max(map(len, column)) for column in columns]
     words = [[max(map(len, cell.split(" "))) for cell in column] for column in columns]

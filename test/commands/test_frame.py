@@ -12,7 +12,7 @@ from typer.main import get_command
 from pkm_twin.apps.frame import Group, command
 from pkm_twin.apps.options import Draws, OfRobot, Writes
 from pkm_twin.report import Column, Fact, Report, Table, Verdict, judged, plots
-from pkm_twin.report.terminal import WIDTH, text_of
+from pkm_twin.report.terminal import WIDTH, table_lines, text_of
 from pkm_twin.settings import setting
 
 
@@ -85,6 +85,14 @@ def test_json_has_the_facts_with_units_and_the_terminal_the_answer_first(run):
     assert [line.split() for line in lines[3:]] == [
         ["mass", "(kg)", "long", "(mm)"], ["arm", "1.5", "250"], ["rod", "0.5", "-"]
     ]  # fmt: skip
+
+
+def test_a_wide_table_may_have_a_column_that_is_blank():
+    columns = [Column("sigma"), Column("text", text="what varies"), Column("", text=" ")]
+    words = " ".join(["word"] * 30)
+    lines = table_lines(Table("parts", columns, {"arm": [1e-5, words, ""]}))
+    assert " ".join(lines[1:]).split().count("word") == 30
+    assert max(map(len, "\n".join(lines).splitlines())) <= WIDTH
 
 
 @pytest.mark.parametrize(
