@@ -191,7 +191,9 @@ class Frame:
             else:
                 if self.static and member.strut:
                     support = replace(support, compliance=(support.compliance[0], *RIGID[1:]))
-                node = self._stood(support, at)
+                node = self._stood(support, at if support.at is None else support.at)
+                if support.at is not None:
+                    node = Node(node.own, rigid_offset(at - node.at) @ node.map, at)
                 ends.append(node._replace(map=turned(member.axes.T, node.map)))
             self.nodes[member.name, k] = node
         self.bars.append(Bar(member, tuple(ends)))

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from pkm_twin.codegen.arrays import Array
-from pkm_twin.codegen.expressions import reference, references
+from pkm_twin.codegen.expressions import SNAP, reference, references
 from pkm_twin.codegen.operations import maximum, sign, sqrt
 from pkm_twin.kinematics.motion import reaction_directions
 from pkm_twin.machine.graph import BASE, Graph, Joint
@@ -74,7 +74,8 @@ class Support:
     base, the platform, a rigid body, or a member, then at its start (``end`` 0) or its end (1).
     ``axes``: the joint's axes as columns, shape (3, 3); None in a plan: the member's own.
     ``compliance``: along them three m/N, about them three rad/(N m); 0 rigid, infinite free.
-    ``screws``: axes about which it turns freely while it goes so far along them, m a rad.
+    ``screws``: axes about which it turns freely while it goes so far along them, m a rad. ``at``:
+    the joint's place where that is beside the member's end, which a rigid lever joins to it.
     """
 
     joint: str
@@ -83,6 +84,7 @@ class Support:
     compliance: tuple[Any, ...] = RIGID
     end: int = 0
     screws: tuple[tuple[int, float], ...] = ()
+    at: Vector | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -216,7 +218,8 @@ def posed(
     def stood(support: Support, own: Any = None) -> Support:
         values = (v if isinstance(v, float) else compliance(*v) for v in support.compliance)
         axes = own if support.axes is None else _axes(support.axes, turn)
-        return replace(support, axes=axes, compliance=tuple(values))
+        at = None if support.at is None else place(*support.at)
+        return replace(support, axes=axes, compliance=tuple(values), at=at)
 
     def part_of(part: Member | Carried) -> Member | Carried:
         if isinstance(part, Carried):
@@ -336,6 +339,16 @@ class _Planner:
                     values[3 * freedom.turns + k] = FREE
         return Support(name, part, axes, tuple(values), end, tuple(screws))
 
+    def _at_joint(self, joint: Joint, body: str, end: tuple[str, Array]) -> Support:
+        """How a member's end stands on a body by a joint, which may be beside that end."""
+        lever = joint.at - end[1]
+        # On a free tape either place may be differentiated by.
+        apart = getattr(getattr(lever[0], "tape", None), "free", False)
+        if not joint.type.placed or not (apart or np.abs(references(lever)).max() >= SNAP):
+            return self._support(joint, body, end[1])
+        own = joint.outer if body == joint.inner else joint.inner
+        return replace(self._support(joint, body, joint.at), at=(own, joint.at))
+
     def _compliance(self, name: str) -> list[Any]:
         """Of a joint in a plan; infinite in a file says what its freedoms say."""
         values = enumerate(self.structure.compliances.get(name, RIGID))
@@ -353,7 +366,7 @@ class _Planner:
         ends = [beam.inner, beam.outer]
         if _nearer(joint.at, ends[1][1], ends[0][1]):
             ends.reverse()
-        support = self._support(joint, known, ends[0][1])
+        support = self._at_joint(joint, known, ends[0])
         for part in [j for j in left if self._inside(j)]:
             if self.beam_of[part.inner] is beam:
                 left.remove(part)
@@ -367,7 +380,7 @@ class _Planner:
         outer = None
         if closing is not None:
             left.remove(closing[0])
-            outer = self._support(*closing, ends[1][1])
+            outer = self._at_joint(*closing, ends[1])
         self._member(beam, ends, support, outer)
 
     def _member(self, beam: Beam, ends: list[Any], inner: Support, outer: Support | None) -> None:

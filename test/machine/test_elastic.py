@@ -6,6 +6,7 @@ import pytest
 import yaml
 
 from pkm_twin.certify.description import expand
+from pkm_twin.design.variants import variants
 from pkm_twin.errors import ParameterError, SingularityError
 from pkm_twin.robot.catalogue import robot_of_data
 from pkm_twin.robot.clearance import clearance
@@ -134,6 +135,37 @@ def test_a_rigid_machine_says_what_is_missing(tmp_path):
     with pytest.raises(ParameterError, match="nothing is elastic") as caught:
         compliance(robot, robot.home())
     assert caught.value.field == "bodies"
+
+
+def test_a_joint_takes_no_compliance_without_end():
+    data = plain("five_bar")
+    data["joints"]["tip"]["compliance"][3] = float("inf")
+    with pytest.raises(ParameterError) as caught:
+        robot_of_data(data, "five_bar")
+    assert caught.value.field == "joints.tip.compliance[3]"
+
+
+@pytest.mark.parametrize("joint", ["tip", "elbow_left"])
+def test_a_joint_beside_its_member_is_on_a_rigid_lever(joint):
+    """As with a body of its own that is fixed to the member's end."""
+    data = plain("five_bar")
+    toe = {"mass": 0.0, "com": [0, 0, 0], "inertia": [0, 0, 0]}
+    place = data["joints"][joint]["at"]
+    data["joints"][joint]["at"] = np.add(place, (0.03, 0.04, -0.05)).tolist()
+    beside = robot_of_data(data, "five_bar")
+    pair = data["joints"][joint]["between"]
+    data["bodies"]["toe"] = toe
+    data["joints"][joint]["between"] = ["toe" if b == "forearm_left" else b for b in pair]
+    data["joints"]["weld"] = {"type": "fixed", "between": ["forearm_left", "toe"], "at": place}
+    welded = robot_of_data(data, "five_bar")
+    pose = beside.forward(beside.graph.home + np.array([0.1, -0.05]))
+    expected, size = compliance(welded, pose), np.abs(compliance(welded, pose)).max()
+    np.testing.assert_allclose(compliance(beside, pose), expected, atol=1e-10 * size)
+    # The program of many machines, whose known case has the joint at the member's end.
+    many = variants(load("five_bar"), {f"joints.{joint}.at[0]": [place[0], place[0] + 0.03]})
+    home = load("five_bar").home()
+    for found, own in zip(many.compliance(home), many, strict=True):
+        np.testing.assert_allclose(found, compliance(own, home), atol=1e-10 * size)
 
 
 def test_factors_of_elements_stand_in_what_is_written_out(delta_in_the_graph_form):
