@@ -25,6 +25,7 @@ from pkm_twin.codegen.code import Code
 from pkm_twin.codegen.kernels import MISSED
 from pkm_twin.design import programs
 from pkm_twin.errors import ParameterError, PkmTwinError
+from pkm_twin.machine.formulas import PARAMETERS
 from pkm_twin.machine.geometry import pattern_of
 from pkm_twin.machine.places import keys_of
 from pkm_twin.machine.tree import Tree
@@ -113,7 +114,8 @@ class Variants:
         away = NEAR * np.array([0.0 * steps, steps, -steps]) * reach
         (poses, *_), good = self.run(programs.forward, (home + away)[None])
         sound = good[..., 0] & np.isfinite(poses).all(-1)
-        return np.asarray(sound.reshape(len(self), 3).all(1))
+        known = np.isfinite(self.geometry).all(1) & np.isfinite(self.masses).all(1)
+        return np.asarray(sound.reshape(len(self), 3).all(1) & known)
 
     def reason(self, index: int) -> str:
         """Why a machine is not valid; empty for one that is."""
@@ -123,6 +125,8 @@ class Variants:
             _ = self[index]
         except PkmTwinError as error:
             return str(error)
+        if not np.isfinite(self.masses[index]).all():
+            return "a number that follows from these is not finite"
         return "no assembly at home, or none beside it"
 
     def inverse_dynamics(
@@ -287,10 +291,13 @@ class Variants:
         return list(sections.values())
 
     def _box_fits(self, columns: Sequence[int], rows: Array) -> bool:
-        """What bounds numbers of a section together is convex: corners that hold do."""
-        if len(columns) > CORNERS:
-            return False
+        """What bounds numbers of a section together is convex: corners that hold do.
+
+        Numbers that hang on a parameter may be any function of it.
+        """
         paths = [self.paths[column] for column in columns]
+        if len(columns) > CORNERS or any(keys_of(path)[0] == PARAMETERS for path in paths):
+            return False
         ends = zip(rows.min(0).tolist(), rows.max(0).tolist(), strict=True)
         return all(self._fits(paths, row) for row in set(itertools.product(*ends)))
 

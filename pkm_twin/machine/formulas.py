@@ -57,12 +57,22 @@ def _power(base: Any, exponent: Any) -> Any:
     if fixed is not None and fixed.is_integer() and abs(fixed) <= MAX_DEPTH:
         product = base ** int(abs(fixed)) if fixed else 1.0
         return product if fixed >= 0.0 else 1.0 / product
-    log = math.log(reference(base))
-    for _ in range(6):
-        # Halley's step for exp(log) = base.
+    own = reference(base)
+    # A step of Halley's method moves a logarithm by at most 2: the 256th root's is found first.
+    ratio = base / own
+    root = ratio
+    for _ in range(8):
+        root = operations.sqrt(root)
+    log = _halley(ratio, 256.0 * _halley(root, 0.0, 4), 2)
+    return operations.exp(exponent * (math.log(own) + log))
+
+
+def _halley(value: Any, log: Any, steps: int) -> Any:
+    """Logarithm of a value by Halley's method for exp(log) = value, of third order."""
+    for _ in range(steps):
         power = operations.exp(log)
-        log = log + 2.0 * (base - power) / (base + power)
-    return operations.exp(exponent * log)
+        log = log + 2.0 * (value - power) / (value + power)
+    return log
 
 
 FUNCTIONS: Final[Mapping[str, tuple[int, Callable[..., Any]]]] = {
@@ -266,7 +276,9 @@ class Book:
 
         :raises ParameterError: a name or value that is refused, or parameters in a circle.
         """
-        given = data.get(PARAMETERS) or {}
+        given = data.get(PARAMETERS, {})
+        if given is None:
+            given = {}
         if not isinstance(given, Mapping):
             raise ParameterError(PARAMETERS, given, "a mapping of names to numbers")
         own: dict[str, Formula] = {}

@@ -86,6 +86,25 @@ def test_variants_over_a_parameter_are_the_files_one_by_one(name):
         assert torques(many[k]) == pytest.approx(found, abs=1e-13)
 
 
+def test_variants_far_from_the_file_are_the_files_one_by_one():
+    data = data_with()
+    data["parameters"] |= {"far": 1.0, "m": "0.1 * far**0.3"}
+    robot, values = robot_of_data(data, "own"), 10.0 ** np.arange(-6, 10, 3.0)
+    many = variants(robot, {"parameters.far": values})
+    assert many.valid.all()
+    for value, found in zip(values, many.inverse_dynamics(Q, RATE, SECOND), strict=True):
+        data["parameters"]["far"] = float(value)
+        assert found == pytest.approx(torques(robot_of_data(data, "own")), rel=1e-12)
+
+
+def test_a_variant_that_a_file_may_not_be_is_not_valid_between_those_that_it_may_be():
+    data = data_with()
+    data["parameters"] |= {"far": 0.5, "m": "(far - 1) * (far - 3)"}
+    many = variants(robot_of_data(data, "own"), {"parameters.far": [0.5, 2.0, 4.0]})
+    assert many.valid.tolist() == [True, False, True]
+    assert np.isnan(many.inverse_dynamics(Q, RATE, SECOND)[1]).all()
+
+
 @pytest.mark.parametrize("name", NAMES)
 def test_a_derivative_by_a_parameter_is_that_of_differences(name):
     robot, path, step = robot_with(), f"parameters.{name}", 1e-5
