@@ -11,6 +11,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
 import numpy as np
+import scipy  # type: ignore[import-untyped]  # its parts come when they are asked for
 
 from delta_dynamics import inverse_dynamics, torque_deviation
 from pkm_twin.codegen.arrays import Array, Mask
@@ -298,11 +299,24 @@ def _shares(r: Recording, idle: Mask, compared: Compared | None) -> tuple[list[F
     )
 
 
+def _rests(c: Compared) -> Mask:
+    """Where a joint rests, and where the filter mixes a rest with the motion, shape (k, n).
+
+    Dry friction holds any effort there, and a rest does not change it.
+    """
+    long, near = (np.ones((2 * round(s / c.period) + 1, 1)) for s in (0.5 * STUCK, c.edge))
+    parts = []
+    for track, rows in zip(c.tracks, c.inner, strict=True):
+        rests = scipy.ndimage.binary_opening(~track.moves(c.how), long)
+        parts.append(scipy.ndimage.binary_dilation(rests, near)[rows])
+    return np.concatenate(parts)
+
+
 def _stuck_efforts(r: Recording, c: Compared) -> str:
     """Efforts that were not measured, or not all the time; saturated ones are no such; or empty."""
     assert r.effort is not None  # noqa: S101
     rows = np.searchsorted(r.time, c.time).clip(0, len(r.time) - 1)
-    texts, good = [], c.good
+    texts, good, moved = [], c.good, np.where(_rests(c), np.nan, c.expected)
     for j, (joint, unit) in enumerate(zip(r.robot.joint_names, r.robot.effort_units, strict=True)):
         values = r.effort[:, j].copy()
         most, told = np.abs(values).max(), np.full(len(values), np.nan)
@@ -312,7 +326,7 @@ def _stuck_efforts(r: Recording, c: Compared) -> str:
                 texts.append(f"the effort of {joint} is {text}")
             continue
         values[np.abs(values) >= most * (1.0 - SAME)] = np.nan
-        told[rows] = c.expected[:, j]
+        told[rows] = moved[:, j]
         found = stuck_from(r.time, values, told, COUNT)
         if found is not None:
             begin, end = found

@@ -93,7 +93,8 @@ def estimate(
     change = target - table @ start
     scaled = table * scales
     size = np.sqrt(_mean(target**2, counts))
-    floor = 1e-9 * max(float(size.max()), 1e-300)
+    # Its square, and what is divided by it, are far from the ends of the numbers.
+    floor = 1e-9 * max(float(size.max()), 1e-60)
     guess = np.sqrt(_mean(change**2, counts)) if begin is None else begin
     noise = np.maximum(guess, floor)
     weights = counts.copy()

@@ -16,6 +16,7 @@ from pkm_twin.identification.check import MEASURED, check
 from pkm_twin.identification.parameters import file_parameters
 from pkm_twin.identification.plausible import recording_fault
 from pkm_twin.identification.rows import rows_of
+from pkm_twin.paths import cycle, timed
 from pkm_twin.recordings import Recording
 from pkm_twin.recordings.topics import JOINT_STATE
 from test.bags.folders import make_folder, write_split
@@ -401,6 +402,17 @@ class TestCauses:
         named = [name in found for name in robot.joint_names]
         assert named == [k in joints for k in range(3)]
         assert f"{m.time[begin] - m.time[0]:.3f} s to" in found
+
+    def test_dry_friction_that_jumps_after_a_rest_is_no_stuck_sensor(self):
+        """The filter spreads its jump into the rest, where the effort stays the same."""
+        robot = load("delta").changed(friction={"coulomb": [2.0] * 3})
+        way = cycle(robot, 0.025, 0.2, 0.025, dwell=0.4)
+        s = timed(robot, way, "quintic", duration=2.8).uniform(1000.0)
+        made = Recording(robot, s.time, s.q, s.qd, s.qdd, s.effort.copy())
+        assert check(made, thorough=False).answer == "good"
+        made.effort[300:500, 1] = made.effort[300, 1]
+        (found,) = (i.value for i in check(made, thorough=False).items if i.text == MEASURED)
+        assert [f"{name} stays" in found for name in robot.joint_names] == [False, True, False]
 
     @pytest.mark.parametrize("level", [0.0, 0.3])
     def test_efforts_that_never_change_were_not_measured(self, rng, level):

@@ -339,3 +339,10 @@ def test_a_bound_that_is_active_counts_in_the_standard_deviations() -> None:
             deviations.append(np.sqrt(np.diag(found.covariance)))
     assert len(errors) > 20
     assert np.mean(np.abs(errors) < 3.0 * np.array(deviations)) >= 0.95
+
+
+def test_efforts_of_zero_leave_nothing_to_fit():
+    """Without an error of the numbers, too."""
+    with np.errstate(all="raise", under="ignore"):
+        found = estimate(np.ones((50, 1, 1)), np.zeros((50, 1)), np.zeros(1), np.ones(1))
+    assert found.values == 0.0 and np.isfinite(found.covariance).all()
