@@ -6,14 +6,14 @@ A path is cut where its payload changes, so that no interval of its points has t
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from delta_dynamics import inverse_dynamics
-from pkm_twin.codegen.arrays import Array
+from pkm_twin.codegen.arrays import Array, doubles
 from pkm_twin.errors import ParameterError
 from pkm_twin.paths.geometry import SHORTEST, Path, Stretch
 from pkm_twin.paths.pieces import Cut
@@ -46,12 +46,17 @@ def carry(
     """
     if payload is None:
         return path, (Carried(robot),)
+    expected = f"{len(path.marks)} masses (kg) or None, one for each waypoint"
+    if isinstance(payload, str | Mapping) or np.ndim(np.asarray(payload, object)) != 1:
+        raise ParameterError("payload", payload, expected)
+    if len(payload) != len(path.marks):
+        raise ParameterError("payload", f"{len(payload)} values", expected)
     own = robot.payload.mass
-    masses = [None if mass is None or mass == own else float(mass) for mass in payload]
-    if len(masses) != len(path.marks):
-        raise ParameterError(
-            "payload", f"{len(masses)} values", f"{len(path.marks)}, one for each waypoint"
-        )
+    try:
+        given = [None if m is None else float(doubles(m, "payload")) for m in payload]
+    except (TypeError, ValueError):
+        raise ParameterError("payload", payload, expected) from None
+    masses = [None if mass == own else mass for mass in given]
     robots = {m: robot if m is None else Load(m).on(robot) for m in dict.fromkeys(masses)}
     result = [Carried(robots[masses[0]], masses[0])]
     stretches = list(path.stretches)

@@ -434,7 +434,21 @@ def test_one_payload_by_waypoints_is_the_robots_to_the_last_digit():
     assert other > one
 
 
-@pytest.mark.parametrize("payload", [[0.1] * 6, [0.1] * 8, [-0.1] * 7, [np.nan] * 7, [500.0] * 7])
+@pytest.mark.parametrize(
+    "payload",
+    [
+        "abc",
+        0.5,
+        ["a", *[0.0] * 6],
+        {0: 1.0},
+        [True] * 7,
+        [0.1] * 6,
+        [0.1] * 8,
+        [-0.1] * 7,
+        [np.nan] * 7,
+        [500.0] * 7,
+    ],
+)
 def test_payloads_that_cannot_be_are_rejected(payload):
     robot = load("delta")
     with pytest.raises(ParameterError, match="payload"):
