@@ -75,7 +75,7 @@ class Support:
     ``axes``: the joint's axes as columns, shape (3, 3); None in a plan: the member's own.
     ``compliance``: along them three m/N, about them three rad/(N m); 0 rigid, infinite free.
     ``screws``: axes about which it turns freely while it goes so far along them, m a rad. ``at``:
-    the joint's place where that is beside the member's end, which a rigid lever joins to it.
+    the joint's place, a rigid lever away from the member's end; None where it is that end.
     """
 
     joint: str
@@ -340,7 +340,7 @@ class _Planner:
         return Support(name, part, axes, tuple(values), end, tuple(screws))
 
     def _at_joint(self, joint: Joint, body: str, end: tuple[str, Array]) -> Support:
-        """How a member's end stands on a body by a joint, which may be beside that end."""
+        """How a member's end stands on a body by a joint, which may be apart from that end."""
         lever = joint.at - end[1]
         # On a free tape either place may be differentiated by.
         apart = getattr(getattr(lever[0], "tape", None), "free", False)

@@ -195,6 +195,9 @@ def _turned(entry: dict[str, Any], turn: Array, own: set[str], number: int) -> d
     for key in ("axes", "ends"):
         if key in entry:
             entry[key] = [(turn @ vector(v)).tolist() for v in entry[key]]
+    if "member" in entry:
+        ends = {key: (turn @ vector(entry["member"][key])).tolist() for key in ("from", "to")}
+        entry["member"] = entry["member"] | ends
     if "inertia" in entry:
         entry["inertia"] = (turn @ tensor(entry["inertia"]) @ turn.T).tolist()
     # Drives of copies may differ: one number a copy.

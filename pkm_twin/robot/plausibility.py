@@ -43,6 +43,10 @@ ROTOR: Final = 100.0
 """A rotor's inertia at the joint, as a mass, at most in parts of all masses that move."""
 LEG: Final = 0.05
 """A leg of no length is one between joints that are farther apart than this part of the extent."""
+LEVER: Final = 0.1
+"""A member's end from a joint of its body at most, in parts of the member's length."""
+SOFTEST: Final = 1e9
+"""Young's modulus below which it looks like MPa or GPa, Pa: plastics have more."""
 INDEX: Final = 0.005
 """Singularity index at home below which a small motion may meet a singularity."""
 
@@ -75,7 +79,7 @@ def findings(robot: Robot) -> tuple[Finding, ...]:
     graph = robot.graph
     found = [
         *_size(graph), *_masses(robot, graph), *_bodies(robot, graph), *_drives(robot, graph),
-        *_gravity(robot), *_home(graph),
+        *_gravity(robot), *_members(robot, graph), *_home(graph),
     ]  # fmt: skip
     # Copies of a limb say the same.
     alike: dict[tuple[Any, ...], list[Finding]] = {}
@@ -229,6 +233,26 @@ def _gravity(robot: Robot) -> Iterator[Finding]:
     yield from _outside("gravity", "gravity", size, GRAVITY, "m/s2", ("in km/s2?", times))
     if size == 1.0:
         yield Finding("gravity", "gravity", size, 1.62, "m/s2", "in units of the Earth's?")
+
+
+def _members(robot: Robot, graph: Graph) -> Iterator[Finding]:
+    try:
+        structure = robot.structure()
+    except PkmTwinError:
+        return
+    for beam in structure.beams:
+        name, modulus = beam.name, structure.sections[beam.name].youngs_modulus
+        if modulus < SOFTEST:
+            likely = "in MPa or GPa?"
+            yield Finding(f"{name}: youngs_modulus", "modulus", modulus, SOFTEST, "Pa", likely)
+        ends = [np.asarray(at, np.float64) for _, at in (beam.inner, beam.outer)]
+        most = LEVER * float(np.linalg.norm(ends[1] - ends[0]))
+        for joint in graph.joints.values():
+            outside = (joint.inner in beam.parts) != (joint.outer in beam.parts)
+            if outside and joint.type.placed and not joint.virtual:
+                far = min(float(np.linalg.norm(joint.at - end)) for end in ends)
+                what, likely = f"distance of its ends from joint {joint.name}", "a mistyped place?"
+                yield from _above(f"{name}: member", what, far, most, "m", likely)
 
 
 def _home(graph: Graph) -> Iterator[Finding]:

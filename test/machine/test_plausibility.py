@@ -81,6 +81,25 @@ HEAVY = {"bodies.crank_2.mass": 1.0, "bodies.crank_2.inertia": [5e6, 5e6, 5e6]}
 OUTSIDE = {"joints.motor_3.limits": {"position": [2.0, 3.0]}, "joints.motor_3.home": 1.0}
 BRICK = {"payload": {"mass": 500.0, "com": [0.0, 0.0, 0.0], "inertia": [1.0, 1.0, 1.0]}}
 FAR = {"payload": {"mass": 0.5, "com": [0.0, 0.0, 40.0], "inertia": [1e-3, 1e-3, 1e-3]}}
+STEEL = {"youngs_modulus": 2.1e11, "shear_modulus": 8e10, "outer_diameter": 0.05,
+         "inner_diameter": 0.04}  # fmt: skip
+
+
+def barred(aside=0.0, **section):
+    """A member between the joints of a crank, whose end is some metres aside."""
+
+    def change(data):
+        ends = [joint["at"] for joint in data["joints"].values() if "crank_2" in joint["between"]]
+        bar = {
+            "from": ends[0],
+            "to": [*ends[1][:2], ends[1][2] + aside],
+            "section": STEEL | section,
+        }
+        data["bodies"]["crank_2"]["member"] = bar
+
+    return change
+
+
 KINDS = {
     "millimetres": (scaled(1e3), "geometry", "m", None),
     "microns": (scaled(1e-4), "geometry", "m", None),
@@ -98,6 +117,8 @@ KINDS = {
     "gram centimetres": ({"joints.motor_2.rotor_inertia": 800.0},
                          "motor_2: rotor_inertia", "kg", None),
     "millimetre gravity": ({"gravity": [0.0, -981000.0, 0.0]}, "gravity", "m/s2", 981000.0),
+    "member's end": (barred(0.1), "crank_2: member", "m", 0.1),
+    "megapascal": (barred(youngs_modulus=2.1e5), "crank_2: youngs_modulus", "Pa", 2.1e5),
     "earths": ({"gravity": [0.0, 0.0, -1.0]}, "gravity", "m/s2", 1.0),
 }  # fmt: skip
 """What is changed, and the finding's field, unit and value."""
@@ -131,6 +152,9 @@ def test_each_kind_is_found_by_its_field_and_number(name, data):
     _, field, unit, value = KINDS[name]
     assert findings(machine(copy.deepcopy(data))) == ()
     found = findings(machine(with_change(data, name)))
+    sound = copy.deepcopy(data)
+    barred(1e-3)(sound)
+    assert findings(machine(sound)) == ()
     assert (found[0].field, found[0].unit) == (field, unit)
     if value is not None:
         assert found[0].value == pytest.approx(value, rel=2e-2, abs=1e-12)
