@@ -6,6 +6,7 @@ from __future__ import annotations
 import math
 import re
 import textwrap
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -26,6 +27,10 @@ MAP: Final = "viridis"
 PREFIXES: Final = {-12: "p", -9: "n", -6: "µ", -3: "m", 0: "", 3: "k", 6: "M"}
 PANELS: Final = 3
 """Most planes in a picture."""
+LEAST_SHOWN: Final = 5e-5
+"""Coordinate, m or rad, and part of a direction."""
+SHARES: Final = ((0.35, 0.85), (0.25, 0.6, 0.9))
+"""Of a plane's values below its contours: where it has neighbours on both sides, and else."""
 
 
 def scale_of(greatest: float, unit: str) -> tuple[float, str]:
@@ -103,8 +108,8 @@ def sentence(answer: dict[str, Any]) -> str:
 
 
 def _plain(value: float) -> float:
-    """Without what is zero but for rounding."""
-    return round(value, 6) + 0.0
+    """Without what is zero but for rounding and a search's steps."""
+    return value if abs(value) >= LEAST_SHOWN else 0.0
 
 
 def units_of(data: Dataset) -> dict[str, str]:
@@ -202,7 +207,7 @@ def planes(data: Dataset, case: int) -> Figure:
             if len(one["names"]) == 1:
                 _line(one, ax, scale, label)
                 continue
-            mesh = _panel(one, ax, scale, scale * low, scale * high)
+            mesh = _panel(one, ax, scale, scale * low, scale * high, SHARES[count < PANELS])
             kind.overlay(data, one["names"], ax)
         if len(drawn[0]["names"]) > 1:
             bar = figure.colorbar(mesh, ax=axes, aspect=25, pad=0.01)
@@ -230,7 +235,7 @@ def _widths(drawn: list[dict[str, Any]]) -> list[float]:
 
 
 def _caption(data: Dataset, drawn: list[dict[str, Any]]) -> str:
-    star = "star: worst pose; " if any(one["star"] for one in drawn) else ""
+    star = "star: worst pose, in its cell's colour; " if any(one["star"] for one in drawn) else ""
     return f"{star}outline: all joint limits are kept; white: does not count"
 
 
@@ -242,7 +247,9 @@ def _line(one: dict[str, Any], ax: Axes, scale: float, label: str) -> None:
         ax.plot(one["star"][0], scale * one["values"][k, 0], "*", color="red", ms=12)
 
 
-def _panel(one: dict[str, Any], ax: Axes, scale: float, low: float, high: float) -> Any:
+def _panel(
+    one: dict[str, Any], ax: Axes, scale: float, low: float, high: float, shares: Sequence[float]
+) -> Any:
     x, y = one["ticks"]
     values = scale * one["values"].T
     mesh = ax.pcolormesh(
@@ -253,7 +260,7 @@ def _panel(one: dict[str, Any], ax: Axes, scale: float, low: float, high: float)
         ax.contour(x, y, one["reach"].T, [0.5], colors="0.2", linewidths=1.2)
     known = values[np.isfinite(values)]
     if len(known) > values.size // 6 and np.ptp(known) > 0.02 * (high - low):
-        levels = np.unique([float(f"{v:.2g}") for v in np.quantile(known, (0.25, 0.6, 0.9))])
+        levels = np.unique([float(f"{v:.2g}") for v in np.quantile(known, shares)])
         contours = ax.contour(x, y, values, levels, colors="white", linewidths=0.7)
         for text in ax.clabel(contours, fmt="%.3g", fontsize=8.5):
             text.set_bbox({"facecolor": "0.25", "edgecolor": "none", "alpha": 0.55, "pad": 0.6})

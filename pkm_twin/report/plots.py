@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import io
+import re
 import textwrap
 from collections.abc import Mapping
 from pathlib import Path
@@ -82,8 +83,10 @@ def rendered(figure: Any, dpi: int, form: str = "png") -> bytes:
 
 def head(figure: Any, text: str, size: float = STYLE["figure.titlesize"]) -> int:
     """A title in as many lines as its letters need; returns how many."""
-    rows = [row for line in text.splitlines() for row in textwrap.wrap(line, int(1050 / size))]
-    figure.suptitle("\n".join(rows), fontsize=size)
+    # A value and its unit stay together: the wrapping knows no hard space.
+    tied = re.sub(r"(?<=\d) (?=[^\W\d])|(?<=\bN) (?=m\b)", "\xa0", text)
+    rows = [row for line in tied.splitlines() for row in textwrap.wrap(line, int(1050 / size))]
+    figure.suptitle("\n".join(rows).replace("\xa0", " "), fontsize=size)
     return len(rows)
 
 

@@ -103,7 +103,7 @@ class Modes(Frequency):
         plots.head(
             figure,
             f"{data.attrs['robot']}: lowest modes where it rings lowest, actuators locked\n"
-            "grey: at rest; coloured: deformed, magnified; below: the parts with most energy",
+            "grey: at rest; coloured: deformed, magnified; named: the parts with most energy",
             10,
         )
         return {"shapes": figure}
