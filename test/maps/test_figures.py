@@ -40,7 +40,6 @@ def test_a_picture_answers_and_the_star_has_its_cells_colour(stored):
 
     told = {one["case"]: one for one in figures.answers(stored)}
     drawn = figures.draw(stored)
-    units = figures.units_of(stored)
     for name in map(str, stored.case.values):
         figure = drawn[name if len(stored.case) > 1 else ""]
         panels = [ax for ax in figure.axes if ax.get_xlabel()]
@@ -52,7 +51,7 @@ def test_a_picture_answers_and_the_star_has_its_cells_colour(stored):
         assert min(sizes) * 900 / plots.WIDTH / 72 >= 10.6
         if name not in told:
             continue
-        assert figures.sentence(told[name], units).split(",")[0] in figure.get_suptitle()
+        assert figures.sentence(told[name]).split(",")[0] in figure.get_suptitle()
         value = told[name]["value"]
         limits = set()
         for ax in panels:
@@ -169,6 +168,5 @@ def test_pages_hold_all_they_need(stored, tmp_path):
     assert links.found == []
     assert '"showSendToCloud": false' in text
     assert 1_000_000 < len(text) < 9_000_000
-    units = figures.units_of(stored)
     for answer in figures.answers(stored):
-        assert html.escape(figures.sentence(answer, units)) in text
+        assert html.escape(figures.sentence(answer)) in text
