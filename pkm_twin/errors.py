@@ -75,7 +75,9 @@ class UnknownNameError(ParameterError):
 
 def unknown_number(path: str, names: Iterable[str]) -> ParameterError:
     """The error of a path where the file has no number, with the closest of some paths."""
-    close = difflib.get_close_matches(path, list(names), 1)
+    known = list(names)
+    close = [n for n in known if n == f"parameters.{path}"]
+    close = close or difflib.get_close_matches(path, known, 1)
     hint = f"did you mean {close[0]!r}? see" if close else "see"
     return ParameterError(path, None, f"a number of the robot's file; {hint} `pkm-twin info`")
 

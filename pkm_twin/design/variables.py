@@ -11,6 +11,7 @@ import numpy as np
 
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError
+from pkm_twin.machine.formulas import PARAMETERS
 from pkm_twin.robot.robot import Robot
 
 
@@ -55,6 +56,10 @@ class Variables:
                 raise ParameterError("vary", text, "a first path without a -")
             if not (math.isfinite(low) and math.isfinite(high) and low < high):
                 raise ParameterError(f"vary {text}", f"{low:g}:{high:g}", "LOW:HIGH, low first")
+            for name in robot.book.unused:
+                if f"{PARAMETERS}.{name}" in paths:
+                    bound = "a parameter that a number of the file depends on"
+                    raise ParameterError("vary", f"{PARAMETERS}.{name}", bound)
             names.append(parts[0])
             lows.append(low)
             highs.append(high)

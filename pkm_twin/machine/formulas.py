@@ -355,11 +355,23 @@ class Book:
         moved = (one for one in self.formulas.values() if one.names & moving)
         return [one for one in moved if not one.path.startswith("uncertainty.")]
 
+    def text(self, path: str) -> str:
+        """The expression that a number of the file is; empty for a plain number."""
+        found = self.own.get(path.partition(f"{PARAMETERS}.")[2]) or self.formulas.get(path)
+        return found.text if found else ""
+
+    @property
+    def unused(self) -> list[str]:
+        """Parameters that no expression has."""
+        used = {n for one in (*self.own.values(), *self.formulas.values()) for n in one.names}
+        return [name for name in self.values if name not in used]
+
     def told(self, units: Mapping[str, str] | None = None) -> list[str]:
         """Each parameter with its value, unit and expression, in words."""
         return [
             f"{name} = {value:.12g} {(units or {}).get(name, '')}".strip()
             + (f" = {self.own[name].text}" if name in self.own else "")
+            + ("; nothing depends on it" if name in self.unused else "")
             for name, value in self.values.items()
         ]
 

@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from pkm_twin.robot.catalogue import load
+from pkm_twin.robot.catalogue import config_folder, load
 from test.support.command import forked
 
 VARY = ("--vary", "geometry.arm_length=0.15:0.3", "--vary", "geometry.forearm_length=0.3:0.6")
@@ -29,11 +29,25 @@ def test_a_better_robot_is_written_and_loads(twin, pick, tmp_path):
     peak, index = data["quantities"]["peak-effort"], data["quantities"]["singularity"]
     assert peak["after"] < peak["before"] and peak["unit"] == "N m"
     assert index["after"] >= 0.2 - 1e-6
+    effort, least = data["items"]
+    assert effort["value"] == f"{peak['after']:.4g} N m"
+    assert [effort["verdict"], least["verdict"]] == ["good", "good"]
     assert picture.read_bytes()[:4] == b"\x89PNG"
     better = load(out)
     for path, value in data["numbers"].items():
         assert better.number(path) == pytest.approx(value, rel=1e-10)
     assert twin(*line, *files).code == 1
+
+
+def test_a_machine_that_asks_too_much_of_its_drives_is_bad(twin, pick, tmp_path):
+    weak, out = tmp_path / "weak.yaml", tmp_path / "light.yaml"
+    text = (config_folder() / "delta.yaml").read_text().replace("effort: 20.0", "effort: 2.0")
+    weak.write_text(text)
+    line = ("design", weak, *VARY, "--path", pick, "--minimise", "mass", "--starts", "4")
+    data = twin.told(*line, "--out", out)
+    effort = data["items"][0]
+    assert data["quantities"]["peak-effort"]["after"] > 2.0
+    assert (effort["bound"], effort["verdict"]) == ("2 N m", "bad")
 
 
 def test_a_sweep_is_a_file_with_the_variables_as_axes(twin, pick, tmp_path):

@@ -11,6 +11,7 @@ import yaml
 from delta_dynamics import inverse_dynamics, torque_derivatives
 from pkm_twin import load, variants
 from pkm_twin.design import tolerances
+from pkm_twin.design.variables import Variables
 from pkm_twin.errors import ParameterError
 from pkm_twin.robot.catalogue import config_folder, robot_of_data
 from pkm_twin.robot.entries import Chosen, edited_yaml, entries, with_entries
@@ -143,6 +144,25 @@ def test_a_new_value_is_written_where_the_parameter_stands(tmp_path):
     path.write_text(text)
     numbers = {"parameters.arm": 0.21, "joints.motor_1.at[0]": 0.1}
     assert torques(load(path)) == pytest.approx(torques(robot.numbered(numbers)), abs=1e-12)
+
+
+def test_a_parameter_that_nothing_depends_on_is_named_and_not_varied():
+    robot = robot_with(idle=1.0)
+    assert robot.book.unused == ["idle"] and robot_with().book.unused == []
+    with pytest.raises(ParameterError, match="depends on"):
+        Variables.of(robot, {"parameters.arm": (0.1, 0.3), "parameters.idle": (0.0, 2.0)})
+
+
+def test_the_expression_that_a_number_was_is_told():
+    book = robot_with().book
+    assert book.text("parameters.forearm") == "arm * 2 + 0.05"
+    assert book.text("bodies.platform.mass") == "m + 0.05"
+    assert book.text("parameters.m") == book.text("forearm") == ""
+
+
+def test_a_parameter_without_its_section_is_suggested():
+    with pytest.raises(ParameterError, match=r"'parameters\.arm'"):
+        robot_with().number("arm")
 
 
 def test_changed_parameters_stay_parameters():

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -16,7 +16,7 @@ from pkm_twin.apps.frame import command
 from pkm_twin.apps.options import Carries, Draws, ReadsMotions, Seeded, Writes
 from pkm_twin.console import progress, writing
 from pkm_twin.errors import ParameterError, UnknownNameError, warn
-from pkm_twin.report import Column, Fact, Report, Table, plots
+from pkm_twin.report import Column, Fact, Report, Table, judged, plots
 from pkm_twin.settings import setting
 
 if TYPE_CHECKING:
@@ -206,6 +206,11 @@ def optimised(given: Design, path: Path) -> Report:
         words = f"{name} {best.quantities[name]:.4g} {unit_of}".rstrip()
         changes.append(f"{words} ({was:.4g} before)" if np.isfinite(was) else words)
     notes = [f"{joint} leaves its position limits on the path" for joint in limits]
+    notes += [
+        f"{name} was {robot.book.text(name)} in the file and is a number now"
+        for name in best.numbers
+        if robot.book.text(name)
+    ]
     if not before.feasible:
         notes.insert(
             0, "before: the file's machine cannot follow the path or does not keep the bounds"
@@ -223,12 +228,32 @@ def optimised(given: Design, path: Path) -> Report:
             Fact("machines", found.machines),
             Fact("rejected_starts", found.rejected),
             Fact("beyond_position_limits", limits),
+            *against_limits(found, way),
         ],
         tables,
         {"": lambda: draw(robot, found, way, answer)},
         notes,
         {"out": given.out},
     )
+
+
+def against_limits(found: Found, path: PosePath) -> Iterator[Fact]:
+    """The effort and the singularity index of the best machine on the path, judged."""
+    from pkm_twin.design.pose_path import Followed
+    from pkm_twin.design.tolerance import REGULAR
+    from pkm_twin.design.variants import Variants
+
+    robot, limit = found.robot, found.robot.limits.effort
+    followed = Followed(Variants(robot, {}), path)
+    if limit is not None and "peak-effort" in found.best.quantities:
+        peaks = np.abs(followed.efforts[0]).max(0)
+        k = int((peaks / limit).argmax())
+        unit, good = robot.effort_units[k], bool(peaks[k] <= limit[k])
+        what = f"effort of {robot.joint_names[k]} on the path"
+        yield judged(what, f"{peaks[k]:.4g} {unit}", f"{limit[k]:g} {unit}", good)
+    index = float(followed.singularity.min())
+    what = "singularity index on the path"
+    yield judged(what, f"{index:.4g}", f"{REGULAR:g} or more", index >= REGULAR)
 
 
 def at_bound(value: float, bound: tuple[float, float]) -> str:
@@ -251,8 +276,12 @@ def write_robot(robot: Robot, source: str, found: Found, path: Path, out: Path) 
 
     kept = "".join(f", {bound}" for bound in found.constraints)
     values = {
-        name: Chosen(float(f"{value:.{FILE_DIGITS}g}"), f"was {robot.number(name):.6g}")
+        name: Chosen(
+            float(f"{value:.{FILE_DIGITS}g}"),
+            f"was {' = '.join([*([text] if text else []), f'{robot.number(name):.6g}'])}",
+        )
         for name, value in found.best.numbers.items()
+        for text in [robot.book.text(name)]
     }
     aim = " and ".join(found.minimise)
     head = [f"{robot.name}, designed for {path}: least {aim}{kept}."]
