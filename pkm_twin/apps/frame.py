@@ -148,7 +148,8 @@ class _Ordered(TyperGroup):
 def execute(command: Command, name: str, given: Any, as_json: bool) -> None:
     """Run a command: check its targets, present its report, write its picture, set the exit code.
 
-    :raises PkmTwinError: what the command raises, or a file that may not be replaced.
+    :raises BadParameter: an option's value that is wrong in itself.
+    :raises PkmTwinError: what else the command raises, or a file that may not be replaced.
     """
     _check_targets(given)
     drawing = given.drawing(name) if hasattr(given, "drawing") else None
@@ -157,7 +158,19 @@ def execute(command: Command, name: str, given: Any, as_json: bool) -> None:
         refuse_existing(drawing, getattr(given, "overwrite", True), _source(given))
     gc.freeze()
     gc.enable()
-    report = command.run(given)
+    try:
+        report = command.run(given)
+    except ParameterError as error:
+        # Words that the command cannot read; a number that this machine cannot meet is no usage.
+        word = error.field.split()[0].removeprefix("--") if error.field else ""
+        wrong = [
+            _spelled(field, row) for field, kind, row, default in _fields(type(given))
+            if getattr(given, field) != default and not row.argument
+            and _plain_type(kind)[0] in (str, tuple[str, ...])
+        ]  # fmt: skip
+        if f"--{word}" not in wrong:
+            raise
+        raise typer.BadParameter(f"--{str(error).removeprefix('--')}") from None
     if hasattr(given, "drawing"):
         report = _drawn(report, drawing)
     present(report, as_json, piped=piped)

@@ -127,7 +127,7 @@ class Tasks(TyperGroup):
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         """As click's; a name that is none comes with the closest one."""
         if args[0] not in self.commands and not args[0].startswith("-"):
-            names = (*self.commands, *OLDER)
+            names = [name for name in self.commands if not self.commands[name].hidden]
             raise UsageError(str(UnknownNameError("command", args[0], names)), ctx)
         return super().resolve_command(ctx, args)
 

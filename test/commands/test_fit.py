@@ -86,7 +86,7 @@ def test_refusals(twin, tmp_path, monkeypatch, arguments, text):
     table(tmp_path / "without.csv", robot, 2.0, efforts=False)
     table(tmp_path / "short.csv", robot, 0.5)
     monkeypatch.chdir(tmp_path)
-    assert text in twin.refused("fit", *arguments)
+    assert text in twin.refused("fit", *arguments, code=2 if "--what" in arguments else 1)
 
 
 def test_excite_writes_a_trajectory_within_the_limits_that_rests_at_both_ends(twin, tmp_path):

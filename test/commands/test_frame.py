@@ -11,6 +11,7 @@ from typer.main import get_command
 
 from pkm_twin.apps.frame import Group, command
 from pkm_twin.apps.options import Draws, OfRobot, Writes
+from pkm_twin.errors import ParameterError
 from pkm_twin.report import Column, Fact, Report, Table, Verdict, judged, plots
 from pkm_twin.report.terminal import WIDTH, table_lines, text_of
 from pkm_twin.settings import setting
@@ -24,6 +25,7 @@ class Weigh(OfRobot, Writes, Draws):
     scale: float = setting(2.0, "of the balance", low=1.0, high=5.0, older=("--balance",))
     at: tuple[float, ...] | None = setting(None, "where", count=2)
     how: str = setting("fast", "how", choices=("fast", "slow"))
+    on: str | None = setting(None, "what it stands on")
     bad: bool = setting(False, "what it finds is bad")
     no_lid: bool = setting(False, "without its lid")
     out: Path | None = setting(None, "table", writes=True, endings=(".csv",))
@@ -34,6 +36,10 @@ SEEN = []
 
 def weigh(given: Weigh) -> Report:
     SEEN.append(given)
+    if given.on is not None:
+        raise ParameterError(f"on {given.on}", given.on, "a table")
+    if given.robot == "feather":
+        raise ParameterError("scale", given.scale, "one for a feather")
     columns = [Column("mass", "kg"), Column("length", "m", "long", 1e3, "mm")]
     return Report(
         "2 kg",
@@ -69,6 +75,13 @@ def test_words_become_values(run):
         with pytest.raises(Exception, match=wrong[1]):
             run("cart", *wrong)
         assert not SEEN
+
+
+def test_words_that_cannot_be_read_are_wrong_usage_and_a_machines_bounds_are_not(run):
+    with pytest.raises(typer.BadParameter, match=r"^--on air: 'air'; expected a table"):
+        run("cart", "--on", "air")
+    with pytest.raises(ParameterError, match=r"^scale: 3"):
+        run("feather", "--scale", "3")
 
 
 def test_json_has_the_facts_with_units_and_the_terminal_the_answer_first(run):

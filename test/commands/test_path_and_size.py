@@ -367,7 +367,7 @@ def test_way_points_are_lines_or_a_smooth_curve(twin, tmp_path):
 def test_what_is_no_path_is_one_line(twin, tmp_path, text, options):
     path = tmp_path / "points.csv"
     path.write_text(text)
-    twin.refused("path", "delta", path, *options)
+    twin.refused("path", "delta", path, *options, code=2 if "--law" in options else 1)
 
 
 def test_a_command_line_needs_one_path(twin, tmp_path):
@@ -423,4 +423,4 @@ def test_a_payload_between_two_waypoints_of_a_cycle(twin):
     for wrong in ("0.5@3:3", "0.5@0:7", "x@0:1", "0.5", "500@0:3"):
         twin(*line, "--load", wrong).one_line_error()
     twin.good(*line, "--load", "0.5@0:3", "--payload", "1", code=2)
-    twin.good(*line, "--load", "0.5@0:3", "--load", "0.5@2:4", code=1)
+    twin.good(*line, "--load", "0.5@0:3", "--load", "0.5@2:4", code=2)

@@ -243,8 +243,9 @@ def test_a_plan_is_a_table_to_fill_in(twin: Commands, tmp_path: Path) -> None:
     # In the data's range: on the bed.
     places = GUESS.nozzle(-1e3 * np.array([row.split(",")[:3] for row in rows], float))
     assert np.abs(places[:, 2]).max() < 2.0
-    for what in ("distance", "length"):
-        twin.refused("calibrate", robot, "--measure", what, "--plan", tmp_path / "d.csv")
+    for what, code in (("distance", 1), ("length", 2)):
+        line = ("calibrate", robot, "--measure", what, "--plan", tmp_path / "d.csv")
+        twin.refused(*line, code=code)
     twin.refused("calibrate", robot)
 
 

@@ -13,9 +13,10 @@ from test.support.pages import write_section
 
 ROOT = Path(__file__).parents[2]
 HEAD = """All errors are subclasses of `PkmTwinError`, one line each: what is wrong, where, what is
-expected. Commands print it on stderr and end with exit code 1, or 2 for wrong usage of an option.
+expected. Commands print it on stderr and end with exit code 1, or 2 for an unknown option,
+an unreadable value, or one outside the range in the help.
 Nodes reject the message and count it by its reason in `/diagnostics`. [Python](api.md#errors) has
-their attributes. Examples, and what to do:
+their attributes. Examples:
 
 """
 ERRORS = {

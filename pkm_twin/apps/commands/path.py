@@ -122,13 +122,18 @@ class Motion(Carries, ReadsTables, AwayFromSingular, Writes, Draws):
         None, "speed limit of the tool point, m/s; default: none; of --slow-where-soft the "
         "programmed feed",
     )  # fmt: skip
-    share: float = setting(1.0, "fraction of the file's effort and velocity limits to use")
+    share: float = setting(
+        1.0, "fraction of the file's effort and velocity limits to use", low=1e-3, high=1.0
+    )
     shaper: str | None = setting(
         None, "input shaper for the first natural frequency: zv, or zvd, which tolerates more "
         "error of the frequency",
     )  # fmt: skip
     damping: float | None = setting(
-        None, "damping ratio of that mode; default: `modal_damping` of the robot file"
+        None,
+        "damping ratio of that mode; default: `modal_damping` of the robot file",
+        low=0.0,
+        high=0.99,
     )
     rate: float = setting(1000.0, "samples per second in the file", low=1.0, high=1e5)
     out: Path | None = setting(
