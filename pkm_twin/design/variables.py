@@ -114,6 +114,8 @@ def _parsed(field: str, texts: Sequence[str], form: str, count: int) -> dict[str
             values = list(map(float, words.split(":")))
         except ValueError:
             values = []
+        if "=" in name:
+            raise ParameterError(field, text, f"one of {form}; repeat --{field} for another")
         if not name or name in found or len(values) != count:
             raise ParameterError(field, text, form)
         found[name] = values

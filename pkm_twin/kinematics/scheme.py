@@ -156,7 +156,8 @@ class Scheme(Linkage):
         if rank_of(matrix) < len(matrix):
             raise ParameterError(
                 "pose", [c.name for c in self.coordinates],
-                "coordinates that determine the platform's pose at home",
+                "coordinates that determine the platform's pose at home, as "
+                f"{', '.join(choose_coordinates(self.graph))}",
             )  # fmt: skip
 
     @cached_property

@@ -34,6 +34,7 @@ MAX_SIZE: Final = 1e18
 _NAME: Final = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 _STRANGE: Final = re.compile(r"[^A-Za-z0-9_ \t.+\-*/(),]")
 _NUMBER: Final = re.compile(r"(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
+_WITH_UNIT: Final = re.compile(r"\s*[-+]?[\d.]+([eE][-+]?\d+)?\s*[A-Za-z]\S*\s*")
 _ANGLES: Final = ("sin", "cos", "tan")
 """Functions of an angle, whose values have no unit."""
 _SQUARE: Final = "^2"
@@ -114,6 +115,8 @@ class Formula:
                 tree = ast.parse(text.strip(), mode="eval").body
         except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
             told = error.msg if isinstance(error, SyntaxError) else "too deep"
+            if _WITH_UNIT.fullmatch(text):
+                raise ParameterError(path, text, "a number without unit, rad and m") from None
             raise ParameterError(path, text, f"arithmetic; {told}") from None
         names = set[str]()
         for node, depth in _walk(tree, 1):

@@ -170,6 +170,8 @@ def interval(*, count: int = 0, default: Any = MISSING, **more: Any) -> Any:
     bounds = Key(**more)
 
     def pair(field: str, value: Any) -> list[float]:
+        if not isinstance(value, (list, tuple, np.ndarray)):
+            raise ParameterError(field, value, "[min, max]")
         low, high = _nested(field, value, (2,), bounds)
         if not low < high:
             raise ParameterError(field, value, "[min, max] with min below max")
@@ -374,7 +376,10 @@ def _sequence(field: str, value: Any, size: int, what: str = "", least: int = 1)
     if not isinstance(value, (list, tuple)) or len(value) < least:
         raise ParameterError(field, value, f"a list of {size or what}")
     if size and len(value) != size:
-        raise ParameterError(field, value, f"a list of {size}, not {len(value)}")
+        # YAML splits an expression at its comma.
+        split = any(isinstance(item, str) and item.count("(") > item.count(")") for item in value)
+        quotes = "; quote an expression with a comma" if split else ""
+        raise ParameterError(field, value, f"a list of {size}, not {len(value)}{quotes}")
     return value
 
 

@@ -176,6 +176,8 @@ def read_motors(path: Path, names: Sequence[str] = ()) -> dict[str, Motor]:
     """
     if str(path) == SHIPPED:
         path = config_folder() / "drives" / "servos.yaml"
+    elif not path.suffix and not path.exists():
+        raise UnknownNameError("drives", str(path), [SHIPPED, "FILE.yaml"])
     entries = read_entries(path, "drives", "names")
     for name in names:
         if name not in entries:

@@ -56,7 +56,9 @@ def robot_path(robot: str | Path) -> Path:
         return Path(robot)
     if text in robot_names():
         return config_folder() / f"{text}.yaml"
-    raise UnknownNameError("robot", text, robot_names())
+    near = [f"{text}{ending}" for ending in (".yaml", ".yml", *TREES)]
+    files = [name for name in near if Path(name).is_file()]
+    raise UnknownNameError("robot", text, [*robot_names(), *files])
 
 
 def load(robot: str | Path, *, platform: str | None = None) -> Robot:

@@ -3,6 +3,7 @@
 
 import math
 import pickle
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,8 +12,10 @@ import yaml
 from delta_dynamics import inverse_dynamics, torque_derivatives
 from pkm_twin import load, variants
 from pkm_twin.design import tolerances
-from pkm_twin.design.variables import Variables
-from pkm_twin.errors import ParameterError
+from pkm_twin.design.variables import Variables, parse_vary
+from pkm_twin.errors import ParameterError, UnknownNameError
+from pkm_twin.machine.strict_yaml import parse_yaml
+from pkm_twin.paths.sizing import read_motors
 from pkm_twin.robot.catalogue import config_folder, robot_of_data
 from pkm_twin.robot.entries import Chosen, edited_yaml, entries, with_entries
 
@@ -163,6 +166,40 @@ def test_the_expression_that_a_number_was_is_told():
 def test_a_parameter_without_its_section_is_suggested():
     with pytest.raises(ParameterError, match=r"'parameters\.arm'"):
         robot_with().number("arm")
+
+
+@pytest.mark.parametrize("text", ["0.26 m", "5 deg", "-1e-3mm"])
+def test_a_number_with_a_unit_is_rejected_by_the_units_that_files_have(text):
+    with pytest.raises(ParameterError, match="rad and m"):
+        robot_with(m=text)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "bound"),
+    [
+        ("axis: [0, cos(0), -sin(0)]", "axis: [atan2(arm, 1), 1, 0]", "quote"),
+        ("actuated: true", "actuated: true\n      limits: {position: 0.15}", "[min, max]"),
+        ("origin:", "pose: [x, y, yaw]\norigin:", "as x, y, z"),
+    ],
+)
+def test_a_slip_is_answered_by_what_is_right(old, new, bound):
+    with pytest.raises(ParameterError) as caught:
+        robot_of_data(parse_yaml(SOURCE.replace(old, new), "slip"), "slip")
+    assert bound in caught.value.bound
+
+
+def test_names_near_a_file_or_a_word_are_suggested(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "gantry.yaml").write_text(SOURCE)
+    for ask, name, near in (
+        (load, "gantry", "gantry.yaml"),
+        (lambda name: read_motors(Path(name)), "shiped", "shipped"),
+    ):
+        with pytest.raises(UnknownNameError) as caught:
+            ask(name)
+        assert caught.value.closest == near
+    with pytest.raises(ParameterError, match="repeat --vary"):
+        parse_vary(["parameters.arm=0.1:0.2,parameters.base=0.1:0.2"])
 
 
 def test_changed_parameters_stay_parameters():
