@@ -253,15 +253,15 @@ class Model:
         return replace(state, wrench=values, refusal="")
 
     def link(self, state: State) -> str:
-        """The fragment of an address that carries robot, pose and load."""
+        """The query of an address that carries robot, pose and load."""
         parts = {"robot": self.robot.name, "pose": _listed(state.pose)}
         if state.wrench.any():
             parts["load"] = _listed(state.wrench)
-        return f"#{urlencode(parts, safe=',')}"
+        return f"?{urlencode(parts, safe=',')}"
 
     def linked(self, state: State, link: str) -> State:
-        """The state of an address with such a fragment, or the old one with the reason why not."""
-        parts = {name: given[-1] for name, given in parse_qs(link.rpartition("#")[2]).items()}
+        """The state of an address with such a query, or the old one with the reason why not."""
+        parts = {name: given[-1] for name, given in parse_qs(link.rpartition("?")[2]).items()}
         if parts.get("robot") != self.robot.name:
             return _refused(state, f"the link is not of the robot {self.robot.name}")
         rows = []

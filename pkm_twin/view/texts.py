@@ -30,17 +30,18 @@ SHEET: Final = """<style>
 }
 </style>
 <img hidden src="data:," onerror="
-  const link = location.hash, tries = setInterval(() => {
+  const link = location.search, tries = setInterval(() => {
     const label = [...document.querySelectorAll('label')].find(l => l.innerText === 'link');
     const input = label && label.closest('.mantine-Flex-root').querySelector('input');
-    if (link && !input) return;
+    const asked = link.includes('robot=');
+    if (asked && !input) return;
     clearInterval(tries);
-    if (!link) return;
-    history.replaceState(null, '', location.pathname + location.search);
+    if (!asked) return;
+    history.replaceState(null, '', location.pathname);
     Object.getOwnPropertyDescriptor(HTMLInputElement.prototype, 'value').set.call(input, link);
     input.dispatchEvent(new Event('input', {bubbles: true}));
   }, 100)">"""
-"""An address with a link's fragment is handed to the text of the link, once.
+"""An address with a link's query is handed to the text of the link, once.
 
 In a narrow window the browser shows the sliders as a sheet at the bottom: it is as wide as the
 window, and the scene ends above it."""
@@ -55,8 +56,12 @@ const input = label.closest('.mantine-Flex-root').querySelector('input'), button
 const whole = location.origin + location.pathname + input.value;
 const done = () => { button.innerText = 'Copied'; setTimeout(() => {
   button.innerText = 'Copy link' }, 1500) };
-if (navigator.clipboard) navigator.clipboard.writeText(whole).then(done);
-else { input.select(); document.execCommand('copy'); done() }"""
+const plainly = () => {
+  const text = document.createElement('textarea');
+  text.value = whole; document.body.append(text); text.select();
+  document.execCommand('copy'); text.remove(); done() };
+if (navigator.clipboard) navigator.clipboard.writeText(whole).then(done, plainly);
+else plainly()"""
 _SAVE: Final = """
 const scene = document.querySelector('canvas[data-engine]'), sheet = scene.cloneNode();
 sheet.width = scene.width; sheet.height = scene.height;

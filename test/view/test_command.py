@@ -21,6 +21,7 @@ from test.commands.conftest import DELTA, REPOSITORY
 from test.maps.browser import Browser, find_browser
 from test.nodes.harness import end_with_parent
 from test.support.robots import load
+from test.support.waiting import wait_until
 
 needs_viser = pytest.mark.usefixtures("viser")
 
@@ -31,15 +32,15 @@ def viser():
 
 
 @pytest.mark.parametrize(
-    ("options", "told"),
+    ("options", "told", "code"),
     [
-        (("--host", "0.0.0.0"), "--host: '0.0.0.0'; expected 127.0.0.1, or "),
-        (("--bag", "nothing.mcap", "--port", "0"), "nothing.mcap"),
+        (("--host", "0.0.0.0"), "--host: '0.0.0.0'; expected 127.0.0.1, or ", 2),
+        (("--bag", "nothing.mcap", "--port", "0"), "nothing.mcap", 1),
     ],
 )
 @needs_viser
-def test_what_cannot_be_served_is_one_line(twin, options, told):
-    assert told in twin.refused("view", "delta_cu", *options)
+def test_what_cannot_be_served_is_one_line(twin, options, told, code):
+    assert told in twin.refused("view", "delta_cu", *options, code=code)
 
 
 @pytest.mark.parametrize(
@@ -171,6 +172,60 @@ def test_a_slider_moves_the_machine_and_the_numbers_are_the_cores(browser):
         assert read(browser, "energy") == number(float(energy.total))
         assert addresses(browser) == {"127.0.0.1"}
         assert colours(browser.picture()) > 200
+
+
+CLICK = "[...document.querySelectorAll('button')].find(e => e.innerText === '%s').click()"
+LINK = "[...document.querySelectorAll('input')].find(e => e.value.startsWith('?robot='))"
+
+
+def clicked(browser, text):
+    browser.run(CLICK % text)
+
+
+def checked(browser, label):
+    """Tick a box by its label."""
+    browser.run(
+        f"[...document.querySelectorAll('label')].find(l => l.innerText === '{label}')"
+        ".closest('.mantine-Flex-root').querySelector('input[type=checkbox]').click()"
+    )
+
+
+@pytest.mark.timeout(1800)
+def test_every_control_does_what_it_says(browser, tmp_path):
+    """A link leads to its pose and load, once; the picture is saved; all else moves the machine."""
+    robot = load("five_bar")
+    pose = robot.home() + np.array([0.02, -0.01])
+    browser.call("Browser.setDownloadBehavior", behavior="allow", downloadPath=str(tmp_path))
+    browser.call(
+        "Browser.grantPermissions", permissions=["clipboardReadWrite", "clipboardSanitizedWrite"]
+    )
+    with serving("five_bar") as (_, address):
+        link = f"?robot=five_bar&pose={pose[0]:.9g},{pose[1]:.9g}&load=0,5,0,0,0,0"
+        browser.visit(address + link)
+        browser.until(f"{TEXT % 'q_0'} === '{number(robot.inverse(pose)[0])}'")
+        energy = strain_energy(robot, pose, [0.0, 5.0, 0.0, 0.0, 0.0, 0.0])
+        assert browser.until(f"{LINK}.value") == link
+        assert browser.run("location.search") == ""
+        clicked(browser, "Copy link")
+        browser.until("[...document.querySelectorAll('#copy')].some(e => e.innerText === 'Copied')")
+        clicked(browser, "Save picture")
+        wait_until(lambda: (tmp_path / "five_bar.png").exists(), lambda: browser.run("1"), 60.0, "")
+        assert colours((tmp_path / "five_bar.png").read_bytes()) > 200
+        for label in ("trail of the tool", "drag platform", "names of drives"):
+            checked(browser, label)
+        clicked(browser, "Home")
+        browser.until(f"{LINK}.value.includes('pose=0,')")
+        browser.run(TAB)
+        browser.press("ArrowRight")
+        browser.until(f"{TEXT % 'energy'} && {TEXT % 'energy'} !== '0'")
+        assert read(browser, "energy") != number(float(energy.total))
+        clicked(browser, "Go to the softest pose")
+        assert "µm" in browser.until(
+            f"({TEXT % 'note'} || '').includes('along') && {TEXT % 'note'}"
+        )
+        clicked(browser, "No wrench")
+        browser.until(f"!{LINK}.value.includes('load')")
+        assert addresses(browser) == {"127.0.0.1"}
 
 
 def colours(png):

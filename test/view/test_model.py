@@ -136,9 +136,9 @@ def test_a_dragged_platform_goes_where_it_can(name, rng):
 def test_a_link_that_says_something_else_changes_nothing():
     model = model_of("five_bar")
     good = model.link(model.start)
-    for link in ("", "#", "#pose=0,0.4", "#robot=delta&pose=0,0.4", "#robot=five_bar",
+    for link in ("", "?", "?pose=0,0.4", "?robot=delta&pose=0,0.4", "?robot=five_bar",
                  good + ",1", good + "&load=1", good + "&load=1,2,3,4,5,nan",
-                 "#robot=five_bar&pose=0,x", "#robot=five_bar&pose=9,9"):  # fmt: skip
+                 "?robot=five_bar&pose=0,x", "?robot=five_bar&pose=9,9"):  # fmt: skip
         state = model.linked(model.start, link)
         assert state.refusal, link
         assert state.q is model.start.q
