@@ -62,8 +62,9 @@ def report_dynamics(bag: Path, recording: Path, prefix: str) -> tuple[list[Fact]
     predicted, residual = (_efforts(found, stamps, robot) for found in (torques, residuals))
     measured = np.zeros_like(predicted) if r.effort is None else r.effort[answered]
     near = _window(time, 2.0, time)
+    rms = f", residual RMS {_rms(residual[near])[0]:.2g} {unit}" if near.any() else ""
     panel = Panel(
-        f"{prefix}: effort of {robot.joint_names[0]}", f"effort ({unit})",
+        f"{prefix}:\neffort of {robot.joint_names[0]}{rms}", f"effort ({unit})",
         [
             (time[near], measured[near, 0], {"color": "0.6", "lw": 2.5, "label": "recorded"}),
             (time[near], predicted[near, 0], {"color": plots.COLOURS[1], "lw": 1, "label": "twin"}),
@@ -254,13 +255,13 @@ def _xyz(vector: Any) -> list[float]:
 
 def draw(panels: Sequence[Panel], path: Path) -> Path:
     """One picture of all stages: a panel each."""
-    figure, columns = plots.columns(2, 2)
+    figure, columns = plots.columns(2, 2, 8)
     axes = [columns[k % 2][k // 2] for k in range(4)]
     for ax, panel in zip(axes, panels, strict=False):
         for time, values, style in panel.lines:
             ax.plot(time, values, **style)
         plots.label(ax, "time (s)", panel.upright, panel.title)
-        ax.legend(loc="best")
+        plots.legend(ax, below=True)
     for ax in axes[len(panels) :]:
         ax.set_visible(False)
     return plots.save(figure, path)

@@ -90,9 +90,12 @@ def head(figure: Any, text: str, size: float = STYLE["figure.titlesize"]) -> int
     return len(rows)
 
 
-def legend(ax: Any) -> None:
-    """A legend beside the data, where it hides none."""
-    ax.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
+def legend(ax: Any, below: bool = False) -> None:
+    """A legend beside the data, or below, where it hides none."""
+    if below:
+        ax.legend(ncol=2, loc="upper center", bbox_to_anchor=(0.5, -0.16))
+    else:
+        ax.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
 
 
 def save(figure: Any, path: Path, dpi: int = DPI) -> Path:

@@ -158,7 +158,7 @@ def draw(motion: Recording, loads: Sequence[Summary], title: str) -> Any:
     for ax in (force, counted):
         if shown:
             # Below: beside curves that fill their axes there is no room.
-            ax.legend(ncol=2, loc="upper center", bbox_to_anchor=(0.5, -0.16))
+            plots.legend(ax, below=True)
     plots.head(figure, title)
     return figure
 
