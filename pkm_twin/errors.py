@@ -153,6 +153,7 @@ class UnreachableError(PkmTwinError, ValueError):
     ``limb`` is the name of the limb or joint, ``index`` the sample's index in the batch (``()`` for
     one sample), ``miss`` the gap that remains (m), ``reached`` the fraction of the straight line
     from home up to which there is an assembly, None if no line was followed.
+    ``question``: whether the pose has another unit, in place of that fraction.
     """
 
     def __init__(
@@ -162,9 +163,11 @@ class UnreachableError(PkmTwinError, ValueError):
         index: tuple[int, ...],
         miss: float,
         reached: float | None = None,
+        question: str = "",
     ) -> None:
         where = f" at sample {index if len(index) != 1 else index[0]}" if index else ""
         way = "" if reached is None else f", beyond {100 * reached:.3g} % of the way from home"
+        way = question or way
         # A limb of no length at all misses nothing, and points nowhere.
         how = f"misses by {miss:.6g} m" if miss else "has no direction there"
         super().__init__(f"{what}{where} is unreachable: {limb} {how}{way}")
@@ -179,7 +182,8 @@ class SingularityError(PkmTwinError, ValueError):
 
     ``measure`` is the dimensionless reciprocal condition number, ``bound`` the least valid one;
     ``reached`` the fraction of the straight line from home at which the singularity occurs, None at
-    the pose itself; ``beyond`` whether the pose is on the other side of one.
+    the pose itself; ``beyond`` whether the pose is on the other side of one;
+    ``question`` ends the text.
     """
 
     def __init__(
@@ -190,6 +194,7 @@ class SingularityError(PkmTwinError, ValueError):
         bound: float,
         reached: float | None = None,
         beyond: bool = False,
+        question: str = "",
     ) -> None:
         where = f" at sample {index if len(index) != 1 else index[0]}" if index else ""
         if beyond:
@@ -201,7 +206,7 @@ class SingularityError(PkmTwinError, ValueError):
                 "lies beyond a singularity, which the straight path from home meets at "
                 f"{100 * reached:.3g} %"
             )
-        super().__init__(f"{what}{where} {text}")
+        super().__init__(f"{what}{where} {text}{question}")
         self.reached, self.beyond = reached, beyond
         self.index = index
         self.measure = measure

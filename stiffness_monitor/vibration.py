@@ -152,7 +152,7 @@ def damping_ratios(robot: Robot, given: ArrayLike | None, count: int) -> Array:
     values = np.atleast_1d(doubles(robot.modal_damping if given is None else given, field))
     if not values.size:
         raise ParameterError(
-            field, None, "damping ratios of the modes, in the robot's file or given"
+            field, None, "damping ratios of the modes, in the robot's file or with --damping"
         )
     if values.ndim != 1:
         raise ParameterError(field, values.shape, "one damping ratio after another")

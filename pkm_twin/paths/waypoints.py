@@ -56,7 +56,10 @@ def read_waypoints(
     other = {*WRENCH, *(name for name in kinds if name.rpartition(".")[2] in EFFORTS[1:])}
     for name in table:
         if name not in kinds or name in other:
-            raise UnknownNameError(f"{file}: column", name, kinds.keys() - other)
+            where, few = f"{file}: column", robot.pose_names if space == "pose" else joints
+            if space == "pose":
+                where = f"{file}: {robot.name} moves in {', '.join(few)}; column"
+            raise UnknownNameError(where, name, (*few, *OPTIONS, "payload"))
     masses = None if carried else _masses(table, robot)
     given = {name: table[name] for name in OPTIONS if name in table}
     if blend is None and not given:

@@ -4,11 +4,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
+
+ROUNDING: Final = 1e-9
+"""What is below this part of the largest number of a column with a unit is shown as 0."""
 
 
 class Verdict(StrEnum):
@@ -71,8 +74,10 @@ class Column:
         unit = self.shown or self.unit
         return f"{self.text or self.name}{f' ({unit})' if unit else ''}"
 
-    def cell(self, value: Any) -> str:
-        """A value as the terminal shows it."""
+    def cell(self, value: Any, least: float = 0.0) -> str:
+        """A value as the terminal shows it; 0 where it is below a least one."""
+        if isinstance(value, float) and abs(value) < least:
+            value = 0.0
         scales = self.scale != 1.0 and isinstance(value, int | float)
         return number(value * self.scale if scales else value, self.form)
 
@@ -96,9 +101,17 @@ class Table:
         """Headings and rows as words, of the columns that have a text."""
         shown = [(k, column) for k, column in enumerate(self.columns) if column.text is not None]
         rows = self.rows.items()
+        # Numbers of one unit: others have nothing to do with each other.
+        least = [
+            ROUNDING * _largest(values[k] for _, values in rows) * bool(column.unit)
+            for k, column in shown
+        ]
         return [
             (self.head, *(column.heading for _, column in shown)),
-            *((name, *(c.cell(values[k]) for k, c in shown)) for name, values in rows),
+            *(
+                (name, *(c.cell(values[k], low) for (k, c), low in zip(shown, least, strict=True)))
+                for name, values in rows
+            ),
         ]
 
     @property
@@ -159,6 +172,12 @@ class Report:
         found |= {"verdict": self.verdict} if self.verdict is not None else {}
         found |= {"error": self.error} if self.error else {}
         return dict(plain(found))
+
+
+def _largest(values: Iterable[Any]) -> float:
+    """The largest size of the finite numbers; 0 where there is none."""
+    sizes = [abs(v) for v in values if isinstance(v, int | float) and math.isfinite(v)]
+    return float(max(sizes, default=0.0))
 
 
 def plain(value: Any) -> Any:

@@ -34,6 +34,8 @@ from pkm_twin.machine.graph import Graph
 from pkm_twin.machine.inertia import Layout
 from pkm_twin.robot.mechanism import Mechanism
 
+FAR: Final = 10.0
+"""Sizes of the machine from home beyond which a pose is taken for one in mm."""
 SINGULARITY_BOUND: Final = 1e-9
 """Least singularity index (0 singular, 1 best) at which a Jacobian is inverted."""
 
@@ -210,15 +212,27 @@ class Robot(Mechanism):
             misses = [float(miss) for miss in found.misses]
             limb = next((k for k, miss in enumerate(misses) if miss > 0.0), None)
             if limb is not None:
-                raise UnreachableError("pose", self.limb_names[limb], index, misses[limb])
+                raise UnreachableError(
+                    "pose", self.limb_names[limb], index, misses[limb], question=self._slip(one)
+                )
             if found.measure is not None and not found.measure > SINGULARITY_BOUND:
                 measure = max(float(found.measure), 0.0)
         elif reached < 1.0:
             part, miss, met = self.engine.shortest_pose(one)
             if not met:
-                raise UnreachableError("pose", part, index, miss, reached)
-            raise SingularityError("pose", index, 0.0, SINGULARITY_BOUND, reached)
-        raise SingularityError("pose", index, measure, SINGULARITY_BOUND, beyond=True)
+                raise UnreachableError("pose", part, index, miss, reached, self._slip(one))
+            slip = self._slip(one)
+            raise SingularityError("pose", index, 0.0, SINGULARITY_BOUND, reached, question=slip)
+        slip = self._slip(one)
+        raise SingularityError("pose", index, measure, SINGULARITY_BOUND, None, True, slip)
+
+    def _slip(self, pose: Array) -> str:
+        """The unit that a pose (m,) far beyond the machine may be in, as a question."""
+        far = np.abs(pose - self.home())
+        angle = np.array([unit == "rad" for unit in self.pose_units])
+        if (far[~angle] > FAR * self.graph.size).any():
+            return "; is it in mm?"
+        return "; in degrees?" if (far[angle] > 2 * np.pi).any() else ""
 
     def forward(self, q: ArrayLike) -> Array:
         """Pose of joint positions q, shape (..., m), in the mechanism's documented assembly.

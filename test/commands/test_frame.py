@@ -84,6 +84,11 @@ def test_words_that_cannot_be_read_are_wrong_usage_and_a_machines_bounds_are_not
         run("feather", "--scale", "3")
 
 
+def test_rounding_is_shown_as_zero_in_a_column_of_one_unit_alone():
+    table = Table("", [Column("a", "N m"), Column("b")], {"x": [2.0, 2.0], "y": [1e-12, 1e-12]})
+    assert table.cells[1:] == [("x", "2", "2"), ("y", "0", "1e-12")]
+
+
 def test_json_has_the_facts_with_units_and_the_terminal_the_answer_first(run):
     code, out = run("cart", "--json", "--bad")
     assert code == 1

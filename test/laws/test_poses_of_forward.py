@@ -130,3 +130,15 @@ def test_all_joints_of_a_spherical_machine_in_one_point(shift, tmp_path, rng):
     loads = least_norm_reactions(robot, q, qd, qdd)
     assert all(np.isfinite(w).all() for w in loads.wrenches)
     assert np.isfinite(inverse_dynamics(robot, q, qd, qdd)).all()
+
+
+@pytest.mark.parametrize(
+    ("name", "far", "question"),
+    [("delta", [0.0, 0.0, -350.0], "is it in mm"), ("prru", [0.84, 30.0, 0.0], "in degrees"),
+     ("delta", [0.0, 0.0, -2.0], "")],
+)  # fmt: skip
+def test_a_pose_in_another_unit_is_asked_for(name, far, question):
+    with pytest.raises((UnreachableError, SingularityError)) as refused:
+        load(name).inverse(far)
+    assert ("?" in str(refused.value)) == bool(question)
+    assert question in str(refused.value)

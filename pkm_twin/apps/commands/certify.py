@@ -3,7 +3,9 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import typer
 
@@ -12,6 +14,9 @@ from pkm_twin.apps.options import OfRobot, Seeded
 from pkm_twin.console import progress
 from pkm_twin.report import Column, Fact, Report, Table, Verdict
 from pkm_twin.settings import setting
+
+if TYPE_CHECKING:
+    from pkm_twin.certify.certificate import Item
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,14 +72,25 @@ def certify(given: Certify) -> Report:
             f"{found.skipped} of {found.drawn} states drawn were skipped: pkm_twin meets a "
             "singularity on the way from home",
         )
+    # The one that is nearest to its bound, or farthest beyond it.
+    worst = max(found.items, key=_share, default=None)
+    most = "" if worst is None else (
+        f"; the largest of its bound: {worst.what.replace('_', ' ')} {worst.worst:.1e} of "
+        f"{worst.bound:.1e}, against {worst.engine}"
+    )  # fmt: skip
     return Report(
         f"{'good' if found.good else 'bad'}: {which}, differences from pkm_twin at {found.states} "
-        f"states, seed {found.seed}",
+        f"states, seed {found.seed}{most}",
         [Fact(name, value) for name, value in found.data.items()],
         [Table("", [*columns, Column("", text="verdict")], rows)],
         notes=notes,
         verdict=Verdict.GOOD if found.good else Verdict.BAD,
     )
+
+
+def _share(item: Item) -> float:
+    """Of its bound, of which nothing may be left where it is 0."""
+    return item.worst / item.bound if item.bound else math.inf if item.worst else 0.0
 
 
 COMMAND = command(certify, "Robots")
