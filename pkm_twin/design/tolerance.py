@@ -162,7 +162,7 @@ def drawn(
     :func:`tolerances` gives to first order.
 
     :param q: joint positions, shape (k, n). Other parameters and errors as there; paths are those
-        of parts, or those of other numbers of the file.
+        of parts alone, or those of numbers of the file alone.
     :returns: displacements and rotation vectors, base axes, m and rad, shape (count, k, 6).
     :raises PkmTwinError: errors so large that a machine cannot be assembled.
     """
@@ -184,7 +184,8 @@ def drawn(
         return found
     if len(parts) < len(sigma):
         path = next(path for path in sigma if path not in parts)
-        raise ParameterError(f"tolerance {path}", None, "parts alone, for drawn machines")
+        bound = "for drawn machines parts alone, or numbers of the file alone"
+        raise ParameterError(f"tolerance {path}", robot.number(path), bound)
     effects: dict[Effect, Array] = {}
     for path, part in parts.items():
         for what, vector in part.effects.items():

@@ -138,8 +138,7 @@ class JointSpec:
     workspace; the others are those of actuated joints.
     ``rotor_inertia``: of the drive, reflected to the joint, inertia without weight; or ``drive``,
     which reflects the rotor's by a gear's ``ratio`` (joints that turn) or a screw's or belt's
-    ``lead`` (joints that slide). ``compliance``: in the joint's own axes; its
-    freedoms are free whatever stands there.
+    ``lead`` (joints that slide). ``compliance``: in the joint's own axes.
     """
 
     type: str = schema.choice(*TYPES)
