@@ -6,6 +6,7 @@ from __future__ import annotations
 import html
 from dataclasses import replace
 from html.parser import HTMLParser
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -83,6 +84,26 @@ def test_a_long_title_is_wrapped_and_keeps_values_with_their_units():
     assert " ".join(rows) == words
     assert not any(row.endswith(("25", "N")) for row in rows)
     plots.rendered(figure, 20)
+
+
+@pytest.mark.parametrize(("seconds", "panels"), [(2.0, 2), (20.0, 4)])
+def test_efforts_have_their_residual_and_a_long_motion_the_seconds_of_its_peak(seconds, panels):
+    from matplotlib import pyplot
+
+    robot, time = load("five_bar"), np.linspace(0.0, seconds, 401)
+    table = {"time": time}
+    for joint in robot.joint_names:
+        effort = np.exp(-((time - 0.7 * seconds) ** 2))
+        table |= {f"{joint}.effort": effort, f"{joint}.measured": effort + 0.01}
+        table |= {f"{joint}.effort_{term}": 0.0 * effort for term in plots.TERMS}
+    figure = plots.torques(SimpleNamespace(robot=robot), table, "title")
+    assert len(figure.axes) == panels
+    for ax in figure.axes:
+        (residual,) = [one for one in ax.lines if one.get_label() == "measured - sum"]
+        assert residual.get_ydata() == pytest.approx(0.01)
+    low, high = figure.axes[-1].get_xlim()
+    assert low < 0.7 * seconds < high and high - low < 2.5
+    pyplot.close(figure)
 
 
 @pytest.mark.parametrize(
