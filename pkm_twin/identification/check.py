@@ -17,6 +17,7 @@ from delta_dynamics import inverse_dynamics, torque_deviation
 from pkm_twin.codegen.arrays import Array, Mask
 from pkm_twin.errors import PkmTwinError, SingularityError, UnreachableError, one_line
 from pkm_twin.identification.compare import (
+    LEAST,
     MAX_RESIDUAL,
     NEAR,
     Compared,
@@ -45,6 +46,8 @@ POSITION_STEPS: Final = "position steps"
 VELOCITIES: Final = "velocities"
 RESIDUAL: Final = "torque residual"
 MEASURED: Final = "measured efforts"
+COMPARED: Final = "compared efforts"
+IDLE: Final = "drives off or braked"
 STUCK: Final = 0.05
 """Time for which a signal stays the same before it counts as stuck, s,"""
 TICKS: Final = 10.0
@@ -289,14 +292,25 @@ def _shares(r: Recording, idle: Mask, compared: Compared | None) -> tuple[list[F
     if idle.any():
         seconds = float(np.sum(np.gradient(r.time)[idle])) if len(r.time) > 1 else 0.0
         text = f"{seconds:.3f} s of {total:.3f} s, left out: efforts zero or constant at standstill"
-        items.append(judged("drives off or braked", text, "some efforts measured", enough or None))
+        items.append(judged(IDLE, text, "some efforts measured", enough or None))
     text = f"{100 * share:.3g} % of {len(r.time)} samples"
     bound = f"at least {100 * MIN_COMPARED:g} %"
-    items.append(judged("compared efforts", text, bound, enough or None))
-    return (
-        items,
-        "" if enough else f"efforts can be compared in {text}, {bound} needed for a verdict",
-    )
+    items.append(judged(COMPARED, text, bound, enough or None))
+    if enough:
+        return items, ""
+    near = np.zeros_like(idle) if r.load is None else r.load.near_change(r.time, NEAR)
+    left_out = {
+        f"are within {NEAR:g} s of a change of the payload: record longer between changes, or "
+        "one payload throughout": float(np.mean(near)),
+        "have idle drives: record with the drives on": float(np.mean(idle & ~near)),
+    }
+    why = max(left_out, key=lambda reason: left_out[reason])
+    part = left_out[why]
+    if part < 0.5 * (1.0 - share):
+        why = f"are near jumps or gaps, or in pieces of fewer than {LEAST} samples: record longer"
+        part = 1.0 - share - sum(left_out.values())
+    told = f"efforts can be compared in {text}, {bound} needed for a verdict"
+    return items, f"{told}; {100 * part:.3g} % {why}"
 
 
 def _rests(c: Compared) -> Mask:

@@ -163,6 +163,8 @@ def test_drives_that_are_off_or_braked_are_left_out(tmp_path, effort):
     report = checked(rewrite(DELTA, tmp_path / "off.mcap", braked, seconds=0.29))
     # Without a share of the recording to compare there is no verdict.
     assert (report.code, report.data["answer"]) == (1, "not judged")
+    share = re.search(r"verdict; ([\d.]+) % have idle drives", report.data["not_judged"])
+    assert float(share.group(1)) > 50.0
     items = items_of(report)
     assert items["drives off or braked"]["verdict"] == "unknown"
     assert not any("torque residual" in what for what in items)

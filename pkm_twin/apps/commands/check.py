@@ -75,6 +75,7 @@ def check(given: Check) -> Report:
 def check_one(given: Check, path: Path, update: Any = None, thorough: bool = True) -> Report:
     """Judge a recording, and append it to the history; errors as of ``recordings.read``."""
     from pkm_twin import load
+    from pkm_twin.identification.check import COMPARED, IDLE
     from pkm_twin.identification.check import check as checked
 
     robot: Any = given.robot
@@ -91,6 +92,9 @@ def check_one(given: Check, path: Path, update: Any = None, thorough: bool = Tru
         name = given.machine_name or r.robot.name
         append(given.history, name, r.robot.name, path, recorded_at(r, path), good, measure(r))
     bad, unknown = found.named(Verdict.BAD), found.named(Verdict.UNKNOWN)
+    if found.answer == "not judged":
+        # The reason is in the answer.
+        unknown = [what for what in unknown if what not in (COMPARED, IDLE)]
     answer = f"{found.answer}: {', '.join(bad) or found.unjudged or found.agreement}"
     none = "uncertainty: none in the robot file, so the model has no uncertainty band"
     why, findings = "; ".join(found.causes), "; ".join(found.findings)
