@@ -461,7 +461,7 @@ def binding(used: Array) -> list[int]:
 
 
 def merged(time: Array, columns: list[int], names: list[str], used: Array) -> list[Bound]:
-    """Parts of one binding limit; one shorter than :data:`BRIEF` of all joins its neighbour."""
+    """Parts of one binding limit; one shorter than :data:`BRIEF` of all joins the one before it."""
     if len(time) < 2:
         return []
     brief = BRIEF * float(time[-1] - time[0])
@@ -470,7 +470,8 @@ def merged(time: Array, columns: list[int], names: list[str], used: Array) -> li
     spans = [(b, e, columns[b]) for b, e in pairwise(edges) if e > b]
     result: list[tuple[int, int, int]] = []
     for b, e, column in spans:
-        short = float(time[e] - time[b]) < brief
+        # What touches a limit is no part of a rest, or of a stretch that touches none.
+        short = float(time[e] - time[b]) < brief and result and result[-1][2] >= 0
         if result and (short or result[-1][2] == column):
             result[-1] = (result[-1][0], e, result[-1][2])
         else:
@@ -478,7 +479,7 @@ def merged(time: Array, columns: list[int], names: list[str], used: Array) -> li
     return [
         Bound(
             float(time[b]), float(time[e]), "" if column < 0 else names[column],
-            float(used[b : e + 1].max()),
+            float(used[b : e + (e == len(time) - 1 or column >= 0)].max()),
         )
         for b, e, column in result
     ]  # fmt: skip

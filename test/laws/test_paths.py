@@ -13,6 +13,7 @@ from pkm_twin.paths.carrying import Carried
 from pkm_twin.paths.fastest import LAWS
 from pkm_twin.paths.jerk import smooth_run
 from pkm_twin.paths.joint_path import joint_paths
+from pkm_twin.paths.motion import BINDS
 from pkm_twin.paths.pieces import Arc, Corner, arc_through
 from pkm_twin.robot.catalogue import robot_of_data
 from test.support.robots import load, parameters_of, partly_long
@@ -133,6 +134,28 @@ def test_all_limits_hold_at_every_moment(name):
     begins = [bound.begin for bound in motion.bounds] + [motion.duration]
     assert begins == sorted(begins)
     assert begins[0] == 0.0
+
+
+@pytest.mark.parametrize("law", ["fastest", "s-curve"])
+def test_a_limit_that_is_reached_binds_and_a_rest_uses_its_own(law):
+    robot, dwell = load("delta"), 0.1
+    motion = timed(robot, cycle(robot, 0.025, 0.1, 0.025, dwell=dwell), law)
+    free = [bound.used for bound in motion.bounds if not bound.what]
+    assert max(free) < BINDS and any(bound.what for bound in motion.bounds)
+    begin = motion.begins[1] - dwell
+    (rest,) = [b for b in motion.bounds if b.begin < begin + 0.02 and b.end > begin + 0.08]
+    assert law != "fastest" or rest.used < 0.1
+
+
+def test_a_planar_cycle_goes_where_the_machine_can():
+    robot = load("five_bar")
+    there, back = (cycle(robot, 0.02, 0.06, direction=way) for way in (None, np.pi))
+    first, second = (walked(path)[0] for path in (there, back))
+    assert first[0] - robot.home()[0] == pytest.approx(-0.03)
+    assert second[0] - robot.home()[0] == pytest.approx(0.03)
+    for way in (0.25 * np.pi, 0.5 * np.pi):
+        with pytest.raises(ParameterError, match="no y"):
+            cycle(robot, 0.02, 0.06, direction=way)
 
 
 def close_pair(robot, seed):
