@@ -134,11 +134,13 @@ class JointSpec:
     inner body, the second in the outer one. ``lead``: how far a ``helical`` joint goes along its
     axis in a turn, m; its number is the turn, and a left-handed thread has a lead below zero. A
     ``translation`` is three slides along base axes, a ``planar`` joint two slides across its axis
-    and a turn about it. ``limits``: of a passive joint its ``position`` and ``swivel`` bound the
-    workspace; the others are those of actuated joints.
+    and a turn about it. ``limits``: a passive joint has ``position`` and ``swivel``, which bound
+    the workspace; an actuated one all but ``swivel``.
     ``rotor_inertia``: of the drive, reflected to the joint, inertia without weight; or ``drive``,
     which reflects the rotor's by a gear's ``ratio`` (joints that turn) or a screw's or belt's
-    ``lead`` (joints that slide). ``compliance``: in the joint's own axes.
+    ``lead`` (joints that slide). ``compliance``: along, then about
+    u (``axis``), v (u times the base axis least along it), w (u times v); of a universal joint u
+    and v are its ``axes``, of a spherical one all are base axes.
     """
 
     type: str = schema.choice(*TYPES)
