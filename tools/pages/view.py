@@ -78,7 +78,7 @@ def shown(browser: Browser, name: str) -> Iterator[Page]:
         listen("127.0.0.1", 0) as listening,
         serving(Door("127.0.0.1"), listening) as server,
     ):
-        page = Page(server, Model(load(robot)))
+        page = Page(server, Model(load(robot)), "Bag" if prepare is recorded else "")
         tab = prepare(page)
         browser.visit(f"http://127.0.0.1:{listening.getsockname()[1]}/")
         browser.until("!!document.getElementById('singularity')")
