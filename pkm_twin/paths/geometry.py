@@ -293,7 +293,7 @@ def cycle(
     lift: float | None = None,
     *,
     at: ArrayLike | None = None,
-    direction: float = 0.0,
+    direction: float | None = None,
     blend: float | None = None,
     dwell: float = 0.0,
     back: bool = True,
@@ -304,7 +304,8 @@ def cycle(
     :param width: between the two places, m.
     :param lift: fall at the second place, m; default ``height``.
     :param at: pose in the middle between the two places, shape (m,); default home.
-    :param direction: of the way across in the x-y plane, rad; of a planar robot it is along x.
+    :param direction: of the way across in the x-y plane, rad; default along x, or along
+        y of a robot that has no x.
     :param blend: rounding of the upper corners, m; default 0.8 of the smaller rise.
     :param dwell: rest in both places, s.
     :param back: whether the path goes back to the first place.
@@ -322,10 +323,16 @@ def cycle(
         raise ParameterError("at", middle.tolist(), f"a pose: {', '.join(names)}")
     across, up = np.zeros(len(names)), np.zeros(len(names))
     up[names.index("z")] = 1.0
-    if {"x", "y"} <= set(names):
-        across[names.index("x")], across[names.index("y")] = np.cos(direction), np.sin(direction)
-    else:
-        across[names.index("x" if "x" in names else "y")] = 1.0
+    if direction is None:
+        direction = 0.0 if "x" in names else 0.5 * np.pi
+    plane = {"x": np.cos(direction), "y": np.sin(direction)}
+    for name, part in plane.items():
+        if name in names:
+            across[names.index(name)] = part
+        elif abs(part) > 1e-9:
+            ways = "90 or 270" if name == "x" else "0 or 180"
+            bound = f"{ways} degrees: the pose has no {name}"
+            raise ParameterError("direction", f"{np.degrees(direction):g} degrees", bound)
     first = middle - 0.5 * width * across
     second = middle + 0.5 * width * across + (height - fall) * up
     there = [first, first + height * up, second + fall * up, second]

@@ -34,14 +34,11 @@ def read_waypoints(
     robot: Robot,
     blend: float | None,
     dialect: Dialect = PLAIN,
-    *,
-    carried: bool = False,
 ) -> tuple[Path, list[float] | None]:
     """The path of a table of waypoints: the pose's coordinates, or JOINT.position of every joint.
 
     A smooth curve; with ``blend`` (m) or one of the columns :data:`OPTIONS`, lines and arcs.
 
-    :param carried: a column ``payload`` is not used.
     :returns: the path, and the payload from each waypoint on, kg, where the table has it.
     :raises ParameterError: a column is missing, unknown, or a number is out of range.
     """
@@ -60,7 +57,7 @@ def read_waypoints(
             if space == "pose":
                 where = f"{file}: {robot.name} moves in {', '.join(few)}; column"
             raise UnknownNameError(where, name, (*few, *OPTIONS, "payload"))
-    masses = None if carried else _masses(table, robot)
+    masses = _masses(table, robot)
     given = {name: table[name] for name in OPTIONS if name in table}
     if blend is None and not given:
         return through(robot, points, space=space), masses
@@ -91,7 +88,7 @@ def _masses(table: Table, robot: Robot) -> list[float] | None:
     if centre is not None and (centre != robot.payload.com)[masses > 0.0].any():
         raise ParameterError(
             f"{table.path}: {', '.join(PAYLOAD[1:])}", "a centre of mass",
-            "that of the robot's file; --payload MASS,x,y,z carries another on the whole path",
+            "that of the robot's file; without the columns, --payload MASS,x,y,z carries another",
         )  # fmt: skip
     return list(masses.tolist())
 

@@ -80,9 +80,10 @@ class Motion(Carries, ReadsTables, AwayFromSingular, Writes, Draws):
         None, "centre of --cycle (between pick and place) or --circle: the pose's coordinates; "
         "default: home", count=0,
     )  # fmt: skip
-    direction: float = setting(
-        0.0, "direction of the cycle in the xy plane, degrees from x towards y"
-    )
+    direction: float | None = setting(
+        None, "direction of the cycle in the xy plane, degrees from x towards y; default: x, "
+        "else y",
+    )  # fmt: skip
     blend: float | None = setting(
         None, "distance from a corner at which rounding begins, m; 0 stops at every waypoint; "
         "default: a smooth curve", low=0.0,
@@ -231,8 +232,10 @@ def _way(given: Motion, machine: Robot) -> tuple[Way, Sequence[float | None] | N
     if given.carries and given.payload is not None:
         raise typer.BadParameter("--payload is for the whole path; leave it out with --load")
     way, masses = _unloaded(given, machine)
-    if given.carries and masses is not None:
-        raise typer.BadParameter("the waypoints have a column payload; leave out --load")
+    option = "--load" if given.carries else "--payload" if given.payload is not None else ""
+    same = not given.carries and set(masses or ()) <= {machine.payload.mass}
+    if masses is not None and option and not same:
+        raise typer.BadParameter(f"the waypoints have a column payload; leave out {option}")
     return way, parse_loads(given.carries, len(way.marks)) if given.carries else masses
 
 
@@ -244,11 +247,9 @@ def _unloaded(given: Motion, machine: Robot) -> tuple[Way, list[float] | None]:
     if sum(one is not None for one in (given.waypoints, given.cycle, given.circle)) != 1:
         raise typer.BadParameter("give one of WAYPOINTS, --cycle and --circle")
     if given.waypoints is not None:
-        if given.at is not None or given.dwell or given.direction:
+        if given.at is not None or given.dwell or given.direction is not None:
             raise typer.BadParameter("--at, --direction and --dwell are for --cycle and --circle")
-        return read_waypoints(
-            given.waypoints, machine, given.blend, given.dialect, carried=given.payload is not None
-        )
+        return read_waypoints(given.waypoints, machine, given.blend, given.dialect)
     if given.at is not None and len(given.at) != len(machine.pose_names):
         names = ", ".join(machine.pose_names)
         raise typer.BadParameter(f"--at has {len(given.at)} numbers; expected a pose: {names}")
@@ -262,10 +263,10 @@ def _unloaded(given: Motion, machine: Robot) -> tuple[Way, list[float] | None]:
             f"--cycle {found}: HEIGHT,WIDTH[,LIFT] in millimetres, for example 25,305,25"
         )
     metres = [1e-3 * value for value in lengths]
+    way = None if given.direction is None else math.radians(given.direction)
     made = paths.cycle(
-        machine, *metres, at=given.at, direction=math.radians(given.direction), blend=given.blend,
-        dwell=given.dwell,
-    )  # fmt: skip
+        machine, *metres, at=given.at, direction=way, blend=given.blend, dwell=given.dwell
+    )
     return made, None
 
 
