@@ -97,3 +97,13 @@ def test_what_cannot_be_asked_is_rejected_in_a_line(twin, pick, line):
     result = twin("design", "delta", "--path", pick, *line)
     assert result.code in (1, 2) and not result.out
     assert "Traceback" not in result.err
+
+
+def test_a_payload_that_changes_matters_to_efforts_alone(twin, tmp_path):
+    out = tmp_path / "loaded.csv"
+    line = ("path", "delta", "--cycle", "25,100,25", "--rate", "100", "--no-picture")
+    twin.good(*line, "--load", "0.5@0:3", "--out", out)
+    asked = ("design", "delta", "--path", out)
+    own, other = (twin.told(*asked, *TOLERANCES, *more) for more in ((), ("--payload", "0.2")))
+    assert own["rms_position_m"] == other["rms_position_m"] > 0.0
+    assert "--payload" in twin.refused(*asked, *VARY, "--minimise", "peak-effort")

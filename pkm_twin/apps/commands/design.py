@@ -124,9 +124,10 @@ def design(given: Design) -> Report:
     return optimised(given, given.path)
 
 
-def read_path(given: Design, path: Path) -> tuple[Robot, PosePath]:
+def read_path(given: Design, path: Path, *, efforts: bool = True) -> tuple[Robot, PosePath]:
     """The robot with the motion's payload, and the platform's path.
 
+    :param efforts: whether they, and so the payload, matter.
     :raises ParameterError: a table that is no motion, or a payload that is held part of the time.
     :raises BagError: a bag without a motion.
     """
@@ -135,12 +136,12 @@ def read_path(given: Design, path: Path) -> tuple[Robot, PosePath]:
 
     robot = given.machine()
     motion = given.read(path, robot, planned=True).with_rates()
-    if motion.load is not None:
+    if motion.load is not None and efforts:
         if motion.load.masses or not motion.load.held(motion.time).all():
-            bound = "one that is held throughout"
+            bound = "one that is held throughout; --payload gives one"
             raise ParameterError(f"{path}: payload", str(motion.load), bound)
         robot = motion.load.on(robot)
-    if robot.has_masses and (unlike := compared(motion, "file").unlike):
+    if efforts and robot.has_masses and (unlike := compared(motion, "file").unlike):
         warn(path, unlike)
     q, qd, qdd, load = motion.motion
     load = load + np.asarray(given.wrench or np.zeros(6))
@@ -380,7 +381,10 @@ def budget(given: Design) -> Report:
     if given.path is None:
         q = workspace_states(robot, STATES, given.seed)
     else:
-        q, where = robot.inverse(read_path(given, given.path)[1].pose), given.path.name
+        q, where = (
+            robot.inverse(read_path(given, given.path, efforts=False)[1].pose),
+            given.path.name,
+        )
     found = tolerances(robot, sigma, q, given.wrench)
     rows: dict[str, list[Any]] = {}
     for name in sorted(sigma, key=lambda name: -found.variance[name]):
