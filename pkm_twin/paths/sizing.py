@@ -209,6 +209,13 @@ class Fit:
         """Whether all three are kept."""
         return max(self.torque, self.thermal, self.speed) <= 1.0
 
+    @property
+    def answer(self) -> str:
+        """In words; beyond its greatest speed a motor has no torque to be compared."""
+        slow = self.speed > 1.0
+        small = max(self.thermal, 0.0 if slow else self.torque) > 1.0
+        return " and ".join(["too small"] * small + ["too slow"] * slow) or "fits"
+
     def as_json(self) -> dict[str, Any]:
         """Plain data; parts are 1 at the bound."""
         return {

@@ -2,6 +2,7 @@
 """`pkm-twin path` and `pkm-twin size` as a user runs them."""
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from pkm_twin.bags.reader import read_messages
 from pkm_twin.errors import ParameterError
 from pkm_twin.machine.sections import DriveSpec
 from pkm_twin.paths import cycle, fastest, timed
-from pkm_twin.paths.sizing import read_motors
+from pkm_twin.paths.sizing import Fit, read_motors
 from pkm_twin.recordings import write_table
 from test.commands.conftest import checked
 from test.support.robots import load, parameters_of
@@ -242,6 +243,10 @@ def test_a_motor_is_limited_by_its_curve(twin, tmp_path, geared):
     assert flat["good"]
     assert not slow["good"]
     assert slow["used_speed"] > 1.0
+    (one,) = read_motors(drives, ["flat"]).values()
+    fit = Fit("flat", one, torque=np.inf, thermal=0.5, speed=1.2, inertia_ratio=1.0)
+    assert fit.answer == "too slow" and replace(fit, thermal=1.1).answer == "too small and too slow"
+    assert [replace(fit, speed=0.9, torque=t).answer for t in (0.9, 1.1)] == ["fits", "too small"]
     text = twin.good("size", geared, out, "--drives", drives).out
     assert all(float(part) <= 1000.0 for part in re.findall(r"([\d.e+]+) %", text))
     drives.write_text("drives: {one: {inertia: 1.0}}")
@@ -415,7 +420,7 @@ def test_payloads_of_waypoints_go_with_the_motion(twin, tmp_path, ending):
         assert posed["masses_kg"] == [0.5, 0.2]
 
 
-def test_a_payload_between_two_waypoints_of_a_cycle(twin):
+def test_a_payload_between_two_waypoints_of_a_cycle(twin, tmp_path):
     line = ("path", "delta", "--cycle", "25,305,25")
     data = twin.told(*line, "--load", "0.5@0:3")
     ((begin, end),) = data["payload"]["held_s"]
@@ -423,4 +428,31 @@ def test_a_payload_between_two_waypoints_of_a_cycle(twin):
     for wrong in ("0.5@3:3", "0.5@0:7", "x@0:1", "0.5", "500@0:3"):
         twin(*line, "--load", wrong).one_line_error()
     twin.good(*line, "--load", "0.5@0:3", "--payload", "1", code=2)
+    points = tmp_path / "points.csv"
+    points.write_text(LOADED)
+    for option in (("--load", "0.5@0:3"), ("--payload", "1")):
+        twin.good("path", "delta", points, *option, code=2)
     twin.good(*line, "--load", "0.5@0:3", "--load", "0.5@2:4", code=2)
+
+
+def test_size_takes_the_models_efforts_for_another_payload(twin, tmp_path):
+    """The file's efforts carry 0.5 kg."""
+    out, plain = tmp_path / "cycle.csv", tmp_path / "plain.csv"
+    twin.good(*CYCLE, "--payload", "0.5", "--out", out, "--no-picture")
+    columns = read_columns(out)
+    write_table({k: v for k, v in columns.items() if not k.endswith("effort")}, plain)
+    line = ("size", "delta", out, "--payload", "3")
+    given = twin.told(*line)
+    expected = twin.told("size", "delta", plain, "--payload", "3")
+    assert given["efforts"] == "the model's" and given["payload"]["mass_kg"] == 3.0
+    assert given["drives"]["arm_1"]["joint"] == pytest.approx(expected["drives"]["arm_1"]["joint"])
+    assert twin.told(*line, "--efforts", "file")["efforts"] == "the file's"
+    assert twin.told("size", "delta", out)["efforts"] == "the file's"
+
+
+def test_the_energy_of_the_motors_is_their_sum(twin, tmp_path, geared):
+    out = tmp_path / "cycle.csv"
+    twin.good("path", geared, "--cycle", "25,200", "--out", out, "--no-picture")
+    data = twin.told("size", geared, out)
+    motors = sum(one["motor"]["energy_J"] for one in data["drives"].values())
+    assert data["motors_energy_J"] == pytest.approx(motors) and motors > data["energy_J"]

@@ -29,6 +29,8 @@ if TYPE_CHECKING:
 
 MOST_PERCENT: Final = 1000.0
 """A used part of more is printed as more."""
+SAME: Final = 1e-6
+"""Relative difference of two computations of the same efforts."""
 DRAWN: Final = 4
 """Most drives in a picture."""
 
@@ -73,9 +75,9 @@ class Size(CarriesAtTimes, ReadsMotions, AwayFromSingular, Draws):
         None, "in place of a motion: speed and acceleration of the tool point (m/s, m/s2), in the "
         "worst direction at the worst pose", count=2, metavar="SPEED,ACCELERATION",
     )  # fmt: skip
-    efforts: str = setting(
-        "file", "efforts to use: those of the motion's file if it has any, or model",
-        choices=("file", "model"),
+    efforts: str | None = setting(
+        None, "efforts to use; default: the file's, with --payload only if measured and near the "
+        "model's", choices=("file", "model"),
     )  # fmt: skip
 
 
@@ -98,7 +100,15 @@ def size(given: Size) -> Report:
     motors = {} if given.drives is None else read_motors(given.drives, given.motor)
     gear = Gear(given.ratio, given.lead, given.efficiency) if geared else None
     motion = given.read(given.motion, given.machine(), planned=True).with_rates()
-    taken = compared(motion, given.efforts)
+    taken, notes = compared(motion, given.efforts or "file"), list(motion.notes)
+    doubted = taken.unlike or motion.efforts != "measured"
+    if given.payload is not None and given.efforts is None and doubted:
+        if taken.difference.max() > SAME:
+            notes.append(
+                f"the file's efforts are not those of {motion.load}: the model's are used; "
+                "--efforts file uses the file's"
+            )
+        taken = compared(motion, "model")
     duties = size_drives(motion, taken.effort, motors, gear)
     duration = float(motion.time[-1] - motion.time[0])
     energy = sum(d.at_joint.energy for d in duties)
@@ -110,6 +120,10 @@ def size(given: Size) -> Report:
         f"{motion.robot.name}: largest effort {worst.at_joint.peak:.4g} {unit} on {worst.joint}, "
         f"RMS {worst.at_joint.rms:.4g} {unit}; net energy of all drives {net:.4g} J"
     )
+    at_motors = [d.at_motor.energy for d in duties if d.at_motor is not None]
+    motors_energy = sum(at_motors) if len(at_motors) == len(duties) else None
+    if motors_energy is not None:
+        answer += f" at the joints, {motors_energy:.4g} J at the motors"
     facts = [
         Fact("robot", motion.robot.name),
         Fact("samples", len(motion.time), text="samples"),
@@ -118,11 +132,11 @@ def size(given: Size) -> Report:
         payload_fact(motion.load),
         Fact("difference_from_model", taken.difference),
         Fact("drives", {d.joint: d.as_json() for d in duties}),
-        Fact("energy_J", energy),
+        Fact("energy_J", energy), Fact("motors_energy_J", motors_energy),
         Fact("regenerated_J", returned, "J", "regenerated energy"),
         Fact("mean_power_W", energy / duration, "W", "mean power"),
     ]  # fmt: skip
-    notes, title = list(motion.notes), answer
+    title = answer
     if taken.unlike:
         notes.append(f"{taken.unlike}; --efforts model uses the model's")
     if motors:
@@ -177,8 +191,8 @@ def _tables(duties: Sequence[DriveDuty]) -> list[Table]:
         columns.append(Column("", "", "inertia ratio", form=".3g"))
         rows = {
             fit.name: [
-                "fits" if fit.good else "too small", *map(_percent, (fit.torque, fit.thermal,
-                fit.speed)), fit.inertia_ratio,
+                fit.answer, "-" if fit.speed > 1.0 else _percent(fit.torque),
+                _percent(fit.thermal), _percent(fit.speed), fit.inertia_ratio,
             ]
             for fit in fits
         }  # fmt: skip
@@ -284,7 +298,7 @@ def draw(taken: Compared, duties: Sequence[DriveDuty], answer: str) -> Any:
             fit = near(d)[-1]
             parts = tuple(map(_percent, (fit.torque, fit.thermal, fit.speed)))
             words = (
-                f"{fit.name} {'fits' if fit.good else 'is too small'}: "
+                f"{fit.name} {'' if fit.good else 'is '}{fit.answer}: "
                 "torque {}, RMS torque {}, speed {}".format(*parts)
             )
             fastest = 1.3 * float(np.abs(speeds).max())
