@@ -12,7 +12,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from pkm_twin.codegen.arrays import Array, vectors
-from pkm_twin.design.parts import CONSISTENT, Assembly, Effect, part_of, rotation_vector
+from pkm_twin.design.parts import (
+    CONSISTENT,
+    Assembly,
+    Effect,
+    part_of,
+    rotation_vector,
+    turned,
+)
 from pkm_twin.design.variants import variants
 from pkm_twin.errors import ParameterError, PkmTwinError
 from pkm_twin.machine import schema
@@ -162,7 +169,7 @@ def drawn(
     :func:`tolerances` gives to first order.
 
     :param q: joint positions, shape (k, n). Other parameters and errors as there; paths are those
-        of parts alone, or those of numbers of the file alone.
+        of parts, or those of numbers of the file.
     :returns: displacements and rotation vectors, base axes, m and rad, shape (count, k, 6).
     :raises PkmTwinError: errors so large that a machine cannot be assembled.
     """
@@ -170,26 +177,34 @@ def drawn(
     known = tolerances(robot, sigma, states)
     rng = np.random.default_rng(seed)
     errors = {path: value * rng.normal(size=count) for path, value in known.sigma.items()}
-    parts = {path: part for path in sigma if (part := part_of(robot, path)) is not None}
-    if not parts:
-        own = {path: robot.number(path) + error for path, error in errors.items()}
-        position, rotation = variants(robot, own).platform(
-            np.broadcast_to(states, (count, *states.shape))
-        )
-        place, turn = robot.platform(states)
-        turns = rotation_vector(rotation @ turn.swapaxes(-1, -2))
-        found = np.concatenate([position - place, turns], -1)
-        if not np.isfinite(found).all():
-            raise PkmTwinError(f"{robot.name}: machines with errors of this size have no assembly")
-        return found
-    if len(parts) < len(sigma):
-        path = next(path for path in sigma if path not in parts)
-        bound = "for drawn machines parts alone, or numbers of the file alone"
-        raise ParameterError(f"tolerance {path}", robot.number(path), bound)
+    parts = [path for path in sigma if part_of(robot, path) is not None]
+    if len(parts) == len(sigma):
+        return _assembled(robot, errors, states)
+    own = {path: robot.number(path) + errors[path] for path in sigma if path not in parts}
+    machines = variants(robot, own)
+    position, rotation = machines.platform(np.broadcast_to(states, (count, *states.shape)))
+    place, turn = robot.platform(states)
+    if parts:
+        # The errors of parts are those of each machine, whose numbers differ.
+        moved = np.concatenate([
+            _assembled(machine, {path: errors[path][k : k + 1] for path in parts}, states)
+            for k, machine in enumerate(machines)
+        ])  # fmt: skip
+        position, rotation = position + moved[..., :3], turned(moved[..., 3:]) @ rotation
+    turns = rotation_vector(rotation @ turn.swapaxes(-1, -2))
+    found = np.concatenate([position - place, turns], -1)
+    if not np.isfinite(found).all():
+        raise PkmTwinError(f"{robot.name}: machines with errors of this size have no assembly")
+    return found
+
+
+def _assembled(robot: Robot, errors: Mapping[str, Array], states: Array) -> Array:
+    """Errors of the platform of a machine by those of parts, (count,) each: (count, states, 6)."""
     effects: dict[Effect, Array] = {}
-    for path, part in parts.items():
-        for what, vector in part.effects.items():
-            effects[what] = effects.get(what, 0.0) + errors[path][:, None] * vector
+    for path, values in errors.items():
+        part = part_of(robot, path)
+        for what, vector in part.effects.items() if part else ():
+            effects[what] = effects.get(what, 0.0) + values[:, None] * vector
     return np.stack([Assembly(robot, one).displaced(effects) for one in states], 1)
 
 

@@ -234,6 +234,18 @@ def test_drawn_machines_have_the_standard_deviations():
     np.testing.assert_allclose(again, 10.0 * small, atol=5e-3 * abs(again).max())
 
 
+def test_drawn_machines_may_have_errors_of_parts_and_of_numbers():
+    robot = load("delta")
+    sigma = {
+        "geometry.arm_length": 2e-6, "joints.arm_1.axis[0]": 1e-5, "geometry.base_radius": 1e-6,
+        "bodies.arm II.length": 3e-6,
+    }  # fmt: skip
+    q = robot.graph.home + np.array([[0.0, 0.0, 0.0], [0.1, -0.2, 0.3]])
+    found, rng = tolerances(robot, sigma, q), np.random.default_rng(0)
+    first = sum(rng.normal(size=5)[:, None, None] * found.part(path) for path in sigma)
+    np.testing.assert_allclose(drawn(robot, sigma, q, 5), first, atol=1e-3 * abs(first).max())
+
+
 def test_numbers_of_a_file_without_parts_vary_as_the_file_says():
     robot = load("delta_cu")
     sigma = {
