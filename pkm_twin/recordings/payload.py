@@ -19,7 +19,7 @@ from pkm_twin.recordings.tables import PAYLOAD, Table
 from pkm_twin.robot.plausibility import payload_findings
 from pkm_twin.robot.robot import Robot
 
-SOURCES = {"bag": "recording", "table": "table", "path": "path's waypoints"}
+SOURCES = {"bag": "recording", "table": "table, as sampled", "path": "path's waypoints"}
 
 
 @dataclass(frozen=True)

@@ -140,7 +140,7 @@ def grouped_reactions(names: Sequence[str]) -> list[str]:
     for joint, kinds in joints.items():
         words = [f"{kind} {_directions(directions)}".strip() for kind, directions in kinds.items()]
         alike.setdefault(" and ".join(words), []).append(joint)
-    return [f"{what} in {_some(names)}" for what, names in alike.items()] + others
+    return [f"{_some(names)}: not determined: {what}" for what, names in alike.items()] + others
 
 
 def _directions(names: list[str]) -> str:
