@@ -249,6 +249,8 @@ def _members(robot: Robot, graph: Graph) -> Iterator[Finding]:
         most = LEVER * float(np.linalg.norm(ends[1] - ends[0]))
         for joint in graph.joints.values():
             outside = (joint.inner in beam.parts) != (joint.outer in beam.parts)
+            # The platform is rigid in the elastic frame: its member says how thick it is.
+            outside = outside and graph.platform not in beam.parts
             if outside and joint.type.placed and not joint.virtual:
                 far = min(float(np.linalg.norm(joint.at - end)) for end in ends)
                 what, likely = f"distance of its ends from joint {joint.name}", "a mistyped place?"

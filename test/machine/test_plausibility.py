@@ -4,6 +4,7 @@
 import copy
 import json
 import warnings
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -30,6 +31,11 @@ def machine(data):
 @pytest.mark.parametrize("name", SHIPPED)
 def test_no_shipped_robot_has_an_implausible_number(name):
     assert findings(SHIPPED[name]) == ()
+
+
+def test_joints_of_a_platform_may_be_anywhere_on_it():
+    folder = Path(__file__).parents[2] / "examples" / "machines"
+    assert findings(pkm_twin.load(folder / "tricept.yaml")) == ()
 
 
 @pytest.mark.parametrize("name", partly_long(NAMES, *NAMES[::4]))
