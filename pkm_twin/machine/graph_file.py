@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import Any, Final, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError, UnknownNameError
@@ -25,7 +26,7 @@ from pkm_twin.machine.graph import (
     array,
     rotation_about_z,
 )
-from pkm_twin.machine.joints import TURN, TYPES, Freedom, unit
+from pkm_twin.machine.joints import TURN, TYPES, Freedom, across, unit
 from pkm_twin.machine.members import Tube, compliances
 from pkm_twin.machine.places import Keys, number_in, path_of, placed
 from pkm_twin.machine.sections import (
@@ -200,6 +201,11 @@ class JointSpec:
         for key in ("limits", "friction", "rotor_inertia", "drive", "home"):
             if getattr(self, key) and len(freedoms) != 1 and not (key == "limits" and swivels):
                 raise ParameterError(f"{path}.{key}", self.type, "a joint of one freedom")
+        if self.compliance is not None:
+            for k in np.flatnonzero(np.isinf(self.compliance) & ~self._free()):
+                raise ParameterError(
+                    f"{path}.compliance[{k}]", math.inf, "a finite number: the joint holds there"
+                )
         if len(freedoms) == 1 and freedoms[0].turns:
             check_angles(self.home or 0.0, f"{path}.home")
 
@@ -211,6 +217,21 @@ class JointSpec:
     def _freedoms(self) -> tuple[Freedom, ...]:
         pitch = 0.0 if self.lead is None else self.lead / TURN
         return TYPES[self.type].freedoms(self._unit_axes(), pitch)
+
+    def _free(self) -> NDArray[np.bool_]:
+        """Which of the six directions of ``compliance`` are freedoms alone."""
+        free = np.zeros(6, bool)
+        if self.actuated:
+            return free
+        if self.axes is not None:
+            free[3:5] = True
+            return free
+        rows = self._unit_axes()
+        basis = np.eye(3) if not len(rows) else np.array([rows[0], *across(rows[0])])
+        for freedom in self._freedoms():
+            if not (freedom.turns and freedom.slide):
+                free[3 * freedom.turns + int(np.abs(basis @ freedom.axis).argmax())] = True
+        return free
 
     def _unit_axes(self) -> Array:
         rows = self.axes if self.axes is not None else self.axis

@@ -74,8 +74,8 @@ def modulus() -> Any:
 
 
 def compliances(**options: Any) -> Any:
-    """Field: compliance of a joint along its three axes and about them."""
-    return schema.vector(6, low=0.0, unit="m/N (3), rad/(N m) (3)", **options)
+    """Field: compliance of a joint along its three axes and about them; .inf where it is free."""
+    return schema.vector(6, low=0.0, high=math.inf, unit="m/N (3), rad/(N m) (3)", **options)
 
 
 @dataclass(frozen=True, eq=False)

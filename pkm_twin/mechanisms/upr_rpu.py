@@ -103,10 +103,10 @@ class JointsCompliance:
     is rigid.
     """
 
-    upr_revolute: Array = compliances(high=math.inf)
-    upr_universal: Array = compliances(high=math.inf)
-    rpu_universal: Array = compliances(high=math.inf)
-    rpu_revolute: Array = compliances(high=math.inf)
+    upr_revolute: Array = compliances()
+    upr_universal: Array = compliances()
+    rpu_universal: Array = compliances()
+    rpu_revolute: Array = compliances()
 
     def verify(self, path: str) -> None:
         """Free exactly where the joint turns; a number in every direction that carries load."""

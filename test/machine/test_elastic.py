@@ -137,12 +137,19 @@ def test_a_rigid_machine_says_what_is_missing(tmp_path):
     assert caught.value.field == "bodies"
 
 
-def test_a_joint_takes_no_compliance_without_end():
+@pytest.mark.parametrize("entry", range(6))
+def test_a_compliance_is_without_end_where_a_joint_is_free_alone(entry):
     data = plain("five_bar")
-    data["joints"]["tip"]["compliance"][3] = float("inf")
+    own = robot_of_data(data, "five_bar")
+    expected = compliance(own, own.home())
+    data["joints"]["tip"]["compliance"][entry] = float("inf")
+    if entry == 3:
+        free = robot_of_data(data, "five_bar")
+        assert (compliance(free, free.home()) == expected).all()
+        return
     with pytest.raises(ParameterError) as caught:
         robot_of_data(data, "five_bar")
-    assert caught.value.field == "joints.tip.compliance[3]"
+    assert caught.value.field == f"joints.tip.compliance[{entry}]"
 
 
 @pytest.mark.parametrize("joint", ["tip", "elbow_left"])
