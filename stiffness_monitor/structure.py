@@ -332,7 +332,7 @@ class _Planner:
             values[3] = values[4] = FREE
         elif not joint.actuated:
             for freedom in joint.freedoms:
-                k = int(np.abs(references(vectors @ freedom.axis)).argmax())
+                k = freedom.nearest(vectors)
                 if freedom.turns and freedom.slide:
                     screws.append((k, freedom.slide))
                 else:

@@ -230,7 +230,7 @@ class JointSpec:
         basis = np.eye(3) if not len(rows) else np.array([rows[0], *across(rows[0])])
         for freedom in self._freedoms():
             if not (freedom.turns and freedom.slide):
-                free[3 * freedom.turns + int(np.abs(basis @ freedom.axis).argmax())] = True
+                free[3 * freedom.turns + freedom.nearest(basis)] = True
         return free
 
     def _unit_axes(self) -> Array:

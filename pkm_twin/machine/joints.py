@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from pkm_twin.codegen.arrays import Array
-from pkm_twin.codegen.expressions import norm, plain, reference
+from pkm_twin.codegen.expressions import norm, plain, reference, references
 
 UNITS: Final = np.eye(3)
 
@@ -54,6 +54,10 @@ class Freedom:
     def unit(self) -> str:
         """Of its number, ``rad`` or ``m``."""
         return "rad" if self.turns else "m"
+
+    def nearest(self, directions: Array) -> int:
+        """The direction, of several (k, 3) in base axes, to which its axis is nearest."""
+        return int(np.abs(references(directions @ self.axis)).argmax())
 
 
 @dataclass(frozen=True, eq=False)
