@@ -279,7 +279,7 @@ class Book:
 
         :raises ParameterError: a name or value that is refused, or parameters in a circle.
         """
-        given = data.get(PARAMETERS, {})
+        given = data.get(PARAMETERS)
         if given is None:
             given = {}
         if not isinstance(given, Mapping):
