@@ -29,7 +29,7 @@ TOLERANCE: Final = 1e-7
 BLOCKS: Final = 10
 """How often all that is wrong changes at once; then one row after the other, which ends."""
 REGULAR: Final = 1e-11
-"""What dependent rows are told apart by, part of the greatest diagonal element."""
+"""Added to the diagonal so that dependent rows have a solution, part of its greatest element."""
 
 DEPENDENT: Final = 1e-7
 """Length of a row without what earlier ones have of it, part of its own."""

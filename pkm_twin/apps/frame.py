@@ -225,7 +225,7 @@ def _check_targets(given: Any) -> None:
 
 
 def _check_inputs(given: Any) -> None:
-    """What is wrong with words, files to read or the robot is told before a target that is there.
+    """Judge words, files to read and the robot, before an existing target is rejected.
 
     :raises PkmTwinError: something is.
     """

@@ -283,7 +283,7 @@ class Score:
 
     @classmethod
     def of(cls, left: float) -> Score:
-        """Of what is left alone."""
+        """The score of a residual, without a price."""
         return cls(left, float(INDEPENDENT * np.log(left**2 + GOOD**2)))
 
 

@@ -81,7 +81,7 @@ def following(t: Traced, program: Program) -> Program:
     away, move = (t.q - anchor) * scales, (t.q - before) * scales
     mean = (0.5 * (qd + speed)) * scales
     near = both(less(0.0, holds), less(away @ away, REACH * REACH))
-    # Of the mean of both speeds: what is left grows with the third power of the time.
+    # With the mean of both speeds the error grows with the third power of the time.
     time = (move @ mean) / maximum(mean @ mean, 1e-300)
     time = minimum(maximum(time, 0.0), LONGEST)
     there, way = np.array(t.tree.home, object), np.zeros(t.tree.unknown_rates, object)

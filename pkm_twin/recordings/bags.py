@@ -331,7 +331,7 @@ def _columns(r: Recording) -> dict[str, Array]:
         change = r.robot.pose_acceleration(q, qd, qdd)
         for word, values in (("", r.pose), (".velocity", rate), (".acceleration", change)):
             for i, name in enumerate(r.robot.pose_names):
-                # A joint that has a coordinate's name is told as the joint.
+                # A joint and a coordinate may have the same name: the column is the joint's.
                 columns.setdefault(f"{name}{word}", values[:, i])
     return columns
 
