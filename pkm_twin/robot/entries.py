@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,12 +27,6 @@ R = TypeVar("R", bound=Robot)
 def entries(robot: Robot) -> dict[str, tuple[float, str]]:
     """Every number that the robot's file gives, by dotted path, with its unit."""
     return robot.file_numbers()
-
-
-def data_of(robot: Robot) -> dict[str, Any]:
-    """What the robot's file gives, as plain data, written out."""
-    data: dict[str, Any] = copy.deepcopy(given(robot.parameter_sections()))
-    return data
 
 
 def with_entries(robot: R, values: Mapping[str, float]) -> R:

@@ -21,9 +21,9 @@ from pkm_twin.identification.measurements import read_poses
 from pkm_twin.machine.joint_map import JointMap, JointMapEntry
 from pkm_twin.messages.reading import JointReader
 from pkm_twin.recordings import Dialect
-from pkm_twin.robot.entries import data_of, with_entries
+from pkm_twin.robot.entries import with_entries
 from test.support.command import Commands
-from test.support.robots import load, partly_long, random_joints
+from test.support.robots import data_of, load, partly_long, random_joints
 from test.support.tables import write_columns
 from tools.reality import BALL, FOOT, fit_a_leg, leg_poses
 

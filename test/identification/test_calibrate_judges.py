@@ -19,8 +19,8 @@ from pkm_twin.identification.calibration import calibrate, geometric
 from pkm_twin.identification.calibration_state import Poses
 from pkm_twin.identification.measurements import whole_of
 from pkm_twin.identification.undetermined import LINES, undetermined
-from pkm_twin.robot.entries import data_of, entries, with_entries
-from test.support.robots import load, random_joints
+from pkm_twin.robot.entries import entries, with_entries
+from test.support.robots import data_of, load, random_joints
 
 NOISE = 2e-5
 QUARTER = Rotation.from_euler("z", 90.0, degrees=True).as_matrix()

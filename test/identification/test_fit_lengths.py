@@ -19,11 +19,11 @@ from pkm_twin.identification.rows import derivative, rows_of
 from pkm_twin.identification.suspects import USUAL, Lengths
 from pkm_twin.recordings import Load, Recording
 from pkm_twin.robot.catalogue import robot_of_data
-from pkm_twin.robot.entries import data_of, with_entries
+from pkm_twin.robot.entries import with_entries
 from test.identification.machines import machine, noisy, of_prior
 from test.laws.test_fit import truths
 from test.machine.random_machines import variant
-from test.support.robots import load
+from test.support.robots import data_of, load
 
 KINDS: Any = ("friction", "payload")
 

@@ -20,9 +20,8 @@ from pkm_twin.identification.calibration_state import FRAME, moved
 from pkm_twin.identification.measurements import KINDS, Measured, kinds_of, measured_of
 from pkm_twin.identification.plan import plan
 from pkm_twin.robot.catalogue import robot_of_data
-from pkm_twin.robot.entries import data_of
 from test.identification.partial_cases import Towers, case, published
-from test.support.robots import load, often, partly_long
+from test.support.robots import data_of, load, often, partly_long
 
 KIT = Towers(
     105.0, np.radians([210.0, 330.0, 90.0]), np.array([215.0, 215.0, 215.0]),

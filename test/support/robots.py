@@ -6,6 +6,7 @@ A law asks the robot what it is, so that a file added to ``config/`` joins all l
 
 from __future__ import annotations
 
+import copy
 import functools
 import json
 import os
@@ -23,6 +24,7 @@ import pkm_twin
 from pkm_twin import Robot, robot_names
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError
+from pkm_twin.machine.places import given
 from pkm_twin.robot.catalogue import config_folder
 
 LIMITED = 0.7
@@ -37,6 +39,12 @@ def partly_long(names: Iterable[Any], *kept: Any) -> list[Any]:
     """Parameters of a kind: those that are kept are run by default, the others by `make long`."""
     marks = pytest.mark.long
     return [name if name in kept else pytest.param(name, marks=marks) for name in names]
+
+
+def data_of(robot: Robot) -> dict[str, Any]:
+    """What the robot's file gives, as plain data, written out."""
+    data: dict[str, Any] = copy.deepcopy(given(robot.parameter_sections()))
+    return data
 
 
 def often(some: int, all_of_them: int) -> list[Any]:
