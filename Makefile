@@ -18,7 +18,7 @@ help:
 	@echo "make long         the same tests with more robots, states and points"
 	@echo "make bags         record the bags again (Pinocchio, PyNite)"
 	@echo "make bench        measure times, into docs/benchmarks.md"
-	@echo "make certificate  cross-check torques and compliance, into docs/certificate.md"
+	@echo "make certificate  cross-check torques and compliance, into docs/validation.md"
 	@echo "make fuzz         random bags, messages, files and command lines (SECONDS, SEED)"
 	@echo "make faults       run the tests of every row of docs/errors.md"
 	@echo "make soak         ten million poses, and all nodes under load, with constant memory (MINUTES)"

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The figures as a document."""
+"""The figures as a part of docs/validation.md."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 from rich.console import Console
 
+from test.support.pages import write_section
 from test.validation.test_upr_rpu_paper import LOAD
 from tools.calculix import ABSENT, CCX, calculix_version
 from tools.certificate.compare import BALANCE_BOUNDS, BOUNDS, PLACE_BOUND, ROUTES, Figures
@@ -76,12 +77,11 @@ def document(
     swings: list[Swing],
     links: dict[str, Links],
     rows: PaperRows,
-    command: str,
     seed: int,
 ) -> tuple[str, list[str]]:
-    """The certificate in Markdown, and one line for every bound that is exceeded."""
+    """The cross-checks in Markdown, and one line for every bound that is exceeded."""
     judge = Judge()
-    parts = [_head(command, seed)]
+    parts = [_head(seed)]
     parts.append(_torques(figures, judge))
     parts.append(_balances(figures, judge))
     if swings:
@@ -95,19 +95,15 @@ def document(
     return "\n".join(parts), judge.failures
 
 
-def _head(command: str, seed: int) -> str:
+def _head(seed: int) -> str:
     today = datetime.datetime.now(datetime.UTC).date()
     versions = ", ".join(f"{name} {version(name)}" for name in PACKAGES)
     if CCX is not None:
         versions += f", CalculiX {calculix_version()}"
-    return f"""# Cross-checks of dynamics and static stiffness
+    return f"""## Cross-checks with other engines
 
-pkm_twin compared with independent methods, as printed on {today} by
-
-    make certificate
-
-(`{command}`, seed {seed}), which fails if a bound is exceeded. Python {platform.python_version()},
-{versions}.
+`make certificate` (seed {seed}) printed this on {today}; it fails if a bound is exceeded.
+Python {platform.python_version()}, {versions}.
 """
 
 
@@ -126,7 +122,7 @@ def _torques(figures: dict[str, Figures], judge: Judge) -> str:
                 f"| {np.median(values):.1e} | {BOUNDS[route]:.0e} | {place} |"
             )
     table = "\n".join(rows)
-    return f"""## Torques
+    return f"""### Torques
 
 Machines have random dimensions, azimuths, masses, inertias, payload, gravity and friction; states
 have random positions, rates, accelerations and a wrench. States with a condition number above
@@ -156,7 +152,7 @@ def _balances(figures: dict[str, Figures], judge: Judge) -> str:
         )
         rows.append(f"| {title} | {text} | {worst} | {BALANCE_BOUNDS[key]:.0e} |")
     table = "\n".join(rows)
-    return f"""## Balances
+    return f"""### Balances
 
 The worst of all robots, relative, for the same states; the last two for those of Lagrange.
 
@@ -186,7 +182,7 @@ def _swings(swings: list[Swing], judge: Judge) -> str:
             f"| {drift} | {closure} | {ends[0]} | {ends[1]} |"
         )
     table = "\n".join(rows)
-    return f"""## Free swing of {DURATION:.0f} s
+    return f"""### Free swing of {DURATION:.0f} s
 
 Shipped robots without friction, with constant efforts that balance the weight, start away from a
 stable equilibrium. DOP853 integrates `forward_dynamics` of both engines with tolerances of
@@ -203,7 +199,7 @@ DOP853 and {SWING_BOUNDS["its own step"]:.0e} with the step (rad or m, and per s
 
 
 def _compliance(links: dict[str, Links], judge: Judge) -> str:
-    title = "## Platform compliance of the 2UPR-RPU"
+    title = "### Platform compliance of the 2UPR-RPU"
     if not links:
         return f"{title}\n\nNot compared: {ABSENT}.\n"
     rows = []
@@ -268,7 +264,7 @@ def _paper_rows(rows: PaperRows, links: dict[str, Links], judge: Judge) -> str:
         {rows.bars[0]:.2f}, would leave {_percent(rows.bars[1])}. The paper shows neither mesh nor
         contacts, so the cause cannot be determined.
     """)
-    return f"""## The paper's finite elements
+    return f"""### The paper's finite elements
 
 Table 1 of the 2UPR-RPU paper compared with pkm_twin and the shipped joint compliances. Percentages
 are those of the paper's finite elements from pkm_twin.
@@ -287,9 +283,8 @@ def _filled(text: str) -> str:
 
 
 def conclude(path: Path, text: str, failures: list[str], console: Console) -> int:
-    """Write a certificate, say what exceeds its bounds: the exit code."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(text)
+    """Write the page's part, say what exceeds its bounds: the exit code."""
+    write_section("cross-checks", text, path)
     console.print(f"{path} written")
     for line in failures:
         console.print(line, style="red")

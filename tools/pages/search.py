@@ -14,11 +14,9 @@ import shutil
 from pathlib import Path
 from typing import Any
 
-BRIEF = {
-    "benchmarks", "certificate", "commands", "engine", "faults", "parameters",
-}  # fmt: skip
+BRIEF = {"benchmarks", "commands", "engine", "faults", "parameters"}
 """Pages of long tables and lists: a section's first paragraph and its names are indexed."""
-REFERENCE = {"api", "certificate", "commands", "errors", "parameters"}
+REFERENCE = {"api", "commands", "errors", "parameters"}
 """Pages that rank below those that explain."""
 ROLE = re.compile(r":(?:attr|class|data|func|meth|mod):<code>(~?)([\w.]+)</code>")
 """A reference of a docstring, which Markdown does not know."""
