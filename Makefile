@@ -112,7 +112,7 @@ pages: $(VENV)/test.stamp
 	$(BIN)/python -m tools.pages.engine docs/engine.md
 	$(BIN)/python -m tools.pages.trend docs/recordings.md
 	$(BIN)/python -m tools.pages.notebooks examples/*.ipynb
-	$(BIN)/python -m tools.pages.architecture docs/architecture.png
+	$(BIN)/python -m tools.pages.architecture docs/gallery/architecture.png
 	$(BIN)/python -m tools.pages.robots docs/gallery
 	$(BIN)/python -m tools.pages.view docs/gallery
 

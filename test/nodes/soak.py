@@ -296,7 +296,7 @@ one), `stiffness_monitor` and `command_gate`; {sent:,} joint states, one in a hu
 {parameters:,} requests for parameters, {trajectory:,} trajectories of 500 points, {suspend:,}
 suspensions of a node, {kill:,} kills of the player. `stale_after` and `deadline` were {stale:g} s.
 
-![Memory, descriptors, threads and ages of a long run](soak.png)
+![Memory, descriptors, threads and ages of a long run](gallery/soak.png)
 
 Memory grew by {grown:.1f} MiB at most from the first to the last third of the time, descriptors and
 threads by {more:g}.
@@ -339,7 +339,7 @@ def main():
     """Copy the picture of a run into the docs and its figures into the page on errors."""
     folder = Path(sys.argv[1])
     summary = json.loads((folder / "soak.json").read_text())
-    shutil.copy(folder / "soak.png", FAULTS.with_name("soak.png"))
+    shutil.copy(folder / "soak.png", FAULTS.with_name("gallery") / "soak.png")
     write_section("soak", section(summary), FAULTS)
 
 

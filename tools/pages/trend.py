@@ -44,5 +44,5 @@ def rewritten(text, picture):
 
 if __name__ == "__main__":
     page = Path(sys.argv[1])
-    text = rewritten(page.read_text(encoding="utf-8"), page.with_name("trend.png"))
+    text = rewritten(page.read_text(encoding="utf-8"), page.with_name("gallery") / "trend.png")
     page.write_text(text, encoding="utf-8")
