@@ -20,7 +20,7 @@ from pkm_twin.codegen.code import NOT_FINITE
 from pkm_twin.codegen.kernels import Kernel
 from pkm_twin.errors import SingularityError
 from pkm_twin.robot.robot import Robot
-from stiffness_monitor.programs import NONE, PARTS, elastic_of
+from stiffness_monitor.programs import NONE, PARTS, Elastic
 
 HELD: Final = 1e-10
 """Least measure of a frame that holds: it goes with the square of the way to where it does not."""
@@ -68,7 +68,7 @@ def platform_response(robot: Robot, q: ArrayLike, wrench: ArrayLike) -> Platform
     :raises SingularityError: a singularity on the way from home, or a frame that is a mechanism.
     :raises ValueError: a wrong last axis, or a value that is not finite.
     """
-    names = elastic_of(robot).names
+    names = robot.made(Elastic).names
     row = _row(robot, q, wrench)
     row.setflags(write=False)
     n = len(names)
@@ -96,17 +96,17 @@ def platform_response(robot: Robot, q: ArrayLike, wrench: ArrayLike) -> Platform
 def _row(robot: Robot, q: ArrayLike, wrench: ArrayLike) -> Array:
     """What the program answers, shape (..., size), rejected by sample."""
     checked = partial(_checked, robot)
-    row = robot.bound("response", _response, otherwise=checked)(q, wrench)
+    row = robot.bound(_response, otherwise=checked)(q, wrench)
     return row if row.ndim > 1 or row[-1] > HELD else checked(q, wrench)
 
 
 def _response(robot: Robot) -> Kernel:
-    return elastic_of(robot).response
+    return robot.made(Elastic).response
 
 
 def _checked(robot: Robot, q: ArrayLike, wrench: ArrayLike) -> Array:
     q, wrench = doubles(q, "joint positions"), vectors(wrench, 6, "the wrench")
-    (rows,), status = elastic_of(robot).response(NONE, q, wrench)
+    (rows,), status = robot.made(Elastic).response(NONE, q, wrench)
     check(robot, q, wrench, rows[..., -1], status)
     return rows
 
@@ -147,7 +147,7 @@ def compliance(robot: Robot, pose: ArrayLike) -> Array:
     :raises UnreachableError: a pose that is none of the mechanism's, by limb, sample and miss.
         Other errors as :func:`platform_response`.
     """
-    _ = elastic_of(robot)
+    _ = robot.made(Elastic)
     return platform_response(robot, robot.inverse(pose), _UNLOADED).compliance.copy()
 
 
@@ -162,7 +162,7 @@ def stiffness(robot: Robot, pose: ArrayLike) -> Array:
 
 def strain_energy(robot: Robot, pose: ArrayLike, wrench: ArrayLike) -> PlatformResponse:
     """:func:`platform_response` in poses, shape (..., m); errors also as :func:`compliance`."""
-    _ = elastic_of(robot)
+    _ = robot.made(Elastic)
     return platform_response(robot, robot.inverse(pose), wrench)
 
 
@@ -175,7 +175,7 @@ def member_deflections(
     :returns: points, shape (..., 5, 3), from start to end, and displacements of the same shape, m;
         base axes.
     """
-    elastic = elastic_of(robot)
+    elastic = robot.made(Elastic)
     (rows, measure), status = elastic.deflections(NONE, q, wrench)
     check(robot, q, wrench, measure[..., 0], status)
     names = [member.name for member in elastic.plan.members]
@@ -188,7 +188,7 @@ def kernels(robot: Robot) -> tuple[Kernel, ...]:
 
     :raises ParameterError: a robot without elastic members.
     """
-    return robot.engine.forward, elastic_of(robot).response
+    return robot.engine.forward, robot.made(Elastic).response
 
 
 @lru_cache(maxsize=8)

@@ -16,11 +16,11 @@ from pkm_twin.codegen.kernels import Kernel
 from pkm_twin.codegen.program import Program
 from pkm_twin.kinematics.gradients import gradient_program
 from pkm_twin.robot.derivatives import Derivatives, geometry_numbers, pose_by_geometry
-from pkm_twin.robot.numbers import cause_slopes, file_numbers
+from pkm_twin.robot.numbers import CauseSlopes, FileNumbers
 from pkm_twin.robot.robot import Robot
 from stiffness_monitor.compliance import compliance
 from stiffness_monitor.numbers import numbers_of
-from stiffness_monitor.programs import NONE, Elastic, Solved, elastic_of
+from stiffness_monitor.programs import NONE, Elastic, Solved
 
 Write = Callable[[Solved], Program]
 Chosen = tuple[int, ...] | None
@@ -39,7 +39,7 @@ def compliance_derivatives(robot: Robot, pose: ArrayLike, by: Sequence[str] = ()
     by_q, by_numbers = _tables(robot, pose, _entries)
     found: dict[str, Array] = {}
     if by:
-        slopes = file_numbers(robot, tuple(by), elastic_numbers).slopes
+        slopes = robot.made(FileNumbers, tuple(by), elastic_numbers).slopes
         table = _square(by_numbers @ slopes)
         found = {path: np.ascontiguousarray(table[..., k]) for k, path in enumerate(by)}
     back = np.linalg.inv(robot.jacobian(robot.inverse(pose)))
@@ -59,7 +59,7 @@ def energy_effects(robot: Robot, pose: ArrayLike, wrench: ArrayLike) -> Array:
 
 
 def _effects(robot: Robot, pose: ArrayLike, write: Write, *loads: Array) -> Array:
-    causes = cause_slopes(robot, elastic_numbers)
+    causes = robot.made(CauseSlopes, elastic_numbers)
     table = _tables(robot, pose, write, causes.chosen, *loads)[1] @ causes.slopes
     return np.asarray(table, np.float64)
 
@@ -74,7 +74,7 @@ def _tables(
     """
     compliance(robot, pose)  # its errors
     q = robot.inverse(pose)
-    kernel = _gradient_of(elastic_of(robot), write, chosen)
+    kernel = _gradient_of(robot.made(Elastic), write, chosen)
     weights = np.eye(kernel.sizes[0][-1])
     (by_q, by_numbers), _ = kernel(NONE, q[..., None, :], *loads, weights)
     if by_q.shape[-1]:

@@ -140,17 +140,6 @@ class Elastic:
         return self.kernel("elastic columns", _columns)
 
 
-def elastic_of(robot: Robot) -> Elastic:
-    """The robot's elastic frame, made once.
-
-    :raises ParameterError: the robot's file lacks a section that elasticity needs.
-    """
-    found: Elastic | None = robot.calls.get("elastic")
-    if found is None:
-        found = robot.calls["elastic"] = Elastic(robot)
-    return found
-
-
 def _text(value: Any) -> Any:
     """A plan as plain data, without what is a number of the machine."""
     if isinstance(value, np.ndarray):

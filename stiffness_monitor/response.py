@@ -23,7 +23,7 @@ from pkm_twin.codegen.arrays import Array, Indices, one_vector, vectors
 from pkm_twin.robot.robot import Robot
 from stiffness_monitor.compliance import platform_response
 from stiffness_monitor.frame import PLATFORM
-from stiffness_monitor.programs import NONE, elastic_of
+from stiffness_monitor.programs import NONE, Elastic
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,7 +98,7 @@ def element_response(robot: Robot, pose: ArrayLike) -> ElementResponse:
     :raises UnreachableError: a pose that is none of the mechanism's.
     :raises SingularityError: a compliance that is not positive definite.
     """
-    elastic = elastic_of(robot)
+    elastic = robot.made(Elastic)
     q = robot.inverse(pose)
     whole = platform_response(robot, q, np.zeros(6)).compliance
     (entries, *places), _ = elastic.columns(NONE, q)

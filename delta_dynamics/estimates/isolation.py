@@ -24,7 +24,6 @@ from pkm_twin.machine.graph import BASE, Graph, limbs
 from pkm_twin.robot.outline import body_points, robot_bars
 from pkm_twin.robot.robot import Robot
 
-TWISTS: Final = "twists of bodies"
 PLATFORM: Final = "platform"
 CLAMPING: Final = "clamping"
 UNKNOWN: Final = "unknown"
@@ -112,7 +111,7 @@ def _twists(t: Traced) -> Program:
 
 
 def _kernel(robot: Robot) -> Kernel:
-    return robot.engine.kernel(TWISTS, _twists)
+    return robot.engine.kernel("twists of bodies", _twists)
 
 
 class Places:
@@ -191,7 +190,7 @@ class Places:
     def at(self, q: Array) -> tuple[Array, Array, Array]:
         """Positions (P, 3), Jacobians (P, n, 3) and directions of the bars (P, 3), base axes."""
         n, count = self.robot.joints_count, len(self.robot.graph.bodies)
-        flat = self.robot.bound(TWISTS, _kernel)(q)
+        flat = self.robot.bound(_kernel)(q)
         placed = np.concatenate([flat[: 12 * count], BASE_PLACED]).reshape(count + 1, 12)
         rates = np.zeros((n, count + 1, 6))
         rates[:, :count] = flat[12 * count :].reshape(n, count, 6)

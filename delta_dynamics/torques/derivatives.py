@@ -18,7 +18,7 @@ from pkm_twin.codegen.kernels import Kernel
 from pkm_twin.codegen.program import Program
 from pkm_twin.kinematics.gradients import gradient_program
 from pkm_twin.kinematics.traced import Traced
-from pkm_twin.robot.numbers import cause_slopes, file_numbers, geometry_and_masses
+from pkm_twin.robot.numbers import CauseSlopes, FileNumbers, geometry_and_masses
 from pkm_twin.robot.robot import Robot
 
 MOTION: Final = ("q", "qd", "qdd")
@@ -82,17 +82,18 @@ def torque_effects(
     robot: Robot, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, wrench: ArrayLike | None
 ) -> Array:
     """What one standard deviation of each of the file's causes changes, shape (..., n, causes)."""
-    kept = robot.calls.get("torque effects")
-    if kept is None:
-        causes = cause_slopes(robot, geometry_and_masses)
-        kernel = robot.massive().kernel(
-            f"torque gradient by {causes.chosen}", partial(_by_chosen, causes.chosen), free=True
-        )
-        kept = robot.calls["torque effects"] = kernel, causes.slopes, np.eye(robot.joints_count)
-    kernel, slopes, weights = kept
-    inputs = _inputs((q, qd, qdd), wrench, weights, rows=True)
+    causes = robot.made(CauseSlopes, geometry_and_masses)
+    kernel = robot.made(_effects)
+    inputs = _inputs((q, qd, qdd), wrench, np.eye(robot.joints_count), rows=True)
     (table,) = robot.evaluate(kernel, robot.inertial, *inputs)
-    return np.asarray(table @ slopes, np.float64)
+    return np.asarray(table @ causes.slopes, np.float64)
+
+
+def _effects(robot: Robot) -> Kernel:
+    chosen = robot.made(CauseSlopes, geometry_and_masses).chosen
+    return robot.massive().kernel(
+        f"torque gradient by {chosen}", partial(_by_chosen, chosen), free=True
+    )
 
 
 def _inputs(
@@ -115,7 +116,7 @@ def _by_paths(robot: Robot, inputs: Sequence[Array], by: Sequence[str]) -> dict[
 
 def numbers_slopes(robot: Robot, by: Sequence[str]) -> Array:
     """Derivatives of geometry and masses by numbers of the file, shape (numbers, paths)."""
-    return file_numbers(robot, tuple(by), geometry_and_masses).slopes
+    return robot.made(FileNumbers, tuple(by), geometry_and_masses).slopes
 
 
 def torques_by_numbers(

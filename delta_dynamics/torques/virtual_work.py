@@ -49,7 +49,7 @@ def inverse_dynamics(
     """
     load = _NO_WRENCH if wrench is None else wrench
     # Without a call where it is made: a stream's sample takes a microsecond or two.
-    call = robot.calls.get("torques") or robot.bound("torques", torques, robot.inertial)
+    call = robot.calls.get(torques) or robot.bound(torques, robot.inertial)
     tau: Array = call(q, qd, qdd, load)
     return tau
 
@@ -70,7 +70,7 @@ def stream_torques(robot: Robot) -> Kernel:
 def mass_matrix(robot: Robot, q: ArrayLike) -> Array:
     """Generalised mass matrix on the actuated joints, payload included, shape (..., n, n)."""
     # A simulation asks for one sample, several thousand times a second.
-    return _square(robot, robot.bound("mass matrix", masses_kernel, robot.inertial)(q))
+    return _square(robot, robot.bound(masses_kernel, robot.inertial)(q))
 
 
 def masses_kernel(robot: Robot) -> Kernel:
@@ -107,7 +107,7 @@ def forward_dynamics(
         efforts = vectors(tau, robot.joints_count, "efforts")
         return robot.evaluate(accelerations(robot), robot.inertial, q, qd, efforts, load)[0]
 
-    call = robot.bound("accelerations", accelerations, robot.inertial, checked)
+    call = robot.bound(accelerations, robot.inertial, checked)
     return call(q, qd, tau, load)
 
 

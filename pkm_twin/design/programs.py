@@ -22,7 +22,7 @@ from pkm_twin.robot.numbers import FileNumbers, geometry_and_masses
 from pkm_twin.robot.robot import Robot
 from stiffness_monitor.derivatives import compliance_gradient
 from stiffness_monitor.numbers import numbers_of
-from stiffness_monitor.programs import elastic_of
+from stiffness_monitor.programs import Elastic
 
 
 class NumberFunctions:
@@ -33,15 +33,6 @@ class NumberFunctions:
         self.others: list[Robot] = []
         """Robots with these numbers changed, one for each other structure that was needed."""
         self.geometry = FileNumbers(robot, paths, geometry_numbers)
-
-    @classmethod
-    def of(cls, robot: Robot, paths: tuple[str, ...]) -> NumberFunctions:
-        """The same, made once a robot."""
-        key = f"number functions {' '.join(paths)}"
-        found: NumberFunctions | None = robot.calls.get(key)
-        if found is None:
-            found = robot.calls[key] = cls(robot, paths)
-        return found
 
     @cached_property
     def rigid(self) -> FileNumbers:
@@ -113,7 +104,7 @@ loads: Final = asks(loads_kernel, of_masses)
 """Of q, qd, qdd and wrench to what joints have to bear, and where they are."""
 masses: Final = asks(masses_kernel, of_masses)
 """Of q to the mass matrix."""
-compliance: Final = asks(lambda robot: elastic_of(robot).compliance, of_elasticity)
+compliance: Final = asks(lambda robot: robot.made(Elastic).compliance, of_elasticity)
 """Of q to the compliance and the measure of its frame."""
 torque_gradient: Final = asks(motion_gradient, of_masses)
 """Of the torques, by q, qd and qdd."""
@@ -125,5 +116,7 @@ pose_motion: Final = asks(lambda robot: pose_motion_gradient(robot.engine))
 """Of pose, rate and acceleration, by q, qd and geometry."""
 singularity_slopes: Final = asks(lambda robot: singularity_gradient(robot.engine))
 """Of the index, by q and geometry."""
-compliance_slopes: Final = asks(lambda robot: compliance_gradient(elastic_of(robot)), of_elasticity)
+compliance_slopes: Final = asks(
+    lambda robot: compliance_gradient(robot.made(Elastic)), of_elasticity
+)
 """Of the compliance, by q and all numbers."""

@@ -24,7 +24,6 @@ from pkm_twin.design.quantities import QUANTITIES, Constraint, Quantity, quantit
 from pkm_twin.design.variables import Variables
 from pkm_twin.design.variants import Variants
 from pkm_twin.errors import ParameterError, PkmTwinError
-from pkm_twin.robot.entries import with_entries
 from pkm_twin.robot.robot import Robot
 
 Index = NDArray[np.intp]
@@ -388,7 +387,7 @@ def design(
         best = _middle(told, names)
     before = problem.point(problem.variables.start, constraints)
     return Design(
-        with_entries(robot, best.numbers), best, before, tuple(told) if len(aims) > 1 else (),
+        robot.filed(best.numbers), best, before, tuple(told) if len(aims) > 1 else (),
         tuple(names), constraints, problem.count, rejected,
     )  # fmt: skip
 

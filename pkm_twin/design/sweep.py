@@ -17,7 +17,6 @@ from pkm_twin.design.quantities import QUANTITIES, quantity_of
 from pkm_twin.design.search import Problem, sobol
 from pkm_twin.design.variables import Variables
 from pkm_twin.errors import ParameterError
-from pkm_twin.robot.entries import entries
 from pkm_twin.robot.robot import Robot
 
 MAX_MACHINES: Final = 10_000_000
@@ -49,7 +48,7 @@ class Sweep:
         dims = names if kind == "grid" else ("machine",)
         coordinates: dict[str, Any] = {}
         for k, (name, values) in enumerate(self.variables.items()):
-            units = {"units": entries(robot).get(name, (0.0, ""))[1]}
+            units = {"units": robot.file_numbers().get(name, (0.0, ""))[1]}
             along = np.moveaxis(values, k, 0).reshape(len(values), -1)[:, 0]
             coordinates[name] = ((name,), along, units) if kind == "grid" else (dims, values, units)
         fields = {

@@ -24,7 +24,6 @@ from pkm_twin.design.variants import variants
 from pkm_twin.errors import ParameterError, PkmTwinError
 from pkm_twin.machine import schema
 from pkm_twin.robot.derivatives import platform_derivatives
-from pkm_twin.robot.entries import entries
 from pkm_twin.robot.robot import Robot
 from stiffness_monitor.compliance import platform_response
 
@@ -114,7 +113,7 @@ def tolerances(
     known = {path: part for path, part in parts.items() if part is not None}
     numbers = [path for path in sigma if path not in known]
     slopes = dict(platform_derivatives(robot, states, numbers).by)
-    given = entries(robot) if numbers else {}
+    given = robot.file_numbers() if numbers else {}
     units = {
         path: (given[path][1] if path in given else "") if part is None else part.unit
         for path, part in parts.items()

@@ -30,10 +30,9 @@ from pkm_twin.machine.geometry import pattern_of
 from pkm_twin.machine.places import keys_of
 from pkm_twin.machine.tree import Tree
 from pkm_twin.robot.derivatives import twist_rows
-from pkm_twin.robot.entries import with_entries
 from pkm_twin.robot.robot import Robot
 from stiffness_monitor.compliance import HELD
-from stiffness_monitor.programs import elastic_of
+from stiffness_monitor.programs import Elastic
 
 Mask = NDArray[np.bool_]
 
@@ -77,7 +76,7 @@ class Variants:
             raise ParameterError("numbers", sizes, "as many of each, one per machine") from None
         self.values: Array = np.stack([np.atleast_1d(row) for row in rows], -1)
         """Of the paths, shape (k, paths)."""
-        self.functions = programs.NumberFunctions.of(robot, self.paths)
+        self.functions = robot.made(programs.NumberFunctions, self.paths)
         self._own: dict[int, Robot | PkmTwinError] = {}
         self._patterns: dict[int, str] = {}
         self._prepared: dict[int, tuple[Code, Array]] = {}
@@ -94,7 +93,7 @@ class Variants:
         if k not in self._own:
             try:
                 given = dict(zip(self.paths, self.values[k].tolist(), strict=True))
-                self._own[k] = with_entries(self.robot, given)
+                self._own[k] = self.robot.filed(given)
             except PkmTwinError as error:
                 self._own[k] = error
         found = self._own[k]
@@ -217,7 +216,7 @@ class Variants:
 
         :raises ParameterError: the robot's file lacks a section that elasticity needs.
         """
-        _ = elastic_of(self.robot)
+        _ = Elastic(self.robot)
         (flat, measure), good = self.run(programs.compliance, self.inverse(pose))
         found = np.where(good & (measure > HELD), flat, np.nan)
         return np.asarray(found.reshape(*flat.shape[:-1], 6, 6), np.float64)

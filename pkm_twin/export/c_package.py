@@ -39,7 +39,7 @@ from pkm_twin.machine.inertia import Layout
 from pkm_twin.machine.sections import MAX_LENGTH, MAX_MASS, payload_margins
 from pkm_twin.robot.robot import Robot
 from stiffness_monitor.compliance import HELD
-from stiffness_monitor.programs import Elastic, elastic_of
+from stiffness_monitor.programs import Elastic
 
 
 def identifier(name: str) -> str:
@@ -78,7 +78,7 @@ class Package:
         self.massive = _has(robot.massive)
         elastic = self._wants("compliance") or self._wants("strain_energy")
         has = elastic and _has(robot.structure)
-        self.elastic: Elastic | None = elastic_of(robot) if has else None
+        self.elastic: Elastic | None = robot.made(Elastic) if has else None
         self.fold = Folding()
         self.payload = self.fold.tape.inputs(PARAMETERS, 13)
         self.routines = self._routines()

@@ -62,8 +62,7 @@ from pkm_twin.machine.formulas import PARAMETERS
 from pkm_twin.machine.joint_map import JointMap
 from pkm_twin.robot.derivatives import geometry_numbers
 from pkm_twin.robot.entries import Fitted as FittedNumber
-from pkm_twin.robot.entries import entries, with_entries
-from pkm_twin.robot.numbers import file_numbers
+from pkm_twin.robot.numbers import FileNumbers
 from pkm_twin.robot.robot import Robot
 
 MOVES: Final = 1e-6
@@ -227,11 +226,11 @@ def geometric(robot: Robot, q: Array, only: Sequence[str] = ()) -> tuple[str, ..
     """
     paths = [
         path
-        for path in entries(robot)
+        for path in robot.file_numbers()
         if not path.startswith(NOT_GEOMETRY if only else (*NOT_GEOMETRY, f"{PARAMETERS}."))
         and (not only or path.startswith(tuple(only)))
     ]
-    slopes = file_numbers(robot, tuple(paths), geometry_numbers).slopes
+    slopes = robot.made(FileNumbers, tuple(paths), geometry_numbers).slopes
     paths = [path for path, moves in zip(paths, np.abs(slopes).max(0) > 1e-9, strict=True) if moves]
     found: list[str] = []
     if paths:
@@ -251,7 +250,7 @@ def geometric(robot: Robot, q: Array, only: Sequence[str] = ()) -> tuple[str, ..
 
 def unknowns(robot: Robot, measured: Measured, paths: Sequence[str], free: Free) -> list[Parameter]:
     """What is fitted, as it is before: the machine's numbers, the instrument's, the kinds' own."""
-    known, prior = entries(robot), free.prior
+    known, prior = robot.file_numbers(), free.prior
     angle = prior / robot.size
     # A joint's value at home and its sensor's offset are one number.
     homes = {f"joints.{name}.home" for name in robot.joint_names} if free.offsets else set()
@@ -375,7 +374,7 @@ def _calibrated(
         found = fit(robot, before, learnt, near, progress)
         steps += found.steps
     told = [replace(p, value=float(v)) for p, v in zip(told, found.values, strict=True)]
-    built = with_entries(robot, found.state.numbers)
+    built = robot.filed(found.state.numbers)
     agreements, outliers = _compared(robot, built, learnt, apart, before, found, parameters)
     changes = [p for p in told if p.name not in (*FRAME, *TARGET, *learnt.own)]
     count = len({k for m in (learnt, apart) if m for one in m.readings for k in one.lines.tolist()})

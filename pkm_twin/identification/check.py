@@ -33,7 +33,6 @@ from pkm_twin.identification.plausible import held_payload, wrenches
 from pkm_twin.identification.samples import usual_size
 from pkm_twin.recordings import Load, Recording
 from pkm_twin.report import Fact, Verdict, judged
-from pkm_twin.robot.entries import with_entries
 from pkm_twin.robot.limits import ranges
 from pkm_twin.robot.plausibility import why_no_torques
 from pkm_twin.robot.robot import Robot
@@ -553,7 +552,7 @@ def _of_fit(r: Recording, leave_out: Mask) -> tuple[Recording | None, tuple[str,
     recorded = recorded_of(r, leave_out)
     try:
         result = fit(r.robot, [recorded], ("friction",), accept=True)
-        fitted = with_entries(r.robot, {one.name: one.after for one in result.numbers})
+        fitted = r.robot.filed({one.name: one.after for one in result.numbers})
     except (PkmTwinError, ValueError, np.linalg.LinAlgError):
         return None, ()
     if result.accepted:

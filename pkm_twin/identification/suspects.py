@@ -36,7 +36,6 @@ from pkm_twin.identification.samples import Resonance, by_blocks
 from pkm_twin.machine.friction import turning_keys
 from pkm_twin.machine.places import path_of
 from pkm_twin.machine.uncertainty import numbers_below
-from pkm_twin.robot.entries import entries
 from pkm_twin.robot.robot import Robot
 
 GAIN: Final = "gain of the efforts"
@@ -136,7 +135,7 @@ class Lengths:
     @classmethod
     def of(cls, robot: Robot) -> Lengths:
         """All that the robot's file gives; an entry of its ``uncertainty`` is one suspect."""
-        known = entries(robot)
+        known = robot.file_numbers()
         units = {p: unit for p, (_, unit) in known.items() if _PLACES.match(p)}
         paths = tuple(path for path, unit in units.items() if unit in ("m", "rad"))
         causes: list[tuple[Suspect, Mapping[str, float]]] = []

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from pkm_twin.codegen.arrays import Array, vectors
 from pkm_twin.kinematics.gradients import platform_gradient
 from pkm_twin.machine.geometry import geometry_of
-from pkm_twin.robot.numbers import cause_slopes, file_numbers
+from pkm_twin.robot.numbers import CauseSlopes, FileNumbers
 from pkm_twin.robot.robot import Robot
 
 _NONE = np.zeros(0)
@@ -99,7 +99,7 @@ def _by_numbers(robot: Robot, q: ArrayLike, rows: Array, by: Sequence[str]) -> d
     """Sums of rows over pose, position and rotation, by numbers of the file."""
     if not by:
         return {}
-    slopes = file_numbers(robot, tuple(by), geometry_numbers).slopes
+    slopes = robot.made(FileNumbers, tuple(by), geometry_numbers).slopes
     table = _by_geometry(robot, q, rows) @ slopes
     return {path: np.ascontiguousarray(table[..., k]) for k, path in enumerate(by)}
 
@@ -114,7 +114,7 @@ def position_effects(robot: Robot, q: ArrayLike) -> Array:
 
     :returns: translations of the reference point, shape (..., 3, causes), m.
     """
-    causes, m = cause_slopes(robot, geometry_numbers), len(robot.pose_names)
+    causes, m = robot.made(CauseSlopes, geometry_numbers), len(robot.pose_names)
     table = _by_geometry(robot, q, np.eye(3, m + 12, m))[..., list(causes.chosen)]
     return np.asarray(table @ causes.slopes, np.float64)
 

@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import yaml
 
@@ -20,21 +20,6 @@ from pkm_twin.robot.catalogue import TREES, load, robot_of_data, robot_path
 from pkm_twin.robot.robot import Robot
 from pkm_twin.robot.robot_urdf import robot_description
 from pkm_twin.robot.urdf_read import read_urdf
-
-R = TypeVar("R", bound=Robot)
-
-
-def entries(robot: Robot) -> dict[str, tuple[float, str]]:
-    """Every number that the robot's file gives, by dotted path, with its unit."""
-    return robot.file_numbers()
-
-
-def with_entries(robot: R, values: Mapping[str, float]) -> R:
-    """The robot of the same file with other numbers.
-
-    :raises ParameterError: a path that there is not, or a value that the file may not have.
-    """
-    return robot.filed(values)
 
 
 @dataclass(frozen=True)
@@ -68,7 +53,7 @@ def edited_yaml(robot: Robot, source: str, values: Mapping[str, Fitted | Chosen]
     every body, joint and rod written out.
 
     :param source: the name or path that the robot was loaded by.
-    :param values: by dotted path, of :func:`pkm_twin.robot.entries.entries`; of ``joint_map``
+    :param values: by dotted path, of :meth:`Robot.file_numbers`; of ``joint_map``
         also such as the file does not have yet.
     :raises ParameterError: a path that no such file can have.
     """

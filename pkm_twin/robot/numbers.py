@@ -8,7 +8,6 @@ numbers; arrays of numbers then take microseconds each, and no robot is built.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -82,40 +81,22 @@ class FileNumbers:
         return table
 
 
-def file_numbers(
-    robot: Robot, paths: Sequence[str], of: Callable[[Robot], Sequence[Any]]
-) -> FileNumbers:
-    """The same, made once a robot."""
-    key = f"numbers {of.__module__}.{of.__qualname__} {' '.join(paths)}"
-    found: FileNumbers | None = robot.calls.get(key)
-    if found is None:
-        found = robot.calls[key] = FileNumbers(robot, paths, of)
-    return found
-
-
-@dataclass(frozen=True, eq=False)
 class CauseSlopes:
-    """What one standard deviation of each cause of doubt adds to the numbers of a row.
+    """What one standard deviation of each of a robot's causes of doubt adds to a row's numbers.
 
     ``chosen``: places of the numbers that any cause changes; ``slopes``: shape (chosen, causes).
+
+    :param of: as of :class:`FileNumbers`.
     """
 
-    chosen: tuple[int, ...]
-    slopes: Array
-
-
-def cause_slopes(robot: Robot, of: Callable[[Robot], Sequence[Any]]) -> CauseSlopes:
-    """The same of a robot's causes, made once a robot."""
-    key = f"causes {of.__module__}.{of.__qualname__}"
-    found: CauseSlopes | None = robot.calls.get(key)
-    if found is None:
+    def __init__(self, robot: Robot, of: Callable[[Robot], Sequence[Any]]) -> None:
         causes = robot.causes.values()
         paths = tuple(dict.fromkeys(path for cause in causes for path in cause))
         steps = np.array([[cause.get(path, 0.0) for cause in causes] for path in paths])
         table = FileNumbers(robot, paths, of).slopes @ steps.reshape(len(paths), len(causes))
         chosen = np.flatnonzero(table.any(1))
-        found = robot.calls[key] = CauseSlopes(tuple(chosen.tolist()), table[chosen])
-    return found
+        self.chosen: tuple[int, ...] = tuple(chosen.tolist())
+        self.slopes: Array = table[chosen]
 
 
 def geometry_and_masses(robot: Robot) -> list[Any]:

@@ -3,10 +3,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Final, Protocol
+from typing import Any, Final, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -33,6 +33,8 @@ from pkm_twin.machine import schema
 from pkm_twin.machine.graph import Graph
 from pkm_twin.machine.inertia import Layout
 from pkm_twin.robot.mechanism import Mechanism
+
+T = TypeVar("T")
 
 FAR: Final = 10.0
 """Sizes of the machine from home beyond which a pose is taken for one in mm."""
@@ -87,13 +89,23 @@ class Robot(Mechanism):
         return self._engine_on(self.with_laws(self.graph)) if self.laws else self.engine
 
     @cached_property
-    def calls(self) -> dict[str, Any]:
-        """Cache of objects that are built once per robot, by name."""
+    def calls(self) -> dict[Callable[[Any], Kernel], Callable[..., Array]]:
+        """What :meth:`bound` made, by the function that gives the program of a robot."""
         return {}
+
+    @cached_property
+    def _made(self) -> dict[tuple[object, ...], Any]:
+        return {}
+
+    def made(self, make: Callable[..., T], *options: Hashable) -> T:
+        """What a function makes of this robot and other arguments, made once."""
+        found: T | None = self._made.get((make, *options))
+        if found is None:
+            found = self._made[make, *options] = make(self, *options)
+        return found
 
     def bound(
         self,
-        name: str,
         kernel: Callable[[Any], Kernel],
         p: Array = _NONE,
         otherwise: Callable[..., Array] | None = None,
@@ -102,17 +114,17 @@ class Robot(Mechanism):
 
         One sample takes the fastest way, any other input that of :meth:`evaluate`.
 
-        :param name: of the program, for this robot. ``kernel``: of a robot.
+        :param kernel: gives the program of a robot.
         :param p: the program's parameters. ``otherwise``: in place of :meth:`evaluate`.
         """
-        call: Callable[..., Array] | None = self.calls.get(name)
+        call = self.calls.get(kernel)
         if call is None:
             made = kernel(self)
 
             def whole(*inputs: ArrayLike) -> Array:
                 return self.evaluate(made, p, *inputs)[0]
 
-            call = self.calls[name] = made.bound(p, otherwise or whole)
+            call = self.calls[kernel] = made.bound(p, otherwise or whole)
         return call
 
     def evaluate(self, kernel: Kernel, p: Array, q: ArrayLike, *inputs: ArrayLike) -> list[Array]:
@@ -166,7 +178,7 @@ class Robot(Mechanism):
         :raises UnreachableError: naming limb, sample and miss.
         :raises SingularityError: a pose beyond a singularity, or in one.
         """
-        return self.bound("inverse", _inverse, otherwise=self._checked_inverse)(pose)
+        return self.bound(_inverse, otherwise=self._checked_inverse)(pose)
 
     def _checked_inverse(self, pose: ArrayLike) -> Array:
         (q,), status = self.inverse_kernel(_NONE, pose)
@@ -240,7 +252,7 @@ class Robot(Mechanism):
         :raises UnreachableError: naming limb, sample and miss.
         :raises SingularityError: a singularity on the way from home.
         """
-        return self.bound("forward", _forward)(q)
+        return self.bound(_forward)(q)
 
     def try_forward(self, q: ArrayLike) -> tuple[Array, Mask]:
         """Poses (..., m), NaN where there is no assembly; and which q are valid, (...)."""
@@ -313,7 +325,7 @@ class Robot(Mechanism):
         edge of the workspace); see ``kinematics.singularity``. It is dimensionless and independent
         of the machine's scale. Errors as :meth:`forward`.
         """
-        return np.asarray(self.bound("singularity", Robot.singularity_kernel)(q)[..., 0])
+        return np.asarray(self.bound(Robot.singularity_kernel)(q)[..., 0])
 
     def singularity_kernel(self) -> Kernel:
         """The same as a program, q to the measure (1)."""

@@ -10,6 +10,7 @@ from typing import Final
 import numpy as np
 
 from pkm_twin.codegen.arrays import Array
+from pkm_twin.codegen.kernels import Kernel
 from pkm_twin.errors import MessageError
 from pkm_twin.kinematics.stream import stream_kernel
 from pkm_twin.messages.stamps import SECOND
@@ -48,7 +49,7 @@ class Continuity:
         n, m = len(robot.joint_names), len(self._scales)
         self._told = n + m + m * n
         self._nothing = np.zeros(self._told + m + 1)
-        self._call = robot.bound("stream", lambda robot: stream_kernel(robot.engine), self._scales)
+        self._call = robot.bound(_stream, self._scales)
         self.reset()
 
     def reset(self) -> None:
@@ -103,3 +104,7 @@ class Continuity:
                 f"{self.robot.pose_names[beyond.index(worst)]} of the platform jumped but the "
                 "joints did not: the assembly mode changed",
             )
+
+
+def _stream(robot: Robot) -> Kernel:
+    return stream_kernel(robot.engine)

@@ -11,7 +11,6 @@ from delta_dynamics import inverse_dynamics
 from pkm_twin.design import design
 from pkm_twin.errors import PkmTwinError
 from pkm_twin.kinematics.engine import Engine
-from pkm_twin.robot.entries import with_entries
 from test.benchmarks.test_speed import record
 from test.laws.test_design import BOX, pick_and_place
 
@@ -33,7 +32,7 @@ def test_an_optimiser_that_compiles_each_machine_finds_no_better_one(benchmark, 
         nonlocal counted
         counted += 1
         try:
-            machine = with_entries(robot, dict(zip(BOX, x.tolist(), strict=True)))
+            machine = robot.filed(dict(zip(BOX, x.tolist(), strict=True)))
             q = machine.inverse(path.pose)
             miss = 0.1 - machine.singularity(q).min()
             qd = np.linalg.solve(machine.jacobian(q), path.rate[..., None])

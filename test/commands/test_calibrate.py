@@ -20,7 +20,6 @@ from pkm_twin.errors import ParameterError, PkmTwinError
 from pkm_twin.identification.calibration import calibrate, geometric
 from pkm_twin.identification.calibration_state import Poses
 from pkm_twin.identification.measurements import read_poses
-from pkm_twin.robot.entries import entries, with_entries
 from test.support.command import Commands
 from test.support.robots import load, random_joints
 
@@ -100,10 +99,10 @@ def crooked(seed: int, only: list[str], count: int) -> tuple[Robot, Poses]:
     """A 3-RPS head some numbers of which are not as drawn, and its poses."""
     robot, rng = load("rps3"), np.random.default_rng([seed, 77])
     q = random_joints(robot, rng, count, 0.05)
-    sizes = {"m": 1e-3, "": 3e-3}
-    moved = {p: entries(robot)[p] for p in geometric(robot, q, only) if not p.endswith(".home")}
+    sizes, known = {"m": 1e-3, "": 3e-3}, robot.file_numbers()
+    moved = {p: known[p] for p in geometric(robot, q, only) if not p.endswith(".home")}
     values = {p: v + sizes[unit] * rng.normal() for p, (v, unit) in moved.items()}
-    position, rotation = with_entries(robot, values).platform(q)
+    position, rotation = robot.filed(values).platform(q)
     turn = Rotation.from_rotvec(1e-4 * rng.normal(size=position.shape)).as_matrix()
     noisy = position + NOISE * rng.normal(size=position.shape)
     return robot, Poses(q + 1e-3 * rng.normal(size=3), noisy, turn @ rotation)

@@ -12,7 +12,7 @@ from delta_dynamics import inverse_dynamics
 from pkm_twin.apps.commands.excite import LARGE, Excite, excite
 from pkm_twin.bags.reader import open_bag
 from pkm_twin.identification.identifiable import identifiable
-from pkm_twin.robot.entries import entries, robot_text, with_entries
+from pkm_twin.robot.entries import robot_text
 from stiffness_monitor import compliance
 from test.commands.conftest import DELTA, STIFFNESS, rewrite
 from test.laws.recordings import smooth_motion
@@ -149,7 +149,7 @@ def test_copies_of_a_limb_keep_elastic_parts_and_the_joint_map(tmp_path):
         assert len(identifiable(other)) > len(identifiable(robot))
         expected = compliance(robot, robot.home())
         assert compliance(other, other.home()) == pytest.approx(expected, rel=1e-9)
-    again = with_entries(robot, {"origin[2]": entries(robot)["origin[2]"][0]})
+    again = robot.filed({"origin[2]": robot.file_numbers()["origin[2]"][0]})
     assert again.structure().compliances == robot.structure().compliances
     assert [beam.radius for beam in again.beams] == [beam.radius for beam in robot.beams]
 

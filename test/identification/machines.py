@@ -14,7 +14,6 @@ from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import PkmTwinError
 from pkm_twin.identification.suspects import Lengths
 from pkm_twin.recordings import Recording
-from pkm_twin.robot.entries import entries, with_entries
 from test.laws.recordings import smooth_motion
 
 
@@ -163,7 +162,7 @@ def lengths(m: Drawn, rng: np.random.Generator) -> Recording:
     """One length of the geometry off by 1 %, or a place by 1 % of the machine's size."""
     robot = m.truth
     found = {
-        path: value for path, (value, unit) in entries(robot).items()
+        path: value for path, (value, unit) in robot.file_numbers().items()
         if unit == "m" and not path.startswith(("limits", "payload", "joint_map", "uncertainty",
                                                 "members", "inertia", "bodies"))
         and ".com" not in path and "compliance" not in path
@@ -173,7 +172,7 @@ def lengths(m: Drawn, rng: np.random.Generator) -> Recording:
         path = str(rng.choice(named or list(found)))
         step = 0.01 * (found[path] if abs(found[path]) > 0.1 * robot.size else robot.size)
         try:
-            other = with_entries(robot, {path: found[path] + step})
+            other = robot.filed({path: found[path] + step})
             effort = inverse_dynamics(other, m.q, m.qd, m.qdd)
         except (PkmTwinError, ValueError):
             continue

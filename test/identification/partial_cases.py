@@ -15,7 +15,6 @@ from pkm_twin.codegen.arrays import Array
 from pkm_twin.identification.calibration import geometric
 from pkm_twin.identification.measurements import Measured, measured_of
 from pkm_twin.robot.catalogue import robot_of_data
-from pkm_twin.robot.entries import with_entries
 from test.support.robots import random_joints
 
 NOISE = {
@@ -54,7 +53,7 @@ def case(drawn: Robot, kinds: Sequence[str], count: int, seed: int, flat: bool =
         turned = any(word in path for word in ("axis", "axes", "angle", "azimuth"))
         size = OFF / drawn.size if turned else OFF
         truth[path] = drawn.number(path) + float(rng.normal(scale=size))
-    real = with_entries(drawn, truth)
+    real = drawn.filed(truth)
     scales = [OFF if unit == "m" else OFF / drawn.size for unit in drawn.joint_units]
     offsets = rng.normal(size=len(scales)) * scales
     names = zip(drawn.joint_names, drawn.controller.offsets + offsets, strict=True)

@@ -14,7 +14,6 @@ from pkm_twin.identification.check import check, recorded_of
 from pkm_twin.identification.compare import compare
 from pkm_twin.identification.fit import Fit, fit
 from pkm_twin.recordings import Recording
-from pkm_twin.robot.entries import with_entries
 from test.identification.machines import IMPOSSIBLE, WRONG, machine, noisy, shifted
 from test.support.robots import load
 
@@ -26,7 +25,7 @@ FAULTS = ("one_effort_negated", "effort_columns_swapped", "half_speed", "kilogra
 
 
 def fitted(result: Fit) -> Robot:
-    return with_entries(result.robot, {number.name: number.after for number in result.numbers})
+    return result.robot.filed({number.name: number.after for number in result.numbers})
 
 
 def agree(robot: Robot, recorded: Recording) -> str:
@@ -62,7 +61,7 @@ def test_an_encoder_s_noise_is_not_the_model_s_fault(name: str) -> None:
     result = fit(m.robot, [recorded], ("friction", "payload"))
     assert result.verdict.answer == "explains"
     friction = {n.name: n.after for n in result.numbers if n.name.startswith("friction")}
-    robot = with_entries(m.truth, friction)
+    robot = m.truth.filed(friction)
     compared = compare(replace(recorded, robot=robot))
     assert compared is not None and compared.good.all()
     held_out = result.judged[0]

@@ -19,7 +19,6 @@ from pkm_twin.identification.calibration import calibrate, geometric
 from pkm_twin.identification.calibration_state import Poses
 from pkm_twin.identification.measurements import whole_of
 from pkm_twin.identification.undetermined import LINES, undetermined
-from pkm_twin.robot.entries import entries, with_entries
 from test.support.robots import data_of, load, random_joints
 
 NOISE = 2e-5
@@ -32,9 +31,9 @@ def sound(seed: int) -> tuple[Robot, tuple[str, ...], Poses]:
     robot, rng = load("delta_cu"), np.random.default_rng([seed, 31])
     q = random_joints(robot, rng, 60, 0.02)
     paths = geometric(robot, q)
-    known = {p: entries(robot)[p] for p in paths}
+    known = {p: robot.file_numbers()[p] for p in paths}
     size = {"m": 3e-3, "rad": 0.03, "": 0.03}
-    truth = with_entries(robot, {p: v + size[u] * rng.normal() for p, (v, u) in known.items()})
+    truth = robot.filed({p: v + size[u] * rng.normal() for p, (v, u) in known.items()})
     position = truth.platform(q)[0] + NOISE * rng.normal(size=(60, 3))
     return robot, paths, Poses(q + 0.03 * rng.normal(size=3), position)
 
@@ -84,7 +83,7 @@ def test_an_offset_that_no_number_takes_up_is_a_frame_too() -> None:
 
 def test_changes_beyond_their_prior_are_rejected_or_marked(tmp_path: Path) -> None:
     robot, _, poses = sound(0)
-    far = with_entries(robot, {"geometry.forearm_length": 0.1 + _forearm(robot)})
+    far = robot.filed({"geometry.forearm_length": 0.1 + _forearm(robot)})
     there = Poses(poses.joints, far.platform(poses.joints)[0])
     only = ("geometry.arm_length", "geometry.forearm_length")
     with pytest.raises(PkmTwinError, match=r"geometry.forearm_length changes by 0.1 m"):
@@ -103,7 +102,7 @@ def test_changes_beyond_their_prior_are_rejected_or_marked(tmp_path: Path) -> No
 
 
 def _forearm(robot: Robot) -> float:
-    return entries(robot)["geometry.forearm_length"][0]
+    return robot.file_numbers()["geometry.forearm_length"][0]
 
 
 def test_many_wrong_poses_are_another_machine() -> None:

@@ -19,7 +19,6 @@ from pkm_twin.identification.rows import derivative, rows_of
 from pkm_twin.identification.suspects import USUAL, Lengths
 from pkm_twin.recordings import Load, Recording
 from pkm_twin.robot.catalogue import robot_of_data
-from pkm_twin.robot.entries import with_entries
 from test.identification.machines import machine, noisy, of_prior
 from test.laws.test_fit import truths
 from test.machine.random_machines import variant
@@ -68,7 +67,7 @@ def test_columns_are_differences_of_the_efforts(name: str) -> None:
         sides = []
         try:
             for one in (heavy, none):
-                pair = [with_entries(one, {path: one.number(path) + h}) for h in (-step, step)]
+                pair = [one.filed({path: one.number(path) + h}) for h in (-step, step)]
                 low, high = (inverse_dynamics(other, *rows.signals.motion.joints) for other in pair)
                 sides.append((high - low) / (2.0 * step))
         except ValueError:

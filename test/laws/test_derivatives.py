@@ -16,7 +16,6 @@ from pkm_twin import (
     variants,
 )
 from pkm_twin.errors import ParameterError
-from pkm_twin.robot.entries import entries
 from stiffness_monitor import compliance, compliance_derivatives
 from test.support.robots import every_robot, has, load, often, partly_long, some_robots
 
@@ -73,7 +72,7 @@ def test_by_the_motion(name, rng):
 def test_by_numbers_of_the_file(name, count, rng):
     robot = load(name)
     given, wrench = motion(robot, rng)
-    known = {p: v for p, (v, _) in entries(robot).items() if v != 0.0}
+    known = {p: v for p, (v, _) in robot.file_numbers().items() if v != 0.0}
     paths = [p for p in known if not any(word in p for word in ASIDE) and "inertia[" not in p]
     paths = rng.permutation(paths)[:count].tolist()
     found = torque_derivatives(robot, *given, wrench, by=paths)
@@ -118,7 +117,7 @@ def test_of_pose_joints_and_compliance(name):
     robot, rng = load(name), np.random.default_rng(2)
     q = motion(robot, rng)[0][0]
     pose = robot.forward(q)
-    known = {p: v for p, (v, _) in entries(robot).items() if v != 0.0}
+    known = {p: v for p, (v, _) in robot.file_numbers().items() if v != 0.0}
     paths = [p for p in known if not any(word in p for word in ("ax", *NOT_GEOMETRY))]
     paths = rng.permutation(paths)[:6].tolist()
     elastic = has(robot, "structure")

@@ -9,7 +9,6 @@ import pytest
 from pkm_twin.errors import ParameterError, UnknownNameError
 from pkm_twin.identification.deflections import fit_elements
 from pkm_twin.recordings import Recording
-from pkm_twin.robot.entries import with_entries
 from stiffness_monitor import compliance, strain_energy
 from stiffness_monitor.response import element_response
 from test.support.robots import load, rigid
@@ -93,7 +92,7 @@ def test_members_of_a_frame_are_fitted():
 
 def test_factors_stand_in_the_file_and_wrong_names_are_refused(tmp_path):
     robot = load("upr_rpu").changed(element_compliance={"3U": 3.0})
-    again = with_entries(robot, {"element_compliance.3U": 2.0})
+    again = robot.filed({"element_compliance.3U": 2.0})
     assert again.element_compliance == {"3U": 2.0}
     with pytest.raises(UnknownNameError, match="did you mean '3U'"):
         robot.changed(element_compliance={"3V": 3.0})

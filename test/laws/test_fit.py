@@ -22,7 +22,7 @@ from pkm_twin.identification.parameters import Number, file_parameters, fitted_y
 from pkm_twin.machine.inertia import standard_parameters
 from pkm_twin.recordings import Recording
 from pkm_twin.robot.catalogue import robot_of_data
-from pkm_twin.robot.entries import entries, with_entries, write_edited
+from pkm_twin.robot.entries import write_edited
 from test.laws.recordings import smooth_motion
 from test.support.robots import load, massive, parameters_of, random_motion
 
@@ -87,9 +87,9 @@ def test_columns_of_the_file_are_the_efforts(name):
 @pytest.mark.parametrize("name", ["delta", "prru", "upr_rpu", "five_bar"])
 def test_numbers_are_those_of_the_robot_and_not_of_another_with_its_geometry(name):
     robot = load(name)
-    keys = [path for path, (_, unit) in entries(robot).items() if unit in ("kg", "kg/m3")]
+    keys = [path for path, (_, unit) in robot.file_numbers().items() if unit in ("kg", "kg/m3")]
     own = [path for path in keys if not path.startswith(("payload", "members", "limits"))]
-    heavier = with_entries(robot, {path: 1.5 * entries(robot)[path][0] for path in own})
+    heavier = robot.filed({path: 1.5 * robot.file_numbers()[path][0] for path in own})
     before, after = (file_parameters(r, ("payload", "inertia")) for r in (robot, heavier))
     masses = [k for k, n in enumerate(after.names) if n.endswith((".mass", "density"))]
     np.testing.assert_allclose(after.values[masses], 1.5 * before.values[masses], rtol=1e-9)

@@ -13,7 +13,7 @@ from delta_dynamics.torques.virtual_work import torques
 from pkm_twin.codegen import key as keys
 from pkm_twin.codegen.key import EMPTY
 from stiffness_monitor.derivatives import compliance_gradient
-from stiffness_monitor.programs import elastic_of
+from stiffness_monitor.programs import Elastic
 from test.support.robots import MASSIVE, has, load, partly_long
 from test.support.sources import PACKAGES, ROOT, room, sources
 
@@ -28,7 +28,7 @@ def kernels(robot):
         "loads": loads_kernel(robot),
     }
     if has(robot, "structure"):
-        elastic = elastic_of(robot)
+        elastic = robot.made(Elastic)
         found |= {"response": elastic.response, "gradient": compliance_gradient(elastic)}
     return found
 

@@ -8,7 +8,6 @@ import pytest
 import yaml
 
 from pkm_twin.errors import ParameterError, SingularityError
-from pkm_twin.robot.entries import with_entries
 from stiffness_monitor import compliance, platform_response, stiffness, strain_energy
 from stiffness_monitor.compliance import kernels, member_deflections
 from test.support.robots import ELASTIC, elastic, load, parameters_of, random_joints, random_poses
@@ -155,7 +154,7 @@ def test_other_numbers_take_the_same_program():
         for k, v in parameters_of("upr_rpu")["joints_compliance"].items()
     }
     other = robot.changed(members={"diameter": [0.07, 0.08, 0.09]}, joints_compliance=joints)
-    other = with_entries(other, {"geometry.base_radius": 1.03 * robot.geometry.base_radius})
+    other = other.filed({"geometry.base_radius": 1.03 * robot.geometry.base_radius})
     program = kernels(robot)[1].code
     assert kernels(other)[1].code is program
     joints["rpu_universal"][0] = 0.0

@@ -19,7 +19,6 @@ from pkm_twin.errors import ParameterError
 from pkm_twin.machine.places import given
 from pkm_twin.robot.catalogue import robot_of_data
 from pkm_twin.robot.derivatives import position_effects
-from pkm_twin.robot.entries import entries, with_entries
 from stiffness_monitor import compliance, compliance_deviation, strain_energy
 from stiffness_monitor.derivatives import compliance_effects, energy_effects
 from test.support.robots import joint_range, load, massive, random_joints
@@ -46,7 +45,7 @@ def unsure(name: str, uncertainty: dict[str, Any], **sections: Any) -> Robot:
 def drawn(robot: Robot, count: int) -> Variants:
     """Machines that the file allows, every cause by a normal deviate of its own."""
     rng = np.random.default_rng(2)
-    known = {path: value for path, (value, _) in entries(robot).items()}
+    known = {path: value for path, (value, _) in robot.file_numbers().items()}
     values = {}
     for name, entry in robot.uncertainty.items():
         deviate = rng.normal(size=count)
@@ -98,7 +97,7 @@ def test_effects_are_differences_of_machines_with_other_numbers() -> None:
 
     def effect(cause: dict[str, float], call: Callable[[Robot], Array]) -> Array:
         low, high = (
-            with_entries(robot, {p: robot.number(p) + step * d for p, d in cause.items()})
+            robot.filed({p: robot.number(p) + step * d for p, d in cause.items()})
             for step in (-0.01, 0.01)
         )
         return (call(high) - call(low)) / 0.02
@@ -152,7 +151,7 @@ def test_a_machine_keeps_what_its_file_says_beside_its_graph() -> None:
     joint = robot.joint_names[0]
     data = {**given(robot.parameter_sections()), "mechanism": "machine"}
     mapped = robot_of_data({**data, "joint_map": {joint: {"offset": 0.1}}}, "mine")
-    again = with_entries(mapped, {"origin[2]": entries(mapped)["origin[2]"][0]})
+    again = mapped.filed({"origin[2]": mapped.file_numbers()["origin[2]"][0]})
     assert again.controller.offsets[0] == 0.1
     q = again.inverse(again.home())
     still = np.zeros_like(q)

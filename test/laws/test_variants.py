@@ -16,9 +16,8 @@ from pkm_twin.errors import ParameterError, PkmTwinError
 from pkm_twin.kinematics.motion import Motion
 from pkm_twin.machine.places import keys_of
 from pkm_twin.robot.catalogue import robot_of_data
-from pkm_twin.robot.entries import entries, with_entries
 from stiffness_monitor import compliance
-from stiffness_monitor.programs import elastic_of, followed
+from stiffness_monitor.programs import Elastic, followed
 from test.machine.random_machines import plain
 from test.support.robots import elastic, load, often, parameters_of, partly_long, some_robots
 
@@ -28,7 +27,7 @@ ASIDE = ("limits", "joint_map", "uncertainty", "member", "section", "compliance"
 
 def numbers_of(robot: Robot) -> dict[str, float]:
     """Numbers of geometry, masses and friction that are not zero."""
-    found = {path: value for path, (value, _) in entries(robot).items() if value != 0.0}
+    found = {path: value for path, (value, _) in robot.file_numbers().items() if value != 0.0}
     return {p: v for p, v in found.items() if not any(word in p for word in ASIDE)}
 
 
@@ -93,7 +92,7 @@ def test_a_number_that_was_zero_goes_through_a_program_of_its_own(name, count, r
     """Places and axes that a program takes for zero: another structure, never a wrong answer."""
     robot = load(name)
     zeros = [
-        path for path, (value, _) in entries(robot).items()
+        path for path, (value, _) in robot.file_numbers().items()
         if value == 0.0 and not any(word in path for word in ASIDE)
     ]  # fmt: skip
     for path in rng.permutation(zeros)[:count]:
@@ -185,8 +184,8 @@ def test_what_was_changed_stays_when_another_number_changes(name, rng):
     n = robot.joints_count
     friction = {key: rng.uniform(1.0, 2.0, n).tolist() for key in ("viscous", "coulomb")}
     changed = robot.changed(friction=friction, payload={"mass": 0.3}, limits={"velocity": 7.0})
-    path = next(path for path, (_, unit) in entries(changed).items() if unit == "kg")
-    again = with_entries(changed, {path: entries(changed)[path][0]})
+    path = next(path for path, (_, unit) in changed.file_numbers().items() if unit == "kg")
+    again = changed.filed({path: changed.file_numbers()[path][0]})
     state = motion(robot, rng, 3)
     expected = inverse_dynamics(changed, *state)
     np.testing.assert_allclose(inverse_dynamics(again, *state), expected, rtol=1e-12)
@@ -294,7 +293,7 @@ def judge_compliance(robot: Robot, numbers, rng):
 
 def elastic_numbers(robot: Robot) -> dict[str, float]:
     """Numbers that a compliance hangs on, and that are not zero."""
-    found = {path: value for path, (value, _) in entries(robot).items() if value != 0.0}
+    found = {path: value for path, (value, _) in robot.file_numbers().items() if value != 0.0}
     return {p: v for p, v in found.items() if not any(word in p for word in RIGID)}
 
 
@@ -307,7 +306,7 @@ def test_compliances_are_those_of_the_robots(name, rng):
     picked = [*rng.permutation(members)[:8], *rng.permutation(others)[:4]]
     numbers = {p: known[p] * (1 + 0.05 * rng.uniform(-1, 1, 4)) for p in picked}
     assert judge_compliance(robot, numbers, rng) > 0
-    masses = [p for p, (v, _) in entries(robot).items() if p.endswith("mass") and v > 0.0]
+    masses = [p for p, (v, _) in robot.file_numbers().items() if p.endswith("mass") and v > 0.0]
     for path in masses[:2]:
         # The wall of a tube follows from mass and density: twenty times the mass has no room.
         values = robot.number(path) * np.array([0.9, 1.1, 20.0, 0.0])
@@ -328,7 +327,7 @@ def test_compliances_of_any_machine_are_those_of_the_robots(name, rng):
 @pytest.mark.parametrize("name", partly_long(SOFT, "five_bar"))
 def test_a_compliance_that_appears_or_vanishes_is_another_structure(name, rng):
     robot = soft(name, rng)
-    paths = [p for p in entries(robot) if p.split("[")[0].endswith("compliance")]
+    paths = [p for p in robot.file_numbers() if p.split("[")[0].endswith("compliance")]
     for path in rng.permutation(paths)[:2]:
         judge_compliance(robot, {path: [0.0, 2e-8, 1e-7, np.inf]}, rng)
 
@@ -350,7 +349,7 @@ def test_a_frame_that_is_singular_at_home_has_programs_of_its_own(rng):
 
 def test_closures_that_are_left_out_follow_from_the_others():
     robot = soft("bolted", np.random.default_rng(7), 0.6)
-    elastic, engine = elastic_of(robot), robot.engine
+    elastic, engine = robot.made(Elastic), robot.engine
     chosen = elastic.followers
     assert chosen is not None
     for x, q in engine.samples:

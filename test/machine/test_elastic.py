@@ -10,7 +10,6 @@ from pkm_twin.design.variants import variants
 from pkm_twin.errors import ParameterError, SingularityError
 from pkm_twin.robot.catalogue import robot_of_data
 from pkm_twin.robot.clearance import clearance
-from pkm_twin.robot.entries import with_entries
 from stiffness_monitor import compliance, platform_response, strain_energy
 from stiffness_monitor.modes import assemble, natural_frequencies
 from stiffness_monitor.structure import structural_model
@@ -178,7 +177,7 @@ def test_a_joint_beside_its_member_is_on_a_rigid_lever(joint):
 def test_factors_of_elements_stand_in_what_is_written_out(delta_in_the_graph_form):
     machine, _ = delta_in_the_graph_form
     softer = machine.changed(element_compliance={"arm I": 2.0})
-    again = with_entries(softer, {"element_compliance.arm I": 3.0})
+    again = softer.filed({"element_compliance.arm I": 3.0})
     assert again.element_compliance == {"arm I": 3.0}
     expected = machine.changed(element_compliance={"arm I": 3.0})
     size = np.abs(compliance(expected, POSES[0])).max()

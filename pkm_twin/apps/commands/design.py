@@ -154,7 +154,6 @@ def optimised(given: Design, path: Path) -> Report:
     from pkm_twin.design import design as find
     from pkm_twin.design.search import searches
     from pkm_twin.design.variables import parse_vary
-    from pkm_twin.robot.entries import entries
     from pkm_twin.robot.limits import beyond_limits
 
     robot, way = read_path(given, path)
@@ -167,7 +166,7 @@ def optimised(given: Design, path: Path) -> Report:
     if given.out is not None:
         write_robot(robot, given.robot, found, path, given.out)
     before, best = found.before, found.best
-    units = {name: entries(robot).get(name, (0.0, ""))[1] for name in best.numbers}
+    units = {name: robot.file_numbers().get(name, (0.0, ""))[1] for name in best.numbers}
     bounds = dict(zip(best.variables, box.values(), strict=True))
     _, beyond = beyond_limits(found.robot, found.robot.inverse(way.pose))
     limits = [one.joint for one in beyond]
