@@ -7,7 +7,7 @@ Write one if a few lengths describe a family of machines, or if the kinematics h
 The file has a schema, a function from its parameters to a graph, and the closed forms; everything
 else comes from the graph. ``solved`` operates on expressions: it uses the functions of
 ``pkm_twin.codegen.operations``, without branches on values. For use in robot files add one line to
-``pkm_twin/robot/catalogue.py``.
+``pkm_twin/mechanisms/catalogue.py``.
 """
 
 from dataclasses import dataclass

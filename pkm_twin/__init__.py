@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     __version__: str
     from pkm_twin.design.variants import variants
-    from pkm_twin.robot.catalogue import load, robot_names
+    from pkm_twin.mechanisms.catalogue import load, robot_names
     from pkm_twin.robot.derivatives import (
         forward_derivatives,
         inverse_derivatives,
@@ -32,8 +32,8 @@ _HOMES = {
     "forward_derivatives": "pkm_twin.robot.derivatives",
     "inverse_derivatives": "pkm_twin.robot.derivatives",
     "platform_derivatives": "pkm_twin.robot.derivatives",
-    "load": "pkm_twin.robot.catalogue",
-    "robot_names": "pkm_twin.robot.catalogue",
+    "load": "pkm_twin.mechanisms.catalogue",
+    "robot_names": "pkm_twin.mechanisms.catalogue",
     "variants": "pkm_twin.design.variants",
 }
 """Loaded when they are asked for: a command or a node answers signals before it loads numpy."""

@@ -17,11 +17,11 @@ OWN = {"pkm_twin.errors", "pkm_twin.files", "pkm_twin.threads", "pkm_twin.settin
 GRAPH = {"pkm_twin.codegen", "pkm_twin.machine", "pkm_twin.kinematics"}
 CORE = GRAPH | {"pkm_twin.robot"}
 STREAMS = CORE | {"pkm_twin.messages", "pkm_twin.streams"}
-RECORDINGS = STREAMS | {"pkm_twin.bags"}
-NODE = STREAMS | {"pkm_twin", "pkm_twin.bags", "pkm_twin.ros"}
+RECORDINGS = STREAMS | {"pkm_twin.bags", "pkm_twin.mechanisms"}
+NODE = RECORDINGS | {"pkm_twin", "pkm_twin.ros"}
 TWINS = {"delta_dynamics", "stiffness_monitor"}
 MAY = {
-    "pkm_twin": {"pkm_twin.robot", "pkm_twin.design"},
+    "pkm_twin": {"pkm_twin.robot", "pkm_twin.mechanisms", "pkm_twin.design"},
     "pkm_twin.errors": set(),
     "pkm_twin.files": set(),
     "pkm_twin.threads": set(),
@@ -36,7 +36,7 @@ MAY = {
     "pkm_twin.mechanisms": CORE | {"delta_dynamics"},
     "pkm_twin.export": CORE | TWINS,
     "pkm_twin.design": CORE | TWINS,
-    "pkm_twin.identification": STREAMS
+    "pkm_twin.identification": RECORDINGS
     | TWINS
     | {"pkm_twin.design", "pkm_twin.recordings", "pkm_twin.report"},
     "pkm_twin.messages": CORE | {"pkm_twin.bags"},
@@ -46,7 +46,7 @@ MAY = {
     "delta_dynamics": STREAMS,
     "stiffness_monitor": STREAMS,
     "pkm_twin.paths": RECORDINGS | TWINS | {"pkm_twin.recordings"},
-    "pkm_twin.ros": STREAMS | {"pkm_twin.bags"},
+    "pkm_twin.ros": RECORDINGS,
     "delta_dynamics.node": NODE | {"delta_dynamics"},
     "stiffness_monitor.node": NODE | {"stiffness_monitor"},
     "pkm_twin.state.node": NODE | {"pkm_twin.state", "stiffness_monitor"},
@@ -151,5 +151,5 @@ def test_a_command_and_a_node_start_without_what_they_may_never_need():
     assert not modules & loaded_by("import pkm_twin.apps.cli")
     assert not {"numpy", "rich"} & loaded_by("import pkm_twin.apps.cli")
     # Masked arrays are a tenth of a short command's time.
-    code = "from pkm_twin.robot import catalogue; catalogue.findings(catalogue.load('delta'))"
+    code = "from pkm_twin.mechanisms import catalogue; catalogue.findings(catalogue.load('delta'))"
     assert "numpy.ma" not in loaded_by(code)

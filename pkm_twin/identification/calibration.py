@@ -60,8 +60,8 @@ from pkm_twin.identification.parameters import OBSERVED, weights_of
 from pkm_twin.identification.undetermined import undetermined
 from pkm_twin.machine.formulas import PARAMETERS
 from pkm_twin.machine.joint_map import JointMap
+from pkm_twin.mechanisms.entries import Fitted as FittedNumber
 from pkm_twin.robot.derivatives import geometry_numbers
-from pkm_twin.robot.entries import Fitted as FittedNumber
 from pkm_twin.robot.numbers import FileNumbers
 from pkm_twin.robot.robot import Robot
 

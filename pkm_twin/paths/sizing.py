@@ -28,9 +28,9 @@ from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import FileError, ParameterError, UnknownNameError
 from pkm_twin.machine import schema
 from pkm_twin.machine.sections import DriveSpec
+from pkm_twin.mechanisms.catalogue import config_folder
 from pkm_twin.recordings.payload import by_load
 from pkm_twin.recordings.recording import Recording
-from pkm_twin.robot.catalogue import config_folder
 
 BLOCK: Final = 4096
 """Samples computed at a time, so that memory stays flat."""

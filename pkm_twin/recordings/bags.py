@@ -16,6 +16,7 @@ from pkm_twin.bags.reader import Bag, BagWriter, open_bag
 from pkm_twin.bags.storage import METADATA_FILE
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import BagError, MessageError, one_line
+from pkm_twin.mechanisms.catalogue import load, robot_names
 from pkm_twin.messages.reading import (
     DeflectionSample,
     JointReader,
@@ -30,7 +31,6 @@ from pkm_twin.recordings.payload import load_facts, metadata_error, payload_colu
 from pkm_twin.recordings.recording import MAPPED, ReadOptions, Recording
 from pkm_twin.recordings.tables import write_table
 from pkm_twin.recordings.topics import DEFINITIONS, JOINT_STATE, TRAJECTORY, Topics, choose_topics
-from pkm_twin.robot.catalogue import load, robot_names
 from pkm_twin.robot.robot import Robot
 from pkm_twin.streams.wrench import PLATFORM
 

@@ -15,6 +15,7 @@ from pkm_twin.codegen.arrays import Array, Mask
 from pkm_twin.errors import FileError, ParameterError, UnknownNameError, one_line, warn
 from pkm_twin.machine.joint_map import JointMap
 from pkm_twin.machine.sections import DriveSpec
+from pkm_twin.mechanisms.catalogue import load
 from pkm_twin.messages.reading import MAX_EFFORT, MAX_LOAD, MAX_SHIFT, MAX_TURN, TINY
 from pkm_twin.recordings.bags import read_bag
 from pkm_twin.recordings.payload import load_of_table
@@ -31,7 +32,6 @@ from pkm_twin.recordings.tables import (
     kinds_of,
     read_table,
 )
-from pkm_twin.robot.catalogue import load
 from pkm_twin.robot.derivatives import joint_rates
 from pkm_twin.robot.limits import beyond_limits
 from pkm_twin.robot.robot import Robot

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Robots: kinematics by the engine, the catalogue, files in and out, workspace, derivatives."""
+"""Robots: kinematics by the engine, URDF in and out, workspace, derivatives."""

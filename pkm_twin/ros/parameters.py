@@ -20,7 +20,7 @@ from rclpy.lifecycle import LifecycleNode
 from rclpy.parameter import Parameter
 
 from pkm_twin.errors import ParameterError, PkmTwinError, UnknownNameError
-from pkm_twin.robot.catalogue import load
+from pkm_twin.mechanisms.catalogue import load
 from pkm_twin.robot.robot import Robot
 from pkm_twin.settings import Setting, settings_of
 

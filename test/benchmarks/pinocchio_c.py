@@ -22,7 +22,7 @@ from pkm_twin.machine.joints import across
 from pkm_twin.machine.mjcf_write import rows
 from pkm_twin.machine.tree import axes_with_z
 from pkm_twin.machine.urdf_write import GROUND
-from pkm_twin.robot.catalogue import robot_of_data
+from pkm_twin.mechanisms.catalogue import robot_of_data
 from pkm_twin.robot.robot_urdf import robot_description, robot_tree
 from test.support.robots import joint_range
 

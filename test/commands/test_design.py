@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from pkm_twin.robot.catalogue import config_folder, load
+from pkm_twin.mechanisms.catalogue import config_folder, load
 from test.support.command import forked
 
 VARY = ("--vary", "geometry.arm_length=0.15:0.3", "--vary", "geometry.forearm_length=0.3:0.6")

@@ -12,7 +12,7 @@ from delta_dynamics import inverse_dynamics
 from pkm_twin.apps.commands.excite import LARGE, Excite, excite
 from pkm_twin.bags.reader import open_bag
 from pkm_twin.identification.identifiable import identifiable
-from pkm_twin.robot.entries import robot_text
+from pkm_twin.mechanisms.entries import robot_text
 from stiffness_monitor import compliance
 from test.commands.conftest import DELTA, STIFFNESS, rewrite
 from test.laws.recordings import smooth_motion

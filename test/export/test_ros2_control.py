@@ -22,7 +22,7 @@ from pkm_twin import robot_names
 from pkm_twin.errors import ParameterError
 from pkm_twin.export.c_package import c_package
 from pkm_twin.export.ros2_control import package_name, ros2_control_package
-from pkm_twin.robot.catalogue import robot_of_data
+from pkm_twin.mechanisms.catalogue import robot_of_data
 from test.support.mapped import sides
 from test.support.robots import (
     load,

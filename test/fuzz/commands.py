@@ -21,7 +21,7 @@ import typer.main
 
 from pkm_twin.apps import cli
 from pkm_twin.machine.strict_yaml import read_yaml
-from pkm_twin.robot import catalogue
+from pkm_twin.mechanisms import catalogue
 from pkm_twin.robot.robot import Robot
 from test.fuzz.bags import small_bag
 from test.fuzz.tally import Kind

@@ -18,9 +18,9 @@ import yaml
 from delta_dynamics import inverse_dynamics
 from pkm_twin import load, robot_names
 from pkm_twin.bags.reader import inspect
+from pkm_twin.mechanisms.catalogue import config_folder, robot_of_data
 from pkm_twin.paths.along import torque_table
 from pkm_twin.recordings import ReadOptions, read
-from pkm_twin.robot.catalogue import config_folder, robot_of_data
 from pkm_twin.robot.limits import beyond_limits
 from pkm_twin.robot.robot import Robot
 from pkm_twin.robot.robot_urdf import robot_urdf

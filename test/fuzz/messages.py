@@ -23,8 +23,8 @@ from delta_dynamics.gate import Gate, GateSettings
 from pkm_twin.bags.cdr import MessageCodec
 from pkm_twin.bags.definitions import message_definition
 from pkm_twin.errors import MessageError
+from pkm_twin.mechanisms.catalogue import robot_of_data
 from pkm_twin.messages.fast_decoder import JointStateDecoder, RawTrajectory
-from pkm_twin.robot.catalogue import robot_of_data
 from pkm_twin.robot.robot import Robot
 from stiffness_monitor import monitor
 from test.fuzz.rules import Rules

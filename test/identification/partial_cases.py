@@ -14,7 +14,7 @@ from pkm_twin import Robot
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.identification.calibration import geometric
 from pkm_twin.identification.measurements import Measured, measured_of
-from pkm_twin.robot.catalogue import robot_of_data
+from pkm_twin.mechanisms.catalogue import robot_of_data
 from test.support.robots import random_joints
 
 NOISE = {

@@ -17,8 +17,8 @@ from pkm_twin.identification.fit import fit
 from pkm_twin.identification.parameters import file_parameters
 from pkm_twin.identification.rows import derivative, rows_of
 from pkm_twin.identification.suspects import USUAL, Lengths
+from pkm_twin.mechanisms.catalogue import robot_of_data
 from pkm_twin.recordings import Load, Recording
-from pkm_twin.robot.catalogue import robot_of_data
 from test.identification.machines import machine, noisy, of_prior
 from test.laws.test_fit import truths
 from test.machine.random_machines import variant

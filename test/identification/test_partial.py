@@ -19,7 +19,7 @@ from pkm_twin.identification.calibration import (
 from pkm_twin.identification.calibration_state import FRAME, moved
 from pkm_twin.identification.measurements import KINDS, Measured, kinds_of, measured_of
 from pkm_twin.identification.plan import plan
-from pkm_twin.robot.catalogue import robot_of_data
+from pkm_twin.mechanisms.catalogue import robot_of_data
 from test.identification.partial_cases import Towers, case, published
 from test.support.robots import data_of, load, often, partly_long
 

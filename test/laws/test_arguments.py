@@ -14,7 +14,7 @@ import delta_dynamics as dynamics
 import stiffness_monitor as elasticity
 from pkm_twin.codegen.arrays import doubles, later
 from pkm_twin.errors import ParameterError, SingularityError, UnreachableError
-from pkm_twin.robot.catalogue import robot_of_data
+from pkm_twin.mechanisms.catalogue import robot_of_data
 from stiffness_monitor.compliance import member_deflections
 from stiffness_monitor.modes import modes, natural_frequencies
 from test.support.robots import both_ways, load, massless, partly_long

@@ -13,9 +13,9 @@ from pkm_twin import Robot
 from pkm_twin.bags.reader import open_bag
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.machine.places import given
+from pkm_twin.mechanisms.catalogue import robot_of_data
 from pkm_twin.recordings import Recording, read
 from pkm_twin.recordings.recording import differentiated
-from pkm_twin.robot.catalogue import robot_of_data
 from test.laws.contacts import OFF, RATE, REST, Stream, measured, moves, pushed, seen_after
 from test.support.robots import load, massive, partly_long
 

@@ -8,7 +8,7 @@ import pytest
 
 from delta_dynamics import inverse_dynamics
 from pkm_twin.errors import SingularityError, UnreachableError
-from pkm_twin.robot.catalogue import robot_of_data
+from pkm_twin.mechanisms.catalogue import robot_of_data
 from test.support.robots import load, parameters_of, partly_long, random_motion
 
 THIRDS = np.pi * np.array([1.0, 5.0 / 3.0, 1.0 / 3.0])

@@ -20,9 +20,9 @@ from pkm_twin.identification.fit import Fit, fit
 from pkm_twin.identification.identifiable import pseudo_inertia
 from pkm_twin.identification.parameters import Number, file_parameters, fitted_yaml
 from pkm_twin.machine.inertia import standard_parameters
+from pkm_twin.mechanisms.catalogue import robot_of_data
+from pkm_twin.mechanisms.entries import write_edited
 from pkm_twin.recordings import Recording
-from pkm_twin.robot.catalogue import robot_of_data
-from pkm_twin.robot.entries import write_edited
 from test.laws.recordings import smooth_motion
 from test.support.robots import load, massive, parameters_of, random_motion
 

@@ -17,7 +17,7 @@ from pkm_twin.certify.maximal import Maximal
 from pkm_twin.errors import ParameterError
 from pkm_twin.export.fmu import Fmu
 from pkm_twin.machine.friction import BASIC, LAWS, all_keys
-from pkm_twin.robot.catalogue import robot_of_data
+from pkm_twin.mechanisms.catalogue import robot_of_data
 from pkm_twin.robot.robot_urdf import robot_description
 from test.machine.random_machines import variant
 from test.support.robots import (

@@ -11,7 +11,7 @@ import pytest
 from pkm_twin.kinematics.iterations import newton
 from pkm_twin.kinematics.limbs import LimbPose
 from pkm_twin.kinematics.motion import Motion, matrices, numbers
-from pkm_twin.robot.catalogue import robot_of_data
+from pkm_twin.mechanisms.catalogue import robot_of_data
 
 
 def unit(vector):

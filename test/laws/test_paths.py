@@ -8,6 +8,7 @@ import pytest
 
 from delta_dynamics import inverse_dynamics
 from pkm_twin.errors import ParameterError
+from pkm_twin.mechanisms.catalogue import robot_of_data
 from pkm_twin.paths import circle, cycle, fastest, lines, through, timed
 from pkm_twin.paths.carrying import Carried
 from pkm_twin.paths.fastest import LAWS
@@ -15,7 +16,6 @@ from pkm_twin.paths.jerk import smooth_run
 from pkm_twin.paths.joint_path import joint_paths
 from pkm_twin.paths.motion import BINDS
 from pkm_twin.paths.pieces import Arc, Corner, arc_through
-from pkm_twin.robot.catalogue import robot_of_data
 from test.support.robots import load, parameters_of, partly_long
 
 SOME = partly_long(

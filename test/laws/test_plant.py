@@ -13,7 +13,7 @@ from delta_dynamics.simulation.machine import Plant
 from delta_dynamics.torques.equations import Equations
 from pkm_twin.errors import PkmTwinError
 from pkm_twin.machine.inertia import loaded_joints
-from pkm_twin.robot.catalogue import robot_of_data
+from pkm_twin.mechanisms.catalogue import robot_of_data
 from test.machine.random_machines import FILES, variant
 from test.support.robots import (
     FREE,

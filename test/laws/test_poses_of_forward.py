@@ -8,7 +8,7 @@ import yaml
 from delta_dynamics import inverse_dynamics, least_norm_reactions
 from pkm_twin import robot_names
 from pkm_twin.errors import SingularityError, UnreachableError
-from pkm_twin.robot.catalogue import robot_of_data
+from pkm_twin.mechanisms.catalogue import robot_of_data
 from pkm_twin.robot.robot_urdf import robot_description
 from test.machine.random_machines import FILES
 from test.support.robots import every_robot, load, often, partly_long

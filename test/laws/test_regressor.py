@@ -19,7 +19,7 @@ from pkm_twin import Robot
 from pkm_twin.identification.estimation import possible
 from pkm_twin.identification.parameters import file_parameters
 from pkm_twin.machine.places import path_of
-from pkm_twin.robot.catalogue import robot_of_data
+from pkm_twin.mechanisms.catalogue import robot_of_data
 from test.machine.random_machines import NAMES, variant
 from test.support.robots import load, loaded, massive, random_motion
 

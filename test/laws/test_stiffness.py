@@ -11,8 +11,8 @@ import pytest
 from pkm_twin.errors import ParameterError, SingularityError
 from pkm_twin.machine import schema
 from pkm_twin.machine.strict_yaml import read_yaml
+from pkm_twin.mechanisms.catalogue import config_folder
 from pkm_twin.mechanisms.upr_rpu import UprRpu
-from pkm_twin.robot.catalogue import config_folder
 from pkm_twin.robot.workspace import regular_workspace
 from stiffness_monitor import compliance, stiffness, strain_energy
 from test.support.robots import load

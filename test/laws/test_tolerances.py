@@ -14,7 +14,7 @@ from pkm_twin.design import drawn, tolerances
 from pkm_twin.design.parts import Assembly, part_of
 from pkm_twin.design.tolerance import workspace_states
 from pkm_twin.errors import ParameterError, UnknownNameError
-from pkm_twin.robot.catalogue import robot_of_data
+from pkm_twin.mechanisms.catalogue import robot_of_data
 from stiffness_monitor import platform_response
 from test.machine.random_machines import NAMES, variant
 from test.machine.test_helical import driven, slide

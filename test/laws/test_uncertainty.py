@@ -17,7 +17,7 @@ from pkm_twin.codegen.arrays import Array
 from pkm_twin.design.variants import Variants
 from pkm_twin.errors import ParameterError
 from pkm_twin.machine.places import given
-from pkm_twin.robot.catalogue import robot_of_data
+from pkm_twin.mechanisms.catalogue import robot_of_data
 from pkm_twin.robot.derivatives import position_effects
 from stiffness_monitor import compliance, compliance_deviation, strain_energy
 from stiffness_monitor.derivatives import compliance_effects, energy_effects

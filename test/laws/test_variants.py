@@ -15,7 +15,7 @@ from pkm_twin.codegen.lu import pivot_order
 from pkm_twin.errors import ParameterError, PkmTwinError
 from pkm_twin.kinematics.motion import Motion
 from pkm_twin.machine.places import keys_of
-from pkm_twin.robot.catalogue import robot_of_data
+from pkm_twin.mechanisms.catalogue import robot_of_data
 from stiffness_monitor import compliance
 from stiffness_monitor.programs import Elastic, followed
 from test.machine.random_machines import plain

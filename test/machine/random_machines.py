@@ -15,7 +15,7 @@ import numpy as np
 from pkm_twin.certify.description import expand, tensor
 from pkm_twin.certify.maximal import Maximal, rotation_of
 from pkm_twin.machine.strict_yaml import read_yaml
-from pkm_twin.robot.catalogue import config_folder
+from pkm_twin.mechanisms.catalogue import config_folder
 
 MACHINES = Path(__file__).resolve().parent / "machines"
 SHIPPED = ("five_bar", "linear_delta", "rps3", "stewart")

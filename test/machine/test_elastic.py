@@ -8,7 +8,7 @@ import yaml
 from pkm_twin.certify.description import expand
 from pkm_twin.design.variants import variants
 from pkm_twin.errors import ParameterError, SingularityError
-from pkm_twin.robot.catalogue import robot_of_data
+from pkm_twin.mechanisms.catalogue import robot_of_data
 from pkm_twin.robot.clearance import clearance
 from stiffness_monitor import compliance, platform_response, strain_energy
 from stiffness_monitor.modes import assemble, natural_frequencies

@@ -8,7 +8,7 @@ from delta_dynamics import inverse_dynamics
 from pkm_twin import load, variants
 from pkm_twin.certify.certificate import certificate_of
 from pkm_twin.machine.strict_yaml import read_yaml
-from pkm_twin.robot.catalogue import robot_of_data
+from pkm_twin.mechanisms.catalogue import robot_of_data
 from pkm_twin.robot.outline import base_face, platform_face
 from pkm_twin.robot.plausibility import findings
 from stiffness_monitor import compliance

@@ -7,7 +7,7 @@ import pytest
 from delta_dynamics import inverse_dynamics, least_norm_reactions, mass_matrix, reactions
 from pkm_twin import variants
 from pkm_twin.errors import ParameterError
-from pkm_twin.robot.catalogue import robot_of_data
+from pkm_twin.mechanisms.catalogue import robot_of_data
 from pkm_twin.robot.robot_urdf import robot_description
 from stiffness_monitor import platform_response
 

@@ -11,7 +11,7 @@ import yaml
 
 from pkm_twin.machine.machine_yaml import describe_machine_yaml
 from pkm_twin.machine.strict_yaml import read_yaml
-from pkm_twin.robot.catalogue import robot_of_data
+from pkm_twin.mechanisms.catalogue import robot_of_data
 from pkm_twin.robot.urdf_read import read_urdf
 from test.support.robots import partly_long
 

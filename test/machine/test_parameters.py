@@ -15,9 +15,9 @@ from pkm_twin.design import tolerances
 from pkm_twin.design.variables import Variables, parse_vary
 from pkm_twin.errors import ParameterError, UnknownNameError
 from pkm_twin.machine.strict_yaml import parse_yaml
+from pkm_twin.mechanisms.catalogue import config_folder, robot_of_data
+from pkm_twin.mechanisms.entries import Chosen, edited_yaml
 from pkm_twin.paths.sizing import read_motors
-from pkm_twin.robot.catalogue import config_folder, robot_of_data
-from pkm_twin.robot.entries import Chosen, edited_yaml
 
 from .random_machines import written_out
 

@@ -6,7 +6,7 @@ import pytest
 
 from delta_dynamics import inverse_dynamics, mass_matrix
 from pkm_twin.errors import ParameterError
-from pkm_twin.robot.catalogue import load, robot_of_data
+from pkm_twin.mechanisms.catalogue import load, robot_of_data
 from pkm_twin.robot.robot_urdf import robot_urdf
 
 AT = [0.4, 0.1, 0.02]

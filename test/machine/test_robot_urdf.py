@@ -17,9 +17,9 @@ from delta_dynamics import inverse_dynamics
 from pkm_twin import robot_names
 from pkm_twin.errors import ParameterError
 from pkm_twin.machine import urdf_file, urdf_xml
+from pkm_twin.mechanisms.catalogue import robot_of_data
 from pkm_twin.mechanisms.machine import Machine
 from pkm_twin.robot import robot_urdf as writing
-from pkm_twin.robot.catalogue import robot_of_data
 from pkm_twin.robot.robot_urdf import joint_names, robot_description, robot_urdf
 from pkm_twin.robot.urdf_read import read_urdf
 from test.machine.random_machines import plain

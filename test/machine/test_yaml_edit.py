@@ -7,7 +7,7 @@ import yaml
 
 from pkm_twin.identification.identifiable import identifiable
 from pkm_twin.machine.machine_yaml import edit_yaml, flow
-from pkm_twin.robot.catalogue import config_folder, robot_of_data
+from pkm_twin.mechanisms.catalogue import config_folder, robot_of_data
 from test.support.robots import massive, parameters_of
 
 

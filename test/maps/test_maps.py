@@ -22,7 +22,7 @@ from pkm_twin.maps.run import run
 from pkm_twin.maps.search import evolved, worst_of
 from pkm_twin.maps.store import open_map
 from pkm_twin.maps.sweep import map_of
-from pkm_twin.robot.catalogue import robot_of_data
+from pkm_twin.mechanisms.catalogue import robot_of_data
 from pkm_twin.robot.workspace import passive_values, reachable, try_forward
 from stiffness_monitor import Milling, compliance, stable_depth, strain_energy
 from stiffness_monitor.modes import natural_frequencies

@@ -18,7 +18,7 @@ from std_msgs.msg import Bool, String
 
 from delta_dynamics.feedforward import Torques
 from delta_dynamics.nodes.estimates import Estimates
-from pkm_twin.robot.catalogue import robot_of_data
+from pkm_twin.mechanisms.catalogue import robot_of_data
 from test.support.robots import often, parameters_of
 
 ROBOT = load("delta_cu")

@@ -12,7 +12,7 @@ import yaml
 
 from pkm_twin import Robot
 from pkm_twin.codegen.arrays import Array
-from pkm_twin.robot.catalogue import robot_of_data
+from pkm_twin.mechanisms.catalogue import robot_of_data
 from test.support.robots import load, parameters_of
 
 

@@ -25,7 +25,7 @@ from pkm_twin import Robot, robot_names
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError
 from pkm_twin.machine.places import given
-from pkm_twin.robot.catalogue import config_folder
+from pkm_twin.mechanisms.catalogue import config_folder
 
 LIMITED = 0.7
 """Part of the joint range that random states are drawn from."""

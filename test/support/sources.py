@@ -10,8 +10,8 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
 DEMO = {"pkm_twin.demo.run", "pkm_twin.demo.tracking"}
-REGISTRIES = {"pkm_twin.robot.catalogue", "pkm_twin.apps.nodes"} | DEMO
-"""Modules that name mechanisms by a file's key, and nodes that become processes."""
+REGISTRIES = {"pkm_twin.apps.nodes"} | DEMO
+"""Modules that name nodes, which become processes."""
 PACKAGES = ("pkm_twin", "delta_dynamics", "stiffness_monitor")
 
 

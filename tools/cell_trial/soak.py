@@ -31,7 +31,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from std_msgs.msg import Float64MultiArray
 
 from pkm_twin.bags.reader import inspect
-from pkm_twin.robot.catalogue import robot_path
+from pkm_twin.mechanisms.catalogue import robot_path
 
 MACHINES = {"picker": ("delta_cu", 0.1, 0.5), "head": ("prru", 300.0, 80.0)}
 """Namespace: robot, its viscous and its dry friction as the nodes know them."""

@@ -30,8 +30,8 @@ from pkm_twin.identification.measurements import (
 )
 from pkm_twin.identification.plan import MAX_MEASUREMENTS, Plan, parse_within
 from pkm_twin.identification.plan import plan as plan_of
+from pkm_twin.mechanisms.entries import edited_yaml, write_edited
 from pkm_twin.report import Column, Fact, Report, Table
-from pkm_twin.robot.entries import edited_yaml, write_edited
 from pkm_twin.settings import setting
 
 if TYPE_CHECKING:

@@ -11,8 +11,8 @@ from pkm_twin.apps.options import ROBOT_HELP, OfPlatform, Writes
 from pkm_twin.console import refuse_existing
 from pkm_twin.errors import FileError, UnknownNameError, one_line
 from pkm_twin.files import open_regular, replace_file
+from pkm_twin.mechanisms.catalogue import TREES, load, robot_names
 from pkm_twin.report import Fact, Report
-from pkm_twin.robot.catalogue import TREES, load, robot_names
 from pkm_twin.robot.printers import Firmware, read_printer
 from pkm_twin.settings import setting
 

@@ -272,7 +272,7 @@ def write_robot(robot: Robot, source: str, found: Found, path: Path, out: Path) 
 
     :raises PkmTwinError: not writable.
     """
-    from pkm_twin.robot.entries import Chosen, edited_yaml, write_edited
+    from pkm_twin.mechanisms.entries import Chosen, edited_yaml, write_edited
 
     kept = "".join(f", {bound}" for bound in found.constraints)
     values = {

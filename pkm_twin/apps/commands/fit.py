@@ -140,8 +140,8 @@ def fit(given: Fit) -> Report:
     from pkm_twin.identification.deflections import fit_elements
     from pkm_twin.identification.friction_laws import fit_recordings
     from pkm_twin.identification.parameters import fitted_yaml
+    from pkm_twin.mechanisms.entries import robot_text, write_edited
     from pkm_twin.report.page import page
-    from pkm_twin.robot.entries import robot_text, write_edited
 
     if given.drive is not None:
         return _of_drive(given, given.drive)

@@ -16,7 +16,7 @@ from pkm_twin.machine.formulas import PARAMETERS
 from pkm_twin.machine.machine_yaml import describe_machine_yaml, edit_yaml
 from pkm_twin.machine.places import given, has_entry, keys_of
 from pkm_twin.machine.strict_yaml import parse_yaml
-from pkm_twin.robot.catalogue import TREES, load, robot_of_data, robot_path
+from pkm_twin.mechanisms.catalogue import TREES, load, robot_of_data, robot_path
 from pkm_twin.robot.robot import Robot
 from pkm_twin.robot.robot_urdf import robot_description
 from pkm_twin.robot.urdf_read import read_urdf
