@@ -19,7 +19,7 @@ from pkm_twin.codegen.arrays import Array
 from pkm_twin.codegen.expressions import Numbers, Objects, snapped, snapped_all
 from pkm_twin.codegen.operations import cos, sin, sqrt
 from pkm_twin.machine.graph import BASE, Direction, Joint, Rod
-from pkm_twin.machine.joints import UNITS, Constraint, across, unit
+from pkm_twin.machine.joints import UNITS, Constraint
 from pkm_twin.machine.tree import Link, Step, Tree
 
 Columns = dict[tuple[str, int], Any]
@@ -405,19 +405,9 @@ def reaction_directions(joint: Joint) -> tuple[Direction, ...]:
     """Three directions in which a joint's reactions are told, fixed in bodies."""
     if joint.directions:
         return joint.directions
-    if not len(joint.axes):
-        return tuple(Direction(n, joint.inner, UNITS[i]) for i, n in enumerate("xyz"))
-    axis = joint.axes[0]
-    if joint.kind == "universal":
-        first = unit(joint.axes[1] - (joint.axes[1] @ axis) * axis)
-        pair = first, np.cross(axis, first)
-    else:
-        pair = across(axis)
-    return (
-        Direction("axis", joint.inner, axis),
-        Direction("across 1", joint.inner, pair[0]),
-        Direction("across 2", joint.inner, pair[1]),
-    )
+    names = ("axis", "across 1", "across 2") if joint.type.count else "xyz"
+    vectors = joint.type.directions(joint.axes)
+    return tuple(Direction(n, joint.inner, v) for n, v in zip(names, vectors, strict=True))
 
 
 def matrices(tree: Tree, rows: Sequence[Row]) -> tuple[Objects, Objects]:

@@ -26,7 +26,7 @@ from pkm_twin.machine.graph import (
     array,
     rotation_about_z,
 )
-from pkm_twin.machine.joints import TURN, TYPES, Freedom, across, unit
+from pkm_twin.machine.joints import TURN, TYPES, Freedom, unit
 from pkm_twin.machine.members import Tube, compliances
 from pkm_twin.machine.places import Keys, number_in, path_of, placed
 from pkm_twin.machine.sections import (
@@ -223,14 +223,12 @@ class JointSpec:
         free = np.zeros(6, bool)
         if self.actuated:
             return free
-        if self.axes is not None:
-            free[3:5] = True
-            return free
-        rows = self._unit_axes()
-        basis = np.eye(3) if not len(rows) else np.array([rows[0], *across(rows[0])])
-        for freedom in self._freedoms():
+        kind = TYPES[self.type]
+        directions = kind.directions(self._unit_axes())
+        for k, freedom in enumerate(self._freedoms()):
             if not (freedom.turns and freedom.slide):
-                free[3 * freedom.turns + freedom.nearest(basis)] = True
+                along = k if kind.count == 2 else freedom.nearest(directions)
+                free[3 * freedom.turns + along] = True
         return free
 
     def _unit_axes(self) -> Array:

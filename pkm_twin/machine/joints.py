@@ -114,6 +114,17 @@ class JointType:
         )
 
     @classmethod
+    def directions(cls, axes: Array) -> Array:
+        """Unit vectors along which loads and compliances are given, shape (3, 3)."""
+        if not cls.count:
+            return UNITS
+        first, other = axes[0], axes[-1]
+        if cls.count == 1:
+            return np.array([first, *across(first)])
+        second = unit(other - (other @ first) * first)
+        return np.array([first, second, np.cross(first, second)])
+
+    @classmethod
     def constraints(cls, axes: Array, pitch: float) -> tuple[Constraint, ...]:
         """What is left of six freedoms; arguments as of :meth:`freedoms`."""
         return tuple(held for key in cls.holds for held in HELD[key](axes, pitch))
