@@ -7,15 +7,16 @@ rotor inertia J and efficiency e of the gear, the motor gives
     torque = J N qdd + load / (N e)     where the load takes power,
     torque = J N qdd + load e / N       where it gives power back,
 
-with load = effort - J N^2 qdd, what goes through the gear.
+with load = effort - J N^2 qdd, what goes through the gear. J includes a gear's own inertia at the
+motor. Joint and effort are the model's: the ratio of a ``joint_map`` converts a controller's
+numbers before, and is not N.
 """
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Final
@@ -38,6 +39,10 @@ LEAST: Final = 2
 """Samples of a motion."""
 SHIPPED: Final = "shipped"
 RPM: Final = 2 * math.pi / 60
+STEPS: Final = 33
+"""Gears of a range that are tried at a time,"""
+ROUNDS: Final = 4
+"""and how often: each time between the neighbours of the best."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +74,7 @@ class Duty:
         power = effort * rate
         whole = float(time[-1] - time[0])
         return cls(
-            float(np.abs(effort).max()), math.sqrt(integral(time, effort**2) / whole),
+            float(np.abs(effort).max()), rms(time, effort),
             float(np.abs(rate).max()), integral(time, np.abs(rate)) / whole,
             max(0.0, float(power.max())), max(0.0, -float(power.min())),
             integral(time, np.maximum(power, 0.0)), integral(time, np.maximum(-power, 0.0)),
@@ -104,6 +109,7 @@ class Motor:
     peak_torque: float = schema.number(low=1e-6, high=1e7, unit="N m")
     rated_speed: float = schema.number(low=1e-3, high=1e7, unit="1/min")
     max_speed: float = schema.number(low=1e-3, high=1e7, unit="1/min")
+    cost: float | None = schema.number(low=0.0, default=None)
     source: str = schema.text(default="")
     curve: Any = schema.key(
         lambda field, value: _curve(field, value), "rows of speed and torque", default=None
@@ -154,8 +160,8 @@ def _curve(field: str, value: Any) -> Array:
     return rows
 
 
-def read_entries(path: Path, key: str, of: str) -> dict[Any, Any]:
-    """The mapping of a YAML under a key, from ``of`` to data.
+def read_entries(path: Path, key: str, of: str, needed: bool = True) -> dict[Any, Any]:
+    """The mapping of a YAML under a key, from ``of`` to data; empty where it is not ``needed``.
 
     :raises ParameterError: the file cannot be read or has no such mapping.
     """
@@ -164,9 +170,91 @@ def read_entries(path: Path, key: str, of: str) -> dict[Any, Any]:
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
         raise FileError(path, error, f"a YAML file of {key}") from None
     entries = data.get(key) if isinstance(data, dict) else None
+    if entries is None and not needed:
+        return {}
     if not isinstance(entries, dict) or not entries:
         raise ParameterError(str(path), None, f"a mapping {key} of {of} to data")
     return entries
+
+
+@dataclass(frozen=True)
+class Gear:
+    """A gear for joints that turn, a screw or belt for joints that slide, as its data sheet has it.
+
+    ``ratio``: turns of the motor per turn of the joint; ``lead``: m per turn of the motor.
+    ``inertia``: at the motor, kg m2. At the joint, N m and rad, or N and m: ``backlash``,
+    ``continuous_torque`` (RMS) and ``peak_torque``.
+    """
+
+    ratio: float | None = schema.number(low=1e-6, high=1e6, unit="turns per turn", default=None)
+    lead: float | None = schema.number(low=1e-6, high=1e6, unit="m per turn", default=None)
+    efficiency: float = schema.number(above=0.0, high=1.0, default=1.0)
+    inertia: float = schema.number(low=0.0, high=1e4, unit="kg m2", default=0.0)
+    backlash: float | None = schema.number(low=0.0, unit="rad or m", default=None)
+    continuous_torque: float | None = schema.number(above=0.0, unit="N m or N", default=None)
+    peak_torque: float | None = schema.number(above=0.0, unit="N m or N", default=None)
+    cost: float | None = schema.number(low=0.0, default=None)
+    source: str = schema.text(default="")
+    name: str = ""
+
+    def verify(self, path: str) -> None:
+        """Either a ratio or a lead."""
+        self.drive().verify(path)
+
+    def drive(self, inertia: float = 0.0) -> DriveSpec:
+        """A drive with this gear; its rotor's inertia, kg m2."""
+        return DriveSpec(inertia, self.ratio, self.lead, self.efficiency)
+
+    @property
+    def size(self) -> float:
+        """The ratio or the lead."""
+        return (self.ratio if self.lead is None else self.lead) or 0.0
+
+    def sized(self, key: str, size: float) -> Gear:
+        """The same with another ratio or lead."""
+        return replace(self, ratio=size) if key == "ratio" else replace(self, lead=size)
+
+    def used(self, time: Array, through: Array) -> float:
+        """The greatest used part of its torques by an effort (k,); 0 without any."""
+        peak = float(np.abs(through).max()) / (self.peak_torque or math.inf)
+        return max(peak, rms(time, through) / (self.continuous_torque or math.inf))
+
+    def __str__(self) -> str:
+        words = f"{self.size:.4g}:1" if self.lead is None else f"{1e3 * self.lead:.4g} mm per turn"
+        return f"{self.name} ({words})" if self.name else words
+
+
+@dataclass(frozen=True)
+class Gears:
+    """Gears to choose from; ``span``: all between two neighbours too."""
+
+    gears: tuple[Gear, ...]
+    span: bool = False
+
+    @classmethod
+    def of(cls, key: str, text: str, efficiency: float = 1.0) -> Gears:
+        """Of ``LOW:HIGH`` or of numbers with commas; ``key``: ratio or lead.
+
+        :raises ParameterError: another form, or numbers that no gear has.
+        """
+        span = ":" in text
+        try:
+            values = [float(word) for word in text.split(":" if span else ",")]
+        except ValueError:
+            values = []
+        low_first = len(values) == 2 and values[0] < values[1]
+        if not values or not all(1e-6 <= v <= 1e6 for v in values) or (span and not low_first):
+            raise ParameterError(f"--{key}s", text, "LOW:HIGH or numbers with commas, 1e-6 to 1e6")
+        steps = np.geomspace(values[0], values[1], STEPS).tolist() if span else values
+        own = Gear(efficiency=efficiency)
+        return cls(tuple(own.sized(key, value) for value in steps), span)
+
+    def near(self, k: int) -> Gears:
+        """Those about one of a span."""
+        low, high = self.gears[max(0, k - 1)], self.gears[min(k + 1, len(self.gears) - 1)]
+        steps = np.geomspace(low.size, high.size, STEPS).tolist()
+        key = "ratio" if low.lead is None else "lead"
+        return replace(self, gears=tuple(low.sized(key, size) for size in steps))
 
 
 def read_motors(path: Path, names: Sequence[str] = ()) -> dict[str, Motor]:
@@ -174,10 +262,7 @@ def read_motors(path: Path, names: Sequence[str] = ()) -> dict[str, Motor]:
 
     :raises ParameterError: by the field.
     """
-    if str(path) == SHIPPED:
-        path = config_folder() / "drives" / "servos.yaml"
-    elif not path.suffix and not path.exists():
-        raise UnknownNameError("drives", str(path), [SHIPPED, "FILE.yaml"])
+    path = _found(path)
     entries = read_entries(path, "drives", "names")
     for name in names:
         if name not in entries:
@@ -189,66 +274,94 @@ def read_motors(path: Path, names: Sequence[str] = ()) -> dict[str, Motor]:
     }
 
 
-@dataclass(frozen=True)
-class Fit:
-    """How a motor suits a drive, its rotor in place of the file's.
+def read_gears(path: Path) -> tuple[Gear, ...]:
+    """Gears of the same file, of a mapping ``gears`` of names to data; none where it has none.
 
-    Greatest used parts of its torque curve, of its continuous torque and of its greatest speed, 1
-    at the bound.
+    :raises ParameterError: by the field.
+    """
+    path = _found(path)
+    return tuple(
+        replace(schema.build(Gear, entry, f"{path}: gears.{name}"), name=str(name))
+        for name, entry in read_entries(path, "gears", "names", needed=False).items()
+    )
+
+
+def _found(path: Path) -> Path:
+    if str(path) == SHIPPED:
+        return config_folder() / "drives" / "servos.yaml"
+    if not path.suffix and not path.exists():
+        raise UnknownNameError("drives", str(path), [SHIPPED, "FILE.yaml"])
+    return path
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """How a motor and a gear suit a drive, the motor's rotor in place of the file's.
+
+    Greatest used parts of its torque curve, of its continuous torque, of its greatest speed and of
+    the gear's torques, 1 at the bound. ``inertia_ratio``: the greatest inertia of the load seen by
+    the motor, and the gear's, against the rotor's. ``torques``, ``speeds``: the motor's, shape
+    (k,), N m and rad/s; ``rms``, N m.
     """
 
     name: str
     motor: Motor
+    gear: Gear
     torque: float
     thermal: float
     speed: float
+    geared: float
     inertia_ratio: float
+    rms: float
+    torques: Array
+    speeds: Array
+
+    @property
+    def used(self) -> float:
+        """The greatest used part."""
+        return max(self.torque, self.thermal, self.speed, self.geared)
 
     @property
     def good(self) -> bool:
-        """Whether all three are kept."""
-        return max(self.torque, self.thermal, self.speed) <= 1.0
+        """Whether all bounds are kept."""
+        return self.used <= 1.0
 
     @property
     def answer(self) -> str:
         """In words; beyond its greatest speed a motor has no torque to be compared."""
         slow = self.speed > 1.0
         small = max(self.thermal, 0.0 if slow else self.torque) > 1.0
-        return " and ".join(["too small"] * small + ["too slow"] * slow) or "fits"
+        words = ["too small"] * small + ["too slow"] * slow + ["gear too small"] * (self.geared > 1)
+        return " and ".join(words) or "fits"
+
+    @property
+    def cost(self) -> float | None:
+        """Of the motor, and of the gear where it has one."""
+        return None if self.motor.cost is None else self.motor.cost + (self.gear.cost or 0.0)
 
     def as_json(self) -> dict[str, Any]:
         """Plain data; parts are 1 at the bound."""
         return {
-            "motor": self.name, "good": self.good, "used_torque": _finite(self.torque),
+            "good": self.good, "used_torque": _finite(self.torque),
             "used_continuous_torque": self.thermal, "used_speed": self.speed,
             "inertia_ratio": _finite(self.inertia_ratio), "source": self.motor.source,
+            **self.choice, "used_gear_torque": self.geared, "rms_torque_N_m": self.rms,
+            "peak_torque_N_m": float(np.abs(self.torques).max()),
+            "peak_speed_rad_s": float(np.abs(self.speeds).max()), "cost": self.cost,
+            "backlash": self.gear.backlash,
         }  # fmt: skip
 
+    @property
+    def choice(self) -> dict[str, Any]:
+        """The motor and the gear as plain data."""
+        gear = self.gear
+        return {
+            "motor": self.name, "gear": gear.name or None, "ratio": gear.ratio,
+            "lead_m": gear.lead,
+        }  # fmt: skip
 
-@dataclass(frozen=True)
-class Gear:
-    """A gear for joints that turn, a screw or belt for joints that slide, where the file has none.
-
-    ``ratio``: turns of the motor per turn of the joint; ``lead``: m per turn of the motor;
-    ``efficiency``: of both.
-    """
-
-    ratio: float | None = None
-    lead: float | None = None
-    efficiency: float = 1.0
-
-    def drive(self, joint: str, slides: bool, rotor: float, own: DriveSpec | None) -> DriveSpec:
-        """The drive of a joint whose rotor has this inertia at the joint, kg m2 or kg.
-
-        :raises ParameterError: the file has a drive, or this has no gear of the joint's type.
-        """
-        if own is not None:
-            raise ParameterError(f"drive of {joint}", "in the file", "no other ratio or lead")
-        way, name = (self.lead, "lead") if slides else (self.ratio, "ratio")
-        if way is None:
-            raise ParameterError(f"drive of {joint}", None, f"--{name}, for this type of joint")
-        made = DriveSpec(0.0, efficiency=self.efficiency, **{name: way})
-        return dataclasses.replace(made, inertia=rotor / made.turns**2)
+    def __str__(self) -> str:
+        return f"{self.name} with {self.gear}"
 
 
 @dataclass(frozen=True)
@@ -257,7 +370,8 @@ class DriveDuty:
 
     ``load_inertia``: least and greatest inertia of the machine at the joint without the rotor,
     kg m2 or kg; ``inertia_ratio``: the greatest, seen by the motor, against the rotor's inertia.
-    ``torques``, ``speeds``: the motor's, shape (k,), N m and rad/s.
+    ``torques``, ``speeds``: the motor's, shape (k,), N m and rad/s. ``fits``: of each motor with
+    the gear that is best for this drive; ``alike``: with the one best for all that may have it.
     """
 
     joint: str
@@ -270,6 +384,7 @@ class DriveDuty:
     torques: Array | None = None
     speeds: Array | None = None
     fits: tuple[Fit, ...] = ()
+    alike: tuple[Fit, ...] = ()
 
     def as_json(self) -> dict[str, Any]:
         """Plain data, units in the keys."""
@@ -287,13 +402,16 @@ class DriveDuty:
 
 def size_drives(
     motion: Recording, effort: Array, motors: Mapping[str, Motor] | None = None,
-    gear: Gear | None = None,
+    given: Sequence[Gear] = (), choices: Sequence[Gears] = (),
 ) -> list[DriveDuty]:  # fmt: skip
     """What each drive must supply for a motion.
 
     :param motion: with rates and accelerations; ``effort``: the joints' efforts, shape (k, n).
     :param motors: candidates by name; each replaces the rotor of the robot's file.
-    :param gear: of joints without a ``drive`` in the file; its ``rotor_inertia`` is behind it.
+    :param given: gears of joints without a ``drive`` in the file, one a type; the file's
+        ``rotor_inertia`` is behind them.
+    :param choices: gears to choose from, one for a type, in place of the file's: for each motor
+        that whose greatest used part is least.
     :raises ParameterError: fewer than two samples; motors for a joint without a gear; a gear for a
         joint that has one, or of another type.
     """
@@ -303,69 +421,127 @@ def size_drives(
     loaded = by_load(robot, motion.load, time, BLOCK)
     inertias = [mass_matrix(one, q[rows]) for one, rows in loaded]
     masses = np.diagonal(np.concatenate(inertias), axis1=-2, axis2=-1)
-    graph = robot.graph
-    result = []
-    for i, (joint, drive) in enumerate(zip(robot.joint_names, robot.drives, strict=True)):
+    duties, axes = [], []
+    for i, (joint, own) in enumerate(zip(robot.joint_names, robot.drives, strict=True)):
         slides = robot.joint_units[i] == "m"
-        rotor = graph.joints[joint].rotor_inertia
+        rotor = robot.graph.joints[joint].rotor_inertia
         load = masses[:, i] - rotor
         span = (float(load.min()), float(load.max()))
-        at_joint = Duty.of(time, effort[:, i], qd[:, i])
-        if gear is not None:
-            drive = gear.drive(joint, slides, rotor, drive)
-        if drive is None:
-            if motors:
-                need = "lead, m per turn of the motor" if slides else "ratio, turns of the motor"
-                raise ParameterError(
-                    f"{robot.name}: drive of {joint}", "no gear in the file",
-                    f"--{need}, or a section drive in the file, to compare motors",
-                )  # fmt: skip
-            result.append(DriveDuty(joint, slides, at_joint, span))
-            continue
-        through = effort[:, i] - rotor * qdd[:, i]
-        turns, share = drive.turns, drive.efficiency
-        speeds = turns * qd[:, i]
-        torques = motor_torque(through, qd[:, i], qdd[:, i], drive.inertia, turns, share)
-        fits = []
-        for name, motor in (motors or {}).items():
-            own = motor_torque(through, qd[:, i], qdd[:, i], motor.inertia, turns, share)
-            fits.append(_fit(name, motor, time, own, speeds, span[1] / turns**2))
-        ratio = span[1] / turns**2 / drive.inertia if drive.inertia > 0.0 else None
-        result.append(
-            DriveDuty(
-                joint, slides, at_joint, span, drive, Duty.of(time, torques, speeds), ratio,
-                torques, speeds, tuple(fits),
-            )
+        duty = DriveDuty(joint, slides, Duty.of(time, effort[:, i], qd[:, i]), span)
+        axis = _Axis(time, qd[:, i], qdd[:, i], effort[:, i] - rotor * qdd[:, i], span[1])
+        drive = own if not given else _drive(joint, slides, rotor, own, given)
+        if drive is not None:
+            torques = axis.torques(drive.inertia, drive)
+            speeds = drive.turns * axis.qd
+            ratio = span[1] / drive.turns**2 / drive.inertia if drive.inertia > 0.0 else None
+            duty = replace(
+                duty, drive=drive, at_motor=Duty.of(time, torques, speeds), inertia_ratio=ratio,
+                torques=torques, speeds=speeds,
+            )  # fmt: skip
+        duties.append(duty)
+        axes.append(axis)
+    if not motors:
+        return duties
+    chosen = [_choice(robot.name, duty, choices) for duty in duties]
+    for choice in dict.fromkeys(chosen):
+        rows = [i for i, one in enumerate(chosen) if one == choice]
+        alike = [_best([axes[i] for i in rows], n, m, choice) for n, m in motors.items()]
+        for column, i in enumerate(rows):
+            shared = tuple(row[column] for row in alike)
+            own_fits = shared
+            if len(choice.gears) > 1 and len(rows) > 1:
+                own_fits = tuple(_best([axes[i]], n, m, choice)[0] for n, m in motors.items())
+            duties[i] = replace(duties[i], fits=own_fits, alike=shared)
+    return duties
+
+
+def _drive(
+    joint: str, slides: bool, rotor: float, own: DriveSpec | None, given: Sequence[Gear]
+) -> DriveSpec:
+    """The drive of a joint whose rotor has this inertia at the joint, kg m2 or kg."""
+    if own is not None:
+        raise ParameterError(f"drive of {joint}", "in the file", "no other ratio or lead")
+    gear = next((gear for gear in given if (gear.lead is not None) == slides), None)
+    if gear is None:
+        name = "lead" if slides else "ratio"
+        raise ParameterError(f"drive of {joint}", None, f"--{name}, for this type of joint")
+    return gear.drive(rotor / gear.drive().turns ** 2)
+
+
+def _choice(robot: str, duty: DriveDuty, choices: Sequence[Gears]) -> Gears:
+    """The gears that a drive may have."""
+    for choice in choices:
+        if (choice.gears[0].lead is not None) == duty.slides:
+            return choice
+    drive = duty.drive
+    if drive is None or choices:
+        need = "lead, m per turn of the motor" if duty.slides else "ratio, turns of the motor"
+        raise ParameterError(
+            f"{robot}: drive of {duty.joint}", f"no {'lead' if duty.slides else 'ratio'}",
+            f"--{need}, or a section drive in the file, to compare motors",
         )  # fmt: skip
-    return result
+    return Gears((Gear(drive.ratio, drive.lead, drive.efficiency),))
 
 
-def motor_torque(
-    through: Array, qd: Array, qdd: Array, inertia: float, turns: float, efficiency: float
-) -> Array:
-    """Torque of the motor, shape (k,), N m, see the module.
-
-    :param through: effort at the joint that goes through the gear, shape (k,), N m or N.
-    :param inertia: of the rotor, kg m2.
+@dataclass(frozen=True)
+class _Axis:
+    """A joint over a motion: rates, accelerations and what goes through the gear, shape (k,) each,
+    and the greatest inertia of the load, kg m2 or kg.
     """
-    losses = np.where(through * qd < 0.0, efficiency, 1.0 / efficiency)
-    return inertia * turns * qdd + through * losses / turns
+
+    time: Array
+    qd: Array
+    qdd: Array
+    through: Array
+    load: float
+
+    def torques(self, inertia: float, drive: DriveSpec) -> Array:
+        """Of the motor, shape (k,), N m, see the module; ``inertia``: at the motor, kg m2."""
+        share, turns = drive.efficiency, drive.turns
+        losses = np.where(self.through * self.qd < 0.0, share, 1.0 / share)
+        return np.asarray(inertia * turns * self.qdd + self.through * losses / turns)
+
+    def fit(self, name: str, motor: Motor, gear: Gear) -> Fit:
+        """How a motor with a gear suits the joint."""
+        drive = gear.drive()
+        torques = self.torques(motor.inertia + gear.inertia, drive)
+        speeds = drive.turns * self.qd
+        most = motor.most(speeds)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            idle = np.where(torques == 0.0, 0.0, np.inf)
+            parts = np.where(most > 0.0, np.abs(torques) / most, idle)
+        root = rms(self.time, torques)
+        seen = self.load / drive.turns**2 + gear.inertia
+        return Fit(
+            name, motor, gear, float(parts.max()), root / motor.continuous_torque,
+            float(np.abs(speeds).max()) / float(motor.limits[0][-1]),
+            gear.used(self.time, self.through), seen / motor.inertia, root, torques, speeds,
+        )  # fmt: skip
 
 
-def _fit(name: str, motor: Motor, time: Array, torques: Array, speeds: Array, load: float) -> Fit:
-    most = motor.most(speeds)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        parts = np.where(most > 0.0, np.abs(torques) / most, np.where(torques == 0.0, 0.0, np.inf))
-    rms = math.sqrt(integral(time, torques**2) / float(time[-1] - time[0]))
-    fastest = float(np.abs(speeds).max()) / float(motor.limits[0][-1])
-    return Fit(
-        name,
-        motor,
-        float(parts.max()),
-        rms / motor.continuous_torque,
-        fastest,
-        load / motor.inertia,
-    )
+def _best(axes: Sequence[_Axis], name: str, motor: Motor, choice: Gears) -> list[Fit]:
+    """Fits of joints with one gear: of the least greatest used part of all."""
+    for _ in range(ROUNDS if choice.span else 1):
+        rows = [[axis.fit(name, motor, gear) for axis in axes] for gear in choice.gears]
+        k = min(range(len(rows)), key=lambda i: _worst(rows[i]))
+        choice = choice.near(k) if choice.span else choice
+    return rows[k]
+
+
+def _worst(fits: Sequence[Fit]) -> tuple[float, float]:
+    """What counts of joints together; beyond the curve, where a torque is infinite, the rest."""
+    return max(f.used for f in fits), max(max(f.thermal, f.speed) for f in fits)
+
+
+def smallest(fits: Sequence[Sequence[Fit]]) -> int | None:
+    """Which motor of the least continuous torque suits all drives, of their fits in one order."""
+    good = [k for k, row in enumerate(zip(*fits, strict=True)) if all(fit.good for fit in row)]
+    return min(good, key=lambda k: fits[0][k].motor.continuous_torque, default=None)
+
+
+def rms(time: Array, values: Array) -> float:
+    """Root of the mean square over time, of values (k,)."""
+    return math.sqrt(integral(time, values**2) / float(time[-1] - time[0]))
 
 
 def _finite(value: float) -> float | None:

@@ -29,6 +29,10 @@ WORST: Final = 8
 """Worst poses of each drive that are looked at closely."""
 SINGULARITY: Final = 0.05
 """Least singularity index of a pose that counts."""
+LEVER: Final = 0.3
+"""Least lever of a drive where a pose counts, against its greatest."""
+STEP: Final = 1e-4
+"""Joint motion of a difference, rad or m."""
 
 
 @dataclass(frozen=True)
@@ -46,13 +50,37 @@ class Worst:
     poses: int
 
 
-def workspace_poses(robot: Robot, rays: int = RAYS, singularity: float = SINGULARITY) -> Array:
+def workspace_poses(
+    robot: Robot,
+    rays: int = RAYS,
+    singularity: float = SINGULARITY,
+    lever: float = 0.0,
+) -> Array:
     """Poses of the workspace, shape (k, m): in reach, within limits, clear of singularities.
 
     On rays from home through the pose coordinates, up to where the workspace ends on them.
 
+    :param lever: least :func:`levers` of each drive, against its greatest in the workspace: near
+        zero at a stretched limb, where the singularity index of the machine may still be high.
     :raises ParameterError: a workspace without bounds, or a home outside of it.
     """
+    least = np.zeros(robot.joints_count)
+    if lever > 0.0:
+        least = lever * levers(robot, robot.inverse(_rays(robot, rays, singularity, least))).max(0)
+    return _rays(robot, rays, singularity, least)
+
+
+def levers(robot: Robot, q: Array) -> Array:
+    """The tool point's speed per joint rate in the direction where it is least, shape (k, n).
+
+    In m per rad or m; of a machine that only turns, the platform's turn, rad per rad or m.
+    """
+    size = np.linalg.norm(_joint_rates(robot, q), axis=-1)
+    with np.errstate(divide="ignore"):
+        return np.asarray(1.0 / size)
+
+
+def _rays(robot: Robot, rays: int, singularity: float, least: Array) -> Array:
     home, box = robot.home(), robot.search_box()
     rng = np.random.default_rng(0)
     ways = rng.normal(size=(rays, len(home)))
@@ -60,25 +88,58 @@ def workspace_poses(robot: Robot, rays: int = RAYS, singularity: float = SINGULA
     ways = np.concatenate([np.eye(len(home)), -np.eye(len(home)), ways])
     # From home to the side of the box that the ray leaves it by.
     span = np.where(ways > 0.0, box[:, 1] - home, home - box[:, 0]) * ways
-    if not _inside(robot, home[None], singularity)[0]:
+    if not _inside(robot, home[None], singularity, least)[0]:
         raise ParameterError(
             "workspace", dict(zip(robot.pose_names, home.tolist(), strict=True)),
-            "a home within the limits, clear of singularities",
+            "a home within the limits, clear of singularities and stretched limbs",
         )  # fmt: skip
     low, high = np.zeros(len(span)), np.ones(len(span))
     for _ in range(HALVINGS):
         middle = 0.5 * (low + high)
-        good = _inside(robot, home + middle[:, None] * span, singularity)
+        good = _inside(robot, home + middle[:, None] * span, singularity, least)
         low, high = np.where(good, middle, low), np.where(good, high, middle)
     rows = [home + (part * low)[:, None] * span for part in PARTS]
     found = np.concatenate([home[None], *rows])
-    return np.asarray(found[_inside(robot, found, singularity)], np.float64)
+    return np.asarray(found[_inside(robot, found, singularity, least)], np.float64)
 
 
-def _inside(robot: Robot, poses: Array, singularity: float) -> Mask:
+def _inside(robot: Robot, poses: Array, singularity: float, least: Array) -> Mask:
     """Which poses (k, m) are of the workspace."""
     q, known = try_inverse(robot, poses)
-    return counts(robot, q, poses, known, singularity, -np.inf)
+    inside = counts(robot, q, poses, known, singularity, -np.inf)
+    if least.any():
+        inside[inside] = (levers(robot, q[inside]) >= least).all(-1)
+    return inside
+
+
+def _places(robot: Robot) -> list[int]:
+    """Which pose coordinates are positions."""
+    return [i for i, name in enumerate(robot.pose_names) if name in ("x", "y", "z")]
+
+
+def _joint_rates(robot: Robot, q: Array) -> Array:
+    """Joint rates by the velocity of the tool point, the orientation constant, (k, n, size).
+
+    Of a machine that only turns, by the platform's angular velocity in axes of its own.
+    """
+    if places := _places(robot):
+        return np.asarray(np.linalg.inv(robot.jacobian(q))[..., places], np.float64)
+    return np.asarray(np.linalg.inv(np.linalg.qr(_turning(robot, q))[1]), np.float64)
+
+
+def _turning(robot: Robot, q: Array) -> Array:
+    return robot.platform_jacobian(q)[..., 3:, :]
+
+
+def _steady(robot: Robot, q: Array, qd: Array) -> Array:
+    """Joint accelerations at which the tool point, or the platform's turn, keeps its velocity."""
+    if _places(robot):
+        own = robot.pose_acceleration(q, qd, np.zeros_like(q))
+        return np.asarray(-np.linalg.solve(robot.jacobian(q), own[..., None])[..., 0])
+    step = STEP / np.maximum(np.abs(qd).max(-1, keepdims=True), STEP)
+    ahead, behind = (_turning(robot, q + way * step * qd) for way in (1.0, -1.0))
+    own = (ahead - behind) @ qd[..., None] / (2.0 * step[..., None])
+    return np.asarray(-(np.linalg.pinv(_turning(robot, q)) @ own)[..., 0], np.float64)
 
 
 def worst_over_workspace(
@@ -87,6 +148,7 @@ def worst_over_workspace(
     acceleration: float,
     *,
     singularity: float = SINGULARITY,
+    lever: float = LEVER,
     rays: int = RAYS,
 ) -> Worst:
     """The largest efforts and speeds of the drives, for the worst directions of the tool point.
@@ -95,16 +157,15 @@ def worst_over_workspace(
     worst acceleration is exact; of the speed :data:`DIRECTIONS` are tried at all poses, and
     :data:`MORE_DIRECTIONS` at the worst.
 
-    :param speed: of the tool point, m/s; ``acceleration``: m/s2.
+    :param speed: of the tool point, m/s; ``acceleration``: m/s2. Of a machine that only turns, of
+        the platform's rotation, rad/s and rad/s2.
     :param singularity: least singularity index of a pose that counts, 0 to 1.
-    :raises ParameterError: a pose without a position, or a workspace without bounds.
+    :param lever: as of :func:`workspace_poses`.
+    :raises ParameterError: a workspace without bounds.
     """
-    places = [i for i, name in enumerate(robot.pose_names) if name in ("x", "y", "z")]
-    if not places:
-        raise ParameterError("over-workspace", robot.name, "a robot whose pose has x, y or z")
-    poses = workspace_poses(robot, rays, singularity)
+    poses = workspace_poses(robot, rays, singularity, lever)
     q = robot.inverse(poses)
-    back = np.asarray(np.linalg.inv(robot.jacobian(q))[..., places], np.float64)
+    back = _joint_rates(robot, q)
     k, n = q.shape
     zero = np.zeros_like(q)
     holding = np.abs(inverse_dynamics(robot, q, zero, zero))
@@ -135,10 +196,7 @@ def _efforts(
     wide = (k, len(ways), n)
     qd = np.einsum("knj,dj->kdn", back, ways).reshape(-1, n)
     qs = np.broadcast_to(q[:, None], wide).reshape(-1, n)
-    zero = np.zeros_like(qs)
-    own = robot.pose_acceleration(qs, qd, zero)
-    qdd = -np.linalg.solve(robot.jacobian(qs), own[..., None])[..., 0]
-    base = inverse_dynamics(robot, qs, qd, qdd).reshape(wide)
+    base = inverse_dynamics(robot, qs, qd, _steady(robot, qs, qd)).reshape(wide)
     still = np.zeros_like(q)
     held = inverse_dynamics(robot, q, still, still)
     # Efforts by an acceleration along each axis of the position.

@@ -8,15 +8,16 @@ import numpy as np
 import pytest
 import yaml
 from scipy.integrate import trapezoid
+from scipy.spatial.transform import Rotation
 
 from delta_dynamics import inverse_dynamics, mass_matrix
 from pkm_twin.bags.reader import read_messages
 from pkm_twin.errors import ParameterError
 from pkm_twin.machine.sections import DriveSpec
 from pkm_twin.paths import cycle, fastest, timed
-from pkm_twin.paths.sizing import Fit, read_motors
+from pkm_twin.paths.sizing import Fit, Gear, read_motors
 from pkm_twin.recordings import write_table
-from test.commands.conftest import checked
+from test.commands.conftest import REPOSITORY, checked
 from test.support.robots import load, parameters_of
 from test.support.tables import joined, read_columns
 
@@ -231,6 +232,108 @@ def test_a_gear_on_the_command_line_is_the_files_drive(twin, tmp_path, name, mot
     assert twin("size", name, out, other, value).code == 1
 
 
+def motor_side(columns, robot, i, rotor, ratio, motor, share):
+    """A reader's own motor: torque and speed of a ratio, and the greatest used part."""
+    t = columns["time"]
+    qd, qdd, tau = (
+        joined(columns, robot, word)[:, i] for word in ("velocity", "acceleration", "effort")
+    )
+    load = tau - rotor * qdd
+    shaft = np.where(load * qd < 0, load * share / ratio, load / (ratio * share))
+    torque, speed = motor["inertia"] * ratio * qdd + shaft, ratio * qd
+    rated, most = (motor[f"{word}_speed"] * np.pi / 30 for word in ("rated", "max"))
+    peak, held = motor["peak_torque"], motor["continuous_torque"]
+    curve = np.interp(np.abs(speed), [0.0, rated, most], [peak, peak, held])
+    rms = np.sqrt(trapezoid(torque**2, t) / (t[-1] - t[0]))
+    beyond = np.inf if np.abs(speed).max() > most else (np.abs(torque) / curve).max()
+    return torque, rms, max(beyond, rms / held, np.abs(speed).max() / most)
+
+
+def test_the_ratio_is_that_of_a_search_by_brute_force(twin, tmp_path, geared):
+    """All ratios of a fine grid, for each motor: of one drive, and of all drives alike."""
+    out, drives = tmp_path / "cycle.csv", tmp_path / "drives.yaml"
+    twin.good("path", geared, "--cycle", "25,200,25", "--duration", "0.5", "--out", out,
+              "--no-picture")  # fmt: skip
+    base = {"rated_speed": 3000.0, "max_speed": 5000.0}
+    motors = {
+        "small": {"inertia": 4e-6, "continuous_torque": 0.12, "peak_torque": 0.4, **base},
+        "middle": {"inertia": 1.1e-5, "continuous_torque": 0.3, "peak_torque": 0.9, **base},
+        "large": {"inertia": 7e-5, "continuous_torque": 1.3, "peak_torque": 4.0, **base},
+    }
+    drives.write_text(yaml.safe_dump({"drives": motors}))
+    data = twin.told("size", geared, out, "--drives", drives, "--ratios", "5:80")
+    robot, columns = load(geared), read_columns(out)
+    rotor, share = GEAR["inertia"] * GEAR["ratio"] ** 2, GEAR["efficiency"]
+    ratios, names = np.arange(5.0, 80.001, 0.25), robot.joint_names
+    used = {
+        name: np.array([[motor_side(columns, robot, i, rotor, n, motor, share)[2] for n in ratios]
+                        for i in range(3)])
+        for name, motor in motors.items()
+    }  # fmt: skip
+    for i, joint in enumerate(names):
+        for entry in data["drives"][joint]["drives"]:
+            name = entry["motor"]
+            best = used[name][i].min()
+            torque, rms, own = motor_side(
+                columns, robot, i, rotor, entry["ratio"], motors[name], share
+            )
+            assert own <= best * (1 + 1e-9) and own >= 0.98 * best
+            assert entry["good"] == (own <= 1.0)
+            assert entry["rms_torque_N_m"] == pytest.approx(rms)
+            assert entry["peak_torque_N_m"] == pytest.approx(np.abs(torque).max())
+        fitting = [name for name in motors if used[name][i].min() <= 1.0]
+        assert data["smallest_for_each"][joint]["motor"] == fitting[0]
+    alike = {name: table.max(0) for name, table in used.items()}
+    (best,) = {tuple(one.items()) for one in data["smallest_for_all"].values()}
+    best = dict(best)
+    assert best["motor"] == data["smallest_motor"] == next(n for n in motors if alike[n].min() <= 1)
+    assert best["ratio"] == pytest.approx(ratios[alike[best["motor"]].argmin()], abs=0.25)
+    # Of a list, one of it.
+    some = twin.told("size", geared, out, "--drives", drives, "--ratios", "7,20,33")
+    listed = {name: table[np.isin(ratios, [7, 20, 33])] for name, table in alike.items()}
+    first = next(name for name in motors if listed[name].min() <= 1.0)
+    assert some["smallest_motor"] == first
+    chosen = {one["ratio"] for one in some["smallest_for_all"].values()}
+    assert chosen == {[7.0, 20.0, 33.0][listed[first].argmin()]}
+    for wrong in ("50:5", "5:x", "0:3", "1:2:3"):
+        twin("size", geared, out, "--drives", drives, "--ratios", wrong).one_line_error()
+
+
+def test_listed_gears_have_inertia_limits_and_cost(twin, tmp_path, geared):
+    out, drives = tmp_path / "cycle.csv", tmp_path / "drives.yaml"
+    twin.good("path", geared, "--cycle", "25,200", "--out", out, "--no-picture")
+    motor = {"inertia": 1.73e-5, "continuous_torque": 9.0, "peak_torque": 9.0, "cost": 100.0,
+             "rated_speed": 3000.0, "max_speed": 9000.0}  # fmt: skip
+    gears = {
+        "weak": {"ratio": 20.0, "peak_torque": 1.0},
+        "tight": {"ratio": 10.0, "inertia": 4e-5, "efficiency": 0.8, "continuous_torque": 50.0,
+                  "backlash": 3e-4, "cost": 40.0},
+    }  # fmt: skip
+    drives.write_text(yaml.safe_dump({"drives": {"one": motor}, "gears": gears}))
+    data = twin.told("size", geared, out, "--drives", drives)
+    robot, columns = load(geared), read_columns(out)
+    (entry,) = data["drives"]["arm_2"]["drives"]
+    rotor = GEAR["inertia"] * GEAR["ratio"] ** 2
+    _, rms, _ = motor_side(columns, robot, 1, rotor, 10.0, motor | {"inertia": 5.73e-5}, 0.8)
+    assert entry["rms_torque_N_m"] == pytest.approx(rms)
+    assert (entry["gear"], entry["cost"], entry["backlash"]) == ("tight", 140.0, 3e-4)
+    qdd, tau = (joined(columns, robot, word)[:, 1] for word in ("acceleration", "effort"))
+    t, through = columns["time"], tau - rotor * qdd
+    assert entry["used_gear_torque"] == pytest.approx(
+        np.sqrt(trapezoid(through**2, t) / (t[-1] - t[0])) / 50.0
+    )
+    seen = data["drives"]["arm_2"]["load_inertia_kg_m2"][1] / 100.0 + 4e-5
+    assert entry["inertia_ratio"] == pytest.approx(seen / 1.73e-5)
+    gears.pop("tight")
+    drives.write_text(yaml.safe_dump({"drives": {"one": motor}, "gears": gears}))
+    weak = twin.told("size", geared, out, "--drives", drives)
+    assert weak["smallest_motor"] is None
+    used = weak["drives"]["arm_2"]["drives"][0]["used_gear_torque"]
+    assert used == pytest.approx(np.abs(through).max())
+    drives.write_text(yaml.safe_dump({"drives": {"one": motor}, "gears": {"none": {"cost": 1.0}}}))
+    assert "gears.none" in twin.refused("size", geared, out, "--drives", drives)
+
+
 def test_a_motor_is_limited_by_its_curve(twin, tmp_path, geared):
     out, drives = tmp_path / "cycle.csv", tmp_path / "drives.yaml"
     twin.good("path", geared, "--cycle", "25,200", "--out", out, "--no-picture")
@@ -244,7 +347,10 @@ def test_a_motor_is_limited_by_its_curve(twin, tmp_path, geared):
     assert not slow["good"]
     assert slow["used_speed"] > 1.0
     (one,) = read_motors(drives, ["flat"]).values()
-    fit = Fit("flat", one, torque=np.inf, thermal=0.5, speed=1.2, inertia_ratio=1.0)
+    fit = Fit(
+        "flat", one, Gear(ratio=1.0), torque=np.inf, thermal=0.5, speed=1.2, geared=0.0,
+        inertia_ratio=1.0, rms=1.0, torques=np.ones(2), speeds=np.ones(2),
+    )  # fmt: skip
     assert fit.answer == "too slow" and replace(fit, thermal=1.1).answer == "too small and too slow"
     assert [replace(fit, speed=0.9, torque=t).answer for t in (0.9, 1.1)] == ["fits", "too small"]
     text = twin.good("size", geared, out, "--drives", drives).out
@@ -327,6 +433,43 @@ def test_the_worst_of_the_workspace_is_that_of_many_tries(twin, name):
         tried = np.abs(inverse_dynamics(robot, qs, qd, qdd)[:, i]).max()
         assert tried <= entry[key] * (1.0 + 0.01)
         assert tried >= entry[key] * 0.93
+
+
+def test_the_workspace_ends_before_a_limb_is_stretched(twin):
+    """A drive's lever, 0 where arm and forearm lie in line, is at most the arm's length."""
+    name, speed = "examples/machines/delta_1130.yaml", 2.0
+    kept, all_ = (
+        twin.told("size", name, "--over-workspace", f"{speed},50", "--lever", least)
+        for least in (0.4, 0.0)
+    )
+    assert kept["least_lever"] == 0.4
+    robot, length = load(REPOSITORY / name), 0.35
+    for data, bounded in ((kept, True), (all_, False)):
+        for i, entry in enumerate(data["drives"].values()):
+            q = robot.inverse(list(entry["speed_pose"].values()))
+            lever = 1.0 / np.linalg.norm(np.linalg.inv(robot.jacobian(q))[i])
+            assert entry["speed_rad_s"] == pytest.approx(speed / lever)
+            assert (lever >= 0.399 * length) == bounded
+
+
+def test_a_machine_that_only_turns_is_sized_by_its_turns(twin):
+    """Against turns of constant rate and growing rate, followed by differences in time."""
+    name, (speed, change) = "examples/machines/agile_eye.yaml", (3.0, 20.0)
+    result = twin.told("size", name, "--over-workspace", f"{speed},{change}")
+    robot, rng, step, count = load(REPOSITORY / name), np.random.default_rng(3), 1e-3, 2000
+    ways = rng.normal(size=(2, count, 3))
+    ways /= np.linalg.norm(ways, axis=-1, keepdims=True)
+    time = step * np.arange(-1.0, 2.0)[:, None, None]
+    turn = Rotation.from_rotvec((speed * ways[0] * time).reshape(-1, 3)) * Rotation.from_rotvec(
+        (0.5 * change * ways[1] * time**2).reshape(-1, 3)
+    )
+    for i, entry in enumerate(result["drives"].values()):
+        at = Rotation.from_euler("ZYX", list(entry["effort_pose"].values())[::-1])
+        poses = (turn * at).as_euler("ZYX")[:, ::-1].reshape(3, count, 3)
+        before, q, after = robot.inverse(poses)
+        rates, changes = (after - before) / (2 * step), (after - 2 * q + before) / step**2
+        tried = np.abs(inverse_dynamics(robot, q, rates, changes)[:, i]).max()
+        assert 0.9 * entry["effort_N_m"] <= tried <= 1.003 * entry["effort_N_m"]
 
 
 WAYPOINTS = "x,y,z,blend,dwell\n-0.05,0,-0.38,0,0\n-0.05,0,-0.35,0.02,0\n0.05,0,-0.35,0,0.1\n"

@@ -25,7 +25,8 @@ from pkm_twin.settings import setting
 
 if TYPE_CHECKING:
     from pkm_twin.paths.along import Compared
-    from pkm_twin.paths.sizing import DriveDuty, Fit
+    from pkm_twin.paths.sizing import DriveDuty, Fit, Gear, Gears
+    from pkm_twin.robot.robot import Robot
 
 MOST_PERCENT: Final = 1000.0
 """A used part of more is printed as more."""
@@ -47,7 +48,9 @@ class Size(CarriesAtTimes, ReadsMotions, AwayFromSingular, Draws):
     --drives compares each motor of a file with the needs of each drive, in percent of what the
     motor can do: peak torque against its torque curve, RMS torque against its continuous torque,
     and speed. The inertia ratio is that of load to rotor. The motor's rotor replaces the one in the
-    robot's file. The last line names the smallest motor that fits all drives.
+    robot's file. --ratios, --leads, or gears in the drives file: each motor has the gear whose
+    greatest used part is least. The last lines name the smallest motor for all drives, with one
+    gear, and for each.
 
     The motion is a table of `pkm-twin path` or `pkm-twin torques`, a recording of joint states, or
     a bag with a JointTrajectory.
@@ -70,10 +73,20 @@ class Size(CarriesAtTimes, ReadsMotions, AwayFromSingular, Draws):
         None, "screw or belt of the joints that slide, where the file has no drive: m per turn of "
         "the motor", low=1e-6, high=1e6,
     )  # fmt: skip
-    efficiency: float = setting(1.0, "efficiency of --ratio and --lead", low=1e-3, high=1.0)
+    ratios: str | None = setting(
+        None, "gears to choose from, in place of the file's: LOW:HIGH, or numbers with commas"
+    )
+    leads: str | None = setting(None, "the same of screws or belts")
+    efficiency: float | None = setting(
+        None, "efficiency of these; default: the robot file's, or 1", low=1e-3, high=1.0
+    )
     over_workspace: tuple[float, ...] | None = setting(
         None, "in place of a motion: speed and acceleration of the tool point (m/s, m/s2), in the "
         "worst direction at the worst pose", count=2, metavar="SPEED,ACCELERATION",
+    )  # fmt: skip
+    lever: float = setting(
+        0.3, "least motion of the tool point per joint motion, relative to the greatest in the "
+        "workspace; 0 where a limb is stretched", low=0.0, high=1.0,
     )  # fmt: skip
     efforts: str | None = setting(
         None, "efforts to use; default: the file's, with --payload only if measured and near the "
@@ -84,13 +97,16 @@ class Size(CarriesAtTimes, ReadsMotions, AwayFromSingular, Draws):
 def size(given: Size) -> Report:
     """What each drive must give, and which motors can."""
     from pkm_twin.paths.along import compared
-    from pkm_twin.paths.sizing import Gear, read_motors, size_drives
+    from pkm_twin.paths.sizing import read_motors, size_drives
 
-    geared = given.ratio is not None or given.lead is not None
     if (given.motion is None) == (given.over_workspace is None):
         raise typer.BadParameter("give a recording or path, or --over-workspace")
-    if given.motor and given.drives is None:
-        raise typer.BadParameter("--motor selects from a drives file; give --drives too")
+    searched = given.ratios is not None or given.leads is not None
+    geared = searched or given.ratio is not None or given.lead is not None
+    if given.drives is None and (given.motor or searched):
+        raise typer.BadParameter("--motor, --ratios and --leads need a drives file; give --drives")
+    if searched and (given.ratio is not None or given.lead is not None):
+        raise typer.BadParameter("--ratio and --lead give one gear; leave out --ratios and --leads")
     if given.over_workspace is not None and (geared or given.drives is not None):
         raise typer.BadParameter(
             "--over-workspace reports joints; leave out --drives, --ratio and --lead"
@@ -98,7 +114,6 @@ def size(given: Size) -> Report:
     if given.motion is None:
         return over_workspace(given)
     motors = {} if given.drives is None else read_motors(given.drives, given.motor)
-    gear = Gear(given.ratio, given.lead, given.efficiency) if geared else None
     motion = given.read(given.motion, given.machine(), planned=True).with_rates()
     taken, notes = compared(motion, given.efforts or "file"), list(motion.notes)
     doubted = taken.unlike or motion.efforts != "measured"
@@ -109,7 +124,7 @@ def size(given: Size) -> Report:
                 "--efforts file uses the file's"
             )
         taken = compared(motion, "model")
-    duties = size_drives(motion, taken.effort, motors, gear)
+    duties = size_drives(motion, taken.effort, motors, *gears(given, motion.robot))
     duration = float(motion.time[-1] - motion.time[0])
     energy = sum(d.at_joint.energy for d in duties)
     returned = sum(d.at_joint.returned for d in duties)
@@ -140,21 +155,60 @@ def size(given: Size) -> Report:
     if taken.unlike:
         notes.append(f"{taken.unlike}; --efforts model uses the model's")
     if motors:
-        best = smallest(duties)
-        facts.append(Fact("smallest_motor", best))
-        notes.append(f"smallest motor for all drives: {best or f'none of {len(motors)}'}")
-        title += f"; {notes[-1]}"
+        best, words = smallest_motors(duties)
+        facts, notes, title = facts + best, notes + words, f"{title}; {words[0]}"
     return Report(
         answer, facts, _tables(duties), {"": lambda: draw(taken, duties, title)}, notes,
     )  # fmt: skip
 
 
-def smallest(duties: Sequence[DriveDuty]) -> str | None:
-    """The motor of the least continuous torque that fits all drives."""
-    fitting = [{fit.name for fit in duty.fits if fit.good} for duty in duties]
-    good = [fit for fit in duties[0].fits if all(fit.name in names for names in fitting)]
-    best = min(good, key=lambda fit: fit.motor.continuous_torque, default=None)
-    return None if best is None else best.name
+def gears(given: Size, robot: Robot) -> tuple[list[Gear], list[Gears]]:
+    """Gears of the joints, and those to choose from.
+
+    :raises ParameterError: numbers that no gear has.
+    """
+    from pkm_twin.paths.sizing import Gear, Gears, read_gears
+
+    shares = {drive.efficiency for drive in robot.drives if drive is not None}
+    if given.efficiency is None and len(shares) > 1 and (given.ratios or given.leads):
+        raise typer.BadParameter("drives of the file have several efficiencies; give --efficiency")
+    share = given.efficiency or next(iter(shares), 1.0)
+    one, choices = [], []
+    for key, value, values in (
+        ("ratio", given.ratio, given.ratios), ("lead", given.lead, given.leads),
+    ):  # fmt: skip
+        if value is not None:
+            one.append(Gear(efficiency=share).sized(key, value))
+        if values is not None:
+            choices.append(Gears.of(key, values, share))
+    if not (one or choices) and given.drives is not None:
+        listed = read_gears(given.drives)
+        for slides in (False, True):
+            if some := tuple(gear for gear in listed if (gear.lead is not None) == slides):
+                choices.append(Gears(some))
+    return one, choices
+
+
+def smallest_motors(duties: Sequence[DriveDuty]) -> tuple[list[Fact], list[str]]:
+    """The smallest motor with a gear for all drives, and those for each, as facts and in words."""
+    from pkm_twin.paths.sizing import smallest
+
+    none = f"none of {len(duties[0].fits)}"
+    alike = smallest([duty.alike for duty in duties])
+    shared = [] if alike is None else [duty.alike[alike] for duty in duties]
+    each = {}
+    for duty in duties:
+        k = smallest([duty.fits])
+        each[duty.joint] = None if k is None else duty.fits[k]
+    facts = [
+        Fact("smallest_motor", shared[0].name if shared else None),
+        Fact("smallest_for_all",
+             dict(zip(each, [fit.choice for fit in shared], strict=True)) if shared else None),
+        Fact("smallest_for_each", {name: fit and fit.choice for name, fit in each.items()}),
+    ]  # fmt: skip
+    words = " and ".join(dict.fromkeys(map(str, shared))) or none
+    own = ", ".join(f"{name} {fit or none}" for name, fit in each.items())
+    return facts, [f"smallest motor for all drives: {words}", f"smallest for each drive: {own}"]
 
 
 def _tables(duties: Sequence[DriveDuty]) -> list[Table]:
@@ -196,6 +250,14 @@ def _tables(duties: Sequence[DriveDuty]) -> list[Table]:
             ]
             for fit in fits
         }  # fmt: skip
+        more: dict[str, list[Any]] = {
+            "gear": [str(fit.gear) for fit in fits] if len({fit.gear for fit in fits}) > 1 else [],
+            "cost": [fit.cost for fit in fits] if any(fit.cost is not None for fit in fits) else [],
+        }
+        for name, values in more.items():
+            columns += [Column("", "", name)] * bool(values)
+            for fit, value in zip(fits, values, strict=False):
+                rows[fit.name].append(value)
         if fits:
             tables.append(Table("", columns, rows, f"used of each motor by {d.joint}:", "motor"))
     return tables
@@ -216,8 +278,11 @@ def over_workspace(given: Size) -> Report:
         check_limit("over-workspace", value or LEAST_LIMIT)
     robot, held = given.machine(), given.load
     robot = robot if held is None else held.on(robot)
-    worst = worst_over_workspace(robot, speed, change, singularity=given.singularity)
+    worst = worst_over_workspace(
+        robot, speed, change, singularity=given.singularity, lever=given.lever
+    )
     names = robot.pose_names
+    turns = not {"x", "y", "z"} & set(names)
     data: dict[str, dict[str, Any]] = {}
     rows: dict[str, list[Any]] = {}
     for i, joint in enumerate(robot.joint_names):
@@ -238,15 +303,22 @@ def over_workspace(given: Size) -> Report:
     k = int(worst.effort.argmax())
     answer = (
         f"{robot.name}: {robot.joint_names[k]} needs up to {worst.effort[k]:.4g} "
-        f"{robot.effort_units[k]} where the tool point moves at {speed:g} m/s and {change:g} m/s2"
-    )
+        f"{robot.effort_units[k]} where the "
+        + ("platform turns at {:g} rad/s and {:g} rad/s2" if turns else
+           "tool point moves at {:g} m/s and {:g} m/s2").format(speed, change)
+    )  # fmt: skip
     columns = [Column("", "", "largest"), Column("", "", " "), Column("", "", "pose (m, rad)")]
     return Report(
         answer,
         [
-            Fact("robot", robot.name), Fact("speed_m_s", speed),
-            Fact("acceleration_m_s2", change),
-            Fact("poses", worst.poses, text="poses of the workspace"), Fact("drives", data),
+            Fact("robot", robot.name), Fact("speed_rad_s" if turns else "speed_m_s", speed),
+            Fact("acceleration_rad_s2" if turns else "acceleration_m_s2", change),
+            Fact("least_singularity", given.singularity),
+            Fact("least_lever", given.lever),
+            Fact("poses", worst.poses, text="poses of the workspace", shown=(
+                f"{worst.poses}, singularity index {given.singularity:g} or more, levers "
+                f"{given.lever:g} or more")),
+            Fact("drives", data),
         ],
         [Table("", columns, rows, head="joint")],
     )  # fmt: skip
@@ -267,8 +339,9 @@ def draw(taken: Compared, duties: Sequence[DriveDuty], answer: str) -> Any:
     figure, axes = plots.columns(1, len(shown))
     m = taken.motion
     for k, (ax, d) in enumerate(zip(axes[0], shown, strict=True)):
-        if d.torques is not None and d.speeds is not None:
-            speeds, torques, words = d.speeds / RPM, d.torques, "motor"
+        chosen = near(d)[-1] if d.fits else d
+        if chosen.torques is not None and chosen.speeds is not None:
+            speeds, torques, words = chosen.speeds / RPM, chosen.torques, "motor"
             labels = "speed of the motor (1/min)", "torque (N m)"
         else:
             speeds, torques = m.motion[1][:, k], taken.effort[:, k]
@@ -296,9 +369,14 @@ def draw(taken: Compared, duties: Sequence[DriveDuty], answer: str) -> Any:
                     ax.plot(way * speed / RPM, sign * torque, color=colour, lw=1, label=label)
         if d.fits:
             fit = near(d)[-1]
+            for sign in (1.0, -1.0):
+                level = sign * fit.motor.continuous_torque
+                ax.axhline(
+                    level, color="0.5", ls="--", lw=1, label="continuous" if sign > 0 else None
+                )
             parts = tuple(map(_percent, (fit.torque, fit.thermal, fit.speed)))
             words = (
-                f"{fit.name} {'' if fit.good else 'is '}{fit.answer}: "
+                f"{fit} {'' if fit.good else 'is '}{fit.answer}: "
                 "torque {}, RMS torque {}, speed {}".format(*parts)
             )
             fastest = 1.3 * float(np.abs(speeds).max())
