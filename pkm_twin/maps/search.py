@@ -30,12 +30,14 @@ INSIDE: Final = 1e-9
 """Part of a joint's range that the search stays away from its ends."""
 
 
-def worst_of(space: Space, case: Case, starts: Array) -> Worst:
+def worst_of(
+    space: Space, case: Case, starts: Array, tell: Callable[[float], object] = abs
+) -> Worst:
     """The worst pose of the workspace.
 
     Over joint positions between finite limits, otherwise over poses in the map's box.
 
-    :param starts: poses that count, shape (k, m).
+    :param starts: poses that count, shape (k, m). ``tell``: gets the part that is done, 0 to 1.
     :raises ParameterError: no pose counts; the error names what removes most of them.
     """
     robot, kind = space.robot, space.kind
@@ -70,7 +72,7 @@ def worst_of(space: Space, case: Case, starts: Array) -> Worst:
         order = np.argsort(-score(more, kind.screen), kind="stable")
         tried = np.concatenate([tried, more[order[: kind.samples]]])
     kept = inside if kind.screen is not None else None
-    x, best = evolved(score, np.clip(tried, low, high), low, high, kind, rng, kept)
+    x, best = evolved(score, np.clip(tried, low, high), low, high, kind, rng, kept, tell)
     if not np.isfinite(best):
         why = "" if inside(tried).any() else causes(
             robot, *space.state(tried), space.least, space.least_clearance
@@ -94,6 +96,7 @@ def evolved(
     kind: Kind,
     rng: np.random.Generator,
     inside: Callable[[Array], NDArray[np.bool_]] | None = None,
+    tell: Callable[[float], object] = abs,
 ) -> tuple[Array, float]:
     """The place (n,) of the highest score in a box, and it, from the best of the places tried.
 
@@ -108,7 +111,8 @@ def evolved(
     x, f = tried[order], scores[order]
     count, n = x.shape
     step = np.full(count, 0.1)
-    for _ in range(kind.rounds):
+    for done in range(kind.rounds):
+        tell(done / kind.rounds)
         a, b = (x[rng.integers(0, count, count)] for _ in range(2))
         alone = np.equal.outer(rng.integers(0, n, count), np.arange(n))
         along = alone | (rng.random((count, 1)) < 0.5)

@@ -140,10 +140,8 @@ def draw(robot: Robot) -> Any:
     scene, q = Scene(robot), robot.inverse(robot.home())
     shapes = scene.shapes(q)
     camera = Camera(*scene.box())
-    half = shapes.cylinder_sizes[:, 2:] / 2 * _along(shapes.cylinder_turns)
-    ends = np.stack([shapes.cylinder_at - half, shapes.cylinder_at + half], axis=1)
     sizes = shapes.cylinder_sizes[:, 0]
-    for pair, radius, colour in zip(ends, sizes, shapes.cylinder_colours, strict=True):
+    for pair, radius, colour in zip(shapes.ends, sizes, shapes.cylinder_colours, strict=True):
         camera.cylinder(pair, float(radius), colour)
     for at, radius, colour in zip(
         shapes.ball_at, shapes.ball_sizes[:, 0], shapes.ball_colours, strict=True
@@ -165,12 +163,6 @@ def draw(robot: Robot) -> Any:
         ax.annotate(name, (right, up), (0, 9), textcoords="offset points", **style)
     _corners(ax, camera, style)
     return figure
-
-
-def _along(turns: Array) -> Array:
-    """The z axes of quaternions with w first, shape (k, 3)."""
-    w, x, y, z = turns.T
-    return np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], axis=-1)
 
 
 def _corners(ax: Any, camera: Camera, style: dict[str, Any]) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Final, Literal
@@ -22,7 +23,9 @@ from pkm_twin.robot.clearance import has_clearance, joint_clearance
 from pkm_twin.robot.limits import beyond_limits
 from pkm_twin.robot.robot import Robot
 from pkm_twin.robot.workspace import has_joint_angles, passive_values
+from pkm_twin.view.scene import Deflection
 from stiffness_monitor import PlatformResponse, platform_response
+from stiffness_monitor.compliance import member_deflections
 
 Grade = Literal["good", "warn", "bad"]
 
@@ -35,7 +38,7 @@ SAME: Final = 1e-6
 """By how much a pose may miss itself, there and back, per 1 and its size; m and rad."""
 STEPS: Final = 6
 """Steps of Newton from one place of the platform to the next that is asked for."""
-VISIBLE: Final = 0.15
+VISIBLE: Final = 0.3
 """Size that the greatest deflection may be enlarged to, per size of the machine."""
 
 
@@ -276,11 +279,11 @@ class Model:
         moved = self.to_pose(state, rows[0])
         return moved if moved.refusal else self.loaded(moved, rows[1])
 
-    def softest(self, state: State) -> tuple[State, str]:
-        """The softest pose of the workspace, or the one that the state's wrench moves most.
+    def softest(self, wrench: Array, tell: Callable[[float], object] = abs) -> tuple[Array, str]:
+        """Joint positions of the softest pose, or of the one that a wrench (6,) moves most.
 
         The second part is the answer in words, with its units. The search is that of
-        ``pkm-twin atlas``.
+        ``pkm-twin atlas``; ``tell`` gets the part that is done, 0 to 1.
 
         :raises PkmTwinError: no elasticity in the robot's file, or no pose that counts.
         """
@@ -289,14 +292,14 @@ class Model:
         from pkm_twin.maps.sweep import map_of
 
         robot, kind = self.robot, Compliance()
-        cases = [kind.loaded(robot, "load", state.wrench.tolist())] if state.wrench.any() else ()
+        cases = [kind.loaded(robot, "load", wrench.tolist())] if wrench.any() else ()
         space = map_of(robot, kind, cases=cases)
-        worst = worst_of(space, space.cases[0], self.start.pose[None])
+        worst = worst_of(space, space.cases[0], self.start.pose[None], tell)
         what = "largest deflection {:.4g} µm" if cases else "softest: {:.4g} µm/N"
         direction = np.zeros(3) if worst.found.direction is None else worst.found.direction
         along = ", ".join(f"{part:.2f}" for part in np.round(direction.reshape(-1), 2) + 0.0)
         told = what.format(1e6 * worst.found.value.item())
-        return self.to_joints(state, worst.q), f"{told} along ({along})"
+        return worst.q, f"{told} along ({along})"
 
     def numbers(self, state: State) -> Numbers:
         """All that is known of a state; what fails at this place is said in ``why``."""
@@ -322,6 +325,12 @@ class Model:
             gap, "good" if gap is None else _grade(gap, 0.0, NEAR),
             effort, self._overloaded(effort), energy, why,
         )  # fmt: skip
+
+    def deflected(self, state: State, deflection: Array) -> Deflection:
+        """The members' displacements where the platform's is (6,), m and rad, base axes."""
+        robot, q = self.robot, state.q
+        wrench = np.linalg.solve(platform_response(robot, q, np.zeros(6)).compliance, deflection)
+        return Deflection(np.asarray(deflection), member_deflections(robot, q, wrench))
 
     def _overloaded(self, effort: Array | None) -> tuple[str, ...]:
         limits = self.robot.limits.effort

@@ -12,6 +12,7 @@ import logging
 import socket
 import threading
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future
 from contextlib import contextmanager
 from functools import partial
 from typing import Any, Final, Protocol
@@ -170,8 +171,7 @@ class Page:
             self.ask(self._enlarge.on_update, "enlarge", self._show)
             self._loads = gui.add_html("")
             if "energy" not in model.numbers(self.state).why:
-                self.ask(gui.add_button("Go to the softest pose").on_click, "soft", self._soften)
-                self._softest = gui.add_html("")
+                self.moving.append(Search(self))
         self._link = gui.add_text("link", model.link(self.state))
         self.ask(self._link.on_update, "link", self._follow)
         gui.add_html(texts.buttons(model.robot.name))
@@ -216,16 +216,6 @@ class Page:
     def _follow(self) -> None:
         self.become(self.model.linked(self.state, self._link.value))
 
-    def _soften(self) -> None:
-        self._softest.content = texts.note("searching the workspace ...")
-        try:
-            state, told = self.model.softest(self.state)
-        except PkmTwinError as error:
-            self._softest.content = texts.note(str(error))
-            return
-        self.become(state)
-        self._softest.content = texts.note(told)
-
     def _go_home(self) -> None:
         self.become(self.model.to_joints(self.state, self.model.start.q))
 
@@ -241,11 +231,11 @@ class Page:
             self._status.content = texts.status(self.model, state, numbers)
             self._loads.content = texts.load(numbers)
             if energy is None or energy.dominant == "none":
-                self.stage.draw(state.q, np.zeros(6), {}, "")
+                self.stage.draw(state.q)
             else:
                 factors = np.asarray(energy.factors).tolist()
                 shares = dict(zip(energy.elements, factors, strict=True))
-                self.draw_deflected(np.asarray(energy.deflection), shares, str(energy.dominant))
+                self.draw_deflected(energy.deflection, shares, str(energy.dominant))
             self.stage.draw_wrench(numbers.position, state.wrench / self._tops)
             self.stage.extend_trail(numbers.position)
             if not self._dragged:
@@ -255,7 +245,58 @@ class Page:
 
     def draw_deflected(self, deflection: Array, shares: dict[str, float], dominant: str) -> None:
         """The state with a deflection (6,), m and rad, base axes, enlarged as the slider says."""
-        self.stage.draw(self.state.q, deflection * self._enlarge.value, shares, dominant)
+        moved = self.model.deflected(self.state, deflection).times(self._enlarge.value)
+        self.stage.draw(self.state.q, moved, shares, dominant)
+
+
+class Search:
+    """The softest pose, looked for in a thread of its own."""
+
+    def __init__(self, page: Page) -> None:
+        self._page, self._done = page, 0.0
+        self._found: Future[tuple[Array, str]] | None = None
+        button = page.server.gui.add_button("Go to the softest pose")
+        self._note = page.server.gui.add_html("")
+        page.ask(button.on_click, "soft", self._begin)
+
+    @property
+    def busy(self) -> bool:
+        """Whether it is under way, or found what is not shown yet."""
+        return self._found is not None
+
+    def _begin(self) -> None:
+        if self.busy:
+            return
+        self._found = found = Future[tuple[Array, str]]()
+        wrench = self._page.state.wrench
+
+        def work() -> None:
+            try:
+                found.set_result(self._page.model.softest(wrench, self._tell))
+            except BaseException as error:
+                found.set_exception(error)
+
+        threading.Thread(target=work, name="softest", daemon=True).start()
+
+    def _tell(self, done: float) -> None:
+        self._done = done
+
+    def step(self) -> None:
+        """Say how far it is, then go there."""
+        found, page = self._found, self._page
+        if found is None:
+            return
+        if not found.done():
+            self._note.content = texts.note(f"searching the workspace: {100 * self._done:.0f} %")
+            return
+        self._found, self._done = None, 0.0
+        try:
+            q, told = found.result()
+        except PkmTwinError as error:
+            self._note.content = texts.note(str(error))
+            return
+        page.become(page.model.to_joints(page.state, q))
+        self._note.content = texts.note(told)
 
 
 def _put(handles: Sequence[Any], values: Array) -> None:

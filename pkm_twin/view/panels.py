@@ -15,6 +15,7 @@ from pkm_twin.view import texts
 from pkm_twin.view.live import SPAN, TOPICS, TRACES, Live
 from pkm_twin.view.model import VISIBLE, State
 from pkm_twin.view.page import Page
+from pkm_twin.view.scene import Deflection
 from pkm_twin.view.timeline import Timeline
 from stiffness_monitor.modes import Modes, modes
 
@@ -176,7 +177,13 @@ class ModePanel:
         if sizes[0] < 0.1 * sizes.max():
             told += f"; {names[int(sizes.argmax())]} moves most, the platform hardly"
         self._told.content = texts.note(told)
-        self._shift = VISIBLE / 2 * self._page.model.robot.graph.size * shape[0] / sizes.max()
+        part = VISIBLE / 3 * self._page.model.robot.graph.size / sizes.max()
+        # A member's nodes have its name and their number.
+        owners = [name.rpartition(" ")[0] for name in names[1:]]
+        at, moved = self._modes.positions[1:], shape[1:, :3]
+        rows = {name: np.array([owner == name for owner in owners]) for name in owners}
+        members = {name: (at[own], moved[own]) for name, own in rows.items()}
+        self._shape = Deflection(shape[0], members).times(part)
         strain = self._modes.energies.strain[k].tolist()
         self._shares = dict(zip(self._modes.energies.elements, strain, strict=True))
 
@@ -188,7 +195,7 @@ class ModePanel:
         if self._modes is not None:
             swing = float(np.sin(2 * np.pi * time.monotonic() / SLOWLY))
             most = max(self._shares, key=lambda name: self._shares[name])
-            self._page.stage.draw(state.q, swing * self._shift, self._shares, most)
+            self._page.stage.draw(state.q, self._shape.times(swing), self._shares, most)
 
 
 class LivePanel:

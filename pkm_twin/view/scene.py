@@ -79,6 +79,34 @@ class Shapes:
     places: dict[str, Array]
     drives: dict[str, Array]
 
+    @property
+    def ends(self) -> Array:
+        """Of the cylinders' axes, (k, 2, 3) m."""
+        turns = Rotation.from_quat(np.roll(self.cylinder_turns, -1, axis=1))
+        half = turns.apply([0.0, 0.0, 0.5]) * self.cylinder_sizes[:, 2:]
+        return np.stack([self.cylinder_at - half, self.cylinder_at + half], axis=1)
+
+
+@dataclass(frozen=True, eq=False)
+class Deflection:
+    """How a machine is deflected, as it is to be drawn; base axes.
+
+    ``platform``: (6,), m and rad. ``members``: by name, points along it at rest, from one end to
+    the other, (k, 3) m, and their displacements of the same shape.
+    """
+
+    platform: Array
+    members: Mapping[str, tuple[Array, Array]]
+
+    def times(self, factor: float) -> Deflection:
+        """The same, enlarged."""
+        members = {name: (at, factor * moved) for name, (at, moved) in self.members.items()}
+        return Deflection(factor * self.platform, members)
+
+
+RIGID: Final = Deflection(np.zeros(6), {})
+"""No deflection."""
+
 
 class Scene:
     """The shapes of a robot in any state: how many they are never changes."""
@@ -86,7 +114,13 @@ class Scene:
     def __init__(self, robot: Robot) -> None:
         self.robot, graph = robot, robot.graph
         self.size = graph.size
-        self.bars = robot_bars(robot)
+        # What slides on an axis stays on a pin along it.
+        pins = [
+            Bar(j.name, (j.inner, j.at), (j.outer, j.at), BAR * graph.size / 2)
+            for j in graph.joints.values()
+            if j.kind == "cylindrical"
+        ]
+        self.bars = (*robot_bars(robot), *pins)
         self.base = base_face(graph)
         self.platform = platform_face(graph) - graph.origin
         self._thin = BAR * graph.size
@@ -94,7 +128,7 @@ class Scene:
         self._joints = [j for j in graph.joints.values() if j.kind not in ("translation", "fixed")]
         self._drives = {j.name: self._motor(j) for j in self._joints if j.actuated}
         self._balls = self._ball_places()
-        self._legs = self._telescopes()
+        self._members: dict[tuple[str, bytes], str] = {}
 
     def _ball_places(self) -> list[tuple[str, Place]]:
         """Where balls stand: joints that turn, and the ends of rods, by the joint's label."""
@@ -110,17 +144,24 @@ class Scene:
                 found += [(name, (body, end + aside)) for name, body, end in ends]
         return found
 
-    def _telescopes(self) -> dict[str, tuple[Place, Place]]:
-        """Foot of the tube and tip of the ram of each telescope on the platform, by body."""
-        graph = self.robot.graph
-        legs: dict[str, tuple[Place, Place]] = {}
-        for joint in filter(telescope, self._joints):
-            foot = joint.inner, tube_start(graph, joint)
-            ends = (spot for bar in self.bars for spot in (bar.start, bar.end))
-            held = (spot for spot in ends if spot[0] == joint.outer and self._on_platform(spot))
-            if (tip := next(held, None)) is not None:
-                legs |= dict.fromkeys((joint.inner, joint.outer), (foot, tip))
-        return legs
+    def _member(self, place: Place) -> str:
+        """The member whose end a point is, else that it is on, else that ends there; or none."""
+        key = place[0], place[1].tobytes()
+        if key not in self._members:
+            self._members[key] = self._find_member(*place)
+        return self._members[key]
+
+    def _find_member(self, body: str, point: Array) -> str:
+        near = 1e-6 * self.size
+        ends = [
+            (owner == body, beam.name)
+            for beam in self.robot.beams
+            for owner, end in (beam.inner, beam.outer)
+            if float(np.linalg.norm(end - point)) < near
+        ]
+        found = [name for own, name in ends if own]
+        found += [beam.name for beam in self.robot.beams if body in beam.parts]
+        return next(iter([*found, *(name for _, name in ends)]), "")
 
     def _on_platform(self, place: Place) -> bool:
         """Whether a point moves with the platform: one of it, or of a joint with it."""
@@ -146,32 +187,26 @@ class Scene:
         return max(at_end, default=self._thin)
 
     def shapes(
-        self, q: Array, deflection: Array | None = None, shares: Mapping[str, float] | None = None
+        self, q: Array, moved: Deflection = RIGID, shares: Mapping[str, float] | None = None
     ) -> Shapes:
         """Shapes at joint positions, shape (n,).
 
-        :param deflection: of the platform as it is to be drawn, already enlarged: (6,), m and rad,
-            base axes.
+        :param moved: the deflection as it is to be drawn, already enlarged.
         :param shares: of the strain energy by element, which colour members and joints.
         """
         posture, graph = Posture(self.robot, q), self.robot.graph
         colours = share_colours(shares or {})
         origin = posture.place(graph.platform, graph.origin)
-        moved = np.zeros(6) if deflection is None else np.array(deflection)
-        turn = Rotation.from_rotvec(moved[3:])
+        shift, turn = moved.platform[:3], Rotation.from_rotvec(moved.platform[3:])
 
         def place(spot: Place) -> Array:
             point = posture.place(*spot)
-            if not moved.any():
+            if moved is RIGID:
                 return point
             if self._on_platform(spot):
-                return np.asarray(origin + moved[:3] + turn.apply(point - origin), np.float64)
-            if spot[0] not in self._legs:
-                return point
-            # A leg turns about its foot, so that its tip stays on the platform.
-            foot, tip = (posture.place(*end) for end in self._legs[spot[0]])
-            part = np.clip((point - foot) @ (tip - foot) / ((tip - foot) @ (tip - foot)), 0.0, 1.0)
-            return np.asarray(point + part * (place(self._legs[spot[0]][1]) - tip), np.float64)
+                return np.asarray(origin + shift + turn.apply(point - origin), np.float64)
+            member = moved.members.get(self._member(spot))
+            return point if member is None else point + _along(*member, point)
 
         motors = list(self._drives.values())
         cylinders = [*self.bars, *motors]
@@ -198,28 +233,26 @@ class Scene:
             np.concatenate([np.array(balls).reshape(-1, 3), tips]),
             np.repeat(np.concatenate([ball_radii, tip_radii])[:, None], 3, axis=1),
             np.array([*ball_colours, *np.repeat(bar_colours, 2, axis=0)], np.uint8),
-            origin + moved[:3],
+            origin + shift,
             _quaternions(turn * whole),
             places,
             dict(zip(self._drives, ends[len(self.bars) :].mean(1), strict=True)),
         )
 
-    def frames(self, q: Array, deflection: Array) -> dict[str, tuple[Array, Array]]:
+    def frames(self, q: Array, moved: Deflection) -> dict[str, tuple[Array, Array]]:
         """Where points of each body that are given at home, base axes, now stand.
 
-        Position (3,), m, and quaternion (4,), w first; the platform's with a deflection (6,), m
-        and rad, already enlarged.
+        Position (3,), m, and quaternion (4,), w first; the platform's with its deflection.
         """
         posture, graph = Posture(self.robot, q), self.robot.graph
         result = {}
         for body, rotation in posture.rotations.items():
             at, turn = posture.place(body, np.zeros(3)), Rotation.from_matrix(rotation)
             if body == graph.platform:
-                origin, more = (
-                    posture.place(body, graph.origin),
-                    Rotation.from_rotvec(deflection[3:]),
-                )
-                at, turn = origin + deflection[:3] + more.apply(at - origin), more * turn
+                origin, more = posture.place(body, graph.origin), moved.platform[3:]
+                about = Rotation.from_rotvec(more)
+                at = origin + moved.platform[:3] + about.apply(at - origin)
+                turn = about * turn
             result[body] = at, _quaternions(turn)
         return result
 
@@ -254,6 +287,14 @@ class Scene:
         return points.min(0), points.max(0)
 
 
+def _along(points: Array, displacements: Array, at: Array) -> Array:
+    """Of displacements at points of a straight line, evenly apart, that at a place, (3,)."""
+    span = points[-1] - points[0]
+    share = np.clip((at - points[0]) @ span / (span @ span), 0.0, 1.0)
+    shares = np.linspace(0.0, 1.0, len(points))
+    return np.array([np.interp(share, shares, column) for column in displacements.T])
+
+
 def _cylinders(ends: Array, radii: Array) -> tuple[Array, Array, Array]:
     """Middles, quaternions and sizes of cylinders between two points each, shape (k, 2, 3)."""
     along = ends[:, 1] - ends[:, 0]
@@ -281,24 +322,32 @@ ANCHORS: Final = {
 
 
 def anchors(spots: Array, sizes: Array, window: tuple[float, float]) -> list[str]:
-    """An anchor for each label, so that none covers an earlier one; empty where none is free.
+    """An anchor for each label, so that none covers another; empty where none is free.
+
+    What finds no place is placed first in another attempt.
 
     :param spots: places named in the picture, (k, 2) pixels, right and down; ``sizes``: (k, 2).
     :param window: width and height; a label outside of it is not placed.
     """
-    taken: list[tuple[Array, Array]] = []
-    result = []
-    for spot, half in zip(spots, sizes / 2, strict=True):
-        for name, aside in ANCHORS.items():
-            middle = spot + half * aside
-            within = (middle >= half).all() and (middle + half <= window).all()
-            if within and all((np.abs(middle - m) >= half + h).any() for m, h in taken):
-                taken.append((middle, half))
-                result.append(name)
-                break
-        else:
-            result.append("")
-    return result
+    order, best = list(range(len(spots))), [""] * len(spots)
+    for _ in spots:
+        taken: list[tuple[Array, Array]] = []
+        result = [""] * len(spots)
+        for k in order:
+            spot, half = spots[k], sizes[k] / 2
+            for name, aside in ANCHORS.items():
+                middle = spot + half * aside
+                within = (middle >= half).all() and (middle + half <= window).all()
+                if within and all((np.abs(middle - m) >= half + h).any() for m, h in taken):
+                    taken.append((middle, half))
+                    result[k] = name
+                    break
+        if sum(map(bool, result)) > sum(map(bool, best)):
+            best = result
+        order.sort(key=lambda k: bool(result[k]))
+        if all(result):
+            break
+    return best
 
 
 def seen(points: Array, camera: Any) -> tuple[Array, Array]:

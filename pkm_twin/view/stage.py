@@ -20,6 +20,8 @@ from pkm_twin.view.scene import (
     BODY,
     GROUND,
     PLATFORM,
+    RIGID,
+    Deflection,
     Scene,
     anchors,
     plate,
@@ -104,7 +106,7 @@ class Stage:
         )  # fmt: skip
         self._server.on_client_connect(self._frame)
         camera = self._server.initial_camera
-        camera.position = tuple((middle + 1.25 * reach * LOOK).tolist())
+        camera.position = tuple((middle + 1.05 * reach * LOOK).tolist())
         camera.look_at = tuple(middle.tolist())
         camera.up = (0.0, 0.0, 1.0)
         draw.add_frame("/base", **_axes(0.12 * size, size))
@@ -157,6 +159,10 @@ class Stage:
         self._platform = draw.add_frame("/platform", **_axes(0.1 * size, size))
         self._tool(away)
         self._rest = draw.add_frame("/at_rest", show_axes=False, visible=False)
+        self._rest_bars = draw.add_line_segments(
+            "/bars_at_rest", np.zeros((1, 2, 3)), colors=GROUND, thickness=1.5,
+            thickness_units="screen", visible=False,
+        )  # fmt: skip
         if len(scene.platform):
             moving = plate(scene.platform, 0.016 * size)
             draw.add_mesh_simple("/platform/plate", *moving, color=PLATFORM, flat_shading=True)
@@ -206,14 +212,20 @@ class Stage:
         for frame in self._meshes.values():
             frame.visible = shown
 
-    def draw(self, q: Array, deflection: Array, shares: Mapping[str, float], dominant: str) -> None:
-        """The machine at q (n,), its platform moved by an enlarged deflection (6,), m and rad.
+    def draw(
+        self,
+        q: Array,
+        moved: Deflection = RIGID,
+        shares: Mapping[str, float] | None = None,
+        dominant: str = "",
+    ) -> None:
+        """The machine at q (n,), with a deflection as it is to be drawn, already enlarged.
 
-        Where it moves, the platform at rest is a shadow beside it. Elements have the colour of
+        At rest it is a shadow of the platform and lines along the bars. Elements have the colour of
         their share, ``dominant`` has a label.
         """
-        moved = bool(deflection.any())
-        shapes = self._scene.shapes(q, deflection if moved else None, shares)
+        shares = shares or {}
+        shapes = self._scene.shapes(q, moved, shares)
         bars, balls = self._cylinders, self._balls
         bars.batched_positions, bars.batched_wxyzs = shapes.cylinder_at, shapes.cylinder_turns
         bars.batched_scales = shapes.cylinder_sizes
@@ -223,14 +235,15 @@ class Stage:
         balls.batched_colors = _linear(shapes.ball_colours)
         self._platform.position, self._platform.wxyz = shapes.platform_at, shapes.platform_turn
         if self._meshes:
-            for body, (at, turn) in self._scene.frames(q, deflection).items():
+            for body, (at, turn) in self._scene.frames(q, moved).items():
                 if body in self._meshes:
                     self._meshes[body].position, self._meshes[body].wxyz = at, turn
         self._places, self._element = dict(shapes.drives), ""
-        self._rest.visible = moved
-        if moved:
+        self._rest.visible = self._rest_bars.visible = moved is not RIGID
+        if moved is not RIGID:
             rest = self._scene.shapes(q)
             self._rest.position, self._rest.wxyz = rest.platform_at, rest.platform_turn
+            self._rest_bars.points = rest.ends
         if dominant in shapes.places:
             self._element = f"{dominant}: {100 * shares[dominant]:.0f} % of the strain energy"
             self._places = {self._element: shapes.places[dominant]} | self._places

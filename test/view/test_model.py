@@ -10,11 +10,22 @@ import pytest
 from delta_dynamics import inverse_dynamics
 from pkm_twin import robot_names
 from pkm_twin.robot.clearance import clearance, has_clearance
-from pkm_twin.robot.outline import Posture
+from pkm_twin.robot.outline import Posture, telescope
 from pkm_twin.view import texts
 from pkm_twin.view.model import Model, _round, _step
-from pkm_twin.view.scene import ANCHORS, SCALE, Scene, anchors, plate, round_mesh, share_colours
+from pkm_twin.view.scene import (
+    ANCHORS,
+    RIGID,
+    SCALE,
+    Deflection,
+    Scene,
+    anchors,
+    plate,
+    round_mesh,
+    share_colours,
+)
 from stiffness_monitor import compliance
+from stiffness_monitor.compliance import member_deflections
 from test.support.robots import has, load, rigid
 
 URDF = Path(__file__).resolve().parents[1] / "machine/five_bar.urdf"
@@ -157,7 +168,10 @@ def test_the_softest_pose_is_softer_than_all_others(rng):
                 return np.linalg.norm((block @ wrench)[:3])
             return np.linalg.eigvalsh(block[:3, :3])[-1]
 
-        found, told = model.softest(model.loaded(model.start, wrench))
+        parts = []
+        q, told = model.softest(wrench, parts.append)
+        assert parts == sorted(parts)
+        found = model.to_joints(model.start, q)
         assert found.refusal == ""
         number, told_unit = told.split(" along ")[0].split()[-2:]
         assert told_unit == unit
@@ -263,31 +277,50 @@ def test_bars_keep_their_lengths_and_the_platform_carries_what_is_on_it(name, rn
             assert shapes.cylinder_sizes[k, 2] == pytest.approx(length, abs=1e-8)
         np.testing.assert_allclose(shapes.platform_at, model.robot.platform(state.q)[0], atol=1e-12)
         shift = np.array([0.01, -0.02, 0.03, 0.0, 0.0, 0.0])
-        moved = scene.shapes(state.q, shift)
+        moved = scene.shapes(state.q, Deflection(shift, {}))
         np.testing.assert_allclose(moved.platform_at - shapes.platform_at, shift[:3], atol=1e-12)
         for (_, spot), before, after in zip(
             scene._balls, shapes.ball_at, moved.ball_at, strict=False
         ):
-            on, leg = scene._on_platform(spot), spot[0] in scene._legs
-            expected = shift[:3] if on else (after - before) * leg
+            expected = shift[:3] * scene._on_platform(spot)
             np.testing.assert_allclose(after - before, expected, atol=1e-12)
         np.testing.assert_allclose(np.linalg.norm(shapes.cylinder_turns, axis=1), 1.0)
 
 
-@pytest.mark.parametrize("name", ["stewart", "upr_rpu"])
-def test_a_deflected_leg_stays_straight_and_keeps_its_drive(name):
-    """The drive stays on the line from the foot of its leg to the platform."""
+@pytest.mark.parametrize("name", ["stewart", "upr_rpu", "delta", "delta_cu", "five_bar", "prru"])
+def test_a_deflected_machine_stays_together_and_moves_as_its_members(name):
+    """What joints without a slide join stays joined, drives stay on their legs."""
     model = model_of(name)
-    scene = Scene(model.robot)
-    shift = scene.size * np.array([0.02, -0.03, 0.01, 0.0, 0.0, 0.0])
-    rest, moved = scene.shapes(model.start.q), scene.shapes(model.start.q, shift)
-    assert set(moved.drives) == set(model.robot.joint_names)
-    for name, at in moved.drives.items():
-        foot, tip = (spot[1] for spot in scene._legs[model.robot.graph.joints[name].inner])
-        along, way = tip + shift[:3] - foot, at - foot
-        assert np.linalg.norm(np.cross(way, along)) < 1e-6 * np.linalg.norm(along) ** 2
-        assert 0.0 < way @ along < along @ along
-        assert np.linalg.norm(at - rest.drives[name]) > 1e-3 * scene.size
+    scene, state = Scene(model.robot), model.loaded(model.start, [10.0, 5, -20, 0, 0, 0])
+    deflection = model.numbers(state).energy.deflection
+    # So small that turns are linear.
+    factor = 1e-4 * scene.size / np.abs(deflection).max()
+    moved = model.deflected(state, deflection).times(factor)
+    rest, after = scene.shapes(state.q), scene.shapes(state.q, moved)
+    before, now = (s.ends[: len(scene.bars)].reshape(-1, 3) for s in (rest, after))
+    ways = now - before
+    graph = model.robot.graph
+    sliding = {j.at.tobytes() for j in graph.joints.values() if j.kind == "cylindrical"}
+    spots = [spot for bar in scene.bars for spot in (bar.start, bar.end)]
+    held = [k for k, (_, at) in enumerate(spots) if at.tobytes() not in sliding]
+    together = np.linalg.norm(before[held][:, None] - before[held], axis=-1) < 1e-6 * scene.size
+    gaps = np.linalg.norm(ways[held][:, None] - ways[held], axis=-1)[together]
+    assert together.sum() > len(held)
+    assert gaps.max() < 0.02 * np.linalg.norm(ways, axis=-1).max()
+    answer = member_deflections(model.robot, state.q, state.wrench)
+    for beam, place in ((b, p) for b in model.robot.beams for p in (b.inner, b.outer)):
+        if not scene._on_platform(place):
+            points, shifts = answer[beam.name]
+            k = next(k for k, spot in enumerate(spots) if spot is place)
+            own = np.linalg.norm(points - before[k], axis=-1).argmin()
+            np.testing.assert_allclose(ways[k], factor * shifts[own], atol=1e-9 * scene.size)
+    for name in filter(lambda name: telescope(graph.joints[name]), after.drives):
+        at = after.drives[name]
+        bars = [k for k, b in enumerate(scene.bars) if graph.joints[name].inner == b.part]
+        assert bars
+        for foot, tip in (now[2 * k : 2 * k + 2] for k in bars):
+            off = np.linalg.norm(np.cross(at - foot, tip - foot))
+            assert off < 1e-4 * np.linalg.norm(tip - foot) ** 2
 
 
 def test_every_element_has_a_place_and_its_colour():
@@ -295,7 +328,7 @@ def test_every_element_has_a_place_and_its_colour():
         model = model_of(name)
         energy = model.numbers(model.loaded(model.start, [10.0, 5, -20, 0, 0, 0])).energy
         shares = dict(zip(energy.elements, energy.factors.tolist(), strict=True))
-        shapes = Scene(model.robot).shapes(model.start.q, energy.deflection, shares)
+        shapes = Scene(model.robot).shapes(model.start.q, RIGID, shares)
         assert set(energy.elements) <= set(shapes.places)
         last = tuple(SCALE[-1].astype(int))
         assert last in {tuple(c) for c in [*shapes.cylinder_colours, *shapes.ball_colours]}

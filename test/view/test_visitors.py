@@ -226,9 +226,14 @@ def test_a_mode_is_animated_at_the_pose_that_is_shown(page, monkeypatch):
     found = modes(page.model.robot, page.state.pose, 6)
     assert number(float(found.frequencies[1])) in panel._told.content
     shape = found.shapes[1, 0]
-    for _, deflection, shares, most in drawn:
-        np.testing.assert_allclose(np.outer(deflection, shape), np.outer(shape, deflection))
-        assert np.linalg.norm(deflection[:3]) <= VISIBLE * page.model.robot.graph.size
+    for _, moved, shares, most in drawn:
+        np.testing.assert_allclose(np.outer(moved.platform, shape), np.outer(shape, moved.platform))
+        assert np.linalg.norm(moved.platform[:3]) <= VISIBLE * page.model.robot.graph.size
+        for name, (at, way) in moved.members.items():
+            own = [k for k, node in enumerate(found.nodes) if node.startswith(f"{name} ")]
+            np.testing.assert_array_equal(at, found.positions[own])
+            both = np.outer(way, shape), np.outer(found.shapes[1, own, :3], moved.platform)
+            np.testing.assert_allclose(*both, atol=1e-12 * np.abs(both[1]).max())
         assert shares[most] == found.energies.strain[1].max()
     panel._choice.value = "none"
     assert not panel.busy
