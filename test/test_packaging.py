@@ -13,6 +13,7 @@ import tarfile
 import venv
 import zipfile
 from functools import cache
+from importlib import metadata
 from importlib.util import find_spec
 from pathlib import Path
 from xml.etree import ElementTree
@@ -20,6 +21,7 @@ from xml.etree import ElementTree
 import pytest
 
 import pkm_twin
+from tools.distribution import bill
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 EXECUTABLES = {
@@ -188,6 +190,30 @@ class TestSourceDistribution:
             assert version == pkm_twin.__version__
             listed = run(home / "bin/pkm-twin", "robots", cwd=tmp_path, **beside)
             assert {line.split()[0] for line in listed.splitlines()} == robots()
+
+
+@pytest.mark.long
+@pytest.mark.skipif(find_spec("wheel") is None, reason="wheel is not installed")
+def test_two_builds_have_equal_hashes(tmp_path):
+    """With other rights of new files, in another folder, at another time."""
+    found = []
+    for k, rights in enumerate((0o022, 0o077)):
+        before = os.umask(rights)
+        try:
+            command = [sys.executable, "-m", "tools.distribution", tmp_path / str(k)]
+            found.append(run(*command, cwd=REPOSITORY))
+        finally:
+            os.umask(before)
+    assert len(found[0].splitlines()) == 2
+    assert found[0] == found[1]
+
+
+def test_the_bill_of_materials_has_each_dependency_with_its_licence():
+    parts = {part["name"]: part["licenses"][0]["expression"] for part in bill()["components"]}
+    own = {line for line in metadata.requires("pkm_twin") if "extra" not in line}
+    assert own and {re.split(r"[^\w-]", line)[0].lower() for line in own} <= parts.keys()
+    assert not [name for name, words in parts.items() if words == "NOASSERTION"]
+    assert {parts["numpy"][:4], parts["pyyaml"]} == {"BSD-", "MIT"}
 
 
 STARTED = """
