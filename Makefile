@@ -9,8 +9,10 @@ SEED ?= 1
 # Tests that run for as long as they are told.
 ENDLESS := test/fuzz/test_nodes.py test/nodes/test_soak.py
 BIN := $(VENV)/bin
+# Tests of the cores.
+CORES := bags laws machine nodes validation
 
-.PHONY: demo test lint types unit long bags bench certificate fuzz faults soak audit scale reality contact-table pages animation docs clean help
+.PHONY: demo test lint types unit long bags bench certificate fuzz faults soak audit scale reality contact-table pages animation docs coverage mutation dist sbom clean help
 
 help:
 	@echo "make demo         set up .venv, run the main nodes on the recorded bags, table and picture in out/"
@@ -29,6 +31,10 @@ help:
 	@echo "make pages        write the generated pages and pictures of docs/"
 	@echo "make animation    draw the moving picture of the README, in a browser"
 	@echo "make docs         build the site, in out/site"
+	@echo "make coverage     branches that tests reach in the cores, by folder"
+	@echo "make mutation     break gate, monitors, readers and Newton's verdict, and count what tests find"
+	@echo "make dist         wheel and source distribution, the same at every build, in out/dist"
+	@echo "make sbom         bill of materials with licences, in out/sbom.json"
 	@echo "make clean        remove .venv, out and caches"
 
 # One stamp a set of extras, made anew when the requirements change.
@@ -110,6 +116,7 @@ pages: $(VENV)/test.stamp
 	$(BIN)/python -m tools.pages.errors docs/errors.md
 	$(BIN)/python -m tools.pages.nodes docs/nodes.md docs/security/policy.xml
 	$(BIN)/python -m tools.pages.engine docs/engine.md
+	$(BIN)/python -m tools.pages.public docs/public_names.txt
 	$(BIN)/python -m tools.pages.trend docs/recordings.md
 	$(BIN)/python -m tools.pages.notebooks examples/*.ipynb
 	$(BIN)/python -m tools.pages.architecture docs/gallery/architecture.png
@@ -123,6 +130,20 @@ animation: $(VENV)/test.stamp
 # Strict: a warning is an error.
 docs: $(VENV)/docs.stamp
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+
+# Each core without its nodes, in this process: what processes of nodes reach is not counted.
+coverage: $(VENV)/test.stamp $(VENV)/coverage.stamp
+	OMP_NUM_THREADS=1 $(BIN)/coverage run -m pytest -q -p no:xdist $(CORES:%=test/%) $(ENDLESS:%=--ignore=%)
+	$(BIN)/python -m tools.coverage
+
+mutation: $(VENV)/test.stamp
+	OMP_NUM_THREADS=1 $(BIN)/python -m tools.mutation
+
+dist: $(VENV)/test.stamp
+	$(BIN)/python -m tools.distribution out/dist
+
+sbom: $(VENV)/demo.stamp
+	$(BIN)/python -m tools.distribution out/sbom.json
 
 clean:
 	rm -rf $(VENV) out build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis .benchmarks

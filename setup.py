@@ -114,6 +114,7 @@ setup(
         "fit": ["cvxpy>=1.4"],
         "mjcf": ["mujoco"],
         "audit": ["pip-audit"],
+        "coverage": ["coverage>=7.4"],
         "view": ["viser>=1.1"],
         "bench": ["pin", "pytest", "pytest-benchmark"],
     },

@@ -1,0 +1,170 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Break one rule at a time and see whether a test fails: ``make mutation``.
+
+A mutant is a module with one operator, number or statement changed. It is compiled in a process of
+its own, which then runs the tests named for the module; the tree stays as it is.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import copy
+import os
+import random
+import signal
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from importlib.machinery import SourceFileLoader
+from pathlib import Path
+
+import pytest
+
+TARGETS = {
+    "delta_dynamics/gate.py": "nodes:gate nodes:joint_map",
+    "pkm_twin/streams/monitor.py": "nodes:gate nodes:streams nodes:monitor nodes:feedforward",
+    "pkm_twin/messages/stamps.py": "nodes:messages nodes:gate nodes:feedforward",
+    "pkm_twin/messages/reading.py": "nodes:messages nodes:gate nodes:joint_map nodes:wrenches "
+    "nodes:fast_decoder nodes:stiffness_watch nodes:feedforward",
+    "pkm_twin/codegen/program.py": "laws:codegen laws:steps nodes:feedforward_singularities",
+}
+"""Module, and the tests that judge it."""
+SWAPS: dict[type, type] = {
+    ast.Lt: ast.LtE, ast.LtE: ast.Lt, ast.Gt: ast.GtE, ast.GtE: ast.Gt,
+    ast.Eq: ast.NotEq, ast.NotEq: ast.Eq, ast.Is: ast.IsNot, ast.IsNot: ast.Is,
+    ast.In: ast.NotIn, ast.NotIn: ast.In, ast.And: ast.Or, ast.Or: ast.And,
+    ast.Add: ast.Sub, ast.Sub: ast.Add, ast.Mult: ast.Div, ast.Div: ast.Mult,
+    ast.BitAnd: ast.BitOr, ast.BitOr: ast.BitAnd,
+}  # fmt: skip
+PLAIN = (ast.Expr, ast.Assign, ast.AugAssign, ast.Raise)
+"""Statements that are left out."""
+
+
+def changes(node: ast.AST) -> Iterator[str]:
+    """Names of what may be changed in a node itself."""
+    if isinstance(node, ast.Compare):
+        yield from (f"compare {k}" for k, one in enumerate(node.ops) if type(one) in SWAPS)
+    elif isinstance(node, (ast.BoolOp, ast.BinOp, ast.AugAssign)) and type(node.op) in SWAPS:
+        yield "operator"
+    elif isinstance(node, ast.UnaryOp):
+        yield "unary"
+    elif isinstance(node, ast.Constant) and isinstance(node.value, (bool, int, float)):
+        yield "constant"
+    elif isinstance(node, (ast.If, ast.IfExp)):
+        yield from ("always", "never")
+    if isinstance(node, PLAIN) and not isinstance(getattr(node, "value", None), ast.Constant):
+        yield "left out"
+
+
+def change(node: ast.AST, name: str) -> ast.AST:
+    """The node with one thing changed."""
+    if name.startswith("compare"):
+        k = int(name.split()[1])
+        node.ops[k] = SWAPS[type(node.ops[k])]()
+    elif name == "operator":
+        node.op = SWAPS[type(node.op)]()
+    elif name == "unary":
+        return node.operand
+    elif name == "constant":
+        node.value = not node.value if isinstance(node.value, bool) else node.value * 2 + 1
+    elif name in ("always", "never"):
+        node.test = ast.Constant(name == "always")
+    else:
+        return ast.copy_location(ast.Pass(), node)
+    return node
+
+
+class Walk(ast.NodeTransformer):
+    """Counts places of change in reach of tests, and changes one of them."""
+
+    def __init__(self, chosen: int | None = None) -> None:
+        self.chosen, self.places = chosen, list[tuple[int, str, str]]()
+
+    def generic_visit(self, node: ast.AST) -> ast.AST:
+        if isinstance(node, ast.AnnAssign):
+            # Types are no rules.
+            node.value = node.value and self.visit(node.value)
+            return node
+        for name in changes(node):
+            self.places.append((node.lineno, name, ast.unparse(node).splitlines()[0]))
+            if self.chosen == len(self.places) - 1:
+                return change(copy.deepcopy(node), name)
+        return super().generic_visit(node)
+
+    def visit_FunctionDef(self, node: ast.FunctionDef) -> ast.AST:
+        node.returns = None
+        return self.generic_visit(node)
+
+    def visit_arguments(self, node: ast.arguments) -> ast.AST:
+        node.defaults = [self.visit(default) for default in node.defaults]
+        return node
+
+    def visit_JoinedStr(self, node: ast.JoinedStr) -> ast.AST:
+        return node  # Words.
+
+    def visit_Call(self, node: ast.Call) -> ast.AST:
+        # The tests of the pages hold the settings, in processes of their own.
+        return node if ast.unparse(node.func) == "setting" else self.generic_visit(node)
+
+
+def put(path: str, chosen: int) -> None:
+    """Give the changed module in place of the one in the tree."""
+    name = path.removesuffix(".py").replace("/", ".")
+    tree = Walk(chosen).visit(ast.parse(Path(path).read_text(encoding="utf-8")))
+    code = compile(ast.fix_missing_locations(tree), path, "exec")
+    read = SourceFileLoader.get_code
+    SourceFileLoader.get_code = lambda self, asked: code if asked == name else read(self, asked)
+
+
+def survives(path: str, chosen: int, tests: list[str], limit: float) -> bool:
+    """Whether all tests pass with a change; an endless one counts as found."""
+    child = os.fork()
+    if not child:
+        signal.alarm(int(limit))
+        put(path, chosen)
+        null = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(null, 1)
+        os.dup2(null, 2)
+        with tempfile.TemporaryDirectory() as folder:
+            # Programs of a changed compiler are no one else's.
+            if "codegen" in path:
+                os.environ["PKM_TWIN_CACHE"] = folder
+            code = pytest.main(["-x", "-q", "-p", "no:cacheprovider", "-p", "no:xdist", *tests])
+        os._exit(int(code))
+    return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
+
+
+def main() -> int:
+    """Print each survivor, and the share that is found."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("paths", nargs="*", default=[*TARGETS])
+    parser.add_argument("--most", type=int, default=60, help="mutants per module, drawn at random")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--only", type=int, nargs="*", help="numbers of mutants, in one module")
+    options = parser.parse_args()
+    sys.path[:0] = [".", "test"]
+    for path in options.paths:
+        tests = [f"test/{test.replace(':', '/test_')}.py" for test in TARGETS[path].split()]
+        walk = Walk()
+        walk.visit(ast.parse(Path(path).read_text(encoding="utf-8")))
+        drawn = options.only or range(len(walk.places))
+        if len(drawn) > options.most:
+            drawn = sorted(random.Random(options.seed).sample(drawn, options.most))
+        started = time.monotonic()
+        if not survives(path, -1, tests, 600):
+            raise SystemExit(f"{path}: the tests fail without a change")
+        limit, found = 3 * (time.monotonic() - started) + 20, 0
+        for k in drawn:
+            if survives(path, k, tests, limit):
+                line, name, text = walk.places[k]
+                print(f"{path}:{line} [{k}] {name}: {text[:90]}", flush=True)
+            else:
+                found += 1
+        print(f"{path}: {found} of {len(drawn)} mutants found, of {len(walk.places)}", flush=True)
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
