@@ -60,7 +60,14 @@ def banned(text: str) -> list[str]:
 
 def pages() -> list[str]:
     docs = sorted((ROOT / "docs").glob("*.md"))
-    names = ("README.md", "CONTRIBUTING.md", "bags/README.md", "examples/README.md")
+    names = (
+        "README.md",
+        "CONTRIBUTING.md",
+        "QUALITY_DECLARATION.md",
+        "SECURITY.md",
+        "bags/README.md",
+        "examples/README.md",
+    )
     return [*names, *(f"docs/{p.name}" for p in docs)]
 
 
