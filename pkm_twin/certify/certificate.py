@@ -48,9 +48,6 @@ BOUNDS: Final = {
 }
 """Greatest difference that passes; places in m and as entries of a rotation, joints in rad or m,
 all else relative."""
-LOOSE: Final = {"mujoco": 1e3}
-"""Engines whose bounds are this much wider: MuJoCo wants some inertia in every body, which a
-small machine shows."""
 SPREAD: Final = 0.02
 """Relative standard deviation of the numbers of drawn machines."""
 SMALL: Final = 1e-3
@@ -311,6 +308,4 @@ def _item(engine: str, what: str, values: Any) -> Item:
     amounts = np.asarray(values, dtype=float)
     # A number that is not finite passes no bound.
     worst = float(np.where(np.isfinite(amounts), amounts, np.inf).max())
-    return Item(
-        engine, what, worst, float(np.median(amounts)), BOUNDS[what] * LOOSE.get(engine, 1.0)
-    )
+    return Item(engine, what, worst, float(np.median(amounts)), BOUNDS[what])

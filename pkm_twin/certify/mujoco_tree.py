@@ -4,7 +4,8 @@
 The tree is made of the joints that come last and leave most freedom, so it is another one than the
 Pinocchio judge's. Body frames stand in the base's at home.
 
-MuJoCo wants some inertia in whatever moves: TINY is added to every body.
+MuJoCo's compiler wants some inertia in whatever moves: TINY is added to every body, and taken away
+again from the model that it makes.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from pkm_twin.certify.rows import Frame
 from pkm_twin.certify.trees import Steps, Tree
 
 TINY: Final = 1e-14
-"""Mass (kg) and moments of inertia (kg m2) that are added to every body."""
+"""Mass (kg) and moments of inertia (kg m2) that every body is compiled with in addition."""
 
 
 class MujocoTree(Tree):
@@ -36,13 +37,14 @@ class MujocoTree(Tree):
         self._root = Xml.Element("mujoco")
         Xml.SubElement(self._root, "compiler", angle="radian", inertiafromgeom="false")
         self._elements = {BASE: Xml.SubElement(self._root, "worldbody")}
+        self._weights: list[tuple[str, float, Array]] = []
         super().__init__(description)
 
     def hang(self, name: str, parent: str, at: Array, steps: Steps | None, body: Body) -> None:
         """Add a body; three turns are a ball."""
         element = Xml.SubElement(self._elements[parent], "body", name=f"body {name}")
         self._elements[name] = element
-        _weigh(element, body)
+        self._weigh(element, body)
         kinds = [("hinge" if turns else "slide", axis) for turns, axis in steps or ()]
         if steps is None:
             Xml.SubElement(element, "freejoint")
@@ -56,6 +58,9 @@ class MujocoTree(Tree):
         option = Xml.SubElement(self._root, "option", gravity=_text(self.machine.gravity))
         Xml.SubElement(option, "flag", contact="disable", constraint="disable")
         self._model = mujoco.MjModel.from_xml_string(Xml.tostring(self._root, encoding="unicode"))
+        for name, mass, moments in self._weights:
+            number = self._model.body(name).id
+            self._model.body_mass[number], self._model.body_inertia[number] = mass, moments
         self._data = mujoco.MjData(self._model)
         self._start = self._data.qpos.copy()
         return int(self._model.nv)
@@ -96,24 +101,27 @@ class MujocoTree(Tree):
     def forces(self, change: Array) -> Array:
         """MuJoCo's inverse dynamics of the tree, shape (size,)."""
         self._data.qacc[:] = change
-        mujoco.mj_inverse(self._model, self._data)
-        return np.array(self._data.qfrc_inverse)
+        result = np.zeros(self.size)
+        # Not mj_inverse: it factorises the mass matrix of the tree, which may be singular.
+        mujoco.mj_rne(self._model, self._data, 1, result)
+        return result
 
-
-def _weigh(element: Xml.Element, body: Body) -> None:
-    moments, axes = np.linalg.eigh(body.inertia)
-    # eigh may leave a mirror image.
-    axes[:, 0] *= np.sign(np.linalg.det(axes))
-    turn = np.zeros(4)
-    mujoco.mju_mat2Quat(turn, axes.ravel())
-    Xml.SubElement(
-        element,
-        "inertial",
-        pos=_text(body.com),
-        quat=_text(turn),
-        mass=repr(float(body.mass + TINY)),
-        diaginertia=_text(np.maximum(moments, 0.0) + TINY),
-    )
+    def _weigh(self, element: Xml.Element, body: Body) -> None:
+        moments, axes = np.linalg.eigh(body.inertia)
+        # eigh may leave a mirror image.
+        axes[:, 0] *= np.sign(np.linalg.det(axes))
+        turn = np.zeros(4)
+        mujoco.mju_mat2Quat(turn, axes.ravel())
+        moments = np.maximum(moments, 0.0)
+        self._weights.append((str(element.get("name")), body.mass, moments))
+        Xml.SubElement(
+            element,
+            "inertial",
+            pos=_text(body.com),
+            quat=_text(turn),
+            mass=repr(float(body.mass + TINY)),
+            diaginertia=_text(moments + TINY),
+        )
 
 
 def _text(values: Any) -> str:

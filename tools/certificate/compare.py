@@ -17,7 +17,7 @@ from tools.certificate.machines import Case, friction, random_case
 from tools.certificate.swing import engine_of
 
 ROUTES = ("Pinocchio", "MuJoCo", "Lagrange")
-BOUNDS = {"Pinocchio": 1e-9, "MuJoCo": 1e-6, "Lagrange": 1e-9}
+EFFORT_BOUND = 1e-9
 """Greatest relative difference of the torques that passes."""
 PLACE_BOUND = 1e-9
 """Greatest difference of the platform's centre that passes, m."""

@@ -15,7 +15,7 @@ from rich.console import Console
 from test.support.pages import write_section
 from test.validation.test_upr_rpu_paper import LOAD
 from tools.calculix import ABSENT, CCX, calculix_version
-from tools.certificate.compare import BALANCE_BOUNDS, BOUNDS, PLACE_BOUND, ROUTES, Figures
+from tools.certificate.compare import BALANCE_BOUNDS, EFFORT_BOUND, PLACE_BOUND, ROUTES, Figures
 from tools.certificate.lagrange import DIGITS
 from tools.certificate.links import (
     BOUND,
@@ -115,7 +115,7 @@ def _torques(figures: dict[str, Figures], judge: Judge) -> str:
             if not len(values):
                 continue
             what = f"{TITLES[name]}, {route}"
-            worst = judge(float(values.max()), BOUNDS[route], f"{what}, torque")
+            worst = judge(float(values.max()), EFFORT_BOUND, f"{what}, torque")
             place = judge(float(places.max()), PLACE_BOUND, f"{what}, place")
             rows.append(
                 f"| {TITLES[name]} | {route} | {len(values)} | {worst} "
@@ -130,11 +130,11 @@ friction; states have random positions, rates, accelerations and a wrench. State
 number above {1 / LEAST_MEASURE:.0f} are left out.
 
 - **Pinocchio**: a tree with loop constraints; recursive Newton-Euler sweeps and multipliers.
-- **MuJoCo**: another tree, as in `pkm-twin certify`; `mj_inverse`, projected on the actuators.
+- **MuJoCo**: another tree, as in `pkm-twin certify`; `mj_rne`, projected on the actuators.
 - **Lagrange**: energies as functions of points, derived by central differences in {DIGITS} digits.
 
-Differences are relative to the largest effort (bound {BOUNDS["Lagrange"]:.0e}, MuJoCo
-{BOUNDS["MuJoCo"]:.0e}). The last column is the platform's position.
+Differences are relative to the largest effort (bound {EFFORT_BOUND:.0e}).
+The last column is the platform's position.
 
 | robot | method | states | worst | median | position, m (bound {PLACE_BOUND:.0e}) |
 |---|---|---|---|---|---|
