@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import os
+import platform
 import re
 import shutil
 import subprocess
@@ -12,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 
 from delta_dynamics import forward_dynamics, inverse_dynamics, mass_matrix
 from pkm_twin import Robot
@@ -20,6 +22,7 @@ from stiffness_monitor import platform_response
 from test.support.robots import has
 
 COMPILERS = [name for name in ("gcc", "clang") if shutil.which(name)]
+glibc = pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="the hook is of glibc")
 SANITIZED = ("-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
 
 
@@ -67,6 +70,62 @@ def inputs_of(robot: Robot, motion: tuple[Array, ...]) -> dict[str, tuple[Array,
     if "strain_energy" in result:
         result["strain_energy"] = (q, wrench)
     return result
+
+
+HOOK = r"""
+#define _GNU_SOURCE
+#include <dlfcn.h>
+#include <pthread.h>
+#include <stdio.h>
+#include <stdlib.h>
+extern void *__libc_malloc(size_t);
+extern void *__libc_calloc(size_t, size_t);
+extern void *__libc_realloc(void *, size_t);
+extern void __libc_free(void *);
+static int watching;
+static long calls, seen;
+static int (*own_lock)(pthread_mutex_t *);
+void watch(int on) { watching = on; calls += on; }
+void *malloc(size_t n) { seen += watching; return __libc_malloc(n); }
+void *calloc(size_t k, size_t n) { seen += watching; return __libc_calloc(k, n); }
+void *realloc(void *p, size_t n) { seen += watching; return __libc_realloc(p, n); }
+void free(void *p) { seen += watching; __libc_free(p); }
+int pthread_mutex_lock(pthread_mutex_t *m)
+{
+    seen += watching;
+    if (!own_lock) { *(void **)&own_lock = dlsym(RTLD_NEXT, "pthread_mutex_lock"); }
+    return own_lock(m);
+}
+__attribute__((destructor)) static void report(void) { fprintf(stderr, "%ld %ld", calls, seen); }
+"""
+"""Counts watched calls, and what they allocate, free and lock."""
+
+
+def hooked(folder: Path, call: str, program: str, *sources: str | Path) -> Path:
+    """A driver, in which ``call`` is watched: it writes its counts to the standard error.
+
+    :param call: regular expression of an expression in ``program``, a file of C or C++.
+    """
+    linkage = '"C" ' if program.endswith("pp") else ""
+    text = (folder / program).read_text()
+    watched, count = re.subn(rf"({call});", r"watch(1); \1; watch(0);", text)
+    assert count
+    changed = f"hooked_{program}"
+    (folder / changed).write_text(f"extern {linkage}void watch(int);\n{watched}")
+    (folder / "hook.c").write_text(HOOK)
+    subprocess.run([COMPILERS[0], "-c", "hook.c", "-o", "hook.o"], cwd=folder, check=True)
+    compiler = ["g++", "-std=c++17"] if linkage else [COMPILERS[0], "-std=c99"]
+    made = folder / "hooked"
+    words = [*compiler, "-O0", changed, *map(str, sources), "hook.o", "-o", str(made), "-lm"]
+    subprocess.run([*words, "-ldl"], cwd=folder, check=True)
+    return made
+
+
+def watched(program: Path, rows: Array, *words: str) -> tuple[int, int]:
+    """Watched calls, and what they allocated, freed and locked."""
+    done = subprocess.run([program, *words], input=rows.tobytes(), capture_output=True, check=True)
+    calls, seen = done.stderr.split()
+    return int(calls), int(seen)
 
 
 DRIVER = r"""

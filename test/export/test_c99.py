@@ -26,7 +26,16 @@ from test.support.robots import (
     random_motion,
 )
 
-from .c_programs import COMPILERS, SANITIZED, Package, functions, inputs_of
+from .c_programs import (
+    COMPILERS,
+    SANITIZED,
+    Package,
+    functions,
+    glibc,
+    hooked,
+    inputs_of,
+    watched,
+)
 
 pytestmark = pytest.mark.skipif(not COMPILERS, reason="there is no C compiler: gcc or clang")
 
@@ -202,6 +211,33 @@ def test_nothing_undefined_happens(name, tmp_path):
         assert np.isfinite(found[status == 0.0]).all()
 
 
+@glibc
+@pytest.mark.parametrize("name", partly_long(NAMES, "bolted"))
+def test_no_call_allocates_or_locks(name, tmp_path, rng):
+    """In 200,000 calls with valid, impossible and infinite inputs; one that is spoilt is seen."""
+    robot = robot_of(name)
+    package = Package(tmp_path, c_package(robot))
+    asked = functions(robot)
+    count = 200_000 // len(asked) + 1
+    q = np.concatenate([random_joints(robot, rng, count // 2), wild(robot, rng, count)])[:count]
+    q[::97] = np.inf
+    given = inputs_of(robot, (q, q, q, np.ones((count, 6))))
+    call, source = r"status = \(double\)[^;]*", f"{package.prefix}.c"
+    program = hooked(tmp_path, call, "driver.c", source)
+    total = 0
+    for name in asked:
+        rows = np.ascontiguousarray(np.concatenate(given[name], 1))
+        number = str(list(package.heads).index(name))
+        calls, seen = watched(program, rows, number, str(count))
+        assert seen == 0, name
+        total += calls
+    assert total >= 200_000
+    driver = (tmp_path / "driver.c").read_text().replace("status =", "free(malloc(8)), status =")
+    (tmp_path / "driver.c").write_text(driver)
+    spoilt = hooked(tmp_path, rf"free.*{call}", "driver.c", source)
+    assert watched(spoilt, q, str(list(package.heads).index("forward")), "9") == (9, 18)
+
+
 STREAM = r"""
 #include <stdio.h>
 #include "@.h"
@@ -223,13 +259,21 @@ int main(void)
 """
 
 
+def state_size(package):
+    return int(re.search(r"_STATE (\d+)", package.header).group(1))
+
+
+def write_stream(package, joints):
+    text = STREAM.replace("@", package.prefix).replace("STATE", str(state_size(package)))
+    (package.folder / "stream.c").write_text(text.replace("JOINTS", str(joints)))
+
+
 def test_a_stream_has_the_results_of_its_samples(exported, rng):
     """Smooth, then with jumps, without an assembly, not finite, and with a spoilt state."""
     robot, package = exported
     n = robot.joints_count
-    size = int(re.search(r"_STATE (\d+)", package.header).group(1))
-    text = STREAM.replace("@", package.prefix).replace("STATE", str(size))
-    (package.folder / "stream.c").write_text(text.replace("JOINTS", str(n)))
+    size = state_size(package)
+    write_stream(package, n)
     command = [COMPILERS[0], "-std=c99", *PLAIN, f"{package.prefix}.c", "stream.c", "-o", "stream"]
     subprocess.run([*command, "-lm"], cwd=package.folder, check=True)
     middle, half = joint_range(robot)
@@ -258,6 +302,15 @@ def test_a_stream_has_the_results_of_its_samples(exported, rng):
     if size > 1:
         # Where the closures were solved from home last.
         assert (state[1:200, 1 : 1 + n] == state[:199, 1 : 1 + n]).all(1).mean() > 0.5
+
+
+@glibc
+def test_a_stream_allocates_and_locks_nothing(small, rng):
+    robot, package = small
+    write_stream(package, robot.joints_count)
+    program = hooked(package.folder, r"status = [^;]*", "stream.c", f"{package.prefix}.c")
+    rows = rng.normal(0.0, 0.3, (200_000, 3 * robot.joints_count + 6 + state_size(package)))
+    assert watched(program, rows) == (len(rows), 0)
 
 
 LANGUAGES = (
