@@ -20,7 +20,9 @@ from collections.abc import Iterator
 from importlib.machinery import SourceFileLoader
 from pathlib import Path
 
+import hypothesis
 import pytest
+import scipy.optimize  # Loaded once, for all mutants.  # noqa: F401
 
 TARGETS = {
     "delta_dynamics/gate.py": "nodes:gate nodes:joint_map",
@@ -145,6 +147,10 @@ def main() -> int:
     parser.add_argument("--only", type=int, nargs="*", help="numbers of mutants, in one module")
     options = parser.parse_args()
     sys.path[:0] = [".", "test"]
+    # A slow machine finds no mutant, and nobody reads the shortest example.
+    phases = hypothesis.Phase.explicit, hypothesis.Phase.generate
+    hypothesis.settings.register_profile("mutants", deadline=None, phases=phases)
+    hypothesis.settings.load_profile("mutants")
     for path in options.paths:
         tests = [f"test/{test.replace(':', '/test_')}.py" for test in TARGETS[path].split()]
         walk = Walk()

@@ -6,7 +6,7 @@ from itertools import permutations
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from delta_dynamics import inverse_dynamics
@@ -145,6 +145,7 @@ def test_refused_messages_do_not_keep_the_gate_open(make):
     assert core.stream.stops["stale torques"] == 1
 
 
+@example(gaps=[DEADLINE, DEADLINE + 1])
 @given(gaps=st.lists(st.integers(1, 3 * DEADLINE), min_size=1, max_size=30))
 def test_it_is_open_exactly_where_no_silence_passed_the_deadline(gaps):
     core = gate(recovery_count=1)
@@ -218,6 +219,12 @@ class TestGravity:
         assert (core.stop_command(STEP) == 0.0).all()
         assert core.states.rejected == {"not finite": 1}
         assert "arm_1 is nan" in core.last_reject
+
+
+def test_limits_are_those_of_the_robot_of_now(make):
+    core, last = opened(make)
+    core.change_robot(ROBOT.changed(limits={"effort": [0.6] * 3}))
+    assert refused(core, make, last + STEP) == "effort limit"
 
 
 def test_a_clock_jump_closes_the_gate_and_begins_anew(make):
