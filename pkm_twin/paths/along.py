@@ -13,6 +13,7 @@ from delta_dynamics import dynamics_terms, inverse_dynamics, reactions, torque_d
 from delta_dynamics.torques.stiction import friction_reach, moving_rates
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError, PkmTwinError, SingularityError, UnreachableError
+from pkm_twin.paths.joint_path import only_turns
 from pkm_twin.recordings.payload import by_load, payload_columns
 from pkm_twin.recordings.recording import Recording
 from pkm_twin.recordings.tables import WRENCH
@@ -97,6 +98,10 @@ class SoftCut:
     force: float
     tolerance: float
     feed: float
+
+    def __post_init__(self) -> None:
+        if only_turns(self.robot):
+            raise ParameterError("slow-where-soft", self.robot.name, "a pose with x, y or z")
 
     def bends(self, q: Array, way: Array) -> Array:
         """Deflection of the reference point per feed, m per m/s, shape (p,).

@@ -267,21 +267,25 @@ def _shortened(piece: Piece, begin: float, end: float) -> list[Piece]:
 def circle(robot: Robot, centre: ArrayLike, radius: float, *, turns: float = 1.0) -> Path:
     """A circle of the platform's reference point about a pose, in the first two of x, y, z.
 
+    Of a pose without two of them, a circle of its first two angles.
+
     :param centre: the pose in the middle, shape (m,).
-    :param radius: m.
+    :param radius: m, of angles rad.
     :param turns: how often; negative turns the other way.
-    :raises ParameterError: a pose without two of x, y, z, or an invalid radius.
+    :raises ParameterError: a pose without two coordinates of one kind, or an invalid radius.
     """
-    middle = np.asarray(centre, float)
-    places = [i for i, name in enumerate(robot.pose_names) if name in ("x", "y", "z")][:2]
-    if len(places) < 2:
-        raise ParameterError("circle", robot.name, "a robot whose pose has two of x, y, z")
+    middle, units = np.asarray(centre, float), robot.pose_units
+    both = ([i for i, unit in enumerate(units) if unit == kind][:2] for kind in ("m", "rad"))
+    places = next((found for found in both if len(found) == 2), None)
+    if places is None:
+        raise ParameterError("circle", robot.name, "a pose with two positions or two angles")
     if not (radius > 0.0 and turns):
-        raise ParameterError("circle", radius, "a radius above 0, m, and turns other than 0")
+        raise ParameterError("circle", radius, "a radius above 0 and turns other than 0")
     across, along = np.zeros(len(middle)), np.zeros(len(middle))
-    across[places[0]], along[places[1]] = 1.0, float(np.sign(turns))
+    scale = float(scales_of(robot, "pose")[places[0]])
+    across[places[0]], along[places[1]] = 1.0 / scale, float(np.sign(turns)) / scale
     angle = 2 * np.pi * abs(turns)
-    piece = Arc(middle, across, along, np.zeros(len(middle)), float(radius), angle)
+    piece = Arc(middle, across, along, np.zeros(len(middle)), scale * float(radius), angle)
     marks = (Mark(-1, 0.0), Mark(0, piece.length))
     return Path("pose", (Stretch((piece,)),), kind="circle", marks=marks)
 

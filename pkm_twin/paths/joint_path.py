@@ -194,8 +194,17 @@ class JointPath:
 
 
 def velocity_of(robot: Robot, q: Array, qd: Array) -> Array:
-    """Velocity of the reference point, base axes, shape (k, 3), m/s, of joint rates (k, n)."""
-    return np.asarray((robot.platform_jacobian(q)[:, :3] @ qd[..., None])[..., 0], np.float64)
+    """Velocity of the reference point, base axes, shape (k, 3), m/s, of joint rates (k, n).
+
+    Of a machine that only turns, the platform's angular velocity, rad/s.
+    """
+    rows = robot.platform_jacobian(q)[:, 3:] if only_turns(robot) else robot.platform_jacobian(q)
+    return np.asarray((rows[:, :3] @ qd[..., None])[..., 0], np.float64)
+
+
+def only_turns(robot: Robot) -> bool:
+    """Whether no coordinate of the pose is a position."""
+    return not {"x", "y", "z"} & set(robot.pose_names)
 
 
 def _joints(robot: Robot, places: Array, way: Array) -> Array:

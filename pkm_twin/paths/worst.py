@@ -12,6 +12,7 @@ from delta_dynamics import inverse_dynamics
 from delta_dynamics.torques.isotropy import sphere_directions
 from pkm_twin.codegen.arrays import Array, Mask
 from pkm_twin.errors import ParameterError
+from pkm_twin.paths.joint_path import only_turns
 from pkm_twin.robot.robot import Robot
 from pkm_twin.robot.workspace import counts, try_inverse
 
@@ -112,19 +113,15 @@ def _inside(robot: Robot, poses: Array, singularity: float, least: Array) -> Mas
     return inside
 
 
-def _places(robot: Robot) -> list[int]:
-    """Which pose coordinates are positions."""
-    return [i for i, name in enumerate(robot.pose_names) if name in ("x", "y", "z")]
-
-
 def _joint_rates(robot: Robot, q: Array) -> Array:
     """Joint rates by the velocity of the tool point, the orientation constant, (k, n, size).
 
     Of a machine that only turns, by the platform's angular velocity in axes of its own.
     """
-    if places := _places(robot):
-        return np.asarray(np.linalg.inv(robot.jacobian(q))[..., places], np.float64)
-    return np.asarray(np.linalg.inv(np.linalg.qr(_turning(robot, q))[1]), np.float64)
+    if only_turns(robot):
+        return np.asarray(np.linalg.inv(np.linalg.qr(_turning(robot, q))[1]), np.float64)
+    places = [i for i, name in enumerate(robot.pose_names) if name in ("x", "y", "z")]
+    return np.asarray(np.linalg.inv(robot.jacobian(q))[..., places], np.float64)
 
 
 def _turning(robot: Robot, q: Array) -> Array:
@@ -133,7 +130,7 @@ def _turning(robot: Robot, q: Array) -> Array:
 
 def _steady(robot: Robot, q: Array, qd: Array) -> Array:
     """Joint accelerations at which the tool point, or the platform's turn, keeps its velocity."""
-    if _places(robot):
+    if not only_turns(robot):
         own = robot.pose_acceleration(q, qd, np.zeros_like(q))
         return np.asarray(-np.linalg.solve(robot.jacobian(q), own[..., None])[..., 0])
     step = STEP / np.maximum(np.abs(qd).max(-1, keepdims=True), STEP)

@@ -472,6 +472,25 @@ def test_a_machine_that_only_turns_is_sized_by_its_turns(twin):
         assert 0.9 * entry["effort_N_m"] <= tried <= 1.003 * entry["effort_N_m"]
 
 
+def test_a_machine_that_only_turns_plans_and_is_sized_like_others(twin, tmp_path):
+    """A circle of roll and pitch, its speed that of the platform's turn."""
+    name, out = REPOSITORY / "examples/machines/agile_eye.yaml", tmp_path / "circle.csv"
+    line = ("path", name, "--circle", "0.15", "--at", "0.05,0,0.1", "--fastest", "--speed", "2")
+    data = twin.told(*line, "--out", out, "--no-picture")
+    assert data["greatest_speed_rad_s"] == pytest.approx(2.0, rel=1e-3)
+    columns = read_columns(out)
+    angles = np.stack([columns[n] for n in ("roll", "pitch", "yaw")], -1)
+    np.testing.assert_allclose(np.hypot(angles[:, 0] - 0.05, angles[:, 1]), 0.15, atol=1e-6)
+    np.testing.assert_allclose(angles[:, 2], 0.1, atol=1e-9)
+    turn = Rotation.from_euler("ZYX", angles[:, ::-1])
+    speed = (turn[2:] * turn[:-2].inv()).magnitude() / (columns["time"][2:] - columns["time"][:-2])
+    assert speed.max() == pytest.approx(2.0, rel=2e-3)
+    assert checked(out, robot=name).code == 0
+    assert max(twin.told("size", name, out)["difference_from_model"]) < 1e-6
+    soft = ("--slow-where-soft", "--force", "1", "--tolerance", "1e-3")
+    twin.refused(*line, *soft)
+
+
 WAYPOINTS = "x,y,z,blend,dwell\n-0.05,0,-0.38,0,0\n-0.05,0,-0.35,0.02,0\n0.05,0,-0.35,0,0.1\n"
 
 

@@ -75,7 +75,7 @@ class Motion(Carries, ReadsTables, AwayFromSingular, Writes, Draws):
         None, "pick-and-place cycle there and back, in mm, as in 25,305,25", count=0,
         metavar="HEIGHT,WIDTH[,LIFT]",
     )  # fmt: skip
-    circle: float | None = setting(None, "follow a circle of this radius, m")
+    circle: float | None = setting(None, "follow a circle of this radius, m, or rad of two angles")
     at: tuple[float, ...] | None = setting(
         None, "centre of --cycle (between pick and place) or --circle: the pose's coordinates; "
         "default: home", count=0,
@@ -120,8 +120,8 @@ class Motion(Carries, ReadsTables, AwayFromSingular, Writes, Draws):
         None, "jerk limit of the joints, rad/s3 or m/s3; default: none", count=0
     )
     speed: float | None = setting(
-        None, "speed limit of the tool point, m/s; default: none; of --slow-where-soft the "
-        "programmed feed",
+        None, "speed limit of the tool point, m/s, or of a pose of angles, rad/s; default: none; "
+        "of --slow-where-soft the programmed feed",
     )  # fmt: skip
     share: float = setting(
         1.0, "fraction of the file's effort and velocity limits to use", low=1e-3, high=1.0
@@ -147,6 +147,7 @@ def path(given: Motion) -> Report:
     """The motion, and which limits it uses."""
     from pkm_twin.paths import ShapedPath, shaped, timed
     from pkm_twin.paths.along import SoftCut
+    from pkm_twin.paths.joint_path import only_turns
     from pkm_twin.recordings import Recording
     from pkm_twin.recordings.bags import write_motion
 
@@ -185,9 +186,10 @@ def path(given: Motion) -> Report:
             source = {"source": "pkm-twin path", "law": motion.law}
             write_motion(given.out, plan, source, given.overwrite)
     fine, robot = motion.fine, motion.robot
+    unit = "rad/s" if only_turns(robot) else "m/s"
     answer = (
         f"{robot.name}: {motion.path.kind}, {motion.path.length:.4g} m in {motion.duration:.6g} s, "
-        f"at most {fine.speed.max():.4g} m/s"
+        f"at most {fine.speed.max():.4g} {unit}"
     )
     facts = [
         Fact("robot", robot.name),
@@ -206,7 +208,7 @@ def path(given: Motion) -> Report:
         Fact("limits", [bound.as_json() for bound in motion.bounds]),
         Fact("used", motion.worst),
         Fact("peaks", motion.peaks),
-        Fact("greatest_speed_m_s", float(fine.speed.max()), "m/s"),
+        Fact(f"greatest_speed_{unit.replace('/', '_')}", float(fine.speed.max()), unit),
     ]  # fmt: skip
     if isinstance(motion, ShapedPath):
         low, high = motion.frequencies
@@ -309,6 +311,7 @@ def _tables(motion: TimedPath, soft: bool) -> list[Table]:
 def draw_limits(motion: TimedPath, title: str) -> Any:
     """How much of each limit is used when, coloured by the one that binds."""
     from pkm_twin.paths.constraints import names_of
+    from pkm_twin.paths.joint_path import only_turns
 
     figure, axes = plots.columns(1, 2)
     used, time = motion.used, motion.fine.time
@@ -336,7 +339,9 @@ def draw_limits(motion: TimedPath, title: str) -> Any:
     if shown:
         plots.legend(top)
     low.plot(time, motion.fine.speed, color="black", lw=1.2)
-    plots.label(low, "time (s)", "speed of the tool point (m/s)")
+    turns = only_turns(motion.robot)
+    words = "speed of the platform's turn (rad/s)" if turns else "speed of the tool point (m/s)"
+    plots.label(low, "time (s)", words)
     low.set_ylim(bottom=0)
     return figure
 

@@ -270,6 +270,7 @@ def _percent(part: float) -> str:
 
 def over_workspace(given: Size) -> Report:
     """The worst efforts and speeds over the workspace."""
+    from pkm_twin.paths.joint_path import only_turns
     from pkm_twin.paths.worst import worst_over_workspace
 
     speed, change = given.over_workspace or (0.0, 0.0)
@@ -282,7 +283,7 @@ def over_workspace(given: Size) -> Report:
         robot, speed, change, singularity=given.singularity, lever=given.lever
     )
     names = robot.pose_names
-    turns = not {"x", "y", "z"} & set(names)
+    turns = only_turns(robot)
     data: dict[str, dict[str, Any]] = {}
     rows: dict[str, list[Any]] = {}
     for i, joint in enumerate(robot.joint_names):
