@@ -330,7 +330,7 @@ class Model:
         """The members' displacements where the platform's is (6,), m and rad, base axes."""
         robot, q = self.robot, state.q
         wrench = np.linalg.solve(platform_response(robot, q, np.zeros(6)).compliance, deflection)
-        return Deflection(np.asarray(deflection), member_deflections(robot, q, wrench))
+        return Deflection(np.array(deflection), member_deflections(robot, q, wrench))
 
     def _overloaded(self, effort: Array | None) -> tuple[str, ...]:
         limits = self.robot.limits.effort

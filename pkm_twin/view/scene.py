@@ -36,6 +36,8 @@ DRIVE: Final = (0, 114, 178)
 GROUND: Final = (70, 74, 80)
 JOINT: Final = (98, 104, 112)
 """Rods, platform and drives: distinct with every kind of colour vision (Okabe and Ito 2008)."""
+PIECES: Final = 4
+"""Straight pieces of a member."""
 SCALE: Final = np.array([[198, 206, 214], [240, 228, 66], [213, 94, 0]], np.float64)
 """From no share of the energy to the greatest one: grey, yellow, vermilion (Okabe and Ito 2008)."""
 
@@ -121,6 +123,9 @@ class Scene:
             if j.kind == "cylindrical"
         ]
         self.bars = (*robot_bars(robot), *pins)
+        members = np.arange(len(self.bars)) < len(robot.beams)
+        self.pieces = np.where(members, PIECES, 1)
+        """Straight pieces that each bar is drawn of: members bend."""
         self.base = base_face(graph)
         self.platform = platform_face(graph) - graph.origin
         self._thin = BAR * graph.size
@@ -206,37 +211,51 @@ class Scene:
             if self._on_platform(spot):
                 return np.asarray(origin + shift + turn.apply(point - origin), np.float64)
             member = moved.members.get(self._member(spot))
-            return point if member is None else point + _along(*member, point)
+            return point if member is None else point + _along(*member, point[None])[0]
 
-        motors = list(self._drives.values())
-        cylinders = [*self.bars, *motors]
-        ends = np.array([[place(bar.start), place(bar.end)] for bar in cylinders])
-        ends = ends.reshape(-1, 2, 3)
-        radii = np.array([bar.radius for bar in cylinders])
-        bar_colours = [self._colour(bar, colours) for bar in self.bars]
-        at, turns, sizes = _cylinders(ends, radii)
+        def line(bar: Bar, pieces: int, name: str) -> Array:
+            first, last = place(bar.start), place(bar.end)
+            shares = np.linspace(0.0, 1.0, pieces + 1)[:, None]
+            if (member := moved.members.get(name)) is None:
+                return np.asarray(first + shares * (last - first), np.float64)
+            start, end = posture.place(*bar.start), posture.place(*bar.end)
+            ways = _along(*member, start + shares * (end - start))
+            bow = ways - ways[0] - shares * (ways[-1] - ways[0])
+            return np.asarray(first + shares * (last - first) + bow, np.float64)
+
+        names = [beam.name for beam in self.robot.beams]
+        names += [""] * (len(self.bars) - len(names))
+        lines = list(map(line, self.bars, self.pieces, names))
+        motors = [line(bar, 1, "") for bar in self._drives.values()]
+        ends = np.concatenate([np.stack([a[:-1], a[1:]], axis=1) for a in (*lines, *motors)])
+        thick = np.array([bar.radius for bar in self.bars])
+        bar_colours = np.array([self._colour(bar, colours) for bar in self.bars])
+        radii = [*np.repeat(thick, self.pieces), *(bar.radius for bar in self._drives.values())]
+        at, turns, sizes = _cylinders(ends, np.array(radii))
         balls = [place(spot) for _, spot in self._balls]
         ball_radii = np.array([1.25 * self._radius(spot) for _, spot in self._balls])
         # Round ends, so that bars of one body meet without gaps.
-        tips = ends[: len(self.bars)].reshape(-1, 3)
-        tip_radii = np.repeat(radii[: len(self.bars)], 2)
+        tips = np.concatenate(lines)
+        tip_radii = np.repeat(thick, self.pieces + 1)
         ball_colours = [colours.get(name, JOINT) for name, _ in self._balls]
         whole = Rotation.from_matrix(posture.rotations[graph.platform])
         places = {
-            bar.element: ends[k].mean(0) for k, bar in enumerate(self.bars) if bar.element
+            bar.element: lines[k].mean(0) for k, bar in enumerate(self.bars) if bar.element
         } | {name: ball for (name, _), ball in zip(self._balls, balls, strict=True)}
         return Shapes(
             at,
             turns,
             sizes,
-            np.array([*bar_colours, *([DRIVE] * len(motors))], np.uint8),
+            np.array(
+                [*np.repeat(bar_colours, self.pieces, axis=0), *([DRIVE] * len(motors))], np.uint8
+            ),
             np.concatenate([np.array(balls).reshape(-1, 3), tips]),
             np.repeat(np.concatenate([ball_radii, tip_radii])[:, None], 3, axis=1),
-            np.array([*ball_colours, *np.repeat(bar_colours, 2, axis=0)], np.uint8),
+            np.array([*ball_colours, *np.repeat(bar_colours, self.pieces + 1, axis=0)], np.uint8),
             origin + shift,
             _quaternions(turn * whole),
             places,
-            dict(zip(self._drives, ends[len(self.bars) :].mean(1), strict=True)),
+            {name: a.mean(0) for name, a in zip(self._drives, motors, strict=True)},
         )
 
     def frames(self, q: Array, moved: Deflection) -> dict[str, tuple[Array, Array]]:
@@ -288,11 +307,12 @@ class Scene:
 
 
 def _along(points: Array, displacements: Array, at: Array) -> Array:
-    """Of displacements at points of a straight line, evenly apart, that at a place, (3,)."""
+    """Of displacements at points of a straight line, evenly apart, those at places, (n, 3)."""
     span = points[-1] - points[0]
-    share = np.clip((at - points[0]) @ span / (span @ span), 0.0, 1.0)
-    shares = np.linspace(0.0, 1.0, len(points))
-    return np.array([np.interp(share, shares, column) for column in displacements.T])
+    at = (at - points[0]) @ span / (span @ span) * (len(points) - 1)
+    first = np.clip(at.astype(int), 0, len(points) - 2)
+    part = np.clip(at - first, 0.0, 1.0)[:, None]
+    return np.asarray((1.0 - part) * displacements[first] + part * displacements[first + 1])
 
 
 def _cylinders(ends: Array, radii: Array) -> tuple[Array, Array, Array]:
