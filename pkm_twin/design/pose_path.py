@@ -149,16 +149,20 @@ class Followed:
 
     # Derivatives by the numbers, of one machine.
 
-    def effort_slopes(self, weights: Array, rates: Array | None = None) -> Array:
-        """Derivatives of each sample's w . tau + r . qd, shape (t, d).
+    def effort_slopes(
+        self, weights: Array, rates: Array | None = None, changes: Array | None = None
+    ) -> Array:
+        """Derivatives of each sample's w . tau + r . qd + c . qdd, shape (t, d).
 
-        :param weights: w, shape (t, n); ``rates``: r, shape (t, n), None is none.
+        :param weights: w, shape (t, n); ``rates``: r, ``changes``: c, shape (t, n), None is none.
         """
         state = (self.q, self.qd, self.qdd, self._each(self.path.wrench), weights[None])
         (by_q, by_qd, by_qdd), _ = self.many.run(programs.torque_gradient, *state)
         (of_geometry, of_masses), _ = self.many.run(programs.torque_numbers, *state)
         if rates is not None:
             by_qd = by_qd + rates
+        if changes is not None:
+            by_qdd = by_qdd + changes
         held = self._held(by_q, (by_qd, by_qdd))
         rows = np.concatenate([of_geometry + held, of_masses], -1)
         return np.asarray(rows[0] @ self.many.rigid_slopes)

@@ -61,7 +61,8 @@ class Quantity:
         if self.name in ("peak-effort", "rms-effort"):
             units = set(robot.effort_units)
             return units.pop() if len(units) == 1 else "of the limit"
-        return {"energy": "J", "deflection": "m", "mass": "kg"}.get(self.name, "")
+        others = {"motor-torque": "N m", "energy": "J", "deflection": "m", "mass": "kg"}
+        return others.get(self.name, "")
 
 
 @dataclass(frozen=True)
@@ -129,18 +130,73 @@ def _peak_slopes(f: Followed, places: Index) -> Array:
     return f.effort_slopes(weights)
 
 
+def _root(f: Followed, values: Array) -> Array:
+    """Root mean square over time of values (k, t, n), shape (k, n)."""
+    squares = (f.path.weights[:, None] * values**2).sum(1) / f.path.duration
+    return np.asarray(np.sqrt(squares), np.float64)
+
+
+def _root_weights(f: Followed, values: Array, place: int) -> Array:
+    """Derivatives of one of them by the values of one machine, shape (t,)."""
+    root = _root(f, values)[0, place] * f.path.duration
+    return np.asarray(f.path.weights * values[0, :, place] / max(root, 1e-300), np.float64)
+
+
 def _rms(f: Followed) -> Array:
-    squares = (f.path.weights[:, None] * f.efforts**2).sum(1) / f.path.duration
-    return np.asarray(np.sqrt(squares) * effort_scales(f.many.robot), np.float64)
+    return _root(f, f.efforts) * effort_scales(f.many.robot)
 
 
 def _rms_slopes(f: Followed, places: Index) -> Array:
-    scales, rms, rows = effort_scales(f.many.robot), _rms(f)[0], []
+    scales, rows = effort_scales(f.many.robot), []
     for place in places:
         weights = np.zeros(f.efforts.shape[1:])
-        share = scales[place] ** 2 / max(rms[place] * f.path.duration, 1e-300)
-        weights[:, place] = f.path.weights * f.efforts[0, :, place] * share
+        weights[:, place] = scales[place] * _root_weights(f, f.efforts, place)
         rows.append(f.effort_slopes(weights).sum(0))
+    return np.array(rows)
+
+
+def _gears(robot: Robot) -> list[Any]:
+    """Turns, inertias of the rotors and efficiencies of the drives."""
+    drives = [drive for drive in robot.drives if drive is not None]
+    if len(drives) < robot.joints_count:
+        raise ParameterError("drive", None, "a section drive for each joint, for motor-torque")
+    found: list[Any] = [drive.turns for drive in drives]
+    return [*found, *(drive.inertia for drive in drives), *(drive.efficiency for drive in drives)]
+
+
+def _motor(f: Followed) -> tuple[Array, Array, Array, Array, Array]:
+    """Torques of the motors, as :mod:`pkm_twin.paths.sizing` has them, shape (k, t, n), and the
+    losses; turns, inertias and efficiencies, shape (k, 1, n).
+    """
+    turns, inertia, share = np.split(_file_numbers(f, _gears)(f.many.values)[:, None], 3, -1)
+    through = f.efforts - inertia * turns**2 * f.qdd
+    losses = np.where(through * f.qd < 0.0, share, 1.0 / share)
+    return inertia * turns * f.qdd + through * losses / turns, losses, turns, inertia, share
+
+
+def _motor_slopes(f: Followed, places: Index) -> Array:
+    torques, losses, *numbers = _motor(f)
+    loss, tau, qdd = losses[0], f.efforts[0], f.qdd[0]
+    turns, inertia, share = (values[0] for values in numbers)
+    through = tau - inertia * turns**2 * qdd
+    # By turns, inertia and efficiency, the effort and the motion as they are.
+    own = (
+        inertia * qdd * (1.0 - loss) - tau * loss / turns**2,
+        turns * qdd * (1.0 - loss),
+        through / turns * np.where(through * f.qd[0] < 0.0, 1.0, -1.0 / share**2),
+    )
+    slopes = _file_numbers(f, _gears).slopes_at(f.many.values)[0].reshape(3, len(turns[0]), -1)
+    rows = []
+    for place in places:
+        weights = np.zeros(tau.shape)
+        weights[:, place] = _root_weights(f, torques, place)
+        along = f.effort_slopes(
+            weights * loss / turns, None, weights * inertia * turns * (1.0 - loss)
+        )
+        direct = sum(
+            (weights * by).sum(0)[place] * s[place] for by, s in zip(own, slopes, strict=True)
+        )
+        rows.append(along.sum(0) + direct)
     return np.array(rows)
 
 
@@ -174,21 +230,23 @@ def _moving_masses(robot: Robot) -> list[Any]:
     return [sum((rod.mass for rod in graph.rods.values()), sum(parts, 0.0))]
 
 
-def _masses(f: Followed) -> FileNumbers:
+def _file_numbers(f: Followed, of: Callable[[Robot], list[Any]]) -> FileNumbers:
+    """Of the machines' numbers, made once."""
     functions = f.many.functions
-    found = vars(functions).get("moving masses")
+    found = vars(functions).get(of.__name__)
     if found is None:
-        found = FileNumbers(functions.robot, functions.paths, _moving_masses)
-        vars(functions)["moving masses"] = found
+        found = FileNumbers(functions.robot, functions.paths, of)
+        vars(functions)[of.__name__] = found
     return found
 
 
 def _mass(f: Followed) -> Array:
-    return _masses(f)(f.many.values)
+    return _file_numbers(f, _moving_masses)(f.many.values)
 
 
 def _mass_slopes(f: Followed, places: Index) -> Array:
-    return np.repeat(_masses(f).slopes_at(f.many.values)[0], len(places), 0)
+    slopes = _file_numbers(f, _moving_masses).slopes_at(f.many.values)
+    return np.repeat(slopes[0], len(places), 0)
 
 
 QUANTITIES: Final = {
@@ -196,6 +254,8 @@ QUANTITIES: Final = {
     for quantity in (
         Quantity("peak-effort", "greatest effort of any joint", _peak, _peak_slopes, True),
         Quantity("rms-effort", "greatest RMS effort of a joint", _rms, _rms_slopes),
+        Quantity("motor-torque", "greatest RMS torque of a motor, of files with drives",
+                 lambda f: _root(f, _motor(f)[0]), _motor_slopes),
         Quantity("energy", "energy that the drives give, nothing regenerated", _energy,
                  _energy_slopes),
         Quantity("deflection", "greatest translation of the reference point under the wrench",

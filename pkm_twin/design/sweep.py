@@ -92,8 +92,8 @@ def known_quantities(robot: Robot, path: PosePath) -> list[str]:
         elastic = bool(robot.element_names)
     except ParameterError:
         elastic = False
-    bends = elastic and path.wrench.any()
-    return [name for name in QUANTITIES if bends or name != "deflection"]
+    known = {"deflection": elastic and path.wrench.any(), "motor-torque": None not in robot.drives}
+    return [name for name in QUANTITIES if known.get(name, True)]
 
 
 Work = Sequence[tuple[int, Array]]

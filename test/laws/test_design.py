@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import copy
+
 import numpy as np
 import pytest
 
@@ -14,7 +16,7 @@ from pkm_twin.design.quantities import QUANTITIES
 from pkm_twin.errors import ParameterError, PkmTwinError, UnknownNameError
 from pkm_twin.paths import cycle, timed
 from test.laws.test_derivatives import POINTS, WEIGHTS
-from test.support.robots import load, partly_long
+from test.support.robots import load, parameters_of, partly_long
 
 NUMBERS = {
     "delta": ["geometry.arm_length", "geometry.forearm_length", "inertia.platform_mass"],
@@ -111,6 +113,50 @@ def test_quantities_are_those_of_each_machine_by_itself(picking):
         assert mass[k] == pytest.approx(
             sum(bodies) + sum(r.mass for r in machine.graph.rods.values())
         )
+
+
+def test_the_ratio_of_least_motor_torque_is_that_of_brute_force(picking):
+    """Every ratio a machine of its own; torques at the motor as a reader writes them."""
+    _, path = picking
+    data = parameters_of("delta")
+    data["inertia"].pop("rotor_inertia")
+    data["drive"] = {"inertia": 9e-6, "ratio": 20.0, "efficiency": 0.8}
+    robot = type(load("delta")).from_data(copy.deepcopy(data), "geared")
+    squares = np.trapezoid if hasattr(np, "trapezoid") else np.trapz
+
+    length = robot.number("geometry.arm_length")
+
+    def torque(ratio, length=length):
+        data["drive"]["ratio"], data["geometry"]["arm_length"] = ratio, length
+        machine = robot.from_data(copy.deepcopy(data), "geared")
+        q = machine.inverse(path.pose)
+        qd = np.linalg.solve(machine.jacobian(q), path.rate[..., None])[..., 0]
+        own = path.acceleration - machine.pose_acceleration(q, qd, 0.0 * qd)
+        qdd = np.linalg.solve(machine.jacobian(q), own[..., None])[..., 0]
+        load = inverse_dynamics(machine, q, qd, qdd) - 9e-6 * ratio**2 * qdd
+        shaft = np.where(load * qd < 0, load * 0.8, load / 0.8) / ratio + 9e-6 * ratio * qdd
+        whole = path.time[-1] - path.time[0]
+        return np.sqrt(squares(shaft**2, path.time, axis=0) / whole)
+
+    best = min((torque(ratio, length).max(), ratio) for ratio in np.arange(5.0, 60.0, 0.5))
+    result = design(robot, {"drive.ratio": (5.0, 60.0)}, path, "motor-torque", starts=4)
+    assert result.best.quantities["motor-torque"] == pytest.approx(best[0], rel=3e-4)
+    assert result.best.numbers["drive.ratio"] == pytest.approx(best[1], abs=0.5)
+    # Its derivatives, by the ratio and by a length that moves the joints otherwise.
+    quantity, f = QUANTITIES["motor-torque"], Followed(variants(robot, {
+        "drive.ratio": 20.0, "geometry.arm_length": length, "drive.efficiency": 0.8,
+        "drive.inertia": 9e-6}), path)  # fmt: skip
+    slopes = quantity.slopes(f, np.arange(3))
+    for k, step in enumerate((1e-3, 1e-6)):
+        ahead, behind = (torque(20.0 + s * (k == 0), length + s * (k == 1)) for s in (step, -step))
+        np.testing.assert_allclose(slopes[:, k], (ahead - behind) / (2 * step), rtol=1e-5)
+    for k, step in ((2, 1e-5), (3, 1e-10)):
+        values = np.tile([20.0, length, 0.8, 9e-6], (2, 1))
+        values[:, k] += [step, -step]
+        ahead, behind = quantity.pieces(Followed(f.many.with_values(values), path))
+        np.testing.assert_allclose(slopes[:, k], (ahead - behind) / (2 * step), rtol=1e-5)
+    with pytest.raises(ParameterError, match="drive"):
+        design(load("delta"), BOX, path, "motor-torque", starts=4)
 
 
 @pytest.mark.parametrize("aim", partly_long(("peak-effort", "energy"), "peak-effort"))

@@ -40,8 +40,9 @@ class Design(Carries, ReadsMotions, Writes, Draws, Seeded):
 
     The platform of every machine follows the same path; machines that cannot follow it are
     rejected. peak-effort is the greatest effort of any joint, rms-effort the greatest RMS effort of
-    a joint, energy what the drives supply without regeneration, deflection the greatest translation
-    of the reference point under the wrench, mass that of all bodies and rods without payload;
+    a joint, motor-torque that of a motor (files with drives), energy what the drives supply without
+    regeneration, deflection the greatest translation of the reference point under the wrench, mass
+    that of all bodies and rods without payload;
     singularity is the least singularity index on the path. The search uses exact gradients from
     several starts and ends in a local optimum.
 
@@ -62,7 +63,9 @@ class Design(Carries, ReadsMotions, Writes, Draws, Seeded):
         None, "motion of the robot: CSV or MCAP of `pkm-twin path`, or a recording"
     )
     minimise: tuple[str, ...] = setting(
-        (), "peak-effort, rms-effort, energy, deflection or mass; two of them give a Pareto front"
+        (),
+        "peak-effort, rms-effort, motor-torque, energy, deflection or mass; two of them give a "
+        "Pareto front",
     )
     subject_to: tuple[str, ...] = setting(
         (), "bound on a quantity, e.g. 'singularity>=0.1' or 'peak-effort<=20'"
