@@ -209,7 +209,7 @@ class RecordReader:
 @cache
 def opcode_name(opcode: int) -> str:
     """Return the name of a kind of record, for error texts."""
-    if opcode >= FIRST_UNKNOWN:
+    if not 0 < opcode < FIRST_UNKNOWN:
         return f"unknown (0x{opcode:02x})"
     return Op(opcode).name.lower().replace("_", " ")
 
