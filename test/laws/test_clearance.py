@@ -8,15 +8,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import yaml
 from scipy.optimize import lsq_linear
 
-from pkm_twin.errors import ParameterError
 from pkm_twin.maps.search import workspace_box
 from pkm_twin.robot.clearance import clearance, distance, has_clearance
 from pkm_twin.robot.workspace import reachable, regular_workspace
 from stiffness_monitor.structure import structural_model
-from test.support.robots import SHIPPED, load, parameters_of, partly_long, random_poses
+from test.support.robots import SHIPPED, load, partly_long, random_poses
 
 ROBOTS = [
     name for name, robot in SHIPPED.items() if has_clearance(robot) and robot.mechanism != "machine"
@@ -214,24 +212,6 @@ def test_the_regular_workspace_ends_where_limbs_meet(variant):
     for height, radius in zip(narrow.z[touched], narrow.radius[touched], strict=True):
         poses = np.column_stack((np.full(72, height), radius * np.cos(turn), radius * np.sin(turn)))
         assert clearance(robot, poses).min() == pytest.approx(0.0, abs=1e-7)
-
-
-@pytest.mark.parametrize("name", partly_long(["delta", "delta_cu", "prru"], "delta_cu"))
-def test_without_members_nothing_is_known_and_all_else_holds(name, tmp_path):
-    data = parameters_of(name)
-    del data["members"]
-    path = tmp_path / f"{name}.yaml"
-    path.write_text(yaml.safe_dump(data))
-    robot = load(path)
-    assert robot.beams == ()
-    assert not has_clearance(robot)
-    poses = box(robot, 11)
-    expected = reachable(load(name), poses, -math.inf)
-    for bound in (0.0, 1e3):
-        assert (reachable(robot, poses, bound) == expected).all()
-    with pytest.raises(ParameterError) as caught:
-        clearance(robot, robot.home())
-    assert caught.value.field == "members"
 
 
 def test_an_rcu_limb_without_its_rod_is_not_known(variant):

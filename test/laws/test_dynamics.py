@@ -6,13 +6,7 @@ import pytest
 
 from delta_dynamics import energy, forward_dynamics, inverse_dynamics, mass_matrix
 from test.support.bodies import bodies, rubs
-from test.support.robots import (
-    load,
-    loaded,
-    massive,
-    parameters_of,
-    random_motion,
-)
+from test.support.robots import load, loaded, massive, parameters_of, random_motion
 
 pytestmark = massive
 
@@ -48,17 +42,23 @@ def rotors(robot):
     return np.array([robot.graph.joints[name].rotor_inertia for name in robot.joint_names])
 
 
-def test_energy_and_mass_matrix_are_the_sums_over_all_bodies(name, robot, rng):
-    q, qd, qdd = states(robot, rng, 100)
+def summed(robot, q, qd, qdd):
+    """All bodies, and the mass matrix as their sum, which the compiled one is."""
     all_ = bodies(robot, q, qd, qdd)
     matrix = np.einsum("nbij,b,nbik->njk", all_.linear, all_.mass, all_.linear)
     matrix += np.einsum("nbij,nbil,nblk->njk", all_.angular, all_.inertia, all_.angular)
     matrix += np.diag(rotors(robot))
     found = mass_matrix(robot, q)
     np.testing.assert_allclose(found, matrix, rtol=1e-11, atol=1e-12 * np.abs(matrix).max())
+    return all_, found
+
+
+def test_energy_and_mass_matrix_are_the_sums_over_all_bodies(name, robot, rng):
+    q, qd, qdd = states(robot, rng, 100)
+    all_, found = summed(robot, q, qd, qdd)
     assert (np.linalg.eigvalsh(found) > 0).all()
     both = energy(robot, q, qd)
-    kinetic = np.einsum("ni,nij,nj->n", qd, matrix, qd) / 2
+    kinetic = np.einsum("ni,nij,nj->n", qd, found, qd) / 2
     np.testing.assert_allclose(both.kinetic, kinetic, rtol=1e-11)
     potential = -np.einsum("b,nbi,i->n", all_.mass, all_.com, robot.gravity)
     np.testing.assert_allclose(both.potential, potential, rtol=1e-11, atol=1e-12)
@@ -113,12 +113,6 @@ def test_machines_of_one_geometry_keep_their_own_masses(name, variant, rng):
     robot, (other, _) = load(name), variant(name, **heavier_sections(parameters_of(name), 3.0))
     assert other.engine is robot.engine
     q, qd, qdd = states(robot, rng, 10)
-    for machine in (robot, other, robot):
-        all_ = bodies(machine, q, qd, qdd)
-        matrix = np.einsum("nbij,b,nbik->njk", all_.linear, all_.mass, all_.linear)
-        matrix += np.einsum("nbij,nbil,nblk->njk", all_.angular, all_.inertia, all_.angular)
-        matrix += np.diag(rotors(machine))
-        found = mass_matrix(machine, q)
-        np.testing.assert_allclose(found, matrix, rtol=1e-11, atol=1e-12 * np.abs(matrix).max())
-    traces = [mass_matrix(machine, q).trace(axis1=1, axis2=2) for machine in (robot, other)]
+    found = [summed(machine, q, qd, qdd)[1] for machine in (robot, other, robot)]
+    traces = [matrix.trace(axis1=1, axis2=2) for matrix in found]
     assert (np.abs(traces[1] / traces[0] - 1.0) > 0.05).all()

@@ -130,19 +130,24 @@ def test_max_driving_force_is_inverse_dynamics_at_the_energy(name, robot, rng):
 def test_max_driving_force_range_holds_all_samples_and_is_attained(name, robot, rng):
     pose = robot.forward(random_joints(robot, rng, 12)).reshape(3, 4, 3)
     amount = energy_of(robot)
-    ends = max_driving_force_range(robot, pose, amount)
+    # An acceleration enters as a constant.
+    acceleration = rng.normal(size=(3, 4, 1, 3))
+    ends = max_driving_force_range(robot, pose, amount, acceleration[..., 0, :])
     assert ends.least.shape == ends.greatest.shape == (3, 4)
     assert ends.directions.shape == (3, 4, 2, 3)
-    samples = max_driving_force(robot, pose[..., None, :], sphere_directions(3000), amount)
+
+    def forces(directions):
+        return max_driving_force(robot, pose[..., None, :], directions, amount, acceleration)
+
+    samples = forces(sphere_directions(3000))
     assert (samples >= ends.least[..., None] * (1 - 1e-11)).all()
     assert (samples <= ends.greatest[..., None] * (1 + 1e-11)).all()
     np.testing.assert_allclose(samples.max(-1), ends.greatest, rtol=2e-2)
-    at = max_driving_force(robot, pose[..., None, :], ends.directions, amount)
-    np.testing.assert_allclose(at, np.stack([ends.least, ends.greatest], -1), rtol=1e-10)
+    ends_again = forces(ends.directions)
+    np.testing.assert_allclose(ends_again, np.stack([ends.least, ends.greatest], -1), rtol=1e-10)
     # Directions one hair away from the least are not lower.
     near = ends.directions[..., :1, :] + 1e-4 * sphere_directions(200)
-    around = max_driving_force(robot, pose[..., None, :], near, amount)
-    assert (around >= ends.least[..., None] * (1 - 1e-11)).all()
+    assert (forces(near) >= ends.least[..., None] * (1 - 1e-11)).all()
 
 
 def descended(forms, start):
@@ -224,16 +229,6 @@ def test_ranges_of_machines_of_two_and_six_freedoms(name, rng):
         assert ends.least <= values.min() and values.max() <= ends.greatest
         at = index(robot, pose, ends.directions)
         np.testing.assert_allclose(at, [ends.least, ends.greatest], rtol=1e-9)
-
-
-@massive
-def test_acceleration_enters_as_a_constant(name, robot, rng):
-    pose = robot.forward(random_joints(robot, rng, 3))
-    acceleration = rng.normal(size=(3, 3))
-    amount = energy_of(robot)
-    ends = max_driving_force_range(robot, pose, amount, acceleration)
-    at = max_driving_force(robot, pose[:, None], ends.directions, amount, acceleration[:, None])
-    np.testing.assert_allclose(at, np.stack([ends.least, ends.greatest], -1), rtol=1e-10)
 
 
 def axis_of(pose):

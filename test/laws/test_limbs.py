@@ -12,45 +12,17 @@ from pkm_twin.kinematics.iterations import newton
 from pkm_twin.kinematics.limbs import LimbPose
 from pkm_twin.kinematics.motion import Motion, matrices, numbers
 from pkm_twin.mechanisms.catalogue import robot_of_data
-
-
-def unit(vector):
-    return vector / np.linalg.norm(vector)
+from test.machine.random_machines import variant
 
 
 def hexapod(seed):
-    """Feet, centres and axes anywhere near a hexapod's; every second one has legs off the feet."""
+    """Of other dimensions than the shipped one's; every second one has legs off the feet."""
     rng = np.random.default_rng(seed)
-    turns = np.radians(60.0) * np.arange(6) + rng.uniform(-0.2, 0.2, (2, 6))
-    turns += np.array([[0.3, -0.3], [-0.24, 0.24]]).repeat(3, 0).reshape(2, 6)
-    height = rng.uniform(0.4, 0.9)
-    body = {"mass": 1.0, "com": [0.0, 0.0, height], "inertia": [0.01, 0.01, 0.02]}
-    bodies, joints = {"platform": body}, {}
-    for k, (foot, top) in enumerate(turns.T):
-        start = 0.5 * np.array([np.cos(foot), np.sin(foot), 0.0]) + rng.uniform(-0.03, 0.03, 3)
-        end = 0.25 * np.array([np.cos(top), np.sin(top), 0.0]) + rng.uniform(-0.03, 0.03, 3)
-        end[2] += height
-        along = unit(end - start)
-        first = unit(np.cross(along, rng.normal(size=3)))
-        second = unit(np.cross(along, first) + 0.2 * rng.normal(size=3))
-        second = unit(second - (second @ first) * first)
-        off = 0.03 * rng.normal(size=3) * (seed % 2)
-        for name, part in (("lower", 0.3), ("upper", 0.7)):
-            com = (start + part * (end - start)).tolist()
-            bodies[f"{name}_{k}"] = {"mass": 0.2, "com": com, "inertia": [1e-3] * 3}
-        joints |= {
-            f"foot_{k}": {"type": "universal", "between": ["base", f"lower_{k}"],
-                          "at": start.tolist(), "axes": [first.tolist(), second.tolist()]},
-            f"leg_{k}": {"type": "prismatic", "between": [f"lower_{k}", f"upper_{k}"],
-                         "at": (start + off).tolist(), "axis": unit(along + off).tolist(),
-                         "actuated": True},
-            f"ball_{k}": {"type": "spherical", "between": [f"upper_{k}", "platform"],
-                          "at": end.tolist()},
-        }  # fmt: skip
-    return robot_of_data({
-        "mechanism": "machine", "platform": "platform", "origin": [0.0, 0.0, height],
-        "pose": ["x", "y", "z", "roll", "pitch", "yaw"], "bodies": bodies, "joints": joints,
-    }, "hexapod")  # fmt: skip
+    data = variant("stewart", rng)
+    for name, joint in data["joints"].items():
+        if name.startswith("leg") and seed % 2:
+            joint["at"] = (np.array(joint["at"]) + 0.03 * rng.normal(size=3)).tolist()
+    return robot_of_data(data, "hexapod")
 
 
 def followed(engine, q, steps=128):

@@ -51,6 +51,8 @@ def test_numbers_of_a_file_are_linear_parameters(name):
     """A file with other masses, centres and inertias needs the efforts that are linear in them."""
     robot, rng = complete(name), np.random.default_rng(2)
     parameters = file_parameters(robot)
+    assert len(set(parameters.names)) == len(parameters.names) == len(parameters.values)
+    assert possible(parameters.values, parameters.cones)
     values, numbers = parameters.values.copy(), {}
     for where, group in zip(parameters.slices, parameters.groups, strict=True):
         step = 0.3 * np.nan_to_num(group.scales) * rng.normal(size=len(group.names))

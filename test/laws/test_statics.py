@@ -3,11 +3,16 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 import yaml
 
 from pkm_twin.errors import ParameterError, SingularityError
+from pkm_twin.maps.search import workspace_box
+from pkm_twin.robot.clearance import clearance, has_clearance
+from pkm_twin.robot.workspace import reachable
 from stiffness_monitor import compliance, platform_response, stiffness, strain_energy
 from stiffness_monitor.compliance import kernels, member_deflections
 from test.support.robots import ELASTIC, elastic, load, parameters_of, random_joints, random_poses
@@ -120,7 +125,7 @@ class TestEveryRobot:
 @pytest.mark.parametrize(
     "name", [name for name in ELASTIC if name != "upr_rpu" and "members" in parameters_of(name)]
 )
-def test_a_file_without_members_has_no_compliance(name, tmp_path):
+def test_without_members_nothing_is_known_of_them_and_all_else_holds(name, tmp_path, rng):
     data = parameters_of(name)
     del data["members"]
     path = tmp_path / "rigid.yaml"
@@ -130,9 +135,18 @@ def test_a_file_without_members_has_no_compliance(name, tmp_path):
         lambda: compliance(robot, robot.home()),
         lambda: strain_energy(robot, robot.home(), np.ones(6)),
         lambda: kernels(robot),
+        lambda: clearance(robot, robot.home()),
     ):
-        with pytest.raises(ParameterError, match="members"):
+        with pytest.raises(ParameterError) as caught:
             ask()
+        assert caught.value.field == "members"
+    assert robot.beams == () and not has_clearance(robot)
+    low, high = np.transpose(workspace_box(robot))
+    poses = rng.uniform(low, high, (1000, len(low)))
+    expected = reachable(load(name), poses, -math.inf)
+    assert 0 < expected.sum() < 1000
+    for bound in (0.0, 1e3):
+        assert (reachable(robot, poses, bound) == expected).all()
 
 
 def test_a_frame_that_is_a_mechanism_is_refused_by_its_sample(variant):

@@ -9,17 +9,12 @@ import numpy as np
 import pytest
 
 from pkm_twin.errors import ParameterError, SingularityError
-from pkm_twin.machine import schema
-from pkm_twin.machine.strict_yaml import read_yaml
-from pkm_twin.mechanisms.catalogue import config_folder
-from pkm_twin.mechanisms.upr_rpu import UprRpu
 from pkm_twin.robot.workspace import regular_workspace
 from stiffness_monitor import compliance, stiffness, strain_energy
 from test.support.robots import load
 from test.support.upr_rpu import closed_form
 
 ROBOT = load("upr_rpu")
-FILE = read_yaml(config_folder() / "upr_rpu.yaml")
 HOME = np.array([-0.6, 0.0, 0.0])
 SWAPPED = [3, 4, 5, 0, 1, 2, 6, 7, 8]
 
@@ -31,26 +26,20 @@ def random_machine(rng):
         values = 10.0 ** rng.uniform([-10.5] * 3 + [-11.5] * 3, [-8.5] * 3 + [-9.5] * 3)
         return [math.inf if i in free else v for i, v in enumerate(values.tolist())]
 
-    return schema.build(
-        UprRpu,
-        {
-            "mechanism": "upr_rpu",
-            "geometry": {
-                "base_radius": float(rng.uniform(0.2, 0.6)),
-                "platform_radius": float(rng.uniform(0.1, 0.5)),
-            },
-            "members": {
-                "youngs_modulus": float(rng.uniform(50e9, 250e9)),
-                "shear_modulus": float(rng.uniform(20e9, 90e9)),
-                "diameter": rng.uniform(0.02, 0.15, 3).tolist(),
-                "shear_factor": float(rng.uniform(0.5, 2.0)),
-            },
-            "joints_compliance": {
-                "upr_revolute": joint((4,)),
-                "upr_universal": joint((3, 4)),
-                "rpu_universal": joint((3, 4)),
-                "rpu_revolute": joint((3,)),
-            },
+    radii, moduli = rng.uniform((0.2, 0.1), (0.6, 0.5)), rng.uniform((50e9, 20e9), (250e9, 90e9))
+    return ROBOT.changed(
+        geometry=dict(zip(("base_radius", "platform_radius"), radii, strict=True)),
+        members={
+            "youngs_modulus": moduli[0],
+            "shear_modulus": moduli[1],
+            "diameter": rng.uniform(0.02, 0.15, 3).tolist(),
+            "shear_factor": rng.uniform(0.5, 2.0),
+        },
+        joints_compliance={
+            "upr_revolute": joint((4,)),
+            "upr_universal": joint((3, 4)),
+            "rpu_universal": joint((3, 4)),
+            "rpu_revolute": joint((3,)),
         },
     )
 

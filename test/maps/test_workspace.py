@@ -147,6 +147,8 @@ def test_a_bound_on_clearance_takes_away(name, small_maps, tmp_path):
     assert (np.isfinite(values(left, "singularity")) == kept).all()
     lost = float(left.interference)
     assert 0 < lost < 0.2
+    assert f"interfere in {100 * lost:.3g} %" in "\n".join(figures.lines(left))
+    assert "interfere in" not in "\n".join(figures.lines(data))
     assert float(left.volume) == pytest.approx((1 - lost) * float(data.volume))
     assert (left.circle.values <= data.circle.values).all()
     assert left.circle.values == pytest.approx(
@@ -165,16 +167,6 @@ def test_the_box_holds_what_interference_takes_away(variant):
     tilt = np.abs(poses[..., 1:]).max((0, 1, 2))
     assert (np.abs(poses[reachable(thick, poses)])[:, 1:].max(0) < 0.9 * tilt).all()
     assert (workspace_box(thick) == box).all()
-
-
-def test_what_interference_takes_away_is_said(small_maps, tmp_path):
-    sweep = map_of(load("delta"), Workspace(), 8000, least_clearance=0.03)
-    with open_map(run(sweep, tmp_path / "a.nc", workers=1)) as data:
-        lost = 100 * float(data.interference)
-        assert lost > 0.0
-        assert f"interfere in {lost:.3g} %" in "\n".join(figures.lines(data))
-    with open_map(small_maps["workspace delta_cu"]) as data:
-        assert "interfere in" not in "\n".join(figures.lines(data))
 
 
 def test_all_taken_away_is_still_a_map(tmp_path):
