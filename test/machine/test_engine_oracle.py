@@ -56,31 +56,20 @@ def case(request, tmp_path_factory):
     return Case(*request.param, tmp_path_factory.mktemp("machine"))
 
 
-def samples(states):
-    return zip(states.q, states.qd, states.qdd, states.wrench, strict=True)
-
-
-def test_names(case):
-    assert tuple(case.robot.joint_names) == tuple(j.name for j in case.judge.machine.actuated)
-    assert tuple(case.robot.pose_names) == case.judge.machine.pose
-
-
 def test_other_engines_agree(case):
     result = certify(case.robot, case.description, states=STATES)
     assert result.good, [item for item in result.items if not item.good]
     assert all("not installed" in reason for reason in result.missing.values())
 
 
-def test_poses(case):
+def test_names_poses_and_home(case):
+    assert tuple(case.robot.joint_names) == tuple(j.name for j in case.judge.machine.actuated)
+    assert tuple(case.robot.pose_names) == case.judge.machine.pose
     poses = case.robot.forward(case.states.q)
     expected = np.array([case.judge.pose(q) for q in case.states.q])
     assert poses.shape == expected.shape
     assert np.abs(poses - expected).max() < BOUND
-
-
-def test_home(case):
-    home = case.judge.machine.home
-    position, rotation = case.robot.platform(home)
+    position, rotation = case.robot.platform(case.judge.machine.home)
     assert np.abs(position - case.judge.machine.origin).max() < BOUND
     assert np.abs(rotation - np.eye(3)).max() < BOUND
 
@@ -93,39 +82,11 @@ def test_forward_dynamics_inverts(case):
     assert np.abs(back - s.qdd).max() < 1e-12 * condition * max(1.0, np.abs(tau).max())
 
 
-def test_batch_axes_and_bits(case):
-    s, n = case.states, len(case.robot.joint_names)
-    m = len(case.robot.pose_names)
-    batch = inverse_dynamics(case.robot, s.q, s.qd, s.qdd, s.wrench)
-    single = [inverse_dynamics(case.robot, *sample) for sample in samples(s)]
-    assert np.array_equal(batch, single)
-    assert np.array_equal(case.robot.forward(s.q), [case.robot.forward(q) for q in s.q])
-    grid = [x.reshape(2, STATES // 2, -1) for x in (s.q, s.qd, s.qdd, s.wrench)]
-    assert np.array_equal(inverse_dynamics(case.robot, *grid), batch.reshape(2, -1, n))
-    assert case.robot.forward(grid[0]).shape == (2, STATES // 2, m)
-    position, rotation = case.robot.platform(grid[0])
-    assert position.shape == (2, STATES // 2, 3)
-    assert rotation.shape == (2, STATES // 2, 3, 3)
-    assert mass_matrix(case.robot, grid[0]).shape == (2, STATES // 2, n, n)
-
-
-def test_no_wrench_is_none(case):
-    s = case.states
-    none = inverse_dynamics(case.robot, s.q, s.qd, s.qdd)
-    assert np.array_equal(none, inverse_dynamics(case.robot, s.q, s.qd, s.qdd, np.zeros(6)))
-
-
-def test_out_of_reach_is_told(tmp_path):
-    robot = loaded(plain("rps3"), tmp_path)
-    with pytest.raises(PkmTwinError):
-        robot.forward([0.3, 1.3, 0.3])
-
-
-def test_a_singularity_on_the_way_is_told(tmp_path):
+@pytest.mark.parametrize(("name", "q"), [("rps3", [0.3, 1.3, 0.3]), ("five_bar", [0.9, -0.9])])
+def test_what_no_way_from_home_reaches_is_told(name, q):
     """The five-bar's elbows meet on the way: behind it all loops close, in no assembly of ours."""
-    robot = loaded(plain("five_bar"), tmp_path)
     with pytest.raises(PkmTwinError):
-        robot.forward([0.9, -0.9])
+        load(name).forward(q)
 
 
 PENDULUM = {

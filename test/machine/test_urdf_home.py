@@ -38,12 +38,16 @@ def closed(tree, robot, q):
     known = dict(zip(robot.joint_names, q, strict=True))
     known |= dict(zip(robot.passive_joints, robot.passive(q), strict=True))
     full = np.array([float(known.get(name, 0.0)) for name in tree.model.names[1:]])
-    free = [i for i, name in enumerate(tree.model.names[1:]) if name not in known]
+    return settled(tree, full, [i for i, n in enumerate(tree.model.names[1:]) if n not in known])
+
+
+def settled(tree, q, free):
+    """Joint values of which the free ones close the loops, if they can."""
     for _ in range(60):
-        value, rates = tree.rows(full)
+        value, rates = tree.rows(q)
         step = np.linalg.lstsq(rates[:, free], -value, rcond=1e-6)[0]
-        full[free] += np.clip(step, -0.5, 0.5)
-    return full
+        q[free] += step * min(1.0, 0.5 / max(np.abs(step).max(), 1e-12))
+    return q
 
 
 def read(path, **options):
@@ -125,11 +129,7 @@ def test_of_several_assemblies_the_best_conditioned_is_home(tries, tmp_path):
     for _ in range(tries):
         q = np.zeros(tree.model.nv)
         q[tree.loose] = rng.uniform(-np.pi, np.pi, len(tree.loose))
-        for _ in range(60):
-            value, rates = tree.rows(q)
-            step = np.linalg.lstsq(rates[:, tree.loose], -value, rcond=1e-6)[0]
-            q[tree.loose] += step * min(1.0, 0.5 / max(np.abs(step).max(), 1e-12))
-        if np.abs(tree.rows(q)[0]).max() < 1e-9:
+        if np.abs(tree.rows(settled(tree, q, tree.loose))[0]).max() < 1e-9:
             found.append(q)
     assert found
     for q in found:
