@@ -19,12 +19,13 @@ from pkm_twin.bags.reader import BagWriter, inspect, read_messages
 from pkm_twin.bags.recover import recover
 from pkm_twin.identification.check import check
 from pkm_twin.recordings import ReadOptions, read
+from test.bags import raw
 from test.bags.conftest import DEFINITIONS
 from test.bags.folders import write_split
+from test.bags.raw import MAGIC, record
 from test.fuzz.definitions import definitions
 from test.fuzz.tally import Kind, damaged, refusal
 
-MAGIC = b"\x89MCAP0\r\n"
 STATE = "sensor_msgs/msg/JointState"
 
 
@@ -95,13 +96,8 @@ class DamagedSplits(DamagedBags):
         return [(self.folder / f"{name}.mcap").read_bytes() for name in ("split", "packed")]
 
 
-def record(opcode: int, content: bytes) -> bytes:
-    return struct.pack("<BQ", opcode, len(content)) + content
-
-
 def text(value: str) -> bytes:
-    raw = value.encode(errors="replace")
-    return struct.pack("<I", len(raw)) + raw
+    return raw.text(value.encode(errors="replace"))
 
 
 NUMBERS = st.one_of(

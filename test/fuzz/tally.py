@@ -7,6 +7,7 @@ import json
 import math
 import random
 import time
+from array import array
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
@@ -14,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import hypothesis
-import psutil
+import numpy as np
 from hypothesis import HealthCheck, Phase, settings
 from hypothesis import strategies as st
 
@@ -26,31 +27,6 @@ CORPUS = Path(__file__).with_name("corpus")
 LONGEST = 2500
 """Characters of an error: a line, not a page."""
 MAX_FAILURES = 20
-BINS = 200
-"""Of the distribution of times, eight to a doubling, from a microsecond on."""
-
-
-@dataclass
-class Times:
-    """How long examples took: a distribution, not a verdict."""
-
-    counts: list[int] = field(default_factory=lambda: [0] * BINS)
-    slowest: float = 0.0
-
-    def add(self, seconds: float) -> None:
-        mantissa, exponent = math.frexp(max(1.0, seconds * 1e6))
-        place = 8 * (exponent - 1) + int(8 * (2 * mantissa - 1))
-        self.counts[min(place, BINS - 1)] += 1
-        self.slowest = max(self.slowest, seconds)
-
-    def quantile(self, share: float) -> float:
-        """Upper end of the bin that holds this share of the examples, s."""
-        left = share * sum(self.counts)
-        for place, count in enumerate(self.counts):
-            left -= count
-            if left <= 0:
-                return min(1e-6 * 2 ** (place // 8) * (1 + (place % 8 + 1) / 8), self.slowest)
-        return self.slowest
 
 
 @dataclass
@@ -59,19 +35,19 @@ class Tally:
 
     kind: str
     seed: int = 0
-    batches: int = 0
-    examples: int = 0
     good: int = 0
     refused: Counter[str] = field(default_factory=Counter)
-    times: Times = field(default_factory=Times)
+    times: array[float] = field(default_factory=lambda: array("d"))
+    """How long each example took, s."""
     failures: list[str] = field(default_factory=list)
     spent: float = 0.0
-    memory: list[float] = field(default_factory=list)
-    """Resident MiB after every batch."""
+
+    @property
+    def examples(self) -> int:
+        return len(self.times)
 
     def note(self, ended: str, seconds: float) -> None:
-        self.times.add(seconds)
-        self.examples += 1
+        self.times.append(seconds)
         if ended == "good":
             self.good += 1
         else:
@@ -83,25 +59,15 @@ class Tally:
         if len(self.failures) < MAX_FAILURES:
             self.failures.append(f"seed {seed}: {what}: {example!r}"[:3000])
 
-    @property
-    def growth(self) -> float:
-        """MiB between the first fifth of the batches, when all is loaded, and the end."""
-        return self.memory[-1] - self.memory[len(self.memory) // 5] if self.memory else 0.0
-
     def as_json(self) -> str:
         return json.dumps(
             {
                 "kind": self.kind,
                 "seed": self.seed,
-                "batches": self.batches,
                 "examples": self.examples,
                 "taken": self.good,
                 "refused": dict(self.refused.most_common()),
-                "median (s)": self.times.quantile(0.5),
-                "99.9 % (s)": self.times.quantile(0.999),
-                "slowest (s)": self.times.slowest,
-                "time (s)": self.spent,
-                "memory grown (MiB)": self.growth,
+                "99.9 % (s)": float(np.quantile(self.times, 0.999)),
                 "failures": self.failures,
             },
             indent=2,
@@ -212,8 +178,6 @@ def batch(kind: Kind, tally: Tally, seed: int, size: int = BATCH) -> None:
         )(hypothesis.given(strategy)(one))
         guarded(hypothesis.seed(seed)(run))
     guarded(kind.end)
-    tally.batches += 1
-    tally.memory.append(psutil.Process().memory_info().rss / 2**20)
 
 
 def run(
