@@ -131,13 +131,13 @@ def test_a_picture_has_its_name_from_the_line_or_the_table(run, tmp_path, words,
 
 
 def test_targets_are_checked_before_the_work(run, tmp_path):
-    (tmp_path / "t.png").touch()
+    (tmp_path / "t.png").write_text("kept")
     for words in (("--out", "t.csv"), ("--out", "t.txt"), ("--picture=t.gif",)):
         with pytest.raises(Exception, match=r"t\.(png|txt|gif)"):
             run("cart", *words)
-        assert not SEEN
+        assert not SEEN and (tmp_path / "t.png").read_text() == "kept"
     run("cart", "--out", "t.csv", "--overwrite")
-    assert SEEN and (tmp_path / "t.png").stat().st_size
+    assert SEEN and (tmp_path / "t.png").read_bytes().startswith(b"\x89PNG")
 
 
 def test_a_table_on_stdout_has_its_report_on_stderr(capfd):

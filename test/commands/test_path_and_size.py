@@ -198,6 +198,8 @@ def test_sizes_are_a_readers_own_sums(twin, tmp_path, geared):
         assert own["good"]
         small = next(d for d in result["drives"][joint]["drives"] if d["motor"] == "SGMAH-A5A")
         assert not small["good"]
+    motors = sum(one["motor"]["energy_J"] for one in result["drives"].values())
+    assert result["motors_energy_J"] == pytest.approx(motors) and motors > result["energy_J"]
 
 
 @pytest.mark.parametrize(
@@ -610,11 +612,3 @@ def test_size_takes_the_models_efforts_for_another_payload(twin, tmp_path):
     assert given["drives"]["arm_1"]["joint"] == pytest.approx(expected["drives"]["arm_1"]["joint"])
     assert twin.told(*line, "--efforts", "file")["efforts"] == "the file's"
     assert twin.told("size", "delta", out)["efforts"] == "the file's"
-
-
-def test_the_energy_of_the_motors_is_their_sum(twin, tmp_path, geared):
-    out = tmp_path / "cycle.csv"
-    twin.good("path", geared, "--cycle", "25,200", "--out", out, "--no-picture")
-    data = twin.told("size", geared, out)
-    motors = sum(one["motor"]["energy_J"] for one in data["drives"].values())
-    assert data["motors_energy_J"] == pytest.approx(motors) and motors > data["energy_J"]

@@ -143,13 +143,3 @@ def test_commands_of_a_kit_take_any_path_of_a_robot_file():
     text = readme(load("delta_cu"), "my machine's.yaml")
     (line,) = (line for line in text.splitlines() if "pkm-twin fit" in line)
     assert shlex.split(line)[2] == "my machine's.yaml"
-
-
-def test_a_recording_does_not_replace_itself(twin, tmp_path):
-    given, link = tmp_path / "given.mcap", tmp_path / "link.mcap"
-    private(DELTA, given, load("delta_cu"))
-    link.symlink_to(given)
-    before = given.read_bytes()
-    for out in (given, link):
-        twin.refused("anonymise", given, "--out", out, "--overwrite")
-        assert given.read_bytes() == before

@@ -24,21 +24,11 @@ def test_processes(process):
     listed = process("robots")
     assert (listed.code, listed.err) == (0, "")
     assert [line.split()[0] for line in listed.out.splitlines()] == robot_names()
-    unknown = process("info", "delta_kuh")
-    assert unknown.code == 1
-    assert "did you mean 'delta_cu'" in unknown.one_line_error()
 
 
 def test_siblings_are_told_apart(twin):
     described = [row["description"] for row in twin.told("robots")["robots"].values()]
     assert len(set(described)) == len(described)
-
-
-def test_bare_command_and_unknown_one(twin):
-    assert twin().code == 2
-    result = twin("torks")
-    assert (result.code, result.out) == (2, "")
-    assert "torks" in result.err
 
 
 @pytest.mark.parametrize("name", robot_names())
@@ -189,12 +179,3 @@ class TestEnds:
     def test_version(self, twin):
         result = twin("--version")
         assert result.code == 0 and result.out.startswith("pkm-twin")
-
-
-def test_a_picture_that_cannot_be_written_is_one_line(twin, tmp_path):
-    for path, why in (
-        (tmp_path / "none" / "a.png", "there is no folder"),
-        (tmp_path / "a", ".png, .svg"),
-    ):
-        error = twin.refused("info", "five_bar", "--picture", path)
-        assert why in error and str(path) in error

@@ -200,11 +200,17 @@ def test_a_full_disk_is_the_targets(tmp_path):
 
 
 def test_what_is_read_is_not_replaced(twin, tmp_path, deflections):
-    same = tmp_path / "same.yaml"
-    shutil.copy(deflections, same)
-    line = ("calibrate", "upr_rpu", same, "--out", same, "--overwrite")
-    assert "the same file" in twin.refused(*line)
-    assert same.read_bytes() == deflections.read_bytes()
+    for line, name in (
+        (("calibrate", "upr_rpu"), "a.yaml"),
+        (("torques", "delta"), "b.csv"),
+        (("anonymise",), "c.mcap"),
+    ):
+        same, link = tmp_path / name, tmp_path / f"link_{name}"
+        shutil.copy(deflections, same)
+        link.symlink_to(same)
+        for out in (same, link):
+            assert "the same file" in twin.refused(*line, same, "--out", out, "--overwrite")
+            assert same.read_bytes() == deflections.read_bytes()
 
 
 def test_names_of_anything_in_titles_and_comments(tmp_path, deflections):

@@ -183,11 +183,9 @@ class TestBeyondLimits:
         result = twin.good(*command, "--beyond-limits")
         assert "beyond limits: arm_2.position is" in result.out
         assert np.array_equal(read_columns(out)["beyond_limits"], outside)
-
-    def test_a_motion_within_has_no_column(self, twin, tmp_path):
-        source = write_columns(tmp_path / "m.csv", motion("delta"))
-        out = tmp_path / "t.csv"
-        twin.good(*TABLE, "delta", source, "--out", out, "--beyond-limits")
+        # A motion within has no column of them.
+        write_columns(source, motion("delta"))
+        twin.good(*command, "--beyond-limits", "--overwrite")
         assert "beyond_limits" not in read_columns(out)
 
     def test_a_bags_samples_are_not_dropped_in_silence(self, twin, tmp_path):
@@ -292,49 +290,21 @@ def test_too_few_rows_to_differentiate(twin, tmp_path):
         twin.good(*TABLE, "delta", source, "--out", tmp_path / f"{code}.csv", code=code)
 
 
-@pytest.mark.parametrize("there", ["t.csv", "t.png"])
-def test_a_target_that_exists_is_refused_and_left_alone(twin, tmp_path, there):
-    source = write_columns(tmp_path / "motion.csv", motion("delta"))
-    (tmp_path / there).write_text("mine")
-    command = "torques", "delta", source, "--out", tmp_path / "t.csv"
-    assert "--overwrite" in twin.refused(*command)
-    assert (tmp_path / there).read_text() == "mine"
-    twin.good(*command, "--overwrite")
-    assert (tmp_path / "t.png").read_bytes().startswith(PNG)
-    assert len(read_columns(tmp_path / "t.csv")["time"]) == 50
-
-
-def test_a_motion_is_never_replaced_by_its_own_torques(twin, tmp_path):
-    source = write_columns(tmp_path / "motion.csv", motion("delta"))
-    before = source.read_bytes()
-    link = tmp_path / "t.csv"
-    link.symlink_to("motion.csv")
-    for target in (source, link):
-        line = (*TABLE, "delta", source, "--out", target, "--overwrite")
-        assert "the same file" in twin.refused(*line)
-        assert source.read_bytes() == before
-
-
 @pytest.mark.parametrize(
-    ("robot", "motion_file", "out", "text"),
+    ("robot", "bag", "text"),
     [
-        ("delta_cuu", DELTA, "t.csv", "did you mean 'delta_cu'"),
-        ("delta_cu", DELTA, "t.txt", ".csv or .parquet"),
-        ("delta_cu", DELTA, "absent/t.csv", "there is no folder"),
-        ("delta_cu", "absent.csv", "t.csv", "absent.csv"),
-        ("delta_cu", "absent.mcap", "t.csv", "no such file"),
-        ("prru", DELTA, "t.csv", "slider_1"),
-        ("massless", STIFFNESS, "t.csv", "inertia"),
+        ("delta_cu", "absent.mcap", "no such file"),
+        ("prru", DELTA, "slider_1"),
+        ("massless", STIFFNESS, "inertia"),
     ],
 )
-def test_refusals(twin, tmp_path, sample, robot, motion_file, out, text):
-    if motion_file == DELTA:
-        motion_file = sample
-    elif motion_file == STIFFNESS:
-        motion_file = rewrite(STIFFNESS, tmp_path / "stiff.mcap", seconds=0.1)
+def test_refusals(twin, tmp_path, robot, bag, text):
+    if robot == "massless":
         robot = massless(tmp_path / "light.yaml")
-    assert text in twin.refused("torques", robot, motion_file, "--out", tmp_path / out)
-    assert not (tmp_path / out).exists()
+    if bag != "absent.mcap":
+        bag = rewrite(bag, tmp_path / "part.mcap", seconds=0.1)
+    assert text in twin.refused("torques", robot, bag, "--out", tmp_path / "t.csv")
+    assert not (tmp_path / "t.csv").exists()
 
 
 def test_a_bag_too_short_to_differentiate(twin, tmp_path):
