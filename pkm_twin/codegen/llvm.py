@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import Final
 
 import llvmlite
@@ -34,7 +35,16 @@ from pkm_twin.codegen.assembly import (
 from pkm_twin.codegen.expressions import GEOMETRY, PARAMETERS, Expression, ordered, uses
 from pkm_twin.codegen.native import CPU, FEATURES, OPTIMISATION, PREPARE, QUICK, SYMBOL
 from pkm_twin.codegen.operations import fused, sub
-from pkm_twin.codegen.program import AT, LARGE, MAX_ITERATIONS, STATE, Equations, Program, holding
+from pkm_twin.codegen.program import (
+    AT,
+    LARGE,
+    MAX_ITERATIONS,
+    STATE,
+    Equations,
+    Program,
+    holding,
+    previous,
+)
 
 STATUS: Final = " status"
 LONG: Final = 100
@@ -286,11 +296,22 @@ class _Writer:
         b.store(b.or_(b.load(self.flags), bad), self.flags)
         samples.close()
 
+    def _store_progress(self, k: Value, n: Sequence[Value]) -> None:
+        """As :func:`.program.progress`, of step k + 1."""
+        b, parts = self.b, []
+        for more in (-1, 0, 1):
+            share = b.fdiv(b.sitofp(b.add(k, whole(more)), DOUBLE), b.sitofp(self.steps, DOUBLE))
+            left = b.fsub(real(1.0), share)
+            parts.append(b.fsub(real(1.0), b.fmul(b.fmul(left, left), left)))
+        b.store(b.splat(parts[2], LANES), n[AT.part])
+        onward = b.fdiv(b.fsub(parts[2], parts[1]), b.fsub(parts[1], parts[0]))
+        b.store(b.splat(onward, LANES), n[AT.onward])
+
     def _solve(self, q: Equations, values: dict[str, list[Value]], n: list[Value]) -> list[Value]:
         """Newton's method in steps; the unknowns. The state is made by the first equations."""
         b, number = self.b, self.emitter().number
         first = not n
-        x, aim = ([b.alloca(VECTOR) for _ in row] for row in (q.home, q.origin))
+        x, last, aim = ([b.alloca(VECTOR) for _ in row] for row in (q.home, q.home, q.origin))
         n += [b.alloca(VECTOR) for _ in (AT if first else ())]
         size = b.alloca(VECTOR)
         if q.goal:
@@ -298,9 +319,9 @@ class _Writer:
 
         def run(
             results: Sequence[Expression],
-            *to: Value,
+            to: Sequence[Value],
+            moved: Mapping[str, Sequence[Value]] = MappingProxyType({}),
             first: Sequence[Expression] = (),
-            **moved: Sequence[Value],
         ) -> None:
             """Results of the state and of what has moved."""
             here = {name: [b.load(place) for place in row] for name, row in moved.items()}
@@ -319,26 +340,32 @@ class _Writer:
             b.store(number(0.0), n[AT.reached])
         # The same for all lanes: a jump, which is foreseen, instead of a choice by lane.
         uniform = {q.state[AT.once].number: once}
-        run(q.begin, *x, size)
+        run(q.home, last)
         steps = _Counter(b, "step", self.steps)
-        k = b.add(steps.begin(), ONE)
-        uniform[q.underway.number] = b.icmp("slt", k, self.steps)
-        # As `progress` has it.
-        left = b.fsub(real(1.0), b.fdiv(b.sitofp(k, DOUBLE), b.sitofp(self.steps, DOUBLE)))
-        part = b.fsub(real(1.0), b.fmul(b.fmul(left, left), left))
-        b.store(b.splat(part, LANES), n[AT.part])
-        b.store(b.load(size), n[AT.size])
-        b.store(number(0.0), n[AT.before])
+        k = steps.begin()
+        uniform[q.underway.number] = b.icmp("slt", b.add(k, ONE), self.steps)
+        self._store_progress(k, n)
         b.store(b.load(n[AT.alive]), n[AT.moving])
-        run(q.aim, *aim)
+        run(q.aim, aim)
+        begin, onward, both = (b.block(name) for name in ("begin", "onward", "turns"))
+        b.cbranch(b.icmp("eq", k, ZERO), begin, onward)
+        b.go_to(begin)
+        run(q.begin, [*x, size, n[AT.before]], {q.target: aim})
+        b.branch(both)
+        b.go_to(onward)
+        here = [b.load(place) for place in x]
+        run(q.onward, x, {q.unknowns: x, previous(q.unknowns): last})
+        for value, place in zip(here, last, strict=True):
+            b.store(value, place)
+        b.branch(both)
+        b.go_to(both)
+        b.store(b.load(size), n[AT.size])
         turns = _Counter(b, "turn", whole(MAX_ITERATIONS))
         turns.begin()
-        run(
-            q.correct, *x, *n[AT.size : AT.reached], first=q.results,
-            **{q.unknowns: x, q.target: aim},
-        )  # fmt: skip
+        kept = [*x, *n[AT.size : AT.reached]]
+        run(q.correct, kept, {q.unknowns: x, q.target: aim}, q.results)
         turns.close(self._any(self._above(b.load(n[AT.moving]))))
-        run(q.arrive, n[AT.alive], n[AT.reached])
+        run(q.arrive, n[AT.alive : AT.reached + 1])
         steps.close(self._any(self._above(b.load(n[AT.alive]))))
         return [b.load(place) for place in x]
 

@@ -21,15 +21,15 @@ from pkm_twin.codegen.program import (
     AT,
     LARGE,
     MAX_ITERATIONS,
+    PARTS,
     STATE,
     Equations,
     Program,
     holding,
+    previous,
     progress,
 )
 
-PARTS: Final = ("goal", "begin", "aim", "correct", "arrive")
-"""Of equations, what is called while they are solved."""
 _LONGEST: Final = 200
 """Characters of an expression that is written into another one."""
 
@@ -100,7 +100,7 @@ class PlainCode:
         results += holding(program.equations)
         parts: dict[Any, Sequence[Expression]] = {"results": results}
         for q in program.equations:
-            names |= {q.unknowns: len(q.home), q.target: len(q.origin), STATE: len(AT)}
+            names |= q.inputs
             parts |= {(q, name): getattr(q, name) for name in PARTS}
         known = {e.number: f"{PARAMETERS}[{k}]" for k, e in enumerate(program.prepared)}
         self._parts = {name: functions(part, names, known) for name, part in parts.items()}
@@ -161,22 +161,23 @@ class PlainCode:
 
         if q.goal:
             named[q.target] = call("goal")
-        *named[q.unknowns], size = call("begin")
+        before = x = call("home")
         for k in range(1, steps + 1):
-            n[AT.part], n[AT.size], n[AT.before], n[AT.moving] = (
-                progress(k / steps),
-                size,
-                0.0,
-                n[AT.alive],
-            )
-            here = named | {q.target: call("aim")}
+            n[AT.part], n[AT.onward], n[AT.moving] = *progress(k, steps), n[AT.alive]
+            here = named | {q.target: call("aim"), q.unknowns: x, previous(q.unknowns): before}
+            before = x
+            if k == 1:
+                *x, size, n[AT.before] = call("begin", here)
+            else:
+                x = call("onward", here)
+            n[AT.size], here[q.unknowns] = size, x
             for _ in range(MAX_ITERATIONS):
                 after = call("correct", here)
                 x, n[AT.size : AT.reached] = after[: len(q.home)], after[len(q.home) :]
                 here[q.unknowns] = x
                 if not some(n[AT.moving]):
                     break
-            named[q.unknowns] = here[q.unknowns]
             n[AT.alive], n[AT.reached] = call("arrive")
             if not some(n[AT.alive]):
                 break
+        named[q.unknowns] = x

@@ -32,6 +32,8 @@ CONTRACTION: Final = 0.25
 """Most that a correction may be of the one before it."""
 FIRST: Final = 0.3
 """Most that the first correction of a guess may be, of unit one: a longer one may go elsewhere."""
+AHEAD: Final = 0.1
+"""The same of each of more steps, which begins where the ones before lead on."""
 NEXT: Final = 0.01
 """Most that the first correction of a stream's sample may be, which starts from the one before."""
 CHANGE: Final = 3.0
@@ -57,14 +59,16 @@ LAST: Final = "last"
 class Places(NamedTuple):
     """Places in the state of Newton's method.
 
-    ``once``: 1 in a single step, else 0. ``part``: of the way, to the target of a step. ``size``,
-    ``before``: square of the last correction, and the determinant there, 0 before the first one.
+    ``once``: 1 in a single step, else 0. ``part``: of the way, to the target of a step. ``onward``:
+    length of the step over that of the one before it, 0 for the first one. ``size``,
+    ``before``: square of the last correction, and the determinant there, 0 where there is none.
     ``moving``, ``alive``: 1 as long as a sample is corrected, and as long as it is not refused.
     ``reached``: part of the way.
     """
 
     once: int
     part: int
+    onward: int
     size: int
     before: int
     moving: int
@@ -72,16 +76,25 @@ class Places(NamedTuple):
     reached: int
 
 
-AT: Final = Places(*range(7))
+AT: Final = Places(*range(8))
 
 
-def progress(share: float) -> float:
-    """Part of the way after a share of the steps, 0 to 1.
+def progress(k: int, steps: int) -> tuple[float, float]:
+    """Part of the way after step k of so many, and the length of this step over the one before it.
 
     The steps become short towards the end: next to a singularity only short ones contract.
     """
-    left = 1.0 - share
-    return 1.0 - left * left * left
+    a, b, c = (1.0 - (1.0 - j / steps) ** 3 for j in (k - 2, k - 1, k))
+    return c, (c - b) / (b - a)
+
+
+def previous(unknowns: str) -> str:
+    """Name of the input that is the unknowns a step before."""
+    return f"{unknowns}_before"
+
+
+PARTS: Final = ("home", "goal", "aim", "begin", "onward", "correct", "arrive")
+"""Of equations, what is computed while they are solved."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,7 +105,10 @@ class Equations:
     equations before these. ``stage``: how many those are.
 
     One step goes from ``start`` (expressions of q; None: from home) to the target at once. In more
-    steps the target moves from ``origin`` to q, from the unknowns ``home``, by :func:`progress`.
+    steps the target moves from ``origin`` to q by :func:`progress`, from the unknowns ``home``.
+    Every step begins where the one before it leads on straight: beyond a place where two assemblies
+    cross, the determinant there is below zero, while Newton's method from the side of the other one
+    would turn to that.
 
     A sample is refused where a correction does not contract, where the determinant leaves its
     bounds, or where a residual stays: then it may be another root that was found.
@@ -103,6 +119,8 @@ class Equations:
     origin: Sequence[Expression]
     """Unknowns and target of the known state: constants, or of parameters alone."""
     start: Sequence[Expression] | None
+    onward: Sequence[Expression]
+    """Unknowns to begin a further step with: of the last ones, and of those a step before."""
     corrected: Sequence[Expression]
     """The unknowns after one correction."""
     size: Expression
@@ -123,9 +141,18 @@ class Equations:
     near: Expression | None = None
     """1 where a single step starts from ``foreseen``: of another sample's unknowns."""
     foreseen: Sequence[Expression] = ()
+    last: Expression | None = None
+    """The determinant of that sample."""
 
     lone: bool = False
     """Whether a sample is solved alone: its state says nothing of whether it moves."""
+
+    @property
+    def inputs(self) -> dict[str, int]:
+        """Sizes of the inputs that exist while it is solved, by name."""
+        n = len(self.home)
+        own = {self.unknowns: n, previous(self.unknowns): n}
+        return own | {self.target: len(self.origin), STATE: len(AT)}
 
     @property
     def results(self) -> list[Expression]:
@@ -145,16 +172,22 @@ class Equations:
 
     @cached_property
     def begin(self) -> list[Expression]:
-        """Unknowns to begin with, and the square that the first correction contracts from."""
+        """Unknowns to begin with; the state's size, that the first correction contracts from, and
+        before: at home the determinant is one.
+        """
         once, known = self.state[AT.once], self.start is not None and not self.guessed
-        starts = zip(self.start or self.home, self.home, strict=True)
-        first = [select(once, start, home) for start, home in starts]
-        size = 1e300 if known else select(once, (FIRST / CONTRACTION) ** 2, 1e300)
+        first: Sequence[Any] = self.start or self.home
+        if known:
+            first = [select(once, a, b) for a, b in zip(first, self.home, strict=True)]
+        ahead = 1e300 if self.start is None else (AHEAD / CONTRACTION) ** 2
+        size = 1e300 if known else select(once, (FIRST / CONTRACTION) ** 2, ahead)
+        before = select(once, 0.0, 1.0)
         if self.near is not None:
             pairs = zip(self.foreseen, first, strict=True)
             first = [select(self.near, a, b) for a, b in pairs]
             size = select(self.near, (NEXT / CONTRACTION) ** 2, size)
-        return self._lift(*first, size)
+            before = select(self.near, self.last, before)
+        return self._lift(*first, size, before)
 
     @cached_property
     def underway(self) -> Expression:
@@ -188,7 +221,8 @@ class Equations:
         sound = both(less(size, CONTRACTION**2 * state[AT.size]), less(least, determinant))
         sound = both(sound, steady)
         moves = both(moving, both(sound, less(CLOSED**2, size)))
-        return self._lift(*new, size, determinant, moves, select(moving, sound, state[AT.alive]))
+        kept = select(moving, determinant, before)
+        return self._lift(*new, size, kept, moves, select(moving, sound, state[AT.alive]))
 
     @cached_property
     def arrive(self) -> list[Expression]:
@@ -232,7 +266,7 @@ class Program:
     def __post_init__(self) -> None:
         known = {**self.inputs, PARAMETERS: self.parameters, GEOMETRY: self.geometry}
         for q in self.equations:
-            known |= {q.unknowns: len(q.home), q.target: len(q.origin), STATE: len(AT)}
+            known |= q.inputs
         for e in ordered(self.results):
             name, index = e.source or ("", -1)
             if not index < known.get(name, 0):
@@ -248,7 +282,7 @@ class Program:
         """Every expression that is computed."""
         rows = [e for row in self.outputs.values() for e in row]
         for q in self.equations:
-            rows += [*q.goal, *q.begin, *q.aim, *q.correct, *q.arrive]
+            rows += [e for name in PARTS for e in getattr(q, name)]
         return rows + holding(self.equations)
 
     @cached_property

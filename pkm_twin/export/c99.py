@@ -34,6 +34,7 @@ from pkm_twin.codegen.program import (
     UNKNOWNS,
     Equations,
     holding,
+    previous,
 )
 
 LADDER: Final = (1, *STEPS)
@@ -156,8 +157,8 @@ def _angles(
     return [groups[k] for k in sorted(groups)]
 
 
-ROWS: Final = ("home", "origin", "start", "corrected", "branch", "goal", "foreseen")
-NUMBERS: Final = ("size", "determinant", "residual", "near")
+ROWS: Final = ("home", "origin", "start", "onward", "corrected", "branch", "goal", "foreseen")
+NUMBERS: Final = ("size", "determinant", "residual", "near", "last")
 """What equations have as expressions, in a row and alone."""
 
 
@@ -351,32 +352,45 @@ static const int @_steps[{len(LADDER)}] = {{{steps}}};
         known = {e.number: f"h[{k}]" for k, e in enumerate(ahead)}
         aim = {q.target: "aim"}
         prepare = self.function(f"{name}_ahead", ahead, {}, aim) % "h" if ahead else "(void)h"
-        begin = self.function(f"{name}_begin", q.begin, known, aim)
+        begin = self.function(f"{name}_begin", q.begin, known, aim) % "next"
+        onward = self.function(f"{name}_onward", q.onward, {}) % "next"
         correct = self.function(f"{name}_correct", q.correct, known, aim) % "next"
         target = self.function(f"{name}_aim", q.aim, {}) % "aim"
         more = "" if q.near is None else "const double *qd, const double *last, "
+        x, x_before = q.unknowns, previous(q.unknowns)
+        self.add(table(f"@_{name}_home", [e.value for e in q.home]))
         self.add(f"""\
 /* Newton's method from the known assembly in so many steps; 0 where it does not get there. */
-static int @_{name}({more}const double *{q.target}, int steps, double *h, double *{q.unknowns})
+static int @_{name}({more}const double *{q.target}, int steps, double *h, double *{x})
 {{
-    double {STATE}[{AT.moving}], aim[{m}], next[{n + 4}], first = 0.0;
+    double {STATE}[{AT.moving}], aim[{m}], {x_before}[{n}], next[{n + 4}], first = 0.0;
+    double part = 0.0, way = 1.0;
     int i, k;
     {STATE}[{AT.once}] = (steps == 1) ? 1.0 : 0.0;
+    for (i = 0; i < {n}; i++) {{
+        {x}[i] = @_{name}_home[i];
+    }}
     for (k = 1; k <= steps; k++) {{
         const double left = 1.0 - ((double)k / (double)steps);
         int turn, moving = 1;
         {STATE}[{AT.part}] = 1.0 - ((left * left) * left);
+        {STATE}[{AT.onward}] = ({STATE}[{AT.part}] - part) / way;
+        way = {STATE}[{AT.part}] - part;
+        part = {STATE}[{AT.part}];
         {target};
         {prepare};
         if (k == 1) {{
-            {begin % "next"};
-            for (i = 0; i < {n}; i++) {{
-                {q.unknowns}[i] = next[i];
-            }}
+            {begin};
             first = next[{n}];
+            {STATE}[{AT.before}] = next[{n + 1}];
+        }} else {{
+            {onward};
+        }}
+        for (i = 0; i < {n}; i++) {{
+            {x_before}[i] = {x}[i];
+            {x}[i] = next[i];
         }}
         {STATE}[{AT.size}] = first;
-        {STATE}[{AT.before}] = 0.0;
         for (turn = 0; (turn < {MAX_ITERATIONS}) && (moving != 0); turn++) {{
             {correct};
             for (i = 0; i < {n}; i++) {{

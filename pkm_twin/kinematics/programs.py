@@ -8,10 +8,10 @@ from typing import Any, Final
 
 import numpy as np
 
-from pkm_twin.codegen.expressions import Numbers, Objects
+from pkm_twin.codegen.expressions import Expression, Numbers, Objects
 from pkm_twin.codegen.lu import SparseLU
 from pkm_twin.codegen.operations import absolute, cos, sin
-from pkm_twin.codegen.program import UNKNOWNS, Equations, Program
+from pkm_twin.codegen.program import AT, STATE, UNKNOWNS, Equations, Program, previous
 from pkm_twin.kinematics import pose as poses
 from pkm_twin.kinematics.motion import Motion, Row, matrices
 from pkm_twin.kinematics.traced import Traced
@@ -154,10 +154,16 @@ def _posed(t: Traced, goal: Objects) -> Equations:
 
     motion, rows, equations, lu = system(everything, goal)
     step = -lu.solve([rows[k].value for k in scheme.independent] + equations)
-    moved = motion.retracted(everything[:size], step[:split])
+
+    def moved(state: Objects, step: Objects) -> list[Expression]:
+        turned = motion.retracted(state[:size], step[:split])
+        return t.lift([*turned, *(state[size:] + step[split:])])
+
+    onward = tape.inputs(STATE, len(AT))[AT.onward]
+    way = onward * (everything - tape.inputs(previous(POSED), len(home)))
     return Equations(
         "pose", t.lift(home), t.lift(origin), None,
-        t.lift([*moved, *(everything[size:] + step[split:])]),
+        moved(everything + way, np.zeros(len(step))), moved(everything, step),
         t.square(step, [*tree.scales, *t.drive_scales]),
         tape.lift(system(home, origin)[3].inverse_determinant / lu.inverse_determinant),
         t.square([r.value for r in rows] + equations, [r.scale for r in rows] + t.pose_scales),

@@ -60,9 +60,9 @@ def _stream(t: Traced) -> Program:
 def following(t: Traced, program: Program) -> Program:
     """A program of motion that starts from the sample before: input and output ``last``.
 
-    The row has 1 where it is valid, the joints that were solved from home last, q, qd, and of the
-    unknowns the values, rates, accelerations and their change. Newton's method starts from the
-    unknowns moved on by these. Results are those of ``program``.
+    The row has the determinant, above zero where it is valid, the joints that were solved from home
+    last, q, qd, and of the unknowns the values, rates, accelerations and their change. Newton's
+    method starts from the unknowns moved on by these. Results are those of ``program``.
     """
     (q,) = program.equations
     n, (places, rates) = t.joints, t.scheme.solved
@@ -84,13 +84,11 @@ def following(t: Traced, program: Program) -> Program:
     # With the mean of both speeds the error grows with the third power of the time.
     time = (move @ mean) / maximum(mean @ mean, 1e-300)
     time = minimum(maximum(time, 0.0), LONGEST)
-    there, way = np.array(t.tree.home, object), np.zeros(t.tree.unknown_rates, object)
-    there[places], way[rates] = x, time * (u + (0.5 * time) * (du + change * (1.0 / 3.0)))
-    foreseen = t.motion.retracted(there, way)
+    foreseen = t.retracted(x, time * (u + (0.5 * time) * (du + change * (1.0 / 3.0))))
     solved = (select(near, a, b) for a, b in zip(anchor, t.q, strict=True))
     changed = (select(near, a - b, 0.0) for a, b in zip(t.du[rates], du, strict=True))
-    kept = [1.0, *solved, *t.q, *qd, *t.unknowns, *t.u[rates], *t.du[rates], *changed]
-    equations = replace(q, near=near, foreseen=t.lift([foreseen[k] for k in places]))
+    kept = [t.determinant, *solved, *t.q, *qd, *t.unknowns, *t.u[rates], *t.du[rates], *changed]
+    equations = replace(q, near=near, foreseen=foreseen, last=t.tape.lift(holds))
     return replace(
         program,
         inputs={**program.inputs, LAST: len(last)},

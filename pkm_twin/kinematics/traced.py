@@ -21,7 +21,7 @@ from pkm_twin.codegen.expressions import (
 )
 from pkm_twin.codegen.lu import SparseLU
 from pkm_twin.codegen.operations import cos, sin
-from pkm_twin.codegen.program import UNKNOWNS, Equations
+from pkm_twin.codegen.program import AT, STATE, UNKNOWNS, Equations, previous
 from pkm_twin.kinematics.limbs import LimbPose
 from pkm_twin.kinematics.motion import Motion, Row, cross, matrices
 from pkm_twin.kinematics.scheme import Scheme
@@ -103,15 +103,29 @@ class Traced:
         closed = scheme.closed.start
         start = self._along() if closed is None else self._ordered(closed(self.closed, self.q))
         moved = self.motion.retracted(self.x, rows)
+        before = self.tape.inputs(previous(UNKNOWNS), len(places))
+        state = self.tape.inputs(STATE, len(AT))
+        onward = self.unknowns + state[AT.onward] * (self.unknowns - before)
         branch = [] if scheme.branch is None else self.lift(scheme.branch(self.motion))
         solved = Equations(
             "q", self.lift([tree.home[k] for k in places]), self.lift(self.graph.home),
-            self.lift([start[k] for k in places]), self.lift([moved[k] for k in places]),
+            self.lift([start[k] for k in places]), self.retracted(onward),
+            self.lift([moved[k] for k in places]),
             self.square(step, [tree.scales[k] for k in rates]), self.tape.lift(self._determinant()),
             self.square([r.value for r in self.rows], [r.scale for r in self.rows]),
             closed is None, [*branch, *more.pop("branch", ())], **more,
         )  # fmt: skip
         return (solved,)
+
+    def retracted(self, values: Numbers, rates: Numbers = ()) -> list[Expression]:
+        """Unknowns of Newton's method, moved by small rates; turns have the length of one then."""
+        places, kept = self.scheme.solved
+        x, du = np.array(self.tree.home, object), np.zeros(self.tree.unknown_rates, object)
+        x[places] = values
+        if len(rates):
+            du[kept] = rates
+        moved = self.motion.retracted(x, du)
+        return self.lift([moved[k] for k in places])
 
     def _determinant(self) -> Any:
         """Of all closures, over that at home: of Newton's equations and of the limbs' turns."""
@@ -125,6 +139,11 @@ class Traced:
         for here, there in zip(self.limbs, limbs, strict=True):
             result = result * (here.steepness / there.steepness)
         return result
+
+    @property
+    def determinant(self) -> Any:
+        """The same of a solution: of the factors that results need."""
+        return self._at_home[2].inverse_determinant / self.lu.inverse_determinant
 
     @cached_property
     def home(self) -> Motion:
