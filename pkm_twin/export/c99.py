@@ -220,11 +220,17 @@ class Routine:
         return [e for row in self.given.values() for e in row]
 
     @property
-    def operations(self) -> tuple[str, int]:
-        """Operations of one correction, of each equations, and of all else."""
-        turns = [str(count(q.results)) for q in self.equations if q.home]
-        rest = [*self.results, *(e for q in self.equations for e in (*q.goal, q.held))]
-        return " + ".join(turns) or "-", count(rest)
+    def worst(self) -> tuple[int, int]:
+        """Most operations of a call: with all attempts, and with one.
+
+        A stream's sample has one attempt more, from the sample before.
+        """
+        solved = [q for q in self.equations if q.home]
+        step = sum(MAX_ITERATIONS * count(q.correct) + count([*q.begin, *q.aim]) for q in solved)
+        rest = count([*self.results, *(e for q in self.equations for e in (*q.goal, q.held))])
+        more = len(self.state) > 1
+        steps, attempts = (sum(LADDER), len(LADDER)) if solved else (1, 1)
+        return (steps + more) * step + (attempts + more) * rest, (1 + more) * (step + rest)
 
 
 HOT: Final = "PKM_HOT "

@@ -34,6 +34,7 @@ from pkm_twin.export.c_templates import (
     PARAMETERS_OF,
     PAYLOAD,
     README,
+    WORST,
 )
 from pkm_twin.machine.inertia import Layout
 from pkm_twin.machine.sections import MAX_LENGTH, MAX_MASS, payload_margins
@@ -294,11 +295,12 @@ int @_parameters(double mass, const double *com, const double *inertia, double *
         lines = [f"#define {m}_{name} {count}" for m in spelled for name, count in sizes]
         parts = []
         for routine in self.routines:
+            most = WORST.format(*routine.worst)
             shape = ", ".join(f"{name}[{len(row)}]" for name, row in routine.outputs.items())
             takes = ", ".join(f"{name}[{count}]" for name, count in routine.inputs.items())
-            what = f"{routine.summary} {takes} -> {shape}."
+            what = f"{routine.summary} {most} {takes} -> {shape}."
             if routine.state:
-                what = f"{routine.summary}{BESIDE.format(size=len(routine.state))}"
+                what = f"{routine.summary}{BESIDE.format(size=len(routine.state))}{most}"
             parts.append(
                 _comment(what)
                 + f"\n{self.unit.signature(routine, given=False)};\n"
@@ -356,16 +358,12 @@ int @_parameters(double mass, const double *com, const double *inertia, double *
 
     def readme(self) -> str:
         """What the functions are, and what they cost at most."""
-        rows = []
-        for routine in self.routines:
-            newton, results = routine.operations
-            rows.append(f"| `{self.prefix}_{routine.name}` | {newton} | {results} |")
         doubles = self.unit.doubles
         largest = max(doubles.values()) * 8
         names = list(self.robot.joint_names)
         return README.format(
             name=self.prefix, robot=self.prefix.removeprefix("pkm_"), joints=", ".join(names),
-            rows="\n".join(rows), corrections=f"{CORRECTIONS:,}", attempts=len(LADDER),
+            corrections=f"{CORRECTIONS:,}", attempts=len(LADDER),
             turns=MAX_ITERATIONS, stack=largest // 1000 + 3,
             dynamics="" if self.massive else MASSLESS,
             payload=PAYLOAD.format(name=self.prefix, macro=self.macro) if self.massive else "",

@@ -15,6 +15,7 @@ BESIDE: Final = """, found from the assembly of the sample before instead of fro
 time. state[{size}] is the caller's, one of each stream. Fill it with zeros before the first sample;
 each call writes it. A sample that does not follow the one before is solved from home.
 """
+WORST: Final = "At most {:,} operations, {:,} with PKM_ATTEMPTS=1."
 PARAMETERS_OF: Final = """\
 The parameters, out[{size}], for another payload: mass (kg), com[3] (m) from the platform's
 reference point and inertia[9] (kg m2) about the com, in axes fixed to the platform that are the
@@ -127,16 +128,11 @@ index is above 0.2. The error grows as the index falls.
 A call usually finds the passive joints with 2 to 4 corrections of Newton's method. If that
 fails, up to five more attempts approach the state in steps from the home pose. One call makes
 at most {corrections} corrections and computes the rest at most {attempts} times, whatever the
-input. The table counts additions, multiplications, divisions and functions of `math.h`; a sine
-and cosine are about 30 operations. `_inverse` solves for the joints first, where
-its row has two numbers of operations: twice as many corrections.
+input. `{name}.h` states for each function how many operations that is: additions, multiplications,
+divisions and functions of `math.h`; a sine and cosine are about 30 operations.
 
 The last attempts are the long ones. Compile with `-DPKM_ATTEMPTS=1` to make only the first one: at
 most {turns} corrections, but valid states far from home may be rejected with status 1.
-
-| function | operations of a correction | other operations |
-|---|---:|---:|
-{rows}
 
 Stack: at most about {stack} kB without optimisation, less with it.
 """

@@ -12,7 +12,9 @@ import pytest
 
 from delta_dynamics import inverse_dynamics
 from pkm_twin import robot_names
+from pkm_twin.codegen.program import MAX_ITERATIONS
 from pkm_twin.errors import ParameterError
+from pkm_twin.export.c99 import CORRECTIONS
 from pkm_twin.export.c_package import c_package, identifier
 from test.machine.random_machines import FILES
 from test.support.robots import (
@@ -174,6 +176,26 @@ def test_one_attempt_rejects_more_and_never_errs(exported, rng):
     assert at_once.any() and (good | ~at_once).all()
     near = at_once & (robot.try_singularity(q)[0] > 1e-3)
     np.testing.assert_allclose(found[near], right[near], 1e-9, 1e-9 * robot.graph.size)
+
+
+def test_no_call_makes_more_corrections_than_the_header_counts(small, tmp_path, rng):
+    robot, package = small
+    text = (package.folder / f"{package.prefix}.c").read_text()
+    text, found = re.subn(r"(?<= )(\w+_correct\((?!const))", r"turns++, \1", text)
+    assert found
+    counted = Package(tmp_path, c_package(robot))
+    head = """
+#include <stdio.h>
+static long turns;
+__attribute__((destructor)) static void report(void) { fprintf(stderr, "%ld 0", turns); }
+"""
+    (tmp_path / f"{package.prefix}.c").write_text(head + text)
+    number = str(list(counted.heads).index("forward"))
+    for flags, most in (((), CORRECTIONS), (("-DPKM_ATTEMPTS=1",), MAX_ITERATIONS)):
+        program = counted.build(*PLAIN, *flags)
+        turns = [watched(program, q, number, "1")[0] for q in wild(robot, rng, 40)]
+        assert 3 <= max(turns) <= most
+        assert flags or max(turns) > 100
 
 
 def test_what_is_not_finite_has_status_2(exported):
