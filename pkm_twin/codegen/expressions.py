@@ -221,6 +221,8 @@ def references(values: Any) -> NDArray[np.float64]:
 
 def plain(values: Any) -> NDArray[Any]:
     """An array of floats where all are numbers, else of objects."""
+    if isinstance(values, np.ndarray) and values.dtype != object:
+        return np.asarray(values, np.float64)
     objects = np.asarray(values, dtype=object)
     if any(isinstance(value, Expression) for value in objects.ravel()):
         return objects
@@ -238,10 +240,8 @@ def snapped_all(values: Any) -> NDArray[Any]:
     """Every entry as :func:`snapped`."""
     array = plain(values)
     if array.dtype != object:
-        result = array.copy()
-        for target in (0.0, 1.0, -1.0):
-            result[np.abs(result - target) < SNAP] = target
-        return result
+        near = np.rint(array).clip(-1.0, 1.0) + 0.0
+        return np.where(np.abs(array - near) < SNAP, near, array)
     return plain(np.frompyfunc(snapped, 1, 1)(array))
 
 

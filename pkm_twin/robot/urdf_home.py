@@ -6,7 +6,7 @@ else at zero, else, where the limits leave zero out, amid the limits. Of several
 one as drawn is taken, else the best conditioned; where there is none, the best conditioned near it.
 
 Every joint is a row of single steps, along or about one axis each, whose values count from the
-drawing; a closure compares two frames. Only numbers, once a file: speed is no concern here.
+drawing: a graph of driven joints to the kinematics. A closure compares two frames.
 """
 
 from __future__ import annotations
@@ -22,11 +22,14 @@ from pkm_twin.codegen.arrays import Array, Mask
 from pkm_twin.errors import ParameterError, SingularityError
 from pkm_twin.kinematics.conditions import Conditions
 from pkm_twin.kinematics.diagnosis import is_clear, is_right
+from pkm_twin.kinematics.motion import Motion, numbers
 from pkm_twin.kinematics.singularity import singularity_at_home
 from pkm_twin.kinematics.spins import hold, without_spins
-from pkm_twin.machine.graph import Graph
+from pkm_twin.machine import graph as graphs
+from pkm_twin.machine.graph import BASE, Graph
 from pkm_twin.machine.loop_tree import Joint, LoopTree
-from pkm_twin.machine.rotations import Pose, skew, to_quaternion
+from pkm_twin.machine.rotations import Pose, to_quaternion
+from pkm_twin.machine.tree import Tree
 
 ROUNDS: Final = 100
 """Corrections of one closing, and steps towards the zeros."""
@@ -84,65 +87,56 @@ class Assembly:
         least, most = CLOSED
         self.closed = min(most, max(least, DIGITS * tree.accuracy))
         """A loop that misses by more is open, m or rad."""
-        self._rows = [(hung, hung.joint.freedoms(hung.parent)) for hung in tree.hung]
-        self.steps = [hung.joint.name for hung, freedoms in self._rows for _ in freedoms]
-        every = [freedom for _, freedoms in self._rows for freedom in freedoms]
-        self.turns = np.array([freedom.turns for freedom in every], bool)
-        self._slides = np.array([freedom.slide for freedom in every])
-        # Rodrigues: 1 + sin K + (1 - cos) K K.
-        self._turning = [(k, k @ k) for k in (skew(freedom.axis) for freedom in every)]
-        self._moved: dict[str, list[int]] = {tree.root: []}
-        count = 0
-        for (_, parent, child), freedoms in self._rows:
-            before, own = self._moved[parent], list(range(count, count + len(freedoms)))
-            self._moved[child] = before + own if own else before
-            count += len(own)
-        self.moves: dict[str, Pose] = {}
-        """Of each link since it was drawn, in the root's axes."""
-        self.place(np.zeros(count))
+        self._bodies, self.steps = {tree.root: BASE}, list[str]()
+        joints: dict[str, graphs.Joint] = {}
+        for joint, parent, child in tree.hung:
+            body = self._bodies[parent]
+            for k, freedom in enumerate(joint.freedoms(parent)):
+                inner, body = body, f"{joint.name} {k}"
+                kinds = ("revolute", "helical") if freedom.turns else ("", "prismatic")
+                joints[body] = graphs.Joint(
+                    body, kinds[bool(freedom.slide)], inner, body, joint.at, freedom.axis[None],
+                    actuated=True, pitch=freedom.slide,
+                )  # fmt: skip
+                self.steps.append(joint.name)
+            self._bodies[child] = body
+        self.turns = np.array([joint.kind != "prismatic" for joint in joints.values()], bool)
+        bodies = {name: graphs.Body(name) for name in joints}
+        self._chain = Tree(Graph(bodies, joints, {}, BASE, np.zeros(3)))
+        self.place(np.zeros(len(joints)))
         extent = float(np.ptp(self.places(), axis=0).max(initial=0.0))
         self.size = extent if extent > 1e-6 else 1.0
 
     def place(self, values: Array) -> None:
-        """Set ``values`` of the steps, shape (count,), and ``moves``."""
-        self.values = values
-        self.moves = {self.tree.root: Pose()}
-        sines, lacks = np.sin(values).tolist(), (1.0 - np.cos(values)).tolist()
-        axes: list[Array] = []
-        points: list[Array] = []
-        for (joint, parent, child), freedoms in self._rows:
-            pose = self.moves[parent]
-            for freedom in freedoms:
-                k = len(axes)
-                axes.append(pose.rotation @ freedom.axis)
-                points.append(pose.point(joint.at))
-                turned, at = pose.rotation, points[-1]
-                if freedom.slide:
-                    at = at + axes[-1] * (values[k] * freedom.slide)
-                if freedom.turns:
-                    first, second = self._turning[k]
-                    turned = turned + turned @ (sines[k] * first + lacks[k] * second)
-                pose = Pose(turned, at - turned @ joint.at)
-            self.moves[child] = pose
-        self._axes, self._points = np.reshape(axes, (-1, 3)), np.reshape(points, (-1, 3))
+        """Set ``values`` of the steps, shape (count,)."""
+        self.values, self._motion = values, Motion(self._chain, (), values)
+        self._moves: dict[str, Pose] = {}
+
+    def move(self, link: str) -> Pose:
+        """How a link has moved since it was drawn, in the root's axes."""
+        if link not in self._moves:
+            turn = numbers(self._motion.turned(self._bodies[link]))
+            at = numbers(self._motion.point(self._bodies[link], np.zeros(3)))
+            self._moves[link] = Pose(turn, at)
+        return self._moves[link]
 
     def places(self) -> Array:
         """Where the links are, shape (links, 3), m."""
-        links = self.tree.links
-        return np.array([move.point(links[n].frame.position) for n, move in self.moves.items()])
+        at, links = self._motion.point, self.tree.links
+        return numbers([at(body, links[n].frame.position) for n, body in self._bodies.items()])
 
     def frame(self, joint: Joint, end: int) -> Pose:
         """A joint's frame on one of its links."""
-        return self.moves[(joint.inner, joint.outer)[end]] @ joint.frames[end]
+        return self.move((joint.inner, joint.outer)[end]) @ joint.frames[end]
 
     def twist(self, link: str, point: Array) -> tuple[Array, Array]:
         """Velocity of a link's point and its angular velocity per step's rate, (3, count) each."""
         linear, angular = np.zeros((2, 3, len(self.steps)))
-        moved = self._moved[link]
-        axes, turns = self._axes[moved].T, self.turns[moved]
-        arms = np.cross(self._axes[moved], point - self._points[moved]).T
-        linear[:, moved] = np.where(turns, arms, 0.0) + axes * self._slides[moved]
-        angular[:, moved] = np.where(turns, axes, 0.0)
+        motion, body = self._motion, self._bodies[link]
+        for (_, k), column in motion.linear_jacobian(body, point).items():
+            linear[:, k] = column
+        for (_, k), column in motion.angular_jacobian(body).items():
+            angular[:, k] = column
         return linear, angular
 
     def residual(self, closure: Joint, rates: bool = True) -> tuple[Array, Array]:
@@ -158,8 +152,8 @@ class Assembly:
         apart, slip, turn = b.position - a.position, vb - va, wb - wa
         across = np.eye(3)
         if len(closure.axes):
-            first = self.moves[closure.inner].rotation @ closure.axes[0]
-            second = self.moves[closure.outer].rotation @ closure.axes[-1]
+            first = self.move(closure.inner).rotation @ closure.axes[0]
+            second = self.move(closure.outer).rotation @ closure.axes[-1]
             across = np.eye(3) - np.outer(first, first)
         rows: list[tuple[Array, Array]] = []
         for held in closure.type.holds:

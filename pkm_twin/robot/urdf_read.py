@@ -196,8 +196,8 @@ def _left_out(tree: LoopTree) -> list[str]:
 
 def _seen(assembly: Assembly, ground: str) -> dict[str, Pose]:
     """What moves each link from where it is drawn to its place in the base's axes."""
-    view = (assembly.moves[ground] @ assembly.tree.links[ground].frame).inverse()
-    return {name: view @ move for name, move in assembly.moves.items()}
+    view = (assembly.move(ground) @ assembly.tree.links[ground].frame).inverse()
+    return {name: view @ assembly.move(name) for name in assembly.tree.links}
 
 
 def _description(assembly: Assembly, graph: Graph, ground: str) -> dict[str, Any]:
