@@ -67,6 +67,8 @@ UNSEEN: Final = 3
 """Most unseen errors that are told."""
 VALUES: Final = 30000
 """Values of the residual that are judged; of more, every so many rows."""
+ALL: Final = "all joints"
+"""Where an error is that all of them share."""
 UNKNOWN: Final = "no known error"
 """What is named where a suspect fits that has no such size."""
 
@@ -485,18 +487,19 @@ def _posterior(
     :returns: the covariance is the factor's transpose times the factor.
     """
     y, left = tables
-    kinds: dict[str, list[int]] = {}
+    kinds: dict[tuple[str, bool] | int, list[int]] = {}
     sizes = np.array([one.usual or 0.0 for one in suspects])
     always = [k for k, one in enumerate(suspects) if one.usual and one.known]
     for k, one in enumerate(suspects):
         if one.usual and not one.known:
-            kinds.setdefault(one.kind, []).append(k)
+            # One error that all joints share is as likely as one of some of them.
+            kinds.setdefault((one.kind, one.where == ALL), []).append(k)
     for place, finding in enumerate(chosen):
         for k in (finding.index, *finding.near):
             norm = float(np.linalg.norm(left[:, k]))
             if not sizes[k] and norm > 0.0:
                 sizes[k] = np.sqrt(len(y)) / norm
-                own = kinds.setdefault(f"{place}", []) if place < MAYBE else always
+                own = kinds.setdefault(place, []) if place < MAYBE else always
                 own.append(k)
     used = np.flatnonzero(sizes)
     scaled = left[:, used] * sizes[used]

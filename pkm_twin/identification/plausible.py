@@ -335,7 +335,8 @@ def recording_fault(rows: Rows) -> str | None:
     rubs = [group.kind == "friction" for group in everything.groups for _ in group.names]
     case = case_of(rows, np.where(rubs, 0.0, moving - standing))
     told = case.judged()
-    if told.left < GOOD and told.cost < INDEPENDENT * np.log(2.0 * GOOD**2):
+    # Nothing that is put right is likelier than a perfect machine at the price of another unit.
+    if told.cost < Score.of(0.0).cost + UNIT:
         return None
     loaded = (case.loaded_in_part(),) if case.payload.any() else ()
     others = [*_efforts(case, joints), ("time runs backwards", case.backwards(), RARE)]
@@ -369,7 +370,8 @@ def recording_fault(rows: Rows) -> str | None:
                 f"the efforts' variation unexplained, as recorded {100 * told.left:.2g} %"
             )
         return f"{cause}: as recorded, masses and payload would be far from the file's"
-    if cause or told.left**2 > POOR**2 + case.noisy**2:
+    # More than all of it: the efforts have nothing of the motion, however large their noise.
+    if cause or told.left**2 > min(POOR**2 + case.noisy**2, 1.0):
         return (
             "no machine like the file's explains the efforts, and no single mistake does: "
             f"{100 * told.left:.2g} % of their variation is left (another machine, another motion, "

@@ -19,6 +19,7 @@ from delta_dynamics.torques.derivatives import numbers_slopes, torques_by_number
 from pkm_twin.codegen.arrays import Array, Mask
 from pkm_twin.errors import ParameterError
 from pkm_twin.identification.judge import (
+    ALL,
     HINT,
     NEAR,
     SIGMAS,
@@ -108,10 +109,10 @@ def errors_of(rows: Rows, values: Array) -> tuple[Errors, Array]:
         found.append((Suspect(ELASTIC, name, unit, positive=True), (need(*back) - here) / size))
     fast, slow = (need(0.0, h * motion.qd, (2.0 * h + h**2) * motion.qdd) for h in (STEP, -STEP))
     found += [
-        (Suspect(GAIN, "all joints", usual=0.05), told),
-        (Suspect(LATE, "all joints", "s"), -change),
-        (Suspect(LOAD, "all joints", usual=share), load),
-        (Suspect(SPEED, "all joints"), (fast - slow) / (2.0 * STEP)),
+        (Suspect(GAIN, ALL, usual=0.05), told),
+        (Suspect(LATE, ALL, "s"), -change),
+        (Suspect(LOAD, ALL, usual=share), load),
+        (Suspect(SPEED, ALL), (fast - slow) / (2.0 * STEP)),
     ]
     return found, (need(0.0, *s.missed) - here)[..., None] * eye
 
@@ -382,7 +383,7 @@ class _Court:
             if give > 0.0
         )
         finding = Finding(
-            Suspect(LATE, "all joints", "s"), float(delays[place]), error, float(clear),
+            Suspect(LATE, ALL, "s"), float(delays[place]), error, float(clear),
             (Suspect(ELASTIC, sizes),),
         )  # fmt: skip
         signals = [case.suspects[..., which] @ gives.clip(0.0)[:, None] for case in cases]
