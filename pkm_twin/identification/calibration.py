@@ -41,6 +41,7 @@ from pkm_twin.identification.calibration_state import (
     FRAME,
     TARGET,
     Instrument,
+    Number,
     Poses,
     State,
     Transmission,
@@ -90,7 +91,8 @@ class Free:
     ``offsets``: of the joints' sensors; ``frame``, ``target``: where the instrument stands, and
     its target on the platform. ``prior``: standard deviation of lengths, m; angles have it at the
     platform's radius. ``transmission``: which ratios of the joint map; ``auto``: those of sliding
-    joints that have one.
+    joints that have one. ``only``: beginnings of paths, as of :func:`geometric`, of what is fitted
+    of the joint map; empty, or with a ``transmission`` that is asked for: all.
     """
 
     offsets: bool = True
@@ -98,6 +100,15 @@ class Free:
     target: bool = False
     prior: float = 0.01
     transmission: Transmission = Transmission.AUTO
+    only: tuple[str, ...] = ()
+
+    def mapped(self, robot: Robot, q: Array) -> list[Number]:
+        """Numbers of the joint map that are fitted to joint states (k, n)."""
+        angle = self.prior / robot.size
+        found = numbers(robot, q, self.transmission, self.offsets, self.prior, angle)
+        if not self.only or self.transmission not in (Transmission.AUTO, Transmission.FILE):
+            return found
+        return [one for one in found if one.name.startswith(tuple(self.only))]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -242,8 +253,9 @@ def geometric(robot: Robot, q: Array, only: Sequence[str] = ()) -> tuple[str, ..
         possible = beside.run(programs.anywhere, each)[1].all((1, 2))
         good = possible & (np.abs(twists).max((0, 1)) > MOVES)
         found = [path for path, one in zip(paths, good, strict=True) if one]
+    known = [*found, *(f"joint_map.{joint}.offset" for joint in robot.joint_names)]
     for beginning in only:
-        if not any(path.startswith(beginning) for path in found):
+        if not any(path.startswith(beginning) for path in known):
             raise ParameterError("--only", beginning, "the beginning of a geometric number's path")
     return tuple(found)
 
@@ -252,15 +264,15 @@ def unknowns(robot: Robot, measured: Measured, paths: Sequence[str], free: Free)
     """What is fitted, as it is before: the machine's numbers, the instrument's, the kinds' own."""
     known, prior = robot.file_numbers(), free.prior
     angle = prior / robot.size
+    mapped = free.mapped(robot, robot.controller.positions(measured.joints))
     # A joint's value at home and its sensor's offset are one number.
-    homes = {f"joints.{name}.home" for name in robot.joint_names} if free.offsets else set()
+    own = {one.name for one in mapped}
+    homes = {f"joints.{j}.home" for j in robot.joint_names if f"joint_map.{j}.offset" in own}
     fitted = [(path, *known[path]) for path in paths if path not in homes]
     parameters = [
         Parameter(path, unit, value, prior if unit == "m" else angle)
         for path, value, unit in fitted
     ]
-    q = robot.controller.positions(measured.joints)
-    mapped = numbers(robot, q, free.transmission, free.offsets, prior, angle)
     parameters += [Parameter(*number) for number in mapped]
     # Where the instrument stands is not known at all.
     far = 100.0 * robot.engine.tree.size

@@ -89,7 +89,6 @@ class Plan:
 def plan(
     robot: Robot,
     kinds: Sequence[Kind],
-    only: Sequence[str] = (),
     *,
     measured: Measured | None = None,
     within: Mapping[str, tuple[float, float]] | None = None,
@@ -100,7 +99,6 @@ def plan(
 ) -> Plan:
     """Choose poses one after the other so that each tells most of the numbers.
 
-    :param only: numbers to fit, or their beginnings; default: all of the geometry.
     :param measured: what was measured already; its poses then bound the workspace.
     :param within: least and greatest value by pose coordinate, m or rad.
     :param accuracy: of the platform's position, m: as many as it needs; ``count``: so many.
@@ -111,7 +109,8 @@ def plan(
     if len(pair) > 1:
         raise ParameterError("--measure", "distance", "distance alone, or other kinds, in a plan")
     q = _candidates(robot, measured, dict(within or {}), kinds)
-    paths = geometric(robot, q, only)
+    free = Free(**options)
+    paths = geometric(robot, q, free.only)
     joints = np.asarray(robot.controller.controller_positions(q))
     first = np.arange(len(q))
     second = np.roll(first, len(q) // 2) if pair == {True} else None
@@ -120,7 +119,7 @@ def plan(
     all_poses = Measured(
         joints, tuple(Readings(k, first, second, k.likely(position), first) for k in kinds), noise
     )
-    parameters = unknowns(robot, all_poses, paths, Free(**options))
+    parameters = unknowns(robot, all_poses, paths, free)
     names = [p.name for p in parameters]
     prior = np.array([p.prior for p in parameters])
     fitted = [name for name in names if name in paths]

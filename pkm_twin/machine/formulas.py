@@ -363,6 +363,18 @@ class Book:
         found = self.own.get(path.partition(f"{PARAMETERS}.")[2]) or self.formulas.get(path)
         return found.text if found else ""
 
+    def lost(self, other: Book) -> list[str]:
+        """What another book of the file has no more, in at most two lines."""
+        texts = [
+            f"{path} was {formula.text}"
+            for path, formula in self.formulas.items()
+            if path not in other.formulas
+        ]
+        kept = other.values.keys() - other.unused
+        dead = [name for name in self.values if name not in kept and name not in self.unused]
+        lines = [f"numbers replace expressions: {', '.join(texts)}"] if texts else []
+        return lines + ([f"nothing depends on {', '.join(dead)} any more"] if dead else [])
+
     @property
     def unused(self) -> list[str]:
         """Parameters that no expression has."""

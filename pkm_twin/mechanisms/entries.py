@@ -75,23 +75,27 @@ def edited_yaml(robot: Robot, source: str, values: Mapping[str, Fitted | Chosen]
     )
 
 
-def write_edited(path: Path, head: Sequence[str], text: str) -> None:
+def write_edited(path: Path, head: Sequence[str], text: str, before: Robot) -> list[str]:
     """Write a robot's file with lines of comment at its head, whole or not at all.
 
+    :param before: the robot of the file that was edited.
+    :returns: what the text has lost of its expressions, in lines, which the head has too.
     :raises PkmTwinError: not writable, or numbers that no robot may have.
     """
     try:
-        robot_of_data(parse_yaml(text, str(path)), path.stem)
+        after = robot_of_data(parse_yaml(text, str(path)), path.stem)
     except ValueError as error:
         raise PkmTwinError(
             f"the values are not a valid robot, so {path} is not written: {error}"
         ) from None
     # A name in it may have anything in it, a new line too.
-    whole = "".join(f"# {one_line(line, 2000)}\n" for line in head) + text
+    lost = before.book.lost(after.book)
+    whole = "".join(f"# {one_line(line, 2000)}\n" for line in (*head, *lost)) + text
     try:
         replace_file(path, whole.encode())
     except OSError as error:
         raise PkmTwinError(f"{path} cannot be written: {error.strerror}") from None
+    return lost
 
 
 def robot_text(

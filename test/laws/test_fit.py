@@ -191,5 +191,5 @@ def test_an_inertia_beyond_what_a_body_can_be_is_written_only_if_by_a_little(
     text = Path("config/five_bar.yaml").read_text()
     out = tmp_path / "fitted.yaml"
     with nullcontext() if written else pytest.raises(PkmTwinError, match="not a valid robot"):
-        write_edited(out, [], fitted_yaml(text, numbers, ["drawn"]))
+        write_edited(out, [], fitted_yaml(text, numbers, ["drawn"]), load("five_bar"))
     assert out.exists() == written

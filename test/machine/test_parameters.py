@@ -11,12 +11,13 @@ import yaml
 
 from delta_dynamics import inverse_dynamics, torque_derivatives
 from pkm_twin import load, variants
+from pkm_twin.apps.commands.calibrate import Calibrate, calibrate
 from pkm_twin.design import tolerances
 from pkm_twin.design.variables import Variables, parse_vary
 from pkm_twin.errors import ParameterError, UnknownNameError
 from pkm_twin.machine.strict_yaml import parse_yaml
 from pkm_twin.mechanisms.catalogue import config_folder, robot_of_data
-from pkm_twin.mechanisms.entries import Chosen, edited_yaml
+from pkm_twin.mechanisms.entries import Chosen, edited_yaml, write_edited
 from pkm_twin.paths.sizing import read_motors
 
 from .random_machines import written_out
@@ -147,6 +148,36 @@ def test_a_new_value_is_written_where_the_parameter_stands(tmp_path):
     path.write_text(text)
     numbers = {"parameters.arm": 0.21, "joints.motor_1.at[0]": 0.1}
     assert torques(load(path)) == pytest.approx(torques(robot.numbered(numbers)), abs=1e-12)
+
+
+def test_what_an_edited_file_loses_of_its_expressions_is_told(tmp_path):
+    path, out = tmp_path / "own.yaml", tmp_path / "out.yaml"
+    path.write_text(SOURCE)
+    robot, new = load(path), {"bodies.platform.mass": Chosen(0.4, "fitted")}
+    (told,) = write_edited(out, [], edited_yaml(robot, str(path), new), robot)
+    assert told.endswith("expressions: bodies.platform.mass was m + 0.05")
+    assert f"# {told}\n" in out.read_text() and load(out).book.values == robot.book.values
+    new = {f"limbs.bodies.arm.{end}": Chosen(0.4, "") for end in ("mass", "inertia[1]")}
+    new |= {"limbs.bodies.arm.inertia[2]": Chosen(0.4, ""), "bodies.platform.mass": Chosen(1.0, "")}
+    _, dead = write_edited(out, [], edited_yaml(robot, str(path), new), robot)
+    assert dead == "nothing depends on m any more"
+    # Written out, the file has none of them.
+    new = {"joints.motor_1.at[0]": Chosen(0.1, "moved")}
+    texts, dead = write_edited(out, [], edited_yaml(robot, str(path), new), robot)
+    assert texts.count(" was ") == len(robot.book.formulas)
+    assert all(name in dead for name in robot.book.values)
+    poses, rng = tmp_path / "poses.csv", np.random.default_rng(3)
+    q = 0.3 * rng.normal(size=(40, 3))
+    names = [*(f"{name}.position" for name in robot.joint_names), "x", "y", "z"]
+    seen = np.hstack([q, robot_with(arm=0.203).platform(q)[0]])
+    np.savetxt(poses, seen, "%.17g", ",", header=",".join(names), comments="")
+    given = Calibrate(
+        robot=str(path), poses=poses, out=tmp_path / "mine.yaml", only=("parameters",)
+    )
+    found = calibrate(given).data["parameters"]
+    assert found["parameters.arm"]["value"] == pytest.approx(0.203, abs=1e-5)
+    assert all(name.startswith("parameters.") for name in found)
+    assert load(tmp_path / "mine.yaml").book.formulas.keys() == robot.book.formulas.keys()
 
 
 def test_a_parameter_that_nothing_depends_on_is_named_and_not_varied():

@@ -73,7 +73,7 @@ class Calibrate(OfRobot, ReadsTables, BeyondLimitsToo, Accepts, Overwrites):
         endings=(".yaml", ".yml"),
     )  # fmt: skip
     only: tuple[str, ...] = setting(
-        (), "fit only numbers whose path begins with this; may be repeated"
+        (), "fit only numbers whose path begins with this, joint offsets too; may be repeated"
     )
     no_offsets: bool = setting(False, "do not fit the joints' sensor offsets")
     frame: bool = setting(False, "fit where the instrument stands: its six numbers")
@@ -133,7 +133,7 @@ class Calibrate(OfRobot, ReadsTables, BeyondLimitsToo, Accepts, Overwrites):
         """What is fitted beside the file's numbers."""
         return {
             "offsets": not self.no_offsets, "frame": self.frame, "target": self.target,
-            "prior": self.prior, "transmission": self.transmission,
+            "prior": self.prior, "transmission": self.transmission, "only": self.only,
         }  # fmt: skip
 
 
@@ -155,7 +155,7 @@ def calibrate(given: Calibrate) -> Report:
     if given.plan is not None:
         some = measured if isinstance(measured, Measured) else None
         chosen = plan_of(
-            machine, kinds, given.only, measured=some, within=within,
+            machine, kinds, measured=some, within=within,
             count=given.count, accuracy=given.accuracy, noise=known, **given.free,
         )  # fmt: skip
         replace_file(given.plan, chosen.table(machine).encode())
@@ -181,9 +181,8 @@ def calibrate(given: Calibrate) -> Report:
     head += [f"{result.scale}."] if result.scale is not None else []
     head += [f"Outlier, with a small weight: {one}." for one in result.outliers]
     out = given.files["out"]
-    write_edited(
-        out, [*head, *marks], edited_yaml(machine, given.robot, result.fitted(machine, source))
-    )
+    text = edited_yaml(machine, given.robot, result.fitted(machine, source))
+    marks += write_edited(out, [*head, *marks], text, machine)
     return report_of(machine, source, result, notes, marks, out)
 
 

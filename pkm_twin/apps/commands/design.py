@@ -166,8 +166,7 @@ def optimised(given: Design, path: Path) -> Report:
             robot, box, way, given.minimise, given.subject_to, starts=given.starts,
             points=given.points, seed=given.seed, progress=update,
         )  # fmt: skip
-    if given.out is not None:
-        write_robot(robot, given.robot, found, path, given.out)
+    lost = [] if given.out is None else write_robot(robot, given.robot, found, path, given.out)
     before, best = found.before, found.best
     units = {name: robot.file_numbers().get(name, (0.0, ""))[1] for name in best.numbers}
     bounds = dict(zip(best.variables, box.values(), strict=True))
@@ -209,11 +208,7 @@ def optimised(given: Design, path: Path) -> Report:
         words = f"{name} {best.quantities[name]:.4g} {unit_of}".rstrip()
         changes.append(f"{words} ({was:.4g} before)" if np.isfinite(was) else words)
     notes = [f"{joint} leaves its position limits on the path" for joint in limits]
-    notes += [
-        f"{name} was {robot.book.text(name)} in the file and is a number now"
-        for name in best.numbers
-        if robot.book.text(name)
-    ]
+    notes += lost
     if not before.feasible:
         notes.insert(
             0, "before: the file's machine cannot follow the path or does not keep the bounds"
@@ -270,8 +265,8 @@ def _point(point: DesignPoint) -> dict[str, Any]:
     return {"variables": dict(point.variables), "quantities": dict(point.quantities)}
 
 
-def write_robot(robot: Robot, source: str, found: Found, path: Path, out: Path) -> None:
-    """Write the robot's file with the new numbers.
+def write_robot(robot: Robot, source: str, found: Found, path: Path, out: Path) -> list[str]:
+    """Write the robot's file with the new numbers; what it loses of expressions, in lines.
 
     :raises PkmTwinError: not writable.
     """
@@ -288,7 +283,7 @@ def write_robot(robot: Robot, source: str, found: Found, path: Path, out: Path) 
     }
     aim = " and ".join(found.minimise)
     head = [f"{robot.name}, designed for {path}: least {aim}{kept}."]
-    write_edited(out, head, edited_yaml(robot, source, values))
+    return write_edited(out, head, edited_yaml(robot, source, values), robot)
 
 
 def draw(robot: Robot, found: Found, path: PosePath, answer: str) -> Any:

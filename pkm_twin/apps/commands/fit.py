@@ -136,12 +136,14 @@ def fit(given: Fit) -> Report:
 
     :raises PkmTwinError: recordings that show nothing, or that the machine cannot have made.
     """
+    from pkm_twin import load
     from pkm_twin.apps.fit_report import report_of
     from pkm_twin.identification.deflections import fit_elements
     from pkm_twin.identification.friction_laws import fit_recordings
     from pkm_twin.identification.parameters import fitted_yaml
     from pkm_twin.mechanisms.entries import robot_text, write_edited
     from pkm_twin.report.page import page
+    from pkm_twin.streams.steps import sampling_of
 
     if given.drive is not None:
         return _of_drive(given, given.drive)
@@ -179,6 +181,7 @@ def fit(given: Fit) -> Report:
     facts = [
         Fact("beyond_limits", beyond),
         Fact("friction_laws", [dataclasses.asdict(choice) for choice in choices]),
+        Fact("missing_samples", [sampling_of(r.time).missing for r in read]),
         Fact("topics", [dataclasses.asdict(r.topics) for r in read]),
     ]
     names, (out, html) = [r.name for r in read], given.files.values()
@@ -193,7 +196,9 @@ def fit(given: Fit) -> Report:
         for name, (before, after, _, unit) in report.tables[-1].rows.items()
     ]
     with writing(out):
-        write_edited(out, head, fitted)
+        before = load(given.robot) if given.per_copy else machine
+        lost = write_edited(out, head, fitted, before)
+        report = dataclasses.replace(report, notes=[*report.notes, *lost])
         if html is not None:
             title = f"{result.robot.name}: fitted from {', '.join(names)}"
             replace_file(html, page(title, report, more).encode())
