@@ -24,6 +24,7 @@ from pkm_twin.identification.compare import (
     by_held,
     compared_of,
     idle_of,
+    missing_samples,
     near_jumps,
     recorded_of,
     step_fault,
@@ -39,7 +40,7 @@ from pkm_twin.robot.robot import Robot
 from pkm_twin.streams.drives import COUNT, SAME
 from pkm_twin.streams.rates import BLOCK, STANDS, STEPS, RateAgreement, likely_cause, rms
 from pkm_twin.streams.rest import SIGMAS, noise
-from pkm_twin.streams.steps import GAP, Steps, sampling_of
+from pkm_twin.streams.steps import GAP, Steps
 
 POSITION_STEPS: Final = "position steps"
 VELOCITIES: Final = "velocities"
@@ -55,8 +56,6 @@ MAX_GAP: Final = 5.0
 """Longest good time between joint states, in median periods."""
 MIN_SINGULARITY: Final = 1e-3
 """Least good singularity index, 0 in a singularity, 1 at best."""
-MAX_MISSING: Final = 0.01
-"""Joint states that may be missing, part of those that there should be."""
 MAX_RATE: Final = 0.15
 """Difference of the measured velocities from the positions' rates, part of them, RMS."""
 MIN_COMPARED: Final = 0.1
@@ -177,20 +176,11 @@ def _motion(r: Recording, steps: Steps) -> list[Fact]:
     periods = np.diff(r.time)
     median, longest = float(np.median(periods)), float(periods.max())
     gap = f"{1e3 * longest:.3f} ms at {r.time[int(periods.argmax())]:.3f} s"
-    sampling, most = sampling_of(r.time), f"at most {100 * MAX_MISSING:g} %"
-    if sampling.missing is None:
-        text = "the samples have no common period"
-        missing = judged("missing samples", text, most, None)
-    else:
-        share = sampling.missing / sampling.expected
-        text = f"{sampling.missing} of {sampling.expected}"
-        text += f" ({100 * share:.3g} %)" if sampling.missing else ""
-        missing = judged("missing samples", text, most, share <= MAX_MISSING)
     within = MAX_GAP * median
     fault = step_fault(r, steps)
     items = [
         judged("rate", f"{1 / median:.1f} Hz over {r.time[-1]:.3f} s", "", True),
-        missing,
+        missing_samples(r.time),
         judged("longest gap", gap, f"at most {1e3 * within:.3f} ms", longest <= within),
         judged(POSITION_STEPS, fault or "no jumps", "within rates and limits", not fault),
     ]
@@ -426,57 +416,55 @@ def check(r: Recording, residual: float = MAX_RESIDUAL, thorough: bool = True) -
     return replace(found, causes=causes, findings=findings)
 
 
-def _causes_of(found: Checked, thorough: bool) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """The first cause that makes the efforts agree, and what `fit` finds where there is none."""
+Explained = tuple[tuple[str, ...], tuple[str, ...]]
+"""Causes that make the efforts agree, and what `fit` finds where there is none."""
+
+
+def _causes_of(found: Checked, thorough: bool) -> Explained:
+    """The first cause that makes the efforts agree."""
     c, r, bad = found.compared, found.recording, found.named(Verdict.BAD)
     # Of positions that are none the efforts say nothing.
     if {POSITION_STEPS, VELOCITIES, MEASURED} & set(bad) or c is None or c.good.all():
         return (), ()
-
-    def good(other: Recording, without: Mask) -> bool:
-        try:
-            compared = compared_of(other, without, c.bound)
-        except (PkmTwinError, ValueError):
-            return False
-        return compared is not None and bool(compared.good.all())
-
-    def explained(other: Recording) -> bool:
-        """Whether it makes the efforts agree on samples on which they do not as recorded."""
-        if other.load is r.load or other.load is None or not other.load.times:
-            return good(other, found.left_out)
-        without = found.left_out | other.load.near_change(r.time, NEAR)
-        return good(other, without) and not good(r, without)
-
-    for text, other in _retold(r, c):
-        if explained(other):
+    for text, other, without in _explanations(r, c, found.left_out):
+        if _agrees(other, without, c.bound):
             return (text,), ()
-    saturated = _saturated(r, c)
-    if saturated:
-        return saturated, ()
-    contact, without = _contact(r, c)
-    if contact and good(r, found.left_out | without):
-        return (contact,), ()
-    fitted, findings = _of_fit(r, found.left_out) if thorough else (None, ())
-    if fitted is not None and explained(fitted):
-        return ("friction other than the file's explains the efforts: `pkm-twin fit`",), ()
-    return (), findings
+    causes = _saturated(r, c) or tuple(
+        text for text, after in _contact(r, c) if _agrees(r, found.left_out | after, c.bound)
+    )
+    if causes or not thorough:
+        return causes, ()
+    return _of_fit(found, c.bound)
 
 
-def _retold(r: Recording, c: Compared) -> Iterator[tuple[str, Recording]]:
-    """Efforts and wrenches of the other sign, wrenches in other axes, a payload."""
+def _agrees(r: Recording, without: Mask, bound: float) -> bool:
+    try:
+        compared = compared_of(r, without, bound)
+    except (PkmTwinError, ValueError):
+        return False
+    return compared is not None and bool(compared.good.all())
+
+
+def _explanations(
+    r: Recording, c: Compared, left_out: Mask
+) -> Iterator[tuple[str, Recording, Mask]]:
+    """The recording without each fault that it may have, and the samples that are left out then."""
     assert r.effort is not None  # noqa: S101
     turned = ~c.good & (np.sum(c.measured * c.expected, 0) < 0.0)
     if turned.any():
         names = ", ".join(np.array(r.robot.joint_names)[turned].tolist())
         effort = r.effort * np.where(turned, -1.0, 1.0)
-        yield f"efforts of {names} have the opposite sign", replace(r, effort=effort)
+        yield f"efforts of {names} have the opposite sign", replace(r, effort=effort), left_out
     for text, wrench in wrenches(r):
-        yield text, replace(r, wrench=wrench)
-    if r.load is None:
-        yield from _payloads(r, c)
+        yield text, replace(r, wrench=wrench), left_out
+    for text, load in _payloads(r, c) if r.load is None else ():
+        near = load.near_change(r.time, NEAR) if load.times else np.zeros_like(left_out)
+        # On these samples the efforts do not agree without it.
+        if not near.any() or not _agrees(r, left_out | near, c.bound):
+            yield text, replace(r, load=load), left_out | near
 
 
-def _payloads(r: Recording, c: Compared) -> Iterator[tuple[str, Recording]]:
+def _payloads(r: Recording, c: Compared) -> Iterator[tuple[str, Load]]:
     """The payload that explains most, while it is held."""
 
     def more(robot: Robot, *motion: Array) -> Array:
@@ -497,23 +485,23 @@ def _payloads(r: Recording, c: Compared) -> Iterator[tuple[str, Recording]]:
     text = f"a payload of {load.mass:g} kg explains the efforts: use --payload {load.mass:g}"
     if times:
         text += " --load-times " + ",".join(f"{edge:.2f}" for pair in times for edge in pair)
-    yield text, replace(r, load=load)
+    yield text, load
 
 
-def _contact(r: Recording, c: Compared) -> tuple[str, Mask]:
+def _contact(r: Recording, c: Compared) -> Iterator[tuple[str, Mask]]:
     """When something else begins to act on the machine, and the samples from then on."""
     begins = c.begins()
     if begins is None:
-        return "", np.zeros(0, np.bool_)
+        return
     before = c.time < begins
     # Before the motion is under way every machine agrees.
     seen = np.abs(c.expected[before]).max(0, initial=0.0) > MOVED * np.abs(c.expected).max(0)
-    text = (
-        f"before {begins:.3f} s the efforts agree with the model, from then on something else "
-        "acts on the machine (contact, collision or another load?)"
-    )
-    found = before.mean() > BEFORE and seen.all()
-    return text if found else "", r.time >= begins - 2.0 * c.edge
+    if before.mean() > BEFORE and seen.all():
+        text = (
+            f"before {begins:.3f} s the efforts agree with the model, from then on something else "
+            "acts on the machine (contact, collision or another load?)"
+        )
+        yield text, r.time >= begins - 2.0 * c.edge
 
 
 def _saturated(r: Recording, c: Compared) -> tuple[str, ...]:
@@ -544,21 +532,24 @@ def _saturated(r: Recording, c: Compared) -> tuple[str, ...]:
     return tuple(texts)
 
 
-def _of_fit(r: Recording, leave_out: Mask) -> tuple[Recording | None, tuple[str, ...]]:
-    """The recording of a machine with the friction that `fit` finds, and what else it finds."""
+def _of_fit(found: Checked, bound: float) -> Explained:
+    """Whether other friction, or all that a fit varies, explains the efforts; else its findings."""
     from pkm_twin.identification.fit import fit
-    from pkm_twin.identification.suspects import ELASTIC
+    from pkm_twin.identification.friction_laws import fit_with_laws
 
-    recorded = recorded_of(r, leave_out)
+    r = found.recording
+    recorded = recorded_of(r, found.left_out)
     try:
-        result = fit(r.robot, [recorded], ("friction",), accept=True)
-        fitted = r.robot.filed({one.name: one.after for one in result.numbers})
+        first = fit(r.robot, [recorded], ("friction",), accept=True)
+        if first.accepted:
+            return (), (first.accepted[0].removeprefix(f"{recorded.name}: "),)
+        rubbing = r.robot.filed({one.name: one.after for one in first.numbers})
+        if _agrees(replace(r, robot=rubbing), found.left_out, bound):
+            return ("friction other than the file's explains the efforts: `pkm-twin fit`",), ()
+        verdict = fit_with_laws(r.robot, [recorded])[0].verdict
     except (PkmTwinError, ValueError, np.linalg.LinAlgError):
-        return None, ()
-    if result.accepted:
-        return None, (result.accepted[0].removeprefix(f"{recorded.name}: "),)
-    # A compliance below zero is no drive's.
-    findings = [
-        str(one) for one in result.verdict.findings if one.suspect.kind != ELASTIC or one.size > 0.0
-    ]
-    return replace(r, robot=fitted), tuple(findings[:FOUND])
+        return (), ()
+    if verdict.answer == "explains":
+        text = "friction, masses or payload other than the file's explain the efforts"
+        return (f"{text}: `pkm-twin fit`",), ()
+    return (), tuple(map(str, verdict.findings[:FOUND]))

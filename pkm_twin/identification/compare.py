@@ -33,10 +33,13 @@ from pkm_twin.identification.samples import (
     usual_size,
 )
 from pkm_twin.recordings import Recording, at_rest, by_load
+from pkm_twin.report import Fact, judged
 from pkm_twin.streams.drives import idle_samples
 from pkm_twin.streams.rates import rms
-from pkm_twin.streams.steps import Steps, steps_of
+from pkm_twin.streams.steps import Steps, sampling_of, steps_of
 
+MAX_MISSING: Final = 0.01
+"""Samples that may be missing, part of those that there should be."""
 MAX_RESIDUAL: Final = 0.05
 """Largest good torque residual RMS, part of the joint's peak effort."""
 LEAST: Final = 40
@@ -212,6 +215,20 @@ def steps_in(r: Recording) -> Steps:
     alone = steps_of(r.time, r.q, None, limit)
     # What jumps by wrong velocities only is not the positions' fault.
     return steps if alone.jumps.any() else alone
+
+
+def missing_samples(time: Array) -> Fact:
+    """How many samples are missing, judged.
+
+    :param time: rising, shape (k,), k 2 or more, s.
+    """
+    sampling, good = sampling_of(time), None
+    text = "the samples have no common period"
+    if sampling.missing is not None:
+        share = sampling.missing / sampling.expected
+        text, good = f"{sampling.missing} of {sampling.expected}", share <= MAX_MISSING
+        text += f" ({100 * share:.3g} %)" if sampling.missing else ""
+    return judged("missing samples", text, f"at most {100 * MAX_MISSING:g} %", good)
 
 
 def step_fault(r: Recording, steps: Steps | None = None) -> str:

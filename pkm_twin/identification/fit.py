@@ -35,10 +35,15 @@ WORSE: Final = 1.2
 """Held-out residual of a joint over that of the file's values that a machine like the file's does
 not leave."""
 
+NO_SHIFT: Final = 0.05
+"""Part of the standard deviations up to which no number is corrected: clean efforts stay exact."""
+
 
 @dataclass(frozen=True, eq=False)
 class Judged:
     """What was held out of a recording: ``time`` (k,), s; measured, before and after (k, n).
+
+    Efforts that are late against the positions are on time here, as in ``check``.
 
     ``deviation``: of those after, by what is not known of the parameters, (k, n).
     """
@@ -168,11 +173,10 @@ def fitted(
             "excite designs a motion that does"
         )
     judged = []
-    for made in problem.rows:
-        end = made.held_out
+    for end in problem.held_out:
         before, after = (end.rest + end.table @ v for v in (parameters.values, best.values))
         spread = np.sqrt(np.sum((end.table @ wide) * end.table, -1).clip(0.0))
-        judged.append(Judged(made.recording.name, end.time, end.effort, before, after, spread))
+        judged.append(Judged(end.recording.name, end.time, end.effort, before, after, spread))
     return Fit(
         robot=problem.robot, problem=problem, estimate=replace(result, bound=best.bound),
         numbers=tuple(numbers), judged=tuple(judged), verdict=verdict, accepted=accepted,
@@ -189,15 +193,15 @@ def faults_of(problem: Problem) -> list[str]:
 def _worse(problem: Problem) -> list[str]:
     """Recordings whose held-out part the fitted values predict worse than the file's."""
     robot, told = problem.robot, []
-    for made in problem.rows:
-        end, values = made.held_out, (problem.parameters.values, problem.estimate.values)
+    values = problem.parameters.values, problem.estimate.values
+    for end in problem.held_out:
         old, new = (
             np.sqrt(np.mean(end.counts * (end.target - end.table @ v) ** 2, 0)) for v in values
         )
         j = int(np.argmax(new / np.maximum(old, 1e-300)))
         if new[j] > WORSE * old[j] and new[j] > EXACT * np.std(end.effort[:, j]):
             told.append(
-                f"{made.recording.name}: the fitted values leave {new[j]:.3g} "
+                f"{end.recording.name}: the fitted values leave {new[j]:.3g} "
                 f"{robot.effort_units[j]} of the held-out efforts of {robot.joint_names[j]}, the "
                 f"file's {old[j]:.3g} (another machine, or a motion that is too short or changes?)"
             )
@@ -218,7 +222,9 @@ def _corrected(parameters: FileParameters, result: Estimate, verdict: Verdict) -
 
     Of recordings that the model does not explain nothing is known of what they changed.
     """
-    if verdict.answer == "does not explain":
+    deviations = np.sqrt(np.diag(verdict.widened(result.covariance)))
+    small = (np.abs(verdict.shift) < NO_SHIFT * deviations).all()
+    if verdict.answer == "does not explain" or small:
         return result
     aim, cones = result.values - verdict.shift, parameters.cones
     if possible(aim, cones):

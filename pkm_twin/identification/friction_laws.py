@@ -18,18 +18,19 @@ import numpy as np
 
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import BagError, ParameterError, PkmTwinError, UnknownNameError
-from pkm_twin.identification.compare import recorded_of, step_fault
+from pkm_twin.identification.compare import missing_samples, recorded_of, step_fault
 from pkm_twin.identification.drives import FIT, fitted_constants, given_constants
 from pkm_twin.identification.fit import Fit, fit, fitted, refuse_faults
 from pkm_twin.identification.identifiable import KINDS, Kind, of_drives
 from pkm_twin.identification.judge import SIGMAS
 from pkm_twin.identification.parameters import Number
-from pkm_twin.identification.rows import Problem, Rows
+from pkm_twin.identification.rows import Problem
 from pkm_twin.identification.samples import EXACT, Track, filtered
 from pkm_twin.identification.suspects import RESONANCE
 from pkm_twin.machine.friction import BASIC, LAWS, taken
 from pkm_twin.recordings import Recording
 from pkm_twin.robot.robot import Robot
+from pkm_twin.streams.steps import sampling_of
 
 AUTO: Final = "auto"
 SPEEDS: Final = np.geomspace(0.01, 1.0, 17)
@@ -177,6 +178,10 @@ def fit_recordings(
     ]
     refuse_faults(faults, accept)
     notes = [f"accepted by --accept: {fault}" for fault in faults]
+    for r in recordings:
+        if sampling_of(r.time).missing:
+            gaps = missing_samples(r.time)
+            notes.append(f"{r.name}: {gaps.text} {gaps.value}, {gaps.bound}: {gaps.verdict}")
     made = [recorded_of(r) for r in recordings]
     if "payload" in what:
         loads = [r.load for r in made if r.load is not None]
@@ -218,11 +223,14 @@ def _compared(name: str, before: Fit, after: Problem) -> Choice:
     """Two fits by what was held out."""
     band = np.array([max(channel.noise, 1e-300) for channel in before.verdict.channels])
     parts = []
-    for one, other in zip(before.problem.rows, after.rows, strict=True):
-        end, least = one.held_out, (_least(before.problem, one), _least(after, other))
+    for end, other in zip(before.problem.held_out, after.held_out, strict=True):
         noise = np.maximum(end.signals.noise, EXACT * np.sqrt(np.mean(end.effort**2, 0)))
-        old, change = end.effort - least[0], least[1] - least[0]
-        each = (old / band) ** 2, ((old - change) / band) ** 2
+        old, new = (
+            rows.target - rows.table @ problem.estimate.values
+            for rows, problem in ((end, before.problem), (other, after))
+        )
+        change = old - new
+        each = (old / band) ** 2, (new / band) ** 2
         parts.append((*each, old * change / noise**2, (change / noise) ** 2))
     sums = np.array([np.concatenate(each).sum(0) for each in zip(*parts, strict=True)])
     count = sum(one.size for one, *_ in parts)
@@ -231,12 +239,6 @@ def _compared(name: str, before: Fit, after: Problem) -> Choice:
     no_joint_worse = (sums[1] <= WORSE**2 * sums[0]).all()
     good = sigmas > SIGMAS and after_rms < before_rms and no_joint_worse
     return Choice(name, bool(good), float(before_rms), float(after_rms), float(sigmas))
-
-
-def _least(problem: Problem, rows: Rows) -> Array:
-    """Held-out efforts by least squares alone, (k, n)."""
-    end = rows.held_out
-    return end.rest + end.table @ problem.estimate.values
 
 
 def _opened(before: Problem, name: str) -> tuple[dict[str, Searched], Robot]:

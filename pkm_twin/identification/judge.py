@@ -98,6 +98,8 @@ class Suspect:
 class Finding:
     """A suspect that the residual shows: its size, standard deviation, and how clearly.
 
+    ``sigmas``: of the residual; no more than of the size, which other findings make less sure.
+
     ``others``: suspects that explain the residual nearly as well.
     """
 
@@ -335,7 +337,8 @@ def judge(
     chosen, after = _select(y, left, seen, _least(few), prior_sizes, positive)
     sizes = _sizes(y, left, prior_sizes, [one.index for one in chosen])
     found = [_finding(suspects, one, pair) for one, pair in zip(chosen, sizes, strict=True)]
-    clear = [one for one in found if one.sigmas >= SIGMAS]
+    sure = sum(one.sigmas >= SIGMAS for one in chosen)
+    clear = found[:sure]
     count = sum(case.residual.size for case in few)
     told = tuple(
         _channel(name, k, few, (y[:count], after[:count]), basis.shape[1] + len(chosen))
@@ -355,7 +358,7 @@ def judge(
     shift, unseen = _posterior(suspects, cases, (y, left), inflation, response, chosen)
     blind = _blind(suspects, cases, (np.linalg.norm(left, axis=0), seen), prior[2], response)
     return Verdict(
-        answer, told, tuple(clear), tuple(one for one in found if one.sigmas < SIGMAS), blind,
+        answer, told, tuple(clear), tuple(found[sure:]), blind,
         shift, inflation, unseen,
     )  # fmt: skip
 
@@ -367,7 +370,7 @@ def _finding(suspects: Sequence[Suspect], one: _Chosen, size: tuple[float, float
         own = replace(own, kind=UNKNOWN)
     others = dict.fromkeys(suspects[k] for k in one.near)
     others.pop(own, None)
-    return Finding(own, *size, one.sigmas, tuple(others))
+    return Finding(own, *size, min(one.sigmas, abs(size[0]) / size[1]), tuple(others))
 
 
 def _rows(

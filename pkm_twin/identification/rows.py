@@ -187,10 +187,10 @@ class Rows:
         """The rows that are fitted."""
         return self._part(slice(0, self.held_from))
 
-    @property
-    def held_out(self) -> Rows:
-        """The others, by which a fit is judged."""
-        return self._part(slice(self.held_from, None))
+    def held_out(self, late: float) -> Rows:
+        """The others, by which a fit is judged; efforts that are so late, s, are put on time."""
+        end = self._part(slice(self.held_from, None))
+        return replace(end, target=end.target + late * end.change)
 
     def _part(self, rows: slice) -> Rows:
         cut = ("time", "table", "target", "rest", "counts", "change")
@@ -537,6 +537,12 @@ class Problem:
     def delays(self) -> tuple[float, ...]:
         """How late the efforts of each recording are, s."""
         return tuple(self.both.values[-len(self.rows) :].tolist())
+
+    @property
+    def held_out(self) -> list[Rows]:
+        """What is not fitted, without the delays."""
+        pairs = zip(self.rows, self.delays, strict=True)
+        return [made.held_out(late) for made, late in pairs]
 
     def response(self, signals: Sequence[Array]) -> Array:
         """What signals (k, n, m) added to the efforts change in the parameters, (p, m)."""

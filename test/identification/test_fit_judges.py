@@ -13,14 +13,16 @@ import pytest
 
 from delta_dynamics import inverse_dynamics, mass_matrix
 from pkm_twin.errors import PkmTwinError
+from pkm_twin.identification.compare import missing_samples
 from pkm_twin.identification.estimation import estimate
 from pkm_twin.identification.fit import Fit, fit
-from pkm_twin.identification.friction_laws import fit_with_laws
+from pkm_twin.identification.friction_laws import fit_recordings, fit_with_laws
 from pkm_twin.identification.identifiable import above_zero
 from pkm_twin.identification.parameters import file_parameters
 from pkm_twin.identification.plausible import case_of, recording_fault
 from pkm_twin.identification.rows import rows_of
 from pkm_twin.recordings import Load, Recording
+from pkm_twin.report import Verdict
 from test.identification.machines import IMPOSSIBLE, WRONG, Drawn, machine, noisy, shifted, unit_of
 from test.laws.test_fit import truths
 from test.support.robots import load, partly_long
@@ -86,7 +88,12 @@ def test_a_recording_with_gaps_is_fitted_like_the_whole_one() -> None:
     for begin in np.cumsum([110, 30, 180, 340]):
         keep[begin : begin + 8] = False
     cut = whole.part(keep)
-    one, other = (fit(m.robot, [record], KINDS) for record in (whole, cut))
+    (one, _, none), (other, _, (note,)) = (
+        fit_recordings(m.robot, [record], KINDS) for record in (whole, cut)
+    )
+    missing = missing_samples(cut.time)
+    assert not none and missing.verdict is Verdict.BAD
+    assert missing.value == "32 of 1200 (2.67 %)" and missing.value in note
     assert other.verdict.answer == "explains" and worst(other, m) < 4.0
     for n, k in zip(one.numbers, other.numbers, strict=True):
         assert k.deviation < 4.0 * n.deviation or n.status != "fitted"
@@ -236,6 +243,8 @@ def test_what_the_model_leaves_out_is_found(what: str) -> None:
         for one in (finding.suspect, *finding.others)
     ]  # fmt: skip
     assert LIKELY[what] in named
+    for finding in result.verdict.findings:
+        assert finding.sigmas <= 1.001 * abs(finding.size) / finding.deviation
     assert result.verdict.deviations in ("widened", "withheld")
 
 
