@@ -246,5 +246,6 @@ def single_names(name: str, freedoms: Sequence[Freedom]) -> list[str]:
     """Names of a joint's freedoms as single turns and slides; a screw is one of each."""
     if len(freedoms) == 1:
         return [name, f"{name}_slide"] if freedoms[0].turns and freedoms[0].slide else [name]
-    marks = {2: ("1", "2"), 3: ("x", "y", "z"), 6: ("px", "py", "pz", "x", "y", "z")}
-    return [f"{name}_{mark}" for mark in marks.get(len(freedoms), ())]
+    marks = {3: ("x", "y", "z"), 6: ("px", "py", "pz", "x", "y", "z")}
+    own = marks.get(len(freedoms), [str(k + 1) for k in range(len(freedoms))])
+    return [f"{name}_{mark}" for mark in own]
