@@ -18,8 +18,7 @@ import numpy as np
 
 from delta_dynamics import inverse_dynamics, mass_matrix
 from pkm_twin.certify.description import UnfitError
-from pkm_twin.certify.maximal import Maximal
-from pkm_twin.certify.states import States, random_states
+from pkm_twin.certify.maximal import Maximal, States, random_states
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import (
     ParameterError,

@@ -9,8 +9,7 @@ import pytest
 
 from delta_dynamics import forward_dynamics, inverse_dynamics, mass_matrix
 from pkm_twin.certify.certificate import certify
-from pkm_twin.certify.maximal import Maximal
-from pkm_twin.certify.states import random_states
+from pkm_twin.certify.maximal import Maximal, random_states
 from pkm_twin.errors import ParameterError, PkmTwinError
 from test.laws.conftest import MISSING, changed
 from test.machine.random_machines import NAMES, plain, variant

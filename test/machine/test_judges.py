@@ -6,8 +6,7 @@ import pytest
 
 from pkm_twin.certify.certificate import certificate_of
 from pkm_twin.certify.description import expand, read
-from pkm_twin.certify.maximal import Maximal
-from pkm_twin.certify.states import random_states
+from pkm_twin.certify.maximal import Maximal, random_states
 from pkm_twin.machine.joints import TYPES
 from test.machine.random_machines import FREE, NAMES, plain
 from test.machine.test_helical import driven, slide
