@@ -11,6 +11,7 @@ import shutil
 import subprocess
 import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -186,3 +187,19 @@ class Browser:
         """Press and release a key, by its name (ArrowRight)."""
         for kind in ("keyDown", "keyUp"):
             self.call("Input.dispatchKeyEvent", type=kind, key=key, code=key)
+
+    def drag(self, *places: tuple[float, float], pause: Callable[[], object] = _pause) -> None:
+        """Press the mouse at the first place, move it along, and release it at the last.
+
+        :param pause: called before each event: a page may have to draw what is under the mouse.
+        """
+        kinds = ["mouseMoved", "mousePressed", *["mouseMoved"] * (len(places) - 1), "mouseReleased"]
+        for k, (kind, (x, y)) in enumerate(
+            zip(kinds, (places[0], *places, places[-1]), strict=True)
+        ):
+            pause()
+            held = kind != "mouseReleased" and k > 0
+            self.call(
+                "Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left" if k else "none",
+                buttons=int(held), clickCount=int(k > 0),
+            )  # fmt: skip

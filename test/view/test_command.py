@@ -10,11 +10,14 @@ import re
 import signal
 import subprocess
 import sys
+import threading
 from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
 
+from pkm_twin.robot.limits import beyond_limits
+from pkm_twin.view.scene import seen
 from pkm_twin.view.texts import number
 from stiffness_monitor import strain_energy
 from test.commands.conftest import DELTA, REPOSITORY
@@ -226,6 +229,79 @@ def test_every_control_does_what_it_says(browser, tmp_path):
         clicked(browser, "No wrench")
         browser.until(f"!{LINK}.value.includes('load')")
         assert addresses(browser) == {"127.0.0.1"}
+
+
+PLACE = """(() => {
+  const found = [...%s].filter(e => e.getBoundingClientRect().width).find(e => %s);
+  if (!found) return false;
+  found.scrollIntoView({block: 'nearest'});
+  const box = found.getBoundingClientRect();
+  return [box.left + box.width / 2, box.top + box.height / 2];
+})()"""
+
+
+def pressed(browser, selector, test):
+    """Click with the mouse on what a selector and a test of it, ``e``, find."""
+    browser.drag(browser.until(PLACE % (f"document.querySelectorAll('{selector}')", test)))
+
+
+@pytest.fixture
+def page():
+    """A page of this process, its loop in a thread."""
+    from pkm_twin.view.door import Door, listen
+    from pkm_twin.view.model import Model
+    from pkm_twin.view.page import Page, serving
+    from pkm_twin.view.panels import ModePanel
+
+    with listen("127.0.0.1", 0) as socket, serving(Door("127.0.0.1"), socket) as server:
+        page = Page(server, Model(load("delta_cu")))
+        page.mode = ModePanel(page)
+        page.address = f"http://127.0.0.1:{socket.getsockname()[1]}/"
+        threading.Thread(target=page.run, daemon=True).start()
+        yield page
+
+
+@pytest.mark.long
+@pytest.mark.timeout(1800)
+def test_the_mouse_drags_the_platform_along_one_axis_within_limits_and_chooses_a_mode(
+    browser, page
+):
+    browser.resize(1000, 700)
+    browser.visit(page.address)
+    pressed(browser, "label", "e.innerText === 'drag platform'")
+    wide = browser.until("(document.querySelector('canvas[data-engine]') || {}).clientWidth")
+
+    def camera():
+        cameras = [camera for camera, _ in page.stage._labels.values()]
+        return cameras and cameras[-1].image_width == wide and cameras[-1]
+
+    def look():
+        browser.run("new Promise(requestAnimationFrame)")
+
+    reach = page.model.robot.graph.size * np.eye(3)
+    wait_until(lambda: camera() and page.stage.gizmo.visible, look, 60.0, "")
+    for axis, way in ((0, 0.2), (1, 0.2), (2, -0.2), (2, -0.6)):
+        pose, at = page.state.pose, np.array(page.stage.gizmo.position)
+        ends = at + np.outer([0.24, 0.24 + way / 2, 0.24 + way], reach[axis])
+
+        def drag(ends=ends):
+            browser.drag(*seen(ends, camera())[0].tolist(), pause=look)
+
+        wait_until(
+            lambda p=pose: (page.state.pose != p).any() or page.state.refusal, drag, 60.0, ""
+        )
+        wait_until(lambda: not page._dragged, look, 60.0, "")
+        moved = page.state.pose - pose
+        assert moved[axis] * way > 0.0 or page.state.refusal
+        assert bool(page.state.refusal) == (way == -0.6)
+        np.testing.assert_allclose(np.delete(moved, axis), 0.0, atol=1e-6)
+        assert not beyond_limits(page.model.robot, page.state.q)[0]
+    pressed(browser, "[role=tab]", "e.innerText === 'Load'")
+    pressed(browser, "input", "e.value === 'none'")
+    pressed(browser, "[role=option]", "e.innerText === '1'")
+    wait_until(lambda: page.mode.busy, look, 60.0, "")
+    rest = page.stage._balls.batched_positions.copy()
+    wait_until(lambda: (page.stage._balls.batched_positions != rest).any(), look, 60.0, "")
 
 
 def colours(png):
