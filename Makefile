@@ -12,7 +12,7 @@ BIN := $(VENV)/bin
 # Tests of the cores.
 CORES := bags laws machine nodes validation
 
-.PHONY: demo test lint types unit long bags bench certificate fuzz faults soak audit scale reality contact-table pages animation docs coverage mutation dist sbom clean help
+.PHONY: demo test lint types unit long bags bench certificate fuzz faults soak audit scale reality contact-table pages pictures animation docs coverage mutation dist sbom clean help
 
 help:
 	@echo "make demo         set up .venv, run the main nodes on the recorded bags, table and picture in out/"
@@ -28,7 +28,8 @@ help:
 	@echo "make scale        measure the cost of workspace maps, into docs/benchmarks.md"
 	@echo "make reality      compare recordings of real machines with the models, into docs/validation.md"
 	@echo "make contact-table  simulate 1,000 contacts, into docs/nodes.md (an hour)"
-	@echo "make pages        write the generated pages and pictures of docs/"
+	@echo "make pages        write the generated pages of docs/"
+	@echo "make pictures     draw the pictures of docs/"
 	@echo "make animation    draw the moving picture of the README, in a browser"
 	@echo "make docs         build the site, in out/site"
 	@echo "make coverage     branches that tests reach in the cores, by folder"
@@ -119,6 +120,10 @@ pages: $(VENV)/test.stamp
 	$(BIN)/python -m tools.pages.public docs/public_names.txt
 	$(BIN)/python -m tools.pages.trend docs/recordings.md
 	$(BIN)/python -m tools.pages.notebooks examples/*.ipynb
+
+# Every picture of docs/ but that of a long run, which `make soak` draws; those of `view` need a browser.
+pictures: $(VENV)/test.stamp
+	$(BIN)/python -m tools.pages.pictures docs/gallery
 	$(BIN)/python -m tools.pages.architecture docs/gallery/architecture.png
 	$(BIN)/python -m tools.pages.robots docs/gallery
 	$(BIN)/python -m tools.pages.view docs/gallery

@@ -11,8 +11,8 @@ from matplotlib.path import Path as Outline
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.report.plots import pyplot
 from pkm_twin.robot.robot import Robot
-from pkm_twin.view.scene import GROUND, PLATFORM, Scene
-from pkm_twin.view.stage import LOOK
+from pkm_twin.view.scene import ANCHORS, GROUND, PLATFORM, Scene, anchors
+from pkm_twin.view.stage import LETTER, LOOK
 
 PICTURES: Final = (".png", ".svg")
 """What a picture's name may end in."""
@@ -158,9 +158,15 @@ def draw(robot: Robot) -> Any:
     ax.axis("off")
     halo = patheffects.withStroke(linewidth=3, foreground="w")
     style: dict[str, Any] = {"fontsize": 9, "path_effects": [halo], "ha": "center"}
-    for name, place in shapes.drives.items():
-        right, up, _ = camera.see(place)
-        ax.annotate(name, (right, up), (0, 9), textcoords="offset points", **style)
+    points = camera.see(np.array(list(shapes.drives.values())))[:, :2]
+    sizes = np.array([[LETTER[0] * len(name) + 8.0, LETTER[1]] for name in shapes.drives])
+    down = np.array([1.0, -1.0])
+    spots = down * (points - [camera.low[0], camera.high[1]]) / camera.pixel
+    found = anchors(spots, sizes, (WIDTH, HEIGHT))
+    for name, point, size, anchor in zip(shapes.drives, points, sizes, found, strict=True):
+        if anchor:
+            at = point + camera.pixel * down * size / 2 * ANCHORS[anchor]
+            ax.text(*at, name, va="center", **style)
     _corners(ax, camera, style)
     return figure
 

@@ -193,7 +193,7 @@ def test_the_python_page_has_each_public_name(package):
 
 
 def test_every_robot_has_its_picture():
-    """Else `make pages` draws it."""
+    """Else `make pictures` draws it."""
     for name in robot_names():
         assert (DOCS / "gallery" / f"robot_{name}.png").stat().st_size, name
         assert f"robot_{name}.png" in (DOCS / "index.md").read_text(encoding="utf-8")

@@ -285,6 +285,10 @@ def write(folder, summary, watched, ages):
     last.set(xscale="log", yscale="log", xlabel="age at publication (ms)", ylabel="messages")
     last.set_title("age of the published messages")
     last.legend()
+    memory, others = growth(summary)
+    figure.suptitle(
+        f"Growth under load: memory {memory:+.1f} MiB, descriptors and threads {others:+g}"
+    )
     figure.savefig(folder / "soak.png", dpi=110)
     pyplot.close(figure)
 
@@ -310,11 +314,18 @@ computer delayed after the check, and the topic's deadline reports it.
 """
 
 
+def growth(summary):
+    """Of memory, MiB, and of descriptors or threads, the greatest of all nodes."""
+    memory, *others = (
+        max(node[what]["last"] - node[what]["first"] for node in summary["nodes"].values())
+        for what in ("memory, bytes", "descriptors", "threads")
+    )
+    return memory / 2**20, max(others)
+
+
 def section(summary):
     """The figures as a part of the page on errors."""
-    parts = [(node["memory, bytes"], node["descriptors"], node["threads"])
-             for node in summary["nodes"].values()]  # fmt: skip
-    grown, *more = (max(part[k]["last"] - part[k]["first"] for part in parts) for k in range(3))
+    grown, more = growth(summary)
     ages = [
         f"| answers | count | {' | '.join(QUANTILES)} (ms) | older than {STALE:g} s |",
         "|---" * (3 + len(QUANTILES)) + "|",
@@ -328,8 +339,8 @@ def section(summary):
         minutes=summary["minutes"],
         sent=summary["joint states sent"],
         stale=STALE,
-        grown=grown / 2**20,
-        more=max(more),
+        grown=grown,
+        more=more,
         ages="\n".join(ages),
         **summary["happened"],
     )
