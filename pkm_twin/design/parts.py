@@ -12,7 +12,10 @@ themselves for errors of any size. Where no V fulfils all rows, rigid parts cann
 
 from __future__ import annotations
 
-from collections.abc import Container, Mapping, Sequence
+import contextlib
+import copy
+import re
+from collections.abc import Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Final, NamedTuple
@@ -21,7 +24,7 @@ import numpy as np
 
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError, PkmTwinError, SingularityError, UnknownNameError
-from pkm_twin.machine.graph import BASE, Joint, rotation_about_z
+from pkm_twin.machine.graph import BASE, Graph, Joint, rotation_about_z
 from pkm_twin.machine.joints import across, unit
 from pkm_twin.machine.places import full_keys, keys_of, path_of
 from pkm_twin.robot.robot import SINGULARITY_BOUND, Robot
@@ -35,9 +38,14 @@ POINTS: Final = 1e-3 * np.array([-2.0, -1.0, 1.0, 2.0])
 WEIGHTS: Final = np.array([1.0, -8.0, 8.0, -1.0]) / 12e-3
 """Differences of fourth order: errors of a rigid part change its rows smoothly."""
 
+HALF: Final = 0.5
+"""Of a play that parts stand away from its middle at most."""
+CLEARANCE: Final = ("clearance[0]", "clearance[1]", "clearance[2]")
+"""A joint's clearance, along each of the base axes at home."""
 ENDS: Final = {
     "bodies": ["length"], "rods": ["length"],
-    "joints": ["at[0]", "at[1]", "at[2]", "axis[0]", "axis[1]", "offset"],
+    "joints": ["at[0]", "at[1]", "at[2]", "axis[0]", "axis[1]", "offset", "backlash",
+               *CLEARANCE],
 }  # fmt: skip
 """How paths of errors end, by the kind of the part."""
 
@@ -82,14 +90,41 @@ def part_of(robot: Robot, path: str) -> Part | None:
     return Part(effects, texts[0] + alike, unit_)
 
 
-def _unknown(robot: Robot, keys: Sequence[str | int], path: str) -> ParameterError:
-    """The error of a path without a part: by its first word that there is not."""
+def _known(robot: Robot) -> Iterator[list[str | int]]:
+    """The keys of every error that is a path's form."""
     places: dict[tuple[str | int, ...], str] = {}
     for kind in ENDS:
         places |= {(kind, name): kind for name in getattr(robot.graph, kind)}
     for (kind, _), source in getattr(robot, "sources", {}).items():
         places[source.path] = kind
-    known = [[*place, *keys_of(end)] for place, kind in places.items() for end in ENDS[kind]]
+    return ([*place, *keys_of(end)] for place, kind in places.items() for end in ENDS[kind])
+
+
+def error_of(path: str) -> str:
+    """The error that a path is of: a clearance is one error along three axes."""
+    return re.sub(r"(\.clearance)\[\d\]$", r"\1", path)
+
+
+def matching(robot: Robot, pattern: str) -> list[str]:
+    """Errors of the machine's parts that a pattern with * for any text names.
+
+    :raises ParameterError: there is none.
+    """
+    fits = re.compile(".*".join(map(re.escape, pattern.split("*")))).fullmatch
+    found = []
+    for path in map(path_of, _known(robot)):
+        if fits(error_of(path)):
+            with contextlib.suppress(ParameterError):
+                part_of(robot, path)
+                found.append(error_of(path))
+    if not found:
+        raise ParameterError("tolerance", pattern, "a pattern that fits a part, as rods.*.length")
+    return list(dict.fromkeys(found))
+
+
+def _unknown(robot: Robot, keys: Sequence[str | int], path: str) -> ParameterError:
+    """The error of a path without a part: by its first word that there is not."""
+    known = list(_known(robot))
     for k in range(len(keys) + 1):
         words = {str(one[k]) for one in known if one[:k] == keys[:k] and len(one) > k}
         if k < len(keys) and words and str(keys[k]) not in words:
@@ -110,20 +145,21 @@ def _effects(
             return {("length", name): np.ones(1)}, f"{name} longer", "m"
         case "bodies", "length":
             return _longer(robot, name, path), f"{name} longer", "m"
-        case "joints", "offset":
+        case "joints", ("offset" | "backlash") as what:
             joint = graph.joints[name]
             if not joint.actuated:
                 raise ParameterError(path, name, "an actuated joint")
-            return (
-                {("offset", name): np.ones(1)}, f"zero of {name}", "m" if joint.slides else "rad"
-            )  # fmt: skip
-        case "joints", ("at" | "axis") as what, int(k) if k < (3 if what == "at" else 2):
+            size, word = (1.0, "zero") if what == "offset" else (HALF, what)
+            unit_ = "m" if joint.slides else "rad"
+            return {("offset", name): np.full(1, size)}, f"{word} of {name}", unit_
+        case "joints", ("at" | "axis" | "clearance") as what, int(k) if k < 3 - (what == "axis"):
             joint = graph.joints[name]
             if joint.virtual:
                 raise ParameterError(path, name, "a joint that does not stand for others")
-            if what == "at":
-                moved = np.asarray(turn @ np.eye(3)[k])
-                return {("inner", name): moved}, f"centre of {name} on {joint.inner}", "m"
+            if what != "axis":
+                size, word = (1.0, "centre") if what == "at" else (HALF, what)
+                moved = np.asarray(size * turn @ np.eye(3)[k])
+                return {("inner", name): moved}, f"{word} of {name} on {joint.inner}", "m"
             if not len(joint.axes):
                 raise ParameterError(path, joint.kind, "a joint with an axis")
             if name in robot.without_point:
@@ -422,25 +458,38 @@ class Assembly:
 
     # Of any size.
 
+    def like(self, graph: Graph) -> Assembly:
+        """A machine of other numbers, whose bodies are sought, and displaced, from these on."""
+        # Factors are made once, before they are shared.
+        _ = self._factors
+        other = copy.copy(self)
+        other.graph = graph
+        return other
+
     def displaced(self, errors: Mapping[Effect, Array]) -> Array:
         """How far errors take the platform, by Newton's method on all rows.
 
-        :param errors: by what moves, shape (count, 3) or (count, 1). The state is a single one.
-        :returns: displacement of the reference point and rotation vector, base axes, (count, 6).
+        :param errors: by what moves, shape (count, 3) or (count, 1).
+        :returns: displacement of the reference point and rotation vector, base axes, shape
+            (count, ..., 6).
         :raises PkmTwinError: parts with these errors cannot be assembled.
         """
-        count = len(next(iter(errors.values())))
+        count, inner = len(next(iter(errors.values()))), self.q.shape[:-1]
+        shape = (count, *inner)
+        errors = {k: v.reshape(count, *(1 for _ in inner), -1) for k, v in errors.items()}
         placed = Placed(
-            {n: np.tile(r, (count, 1, 1)) for n, r in self.placed.rotation.items()},
-            {n: np.tile(o, (count, 1)) for n, o in self.placed.origin.items()},
+            {n: np.broadcast_to(r, (*shape, 3, 3)) for n, r in self.placed.rotation.items()},
+            {n: np.broadcast_to(o, (*shape, 3)) for n, o in self.placed.origin.items()},
         )
+        worst = 0
         for _ in range(CORRECTIONS):
             rows = self.rows(placed, self.q, errors)
-            values = np.stack([np.broadcast_to(row.value, (count,)) for row in rows])
-            step = self._solved(values)
-            twists = step.T.reshape(count, -1, 6) * ([self.size] * 3 + [1.0] * 3)
-            placed = placed.moved(dict(zip(self.bodies, np.moveaxis(twists, 1, 0), strict=True)))
+            values = np.stack([np.broadcast_to(row.value, shape) for row in rows], -1)
+            step = np.moveaxis(self._solved(np.moveaxis(values, 0, -1)), -1, 0)
+            twists = step.reshape(*shape, -1, 6) * ([self.size] * 3 + [1.0] * 3)
+            placed = placed.moved({n: twists[..., k, :] for k, n in enumerate(self.bodies)})
             last = float(np.abs(step).max())
+            worst = int(np.abs(values).max(-1).max(0).argmax())
             if not last < 1.0:
                 break
             if last < CLOSED:
@@ -449,10 +498,10 @@ class Assembly:
                     break
                 name, origin = self.graph.platform, self.graph.origin
                 there = self._point(placed, name, origin, errors.get(("origin", name)))
-                turn = placed.rotation[name] @ self.placed.rotation[name].T
-                moved = there - self._point(self.placed, name, origin, None)
+                turn = placed.rotation[name] @ self.placed.rotation[name].swapaxes(-1, -2)
+                moved = there - self._point(self.placed, name, self.robot.graph.origin, None)
                 return np.concatenate([moved, rotation_vector(turn)], -1)
         raise PkmTwinError(
             f"{self.robot.name}: rigid parts with errors of this size cannot be assembled at "
-            f"{np.round(self.q, 6).tolist()}"
+            f"{np.round(self.q.reshape(-1, self.q.shape[-1])[worst], 6).tolist()}"
         )

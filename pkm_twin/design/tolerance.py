@@ -3,8 +3,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Final
 
@@ -16,13 +16,15 @@ from pkm_twin.design.parts import (
     CONSISTENT,
     Assembly,
     Effect,
+    error_of,
+    matching,
     part_of,
     rotation_vector,
-    turned,
 )
 from pkm_twin.design.variants import variants
 from pkm_twin.errors import ParameterError, PkmTwinError
 from pkm_twin.machine import schema
+from pkm_twin.machine.uncertainty import Tolerance
 from pkm_twin.robot.derivatives import platform_derivatives
 from pkm_twin.robot.robot import Robot
 from stiffness_monitor.compliance import platform_response
@@ -41,9 +43,9 @@ class Tolerances:
 
     All arrays (..., 6): displacement of the reference point and small turns, base axes, m and rad,
     against the machine without errors at the same joint positions. ``sigma``: standard deviation
-    by path, m or rad. ``sensitivity``: by path, per m or rad of the error. ``texts``: what each
-    error is, in words. ``deflection``: of the machine without errors under the wrench, None
-    without one: to first order an error does not change it.
+    by path, m or rad, and ``bounds``: how far the error may go. ``sensitivity``: by path, per m or
+    rad of the error. ``texts``: what each error is, in words. ``deflection``: of the machine
+    without errors under the wrench, None without one: to first order an error does not change it.
     """
 
     sigma: Mapping[str, float]
@@ -51,6 +53,28 @@ class Tolerances:
     texts: Mapping[str, str]
     units: Mapping[str, str]
     deflection: Array | None = None
+    bounds: Mapping[str, float] = field(default_factory=dict)
+
+    @cached_property
+    def together(self) -> dict[str, list[str]]:
+        """Paths of each error: of a clearance the three of its axes."""
+        found: dict[str, list[str]] = {}
+        for path in self.sigma:
+            found.setdefault(error_of(path), []).append(path)
+        return found
+
+    def effect(self, error: str) -> Array:
+        """Standard deviation by one error of :attr:`together`, shape (..., 6)."""
+        return _root([self.part(path) for path in self.together[error]])
+
+    @cached_property
+    def worst(self) -> Array:
+        """The most that all errors together do to each component, shape (..., 6)."""
+        each = [
+            _root([self.bounds[path] * self.sensitivity[path] for path in paths])
+            for paths in self.together.values()
+        ]
+        return np.asarray(sum(each), np.float64)
 
     def part(self, path: str) -> Array:
         """Effect of one standard deviation of an error, shape (..., 6)."""
@@ -59,7 +83,7 @@ class Tolerances:
     @cached_property
     def deviation(self) -> Array:
         """Standard deviation by all errors together, shape (..., 6)."""
-        return np.asarray(np.sqrt(sum(self.part(path) ** 2 for path in self.sigma)), np.float64)
+        return _root([self.part(path) for path in self.sigma])
 
     @cached_property
     def variance(self) -> dict[str, float]:
@@ -75,8 +99,39 @@ class Tolerances:
         return {path: self.part(path) ** 2 / whole for path in self.sigma}
 
 
+def _root(parts: Sequence[Array]) -> Array:
+    """Root of the sum of squares."""
+    return np.asarray(np.sqrt(sum(part**2 for part in parts)), np.float64)
+
+
+def is_play(path: str) -> bool:
+    """Whether an error is a play, which no calibration knows."""
+    return error_of(path).endswith((".backlash", ".clearance"))
+
+
+def spread(robot: Robot, given: Mapping[str, float | Tolerance]) -> dict[str, float | Tolerance]:
+    """Errors by single path: a pattern for all parts that fit, a clearance for its three axes.
+
+    :raises ParameterError: a pattern that fits nothing, or a play that is not a bound.
+    """
+    found: dict[str, float | Tolerance] = {}
+    # What is said of one part counts before a pattern.
+    for path in sorted(given, key=lambda path: "*" not in str(path)):
+        value = given[path]
+        for name in matching(robot, path) if "*" in str(path) else [path]:
+            play = isinstance(name, str) and is_play(name)
+            if play and getattr(value, "bound", None) is None:
+                raise ParameterError(f"tolerance {name}", value, "a bound, the whole play")
+            axes = range(3) if play and name.endswith(".clearance") else ()
+            found |= {f"{name}[{k}]": value for k in axes} or {name: value}
+    return found
+
+
 def tolerances(
-    robot: Robot, sigma: Mapping[str, float], q: ArrayLike, wrench: ArrayLike | None = None
+    robot: Robot,
+    sigma: Mapping[str, float | Tolerance],
+    q: ArrayLike,
+    wrench: ArrayLike | None = None,
 ) -> Tolerances:
     """Errors of the platform by independent errors of single parts, to first order.
 
@@ -91,13 +146,19 @@ def tolerances(
     - ``joints.NAME.axis[0]``, ``[1]``: the joint's frame on its inner body turns about its centre
       and two axes across the joint's (first) axis;
     - ``joints.NAME.offset``: an actuated joint stands by this beyond its position;
+    - ``joints.NAME.backlash``: the play of an actuated joint, which stands half of it away at most;
+    - ``joints.NAME.clearance``: the play of a joint, whose centre on the inner body is half of it
+      away at most, in any direction;
     - ``limbs.`` in front, or ``limbs[0].`` where ``limbs`` is a list: all copies of a limb alike,
       in the axes of azimuth 0.
 
     Any other number of the file that moves the platform may be given too, such as
     ``geometry.arm_length``: then the file's number changes, with all that follows from it.
 
-    :param sigma: standard deviation by path, m or rad, at most :data:`LARGEST`.
+    A * in a path stands for any text: each part that fits has an error of its own.
+
+    :param sigma: standard deviation by path, m or rad, at most :data:`LARGEST`; or how the error
+        is distributed.
     :param q: joint positions, shape (..., n), rad or m.
     :param wrench: on the platform, shape (6,) or (..., 6), N and N m, for ``deflection``.
     :raises ParameterError: a path that there is not, a standard deviation that is none, a number
@@ -109,19 +170,23 @@ def tolerances(
     states = vectors(q, robot.joints_count, "q")
     if not sigma:
         raise ParameterError("tolerance", None, "at least one PATH with its standard deviation")
-    parts = {path: part_of(robot, path) for path in sigma}
+    given_sizes = spread(robot, sigma)
+    parts = {path: part_of(robot, path) for path in given_sizes}
     known = {path: part for path, part in parts.items() if part is not None}
-    numbers = [path for path in sigma if path not in known]
+    numbers = [path for path in given_sizes if path not in known]
     slopes = dict(platform_derivatives(robot, states, numbers).by)
     given = robot.file_numbers() if numbers else {}
     units = {
         path: (given[path][1] if path in given else "") if part is None else part.unit
         for path, part in parts.items()
     }
-    for path, value in sigma.items():
+    sizes: dict[str, Tolerance] = {}
+    for path, value in given_sizes.items():
         most = {"m": LARGEST * robot.graph.size, "rad": LARGEST}.get(units[path])
-        size = schema.number(low=0.0, high=most, unit=units[path])
-        schema.checked(size, f"tolerance {path}", value)
+        number = schema.number(low=0.0, high=most, unit=units[path])
+        told = value.size if isinstance(value, Tolerance) else value
+        size = schema.checked(number, f"tolerance {path}", told)
+        sizes[path] = value if isinstance(value, Tolerance) else Tolerance(deviation=size)
     for path in numbers:
         if states.size and not slopes[path].any():
             raise ParameterError(f"tolerance {path}", robot.number(path), "a length or an angle")
@@ -143,10 +208,11 @@ def tolerances(
                     f"and {100 * missed:.2g} % of this error are left to clearance or deformation",
                 )  # fmt: skip
     return Tolerances(
-        dict(sigma), {path: slopes[path] for path in sigma},
+        {path: size.sigma for path, size in sizes.items()}, {path: slopes[path] for path in sizes},
         {path: "number of the file" if part is None else part.text for path, part in parts.items()},
         units,
         None if wrench is None else _deflection(robot, states, wrench),
+        {path: size.most for path, size in sizes.items()},
     )  # fmt: skip
 
 
@@ -160,9 +226,9 @@ def _deflection(robot: Robot, q: Array, wrench: ArrayLike) -> Array | None:
 
 
 def drawn(
-    robot: Robot, sigma: Mapping[str, float], q: ArrayLike, count: int, seed: int = 0
+    robot: Robot, sigma: Mapping[str, float | Tolerance], q: ArrayLike, count: int, seed: int = 0
 ) -> Array:
-    """Errors of the platform of machines with normally distributed errors, on exact geometry.
+    """Errors of the platform of machines with random errors, on exact geometry.
 
     Every machine is assembled in every state, without a linear step: what
     :func:`tolerances` gives to first order.
@@ -173,38 +239,51 @@ def drawn(
     :raises PkmTwinError: errors so large that a machine cannot be assembled.
     """
     states = np.atleast_2d(vectors(q, robot.joints_count, "q"))
-    known = tolerances(robot, sigma, states)
+    known, sizes = tolerances(robot, sigma, states), spread(robot, sigma)
     rng = np.random.default_rng(seed)
-    errors = {path: value * rng.normal(size=count) for path, value in known.sigma.items()}
-    parts = [path for path in sigma if part_of(robot, path) is not None]
-    if len(parts) == len(sigma):
-        return _assembled(robot, errors, states)
-    own = {path: robot.number(path) + errors[path] for path in sigma if path not in parts}
+    errors: dict[str, Array] = {}
+    for paths in known.together.values():
+        bounds = [getattr(sizes[path], "bound", None) for path in paths]
+        if bounds[0] is None:
+            errors |= {path: known.sigma[path] * rng.normal(size=count) for path in paths}
+        else:
+            # The parts of a clearance touch somewhere: any direction, the bound's length.
+            way = rng.normal(size=(len(paths), count)) if len(paths) > 1 else None
+            unit = rng.uniform(-1.0, 1.0, (1, count)) if way is None else (
+                way / np.linalg.norm(way, axis=0))  # fmt: skip
+            errors |= {path: bounds[0] * row for path, row in zip(paths, unit, strict=True)}
+    parts = [path for path in errors if part_of(robot, path) is not None]
+    assembly = Assembly(robot, states)
+    if len(parts) == len(errors):
+        return assembly.displaced(_effects(robot, errors))
+    own = {path: robot.number(path) + errors[path] for path in errors if path not in parts}
     machines = variants(robot, own)
-    position, rotation = machines.platform(np.broadcast_to(states, (count, *states.shape)))
-    place, turn = robot.platform(states)
     if parts:
         # The errors of parts are those of each machine, whose numbers differ.
-        moved = np.concatenate([
-            _assembled(machine, {path: errors[path][k : k + 1] for path in parts}, states)
+        found = np.concatenate([
+            assembly.like(machine.graph).displaced(
+                _effects(robot, {path: errors[path][k : k + 1] for path in parts})
+            )
             for k, machine in enumerate(machines)
         ])  # fmt: skip
-        position, rotation = position + moved[..., :3], turned(moved[..., 3:]) @ rotation
-    turns = rotation_vector(rotation @ turn.swapaxes(-1, -2))
-    found = np.concatenate([position - place, turns], -1)
+    else:
+        position, rotation = machines.platform(np.broadcast_to(states, (count, *states.shape)))
+        place, turn = robot.platform(states)
+        turns = rotation_vector(rotation @ turn.swapaxes(-1, -2))
+        found = np.concatenate([position - place, turns], -1)
     if not np.isfinite(found).all():
         raise PkmTwinError(f"{robot.name}: machines with errors of this size have no assembly")
     return found
 
 
-def _assembled(robot: Robot, errors: Mapping[str, Array], states: Array) -> Array:
-    """Errors of the platform of a machine by those of parts, (count,) each: (count, states, 6)."""
+def _effects(robot: Robot, errors: Mapping[str, Array]) -> dict[Effect, Array]:
+    """What moves by errors of parts, (count,) each."""
     effects: dict[Effect, Array] = {}
     for path, values in errors.items():
         part = part_of(robot, path)
         for what, vector in part.effects.items() if part else ():
             effects[what] = effects.get(what, 0.0) + values[:, None] * vector
-    return np.stack([Assembly(robot, one).displaced(effects) for one in states], 1)
+    return effects
 
 
 def workspace_states(robot: Robot, count: int, seed: int = 0) -> Array:

@@ -12,6 +12,7 @@ import numpy as np
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError
 from pkm_twin.machine.formulas import PARAMETERS
+from pkm_twin.machine.uncertainty import Tolerance
 from pkm_twin.robot.robot import Robot
 
 
@@ -92,16 +93,18 @@ def parse_vary(texts: Sequence[str]) -> dict[str, tuple[float, float]]:
     return {name: (low, high) for name, (low, high) in found.items()}
 
 
-def parse_tolerances(texts: Sequence[str]) -> dict[str, float]:
-    """Standard deviations by path of ``PATH=SIGMA`` texts.
+def parse_tolerances(texts: Sequence[str]) -> dict[str, Tolerance]:
+    """By path of ``PATH=SIGMA`` texts, standard deviations, and ``PATH=+-BOUND``.
 
     :raises ParameterError: another form, or a path that is given twice.
     """
-    form = "PATH=SIGMA, each path once, a standard deviation of 0 or more"
-    found = {name: value for name, (value,) in _parsed("tolerance", texts, form, 1).items()}
-    for name, value in found.items():
+    form = "PATH=SIGMA or PATH=+-BOUND, each path once, 0 or more"
+    plain = _parsed("tolerance", [text.replace("=+-", "=") for text in texts], form, 1)
+    found = {}
+    for text, (name, (value,)) in zip(texts, plain.items(), strict=True):
         if not 0.0 <= value < math.inf:
             raise ParameterError("tolerance", f"{name}={value:g}", form)
+        found[name] = Tolerance(bound=value) if "=+-" in text else Tolerance(deviation=value)
     return found
 
 

@@ -70,6 +70,8 @@ MOVES: Final = 1e-6
 """A number that moves the platform less than this, per unit, is no number of the geometry."""
 HELD_OUT: Final = 4
 """Every so many whole poses one is held out."""
+UNSEEN: Final = 1e-8
+"""Least singular value, of the greatest, of a combination of numbers that poses tell."""
 STEP: Final = 1e-6
 """By which a number is moved to see whether the machine can be assembled with another one."""
 SAME: Final = 1e-4
@@ -258,6 +260,30 @@ def geometric(robot: Robot, q: Array, only: Sequence[str] = ()) -> tuple[str, ..
         if not any(path.startswith(beginning) for path in known):
             raise ParameterError("--only", beginning, "the beginning of a geometric number's path")
     return tuple(found)
+
+
+def left_by_calibration(
+    robot: Robot, errors: Callable[[Array], Array], states: Array, q: Array
+) -> Array:
+    """What a calibration without noise leaves of errors of the platform, shape (k, 6, p).
+
+    :param errors: of joint states (k, n) the twists by each error, shape (k, 6, p).
+    :param states: with measured poses, shape (s, n); ``q``: where the errors count, shape (k, n).
+    """
+    paths = geometric(robot, states)
+
+    def slopes(rows: Array) -> Array:
+        """By the numbers that it fits, and by the zeros of the joints."""
+        zeros = robot.platform_jacobian(rows)
+        if not paths:
+            return zeros
+        many = Variants(robot, {path: robot.number(path) for path in paths})
+        return np.concatenate([zeros, many.platform_slopes(rows)], -1)
+
+    scale = np.repeat([1.0, robot.size], 3)[:, None]
+    table, wanted = ((scale * of(states)).reshape(6 * len(states), -1) for of in (slopes, errors))
+    found = np.linalg.lstsq(table, wanted, rcond=UNSEEN)[0]
+    return np.asarray(errors(q) - slopes(q) @ found, np.float64)
 
 
 def unknowns(robot: Robot, measured: Measured, paths: Sequence[str], free: Free) -> list[Parameter]:

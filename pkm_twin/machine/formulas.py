@@ -356,7 +356,7 @@ class Book:
                 moving.add(name)
         # How sure a number is stays as the file has it.
         moved = (one for one in self.formulas.values() if one.names & moving)
-        return [one for one in moved if not one.path.startswith("uncertainty.")]
+        return [one for one in moved if not one.path.startswith(("uncertainty.", "tolerances."))]
 
     def text(self, path: str) -> str:
         """The expression that a number of the file is; empty for a plain number."""

@@ -52,7 +52,7 @@ def numbers_of(
     sections: Mapping[str, Any], units: Mapping[str, Any]
 ) -> dict[str, tuple[float, str]]:
     """Every number that sections of a file give, by dotted path, with its unit."""
-    data = {k: v for k, v in given(sections).items() if k != "uncertainty"}
+    data = {k: v for k, v in given(sections).items() if k not in ("uncertainty", "tolerances")}
     return dict(_walk(data, units, ""))
 
 

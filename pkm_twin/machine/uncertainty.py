@@ -29,6 +29,38 @@ class UncertaintyEntry:
             raise ParameterError(path, None, "either `deviation` or `relative`")
 
 
+@dataclass(frozen=True)
+class Tolerance:
+    """How far a part's error may go, by its path as of `design --tolerance`; * stands for any text.
+
+    ``deviation``: standard deviation of a normal distribution; or ``bound``: anywhere within
+    it on both sides of zero. Of a ``backlash`` or a ``clearance`` the bound is the whole play.
+    """
+
+    deviation: float | None = schema.number(low=0.0, unit="m or rad", default=None)
+    bound: float | None = schema.number(low=0.0, unit="m or rad", default=None)
+
+    def verify(self, path: str) -> None:
+        """One of both."""
+        if (self.deviation is None) == (self.bound is None):
+            raise ParameterError(path, None, "either `deviation` or `bound`")
+
+    @property
+    def size(self) -> float:
+        """The one that is given."""
+        return (self.deviation if self.bound is None else self.bound) or 0.0
+
+    @property
+    def sigma(self) -> float:
+        """The standard deviation."""
+        return self.size if self.bound is None else self.size / math.sqrt(3.0)
+
+    @property
+    def most(self) -> float:
+        """The bound; of a normal distribution three standard deviations."""
+        return 3.0 * self.size if self.bound is None else self.size
+
+
 def causes_of(
     entries: Mapping[str, UncertaintyEntry], numbers: Mapping[str, tuple[float, str]]
 ) -> dict[str, dict[str, float]]:

@@ -43,6 +43,7 @@ from pkm_twin.machine.pose_grid import PoseGrid
 from pkm_twin.machine.reach import PassiveLimit, position_box
 from pkm_twin.machine.sections import DriveSpec, JointLimits, Payload, friction_of, limits_of
 from pkm_twin.machine.uncertainty import (
+    Tolerance,
     UncertaintyEntry,
     causes_of,
 )
@@ -77,6 +78,7 @@ class Common:
     )
     joint_map: Mapping[str, JointMapEntry] = schema.mapping(JointMapEntry, default={})
     uncertainty: Mapping[str, UncertaintyEntry] = schema.mapping(UncertaintyEntry, default={})
+    tolerances: Mapping[str, Tolerance] = schema.mapping(Tolerance, default={})
     element_compliance: Mapping[str, float] = schema.mapping(
         schema.number(low=1e-6, high=1e6), default={},
         text="factors on the compliance of elements, by the names of `strain_energy`; else 1",

@@ -31,6 +31,7 @@ _LEFT_ALONE: Final = (
     "member",
     "section",
     "uncertainty",
+    "tolerances",
 )
 """What is told of the machine beside its rigid bodies."""
 

@@ -3,9 +3,11 @@
 
 import numpy as np
 import pytest
+import yaml
 
 from pkm_twin.mechanisms.catalogue import config_folder, load
 from test.support.command import forked
+from test.support.robots import parameters_of
 
 VARY = ("--vary", "geometry.arm_length=0.15:0.3", "--vary", "geometry.forearm_length=0.3:0.6")
 TOLERANCES = ("--tolerance", "geometry.arm_length=1e-4", "--tolerance", "geometry.base_radius=5e-5")
@@ -73,6 +75,32 @@ def test_a_budget_names_each_contribution(twin, pick):
     assert machines["rms_position_m"] == pytest.approx(
         machines["first_order_rms_position_m"], rel=0.15
     )
+
+
+@pytest.mark.parametrize("name", ["delta", "linear_delta"])
+def test_a_file_has_tolerances_of_its_parts(twin, tmp_path, name):
+    path, data = tmp_path / "loose.yaml", parameters_of(name)
+    actuated = load(name).joint_names
+    data["tolerances"] = {
+        "joints.*.offset": {"deviation": 1e-4}, f"joints.{actuated[0]}.backlash": {"bound": 3e-4},
+    }  # fmt: skip
+    path.write_text(yaml.safe_dump(data))
+    asked = twin.told("design", path, "--tolerance", "file")
+    given = [f"joints.{joint}.offset=1e-4" for joint in actuated]
+    given.append(f"joints.{actuated[0]}.backlash=+-3e-4")
+    same = twin.told("design", name, *(w for one in given for w in ("--tolerance", one)))
+    assert asked["contributions"] == same["contributions"]
+    assert asked["bound_position_m"] == same["bound_position_m"] > asked["greatest_position_m"]
+    # Zeros of joints are calibrated, a play is not.
+    rows = asked["contributions"]
+    play = rows.pop(f"joints.{actuated[0]}.backlash")
+    assert play["rms_calibrated_position_m"] == pytest.approx(play["rms_position_m"])
+    assert max(row["rms_calibrated_position_m"] for row in rows.values()) < 1e-9
+    assert asked["rms_calibrated_position_m"] == pytest.approx(play["rms_position_m"])
+    twin.refused("design", name, "--tolerance", "file")
+    data["tolerances"] = {"joints.*.offset": {"deviation": 1e-4, "bound": 1e-4}}
+    path.write_text(yaml.safe_dump(data))
+    assert "tolerances.joints.*.offset" in twin.refused("design", path, "--tolerance", "file")
 
 
 @pytest.mark.parametrize(

@@ -12,8 +12,11 @@ from pkm_twin.certify.description import across
 from pkm_twin.certify.maximal import Maximal, rotation_of
 from pkm_twin.design import drawn, tolerances
 from pkm_twin.design.parts import Assembly, part_of
-from pkm_twin.design.tolerance import workspace_states
+from pkm_twin.design.tolerance import rms, workspace_states
 from pkm_twin.errors import ParameterError, UnknownNameError
+from pkm_twin.identification.calibration import calibrate, geometric, left_by_calibration
+from pkm_twin.identification.calibration_state import Poses
+from pkm_twin.machine.uncertainty import Tolerance
 from pkm_twin.mechanisms.catalogue import robot_of_data
 from stiffness_monitor import platform_response
 from test.machine.random_machines import NAMES, variant
@@ -244,6 +247,96 @@ def test_drawn_machines_may_have_errors_of_parts_and_of_numbers():
     found, rng = tolerances(robot, sigma, q), np.random.default_rng(0)
     first = sum(rng.normal(size=5)[:, None, None] * found.part(path) for path in sigma)
     np.testing.assert_allclose(drawn(robot, sigma, q, 5), first, atol=1e-3 * abs(first).max())
+
+
+def pick_and_place_delta():
+    """A Delta of base 0.2, arm 0.35, forearm 0.8 and platform 0.045 m, arms level at home."""
+    rods = {
+        side: {"between": ["arm", "platform"], "mass": 0.1,
+               "ends": [[0.55, y, 0.0], [0.045, y, -(0.8**2 - 0.505**2) ** 0.5]]}
+        for side, y in (("left", 0.05), ("right", -0.05))
+    }  # fmt: skip
+    inertia = {"mass": 0.5, "inertia": [1e-3, 1e-3, 1e-3]}
+    motor = {"type": "revolute", "between": ["base", "arm"], "at": [0.2, 0.0, 0.0],
+             "axis": [0.0, 1.0, 0.0], "actuated": True,
+             "limits": {"position": [-0.9, 1.5]}}  # fmt: skip
+    origin = [0.0, 0.0, rods["left"]["ends"][1][2]]
+    return robot_of_data({
+        "mechanism": "machine", "platform": "platform", "origin": origin, "pose": ["x", "y", "z"],
+        "bodies": {"platform": {**inertia, "com": origin}},
+        "limbs": {
+            "azimuths": [0.0, 2.0943951, 4.1887902], "rods": rods, "joints": {"motor": motor},
+            "bodies": {"arm": {**inertia, "com": [0.34, 0.0, 0.0]}},
+        },
+    }, "picker")  # fmt: skip
+
+
+def test_one_longer_arm_and_all_arms_alike_or_by_themselves():
+    """0.072 mm by one arm that is 0.1 mm longer; on a cycle 0.043 mm alike, 0.068 mm each."""
+    robot = pick_and_place_delta()
+    one = tolerances(robot, {"bodies.arm_1.length": 1e-4}, robot.graph.home)
+    assert np.linalg.norm(one.deviation[:3]) == pytest.approx(7.2e-5, abs=5e-7)
+    across = -0.1525 * np.cos(np.linspace(0.0, np.pi, 101))
+    up = np.minimum(0.025, 0.1525 - np.abs(across))
+    q = robot.inverse(np.stack([across, 0.0 * across, up - 0.755], -1))
+    alike, each = (
+        rms(tolerances(robot, {path: 1e-4}, q).deviation[:, :3])
+        for path in ("limbs.bodies.arm.length", "bodies.arm_*.length")
+    )
+    assert alike == pytest.approx(4.3e-5, rel=0.02) and each == pytest.approx(6.8e-5, rel=0.02)
+
+
+def test_bounds_hold_for_machines_that_are_drawn_within_them():
+    """Uniform errors, a backlash and a clearance: their spread, and the worst of all signs."""
+    robot = pick_and_place_delta()
+    sigma = {
+        "rods.*.length": Tolerance(bound=3e-5), "rods.left_1.length": 1e-5,
+        "joints.motor_2.backlash": Tolerance(bound=2e-4),
+        "joints.motor_3.clearance": Tolerance(bound=4e-5),
+    }  # fmt: skip
+    q = robot.graph.home + np.array([[0.0, 0.0, 0.0], [0.3, -0.2, 0.4]])
+    found, errors = tolerances(robot, sigma, q), drawn(robot, sigma, q, 4000)
+    assert len(found.sigma) == 6 + 1 + 3 and len(found.together) == 8
+    assert found.sigma["rods.left_1.length"] == 1e-5
+    assert found.bounds["rods.left_1.length"] == pytest.approx(3e-5)
+    np.testing.assert_allclose(np.sqrt((errors**2).mean(0)), found.deviation, rtol=0.05)
+    bounded = {path: one for path, one in sigma.items() if isinstance(one, Tolerance)}
+    found, errors = tolerances(robot, bounded, q), drawn(robot, bounded, q, 4000)
+    assert (np.abs(errors) <= 1.001 * found.worst).all()
+    assert (np.abs(errors).max(0) > 0.6 * found.worst).all()
+    # The worst of x: every error at its bound, with the sign that adds to it.
+    for state, worst in zip(q, found.worst, strict=True):
+        there = tolerances(robot, bounded, state).sensitivity
+        effects = {}
+        for paths in found.together.values():
+            slopes = np.array([there[path][0] for path in paths])
+            size = found.bounds[paths[0]] * slopes / np.linalg.norm(slopes)
+            for path, value in zip(paths, size, strict=True):
+                for what, vector in part_of(robot, path).effects.items():
+                    effects[what] = effects.get(what, 0.0) + value * vector[None]
+        exact = Assembly(robot, state).displaced(effects)[0]
+        assert exact[0] == pytest.approx(worst[0], rel=2e-3)
+    for path, size in (("joints.motor_1.backlash", 1e-4), ("joints.motor_1.clearance", 1e-4),
+                       ("joints.none*.offset", Tolerance(bound=1e-4))):  # fmt: skip
+        with pytest.raises(ParameterError):
+            tolerances(robot, {path: size}, q)
+
+
+def test_what_a_calibration_leaves_is_what_it_leaves():
+    """Poses of a machine with one longer arm, whose file has one length for all of them."""
+    robot, path, error = load("delta"), "bodies.arm I.length", 1e-4
+    q = workspace_states(robot, 60)
+    effects = part_of(robot, path).effects
+    moved = Assembly(robot, q).displaced({k: error * v[None] for k, v in effects.items()})[0]
+    place, turn = robot.platform(q)
+    found = calibrate(robot, Poses(q, place + moved[:, :3], turn), geometric(robot, q))
+    there, _ = found.robot.platform(found.joint_map.positions(q))
+    left = left_by_calibration(
+        robot, lambda s: error * tolerances(robot, {path: error}, s).sensitivity[path][..., None],
+        q, q,
+    )  # fmt: skip
+    assert rms(left[:, :3, 0]) == pytest.approx(rms(place + moved[:, :3] - there), rel=0.03)
+    assert rms(left[:, :3, 0]) < 0.9 * rms(moved[:, :3])
 
 
 def test_numbers_of_a_file_without_parts_vary_as_the_file_says():

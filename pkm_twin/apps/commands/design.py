@@ -21,7 +21,7 @@ from pkm_twin.settings import setting
 
 if TYPE_CHECKING:
     from pkm_twin.design import Design as Found
-    from pkm_twin.design import DesignPoint, PosePath
+    from pkm_twin.design import DesignPoint, PosePath, Tolerances
     from pkm_twin.robot.robot import Robot
 
 SWEEPS: Final = ("grid", "sobol")
@@ -29,6 +29,10 @@ FILE_DIGITS: Final = 12
 """Significant digits of a number that is written."""
 STATES: Final = 2000
 """Joint states that stand for the workspace."""
+MEASURED: Final = 100
+"""Joint states of the workspace in which a calibration measures poses."""
+OF_FILE: Final = "file"
+"""In place of a tolerance: those of the robot's file."""
 DRAWN_STATES: Final = 25
 """Joint states, spread over all, in which drawn machines are assembled."""
 Box = Mapping[str, tuple[float, float]]
@@ -47,11 +51,11 @@ class Design(Carries, ReadsMotions, Writes, Draws, Seeded):
     several starts and ends in a local optimum.
 
     --sweep writes all quantities of machines within the bounds to a NetCDF file, with --scheduler
-    computed by a Dask cluster. --tolerance prints
-    the standard deviations of the platform's position and rotation, with the share of each part,
-    on the path or, without --path, over the workspace. The actuated joints keep their positions.
-    Parts are rods.NAME.length, bodies.NAME.length, joints.NAME.at[0..2], joints.NAME.axis[0..1] and
-    joints.NAME.offset; with limbs. in front all copies are alike.
+    computed by a Dask cluster. --tolerance prints the standard deviations of the platform's
+    position and rotation, the worst case, and the share of each part, on the path or, without
+    --path, over the workspace; the actuated joints keep their positions. Parts are
+    rods.NAME.length, bodies.NAME.length and joints.NAME with at[0..2], axis[0..1], offset, backlash
+    or clearance; * stands for any text; with limbs. in front all copies are alike.
     """
 
     vary: tuple[str, ...] = setting(
@@ -72,8 +76,8 @@ class Design(Carries, ReadsMotions, Writes, Draws, Seeded):
     )
     tolerance: tuple[str, ...] = setting(
         (),
-        "PATH=SIGMA: the standard deviation of a part's error, e.g. rods.left_1.length=2e-5; "
-        "prints the pose error budget",
+        "PATH=SIGMA, standard deviation of a part's error, or PATH=+-BOUND, e.g. "
+        "rods.*.length=2e-5; file: those of the robot's file; prints the pose error budget",
     )
     monte_carlo: int = setting(
         0, "of --tolerance: machines to draw and assemble exactly as well", low=0
@@ -374,7 +378,12 @@ def budget(given: Design) -> Report:
     from pkm_twin.design.tolerance import greatest, rms, workspace_states
     from pkm_twin.design.variables import parse_tolerances
 
-    sigma, robot, where = parse_tolerances(given.tolerance), given.machine(), "the workspace"
+    robot, where = given.machine(), "the workspace"
+    sigma = parse_tolerances([text for text in given.tolerance if text != OF_FILE])
+    if OF_FILE in given.tolerance:
+        if not robot.tolerances:
+            raise ParameterError("tolerances", None, "a section tolerances in the robot file")
+        sigma = {**robot.tolerances, **sigma}
     if given.path is None:
         q = workspace_states(robot, STATES, given.seed)
     else:
@@ -383,29 +392,37 @@ def budget(given: Design) -> Report:
             given.path.name,
         )
     found = tolerances(robot, sigma, q, given.wrench)
+    left = after_calibration(robot, found, q)
+    shares = {
+        name: sum(found.variance[path] for path in paths) for name, paths in found.together.items()
+    }
     rows: dict[str, list[Any]] = {}
-    for name in sorted(sigma, key=lambda name: -found.variance[name]):
-        moves, turns = np.split(found.part(name), 2, -1)
-        still = not np.any(np.abs(found.sensitivity[name]) > 1e-9)
+    for name, paths in sorted(found.together.items(), key=lambda item: -shares[item[0]]):
+        moves, turns = np.split(found.effect(name), 2, -1)
+        still = not any(np.any(np.abs(found.sensitivity[path]) > 1e-9) for path in paths)
         rows[name] = [
-            sigma[name], found.units[name], rms(moves), greatest(moves), rms(turns),
-            greatest(turns), found.variance[name], found.texts[name],
-            "moves nothing" if still else "",
+            found.sigma[paths[0]], found.bounds[paths[0]], found.units[paths[0]], rms(moves),
+            greatest(moves), rms(turns), greatest(turns), rms(left[name]), shares[name],
+            found.texts[paths[0]], "moves nothing" if still else "",
         ]  # fmt: skip
     columns = [
         Column("sigma"),
+        Column("bound", "", None),
         Column("unit", text=" "),
         Column("rms_position_m", "m", "RMS", 1e3, "mm"),
         Column("greatest_position_m", "m", "max", 1e3, "mm"),
         Column("rms_angle_rad", "rad", "RMS", 1e3, "mrad"),
         Column("greatest_angle_rad", "rad", None),
+        Column("rms_calibrated_position_m", "m", "RMS calibrated", 1e3, "mm"),
         Column("share", "", "share", 100.0, "%", ".3g"),
         Column("varied", text="what varies"),
         Column("", text=" "),
     ]
     moves, turns = found.deviation[:, :3], found.deviation[:, 3:]
+    most = np.linalg.norm(found.worst[:, :3], axis=-1)
+    farthest = robot.forward(q[int(most.argmax())]).round(12) + 0.0
     worst = robot.forward(q[int(np.linalg.norm(moves, axis=-1).argmax())]).round(12) + 0.0
-    at = ", ".join(f"{n} {value:.4g}" for n, value in zip(robot.pose_names, worst, strict=True))
+    at = _place(robot, worst)
     facts = [
         Fact("robot", robot.name),
         Fact("states", len(q)),
@@ -416,6 +433,12 @@ def budget(given: Design) -> Report:
              f"{1e3 * rms(turns.round(12)):.4g} mrad"),
         Fact("greatest_angle_rad", greatest(turns), "rad"),
         Fact("worst_pose", worst),
+        _length("bound_position_m", float(most.max()), "worst case of all bounds",
+                f" at {_place(robot, farthest)}"),
+        Fact("bound_angle_rad", greatest(found.worst[:, 3:]), "rad"),
+        Fact("bound_pose", farthest),
+        _length("rms_calibrated_position_m", rms(np.sqrt(sum(v**2 for v in left.values()))),
+                "RMS after a calibration without noise"),
     ]  # fmt: skip
     if given.monte_carlo:
         chosen = np.unique(np.linspace(0, len(q) - 1, DRAWN_STATES).round().astype(int))
@@ -443,6 +466,36 @@ def budget(given: Design) -> Report:
         facts,
         [Table("contributions", columns, rows, head="error")],
     )
+
+
+def after_calibration(robot: Robot, found: Tolerances, q: Any) -> dict[str, Any]:
+    """What a calibration leaves of each error's standard deviation of the position, (k, 3).
+
+    Plays change from pose to pose: no calibration knows them.
+    """
+    from pkm_twin.design import tolerances
+    from pkm_twin.design.tolerance import is_play, workspace_states
+    from pkm_twin.identification.calibration import left_by_calibration
+
+    known = {path: sigma for path, sigma in found.sigma.items() if not is_play(path)}
+    left = {n: found.effect(n)[:, :3] for n in found.together if is_play(n)}
+    if not known:
+        return left
+    try:
+        states = workspace_states(robot, MEASURED)
+    except ParameterError:
+        states = q[np.unique(np.linspace(0, len(q) - 1, MEASURED).round().astype(int))]
+
+    def errors(rows: Any) -> Any:
+        own = tolerances(robot, known, rows)
+        return np.stack([own.part(path) for path in known], -1)
+
+    stays = left_by_calibration(robot, errors, states, q)
+    return left | {path: stays[:, :3, k] for k, path in enumerate(known)}
+
+
+def _place(robot: Robot, pose: Any) -> str:
+    return ", ".join(f"{n} {value:.4g}" for n, value in zip(robot.pose_names, pose, strict=True))
 
 
 def _length(name: str, value: float, text: str | None = None, more: str = "") -> Fact:
