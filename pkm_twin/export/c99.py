@@ -17,6 +17,7 @@ from pkm_twin.codegen.code import STEPS
 from pkm_twin.codegen.expressions import Expression, Tape, count, ordered, uses
 from pkm_twin.codegen.operations import (
     OPERATIONS,
+    SAMPLE,
     Operation,
     c_number,
     cos,
@@ -199,7 +200,8 @@ class Routine:
     """One public function.
 
     ``outputs``: expressions by argument. ``equations``: are solved one after the other.
-    ``state``: what it leaves to its next call, by the input ``last``.
+    ``state``: what it leaves to its next call, by the input ``last``. ``upon``: a function whose
+    body it calls and goes on from.
     """
 
     name: str
@@ -208,6 +210,7 @@ class Routine:
     equations: Sequence[Equations]
     summary: str
     state: Sequence[Expression] = ()
+    upon: Routine | None = None
 
     @property
     def given(self) -> dict[str, Sequence[Expression]]:
@@ -220,13 +223,20 @@ class Routine:
         return [e for row in self.given.values() for e in row]
 
     @property
+    def body(self) -> list[Expression]:
+        """Results, then whether the closures hold: 1 or 0."""
+        return [*self.results, *holding(self.equations)]
+
+    @property
     def worst(self) -> tuple[int, int]:
         """Most operations of a call: with all attempts, and with one.
 
         A stream's sample has one attempt more, from the sample before.
         """
         solved = [q for q in self.equations if q.home]
-        step = sum(MAX_ITERATIONS * count(q.correct) + count([*q.begin, *q.aim]) for q in solved)
+        step = sum(
+            MAX_ITERATIONS * count(q.correct) + count([*q.begin, *q.onward, *q.aim]) for q in solved
+        )
         rest = count([*self.results, *(e for q in self.equations for e in (*q.goal, q.held))])
         more = len(self.state) > 1
         steps, attempts = (sum(LADDER), len(LADDER)) if solved else (1, 1)
@@ -279,15 +289,22 @@ class Unit:
     :param parameters: expressions of the tape that a caller gives as a table of numbers.
     """
 
-    def __init__(self, prefix: str, parameters: Sequence[Expression]) -> None:
+    def __init__(
+        self, prefix: str, parameters: Sequence[Expression], routines: Sequence[Routine]
+    ) -> None:
         self.prefix = prefix
         self._known = {e.number: f"p[{k}]" for k, e in enumerate(parameters)}
         self._needed: set[Operation] = set()
         self._parts: list[str] = []
         self._ahead: dict[str, dict[int, int]] = {}
         self._functions: dict[str, str] = {}
+        self._routines = routines
+        self._bodies: dict[str, tuple[str, list[Expression]]] = {}
+        """By routine: how to call its body, and what that gives."""
         self.doubles: dict[str, int] = {}
-        """Local doubles of every function, by name."""
+        """Local doubles of every static function, by name."""
+        self.rooms = 0
+        """Most of a public one."""
 
     def text(self) -> str:
         """Helpers and all functions."""
@@ -430,10 +447,10 @@ static int @_{name}({more}const double *{q.target}, int steps, double *h, double
 
         :param kind: what stands before it: ``static`` or :data:`HOT`.
         """
-        wanted, held = routine.results, holding(routine.equations)
         known, given = dict(self._known), {"p": "parameters"}
         # Compilers do not see that nothing is read without a value.
-        rooms, solving = {"r": len(wanted) + len(held)}, []
+        rooms: dict[str, int] = {}
+        solving: list[str] = []
         for k, q in enumerate(routine.equations):
             if q.goal:
                 rooms["goal"], given[q.target] = len(q.goal), "goal"
@@ -449,8 +466,19 @@ static int @_{name}({more}const double *{q.target}, int steps, double *h, double
                     rooms["none"] = len(routine.state)
                     solving.append(f"const double *{LAST} = (rung < 0) ? state : none;")
                 solving += [f"if (@_{name}({to}) == 0) {{", "    continue;", "}"]
-        call = self.function(f"{routine.name}_of", [*wanted, *held], known, given) % "r"
-        work = "\n".join([*solving, f"{call};", f"status = @_judged(r, {len(wanted)});"])
+        if routine.upon is not None:
+            call, found = self._bodies[routine.upon.name]
+            rooms["b"] = len(found)
+            solving.append(f"{call % 'b'};")
+            known |= {e.number: f"b[{k}]" for k, e in enumerate(found) if e.op is not None}
+        above = [other.body for other in self._routines if other.upon is routine]
+        body = [*routine.body, *_read_of(routine.body, above)]
+        call = self.function(f"{routine.name}_of", body, known, given)
+        self._bodies[routine.name] = call, body
+        rooms["r"] = len(body)
+        work = "\n".join(
+            [*solving, f"{call % 'r'};", f"status = @_judged(r, {len(routine.results)});"]
+        )
         lines = [f"    double {name}[{size}] = {{0.0}};" for name, size in rooms.items()]
         if any(q.home for q in routine.equations):
             lines.append("    int rung;")
@@ -468,7 +496,7 @@ static int @_{name}({more}const double *{q.target}, int steps, double *h, double
             lines.append(f"    @_give(status, {source}, {name}, {len(row)});")
             at += len(row)
         lines.append("    return status;")
-        self.doubles[routine.name] = sum(rooms.values())
+        self.rooms = max(self.rooms, sum(rooms.values()))
         self.add(f"{kind}{self.signature(routine, given=True)}\n{{\n" + "\n".join(lines) + "\n}\n")
 
     def own(self, routine: Routine) -> None:
@@ -479,6 +507,18 @@ static int @_{name}({more}const double *{q.target}, int steps, double *h, double
             f"{self.signature(routine, given=False)}\n{{\n"
             f"    return @_{routine.name}_with({names});\n}}\n"
         )
+
+
+def _read_of(body: Sequence[Expression], above: Iterable[Sequence[Expression]]) -> list[Expression]:
+    """What a body computes on the way and others, that go on from it, read."""
+    inner = {e.number for e in ordered(body) if e.op is not None and e.level == SAMPLE}
+    known = {e.number for e in body}
+    found: dict[int, Expression] = {}
+    for results in above:
+        beyond = [e for e in ordered(results, known) if e.number not in inner]
+        read = [*results, *(x for e in beyond for x in e.args)]
+        found |= {e.number: e for e in read if e.number in inner - known}
+    return list(found.values())
 
 
 def _without(names: Container[str], results: Sequence[Expression]) -> list[Expression]:

@@ -87,7 +87,7 @@ class Package:
         # A table of no numbers is none in C.
         edges = {e.number: e for row in rows for e in edge(row)}
         self.parameters = [*edges.values()] or [self.payload[0]]
-        self.unit = Unit(self.prefix, self.parameters)
+        self.unit = Unit(self.prefix, self.parameters, self.routines)
         self._write()
 
     # Programs.
@@ -112,6 +112,7 @@ class Package:
             inputs: Mapping[str, int],
             kernels: Callable[[], Kernel] | Sequence[Callable[[], Kernel]],
             own: Sequence[Any] | Array = (),
+            upon: str = "",
             **outputs: str,
         ) -> None:
             if self._wants(name):
@@ -121,7 +122,8 @@ class Package:
                     rows |= found
                 made = {key: rows[row] for key, row in outputs.items()}
                 last = rows.get(LAST, ())
-                result.append(Routine(name, inputs, made, equations, summary, state=last))
+                base = next((r for r in result if r.name == upon), None)
+                result.append(Routine(name, inputs, made, equations, summary, last, base))
 
         engine, p = robot.engine, self._inertial() if self.massive else ()
         if self.massive:
@@ -138,13 +140,14 @@ class Package:
             )  # fmt: skip
             add(
                 "torques_next", "The efforts of _torques",
-                rates | {"qdd": n} | wrench, lambda: stream_torques(robot), p, tau="efforts",
+                rates | {"qdd": n} | wrench, lambda: stream_torques(robot), p, "torques",
+                tau="efforts",
             )  # fmt: skip
             add(
                 "torques_and_singularity_next", "The results of _torques_and_singularity",
                 rates | {"qdd": n} | wrench,
                 [lambda: stream_torques(robot), robot.singularity_kernel], p,
-                tau="efforts", index="measure",
+                "torques_and_singularity", tau="efforts", index="measure",
             )  # fmt: skip
         add("forward", "Pose of joint positions.", q, lambda: engine.forward, pose="pose")
         add(
@@ -164,7 +167,8 @@ class Package:
             )  # fmt: skip
             add(
                 "accelerations", "Joint accelerations that efforts tau cause.",
-                rates | {"tau": n} | wrench, lambda: accelerations(robot), p, qdd="accelerations",
+                rates | {"tau": n} | wrench, lambda: accelerations(robot), p, "mass_matrix",
+                qdd="accelerations",
             )  # fmt: skip
         if "terms" in self._names:
             add(
@@ -203,18 +207,17 @@ class Package:
         # No frame that is a mechanism.
         sound = self.fold.tape.lift(row[-1] - HELD)
         equations = [replace(q, branch=[*q.branch, sound]) for q in equations]
-        made = (
-            Routine(
-                "compliance", {"q": self.n}, {"c": row[2 * k + 7 : 2 * k + 43]}, equations,
-                "Compliance of the platform at its reference point, joints locked: x y z rx ry rz, "
-                "base axes, row by row.",
-            ),
-            Routine(
-                "strain_energy", {"q": self.n, "wrench": 6}, {"energies": row[k : 2 * k]},
-                equations, f"Strain energy (J) of each element: {', '.join(elastic.names)}.",
-            ),
+        compliance = Routine(
+            "compliance", {"q": self.n}, {"c": row[2 * k + 7 : 2 * k + 43]}, equations,
+            "Compliance of the platform at its reference point, joints locked: x y z rx ry rz, "
+            "base axes, row by row.",
         )  # fmt: skip
-        result += [routine for routine in made if self._wants(routine.name)]
+        energy = Routine(
+            "strain_energy", {"q": self.n, "wrench": 6}, {"energies": row[k : 2 * k]}, equations,
+            f"Strain energy (J) of each element: {', '.join(elastic.names)}.",
+            upon=compliance if self._wants("compliance") else None,
+        )  # fmt: skip
+        result += [routine for routine in (compliance, energy) if self._wants(routine.name)]
 
     def _inertial(self) -> Array:
         """Run-time inputs of the dynamics, by the payload's numbers."""
@@ -358,8 +361,7 @@ int @_parameters(double mass, const double *com, const double *inertia, double *
 
     def readme(self) -> str:
         """What the functions are, and what they cost at most."""
-        doubles = self.unit.doubles
-        largest = max(doubles.values()) * 8
+        largest = (self.unit.rooms + max(self.unit.doubles.values())) * 8
         names = list(self.robot.joint_names)
         return README.format(
             name=self.prefix, robot=self.prefix.removeprefix("pkm_"), joints=", ".join(names),
