@@ -179,7 +179,7 @@ LEAST = {"delta": 0.026, "delta_cu": 0.026, "prru": 0.26, "upr_rpu": 0.23}
 def test_limbs_of_the_shipped_robots_never_meet(name):
     """In no pose that the other limits allow; the least is at the edge of these."""
     robot, at_least = load(name), LEAST[name]
-    poses = box(robot, 41)
+    poses = box(robot, 29)
     otherwise = reachable(robot, poses, -math.inf)
     assert otherwise.sum() > 1000
     assert at_least < clearance(robot, poses[otherwise]).min() < 1.1 * at_least

@@ -10,14 +10,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from delta_dynamics import inverse_dynamics
 from pkm_twin import Robot
 from pkm_twin.certify.maximal import Maximal, State
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.identification.fit import fit
 from pkm_twin.recordings import Recording
 from pkm_twin.robot.robot_urdf import robot_description
-from test.identification.machines import machine
+from test.identification.machines import machine, noisy
 from test.laws.recordings import engine_efforts
 from test.laws.test_fit import truths
 from test.support.robots import load
@@ -42,20 +41,19 @@ class Walking(Maximal):
 
 
 @cache
-def drawn(name: str) -> tuple[Robot, Robot, Recording, Array]:
-    """The robot as its file has it and in truth, a recording, and the efforts' size by joint."""
+def drawn(name: str) -> tuple[Robot, Robot, Recording]:
+    """The robot as its file has it and in truth, and a recording."""
     rng = np.random.default_rng([7, *name.encode()])
     robot = load(name)
     m = machine(robot, rng)
-    size = np.sqrt(np.mean(inverse_dynamics(robot, m.q, m.qd, m.qdd) ** 2, 0))
     efforts = engine_efforts(Walking(robot_description(m.truth)), m.q, m.qd, m.qdd)
-    return robot, m.truth, Recording(robot, m.time, m.q, effort=efforts), size
+    return robot, m.truth, Recording(robot, m.time, m.q, effort=efforts)
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("name", ROBOTS)
 def test_clean_efforts_give_what_was_drawn(name: str) -> None:
-    robot, truth, recorded, _ = drawn(name)
+    robot, truth, recorded = drawn(name)
     true = truths(truth, KINDS)
     for number in fit(robot, [recorded], KINDS).numbers:
         error = abs(number.after - true[number.name])
@@ -75,16 +73,10 @@ def test_clean_efforts_give_what_was_drawn(name: str) -> None:
 @pytest.mark.parametrize("name", ROBOTS)
 def test_noisy_efforts_keep_every_truth_within_three_deviations(name: str) -> None:
     """In 95 of 100: 1 % noise of the efforts, an encoder with 1e5 steps a span."""
-    robot, truth, recorded, size = drawn(name)
-    true, good, step = truths(truth, KINDS), 0, 1e-5 * np.ptp(recorded.q, axis=0)
+    robot, truth, recorded = drawn(name)
+    true, good = truths(truth, KINDS), 0
     for seed in range(100):
-        rng = np.random.default_rng([seed, 5])
-        shape = recorded.q.shape
-        noisy = dataclasses.replace(
-            recorded,
-            q=np.round(recorded.q / step + rng.normal(size=shape)) * step,
-            effort=recorded.effort + 0.01 * size * rng.normal(size=shape),
-        )
-        numbers = fit(robot, [noisy], KINDS).numbers
+        one = noisy(recorded, np.random.default_rng([seed, 5]))
+        numbers = fit(robot, [one], KINDS).numbers
         good += all(abs(n.after - true[n.name]) <= 3.0 * n.deviation for n in numbers)
     assert good >= 95

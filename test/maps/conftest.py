@@ -30,7 +30,7 @@ def same(one, other):
     return True
 
 
-POINTS = {"modes": 60, "frequency": 60, "workspace": 4000, "isotropy": 2000}
+POINTS = {"modes": 60, "frequency": 60, "workspace": 4000, "isotropy": 2000, "payload": 600}
 
 
 class Few(StrainEnergy):

@@ -63,7 +63,7 @@ def test_the_volume_is_that_of_random_poses(name, count, rng, tmp_path):
     robot = load(name)
     low, high = robot.search_box().T
     share = reachable(robot, rng.uniform(low, high, (count, len(low)))).mean()
-    sweep = map_of(robot, Workspace(), 40 ** len(low))
+    sweep = map_of(robot, Workspace(), 32 ** len(low))
     with open_map(run(sweep, tmp_path / "a.nc", workers=1)) as data:
         expected = share * np.prod(high - low)
         assert float(data.volume) == pytest.approx(expected, rel=0.06)
