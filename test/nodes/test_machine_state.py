@@ -72,7 +72,7 @@ class TestState:
             assert len(MachineState(robot).joint_names) == len(state.joints)
             assert state.twist is None and state.rates is None
 
-    def test_rates_of_all_joints(self, robot):
+    def test_rates_of_all_joints_and_the_platforms_twist(self, robot):
         q = poses(robot, 1)[0]
         qd = np.linspace(0.1, 0.3, len(q))
         state = told(robot, q, qd)
@@ -80,12 +80,6 @@ class TestState:
         ends = [told(robot, q + s * h * qd).joints for s in (-1.0, 1.0)]
         assert np.allclose(state.rates, (ends[1] - ends[0]) / (2 * h), atol=1e-7)
         assert (state.rates[: len(q)] == qd).all()
-
-    def test_the_twist_is_the_platforms_motion(self, robot):
-        q = poses(robot, 1)[0]
-        qd = np.linspace(0.1, 0.3, len(q))
-        state = told(robot, q, qd)
-        h = 1e-5
         places = [robot.platform(q + s * h * qd) for s in (-1.0, 1.0)]
         velocity = (places[1][0] - places[0][0]) / (2 * h)
         spin = (places[1][1] - places[0][1]) @ state.rotation.T / (2 * h)
@@ -110,7 +104,7 @@ class TestState:
         core.reset()
         assert core.latest is None
 
-    def test_the_loadis_the_nearest_wrench_and_not_an_old_one(self):
+    def test_the_load_is_the_nearest_wrench_and_not_an_old_one(self):
         robot = load("upr_rpu")
         settings = WrenchSettings("ft", max_state_age=0.01, sensor_xyz=(0.0, 0.0, 0.1))
         core = MachineState(robot, settings)
@@ -161,11 +155,11 @@ class TestScene:
             lengths.append(np.linalg.norm(places[:, 1] - places[:, 0], axis=1)[straight])
         assert np.ptp(lengths, axis=0).max(initial=0.0) < 1e-9
 
-    def test_without_a_loadthere_is_the_machine_alone(self, robot):
+    def test_without_a_load_there_is_the_machine_alone(self, robot):
         assert set(by_group(Scene(robot).shapes(told(robot, poses(robot, 1)[0])))) == {"bars"}
 
     @each_elastic
-    def test_a_loadis_drawn_as_the_numbers_say(self, robot):
+    def test_a_load_is_drawn_as_the_numbers_say(self, robot):
         scales = Scales(deflection=500.0, force=0.002, moment=0.03, ellipsoid_force=50.0)
         scene = Scene(robot, scales)
         state = told(robot, poses(robot, 1)[0])
@@ -220,15 +214,3 @@ class TestScene:
         groups = by_group(Scene(robot).shapes(state, loaded(robot, state.q, np.zeros(6))))
         assert not {"dominant", "wrench"} & set(groups)
         assert "compliance" in groups
-
-
-def test_members_move_with_the_platform_where_they_meet_it():
-    robot = load("prru")
-    state = told(robot, poses(robot, 1)[0])
-    given = loaded(robot, state.q)
-    for limb in ("limb I", "limb II", "limb III"):
-        points, moved = given.members[limb]
-        end = int(np.argmin(np.linalg.norm(points - state.position, axis=1)))
-        arm = points[end] - state.position
-        rigid = given.deflection[:3] + np.cross(given.deflection[3:], arm)
-        assert np.allclose(moved[end], rigid, atol=1e-3 * np.abs(rigid).max())

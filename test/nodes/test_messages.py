@@ -63,7 +63,7 @@ def trajectory(make, **changes):
     return make.trajectory(**(fields | changes))
 
 
-def with_entry(values, index, value):
+def at(values, index, value):
     changed = list(values)
     changed[index] = value
     return changed
@@ -86,13 +86,13 @@ def damaged(value):
     """Each value of each kind of message, damaged: the message, the changes, the reason, words."""
     reason = "" if math.isfinite(value) else "not finite"
     for what, joint in product(("position", "velocity", "effort"), range(3)):
-        yield "state", {what: with_entry(Q, joint, value)}, reason, (NAMES[joint], what)
+        yield "state", {what: at(Q, joint, value)}, reason, (NAMES[joint], what)
     for what in ("positions", "velocities", "accelerations"):
-        row = with_entry(Q, 1, value)
-        yield "trajectory", {what: with_entry([Q] * 3, 2, row)}, reason, ("point 2: ", "arm_2")
+        row = at(Q, 1, value)
+        yield "trajectory", {what: at([Q] * 3, 2, row)}, reason, ("point 2: ", "arm_2")
     for entry in range(6):
         word = ("force" if entry < 3 else "torque") + "." + "xyz"[entry % 3]
-        yield "wrench", {"values": with_entry(WRENCH, entry, value)}, reason or "bounds", (word,)
+        yield "wrench", {"values": at(WRENCH, entry, value)}, reason or "bounds", (word,)
 
 
 @pytest.mark.parametrize("value", DAMAGED)
@@ -108,7 +108,7 @@ def wrong_lengths():
         yield "state", {what: row}, f"{len(row)} values for 3 names"
     rows = ((), (0.1, 0.2), (*Q, 0.4))
     for what, row, point in product(("positions", "velocities", "accelerations"), rows, range(3)):
-        values = {what: with_entry([Q] * 3, point, row)}
+        values = {what: at([Q] * 3, point, row)}
         yield "trajectory", values, f"point {point}: {len(row)} {what} for 3"
 
 
@@ -116,10 +116,6 @@ def test_a_wrong_length_names_both_lengths(make):
     for kind, changes, word in wrong_lengths():
         reason, text = reject(READ[kind], changed(make, kind, changes))
         assert reason == "length" and word in text
-
-
-def at(values, joint, value):
-    return with_entry(values, joint, value)
 
 
 @pytest.mark.parametrize(
@@ -221,7 +217,7 @@ class TestJointState:
 
     @pytest.mark.parametrize(("what", "value"), [("position", 6300.0), ("velocity", 1.1e4)])
     def test_a_robot_without_limits_still_has_physical_bounds(self, make, limitless, what, value):
-        message = state(make, **{what: with_entry(Q, 0, value)})
+        message = state(make, **{what: at(Q, 0, value)})
         assert reject(JointReader(limitless).joint_state, message, NOW, RULES)[0] == "bounds"
         assert JointReader(limitless).joint_state(state(make, position=(3, 3, 3)), NOW, RULES)
 
