@@ -22,6 +22,7 @@ from pkm_twin.identification.calibration_state import Poses
 from pkm_twin.identification.measurements import read_poses
 from test.support.command import Commands
 from test.support.robots import load, random_joints
+from test.support.tables import write_columns
 
 
 def measured(path: Path, noise: float = NOISE, count: int = 60) -> None:
@@ -159,8 +160,7 @@ def test_numbers_that_are_no_poses_of_this_machine(
         if name.removesuffix(".position") in names.split():
             columns[name] = how(columns[name])
     path, out = tmp_path / "poses.csv", tmp_path / "mine.yaml"
-    table = np.stack(list(columns.values()), -1)
-    np.savetxt(path, table, "%.17g", ",", header=",".join(columns), comments="")
+    write_columns(path, columns)
     with pytest.raises(PkmTwinError, match=re.escape(text)):
         command(Calibrate(robot="upr_rpu", poses=path, out=out, frame=frame))
     assert not out.exists()

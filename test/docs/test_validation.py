@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import yaml
 
 from delta_dynamics import inverse_dynamics
 from pkm_twin import load
@@ -29,13 +28,6 @@ class TestFrequenciesOfTheDeltaCu:
     def first(self, robot):
         return natural_frequencies(robot, self.pose, 1)[0]
 
-    def changed(self, folder, **members):
-        data = parameters_of("delta_cu")
-        data["members"].update(members)
-        path = folder / "changed.yaml"
-        path.write_text(yaml.safe_dump(data, sort_keys=False))
-        return load(path)
-
     def across(self):
         """The same robot, the universal joint's second axis across its forearm."""
         robot = replace(self.robot, name="across")
@@ -46,21 +38,21 @@ class TestFrequenciesOfTheDeltaCu:
         vars(robot)["graph"] = replace(graph, joints=graph.joints | {joint.name: turned})
         return robot
 
-    def test_what_they_hang_on(self, tmp_path):
+    def test_what_they_hang_on(self, variant):
         members = parameters_of("delta_cu")["members"]
         carbon = {k: members["forearm"][k] for k in ("youngs_modulus", "shear_modulus", "density")}
         width = members["parallelogram_width"]
-        rod = self.changed(tmp_path, rcu_forearm={**members["rcu_forearm"], **carbon})
+        rod, _ = variant("delta_cu", members={"rcu_forearm": members["rcu_forearm"] | carbon})
         own = self.first(self.robot)
         pattern = (
             r"second axis is the limb's radial one \(first frequency (\d+) Hz; (\d+\.\d+) Hz with "
             r"an axis across the forearm\) and its rod is of aluminium \((\d+) Hz of carbon\)"
         )
         assert_printed(PAGE, pattern, own, self.first(self.across()), self.first(rod))
-        moved = [
-            abs(self.first(self.changed(tmp_path, parallelogram_width=f * width)) / own - 1)
-            for f in (0.5, 2.0)
+        others = [
+            variant("delta_cu", members={"parallelogram_width": f * width})[0] for f in (0.5, 2.0)
         ]
+        moved = [abs(self.first(robot) / own - 1) for robot in others]
         pattern = r"half or twice the parallelograms' width moves it by (\d+) %"
         assert_printed(PAGE, pattern, 100 * max(moved))
 

@@ -17,7 +17,6 @@ import pytest
 from numpy.typing import NDArray
 
 from delta_dynamics import inverse_dynamics
-from pkm_twin.machine import schema
 from pkm_twin.mechanisms.prru import Prru
 from test.support.bodies import bodies
 from test.support.robots import load, partly_long
@@ -30,31 +29,16 @@ INERTIA = ((0.6, 0.05, -0.02), (0.05, 0.5, 0.03), (-0.02, 0.03, 0.8))
 
 
 def machine(branch: str, link_com: float, platform_com: tuple[float, ...] = (0, 0, 0)) -> Prru:
-    robot = load("prru")
-    assert isinstance(robot, Prru)
     inertia = {
-        "slider_mass": 8.0,
-        "lower_link_mass": 3.5,
-        "upper_link_mass": 2.5,
-        "platform_mass": 25.0,
         "link_com": link_com,
         "lower_link_inertia": list(LOWER),
         "upper_link_inertia": list(UPPER),
         "platform_com": list(platform_com),
         "platform_inertia": [list(row) for row in INERTIA],
     }
-    g = robot.geometry
-    return schema.build(
-        Prru,
-        {
-            "mechanism": "prru",
-            "geometry": {
-                **{f.name: getattr(g, f.name) for f in dataclasses.fields(g)},
-                "branch": branch,
-            },
-            "inertia": inertia,
-        },
-    )
+    robot = load("prru").changed(geometry={"branch": branch}, inertia=inertia)
+    assert isinstance(robot, Prru)
+    return robot
 
 
 def turn(axis: int, angle: Any) -> Array:

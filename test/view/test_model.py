@@ -44,12 +44,8 @@ def states(model, count, rng):
     tried = low + (high - low) * rng.random((count, len(low)))
     moved = [model.to_joints(model.start, q) for q in tried]
     good = [state for state in moved if not state.refusal]
-    assert len(good) >= count / 5, name_of(model)
+    assert len(good) >= count / 5, model.robot.name
     return good
-
-
-def name_of(model):
-    return model.robot.name
 
 
 @every_model
