@@ -139,11 +139,8 @@ class Assembly:
             angular[:, k] = column
         return linear, angular
 
-    def residual(self, closure: Joint, rates: bool = True) -> tuple[Array, Array]:
-        """How far a closure is open, shape (rows,), m and rad, and its rates, (rows, count).
-
-        :param rates: without them their count is zero.
-        """
+    def _misses(self, closure: Joint, rates: bool) -> list[tuple[Array, Array]]:
+        """How far a closure is open, m and rad, and the rates of that, shape (rows, count)."""
         a, b = self.frame(closure, 0), self.frame(closure, 1)
         (va, wa), (vb, wb) = (
             self.twist(link, pose.position) if rates else np.zeros((2, 3, 0))
@@ -172,16 +169,18 @@ class Assembly:
                 rows.append((np.array([first @ second - closure.cosine]), (normal @ turn)[None]))
             else:
                 raise NotImplementedError(f"a closure that holds {held!r}")
-        return np.concatenate([r for r, _ in rows]), np.vstack([j for _, j in rows])
+        return rows
 
     def residuals(self, rates: bool = True) -> tuple[Array, Array]:
-        """All closures' rows."""
-        rows = [self.residual(closure, rates) for closure in self.tree.closures]
-        if not rows:
-            return np.zeros(0), np.zeros((0, len(self.steps) if rates else 0))
+        """How far the closures are open, shape (rows,), m and rad, and the rates, (rows, count).
+
+        :param rates: without them their count is zero.
+        """
+        rows = [(np.zeros(0), np.zeros((0, len(self.steps) if rates else 0)))]
+        rows += [row for closure in self.tree.closures for row in self._misses(closure, rates)]
         return np.concatenate([r for r, _ in rows]), np.vstack([j for _, j in rows])
 
-    def close(self, values: Array, held: Mask | None = None) -> tuple[Array, float]:
+    def close(self, values: Array, held: Mask | bool = False) -> tuple[Array, float]:
         """Values that close the loops by least steps, and the greatest miss left.
 
         Redundant closures of a rounded file contradict each other by that rounding: directions that
@@ -199,7 +198,7 @@ class Assembly:
         self.place(best)
         return best, miss
 
-    def _close(self, values: Array, rank: float, held: Mask | None) -> tuple[Array, float]:
+    def _close(self, values: Array, rank: float, held: Mask | bool) -> tuple[Array, float]:
         self.place(values)
         residual, _ = self.residuals(rates=False)
         slow = 0
@@ -207,12 +206,8 @@ class Assembly:
             miss = float(np.linalg.norm(residual))
             if miss < 1e-15 or slow > SLOW:
                 break
-            rates = self.residuals()[1]
-            if held is not None:
-                rates = np.where(held, 0.0, rates)
-            step = -np.linalg.lstsq(rates, residual, rcond=rank)[0]
-            if held is not None:
-                step[held] = 0.0
+            rates = np.where(held, 0.0, self.residuals()[1])
+            step = np.where(held, 0.0, -np.linalg.lstsq(rates, residual, rcond=rank)[0])
             step *= min(1.0, STEP / max(float(np.abs(step).max(initial=0.0)), 1e-300))
             for _ in range(12):
                 self.place(values + step)
@@ -252,16 +247,15 @@ class Assembly:
             raise self._open()
         return values, miss
 
-    def relaxed(self, values: Array, held: Mask | None = None) -> Array:
+    def relaxed(self, values: Array, held: Mask | bool = False) -> Array:
         """The values nearest to the drawing that closed loops can move to from these; place them.
 
         :param held: steps that keep their values, shape (count,); by default none does.
         """
-        free = np.ones(len(self.steps), bool) if held is None else ~held
         self.place(values)
         miss = max(self.miss(), 1e-12)
         for _ in range(ROUNDS):
-            rates, own = self.residuals()[1] * free, values * free
+            rates, own = (np.where(held, 0.0, table) for table in (self.residuals()[1], values))
             slope = own - np.linalg.lstsq(rates, rates @ own, rcond=RANKS[0])[0]
             if float(np.abs(slope).max(initial=0.0)) < 1e-12:
                 break
@@ -279,9 +273,10 @@ class Assembly:
 
     def _open(self) -> ParameterError:
         """The error of loops that do not close, with the one that misses the most."""
-        misses = {c.name: self.residual(c)[0] for c in self.tree.closures}
-        worst = max(misses, key=lambda name: float(np.abs(misses[name]).max()))
-        closure = next(c for c in self.tree.closures if c.name == worst)
+        closure = max(
+            self.tree.closures,
+            key=lambda one: max(float(np.abs(r).max()) for r, _ in self._misses(one, rates=False)),
+        )
         a, b = (self.frame(closure, end) for end in (0, 1))
         apart = 1e3 * float(np.linalg.norm(b.position - a.position))
         turned = float(np.linalg.norm(_angle(a.rotation.T, b.rotation)))
@@ -289,7 +284,7 @@ class Assembly:
         if closure.kind == "fixed":
             what += f" and {turned:.3g} rad"
         return ParameterError(
-            worst, f"open by {what} between {closure.inner} and {closure.outer}",
+            closure.name, f"open by {what} between {closure.inner} and {closure.outer}",
             f"loops that close within {self.closed:g} (m or rad)",
         )  # fmt: skip
 
@@ -297,13 +292,10 @@ class Assembly:
 def _between(first: Array, second: Array) -> Array:
     """The rotation vector that turns one line into the other; a hinge's axis has no sign."""
     side = float(first @ second)
-    normal: Array = np.cross(first, second if side >= 0.0 else -second)
+    normal = np.cross(first, second if side >= 0.0 else -second)
     size = float(np.linalg.norm(normal))
-    angle = math.atan2(size, abs(side))
-    if size > 1e-12:
-        scaled: Array = normal * (angle / size)
-        return scaled
-    return normal
+    scale = math.atan2(size, abs(side)) / size if size > 1e-12 else 1.0
+    return np.asarray(scale * normal, np.float64)
 
 
 def _angle(inverse: Array, rotation: Array) -> Array:
