@@ -7,10 +7,40 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from delta_dynamics.feedforward import Feedforward, Settings
-from pkm_twin.streams.monitor import Pace, TopicStatistics
+from pkm_twin.streams.monitor import MANY, Pace, StreamMonitor, TopicStatistics
 from pkm_twin.streams.rates import RateAgreement
 from test.nodes.harness import SECOND
 from test.support.robots import load
+
+
+def test_a_stop_holds_with_its_reason_until_enough_good_samples_in_a_row():
+    stream = StreamMonitor(trip_count=2, recovery_count=2)
+    assert not stream.reject("a", "1") and stream.accept()
+    assert not stream.reject("a", "2") and stream.reject("b", "3")
+    # It stops once.
+    assert not stream.stop("c", "4") and not stream.reject("d", "5")
+    assert (stream.stops, stream.rejected) == ({"b": 1}, {"a": 2, "b": 1, "d": 1})
+    assert [stream.accept(), stream.reject("d", "6"), stream.accept()] == [False] * 3
+    assert stream.stopped and stream.accept() and stream.accepted == 2
+    assert not stream.reject("a", "7") and stream.status == "a: 7"
+    assert stream.stop("e", "8") and not stream.accept()
+    # By hand, it runs at once, and counts from there.
+    assert stream.resume() and not stream.resume()
+    assert stream.accept() and not stream.reject("a", "9") and stream.reject("a", "10")
+
+
+def test_the_status_has_the_rejects_since_the_stop_where_they_are_many():
+    stream = StreamMonitor(trip_count=1, recovery_count=1)
+    for reason in ("a", "b"):
+        stream.stop(reason, "1")
+        for _ in range(MANY - 1):
+            stream.reject(reason, "2")
+        assert stream.status == f"{reason}: 1"
+        stream.reject(reason, "3")
+        assert stream.status == f"{reason}: 1; rejected since then: {MANY}"
+        stream.reject("c", "4")
+        assert stream.status.endswith(f": {MANY + 1}, the last: c: 4")
+        stream.accept()
 
 
 def answered(pace, stamps):
