@@ -19,12 +19,12 @@ from pkm_twin.errors import PkmTwinError, SingularityError, UnreachableError, on
 from pkm_twin.identification.compare import (
     LEAST,
     MAX_RESIDUAL,
-    NEAR,
     Compared,
     by_held,
     compared_of,
     idle_of,
     missing_samples,
+    near_change,
     near_jumps,
     recorded_of,
     step_fault,
@@ -287,9 +287,9 @@ def _shares(r: Recording, idle: Mask, compared: Compared | None) -> tuple[list[F
     items.append(judged(COMPARED, text, bound, enough or None))
     if enough:
         return items, ""
-    near = np.zeros_like(idle) if r.load is None else r.load.near_change(r.time, NEAR)
+    near, within = near_change(r)
     left_out = {
-        f"are within {NEAR:g} s of a change of the payload: record longer between changes, or "
+        f"are within {within:.3g} s of a change of the payload: record longer between changes, or "
         "one payload throughout": float(np.mean(near)),
         "have idle drives: record with the drives on": float(np.mean(idle & ~near)),
     }
@@ -458,7 +458,7 @@ def _explanations(
     for text, wrench in wrenches(r):
         yield text, replace(r, wrench=wrench), left_out
     for text, load in _payloads(r, c) if r.load is None else ():
-        near = load.near_change(r.time, NEAR) if load.times else np.zeros_like(left_out)
+        near, _ = near_change(r, load)
         # On these samples the efforts do not agree without it.
         if not near.any() or not _agrees(r, left_out | near, c.bound):
             yield text, replace(r, load=load), left_out | near

@@ -32,7 +32,7 @@ from pkm_twin.identification.samples import (
     tracks,
     usual_size,
 )
-from pkm_twin.recordings import Recording, at_rest, by_load
+from pkm_twin.recordings import Load, Recording, at_rest, by_load
 from pkm_twin.report import Fact, judged
 from pkm_twin.streams.drives import idle_samples
 from pkm_twin.streams.rates import rms
@@ -51,7 +51,9 @@ MORE: Final = 3.0
 LIGHT: Final = 0.05
 """Part of the greatest peak effort of its unit that a joint's peak is taken for at least."""
 NEAR: Final = 0.5
-"""Around a pick or release the payload is neither held nor gone, s."""
+"""Around a pick or release the payload is neither held nor gone, s, at most;"""
+LENGTHS: Final = 4.0
+"""and so many lengths of the filter, which follows the motion: a short cycle has fast ones."""
 SHOWN: Final = 4
 """Jumps that are listed."""
 CLEAR: Final = 4
@@ -268,8 +270,23 @@ def recorded_of(r: Recording, leave_out: Mask | None = None) -> Recording:
             leave_out |= idle_of(r) & (r.efforts != "current")
         # Where nothing would be left, the efforts themselves are the fault.
         leave_out &= not leave_out.all()
-    keep = ~leave_out
-    return r.part(keep if r.load is None else keep & ~r.load.near_change(r.time, NEAR))
+    return r.part(~(leave_out | near_change(r)[0]))
+
+
+def near_change(r: Recording, load: Load | None = None) -> tuple[Mask, float]:
+    """Samples next to a pick or release, shape (samples,), and how near they are, s."""
+    load, within = load or r.load, NEAR
+    if load is None or not load.times:
+        return np.zeros(len(r.time), np.bool_), within
+    if len(r.time) >= LEAST:
+        rates = None if r.qd is None or r.qdd is None else (r.qd, r.qdd)
+        pieces, how = tracks(r.time, r.q, np.zeros_like(r.q), rates=rates, least=LEAST)
+        if how.cutoff is not None:
+            within = min(NEAR, LENGTHS / how.cutoff)
+        elif any(piece.qd.any() for piece in pieces):
+            # Not filtered from a fifth of the rate of the samples on.
+            within = min(NEAR, LENGTHS * 5.0 * pieces[0].period)
+    return load.near_change(r.time, within), within
 
 
 def compared_of(r: Recording, idle: Mask, bound: float = MAX_RESIDUAL) -> Compared | None:

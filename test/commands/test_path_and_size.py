@@ -589,6 +589,11 @@ def test_a_payload_between_two_waypoints_of_a_cycle(twin, tmp_path):
     data = twin.told(*line, "--load", "0.5@0:3")
     ((begin, end),) = data["payload"]["held_s"]
     assert (begin, end) == (0.0, pytest.approx(data["stretches"][1]["begin_s"], abs=1e-9))
+    # A cycle of a quarter of a second can be checked between the changes of its payload.
+    out = tmp_path / "cycle.csv"
+    twin.good(*line, "--fastest", "--load", "0.5@0:3", "--out", out, "--no-picture")
+    assert checked(out, robot="delta").code == 0
+    assert checked(out, robot="delta", payload="0.5").code == 1
     for wrong in ("0.5@3:3", "0.5@0:7", "x@0:1", "0.5", "500@0:3"):
         twin(*line, "--load", wrong).one_line_error()
     twin.good(*line, "--load", "0.5@0:3", "--payload", "1", code=2)
