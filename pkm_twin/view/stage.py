@@ -106,7 +106,7 @@ class Stage:
         )  # fmt: skip
         self._server.on_client_connect(self._frame)
         camera = self._server.initial_camera
-        camera.position = tuple((middle + 1.05 * reach * LOOK).tolist())
+        camera.position = tuple((middle + 1.15 * reach * LOOK).tolist())
         camera.look_at = tuple(middle.tolist())
         camera.up = (0.0, 0.0, 1.0)
         draw.add_frame("/base", **_axes(0.12 * size, size))
