@@ -51,6 +51,10 @@ NOUNS: Final = ("robot", "mechanism", "map", "launch argument", "command")
 """Fields whose value is a name of this kind of thing."""
 
 
+MOST_NAMES: Final = 60
+"""Valid names that an error lists; of more it lists the nearest."""
+
+
 class UnknownNameError(ParameterError):
     """A key or name that does not exist.
 
@@ -61,7 +65,11 @@ class UnknownNameError(ParameterError):
         names = sorted(valid)
         match = difflib.get_close_matches(str(name), names, n=1, cutoff=0.5)
         self.closest: str | None = match[0] if match else None
-        super().__init__(field, name, f"one of {', '.join(names)}")
+        shown, more = names, ""
+        if len(names) > MOST_NAMES:
+            shown = difflib.get_close_matches(str(name), names, n=5, cutoff=0.0)
+            more = f" or {len(names) - len(shown)} others"
+        super().__init__(field, name, f"one of {', '.join(shown)}{more}")
         self.valid = names
         if field == str(name) or field.endswith(f".{name}"):
             what = f"unknown key {field!r}"

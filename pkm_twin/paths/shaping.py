@@ -216,7 +216,7 @@ def shaped(
             check_positions(motion.robot, way, fine.q, 0.0, singularity)
             return result
         plain = replace(plain, runs=tuple(run.slower(over) for run in plain.runs))
-    raise ParameterError("shaper", shaper, "limits that the shaped motion meets")
+    raise ParameterError("motion", f"{shaper} passes its limits", "wider limits, or no shaper")
 
 
 def _rates(

@@ -100,7 +100,7 @@ def parse_loads(texts: Sequence[str], waypoints: int) -> list[float | None]:
     """
     result: list[float | None] = [None] * waypoints
     for text in texts:
-        match = re.fullmatch(r"([^@]+)@(\d+):(\d+)", text.strip())
+        match = re.fullmatch(r"([^@]+)@([0-9]+):([0-9]+)", text.strip())
         masses = parse_numbers(match[1]) if match else []
         if match is None or len(masses) != 1 or masses[0] < 0.0:
             raise ParameterError("load", text, "MASS@FROM:TO, kg and two waypoints, as in 0.5@2:4")

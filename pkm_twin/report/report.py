@@ -29,7 +29,7 @@ class Fact:
     ``name``: its key in JSON; empty where JSON has the value elsewhere. ``value``: a number, word,
     list or mapping, in SI units. ``text``: its label in the terminal; None where it is in JSON
     alone. ``shown``: the value in words, by default its number. ``bound`` and ``verdict``: of a
-    judged property.
+    judged property, with its ``numbers`` for JSON.
     """
 
     name: str
@@ -39,6 +39,7 @@ class Fact:
     shown: str = ""
     bound: Any = None
     verdict: Verdict | None = None
+    numbers: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def words(self) -> str:
@@ -46,10 +47,13 @@ class Fact:
         return self.shown or f"{number(self.value)} {self.unit}".strip()
 
 
-def judged(what: str, value: str, bound: str, good: bool | None) -> Fact:
-    """A property in words against its bound; ``good``: None where nothing can be told."""
+def judged(what: str, value: str, bound: str, good: bool | None, **numbers: Any) -> Fact:
+    """A property in words against its bound; ``good``: None where nothing can be told.
+
+    :param numbers: of the property, for JSON: ``number``, ``limit`` and ``unit``.
+    """
     verdict = Verdict.UNKNOWN if good is None else Verdict.GOOD if good else Verdict.BAD
-    return Fact("", value, text=what, bound=bound, verdict=verdict)
+    return Fact("", value, text=what, bound=bound, verdict=verdict, numbers=numbers)
 
 
 @dataclass(frozen=True)
@@ -158,7 +162,7 @@ class Report:
         """
         found = {fact.name: fact.value for fact in self.facts if fact.name}
         items = [
-            {"what": f.text, "value": f.words, "bound": f.bound, "verdict": f.verdict}
+            {"what": f.text, "value": f.words, "bound": f.bound, "verdict": f.verdict, **f.numbers}
             for f in self.facts
             if f.verdict is not None
         ]

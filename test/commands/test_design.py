@@ -34,6 +34,9 @@ def test_a_better_robot_is_written_and_loads(twin, pick, tmp_path):
     effort, least = data["items"]
     assert effort["value"] == f"{peak['after']:.4g} N m"
     assert [effort["verdict"], least["verdict"]] == ["good", "good"]
+    assert effort["number"] == pytest.approx(peak["after"])
+    assert (effort["limit"], effort["unit"]) == (20.0, "N m")
+    assert least["number"] == pytest.approx(index["after"])
     assert picture.read_bytes()[:4] == b"\x89PNG"
     better = load(out)
     for path, value in data["numbers"].items():

@@ -542,6 +542,7 @@ def test_what_is_no_path_is_one_line(twin, tmp_path, text, options):
 def test_a_command_line_needs_one_path(twin, tmp_path):
     for words in (
         "path delta", "path delta --cycle 0.025,0.305", "path delta --cycle 25,305 --circle 0.1",
+        "path delta --circle 0.1 --direction 45",
         "path delta --cycle 25,305 --effort 1,2", "size delta",
     ):  # fmt: skip
         twin.good(*words.split(), code=2)
@@ -594,7 +595,7 @@ def test_a_payload_between_two_waypoints_of_a_cycle(twin, tmp_path):
     twin.good(*line, "--fastest", "--load", "0.5@0:3", "--out", out, "--no-picture")
     assert checked(out, robot="delta").code == 0
     assert checked(out, robot="delta", payload="0.5").code == 1
-    for wrong in ("0.5@3:3", "0.5@0:7", "x@0:1", "0.5", "500@0:3"):
+    for wrong in ("0.5@3:3", "0.5@0:7", "x@0:1", "0.5", "500@0:3", "0.5@\u0660:3"):
         twin(*line, "--load", wrong).one_line_error()
     twin.good(*line, "--load", "0.5@0:3", "--payload", "1", code=2)
     points = tmp_path / "points.csv"

@@ -283,3 +283,10 @@ class TestChanges:
         with pytest.raises(ParameterError):
             robot.changed(**sections)
         assert (robot.inertial == before).all()
+
+
+def test_of_many_names_the_nearest_are_listed():
+    names = [f"offset_{k}" for k in range(5000)]
+    error = UnknownNameError("parameter", "offset_12x", names)
+    assert error.closest in names and error.valid == sorted(names)
+    assert len(str(error)) < 200

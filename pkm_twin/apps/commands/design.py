@@ -252,10 +252,12 @@ def against_limits(found: Found, path: PosePath) -> Iterator[Fact]:
         k = int((peaks / limit).argmax())
         unit, good = robot.effort_units[k], bool(peaks[k] <= limit[k])
         what = f"effort of {robot.joint_names[k]} on the path"
-        yield judged(what, f"{peaks[k]:.4g} {unit}", f"{limit[k]:g} {unit}", good)
+        numbers = {"number": float(peaks[k]), "limit": float(limit[k]), "unit": unit}
+        yield judged(what, f"{peaks[k]:.4g} {unit}", f"{limit[k]:g} {unit}", good, **numbers)
     index = float(followed.singularity.min())
     what = "singularity index on the path"
-    yield judged(what, f"{index:.4g}", f"{REGULAR:g} or more", index >= REGULAR)
+    numbers = {"number": index, "limit": REGULAR, "unit": ""}
+    yield judged(what, f"{index:.4g}", f"{REGULAR:g} or more", index >= REGULAR, **numbers)
 
 
 def at_bound(value: float, bound: tuple[float, float]) -> str:

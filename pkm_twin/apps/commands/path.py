@@ -250,12 +250,14 @@ def _unloaded(given: Motion, machine: Robot) -> tuple[Way, list[float] | None]:
         raise typer.BadParameter("give one of WAYPOINTS, --cycle and --circle")
     if given.waypoints is not None:
         if given.at is not None or given.dwell or given.direction is not None:
-            raise typer.BadParameter("--at, --direction and --dwell are for --cycle and --circle")
+            raise typer.BadParameter("--at, --direction and --dwell are not for waypoints")
         return read_waypoints(given.waypoints, machine, given.blend, given.dialect)
     if given.at is not None and len(given.at) != len(machine.pose_names):
         names = ", ".join(machine.pose_names)
         raise typer.BadParameter(f"--at has {len(given.at)} numbers; expected a pose: {names}")
     if given.circle is not None:
+        if given.direction is not None or given.dwell:
+            raise typer.BadParameter("--direction and --dwell are for --cycle")
         home = machine.home() if given.at is None else np.array(given.at)
         return paths.circle(machine, home, given.circle), None
     lengths = given.cycle or ()
