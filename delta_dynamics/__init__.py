@@ -46,6 +46,7 @@ from delta_dynamics.torques.virtual_work import (
     forward_dynamics,
     inverse_dynamics,
     mass_matrix,
+    null_efforts,
 )
 
 __all__ = [
@@ -76,6 +77,7 @@ __all__ = [
     "mass_matrix",
     "max_driving_force",
     "max_driving_force_range",
+    "null_efforts",
     "parameter_names",
     "parameter_units",
     "parameter_values",

@@ -161,7 +161,8 @@ class UnreachableError(PkmTwinError, ValueError):
     ``limb`` is the name of the limb or joint, ``index`` the sample's index in the batch (``()`` for
     one sample), ``miss`` the gap that remains (m), ``reached`` the fraction of the straight line
     from home up to which there is an assembly, None if no line was followed.
-    ``question``: whether the pose has another unit, in place of that fraction.
+    ``question``: whether the pose has another unit, in place of that fraction. ``how``: why the
+    limb has no place, in place of the gap.
     """
 
     def __init__(
@@ -172,12 +173,13 @@ class UnreachableError(PkmTwinError, ValueError):
         miss: float,
         reached: float | None = None,
         question: str = "",
+        how: str = "",
     ) -> None:
         where = f" at sample {index if len(index) != 1 else index[0]}" if index else ""
         way = "" if reached is None else f", beyond {100 * reached:.3g} % of the way from home"
         way = question or way
         # A limb of no length at all misses nothing, and points nowhere.
-        how = f"misses by {miss:.6g} m" if miss else "has no direction there"
+        how = how or (f"misses by {miss:.6g} m" if miss else "has no direction there")
         super().__init__(f"{what}{where} is unreachable: {limb} {how}{way}")
         self.reached = reached
         self.limb = limb

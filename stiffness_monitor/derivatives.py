@@ -42,7 +42,7 @@ def compliance_derivatives(robot: Robot, pose: ArrayLike, by: Sequence[str] = ()
         slopes = robot.made(FileNumbers, tuple(by), elastic_numbers).slopes
         table = _square(by_numbers @ slopes)
         found = {path: np.ascontiguousarray(table[..., k]) for k, path in enumerate(by)}
-    back = np.linalg.inv(robot.jacobian(robot.inverse(pose)))
+    back = robot.inverse_jacobian(robot.inverse(pose))
     return Derivatives(_square(by_q @ back), found)
 
 

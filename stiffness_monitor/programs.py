@@ -252,7 +252,7 @@ class Solved:
         """These outputs of q and further inputs."""
         t = self.t
         rows = {name: t.lift(row) for name, row in outputs.items()}
-        sizes = {"q": t.joints} | inputs
+        sizes = t.inputs("q") | inputs
         return Program(sizes, 0, rows, t.equations())
 
 

@@ -58,6 +58,7 @@ class MomentumObserver:
         """
         if not 0.0 < bandwidth < np.inf:
             raise ValueError(f"bandwidth is {bandwidth:g} 1/s; expected more than 0")
+        robot.check_independent("contacts of measured efforts")
         self.robot = robot
         self.bandwidth = bandwidth
         self._still = np.zeros(robot.joints_count)
@@ -121,6 +122,7 @@ def platform_wrench(robot: Robot, q: ArrayLike, external: ArrayLike) -> Array:
     :param external: external efforts at the joints, shape (..., n):
         J' wrench with the platform's Jacobian J.
     """
+    robot.check_independent("wrenches of measured efforts")
     lever = np.array([1.0, 1.0, 1.0, *(3 * [robot.size])])
     jacobian = robot.platform_jacobian(q) * lever[:, None]
     inverse = np.linalg.pinv(np.swapaxes(jacobian, -1, -2), rcond=RANK)

@@ -103,11 +103,11 @@ def _twists(t: Traced) -> Program:
     columns, rows = t.rate_columns(), []
     for body in t.graph.bodies:
         rows += [*np.ravel(t.motion.turned(body)), *t.motion.origin[body]]
-    for j in range(t.joints):
-        t.motion.set_rates(columns[j], np.eye(t.joints)[j])
+    for column, own in zip(columns, np.eye(t.joints), strict=True):
+        t.motion.set_rates(column, own)
         for body in t.graph.bodies:
             rows += [*t.motion.speed[body], *t.motion.omega[body]]
-    return Program({"q": t.joints}, 0, {"bodies": t.lift(rows)}, t.equations())
+    return Program(t.inputs("q"), 0, {"bodies": t.lift(rows)}, t.equations())
 
 
 def _kernel(robot: Robot) -> Kernel:

@@ -73,6 +73,7 @@ class PayloadEstimator:
         :param mass_range: standard deviation of a load's mass before anything is known, kg.
         :param reach: the same of its centre, m.
         """
+        robot.check_independent("payloads of measured efforts")
         self._share = LoadShare(robot)
         self.robot = robot = self._share.robot
         names = parameter_names(robot)

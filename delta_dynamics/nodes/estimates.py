@@ -55,11 +55,12 @@ class Estimates:
         """Compile what a stream's samples call, before there are any."""
         still = np.zeros(robot.joints_count)
         motion = robot.inverse(robot.home()), still, still
-        load, contact = PayloadEstimator(robot), ContactMonitor(robot)
+        load = None if self._payload is None else PayloadEstimator(robot)
+        contact = None if self._contact is None else ContactMonitor(robot)
         for k in range(2):
-            if self._payload is not None:
+            if load is not None:
                 load.push(float(k), *motion, still)
-            if self._contact is not None:
+            if contact is not None:
                 contact.push(float(k), motion, still)
         if self._contact is not None:
             self._contact.prepare()

@@ -376,6 +376,7 @@ class Simulation(Core):
     """
 
     def __init__(self, robot: Robot, settings: MachineSettings, start: int) -> None:
+        robot.check_independent("simulated motions")
         bounds = robot.limits.position
         if bounds is not None:
             places = zip(robot.joint_names, settings.start, bounds, strict=True)

@@ -148,7 +148,7 @@ def numbers_gradient(robot: Robot) -> Kernel:
 
 def _by_motion(t: Traced) -> Program:
     program = torque_program(t)
-    return gradient_program(t, program, {name: t.tape.inputs(name, t.joints) for name in MOTION})
+    return gradient_program(t, program, {name: t.drives.variables(name) for name in MOTION})
 
 
 def _by_numbers(t: Traced) -> Program:

@@ -26,6 +26,7 @@ from delta_dynamics.torques.virtual_work import body_mass_matrix, frictionless, 
 from pkm_twin.codegen.arrays import Array, doubles, finite, vectors
 from pkm_twin.errors import ParameterError, SingularityError
 from pkm_twin.machine.pose_grid import zero_torsion
+from pkm_twin.robot.derivatives import joint_changes
 from pkm_twin.robot.robot import Robot
 
 
@@ -203,8 +204,7 @@ def joint_motion(
     q, inverse = _inverse_jacobian(robot, pose)
     m = len(robot.pose_names)
     qd = np.einsum("...ij,...j->...i", inverse, vectors(rates, m, "pose rates"))
-    bias = robot.pose_acceleration(q, qd, np.zeros(robot.joints_count))
-    qdd = np.einsum("...ij,...j->...i", inverse, _accelerations(accelerations, m) - bias)
+    qdd = joint_changes(robot, q, qd, inverse, _accelerations(accelerations, m))
     finite(qdd, "an acceleration")
     q, qd, qdd = np.broadcast_arrays(q, qd, qdd)
     return JointMotion(q.copy(), qd.copy(), qdd)
@@ -376,15 +376,14 @@ def _accelerations(values: ArrayLike, size: int) -> Array:
 def _inverse_jacobian(robot: Robot, pose: ArrayLike) -> tuple[Array, Array]:
     """Joint positions and joint rates per pose rate, shapes (..., n) and (..., n, m)."""
     q = robot.inverse(pose)
-    u, s, vt = np.linalg.svd(robot.jacobian(q))
+    s = np.linalg.svd(robot.jacobian(q), compute_uv=False)
     # Against one m/rad at least: where all limbs are stretched the whole Jacobian vanishes.
     measure = s[..., -1] / np.maximum(s[..., 0], 1.0)
     bad = np.argwhere(~(measure > STRETCHED))
     if len(bad):
         index = tuple(int(i) for i in bad[0])
         raise SingularityError("pose", index, float(measure[index]), STRETCHED)
-    inverse = (vt.swapaxes(-1, -2) / s[..., None, :]) @ u.swapaxes(-1, -2)
-    return q, np.asarray(inverse, np.float64)
+    return q, robot.inverse_jacobian(q)
 
 
 def _inverse_root(robot: Robot, form: Array) -> Array:

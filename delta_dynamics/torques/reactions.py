@@ -14,7 +14,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from delta_dynamics.torques.virtual_work import Forces
+from delta_dynamics.torques.virtual_work import Forces, body_efforts
 from pkm_twin.codegen.arrays import Array, Mask, finite
 from pkm_twin.codegen.expressions import PARAMETERS
 from pkm_twin.codegen.kernels import Kernel
@@ -352,8 +352,26 @@ def balance(
     load = np.zeros(6) if wrench is None else wrench
     loads = robot.evaluate(loads_kernel(robot), robot.inertial, q, qd, qdd, load)
     found = balanced(robot, loads)
+    if robot.redundant:
+        efforts = robot.evaluate(body_efforts(robot), robot.inertial, q, qd, qdd, load)[0]
+        found = _with_efforts(found, efforts)
     finite(found.value, "the motion or the wrench")
     return found
+
+
+def _with_efforts(found: Balance, efforts: Array) -> Balance:
+    """The balances whose actuated components are these, which are chosen, shape (..., n)."""
+    names = [joint.actuated for joint in found.joints if joint.actuated is not None]
+    rows = [found.components.index(name) for name in names]
+    unit = found.unit[..., rows]
+    u, s, vt = np.linalg.svd(found.null[..., rows, :])
+    used, turned = s > RANK_BOUND, found.null @ vt.swapaxes(-1, -2)
+    apart = np.einsum("...ij,...i->...j", u, (efforts - found.value[..., rows]) / unit)
+    along = np.where(used, apart / np.where(used, s, 1.0), 0.0)
+    n = len(rows)
+    moved = np.einsum("...kj,...j->...k", turned[..., :n], along)
+    turned[..., :n] = np.where(used[..., None, :], 0.0, turned[..., :n])
+    return replace(found, value=found.value + moved * found.unit, null=turned)
 
 
 def balanced(robot: Robot, loads: Sequence[Array], *, strict: bool = True) -> Balance:
@@ -404,9 +422,8 @@ def _loads(t: Traced) -> Program:
     t.solve()
     layout = Layout(t.tree)
     bodies, rods, gravity, *_, passive = layout.split(t.tape.inputs(PARAMETERS, layout.size))
-    n = t.joints
-    t.set_rates(t.tape.inputs("qd", n))
-    t.set_accelerations(t.tape.inputs("qdd", n), gravity)
+    t.set_rates(t.drives.given("qd"))
+    t.set_accelerations(t.drives.given("qdd"), gravity)
     motion, graph = t.motion, t.graph
     forces = Forces(motion)
     # Rods stand for themselves here.
@@ -442,7 +459,7 @@ def _loads(t: Traced) -> Program:
         "rods": t.lift(rod_rows),
         "joints": t.lift(joint_rows),
     }
-    return Program({"q": n, "qd": n, "qdd": n, "wrench": 6}, layout.size, outputs, t.equations())
+    return Program(t.inputs("q", "qd", "qdd", wrench=6), layout.size, outputs, t.equations())
 
 
 def _unit(moment: Mask, size: Array) -> Array:

@@ -96,6 +96,7 @@ def regressor(
     :returns: Y, shape (..., n, p), N m or N per unit of the parameter; parameters and errors as of
         :func:`~delta_dynamics.inverse_dynamics`.
     """
+    robot.check_independent("parameters of efforts")
     load = np.zeros(6) if wrench is None else wrench
     kernel, gravity = robot.massive().kernel("regressor", _regressor), robot.gravity
     bodies, others = robot.evaluate(kernel, np.ascontiguousarray(gravity), q, qd, qdd, load)

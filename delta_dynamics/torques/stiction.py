@@ -30,6 +30,9 @@ def friction_reach(robot: Robot) -> Array:
     n = robot.joints_count
     if not robot.has_masses:
         return np.zeros(n)
+    if robot.redundant:
+        # A drive cannot move alone: its own friction.
+        return np.array(robot.friction.coulomb)
     q, still = robot.inverse(robot.home()), np.zeros(n)
     size = np.abs(inverse_dynamics(robot, q, still, still)).max()
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Final
 
 import numpy as np
@@ -276,10 +277,10 @@ class Forces:
         self.moment[graph.platform] = self.moment[graph.platform] - six[3:]
 
     def generalised(self) -> tuple[Objects, Objects]:
-        """Down the tree: generalised forces of the unknown rates and of the actuated joints."""
+        """Down the tree: generalised forces of the unknown rates and of the drives that lead."""
         m, tree = self.motion, self.motion.tree
         unknown = np.zeros(tree.unknown_rates, dtype=object)
-        driven = np.zeros(len(tree.graph.actuated), dtype=object)
+        driven = np.zeros(len(tree.graph.leads), dtype=object)
         for link in reversed(list(tree.links.values())):
             force, moment = self.force[link.body], self.moment[link.body]
             absolute = free = False
@@ -317,18 +318,28 @@ def begun(t: Traced) -> tuple[Layout, list[Objects]]:
     return layout, layout.split(t.tape.inputs(PARAMETERS, layout.size))
 
 
-def _efforts(t: Traced, parts: list[Objects], qd: Objects, qdd: Objects) -> list[Any]:
-    """Efforts for a motion under the input ``wrench``."""
-    rotors = parts[ROTORS]
-    loads, basic = _loads(t, parts, qd, qdd), _basic_friction(parts, qd)
-    efforts = [loads[k] + basic[k] + rotors[k] * qdd[k] for k in range(t.joints)]
+def _efforts(
+    t: Traced, parts: list[Objects], qd: Objects, qdd: Objects
+) -> tuple[list[Any], list[Any]]:
+    """Efforts for a motion under the input ``wrench``, of the drives that lead alone.
+
+    :returns: them, and what friction and rotor of each drive take, shape (n,).
+    """
+    loads = _loads(t, parts, qd, qdd)
+    q, rates = t.drives.variables("q"), t.tree.of_drives(qd, t.u)
+    changes = t.tree.of_drives(qdd, t.du)
+    rotors = [rotor * change for rotor, change in zip(parts[ROTORS], changes, strict=True)]
+    basic = _basic_friction(parts, rates)
     for k, values in enumerate(_laws_of(t, parts)):
-        load = loads[k] + rotors[k] * qdd[k]
-        efforts[k] = efforts[k] + friction.taken(t.graph.laws, values, t.q[k], qd[k], load)
-    return efforts
+        # Of drives that share the effort none has a law by load.
+        load = 0.0 if t.drives.others else loads[k] + rotors[k]
+        basic[k] = basic[k] + friction.taken(t.graph.laws, values, q[k], rates[k], load)
+    rows = loads, t.drives.on_leads(basic), t.drives.on_leads(rotors)
+    efforts = [load + rubs + rotor for load, rubs, rotor in zip(*rows, strict=True)]
+    return efforts, [rubs + rotor for rubs, rotor in zip(basic, rotors, strict=True)]
 
 
-def _basic_friction(parts: list[Objects], qd: Objects) -> list[Any]:
+def _basic_friction(parts: list[Objects], qd: Numbers) -> list[Any]:
     """Viscous and Coulomb friction and the constant effort of each drive."""
     rows = zip(*parts[3:6], qd, strict=True)
     return [viscous * v + coulomb * sign(v) + offset for viscous, coulomb, offset, v in rows]
@@ -337,7 +348,7 @@ def _basic_friction(parts: list[Objects], qd: Objects) -> list[Any]:
 def _laws_of(t: Traced, parts: list[Objects]) -> list[dict[str, Any]]:
     """By drive the parameters of its other friction laws; none where there is no law."""
     laws = Layout(t.tree).laws(parts[LAW_VALUES])
-    return [{key: v[k] for key, v in laws.items()} for k in range(t.joints if laws else 0)]
+    return [{key: v[k] for key, v in laws.items()} for k in range(t.drives.count if laws else 0)]
 
 
 def _loads(t: Traced, parts: list[Objects], qd: Objects, qdd: Objects) -> list[Any]:
@@ -357,11 +368,22 @@ def _loads(t: Traced, parts: list[Objects], qd: Objects, qdd: Objects) -> list[A
 
 def torque_program(t: Traced) -> Program:
     """The program of :func:`torques`, to write others with."""
+    return _torques(t, on_bodies=False)
+
+
+def body_efforts(robot: Robot) -> Kernel:
+    """The same less friction and rotors: what the drives do to the bodies."""
+    return robot.massive().kernel("body efforts", partial(_torques, on_bodies=True))
+
+
+def _torques(t: Traced, *, on_bodies: bool) -> Program:
     layout, parts = begun(t)
-    n = t.joints
-    tau = _efforts(t, parts, t.tape.inputs("qd", n), t.tape.inputs("qdd", n))
-    sizes = {"q": n, "qd": n, "qdd": n, "wrench": 6}
-    return Program(sizes, layout.size, {"efforts": t.lift(tau)}, t.equations())
+    leads, own = _efforts(t, parts, t.drives.given("qd"), t.drives.given("qdd"))
+    efforts = t.drives.shared(leads, preload=True)
+    if on_bodies:
+        efforts = [effort - part for effort, part in zip(efforts, own, strict=True)]
+    sizes = t.inputs("q", "qd", "qdd", wrench=6)
+    return Program(sizes, layout.size, {"efforts": t.lift(efforts)}, t.equations())
 
 
 def _stream_torques(t: Traced) -> Program:
@@ -371,10 +393,10 @@ def _stream_torques(t: Traced) -> Program:
 def _accelerations(t: Traced) -> Program:
     layout, parts = begun(t)
     n = t.joints
-    qd, tau = t.tape.inputs("qd", n), t.tape.inputs("tau", n)
-    rest = tau - _efforts(t, parts, qd, np.zeros(n))
+    qd, tau = t.drives.given("qd"), t.tape.inputs("tau", t.drives.count)
+    rest = np.array(t.drives.on_leads([*tau])) - _efforts(t, parts, qd, np.zeros(n))[0]
     laws = _laws_of(t, parts)
-    if laws:
+    if laws and not t.drives.others:
         loads, basic = _loads(t, parts, qd, np.zeros(n)), _basic_friction(parts, qd)
         for k, values in enumerate(laws):
             at_place, dry, share = friction.parts(t.graph.laws, values, t.q[k], absolute(qd[k]))
@@ -389,15 +411,16 @@ def _accelerations(t: Traced) -> Program:
         least = minimum(least, pivot / mass[index, index])
     # Infinite where something would move without mass: the sample is rejected.
     sound = 1.0 / sign(maximum(least - MASSLESS, 0.0))
-    outputs = {"accelerations": t.lift([value * sound for value in root.solve(rest)])}
-    sizes = {"q": n, "qd": n, "tau": n, "wrench": 6}
+    leads = [value * sound for value in root.solve(rest)]
+    outputs = {"accelerations": t.lift(t.drives.followed(leads, t.du))}
+    sizes = t.inputs("q", "qd", "tau", wrench=6)
     return Program(sizes, layout.size, outputs, t.equations())
 
 
 def mass_entries(
     t: Traced, parts: list[Objects], visit: Callable[[Forces], None] | None = None
 ) -> list[Any]:
-    """Entries of the mass matrix, row by row.
+    """Entries of the mass matrix of the drives that lead, row by row.
 
     :param visit: called once a joint, while that joint alone moves, at rate one.
     """
@@ -405,6 +428,7 @@ def mass_entries(
     columns = t.rate_columns()
     n = t.joints
     table: list[list[Any]] = [[0.0] * n for _ in range(n)]
+    rates = [t.tree.of_drives(own, column) for own, column in zip(np.eye(n), columns, strict=True)]
     for j in range(n):
         t.motion.set_rates(columns[j], np.eye(n)[j])
         forces = Forces(t.motion)
@@ -415,14 +439,21 @@ def mass_entries(
         unknown, driven = forces.generalised()
         for k in range(j + 1):
             value = driven[k] + columns[k] @ unknown
-            table[j][k] = table[k][j] = value + rotors[j] if j == k else value
+            if j == k:
+                value = value + rotors[t.drives.leading[j]]
+            for i in t.drives.others:
+                value = value + rotors[i] * rates[j][i] * rates[k][i]
+            table[j][k] = table[k][j] = value
     return [value for row in table for value in row]
 
 
 def _masses(t: Traced) -> Program:
     layout, parts = begun(t)
-    outputs = {"matrix": t.lift(mass_entries(t, parts))}
-    return Program({"q": t.joints}, layout.size, outputs, t.equations())
+    rows: Any = np.reshape(mass_entries(t, parts), (t.joints, t.joints)).tolist()
+    for _ in range(2):
+        rows = [t.drives.shared(row) for row in zip(*rows, strict=True)]
+    outputs = {"matrix": t.lift([value for row in rows for value in row])}
+    return Program(t.inputs("q"), layout.size, outputs, t.equations())
 
 
 def potential(t: Traced, bodies: Objects, rods: Objects, gravity: Objects) -> Any:
@@ -439,16 +470,42 @@ def potential(t: Traced, bodies: Objects, rods: Objects, gravity: Objects) -> An
 
 def _energy(t: Traced) -> Program:
     layout, (bodies, rods, gravity, *_, rotors, passive) = begun(t)
-    n = t.joints
-    qd = t.tape.inputs("qd", n)
+    qd = t.drives.given("qd")
     u = t.set_rates(qd)
     forces = Forces(t.motion)
     forces.momenta(bodies, rods)
     forces.passive_momenta(passive)
     unknown, driven = forces.generalised()
-    double = driven @ qd + u @ unknown + sum((rotors[k] * qd[k] * qd[k] for k in range(n)), 0.0)
+    rates = t.tree.of_drives(qd, u)
+    double = driven @ qd + u @ unknown
+    double = double + sum((r * v * v for r, v in zip(rotors, rates, strict=True)), 0.0)
     outputs = {"energy": t.lift([double * 0.5, potential(t, bodies, rods, gravity)])}
-    return Program({"q": n, "qd": n}, layout.size, outputs, t.equations())
+    return Program(t.inputs("q", "qd"), layout.size, outputs, t.equations())
+
+
+def null_efforts(robot: Robot, q: ArrayLike) -> Array:
+    """Efforts that move nothing, shape (..., n - m, n), of n actuated joints and m freedoms.
+
+    The machine's inner forces: added to any efforts, they change the motion of no part. Rows are
+    of unit length and at right angles in efforts over their limits (``limits.effort``; without
+    limits, in efforts). Errors as of :meth:`Robot.forward`.
+    """
+    if not robot.redundant:
+        batch = vectors(robot.forward(q), len(robot.pose_names), "pose").shape[:-1]
+        return np.zeros((*batch, 0, robot.joints_count))
+    flat = robot.bound(null_kernel)(q)
+    return flat.reshape(*flat.shape[:-1], -1, robot.joints_count)
+
+
+def null_kernel(robot: Robot) -> Kernel:
+    """The program of :func:`null_efforts`: q to its entries, row by row."""
+    return robot.engine.kernel("null efforts", _null_efforts)
+
+
+def _null_efforts(t: Traced) -> Program:
+    t.solve()
+    rows = t.lift([value for row in t.drives.null_efforts() for value in row])
+    return Program(t.inputs("q"), 0, {"efforts": rows}, t.equations())
 
 
 def kernels(robot: Robot) -> tuple[Kernel, ...]:
@@ -490,6 +547,8 @@ class TorqueLoop:
 class Terms:
     """Actuator efforts by cause, shape (..., n) each, N m or N.
 
+    ``preload`` is what drives that share the effort have besides: efforts that move nothing.
+
     ``gravity``, ``inertia`` (linear in qdd) and ``velocity`` (quadratic in qd) are those of the
     robot without its payload; ``payload`` is the gravity, inertia and velocity part of the
     payload together; ``friction`` is viscous, Coulomb and offset; ``external`` balances
@@ -502,12 +561,13 @@ class Terms:
     payload: Array
     friction: Array
     external: Array
+    preload: Array
 
     @property
     def total(self) -> Array:
         """Sum of all, shape (..., n): what ``inverse_dynamics`` gives."""
         own = self.gravity + self.inertia + self.velocity
-        return own + self.payload + self.friction + self.external
+        return own + self.payload + self.friction + self.external + self.preload
 
 
 def frictionless(
@@ -556,8 +616,13 @@ def dynamics_terms(
     still = np.zeros(n)
     none = np.zeros(6)
 
-    def efforts(p: Array, qd: Array, qdd: Array, wrench: Array) -> Array:
+    def whole(p: Array, qd: Array, qdd: Array, wrench: Array) -> Array:
         return robot.evaluate(kernel, p, place, qd, qdd, wrench)[0]
+
+    inner = whole(np.zeros_like(robot.inertial), still, still, none)
+
+    def efforts(p: Array, qd: Array, qdd: Array, wrench: Array) -> Array:
+        return whole(p, qd, qdd, wrench) - inner
 
     layout = Layout(robot.massive().tree)
 
@@ -566,17 +631,25 @@ def dynamics_terms(
     weightless = _without(empty, layout.part(GRAVITY))
     rubbing = _without(robot.own_inertial, layout.part(GRAVITY))
 
-    velocity = efforts(weightless, rate, still, none)
-    friction = efforts(rubbing, rate, still, none) - velocity
+    bent, linear = still, change
+    if robot.redundant:
+        # Of dependent drives, the part of the accelerations that the mass matrix takes.
+        onto = robot.inverse_jacobian(place) @ robot.jacobian(place)
+        bent = robot.agreeing(place, rate)[2]
+        bent = bent - np.einsum("...ij,...j->...i", onto, bent)
+        linear = np.einsum("...ij,...j->...i", onto, change)
+    velocity = efforts(weightless, rate, bent, none)
+    friction = efforts(rubbing, rate, bent, none) - velocity
     if robot.laws:
         # It may grow with the load of the motion itself.
-        whole = (efforts(p, rate, change, load) for p in (robot.inertial, held))
-        friction = next(whole) - next(whole)
+        both = (efforts(p, rate, change, load) for p in (robot.inertial, held))
+        friction = next(both) - next(both)
     return Terms(
         gravity=efforts(empty, still, still, none),
-        inertia=efforts(weightless, still, change, none),
+        inertia=efforts(weightless, still, linear, none),
         velocity=velocity,
         payload=efforts(held, rate, change, none) - efforts(empty, rate, change, none),
         friction=friction,
         external=efforts(weightless, still, still, load),
+        preload=inner,
     )

@@ -263,6 +263,7 @@ class Assembly:
     """
 
     def __init__(self, robot: Robot, q: Array) -> None:
+        robot.check_independent("errors of parts")
         self.robot, self.graph = robot, robot.graph
         self.at, self.size = robot.engine.tree.at, float(robot.graph.size)
         self.bodies = list(self.graph.bodies)

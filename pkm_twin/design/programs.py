@@ -90,6 +90,8 @@ forward: Final = asks(lambda robot: robot.engine.forward)
 """Of q to pose, position and rotation."""
 anywhere: Final = asks(lambda robot: free_forward(robot.engine))
 """As :func:`forward`, one program for machines of every structure."""
+agreeing: Final = asks(lambda robot: robot.agreeing_kernel)
+"""Of q, qd, qdd to those of all drives by the drives that lead."""
 inverse: Final = asks(lambda robot: robot.inverse_kernel)
 """Of the pose to q of some assembly."""
 jacobian: Final = asks(lambda robot: robot.engine.jacobian)

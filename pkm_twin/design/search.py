@@ -66,6 +66,7 @@ class Problem:
     """Machines of a box of variables (each 0 to 1) on a path."""
 
     def __init__(self, robot: Robot, variables: Variables, path: PosePath) -> None:
+        robot.check_independent("designs")
         self.robot, self.variables, self.path = robot, variables, path
         corners = variables.values(np.array([np.zeros(len(variables)), np.ones(len(variables))]))
         self._many = Variants(robot, dict(zip(variables.paths, corners.T, strict=True)))

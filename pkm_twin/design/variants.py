@@ -111,7 +111,9 @@ class Variants:
         reach = [graph.size if graph.joints[name].slides else 1.0 for name in graph.actuated]
         steps = np.linspace(-1.0, 1.0, len(home)) + 0.3
         away = NEAR * np.array([0.0 * steps, steps, -steps]) * reach
-        (poses, *_), good = self.run(programs.forward, (home + away)[None])
+        rest = [np.zeros_like(home)] * 2 * self.robot.redundant
+        ask = programs.agreeing if self.robot.redundant else programs.forward
+        (poses, *_), good = self.run(ask, (home + away)[None], *rest)
         sound = good[..., 0] & np.isfinite(poses).all(-1)
         known = np.isfinite(self.geometry).all(1) & np.isfinite(self.masses).all(1)
         return np.asarray(sound.reshape(len(self), 3).all(1) & known)
@@ -143,6 +145,7 @@ class Variants:
         Where a machine has no assembly or no equilibrium nothing is determinate. Components along
         "across 1" and "across 2" are in the directions that the first robot has.
         """
+        self.robot.check_independent("joint loads of variants")
         load = np.zeros(6) if wrench is None else wrench
         loads, good = self.run(programs.loads, q, qd, qdd, load)
         rows, at = [part.reshape(good.size, part.shape[-1]) for part in loads], np.flatnonzero(good)

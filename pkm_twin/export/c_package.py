@@ -16,6 +16,7 @@ from delta_dynamics.torques.virtual_work import (
     accelerations,
     inverse_dynamics,
     masses_kernel,
+    null_kernel,
     stream_torques,
     torques,
 )
@@ -169,6 +170,11 @@ class Package:
                 "accelerations", "Joint accelerations that efforts tau cause.",
                 rates | {"tau": n} | wrench, lambda: accelerations(robot), p, "mass_matrix",
                 qdd="accelerations",
+            )  # fmt: skip
+        if robot.redundant:
+            add(
+                "null_efforts", "Efforts that move nothing, of unit length over their limits, "
+                "row by row.", q, lambda: null_kernel(robot), n="efforts",
             )  # fmt: skip
         if "terms" in self._names:
             add(
@@ -329,16 +335,16 @@ int @_parameters(double mass, const double *com, const double *inertia, double *
     def example(self) -> str:
         """Home, checked against the Python functions."""
         robot, home = self.robot, self.robot.graph.home
-        rates = np.full(self.n, 0.1)
+        rates, changes = robot.agreeing(home, *np.full((2, self.n), 0.1))[1:]
         tests = {
             "pose": ("forward(q, pose)", robot.forward(home)),
             "joints": ("inverse(pose, joints)", home),
         }
         given = {"q": home}
         if self.massive:
-            tau = inverse_dynamics(robot, home, rates, rates)
-            tests["tau"] = "torques(q, rates, rates, wrench, tau)", tau
-            given |= {"rates": rates, "wrench": np.zeros(6)}
+            tau = inverse_dynamics(robot, home, rates, changes)
+            tests["tau"] = "torques(q, rates, changes, wrench, tau)", tau
+            given |= {"rates": rates, "changes": changes, "wrench": np.zeros(6)}
         for name, (_, values) in tests.items():
             given[f"right_{name}"] = np.round(values, 9) + 0.0
         rows = [

@@ -67,6 +67,8 @@ class Fmu:
                 "friction", law, "viscous, coulomb and offset in an FMU of kind dynamics; "
                 "--kind torques has every law"
             )  # fmt: skip
+        if kind == "dynamics":
+            robot.check_independent("an FMU's dynamics")
         self.robot, self.version, self.kind = robot, version, kind
         self.dynamic = kind == "dynamics"
         self.n = robot.joints_count

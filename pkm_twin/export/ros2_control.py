@@ -50,6 +50,7 @@ def ros2_control_package(robot: Robot, bandwidth: float = 0.0) -> dict[str, str]
     """
     if bandwidth != 0.0:
         check_limit("bandwidth", bandwidth, "Hz")
+    robot.check_independent("controllers of ros2_control")
     robot.massive()
     package = package_name(robot)
     words = _words(robot, package)

@@ -341,6 +341,7 @@ def calibrate(
     :raises ParameterError: too few poses, poses of another machine, unit or frame, poses that tell
         no number, or a fit that does not settle.
     """
+    robot.check_independent("calibrations")
     free, apart = Free(**options), None
     if isinstance(poses, Measured):
         learnt = poses

@@ -33,11 +33,14 @@ _CLEAR: Final = 1e-5
 """Singular values below this share of the greatest are those of deviations."""
 
 
-def mobility_error(linkage: Linkage) -> MobilityError:
-    """The error of a machine whose actuated joints do not determine it, with the causes."""
+def mobility_error(linkage: Linkage, causes: Sequence[Condition] = ()) -> MobilityError:
+    """The error of a machine whose actuated joints do not determine it, with the causes.
+
+    :param causes: what nearly holds; empty: looked for.
+    """
     # What nearly holds takes freedoms away; where there are too many, none is lost.
     lost = linkage.mobility.freedoms < linkage.joints
-    causes = near_conditions(linkage.graph) if lost else []
+    causes = causes or (near_conditions(linkage.graph) if lost else [])
     texts = [c.text for c in causes[:MAX_CAUSES]]
     if len(causes) > MAX_CAUSES:
         texts.append(f"and {len(causes) - MAX_CAUSES} deviations more")
@@ -54,9 +57,7 @@ def singular_home(linkage: Linkage, rank: int, beside: int) -> ParameterError:
     there = null(ju, _NONE)
     # What is free at home and not beside it.
     extra = here - there @ (there.T @ here)
-    names = (
-        _owners(linkage, extra) if here.shape[1] > there.shape[1] else list(linkage.graph.actuated)
-    )
+    names = _owners(linkage, extra) if here.shape[1] > there.shape[1] else list(linkage.graph.leads)
     return ParameterError(
         "joints", f"rank {rank} of the closures at home, {beside} near it",
         f"a home that is not a singularity; at this home {', '.join(names[:8])} can move without "
@@ -64,9 +65,10 @@ def singular_home(linkage: Linkage, rank: int, beside: int) -> ParameterError:
     )  # fmt: skip
 
 
-def near_conditions(graph: Graph) -> list[Condition]:
+def near_conditions(graph: Graph, freedoms: int = 0) -> list[Condition]:
     """Conditions that, were they exact, would give the mobility that the actuated joints need.
 
+    :param freedoms: that they would give at least, in place of one an actuated joint.
     :returns: the least set that is found, the largest deviation first; empty where there is none.
     """
     tried = 0
@@ -76,22 +78,27 @@ def near_conditions(graph: Graph) -> list[Condition]:
         if len(missed) == tried:
             continue
         tried = len(missed)
-        if not is_right(conditions.idealized()):
+        if not is_right(conditions.idealized(), freedoms):
             continue
         dropped: list[Condition] = []
         for condition in missed[:_TRIED]:
-            if is_right(conditions.idealized([*dropped, condition])):
+            if is_right(conditions.idealized([*dropped, condition]), freedoms):
                 dropped.append(condition)
         left = [c for c in missed if not any(c is d for d in dropped)]
         return sorted(left, key=lambda c: -c.size)
     return []
 
 
-def is_right(graph: Graph | None) -> bool:
-    """Whether at home the actuated joints determine the machine and move independently."""
+def is_right(graph: Graph | None, freedoms: int = 0) -> bool:
+    """Whether at home the actuated joints determine the machine and move independently.
+
+    :param freedoms: whether it has as many at least, in place of that.
+    """
     if graph is None:
         return False
     linkage = Linkage(graph)
+    if freedoms:
+        return linkage.mobility.freedoms >= freedoms
     ju, _ = linkage.scaled_at_home()
     return null(ju, _NONE).shape[1] == 0 and linkage.mobility.freedoms == linkage.joints
 
@@ -128,7 +135,7 @@ def _locked(linkage: Linkage) -> list[str]:
     ju, jq = linkage.scaled_at_home()
     unknown = ju.shape[1]
     moves = null(np.hstack([ju, jq]), _NONE)[unknown:]
-    names = np.array(linkage.graph.actuated)
+    names = np.array(linkage.graph.leads)
     rank = int(np.linalg.matrix_rank(moves, _NONE)) if moves.size else 0
     if rank == linkage.joints:
         return []

@@ -73,7 +73,7 @@ class Engine(Scheme):
         :returns: the part of the way, the unknowns there, and the closures' least reciprocal
             condition on it.
         """
-        home = self.graph.home
+        home = self.graph.lead_home
         x, done = np.array(self.tree.home, float), 0.0
         side, least = self._regularity(x, home)
         step = 1 / 8
@@ -128,7 +128,7 @@ class Engine(Scheme):
         def move(state: Array, step: Array) -> Array:
             return self._walk(pose, state, step)[2]
 
-        home = np.array([*self.tree.home, *self.graph.home], float)
+        home = np.array([*self.tree.home, *self.graph.lead_home], float)
         values = least_squares(home, look, move, 40)
         if values is None:
             return self.graph.platform, math.inf, False

@@ -55,7 +55,7 @@ def _by_geometry(t: Traced) -> Program:
 
 def _pose_motion(t: Traced) -> Program:
     t.solve()
-    qd, qdd = t.tape.inputs("qd", t.joints), t.tape.inputs("qdd", t.joints)
+    qd, qdd = t.drives.given("qd"), t.drives.given("qdd")
     t.set_rates(qd)
     t.set_accelerations(qdd)
     motion, graph, of = t.motion, t.graph, t.scheme.coordinates
@@ -70,7 +70,6 @@ def _pose_motion(t: Traced) -> Program:
         "rates": t.lift(poses.rates(of, rotation, velocity, omega)),
         "accelerations": t.lift(second),
     }
-    sizes = {"q": t.joints, "qd": t.joints, "qdd": t.joints}
-    return gradient_program(
-        t, Program(sizes, 0, outputs, t.equations()), {"q": t.q, "qd": qd, "geometry": t.geometry}
-    )
+    program = Program(t.inputs("q", "qd", "qdd"), 0, outputs, t.equations())
+    by = {name: t.drives.variables(name) for name in ("q", "qd")}
+    return gradient_program(t, program, {**by, "geometry": t.geometry})

@@ -97,8 +97,8 @@ def _root(links: Mapping[str, Link], tip: str) -> str | None:
 
 def _regular(tree: Tree, limb: Limb) -> bool:
     """Whether home is far from where the turns do not follow."""
-    motion = Motion(tree, tree.home, tree.graph.home)
-    pose = LimbPose(motion, limb, tree.graph.home)
+    motion = Motion(tree, tree.home, tree.graph.lead_home)
+    pose = LimbPose(motion, limb, tree.graph.lead_home)
     size = float(np.linalg.norm(np.array(pose.lever, float)))
     return bool(abs(float(pose.steepness)) > LEVER * size)
 
@@ -116,7 +116,7 @@ class LimbPose:
         at = motion.graph.joints[limb.ball].at
         self.lever, self._at_home = (
             Motion(tree, (), values, limb.bodies[1:], limb.root).point(limb.tip, at)
-            for values in (q, motion.graph.home)
+            for values in (q, motion.graph.lead_home)
         )
         self.end = motion.point(limb.beyond, at)
         self.apart = self.end - self.link.arm

@@ -49,8 +49,8 @@ class Linkage:
 
     @property
     def joints(self) -> int:
-        """Number of actuated joints."""
-        return len(self.graph.actuated)
+        """Number of actuated joints, of dependent ones of those that lead."""
+        return len(self.graph.leads)
 
     def at(self, x: Numbers, q: Numbers) -> tuple[Motion, list[Row]]:
         """Motion and closures in a state, on numbers."""
@@ -61,7 +61,7 @@ class Linkage:
         """Derivatives by u and by qd, every row and column of unit one."""
         ju, jq = (numbers(m) for m in matrices(self.tree, rows))
         left = np.array([row.scale for row in rows]).reshape(-1, 1)
-        drives = np.array([self._drive_scale(name) for name in self.graph.actuated])
+        drives = np.array([self._drive_scale(name) for name in self.graph.leads])
         return left * ju / np.array(self.tree.scales), left * jq / drives
 
     def _drive_scale(self, name: str) -> float:
@@ -94,10 +94,10 @@ class Linkage:
 
     def _near_home(self) -> list[tuple[Array, Array]]:
         """The same in every run."""
-        graph, home = self.graph, self.graph.home
+        graph, home = self.graph, self.graph.lead_home
         states = [(np.array(self.tree.home, float), home)]
         random = np.random.default_rng(0)
-        slides = np.array([graph.joints[name].slides for name in graph.actuated])
+        slides = np.array([graph.joints[name].slides for name in graph.leads])
         reach = np.where(slides, self.tree.size / 2, 1.0) * REACH
         for _ in range(4 * SAMPLES):
             if len(states) > SAMPLES:
@@ -121,11 +121,11 @@ class Linkage:
     @cached_property
     def parts(self) -> list[str]:
         """The joint or rod of every closure."""
-        return [row.part for row in self.at(self.tree.home, self.graph.home)[1]]
+        return [row.part for row in self.at(self.tree.home, self.graph.lead_home)[1]]
 
     def scaled_at_home(self) -> tuple[Array, Array]:
         """Derivatives of the closures at home by u and by qd, every row and column of unit one."""
-        return self._scaled(self.at(self.tree.home, self.graph.home)[1])
+        return self._scaled(self.at(self.tree.home, self.graph.lead_home)[1])
 
     def regular_state(self) -> tuple[Motion, Array]:
         """The motion in a state of the highest rank at or beside home, and derivatives by u."""
@@ -135,7 +135,7 @@ class Linkage:
     @cached_property
     def mobility(self) -> Mobility:
         """Freedoms, rank and redundancy at home."""
-        _, rows = self.at(self.tree.home, self.graph.home)
+        _, rows = self.at(self.tree.home, self.graph.lead_home)
         both = np.hstack(self._scaled(rows))
         rank = rank_of(both)
         parts: tuple[str, ...] = ()

@@ -97,7 +97,7 @@ class Motion:
 
     def place(self, bodies: Iterable[str], x: Numbers, q: Numbers) -> None:
         """Place further bodies, in the tree's order."""
-        origin = self.graph.home
+        origin = self.graph.lead_home
         for link in map(self.tree.links.__getitem__, bodies):
             turned = self.rotation[link.parent]
             lever = turned @ link.arm
@@ -412,7 +412,7 @@ def reaction_directions(joint: Joint) -> tuple[Direction, ...]:
 
 def matrices(tree: Tree, rows: Sequence[Row]) -> tuple[Objects, Objects]:
     """Derivatives of the closures by u, shape (rows, unknown rates), and by qd, (rows, n)."""
-    n = len(tree.graph.actuated)
+    n = len(tree.graph.leads)
 
     def block(letter: str, size: int) -> NDArray[Any]:
         table = np.zeros((len(rows), size), dtype=object)

@@ -45,31 +45,31 @@ def passive_names(engine: Engine) -> tuple[str, ...]:
 def passive_program(t: Traced) -> Program:
     """Q to all passive numbers."""
     t.solve()
-    return Program({"q": t.joints}, 0, {"passive": t.lift(_values(t))}, t.equations())
+    return Program(t.inputs("q"), 0, {"passive": t.lift(_values(t))}, t.equations())
 
 
 def passive_rates_program(t: Traced) -> Program:
     """Q and qd to the rates of all passive numbers."""
     t.solve()
-    qd = t.tape.inputs("qd", t.joints)
+    qd = t.drives.given("qd")
     rates = t.lift(_rates(t, qd, t.set_rates(qd)))
-    return Program({"q": t.joints, "qd": t.joints}, 0, {"rates": rates}, t.equations())
+    return Program(t.inputs("q", "qd"), 0, {"rates": rates}, t.equations())
 
 
 def state_program(t: Traced) -> Program:
     """Q to position (3) and rotation (9) of the platform, and all passive numbers."""
     t.solve()
-    return Program({"q": t.joints}, 0, _state(t), t.equations())
+    return Program(t.inputs("q"), 0, _state(t), t.equations())
 
 
 def moving_state_program(t: Traced) -> Program:
     """The same of q and qd; then the rates of all passive numbers, and the platform's twist (6)."""
     t.solve()
-    qd = t.tape.inputs("qd", t.joints)
+    qd = t.drives.given("qd")
     u, motion, graph = t.set_rates(qd), t.motion, t.graph
     twist = [*motion.velocity(graph.platform, graph.origin), *motion.omega[graph.platform]]
     outputs = {**_state(t), "rates": t.lift(_rates(t, qd, u)), "twist": t.lift(twist)}
-    return Program({"q": t.joints, "qd": t.joints}, 0, outputs, t.equations())
+    return Program(t.inputs("q", "qd"), 0, outputs, t.equations())
 
 
 def _state(t: Traced) -> dict[str, list[Expression]]:
@@ -98,7 +98,7 @@ def _values(t: Traced) -> list[Any]:
             value = t.q[step.position] - home if step.actuated else t.x[step.position]
             if step.circle:
                 value = atan2(t.x[step.position + 1], value)
-            values += [] if step.actuated else [value + home]
+            values += [] if tree.graph.joints[step.joint].actuated else [value + home]
             values += [step.slide * value] if step.turns and step.slide else []
     for rod in t.graph.rods.values():
         span = motion.turned(rod.inner).T @ _across_ends(t, rod)
@@ -122,7 +122,7 @@ def _rates(t: Traced, qd: Numbers, u: Numbers) -> list[Any]:
             continue
         for step in steps:
             rate = (qd if step.actuated else u)[step.rate]
-            rates += [] if step.actuated else [rate]
+            rates += [] if t.graph.joints[step.joint].actuated else [rate]
             rates += [step.slide * rate] if step.turns and step.slide else []
     for rod in t.graph.rods.values():
         inner, apart = motion.turned(rod.inner), _across_ends(t, rod)

@@ -64,7 +64,7 @@ def forward_program(t: Traced) -> Program:
         "position": t.lift(position),
         "rotation": t.lift(np.ravel(rotation)),
     }
-    return Program({"q": t.joints}, 0, outputs, t.equations())
+    return Program(t.inputs("q"), 0, outputs, t.equations())
 
 
 def jacobian_program(t: Traced) -> Program:
@@ -73,11 +73,12 @@ def jacobian_program(t: Traced) -> Program:
     _, rotation = t.motion.platform()
     twists = t.twists()
     rates = [poses.rates(t.scheme.coordinates, rotation, v, w) for v, w in twists]
+    by_pose, by_twist = (zip(*r, strict=True) for r in (rates, [[*v, *w] for v, w in twists]))
     outputs = {
-        "rates": t.lift([row[i] for i in range(len(t.scheme.coordinates)) for row in rates]),
-        "twist": t.lift([pair[part][i] for part in (0, 1) for i in range(3) for pair in twists]),
+        "rates": t.lift([value for row in by_pose for value in t.drives.shared(row)]),
+        "twist": t.lift([value for row in by_twist for value in t.drives.shared(row)]),
     }
-    return Program({"q": t.joints}, 0, outputs, t.equations())
+    return Program(t.inputs("q"), 0, outputs, t.equations())
 
 
 def placement_program(t: Traced) -> Program:
@@ -86,13 +87,13 @@ def placement_program(t: Traced) -> Program:
     rows: list[Any] = []
     for body in t.graph.bodies:
         rows += [*np.ravel(t.motion.turned(body)), *t.motion.origin[body]]
-    return Program({"q": t.joints}, 0, {"bodies": t.lift(rows)}, t.equations())
+    return Program(t.inputs("q"), 0, {"bodies": t.lift(rows)}, t.equations())
 
 
 def acceleration_program(t: Traced) -> Program:
     """The program of :attr:`.engine.Engine.acceleration`."""
     t.solve()
-    qd, qdd = t.tape.inputs("qd", t.joints), t.tape.inputs("qdd", t.joints)
+    qd, qdd = t.drives.given("qd"), t.drives.given("qdd")
     t.set_rates(qd)
     t.set_accelerations(qdd)
     motion, graph = t.motion, t.graph
@@ -101,8 +102,23 @@ def acceleration_program(t: Traced) -> Program:
         t.scheme.coordinates, motion.turned(body), motion.omega[body],
         motion.acceleration(body, graph.origin), motion.alpha[body],
     )  # fmt: skip
-    sizes = {"q": t.joints, "qd": t.joints, "qdd": t.joints}
-    return Program(sizes, 0, {"acceleration": t.lift(second)}, t.equations())
+    return Program(t.inputs("q", "qd", "qdd"), 0, {"acceleration": t.lift(second)}, t.equations())
+
+
+def agreeing_program(t: Traced) -> Program:
+    """Positions, rates and accelerations of all drives, by those of the drives that lead."""
+    t.solve()
+    q, qd, qdd = (
+        t.tape.inputs(name, t.drives.count)[t.drives.leading] for name in ("q", "qd", "qdd")
+    )
+    t.set_rates(qd)
+    t.set_accelerations(qdd)
+    outputs = {
+        "q": t.lift(t.tree.values_of_drives(q, t.x)),
+        "qd": t.lift(t.tree.of_drives(qd, t.u)),
+        "qdd": t.lift(t.tree.of_drives(qdd, t.du)),
+    }
+    return Program(t.inputs("q", "qd", "qdd"), 0, outputs, t.equations(goal=t.lift(q)))
 
 
 def inverse_program(
@@ -132,14 +148,16 @@ def inverse_program(
             apart = sin(apart)
         same.append(SAME_POSE - absolute(apart) * scale)
     solved = t.equations(branch=t.lift(same), goal=t.lift(q), stage=len(first))
-    return Program({"pose": len(pose)}, 0, {"q": t.lift(q)}, first + solved)
+    return Program(
+        {"pose": len(pose)}, 0, {"q": t.lift(t.tree.values_of_drives(q, t.x))}, first + solved
+    )
 
 
 def _posed(t: Traced, goal: Objects) -> Equations:
     """Newton's method for the unknowns and the joints of a pose, from home."""
     scheme, tree, tape = t.scheme, t.tree, t.tape
     size, split = len(tree.home), tree.unknown_rates
-    home = [*tree.home, *t.graph.home]
+    home = [*tree.home, *t.graph.lead_home]
     everything = tape.inputs(POSED, len(home))
     origin = [0.0 if c.axis is None else t.graph.origin[c.axis] for c in scheme.coordinates]
 

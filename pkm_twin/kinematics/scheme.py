@@ -7,7 +7,8 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from itertools import combinations
+from typing import Any, Final
 
 import numpy as np
 
@@ -17,13 +18,18 @@ from pkm_twin.codegen.key import EMPTY, ProgramKey
 from pkm_twin.codegen.lu import Order, independent_rows, pivot_order
 from pkm_twin.errors import ParameterError
 from pkm_twin.kinematics import pose as poses
-from pkm_twin.kinematics.diagnosis import mobility_error, singular_home
+from pkm_twin.kinematics.diagnosis import mobility_error, near_conditions, singular_home
+from pkm_twin.kinematics.iterations import RANK
 from pkm_twin.kinematics.limbs import Limb, LimbPose, find_limbs
 from pkm_twin.kinematics.linkage import Linkage, rank_of
 from pkm_twin.kinematics.motion import Motion, Row, matrices, numbers
 from pkm_twin.kinematics.pose import Coordinate
+from pkm_twin.kinematics.spins import null
 from pkm_twin.machine.geometry import geometry_of, pattern_of
 from pkm_twin.machine.graph import BASE, Graph
+
+MOVES: Final = 1e-6
+"""Motion of a drive at home, of unit one, and part of the best choice of drives, that is none."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,7 +178,7 @@ class Scheme(Linkage):
         extra = self.pose_rows(motion, pose)
         table = np.array(self._pose_scales)[:, None] * numbers(extra)
         n = self.tree.unknown_rates
-        drives = np.array([self._drive_scale(name) for name in self.graph.actuated])
+        drives = np.array([self._drive_scale(name) for name in self.graph.leads])
         lower = np.hstack([table[:, :n] / np.array(self.tree.scales), table[:, n:] / drives])
         return np.vstack([np.hstack([ju, jq])[self.independent], lower])
 
@@ -190,13 +196,48 @@ class Scheme(Linkage):
         return table
 
 
+def choose_leads(graph: Graph, wanted: Sequence[str] = (), pose: int = 0) -> tuple[str, ...]:
+    """The drives that lead: all, or of more than there are freedoms the most independent ones.
+
+    :param wanted: names, in place of that choice. ``pose``: number of pose coordinates, 0: any.
+    :raises MobilityError: there are more for a deviation alone, or one of them cannot move.
+    :raises ParameterError: names that are no such drives.
+    """
+    linkage, names = Linkage(graph), graph.actuated
+    freedoms = linkage.mobility.freedoms
+    if not 0 < freedoms < len(names) or pose == len(names):
+        if wanted and set(wanted) != set(names):
+            raise ParameterError("redundancy.leads", list(wanted), f"{', '.join(names)}: all lead")
+        return names
+    ju, jq = linkage.scaled_at_home()
+    rates = null(np.hstack([ju, jq]), RANK)[ju.shape[1] :]
+    causes = near_conditions(graph, freedoms + 1)
+    if causes or (np.abs(rates).max(1) < MOVES).any():
+        raise mobility_error(linkage, causes)
+    sizes = {
+        chosen: abs(float(np.linalg.det(rates[list(chosen)])))
+        for chosen in combinations(range(len(names)), freedoms)
+    }
+    best = max(sizes.values())
+    if wanted:
+        places = tuple(sorted(names.index(name) for name in wanted if name in names))
+        if len(places) != len(wanted) or not sizes.get(places, 0.0) > MOVES * best:
+            raise ParameterError(
+                "redundancy.leads", list(wanted),
+                f"{freedoms} of {', '.join(names)} that determine the machine at home",
+            )  # fmt: skip
+        return tuple(names[k] for k in places)
+    # Rounding does not choose among those that are alike.
+    return tuple(names[k] for k in next(c for c, size in sizes.items() if size > 0.999 * best))
+
+
 def choose_coordinates(graph: Graph) -> tuple[str, ...]:
     """Pose coordinates that determine the platform at home, the first ones that do.
 
     :raises ParameterError: something is free to move while the actuated joints are held.
     """
     scheme = Scheme(graph, tuple(poses.COORDINATES.values()))
-    motion, closed = scheme.at(scheme.tree.home, graph.home)
+    motion, closed = scheme.at(scheme.tree.home, graph.lead_home)
     ju, jq = (numbers(m) for m in matrices(scheme.tree, closed))
     independent = scheme.independent
     rates = np.vstack([-np.linalg.solve(ju[independent], jq[independent]), np.eye(scheme.joints)])
@@ -217,16 +258,17 @@ def check_masses(scheme: Scheme, graph: Graph) -> None:
     :param graph: has the masses; the scheme's own graph may have those of another machine.
     :raises ParameterError: by a massless body that must move alone.
     """
-    motion, rows = scheme.at(scheme.tree.home, graph.home)
+    motion, rows = scheme.at(scheme.tree.home, graph.lead_home)
     ju, jq = (numbers(m) for m in matrices(scheme.tree, rows))
     moved = -np.linalg.solve(ju[scheme.independent], jq[scheme.independent])
-    n = len(graph.actuated)
+    n = scheme.joints
     table = []
     for j in range(n):
         motion.set_rates(moved[:, j], np.eye(n)[j])
+        rates = scheme.tree.of_drives(np.eye(n)[j], moved[:, j])
         column = [
-            np.sqrt(graph.joints[name].rotor_inertia) * np.eye(n)[j][k]
-            for k, name in enumerate(graph.actuated)
+            np.sqrt(graph.joints[name].rotor_inertia) * rate
+            for name, rate in zip(graph.actuated, rates, strict=True)
         ]
         for body in graph.bodies.values():
             root = _root(body.inertia)
@@ -241,7 +283,7 @@ def check_masses(scheme: Scheme, graph: Graph) -> None:
     size = np.linalg.norm(values, axis=1, keepdims=True)
     if (size > 0.0).all() and np.linalg.matrix_rank(values / size, 1e-6) == n:
         return
-    joint = graph.joints[graph.actuated[int(np.argmin(size))]]
+    joint = graph.joints[graph.leads[int(np.argmin(size))]]
     idle = next((b for b in (joint.outer, joint.inner) if b != BASE), graph.platform)
     raise ParameterError(
         f"bodies.{idle}.mass", graph.bodies[idle].mass,

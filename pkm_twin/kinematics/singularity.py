@@ -33,7 +33,7 @@ import numpy as np
 
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.codegen.cholesky import SparseCholesky, traces_over
-from pkm_twin.codegen.expressions import Objects, norm, plain
+from pkm_twin.codegen.expressions import Numbers, Objects, norm, plain
 from pkm_twin.codegen.kernels import Kernel
 from pkm_twin.codegen.operations import maximum, minimum, sqrt
 from pkm_twin.codegen.program import Program
@@ -73,7 +73,8 @@ class Placed(Motion):
 
     def __init__(self, motion: Motion) -> None:
         graph = motion.graph
-        true = {name: joint for name, joint in graph.joints.items() if not joint.virtual}
+        # Locked are all drives, those that follow too.
+        true = {n: replace(j, follows=False) for n, j in graph.joints.items() if not j.virtual}
         self.graph: Graph = replace(graph, joints=true)
         self.tree = Tree(self.graph)
         self._found = motion
@@ -119,11 +120,12 @@ class Placed(Motion):
 def _singularity(t: Traced) -> Program:
     t.solve()
     outputs = {"measure": [t.tape.lift(singularity_measure(t))]}
-    return Program({"q": t.joints}, 0, outputs, t.equations())
+    return Program(t.inputs("q"), 0, outputs, t.equations())
 
 
 def _gradient(t: Traced) -> Program:
-    return gradient_program(t, _singularity(t), {"q": t.q, "geometry": t.geometry})
+    by: dict[str, Numbers] = {"q": t.drives.variables("q"), "geometry": t.geometry}
+    return gradient_program(t, _singularity(t), by)
 
 
 def singularity_measure(t: Traced | _AtHome) -> Any:
@@ -144,7 +146,7 @@ class _AtHome:
 
     def __init__(self, linkage: Linkage) -> None:
         self.graph, self.joints = linkage.graph, linkage.joints
-        self.motion, rows = linkage.at(linkage.tree.home, linkage.graph.home)
+        self.motion, rows = linkage.at(linkage.tree.home, linkage.graph.lead_home)
         ju, jq = (numbers(m) for m in matrices(linkage.tree, rows))
         if ju.size and np.linalg.matrix_rank(ju, 1e-9) < ju.shape[1]:
             raise SingularityError("home", (), 0.0, 1e-9)
@@ -185,7 +187,7 @@ def _moved(t: Traced | _AtHome) -> Any:
     lower = {(a, b): table[a, b] for a in range(n) for b in range(a + 1)}
     # Pivots stay above zero where the platform stands still while a joint moves.
     size = t.motion.tree.size
-    lengths = [1.0 if graph.joints[name].slides else size * size for name in graph.actuated]
+    lengths = [1.0 if graph.joints[name].slides else size * size for name in graph.leads]
     root = SparseCholesky(lower, [table[k, k] + length for k, length in enumerate(lengths)])
     farthest: Any = float(n)
     for name in graph.bodies:

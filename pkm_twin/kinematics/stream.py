@@ -26,7 +26,8 @@ LONGEST: Final = 0.02
 def stream_kernel(engine: Engine) -> Kernel:
     """Program of a sample: q (n) and the row of the sample before, to its own row.
 
-    A row begins with q (n), the pose (m) and its rates per joint rate (m n, by row). Then comes
+    A row begins with q (n), the pose (m) and its rates per rate of the drives that lead (m m, by
+    row). Then comes
     what a jump is told by (m): how far the pose is from where the rates lead; and the singularity
     measure. Parameters: what makes lengths of pose coordinates (m); poses and rates are multiplied
     by it.
@@ -39,22 +40,22 @@ def stream_kernel(engine: Engine) -> Kernel:
 
 
 def _stream(t: Traced) -> Program:
-    n, m = t.joints, len(t.scheme.coordinates)
+    n, m = t.drives.count, len(t.scheme.coordinates)
     scales = t.tape.inputs(PARAMETERS, m)
-    before = t.tape.inputs("before", n + m + m * n + m + 1)
+    before = t.tape.inputs("before", n + m + m * m + m + 1)
     t.solve()
     position, rotation = t.motion.platform()
     pose = scales * np.array(poses.values(t.scheme.coordinates, position, rotation), dtype=object)
     columns = [poses.rates(t.scheme.coordinates, rotation, v, w) for v, w in t.twists()]
     rates = scales[:, None] * np.array(columns, dtype=object).T
-    last = before[n + m : n + m + m * n].reshape(m, n)
-    move = t.q - before[:n]
+    last = before[n + m : n + m + m * m].reshape(m, m)
+    move = t.q - before[t.drives.leading]
     predicted = 0.5 * ((rates + last) @ move)
     bend = _sizes(rates - last) @ _sizes(move)
     error = _sizes(pose - before[n : n + m] - predicted)
     beyond = error - 0.5 * _sizes(predicted) - bend
-    row = t.lift([*t.q, *pose, *rates.ravel(), *beyond, singularity_measure(t)])
-    return Program({"q": n, "before": len(before)}, m, {"sample": row}, t.equations())
+    row = t.lift([*t.drives.variables("q"), *pose, *rates.ravel(), *beyond, singularity_measure(t)])
+    return Program(t.inputs("q", before=len(before)), m, {"sample": row}, t.equations())
 
 
 def following(t: Traced, program: Program) -> Program:
@@ -77,7 +78,7 @@ def following(t: Traced, program: Program) -> Program:
     sizes = (1, n, n, n, len(places), k, k, k)
     last = t.tape.inputs(LAST, sum(sizes))
     (holds,), anchor, before, speed, x, u, du, change = np.split(last, np.cumsum(sizes)[:-1])
-    qd, scales = t.tape.inputs("qd", n), np.array(t.drive_scales, dtype=object)
+    qd, scales = t.drives.given("qd"), np.array(t.drive_scales, dtype=object)
     away, move = (t.q - anchor) * scales, (t.q - before) * scales
     mean = (0.5 * (qd + speed)) * scales
     near = both(less(0.0, holds), less(away @ away, REACH * REACH))

@@ -22,6 +22,7 @@ from pkm_twin.codegen.expressions import (
 from pkm_twin.codegen.lu import SparseLU
 from pkm_twin.codegen.operations import cos, sin
 from pkm_twin.codegen.program import AT, STATE, UNKNOWNS, Equations, previous
+from pkm_twin.kinematics.drives import LEADS, TIME, Drives
 from pkm_twin.kinematics.limbs import LimbPose
 from pkm_twin.kinematics.motion import Motion, Row, cross, matrices
 from pkm_twin.kinematics.scheme import Scheme
@@ -47,7 +48,10 @@ class Traced:
         self.more = given[end:]
         """Numbers beside the geometry's, see :meth:`.engine.Engine.kernel_with`."""
         self.tree, self.joints = Tree(self.graph), scheme.joints
-        self.q = self.tape.inputs("q", self.joints)
+        self.drives = Drives(self)
+        self.target = LEADS if self.drives.others else "q"
+        self.q = self.tape.inputs(self.target, self.joints)
+        """Of the drives that lead, all where there are no others."""
 
     def solve(self) -> None:
         """Take unknowns and closures."""
@@ -80,7 +84,7 @@ class Traced:
     @property
     def drive_scales(self) -> list[Any]:
         """What makes joint rates of unit one."""
-        joints = (self.graph.joints[name] for name in self.graph.actuated)
+        joints = (self.graph.joints[name] for name in self.graph.leads)
         return [1.0 / self.tree.size if joint.slides else 1.0 for joint in joints]
 
     @property
@@ -89,11 +93,18 @@ class Traced:
         size = self.tree.size
         return [1.0 if c.axis is None else 1.0 / size for c in self.scheme.coordinates]
 
+    def inputs(self, *names: str, **more: int) -> dict[str, int]:
+        """Sizes of inputs of a program: by name those of all drives, and others."""
+        return dict.fromkeys(names, self.drives.count) | more
+
     def equations(self, **more: Any) -> tuple[Equations, ...]:
         """Newton's method for the unknowns at q, from home or the mechanism's closed form.
 
         :param more: further fields of the equations; ``branch``: beside the mechanism's own.
         """
+        if self.drives.others and "goal" not in more:
+            more["goal"] = self.lift(self.drives.given("q"))
+            more["branch"] = [*more.pop("branch", ()), *self.lift(self.drives.agreeing())]
         scheme, tree = self.scheme, self.tree
         places, rates = scheme.solved
         step = -self.newton.solve([row.value for row in self.solved])
@@ -108,7 +119,7 @@ class Traced:
         onward = self.unknowns + state[AT.onward] * (self.unknowns - before)
         branch = [] if scheme.branch is None else self.lift(scheme.branch(self.motion))
         solved = Equations(
-            "q", self.lift([tree.home[k] for k in places]), self.lift(self.graph.home),
+            self.target, self.lift([tree.home[k] for k in places]), self.lift(self.graph.lead_home),
             self.lift([start[k] for k in places]), self.retracted(onward),
             self.lift([moved[k] for k in places]),
             self.square(step, [tree.scales[k] for k in rates]), self.tape.lift(self._determinant()),
@@ -130,7 +141,7 @@ class Traced:
     def _determinant(self) -> Any:
         """Of all closures, over that at home: of Newton's equations and of the limbs' turns."""
         scheme, motion = self.scheme, self.home
-        limbs = [LimbPose(motion, limb, self.graph.home) for limb in scheme.limbs]
+        limbs = [LimbPose(motion, limb, self.graph.lead_home) for limb in scheme.limbs]
         lu = self._at_home[2]
         if limbs:
             table = self._table(scheme.solved_rows(motion.closures(), limbs))
@@ -148,7 +159,7 @@ class Traced:
     @cached_property
     def home(self) -> Motion:
         """The motion at home."""
-        return Motion(self.tree, self.tree.home, self.graph.home)
+        return Motion(self.tree, self.tree.home, self.graph.lead_home)
 
     @cached_property
     def _at_home(self) -> tuple[Motion, Objects, SparseLU]:
@@ -162,7 +173,7 @@ class Traced:
     def _along(self) -> list[Any]:
         """Unknowns along the tangent at home: nearer than home itself."""
         motion, jq, lu = self._at_home
-        away = self.q - self.graph.home
+        away = self.q - self.graph.lead_home
         # Solved per joint: a sample then only multiplies by what is prepared.
         columns = snapped_all([-lu.solve(jq[:, j]) for j in range(self.joints)])
         return motion.retracted(self.tree.home, columns.T @ away)
@@ -239,6 +250,7 @@ class Traced:
         kept = self.scheme.independent
         self.u = self.lu.solve(-(self.jq[kept] @ np.asarray(qd, dtype=object)))
         self.motion.set_rates(self.u, qd)
+        self.drives.judge("qd", qd, self.u, TIME)
         return self.u
 
     def set_accelerations(self, qdd: Numbers, gravity: Any | None = None) -> None:
@@ -247,6 +259,7 @@ class Traced:
         self.motion.set_accelerations(np.zeros(self.tree.unknown_rates), qdd)
         bias = [self.rows[k].bias() for k in kept]
         self.du = -self.lu.solve(bias)
+        self.drives.judge("qdd", qdd, self.du, TIME * TIME)
         self.motion.set_accelerations(self.du, qdd, gravity)
 
     def rate_columns(self) -> list[Objects]:

@@ -183,6 +183,11 @@ def law_names(friction: Any, opened: Sequence[str] = ()) -> tuple[str, ...]:
     )
 
 
+def by_load(names: Sequence[str]) -> list[str]:
+    """Those of some laws whose effort grows with the load."""
+    return [name for name in names if LAWS[name].share is not FrictionLaw.share]
+
+
 def keys_of(names: Sequence[str]) -> dict[str, Parameter]:
     """Parameters of laws by key, in order."""
     return {key: one for name in names for key, one in LAWS[name].parameters.items()}

@@ -77,7 +77,10 @@ def graph_on(graph: Graph, numbers: Numbers) -> SizedGraph:
         ends = take(rod.ends)
         rods[name] = replace(rod, ends=ends, pair=None if rod.pair is None else take(rod.pair))
     origin = take(graph.origin)
-    return SizedGraph(graph.bodies, joints, rods, graph.platform, origin, graph.laws, list(left))
+    sharing = take(graph.sharing)
+    return SizedGraph(
+        graph.bodies, joints, rods, graph.platform, origin, graph.laws, sharing, list(left)
+    )
 
 
 def pattern_of(tree: Tree) -> str:

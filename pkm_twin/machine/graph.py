@@ -71,6 +71,7 @@ class Joint:
     ``home``: the joint's value at home. ``viscous``, ``coulomb``: friction along its freedom;
     ``rotor_inertia``: against its acceleration, kg m2 or kg.
     ``virtual``: a joint that stands for what other parts hold: it carries no load itself.
+    ``follows``: an actuated joint whose value the other ones determine, see :attr:`Graph.leads`.
     ``directions``: of reactions; without them the joint's own axes. ``normal``: name of a universal
     joint's direction across both axes. ``label``: its name among the reactions, else its own.
     """
@@ -91,6 +92,12 @@ class Joint:
     label: str = ""
     normal: str = "n"
     pitch: float = 0.0
+    follows: bool = False
+
+    @property
+    def leads(self) -> bool:
+        """Whether it is actuated, and its value is none that others determine."""
+        return self.actuated and not self.follows
 
     @property
     def type(self) -> type[JointType]:
@@ -153,6 +160,9 @@ class Graph:
     """Bodies, joints and rods by name; ``platform`` carries the tool at ``origin`` (at home).
 
     ``laws``: of the drives' friction beside the basic one, see :mod:`~pkm_twin.machine.friction`.
+    ``sharing``: of a machine with more drives than freedoms, shape (1 + 2 n,): by how much
+    positions may contradict each other, effort limits (only their ratios count), preload. Else
+    empty.
     """
 
     bodies: Mapping[str, Body]
@@ -161,6 +171,7 @@ class Graph:
     platform: str
     origin: Array
     laws: tuple[str, ...] = ()
+    sharing: Array = field(default_factory=lambda: array([]))
 
     @property
     def actuated(self) -> tuple[str, ...]:
@@ -171,6 +182,21 @@ class Graph:
     def home(self) -> Array:
         """Values of the actuated joints at home, shape (n,)."""
         return np.array([self.joints[name].home for name in self.actuated])
+
+    @property
+    def leads(self) -> tuple[str, ...]:
+        """The actuated joints that determine the machine, as many as it has freedoms, in order."""
+        return tuple(name for name, joint in self.joints.items() if joint.leads)
+
+    @property
+    def leading(self) -> list[int]:
+        """Their places among the actuated joints."""
+        return [k for k, name in enumerate(self.actuated) if self.joints[name].leads]
+
+    @property
+    def lead_home(self) -> Array:
+        """Their values at home, shape (m,)."""
+        return np.array([self.joints[name].home for name in self.leads])
 
     @property
     def size(self) -> float:
@@ -226,7 +252,7 @@ class Graph:
         joints = [
             (
                 j.name, j.kind, j.inner, j.outer, j.actuated, j.virtual, j.loaded,
-                [d.body for d in j.directions],
+                *["follows"] * j.follows, [d.body for d in j.directions],
             )
             for j in self.joints.values()
         ]  # fmt: skip
@@ -245,7 +271,7 @@ class Graph:
                 found += (*direction.vector,)
         for rod in self.rods.values():
             found += (*rod.ends.ravel(), *(() if rod.pair is None else rod.pair))
-        return [*found, *self.origin]
+        return [*found, *self.origin, *self.sharing]
 
     @property
     def key(self) -> str:

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pkm_twin.codegen.arrays import Array
+from pkm_twin.codegen.expressions import references
 from pkm_twin.errors import ParameterError, UnknownNameError
 from pkm_twin.machine import schema
 from pkm_twin.machine.formulas import Written
@@ -31,6 +32,7 @@ from pkm_twin.machine.members import Tube, compliances
 from pkm_twin.machine.places import Keys, number_in, path_of, placed
 from pkm_twin.machine.sections import (
     DriveSpec,
+    Redundancy,
     check_angles,
     friction_fields,
     friction_of,
@@ -474,6 +476,39 @@ def graph_of_entries(
     rods = {n: Rod(n, r.between[0], r.between[1], r.ends, r.mass) for n, r in specs["rods"].items()}
     place = bodies[platform].com if origin is None else array(origin)
     return Graph(bodies, joints, rods, platform, place)
+
+
+def shared_by(graph: Graph, leads: Sequence[str], how: Redundancy, effort: Any) -> Graph:
+    """The graph whose other actuated joints follow of those that lead, and how all share efforts.
+
+    :param effort: limits of all actuated joints, shape (n,); None: none has one.
+    :raises ParameterError: limits of some alone, or a preload of another number of joints.
+    """
+    names = graph.actuated
+    if len(leads) == len(names):
+        if how.preload.size:
+            raise ParameterError(
+                "redundancy.preload", how.preload.tolist(),
+                "none where there are no more actuated joints than degrees of freedom",
+            )  # fmt: skip
+        return graph
+    n = len(names)
+    preload: Any = how.preload if how.preload.size else np.zeros(n)
+    if len(preload) != n:
+        raise ParameterError("redundancy.preload", list(preload), f"{n} efforts, one a joint")
+    limits: Any = np.ones(n) if effort is None else np.broadcast_to(effort, n)
+    for name, limit in zip(names, references(limits), strict=True):
+        if not np.isfinite(limit):
+            raise ParameterError(
+                f"joints.{name}.limits.effort", None,
+                "a limit of every actuated joint, or of none: they share the effort by it",
+            )  # fmt: skip
+    joints = {
+        name: dataclasses.replace(joint, follows=joint.actuated and name not in leads)
+        for name, joint in graph.joints.items()
+    }
+    sharing = array([how.tolerance, *limits, *preload])
+    return dataclasses.replace(graph, joints=joints, sharing=sharing)
 
 
 def drives_of(graph: Graph, joints: Mapping[str, JointSpec]) -> dict[str, Any]:

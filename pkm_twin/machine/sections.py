@@ -120,6 +120,22 @@ class DriveSpec:
         return self.inertia * self.turns**2
 
 
+@dataclass(frozen=True, eq=False)
+class Redundancy:
+    """More actuated joints than degrees of freedom.
+
+    ``leads``: the joints that determine the machine, as many as its freedoms; by default those
+    that are the most independent at home. ``tolerance``: by how much the positions of the others
+    may contradict them, rad, of joints that slide over the machine's size; rates may by as much in
+    0.02 s. ``preload``: the efforts, one a joint, to which those that move the machine come
+    nearest; by default zero.
+    """
+
+    leads: tuple[str, ...] | None = schema.words(default=None)
+    tolerance: float = schema.number(above=0.0, high=0.1, unit="rad", default=1e-3)
+    preload: Array = schema.vector(0, unit="{effort}", default=[])
+
+
 @remembered
 def friction_of(joints: int) -> Any:
     """Schema of friction at so many actuated joints: viscous per rate, Coulomb by its sign.

@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any, Final
 
 import numpy as np
@@ -129,9 +130,32 @@ class Tree:
         """How many rates are unknown."""
         return len(self.owners)
 
+    @cached_property
+    def drives(self) -> list[Step]:
+        """The step of every actuated joint, those that follow too."""
+        steps = {step.joint: step for link in self.links.values() for step in link.steps}
+        return [steps[name] for name in self.graph.actuated]
+
+    def of_drives(self, leads: Any, rest: Any) -> list[Any]:
+        """Rates or accelerations of all drives, of those that lead, shape (m,), and the unknown."""
+        return [(leads if step.actuated else rest)[step.rate] for step in self.drives]
+
+    def values_of_drives(self, leads: Any, x: Any) -> list[Any]:
+        """Positions of all drives of those that lead; turns within half a turn of home."""
+        found = []
+        for step in self.drives:
+            k, home = step.position, self.graph.joints[step.joint].home
+            if step.actuated:
+                found.append(leads[k])
+            else:
+                found.append((atan2(x[k + 1], x[k]) if step.circle else x[k]) + home)
+        return found
+
     def _span(self) -> dict[str, list[tuple[str, str | None]]]:
         graph = self.graph
-        order = sorted(graph.joints.values(), key=lambda j: (not j.actuated, j.type.cost))
+        order = sorted(
+            graph.joints.values(), key=lambda j: (not j.leads, not j.actuated, j.type.cost)
+        )
         pairs: dict[str | tuple[str], tuple[str, str]]
         pairs = {joint.name: (joint.inner, joint.outer) for joint in order}
         pairs |= {(body,): (BASE, body) for body in graph.bodies}
@@ -167,7 +191,7 @@ class Tree:
         else:
             joint = graph.joints[name]
             freedoms, at = joint.freedoms, joint.at
-            backwards, actuated = joint.inner != parent, joint.actuated
+            backwards, actuated = joint.inner != parent, joint.leads
             start = BALL if joint.type.ball else ()
             freedoms = freedoms[::-1] if backwards else freedoms
         sign, frame = -1.0 if backwards else 1.0, self.axes[parent]
@@ -196,7 +220,7 @@ class Tree:
                 before, frame = snapped_all(frame.T @ turned), turned @ rotation_about_z(offset)
             circle = freedom.turns and not freedom.slide and not actuated
             if actuated:
-                position = rate = graph.actuated.index(str(name))
+                position = rate = graph.leads.index(str(name))
             else:
                 position, rate = self._claim(CIRCLE if circle else (0.0,), str(name), 1)
                 self.scales.append(1.0 if freedom.turns else 1.0 / graph.size)

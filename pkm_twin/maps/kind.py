@@ -314,18 +314,13 @@ def unit_motions(robot: Robot, q: Array) -> tuple[Array, Array]:
     """Joint rates of unit rates of the platform, shape (k, n, d), and their directions, (d, 3).
 
     Of the position in the pose, its angles at rest; of a pose of angles alone about the base axes.
-
-    :raises ParameterError: more drives than freedoms, whose rates depend on each other.
     """
-    if len(robot.joint_names) != len(robot.pose_names):
-        what = "as many actuated joints as pose coordinates"
-        raise ParameterError("joints", len(robot.joint_names), what)
+    back = robot.inverse_jacobian(q)
     places = [k for k, name in enumerate(robot.pose_names) if name in "xyz"]
     if not places:
-        turned = np.linalg.pinv(robot.platform_jacobian(q)[..., 3:, :])
-        return np.asarray(turned, np.float64), np.eye(3)
+        return back @ np.linalg.pinv(robot.platform_jacobian(q)[..., 3:, :] @ back), np.eye(3)
     ways = np.eye(3)[["xyz".index(robot.pose_names[k]) for k in places]]
-    return np.asarray(np.linalg.pinv(robot.jacobian(q))[..., places], np.float64), ways
+    return back[..., places], ways
 
 
 def unit_of_motion(robot: Robot) -> str:

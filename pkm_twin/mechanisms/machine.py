@@ -14,7 +14,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, reduce
 from operator import getitem
-from typing import Any, Final, TypeVar
+from typing import Any, ClassVar, Final, TypeVar
 
 import numpy as np
 
@@ -22,9 +22,10 @@ from pkm_twin.codegen.arrays import Array
 from pkm_twin.codegen.expressions import norm, plain, reference
 from pkm_twin.errors import ParameterError
 from pkm_twin.kinematics.pose import COORDINATES, Coordinate
-from pkm_twin.kinematics.scheme import check_masses, choose_coordinates
+from pkm_twin.kinematics.scheme import check_masses, choose_coordinates, choose_leads
 from pkm_twin.machine import schema
 from pkm_twin.machine.formulas import PARAMETERS, Book
+from pkm_twin.machine.friction import by_load
 from pkm_twin.machine.graph import (
     BASE,
     Graph,
@@ -45,6 +46,7 @@ from pkm_twin.machine.graph_file import (
     limbs_of,
     number_of_entry,
     numbered_entry,
+    shared_by,
     written_out,
 )
 from pkm_twin.machine.joints import unit
@@ -61,14 +63,14 @@ from pkm_twin.machine.places import (
     placed,
 )
 from pkm_twin.machine.reach import PassiveLimit
-from pkm_twin.machine.sections import DriveSpec
+from pkm_twin.machine.sections import DriveSpec, Redundancy
 from pkm_twin.mechanisms import TwinRobot
 from pkm_twin.robot.mechanism import Common
 from pkm_twin.robot.robot_urdf import robot_description
 
 M = TypeVar("M", bound="Machine")
 
-MOST_JOINTS: Final = 6
+MOST_JOINTS: Final = 12
 """Most actuated joints."""
 
 
@@ -95,6 +97,7 @@ class MachineFile(Common):
     bodies: Mapping[str, BodySpec] = schema.mapping(BodySpec, default={})
     joints: Mapping[str, JointSpec] = schema.mapping(JointSpec, default={})
     rods: Mapping[str, RodSpec] = schema.mapping(RodSpec, default={})
+    redundancy: Redundancy = schema.section(Redundancy, default={})
     limbs: Sequence[Limb] = schema.key(limbs_of, "a section or a list of them", default=[])
     parameters: Mapping[str, Any] = schema.key(
         lambda _, value: value, "names to numbers or [expressions](new_machine.md#parameters)",
@@ -111,6 +114,9 @@ class Machine(TwinRobot):
     sources: Mapping[tuple[str, str], Source]
     """Where each entry stands in the file, by kind and name."""
     pose: tuple[str, ...]
+    redundancy: Redundancy = schema.section(Redundancy, default={})
+
+    changeable: ClassVar = (*TwinRobot.changeable, "redundancy")
 
     @classmethod
     def from_data(cls, data: Mapping[str, Any], name: str) -> Machine:
@@ -127,12 +133,16 @@ class Machine(TwinRobot):
             raise ParameterError(
                 "joints", len(graph.actuated), f"at most {MOST_JOINTS} actuated joints"
             )
+        own = drives_of(graph, specs["joints"])
+        leads = choose_leads(graph, file.redundancy.leads or (), len(file.pose or ()))
+        graph = shared_by(graph, leads, file.redundancy, own["limits"].effort)
         pose = tuple(file.pose or choose_coordinates(graph))
         common = {field.name: getattr(file, field.name) for field in dataclasses.fields(Common)}
         robot = cls(
             name=name, described=graph, specs=specs, sources=sources, pose=pose, book=book,
-            **common, **drives_of(graph, specs["joints"]),
+            redundancy=file.redundancy, **common, **own,
         )  # fmt: skip
+        robot.check_laws()
         _ = robot.controller
         robot.engine.check()
         check_masses(robot.engine, robot.graph)
@@ -152,7 +162,7 @@ class Machine(TwinRobot):
         made = super().changed(**sections)
         if not sections or not set(sections) <= set(self.changeable):
             return made
-        drives = not {"friction", "limits"}.isdisjoint(sections)
+        drives = not {"friction", "limits", "redundancy"}.isdisjoint(sections)
         told = {key: schema.plain(getattr(made, key)) for key in sections if not drives}
         made = made._with(book=made.book.told_anew(told))
         if not drives:
@@ -162,7 +172,23 @@ class Machine(TwinRobot):
             joints[name] = driven(joints[name], made.friction, made.limits, k)
         specs = {**made.specs, "joints": joints}
         described = graph_of_entries(made.described.platform, specs, made.described.origin)
-        return made._with(specs=specs, described=described)
+        leads = choose_leads(described, made.redundancy.leads or made.described.leads)
+        described = shared_by(described, leads, made.redundancy, made.limits.effort)
+        made = made._with(specs=specs, described=described)
+        made.check_laws()
+        return made
+
+    def check_laws(self) -> None:
+        """Reject friction by the load where drives share it.
+
+        :raises ParameterError: by the law.
+        """
+        if self.redundant and by_load(self.laws):
+            raise ParameterError(
+                "friction", by_load(self.laws)[0],
+                f"a law that does not grow with the load: {self.joints_count} actuated joints "
+                f"share that of {len(self.graph.leads)} degrees of freedom",
+            )  # fmt: skip
 
     def numbered(self, values: Mapping[str, Any]) -> Machine:
         """Paths of entries, ``joints.ball_1.at[0]``, or of a limb's, ``limbs.joints.ball.at[0]``.
@@ -194,10 +220,10 @@ class Machine(TwinRobot):
                 sources[kind, name] = dataclasses.replace(sources[kind, name], azimuth=turned)
         described = graph_of_entries(self.described.platform, specs, origin)
         made = super().numbered(rest)
-        return made._with(
-            described=described, specs=specs, sources=sources, book=book,
-            **drives_of(described, specs["joints"]),
-        )  # fmt: skip
+        own = drives_of(described, specs["joints"])
+        leads, sharing = self.described.leads, made.redundancy
+        described = shared_by(described, leads, sharing, own["limits"].effort)
+        return made._with(described=described, specs=specs, sources=sources, book=book, **own)
 
     def filed(self, values: Mapping[str, Any]) -> Any:
         """As of every robot; parameters and expressions stay, but where a copy's number is new."""
@@ -309,7 +335,7 @@ class Machine(TwinRobot):
         """Units of the same, of each joint by its own type."""
         sections = self.parameter_sections()
         plain = {key: value for key, value in sections.items() if key not in KINDS}
-        result = schema.units(MachineFile, plain, {})
+        result = schema.units(MachineFile, plain, {"effort": self.effort_unit})
         for kind, spec in KINDS.items():
             result[kind] = {}
             for name, entry in sections.get(kind, {}).items():
@@ -390,6 +416,13 @@ class Machine(TwinRobot):
                 if value is not None:
                     told[kind].setdefault(name, {})[word] = value
         return {kind: entries for kind, entries in told.items() if entries}
+
+    def sharing_entries(self) -> dict[str, Any]:
+        """Of the file, with the joints that lead."""
+        if not self.redundant:
+            return {}
+        own = schema.plain(self.redundancy)
+        return {"redundancy": {**own, "leads": list(self.graph.leads)}}
 
     @cached_property
     def passive_limits(self) -> tuple[PassiveLimit, ...]:

@@ -13,6 +13,7 @@ from delta_dynamics.torques.isotropy import sphere_directions
 from pkm_twin.codegen.arrays import Array, Mask
 from pkm_twin.errors import ParameterError
 from pkm_twin.paths.joint_path import only_turns
+from pkm_twin.robot.derivatives import joint_changes
 from pkm_twin.robot.robot import Robot
 from pkm_twin.robot.workspace import counts, try_inverse
 
@@ -119,9 +120,10 @@ def _joint_rates(robot: Robot, q: Array) -> Array:
     Of a machine that only turns, by the platform's angular velocity in axes of its own.
     """
     if only_turns(robot):
+        robot.check_independent("worst directions of a rotation")
         return np.asarray(np.linalg.inv(np.linalg.qr(_turning(robot, q))[1]), np.float64)
     places = [i for i, name in enumerate(robot.pose_names) if name in ("x", "y", "z")]
-    return np.asarray(np.linalg.inv(robot.jacobian(q))[..., places], np.float64)
+    return robot.inverse_jacobian(q)[..., places]
 
 
 def _turning(robot: Robot, q: Array) -> Array:
@@ -131,8 +133,7 @@ def _turning(robot: Robot, q: Array) -> Array:
 def _steady(robot: Robot, q: Array, qd: Array) -> Array:
     """Joint accelerations at which the tool point, or the platform's turn, keeps its velocity."""
     if not only_turns(robot):
-        own = robot.pose_acceleration(q, qd, np.zeros_like(q))
-        return np.asarray(-np.linalg.solve(robot.jacobian(q), own[..., None])[..., 0])
+        return joint_changes(robot, q, qd, robot.inverse_jacobian(q))
     step = STEP / np.maximum(np.abs(qd).max(-1, keepdims=True), STEP)
     ahead, behind = (_turning(robot, q + way * step * qd) for way in (1.0, -1.0))
     own = (ahead - behind) @ qd[..., None] / (2.0 * step[..., None])

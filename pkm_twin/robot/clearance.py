@@ -108,6 +108,6 @@ def _kernel(robot: Robot) -> Kernel:
             gap = distance(*segments[i], *segments[j]) - (radii[i] + radii[j])
             least = gap if least is None else minimum(least, gap)
         outputs = {"clearance": t.lift([least])}
-        return Program({"q": t.joints}, len(segments), outputs, t.equations())
+        return Program(t.inputs("q"), len(segments), outputs, t.equations())
 
     return robot.engine.kernel(f"clearance {ends!r}", write)

@@ -33,11 +33,21 @@ class Derivatives:
 
 def joint_rates(robot: Robot, q: Array, rate: Array, change: Array) -> tuple[Array, Array]:
     """First and second derivatives of joints (k, n) by those of the pose, shape (k, m) each."""
-    jacobian = robot.jacobian(q)
-    first = np.asarray(np.linalg.solve(jacobian, rate[..., None])[..., 0], np.float64)
-    own = robot.pose_acceleration(q, first, np.zeros_like(first))
-    second = np.linalg.solve(jacobian, (change - own)[..., None])[..., 0]
-    return first, np.asarray(second, np.float64)
+    back = robot.inverse_jacobian(q)
+    first = (back @ rate[..., None])[..., 0]
+    return first, joint_changes(robot, q, first, back, change)
+
+
+def joint_changes(
+    robot: Robot, q: Array, qd: Array, back: Array, change: Array | float = 0.0
+) -> Array:
+    """Second derivatives of joints (k, n) by those of the pose, at joint rates (k, n).
+
+    :param back: of :meth:`Robot.inverse_jacobian`, shape (k, n, m).
+    """
+    bent = robot.agreeing(q, qd)[2]
+    own = change - robot.pose_acceleration(q, qd, bent)
+    return np.asarray(bent + (back @ own[..., None])[..., 0], np.float64)
 
 
 def forward_derivatives(robot: Robot, q: ArrayLike, by: Sequence[str] = ()) -> Derivatives:
@@ -63,7 +73,7 @@ def inverse_derivatives(robot: Robot, pose: ArrayLike, by: Sequence[str] = ()) -
     :raises ParameterError: a path that there is not. Other errors as of ``inverse``.
     """
     found = forward_derivatives(robot, robot.inverse(pose), by)
-    back = np.asarray(np.linalg.inv(found.state), np.float64)
+    back = robot.inverse_jacobian(robot.inverse(pose))
     return Derivatives(
         back, {path: -(back @ row[..., None])[..., 0] for path, row in found.by.items()}
     )
@@ -120,6 +130,7 @@ def position_effects(robot: Robot, q: ArrayLike) -> Array:
 
 
 def _by_geometry(robot: Robot, q: ArrayLike, rows: Array) -> Array:
+    robot.check_independent("derivatives by numbers of the file")
     states = vectors(q, robot.joints_count, "q")[..., None, :]
     return robot.evaluate(platform_gradient(robot.engine), _NONE, states, rows)[0]
 

@@ -226,6 +226,10 @@ class Mechanism(Common):
         """
         return {}
 
+    def sharing_entries(self) -> dict[str, Any]:
+        """How more actuated joints than freedoms share the effort, as in a file; else empty."""
+        return {}
+
     @property
     def without_home(self) -> frozenset[str]:
         """Joints of which the file should say where they count from, and does not."""
@@ -385,6 +389,25 @@ class Mechanism(Common):
     def joints_count(self) -> int:
         """How many joints are actuated, n."""
         return len(self.joint_names)
+
+    @property
+    def redundant(self) -> bool:
+        """Whether there are more actuated joints than degrees of freedom."""
+        return len(self.graph.leads) < self.joints_count
+
+    def check_independent(self, what: str) -> None:
+        """Reject what needs as many actuated joints as degrees of freedom.
+
+        :param what: in the plural, in words.
+        :raises ParameterError: there are more.
+        """
+        if self.redundant:
+            raise ParameterError(
+                "joints", self.joints_count,
+                f"{len(self.graph.leads)} actuated joints, the degrees of freedom: {what} are not "
+                "defined for more; leave out `actuated` of "
+                f"{', '.join(n for n in self.joint_names if n not in self.graph.leads)}",
+            )  # fmt: skip
 
     @property
     def pose_names(self) -> tuple[str, ...]:

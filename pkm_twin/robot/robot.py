@@ -25,7 +25,7 @@ from pkm_twin.kinematics.passive import (
     passive_program,
     passive_rates_program,
 )
-from pkm_twin.kinematics.programs import inverse_program
+from pkm_twin.kinematics.programs import agreeing_program, inverse_program
 from pkm_twin.kinematics.scheme import Closed
 from pkm_twin.kinematics.singularity import singularity_kernel
 from pkm_twin.kinematics.traced import Traced
@@ -313,6 +313,46 @@ class Robot(Mechanism):
         n = self.joints_count
         return rates.reshape(*rates.shape[:-1], rates.shape[-1] // n, n), good
 
+    def inverse_jacobian(self, q: ArrayLike) -> Array:
+        """Joint rates per pose rate, shape (..., n, m)."""
+        jacobian = self.jacobian(q)
+        if not self.redundant:
+            return np.asarray(np.linalg.inv(jacobian), np.float64)
+        # The Jacobian's transpose shares efforts by the squares of their limits.
+        limits = np.asarray(self.graph.sharing[1 : 1 + self.joints_count])
+        back = (jacobian / limits**2).swapaxes(-1, -2)
+        return np.asarray(back @ np.linalg.inv(jacobian @ back), np.float64)
+
+    def agreeing(
+        self, q: ArrayLike, qd: ArrayLike | None = None, qdd: ArrayLike | None = None
+    ) -> tuple[Array, Array, Array]:
+        """Positions, rates and accelerations of all actuated joints, by those that lead.
+
+        The same where there are no more than freedoms; errors as :meth:`forward`.
+
+        :param q: joint positions, shape (..., n); ``qd``, ``qdd``: None is zero of those that lead.
+        :returns: shape (..., n) each.
+        """
+        still = np.zeros(self.joints_count)
+        given = (q, still if qd is None else qd, still if qdd is None else qdd)
+        if not self.redundant:
+            arrays = np.broadcast_arrays(*(np.asarray(one, np.float64) for one in given))
+            return arrays[0], arrays[1], arrays[2]
+        first, second, third = self.evaluate(self.agreeing_kernel, _NONE, *given)
+        return first, second, third
+
+    def try_agreeing(self, q: Array) -> Array:
+        """The positions alone, NaN where there is no assembly."""
+        if not self.redundant:
+            return q
+        still = np.zeros(self.joints_count)
+        return self.agreeing_kernel(_NONE, q, still, still)[0][0]
+
+    @property
+    def agreeing_kernel(self) -> Kernel:
+        """The program of :meth:`agreeing`."""
+        return self.engine.kernel("agreeing", agreeing_program)
+
     def pose_acceleration(self, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike) -> Array:
         """Second derivative of the pose in time, shape (..., m)."""
         return self.evaluate(self.engine.acceleration, _NONE, q, qd, qdd)[0]
@@ -383,6 +423,9 @@ class Robot(Mechanism):
             raise _not_finite("joint state", index)
         place = np.asarray(q, float)
         sample = np.broadcast_to(place, (*batch, place.shape[-1]))[index]
+        if self.redundant:
+            self._refuse_contradiction(sample, index)
+            sample = sample[self.graph.leading]
         limb = self.unreachable_limb(sample, reached)
         if limb is not None:
             raise UnreachableError("joint state", self.limb_names[limb[0]], index, limb[1])
@@ -390,6 +433,28 @@ class Robot(Mechanism):
         if measure is not None:
             raise SingularityError("joint state", index, measure, SINGULARITY_BOUND, reached)
         raise UnreachableError("joint state", part, index, miss, reached)
+
+    def _refuse_contradiction(self, q: Array, index: tuple[int, ...]) -> None:
+        """Raise the error of drives that are where those that lead do not put them."""
+        tree, graph = self.engine.tree, self.graph
+        way, x, _ = self.engine.reach(q[graph.leading])
+        if way < 1.0:
+            return
+        apart = np.array(tree.values_of_drives(q[graph.leading], x), float) - q
+        slides = np.array([unit == "m" for unit in self.joint_units])
+        apart = np.where(slides, apart, (apart + np.pi) % (2 * np.pi) - np.pi)
+        worst = int(np.argmax(np.abs(apart) / np.where(slides, tree.size, 1.0)))
+        bound = float(graph.sharing[0]) * (tree.size if slides[worst] else 1.0)
+        name, unit, leads = self.joint_names[worst], self.joint_units[worst], ", ".join(graph.leads)
+        how = f"follows {leads}, and its velocity or acceleration contradicts theirs"
+        if abs(apart[worst]) > bound:
+            how = (
+                f"is {abs(apart[worst]):.3g} {unit} from where {leads} put it, allowed "
+                f"{bound:.3g} (redundancy.tolerance)"
+            )
+        else:
+            name = next(n for n in self.joint_names if n not in graph.leads)
+        raise UnreachableError("joint state", name, index, 0.0, how=how)
 
 
 def _tried(kernel: Kernel, given: ArrayLike) -> tuple[Array, Mask]:

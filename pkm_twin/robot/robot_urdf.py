@@ -187,6 +187,7 @@ def robot_description(robot: Robot) -> dict[str, Any]:
     # A mechanism may have coordinates of its own.
     if all(name in POSE for name in pose):
         data["pose"] = pose
+    data |= robot.sharing_entries()
     load = robot.payload
     if load.mass > 0.0 or load.inertia.any():
         data["payload"] = {

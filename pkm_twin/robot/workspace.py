@@ -340,8 +340,9 @@ def random_joints(robot: Robot, rng: np.random.Generator, count: int) -> Array:
     middle, reach = (low + high) / 2, (high - low) / 2
     while len(kept) < count:
         drawn = rng.uniform(middle - share * reach, middle + share * reach, (2 * count, len(home)))
+        drawn = robot.try_agreeing(drawn)
         measure, good = robot.try_singularity(drawn)
-        good = good & (measure > INSIDE)
+        good = good & (measure > INSIDE) & ((low <= drawn) & (drawn <= high)).all(-1)
         kept = np.concatenate([kept, drawn[good]])
         if good.mean() < 0.05:
             # Few joint positions together make an assembly: nearer to home more of them do.

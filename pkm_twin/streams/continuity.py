@@ -47,7 +47,7 @@ class Continuity:
         self._largest = MAX_MOVE * robot.size
         self._scales = robot.pose_scales
         n, m = len(robot.joint_names), len(self._scales)
-        self._told = n + m + m * n
+        self._told = n + m + m * m
         self._nothing = np.zeros(self._told + m + 1)
         self._call = robot.bound(_stream, self._scales)
         self.reset()

@@ -138,8 +138,9 @@ class Model:
         random = np.random.default_rng(0).random((SAMPLES, robot.joints_count))
         corners = np.array(list(itertools.product((0.0, 1.0), repeat=robot.joints_count)))
         parts = np.concatenate([corners, random])
-        poses, good = robot.try_forward(lows + (highs - lows) * parts)
-        rows = (lows + (highs - lows) * parts)[good]
+        states = robot.try_agreeing(lows + (highs - lows) * parts)
+        poses, good = robot.try_forward(states)
+        rows = states[good]
         kept = [
             pose
             for q, pose in zip(rows, poses[good], strict=True)
@@ -209,12 +210,16 @@ class Model:
                 turned = Rotation.from_matrix(rotation @ turn.T).as_rotvec()
                 missing = weights * np.concatenate([position - at, turned])
                 twists = weights[:, None] * robot.platform_jacobian(q)
-                q = q + np.linalg.lstsq(twists, missing, rcond=1e-9)[0]
+                q = robot.agreeing(q + np.linalg.lstsq(twists, missing, rcond=1e-9)[0])[0]
         except ValueError as error:
             return _refused(state, str(error))
         return self._moved(state, q, None)
 
     def _moved(self, state: State, q: Array, asked: Array | None) -> State:
+        try:
+            q = self.robot.agreeing(q)[0]
+        except ValueError as error:
+            return _refused(state, str(error))
         _, found = beyond_limits(self.robot, q)
         if found:
             more = f" ({len(found) - 1} more)" if len(found) > 1 else ""

@@ -128,16 +128,13 @@ def actuate(data, name, value):
     data["joints"][name]["actuated"] = value
 
 
-@pytest.mark.parametrize(
-    ("joint", "value", "numbers"), [("wrist_1", True, (4, 3)), ("motor_2", False, (2, 3))]
-)
-def test_drives_are_counted(joint, value, numbers, rng):
+def test_drives_are_counted(rng):
     data = changed("rrr3_planar", rng)
-    actuate(data, joint, value)
+    actuate(data, "motor_2", False)
     with pytest.raises(MobilityError) as error:
         Machine.from_data(data, "x")
-    assert (error.value.actuated, error.value.freedoms) == numbers
-    assert joint in " ".join(error.value.causes)
+    assert (error.value.actuated, error.value.freedoms) == (2, 3)
+    assert "motor_2" in " ".join(error.value.causes)
 
 
 def balls():

@@ -1,0 +1,158 @@
+# SPDX-License-Identifier: Apache-2.0
+"""All drives of a machine, of which there may be more than it has freedoms.
+
+As many as there are freedoms lead: the closures are solved for their m values, of which the others
+follow. Rates of all n drives are B qd of the leading ones, B' tau of all efforts is what the
+leading drives would have to give alone. Rows N of efforts that move nothing have N B = 0; on them
+the sum of (effort / limit)^2 is made least. Where all drives lead, B is one and N has no rows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from pkm_twin.codegen.cholesky import SparseCholesky
+from pkm_twin.codegen.expressions import Numbers, Objects
+from pkm_twin.codegen.operations import absolute, cos, sin, sqrt
+
+if TYPE_CHECKING:
+    from pkm_twin.kinematics.traced import Traced
+
+LEADS: Final = "leads"
+"""Input of the drives that lead, where ``q`` is of all and has more."""
+TIME: Final = 0.02
+"""Time in which rates may contradict by as much as positions may at all, s."""
+
+
+class Drives:
+    """The drives of a machine on expressions; all but the inputs after its closures are solved."""
+
+    def __init__(self, t: Traced) -> None:
+        self.t, self.graph = t, t.graph
+        self.count = len(self.graph.actuated)
+        self.leading = self.graph.leading
+        self.others = [k for k in range(self.count) if k not in self.leading]
+        self._given: dict[str, tuple[Objects, Objects]] = {}
+        self._agreeing: list[Any] = []
+
+    def given(self, name: str) -> Objects:
+        """Inputs of all drives: those of the leading ones, shape (m,); the others' are judged."""
+        values = self.t.tape.inputs(name, self.count)
+        _, leads = self._given.setdefault(name, (values, values[self.leading]))
+        return leads
+
+    def variables(self, name: str) -> list[Any]:
+        """Inputs of all drives, to read and to differentiate by, shape (n,)."""
+        values = list(self.t.tape.inputs(name, self.count))
+        for k, lead in zip(self.leading, self.t.q, strict=True):
+            values[k] = lead if name == "q" else values[k]
+        return values
+
+    def judge(self, name: str, leads: Numbers, rest: Numbers, time: float) -> None:
+        """Rates or accelerations of the other drives have to be those that follow of the leads."""
+        values, own = self._given.get(name, ((), ()))
+        if own is leads:
+            for k in self.others:
+                apart = rest[self.t.tree.drives[k].rate] - values[k]
+                self._agreeing.append(self._tolerance(k) / time - absolute(apart))
+
+    def agreeing(self) -> list[Any]:
+        """Numbers above zero where no drive contradicts those that lead; positions too."""
+        q, found = self.t.tape.inputs("q", self.count), list(self._agreeing)
+        for k in self.others:
+            x, step = self.t.x, self.t.tree.drives[k]
+            away = q[k] - self.graph.joints[step.joint].home
+            if step.circle:
+                c, s = x[step.position], x[step.position + 1]
+                away, facing = s * cos(away) - c * sin(away), c * cos(away) + s * sin(away)
+                found.append(facing)
+            else:
+                away = x[step.position] - away
+            found.append(self._tolerance(k) - absolute(away))
+        return found
+
+    def _tolerance(self, k: int) -> Any:
+        slides = self.graph.joints[self.graph.actuated[k]].slides
+        tolerance = self.graph.sharing[0]
+        return tolerance * self.t.tree.size if slides else tolerance
+
+    @cached_property
+    def null_rows(self) -> list[list[Any]]:
+        """N: by drive that does not lead, its own effort of one, and what the leading ones add."""
+        if not self.others:
+            return []
+        t, rows = self.t, []
+        kept = t.jq[t.scheme.independent]
+        for k in self.others:
+            unit = np.eye(t.tree.unknown_rates)[t.tree.drives[k].rate]
+            row: list[Any] = [0.0] * self.count
+            row[k] = 1.0
+            for j, value in zip(self.leading, kept.T @ t.lu.solve_transposed(unit), strict=True):
+                row[j] = value
+            rows.append(row)
+        return rows
+
+    @cached_property
+    def _weights(self) -> list[Any]:
+        limits = self.graph.sharing[1 : 1 + self.count]
+        return [1.0 / (limit * limit) for limit in limits]
+
+    @cached_property
+    def _root(self) -> SparseCholesky:
+        """Factors of N W N'."""
+        rows, lower = self.null_rows, {}
+        for i, a in enumerate(rows):
+            for j, b in enumerate(rows[: i + 1]):
+                parts = zip(a, self._weights, b, strict=True)
+                lower[i, j] = sum((x * w * y for x, w, y in parts), 0.0)
+        return SparseCholesky(lower, [lower[i, i] for i in range(len(rows))])
+
+    def shared(self, leads: Sequence[Any], *, preload: bool = False) -> list[Any]:
+        """Efforts of all drives that do what these of the leading ones would, shape (n,).
+
+        Nearest to the preload, or least, each over its limit.
+        """
+        if not self.others:
+            return list(leads)
+        efforts: list[Any] = [0.0] * self.count
+        for k, value in zip(self.leading, leads, strict=True):
+            efforts[k] = value
+        wanted = self.graph.sharing[1 + self.count :] if preload else np.zeros(self.count)
+        apart = [(a - p) * w for a, p, w in zip(efforts, wanted, self._weights, strict=True)]
+        rows = self.null_rows
+        sums = [sum((a * b for a, b in zip(row, apart, strict=True)), 0.0) for row in rows]
+        for amount, row in zip(self._root.solve(sums), rows, strict=True):
+            efforts = [effort - amount * value for effort, value in zip(efforts, row, strict=True)]
+        return efforts
+
+    def on_leads(self, efforts: Sequence[Any]) -> list[Any]:
+        """B' tau: efforts of the leading drives alone that do what these of all do, shape (m,)."""
+        result = [efforts[k] for k in self.leading]
+        for k, row in zip(self.others, self.null_rows, strict=True):
+            result = [a - row[j] * efforts[k] for a, j in zip(result, self.leading, strict=True)]
+        return result
+
+    def followed(self, leads: Sequence[Any], still: Numbers) -> list[Any]:
+        """Accelerations of all drives by those that lead, and those of the unknowns without."""
+        result: list[Any] = [0.0] * self.count
+        for k, value in zip(self.leading, leads, strict=True):
+            result[k] = value
+        for k, row in zip(self.others, self.null_rows, strict=True):
+            result[k] = still[self.t.tree.drives[k].rate]
+            for j, value in zip(self.leading, leads, strict=True):
+                result[k] = result[k] - row[j] * value
+        return result
+
+    def null_efforts(self) -> list[list[Any]]:
+        """N with rows of length one, at right angles, of efforts over their limits."""
+        if not self.others:
+            return []
+        columns = [self._root.forward(list(column)) for column in zip(*self.null_rows, strict=True)]
+        return [
+            [column[i] * sqrt(inverse) for column in columns]
+            for i, inverse in enumerate(self._root.inverses)
+        ]
