@@ -431,7 +431,13 @@ class Robot(Mechanism):
             raise UnreachableError("joint state", self.limb_names[limb[0]], index, limb[1])
         part, miss, measure = self.engine.ending(sample, reached)
         if measure is not None:
-            raise SingularityError("joint state", index, measure, SINGULARITY_BOUND, reached)
+            question = ""
+            if self.redundant:
+                leads = ", ".join(self.graph.leads)
+                question = f"; it is one of {leads} alone, others may lead (redundancy.leads)"
+            raise SingularityError(
+                "joint state", index, measure, SINGULARITY_BOUND, reached, question=question
+            )
         raise UnreachableError("joint state", part, index, miss, reached)
 
     def _refuse_contradiction(self, q: Array, index: tuple[int, ...]) -> None:
@@ -450,7 +456,8 @@ class Robot(Mechanism):
         if abs(apart[worst]) > bound:
             how = (
                 f"is {abs(apart[worst]):.3g} {unit} from where {leads} put it, allowed "
-                f"{bound:.3g} (redundancy.tolerance)"
+                f"{bound:.3g} (redundancy.tolerance); or these alone are past a singularity, where "
+                "others may lead (redundancy.leads)"
             )
         else:
             name = next(n for n in self.joint_names if n not in graph.leads)
