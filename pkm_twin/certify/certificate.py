@@ -134,7 +134,8 @@ def certify(
 
     :param robot: what is judged.
     :param description: the same machine as a ``mechanism: machine`` mapping; of a robot that is
-        loaded it is ``robot_description(robot)``.
+        loaded it is ``robot_description(robot)``. Of more actuated joints than degrees of freedom,
+        those that lead count: what the efforts of all do together is compared.
     :param states: how many random states inside the limits.
     :param seed: where the random numbers begin.
     :param engines: names out of ``ENGINES``; what is not installed is told, not raised.
@@ -144,11 +145,12 @@ def certify(
 
     def reaches(q: Array) -> bool:
         try:
-            robot.forward(q)
+            robot.forward(_agreeing(robot, q)[0])
         except (SingularityError, UnreachableError):
             return False
         return True
 
+    description = _led(robot, description)
     try:
         first = Maximal(description)
         drawn = random_states(first, np.random.default_rng(seed), states, reaches)
@@ -238,17 +240,32 @@ def drawn(robot: Robot, seed: int) -> Robot:
         return varied(robot, dict.fromkeys(kinds, SPREAD), seed).robot
 
 
+def _led(robot: Any, description: Mapping[str, Any]) -> Mapping[str, Any]:
+    """The description whose joints that follow others are not actuated."""
+    idle = set(robot.joint_names) - set(robot.graph.leads)
+    joints = {
+        name: {**joint, "actuated": False, "limits": {}} if name in idle else joint
+        for name, joint in description["joints"].items()
+    }
+    return {**description, "joints": joints}
+
+
+def _agreeing(robot: Any, *motion: Array) -> tuple[Array, Array, Array]:
+    """Positions, rates and accelerations of all joints, by those that lead."""
+    whole = [np.zeros((*one.shape[:-1], robot.joints_count)) for one in motion]
+    for one, leads in zip(whole, motion, strict=True):
+        one[..., robot.graph.leading] = leads
+    made: tuple[Array, Array, Array] = robot.agreeing(*whole)
+    return made
+
+
 def _own(robot: Any, states: States) -> list[Item]:
     """What needs no other engine: the round trip, and one sample against the batch."""
-    back = robot.inverse(robot.forward(states.q))
-    trip = np.abs(back - states.q).max(-1)
-    batch = inverse_dynamics(robot, states.q, states.qd, states.qdd, states.wrench)
-    single = np.array(
-        [
-            inverse_dynamics(robot, *state)
-            for state in zip(states.q, states.qd, states.qdd, states.wrench, strict=True)
-        ]
-    )
+    motion = *_agreeing(robot, states.q, states.qd, states.qdd), states.wrench
+    back = robot.inverse(robot.forward(motion[0]))
+    trip = np.abs(back - motion[0]).max(-1)
+    batch = inverse_dynamics(robot, *motion)
+    single = np.array([inverse_dynamics(robot, *state) for state in zip(*motion, strict=True)])
     return [_item("twin", "round_trip", trip), _item("twin", "batch", np.abs(batch - single))]
 
 
@@ -258,9 +275,16 @@ def _compared(
     states: States,
     progress: Callable[[int], None],
 ) -> list[Item]:
-    tau = inverse_dynamics(robot, states.q, states.qd, states.qdd, states.wrench)
-    position, rotation = robot.platform(states.q)
-    twist, inertia = robot.platform_jacobian(states.q), mass_matrix(robot, states.q)
+    place, rates, changes = _agreeing(robot, states.q, states.qd, states.qdd)
+    tau = inverse_dynamics(robot, place, rates, changes, states.wrench)
+    position, rotation = robot.platform(place)
+    twist, inertia = robot.platform_jacobian(place), mass_matrix(robot, place)
+    if robot.redundant:
+        # Rates of all joints by those that lead.
+        back = robot.inverse_jacobian(place)
+        by = back @ np.linalg.inv(back[:, robot.graph.leading])
+        tau = np.einsum("knm,kn->km", by, tau)
+        twist, inertia = twist @ by, by.swapaxes(-1, -2) @ inertia @ by
     efforts: dict[str, list[Array]] = {name: [] for name in judges}
     found: dict[tuple[str, str], list[float]] = {}
     for k in range(len(states.q)):

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 LEADS: Final = "leads"
 """Input of the drives that lead, where ``q`` is of all and has more."""
-TIME: Final = 0.02
+TIME: Final = 0.01
 """Time in which rates may contradict by as much as positions may at all, s."""
 
 

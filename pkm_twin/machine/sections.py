@@ -127,7 +127,7 @@ class Redundancy:
     ``leads``: the joints that determine the machine, as many as its freedoms; by default those
     that are the most independent at home. ``tolerance``: by how much the positions of the others
     may contradict them, rad, of joints that slide over the machine's size; rates may by as much in
-    0.02 s. ``preload``: the efforts, one a joint, to which those that move the machine come
+    0.01 s. ``preload``: the efforts, one a joint, to which those that move the machine come
     nearest; by default zero.
     """
 

@@ -119,7 +119,7 @@ class ShapedPath(TimedPath):
         """The shaped motion at times (k,), s from its beginning."""
         t = np.asarray(times, np.float64)
         robot = self.robot
-        pose, rate, change = (np.zeros((len(t), robot.joints_count)) for _ in range(3))
+        pose, rate, change = (np.zeros((len(t), len(robot.pose_names))) for _ in range(3))
         for k, amplitude in enumerate(self.amplitudes):
             assert self.phase is not None  # noqa: S101  shaped() gives it
             when, first, second = self.phase.before(t, k * np.pi)
