@@ -11,16 +11,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
 
 from pkm_twin.codegen.cholesky import SparseCholesky
 from pkm_twin.codegen.expressions import Numbers, Objects
 from pkm_twin.codegen.operations import absolute, cos, sin, sqrt
-
-if TYPE_CHECKING:
-    from pkm_twin.kinematics.traced import Traced
 
 LEADS: Final = "leads"
 """Input of the drives that lead, where ``q`` is of all and has more."""
@@ -29,9 +26,12 @@ TIME: Final = 0.01
 
 
 class Drives:
-    """The drives of a machine on expressions; all but the inputs after its closures are solved."""
+    """The drives of a machine on expressions; all but the inputs after its closures are solved.
 
-    def __init__(self, t: Traced) -> None:
+    :param t: the machine, a :class:`~pkm_twin.kinematics.traced.Traced`, which imports this.
+    """
+
+    def __init__(self, t: Any) -> None:
         self.t, self.graph = t, t.graph
         self.count = len(self.graph.actuated)
         self.leading = self.graph.leading

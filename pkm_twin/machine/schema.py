@@ -154,7 +154,11 @@ def words(
             raise ParameterError(field, list(value), "different names")
         return tuple(map(str, items))
 
-    bound = f"different ones of {', '.join(allowed)}" if allowed else f"{size} different names"
+    bound = (
+        f"different ones of {', '.join(allowed)}"
+        if allowed
+        else f"{size or ''} different names".strip()
+    )
     if not distinct:
         bound = f"{size} words, each {' or '.join(allowed)}"
     return key(check, bound, default, **more)

@@ -122,18 +122,19 @@ class DriveSpec:
 
 @dataclass(frozen=True, eq=False)
 class Redundancy:
-    """More actuated joints than degrees of freedom.
+    """Of more actuated joints than degrees of freedom, of which some lead and the others follow."""
 
-    ``leads``: the joints that determine the machine, as many as its freedoms; by default those
-    that are the most independent at home. ``tolerance``: by how much the positions of the others
-    may contradict them, rad, of joints that slide over the machine's size; rates may by as much in
-    0.01 s. ``preload``: the efforts, one a joint, to which those that move the machine come
-    nearest; by default zero.
-    """
-
-    leads: tuple[str, ...] | None = schema.words(default=None)
-    tolerance: float = schema.number(above=0.0, high=0.1, unit="rad", default=1e-3)
-    preload: Array = schema.vector(0, unit="{effort}", default=[])
+    leads: tuple[str, ...] | None = schema.words(
+        text="joints that determine the machine; by default the most independent", default=None
+    )
+    tolerance: float = schema.number(
+        above=0.0, high=0.1, unit="rad", default=1e-3,
+        text="how far others may contradict them; of slides, parts of the size; of rates, in 10 ms",
+    )  # fmt: skip
+    preload: Array = schema.vector(
+        0, unit="{effort}", text="efforts, one a joint, that shared ones come nearest to",
+        default=[],
+    )  # fmt: skip
 
 
 @remembered

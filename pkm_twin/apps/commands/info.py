@@ -33,6 +33,12 @@ class Info(OfRobot, Draws):
     """
 
 
+def _leading(robot: Robot) -> list[Fact]:
+    """Of more actuated joints than degrees of freedom those that lead."""
+    leads = list(robot.graph.leads)
+    return [Fact("leads", leads, text="joints that lead")] if robot.redundant else []
+
+
 def info(given: Info) -> Report:
     """Every parameter, mobility, overconstraint and the home pose."""
     robot = given.machine()
@@ -72,6 +78,7 @@ def info(given: Info) -> Report:
         Fact("assumed_joints", assumed),
         Fact("pose", pose_units, text="pose", shown=_named(pose_units)),
         Fact("joints", list(robot.joint_names), text="actuated joints", shown=_named(joint_units)),
+        *_leading(robot),
         Fact("joint_unit", robot.joint_unit),
         Fact("joint_units", list(robot.joint_units)),
         Fact("effort_unit", None if why_no_torques(robot) else robot.effort_unit),
