@@ -242,6 +242,8 @@ def drawn(robot: Robot, seed: int) -> Robot:
 
 def _led(robot: Any, description: Mapping[str, Any]) -> Mapping[str, Any]:
     """The description whose joints that follow others are not actuated."""
+    if not _shares(robot):
+        return description
     idle = set(robot.joint_names) - set(robot.graph.leads)
     joints = {
         name: {**joint, "actuated": False, "limits": {}} if name in idle else joint
@@ -250,12 +252,19 @@ def _led(robot: Any, description: Mapping[str, Any]) -> Mapping[str, Any]:
     return {**description, "joints": joints}
 
 
-def _agreeing(robot: Any, *motion: Array) -> tuple[Array, Array, Array]:
+def _shares(robot: Any) -> bool:
+    """Whether there are more actuated joints than freedoms."""
+    return bool(getattr(robot, "redundant", False))
+
+
+def _agreeing(robot: Any, *motion: Array) -> tuple[Array, ...]:
     """Positions, rates and accelerations of all joints, by those that lead."""
+    if not _shares(robot):
+        return motion
     whole = [np.zeros((*one.shape[:-1], robot.joints_count)) for one in motion]
     for one, leads in zip(whole, motion, strict=True):
         one[..., robot.graph.leading] = leads
-    made: tuple[Array, Array, Array] = robot.agreeing(*whole)
+    made: tuple[Array, ...] = robot.agreeing(*whole)
     return made
 
 
@@ -279,7 +288,7 @@ def _compared(
     tau = inverse_dynamics(robot, place, rates, changes, states.wrench)
     position, rotation = robot.platform(place)
     twist, inertia = robot.platform_jacobian(place), mass_matrix(robot, place)
-    if robot.redundant:
+    if _shares(robot):
         # Rates of all joints by those that lead.
         back = robot.inverse_jacobian(place)
         by = back @ np.linalg.inv(back[:, robot.graph.leading])
