@@ -116,8 +116,12 @@ class CarriesAtTimes(Carries):
 class ReadsTables:
     """How tables are written."""
 
-    separator: str | None = setting(None, "of a table's columns: , ; or tab; default: found")
-    decimal: str | None = setting(None, "of a table's numbers: . or ,")
+    separator: str | None = setting(
+        None, "separator of a table's columns: , ; or tab; default: detected"
+    )
+    decimal: str | None = setting(
+        None, "decimal mark of a table's numbers: . or ,; default: detected"
+    )
     columns: tuple[str, ...] = setting(
         (),
         "names of a table's columns, OURS=THEIRS,...: 'leg_*.position=motor_*, x=pos_x [mm]'; * in "
@@ -125,7 +129,7 @@ class ReadsTables:
     )
     units: str | None = setting(
         None,
-        "of a table's columns without one: of rad, mrad, deg, rev, m, cm, mm, um, s, ms, us, "
+        "units of columns whose header has none: of rad, mrad, deg, rev, m, cm, mm, um, s, ms, us, "
         "percent (of the motor's rated torque, with --side motor); default SI",
         older=("--unit",),
     )
@@ -147,7 +151,7 @@ class ReadsRecordings(ReadsTables):
     """Which topics of a recording are read, and how its tables are written."""
 
     topic: tuple[str, ...] = setting(
-        (), "topic of joint states or wrenches; default: found by the robot's joint names"
+        (), "topic of joint states or wrenches; default: detected by the robot's joint names"
     )
     side: str = setting(
         "joint", "whose values a table's joints have: the joint's, the controller's (joint_map) or "
@@ -264,7 +268,9 @@ class OfMilling:
     radial: float = setting(..., "ratio of radial to tangential cutting force, Kr")
     immersion: float = setting(1.0, "radial depth of cut over tool diameter, 1 is a slot")
     up: bool = setting(False, "up-milling instead of down-milling")
-    feed: float = setting(0.0, "direction of the feed in the platform's xy plane, deg from x to y")
+    feed: float = setting(
+        0.0, "direction of the feed in the platform's xy plane, degrees from x towards y"
+    )
 
     @property
     def milling(self) -> Milling:
@@ -350,7 +356,7 @@ class Parallel:
 class Seeded:
     """Random numbers."""
 
-    seed: int = setting(0, "of the random numbers", low=0, high=2**32 - 1)
+    seed: int = setting(0, "seed of the random numbers", low=0, high=2**32 - 1)
 
 
 @dataclass(frozen=True, kw_only=True)

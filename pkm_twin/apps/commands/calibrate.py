@@ -75,7 +75,7 @@ class Calibrate(OfRobot, ReadsTables, BeyondLimitsToo, Accepts, Overwrites):
     only: tuple[str, ...] = setting(
         (), "fit only numbers whose path begins with this, joint offsets too; may be repeated"
     )
-    no_offsets: bool = setting(False, "do not fit the joints' sensor offsets")
+    no_offsets: bool = setting(False, "do not fit joint offsets")
     frame: bool = setting(False, "fit where the instrument stands: its six numbers")
     target: bool = setting(False, "fit where the target is on the platform: three numbers")
     prior: float = setting(

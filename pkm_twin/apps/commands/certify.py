@@ -39,7 +39,7 @@ class Certify(OfRobot, Seeded):
     """
 
     states: int = setting(20, "number of random states", low=1, high=100000)
-    seed: int = setting(1, "of the random states", low=0, high=2**63 - 1)
+    seed: int = setting(1, "seed of the random states", low=0, high=2**63 - 1)
     engine: tuple[str, ...] = setting((), "use only this engine: maximal, pinocchio or mujoco")
     variants: int = setting(
         0, "also check this many machines with other lengths and masses", low=0, high=10000

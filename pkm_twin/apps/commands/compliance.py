@@ -33,7 +33,7 @@ class Compliance(OfRobot, BeyondLimitsToo):
     )
     wrench: tuple[float, ...] = setting(
         (0.0, 0.0, 1.0, 0.0, 0.0, 0.0),
-        "load case, FX,FY,FZ,MX,MY,MZ at the platform's reference point, N and N m, base axes",
+        "load case, fx,fy,fz,mx,my,mz at the platform's reference point, N and N m, base axes",
         count=6,
     )
 

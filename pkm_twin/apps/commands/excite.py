@@ -26,7 +26,7 @@ LARGE: Final = 1e3
 
 @dataclass(frozen=True, kw_only=True)
 class Excite(OfRobot, AwayFromSingular, Seeded, Writes):
-    """Design a trajectory that excites the parameters to identify.
+    """Design a motion that excites the parameters to identify.
 
     Every joint follows a finite Fourier series that starts and ends at rest. The trajectory is
     D-optimal for the base parameters of what is to be fitted. It stays inside the robot file's
@@ -40,16 +40,14 @@ class Excite(OfRobot, AwayFromSingular, Seeded, Writes):
 
     what: str = setting(
         "friction,rotor,payload,inertia",
-        "what a fit shall identify: friction,rotor,payload,inertia or some",
+        "what the fit identifies: friction,rotor,payload,inertia or some",
     )
     out: Path = setting(
         Path("excite.mcap"), "MCAP to write; the CSV has the same name with .csv", writes=True,
         endings=(".mcap",),
     )  # fmt: skip
     beside: Path | None = setting(None, "also report the condition number of this bag")
-    friction: bool = setting(
-        False, "slow sweeps up and down, a joint at a time, which show friction"
-    )
+    friction: bool = setting(False, "slow sweeps up and down, one joint at a time, for friction")
     duration: float = setting(10.0, "duration, s", low=1.0, high=600.0)
     harmonics: int = setting(6, "harmonics per joint", low=3, high=50)
     rate: float = setting(100.0, "points per second", low=10.0, high=1000.0)
@@ -57,7 +55,7 @@ class Excite(OfRobot, AwayFromSingular, Seeded, Writes):
     acceleration: float | None = setting(
         None, "acceleration limit of every joint, rad/s2 or m/s2; default: none"
     )
-    trials: int = setting(300, "number of trajectories to try", low=10, high=10**6)
+    trials: int = setting(300, "number of motions to try", low=10, high=10**6)
 
     @property
     def files(self) -> dict[str, Path]:

@@ -47,7 +47,7 @@ class Loads(CarriesAtTimes, ReadsMotions, Writes, Draws):
     )
     bearings: Path | None = setting(None, "YAML of bearings by joint: C (N), p, and X, Y")
     exponent: float = setting(
-        5.0, "Woehler exponent of the equivalent load range", low=1.0, high=50.0
+        5.0, "Wöhler exponent of the equivalent load range", low=1.0, high=50.0
     )
     out: Path | None = setting(None, "CSV of the loads over time", writes=True)
     spectrum: Path | None = setting(None, "CSV of the rainflow counts", writes=True)

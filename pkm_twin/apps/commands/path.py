@@ -41,7 +41,7 @@ SHOWN: Final = 0.3
 
 @dataclass(frozen=True, kw_only=True)
 class Motion(Carries, ReadsTables, AwayFromSingular, Writes, Draws):
-    """Plan a motion along a path, also the fastest one, or a cut that is slower where it bends.
+    """Plan a motion along a path: by a law, the fastest, or slower where the machine is soft.
 
     The table of waypoints has a header row and the pose's coordinates (m, rad) or JOINT.position of
     every joint. The platform passes through the points on a smooth curve without a stop. With a

@@ -76,9 +76,12 @@ class Size(CarriesAtTimes, ReadsMotions, AwayFromSingular, Draws):
     ratios: str | None = setting(
         None, "gears to choose from, in place of the file's: LOW:HIGH, or numbers with commas"
     )
-    leads: str | None = setting(None, "the same of screws or belts")
+    leads: str | None = setting(None, "leads of screws or belts to choose from, likewise")
     efficiency: float | None = setting(
-        None, "efficiency of these; default: the robot file's, or 1", low=1e-3, high=1.0
+        None,
+        "efficiency of gears, screws and belts; default: the robot file's, or 1",
+        low=1e-3,
+        high=1.0,
     )
     over_workspace: tuple[float, ...] | None = setting(
         None, "in place of a motion: speed and acceleration of the tool point (m/s, m/s2), in the "
