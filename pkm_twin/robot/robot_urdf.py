@@ -206,12 +206,14 @@ def robot_description(robot: Robot) -> dict[str, Any]:
             data["joints"][name]["friction"] = {
                 key: value for key, value in rub.items() if value or key in ("viscous", "coulomb")
             }
-    for key in ("joint_map", "uncertainty"):
+    for key in ("joint_map", "uncertainty", "tolerances"):
         told = {
             name: {field: value for field, value in entry.items() if value is not None}
             for name, entry in schema.plain(getattr(robot, key)).items()
             # Numbers that the graph does not have are unsure no more.
-            if key == "joint_map" or has_entry(data, name)
+            if key == "joint_map"
+            or has_entry(data, name)
+            or (key == "tolerances" and name.partition(".")[0] in ("bodies", "joints", "rods"))
         }
         if told:
             data[key] = told

@@ -101,6 +101,9 @@ def test_a_file_has_tolerances_of_its_parts(twin, tmp_path, name):
     assert max(row["rms_calibrated_position_m"] for row in rows.values()) < 1e-9
     assert asked["rms_calibrated_position_m"] == pytest.approx(play["rms_position_m"])
     twin.refused("design", name, "--tolerance", "file")
+    out = tmp_path / "graph.yaml"
+    twin.good("convert", path, "--out", out)
+    assert yaml.safe_load(out.read_text())["tolerances"] == data["tolerances"]
     data["tolerances"] = {"joints.*.offset": {"deviation": 1e-4, "bound": 1e-4}}
     path.write_text(yaml.safe_dump(data))
     assert "tolerances.joints.*.offset" in twin.refused("design", path, "--tolerance", "file")
