@@ -22,7 +22,7 @@ from pkm_twin.recordings import Load, Recording
 from test.identification.machines import machine, noisy, of_prior
 from test.laws.test_fit import truths
 from test.machine.random_machines import variant
-from test.support.robots import data_of, load
+from test.support.robots import load, unsure
 
 KINDS: Any = ("friction", "payload")
 
@@ -33,10 +33,6 @@ def robot_named(name: str) -> Robot:
     if kind != "random":
         return load(name)
     return robot_of_data(variant(what, np.random.default_rng(len(what))), what)
-
-
-def unsure(robot: Robot, uncertainty: dict[str, dict[str, float]]) -> Robot:
-    return type(robot).from_data(data_of(robot) | {"uncertainty": uncertainty}, robot.name)
 
 
 @pytest.mark.parametrize(

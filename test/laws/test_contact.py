@@ -12,12 +12,10 @@ from delta_dynamics import Contact, ContactMonitor, inverse_dynamics
 from pkm_twin import Robot
 from pkm_twin.bags.reader import open_bag
 from pkm_twin.codegen.arrays import Array
-from pkm_twin.machine.places import given
-from pkm_twin.mechanisms.catalogue import robot_of_data
 from pkm_twin.recordings import Recording, read
 from pkm_twin.recordings.recording import differentiated
 from test.laws.contacts import OFF, RATE, REST, Stream, measured, moves, pushed, seen_after
-from test.support.robots import load, massive, partly_long
+from test.support.robots import load, massive, partly_long, unsure
 
 BAGS = Path(__file__).resolve().parents[2] / "bags"
 COLLISION = BAGS / "delta_cu_collision.mcap"
@@ -73,12 +71,10 @@ def test_fast_picks_are_no_contact() -> None:
 
 def test_a_model_that_is_less_sure_lets_more_pass() -> None:
     robot = load("delta_cu")
-    data = {**given(robot.parameter_sections()), "mechanism": robot.mechanism}
-    unsure = robot_of_data({**data, "uncertainty": {"inertia": {"relative": 0.05}}}, "unsure")
     q = robot.inverse(robot.home())
     still = np.zeros(3)
     bounds = []
-    for machine in (robot, unsure):
+    for machine in (robot, unsure(robot, {"inertia": {"relative": 0.05}})):
         monitor = ContactMonitor(machine)
         effort = np.full(3, 0.4)
         for k in range(400):
@@ -212,9 +208,7 @@ def test_drives_that_are_off_or_braked_are_no_contact(braked: float) -> None:
 
 def test_the_default_is_used_where_the_file_says_nothing_of_efforts() -> None:
     robot = load("delta_cu")
-    data = {**given(robot.parameter_sections()), "mechanism": robot.mechanism}
-    sure = robot_of_data({**data, "uncertainty": {"inertia": {"relative": 0.02}}}, "sure")
-    assert ContactMonitor(sure).stated
+    assert ContactMonitor(unsure(robot, {"inertia": {"relative": 0.02}})).stated
     # The second one is unsure of its elastic parts alone.
     assert not ContactMonitor(robot).stated and not ContactMonitor(load("upr_rpu")).stated
 

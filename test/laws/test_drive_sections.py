@@ -3,11 +3,11 @@
 
 import numpy as np
 import pytest
-import yaml
 
 from delta_dynamics import inverse_dynamics
 from pkm_twin.errors import ParameterError
 from pkm_twin.identification.parameters import file_parameters
+from pkm_twin.mechanisms.catalogue import robot_of_data
 from pkm_twin.robot.robot_urdf import robot_description
 from test.support.robots import load, parameters_of
 
@@ -19,19 +19,17 @@ GEARS = {
 }
 
 
-def with_drive(tmp_path, name, drive, **inertia):
+def with_drive(name, drive, **inertia):
     data = parameters_of(name)
     data["drive"] = drive
     data["inertia"] = {**data["inertia"], **inertia}
-    path = tmp_path / "geared.yaml"
-    path.write_text(yaml.safe_dump(data))
-    return load(path)
+    return robot_of_data(data, "geared")
 
 
 @pytest.mark.parametrize("name", GEARS)
-def test_a_drive_is_the_rotor_times_the_square_of_its_gear(tmp_path, name):
+def test_a_drive_is_the_rotor_times_the_square_of_its_gear(name):
     drive = GEARS[name]
-    robot, bare = with_drive(tmp_path, name, drive, rotor_inertia=0.0), load(name)
+    robot, bare = with_drive(name, drive, rotor_inertia=0.0), load(name)
     n = robot.joints_count
     q, qdd = robot.inverse(robot.home()), np.arange(1.0, n + 1)
     turns = drive.get("ratio") or 2 * np.pi / drive["lead"]
@@ -41,19 +39,19 @@ def test_a_drive_is_the_rotor_times_the_square_of_its_gear(tmp_path, name):
 
 
 @pytest.mark.parametrize("name", ["delta", "prru"])
-def test_a_gear_is_of_its_kind_of_joint_and_alone(tmp_path, name):
+def test_a_gear_is_of_its_kind_of_joint_and_alone(name):
     other = {"inertia": 1e-5, "lead" if "ratio" in GEARS[name] else "ratio": 2.0}
     with pytest.raises(ParameterError) as error:
-        _ = with_drive(tmp_path, name, other, rotor_inertia=0.0).graph
+        _ = with_drive(name, other, rotor_inertia=0.0).graph
     assert error.value.field == "drive"
     with pytest.raises(ParameterError) as error:
-        _ = with_drive(tmp_path, name, GEARS[name], rotor_inertia=0.1).graph
+        _ = with_drive(name, GEARS[name], rotor_inertia=0.1).graph
     assert error.value.field == "inertia.rotor_inertia"
 
 
 @pytest.mark.parametrize("name", GEARS)
-def test_a_drive_is_written_out_as_one(tmp_path, name):
-    robot = with_drive(tmp_path, name, GEARS[name], rotor_inertia=0.0)
+def test_a_drive_is_written_out_as_one(name):
+    robot = with_drive(name, GEARS[name], rotor_inertia=0.0)
     joints = robot_description(robot)["joints"]
     for joint in robot.joint_names:
         assert "rotor_inertia" not in joints[joint]
@@ -62,8 +60,8 @@ def test_a_drive_is_written_out_as_one(tmp_path, name):
 
 
 @pytest.mark.parametrize("name", GEARS)
-def test_a_fit_writes_the_rotor_before_the_gear(tmp_path, name):
-    robot = with_drive(tmp_path, name, GEARS[name], rotor_inertia=0.0)
+def test_a_fit_writes_the_rotor_before_the_gear(name):
+    robot = with_drive(name, GEARS[name], rotor_inertia=0.0)
     (rotor,) = file_parameters(robot, ("rotor",)).groups
     ((path, value),) = rotor.keys(2.0 * rotor.values).items()
     assert path == ("drive", "inertia")

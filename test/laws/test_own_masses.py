@@ -8,11 +8,11 @@ import weakref
 
 import numpy as np
 import pytest
-import yaml
 
 from delta_dynamics import least_norm_reactions
 from pkm_twin.errors import ParameterError
 from pkm_twin.kinematics.linkage import Linkage
+from pkm_twin.mechanisms.catalogue import robot_of_data
 from pkm_twin.mechanisms.machine import Machine
 from test.support.robots import load, parameters_of
 
@@ -63,17 +63,15 @@ def test_directions_of_reactions_are_each_machines_own():
     np.testing.assert_allclose(other.values[along], -one.values[along], atol=1e-9)
 
 
-def test_states_near_home_are_found_once_a_geometry(monkeypatch, tmp_path):
+def test_states_near_home_are_found_once_a_geometry(monkeypatch):
     """Also where a file leaves the pose's coordinates to be chosen, by an engine without any."""
     data = parameters_of("rps3")
     del data["pose"]
     data["origin"] = [0.001, 0.0, 0.6]
-    path = tmp_path / "chosen.yaml"
-    path.write_text(yaml.safe_dump(data, sort_keys=False))
     found = []
     once = Linkage._near_home
     monkeypatch.setattr(Linkage, "_near_home", lambda self: found.append(self) or once(self))
-    load(path).engine.check()
+    robot_of_data(data, "chosen").engine.check()
     assert len(found) == 1
 
 

@@ -114,7 +114,7 @@ def test_tubes_are_half_as_long_as_the_limb_at_home():
 
 
 @pytest.mark.parametrize("shift", [0.0, 0.05])
-def test_all_joints_of_a_spherical_machine_in_one_point(shift, tmp_path, rng):
+def test_all_joints_of_a_spherical_machine_in_one_point(shift, rng):
     """Reactions and torques do not hang on a size that there is not; nor where the point is."""
     data = yaml.safe_load(FILES["rrr3_spherical"].read_text())
     data["origin"] = [0.0, 0.0, shift]
@@ -123,9 +123,7 @@ def test_all_joints_of_a_spherical_machine_in_one_point(shift, tmp_path, rng):
             body["com"] = [v + (shift if k == 2 else 0.0) for k, v in enumerate(body["com"])]
     for joint in data["limbs"]["joints"].values():
         joint["at"] = [0.0, 0.0, shift]
-    path = tmp_path / "agile_eye.yaml"
-    path.write_text(yaml.safe_dump(data))
-    robot = load(path)
+    robot = robot_of_data(data, "agile_eye")
     q, qd, qdd = (scale * rng.normal(size=(5, 3)) for scale in (0.1, 1.0, 5.0))
     loads = least_norm_reactions(robot, q, qd, qdd)
     assert all(np.isfinite(w).all() for w in loads.wrenches)

@@ -3,20 +3,18 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
-import yaml
 
 from pkm_twin import Robot
 from pkm_twin.errors import ParameterError
 from pkm_twin.machine.reach import position_box
+from pkm_twin.mechanisms.catalogue import robot_of_data
 from test.support.robots import every_robot, joint_range, load
 
 
 @pytest.fixture
-def slide(tmp_path: Path):
+def slide():
     """One slide along z from its home value 0.1, and the platform's reference point beside it."""
 
     def make(limits: object) -> Robot:
@@ -31,9 +29,7 @@ def slide(tmp_path: Path):
                 }
             },
         }  # fmt: skip
-        path = tmp_path / "slide.yaml"
-        path.write_text(yaml.safe_dump(data, sort_keys=False))
-        return load(path)
+        return robot_of_data(data, "slide")
 
     return make
 

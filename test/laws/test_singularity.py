@@ -3,11 +3,8 @@
 
 from __future__ import annotations
 
-import json
-
 import numpy as np
 import pytest
-import yaml
 from scipy.optimize import minimize_scalar
 
 from delta_dynamics import reactions
@@ -17,6 +14,7 @@ from pkm_twin.certify.rows import stacked
 from pkm_twin.errors import SingularityError
 from pkm_twin.kinematics.singularity import Placed
 from pkm_twin.machine.graph_file import graph_description
+from pkm_twin.mechanisms.catalogue import robot_of_data
 from pkm_twin.robot.robot_urdf import robot_description
 from stiffness_monitor import compliance
 from test.machine.random_machines import NAMES, plain
@@ -28,13 +26,6 @@ UP = np.array([0.0, 0.0, 1.0])
 SHORT = ("five_bar", "four_bar", "gantry", "rps3", "upr_rpu")
 """Machines of few operations: with redundant closures, with none, with three of balls."""
 MACHINES = [name for name in robot_names() if name not in ("delta", "delta_cu")]
-
-
-def built(data, tmp_path):
-    path = tmp_path / "machine.yaml"
-    # What JSON has been through has no aliases.
-    path.write_text(yaml.safe_dump(json.loads(json.dumps(data)), sort_keys=False))
-    return load(path)
 
 
 def with_both_rods(robot):
@@ -111,8 +102,8 @@ def expected(robot, judge, q):
         for name in dict.fromkeys([*MACHINES, *NAMES])
     ],
 )
-def test_the_definition_in_maximal_coordinates(name, tmp_path):
-    robot = load(name) if name in MACHINES else built(plain(name), tmp_path)
+def test_the_definition_in_maximal_coordinates(name):
+    robot = load(name) if name in MACHINES else robot_of_data(plain(name), name)
     judge = Maximal(robot_description(robot))
     q = random_joints(robot, np.random.default_rng(3), 8, clear=0.01)
     by_twin = robot.singularity(q)
@@ -122,10 +113,10 @@ def test_the_definition_in_maximal_coordinates(name, tmp_path):
     assert [float(robot.singularity(here)) for here in q] == by_twin.tolist()
 
 
-def test_both_rods_of_a_parallelogram_say_what_its_couple_says(tmp_path):
+def test_both_rods_of_a_parallelogram_say_what_its_couple_says():
     """One rod and a couple, beside two rods, which nothing but the lengths of rods holds."""
     whole = load("delta_cu")
-    split = built(with_both_rods(whole), tmp_path)
+    split = robot_of_data(with_both_rods(whole), "split")
     q = np.random.default_rng(4).uniform(*whole.limits.position.T, (300, 3))
     one, other = whole.singularity(q), split.singularity(q)
     # Errors of two rods are not those of one and a couple, so they agree in kind, not in digits.
@@ -211,9 +202,9 @@ class TestWays:
         # With the square root of what is left.
         assert np.diff(np.log10(measure[:3])) == pytest.approx([1.0, 1.0], abs=0.1)
 
-    def test_dead_points_of_one_joint(self, tmp_path):
+    def test_dead_points_of_one_joint(self):
         """One joint and one coordinate: no ratio of singular values tells anything there."""
-        robot = built(plain("slider_crank"), tmp_path)
+        robot = robot_of_data(plain("slider_crank"), "crank")
         home = float(robot.graph.home[0])
         q = home + np.linspace(-3.0, 3.0, 20_001)[:, None]
         measure, good = robot.try_singularity(q)

@@ -7,10 +7,10 @@ import math
 
 import numpy as np
 import pytest
-import yaml
 
 from pkm_twin.errors import ParameterError, SingularityError
 from pkm_twin.maps.search import workspace_box
+from pkm_twin.mechanisms.catalogue import robot_of_data
 from pkm_twin.robot.clearance import clearance, has_clearance
 from pkm_twin.robot.workspace import reachable
 from stiffness_monitor import compliance, platform_response, stiffness, strain_energy
@@ -125,12 +125,10 @@ class TestEveryRobot:
 @pytest.mark.parametrize(
     "name", [name for name in ELASTIC if name != "upr_rpu" and "members" in parameters_of(name)]
 )
-def test_without_members_nothing_is_known_of_them_and_all_else_holds(name, tmp_path, rng):
+def test_without_members_nothing_is_known_of_them_and_all_else_holds(name, rng):
     data = parameters_of(name)
     del data["members"]
-    path = tmp_path / "rigid.yaml"
-    path.write_text(yaml.safe_dump(data))
-    robot = load(path)
+    robot = robot_of_data(data, "rigid")
     for ask in (
         lambda: compliance(robot, robot.home()),
         lambda: strain_energy(robot, robot.home(), np.ones(6)),

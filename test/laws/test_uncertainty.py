@@ -21,7 +21,7 @@ from pkm_twin.mechanisms.catalogue import robot_of_data
 from pkm_twin.robot.derivatives import position_effects
 from stiffness_monitor import compliance, compliance_deviation, strain_energy
 from stiffness_monitor.derivatives import compliance_effects, energy_effects
-from test.support.robots import joint_range, load, massive, random_joints
+from test.support.robots import joint_range, load, massive, random_joints, unsure
 
 DELTA = {
     "inertia.platform_mass": {"deviation": 0.01},
@@ -32,14 +32,6 @@ DELTA = {
 FULL = ((120, 0.25), (10_000, 0.03))
 """Draws, and by how much the spread may differ from what is said."""
 HEAD = {"members.youngs_modulus": {"relative": 0.02}, "joints_compliance": {"relative": 0.04}}
-
-
-def unsure(name: str, uncertainty: dict[str, Any], **sections: Any) -> Robot:
-    """A shipped robot whose file says how sure it is."""
-    robot = load(name)
-    robot = robot.changed(**sections) if sections else robot
-    data = {**given(robot.parameter_sections()), "mechanism": robot.mechanism}
-    return robot_of_data({**data, "uncertainty": uncertainty}, name)
 
 
 def drawn(robot: Robot, count: int) -> Variants:
@@ -60,7 +52,7 @@ def drawn(robot: Robot, count: int) -> Variants:
 
 def delta() -> tuple[Robot, Array, Array, Array]:
     friction = {"viscous": [0.05, 0.06, 0.07], "coulomb": [0.1, 0.2, 0.1]}
-    robot = unsure("delta_cu", DELTA, friction=friction)
+    robot = unsure(load("delta_cu").changed(friction=friction), DELTA)
     middle, half = joint_range(robot)
     rng = np.random.default_rng(4)
     return robot, middle + 0.5 * half * rng.uniform(-1, 1, (5, 3)), *rng.normal(size=(2, 5, 3))
@@ -72,7 +64,7 @@ def check(count: int, tolerance: float) -> None:
     found = torque_deviation(robot, q, qd, qdd)
     expected = np.std(drawn(robot, count).inverse_dynamics(q, qd, qdd), axis=0)
     np.testing.assert_allclose(found, expected, rtol=tolerance)
-    head = unsure("upr_rpu", HEAD)
+    head = unsure(load("upr_rpu"), HEAD)
     pose = [-0.6, 0.1, 0.05]
     found = compliance_deviation(head, pose)
     expected = np.std(drawn(head, count).compliance(pose), axis=0)
@@ -90,7 +82,7 @@ def test_random_machines_spread_as_is_said(count: int, tolerance: float) -> None
 
 def test_effects_are_differences_of_machines_with_other_numbers() -> None:
     geometry = {"geometry.arm_length": {"deviation": 1e-4}, "inertia": {"relative": 0.1}}
-    robot = unsure("delta", {**geometry, "members": {"relative": 0.02}})
+    robot = unsure(load("delta"), {**geometry, "members": {"relative": 0.02}})
     q, still = robot.graph.home + np.array([0.1, -0.1, 0.2]), np.ones(3)
     loads = np.diag(np.repeat([1.0, 5.0], 3))
     pose = robot.forward(q)
@@ -122,10 +114,11 @@ def test_a_file_that_names_none_is_sure() -> None:
 
 def test_what_scales_all_scales_the_answer() -> None:
     """All that is elastic softer by a share: the compliance by the same."""
-    head = unsure("upr_rpu", {"joints_compliance": {"relative": 0.05}})
+    head = unsure(load("upr_rpu"), {"joints_compliance": {"relative": 0.05}})
     pose = head.home()
     part = compliance_deviation(head, pose)
-    whole = compliance_deviation(unsure("upr_rpu", {"members": {"relative": 0.05}}), pose)
+    other = unsure(load("upr_rpu"), {"members": {"relative": 0.05}})
+    whole = compliance_deviation(other, pose)
     assert 0.0 < np.trace(part) < 0.05 * np.trace(compliance(head, pose)) * 1.001
     assert np.trace(whole) > 0.0
 
@@ -143,11 +136,11 @@ def test_what_scales_all_scales_the_answer() -> None:
 )
 def test_what_is_no_number_of_the_file_is_refused(entry: dict[str, Any], text: str) -> None:
     with pytest.raises(ParameterError, match=text):
-        unsure("delta_cu", entry)
+        unsure(load("delta_cu"), entry)
 
 
 def test_a_machine_keeps_what_its_file_says_beside_its_graph() -> None:
-    robot = unsure("five_bar", {"gravity": {"relative": 0.02}})
+    robot = unsure(load("five_bar"), {"gravity": {"relative": 0.02}})
     joint = robot.joint_names[0]
     data = {**given(robot.parameter_sections()), "mechanism": "machine"}
     mapped = robot_of_data({**data, "joint_map": {joint: {"offset": 0.1}}}, "mine")

@@ -20,12 +20,6 @@ pytestmark = pytest.mark.usefixtures("quickly_compiled")
 POSES = [[0.02, 0.03, -0.33], [-0.05, 0.0, -0.36]]
 
 
-def written(data, folder):
-    path = folder / "elastic.yaml"
-    path.write_text(yaml.safe_dump(data), encoding="utf-8")
-    return load(path)
-
-
 def tube(members):
     return {
         "youngs_modulus": members.youngs_modulus,
@@ -36,7 +30,7 @@ def tube(members):
 
 
 @pytest.fixture
-def delta_in_the_graph_form(tmp_path):
+def delta_in_the_graph_form():
     """The shipped Delta with both rods of every parallelogram, arms and rods elastic."""
     delta = load("delta")
     g, m, members = delta.geometry, delta.inertia, delta.members
@@ -87,7 +81,7 @@ def delta_in_the_graph_form(tmp_path):
                 "mass": m.forearm_mass / 2,
                 "section": tube(members.forearm),
             }
-    return delta, written(data, tmp_path)
+    return delta, robot_of_data(data, "elastic")
 
 
 def test_the_graph_form_of_a_delta_is_as_stiff(delta_in_the_graph_form):
@@ -115,7 +109,7 @@ def test_springs_in_the_drives_alone_give_the_jacobians_compliance(name, tmp_pat
         for joint in section.get("joints", {}).values():
             if joint.get("actuated"):
                 joint["compliance"] = [along, 0, 0, 0, 0, 0]
-    robot = written(data, tmp_path)
+    robot = robot_of_data(data, "elastic")
     q = robot.graph.home + 0.02 * np.sin(np.arange(len(robot.joint_names)) + 1.0)
     pose = robot.forward(q)
     jacobian = robot.platform_jacobian(q)

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The engine beside other engines, over machines of every kind of joint."""
 
-import json
 import os
 
 import numpy as np
@@ -11,6 +10,7 @@ from delta_dynamics import forward_dynamics, inverse_dynamics, mass_matrix
 from pkm_twin.certify.certificate import certify
 from pkm_twin.certify.maximal import Maximal, random_states
 from pkm_twin.errors import ParameterError, PkmTwinError
+from pkm_twin.mechanisms.catalogue import robot_of_data
 from test.laws.conftest import MISSING, changed
 from test.machine.random_machines import NAMES, plain, variant
 from test.support.robots import load, partly_long
@@ -22,20 +22,13 @@ STATES = 2
 BOUND = 1e-9
 
 
-def loaded(description, folder):
-    path = folder / "machine.yaml"
-    # Without aliases, which a file may not have.
-    path.write_text(json.dumps(description))
-    return load(path)
-
-
 class Case:
     """A machine, what judges it, and states of it."""
 
-    def __init__(self, name, number, folder):
+    def __init__(self, name, number):
         rng = np.random.default_rng([20261121, NAMES.index(name), number])
         self.description = variant(name, rng) if number else plain(name)
-        self.robot = loaded(self.description, folder)
+        self.robot = robot_of_data(self.description, "machine")
         self.judge = Maximal(self.description)
         self.states = random_states(self.judge, rng, STATES)
 
@@ -51,8 +44,8 @@ VARIED = ("five_bar", "four_bar", "gantry", "prru3", "rcuu", "rps3")
     params=partly_long(CASES, *((n, 0) for n in PLAIN), *((n, 1) for n in VARIED)),
     ids=str,
 )
-def case(request, tmp_path_factory):
-    return Case(*request.param, tmp_path_factory.mktemp("machine"))
+def case(request):
+    return Case(*request.param)
 
 
 def test_other_engines_agree(case):
@@ -139,12 +132,12 @@ REFUSALS = [
 
 
 @pytest.mark.parametrize(("name", "changes", "fields", "text"), REFUSALS)
-def test_refusals_name_the_field(name, changes, fields, text, tmp_path):
+def test_refusals_name_the_field(name, changes, fields, text):
     data = plain(name)
     for dotted, value in changes.items():
         data = changed(data, dotted, value)
     with pytest.raises(ParameterError) as refused:
-        loaded(data, tmp_path)
+        robot_of_data(data, "machine")
     assert refused.value.field in fields
     assert text in str(refused.value)
     assert "\n" not in str(refused.value)

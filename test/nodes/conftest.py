@@ -5,9 +5,9 @@ import os
 
 import numpy as np
 import pytest
-import yaml
 
 from delta_dynamics import inverse_dynamics
+from pkm_twin.mechanisms.catalogue import robot_of_data
 from stiffness_monitor import compliance, strain_energy
 from test.nodes.harness import Domain, ForkedNode, Maker, NodeProcess, Peer, Plain
 from test.support.robots import load, parameters_of
@@ -20,13 +20,11 @@ def make():
 
 
 @pytest.fixture(scope="session")
-def limitless(tmp_path_factory):
+def limitless():
     """The Delta-CU without limits."""
     data = parameters_of("delta_cu")
     del data["limits"]
-    path = tmp_path_factory.mktemp("limitless") / "limitless.yaml"
-    path.write_text(yaml.safe_dump(data))
-    return load(path)
+    return robot_of_data(data, "limitless")
 
 
 @pytest.fixture(scope="module")

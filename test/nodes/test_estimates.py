@@ -18,8 +18,7 @@ from std_msgs.msg import Bool, String
 
 from delta_dynamics.feedforward import Torques
 from delta_dynamics.nodes.estimates import Estimates
-from pkm_twin.mechanisms.catalogue import robot_of_data
-from test.support.robots import often, parameters_of
+from test.support.robots import often, unsure
 
 ROBOT = load("delta_cu")
 PARAMETERS = ("estimate_payload:=true", "observe_wrench:=true", "stale_after:=600.0")
@@ -193,8 +192,7 @@ def test_a_file_that_says_nothing_of_its_efforts_is_warned_of():
         assert estimates.diagnose()["model uncertainty"] == "default"
     # One has no uncertainty, the other one of elastic parts alone.
     assert all(told)
-    data = {**parameters_of("delta_cu"), "uncertainty": {"inertia": {"relative": 0.02}}}
-    sure = robot_of_data(data, "sure")
+    sure = unsure(ROBOT, {"inertia": {"relative": 0.02}})
     estimates = Estimates(Topics(), lambda: sure, ("base_link", "platform"))
     assert not estimates.warning()
     assert estimates.diagnose()["model uncertainty"] == "robot file"

@@ -12,7 +12,7 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -45,6 +45,11 @@ def data_of(robot: Robot) -> dict[str, Any]:
     """What the robot's file gives, as plain data, written out."""
     data: dict[str, Any] = copy.deepcopy(given(robot.parameter_sections()))
     return data
+
+
+def unsure(robot: Robot, uncertainty: Mapping[str, Any]) -> Robot:
+    """The robot of a file that says how sure it is of its numbers."""
+    return type(robot).from_data(data_of(robot) | {"uncertainty": uncertainty}, robot.name)
 
 
 def often(some: int, all_of_them: int) -> list[Any]:

@@ -7,19 +7,19 @@ the path are those of a spline, limits hold in the middle of intervals.
 
 import numpy as np
 import pytest
-import yaml
 from scipy import sparse
 from scipy.interpolate import make_interp_spline
 from scipy.optimize import brentq, linprog
 
 from delta_dynamics import inverse_dynamics
+from pkm_twin.mechanisms.catalogue import robot_of_data
 from pkm_twin.paths import cycle, fastest, lines, through
 from test.support.robots import load, often
 
 FORCE, MASS, WAY = 12.0, 3.0, 0.5
 
 
-def slider(tmp_path, *, velocity=None, viscous=0.0, coulomb=0.0, gravity=(0.0, 0.0, 0.0)):
+def slider(*, velocity=None, viscous=0.0, coulomb=0.0, gravity=(0.0, 0.0, 0.0)):
     """One mass on one prismatic joint."""
     limits = {"position": [-1.0, 1.0], "effort": FORCE}
     if velocity is not None:
@@ -35,9 +35,7 @@ def slider(tmp_path, *, velocity=None, viscous=0.0, coulomb=0.0, gravity=(0.0, 0
             }
         },
     }  # fmt: skip
-    path = tmp_path / "slider.yaml"
-    path.write_text(yaml.safe_dump(data))
-    return load(path)
+    return robot_of_data(data, "slider")
 
 
 def duration(robot, **options):
@@ -47,30 +45,30 @@ def duration(robot, **options):
     return motion.duration
 
 
-def test_one_mass_accelerates_half_the_way(tmp_path):
+def test_one_mass_accelerates_half_the_way():
     best = 2.0 * np.sqrt(WAY * MASS / FORCE)
-    assert duration(slider(tmp_path)) == pytest.approx(best, rel=1e-4)
+    assert duration(slider()) == pytest.approx(best, rel=1e-4)
 
 
-def test_one_mass_up_to_a_speed(tmp_path):
+def test_one_mass_up_to_a_speed():
     top = 0.8
     rate = FORCE / MASS
     best = WAY / top + top / rate
-    assert duration(slider(tmp_path, velocity=top)) == pytest.approx(best, rel=3e-4)
+    assert duration(slider(velocity=top)) == pytest.approx(best, rel=3e-4)
 
 
-def test_one_mass_against_gravity_and_dry_friction(tmp_path):
+def test_one_mass_against_gravity_and_dry_friction():
     up, dry = 1.1, 1.7
-    robot = slider(tmp_path, coulomb=dry, gravity=(-up, 0.0, 0.0))
+    robot = slider(coulomb=dry, gravity=(-up, 0.0, 0.0))
     on, off = (FORCE - dry) / MASS - up, (FORCE + dry) / MASS + up
     # v^2 / 2 (1 / on + 1 / off) = way
     top = np.sqrt(2.0 * WAY / (1.0 / on + 1.0 / off))
     assert duration(robot) == pytest.approx(top / on + top / off, rel=3e-4)
 
 
-def test_one_mass_in_oil(tmp_path):
+def test_one_mass_in_oil():
     oil = 9.0
-    robot = slider(tmp_path, viscous=oil)
+    robot = slider(viscous=oil)
     a, b = FORCE / MASS, oil / MASS
 
     def started(t):
