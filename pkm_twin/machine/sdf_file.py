@@ -21,7 +21,7 @@ import numpy as np
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError, UnknownNameError, warn
 from pkm_twin.machine import urdf_xml
-from pkm_twin.machine.graph import spanning
+from pkm_twin.machine.graph import groups, spanning
 from pkm_twin.machine.joints import TURN, TYPES
 from pkm_twin.machine.loop_tree import Joint, Link, LoopTree, hung, link_of
 from pkm_twin.machine.rotations import Pose, from_rpy
@@ -163,11 +163,9 @@ def _gravity(
 
     :raises ParameterError: only some have.
     """
-    held = {WORLD}
-    bolts = [(joint.inner, joint.outer) for joint in joints if joint.kind == "fixed"]
-    while reached := {end for pair in bolts if held & set(pair) for end in pair} - held:
-        held |= reached
     weight = {name: _flag(part, "gravity", True) for name, part in model.all("link")}
+    bolts = [(joint.inner, joint.outer) for joint in joints if joint.kind == "fixed"]
+    held = groups([WORLD, *weight], bolts)[0]
     moving = [name for name in weight if name not in held]
     off = [name for name in moving if not weight[name]]
     if off and len(off) < len(moving):

@@ -212,19 +212,10 @@ def _root(links: dict[str, Link], joints: dict[str, Joint]) -> str:
     roots = [name for name in links if name not in parents]
     if len(roots) != 1:
         raise ParameterError("robot", roots, "exactly one root link (a link that is not a child)")
-    known = {roots[0]}
-    for link in links:
-        # Up to what is known to hang on the root: every link is passed once.
-        way: dict[str, None] = {}
-        while link not in known:
-            if link in way:
-                circle = sorted(way)
-                raise ParameterError(
-                    f"joint.{parents[link].name}", circle, "a tree; these links form a circle"
-                )
-            way[link] = None
-            link = parents[link].inner
-        known.update(way)
+    reached = {roots[0], *(one.child for one in hung(roots[0], joints.values()))}
+    if circle := sorted(set(links) - reached):
+        where = f"joint.{parents[circle[0]].name}"
+        raise ParameterError(where, circle, "a tree; these links form a circle, or hang on one")
     return roots[0]
 
 
