@@ -23,9 +23,9 @@ from pkm_twin.errors import PkmTwinError
 UNKNOWNS: Final = "x"
 """Name of the input that Newton's method finds."""
 
-CLOSED: Final = 1e-9
-"""Newton's method ends with a correction below this: it converges quadratically, so what is left
-is below rounding."""
+CLOSED: Final = 1e-8
+"""Newton's method ends with a correction below this: it converges quadratically, so its square, of
+unit one, is left: half a unit of rounding."""
 MAX_ITERATIONS: Final = 12
 """Most corrections a step."""
 CONTRACTION: Final = 0.25
