@@ -22,13 +22,13 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-import yaml
 
 from delta_dynamics import mass_matrix
 from pkm_twin.codegen.arrays import Array
-from pkm_twin.errors import FileError, ParameterError, UnknownNameError
+from pkm_twin.errors import ParameterError, UnknownNameError
 from pkm_twin.machine import schema
 from pkm_twin.machine.sections import DriveSpec
+from pkm_twin.machine.strict_yaml import read_yaml
 from pkm_twin.mechanisms.catalogue import config_folder
 from pkm_twin.recordings.payload import by_load
 from pkm_twin.recordings.recording import Recording
@@ -165,11 +165,7 @@ def read_entries(path: Path, key: str, of: str, needed: bool = True) -> dict[Any
 
     :raises ParameterError: the file cannot be read or has no such mapping.
     """
-    try:
-        data = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise FileError(path, error, f"a YAML file of {key}") from None
-    entries = data.get(key) if isinstance(data, dict) else None
+    entries = read_yaml(path).get(key)
     if entries is None and not needed:
         return {}
     if not isinstance(entries, dict) or not entries:

@@ -311,7 +311,8 @@ def test_listed_gears_have_inertia_limits_and_cost(twin, tmp_path, geared):
         "tight": {"ratio": 10.0, "inertia": 4e-5, "efficiency": 0.8, "continuous_torque": 50.0,
                   "backlash": 3e-4, "cost": 40.0},
     }  # fmt: skip
-    drives.write_text(yaml.safe_dump({"drives": {"one": motor}, "gears": gears}))
+    text = yaml.safe_dump({"drives": {"one": motor}, "gears": gears})
+    drives.write_text(text.replace("4.0e-05", "4e-5"))
     data = twin.told("size", geared, out, "--drives", drives)
     robot, columns = load(geared), read_columns(out)
     (entry,) = data["drives"]["arm_2"]["drives"]
