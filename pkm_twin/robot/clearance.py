@@ -22,6 +22,7 @@ from pkm_twin.codegen.program import Program
 from pkm_twin.errors import ParameterError
 from pkm_twin.kinematics.motion import cross
 from pkm_twin.kinematics.traced import Traced
+from pkm_twin.machine.members import Beam
 from pkm_twin.robot.robot import Robot
 
 _TINY = 1e-300
@@ -76,10 +77,20 @@ def joint_clearance(robot: Robot, q: ArrayLike, refuse: bool = True) -> Array:
 
     :param refuse: False gives NaN where there is no assembly, instead of an error.
     """
-    (gap,), status = _kernel(robot)(_radii(robot), q)
+    return np.asarray(member_gaps(robot, q, refuse).min(-1), np.float64)
+
+
+def member_gaps(robot: Robot, q: ArrayLike, refuse: bool = True) -> Array:
+    """The distances of all :func:`member_pairs`, shape (..., pairs), m."""
+    (gaps,), status = _kernel(robot)(_radii(robot), q)
     if status is not None and refuse:
         robot.refuse_joints(status, q)
-    return np.asarray(gap[..., 0], np.float64)
+    return gaps
+
+
+def member_pairs(robot: Robot) -> list[tuple[Beam, Beam]]:
+    """The members of different limbs, two by two."""
+    return [pair for pair in combinations(robot.beams, 2) if pair[0].limb != pair[1].limb]
 
 
 def _radii(robot: Robot) -> Array:
@@ -96,18 +107,15 @@ def _kernel(robot: Robot) -> Kernel:
 
     def write(t: Traced) -> Program:
         t.solve()
-        segments = []
-        for beam in robot.beams:
+        segments, radii = {}, {}
+        for beam, radius in zip(robot.beams, t.tape.inputs("p", len(robot.beams)), strict=True):
             start, end = (t.motion.point(body, point) for body, point in (beam.inner, beam.outer))
-            segments.append((start, end - start))
-        radii = t.tape.inputs("p", len(segments))
-        least: Any = None
-        for i, j in combinations(range(len(segments)), 2):
-            if robot.beams[i].limb == robot.beams[j].limb:
-                continue
-            gap = distance(*segments[i], *segments[j]) - (radii[i] + radii[j])
-            least = gap if least is None else minimum(least, gap)
-        outputs = {"clearance": t.lift([least])}
+            segments[beam.name], radii[beam.name] = (start, end - start), radius
+        gaps = [
+            distance(*segments[a.name], *segments[b.name]) - (radii[a.name] + radii[b.name])
+            for a, b in member_pairs(robot)
+        ]
+        outputs = {"clearance": t.lift(gaps)}
         return Program(t.inputs("q"), len(segments), outputs, t.equations())
 
     return robot.engine.kernel(f"clearance {ends!r}", write)

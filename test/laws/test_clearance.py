@@ -11,7 +11,13 @@ import pytest
 from scipy.optimize import lsq_linear
 
 from pkm_twin.maps.search import workspace_box
-from pkm_twin.robot.clearance import clearance, distance, has_clearance
+from pkm_twin.robot.clearance import (
+    clearance,
+    distance,
+    has_clearance,
+    member_gaps,
+    member_pairs,
+)
 from pkm_twin.robot.workspace import reachable, regular_workspace
 from stiffness_monitor.structure import structural_model
 from test.support.robots import SHIPPED, load, partly_long, random_poses
@@ -126,13 +132,18 @@ def test_members_are_those_of_the_frame(name, sections, variant, rng):
         # "arm II", "forearm II a", "limb II", "2B"
         limbs = [m.name.split()[1] if " " in m.name else m.name[0] for m in members]
         assert len(set(limbs)) == 3
-        gaps = [
-            bounded(*bars[i][:2], *bars[j][:2]) - bars[i][2] - bars[j][2]
+        gaps = {
+            frozenset((members[i].name, members[j].name)): bounded(*bars[i][:2], *bars[j][:2])
+            - bars[i][2]
+            - bars[j][2]
             for i in range(len(bars))
             for j in range(i)
             if limbs[i] != limbs[j]
-        ]
-        assert float(clearance(robot, pose)) == pytest.approx(min(gaps), abs=1e-9)
+        }
+        assert float(clearance(robot, pose)) == pytest.approx(min(gaps.values()), abs=1e-9)
+        found = member_gaps(robot, robot.inverse(pose))
+        for (a, b), gap in zip(member_pairs(robot), found, strict=True):
+            assert gap == pytest.approx(gaps[frozenset((a.name, b.name))], abs=1e-9)
 
 
 def box(robot, count=25):

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.maps.kind import POSITIVE, SHARE, Case, Found, Kind, Space, Variable, about, number
-from pkm_twin.robot.clearance import has_clearance, joint_clearance
+from pkm_twin.robot.clearance import has_clearance, member_gaps, member_pairs
 from pkm_twin.robot.robot import Robot
 from pkm_twin.robot.workspace import (
     CLEAR,
@@ -46,6 +46,11 @@ class Workspace(Kind):
     least = 0.0
     signed = True
     points = 200_000
+    element = "members that are nearest"
+
+    def elements(self, robot: Robot) -> tuple[str, ...]:
+        """Members of different limbs, two by two."""
+        return tuple(f"{a.name} and {b.name}" for a, b in member_pairs(robot))
 
     def cases(self, robot: Robot) -> tuple[Case, ...]:
         """The singularity index; clearance and passive angle where the file gives them."""
@@ -58,11 +63,12 @@ class Workspace(Kind):
         return ()
 
     def found(self, robot: Robot, q: Array, case: Case) -> Found:
-        """One number a pose, without direction or element."""
+        """One number a pose, without direction; of the clearance the members that are nearest."""
         if case == SINGULARITY:
             return Found(robot.try_singularity(q)[0])
         if case == CLEARANCE:
-            return Found(joint_clearance(robot, q, refuse=False))
+            gaps = member_gaps(robot, q, refuse=False)
+            return Found(gaps.min(-1), element=gaps.argmin(-1))
         return Found(joint_angle_at(robot, robot.forward(q)))
 
     def summaries(self, space: Space, counted: int, apart: int) -> dict[str, Variable]:
