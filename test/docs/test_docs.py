@@ -19,7 +19,7 @@ from pkm_twin import design, paths, robot_names
 from pkm_twin import errors as module
 from test.support.command import typed_line
 from test.support.pages import assert_output, read_section
-from tools.pages import architecture, engine, errors, notebooks, parameters, trend
+from tools.pages import architecture, engine, errors, notebooks, parameters, public, trend
 
 DOCS = Path(__file__).parents[2] / "docs"
 
@@ -190,6 +190,24 @@ def test_the_python_page_has_each_public_name(package):
     page = (DOCS / "api.md").read_text(encoding="utf-8")
     listed = re.search(rf"::: {package.__name__}\n.*?members: \[(.*?)\]", page, re.DOTALL)[1]
     assert sorted(re.split(r",\s+", listed)) == sorted(package.__all__)
+
+
+def test_public_names_change_only_with_an_announcement():
+    found, known = (
+        {line.rpartition(": ")[0]: set(line.split(": ")[-1].split()) for line in text.splitlines()}
+        for text in (public.names(), (DOCS / "public_names.txt").read_text(encoding="utf-8"))
+    )
+    changes = [
+        f"{group}: {word} {sorted(names)}"
+        for one, other, word in ((known, found, "without"), (found, known, "with"))
+        for group in one
+        if (names := one[group] - other.get(group, set()))
+    ]
+    assert not changes, (
+        f"{'; '.join(changes)}. A replaced name works until the next major version "
+        "(docs/stability.md). Write a line in CHANGELOG.md under Added or Changed, with reason and "
+        "replacement, and run `make pages`."
+    )
 
 
 def test_every_robot_has_its_picture():

@@ -221,6 +221,20 @@ class TestJointState:
         assert reject(JointReader(limitless).joint_state, message, NOW, RULES)[0] == "bounds"
         assert JointReader(limitless).joint_state(state(make, position=(3, 3, 3)), NOW, RULES)
 
+    def test_beyond_its_limits_a_machine_may_be_measured_and_no_farther_than_any_can_go(self, make):
+        far = state(make, position=(3.0,) * 3, velocity=(20.0,) * 3)
+        assert reject(READ["state"], far)[0] == "limit"
+        sample = JointReader(ROBOT, limited=False).joint_state(far, NOW, RULES)
+        assert (sample.q.tolist(), sample.qd.tolist()) == ([3.0] * 3, [20.0] * 3)
+        sliding = load("linear_delta")
+        reader = JointReader(sliding, limited=False)
+        for most, good in ((100.0, True), (100.1, False)):
+            message = make.joint_state(sliding.joint_names, [most, -most, 0.0], stamp=NOW)
+            if good:
+                assert reader.positions(message, NOW, RULES).q.tolist() == [most, -most, 0.0]
+            else:
+                assert reject(reader.positions, message, NOW, RULES)[0] == "bounds"
+
 
 class TestStamps:
     @pytest.mark.parametrize("stamp", [NOW - SECOND // 10, NOW, NOW + SECOND // 10])

@@ -23,6 +23,9 @@ def test_a_stop_holds_with_its_reason_until_enough_good_samples_in_a_row():
     assert [stream.accept(), stream.reject("d", "6"), stream.accept()] == [False] * 3
     assert stream.stopped and stream.accept() and stream.accepted == 2
     assert not stream.reject("a", "7") and stream.status == "a: 7"
+    assert stream.counts("x", "taken") == {
+        "x taken": 2, "x rejected: a": 3, "x rejected: b": 1, "x rejected: d": 2,
+    }  # fmt: skip
     assert stream.stop("e", "8") and not stream.accept()
     # By hand, it runs at once, and counts from there.
     assert stream.resume() and not stream.resume()
