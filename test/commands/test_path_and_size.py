@@ -457,7 +457,7 @@ def test_the_workspace_ends_before_a_limb_is_stretched(twin):
 
 def test_a_machine_that_only_turns_is_sized_by_its_turns(twin):
     """Against turns of constant rate and growing rate, followed by differences in time."""
-    name, (speed, change) = "examples/machines/agile_eye.yaml", (3.0, 20.0)
+    name, (speed, change) = "examples/machines/agile_eye.yaml", (15.0, 20.0)
     result = twin.told("size", name, "--over-workspace", f"{speed},{change}")
     robot, rng, step, count = load(REPOSITORY / name), np.random.default_rng(3), 1e-3, 2000
     ways = rng.normal(size=(2, count, 3))

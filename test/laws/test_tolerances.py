@@ -316,6 +316,11 @@ def test_bounds_hold_for_machines_that_are_drawn_within_them():
                     effects[what] = effects.get(what, 0.0) + value * vector[None]
         exact = Assembly(robot, state).displaced(effects)[0]
         assert exact[0] == pytest.approx(worst[0], rel=2e-3)
+    # A play is the whole of it: parts stand half of it away at most.
+    for play, part in (("backlash", "offset"), ("clearance[1]", "at[1]")):
+        one, other = (f"joints.motor_1.{name}" for name in (play, part))
+        each = tolerances(robot, {one: Tolerance(bound=1e-4), other: 1e-5}, q).sensitivity
+        np.testing.assert_allclose(each[one], 0.5 * each[other], atol=1e-12)
     for path, size in (("joints.motor_1.backlash", 1e-4), ("joints.motor_1.clearance", 1e-4),
                        ("joints.none*.offset", Tolerance(bound=1e-4))):  # fmt: skip
         with pytest.raises(ParameterError):
