@@ -8,8 +8,6 @@ judged by the same machine with fewer drives, and a programme of its own.
 
 from __future__ import annotations
 
-import itertools
-
 import numpy as np
 import pytest
 
@@ -23,10 +21,18 @@ from delta_dynamics import (
     reactions,
     torque_derivatives,
 )
+from delta_dynamics.feedforward import Feedforward, Settings
 from pkm_twin import load
-from pkm_twin.errors import MobilityError, ParameterError, SingularityError, UnreachableError
+from pkm_twin.errors import (
+    MessageError,
+    MobilityError,
+    ParameterError,
+    SingularityError,
+    UnreachableError,
+)
 from pkm_twin.mechanisms.catalogue import robot_of_data
 from pkm_twin.robot.derivatives import joint_rates
+from test.nodes.harness import SECOND, Maker, Plain
 
 GRAVITY = np.array([1.0, -9.0, -3.0])
 ROOT = "examples/machines"
@@ -393,7 +399,33 @@ def test_changes_keep_the_sharing(planar):
     assert np.abs(apart).max() > 0.1
     again = robot_of_data(tense.parameter_sections(), "again")
     np.testing.assert_allclose(inverse_dynamics(again, q, zero, zero), before + apart, atol=1e-14)
-    assert [*itertools.chain(again.graph.leads)] == ["motor_1", "motor_2", "motor_3"]
+    assert again.graph.leads == ("motor_1", "motor_2", "motor_3")
+
+
+def test_a_stream_of_encoders_that_differ_is_answered(planar):
+    """Positions to 1e-5 rad, rates and accelerations by the node; then one encoder slips."""
+    make, rng, step = Maker(Plain()), np.random.default_rng(4), SECOND // 1000
+    twin = Feedforward(planar, Settings(differentiate=True, recovery_count=3))
+    pose, rate, change = [], [], []
+    for t in np.arange(0.0, 0.2, 1e-3):
+        wave, size = np.array([5.0, 7.0, 4.0]), np.array([0.03, 0.02, 0.1])
+        pose.append(size * np.sin(wave * t))
+        rate.append(size * wave * np.cos(wave * t))
+        change.append(-size * wave**2 * np.sin(wave * t))
+    q = planar.inverse(pose)
+    qd, qdd = joint_rates(planar, q, np.array(rate), np.array(change))
+    expected, answered = inverse_dynamics(planar, q, qd, qdd), 0
+    for k, seen in enumerate(q + 1e-5 * rng.uniform(-1, 1, q.shape)):
+        now = 1000 * SECOND + k * step
+        answer = twin.joint_state(make.joint_state(planar.joint_names, seen, stamp=now), now)
+        if answer is not None and k > 60:
+            answered += 1
+            np.testing.assert_allclose(answer.effort, expected[k], atol=0.1)
+    assert answered == len(q) - 61
+    now += step
+    slipped = make.joint_state(planar.joint_names, seen + 5e-3 * np.eye(4)[2], stamp=now)
+    with pytest.raises(MessageError):
+        twin.joint_state(slipped, now)
 
 
 def test_without_redundancy_nothing_moves_nothing():
