@@ -132,7 +132,7 @@ class Redundancy:
         text="how far others may contradict them; of slides, parts of the size; of rates, in 10 ms",
     )  # fmt: skip
     preload: Array = schema.vector(
-        0, unit="{effort}", text="efforts, one a joint, that shared ones come nearest to",
+        0, unit="{effort}", text="efforts, one per joint, that shared ones come nearest to",
         default=[],
     )  # fmt: skip
 
