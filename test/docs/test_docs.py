@@ -59,7 +59,7 @@ def clone(tmp_path, monkeypatch):
     ("page", "made"),
     [
         ("tutorial.md", ("pick.png", "pick_torques.csv", "mine.png")),
-        ("new_machine.md", ("my_delta.png", "torques.csv", "loaded.csv", "converted.yaml")),
+        ("new_machine.md", ("my_delta.png", "torques.csv", "converted.yaml")),
     ],
 )
 def test_a_page_from_its_first_block_to_its_last(page, made, clone, twin):
