@@ -495,7 +495,7 @@ def shared_by(graph: Graph, leads: Sequence[str], how: Redundancy, effort: Any) 
     n = len(names)
     preload: Any = how.preload if how.preload.size else np.zeros(n)
     if len(preload) != n:
-        raise ParameterError("redundancy.preload", list(preload), f"{n} efforts, one a joint")
+        raise ParameterError("redundancy.preload", list(preload), f"{n} efforts, one per joint")
     limits: Any = np.ones(n) if effort is None else np.broadcast_to(effort, n)
     for name, limit in zip(names, references(limits), strict=True):
         if not np.isfinite(limit):

@@ -14,7 +14,7 @@ MACHINES = Path(__file__).parents[2] / "examples/machines"
 GALLERY = sorted(path for path in MACHINES.iterdir() if path.suffix in (".yaml", ".urdf"))
 """Files of example machines."""
 _PAGE = (MACHINES.parents[1] / "docs/index.md").read_text(encoding="utf-8")
-PICTURED = [path for path in GALLERY if path.name in _PAGE]
+PICTURED = [path for path in GALLERY if f"robot_{path.stem}.png" in _PAGE]
 """Those of which the page of machines has a picture."""
 
 
