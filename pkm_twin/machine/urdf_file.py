@@ -215,7 +215,7 @@ def _root(links: dict[str, Link], joints: dict[str, Joint]) -> str:
     reached = {roots[0], *(one.child for one in hung(roots[0], joints.values()))}
     if circle := sorted(set(links) - reached):
         where = f"joint.{parents[circle[0]].name}"
-        raise ParameterError(where, circle, "a tree; these links form a circle, or are attached to one")
+        raise ParameterError(where, circle, "a tree; these links form a circle or depend on one")
     return roots[0]
 
 
