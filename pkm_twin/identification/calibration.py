@@ -26,7 +26,6 @@ from pkm_twin.identification.calibration_fit import (
     Fault,
     Fitted,
     Outlier,
-    Parameter,
     RejectedPosesError,
     UnsettledError,
     cost_of,
@@ -41,7 +40,7 @@ from pkm_twin.identification.calibration_state import (
     FRAME,
     TARGET,
     Instrument,
-    Number,
+    Parameter,
     Poses,
     State,
     Transmission,
@@ -104,7 +103,7 @@ class Free:
     transmission: Transmission = Transmission.AUTO
     only: tuple[str, ...] = ()
 
-    def mapped(self, robot: Robot, q: Array) -> list[Number]:
+    def mapped(self, robot: Robot, q: Array) -> list[Parameter]:
         """Numbers of the joint map that are fitted to joint states (k, n)."""
         angle = self.prior / robot.size
         found = numbers(robot, q, self.transmission, self.offsets, self.prior, angle)
@@ -299,7 +298,7 @@ def unknowns(robot: Robot, measured: Measured, paths: Sequence[str], free: Free)
         Parameter(path, unit, value, prior if unit == "m" else angle)
         for path, value, unit in fitted
     ]
-    parameters += [Parameter(*number) for number in mapped]
+    parameters += mapped
     # Where the instrument stands is not known at all.
     far = 100.0 * robot.engine.tree.size
     for name in [*(FRAME if free.frame else ()), *(TARGET if free.target else ())]:

@@ -17,12 +17,12 @@ from pkm_twin.errors import ParameterError, PkmTwinError, one_line
 from pkm_twin.identification.calibration_state import (
     FRAME,
     Instrument,
+    Parameter,
     State,
     moved,
     value_of,
 )
 from pkm_twin.identification.measurements import Measured, Readings, Weights
-from pkm_twin.identification.parameters import OBSERVED
 from pkm_twin.identification.samples import OUTLIER
 from pkm_twin.robot.robot import Robot
 
@@ -58,25 +58,6 @@ EXPLAINED: Final = 0.8
 """Part of the sum of squares below which another place of the instrument is tried."""
 MAX_OUTLIERS: Final = 0.25
 """Part of the poses that may be outliers."""
-
-
-@dataclass(frozen=True)
-class Parameter:
-    """One number that is fitted, in its unit, with standard deviations before and after."""
-
-    name: str
-    unit: str
-    before: float
-    prior: float
-    value: float = np.nan
-    deviation: float = np.nan
-    scaled: bool = False
-    """Whether it hangs on a scale that was not measured."""
-
-    @property
-    def observed(self) -> bool:
-        """Whether the poses tell it: they, not the prior, make its deviation."""
-        return self.deviation < OBSERVED * self.prior and not self.scaled
 
 
 class UnsettledError(ParameterError):

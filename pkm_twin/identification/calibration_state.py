@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from enum import StrEnum
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -12,16 +13,13 @@ import numpy as np
 from pkm_twin.codegen.arrays import Array, Mask
 from pkm_twin.design.variants import Variants
 from pkm_twin.errors import ParameterError
+from pkm_twin.identification.parameters import OBSERVED
 from pkm_twin.machine.joint_map import JointMap
 from pkm_twin.machine.rotations import skew
 from pkm_twin.robot.robot import Robot
 
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation  # type: ignore[import-untyped]
-
-
-from enum import StrEnum
-from typing import NamedTuple
 
 FRAME: Final = tuple(f"frame.{axis}" for axis in ("x", "y", "z", "rx", "ry", "rz"))
 TARGET: Final = ("target.x", "target.y", "target.z")
@@ -203,13 +201,23 @@ class Transmission(StrEnum):
     FILE = "file"
 
 
-class Number(NamedTuple):
-    """A number of the joint map: its unit, value and standard deviation before."""
+@dataclass(frozen=True)
+class Parameter:
+    """One number that is fitted, in its unit, with standard deviations before and after."""
 
     name: str
     unit: str
-    value: float
+    before: float
     prior: float
+    value: float = np.nan
+    deviation: float = np.nan
+    scaled: bool = False
+    """Whether it hangs on a scale that was not measured."""
+
+    @property
+    def observed(self) -> bool:
+        """Whether the poses tell it: they, not the prior, make its deviation."""
+        return self.deviation < OBSERVED * self.prior and not self.scaled
 
 
 def unit_of(robot: Robot, joint: int) -> str:
@@ -226,7 +234,7 @@ def per(controller: str, model: str) -> str:
 
 def numbers(
     robot: Robot, q: Array, how: Transmission, offsets: bool, prior: float, angle: float
-) -> list[Number]:
+) -> list[Parameter]:
     """What is fitted of the joint map.
 
     :param q: the poses' joints, (k, n). ``prior``, ``angle``: standard deviations of lengths, m,
@@ -248,17 +256,17 @@ def numbers(
         size = prior if sliding[i] else angle
         size = float(np.hypot(size, RATIO_DEVIATION * farthest[i] if fitted[i] else 0.0))
         if offsets:
-            found.append(Number(f"{path}.offset", unit, float(own.offsets[i]), size * ratio))
+            found.append(Parameter(f"{path}.offset", unit, float(own.offsets[i]), size * ratio))
         if fitted[i] and how is not Transmission.SHARED:
             its = per(unit, robot.joint_units[i])
-            found.append(Number(f"{path}.ratio", its, ratio, RATIO_DEVIATION * ratio))
+            found.append(Parameter(f"{path}.ratio", its, ratio, RATIO_DEVIATION * ratio))
         if how is Transmission.TRAVEL:
             change, prior_change = float(own.changes[i]), 2.0 * RATIO_DEVIATION / float(travel[i])
             found.append(
-                Number(f"{path}.ratio_change", f"1/{robot.joint_units[i]}", change, prior_change)
+                Parameter(f"{path}.ratio_change", f"1/{robot.joint_units[i]}", change, prior_change)
             )
     if how is Transmission.SHARED:
-        found.append(Number(SHARED, "", 1.0, RATIO_DEVIATION))
+        found.append(Parameter(SHARED, "", 1.0, RATIO_DEVIATION))
     return found
 
 

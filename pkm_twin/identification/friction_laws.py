@@ -269,9 +269,7 @@ def _searched(robot: Robot, result: Fit, name: str, found: dict[str, Searched]) 
             old = float(np.asarray(getattr(robot.friction, key))[k])
             if result.verdict.deviations == "withheld":
                 deviation = np.full(len(value), np.nan)
-            more.append(
-                Number(path, unit, old, float(value[k]), float(deviation[k]), 0.0, "fitted")
-            )
+            more.append(Number(path, unit, old, float(value[k]), float(deviation[k]), "fitted"))
     return more
 
 

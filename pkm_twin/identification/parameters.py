@@ -138,7 +138,7 @@ class Number:
     """One number of the file: where it stands, before and after, and its standard deviation.
 
     ``deviation``: NaN where it is withheld, as the model does not explain the recordings.
-    ``share``: that of the noise alone over that of before. ``status``: ``fitted``; ``combination``:
+    ``status``: ``fitted``; ``combination``:
     known only in combination; ``not excited``: the motion does not identify it, the file's value
     stays.
     """
@@ -148,7 +148,6 @@ class Number:
     before: float
     after: float
     deviation: float
-    share: float
     status: Status
 
     @property
@@ -173,9 +172,9 @@ def number_of(
     plain, wide = deviations
     share = plain / prior if prior > 0.0 else 1.0
     if share > UNSURE and abs(value - before) <= NO_CHANGE * prior:
-        return Number(key, unit, before, before, plain, share, "not excited")
+        return Number(key, unit, before, before, plain, "not excited")
     status: Status = "fitted" if share < FITTED_RATIO else "combination"
-    return Number(key, unit, before, value, wide, share, status)
+    return Number(key, unit, before, value, wide, status)
 
 
 def numbers_of_group(

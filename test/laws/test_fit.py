@@ -184,10 +184,10 @@ def test_an_inertia_beyond_what_a_body_can_be_is_written_only_if_by_a_little(
     """As where one of its numbers keeps the file's value."""
     entries = zip(*np.triu_indices(3), [1.0 + beyond, 0.0, 0.0, 0.0, 0.0, 1.0], strict=True)
     numbers = [
-        Number(("payload", "inertia", int(i), int(j)), "kg m2", 0.0, value, 0.1, 0.5, "combination")
+        Number(("payload", "inertia", int(i), int(j)), "kg m2", 0.0, value, 0.1, "combination")
         for i, j, value in entries
     ]
-    numbers.append(Number(("payload", "mass"), "kg", 0.0, 0.5, 0.1, 0.5, "fitted"))
+    numbers.append(Number(("payload", "mass"), "kg", 0.0, 0.5, 0.1, "fitted"))
     text = Path("config/five_bar.yaml").read_text()
     out = tmp_path / "fitted.yaml"
     with nullcontext() if written else pytest.raises(PkmTwinError, match="not a valid robot"):
