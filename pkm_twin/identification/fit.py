@@ -35,9 +35,6 @@ WORSE: Final = 1.2
 """Held-out residual of a joint over that of the file's values that a machine like the file's does
 not leave."""
 
-NO_SHIFT: Final = 0.05
-"""Part of the standard deviations up to which no number is corrected: clean efforts stay exact."""
-
 
 @dataclass(frozen=True, eq=False)
 class Judged:
@@ -222,9 +219,7 @@ def _corrected(parameters: FileParameters, result: Estimate, verdict: Verdict) -
 
     Of recordings that the model does not explain nothing is known of what they changed.
     """
-    deviations = np.sqrt(np.diag(verdict.widened(result.covariance)))
-    small = (np.abs(verdict.shift) < NO_SHIFT * deviations).all()
-    if verdict.answer == "does not explain" or small:
+    if verdict.answer == "does not explain":
         return result
     aim, cones = result.values - verdict.shift, parameters.cones
     if possible(aim, cones):

@@ -484,7 +484,8 @@ def _posterior(
 
     One linear Gaussian model, averaged over which kinds of errors there are (Hoeting et al., 1999).
     Lengths are always in it, as none are exact. An error without a usual size is in it where the
-    residual shows it, with a prior as wide as one row determines it.
+    residual shows it, with a prior as wide as one row determines it. Of an error that all joints
+    share and the residual does not show, the mean knows nothing: else it would spoil sound fits.
 
     :param tables: the residual and the suspects without what the fitted parameters explain.
     :returns: the covariance is the factor's transpose times the factor.
@@ -508,7 +509,9 @@ def _posterior(
     scaled = left[:, used] * sizes[used]
     moved = response([case.suspects[..., used] * sizes[used] for case in cases])
     gram, side = scaled.T @ scaled / inflation, scaled.T @ y / inflation
-    logs, parts = [], []
+    shown = {k for one in chosen for k in (one.index, *one.near)}
+    quiet = [suspects[own[0]].where == ALL and not shown & {*own} for own in kinds.values()]
+    logs, parts, counts = [], [], []
     for which in product((False, True), repeat=len(kinds)):
         inside = [k for own, good in zip(kinds.values(), which, strict=True) if good for k in own]
         rows = np.searchsorted(used, sorted([*always, *inside]))
@@ -516,9 +519,11 @@ def _posterior(
         half = np.linalg.solve(root, np.column_stack([side[rows], moved[:, rows].T]))
         logs.append(0.5 * half[:, 0] @ half[:, 0] - np.log(np.diag(root)).sum())
         parts.append((half[:, 1:].T @ half[:, 0], half[:, 1:]))
+        counts.append(not any(good and one for good, one in zip(which, quiet, strict=True)))
     weights = np.exp(np.array(logs) - max(logs))
     weights /= weights.sum()
-    mean = np.einsum("w,wf->f", weights, np.stack([middle for middle, _ in parts]))
+    told = np.where(counts, weights, 0.0)
+    mean = np.einsum("w,wf->f", told / told.sum(), np.stack([middle for middle, _ in parts]))
     factors = [
         np.sqrt(weight) * np.concatenate([half, (middle - mean)[None]])
         for weight, (middle, half) in zip(weights, parts, strict=True)
