@@ -20,6 +20,7 @@ from pkm_twin.identification.calibration_state import Poses
 from pkm_twin.identification.measurements import whole_of
 from pkm_twin.identification.undetermined import LINES, undetermined
 from test.support.robots import data_of, load, random_joints
+from test.support.tables import write_columns
 
 NOISE = 2e-5
 QUARTER = Rotation.from_euler("z", 90.0, degrees=True).as_matrix()
@@ -92,7 +93,7 @@ def test_changes_beyond_their_prior_are_rejected_or_marked(tmp_path: Path) -> No
     names = [*(f"{j}.position" for j in robot.controller.names), "x", "y", "z"]
     table, out = tmp_path / "poses.csv", tmp_path / "mine.yaml"
     rows = np.hstack([there.joints, there.position])
-    np.savetxt(table, rows, "%.17g", ",", header=",".join(names), comments="")
+    write_columns(table, dict(zip(names, rows.T, strict=True)))
     given = Calibrate(
         robot="delta_cu", poses=table, out=out, only=only, no_offsets=True, accept=True
     )

@@ -13,29 +13,24 @@ from pkm_twin.mechanisms.catalogue import robot_of_data
 from test.support.robots import every_robot, joint_range, load
 
 
-@pytest.fixture
-def slide():
+def slide(limits: object) -> Robot:
     """One slide along z from its home value 0.1, and the platform's reference point beside it."""
-
-    def make(limits: object) -> Robot:
-        data = {
-            "mechanism": "machine", "platform": "table", "origin": [0.3, 0.0, 1.0], "pose": ["z"],
-            "bodies": {"table": {"mass": 1.0, "com": [0, 0, 1.0], "inertia": [0.1, 0.1, 0.1]}},
-            "joints": {
-                "rail": {
-                    "type": "prismatic", "between": ["base", "table"], "at": [0, 0, 1.0],
-                    "axis": [0, 0, 1], "actuated": True, "home": 0.1,
-                    **({} if limits is None else {"limits": {"position": limits}}),
-                }
-            },
-        }  # fmt: skip
-        return robot_of_data(data, "slide")
-
-    return make
+    data = {
+        "mechanism": "machine", "platform": "table", "origin": [0.3, 0.0, 1.0], "pose": ["z"],
+        "bodies": {"table": {"mass": 1.0, "com": [0, 0, 1.0], "inertia": [0.1, 0.1, 0.1]}},
+        "joints": {
+            "rail": {
+                "type": "prismatic", "between": ["base", "table"], "at": [0, 0, 1.0],
+                "axis": [0, 0, 1], "actuated": True, "home": 0.1,
+                **({} if limits is None else {"limits": {"position": limits}}),
+            }
+        },
+    }  # fmt: skip
+    return robot_of_data(data, "slide")
 
 
 @pytest.mark.parametrize("limits", [[0.0, 0.6], [-0.4, 0.1]])
-def test_a_slide_reaches_as_far_as_its_farther_limit(slide, limits) -> None:
+def test_a_slide_reaches_as_far_as_its_farther_limit(limits) -> None:
     """Half a metre of travel either way of home, and 0.3 m to the reference point."""
     robot = slide(limits)
     box = position_box(robot.graph, robot.limits.position)
@@ -44,7 +39,7 @@ def test_a_slide_reaches_as_far_as_its_farther_limit(slide, limits) -> None:
     assert ((places >= box[:, 0]) & (places <= box[:, 1])).all()
 
 
-def test_a_slide_without_limits_has_no_end(slide) -> None:
+def test_a_slide_without_limits_has_no_end() -> None:
     robot = slide(None)
     with pytest.raises(ParameterError) as caught:
         position_box(robot.graph, robot.limits.position)
