@@ -109,7 +109,7 @@ REFUSALS = [
     ("five_bar", {"bodies.island": ISLAND}, ("bodies.island", "bodies"), "island"),
     ("five_bar", {"joints.right.actuated": MISSING}, ("joints",), ""),
     ("five_bar", PENDULUM, ("joints", "joints.pivot"), "pivot"),
-    ("five_bar", {"joints.tip.actuated": True}, ("joints", "joints.tip"), ""),
+    ("five_bar", {"joints.tip.actuated": True}, ("joints.tip.limits.effort",), "share"),
     ("five_bar", IDLE, ("joints", "joints.neck", "platform"), "neck"),
     ("five_bar", {"pose": ["x", "y"]}, ("pose",), "y"),
     ("five_bar", {"pose": ["x"]}, ("pose",), ""),
