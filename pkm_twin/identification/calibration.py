@@ -31,7 +31,6 @@ from pkm_twin.identification.calibration_fit import (
     cost_of,
     faults_of,
     fit,
-    looks_placed,
     outliers_of,
     place_fault,
 )
@@ -81,6 +80,8 @@ SCALED: Final = 0.5
 which on it depends on the scale."""
 KEPT: Final = 0.1
 """Part of its prior deviation to which a length is kept that is known worse, without a scale."""
+EXPLAINED: Final = 0.8
+"""Part of the sum of squares below which another place of the instrument is tried."""
 CURVED: Final = 1e-4
 """Deviation of a scale below which no measured length is needed: 0.01 mm in 100 mm."""
 
@@ -485,9 +486,14 @@ def _compared(
 def _looks_placed(
     robot: Robot, measured: Measured, found: Fitted, told: Sequence[Parameter]
 ) -> bool:
+    """Whether another place of the instrument would explain a part of what a fit leaves."""
     over, asked = found.weights.over, [(p.before - p.value) / p.prior for p in told]
-    columns = over(measured.slopes(robot, found.state, FRAME))
-    return looks_placed(found.table, columns, np.append(over(measured.parts(found.state)), asked))
+    target = np.append(over(measured.parts(found.state)), asked)
+    own = np.vstack([found.table, np.eye(len(told))])
+    frame = over(measured.slopes(robot, found.state, FRAME))
+    both = np.hstack([own, np.pad(frame, ((0, len(told)), (0, 0)))])
+    left = [target - one @ np.linalg.lstsq(one, target, rcond=None)[0] for one in (own, both)]
+    return float(left[1] @ left[1]) < EXPLAINED * float(left[0] @ left[0])
 
 
 def _scaled(

@@ -54,8 +54,6 @@ MOVED: Final = 14.0
 instrument must save: with sound priors six free numbers save so much in 3 of 100 cases."""
 HALF: Final = 0.5
 """And the part of all squares below which they then are: an error of the model saves a few too."""
-EXPLAINED: Final = 0.8
-"""Part of the sum of squares below which another place of the instrument is tried."""
 MAX_OUTLIERS: Final = 0.25
 """Part of the poses that may be outliers."""
 
@@ -272,20 +270,6 @@ def faults_of(
 def cost_of(changes: Sequence[Parameter]) -> float:
     """Squares of the machine's changes over their prior standard deviations, summed."""
     return sum(((p.value - p.before) / p.prior) ** 2 for p in changes)
-
-
-def looks_placed(table: Array, columns: Array, target: Array) -> bool:
-    """Whether another place of the instrument would explain a part of what a fit leaves.
-
-    :param table: derivatives by the fitted numbers in units of their priors, (rows, p), and by the
-        instrument's position and rotation, ``columns``, (rows, 6). ``target``: residuals of the
-        measurements, then of the priors, (rows + p,).
-    """
-    p = table.shape[1]
-    own = np.vstack([table, np.eye(p)])
-    both = np.hstack([own, np.vstack([columns, np.zeros((p, columns.shape[1]))])])
-    left = [target - one @ np.linalg.lstsq(one, target, rcond=None)[0] for one in (own, both)]
-    return float(left[1] @ left[1]) < EXPLAINED * float(left[0] @ left[0])
 
 
 def place_fault(instrument: Instrument) -> Fault:
