@@ -239,23 +239,26 @@ class Scene:
         tip_radii = np.repeat(thick, self.pieces + 1)
         ball_colours = [colours.get(name, JOINT) for name, _ in self._balls]
         whole = Rotation.from_matrix(posture.rotations[graph.platform])
-        places = {
-            bar.element: lines[k].mean(0) for k, bar in enumerate(self.bars) if bar.element
-        } | {name: ball for (name, _), ball in zip(self._balls, balls, strict=True)}
+        labels = [graph.joints[name].label or name for name in self._drives]
+        drive_colours = [colours.get(label, DRIVE) for label in labels]
+        drives = [a.mean(0) for a in motors]
+        places = (
+            dict(zip(labels, drives, strict=True))
+            | {bar.element: lines[k].mean(0) for k, bar in enumerate(self.bars) if bar.element}
+            | {name: ball for (name, _), ball in zip(self._balls, balls, strict=True)}
+        )
         return Shapes(
             at,
             turns,
             sizes,
-            np.array(
-                [*np.repeat(bar_colours, self.pieces, axis=0), *([DRIVE] * len(motors))], np.uint8
-            ),
+            np.array([*np.repeat(bar_colours, self.pieces, axis=0), *drive_colours], np.uint8),
             np.concatenate([np.array(balls).reshape(-1, 3), tips]),
             np.repeat(np.concatenate([ball_radii, tip_radii])[:, None], 3, axis=1),
             np.array([*ball_colours, *np.repeat(bar_colours, self.pieces + 1, axis=0)], np.uint8),
             origin + shift,
             _quaternions(turn * whole),
             places,
-            {name: a.mean(0) for name, a in zip(self._drives, motors, strict=True)},
+            dict(zip(self._drives, drives, strict=True)),
         )
 
     def frames(self, q: Array, moved: Deflection) -> dict[str, tuple[Array, Array]]:

@@ -324,7 +324,7 @@ def test_a_deflected_machine_stays_together_and_moves_as_its_members(name):
 
 
 def test_every_element_has_a_place_and_its_colour():
-    for name in ("delta_cu", "prru", "upr_rpu"):
+    for name in ("delta_cu", "prru", "upr_rpu", "stewart", "linear_delta"):
         model = model_of(name)
         energy = model.numbers(model.loaded(model.start, [10.0, 5, -20, 0, 0, 0])).energy
         shares = dict(zip(energy.elements, energy.factors.tolist(), strict=True))
