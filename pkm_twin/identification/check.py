@@ -131,6 +131,10 @@ def checked(r: Recording, residual: float) -> Checked:
     left_out = np.zeros(len(r.time), np.bool_)
     bound = f"RMS below {100 * residual:g} % of peak"
     reason = why_no_torques(r.robot)
+    if r.robot.redundant:
+        reason = (
+            reason or "more motors than degrees of freedom share efforts as their controller says"
+        )
     if r.effort is None:
         reason = reason or "the bag carries no efforts"
     if reason or r.effort is None:

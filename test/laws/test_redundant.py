@@ -30,8 +30,10 @@ from pkm_twin.errors import (
     SingularityError,
     UnreachableError,
 )
+from pkm_twin.export.c_package import c_package
 from pkm_twin.mechanisms.catalogue import robot_of_data
 from pkm_twin.robot.derivatives import joint_rates
+from test.export.c_programs import Package, functions, inputs_of
 from test.nodes.harness import SECOND, Maker, Plain
 
 GRAVITY = np.array([1.0, -9.0, -3.0])
@@ -426,6 +428,26 @@ def test_a_stream_of_encoders_that_differ_is_answered(planar):
     slipped = make.joint_state(planar.joint_names, seen + 5e-3 * np.eye(4)[2], stamp=now)
     with pytest.raises(MessageError):
         twin.joint_state(slipped, now)
+
+
+def test_exported_functions_share_alike(planar, tmp_path):
+    package = Package(tmp_path / "c", c_package(planar))
+    program = package.build("-O0")
+    rng = np.random.default_rng(6)
+    q = planar.inverse(rng.uniform(-0.03, 0.03, (20, 3)))
+    qd, qdd = joint_rates(planar, q, *rng.uniform(-2, 2, (2, 20, 3)))
+    wrench = rng.uniform(-9, 9, (20, 6))
+    asked = functions(planar) | {"null_efforts": lambda q: null_efforts(planar, q).reshape(20, -1)}
+    assert set(package.heads) == set(asked)
+    given = inputs_of(planar, (q, qd, qdd, wrench)) | {"null_efforts": (q,)}
+    for name, ask in asked.items():
+        status, found = package.run(program, name, *given[name])
+        right = ask(*given[name])
+        assert not status.any(), name
+        np.testing.assert_allclose(found, right, atol=1e-12 * np.abs(right).max(), err_msg=name)
+    status, found = package.run(program, "torques", q + 3e-3 * np.eye(4)[2], qd, qdd, wrench)
+    assert (status == 1).all()
+    assert np.isnan(found).all()
 
 
 def test_without_redundancy_nothing_moves_nothing():
