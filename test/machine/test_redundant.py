@@ -36,6 +36,7 @@ from pkm_twin.robot.derivatives import joint_rates
 from test.export.c_programs import Package, functions, inputs_of
 from test.nodes.harness import SECOND, Maker, Plain
 
+pytestmark = pytest.mark.usefixtures("quickly_compiled")
 GRAVITY = np.array([1.0, -9.0, -3.0])
 ROOT = "examples/machines"
 
