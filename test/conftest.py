@@ -12,6 +12,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import numpy as np
 import pytest
 import yaml
+from hypothesis import settings
 
 from test.support.command import Commands
 from test.support.robots import (  # noqa: F401
@@ -23,6 +24,10 @@ from test.support.robots import (  # noqa: F401
     random_joints,
     random_poses,
 )
+
+# A loaded machine is no fault.
+settings.register_profile("patient", deadline=None)
+settings.load_profile("patient")
 
 # A background job of a shell ignores SIGINT, and so would every process started from here.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
