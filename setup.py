@@ -28,6 +28,8 @@ setup(
         "pkm_twin.config": ["*.yaml", "drives/*.yaml"],
         "pkm_twin.export": [
             "fmu_sources/*.c",
+            "moveit_package/*.*",
+            "moveit_package/*/*.*",
             "ros2_control_package/*.*",
             "ros2_control_package/*/*.*",
         ],

@@ -76,8 +76,9 @@ def modules():
 
 
 def templates():
-    """Sources of the exported ROS package."""
-    return {str(name) for name in tracked() if "ros2_control_package" in name.parts}
+    """Sources of the exported ROS packages."""
+    folders = {"moveit_package", "ros2_control_package"}
+    return {str(name) for name in tracked() if folders & set(name.parts)}
 
 
 def robots():

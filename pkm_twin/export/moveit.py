@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """A MoveIt configuration of a robot: a ROS package with its URDF, SRDF and settings.
 
-MoveIt knows trees. Its planning group is the actuated joints, for goals in joint space; the passive
-joints of the tree are declared passive, so that nobody waits for their states. Goals of the
-platform's pose need inverse kinematics that knows the loops: a plugin of one's own, by name. A
+MoveIt knows trees. Its planning group is the actuated joints; the passive joints of the tree are
+declared passive, so that nobody waits for their states. Inverse kinematics that knows the loops is
+a plugin of the package, on the robot's exported C; its source stands in ``moveit_package``. A
 numeric solver only solves the chain of the tree that leads to the platform, a group of its own
 where that chain has a drive (a Delta's has none).
 """
@@ -15,12 +15,16 @@ import xml.etree.ElementTree as ET
 from collections.abc import Sequence
 from itertools import combinations
 from typing import Any, Final
+from xml.sax.saxutils import escape
 
 import numpy as np
 import yaml
 
 from delta_dynamics import inverse_dynamics, mass_matrix
 from pkm_twin.errors import ParameterError
+from pkm_twin.export.c_package import c_package, identifier
+from pkm_twin.export.ros2_control import filled, literal, number, package_name, printable
+from pkm_twin.kinematics.pose import Coordinate, Entry
 from pkm_twin.machine.loop_tree import LoopTree, Single
 from pkm_twin.machine.urdf_write import GROUND, PLATFORM, parts_of
 from pkm_twin.robot.clearance import distance
@@ -34,6 +38,12 @@ LIMB: Final = "limb"
 NUMERIC: Final = "kdl_kinematics_plugin/KDLKinematicsPlugin"
 SHARE: Final = 0.5
 """Fraction of the effort left at home after gravity that a planner may use to accelerate."""
+POSITION: Final = 1e-4
+"""Between a goal and the machine's pose, m: MoveIt's own tolerance of goals."""
+ORIENTATION: Final = 1e-3
+"""The same of rotations, rad."""
+SINGULAR: Final = 0.01
+"""Least singularity index of solutions, as of the controllers of ros2_control."""
 CONTROLLER: Final = "delta_dynamics"
 """The node whose action fills goals with effort, as MoveIt's controller."""
 
@@ -41,7 +51,7 @@ CONTROLLER: Final = "delta_dynamics"
 def moveit_package(robot: Robot, kinematics: str = "") -> dict[str, str]:
     """The files of a package ``ROBOT_moveit_config`` by their paths in it.
 
-    :param kinematics: plugin of the planning group's inverse kinematics; empty: none.
+    :param kinematics: plugin of the planning group's inverse kinematics; empty: the package's own.
     :raises ParameterError: the robot has a ``joint_map``: plans are in the numbers of the URDF.
     """
     robot.check_independent("plans of MoveIt")
@@ -51,19 +61,60 @@ def moveit_package(robot: Robot, kinematics: str = "") -> dict[str, str]:
         )
     name = re.sub(r"\W", "_", robot.name or robot.mechanism)
     groups = srdf(robot)
-    package = f"{name}_moveit_config"
+    package = package_name(robot, "moveit_config")
+    solver = kinematics or f"{package}/Kinematics"
     texts = {
         f"config/{name}.urdf": robot_urdf(robot, hardware=""),
         f"config/{name}.srdf": groups,
         "config/joint_limits.yaml": _yaml(_joint_limits(robot, accelerations(robot))),
-        "config/kinematics.yaml": _yaml(_kinematics(kinematics, f'name="{LIMB}"' in groups)),
+        "config/kinematics.yaml": _yaml(_kinematics(solver, f'name="{LIMB}"' in groups)),
         "config/moveit_controllers.yaml": _yaml(_controllers(robot)),
         "config/ompl_planning.yaml": _yaml(PLANNING),
         "launch/move_group.launch.py": LAUNCH.format(name=name, package=package),
-        "package.xml": PACKAGE.format(name=name, package=package),
-        "CMakeLists.txt": CMAKE.format(package=package),
     }
-    return dict(sorted(texts.items()))
+    texts |= {f"c/{path}": text for path, text in c_package(robot).items()}
+    return dict(sorted((texts | filled("moveit_package", _words(robot, package))).items()))
+
+
+def _words(robot: Robot, package: str) -> dict[str, str]:
+    """What stands for the words between two ``@``."""
+    own, shown = identifier(robot.name), printable(robot)
+    limits = robot.limits.position
+    ends = np.array([[-np.inf, np.inf]] * robot.joints_count) if limits is None else limits
+    drives = zip(robot.joint_names, ends.tolist(), strict=True)
+    return {
+        "ROBOT": shown,
+        "XMLROBOT": escape(shown),
+        "PACKAGE": package,
+        "PREFIX": f"pkm_{own}",
+        "MACRO": f"PKM_{own}".upper(),
+        "JOINTNAMES": ", ".join(f"`{joint}`" for joint in robot.joint_names),
+        "POSENAMES": ", ".join(robot.pose_names),
+        "POSE": ", ".join(map(_coordinate, robot.coordinates)),
+        "DRIVES": "\n".join(
+            f"  {{{literal(joint)}, {number(low)}, {number(high)}}},"
+            for joint, (low, high) in drives
+        ),
+        "POSITION": f"{POSITION:g}",
+        "ORIENTATION": f"{ORIENTATION:g}",
+        "SINGULARITY": f"{SINGULAR:g}",
+    }
+
+
+def _coordinate(c: Coordinate) -> str:
+    """A pose coordinate in C++, of the position p and the rotation r, row by row."""
+
+    def entry(of: Entry) -> str:
+        row, column, sign = of
+        return f"{'-' if sign < 0.0 else ''}r[{3 * row + column}]"
+
+    if c.axis is not None:
+        return f"p[{c.axis}]"
+    first, *rest = c.entries
+    if rest:
+        return f"std::atan2({entry(first)}, {entry(rest[0])})"
+    others = ", ".join(entry((row, first[1], 1.0)) for row in range(3) if row != first[0])
+    return f"std::atan2({entry(first)}, std::hypot({others}))"
 
 
 def accelerations(robot: Robot) -> list[float]:
@@ -223,31 +274,4 @@ def generate_launch_description():
         .to_moveit_configs()
     )
     return generate_move_group_launch(config)
-"""
-
-PACKAGE: Final = """<?xml version="1.0"?>
-<package format="3">
-  <name>{package}</name>
-  <version>0.1.0</version>
-  <description>MoveIt configuration of {name}, made by pkm-twin export moveit {name}</description>
-  <maintainer email="user@example.org">you</maintainer>
-  <license>Apache-2.0</license>
-  <buildtool_depend>ament_cmake</buildtool_depend>
-  <exec_depend>moveit_configs_utils</exec_depend>
-  <exec_depend>moveit_kinematics</exec_depend>
-  <exec_depend>moveit_planners_ompl</exec_depend>
-  <exec_depend>moveit_ros_move_group</exec_depend>
-  <exec_depend>moveit_simple_controller_manager</exec_depend>
-  <exec_depend>pkm_twin</exec_depend>
-  <export>
-    <build_type>ament_cmake</build_type>
-  </export>
-</package>
-"""
-
-CMAKE: Final = """cmake_minimum_required(VERSION 3.22)
-project({package} NONE)
-find_package(ament_cmake REQUIRED)
-install(DIRECTORY config launch DESTINATION share/${{PROJECT_NAME}})
-ament_package()
 """

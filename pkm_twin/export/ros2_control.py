@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from importlib.resources import files
 from importlib.resources.abc import Traversable
 from itertools import combinations
@@ -36,10 +36,10 @@ CLEAR: Final = 0.05
 """Least singularity index of the motions that the package's own test makes."""
 
 
-def package_name(robot: Robot) -> str:
-    """Name of the robot's ROS package: lower case, digits and single underscores (REP 144)."""
+def package_name(robot: Robot, kind: str = "ros2_control") -> str:
+    """Name of a robot's ROS package: lower case, digits and single underscores (REP 144)."""
     name = re.sub(r"_+", "_", identifier(robot.name or robot.mechanism).lower()).strip("_")
-    return f"{name if name[:1].isalpha() else f'robot_{name}'.rstrip('_')}_ros2_control"
+    return f"{name if name[:1].isalpha() else f'robot_{name}'.rstrip('_')}_{kind}"
 
 
 def ros2_control_package(robot: Robot, bandwidth: float = 0.0) -> dict[str, str]:
@@ -56,11 +56,21 @@ def ros2_control_package(robot: Robot, bandwidth: float = 0.0) -> dict[str, str]
     words = _words(robot, package)
     result = {f"c/{name}": text for name, text in c_package(robot).items()}
     result["config/controllers.yaml"] = _controllers(robot, package, bandwidth)
-    for path, text in _templates(files("pkm_twin.export") / "ros2_control_package"):
+    for path, text in filled("ros2_control_package", words).items():
         # Headers are included as PACKAGE/NAME.hpp.
-        target = path.replace("include/", f"include/{package}/")
-        result[target] = re.sub(r"@([A-Z]+)@", lambda word: words[word[1]], text)
+        result[path.replace("include/", f"include/{package}/")] = text
     return dict(sorted(result.items()))
+
+
+def filled(folder: str, words: Mapping[str, str]) -> dict[str, str]:
+    """The files of a folder of sources, text by path; words between two ``@`` are replaced."""
+    templates = _templates(files("pkm_twin.export") / folder)
+    return {p: re.sub(r"@([A-Z]+)@", lambda word: words[word[1]], text) for p, text in templates}
+
+
+def printable(robot: Robot) -> str:
+    """The robot's name as a comment, a Markdown table and a string literal bear it."""
+    return re.sub(r"[^\w .:+-]", "_", robot.name or robot.mechanism)
 
 
 def _templates(folder: Traversable, above: str = "") -> Iterable[tuple[str, str]]:
@@ -75,8 +85,7 @@ def _templates(folder: Traversable, above: str = "") -> Iterable[tuple[str, str]
 def _words(robot: Robot, package: str) -> dict[str, str]:
     """What stands for the words between two ``@``."""
     own = identifier(robot.name)
-    # A comment, a Markdown table and a string literal bear these.
-    shown = re.sub(r"[^\w .:+-]", "_", robot.name or robot.mechanism)
+    shown = printable(robot)
     load, controller = robot.payload, robot.controller
     home = _start(robot)
     directions = _directions(robot)
@@ -92,12 +101,12 @@ def _words(robot: Robot, package: str) -> dict[str, str]:
         "POSENAMES": ", ".join(POSE[k] for k in directions),
         "POSE": _row(directions),
         "PAYLOAD": "{"
-        + ", ".join([_number(load.mass), _row(load.com), _row(np.ravel(load.inertia))])
+        + ", ".join([number(load.mass), _row(load.com), _row(np.ravel(load.inertia))])
         + "}",
         "DRIVES": _drives(robot),
         "STOP": f"{STOP:g}",
-        "MAXMASS": _number(MAX_MASS),
-        "MAXLENGTH": _number(MAX_LENGTH),
+        "MAXMASS": number(MAX_MASS),
+        "MAXLENGTH": number(MAX_LENGTH),
         "START": _row(controller.controller_positions(home)),
         "RANGE": _row(steps),
     }
@@ -133,7 +142,7 @@ def _drives(robot: Robot) -> str:
         effort / np.abs(controller.factors), friction.viscous, friction.coulomb, _damping(robot),
     )  # fmt: skip
     lines = [
-        f"  {{{_string(name)}, {', '.join(_number(column[k]) for column in columns)}}},"
+        f"  {{{literal(name)}, {', '.join(number(column[k]) for column in columns)}}},"
         for k, name in enumerate(controller.names)
     ]
     return "\n".join(lines)
@@ -216,7 +225,7 @@ def _controllers(robot: Robot, package: str, bandwidth: float) -> str:
     return head + yaml.safe_dump(sections, sort_keys=False)
 
 
-def _number(value: float) -> str:
+def number(value: float) -> str:
     """A double as C++ has it, exactly."""
     value = float(value)
     if math.isinf(value):
@@ -226,11 +235,11 @@ def _number(value: float) -> str:
 
 def _row(values: Iterable[Any]) -> str:
     """A std::array's numbers."""
-    items = [str(v) if isinstance(v, int) else _number(v) for v in values]
+    items = [str(v) if isinstance(v, int) else number(v) for v in values]
     return "{" + ", ".join(items) + "}"
 
 
-def _string(text: str) -> str:
+def literal(text: str) -> str:
     """A string literal of C++; what is not plain is written in octal."""
     plain = re.compile(rb"[A-Za-z0-9 _./:+-]")
     return '"' + "".join(

@@ -102,7 +102,12 @@ def test_a_numeric_solver_is_offered_where_its_chain_has_a_drive(exported):
         link = above[link].find("parent").get("link")
     assert link == "base_link"
     driven = bool(set(chain) & set(robot.joint_names))
-    assert set(settings(folder, "kinematics")) == ({LIMB} if driven else set())
+    solvers = settings(folder, "kinematics")
+    assert set(solvers) == {GROUP} | ({LIMB} if driven else set())
+    library = ET.parse(folder / "kinematics.xml").getroot()
+    assert solvers[GROUP]["kinematics_solver"] == library.find("class").get("name")
+    package = ET.parse(folder / "package.xml").find("name").text
+    assert library.get("path") == f"{package}_kinematics"
     srdf = ET.parse(folder / f"config/{robot.name}.srdf").getroot()
     assert (srdf.find(f"group[@name='{LIMB}']") is not None) is driven
     files = moveit_package(robot, "mine/Kinematics")

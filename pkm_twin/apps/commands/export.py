@@ -66,12 +66,12 @@ class Printed(OfRobot, Overwrites):
 class Moveit(ToFolder):
     """Write a MoveIt configuration: URDF, SRDF, limits, controllers, kinematics and a launch file.
 
-    MoveIt sends its plans to delta_dynamics, which adds efforts for the controller. Goals in joint
-    space work as they are; goals of the platform's pose need a kinematics plugin.
+    MoveIt sends its plans to delta_dynamics, which adds efforts for the controller. The package has
+    a kinematics plugin for poses of the platform, in C++.
     """
 
     kinematics_plugin: str = setting(
-        "", "MoveIt's plugin for the inverse kinematics", metavar="NAME"
+        "", "another plugin for the inverse kinematics than the package's", metavar="NAME"
     )
 
 
