@@ -22,6 +22,8 @@ from stiffness_monitor import platform_response
 from test.support.robots import has
 
 COMPILERS = [name for name in ("gcc", "clang") if shutil.which(name)]
+STRICT = ("-std=c++17", "-O0", "-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Werror")
+"""Of C++."""
 glibc = pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="the hook is of glibc")
 SANITIZED = ("-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
 

@@ -18,12 +18,11 @@ from pkm_twin.export.moveit import ORIENTATION, POSITION, moveit_package
 from pkm_twin.kinematics.pose import values
 from test.support.robots import load, partly_long, random_joints
 
-from .c_programs import COMPILERS
+from .c_programs import COMPILERS, STRICT
 
 pytestmark = pytest.mark.skipif(
     not COMPILERS or not shutil.which("g++"), reason="there is no C and C++ compiler"
 )
-STRICT = ("-std=c++17", "-O0", "-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Werror")
 SUCCESS, IN_COLLISION, NO_SOLUTION = 1.0, -12.0, -31.0
 HEADERS = ("kinematics_base/kinematics_base", "robot_model/robot_model")
 DRIVER = r"""
@@ -33,7 +32,7 @@ DRIVER = r"""
 using kinematics::KinematicsBase;
 using moveit_msgs::msg::MoveItErrorCodes;
 using Numbers = std::vector<double>;
-static const moveit::core::LinkModel ground{"base_link", nullptr}, bar{"bar", &ground};
+static const moveit::core::LinkModel foot{"foot", nullptr}, bar{"bar", &foot};
 
 static bool started(
   KinematicsBase & it, const std::vector<std::string> & joints, const char * base,
@@ -53,7 +52,7 @@ int main(int, char ** words)
   auto joints = it->getJointNames();
   const std::size_t n = joints.size();
   std::reverse(joints.begin(), joints.end());
-  const bool good = started(*it, joints, "base_link", {"bar"}, "platform",
+  const bool good = started(*it, joints, "foot", {"bar"}, "platform",
     std::atof(words[2]), "actuated");
   if (std::strcmp(words[1], "start") == 0) {
     for (const auto & joint : it->getJointNames()) {std::cout << joint << ' ';}
@@ -66,7 +65,7 @@ int main(int, char ** words)
       started(*it, joints, "base_link", {"bar"}, "platform", -0.5, "actuated") <<
       started(*it, joints, "base_link", {"bar"}, "platform", 1.0, "actuated") <<
       started(*it, joints, "base_link", {"bar"}, "platform", 0.0, "limb") <<
-      started(*it, {"bar"}, "base_link", {"bar"}, "platform", 0.0, "actuated");
+      started(*it, {n, joints[0]}, "base_link", {"bar"}, "platform", 0.0, "actuated");
     return 0;
   }
   // Overload, approximate, numbers of the seed and the limits, the limit, pose, seed.
@@ -173,7 +172,7 @@ def goals_of(robot, q):
 def test_it_starts_with_what_moveit_names_and_with_nothing_else(plugin):
     *names, flags = plugin.run("start").decode().split()
     assert names == [*plugin.robot.joint_names, "platform"]
-    # The group's own link and the platform; then all that is wrong.
+    # What MoveIt's loader names, the solver's own; then all that is wrong.
     assert flags == "11" + 8 * "0"
 
 

@@ -34,7 +34,7 @@ from test.support.robots import (
     random_motion,
 )
 
-from .c_programs import COMPILERS, glibc, hooked, watched
+from .c_programs import COMPILERS, STRICT, glibc, hooked, watched
 
 ROS = [p for p in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep) if p]
 needs_ros2_control = pytest.mark.skipif(
@@ -45,7 +45,6 @@ needs_ros2_control = pytest.mark.skipif(
 needs_compiler = pytest.mark.skipif(
     not COMPILERS or not shutil.which("g++"), reason="there is no C and C++ compiler"
 )
-STRICT = ("-std=c++17", "-O0", "-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Werror")
 NAMES = ["NOT_FINITE", "BEYOND_LIMIT", "NO_ASSEMBLY", "SINGULAR", "NO_STATE", "NONE"]
 DRIVER = r"""
 #include <cstdio>

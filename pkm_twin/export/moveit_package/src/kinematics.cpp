@@ -142,17 +142,17 @@ public:
       return false;
     }
     const auto & links = group->getLinkModels();
-    const auto * above = links.empty() ? nullptr : links.front()->getParentLinkModel();
+    const std::string & above = links.front()->getParentLinkModel()->getName();
     if (!robot_model.hasLinkModel(BASE) || !robot_model.hasLinkModel(TIP)) {
       RCLCPP_ERROR(logger_, "robot model: expected links '%s' and '%s'", BASE, TIP);
       return false;
     }
-    if (base_frame_ != BASE && (above == nullptr || base_frame_ != above->getName())) {
+    if (base_frame_ != BASE && base_frame_ != above) {
       RCLCPP_ERROR(logger_, "base frame '%s': expected '%s'", base_frame_.c_str(), BASE);
       return false;
     }
-    if (tip_frames_.size() != 1 || (tip_frames_[0] != TIP &&
-      (links.empty() || tip_frames_[0] != links.back()->getName())))
+    if (tip_frames_.size() != 1 ||
+      (tip_frames_[0] != TIP && tip_frames_[0] != links.back()->getName()))
     {
       RCLCPP_ERROR(logger_, "tip frames: expected one, '%s'", TIP);
       return false;
