@@ -386,7 +386,7 @@ static const int @_steps[{len(LADDER)}] = {{{steps}}};
 /* Newton's method from the known assembly in so many steps; 0 where it does not get there. */
 static int @_{name}({more}const double *{q.target}, int steps, double *h, double *{x})
 {{
-    double {STATE}[{AT.moving}], aim[{m}], {x_before}[{n}], next[{n + 4}], first = 0.0;
+    double {STATE}[{AT.moving}], aim[{m}], {x_before}[{n}] = {{0.0}}, next[{n + 4}], first = 0.0;
     double part = 0.0, way = 1.0;
     int i, k;
     {STATE}[{AT.once}] = (steps == 1) ? 1.0 : 0.0;

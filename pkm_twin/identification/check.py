@@ -80,7 +80,8 @@ class Checked:
     compared: Compared | None = None
     left_out: Mask = field(default_factory=lambda: np.zeros(0, np.bool_))
     causes: tuple[str, ...] = ()
-    """What explains efforts that contradict the model: with it they agree."""
+    """What explains efforts that contradict the model: with it they agree. Or, before any are
+    compared, why they are not one machine's."""
     findings: tuple[str, ...] = ()
     """What `fit` says of them, where nothing explains them."""
 
@@ -137,8 +138,10 @@ def checked(r: Recording, residual: float) -> Checked:
         )
     if r.effort is None:
         reason = reason or "the bag carries no efforts"
-    if reason or r.effort is None:
-        return Checked(r, [*items, judged(RESIDUAL, reason, bound, None)])
+    mixed = step_fault(r, steps) if steps.publishers else ""
+    if mixed or reason or r.effort is None:
+        items.append(judged(RESIDUAL, mixed or reason, bound, None))
+        return Checked(r, items, causes=(mixed,) if mixed else ())
     try:
         idle = idle_of(r)
         left_out = idle | near_jumps(steps, len(r.time))
@@ -416,6 +419,8 @@ def check(r: Recording, residual: float = MAX_RESIDUAL, thorough: bool = True) -
     :param thorough: also ask what `fit` finds, which takes some seconds.
     """
     found = checked(r, residual)
+    if found.causes:
+        return found
     causes, findings = _causes_of(found, thorough)
     return replace(found, causes=causes, findings=findings)
 

@@ -13,6 +13,7 @@ import keyword
 import math
 import operator
 import re
+import sys
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
@@ -134,6 +135,8 @@ class Formula:
         :raises ParameterError: an unknown parameter, or no finite number.
         """
         for name in sorted(self.names - given.keys()):
+            if name.lower() in ("nan", "inf"):
+                raise self._error("a finite number")
             close = difflib.get_close_matches(name, [*given, *FUNCTIONS, "pi"], 1)
             hint = f"; did you mean {close[0]!r}?" if close else ""
             raise self._error(f"names under `{PARAMETERS}`; {name!r} is none{hint}")
@@ -141,6 +144,8 @@ class Formula:
             found = _value(self.tree, given)
         except ZeroDivisionError:
             raise self._error("a finite number, not a division by zero") from None
+        except FloatingPointError:
+            raise self._error(f"0, or at least {sys.float_info.min:.1e} in size") from None
         except (ValueError, OverflowError, TypeError):
             raise self._error("a finite real number") from None
         if hasattr(found, "tape"):
@@ -181,7 +186,10 @@ def _refused(node: ast.expr, text: str) -> str:
     if isinstance(node, ast.Name):
         return f"{own}( )" if own in FUNCTIONS else ""
     if isinstance(node, ast.Constant):
-        return "" if _NUMBER.fullmatch(own) else f"decimal numbers; {own!r} is none"
+        if not _NUMBER.fullmatch(own):
+            return f"decimal numbers; {own!r} is none"
+        lost = not float(own) and re.match(r"[0.]*[1-9]", own)
+        return f"0, or at least {sys.float_info.min:.1e} in size" if lost else ""
     if isinstance(node, (ast.BinOp, ast.UnaryOp)) and type(node.op) in _OPERATORS:
         return ""
     if isinstance(node, ast.Call) and isinstance(node.func, ast.Name):
@@ -203,7 +211,11 @@ def _value(node: ast.expr, given: Mapping[str, Any]) -> Any:
     values = [_value(part, given) for part in _parts(node)]
     if isinstance(node, ast.Call):
         return FUNCTIONS[node.func.id][1](*values)  # type: ignore[attr-defined]
-    return _OPERATORS[type(node.op)](*values)  # type: ignore[attr-defined]
+    found = _OPERATORS[type(node.op)](*values)  # type: ignore[attr-defined]
+    products = isinstance(node, ast.BinOp) and isinstance(node.op, (ast.Mult, ast.Div, ast.Pow))
+    if products and isinstance(found, float) and not found and all(values):
+        raise FloatingPointError
+    return found
 
 
 def _units(node: ast.expr, unit: str) -> Iterator[tuple[str, str]]:

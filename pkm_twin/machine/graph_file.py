@@ -31,6 +31,7 @@ from pkm_twin.machine.joints import TURN, TYPES, Freedom, unit
 from pkm_twin.machine.members import Tube, compliances
 from pkm_twin.machine.places import Keys, number_in, path_of, placed
 from pkm_twin.machine.sections import (
+    MAX_PLACE,
     DriveSpec,
     Redundancy,
     check_angles,
@@ -39,6 +40,7 @@ from pkm_twin.machine.sections import (
     length,
     limits_of,
     mass,
+    place,
 )
 
 T = TypeVar("T")
@@ -51,8 +53,8 @@ class MemberSpec:
     ``section``: with the body's mass along the bar; without one the body is rigid.
     """
 
-    start: Array = schema.vector(3, name="from", unit="m")
-    end: Array = schema.vector(3, name="to", unit="m")
+    start: Array = place(name="from")
+    end: Array = place(name="to")
     section: Tube | None = schema.section(Tube, default=None)
     radius: float | None = length(default=None)
 
@@ -76,7 +78,7 @@ class BodySpec:
     """Mass (kg), centre of mass (m) and inertia about it (kg m2), base axes at home."""
 
     mass: float = mass(default=0.0)
-    com: Array | None = schema.vector(3, unit="m", default=None)
+    com: Array | None = place(default=None)
     inertia: Array = schema.inertia(positive=False, default=[0, 0, 0])
     member: MemberSpec | None = schema.section(MemberSpec, default=None)
 
@@ -148,7 +150,7 @@ class JointSpec:
 
     type: str = schema.choice(*TYPES)
     between: tuple[str, ...] = schema.words(size=2)
-    at: Array | None = schema.vector(3, unit="m", default=None)
+    at: Array | None = place(default=None)
     axis: Array | None = schema.vector(3, default=None)
     axes: Array | None = schema.matrix(2, 3, default=None)
     lead: float | None = schema.number(low=-10.0, high=10.0, unit="m per turn", default=None)
@@ -261,7 +263,7 @@ class RodSpec:
     """
 
     between: tuple[str, ...] = schema.words(size=2)
-    ends: Array = schema.matrix(2, 3, unit="m")
+    ends: Array = schema.matrix(2, 3, low=-MAX_PLACE, high=MAX_PLACE, unit="m")
     mass: float = mass(default=0.0)
     section: Tube | None = schema.section(Tube, default=None)
     radius: float | None = length(default=None)

@@ -19,11 +19,18 @@ from pkm_twin.machine.graph import MIN_LENGTH
 
 MAX_LENGTH: Final = 100.0
 MAX_MASS: Final = 1e5
+MAX_PLACE: Final = 1e6
+"""How far a point of a machine may be from the origin of its axes, along each, m."""
 
 
 def length(**options: Any) -> Any:
     """Field: a length that may be divided by, m."""
     return schema.number(low=MIN_LENGTH, high=MAX_LENGTH, unit="m", **options)
+
+
+def place(**options: Any) -> Any:
+    """Field: a point of the machine, m."""
+    return schema.vector(3, low=-MAX_PLACE, high=MAX_PLACE, unit="m", **options)
 
 
 def mass(**options: Any) -> Any:

@@ -51,10 +51,12 @@ class _StrictLoader(yaml.SafeLoader):
             raise yaml.YAMLError("an integer too large for a float")
         return value
 
-    def construct_yaml_float(self, node: Any) -> float:
+    def construct_yaml_float(self, node: Any) -> Any:
         if "_" in node.value or ":" in node.value:
             raise yaml.YAMLError(f"{node.value}: write a decimal number, or text in quotes")
-        return float(super().construct_yaml_float(node))
+        value = float(super().construct_yaml_float(node))
+        # Too small for a float: as a text it is rejected by the path of its key.
+        return value or (node.value if re.match(r"[-+]?[0.]*[1-9]", node.value) else value)
 
 
 _StrictLoader.add_constructor("tag:yaml.org,2002:int", _StrictLoader.construct_yaml_int)

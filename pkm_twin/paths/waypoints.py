@@ -13,6 +13,7 @@ import numpy as np
 from pkm_twin.errors import ParameterError, UnknownNameError
 from pkm_twin.files import parse_numbers
 from pkm_twin.paths.geometry import Path, Space, lines, through
+from pkm_twin.recordings.payload import Load
 from pkm_twin.recordings.tables import (
     EFFORTS,
     PAYLOAD,
@@ -83,8 +84,12 @@ def _masses(table: Table, robot: Robot) -> list[float] | None:
     if PAYLOAD[0] not in table:
         return None
     masses, centre = table[PAYLOAD[0]], table.fill(PAYLOAD[1:])
-    if (masses < 0.0).any():
-        raise ParameterError(f"{table.path}: payload", float(masses.min()), "0 kg or more")
+    for mass in np.unique(masses[masses != robot.payload.mass]).tolist():
+        try:
+            Load(mass).on(robot)
+        except ParameterError as error:
+            where = f"{table.line(int((masses == mass).argmax()))}, column payload"
+            raise ParameterError(where, error.value, error.bound) from None
     if centre is not None and (centre != robot.payload.com)[masses > 0.0].any():
         raise ParameterError(
             f"{table.path}: {', '.join(PAYLOAD[1:])}", "a centre of mass",

@@ -217,12 +217,12 @@ def read_table(
     if len(set(names)) != len(names):
         raise ParameterError(f"{path}: header row", ", ".join(names), "different names")
     table = Table(path, dict(zip(names, values, strict=True)), above)
-    for name, scale in zip(names, sizes, strict=True):
+    for cell, name, scale in zip(header, names, sizes, strict=True):
         empty = np.isnan(table[name])
         if empty.all() and not blank:
             del table[name]
         elif empty.any() and not blank:
-            where = f"{table.line(int(empty.argmax()))}, column {name}"
+            where = f"{table.line(int(empty.argmax()))}, column {cell}"
             raise ParameterError(where, "empty", "a finite number")
         elif scale != 1.0:
             table[name] = scale * table[name]

@@ -133,6 +133,10 @@ def test_a_fault_is_bad_and_named(tmp_path, change, what, value):
     assert report.code == 1 and what in report.answer
     assert item["verdict"] == "bad"
     assert value in item["value"]
+    if change is other_publisher:
+        assert report.answer.startswith(f"bad: {value}") and "idle" not in report.answer
+        assert value in report.data["causes"][0]
+        assert items_of(report)["torque residual"]["verdict"] == "unknown"
 
 
 def test_a_collision_is_bad_with_its_time(twin):

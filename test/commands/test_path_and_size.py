@@ -479,6 +479,7 @@ def test_a_machine_that_only_turns_plans_and_is_sized_like_others(twin, tmp_path
     """A circle of roll and pitch, its speed that of the platform's turn."""
     name, out = REPOSITORY / "examples/machines/agile_eye.yaml", tmp_path / "circle.csv"
     line = ("path", name, "--circle", "0.15", "--at", "0.05,0,0.1", "--fastest", "--speed", "2")
+    assert f"circle, {2 * np.pi * 0.15:.4g} rad in" in twin.good(*line, "--no-picture").out
     data = twin.told(*line, "--out", out, "--no-picture")
     assert data["greatest_speed_rad_s"] == pytest.approx(2.0, rel=1e-3)
     columns = read_columns(out)
@@ -520,6 +521,13 @@ def test_way_points_are_lines_or_a_smooth_curve(twin, tmp_path):
     own, told = (twin.told(*line, *options) for options in ((), ("--payload", "0.2")))
     assert own["payload"]["mass_kg"] == 0.2
     assert own["duration_s"] == told["duration_s"]
+
+
+@pytest.mark.parametrize("payload", ["1e9", "900", "-1", ""])
+def test_a_payload_that_cannot_be_is_named_by_its_line_and_column(twin, tmp_path, payload):
+    path = tmp_path / "points.csv"
+    path.write_text(f"x,y,z,payload\n0,0,-0.35,0\n0,0,-0.4,{payload}\n0,0,-0.35,0\n")
+    assert f"{path}: line 3, column payload: " in twin.refused("path", "delta", path)
 
 
 @pytest.mark.parametrize(

@@ -95,9 +95,12 @@ def check_one(given: Check, path: Path, update: Any = None, thorough: bool = Tru
     if found.answer == "not judged":
         # The reason is in the answer.
         unknown = [what for what in unknown if what not in (COMPARED, IDLE)]
-    answer = f"{found.answer}: {', '.join(bad) or found.unjudged or found.agreement}"
-    none = "uncertainty: none in the robot file, so the model has no uncertainty band"
     why, findings = "; ".join(found.causes), "; ".join(found.findings)
+    what = ", ".join(bad) or found.unjudged or found.agreement
+    if why and found.compared is None:
+        what = f"{why} ({what})"
+    answer = f"{found.answer}: {what}"
+    none = "uncertainty: none in the robot file, so the model has no uncertainty band"
     return Report(
         answer + (f"; not judged: {', '.join(unknown)}" if unknown else ""),
         [

@@ -186,9 +186,13 @@ def path(given: Motion) -> Report:
             source = {"source": "pkm-twin path", "law": motion.law}
             write_motion(given.out, plan, source, given.overwrite)
     fine, robot = motion.fine, motion.robot
-    unit = "rad/s" if only_turns(robot) else "m/s"
+    turns, length = only_turns(robot), f"{motion.path.length:.4g} m"
+    unit = "rad/s" if turns else "m/s"
+    way_units = robot.pose_units if motion.path.space == "pose" else robot.joint_units
+    if turns and "m" not in way_units:
+        length = f"{motion.path.length / robot.size:.4g} rad"
     answer = (
-        f"{robot.name}: {motion.path.kind}, {motion.path.length:.4g} m in {motion.duration:.6g} s, "
+        f"{robot.name}: {motion.path.kind}, {length} in {motion.duration:.6g} s, "
         f"at most {fine.speed.max():.4g} {unit}"
     )
     facts = [
