@@ -51,8 +51,8 @@ class Settings:
     )
     window: int = setting(
         25,
-        "samples in the window; a slow stream has fewer: those of 24 ms, or of as many ms as "
-        "there are samples, and at least 5",
+        "samples in the window at 1 kHz; a slower stream has those of the same time (at least "
+        "24 ms), and at least 5",
         name="differentiator.window",
         low=3,
         high=1000,
@@ -63,8 +63,8 @@ class Settings:
     )  # fmt: skip
     stale_after: float = setting(
         0.1,
-        "largest age of a joint state, and longest gap before the stream stops; also lifespan "
-        "and deadline of the published torques, so at most deadline of command_gate",
+        "largest age of a joint state, and longest gap before the stream stops; published "
+        "torques have it as lifespan and deadline, so it is at most command_gate's deadline",
         **LATE,
     )
     future_tolerance: float = setting(0.1, FUTURE, **SECONDS)

@@ -71,7 +71,7 @@ class SetpointCorrection(Core):
         self._age = node.declare(
             "correction_age",
             0.1,
-            "largest time from a wrench to the set point that it corrects",
+            "largest time from a wrench to the setpoint that it corrects",
             unit="s",
             low=0.0,
             high=3600.0,
@@ -79,8 +79,8 @@ class SetpointCorrection(Core):
         paired = node.declare(
             "pair_torques",
             False,
-            "also publish ~/setpoint_with_torques: the corrected set point, and the torques of the "
-            "same stamp; needs correct_setpoint, and delta_dynamics needs the set points as well",
+            "publish ~/setpoint_with_torques: the corrected setpoint with torques of its stamp; "
+            "needs correct_setpoint, and a delta_dynamics that receives the same setpoints",
         )
         self._waiting: dict[int, tuple[str, Any]] = {}
         self.unpaired = 0

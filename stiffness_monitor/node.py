@@ -55,8 +55,8 @@ class StiffnessMonitor(TwinNode):
         given = self.declare(
             "platform_frame",
             "",
-            "frame of ~/deflection; empty: wrench_frame, or platform if wrench_frame is base_frame "
-            "or the sensor is not at the platform's reference point",
+            "frame of ~/deflection; empty: wrench_frame if it moves with the platform and the "
+            "sensor is at the reference point, else `platform`",
         )
         mounts = declare_mounts(self, given or PLATFORM)
         self._platform_frame = given or ("" if mounts is None else PLATFORM)

@@ -20,7 +20,7 @@ STIFFNESS: Final = table(
     Topic("out", "~/compliance_stamped", JOINTS,
           "its upper triangle, name `x_ry` and so on, position the entry"),
     Topic("out", "~/strain_energy", STATUSES,
-          "message: the dominant element; values: each element's share (factor), `total_energy`, "
+          "message: the dominant element; values: each element's share, `total_energy`, "
           "the pose, `frame`"),
     Topic("out", "~/strain_energy_stamped", JOINTS,
           "name of an element, position its share, effort its energy in J"),
@@ -30,19 +30,19 @@ STIFFNESS: Final = table(
           "with `_deflected`"),
     Topic("in", "setpoint", JOINTS, "commanded positions", _CORRECTED),
     Topic("out", "~/setpoint_offset", JOINTS,
-          "offsets for the joints' set points that keep the tool point in place", _CORRECTED),
+          "offsets for the joints' setpoints that keep the tool point in place", _CORRECTED),
     Topic("out", "~/corrected_setpoint", JOINTS, "`setpoint` with the last offset", _CORRECTED),
     Topic("in", "torques", JOINTS, "efforts, as `~/joint_torques` of `delta_dynamics`",
           "`pair_torques`"),
     Topic("out", "~/setpoint_with_torques", JOINTS,
-          "corrected set point and efforts of the same stamp in one message", "`pair_torques`"),
+          "corrected setpoint and efforts of the same stamp in one message", "`pair_torques`"),
     Topic("in", "measured_deflection", _TRANSFORM,
           "the platform's deflection, where it is measured, in `base_frame` or the frame of "
           "`~/deflection`", "`watch_stiffness`"),
     Topic("out", "~/stiffness_alarm", STATUSES,
           "an element whose compliance differs from the file: WARN, message its name, or the names "
           "that the loads do not distinguish; values `element`, `factor`, `deviation`, `bound`, "
-          "`or NAME`; once a second of stamps while active, then once OK and `none`",
+          "`or NAME`; once a second (by the stamps) while active; at its end once OK, name `none`",
           "`watch_stiffness`", latched=True),
     Topic("out", "~/natural_frequencies", NUMBERS,
           "the first six at the latest joint state with locked actuators, Hz, where the robot's "

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The command ``pkm-twin``. Exit codes: 0 good, 1 rejected, 2 usage, 3 recovered with loss."""
+"""The command ``pkm-twin``. Exit codes: 0 good, 1 rejected, 2 usage, 3 damaged file."""
 
 import gc
 import sys
@@ -35,16 +35,19 @@ def _application(
     context: typer.Context,
     _asked: Annotated[
         bool,
-        typer.Option("--version", help="print the version", callback=_version, is_eager=True),
+        typer.Option(
+            "--version", help="Show the version and exit.", callback=_version, is_eager=True
+        ),
     ] = False,
 ) -> None:
     """Compute torques and stiffness of parallel robots, and compare recordings with the model.
 
     Start with `pkm-twin robots`, then `pkm-twin info delta_cu`; or check a recording with
-    `pkm-twin check BAG`. SI units, world z up. Only play, monitor-torques and view --live need ROS.
+    `pkm-twin check BAG`. SI units unless an option states others, world z up. Only play,
+    monitor-torques and view --live need ROS.
 
-    Exit codes: 0 good, 1 bad or invalid, 2 wrong usage, 3 recovered with loss. An error is one line
-    on stderr. Results go to stdout, with --json as JSON only.
+    Exit codes: 0 good, 1 bad or invalid, 2 wrong usage, 3 damaged file, of which `recover` saves a
+    part. An error is one line on stderr. Results go to stdout, with --json as JSON only.
     """
     greet(context)
 

@@ -159,8 +159,8 @@ def _delays(result: Fit) -> list[str]:
         cutoff = "no low-pass" if how.cutoff is None else f"low-pass at {how.cutoff:.3g} Hz"
         lines.append(
             f"{judged.name}: efforts are {1e3 * delay:.3g} ms later than the positions; "
-            f"differentiated over {how.window} samples, {cutoff}, one of {how.keep_every} samples "
-            "kept"
+            f"differentiated over {how.window} samples, {cutoff}, "
+            f"one of every {how.keep_every} samples used"
         )
     return lines
 

@@ -134,6 +134,10 @@ class _Ordered(TyperGroup):
 
     group: Group
 
+    def collect_usage_pieces(self, ctx: Any) -> list[str]:
+        # But for the group's own options, of which there is only --help.
+        return [str(self.subcommand_metavar)]
+
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         return super().parse_args(ctx, self.group.ordered(args))
 
@@ -384,7 +388,16 @@ class _Words(TyperCommand):
     def collect_usage_pieces(self, ctx: Any) -> list[str]:
         # But for what stands before the command's name.
         before = str(ctx.info_name).split()[:-1]
-        return [p for p in super().collect_usage_pieces(ctx) if p.strip("{}") not in before]
+        pieces = (re.sub(r"[{}]", "", piece) for piece in super().collect_usage_pieces(ctx))
+        return [piece for piece in pieces if piece not in before]
+
+    def get_params(self, ctx: Any) -> list[Any]:
+        """Their help has no types of Python, which some versions of typer show of arguments."""
+        found = super().get_params(ctx)
+        for one in found:
+            if one.param_type_name == "argument":
+                vars(one)["display_type_rich"] = lambda **_: None
+        return found
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         return super().parse_args(ctx, list(self._plain(args)))

@@ -73,7 +73,7 @@ class Carries(OfRobot):
     payload: str | None = setting(
         None,
         "payload on the platform: MASS[,x,y,z], kg, m from the platform's reference point; "
-        "default: that of the recording or the robot file",
+        "default: the recording's if it has one, else the robot file's",
     )
 
     @property
@@ -159,8 +159,8 @@ class ReadsRecordings(ReadsTables):
     )  # fmt: skip
     wrench_frame: str | None = setting(
         None,
-        "accepted frame of a bag's wrenches, which turns with the platform; default: platform or "
-        "--base-frame, whichever comes first",
+        "only accepted frame of a bag's wrenches, which turns with the platform; default: platform "
+        "or --base-frame, as in the first wrench",
     )
     base_frame: str = setting("base_link", "frame of a bag's wrenches with base axes")
 

@@ -261,7 +261,7 @@ def _limits(r: Recording) -> list[Fact]:
         used = np.maximum((values - high).max(0), (low - values).max(0))
         # Joints that turn and joints that slide have no common margin.
         worst = {u: max(x for x, v in zip(used, units, strict=True) if v == u) for u in units}
-        margins = ", ".join(f"{-most:.4g} {unit}" for unit, most in worst.items())
+        margins = ", ".join(f"{0.0 - most:.4g} {unit}" for unit, most in worst.items())
         good = bool((used <= 0).all())
         items.append(judged(f"{what} limits", f"least margin {margins}", "0 or more", good))
     return items

@@ -240,7 +240,9 @@ def timed(
     moving = sum(run.duration for run in result.runs)
     least = moving + sum(result.rests)
     if not (np.isfinite(duration) and duration >= least * (1.0 - 1e-9)):
-        raise ParameterError("duration", duration, f"{least:.6g} s or more, within the limits")
+        raise ParameterError(
+            "duration", duration, f"{least:.6g} s or more, within the limits by law {law}"
+        )
     factor = (duration - sum(result.rests)) / moving
     result = replace(result, runs=tuple(run.slower(factor) for run in result.runs))
     over = max(result.worst.values(), default=0.0)

@@ -72,6 +72,8 @@ def test_a_budget_names_each_contribution(twin, pick):
         data = twin.told("design", "delta", *errors, *where)
         parts = data["contributions"].values()
         assert sum(part["share"] for part in parts) == pytest.approx(1.0)
+        # Rounding is no rotation.
+        assert all(one == 0.0 or one > 1e-9 for one in (part["rms_angle_rad"] for part in parts))
         squares = sum(part["rms_position_m"] ** 2 for part in parts)
         assert data["rms_position_m"] == pytest.approx(np.sqrt(squares))
     machines = data["monte_carlo"]

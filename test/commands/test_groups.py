@@ -25,6 +25,14 @@ def test_help_lists_every_purpose_whole(twin):
     assert "..." not in words.split("Robots:")[1]
 
 
+def test_help_has_no_types_of_python(twin):
+    for name in ("compliance", "map", "map delta compliance", "fit"):
+        help_text = twin(*name.split(), "--help").out
+        usage, _, arguments = help_text.partition("Arguments:")
+        assert not re.search(r"[{}]|\[OPTIONS\].*\[OPTIONS\]", usage.splitlines()[0])
+        assert "<" not in arguments.partition("Options:")[0]
+
+
 def test_each_line_of_the_greeting_is_a_command_that_runs(twin, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     alone = twin()

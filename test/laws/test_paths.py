@@ -335,6 +335,7 @@ def test_laws_are_as_short_as_limits_let_them_be(name, law):
     with pytest.raises(ParameterError) as error:
         timed(robot, path, law, duration=0.9 * motion.duration)
     assert error.value.field == "duration"
+    assert law in str(error.value)
     assert motion.duration > fastest(robot, path).duration
 
 

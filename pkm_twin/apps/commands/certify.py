@@ -27,7 +27,8 @@ class Certify(OfRobot, Seeded):
     pkm_twin: maximal (free bodies, every joint as equations), pinocchio and mujoco (a tree with
     loop constraints each; `pip install '.[certificate]'`). The command compares torques with
     wrench, payload and friction, the platform's pose and Jacobian, and the mass matrix, at random
-    states inside the limits. It also checks the round trip from joint positions to pose and back.
+    states inside the limits. Lines `twin` compare pkm_twin with itself:
+    the round trip from joint positions to pose and back, and one state with a batch of states.
     States beyond a singularity on pkm_twin's way from home are skipped and counted.
 
     --variants N repeats this for N machines whose masses, inertias, friction and lengths are drawn

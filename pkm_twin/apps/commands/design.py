@@ -209,8 +209,8 @@ def optimised(given: Design, path: Path) -> Report:
     changes = []
     for name in found.minimise:
         was, unit_of = before.quantities.get(name, np.nan), QUANTITIES[name].unit(robot)
-        words = f"{name} {best.quantities[name]:.4g} {unit_of}".rstrip()
-        changes.append(f"{words} ({was:.4g} before)" if np.isfinite(was) else words)
+        words = f"{name} {best.quantities[name]:.5g} {unit_of}".rstrip()
+        changes.append(f"{words} ({was:.5g} before)" if np.isfinite(was) else words)
     notes = [f"{joint} leaves its position limits on the path" for joint in limits]
     notes += lost
     if not before.feasible:
@@ -400,7 +400,7 @@ def budget(given: Design) -> Report:
     }
     rows: dict[str, list[Any]] = {}
     for name, paths in sorted(found.together.items(), key=lambda item: -shares[item[0]]):
-        moves, turns = np.split(found.effect(name), 2, -1)
+        moves, turns = np.split(found.effect(name).round(FILE_DIGITS), 2, -1)
         still = not any(np.any(np.abs(found.sensitivity[path]) > 1e-9) for path in paths)
         rows[name] = [
             found.sigma[paths[0]], found.bounds[paths[0]], found.units[paths[0]], rms(moves),
@@ -420,7 +420,7 @@ def budget(given: Design) -> Report:
         Column("varied", text="what varies"),
         Column("", text=" "),
     ]
-    moves, turns = found.deviation[:, :3], found.deviation[:, 3:]
+    moves, turns = np.split(found.deviation.round(FILE_DIGITS), 2, -1)
     most = np.linalg.norm(found.worst[:, :3], axis=-1)
     farthest = robot.forward(q[int(most.argmax())]).round(12) + 0.0
     worst = robot.forward(q[int(np.linalg.norm(moves, axis=-1).argmax())]).round(12) + 0.0
@@ -432,7 +432,7 @@ def budget(given: Design) -> Report:
         _length("rms_position_m", rms(moves)),
         _length("greatest_position_m", greatest(moves), "largest position error", f" at {at}"),
         Fact("rms_angle_rad", rms(turns), "rad", "RMS rotation",
-             f"{1e3 * rms(turns.round(12)):.4g} mrad"),
+             f"{1e3 * rms(turns):.4g} mrad"),
         Fact("greatest_angle_rad", greatest(turns), "rad"),
         Fact("worst_pose", worst),
         _length("bound_position_m", float(most.max()), "worst case of all bounds",
@@ -452,11 +452,11 @@ def budget(given: Design) -> Report:
             "rms_angle_rad": rms(errors[..., 3:]), "first_order_rms_position_m": rms(moves[chosen]),
         }  # fmt: skip
         words = (
-            f"in {len(chosen)} of the states: RMS {1e3 * exact['rms_position_m']:.4g} mm, to first "
-            f"order there {1e3 * exact['first_order_rms_position_m']:.4g} mm; largest error "
+            f"RMS {1e3 * exact['rms_position_m']:.4g} mm in {len(chosen)} of the states "
+            f"({1e3 * exact['first_order_rms_position_m']:.4g} mm to first order), largest error "
             f"{1e3 * exact['greatest_position_m']:.4g} mm"
         )
-        label = f"{given.monte_carlo} drawn machines, assembled exactly"
+        label = f"{given.monte_carlo} random machines, assembled exactly"
         facts.append(Fact("monte_carlo", exact, text=label, shown=words))
     if found.deflection is not None:
         bent = rms(found.deflection[..., :3])

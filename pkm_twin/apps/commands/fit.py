@@ -48,9 +48,9 @@ class Fit(CarriesAtTimes, ReadsRecordings, BeyondLimitsToo, Accepts):
     recordings, what does not fit and which error is likely. If the model does not explain them,
     standard deviations are widened or withheld.
 
-    Where Coulomb and viscous friction leave something unexplained, `fit` tries the other friction
+    If Coulomb and viscous friction leave a residual, `fit` tries the other friction
     laws and takes one that predicts the held-out part better; a line gives the evidence.
-    `--friction coulomb` keeps the law of the file, `--friction LAW` takes a law in any case.
+    `--friction coulomb` adds no law to the file's, `--friction LAW` adds a law in any case.
 
     With --torque-constant the efforts of the recordings are motor currents in A; in a CSV they may
     be in columns JOINT.current.
@@ -68,8 +68,8 @@ class Fit(CarriesAtTimes, ReadsRecordings, BeyondLimitsToo, Accepts):
     iq_up_A, iq_down_A; optionally speed, drive (a number). At least two weights are needed. A
     friction law has the terms that the runs determine: Coulomb, viscous (two speeds or more),
     load-dependent. A term is accepted if an F test at 5 % rejects the law without it, and if the
-    law predicts left-out runs better. Each run is left out once. Several drives of one kind share
-    their numbers; each drive is left out once, too.
+    law predicts left-out runs better. Each run is left out once. Several drives of one kind get
+    one torque constant and friction; each drive is left out once, too.
     """
 
     robot: str = setting("", f"{ROBOT_HELP}: the values to start from", argument=True)

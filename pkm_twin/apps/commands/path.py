@@ -72,10 +72,13 @@ class Motion(Carries, ReadsTables, AwayFromSingular, Writes, Draws):
         None, "table of waypoints, unless --cycle or --circle is given", argument=True
     )
     cycle: tuple[float, ...] | None = setting(
-        None, "pick-and-place cycle there and back, in mm, as in 25,305,25", count=0,
+        None, "pick-and-place cycle, mm: HEIGHT up, WIDTH across, LIFT down (default: HEIGHT), and "
+        "back; the pose needs z, and x or y", count=0,
         metavar="HEIGHT,WIDTH[,LIFT]",
     )  # fmt: skip
-    circle: float | None = setting(None, "follow a circle of this radius, m, or rad of two angles")
+    circle: float | None = setting(
+        None, "follow a circle of this radius, m, or rad for a circle of two angles"
+    )
     at: tuple[float, ...] | None = setting(
         None, "centre of --cycle (between pick and place) or --circle: the pose's coordinates; "
         "default: home", count=0,
@@ -120,8 +123,8 @@ class Motion(Carries, ReadsTables, AwayFromSingular, Writes, Draws):
         None, "jerk limit of the joints, rad/s3 or m/s3; default: none", count=0
     )
     speed: float | None = setting(
-        None, "speed limit of the tool point, m/s, or of a pose of angles, rad/s; default: none; "
-        "of --slow-where-soft the programmed feed",
+        None, "speed limit of the reference point, m/s, or of a pose of angles, rad/s; default: "
+        "none; of --slow-where-soft the programmed feed",
     )  # fmt: skip
     share: float = setting(
         1.0, "fraction of the file's effort and velocity limits to use", low=1e-3, high=1.0

@@ -48,8 +48,8 @@ class Size(CarriesAtTimes, ReadsMotions, AwayFromSingular, Draws):
     --drives compares each motor of a file with the needs of each drive, in percent of what the
     motor can do: peak torque against its torque curve, RMS torque against its continuous torque,
     and speed. The inertia ratio is that of load to rotor. The motor's rotor replaces the one in the
-    robot's file. --ratios, --leads, or gears in the drives file: each motor has the gear whose
-    greatest used part is least. The last lines name the smallest motor for all drives, with one
+    robot's file. --ratios, --leads, or gears in the drives file: each motor gets the gear
+    that leaves the most margin. The last lines name the smallest motor for all drives, with one
     gear, and for each.
 
     The motion is a table of `pkm-twin path` or `pkm-twin torques`, a recording of joint states, or
@@ -92,8 +92,8 @@ class Size(CarriesAtTimes, ReadsMotions, AwayFromSingular, Draws):
         "workspace; 0 where a limb is stretched", low=0.0, high=1.0,
     )  # fmt: skip
     efforts: str | None = setting(
-        None, "efforts to use; default: the file's, with --payload only if measured and near the "
-        "model's", choices=("file", "model"),
+        None, "efforts to use; default: the motion file's; with --payload these only if they are "
+        "measured and near the model's", choices=("file", "model"),
     )  # fmt: skip
 
 

@@ -34,8 +34,9 @@ class Torques(CarriesAtTimes, ReadsMotions, BeyondLimitsToo, Writes, Draws):
 
     The command prints peak and RMS effort of each joint. The table that it writes has one row per
     sample: each joint's effort (N m or N), the terms that sum to it (JOINT.effort_gravity,
-    _inertia, _velocity, _payload, _friction, _external), the measured effort of a recording, and
-    force and moment in every joint. A reaction that rigid-body equations do not determine is empty.
+    _inertia, _velocity, _payload, _friction, _external, _preload), the measured effort of a
+    recording, and force and moment in every joint. A reaction that rigid-body equations do not
+    determine is empty.
     With --beyond-limits, the column beyond_limits is 1 where a joint is outside its limits.
     """
 
