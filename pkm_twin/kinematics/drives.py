@@ -67,6 +67,8 @@ class Drives:
             x, step = self.t.x, self.t.tree.drives[k]
             away = q[k] - self.graph.joints[step.joint].home
             if step.circle:
+                # No closure counts turns: that of the drive is within half a turn of home.
+                found.append(np.pi + self._tolerance(k) - absolute(away))
                 c, s = x[step.position], x[step.position + 1]
                 away, facing = s * cos(away) - c * sin(away), c * cos(away) + s * sin(away)
                 found.append(facing)

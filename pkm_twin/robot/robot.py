@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Final, Protocol, TypeVar
@@ -19,6 +19,7 @@ from pkm_twin.codegen.key import EMPTY
 from pkm_twin.codegen.operations import less
 from pkm_twin.codegen.program import Program
 from pkm_twin.errors import ParameterError, SingularityError, UnreachableError
+from pkm_twin.kinematics.drives import TIME
 from pkm_twin.kinematics.engine import Engine, engine_of
 from pkm_twin.kinematics.passive import (
     passive_names,
@@ -136,7 +137,8 @@ class Robot(Mechanism):
         """
         outputs, status = kernel(p, q, *inputs)
         if status is not None:
-            self.refuse_joints(status, q, inputs)
+            names = list(kernel.program.inputs)[1:]
+            self.refuse_joints(status, q, dict(zip(names, inputs, strict=True)))
         return outputs
 
     @cached_property
@@ -404,27 +406,30 @@ class Robot(Mechanism):
         kernel = self.engine.kernel("passive rates", passive_rates_program)
         return self.evaluate(kernel, _NONE, q, qd)[0]
 
-    def refuse_joints(self, status: Array, q: ArrayLike, inputs: Sequence[ArrayLike] = ()) -> None:
+    def refuse_joints(
+        self, status: Array, q: ArrayLike, inputs: Mapping[str, ArrayLike] | None = None
+    ) -> None:
         """Raise the typed error of the first rejected sample, if there is one.
 
         :param status: of a kernel, shape (..., 2).
-        :param inputs: everything else that the kernel was given.
+        :param inputs: everything else that the kernel was given, by name.
         """
         index = _first(status[..., 0])
         if index is None:
             return
         batch = status.shape[:-1]
-        for value in (q, *inputs):
+        given: dict[str, Array] = {}
+        for name, value in {"q": q, **(inputs or {})}.items():
             array = np.asarray(value, float)
-            if not np.isfinite(np.broadcast_to(array, (*batch, array.shape[-1]))[index]).all():
+            given[name] = np.broadcast_to(array, (*batch, array.shape[-1]))[index]
+            if not np.isfinite(given[name]).all():
                 raise _not_finite("joint state", index)
         code, reached = status[index].tolist()
         if code == NOT_FINITE:
             raise _not_finite("joint state", index)
-        place = np.asarray(q, float)
-        sample = np.broadcast_to(place, (*batch, place.shape[-1]))[index]
+        sample = given["q"]
         if self.redundant:
-            self._refuse_contradiction(sample, index)
+            self._refuse_contradiction(given, index)
             sample = sample[self.graph.leading]
         limb = self.unreachable_limb(sample, reached)
         if limb is not None:
@@ -440,28 +445,33 @@ class Robot(Mechanism):
             )
         raise UnreachableError("joint state", part, index, miss, reached)
 
-    def _refuse_contradiction(self, q: Array, index: tuple[int, ...]) -> None:
-        """Raise the error of drives that are where those that lead do not put them."""
-        tree, graph = self.engine.tree, self.graph
-        way, x, _ = self.engine.reach(q[graph.leading])
-        if way < 1.0:
-            return
-        apart = np.array(tree.values_of_drives(q[graph.leading], x), float) - q
-        slides = np.array([unit == "m" for unit in self.joint_units])
-        apart = np.where(slides, apart, (apart + np.pi) % (2 * np.pi) - np.pi)
-        worst = int(np.argmax(np.abs(apart) / np.where(slides, tree.size, 1.0)))
-        bound = float(graph.sharing[0]) * (tree.size if slides[worst] else 1.0)
-        name, unit, leads = self.joint_names[worst], self.joint_units[worst], ", ".join(graph.leads)
-        how = f"follows {leads}, and its velocity or acceleration contradicts theirs"
-        if abs(apart[worst]) > bound:
-            how = (
-                f"is {abs(apart[worst]):.3g} {unit} from where {leads} put it, allowed "
-                f"{bound:.3g} (redundancy.tolerance); or these alone are past a singularity, where "
-                "others may lead (redundancy.leads)"
-            )
-        else:
-            name = next(n for n in self.joint_names if n not in graph.leads)
-        raise UnreachableError("joint state", name, index, 0.0, how=how)
+    def _refuse_contradiction(self, given: Mapping[str, Array], index: tuple[int, ...]) -> None:
+        """Raise the error of drives that do not follow those that lead: q, or else qd, or qdd."""
+        graph, leads = self.graph, ", ".join(self.graph.leads)
+        still = np.zeros(self.joints_count)
+        state = [given.get(name, still) for name in ("q", "qd", "qdd")]
+        scales = np.where(np.array(self.joint_units) == "m", self.engine.tree.size, 1.0)
+        ways = (
+            ("is", "where {} put it", ""),
+            ("has a velocity of {:.4g} {}, ", "what {} make it", "/s"),
+            ("has an acceleration of {:.4g} {}, ", "what {} make it", "/s2"),
+        )
+        found = self.agreeing_kernel(_NONE, *state)[0]
+        for k, (own, follows, (has, whence, per)) in enumerate(
+            zip(state, found, ways, strict=True)
+        ):
+            apart = np.abs(own - follows)
+            worst = int(np.argmax(apart / scales))
+            bound = float(graph.sharing[0] * scales[worst]) / TIME**k
+            if not apart[worst] > bound:
+                continue
+            unit = self.joint_units[worst] + per
+            how = f"{has.format(own[worst], unit).strip()} {apart[worst]:.3g} {unit} from "
+            how += f"{whence.format(leads)}, allowed {bound:.3g} (redundancy.tolerance)"
+            if k == 0:
+                how += "; or these alone are past a singularity, where others may lead "
+                how += "(redundancy.leads)"
+            raise UnreachableError("joint state", self.joint_names[worst], index, 0.0, how=how)
 
 
 def _tried(kernel: Kernel, given: ArrayLike) -> tuple[Array, Mask]:

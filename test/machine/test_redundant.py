@@ -345,7 +345,8 @@ def test_contradictions_are_no_assembly(planar, joint, what, amount):
     state = [q, *joint_rates(planar, q, np.ones((1, 3)), np.ones((1, 3)))]
     good = inverse_dynamics(planar, *state)
     state[what] = state[what] + amount * np.eye(4)[joint]
-    with pytest.raises(UnreachableError, match="motor_"):
+    place = ("", "has a velocity of", "has an acceleration of")[what]
+    with pytest.raises(UnreachableError, match=rf"motor_\d .*{place}.*, allowed (0.001|0.1|10) "):
         inverse_dynamics(planar, *state)
     loop = planar.torque_loop()
     loop.q[:], loop.qd[:], loop.qdd[:] = (one[0] for one in state)
@@ -359,6 +360,17 @@ def test_contradictions_are_no_assembly(planar, joint, what, amount):
     np.testing.assert_allclose(
         inverse_dynamics(planar, *agreed), inverse_dynamics(planar, *state), atol=1e-12
     )
+
+
+@pytest.mark.parametrize("turns", [1, -1])
+def test_a_full_turn_of_a_drive_alone_is_no_assembly(planar, turns):
+    """No closure sees it: an encoder has lost its turns."""
+    q = planar.inverse([0.02, -0.01, 0.1])
+    for turn in 2 * np.pi * turns * np.eye(4):
+        with pytest.raises((UnreachableError, SingularityError)):
+            planar.forward(q + turn)
+    with pytest.raises(UnreachableError, match=r"motor_4 is 6\.28 rad from where"):
+        planar.forward(q + turn)
 
 
 def test_what_a_file_may_not_say():
