@@ -84,9 +84,11 @@ class UnknownNameError(ParameterError):
 def unknown_number(path: str, names: Iterable[str]) -> ParameterError:
     """The error of a path where the file has no number, with the closest of some paths."""
     known = list(names)
-    close = [n for n in known if n == f"parameters.{path}"]
-    close = close or difflib.get_close_matches(path, known, 1)
-    hint = f"did you mean {close[0]!r}? see" if close else "see"
+    # What has the path's words in a row, first at the end; else what is spelt alike.
+    close = [n for n in known if f".{path}.".replace("[", ".[") in f".{n}.".replace("[", ".[")]
+    close = sorted(close, key=lambda name: not name.endswith(path))
+    close = close[:3] or difflib.get_close_matches(path, known, 1)
+    hint = f"did you mean {' or '.join(map(repr, close))}? see" if close else "see"
     return ParameterError(path, None, f"a number of the robot's file; {hint} `pkm-twin info`")
 
 
@@ -270,7 +272,9 @@ def one_line(text: str, limit: int = 400) -> str:
 
 
 def short(value: object, limit: int = 80) -> str:
-    """A value for an error message, its end cut; numbers of numpy as plain ones."""
+    """A value for an error message, its end cut; numbers of numpy as plain ones, errors whole."""
+    if isinstance(value, Exception):
+        return str(value)
     text = repr(_plain(value))
     return text if len(text) <= limit else text[: limit - 3] + "..."
 

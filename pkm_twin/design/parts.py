@@ -23,7 +23,13 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from pkm_twin.codegen.arrays import Array
-from pkm_twin.errors import ParameterError, PkmTwinError, SingularityError, UnknownNameError
+from pkm_twin.errors import (
+    ParameterError,
+    PkmTwinError,
+    SingularityError,
+    UnknownNameError,
+    unknown_number,
+)
 from pkm_twin.machine.graph import BASE, Graph, Joint, rotation_about_z
 from pkm_twin.machine.joints import across, unit
 from pkm_twin.machine.places import full_keys, keys_of, path_of
@@ -73,8 +79,11 @@ def part_of(robot: Robot, path: str) -> Part | None:
     :raises ParameterError: an entry of the machine without such an error.
     """
     keys = full_keys(path)
-    if keys[0] not in ("bodies", "joints", "rods", "limbs"):
-        return None
+    if keys[0] not in (*ENDS, "limbs"):
+        numbers = robot.file_numbers()
+        if keys[0] in {keys_of(number)[0] for number in numbers}:
+            return None
+        raise unknown_number(path, [*map(path_of, _known(robot)), *numbers])
     effects: dict[Effect, Array] = {}
     texts, unit_ = [], ""
     for kind, name, where, azimuth in robot.named(keys):

@@ -64,7 +64,9 @@ def read(path: Path, top: ET.Element) -> LoopTree:
         text = " ".join(str(error).split())
         model = _without_meshes(mujoco, path)
         if model is None:
-            raise ParameterError(str(path), text, "a model that MuJoCo compiles") from None
+            raise ParameterError(
+                str(path), ValueError(text), "a model that MuJoCo compiles"
+            ) from None
         warn(path, f"read without its meshes, as its bodies have inertias: {text}")
     return _Reader(mujoco, model, path).tree()
 

@@ -69,7 +69,7 @@ def elements(path: Path) -> ET.Element:
     except (expat.ExpatError, ValueError, LookupError) as error:
         if isinstance(error, ParameterError):
             raise
-        raise ParameterError(str(path), str(error), "well-formed XML") from None
+        raise ParameterError(str(path), error, "well-formed XML") from None
     return builder.close()
 
 

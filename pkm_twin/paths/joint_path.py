@@ -220,9 +220,7 @@ def _joints(robot: Robot, places: Array, way: Array) -> Array:
     try:
         robot.inverse(places[row])
     except (UnreachableError, SingularityError) as error:
-        raise ParameterError(
-            f"path {where}", str(error), "a pose that the machine reaches"
-        ) from None
+        raise ParameterError(f"path {where}", error, "a pose that the machine reaches") from None
     return robot.inverse(places)
 
 
@@ -326,6 +324,6 @@ def joint_paths(
         try:
             result.append(curve.at(curve.grid(share)))
         except (UnreachableError, SingularityError) as error:
-            raise ParameterError("path", str(error), "joints that can be assembled") from None
+            raise ParameterError("path", error, "joints that can be assembled") from None
         begin += stretch.length
     return result

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from delta_dynamics import inverse_dynamics
-from pkm_twin.errors import ParameterError
+from pkm_twin.errors import ParameterError, UnreachableError
 from pkm_twin.mechanisms.catalogue import robot_of_data
 from pkm_twin.paths import circle, cycle, fastest, lines, through, timed
 from pkm_twin.paths.carrying import Carried
@@ -354,6 +354,14 @@ def test_what_cannot_be_is_rejected_by_its_place():
     assert "singularity" in error.value.field
     with pytest.raises(ParameterError):
         fastest(load("upr_rpu"), points_of(load("upr_rpu")))
+    rails = load("linear_delta")
+    away = rails.home() + np.array([-0.45, 0.0, 0.0])
+    with pytest.raises(UnreachableError) as why:
+        rails.inverse(away)
+    with pytest.raises(ParameterError) as error:
+        fastest(rails, [away, rails.home()])
+    assert len(str(why.value)) > 80
+    assert str(why.value) in str(error.value), "the reason is cut"
     assert fastest(load("upr_rpu"), points_of(load("upr_rpu")), velocity=0.3).duration > 0.0
 
 

@@ -415,6 +415,16 @@ def test_the_first_wrong_word_of_a_path_is_named():
             tolerances(robot, {path: 1e-4}, robot.graph.home)
 
 
+def test_a_path_s_end_alone_names_the_whole_paths():
+    for name, path, near in (
+        ("linear_delta", "left_1", "rods.left_1.length"),
+        ("linear_delta", "left_1.length", "rods.left_1.length"),
+        ("delta", "arm_length", "geometry.arm_length"),
+    ):
+        with pytest.raises(ParameterError, match=f"mean '{near}'"):
+            tolerances(load(name), {path: 1e-4}, np.zeros((0, 3)))
+
+
 def test_a_wrench_adds_the_deflection_of_the_machine_itself():
     robot, load_on = load("delta"), [0.0, 0.0, -100.0, 0.0, 0.0, 0.0]
     q = robot.graph.home
