@@ -179,7 +179,11 @@ def _effects(
 
 
 def _longer(robot: Robot, body: str, path: str) -> dict[Effect, Array]:
-    """All points of a body but its joint towards the base, along the line to their mean."""
+    """All points of a body but its joint towards the base, along the line to their mean.
+
+    Where all its joints turn about parallel axes, the line is across these: a part along them would
+    tilt the body out of its plane.
+    """
     graph = robot.graph
     joints = [j for j in graph.joints.values() if not j.virtual]
     far, ring = {BASE: 0}, [BASE]
@@ -210,6 +214,12 @@ def _longer(robot: Robot, body: str, path: str) -> dict[Effect, Array]:
     if body == graph.platform:
         moved["origin", body] = graph.origin
     line = np.mean(list(moved.values()), 0) - start.at if moved else np.zeros(3)
+    if len(moved) == len(own) - 1 and all(joint.kind == "revolute" for joint in own):
+        axis = start.axes[0]
+        flat = line - axis * (axis @ line)
+        parallel = all(np.linalg.norm(np.cross(j.axes[0], axis)) < CONSISTENT for j in own)
+        if parallel and float(np.linalg.norm(flat)) > CONSISTENT * graph.size:
+            line = flat
     if not float(np.linalg.norm(line)) > CONSISTENT * graph.size:
         raise ParameterError(path, start.name, "a body with points apart from that joint")
     return dict.fromkeys(moved, unit(line))

@@ -141,7 +141,7 @@ def tolerances(
     - ``rods.NAME.length``;
     - ``bodies.NAME.length``: all joints and rods of the body, and the reference point on the
       platform, but for its joint towards the base, move along the line from that joint to their
-      mean;
+      mean, across the axes where all joints of the body turn about parallel ones;
     - ``joints.NAME.at[0]`` to ``[2]``: the joint's centre on its inner body alone;
     - ``joints.NAME.axis[0]``, ``[1]``: the joint's frame on its inner body turns about its centre
       and two axes across the joint's (first) axis;

@@ -555,7 +555,10 @@ def _of_fit(found: Checked, bound: float) -> Explained:
         rubbing = r.robot.filed({one.name: one.after for one in first.numbers})
         if _agrees(replace(r, robot=rubbing), found.left_out, bound):
             return ("friction other than the file's explains the efforts: `pkm-twin fit`",), ()
-        verdict = fit_with_laws(r.robot, [recorded])[0].verdict
+        last = fit_with_laws(r.robot, [recorded], accept=True)[0]
+        verdict = last.verdict
+        if last.accepted:
+            return (), (last.accepted[0].removeprefix(f"{recorded.name}: "),)
     except (PkmTwinError, ValueError, np.linalg.LinAlgError):
         return (), ()
     if verdict.answer == "explains":

@@ -27,7 +27,7 @@ from pkm_twin.identification.parameters import (
 from pkm_twin.identification.plausible import recording_fault
 from pkm_twin.identification.rows import Problem, next_window
 from pkm_twin.identification.samples import EXACT, Filtering
-from pkm_twin.identification.suspects import verdict_of
+from pkm_twin.identification.suspects import scaled_efforts, verdict_of
 from pkm_twin.recordings import Recording
 from pkm_twin.robot.robot import Robot
 
@@ -138,7 +138,12 @@ def fit(
     problem.check_count()
     faults = faults or _worse(problem)
     refuse_faults(faults, accept)
-    return fitted(problem, tuple(faults), progress)
+    result = fitted(problem, tuple(faults), progress)
+    scaled = None if faults else scaled_efforts(problem, result.verdict)
+    if scaled is None:
+        return result
+    refuse_faults([scaled], accept)
+    return fitted(problem, (scaled,))
 
 
 def fitted(

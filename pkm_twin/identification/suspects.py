@@ -18,6 +18,7 @@ import numpy as np
 from delta_dynamics.torques.derivatives import numbers_slopes, torques_by_numbers
 from pkm_twin.codegen.arrays import Array, Mask
 from pkm_twin.errors import ParameterError
+from pkm_twin.identification.identifiable import KINDS
 from pkm_twin.identification.judge import (
     ALL,
     HINT,
@@ -50,6 +51,10 @@ SPEED: Final = "time at another rate"
 RESONANCE: Final = "drive resonance"
 INTERFERENCE: Final = "interference at one frequency"
 GEOMETRY: Final = "geometry"
+OFF: Final = 0.05
+"""Usual size of a gain: constants of drives and current sensors are known to some per cent."""
+CLEAR: Final = 0.1
+"""Standard deviation of a factor on the file's numbers from which it is known."""
 STEP: Final = 1e-4
 """Of difference quotients by an offset or a give, rad or machine sizes."""
 USUAL: Final = 5e-3
@@ -90,7 +95,7 @@ def errors_of(rows: Rows, values: Array) -> tuple[Errors, Array]:
     share = None if "load-dependent" in robot.laws else 0.05
     found: Errors = []
     for kind, units, usual, column in (
-        (GAIN, [""] * len(names), 0.05, told), (LATE, ["s"] * len(names), 2e-3, -change),
+        (GAIN, [""] * len(names), OFF, told), (LATE, ["s"] * len(names), 2e-3, -change),
         (LOAD, [""] * len(names), share, load),
         (SQUARE, [f"{e} s2/{u}2" for u, e in pairs], None, square),
         *((STATIC, efforts, None, law) for law in static),
@@ -109,7 +114,7 @@ def errors_of(rows: Rows, values: Array) -> tuple[Errors, Array]:
         found.append((Suspect(ELASTIC, name, unit, positive=True), (need(*back) - here) / size))
     fast, slow = (need(0.0, h * motion.qd, (2.0 * h + h**2) * motion.qdd) for h in (STEP, -STEP))
     found += [
-        (Suspect(GAIN, ALL, usual=0.05), told),
+        (Suspect(GAIN, ALL, usual=OFF), told),
         (Suspect(LATE, ALL, "s"), -change),
         (Suspect(LOAD, ALL, usual=share), load),
         (Suspect(SPEED, ALL), (fast - slow) / (2.0 * STEP)),
@@ -299,6 +304,59 @@ def _simpler(verdict: Verdict, frozen: Verdict) -> Verdict:
         verdict, answer="explains partly", findings=findings,
         unseen=np.concatenate([verdict.unseen, frozen.shift[None] - verdict.shift]),
     )  # fmt: skip
+
+
+def scaled_efforts(problem: Problem, verdict: Verdict) -> str | None:
+    """Efforts that are scaled beyond what a drive's constant may be off by, in words; or None.
+
+    A heavier machine has the friction of its file, efforts of another scale do not: they ask for
+    friction, rotors and masses that all are so many times the file's. Without a friction in the
+    file a gain that explains the efforts is told from heavier masses by nothing.
+    """
+    gains = [one for one in verdict.findings if one.suspect.kind == GAIN and one.size < 1.0]
+    gains = [g for g in gains if abs(g.size) > SIGMAS * np.hypot(OFF, g.deviation)]
+    if set(problem.what) != set(KINDS):
+        # A payload, or other masses, may be what is there.
+        whole = replace(problem, what=KINDS)
+        return scaled_efforts(whole, verdict_of(whole)) if gains else None
+    known = _factors(problem)
+    rubs = known.get("friction")
+    if gains:
+        factor, where = 1.0 / (1.0 - gains[0].size), gains[0].suspect.where
+        if where == ALL and rubs is not None and abs(rubs[0] - 1.0) < abs(rubs[0] - factor):
+            return None
+    elif rubs is not None and len(known) > 1:
+        each, deviations = np.array(list(known.values())).T
+        weights = 1.0 / (deviations**2 + OFF**2)
+        factor, where = float(weights @ each / weights.sum()), ALL
+        alike = weights @ (each - factor) ** 2 < HINT**2
+        if not alike or not abs(1.0 - 1.0 / factor) > SIGMAS * OFF:
+            return None
+    else:
+        return None
+    told = f"efforts scaled by {factor:.2g} ({'all drives' if where == ALL else where})"
+    told += f", a drive's constant is within {100 * SIGMAS * OFF:.2g} %"
+    if where == ALL and rubs is None:
+        told += f"; or all masses are {factor:.2g} times the file's, the recordings cannot tell"
+    return told
+
+
+def _factors(problem: Problem) -> dict[str, tuple[float, float]]:
+    """How many times the file's the fitted numbers are, by kind, with standard deviations.
+
+    Where the recordings tell it: friction, rotors, and all masses together.
+    """
+    kinds = [g.kind for g in problem.everything.groups for _ in g.names]
+    alike = np.array(["inertia" if kind == "payload" else kind for kind in kinds])
+    file, e, found = problem.everything.values, problem.estimate, {}
+    for kind in ("friction", "rotor", "inertia"):
+        some = (alike == kind) & (file != 0.0) & problem.chosen
+        own, rows = file[some], np.flatnonzero(some[problem.chosen])
+        known = np.linalg.pinv(e.covariance[np.ix_(rows, rows)], hermitian=True) @ own
+        sure = float(known @ own)
+        if sure > CLEAR**-2:
+            found[kind] = float(known @ problem.values[some]) / sure, float(sure**-0.5)
+    return found
 
 
 @dataclass(frozen=True, eq=False)

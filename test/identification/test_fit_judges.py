@@ -318,6 +318,28 @@ def test_what_is_accepted_is_marked() -> None:
     assert all(np.isnan(n.deviation) for n in result.numbers if n.status != "not excited")
 
 
+@pytest.mark.parametrize("name", partly_long(["delta_cu", "stewart"], "delta_cu"))
+def test_scaled_efforts_are_rejected_and_heavier_machines_are_not(name: str) -> None:
+    """Friction tells them apart; a file without any does not."""
+    m = drawn(name, 3)
+    rubs = {key: getattr(m.truth.friction, key).tolist() for key in ("viscous", "coulomb")}
+    robot, bare = (m.robot.changed(friction=one) for one in (rubs, {"viscous": 0.0, "coulomb": 0}))
+    kg = {p: 1.5 * v for p, (v, unit) in robot.file_numbers().items() if unit in ("kg", "kg m2")}
+    heavy = robot.numbered({p: v for p, v in kg.items() if "rotor" not in p})
+    rng = np.random.default_rng(8)
+    sound, heavier = (
+        noisy(m.recorded(effort=inverse_dynamics(one, m.q, m.qd, m.qdd)), rng)
+        for one in (robot, heavy)
+    )
+    scaled = replace(sound, effort=1.5 * sound.effort)
+    with pytest.raises(PkmTwinError, match=r"scaled by 1\.5 .*%; --accept"):
+        fit(robot, [scaled])
+    if name == "delta_cu":
+        with pytest.raises(PkmTwinError, match=r"cannot tell; --accept"):
+            fit(bare, [scaled])
+    assert not fit(robot, [heavier]).accepted
+
+
 def test_a_bound_that_is_active_counts_in_the_standard_deviations() -> None:
     """Of two columns with a common part the noise, which is slow, hides the one that is bounded.
 

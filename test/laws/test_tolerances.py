@@ -221,6 +221,19 @@ def test_copies_of_a_limb_vary_alike(name, rng):
         np.testing.assert_allclose(alike, total, rtol=0, atol=1e-9 * max(1.0, abs(total).max()))
 
 
+def test_a_body_of_a_planar_chain_is_longer_in_its_plane():
+    """Though its joints lie in several planes."""
+    robot = load("examples/machines/rrr3_planar.yaml")
+    q = robot.graph.home
+    motor, elbow = (robot.graph.joints[f"{one}_1"].at[:2] for one in ("motor", "elbow"))
+    way = (elbow - motor) / np.linalg.norm(elbow - motor)
+    paths = ["bodies.crank_1.length", "limbs.bodies.crank.length"]
+    paths += [f"joints.elbow_1.at[{k}]" for k in range(2)]
+    own, alike, x, y = tolerances(robot, dict.fromkeys(paths, 1e-4), q).sensitivity.values()
+    np.testing.assert_allclose(own, way[0] * x + way[1] * y, rtol=0, atol=1e-8)
+    np.testing.assert_allclose(alike[..., [2, 3, 4]], 0.0, atol=1e-9)
+
+
 def test_drawn_machines_have_the_standard_deviations():
     robot = load("linear_delta")
     sigma = {

@@ -68,17 +68,20 @@ def convert(given: Convert) -> Report:
     from pkm_twin.robot.robot_urdf import robot_description
     from pkm_twin.robot.urdf_read import read_urdf
 
-    told: list[str] = []
+    told, notes = list[str](), list[str]()
     if ending in TREES:
         described = read_urdf(Path(first), platform=given.platform)
     else:
         robot = load(first, platform=given.platform)
         described, told = robot_description(robot), robot.book.told()
-    text = describe_machine_yaml(described, told)
+        lost = sorted({*robot.tolerances} - {*described.get("tolerances", ())})
+        if lost:
+            notes = [f"left out, not numbers of these parts: tolerances of {', '.join(lost)}"]
+    text = describe_machine_yaml(described, told + notes)
     if given.out is None:
-        return Report(facts=[Fact("yaml", text)], raw=text)
+        return Report(facts=[Fact("yaml", text)], raw=text, notes=notes)
     replace_file(given.out, text.encode())
-    return Report(files={"out": given.out})
+    return Report(files={"out": given.out}, notes=notes)
 
 
 def _of_printer(given: Convert) -> Report:
