@@ -106,6 +106,12 @@ def test_a_file_has_tolerances_of_its_parts(twin, tmp_path, name):
     out = tmp_path / "graph.yaml"
     twin.good("convert", path, "--out", out)
     assert yaml.safe_load(out.read_text())["tolerances"] == data["tolerances"]
+    # A graph has no parameters: what names one is left out, and named.
+    more = {"geometry.arm_length": {"deviation": 1e-4}}
+    path.write_text(yaml.safe_dump(data | {"tolerances": data["tolerances"] | more}))
+    twin.good("convert", path, "--out", out, "--overwrite")
+    assert yaml.safe_load(out.read_text())["tolerances"] == data["tolerances"]
+    assert "tolerances of geometry.arm_length" in out.read_text()
     data["tolerances"] = {"joints.*.offset": {"deviation": 1e-4, "bound": 1e-4}}
     path.write_text(yaml.safe_dump(data))
     assert "tolerances.joints.*.offset" in twin.refused("design", path, "--tolerance", "file")
