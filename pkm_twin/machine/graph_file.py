@@ -6,7 +6,7 @@ from __future__ import annotations
 import copy
 import dataclasses
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final, TypeVar
 
@@ -117,8 +117,8 @@ class LimitSpec:
     """
 
     position: Array | None = schema.interval(unit="{joint}", default=None)
-    velocity: float | None = schema.number(above=0.0, unit="{joint}/s", default=None)
-    effort: float | None = schema.number(above=0.0, unit="{effort}", default=None)
+    velocity: float | None = schema.number(above=0.0, high=math.inf, unit="{joint}/s", default=None)
+    effort: float | None = schema.number(above=0.0, high=math.inf, unit="{effort}", default=None)
     swivel: float | None = schema.number(above=0.0, high=np.pi, unit="rad", default=None)
     axis: Array | None = schema.vector(3, default=None)
 
@@ -429,8 +429,7 @@ def numbered_entry(entry: T, values: Mapping[Keys, Any], azimuth: float, path: s
     if ("azimuth",) in values:
         turned: T = _turned(entry, values["azimuth",] - azimuth, set(), 0)
         return turned
-    if ("home",) in values and isinstance(entry, JointSpec) and entry.home is None:
-        entry = dataclasses.replace(entry, home=0.0)
+    entry = _spelled(entry, values)
     if azimuth:
         made = placed(_turned(entry, -azimuth, set(), 0), values, path)
         back, whole = _turned(made, azimuth, set(), 0), copy.copy(entry)
@@ -453,9 +452,18 @@ def number_of_entry(entry: Any, keys: tuple[str | int, ...], azimuth: float, pat
         return azimuth
     if azimuth:
         entry = _turned(entry, -azimuth, set(), 0)
-    if keys == ("home",) and entry.home is None:
-        return 0.0
-    return number_in(schema.plain(entry), keys, path)
+    return number_in(schema.plain(_spelled(entry, [keys])), keys, path)
+
+
+def _spelled(entry: T, places: Iterable[Keys]) -> T:
+    """An entry with the zeros at some keys that a joint's may leave out."""
+    if not isinstance(entry, JointSpec):
+        return entry
+    zeros: dict[str, Any] = {"home": 0.0}
+    zeros |= {"friction": FrictionSpec()} if entry.actuated else {}
+    named = {str(key) for key, *_ in places}
+    zeros = {k: v for k, v in zeros.items() if k in named and getattr(entry, k) is None}
+    return dataclasses.replace(entry, **zeros) if zeros else entry
 
 
 def graph_of_entries(
@@ -483,7 +491,7 @@ def graph_of_entries(
 def shared_by(graph: Graph, leads: Sequence[str], how: Redundancy, effort: Any) -> Graph:
     """The graph whose other actuated joints follow of those that lead, and how all share efforts.
 
-    :param effort: limits of all actuated joints, shape (n,); None: none has one.
+    :param effort: limits of all actuated joints, shape (n,); None, or all infinite: none has one.
     :raises ParameterError: limits of some alone, or a preload of another number of joints.
     """
     names = graph.actuated
@@ -498,12 +506,13 @@ def shared_by(graph: Graph, leads: Sequence[str], how: Redundancy, effort: Any) 
     preload: Any = how.preload if how.preload.size else np.zeros(n)
     if len(preload) != n:
         raise ParameterError("redundancy.preload", list(preload), f"{n} efforts, one per joint")
-    limits: Any = np.ones(n) if effort is None else np.broadcast_to(effort, n)
+    none = effort is None or np.isinf(references(effort)).all()
+    limits: Any = np.ones(n) if none else np.broadcast_to(effort, n)
     for name, limit in zip(names, references(limits), strict=True):
         if not np.isfinite(limit):
             raise ParameterError(
-                f"joints.{name}.limits.effort", None,
-                "a limit of every actuated joint, or of none: they share the effort by it",
+                f"joints.{name}.limits.effort", float(limit),
+                "a finite limit of every actuated joint, or of none: they share the effort by it",
             )  # fmt: skip
     joints = {
         name: dataclasses.replace(joint, follows=joint.actuated and name not in leads)

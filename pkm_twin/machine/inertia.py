@@ -38,7 +38,8 @@ def standard_parameters(mass: float, com: Array, inertia: Array) -> Array:
 
     :param com: centre of mass, shape (3,), m; ``inertia`` about it, shape (3, 3), kg m2.
     """
-    about = inertia + mass * (com @ com * np.eye(3) - np.outer(com, com))
+    # Expressions of one entry alone are half of the effect of both.
+    about = 0.5 * (inertia + inertia.T) + mass * (com @ com * np.eye(3) - np.outer(com, com))
     return _numbers(mass, mass * com, about)
 
 

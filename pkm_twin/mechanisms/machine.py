@@ -142,6 +142,7 @@ class Machine(TwinRobot):
             name=name, described=graph, specs=specs, sources=sources, pose=pose, book=book,
             redundancy=file.redundancy, **common, **own,
         )  # fmt: skip
+        robot = robot._with(uncertainty=robot.resolved(robot.uncertainty))
         robot.check_laws()
         _ = robot.controller
         robot.engine.check()
@@ -196,7 +197,7 @@ class Machine(TwinRobot):
         A limb's number is that of all its copies, in the axes of azimuth zero; of an azimuth, the
         copy is turned on.
         """
-        book, values = self.book.moved(values)
+        book, values = self.book.moved(self.resolved(values))
         sources = dict(self.sources)
         specs = {kind: dict(entries) for kind, entries in self.specs.items()}
         rest, origin = {}, self.described.origin
@@ -228,6 +229,7 @@ class Machine(TwinRobot):
     def filed(self, values: Mapping[str, Any]) -> Any:
         """As of every robot; parameters and expressions stay, but where a copy's number is new."""
         data: Any = copy.deepcopy(self.book.data)
+        values = self.resolved(values)
         kept = data and (self.book.values or self.book.formulas)
         if not kept or not all(has_entry(data, path) for path in values):
             return super().filed(values)
@@ -238,6 +240,7 @@ class Machine(TwinRobot):
 
     def check_number(self, path: str) -> None:
         """As a file's, in each of the entries that have it."""
+        path = self.own_path(path)
         keys = full_keys(path)
         for moved in self.book.moving([str(keys[-1])]) if keys[0] == PARAMETERS else ():
             self.check_number(moved.path)
@@ -250,6 +253,7 @@ class Machine(TwinRobot):
 
     def number(self, path: str) -> float:
         """Of a limb's numbers those of its first copy."""
+        path = self.own_path(path)
         keys = full_keys(path)
         if keys[0] == PARAMETERS:
             return number_in(dict(self.book.values), keys[1:], path)
@@ -258,6 +262,14 @@ class Machine(TwinRobot):
         for kind, name, where, azimuth in self.named(keys):
             return number_of_entry(self.specs[kind][name], where, azimuth, path)
         return super().number(path)
+
+    def own_path(self, path: str) -> str:
+        """Friction and limits of the drives, ``friction.viscous[0]``, stand at the joints."""
+        section, key, k, *rest = [*keys_of(path), "", ""]
+        drive = section in ("friction", "limits") and isinstance(k, int)
+        if not drive or int(k) >= self.joints_count:
+            return path
+        return path_of(["joints", self.joint_names[int(k)], section, key, *rest[:-2]])
 
     def named(self, keys: Sequence[str | int]) -> Iterator[tuple[str, str, Keys, float]]:
         """As of every robot; of a limb's entry all copies; keys ``azimuth`` for a limb's own."""

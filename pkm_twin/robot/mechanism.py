@@ -447,8 +447,28 @@ class Mechanism(Common):
 
         :raises ParameterError: a path that there is not.
         """
+        values = self.resolved(values)
         made = placed(self, {tuple(full_keys(path)): value for path, value in values.items()})
         return self._with(**{f.name: getattr(made, f.name) for f in dataclasses.fields(self)})
+
+    def own_path(self, path: str) -> str:
+        """Where the robot's file has a number that another path names too."""
+        return path
+
+    def resolved(self, values: Mapping[str, Any]) -> dict[str, Any]:
+        """Values by :meth:`own_path`.
+
+        :raises ParameterError: two paths of one number.
+        """
+        found: dict[str, Any] = {}
+        told: dict[Keys, str] = {}
+        for path, value in values.items():
+            own = self.own_path(path)
+            first = told.setdefault(tuple(full_keys(own)), path)
+            if first != path:
+                raise ParameterError("path", path, f"each number once; {first} is the same")
+            found[own] = value
+        return found
 
     def number(self, path: str) -> float:
         """The number of the robot's file at a dotted path, as :meth:`numbered` takes it.
@@ -522,7 +542,7 @@ class Mechanism(Common):
         if not set(sections) <= set(self.changeable):
             known = self.parameter_sections()
             for key in sections:
-                if key not in known:
+                if key not in known and key not in settings_of(Common):
                     raise UnknownNameError(key, key, known)
             return type(self).from_data(merged(given(known), sections), self.name)
         new: dict[str, Any] = {}

@@ -106,6 +106,14 @@ def test_effects_are_differences_of_machines_with_other_numbers() -> None:
         np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-6 * np.abs(expected).max())
 
 
+@pytest.mark.parametrize("name", ["delta", "five_bar"])
+def test_a_drive_s_friction_is_unsure_by_its_place(name: str) -> None:
+    robot = load(name).changed(uncertainty={"friction.viscous[1]": {"deviation": 0.1}})
+    rate = np.linspace(1.0, 2.0, robot.joints_count)
+    found = torque_deviation(robot, robot.graph.home, rate, rate)
+    np.testing.assert_allclose(found, np.where(np.arange(len(rate)) == 1, 0.1 * rate, 0.0))
+
+
 def test_a_file_that_names_none_is_sure() -> None:
     robot = load("delta")
     q = robot.inverse(robot.home())

@@ -4,22 +4,37 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from delta_dynamics import inverse_dynamics, mass_matrix, reactions
-from pkm_twin import Robot, variants
+from delta_dynamics import inverse_dynamics, mass_matrix, reactions, torque_derivatives
+from pkm_twin import Robot, robot_names, variants
 from pkm_twin.certify.description import expand
+from pkm_twin.codegen.expressions import references
 from pkm_twin.codegen.lu import pivot_order
 from pkm_twin.errors import ParameterError, PkmTwinError
 from pkm_twin.kinematics.motion import Motion
+from pkm_twin.machine import places, schema
 from pkm_twin.machine.places import keys_of
 from pkm_twin.mechanisms.catalogue import robot_of_data
-from stiffness_monitor import compliance
+from pkm_twin.robot.numbers import geometry_and_masses
+from stiffness_monitor import compliance, derivatives
 from stiffness_monitor.programs import Elastic, followed
 from test.machine.random_machines import plain
-from test.support.robots import elastic, load, often, parameters_of, partly_long, some_robots
+from test.support.robots import (
+    elastic,
+    has,
+    load,
+    often,
+    parameters_of,
+    partly_long,
+    some_robots,
+)
+
+MACHINES = Path(__file__).parents[2] / "examples" / "machines"
+SHARED = MACHINES / "rrr3_point.yaml"
 
 ASIDE = ("limits", "joint_map", "uncertainty", "member", "section", "compliance", "radius")
 """Words in paths of numbers that no program of these reads."""
@@ -84,6 +99,72 @@ def test_variants_are_the_robots_of_their_files(name, rng):
     assert judge(robot, numbers, rng, True) > 0 or "azimuth" in str(list(numbers))
     mass = next(p for p in known if p.endswith("mass"))
     assert judge(robot, {mass: [known[mass], -1.0]}, rng, True) == 1
+
+
+def taken(robot: Robot) -> tuple[list[float], str]:
+    """What programs, nodes and commands take of a robot."""
+    rows = derivatives.elastic_numbers(robot) if has(robot, "structure") else []
+    rest = (
+        robot.limits, robot.passive_limits, robot.controller, robot.drives, robot.modal_damping,
+        [beam.outer for beam in robot.beams],
+    )  # fmt: skip
+    return references([*geometry_and_masses(robot), *rows]).tolist(), repr(rest)
+
+
+@pytest.mark.parametrize(
+    "name",
+    partly_long(
+        [*robot_names(), *sorted(map(str, MACHINES.glob("*.yaml")))],
+        "delta", "five_bar", str(SHARED),
+    ),
+    ids=lambda name: Path(name).stem,
+)  # fmt: skip
+def test_a_number_has_an_effect_or_is_refused(name):
+    """Those that the file lists, and the drives' of other names."""
+    robot = load(name)
+    carried = {"mass": 0.3, "com": [0.01, 0.02, 0.03], "inertia": [0.01, 0.02, 0.02]}
+    robot = robot.changed(payload=carried)
+    own = taken(robot)
+    drives = {key: schema.plain(getattr(robot, key)) for key in ("friction", "limits")}
+    for path in robot.file_numbers() | places.numbers_of(drives, {}):
+        try:
+            value = robot.number(path)
+            other = 1.07 * value + 0.011 if np.isfinite(value) else 3.0
+            made = robot.numbered({path: other})
+            effect = taken(made)
+        except ParameterError:
+            continue
+        assert made.number(path) == pytest.approx(other), path
+        # A direction has no length.
+        assert effect != own or (".ax" in path and abs(value) == 1.0), path
+
+
+def test_a_drive_s_number_is_the_same_by_both_names(rng):
+    robot = load("five_bar")
+    states, both = motion(robot, rng, 3), ("friction.viscous[1]", "joints.right.friction.viscous")
+    values = np.array([0.0, 2.0])
+    first, second = (variants(robot, {p: values}).inverse_dynamics(*states) for p in both)
+    np.testing.assert_array_equal(first, second)
+    assert first[1, :, 1] - first[0, :, 1] == pytest.approx(2.0 * states[1][:, 1])
+    for p in both:
+        assert torque_derivatives(robot, *states, by=[p]).by[p][:, 1] == pytest.approx(
+            states[1][:, 1]
+        )
+    with pytest.raises(ParameterError, match="each number once"):
+        variants(robot, dict.fromkeys(both, 1.0))
+
+
+def test_limits_by_either_name_share_efforts():
+    robot, efforts = load(SHARED), np.array([4.0, 1.0, 0.1])
+    home, still, wrench = robot.graph.home, np.zeros(3), np.array([3.0, 5.0, 0, 0, 0, 0])
+    expected = []
+    for effort in efforts:
+        own = robot.changed(limits={"effort": [effort, *robot.limits.effort[1:]]})
+        expected.append(inverse_dynamics(own, home, still, still, wrench))
+    assert np.ptp(expected, axis=0).max() > 0.1
+    for path in ("limits.effort[0]", f"joints.{robot.joint_names[0]}.limits.effort"):
+        found = variants(robot, {path: efforts}).inverse_dynamics(home, still, still, wrench)
+        np.testing.assert_allclose(found, expected, atol=1e-12)
 
 
 @pytest.mark.parametrize("count", often(2, 4))

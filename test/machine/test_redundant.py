@@ -385,6 +385,8 @@ def test_what_a_file_may_not_say():
             robot_of_data(data, "plane")
 
     rejected("limits.effort", lambda joints: joints["motor_1"].pop("limits"))
+    endless = {"limits": {"effort": np.inf}}
+    rejected("motor_1.limits.effort: inf", lambda joints: joints["motor_1"].update(endless))
     rejected("redundancy.preload", redundancy={"preload": [1.0, 2.0]})
     rejected("redundancy.leads", redundancy={"leads": ["motor_0", "motor_1"]})
     rejected("redundancy.leads", redundancy={"leads": ["motor_0", "motor_1", "elbow_0"]})
@@ -468,3 +470,14 @@ def test_exported_functions_share_alike(planar, tmp_path):
 def test_without_redundancy_nothing_moves_nothing():
     robot = load("five_bar")
     assert null_efforts(robot, np.zeros((5, 2)) + robot.graph.home).shape == (5, 0, 2)
+
+
+def test_limits_that_are_all_infinite_are_none():
+    sharing = []
+    for limits in (None, np.full(4, np.inf)):
+        plane = Planar(np.random.default_rng(2), 4, point=False, limits=limits)
+        robot = robot_of_data(plane.file(), "plane")
+        sharing.append(robot.graph.sharing)
+        again = robot.changed(limits={"effort": np.inf, "velocity": np.inf})
+        sharing.append(again.graph.sharing)
+    np.testing.assert_array_equal(sharing, sharing[:1] * 4)
