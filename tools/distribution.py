@@ -100,10 +100,10 @@ def needed(name: str = NAME) -> dict[str, metadata.Distribution]:
 def licence(package: metadata.Distribution) -> str:
     """SPDX expression, or the package's own short words."""
     about = package.metadata
-    if about["License-Expression"]:
+    if "License-Expression" in about:
         return str(about["License-Expression"])
     classified = [c for c in about.get_all("Classifier", []) if c.startswith("License")]
-    text = " ".join([*classified, (about["License"] or "").partition("\n")[0]])
+    text = " ".join([*classified, str(about.get("License", "")).partition("\n")[0]])
     names = {name for word, name in CLASSIFIED.items() if word in text}
     return " AND ".join(sorted(names)) or text.strip()[:60] or "NOASSERTION"
 

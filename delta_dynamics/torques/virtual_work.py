@@ -619,17 +619,16 @@ def dynamics_terms(
     def whole(p: Array, qd: Array, qdd: Array, wrench: Array) -> Array:
         return robot.evaluate(kernel, p, place, qd, qdd, wrench)[0]
 
-    inner = whole(np.zeros_like(robot.inertial), still, still, none)
-
-    def efforts(p: Array, qd: Array, qdd: Array, wrench: Array) -> Array:
-        return whole(p, qd, qdd, wrench) - inner
-
     layout = Layout(robot.massive().tree)
-
     held = _without(robot.inertial, layout.friction)
     empty = _without(robot.own_inertial, layout.friction)
     weightless = _without(empty, layout.part(GRAVITY))
     rubbing = _without(robot.own_inertial, layout.part(GRAVITY))
+    # At rest, without gravity, friction and wrench: the preload.
+    inner = whole(weightless, still, still, none)
+
+    def efforts(p: Array, qd: Array, qdd: Array, wrench: Array) -> Array:
+        return whole(p, qd, qdd, wrench) - inner
 
     bent, linear = still, change
     if robot.redundant:

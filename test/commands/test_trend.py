@@ -87,7 +87,7 @@ def test_a_recording_tells_friction_and_payload(tmp_path, rng):
     load_ = found["payload beyond the load", "platform"]
     assert abs(load_.value - 0.12) < 5 * load_.deviation
     # With what errors of lengths and sensors may do to it.
-    assert load_.deviation < 0.02
+    assert load_.deviation < 0.03
 
 
 def test_nights_to_a_verdict(twin, tmp_path, monkeypatch, rng):

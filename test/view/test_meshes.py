@@ -11,7 +11,7 @@ from pkm_twin import load
 from pkm_twin.errors import RobotWarning
 from pkm_twin.robot.outline import Posture
 from pkm_twin.view.meshes import body_meshes
-from pkm_twin.view.scene import Scene
+from pkm_twin.view.scene import RIGID, Scene
 from test.commands.conftest import REPOSITORY
 
 SOURCE = (REPOSITORY / "examples/machines/dual_scara.urdf").read_text(encoding="utf-8")
@@ -45,7 +45,7 @@ def test_a_mesh_moves_with_its_link(tmp_path, filename, rng):
     graph, scene = robot.graph, Scene(robot)
     for _ in range(5):
         q = robot.inverse(robot.home()) + rng.uniform(-0.2, 0.2, 2)
-        at, turn = scene.frames(q, np.zeros(6))["upper_left"]
+        at, turn = scene.frames(q, RIGID)["upper_left"]
         now = Rotation.from_quat(np.roll(turn, -1)).apply(corners) + at
         posture = Posture(robot, q)
         for name, corner in (("motor_left", 0), ("elbow_left", 1)):
