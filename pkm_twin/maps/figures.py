@@ -25,10 +25,15 @@ if TYPE_CHECKING:
 
 MAP: Final = "viridis"
 PREFIXES: Final = {-12: "p", -9: "n", -6: "µ", -3: "m", 0: "", 3: "k", 6: "M"}
+NOISE: Final = 5e-6
+"""Coordinate, m or rad, that a search leaves of zero."""
 PANELS: Final = 3
 """Most planes in a picture."""
 LEAST_SHOWN: Final = 5e-5
 """Coordinate, m or rad, and part of a direction."""
+BULK: Final = 0.95
+"""Part of the values that has the whole scale where the largest is ``FAR`` times as large."""
+FAR: Final = 2.0
 SHARES: Final = ((0.35, 0.85), (0.25, 0.6, 0.9))
 """Of a plane's values below its contours: where it has neighbours on both sides, and else."""
 
@@ -82,6 +87,10 @@ def answers(data: Dataset) -> list[dict[str, Any]]:
             "unit": str(part.case_unit.values),
             "pose": dict(zip(names, part.worst_pose.values.tolist(), strict=True)),
         }
+        if "worst_bound" in data:
+            answer["singularity"] = float(part.worst_singularity)
+            bound = float(part.worst_bound)
+            answer["singularity_bound"] = bound if math.isfinite(bound) else None
         if "worst_direction" in data:
             answer["direction"] = part.worst_direction.values.tolist()
             answer["axes"] = [str(name) for name in data.axis.values]
@@ -94,9 +103,9 @@ def answers(data: Dataset) -> list[dict[str, Any]]:
 def sentence(answer: dict[str, Any]) -> str:
     """The worst of a case in words: "softest: 32.8 µm/N along y at (0, -0.16, -0.35), arm III".
 
-    The pose is in m and rad, as commands read it.
+    The pose is in m and rad, as commands read it, with digits that keep its singularity index.
     """
-    pose = ", ".join(f"{_plain(v):.4g}" for v in answer["pose"].values())
+    pose = ", ".join(f"{_plain(v, NOISE):.6g}" for v in answer["pose"].values())
     text = f"{answer['answer']}: {shown(answer['value'], answer['unit'])}"
     way = np.array(answer.get("direction", []))
     if len(way) and np.isfinite(way).all() and way.any():
@@ -104,12 +113,15 @@ def sentence(answer: dict[str, Any]) -> str:
         alone = abs(way[axis]) > 0.9995
         words = ", ".join(f"{_plain(v):.3g}" for v in way)
         text += f" along {answer['axes'][axis] if alone else f'({words})'}"
-    return f"{text} at ({pose})" + (f", {answer['element']}" if "element" in answer else "")
+    text += f" at ({pose})" + (f", {answer['element']}" if "element" in answer else "")
+    if (bound := answer.get("singularity_bound")) is not None:
+        text += f"; on the bound of the singularity index, {bound:g}: worse poses lie below it"
+    return text
 
 
-def _plain(value: float) -> float:
+def _plain(value: float, least: float = LEAST_SHOWN) -> float:
     """Without what is zero but for rounding and a search's steps."""
-    return value if abs(value) >= LEAST_SHOWN else 0.0
+    return value if abs(value) >= least else 0.0
 
 
 def units_of(data: Dataset) -> dict[str, str]:
@@ -122,9 +134,9 @@ def lines(data: Dataset) -> list[str]:
     found = answers(data)
     alone = len(found) == 1
     texts = [("" if alone else f"{a['case']}: ") + sentence(a) for a in found]
-    facts = kind_of(data).facts(data)
-    searched = bool(np.isfinite(data.worst_value.values[0]))
-    return [*texts, *facts] if searched else [*facts, *texts]
+    kind = kind_of(data)
+    facts = kind.facts(data)
+    return [*facts, *texts] if kind.facts_first else [*texts, *facts]
 
 
 def title(data: Dataset, case: int) -> list[str]:
@@ -133,7 +145,9 @@ def title(data: Dataset, case: int) -> list[str]:
     own = [sentence(a) for a in answers(data) if a["case"] == name]
     label = "" if len(data.case) == 1 else f", {name.replace('-', ' ')}"
     head = f"{data.attrs['robot']}{label}: {data.attrs['question']}"
-    return [head, *(own or ["; ".join(kind_of(data).facts(data))])]
+    kind = kind_of(data)
+    facts = ["; ".join(kind.facts(data))] if kind.facts_first and case == 0 else []
+    return [head, *facts, *own]
 
 
 def draw(data: Dataset) -> dict[str, Figure]:
@@ -144,10 +158,15 @@ def draw(data: Dataset) -> dict[str, Figure]:
 
 
 def limits(values: Array, worst: float) -> tuple[float, float]:
-    """First and last value of a scale: from 0, or from least to most where these are near."""
+    """First and last value of a scale: from 0, or from least to most where these are near.
+
+    A few values far above the others share its last colour.
+    """
     known = values[np.isfinite(values)]
     every = np.append(known, worst) if math.isfinite(worst) else known
     low, high = (float(every.min()), float(every.max())) if len(every) else (0.0, 1.0)
+    if len(known) and high > FAR * (most := float(np.quantile(known, BULK))) > 0.0:
+        high = most
     if 0.0 <= low <= 0.5 * high:
         low = 0.0
     return low, high if high > low else low + (abs(low) or 1.0)
@@ -175,6 +194,7 @@ def plane_of(data: Dataset, case: int, plane: int) -> dict[str, Any]:
         "values": part.plane_value.values,
         "reach": part.plane_reach.values,
         "star": star,
+        "through": at,
         "held": ", ".join(held),
     }
 
@@ -194,6 +214,7 @@ def planes(data: Dataset, case: int) -> Figure:
     worst = float(part.worst_value)
     values = np.concatenate([one["values"].ravel() for one in drawn])
     low, high = limits(values, worst)
+    beyond = bool((np.append(values, worst) > high).any())
     scale, unit = scale_of(max(abs(low), abs(high)), str(part.case_unit.values))
     label = textwrap.fill(f"{part.case_what.values} ({unit or 'dimensionless'})", 48)
     with plots.pyplot().rc_context({"font.size": 9}):
@@ -208,13 +229,15 @@ def planes(data: Dataset, case: int) -> Figure:
                 _line(one, ax, scale, label)
                 continue
             mesh = _panel(one, ax, scale, scale * low, scale * high, SHARES[count < PANELS])
-            kind.overlay(data, one["names"], ax)
+            kind.overlay(data, one["names"], one["through"], ax)
         if len(drawn[0]["names"]) > 1:
-            bar = figure.colorbar(mesh, ax=axes, aspect=25, pad=0.01)
+            bar = figure.colorbar(
+                mesh, ax=axes, aspect=25, pad=0.01, extend="max" if beyond else "neither"
+            )
             bar.set_label(label)
         rows = plots.head(figure, "\n".join(title(data, case)), 10)
         figure.set_figheight(high_of + 0.2 * rows)
-        figure.supxlabel(_caption(data, drawn), fontsize=8.5, color="0.3")
+        figure.supxlabel(_caption(drawn, beyond), fontsize=8.5, color="0.3")
     return figure
 
 
@@ -234,9 +257,10 @@ def _widths(drawn: list[dict[str, Any]]) -> list[float]:
     return list(np.clip(widths / widths.max(), 0.5, 1.0).tolist())
 
 
-def _caption(data: Dataset, drawn: list[dict[str, Any]]) -> str:
+def _caption(drawn: list[dict[str, Any]], beyond: bool) -> str:
     star = "star: worst pose, in its cell's colour; " if any(one["star"] for one in drawn) else ""
-    return f"{star}outline: all joint limits are kept; white: does not count"
+    more = "; brightest: or more" if beyond else ""
+    return f"{star}outline: all joint limits are kept; white: does not count{more}"
 
 
 def _line(one: dict[str, Any], ax: Axes, scale: float, label: str) -> None:

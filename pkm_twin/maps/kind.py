@@ -88,9 +88,8 @@ class Case:
 
     ``what`` and ``unit``: of the value. ``answer``: what the worst pose is, as "softest".
     ``largest``: is the largest value the worst? ``wrench``: force (N) and moment (N m) that the
-    surroundings apply to the platform at its reference point, base axes. ``searched``: whether the
-    worst pose is searched; otherwise the planes go through home. ``interfering``: whether poses
-    count in which limbs interfere.
+    surroundings apply to the platform at its reference point, base axes. ``interfering``: whether
+    poses count in which limbs interfere.
     """
 
     name: str
@@ -99,7 +98,6 @@ class Case:
     answer: str
     largest: bool = True
     wrench: tuple[float, ...] | None = None
-    searched: bool = True
     interfering: bool = False
 
 
@@ -111,8 +109,8 @@ class Kind:
     computed at once; ``samples``, ``population`` and ``rounds``: size of the search for the worst
     pose. ``screen``: of a quantity that takes long, a fast one that is bad in the same poses.
     ``least``: default singularity index below which a pose does not count. ``together``: all cases
-    share the worst pose of the first. ``signed``: values may be negative. ``page_help``:
-    explains the further figure of the page.
+    share the worst pose of the first. ``signed``: values may be negative. ``facts_first``: whether
+    the facts answer the question. ``page_help``: explains the further figure of the page.
     """
 
     name: ClassVar[str]
@@ -126,6 +124,7 @@ class Kind:
     takes_wrench: ClassVar[bool] = False
     together: ClassVar[bool] = False
     signed: ClassVar[bool] = False
+    facts_first: ClassVar[bool] = False
     least: ClassVar[float] = 0.05
     points: ClassVar[int] = 50_000
     chunk: ClassVar[int] = 16384
@@ -188,8 +187,10 @@ class Kind:
         return []
 
     @classmethod
-    def overlay(cls, data: Dataset, names: tuple[str, ...], ax: Axes) -> None:
-        """What is drawn over a plane of two pose coordinates."""
+    def overlay(
+        cls, data: Dataset, names: tuple[str, ...], through: Mapping[str, float], ax: Axes
+    ) -> None:
+        """What is drawn over a plane of two pose coordinates through a pose."""
 
     @classmethod
     def figures(cls, data: Dataset) -> dict[str, Figure]:
@@ -204,11 +205,17 @@ class Kind:
 
 @dataclass(frozen=True, eq=False)
 class Worst:
-    """A worst pose (m,), its joint positions (n,), and what was found there."""
+    """A worst pose (m,), its joint positions (n,), and what was found there.
+
+    ``index``: singularity index. ``bounded``: whether only its bound keeps next poses from being
+    worse.
+    """
 
     pose: Array
     q: Array
     found: Found
+    index: float
+    bounded: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -219,7 +226,7 @@ class Space:
     otherwise empty, and ``samples`` joint positions are drawn. ``side``: poses along a side of a
     plane. ``least``: singularity index, and ``least_clearance``: distance of the limbs, m, below
     which a pose does not count. ``at``: the pose (m,) that planes go through, instead of the worst.
-    ``worst``: of each case, once they are known; None where none is searched.
+    ``worst``: of each case, once they are known.
     """
 
     robot: Robot
@@ -232,7 +239,7 @@ class Space:
     least: float
     least_clearance: float
     at: Array | None = None
-    worst: tuple[Worst | None, ...] = ()
+    worst: tuple[Worst, ...] = ()
 
     @property
     def by_joints(self) -> bool:
@@ -265,10 +272,7 @@ class Space:
 
     def through(self, case: int) -> Array:
         """The pose that the planes of a case go through, shape (m,)."""
-        worst = self.worst[0 if self.kind.together else case]
-        if self.at is not None or worst is None:
-            return self.robot.home() if self.at is None else self.at
-        return worst.pose
+        return self.worst[case].pose if self.at is None else self.at
 
 
 def found_of(kind: Kind, robot: Robot, q: Array, cases: Sequence[Case]) -> list[Found]:

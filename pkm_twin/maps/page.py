@@ -76,6 +76,7 @@ def _case(data: Dataset, case: int, values: Array) -> tuple[float, str, dict[str
     low, high = figures.limits(values, float(part.worst_value))
     scale, unit = figures.scale_of(max(abs(low), abs(high)), str(part.case_unit.values))
     label = f"{part.case_what.values} ({unit})" if unit else str(part.case_what.values)
+    label += ", brightest: or more" if (values > high).any() else ""
     layout = {
         "coloraxis.cmin": float(few(np.array(scale * low))),
         "coloraxis.cmax": float(few(np.array(scale * high))),

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
@@ -24,6 +25,8 @@ COARSE: Final = 33
 """Poses along each coordinate of the grid that bounds a workspace."""
 FULL: Final = 3
 """Most pose coordinates of which a whole grid is made."""
+NEAR: Final = 64
+"""Places next to the worst that show whether the singularity index excludes worse ones."""
 HALVINGS: Final = 12
 """Of the way to a place that does not count, to find where it still does."""
 INSIDE: Final = 1e-9
@@ -80,7 +83,14 @@ def worst_of(
         bound = "a workspace in which some pose counts"
         raise ParameterError("robot", robot.name, f"{bound}: {why}" if why else bound)
     q, pose, _ = space.state(x[None])
-    return Worst(pose[0], q[0], found_of(kind, robot, q, [case])[0])
+    found = found_of(kind, robot, q, [case])[0]
+    near = rng.normal(size=(NEAR, len(x))) * 10.0 ** rng.uniform(-4.0, -2.0, (NEAR, 1))
+    state = space.state(np.clip(x + near * (high - low), low, high))
+    below = replace(space, least=0.0).counts(*state, case) & ~space.counts(*state, case)
+    (beyond,) = found_of(kind, robot, state[0][below], [case])
+    worse = badness(beyond.value, case.largest) > badness(found.value, case.largest)
+    index = float(robot.try_singularity(q)[0][0])
+    return Worst(pose[0], q[0], found, index, bool(worse.any()))
 
 
 def badness(value: Array, largest: bool) -> Array:

@@ -310,10 +310,9 @@ class Map(Space):
         cases = range(len(self.cases)) if case is None else [case]
         for column, k in enumerate(cases):
             worst = self.worst[k]
-            if worst is not None:
-                kept = (poses == worst.pose).all(-1)
-                _put(values, column, kept, worst.found)
-                values["reach"][kept, column] = 1
+            kept = (poses == worst.pose).all(-1)
+            _put(values, column, kept, worst.found)
+            values["reach"][kept, column] = 1
 
     def _values(self, q: Array, pose: Array, known: Mask, cases: Sequence[Case]) -> Values:
         robot, count = self.robot, len(q)
@@ -354,13 +353,14 @@ class Map(Space):
         """
         starts = np.concatenate([values["starts"] for values in grid])
 
-        def worst(k: int) -> Worst | None:
+        def worst(k: int) -> Worst:
             first = starts[:, k].reshape(-1, starts.shape[-1])
             first = first[np.isfinite(first[:, 0])]
-            return worst_of(self, self.cases[k], first) if self.cases[k].searched else None
+            return worst_of(self, self.cases[k], first)
 
         count = range(len(self.cases))
-        if self.kind.together and (one := worst(0)) is not None:
+        if self.kind.together:
+            one = worst(0)
             every = found_of(self.kind, self.robot, one.q[None], self.cases)
             found = replace(self, worst=tuple(replace(one, found=value) for value in every))
         else:
@@ -386,13 +386,18 @@ class Map(Space):
         return result | self._worst() | self.kind.summaries(self, counted, apart)
 
     def _worst(self) -> dict[str, Variable]:
-        """Value, pose, direction and element of the worst poses; NaN where none was searched."""
-        none = Worst(np.full(len(self.bounds), np.nan), np.empty(0), Found(np.full(1, np.nan)))
-        worst = [one or none for one in self.worst]
+        """Value, pose, singularity index, direction and element of the worst poses."""
+        worst, what = self.worst, "the worst value"
         value = [one.found.value[0] for one in worst]
-        what = "the worst value"
+        index = [one.index for one in worst]
+        bound = [self.least if one.bounded else np.nan for one in worst]
+        least = f"singularity index below which poses are worse than {what}, if it is there"
         result = {
             "worst_value": Variable(("case",), np.array(value), about(what)),
+            "worst_singularity": Variable(
+                ("case",), np.array(index), about(f"singularity index of {what}", "", SHARE)
+            ),
+            "worst_bound": Variable(("case",), np.array(bound), about(least, "", SHARE)),
             "worst_pose": Variable(
                 ("case", "coordinate"), np.array([one.pose for one in worst]), about(f"of {what}")
             ),

@@ -522,8 +522,8 @@ class Machine(TwinRobot):
         }
         if not sections and not compliances:
             raise ParameterError(
-                "bodies", None, "a member with a section in a body, a section in a rod, or the "
-                "compliance of a joint: nothing is elastic"
+                "bodies.NAME.member.section", None,
+                "it, rods.NAME.section or joints.NAME.compliance: nothing is elastic",
             )  # fmt: skip
         missing = [name for name in self.specs["rods"] if name not in sections]
         if missing:

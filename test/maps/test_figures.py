@@ -68,7 +68,12 @@ def test_a_picture_answers_and_the_star_has_its_cells_colour(stored):
             factor = colours[row, column] / value
             prefixes = [10.0**-power for power in figures.PREFIXES]
             assert np.isclose([*prefixes, 180 / np.pi], factor, rtol=1e-9).any()
-            assert low * (1 - 1e-12) <= colours[row, column] <= high * (1 + 1e-12)
+            assert low * (1 - 1e-12) <= colours[row, column]
+            assert star.get_markerfacecolor() == mesh.to_rgba(colours[row, column])
+            # Colours end below the largest value only with an arrow on their bar.
+            beyond = mesh.get_array().max() > high * (1 + 1e-12)
+            (bar,) = {one.colorbar for a in panels for one in a.collections} - {None}
+            assert bar.extend == ("max" if beyond else "neither")
         # One scale, from 0 or from the least that is drawn.
         assert len(limits) == 1
     for figure in drawn.values():
@@ -114,6 +119,7 @@ def test_efforts_have_their_residual_and_a_long_motion_the_seconds_of_its_peak(s
         ([-1.0, 3.0], -2.0, (-2.0, 3.0)),
         ([2.0, 2.0], np.nan, (2.0, 4.0)),
         ([np.nan], np.nan, (0.0, 1.0)),
+        ([0.5, *[1.0] * 39, 10.0], 12.0, (0.0, 1.0)),
     ],
 )
 def test_a_scale_begins_at_zero_or_at_the_least_with_the_worst_inside(values, worst, ends):

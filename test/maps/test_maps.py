@@ -220,12 +220,31 @@ def test_documented_worst_values():
     sweep = map_of(robot, kind)
     worst = worst_of(sweep, sweep.cases[0], np.empty((0, 3)))
     assert 1e6 * worst.found.value[0] == pytest.approx(softest, rel=0.01)
+    assert worst.bounded and worst.index == pytest.approx(LEAST, rel=1e-3)
+    # Also as it is printed.
+    printed = numbers(page, r"softest: .*? at \((\S+), (\S+), (\S+)\), arm III")
+    assert robot.singularity(robot.inverse(printed)) == pytest.approx(LEAST, rel=1e-3)
     pattern = r"push: moves most: (\S+) µm .*? at \((\S+), (\S+), (\S+)\), arm I; .*?lift: moves "
     push, x, y, z, lift = numbers(page, pattern + r"most: (\S+) µm")
     q = robot.inverse([[x, y, z]])
     for value, wrench in ((push, (30.0, 0, 0, 0, 0, 0)), (lift, (0, 0, 30.0, 0, 0, 0))):
         moved = found_of(kind, robot, q, [kind.loaded(robot, "load", wrench)])[0]
         assert 1e6 * moved.value[0] == pytest.approx(value, rel=1e-3)
+
+
+@pytest.mark.parametrize(("least", "bound"), [(0.05, None), (0.2, 0.2)])
+def test_an_answer_on_the_bound_of_the_singularity_index_has_it(least, bound, tmp_path):
+    """The five-bar is softest at its nearest pose to a singularity, of index 0.135."""
+    sweep = map_of(load("five_bar"), KINDS["compliance"](), 400, least_singularity=least)
+    with open_map(run(sweep, tmp_path / "a.nc", workers=1)) as data:
+        (answer,) = figures.answers(data)
+        (text,) = figures.lines(data)
+    assert answer["singularity_bound"] == bound
+    assert answer["singularity"] == pytest.approx(bound or 0.13504, rel=1e-4)
+    assert ("worse poses lie below" in text) == (bound is not None)
+    pose = [float(word) for word in text.partition("at (")[2].partition(")")[0].split(",")]
+    index = sweep.robot.singularity(sweep.robot.inverse(pose))
+    assert index == pytest.approx(answer["singularity"], rel=1e-4)
 
 
 def test_along_a_path_and_as_numbers(capsys, tmp_path, monkeypatch):

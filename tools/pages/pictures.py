@@ -27,7 +27,7 @@ PICTURES: Final = {
     "map_compliance": "map delta compliance",
     "map_stewart_payload": "map stewart payload",
     "map_upr_rpu_strain-energy": "map upr_rpu strain-energy",
-    "map_delta_cu_workspace": "map delta_cu workspace",
+    "map_delta_cu_workspace": "map delta_cu workspace --at 0,0,-0.35",
     "map_five_bar_speeds": "map five_bar speeds",
     "map_prru_isotropy": "map prru isotropy",
     "map_upr_rpu_modes": "map upr_rpu modes",

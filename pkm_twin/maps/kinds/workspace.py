@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from xarray import Dataset
 
 SINGULARITY: Final = Case(
-    "singularity", "singularity index", "", "nearest to a singularity", False, searched=False
+    "singularity", "singularity index", "", "least singularity index", largest=False
 )
 CLEARANCE: Final = Case(
     "clearance", "clearance of the limbs", "m", "limbs nearest", False, interfering=True
@@ -45,6 +45,7 @@ class Workspace(Kind):
     question = "where can it move?"
     least = 0.0
     signed = True
+    facts_first = True
     points = 200_000
     element = "members that are nearest"
 
@@ -107,18 +108,26 @@ class Workspace(Kind):
         return facts
 
     @classmethod
-    def overlay(cls, data: Dataset, names: tuple[str, ...], ax: Axes) -> None:
-        """The circles about the axis and the cylinder, in planes that they lie in."""
+    def overlay(
+        cls, data: Dataset, names: tuple[str, ...], through: Mapping[str, float], ax: Axes
+    ) -> None:
+        """The circles about the axis and the cylinder, where a plane cuts them."""
         if "circle" not in data or len(names) != 2:
             return
-        radius, height = float(data.cylinder_radius), data.attrs["height"]
+        height = data.attrs["height"]
+        apart = math.hypot(*(v for name, v in through.items() if name not in (*names, height)))
+        radii = np.array([float(data.cylinder_radius), *data.circle.values])
+        cut = np.sqrt(np.maximum(radii**2 - apart**2, 0.0))
+        radius = float(cut[0])
+        low, high = float(data.cylinder_low), float(data.cylinder_high)
         if height not in names:
+            if not low <= through[height] <= high:
+                return
             turn = np.linspace(0.0, 2 * np.pi, 181)
             ax.plot(radius * np.cos(turn), radius * np.sin(turn), "--", color="white", lw=1.2)
             return
-        low, high = float(data.cylinder_low), float(data.cylinder_high)
         outline = [radius, radius, -radius, -radius, radius], [low, high, high, low, low]
-        circle = np.where(data.circle.values > 0.0, data.circle.values, np.nan)
+        circle = np.where(cut[1:] > 0.0, cut[1:], np.nan)
         sides = np.concatenate([circle, [np.nan], -circle])
         heights = np.concatenate([data.height.values, [np.nan], data.height.values])
         for style, (x, y) in (("-", (sides, heights)), ("--", outline)):
