@@ -48,6 +48,7 @@ RESIDUAL: Final = "torque residual"
 MEASURED: Final = "measured efforts"
 COMPARED: Final = "compared efforts"
 IDLE: Final = "drives off or braked"
+COMPUTED: Final = "the efforts of this table are the model's; expected columns JOINT.measured"
 STUCK: Final = 0.05
 """Time for which a signal stays the same before it counts as stuck, s,"""
 TICKS: Final = 10.0
@@ -137,11 +138,12 @@ def checked(r: Recording, residual: float) -> Checked:
             reason or "more motors than degrees of freedom share efforts as their controller says"
         )
     if r.effort is None:
-        reason = reason or "the bag carries no efforts"
+        reason = reason or (COMPUTED if r.efforts == "model" else "the bag carries no efforts")
     mixed = step_fault(r, steps) if steps.publishers else ""
     if mixed or reason or r.effort is None:
         items.append(judged(RESIDUAL, mixed or reason, bound, None))
-        return Checked(r, items, causes=(mixed,) if mixed else ())
+        unjudged = COMPUTED if reason == COMPUTED else ""
+        return Checked(r, items, unjudged=unjudged, causes=(mixed,) if mixed else ())
     try:
         idle = idle_of(r)
         left_out = idle | near_jumps(steps, len(r.time))

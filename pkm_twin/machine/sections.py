@@ -21,6 +21,8 @@ MAX_LENGTH: Final = 100.0
 MAX_MASS: Final = 1e5
 MAX_PLACE: Final = 1e6
 """How far a point of a machine may be from the origin of its axes, along each, m."""
+MAX_LEAD: Final = 1.0
+"""Of screws and belts to choose from, m per turn: more are mm."""
 
 
 def length(**options: Any) -> Any:

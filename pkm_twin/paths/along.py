@@ -23,6 +23,8 @@ from pkm_twin.robot.robot import Robot
 BLOCK: Final = 4096
 """Samples computed at a time, so that memory stays flat."""
 BEYOND_LIMITS: Final = "beyond_limits"
+SAME: Final = 1e-6
+"""Relative difference of two computations of the same efforts."""
 UNLIKE: Final = 0.05
 """Difference between a file's efforts and the model's, over the RMS, from which it is reported."""
 
@@ -137,6 +139,7 @@ def torque_table(m: Recording, progress: Callable[[int], None] | None = None) ->
         columns.setdefault(name, []).append(values)
 
     q, qd, qdd, wrench = m.motion
+    told = m.efforts == "measured" or (m.efforts == "effort" and m.bag is None)
     outside, _ = beyond_limits(m.robot, q, qd)
     rates = _moving(m)
     for robot, part in by_load(m.robot, m.load, m.time, BLOCK):
@@ -166,7 +169,7 @@ def torque_table(m: Recording, progress: Callable[[int], None] | None = None) ->
             put(f"{joint}.effort", tau[:, i])
             if spread is not None:
                 put(f"{joint}.effort_deviation", spread[:, i])
-            if m.effort is not None and m.efforts == "measured":
+            if m.effort is not None and told:
                 put(f"{joint}.measured", m.effort[part][:, i])
             for field in fields(terms):
                 put(f"{joint}.effort_{field.name}", getattr(terms, field.name)[:, i])
@@ -176,4 +179,9 @@ def torque_table(m: Recording, progress: Callable[[int], None] | None = None) ->
         if progress is not None:
             progress(part.stop)
     whole = {name: np.concatenate(parts) for name, parts in columns.items()}
+    if m.effort is not None and m.efforts == "effort" and told:
+        model = np.stack([whole[f"{joint}.effort"] for joint in m.robot.joint_names], -1)
+        if np.abs(m.effort - model).max() <= SAME * np.abs(model).max():
+            # A plan of this machine: nothing was measured.
+            whole = {name: v for name, v in whole.items() if not name.endswith(".measured")}
     return whole | payload_columns(m.robot, m.load, m.time)

@@ -22,13 +22,17 @@ from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError
 from pkm_twin.files import replacing
 from pkm_twin.machine import schema
-from pkm_twin.machine.graph import BASE
+from pkm_twin.machine.graph import BASE, Joint
 from pkm_twin.paths.sizing import read_entries
 from pkm_twin.recordings import Recording, by_load
 from pkm_twin.recordings.tables import WRENCH as AXES
 from pkm_twin.robot.robot import Robot
 
-MILLION = 1e6
+MILLION: Final = 1e6
+TRAVEL: Final = 1e5
+"""Of a linear bearing, m, for which its C holds."""
+STILL: Final = 1e-12
+"""Mean step of a bearing that does not move, rad or m: rounding."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,38 +114,41 @@ def rainflow(values: ArrayLike) -> Cycles:
 
 @dataclass(frozen=True)
 class Life:
-    """Of a bearing: equivalent load, N; turns of the recording; life in turns and hours.
+    """Of a bearing: equivalent load, N; its motion in turns or m; life in these and in hours.
 
-    Infinite where nothing turns or loads it.
+    Infinite where nothing loads it, NaN where it bears a load and does not move.
     """
 
     load: float
-    turns: float
-    life_turns: float
-    life_hours: float
+    moved: float
+    life: float
+    hours: float
 
 
 def bearing_life(
-    load: ArrayLike, turned: ArrayLike, duration: float, rating: float, exponent: float = 3.0
-) -> Life:
-    """L10 of a rolling bearing (ISO 281) under a load that varies with how it turns.
+    load: ArrayLike, moved: ArrayLike, duration: float, rating: float, exponent: float = 3.0,
+    slides: bool = False,
+) -> Life:  # fmt: skip
+    """L10 of a rolling bearing under a load that varies with how it moves.
 
-    P = (sum F^p dphi / sum dphi)^(1/p), L10 = (C / P)^p million turns. To and fro is turning.
+    P = (sum F^p dphi / sum dphi)^(1/p), L10 = (C / P)^p million turns (ISO 281), or times 100 km of
+    a linear bearing (ISO 14728-1). To and fro is motion.
 
     :param load: equivalent load of the bearing in each interval, shape (k,), N.
-    :param turned: angle that it turns in each, shape (k,), rad.
+    :param moved: angle or travel in each, shape (k,), rad or m.
     :param duration: of all, s.
     :param rating: C, basic dynamic load rating, N; ``exponent``: p, 3 of balls, 10/3 of rollers.
     """
-    force, angle = np.asarray(load, np.float64), np.abs(np.asarray(turned, np.float64))
-    whole = float(angle.sum())
-    turns = whole / math.tau
-    mean = float(np.sum(force**exponent * angle) / whole) if whole > 0.0 else 0.0
-    equivalent = mean ** (1.0 / exponent)
-    if not equivalent > 0.0:
-        return Life(equivalent, turns, math.inf, math.inf)
-    life = MILLION * (rating / equivalent) ** exponent
-    return Life(equivalent, turns, life, life / turns * duration / 3600.0)
+    force, steps = np.asarray(load, np.float64), np.abs(np.asarray(moved, np.float64))
+    whole = float(steps.sum())
+    still = whole <= STILL * len(steps)
+    mean = float(np.mean(force**exponent) if still else np.sum(force**exponent * steps) / whole)
+    equivalent, amount = mean ** (1.0 / exponent), whole if slides else whole / math.tau
+    if still or not equivalent > 0.0:
+        life = math.nan if equivalent > 0.0 else math.inf
+        return Life(equivalent, amount, life, life)
+    life = (TRAVEL if slides else MILLION) * (rating / equivalent) ** exponent
+    return Life(equivalent, amount, life, life / amount * duration / 3600.0)
 
 
 BLOCK: Final = 512
@@ -155,7 +162,8 @@ ALONG: Final = 1e-9
 class BearingSpec:
     """A bearing of a joint: C (N), the life's exponent p, and its load X Fr + Y Fa.
 
-    Without Y the load is the force's amount. ``axis`` (base axes, at home): default the joint's.
+    Without Y the load is the force's amount; of a sliding joint always its part across the axis:
+    what is along it, the drive bears. ``axis`` (base axes, at home): default the joint's.
     """
 
     C: float = schema.number(above=0.0, unit="N")
@@ -170,13 +178,15 @@ class JointLoad:
     """Of one joint, what its inner body applies to its outer one at its point, some samples.
 
     ``wrench``: base axes, ``own``: axes that turn with the inner body, (k, 6), N and N m; NaN where
-    undetermined. ``turned``: between samples, the outer body against the inner one, rad, (k - 1,).
+    undetermined. ``turned``: between samples, the outer body against the inner one, rad, (k - 1,);
+    ``travelled``: likewise of a joint that slides, m, else 0.
     """
 
     name: str
     wrench: Array
     own: Array
     turned: Array
+    travelled: Array
 
 
 def joint_loads(motion: Recording) -> Iterator[list[JointLoad]]:
@@ -185,6 +195,7 @@ def joint_loads(motion: Recording) -> Iterator[list[JointLoad]]:
     Errors as ``reactions``.
     """
     last: dict[str, tuple[Array, ...]] = {}
+    slides = {name: joint for name, joint in by_label(motion.robot).items() if joint.slides}
     for robot, rows in by_load(motion.robot, motion.load, motion.time, BLOCK):
         q, *others = (values[rows] for values in motion.motion)
         found = elastic_reactions(robot, q, *others)
@@ -195,16 +206,22 @@ def joint_loads(motion: Recording) -> Iterator[list[JointLoad]]:
             # What a rod turns is its direction; its spin is idle.
             start, end = (found.points[:, order.index(name)] for name in rod.joint_names)
             turn[rod.name] = _swung(rod.ends[1] - rod.ends[0], end - start)
+        values = dict(zip(motion.robot.joint_names, q.T, strict=True))
+        if any(not joint.actuated for joint in slides.values()):
+            passive = zip(motion.robot.passive_joints, motion.robot.passive(q).T, strict=True)
+            values = dict(passive) | values
         result = []
         for k, (name, (inner, outer)) in enumerate(zip(found.names, found.bodies, strict=True)):
             back = turn[inner].swapaxes(-1, -2)
             wrench = found.wrenches[:, k]
             own = np.concatenate([_times(back, wrench[:, :3]), _times(back, wrench[:, 3:])], -1)
-            parts: tuple[Array, ...] = (wrench, own, back @ turn[outer])
+            place = values[slides[name].name] if name in slides else np.zeros(len(q))
+            parts: tuple[Array, ...] = (wrench, own, back @ turn[outer], place)
             if name in last:
                 parts = tuple(map(np.concatenate, zip(last[name], parts, strict=True)))
             last[name] = tuple(part[-1:] for part in parts)
-            result.append(JointLoad(name, parts[0], parts[1], _angles(parts[2])))
+            travelled = np.abs(np.diff(parts[3]))
+            result.append(JointLoad(name, parts[0], parts[1], _angles(parts[2]), travelled))
         yield result
 
 
@@ -221,8 +238,10 @@ class Summary:
 
     def __init__(self, robot: Robot, name: str, spec: BearingSpec | None) -> None:
         self.name, self.spec = name, spec
-        self.axis = None if spec is None else bearing_axis(robot, name, spec)
-        self.samples, self.turned = 0, 0.0
+        joint = by_label(robot).get(name)
+        self.slides = joint is not None and joint.slides
+        self.axis = None if spec is None else bearing_axis(joint, name, spec)
+        self.samples, self.turned, self.travelled = 0, 0.0, 0.0
         self.peaks, self.squares = np.zeros(2), np.zeros(2)
         self.determined = np.ones(len(AXES), np.bool_)
         self.reversals = [Reversals() for _ in AXES]
@@ -235,6 +254,7 @@ class Summary:
         size = np.linalg.norm(load.wrench[fresh].reshape(-1, 2, 3), axis=-1)
         self.samples += len(size)
         self.turned += float(load.turned.sum())
+        self.travelled += float(load.travelled.sum())
         self.peaks = np.maximum(self.peaks, size.max(0))
         self.squares += (size**2).sum(0)
         self.sizes.append(size[:, 0].astype(np.float32))
@@ -243,7 +263,8 @@ class Summary:
             self.reversals[k].add(load.own[fresh, k])
         if self.spec is not None:
             amount = bearing_load(load.own[:, :3], self.spec, self.axis)
-            self.bearing.append(((amount[1:] + amount[:-1]) / 2.0, load.turned))
+            moved = load.travelled if self.slides else load.turned
+            self.bearing.append(((amount[1:] + amount[:-1]) / 2.0, moved))
 
     @property
     def known(self) -> bool:
@@ -257,8 +278,8 @@ class Summary:
     def life(self, duration: float) -> Life:
         """L10 of its bearing, whose load between samples is their mean."""
         assert self.spec is not None  # noqa: S101  asked for joints with a bearing
-        load, turned = (np.concatenate(column) for column in zip(*self.bearing, strict=True))
-        return bearing_life(load, turned, duration, self.spec.C, self.spec.p)
+        load, moved = (np.concatenate(column) for column in zip(*self.bearing, strict=True))
+        return bearing_life(load, moved, duration, self.spec.C, self.spec.p, self.slides)
 
 
 def _times(matrices: Array, vectors: Array) -> Array:
@@ -293,14 +314,30 @@ def read_bearings(path: Path, names: tuple[str, ...]) -> dict[str, BearingSpec]:
     return found
 
 
-def bearing_axis(robot: Robot, name: str, spec: BearingSpec) -> Array | None:
+def by_label(robot: Robot) -> dict[str, Joint]:
+    """The joints by their names among the reactions."""
+    return {joint.label or joint.name: joint for joint in robot.graph.joints.values()}
+
+
+def bearing_axis(joint: Joint | None, name: str, spec: BearingSpec) -> Array | None:
     """The axis of a joint's bearing, base axes at home, of length 1; None where none is needed.
 
-    :raises ParameterError: Y without an axis.
+    :param joint: None of a rod's end.
+    :raises ParameterError: Y without an axis, or of a sliding joint; a joint that slides and has
+        other freedoms.
     """
+    if joint is not None and not joint.slides and not all(f.turns for f in joint.freedoms):
+        raise ParameterError(f"bearings.{name}", joint.kind, "a joint that only turns or slides")
+    if joint is not None and joint.slides:
+        if spec.Y is not None:
+            raise ParameterError(
+                f"bearings.{name}.Y",
+                spec.Y,
+                "none: along a sliding joint the drive bears the force",
+            )
+        return np.asarray(joint.axes[0], np.float64)
     if spec.Y is None:
         return None
-    joint = {j.label or j.name: j for j in robot.graph.joints.values()}.get(name)
     axis = spec.axis
     if axis is None and joint is not None and len(joint.axes) == 1:
         axis = joint.axes[0]
@@ -312,11 +349,11 @@ def bearing_axis(robot: Robot, name: str, spec: BearingSpec) -> Array | None:
 def bearing_load(force: Array, spec: BearingSpec, axis: Array | None) -> Array:
     """Equivalent load of a bearing under forces (k, 3), in axes of the inner body, (k,), N."""
     amount = np.linalg.norm(force, axis=-1)
-    if axis is None or spec.Y is None:
+    if axis is None:
         return np.asarray(amount)
     along = force @ axis
     across = np.sqrt(np.maximum(amount**2 - along**2, 0.0))
-    return np.asarray(spec.X * across + spec.Y * np.abs(along), np.float64)
+    return np.asarray(spec.X * across + (spec.Y or 0.0) * np.abs(along), np.float64)
 
 
 def write_rows(writer: Any, time: Array, loads: Sequence[JointLoad]) -> None:

@@ -27,7 +27,7 @@ from delta_dynamics import mass_matrix
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError, UnknownNameError
 from pkm_twin.machine import schema
-from pkm_twin.machine.sections import DriveSpec
+from pkm_twin.machine.sections import MAX_LEAD, DriveSpec
 from pkm_twin.machine.strict_yaml import read_yaml
 from pkm_twin.mechanisms.catalogue import config_folder
 from pkm_twin.recordings.payload import by_load
@@ -183,7 +183,7 @@ class Gear:
     """
 
     ratio: float | None = schema.number(low=1e-6, high=1e6, unit="turns per turn", default=None)
-    lead: float | None = schema.number(low=1e-6, high=1e6, unit="m per turn", default=None)
+    lead: float | None = schema.number(low=1e-6, high=MAX_LEAD, unit="m per turn", default=None)
     efficiency: float = schema.number(above=0.0, high=1.0, default=1.0)
     inertia: float = schema.number(low=0.0, high=1e4, unit="kg m2", default=0.0)
     backlash: float | None = schema.number(low=0.0, unit="rad or m", default=None)
@@ -239,8 +239,10 @@ class Gears:
         except ValueError:
             values = []
         low_first = len(values) == 2 and values[0] < values[1]
-        if not values or not all(1e-6 <= v <= 1e6 for v in values) or (span and not low_first):
-            raise ParameterError(f"--{key}s", text, "LOW:HIGH or numbers with commas, 1e-6 to 1e6")
+        most, unit = (1e6, "") if key == "ratio" else (MAX_LEAD, " m per turn")
+        if not values or not all(1e-6 <= v <= most for v in values) or (span and not low_first):
+            bound = f"LOW:HIGH or numbers with commas, 1e-6 to {most:g}{unit}"
+            raise ParameterError(f"--{key}s", text, bound)
         steps = np.geomspace(values[0], values[1], STEPS).tolist() if span else values
         own = Gear(efficiency=efficiency)
         return cls(tuple(own.sized(key, value) for value in steps), span)

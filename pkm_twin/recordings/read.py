@@ -48,6 +48,8 @@ CONVERTED: Final[Mapping[str, Callable[[JointMap, Array], Array]]] = {
     "current": lambda own, values: values * np.sign(own.factors),
 }  # fmt: skip
 """The joints' values of a controller's or motor's, by the column's word."""
+TERM: Final = "effort_gravity"
+"""In every table that `torques` writes."""
 POSE_MISS: Final = 1e-3
 """Difference between a table's pose and that of its joint positions, of the robot's size."""
 BLOCK: Final = 4096
@@ -138,6 +140,8 @@ def _of_table(path: Path, name: str | Robot | None, how: ReadOptions) -> Recordi
         or_pose = f"; or time, {', '.join(robot.pose_names)}"
         raise ParameterError(str(path), ", ".join(table), f"columns time, {needed}{or_pose}")
     time, notes, effort, word = times_of(path, times), [], None, how.efforts[0]
+    # Beside the terms of a model the efforts are their sum.
+    computed = any(f"{joint}.{TERM}" in table for joint in robot.joint_names)
     if posed:
         assert pose is not None  # noqa: S101  one of the two is there
         q, qd, qdd = _of_pose(table, robot, pose)
@@ -151,7 +155,8 @@ def _of_table(path: Path, name: str | Robot | None, how: ReadOptions) -> Recordi
         qd, qdd = map(stack, RATES[1:])
     if not (posed and how.planned):
         for word in how.efforts:
-            effort = stack(word)
+            if how.planned or not computed or word != "effort":
+                effort = stack(word)
             if effort is not None:
                 break
     check_units(path, robot, time, q, qd, how.dialect)
@@ -168,8 +173,8 @@ def _of_table(path: Path, name: str | Robot | None, how: ReadOptions) -> Recordi
     _check_sizes(table, SIZES | dict.fromkeys(efforts, MAX_EFFORT))
     held = how.load or load_of_table(robot, table, time)
     return Recording(
-        robot, time, q, qd, qdd, effort, wrench, deflection, pose, held, efforts=word,
-        source=str(path), notes=(
+        robot, time, q, qd, qdd, effort, wrench, deflection, pose, held,
+        efforts="model" if computed and word == "effort" else word, source=str(path), notes=(
             *notes,
             *([f"joints have the {how.side}'s values"] if side is not None else []),
             *([] if robot.controller.plain or side is not None else [MAPPED]),
@@ -234,7 +239,7 @@ def _refuse_misspelt(table: Table, robot: Robot, joints: Sequence[str], how: Rea
     if how.planned:
         for name in table:
             joint, dot, what = name.rpartition(".")
-            computed = what in EFFORTS or what.startswith("effort_")
+            computed = what in (*EFFORTS, *WRENCH) or what.startswith("effort_")
             if dot and joint in joints and name not in inputs and not computed:
                 raise UnknownNameError(f"{table.path}: column", name, inputs)
     if how.deflected:

@@ -62,8 +62,6 @@ class ReadOptions:
     @property
     def efforts(self) -> tuple[str, ...]:
         """Columns of a table's efforts; the first that are there are taken."""
-        if self.planned:
-            return ("effort",)
         return (*(["current"] if self.currents else []), "measured", "effort")
 
 
@@ -92,7 +90,8 @@ class Recording:
     """Where differentiation cannot tell a joint from one at rest, so that dry friction has no
     direction, shape (samples, n); None is nowhere."""
     efforts: str = "measured"
-    """What the efforts are: ``measured``, the ``effort`` of a plan, or a ``current``, A."""
+    """What the efforts are: ``measured``, the ``effort`` of a plan or of a table that does not
+    tell, the ``model``'s, which only a plan has, or a ``current``, A."""
     source: str = ""
     """The file, as it was named."""
     notes: tuple[str, ...] = ()

@@ -21,6 +21,11 @@ class Verdict(StrEnum):
     BAD = "bad"
     UNKNOWN = "unknown"
 
+    @property
+    def words(self) -> str:
+        """As the terminal shows it."""
+        return "not judged" if self is Verdict.UNKNOWN else str(self)
+
 
 @dataclass(frozen=True)
 class Fact:

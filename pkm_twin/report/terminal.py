@@ -59,11 +59,14 @@ def text_of(report: Report) -> str:
 
 def _judged(facts: Sequence[Fact]) -> Iterator[str]:
     """Judged properties as a table."""
-    rows = [(f.text or f.name, f.words, _words(f.bound), f.verdict or "") for f in facts]
+    words = [fact.verdict.words if fact.verdict else "" for fact in facts]
+    rows = [
+        (f.text or f.name, f.words, _words(f.bound), word)
+        for f, word in zip(facts, words, strict=True)
+    ]
     lines = aligned([("", "value", "limit", "verdict"), *rows], "<<<<")
     yield next(lines)
-    for fact, line in zip(facts, lines, strict=True):
-        word = str(fact.verdict)
+    for fact, word, line in zip(facts, words, lines, strict=True):
         first, *rest = line.split("\n")
         shown = typer.style(word, fg=COLOURS[fact.verdict or Verdict.UNKNOWN])
         yield "\n".join([first[: -len(word)] + shown, *rest])

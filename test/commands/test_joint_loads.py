@@ -7,10 +7,17 @@ import pytest
 from delta_dynamics import elastic_reactions, least_norm_reactions, reactions
 from delta_dynamics.torques.elastic_reactions import reaction_energies
 from delta_dynamics.torques.reactions import balance
-from pkm_twin.paths.joint_loads import Reversals, bearing_life, rainflow, turning_points
+from pkm_twin.paths.joint_loads import (
+    Reversals,
+    bearing_life,
+    joint_loads,
+    rainflow,
+    turning_points,
+)
+from pkm_twin.recordings import ReadOptions, Recording, read
 from stiffness_monitor import platform_response
 from test.support.robots import SHIPPED, load, partly_long, random_joints, rigid
-from test.support.tables import of_joints, read_columns, write_columns
+from test.support.tables import joined, of_joints, read_columns, write_columns
 
 ASTM = [-2, 1, -3, 5, -1, 3, -4, 4, -2]
 """Load of ASTM E1049-85, figure 6."""
@@ -80,9 +87,34 @@ def test_life_of_a_bearing_by_hand():
     life = bearing_life(load_, turned, 60.0, 10_000.0)
     mean = ((1000.0**3 + 2000.0**3) / 2) ** (1 / 3)
     assert life.load == pytest.approx(mean)
-    assert life.life_turns == pytest.approx(1e6 * (10_000.0 / mean) ** 3)
-    assert life.life_hours == pytest.approx(life.life_turns / 100 / 60)
-    assert bearing_life(load_, 0 * turned, 60.0, 10_000.0).life_hours == np.inf
+    assert life.life == pytest.approx(1e6 * (10_000.0 / mean) ** 3)
+    assert life.hours == pytest.approx(life.life / 100 / 60)
+    # What bears a load and does not move has no life that follows from motion.
+    assert np.isnan(bearing_life(load_, 0 * turned, 60.0, 10_000.0).hours)
+    assert bearing_life(0 * load_, turned, 60.0, 10_000.0).hours == np.inf
+
+
+@pytest.mark.parametrize("name", ["linear_delta", "prru", "upr_rpu"])
+def test_life_of_a_sliding_joint_is_that_of_its_travel(name, twin, tmp_path):
+    """C for 100 km; the force along it is the drive's."""
+    robot = load(name)
+    joint = next(joint for joint in robot.graph.joints.values() if joint.slides)
+    label, source = joint.label or joint.name, path(robot, tmp_path)
+    given = tmp_path / "bearings.yaml"
+    given.write_text(f"bearings: {{'{label}': {{C: 8000}}}}")
+    told = twin.told("loads", name, source, "--bearings", given)["joints"][label]
+    motion = read(source, robot, ReadOptions(planned=True)).with_rates()
+    load_ = next(one for one in next(joint_loads(motion)) if one.name == label)
+    steps = np.abs(np.diff(joined(read_columns(source), robot, "position")[:, 0]))
+    across = np.linalg.norm(np.cross(load_.own[:, :3], joint.axes[0]), axis=1)
+    mean = np.average(((across[1:] + across[:-1]) / 2) ** 3, weights=steps) ** (1 / 3)
+    assert 0.0 < mean < told["force_peak_N"]
+    life = told["life"]
+    assert life["equivalent_load_N"] == pytest.approx(mean)
+    assert life["travel_m"] == pytest.approx(steps.sum())
+    assert life["L10_hours"] == pytest.approx(1e5 * (8000 / mean) ** 3 / steps.sum() / 3600)
+    given.write_text(f"bearings: {{'{label}': {{C: 8000, Y: 1}}}}")
+    assert f"bearings.{label}.Y" in twin.refused("loads", name, source, "--bearings", given)
 
 
 @pytest.mark.parametrize("name", ["five_bar", "upr_rpu"])
@@ -147,9 +179,6 @@ def test_what_nothing_decides_is_named(twin, tmp_path):
 
 
 def test_turning_of_a_hinge_and_of_a_rod(rng):
-    from pkm_twin.paths.joint_loads import joint_loads
-    from pkm_twin.recordings import Recording
-
     robot = load("five_bar")
     time = np.linspace(0.0, 1.0, 50)
     q = robot.graph.home + 0.1 * np.outer(np.sin(7 * time), [1.0, -0.6])

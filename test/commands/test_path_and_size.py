@@ -553,6 +553,7 @@ def test_a_command_line_needs_one_path(twin, tmp_path):
         "path delta", "path delta --cycle 0.025,0.305", "path delta --cycle 25,305 --circle 0.1",
         "path delta --circle 0.1 --direction 45",
         "path delta --cycle 25,305 --effort 1,2", "size delta",
+        "size linear_delta x.csv --drives shipped --leads 5:40", "size linear_delta x.csv --lead 5",
     ):  # fmt: skip
         twin.good(*words.split(), code=2)
 

@@ -2,14 +2,15 @@
 """torques: the table and picture of a recorded or a written-down motion."""
 
 import importlib.util
+import itertools
 
 import numpy as np
 import pytest
 
 from delta_dynamics import inverse_dynamics, reactions
-from test.commands.conftest import DELTA, MILLING, STIFFNESS, rewrite
+from test.commands.conftest import DELTA, MILLING, STIFFNESS, checked, rewrite
 from test.support.command import forked
-from test.support.robots import load, massless
+from test.support.robots import SHIPPED, load, massless, partly_long
 from test.support.tables import joined, of_joints, read_columns, write_columns
 
 TERMS = ("gravity", "inertia", "velocity", "payload", "friction", "external")
@@ -97,12 +98,54 @@ def test_absent_rates_are_differentiated_and_columns_come_in_any_order(twin, tmp
     assert np.abs(joined(found, load("delta"), "effort_external")).min() > 0.0
 
 
-def test_its_own_table_is_a_motion_again(twin, tmp_path):
-    write_columns(tmp_path / "a.csv", motion("delta"))
+@pytest.mark.parametrize("name", partly_long(list(SHIPPED), "delta", "linear_delta"))
+def test_its_own_table_is_a_motion_again(twin, tmp_path, name):
+    write_columns(tmp_path / "a.csv", motion(name))
     for source, target in (("a", "b"), ("b", "c")):
         paths = tmp_path / f"{source}.csv", "--out", tmp_path / f"{target}.csv"
-        twin.good(*TABLE, "delta", *paths)
+        twin.good(*TABLE, name, *paths)
     assert (tmp_path / "b.csv").read_bytes() == (tmp_path / "c.csv").read_bytes()
+    for command in ("size", "loads"):
+        twin.good(command, name, tmp_path / "b.csv")
+
+
+@pytest.mark.parametrize(("word", "factor"), [("effort", 1.2), ("measured", 1.2), ("effort", 1.0)])
+def test_measured_efforts_stay_and_the_models_are_not_judged(twin, tmp_path, word, factor):
+    """The model against itself is no evidence; efforts of a table may be a plan's."""
+    robot, columns = load("linear_delta"), motion("linear_delta", 200)
+    states = [joined(columns, robot, what) for what in ("position", "velocity", "acceleration")]
+    efforts = factor * inverse_dynamics(robot, *states)
+    paths = [tmp_path / f"{name}.csv" for name in "abc"]
+    write_columns(paths[0], columns | of_joints(robot, word, efforts))
+    for source, target in itertools.pairwise(paths):
+        twin.good(*TABLE, robot.name, source, "--out", target)
+        table = read_columns(target)
+        if factor == 1.0:
+            assert "rail_1.measured" not in table
+        else:
+            assert np.array_equal(joined(table, robot, "measured"), efforts)
+        report = checked(target, robot=robot.name)
+        assert report.code == 1
+        assert report.data["answer"] == ("not judged" if factor == 1.0 else "bad")
+
+
+def test_at_rest_at_a_pose(twin, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    pose, wrench = (0.05, 0.02, -0.3), (3.0, 0.0, -10.0, 0.0, 0.2, 0.0)
+    words = ["--at", ",".join(map(str, pose)), "--wrench", ",".join(map(str, wrench))]
+    data = twin.told("torques", "delta", *words, "--payload", "0.5")
+    assert not list(tmp_path.iterdir())
+    robot = load("delta").changed(payload={"mass": 0.5})
+    q, still = robot.inverse(pose), np.zeros(3)
+    wanted = inverse_dynamics(robot, q, still, still, wrench)
+    efforts = data["efforts"].values()
+    np.testing.assert_allclose([one["effort"] for one in efforts], wanted)
+    sums = [sum(v for k, v in one.items() if k not in ("effort", "unit")) for one in efforts]
+    np.testing.assert_allclose(sums, wanted)
+    largest = wanted[np.abs(wanted).argmax()]
+    out = twin.good("torques", "delta", *words, "--payload", "0.5").out
+    assert f"{largest:.4g} N m" in out.splitlines()[0]
+    assert twin("torques", "delta").code == twin("torques", "delta", "a.csv", *words).code == 2
 
 
 def spoiled(change):

@@ -28,10 +28,12 @@ class Check(CarriesAtTimes, ReadsRecordings):
     no samples are missing, that positions and velocities belong to one moving machine, that joints
     stay inside their limits and away from singularities, and that the measured efforts agree with
     the model. If they do not, an explanation is named only if it makes them agree. An item without
-    data (no CRCs, no efforts, a robot without masses) is unknown, which is neither good nor bad.
+    data (no CRCs, no efforts, a robot without masses) is not judged, which is neither good nor bad.
+    The whole is not judged where there are efforts without a verdict: too few can be compared, or
+    they are the model's own, as those of a table of `torques`.
 
-    Exit code 0: good. 1: an item is bad, too few efforts can be compared for a verdict, or the file
-    is no recording. 3: the file is damaged, but `pkm-twin recover` can save part of it.
+    Exit code 0: good. 1: bad, not judged, or no recording. 3: the file is damaged, but `pkm-twin
+    recover` can save part of it.
     """
 
     bag: Path = setting(
@@ -75,7 +77,7 @@ def check(given: Check) -> Report:
 def check_one(given: Check, path: Path, update: Any = None, thorough: bool = True) -> Report:
     """Judge a recording, and append it to the history; errors as of ``recordings.read``."""
     from pkm_twin import load
-    from pkm_twin.identification.check import COMPARED, IDLE
+    from pkm_twin.identification.check import COMPARED, IDLE, RESIDUAL
     from pkm_twin.identification.check import check as checked
 
     robot: Any = given.robot
@@ -94,7 +96,7 @@ def check_one(given: Check, path: Path, update: Any = None, thorough: bool = Tru
     bad, unknown = found.named(Verdict.BAD), found.named(Verdict.UNKNOWN)
     if found.answer == "not judged":
         # The reason is in the answer.
-        unknown = [what for what in unknown if what not in (COMPARED, IDLE)]
+        unknown = [what for what in unknown if what not in (COMPARED, IDLE, RESIDUAL)]
     why, findings = "; ".join(found.causes), "; ".join(found.findings)
     what = ", ".join(bad) or found.unjudged or found.agreement
     if why and found.compared is None:

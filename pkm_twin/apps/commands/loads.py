@@ -28,6 +28,7 @@ SHOWN: Final = 6
 UNDETERMINED: Final = (
     "undetermined: neither rigid-body equations nor elastic members or joints determine it"
 )
+IDLE: Final = "no life, because the bearing bears a load and does not move"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,7 +37,8 @@ class Loads(CarriesAtTimes, ReadsMotions, Writes, Draws):
 
     For each joint it prints peak and RMS force and moment, and the equivalent load range: one cycle
     of this range does the same damage as all cycles of the motion (rainflow counting, in axes that
-    turn with the joint's inner body). With --bearings also equivalent load and L10 life (ISO 281).
+    turn with the joint's inner body). With --bearings also equivalent load and L10 life (ISO 281;
+    of sliding joints ISO 14728-1, C for 100 km).
 
     In an overconstrained machine the elasticity of members and joints determines what rigid-body
     equations do not. Without elasticity these components are reported as undetermined.
@@ -70,6 +72,7 @@ def loads(given: Loads) -> Report:
     if worst is not None:
         answer = f"{robot.name}: {worst.name} bears most, a force of up to {worst.peaks[0]:.4g} N"
     open_ = any(one["undetermined"] for one in joints.values())
+    idle = [n for n, j in joints.items() if j.get("life") and math.isnan(j["life"]["L10_hours"])]
     return Report(
         answer,
         [
@@ -82,7 +85,8 @@ def loads(given: Loads) -> Report:
         ],
         _tables(joints),
         figures={"": lambda: draw(motion, found, answer)},
-        notes=[*motion.notes, *([UNDETERMINED] if open_ else [])],
+        notes=[*motion.notes, *([UNDETERMINED] if open_ else []),
+               *([f"{IDLE}: {', '.join(idle)}"] if idle else [])],
         files={"out": given.out, "spectrum": given.spectrum},
     )  # fmt: skip
 
@@ -91,6 +95,7 @@ def of_joint(load: Summary, exponent: float, duration: float) -> dict[str, Any]:
     """What is reported of one joint, units in the keys."""
     open_axes = [axis for axis, good in zip(WRENCH, load.determined, strict=True) if not good]
     entry: dict[str, Any] = {"undetermined": open_axes, "turned_rad": load.turned}
+    entry |= {"travelled_m": load.travelled} if load.slides else {}
     for k, (what, unit) in enumerate((("force", "N"), ("moment", "N_m"))):
         rms = math.sqrt(load.squares[k] / load.samples)
         entry |= {f"{what}_peak_{unit}": float(load.peaks[k]), f"{what}_rms_{unit}": rms}
@@ -104,9 +109,12 @@ def of_joint(load: Summary, exponent: float, duration: float) -> dict[str, Any]:
         if load.known:
             life = load.life(duration)
             entry["life"] = {
-                "equivalent_load_N": life.load, "turns": life.turns, "L10_turns": life.life_turns,
-                "L10_hours": life.life_hours,
+                "equivalent_load_N": life.load, "turns": life.moved, "L10_turns": life.life,
+                "L10_hours": life.hours,
             }  # fmt: skip
+            if load.slides:
+                travel = {"travel_m": life.moved, "L10_m": life.life}
+                entry["life"] |= {"turns": 0.0, "L10_turns": math.nan} | travel
     return entry
 
 

@@ -310,7 +310,7 @@ def _tables(motion: TimedPath, soft: bool) -> list[Table]:
     used = {words_of.get(name, name): [100.0 * value] for name, value in worst}
     tables = [
         Table("", [Column("", "", "limit that binds")], rows, head="time (s)"),
-        Table("", words, peaks, head="peak"),
+        Table("", words, peaks, head="|peak|"),
     ]
     if used:
         tables.append(Table("", [Column("", "%", "used")], used, head="limit"))

@@ -20,6 +20,7 @@ from pkm_twin.apps.options import (
     payload_fact,
 )
 from pkm_twin.errors import LEAST_LIMIT, check_limit
+from pkm_twin.machine.sections import MAX_LEAD
 from pkm_twin.report import Column, Fact, Report, Table, plots
 from pkm_twin.settings import setting
 
@@ -30,8 +31,6 @@ if TYPE_CHECKING:
 
 MOST_PERCENT: Final = 1000.0
 """A used part of more is printed as more."""
-SAME: Final = 1e-6
-"""Relative difference of two computations of the same efforts."""
 DRAWN: Final = 4
 """Most drives in a picture."""
 
@@ -71,7 +70,7 @@ class Size(CarriesAtTimes, ReadsMotions, AwayFromSingular, Draws):
     )  # fmt: skip
     lead: float | None = setting(
         None, "screw or belt of the joints that slide, where the file has no drive: m per turn of "
-        "the motor", low=1e-6, high=1e6,
+        "the motor", low=1e-6, high=MAX_LEAD,
     )  # fmt: skip
     ratios: str | None = setting(
         None, "gears to choose from, in place of the file's: LOW:HIGH, or numbers with commas"
@@ -99,7 +98,7 @@ class Size(CarriesAtTimes, ReadsMotions, AwayFromSingular, Draws):
 
 def size(given: Size) -> Report:
     """What each drive must give, and which motors can."""
-    from pkm_twin.paths.along import compared
+    from pkm_twin.paths.along import SAME, compared
     from pkm_twin.paths.sizing import read_motors, size_drives
 
     if (given.motion is None) == (given.over_workspace is None):
@@ -233,8 +232,8 @@ def _tables(duties: Sequence[DriveDuty]) -> list[Table]:
         force, rate, mass = ("N", "m/s", "kg") if slides else ("N m", "rad/s", "kg m2")
         last = Column("", mass, "load inertia") if side == "joint" else Column("", "", "load/rotor")
         columns = [
-            Column("", force, "effort peak"), Column("", force, "RMS"),
-            Column("", rate, "speed peak"), Column("", rate, "mean"),
+            Column("", force, "effort |peak|"), Column("", force, "RMS"),
+            Column("", rate, "speed |peak|"), Column("", rate, "mean"),
             Column("", "W", "power peak"), Column("", "W", "regenerated peak"),
             Column("", "J", "net energy"), Column("", "J", "regenerated"), last,
         ]  # fmt: skip

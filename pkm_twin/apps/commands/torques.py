@@ -6,11 +6,14 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+import typer
 
 from pkm_twin.apps.frame import command
 from pkm_twin.apps.options import (
-    BeyondLimitsToo,
+    AtPose,
     CarriesAtTimes,
     Draws,
     ReadsMotions,
@@ -22,30 +25,63 @@ from pkm_twin.recordings.tables import ENDINGS, check_target, write_table
 from pkm_twin.report import Column, Fact, Report, Table, plots
 from pkm_twin.settings import setting
 
+if TYPE_CHECKING:
+    from pkm_twin.recordings import Recording
+    from pkm_twin.robot.robot import Robot
+
+RESTING: Final = ("gravity", "payload", "friction", "external", "preload")
+"""Terms of an effort at rest."""
+
 
 @dataclass(frozen=True, kw_only=True)
-class Torques(CarriesAtTimes, ReadsMotions, BeyondLimitsToo, Writes, Draws):
+class Torques(CarriesAtTimes, ReadsMotions, AtPose, Writes, Draws):
     """Compute torques, their terms and joint reactions.
+
+    Example: `pkm-twin torques delta --at 0,0,-0.4 --payload 0.5`, at rest at a pose.
 
     Columns of a table: time (s) and JOINT.position (rad or m) for every actuated joint. Optional:
     JOINT.velocity and JOINT.acceleration, which are otherwise differentiated from the positions,
     and the wrench on the platform, fx fy fz mx my mz (N, N m, base axes). `pkm-twin info` lists the
     joint names.
 
-    The command prints peak and RMS effort of each joint. The table that it writes has one row per
-    sample: each joint's effort (N m or N), the terms that sum to it (JOINT.effort_gravity,
-    _inertia, _velocity, _payload, _friction, _external, _preload), the measured effort of a
-    recording, and force and moment in every joint. A reaction that rigid-body equations do not
-    determine is empty.
+    The command prints peak and RMS effort of each joint, with --at the effort and its terms, where
+    dry friction is zero. The table that it writes has one row per sample: each joint's effort (N m
+    or N), the terms that sum to it (JOINT.effort_gravity, _inertia, _velocity, _payload, _friction,
+    _external, _preload), a recording's measured effort (JOINT.measured), and force and moment in
+    every joint. A reaction that rigid-body equations do not determine is empty.
     With --beyond-limits, the column beyond_limits is 1 where a joint is outside its limits.
     """
 
-    motion: Path = setting(
-        ..., "a recording or a path: MCAP, rosbag2 folder or table", argument=True
+    motion: Path | None = setting(
+        None, "a recording or a path: MCAP, rosbag2 folder or table", argument=True
     )
-    out: Path = setting(
-        Path("torques.csv"), "table to write, .csv, .parquet or .mat", writes=True, endings=ENDINGS
+    at: str | None = setting(
+        None, "in place of a motion: at rest at this pose, coordinates separated by commas"
     )
+    wrench: tuple[float, ...] | None = setting(
+        None, "with --at: force and moment on the platform, N and N m, base axes",
+        count=6, metavar="fx,fy,fz,mx,my,mz",
+    )  # fmt: skip
+    out: Path | None = setting(
+        None, "table to write, .csv, .parquet or .mat; default of a motion: torques.csv",
+        writes=True, endings=ENDINGS,
+    )  # fmt: skip
+
+    def __post_init__(self) -> None:
+        if self.out is None and self.at is None:
+            object.__setattr__(self, "out", Path("torques.csv"))
+
+    def resting(self, machine: Robot) -> Recording:
+        """One sample at rest at the pose.
+
+        :raises PkmTwinError: out of reach or of limits.
+        """
+        from pkm_twin.recordings import Recording
+
+        q = np.atleast_2d(machine.inverse(self.pose(machine)))
+        wrench = None if self.wrench is None else np.array([self.wrench])
+        still = np.zeros_like(q)
+        return Recording(machine, np.zeros(1), q, still, still, wrench=wrench, load=self.load)
 
 
 def torques(given: Torques) -> Report:
@@ -53,13 +89,24 @@ def torques(given: Torques) -> Report:
     from pkm_twin.paths.along import torque_table
     from pkm_twin.paths.sizing import integral
 
-    check_target(given.out)
-    motion = given.read(given.motion, given.machine(), planned=True).with_rates()
+    if given.out is not None:
+        check_target(given.out)
+    if (given.motion is None) == (given.at is None):
+        raise typer.BadParameter("give a recording or path, or --at")
+    if given.motion is None:
+        if given.picture is not None or given.load_times is not None:
+            raise typer.BadParameter("--picture and --load-times need a recording or path")
+        motion = given.resting(given.machine())
+    else:
+        if given.wrench is not None:
+            raise typer.BadParameter("--wrench needs --at; a motion has it in columns fx ... mz")
+        motion = given.read(given.motion, given.machine(), planned=True).with_rates()
     beyond = given.admitted(motion.robot, motion.q, motion.qd)
     with progress("torques", len(motion.time)) as update:
         columns = torque_table(motion, update)
-    with writing(given.out):
-        write_table(columns, given.out)
+    if given.out is not None:
+        with writing(given.out):
+            write_table(columns, given.out)
     robot, time = motion.robot, columns["time"]
     units = dict(zip(robot.joint_names, robot.effort_units, strict=True))
     rows: dict[str, list[Any]] = {}
@@ -68,15 +115,27 @@ def torques(given: Torques) -> Report:
         at, whole = int(abs(effort).argmax()), float(time[-1] - time[0])
         peak = float(abs(effort[at]))
         rms = math.sqrt(integral(time, effort**2) / whole) if whole > 0.0 else peak
-        rows[joint] = [peak, rms, unit, float(time[at])]
+        rows[joint] = [peak, float(effort[at]), rms, unit, float(time[at])]
     # Forces and moments have no common size.
     alike = [name for name in rows if units[name] == robot.effort_units[0]]
     worst = max(alike, key=lambda name: rows[name][0])
-    peak, rms, unit, when = rows[worst]
-    answer = (
-        f"{robot.name}: largest effort {peak:.4g} {unit} on {worst} at {when:.4g} s, RMS {rms:.4g} "
-        f"{unit}"
-    )
+    _, effort, rms, unit, when = rows[worst]
+    answer = f"{robot.name}: largest effort {effort:.4g} {unit} on {worst} at "
+    answer += f"{when:.4g} s, RMS {rms:.4g} {unit}" if given.at is None else "rest"
+    shown = [
+        Column("peak", text=None), Column("effort_at_peak", text="peak"),
+        Column("rms", text="RMS"), Column("unit"), Column("peak_at_s", "s", "peak at"),
+    ]  # fmt: skip
+    if given.at is not None:
+        shown = [Column(name) for name in ("effort", "unit", *RESTING)]
+        rows = {
+            joint: [
+                row[1],
+                units[joint],
+                *(float(columns[f"{joint}.effort_{t}"][0]) for t in RESTING),
+            ]
+            for joint, row in rows.items()
+        }
     return Report(
         answer,
         [
@@ -86,17 +145,11 @@ def torques(given: Torques) -> Report:
             payload_fact(motion.load),
             Fact("beyond_limits", [str(item) for item in beyond]),
         ],
-        [
-            Table(
-                "efforts",
-                [Column("peak"), Column("rms", text="RMS"), Column("unit"),
-                 Column("peak_at_s", "s", "peak at")],
-                rows, head="joint",
-            )
-        ],
-        figures={"": lambda: plots.torques(motion, columns, answer)},
+        [Table("efforts", shown, rows, head="joint")],
+        figures={"": lambda: plots.torques(motion, columns, answer)} if given.at is None else {},
         notes=[
-            f"table: {len(time)} rows, {len(columns)} columns", *motion.notes,
+            *([f"table: {len(time)} rows, {len(columns)} columns"] if given.out else []),
+            *motion.notes,
             *(f"beyond limits: {item}" for item in beyond),
         ],
         files={"out": given.out},
