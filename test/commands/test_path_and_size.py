@@ -232,6 +232,9 @@ def test_a_gear_on_the_command_line_is_the_files_drive(twin, tmp_path, name, mot
     assert twin("size", path, out, *given).code == 1
     other = {"ratio": "--lead", "lead": "--ratio"}[key]
     assert twin("size", name, out, other, value).code == 1
+    # Leads in mm are refused with the unit.
+    for words in (("--lead", 5), ("--drives", "shipped", "--leads", "5:40")):
+        assert "1 m per turn" in twin("size", name, out, *words).err
 
 
 def motor_side(columns, robot, i, rotor, ratio, motor, share):
@@ -553,7 +556,6 @@ def test_a_command_line_needs_one_path(twin, tmp_path):
         "path delta", "path delta --cycle 0.025,0.305", "path delta --cycle 25,305 --circle 0.1",
         "path delta --circle 0.1 --direction 45",
         "path delta --cycle 25,305 --effort 1,2", "size delta",
-        "size linear_delta x.csv --drives shipped --leads 5:40", "size linear_delta x.csv --lead 5",
     ):  # fmt: skip
         twin.good(*words.split(), code=2)
 

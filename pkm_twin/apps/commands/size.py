@@ -19,8 +19,7 @@ from pkm_twin.apps.options import (
     ReadsMotions,
     payload_fact,
 )
-from pkm_twin.errors import LEAST_LIMIT, check_limit
-from pkm_twin.machine.sections import MAX_LEAD
+from pkm_twin.errors import LEAST_LIMIT, ParameterError, check_limit
 from pkm_twin.report import Column, Fact, Report, Table, plots
 from pkm_twin.settings import setting
 
@@ -70,7 +69,7 @@ class Size(CarriesAtTimes, ReadsMotions, AwayFromSingular, Draws):
     )  # fmt: skip
     lead: float | None = setting(
         None, "screw or belt of the joints that slide, where the file has no drive: m per turn of "
-        "the motor", low=1e-6, high=MAX_LEAD,
+        "the motor", low=1e-6, high=1e6,
     )  # fmt: skip
     ratios: str | None = setting(
         None, "gears to choose from, in place of the file's: LOW:HIGH, or numbers with commas"
@@ -169,8 +168,11 @@ def gears(given: Size, robot: Robot) -> tuple[list[Gear], list[Gears]]:
 
     :raises ParameterError: numbers that no gear has.
     """
+    from pkm_twin.machine.sections import MAX_LEAD
     from pkm_twin.paths.sizing import Gear, Gears, read_gears
 
+    if given.lead is not None and given.lead > MAX_LEAD:
+        raise ParameterError("--lead", given.lead, f"at most {MAX_LEAD:g} m per turn")
     shares = {drive.efficiency for drive in robot.drives if drive is not None}
     if given.efficiency is None and len(shares) > 1 and (given.ratios or given.leads):
         raise typer.BadParameter("drives of the file have several efficiencies; give --efficiency")
