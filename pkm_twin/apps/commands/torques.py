@@ -56,7 +56,7 @@ class Torques(CarriesAtTimes, ReadsMotions, AtPose, Writes, Draws):
         None, "a recording or a path: MCAP, rosbag2 folder or table", argument=True
     )
     at: str | None = setting(
-        None, "in place of a motion: at rest at this pose, coordinates separated by commas"
+        None, "at rest at this pose, in place of a motion; separated by commas"
     )
     wrench: tuple[float, ...] | None = setting(
         None, "with --at: force and moment on the platform, N and N m, base axes",
