@@ -523,7 +523,8 @@ class Machine(TwinRobot):
         if not sections and not compliances:
             raise ParameterError(
                 "bodies.NAME.member.section", None,
-                "it, rods.NAME.section or joints.NAME.compliance: nothing is elastic",
+                "a member's section, rods.NAME.section or joints.NAME.compliance: "
+                "nothing is elastic",
             )  # fmt: skip
         missing = [name for name in self.specs["rods"] if name not in sections]
         if missing:

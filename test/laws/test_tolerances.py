@@ -108,6 +108,13 @@ def with_drives(data, path):
             points += [e for e, on in zip(rod["ends"], rod["between"], strict=True) if on == name]
         points += [data["origin"]] if data["platform"] == name else []
         line = np.mean(points, 0) - data["joints"][start].get("at", np.mean(points, 0))
+        own = [joint for joint in data["joints"].values() if name in joint["between"]]
+        if len(points) == len(own) - 1 and all(joint["type"] == "revolute" for joint in own):
+            axes = [np.array(j["axis"], float) / np.linalg.norm(j["axis"]) for j in own]
+            flat = line - axes[0] * (axes[0] @ line)
+            if all(np.linalg.norm(np.cross(axis, axes[0])) < 1e-9 for axis in axes):
+                # Of a planar chain the line lies in the plane.
+                line = flat if np.linalg.norm(flat) > 1e-9 else line
         if others or np.linalg.norm(line) < 1e-9:
             return None
         for other, joint in list(made["joints"].items()):
