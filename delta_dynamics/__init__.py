@@ -37,11 +37,10 @@ from delta_dynamics.torques.regressor import (
     parameter_values,
     regressor,
 )
+from delta_dynamics.torques.torque_terms import Terms, dynamics_terms
 from delta_dynamics.torques.uncertainty import torque_deviation
 from delta_dynamics.torques.virtual_work import (
     Energy,
-    Terms,
-    dynamics_terms,
     energy,
     forward_dynamics,
     inverse_dynamics,

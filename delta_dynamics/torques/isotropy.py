@@ -22,7 +22,8 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from delta_dynamics.torques.virtual_work import body_mass_matrix, frictionless, mass_matrix
+from delta_dynamics.torques.torque_terms import frictionless
+from delta_dynamics.torques.virtual_work import body_mass_matrix, mass_matrix
 from pkm_twin.codegen.arrays import Array, doubles, finite, vectors
 from pkm_twin.errors import ParameterError, SingularityError
 from pkm_twin.machine.pose_grid import zero_torsion

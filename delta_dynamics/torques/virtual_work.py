@@ -11,7 +11,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from pkm_twin.codegen.arrays import Array, Indices, vectors
+from pkm_twin.codegen.arrays import Array, vectors
 from pkm_twin.codegen.cholesky import SparseCholesky
 from pkm_twin.codegen.expressions import PARAMETERS, Numbers, Objects
 from pkm_twin.codegen.kernels import BoundCall, Kernel
@@ -22,7 +22,7 @@ from pkm_twin.kinematics.stream import following
 from pkm_twin.kinematics.traced import Traced
 from pkm_twin.machine import friction
 from pkm_twin.machine.graph import BASE, Joint, Rod
-from pkm_twin.machine.inertia import GRAVITY, LAW_VALUES, ROTORS, Layout, loaded_joints
+from pkm_twin.machine.inertia import LAW_VALUES, ROTORS, Layout, loaded_joints
 from pkm_twin.robot.robot import Robot
 
 _NO_WRENCH: Final = np.zeros(6)
@@ -541,114 +541,3 @@ class TorqueLoop:
     def __call__(self) -> int:
         """Compute tau: 0 all samples are good, 1 one has no assembly, 2 one is not finite."""
         return self._bound()
-
-
-@dataclass(frozen=True)
-class Terms:
-    """Actuator efforts by cause, shape (..., n) each, N m or N.
-
-    ``preload`` is what drives that share the effort have besides: efforts that move nothing.
-
-    ``gravity``, ``inertia`` (linear in qdd) and ``velocity`` (quadratic in qd) are those of the
-    robot without its payload; ``payload`` is the gravity, inertia and velocity part of the
-    payload together; ``friction`` is viscous, Coulomb and offset; ``external`` balances
-    the wrench on the platform.
-    """
-
-    gravity: Array
-    inertia: Array
-    velocity: Array
-    payload: Array
-    friction: Array
-    external: Array
-    preload: Array
-
-    @property
-    def total(self) -> Array:
-        """Sum of all, shape (..., n): what ``inverse_dynamics`` gives."""
-        own = self.gravity + self.inertia + self.velocity
-        return own + self.payload + self.friction + self.external + self.preload
-
-
-def frictionless(
-    robot: Robot, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, *, weight: bool = True
-) -> Array:
-    """Actuator efforts without friction of any joint, shape (..., n), N m or N.
-
-    :param weight: False leaves gravity out, too.
-    """
-    layout = Layout(robot.massive().tree)
-    p = _without(robot.inertial, layout.friction)
-    if not weight:
-        p = _without(p, layout.part(GRAVITY))
-    return robot.evaluate(torques(robot), p, q, qd, qdd, np.zeros(6))[0]
-
-
-def _without(p: Array, part: slice | Indices) -> Array:
-    """Inputs with some of them zero."""
-    result = p.copy()
-    result[part] = 0.0
-    return result
-
-
-def dynamics_terms(
-    robot: Robot, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, wrench: ArrayLike | None = None
-) -> Terms:
-    """Split the actuator efforts of a motion by cause, exactly.
-
-    Each term is the inverse dynamics (virtual work; Delta-CU paper, step 4; 3-PRRU paper, equation
-    41) with the other causes set to zero. The terms of payload and friction are differences of the
-    efforts with and without them. This is exact because the efforts are linear in gravity, qdd, the
-    masses, the basic friction's coefficients and the wrench; other friction laws are the difference
-    of all efforts with and without friction.
-
-    :returns: the terms, each of the common batch shape; parameters and errors as of
-        :func:`~delta_dynamics.inverse_dynamics`.
-    """
-    kernel = torques(robot)
-    load = np.zeros(6) if wrench is None else vectors(wrench, 6, "the wrench")
-    n = robot.joints_count
-    given = (q, "joint positions"), (qd, "joint rates"), (qdd, "joint accelerations")
-    arrays = [vectors(values, n, what) for values, what in given]
-    # The batch of all inputs together, so that every term has it.
-    shape = np.broadcast_shapes(*(a.shape[:-1] for a in arrays), load.shape[:-1])
-    place, rate, change = (np.broadcast_to(a, (*shape, *a.shape[-1:])) for a in arrays)
-    still = np.zeros(n)
-    none = np.zeros(6)
-
-    def whole(p: Array, qd: Array, qdd: Array, wrench: Array) -> Array:
-        return robot.evaluate(kernel, p, place, qd, qdd, wrench)[0]
-
-    layout = Layout(robot.massive().tree)
-    held = _without(robot.inertial, layout.friction)
-    empty = _without(robot.own_inertial, layout.friction)
-    weightless = _without(empty, layout.part(GRAVITY))
-    rubbing = _without(robot.own_inertial, layout.part(GRAVITY))
-    # At rest, without gravity, friction and wrench: the preload.
-    inner = whole(weightless, still, still, none)
-
-    def efforts(p: Array, qd: Array, qdd: Array, wrench: Array) -> Array:
-        return whole(p, qd, qdd, wrench) - inner
-
-    bent, linear = still, change
-    if robot.redundant:
-        # Of dependent drives, the part of the accelerations that the mass matrix takes.
-        onto = robot.inverse_jacobian(place) @ robot.jacobian(place)
-        bent = robot.agreeing(place, rate)[2]
-        bent = bent - np.einsum("...ij,...j->...i", onto, bent)
-        linear = np.einsum("...ij,...j->...i", onto, change)
-    velocity = efforts(weightless, rate, bent, none)
-    friction = efforts(rubbing, rate, bent, none) - velocity
-    if robot.laws:
-        # It may grow with the load of the motion itself.
-        both = (efforts(p, rate, change, load) for p in (robot.inertial, held))
-        friction = next(both) - next(both)
-    return Terms(
-        gravity=efforts(empty, still, still, none),
-        inertia=efforts(weightless, still, linear, none),
-        velocity=velocity,
-        payload=efforts(held, rate, change, none) - efforts(empty, rate, change, none),
-        friction=friction,
-        external=efforts(weightless, still, still, load),
-        preload=inner,
-    )

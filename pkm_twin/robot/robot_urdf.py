@@ -12,7 +12,8 @@ from pkm_twin.errors import warn
 from pkm_twin.kinematics.passive import rod_axes
 from pkm_twin.machine import schema
 from pkm_twin.machine.graph import BASE, POSE
-from pkm_twin.machine.graph_file import drive_numbers, graph_description
+from pkm_twin.machine.graph_description import graph_description
+from pkm_twin.machine.graph_file import drive_numbers
 from pkm_twin.machine.loop_tree import Capsule, Joint, Link, LoopTree
 from pkm_twin.machine.mjcf_write import write_mjcf
 from pkm_twin.machine.places import has_entry

@@ -15,7 +15,7 @@ from pkm_twin.errors import ParameterError, warn
 from pkm_twin.machine import graph as graphs
 from pkm_twin.machine import mjcf_file, sdf_file, urdf_file, urdf_xml
 from pkm_twin.machine.graph import Graph, groups
-from pkm_twin.machine.graph_file import graph_description
+from pkm_twin.machine.graph_description import graph_description
 from pkm_twin.machine.loop_tree import SINGLE, Joint, LoopTree
 from pkm_twin.machine.rotations import Pose
 from pkm_twin.machine.urdf_control import take_drives

@@ -13,7 +13,7 @@ from pkm_twin.certify.maximal import Maximal
 from pkm_twin.certify.rows import stacked
 from pkm_twin.errors import SingularityError
 from pkm_twin.kinematics.singularity import Placed
-from pkm_twin.machine.graph_file import graph_description
+from pkm_twin.machine.graph_description import graph_description
 from pkm_twin.mechanisms.catalogue import robot_of_data
 from pkm_twin.robot.robot_urdf import robot_description
 from stiffness_monitor import compliance
