@@ -18,12 +18,11 @@ from pkm_twin.robot.robot import Robot
 class Terms:
     """Actuator efforts by cause, shape (..., n) each, N m or N.
 
-    ``preload`` is what drives that share the effort have besides: efforts that move nothing.
-
     ``gravity``, ``inertia`` (linear in qdd) and ``velocity`` (quadratic in qd) are those of the
     robot without its payload; ``payload`` is the gravity, inertia and velocity part of the
     payload together; ``friction`` is viscous, Coulomb and offset; ``external`` balances
-    the wrench on the platform.
+    the wrench on the platform; ``preload`` is what drives that share the effort have besides:
+    efforts that move nothing.
     """
 
     gravity: Array
@@ -95,11 +94,13 @@ def dynamics_terms(
     empty = _without(robot.own_inertial, layout.friction)
     weightless = _without(empty, layout.part(GRAVITY))
     rubbing = _without(robot.own_inertial, layout.part(GRAVITY))
-    # At rest, without gravity, friction and wrench: the preload.
-    inner = whole(weightless, still, still, none)
+    preload = np.zeros((*shape, n))
+    if robot.redundant:
+        # What is left at rest, without gravity, friction and wrench.
+        preload = whole(weightless, still, still, none)
 
     def efforts(p: Array, qd: Array, qdd: Array, wrench: Array) -> Array:
-        return whole(p, qd, qdd, wrench) - inner
+        return whole(p, qd, qdd, wrench) - preload
 
     bent, linear = still, change
     if robot.redundant:
@@ -121,5 +122,5 @@ def dynamics_terms(
         payload=efforts(held, rate, change, none) - efforts(empty, rate, change, none),
         friction=friction,
         external=efforts(weightless, still, still, load),
-        preload=inner,
+        preload=preload,
     )

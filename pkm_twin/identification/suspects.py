@@ -309,9 +309,9 @@ def _simpler(verdict: Verdict, frozen: Verdict) -> Verdict:
 def scaled_efforts(problem: Problem, verdict: Verdict) -> str | None:
     """Efforts that are scaled beyond what a drive's constant may be off by, in words; or None.
 
-    A heavier machine has the friction of its file, efforts of another scale do not: they ask for
-    friction, rotors and masses that all are so many times the file's. Without a friction in the
-    file a gain that explains the efforts is told from heavier masses by nothing.
+    A heavier machine has the friction of its file. Efforts of another scale do not: they need
+    friction, rotors and masses that are all the same multiple of the file's. Without friction in
+    the file, a gain that explains the efforts and heavier masses look alike.
     """
     gains = [one for one in verdict.findings if one.suspect.kind == GAIN and one.size < 1.0]
     gains = [g for g in gains if abs(g.size) > SIGMAS * np.hypot(OFF, g.deviation)]

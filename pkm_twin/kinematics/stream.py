@@ -27,10 +27,9 @@ def stream_kernel(engine: Engine) -> Kernel:
     """Program of a sample: q (n) and the row of the sample before, to its own row.
 
     A row begins with q (n), the pose (m) and its rates per rate of the drives that lead (m m, by
-    row). Then comes
-    what a jump is told by (m): how far the pose is from where the rates lead; and the singularity
-    measure. Parameters: what makes lengths of pose coordinates (m); poses and rates are multiplied
-    by it.
+    row). Then comes what shows a jump (m): how far the pose is from where the rates lead; and the
+    singularity measure. Parameters: what makes lengths of pose coordinates (m); poses and rates are
+    multiplied by it.
 
     What the mean of both samples' rates predicts errs by the third power of the move; how much,
     the change of the rates tells, and is taken off. So is half of what is predicted, for where the

@@ -121,21 +121,17 @@ def torques(given: Torques) -> Report:
     worst = max(alike, key=lambda name: rows[name][0])
     _, effort, rms, unit, when = rows[worst]
     answer = f"{robot.name}: largest effort {effort:.4g} {unit} on {worst} at "
-    answer += f"{when:.4g} s, RMS {rms:.4g} {unit}" if given.at is None else "rest"
-    shown = [
-        Column("peak", text=None), Column("effort_at_peak", text="peak"),
-        Column("rms", text="RMS"), Column("unit"), Column("peak_at_s", "s", "peak at"),
-    ]  # fmt: skip
-    if given.at is not None:
+    if given.at is None:
+        answer += f"{when:.4g} s, RMS {rms:.4g} {unit}"
+        shown = [
+            Column("peak", text=None), Column("effort_at_peak", text="peak"),
+            Column("rms", text="RMS"), Column("unit"), Column("peak_at_s", "s", "peak at"),
+        ]  # fmt: skip
+    else:
+        answer += "rest"
         shown = [Column(name) for name in ("effort", "unit", *RESTING)]
-        rows = {
-            joint: [
-                row[1],
-                units[joint],
-                *(float(columns[f"{joint}.effort_{t}"][0]) for t in RESTING),
-            ]
-            for joint, row in rows.items()
-        }
+        terms = {joint: [columns[f"{joint}.effort_{t}"].item() for t in RESTING] for joint in rows}
+        rows = {joint: [rows[joint][1], units[joint], *terms[joint]] for joint in rows}
     return Report(
         answer,
         [
