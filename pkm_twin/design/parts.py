@@ -76,9 +76,13 @@ class Part:
 def part_of(robot: Robot, path: str) -> Part | None:
     """The part that a path names; None where it names a number of the file.
 
+    Paths with commas between are of parts that are off alike, with a ``-`` before it the other way.
+
     :raises ParameterError: an entry of the machine without such an error.
     """
     keys = full_keys(path)
+    if "," in path:
+        return _alike(robot, path)
     if keys[0] not in (*ENDS, "limbs"):
         numbers = robot.file_numbers()
         if keys[0] in {keys_of(number)[0] for number in numbers}:
@@ -97,6 +101,21 @@ def part_of(robot: Robot, path: str) -> Part | None:
         raise _unknown(robot, keys, path)
     alike = ", and its copies alike" if len(texts) > 1 else ""
     return Part(effects, texts[0] + alike, unit_)
+
+
+def _alike(robot: Robot, path: str) -> Part:
+    """The part that several paths name together."""
+    effects: dict[Effect, Array] = {}
+    found: list[Part] = []
+    for word in path.split(","):
+        one = word.strip()
+        part = part_of(robot, one.removeprefix("-"))
+        if part is None or part.unit != (found or [part])[0].unit:
+            raise ParameterError(f"tolerance {path}", one, "parts alone, in m or in rad")
+        found.append(part)
+        for what, vector in part.effects.items():
+            effects[what] = effects.get(what, 0.0) + (-vector if one.startswith("-") else vector)
+    return Part(effects, f"{found[0].text}, and {len(found) - 1} more alike", found[0].unit)
 
 
 def _known(robot: Robot) -> Iterator[list[str | int]]:

@@ -150,7 +150,7 @@ def tolerances(
     - ``joints.NAME.clearance``: the play of a joint, whose centre on the inner body is half of it
       away at most, in any direction;
     - ``limbs.`` in front, or ``limbs[0].`` where ``limbs`` is a list: all copies of a limb alike,
-      in the axes of azimuth 0.
+      in the axes of azimuth 0; paths with commas between: these parts alike.
 
     Any other number of the file that moves the platform may be given too, such as
     ``geometry.arm_length``: then the file's number changes, with all that follows from it.

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from typing import Any, Final
 
@@ -16,7 +17,7 @@ from pkm_twin.machine.graph_description import graph_description
 from pkm_twin.machine.graph_file import drive_numbers
 from pkm_twin.machine.loop_tree import Capsule, Joint, Link, LoopTree
 from pkm_twin.machine.mjcf_write import write_mjcf
-from pkm_twin.machine.places import has_entry
+from pkm_twin.machine.places import has_entry, path_of
 from pkm_twin.machine.rotations import Pose
 from pkm_twin.machine.sdf_write import write_sdf
 from pkm_twin.machine.urdf_control import Control, tree_names
@@ -218,4 +219,31 @@ def robot_description(robot: Robot) -> dict[str, Any]:
         }
         if told:
             data[key] = told
-    return data
+    told = {
+        path: {field: value for field, value in entry.items() if value is not None}
+        for name, paths in copied_tolerances(robot).items()
+        for entry in [schema.plain(robot.tolerances[name])]
+        for path in paths
+    }
+    return data | ({"tolerances": data.get("tolerances", {}) | told} if told else {})
+
+
+def copied_tolerances(robot: Robot) -> dict[str, list[str]]:
+    """Paths by names of ``tolerances`` of a limb's parts, of all copies, which have one error.
+
+    Errors along axes are left out: those of the copies are turned.
+    """
+    copies: dict[str, list[str]] = {}
+    for (kind, name), source in getattr(robot, "sources", {}).items():
+        drive = kind == "joints" and robot.graph.joints[name].actuated
+        for end in ("offset", "backlash") if drive else ("length",) if kind != "joints" else ():
+            if source.path[0] == "limbs":
+                copies.setdefault(path_of([*source.path, end]), []).append(f"{kind}.{name}.{end}")
+    found: dict[str, list[str]] = {}
+    for name in robot.tolerances:
+        fits = re.compile(".*".join(map(re.escape, name.split("*")))).fullmatch
+        for path, own in copies.items():
+            # Not every body has a length.
+            if fits(path) and not ("*" in name and own[0].startswith("bodies")):
+                found.setdefault(name, []).append(",".join(own))
+    return found

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """`pkm-twin design` as a user runs it."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import yaml
@@ -115,6 +117,32 @@ def test_a_file_has_tolerances_of_its_parts(twin, tmp_path, name):
     data["tolerances"] = {"joints.*.offset": {"deviation": 1e-4, "bound": 1e-4}}
     path.write_text(yaml.safe_dump(data))
     assert "tolerances.joints.*.offset" in twin.refused("design", path, "--tolerance", "file")
+
+
+def test_copies_that_are_off_alike_stay_so_without_limbs(twin, tmp_path):
+    path, out = tmp_path / "delta.yaml", tmp_path / "graph.yaml"
+    data = yaml.safe_load(Path("examples/machines/delta_graph.yaml").read_text())
+    data["tolerances"] = {
+        "limbs.joints.*.offset": {"deviation": 1e-4}, "limbs.rods.*.length": {"bound": 2e-4},
+        "limbs.bodies.arm.length": {"deviation": 3e-5}, "rods.left_2.length": {"deviation": 1e-5},
+        "limbs.joints.motor.at[0]": {"deviation": 1e-4},
+    }  # fmt: skip
+    path.write_text(yaml.safe_dump(data))
+    assert "tolerances of limbs.joints.motor.at[0]" in twin.good("convert", path, "--out", out).out
+    del data["tolerances"]["limbs.joints.motor.at[0]"]
+    path.write_text(yaml.safe_dump(data))
+    before, after = (twin.told("design", one, "--tolerance", "file") for one in (path, out))
+    for key in ("rms_position_m", "bound_position_m", "rms_angle_rad", "rms_calibrated_position_m"):
+        assert after[key] == pytest.approx(before[key], rel=1e-9, abs=1e-12)
+    assert len(after["contributions"]) == len(before["contributions"]) == 5
+    one = "joints.motor_1.offset,-joints.motor_2.offset=1e-4"
+    other = "joints.motor_1.offset,joints.motor_2.offset=1e-4"
+    ways = [
+        twin.told("design", out, "--tolerance", text)["rms_position_m"] for text in (one, other)
+    ]
+    assert ways[0] != pytest.approx(ways[1], rel=0.1)
+    bad = "joints.motor_1.offset,rods.left_1.length=1e-4"
+    assert "rods.left_1.length" in twin.refused("design", out, "--tolerance", bad, code=2)
 
 
 @pytest.mark.parametrize(

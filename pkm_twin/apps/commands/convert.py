@@ -65,7 +65,7 @@ def convert(given: Convert) -> Report:
     if not ending and first not in robot_names():
         raise UnknownNameError("SOURCE", first, [*robot_names(), "a robot's or a printer's file"])
     from pkm_twin.machine.machine_yaml import describe_machine_yaml
-    from pkm_twin.robot.robot_urdf import robot_description
+    from pkm_twin.robot.robot_urdf import copied_tolerances, robot_description
     from pkm_twin.robot.urdf_read import read_urdf
 
     told, notes = list[str](), list[str]()
@@ -74,7 +74,8 @@ def convert(given: Convert) -> Report:
     else:
         robot = load(first, platform=given.platform)
         described, told = robot_description(robot), robot.book.told()
-        lost = sorted({*robot.tolerances} - {*described.get("tolerances", ())})
+        carried = {*described.get("tolerances", ())} | {*copied_tolerances(robot)}
+        lost = sorted({*robot.tolerances} - carried)
         if lost:
             notes = [f"left out, not numbers of these parts: tolerances of {', '.join(lost)}"]
     text = describe_machine_yaml(described, told + notes)

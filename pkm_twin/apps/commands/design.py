@@ -55,7 +55,8 @@ class Design(Carries, ReadsMotions, Writes, Draws, Seeded):
     position and rotation, the worst case, and the share of each part, on the path or, without
     --path, over the workspace; the actuated joints keep their positions. Parts are
     rods.NAME.length, bodies.NAME.length and joints.NAME with at[0..2], axis[0..1], offset, backlash
-    or clearance; * stands for any text; with limbs. in front all copies are alike.
+    or clearance; * stands for any text; with limbs. in front all copies are alike,
+    with commas between those parts.
     """
 
     vary: tuple[str, ...] = setting(
