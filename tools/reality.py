@@ -194,7 +194,7 @@ fourth are left out; the two fits differ by up to {apart:.1f} of their standard 
 Calibrated with the half of the grid at x < 0, the leg lengths of the other half are off by {halves} (one offset per leg
 removed). It does not show other heights, tilts above 2 degrees, loads, or changes from day to day.
 
-**A drive** that lifts four weights at one speed, `pkm-twin fit --drive leg_currents.csv --lever 0.011391`:
+**A drive** that lifts four weights at one speed, `pkm-twin fit --drive leg_currents.csv --spool-radius 0.011391`:
 
 ```text
 {drive}

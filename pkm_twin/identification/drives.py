@@ -193,7 +193,7 @@ def runs_of(table: Table, lever: float | None = None) -> Runs:
         raise ParameterError(str(table.path), ", ".join(table), "a column 'mass_kg' or 'torque_nm'")
     if torque is None:
         if lever is None:
-            raise ParameterError("--lever", None, "m per rad, above 0, for a column mass_kg")
+            raise ParameterError("--spool-radius", None, "m per rad, above 0, for a column mass_kg")
         torque = GRAVITY * lever * table["mass_kg"]
     return torque, table["iq_up_A"], table["iq_down_A"], table.get("speed"), table.get("drive")
 

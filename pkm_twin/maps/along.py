@@ -25,7 +25,7 @@ from pkm_twin.robot.workspace import counts
 class Along:
     """What a kind finds on a path: ``time`` (k,), s; ``pose`` (k, m); ``found`` of each case.
 
-    ``counted``: which samples keep all limits, shape (k,).
+    ``counted``: which samples keep all limits, of the singularity index ``least``, shape (k,).
     """
 
     robot: Robot
@@ -33,6 +33,7 @@ class Along:
     cases: tuple[Case, ...]
     time: Array
     pose: Array
+    least: float
     counted: NDArray[np.bool_]
     found: Sequence[Found]
 
@@ -125,4 +126,4 @@ def along(
     known = np.ones(len(pose), bool)
     least = kind.least if least is None else least
     counted = counts(robot, q, pose, known, least, least_clearance)
-    return Along(robot, kind, chosen, time, pose, counted, found_of(kind, robot, q, chosen))
+    return Along(robot, kind, chosen, time, pose, least, counted, found_of(kind, robot, q, chosen))

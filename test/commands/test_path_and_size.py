@@ -494,7 +494,7 @@ def test_a_machine_that_only_turns_plans_and_is_sized_like_others(twin, tmp_path
     assert speed.max() == pytest.approx(2.0, rel=2e-3)
     assert checked(out, robot=name).code == 0
     assert max(twin.told("size", name, out)["difference_from_model"]) < 1e-6
-    soft = ("--slow-where-soft", "--force", "1", "--tolerance", "1e-3")
+    soft = ("--slow-where-soft", "--force", "1", "--deflection", "1e-3")
     twin.refused(*line, *soft)
 
 

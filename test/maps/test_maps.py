@@ -251,17 +251,8 @@ def test_along_a_path_and_as_numbers(capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     points = "time,x,z\n" + "".join(f"{0.01 * k},{0.002 * k},0.36\n" for k in range(20))
     (tmp_path / "path.csv").write_text(points)
-    done = command(
-        capsys,
-        "map",
-        "five_bar",
-        "acceleration",
-        "--along",
-        "path.csv",
-        "--out",
-        "a.csv",
-        "--json",
-    )
+    words = ("map", "five_bar", "acceleration", "--along", "path.csv", "--out", "a.csv", "--json")
+    done = command(capsys, *words)
     told = json.loads(done.out)
     robot = load("five_bar")
     q = robot.inverse(np.stack([0.002 * np.arange(20), np.full(20, 0.36)], -1))
@@ -270,6 +261,7 @@ def test_along_a_path_and_as_numbers(capsys, tmp_path, monkeypatch):
     assert told["worst"][0]["value"] == pytest.approx(values.min())
     assert told["worst"][0]["time_s"] == pytest.approx(0.01 * values.argmin())
     assert told["worst"][0]["unit"] == "m/s2"
+    assert (told["singularity_bound"], told["samples_that_do_not_count"]) == (0.05, 0)
     rows = (tmp_path / "a.csv").read_text().splitlines()
     assert [float(row.split(",")[4]) for row in rows[1:]] == pytest.approx(values.tolist())
     header = rows[0].split(",")
@@ -278,6 +270,12 @@ def test_along_a_path_and_as_numbers(capsys, tmp_path, monkeypatch):
     table = [[float(row.split(",")[k]) for k in ways] for row in rows[1:]]
     np.testing.assert_allclose(table, least.direction)
     assert (tmp_path / "a.png").stat().st_size
+    # What lies below a bound is on the path all the same.
+    bound = float(np.median(robot.singularity(q)))
+    more = ("--singularity", bound, "--overwrite")
+    again = json.loads(command(capsys, *map(str, (*words, *more))).out)
+    assert again["worst"] == told["worst"]
+    assert again["samples_that_do_not_count"] == np.sum(robot.singularity(q) < bound) > 0
 
 
 def test_a_pose_in_a_sentence_is_as_commands_read_it():

@@ -34,7 +34,7 @@ class Excite(OfRobot, AwayFromSingular, Seeded, Writes):
     command writes a trajectory_msgs/JointTrajectory on /delta_dynamics/joint_trajectory, and a CSV
     for `pkm-twin torques`.
 
-    With --friction every joint alone sweeps its range up and down at three speeds, 1 : 4 : 16, and
+    With --sweeps every joint alone sweeps its range up and down at three speeds, 1 : 4 : 16, and
     --duration is that of all sweeps; --harmonics, --trials and --seed are not used.
     """
 
@@ -47,7 +47,10 @@ class Excite(OfRobot, AwayFromSingular, Seeded, Writes):
         endings=(".mcap",),
     )  # fmt: skip
     beside: Path | None = setting(None, "also report the condition number of this bag")
-    friction: bool = setting(False, "slow sweeps up and down, one joint at a time, for friction")
+    friction: bool = setting(
+        False, "slow sweeps up and down, one joint at a time, for friction", name="sweeps",
+        older=("--friction",),
+    )  # fmt: skip
     duration: float = setting(10.0, "duration, s", low=1.0, high=600.0)
     harmonics: int = setting(6, "harmonics per joint", low=3, high=50)
     rate: float = setting(100.0, "points per second", low=10.0, high=1000.0)

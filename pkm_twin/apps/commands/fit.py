@@ -98,8 +98,8 @@ class Fit(CarriesAtTimes, ReadsRecordings, BeyondLimitsToo, Accepts):
     )
     drive: Path | None = setting(None, "CSV of traverses with weights, one row per run")
     lever: float | None = setting(
-        None, "with --drive, for mass_kg: travel per radian of the motor (spool radius), m",
-        low=1e-6, high=1e3,
+        None, "with --drive, for mass_kg: travel per radian of the motor, m", name="spool-radius",
+        older=("--lever",), low=1e-6, high=1e3,
     )  # fmt: skip
     overwrite: bool = setting(False, "replace the YAML and the report")
 

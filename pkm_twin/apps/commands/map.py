@@ -210,11 +210,13 @@ def along_path(
     )  # fmt: skip
     if given.out is not None:
         replace_file(given.out, found.table().encode())
-    beyond = int((~found.counted).sum())
+    beyond, least = int((~found.counted).sum()), found.least
     first, *rest = found.sentences
-    notes = [*rest, f"{len(found.time)} samples of {path}"]
+    bound = f", singularity index {least:g} or more" if least > 0.0 else ""
+    notes = [*rest, f"{len(found.time)} samples of {path}{bound if not beyond else ''}"]
     if beyond:
-        notes.append(f"{beyond} samples are beyond limits, near a singularity, or limbs interfere")
+        near = f", below the singularity index {least:g}" if least > 0.0 else ""
+        notes.append(f"included: {beyond} beyond limits{near}, or where limbs interfere")
     return Report(
         first,
         [
@@ -222,6 +224,7 @@ def along_path(
             Fact("kind", kind.name),
             Fact("samples", len(found.time)),
             Fact("samples_that_do_not_count", beyond),
+            Fact("singularity_bound", least if least > 0.0 else None),
             Fact("worst", found.worst),
             Fact("files", [str(path) for path in (given.out, given.drawing("")) if path]),
         ],

@@ -60,7 +60,7 @@ class Motion(Carries, ReadsTables, AwayFromSingular, Writes, Draws):
 
     --slow-where-soft plans a cut: a force that is proportional to the feed and against the motion
     deflects the platform's reference point by its compliance at the pose. The motion is the fastest
-    one whose feed is at most --speed and whose deflection is at most --tolerance.
+    one whose feed is at most --speed and whose deflection is at most --deflection.
 
     The table that it writes has the columns time, JOINT.position, JOINT.velocity,
     JOINT.acceleration, JOINT.effort, the pose's coordinates with their velocity and acceleration,
@@ -98,13 +98,14 @@ class Motion(Carries, ReadsTables, AwayFromSingular, Writes, Draws):
         metavar="MASS@FROM:TO",
     )  # fmt: skip
     fastest: bool = setting(False, "plan the shortest motion within all limits")
-    slow_where_soft: bool = setting(False, "plan the fastest cut within --tolerance")
+    slow_where_soft: bool = setting(False, "plan the fastest cut within --deflection")
     force: float | None = setting(
         None, "of --slow-where-soft: cutting force per feed, N per m/s, against the motion", low=0.0
     )
     tolerance: float | None = setting(
-        None, "of --slow-where-soft: largest deflection of the platform, m"
-    )
+        None, "of --slow-where-soft: largest deflection of the platform, m", name="deflection",
+        older=("--tolerance",),
+    )  # fmt: skip
     law: str = setting(
         "quintic", "motion law without --fastest: quintic or s-curve, from stop to stop"
     )
@@ -162,7 +163,7 @@ def path(given: Motion) -> Report:
         for name, unit in (("tolerance", "m"), ("speed", "m/s")):
             check_limit(name, getattr(given, name), unit)
     elif given.force is not None or given.tolerance is not None:
-        raise typer.BadParameter("--force and --tolerance are for --slow-where-soft")
+        raise typer.BadParameter("--force and --deflection are for --slow-where-soft")
     cut = None
     if given.slow_where_soft:
         cut = SoftCut(machine, given.force or 0.0, given.tolerance or 0.0, given.speed or 0.0)
