@@ -51,8 +51,8 @@ class Settings:
     )
     window: int = setting(
         25,
-        "samples in the window at 1 kHz; a slower stream has those of the same time (at least "
-        "24 ms), and at least 5",
+        "samples in the window at 1 kHz; at a lower rate those of the same time, at least 24 ms "
+        "and 5 samples",
         name="differentiator.window",
         low=3,
         high=1000,
@@ -63,8 +63,8 @@ class Settings:
     )  # fmt: skip
     stale_after: float = setting(
         0.1,
-        "largest age of a joint state, and longest gap before the stream stops; published "
-        "torques have it as lifespan and deadline, so it is at most command_gate's deadline",
+        "largest age of a joint state, and longest gap before the stream stops; also lifespan and "
+        "deadline of published torques, so at most command_gate's deadline",
         **LATE,
     )
     future_tolerance: float = setting(0.1, FUTURE, **SECONDS)
@@ -78,7 +78,7 @@ class Settings:
     )  # fmt: skip
     on_stop: OnStop = setting(
         "nothing",
-        "command sent once when the stream stops; must be set with publish_commands",
+        "command sent once when the stream stops; required with publish_commands",
         choices=("nothing", "zeros", "gravity"),
     )
     singularity_warn: float = setting(0.05, "warn below this singularity index", **SHARE)

@@ -35,9 +35,9 @@ class GateSettings:
 
     on_stop: OnStop = setting(
         "zeros",
-        "command while no torques arrive: zeros, or gravity, the effort against gravity "
-        "at the measured position; zeros too where that position is older than deadline, or the "
-        "effort is beyond effort_limits",
+        "command while no torques arrive: zeros, or gravity (the effort against gravity at the "
+        "measured position, but zeros if that position is older than deadline or the effort "
+        "exceeds effort_limits)",
         choices=("zeros", "gravity"),
     )
     deadline: float = setting(

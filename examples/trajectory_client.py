@@ -149,7 +149,7 @@ def main():
         rclpy.try_shutdown()
     miss = abs(positions(states[-1], joints.names) - start - rows[0][-1]).max()
     peak = ", ".join(f"{value:.3g}" for value in abs(efforts).max(0))
-    print(f"{len(efforts)} points, peak efforts {peak}, {miss:.2e} from the goal at the end")
+    print(f"{len(efforts)} points, peak efforts {peak}, position error at the end {miss:.2e}")
     return 0
 
 

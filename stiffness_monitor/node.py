@@ -63,8 +63,8 @@ class StiffnessMonitor(TwinNode):
         self.core = Monitor(robot, settings, mounts)
         self.core.pace = Pace(
             self.declare(
-                "rate", 0.0, "largest rate of answers, by the stamps of the wrenches; 0: every "
-                "wrench",
+                "rate", 0.0, "largest rate of messages, by the stamps of the wrenches; 0: one for "
+                "each wrench",
                 unit="Hz", low=0.0, high=1e4
             )
         )  # fmt: skip

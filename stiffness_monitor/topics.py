@@ -40,9 +40,9 @@ STIFFNESS: Final = table(
           "the platform's deflection, where it is measured, in `base_frame` or the frame of "
           "`~/deflection`", "`watch_stiffness`"),
     Topic("out", "~/stiffness_alarm", STATUSES,
-          "an element whose compliance differs from the file: WARN, message its name, or the names "
-          "that the loads do not distinguish; values `element`, `factor`, `deviation`, `bound`, "
-          "`or NAME`; once a second (by the stamps) while active; at its end once OK, name `none`",
+          "WARN once a second (by the stamps) while an element's compliance differs from the file; "
+          "message: its name, or the names that the loads do not distinguish; values `element`, "
+          "`factor`, `deviation`, `bound`, `or NAME`; at the end one OK with the name `none`",
           "`watch_stiffness`", latched=True),
     Topic("out", "~/natural_frequencies", NUMBERS,
           "the first six at the latest joint state with locked actuators, Hz, where the robot's "

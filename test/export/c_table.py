@@ -21,7 +21,6 @@ SAMPLES, TURNS = 5000, 9
 BUILDS = {
     "-O2": ("gcc", "-O2"),
     "native": ("gcc", "-O3", "-march=native"),
-    "clang": ("clang", "-O3", "-march=native"),
 }
 LOOP = r"""
 #include <stdint.h>

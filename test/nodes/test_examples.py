@@ -119,7 +119,7 @@ class TestByTheTwin:
     def test_the_trajectory_client_reaches_its_goal_with_the_twin_s_efforts(self, launch):
         client = example(launch, "trajectory_client.py")
         assert client.wait(PATIENCE) == 0, client.output
-        points, *peak, miss = numbers(client.output.replace(" from the goal", ""))
+        points, *peak, miss = numbers(client.output)
         q = ROBOT.inverse(ROBOT.home())
         x = np.linspace(0.0, 1.0, 101)
         way = np.array([6.0, -15.0, 10.0, 0.0, 0.0, 0.0])

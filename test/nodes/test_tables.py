@@ -35,8 +35,8 @@ def rows(node):
     return re.findall(r"^\* (in|out|service) `(.*?)` \((.*?)\)", section(node), re.MULTILINE)
 
 
-def parameters(part):
-    return set(re.findall(r"^\* `([\w.]+)` \(", section(part), re.MULTILINE))
+def parameters(text):
+    return set(re.findall(r"^\* `([\w.]+)` \(", text, re.MULTILINE))
 
 
 @pytest.fixture(scope="module", params=list(MODULES))
@@ -113,11 +113,11 @@ def test_parameters(node, peer):
     request = ListParameters.Request()
     found = peer.call(ListParameters, f"/{node}/list_parameters", request).result.names
     known = {name for name in found if not MIDDLEWARE.fullmatch(name)}
-    shared = set(
-        re.findall(r"`([\w.]+)`", section(node).split("\nAs [all nodes]")[1].split("\n")[0])
-    )
-    assert shared <= parameters("All nodes")
-    assert parameters(node) | shared == known
+    own, _, others = section(node).partition("\nAlso, as [other nodes]")
+    shared = set(re.findall(r"`([\w.]+)`", others.split("\n")[0]))
+    common, some = map(parameters, section("All nodes").split("\nSome nodes also have:\n"))
+    assert shared <= some
+    assert parameters(own) | common | shared == known
 
 
 def test_page_and_policy_are_those_of_the_nodes(tmp_path):

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import importlib
 import os
+import re
 import sys
 from collections import Counter
 from pathlib import Path
@@ -82,7 +83,8 @@ def _value(value: Any) -> str:
 
 def _values(setting: Setting) -> str:
     if setting.choices:
-        return ", ".join(f"`{word}`" for word in setting.choices)
+        told = all(re.search(rf"\b{word}\b", setting.text) for word in setting.choices)
+        return "" if told else ", ".join(f"`{word}`" for word in setting.choices)
     if setting.low is None or setting.high is None:
         return setting.unit
     low, high = (
@@ -96,12 +98,16 @@ def parts() -> dict[str, str]:
     rows = {node: {k: row(k, *v) for k, v in rows_of(node).items()} for node in MODULES}
     times = Counter(line for own in rows.values() for line in own.values())
     shared = sorted(line for line, count in times.items() if count > 1)
-    found = {"all nodes": "".join(shared)}
+    common = [line for line in shared if times[line] == len(rows)]
+    rest = [line for line in shared if line not in common]
+    found = {"all nodes": "".join([*common, "\nSome nodes also have:\n\n", *rest])}
     for node, own in rows.items():
         topics = "".join(map(topic_row, class_of(node).topics.values()))
         lines = "".join(line for line in own.values() if line not in shared)
-        names = ", ".join(f"`{name}`" for name, line in own.items() if line in shared)
-        found[node] = f"{topics}\nParameters:\n\n{lines}\nAs [all nodes](#all-nodes): {names}."
+        some = [name for name, line in own.items() if 1 < times[line] < len(rows)]
+        names = ", ".join(f"`{name}`" for name in some)
+        also = f"Also, as [other nodes](#all-nodes): {names}."
+        found[node] = f"{topics}\nParameters:\n\n{lines}\n{also}"
     return found
 
 
