@@ -121,23 +121,17 @@ def section() -> str:
             own.append(errors)
     table = "\n".join(_row(name, own) for name, own in rows.items())
     fitted = {p.name: p for p in found.parameters}
-    ratios, apart = [], 0.0
+    apart = 0.0
     for joint, leg, sd in zip(robot.joint_names, legs, deviations, strict=True):
-        one, own, own_sd = fitted[f"joint_map.{joint}.ratio"], 1.0 / leg[7], sd[7] / leg[7] ** 2
-        ratios.append(
-            f"| {joint} | {one.before:.3f} | {one.value:.3f} +- {one.deviation:.3f} | "
-            f"{own:.3f} +- {own_sd:.3f} |"
-        )
-        apart = max(apart, abs(one.value - own) / float(np.hypot(one.deviation, own_sd)))
+        one, own_sd = fitted[f"joint_map.{joint}.ratio"], sd[7] / leg[7] ** 2
+        apart = max(apart, abs(one.value - 1.0 / leg[7]) / float(np.hypot(one.deviation, own_sd)))
     halves = _transfer(robot, poses)
     columns = read_table(DATA / "leg_currents.csv")
     drive = drive_friction(
         GRAVITY * SPOOL * columns["mass_kg"], columns["iq_up_A"], columns["iq_down_A"]
     )
     told = text_of(drive_report(drive))
-    return SECTION.format(
-        count=count, table=table, ratios="\n".join(ratios), apart=apart, halves=halves, drive=told
-    )
+    return SECTION.format(count=count, table=table, apart=apart, halves=halves, drive=told)
 
 
 def _rolled(poses: Poses, by: int) -> Poses:
@@ -172,37 +166,33 @@ def _rms(values: Array) -> float:
 
 SECTION = """## Real machines
 
-No public recording of the motor torques of a whole parallel machine is known to us, so the torques are verified only against
-other engines. `make reality` prints this section from public recordings of Jugglebot, a 6-UPS hexapod with spools
+No public recording has the motor torques of a whole parallel machine, so torques are verified only against other engines.
+`make reality` prints this section from public recordings of Jugglebot, a 6-UPS hexapod with spools
 ([source](https://github.com/Project-DeepBlue-Juggling/Jugglebot), MIT licence;
 [files](../examples/machines/hexapod)).
 
-**Poses**: {count} poses on a grid of one height, by motion capture. Four fits: each leaves out every fourth pose, starting
-at pose 1, 2, 3 or 4. The table has the RMS error of the poses left out, and of all {count}.
+**Poses**: {count} poses on a grid at one height, by motion capture. Each of four fits leaves out every fourth pose, starting
+at pose 1, 2, 3 or 4. The table has the RMS error of these poses, and of all {count}.
 
 | held out | 1st, mm | 2nd, mm | 3rd, mm | 4th, mm | all, mm | worst, mm | all, mrad |
 |---|---|---|---|---|---|---|---|
 {table}
 
-The last row is an independent fit with scipy, one leg at a time, that knows no closed loop. Revolutions per metre, where the
-fourth are left out; the two fits differ by up to {apart:.1f} of their standard deviations together:
+The last row is an independent fit with scipy of each leg by itself. Revolutions per metre of the two fits differ by up to
+{apart:.1f} combined standard deviations.
 
-| leg | file | `calibrate` | leg by itself |
-|---|---|---|---|
-{ratios}
+After a calibration with the half of the grid at x < 0, the leg lengths of the other half are off by {halves} (one offset per
+leg removed). The recording has no other heights, tilts above 2 degrees, loads or days.
 
-Calibrated with the half of the grid at x < 0, the leg lengths of the other half are off by {halves} (one offset per leg
-removed). It does not show other heights, tilts above 2 degrees, loads, or changes from day to day.
-
-**A drive** that lifts four weights at one speed, `pkm-twin fit --drive leg_currents.csv --spool-radius 0.011391`:
+**A drive** lifts four weights at one speed; `pkm-twin fit --drive leg_currents.csv --spool-radius 0.011391` prints:
 
 ```text
 {drive}
 ```
 
-A constant friction does not explain the data: friction grows with the load. The owner has repeated the test with weighed
-masses: 0.0564 +- 0.0011 N m/A, both together 0.0570 +- 0.0008 N m/A. Holding currents differ by up to 1.5 A with the
-direction of approach: compare a model with currents of slow motion in both directions.
+A constant friction does not explain the data: friction grows with the load. The owner repeated the test with weighed
+masses: 0.0564 +- 0.0011 N m/A. Holding currents differ by up to 1.5 A with the direction of approach, so compare a model
+with currents of slow motion in both directions.
 """  # noqa: E501
 
 

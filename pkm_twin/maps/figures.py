@@ -223,13 +223,13 @@ def planes(data: Dataset, case: int) -> Figure:
         figure, columns = plots.columns(
             count, 1, high_of, gridspec_kw={"width_ratios": _widths(drawn)}
         )
-        axes = [column[0] for column in columns]
+        axes, over = [column[0] for column in columns], ""
         for one, ax in zip(drawn, axes, strict=True):
             if len(one["names"]) == 1:
                 _line(one, ax, scale, label)
                 continue
             mesh = _panel(one, ax, scale, scale * low, scale * high, SHARES[count < PANELS])
-            kind.overlay(data, one["names"], one["through"], ax)
+            over = kind.overlay(data, one["names"], one["through"], ax)
         if len(drawn[0]["names"]) > 1:
             bar = figure.colorbar(
                 mesh, ax=axes, aspect=25, pad=0.01, extend="max" if beyond else "neither"
@@ -237,7 +237,7 @@ def planes(data: Dataset, case: int) -> Figure:
             bar.set_label(label)
         rows = plots.head(figure, "\n".join(title(data, case)), 10)
         figure.set_figheight(high_of + 0.2 * rows)
-        figure.supxlabel(_caption(drawn, beyond), fontsize=8.5, color="0.3")
+        figure.supxlabel(_caption(drawn, beyond) + over, fontsize=8.5, color="0.3")
     return figure
 
 
@@ -258,9 +258,9 @@ def _widths(drawn: list[dict[str, Any]]) -> list[float]:
 
 
 def _caption(drawn: list[dict[str, Any]], beyond: bool) -> str:
-    star = "star: worst pose, in its cell's colour; " if any(one["star"] for one in drawn) else ""
-    more = "; brightest: or more" if beyond else ""
-    return f"{star}outline: all joint limits are kept; white: does not count{more}"
+    star = "star: worst pose; " if any(one["star"] for one in drawn) else ""
+    more = "; brightest: this or more" if beyond else ""
+    return f"{star}outline: joint limits; white: does not count{more}"
 
 
 def _line(one: dict[str, Any], ax: Axes, scale: float, label: str) -> None:

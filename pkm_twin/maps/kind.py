@@ -189,8 +189,9 @@ class Kind:
     @classmethod
     def overlay(
         cls, data: Dataset, names: tuple[str, ...], through: Mapping[str, float], ax: Axes
-    ) -> None:
-        """What is drawn over a plane of two pose coordinates through a pose."""
+    ) -> str:
+        """Draw over a plane of two pose coordinates through a pose; what it is, for the caption."""
+        return ""
 
     @classmethod
     def figures(cls, data: Dataset) -> dict[str, Figure]:

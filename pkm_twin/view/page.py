@@ -158,7 +158,7 @@ class Page:
             self.ask(self.stage.gizmo.on_update, "drag", self._drag)
             self._check("trail of the tool", False, self.stage.leave_trail)
             if self.stage.has_meshes:
-                self._check("meshes of the URDF", True, self.stage.show_meshes)
+                self._check("meshes of the URDF, which do not bend", True, self.stage.show_meshes)
         self.load_tab = tabs.add_tab("Load")
         with self.load_tab:
             with gui.add_folder("Wrench on the platform, base axes"):

@@ -159,8 +159,8 @@ def main(target):
         "Processor time of one thread of the node `delta_dynamics` with `delta_cu`, medians, no "
         "subscriber. The round trip above includes the middleware.",
         "",
-        "The node decodes and encodes bytes itself; three compiled programs compute. At 1 kHz the "
-        "caches are cold, and a call takes about twice as long as here.",
+        "Three compiled programs compute. At 1 kHz the processor's caches are cold, and a call "
+        "takes about twice as long as here.",
         "",
         *table(stream, "µs"),
         "",

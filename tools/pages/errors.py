@@ -39,7 +39,7 @@ ERRORS = {
     errors.MobilityError: (
         errors.MobilityError(2, 1, ["elbow_2's axis is 1e-05 rad from parallel to motor_1's axis"]),
         "correct the named joint, or the number of `actuated` joints "
-        "([new machine](new_machine.md#what-to-check-first))",
+        "([new machine](new_machine.md#cross-check-and-errors-of-a-file))",
     ),
     errors.UnreachableError: (
         errors.UnreachableError("pose", "limb 2", (3,), 0.0125),

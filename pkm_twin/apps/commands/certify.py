@@ -76,11 +76,11 @@ def certify(given: Certify) -> Report:
     # The one that is nearest to its bound, or farthest beyond it.
     worst = max(found.items, key=_share, default=None)
     most = "" if worst is None else (
-        f"; the largest of its bound: {worst.what.replace('_', ' ')} {worst.worst:.1e} of "
+        f"; nearest to its bound: {worst.what.replace('_', ' ')} {worst.worst:.1e} of "
         f"{worst.bound:.1e}, against {worst.engine}"
     )  # fmt: skip
     return Report(
-        f"{'good' if found.good else 'bad'}: {which}, differences from pkm_twin at {found.states} "
+        f"{'good' if found.good else 'bad'}: {which}, compared with pkm_twin at {found.states} "
         f"states, seed {found.seed}{most}",
         [Fact(name, value) for name, value in found.data.items()],
         [Table("", [*columns, Column("", text="verdict")], rows)],

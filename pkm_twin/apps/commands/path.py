@@ -72,9 +72,9 @@ class Motion(Carries, ReadsTables, AwayFromSingular, Writes, Draws):
         None, "table of waypoints, unless --cycle or --circle is given", argument=True
     )
     cycle: tuple[float, ...] | None = setting(
-        None, "pick-and-place cycle, mm: HEIGHT up, WIDTH across, LIFT down (default: HEIGHT), and "
+        None, "pick-and-place cycle, mm: HEIGHT up, WIDTH across, DROP down (default: HEIGHT), and "
         "back; the pose needs z, and x or y", count=0,
-        metavar="HEIGHT,WIDTH[,LIFT]",
+        metavar="HEIGHT,WIDTH[,DROP]",
     )  # fmt: skip
     circle: float | None = setting(
         None, "follow a circle of this radius, m, or rad for a circle of two angles"
@@ -272,7 +272,7 @@ def _unloaded(given: Motion, machine: Robot) -> tuple[Way, list[float] | None]:
     if len(lengths) not in (2, 3) or min(lengths) < LEAST_CYCLE:
         found = ",".join(f"{length:g}" for length in lengths)
         raise typer.BadParameter(
-            f"--cycle {found}: HEIGHT,WIDTH[,LIFT] in millimetres, for example 25,305,25"
+            f"--cycle {found}: HEIGHT,WIDTH[,DROP] in millimetres, for example 25,305,25"
         )
     metres = [1e-3 * value for value in lengths]
     way = None if given.direction is None else math.radians(given.direction)

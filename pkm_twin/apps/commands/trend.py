@@ -101,7 +101,8 @@ def draw(results: Sequence[Judged], answer: str) -> Any:
         plots.label(ax, "", s.unit, s.label)
         ax.tick_params(axis="x", labelrotation=30)
     shown = "" if len(order) == len(results) else f"; {len(order)} shown"
-    plots.head(figure, f"Is it getting worse? {answer}{shown}")
+    marks = "band: control limits; ring: outside them; dashed: the mean changed"
+    plots.head(figure, f"Is it getting worse? {answer}{shown}\n{marks}")
     return figure
 
 

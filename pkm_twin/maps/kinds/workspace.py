@@ -36,6 +36,7 @@ CLEARANCE: Final = Case(
 ANGLE: Final = Case("joint-angle", "largest passive joint angle", "rad", "bends most")
 LAYERS: Final = 101
 """Heights of the circles."""
+OVER: Final = "; white lines: largest circles; dashed: largest cylinder"
 
 
 class Workspace(Kind):
@@ -110,10 +111,10 @@ class Workspace(Kind):
     @classmethod
     def overlay(
         cls, data: Dataset, names: tuple[str, ...], through: Mapping[str, float], ax: Axes
-    ) -> None:
+    ) -> str:
         """The circles about the axis and the cylinder, where a plane cuts them."""
         if "circle" not in data or len(names) != 2:
-            return
+            return ""
         height = data.attrs["height"]
         apart = math.hypot(*(v for name, v in through.items() if name not in (*names, height)))
         radii = np.array([float(data.cylinder_radius), *data.circle.values])
@@ -121,17 +122,17 @@ class Workspace(Kind):
         radius = float(cut[0])
         low, high = float(data.cylinder_low), float(data.cylinder_high)
         if height not in names:
-            if not low <= through[height] <= high:
-                return
-            turn = np.linspace(0.0, 2 * np.pi, 181)
-            ax.plot(radius * np.cos(turn), radius * np.sin(turn), "--", color="white", lw=1.2)
-            return
+            if low <= through[height] <= high:
+                turn = np.linspace(0.0, 2 * np.pi, 181)
+                ax.plot(radius * np.cos(turn), radius * np.sin(turn), "--", color="white", lw=1.2)
+            return OVER
         outline = [radius, radius, -radius, -radius, radius], [low, high, high, low, low]
         circle = np.where(cut[1:] > 0.0, cut[1:], np.nan)
         sides = np.concatenate([circle, [np.nan], -circle])
         heights = np.concatenate([data.height.values, [np.nan], data.height.values])
         for style, (x, y) in (("-", (sides, heights)), ("--", outline)):
             ax.plot(*((x, y) if names[1] == height else (y, x)), style, color="white", lw=1.2)
+        return OVER
 
 
 def regular(
