@@ -350,7 +350,7 @@ class _Writer:
         begin, onward, both = (b.block(name) for name in ("begin", "onward", "turns"))
         b.cbranch(b.icmp("eq", k, ZERO), begin, onward)
         b.go_to(begin)
-        run(q.begin, [*x, size, n[AT.before]], {q.target: aim})
+        run(q.begin, [*x, size], {q.target: aim})
         b.branch(both)
         b.go_to(onward)
         here = [b.load(place) for place in x]

@@ -167,7 +167,7 @@ class PlainCode:
             here = named | {q.target: call("aim"), q.unknowns: x, previous(q.unknowns): before}
             before = x
             if k == 1:
-                *x, size, n[AT.before] = call("begin", here)
+                *x, size = call("begin", here)
             else:
                 x = call("onward", here)
             n[AT.size], here[q.unknowns] = size, x

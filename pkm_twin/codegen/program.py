@@ -36,8 +36,6 @@ AHEAD: Final = 0.1
 """The same of each of more steps, which begins where the ones before lead on."""
 NEXT: Final = 0.01
 """Most that the first correction of a stream's sample may be, which starts from the one before."""
-CHANGE: Final = 3.0
-"""Most that the determinant may change by, as a factor, in one correction."""
 DIRECT: Final = 1e-3
 """Least determinant, over the one at home, of a state that is reached in one step from home."""
 STEPPED: Final = 1e-8
@@ -60,23 +58,21 @@ class Places(NamedTuple):
     """Places in the state of Newton's method.
 
     ``once``: 1 in a single step, else 0. ``part``: of the way, to the target of a step. ``onward``:
-    length of the step over that of the one before it, 0 for the first one. ``size``,
-    ``before``: square of the last correction, and the determinant there, 0 where there is none.
-    ``moving``, ``alive``: 1 as long as a sample is corrected, and as long as it is not refused.
-    ``reached``: part of the way.
+    length of the step over that of the one before it, 0 for the first one. ``size``: square of the
+    last correction. ``moving``, ``alive``: 1 as long as a sample is corrected, and as long as it is
+    not refused. ``reached``: part of the way.
     """
 
     once: int
     part: int
     onward: int
     size: int
-    before: int
     moving: int
     alive: int
     reached: int
 
 
-AT: Final = Places(*range(8))
+AT: Final = Places(*range(7))
 
 
 def progress(k: int, steps: int) -> tuple[float, float]:
@@ -110,8 +106,8 @@ class Equations:
     cross, the determinant there is below zero, while Newton's method from the side of the other one
     would turn to that.
 
-    A sample is refused where a correction does not contract, where the determinant leaves its
-    bounds, or where a residual stays: then it may be another root that was found.
+    A sample is refused where a correction does not contract, where the determinant is too small, or
+    where a residual stays: then it may be another root that was found.
     """
 
     target: str
@@ -141,8 +137,6 @@ class Equations:
     near: Expression | None = None
     """1 where a single step starts from ``foreseen``: of another sample's unknowns."""
     foreseen: Sequence[Expression] = ()
-    last: Expression | None = None
-    """The determinant of that sample."""
 
     lone: bool = False
     """Whether a sample is solved alone: its state says nothing of whether it moves."""
@@ -172,22 +166,18 @@ class Equations:
 
     @cached_property
     def begin(self) -> list[Expression]:
-        """Unknowns to begin with; the state's size, that the first correction contracts from, and
-        before: at home the determinant is one.
-        """
+        """Unknowns to begin with, and the size that the first correction contracts from."""
         once, known = self.state[AT.once], self.start is not None and not self.guessed
         first: Sequence[Any] = self.start or self.home
         if known:
             first = [select(once, a, b) for a, b in zip(first, self.home, strict=True)]
         ahead = 1e300 if self.start is None else (AHEAD / CONTRACTION) ** 2
         size = 1e300 if known else select(once, (FIRST / CONTRACTION) ** 2, ahead)
-        before = select(once, 0.0, 1.0)
         if self.near is not None:
             pairs = zip(self.foreseen, first, strict=True)
             first = [select(self.near, a, b) for a, b in pairs]
             size = select(self.near, (NEXT / CONTRACTION) ** 2, size)
-            before = select(self.near, self.last, before)
-        return self._lift(*first, size, before)
+        return self._lift(*first, size)
 
     @cached_property
     def underway(self) -> Expression:
@@ -207,22 +197,17 @@ class Equations:
         """After a correction: the unknowns, then the state from size to alive.
 
         A sample stays refused where a correction does not contract, or where the determinant is
-        too small or changes too much. A closed form of the start is in the right assembly; a guess
-        may lead to another.
+        too small. A closed form of the start is in the right assembly; a guess may lead to another.
         """
         state, size, determinant = self.state, self.size, self.determinant
-        once, before, moving = state[AT.once], state[AT.before], state[AT.moving]
+        once, moving = state[AT.once], state[AT.moving]
         known = self.start is not None and not self.guessed
         x = self.size.tape.inputs(self.unknowns, len(self.home))
         new = (select(moving, a, b) for a, b in zip(self.corrected, x, strict=True))
-        near = select(less(0.0, before), before, determinant)
-        steady = both(less(near, CHANGE * determinant), less(determinant, CHANGE * near))
         least = STEPPED if known else select(once, DIRECT, STEPPED)
         sound = both(less(size, CONTRACTION**2 * state[AT.size]), less(least, determinant))
-        sound = both(sound, steady)
         moves = both(moving, both(sound, less(CLOSED**2, size)))
-        kept = select(moving, determinant, before)
-        return self._lift(*new, size, kept, moves, select(moving, sound, state[AT.alive]))
+        return self._lift(*new, size, moves, select(moving, sound, state[AT.alive]))
 
     @cached_property
     def arrive(self) -> list[Expression]:

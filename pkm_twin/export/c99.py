@@ -159,7 +159,7 @@ def _angles(
 
 
 ROWS: Final = ("home", "origin", "start", "onward", "corrected", "branch", "goal", "foreseen")
-NUMBERS: Final = ("size", "determinant", "residual", "near", "last")
+NUMBERS: Final = ("size", "determinant", "residual", "near")
 """What equations have as expressions, in a row and alone."""
 
 
@@ -386,7 +386,7 @@ static const int @_steps[{len(LADDER)}] = {{{steps}}};
 /* Newton's method from the known assembly in so many steps; 0 where it does not get there. */
 static int @_{name}({more}const double *{q.target}, int steps, double *h, double *{x})
 {{
-    double {STATE}[{AT.moving}], aim[{m}], {x_before}[{n}] = {{0.0}}, next[{n + 4}], first = 0.0;
+    double {STATE}[{AT.moving}], aim[{m}], {x_before}[{n}] = {{0.0}}, next[{n + 3}], first = 0.0;
     double part = 0.0, way = 1.0;
     int i, k;
     {STATE}[{AT.once}] = (steps == 1) ? 1.0 : 0.0;
@@ -405,7 +405,6 @@ static int @_{name}({more}const double *{q.target}, int steps, double *h, double
         if (k == 1) {{
             {begin};
             first = next[{n}];
-            {STATE}[{AT.before}] = next[{n + 1}];
         }} else {{
             {onward};
         }}
@@ -420,9 +419,8 @@ static int @_{name}({more}const double *{q.target}, int steps, double *h, double
                 {q.unknowns}[i] = next[i];
             }}
             {STATE}[{AT.size}] = next[{n}];
-            {STATE}[{AT.before}] = next[{n + 1}];
-            moving = (next[{n + 2}] > 0.0) ? 1 : 0;
-            if (!(next[{n + 3}] > 0.0)) {{
+            moving = (next[{n + 1}] > 0.0) ? 1 : 0;
+            if (!(next[{n + 2}] > 0.0)) {{
                 return 0;
             }}
         }}

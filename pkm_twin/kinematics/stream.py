@@ -60,9 +60,9 @@ def _stream(t: Traced) -> Program:
 def following(t: Traced, program: Program) -> Program:
     """A program of motion that starts from the sample before: input and output ``last``.
 
-    The row has the determinant, above zero where it is valid, the joints that were solved from home
-    last, q, qd, and of the unknowns the values, rates, accelerations and their change. Newton's
-    method starts from the unknowns moved on by these. Results are those of ``program``.
+    The row has 1 where the sample is valid, the joints that were solved from home last, q, qd, and
+    of the unknowns the values, rates, accelerations and their change. Newton's method starts from
+    the unknowns moved on by these. Results are those of ``program``.
     """
     (q,) = program.equations
     n, (places, rates) = t.joints, t.scheme.solved
@@ -87,8 +87,8 @@ def following(t: Traced, program: Program) -> Program:
     foreseen = t.retracted(x, time * (u + (0.5 * time) * (du + change * (1.0 / 3.0))))
     solved = (select(near, a, b) for a, b in zip(anchor, t.q, strict=True))
     changed = (select(near, a - b, 0.0) for a, b in zip(t.du[rates], du, strict=True))
-    kept = [t.determinant, *solved, *t.q, *qd, *t.unknowns, *t.u[rates], *t.du[rates], *changed]
-    equations = replace(q, near=near, foreseen=foreseen, last=t.tape.lift(holds))
+    kept = [1.0, *solved, *t.q, *qd, *t.unknowns, *t.u[rates], *t.du[rates], *changed]
+    equations = replace(q, near=near, foreseen=foreseen)
     return replace(
         program,
         inputs={**program.inputs, LAST: len(last)},

@@ -151,11 +151,6 @@ class Traced:
             result = result * (here.steepness / there.steepness)
         return result
 
-    @property
-    def determinant(self) -> Any:
-        """The same of a solution: of the factors that results need."""
-        return self._at_home[2].inverse_determinant / self.lu.inverse_determinant
-
     @cached_property
     def home(self) -> Motion:
         """The motion at home."""
