@@ -42,27 +42,26 @@ Box = Mapping[str, tuple[float, float]]
 class Design(Carries, ReadsMotions, Writes, Draws, Seeded):
     """Optimise values of a robot's file for a path.
 
-    The platform of every machine follows the same path; machines that cannot follow it are
+    The platform of every machine follows the same path. Machines that cannot follow it are
     rejected. peak-effort is the greatest effort of any joint, rms-effort the greatest RMS effort of
-    a joint, motor-torque that of a motor (files with drives), energy what the drives supply without
-    regeneration, deflection the greatest translation of the reference point under the wrench, mass
-    that of all bodies and rods without payload;
-    singularity is the least singularity index on the path. The search uses exact gradients from
-    several starts and ends in a local optimum.
+    a joint, motor-torque the greatest RMS torque of a motor (files with drives). energy is what the
+    drives supply without regeneration, deflection the greatest translation of the reference point
+    under the wrench, mass the mass of all bodies and rods without payload. singularity is the least
+    singularity index on the path. The search uses exact gradients from several starts and ends in a
+    local optimum.
 
-    --sweep writes all quantities of machines within the bounds to a NetCDF file, with --scheduler
-    computed by a Dask cluster. --tolerance prints the standard deviations of the platform's
-    position and rotation, the worst case, and the share of each part, on the path or, without
-    --path, over the workspace; the actuated joints keep their positions. Parts are
-    rods.NAME.length, bodies.NAME.length and joints.NAME with at[0..2], axis[0..1], offset, backlash
-    or clearance; * stands for any text; with limbs. in front all copies are alike,
-    with commas between those parts.
+    --sweep writes all quantities of machines within the bounds to a NetCDF file. With --scheduler a
+    Dask cluster computes it. --tolerance prints the standard deviations of the platform's position
+    and rotation, the worst case, and the share of each part, at the joint positions of the path or,
+    without --path, of the workspace. Parts are rods.NAME.length, bodies.NAME.length and joints.NAME
+    with at[0..2], axis[0..1], offset, backlash or clearance. * stands for any text. All copies of a
+    limb share the error of a part with limbs. in front; parts with commas between share one too.
     """
 
     vary: tuple[str, ...] = setting(
         (),
-        "PATH=LOW:HIGH: a value of the robot's file and its bounds, e.g. "
-        "geometry.arm_length=0.15:0.3; PATH,PATH,-PATH=LOW:HIGH changes several by the same amount",
+        "KEY=LOW:HIGH: a value of the robot's file and its bounds, e.g. "
+        "geometry.arm_length=0.15:0.3; KEY,KEY,-KEY=LOW:HIGH changes several by the same amount",
     )
     path: Path | None = setting(
         None, "motion of the robot: CSV or MCAP of `pkm-twin path`, or a recording"
@@ -77,11 +76,11 @@ class Design(Carries, ReadsMotions, Writes, Draws, Seeded):
     )
     tolerance: tuple[str, ...] = setting(
         (),
-        "PATH=SIGMA, standard deviation of a part's error, or PATH=+-BOUND, e.g. "
+        "KEY=SIGMA, standard deviation of a part's error, or KEY=+-BOUND, e.g. "
         "rods.*.length=2e-5; file: those of the robot's file; prints the pose error budget",
     )
     monte_carlo: int = setting(
-        0, "of --tolerance: machines to draw and assemble exactly as well", low=0
+        0, "with --tolerance: number of random machines to assemble exactly, too", low=0
     )
     sweep: str | None = setting(
         None, "grid or sobol: compute machines within the bounds into --out FILE.nc"
@@ -90,14 +89,14 @@ class Design(Carries, ReadsMotions, Writes, Draws, Seeded):
         20, "machines of a sweep: per axis of a grid, or in total with sobol", low=1
     )
     scheduler: str | None = setting(
-        None, "of a sweep: address of a Dask scheduler: tcp://HOST:8786"
+        None, "with --sweep: address of a Dask scheduler, tcp://HOST:8786"
     )
     wrench: tuple[float, ...] | None = setting(
         None,
         "force and moment on the platform, N and N m, base axes; added to the path's",
         count=6, metavar="fx,fy,fz,mx,my,mz",
     )  # fmt: skip
-    starts: int = setting(64, "machines to start from; the best are optimised", low=1)
+    starts: int = setting(64, "machines to try first; the best are optimised", low=1)
     points: int = setting(9, "points of a Pareto front", low=3)
     out: Path | None = setting(
         None, "FILE.yaml: the robot's file with the new values; for a sweep FILE.nc", writes=True

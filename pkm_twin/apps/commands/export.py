@@ -71,7 +71,7 @@ class Moveit(ToFolder):
     """
 
     kinematics_plugin: str = setting(
-        "", "another plugin for the inverse kinematics than the package's", metavar="NAME"
+        "", "plugin for the inverse kinematics; default: the package's own", metavar="NAME"
     )
 
 
@@ -109,7 +109,7 @@ class Ros2Control(ToFolder):
     """
 
     bandwidth: float = setting(
-        0.0, "bandwidth for the gains, from the masses at home; 0: no gains", metavar="HZ"
+        0.0, "bandwidth for gains from the masses at home; 0: no gains", metavar="HZ"
     )
 
 

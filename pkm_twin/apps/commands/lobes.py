@@ -30,18 +30,20 @@ class Lobes(OfMilling, AtPose, OfTool, Writes, Draws):
     The tool turns about the platform's z axis, clockwise from above. The command prints the
     smallest limit in the range of speeds, and the spindle speed with the largest stable axial depth
     of cut if the speed may be off by 1 %. Speeds are added at lobes, minima and steep flanks of the
-    limit, and every 0.1 % within this 1 %. The machine's modes count, not the flexibility of
-    spindle, holder and tool.
+    limit, and every 0.1 % within this 1 %. Only the machine's modes are included, not the
+    flexibility of spindle, holder and tool.
 
     The table has the columns speed (rpm), depth (m) and open: 1 where the cut is stable up to the
     largest depth that was computed.
     """
 
     speeds: tuple[float, ...] = setting(..., "spindle speeds, rpm", count=2, metavar="LOW,HIGH")
-    points: int = setting(181, "even spindle speeds; more are added at lobes", low=2, high=10**5)
+    points: int = setting(
+        181, "evenly spaced spindle speeds; more are added at lobes", low=2, high=10**5
+    )
     deepest: float | None = setting(
         None,
-        "largest depth to look at, m; default: 25 times the depth that is stable at every speed",
+        "largest depth to compute, m; default: 25 times the depth that is stable at every speed",
     )
     out: Path | None = setting(
         None, "table to write, .csv, .parquet or .mat", writes=True, endings=ENDINGS
