@@ -134,18 +134,17 @@ class LimitSpec:
 class JointSpec:
     """A joint between an inner and an outer body, through the point ``at`` (m) at home.
 
-    Its number is the motion of the outer body against the inner one, along or about ``axis``, and
-    ``home`` at home (0 where left out). ``axes``: of a universal joint, the first fixed in the
-    inner body, the second in the outer one. ``lead``: how far a ``helical`` joint goes along its
-    axis in a turn, m; its number is the turn, and a left-handed thread has a lead below zero. A
-    ``translation`` is three slides along base axes, a ``planar`` joint two slides across its axis
-    and a turn about it. ``limits``: a passive joint has ``position`` and ``swivel``, which bound
-    the workspace; an actuated one all but ``swivel``.
-    ``rotor_inertia``: of the drive, reflected to the joint, inertia without weight; or ``drive``,
-    which reflects the rotor's by a gear's ``ratio`` (joints that turn) or a screw's or belt's
-    ``lead`` (joints that slide). ``compliance``: along, then about
-    u (``axis``), v (u times the base axis least along it), w (u times v); of a universal joint u
-    and v are its ``axes``, of a spherical one all are base axes.
+    Its value is how far the outer body has moved relative to the inner one, along or about
+    ``axis``; ``home`` is the value at home (default 0). A ``universal`` joint has two ``axes``, the
+    first fixed in the inner body, the second in the outer one. The value of a ``helical`` joint is
+    its turn; ``lead`` is the travel per turn, negative for a left-handed thread. A ``translation``
+    has three slides along base axes, a ``planar`` joint two slides across its axis and a turn about
+    it. ``limits``: a passive joint may have ``position`` and ``swivel``, which bound the workspace;
+    an actuated one all but ``swivel``. ``rotor_inertia`` is reflected to the joint and has no
+    weight. ``drive`` in its place has the rotor's own inertia, and the ``ratio`` of a gear (joints
+    that turn) or the ``lead`` of a screw or belt (joints that slide). ``compliance``: along u, v,
+    w, then about them. u is ``axis``, v is u times the base axis least along it, w is u times v.
+    For a universal joint u and v are its ``axes``; for a spherical one u, v, w are base axes.
     """
 
     type: str = schema.choice(*TYPES)
