@@ -46,8 +46,8 @@ def _application(
     `pkm-twin check BAG`. SI units unless an option states others, world z up. Only play,
     monitor-torques and view --live need ROS.
 
-    Exit codes: 0 good, 1 bad or invalid, 2 wrong usage, 3 damaged file, of which `recover` saves a
-    part. An error is one line on stderr. Results go to stdout, with --json as JSON only.
+    Exit codes: 0 good, 1 bad or invalid, 2 wrong usage, 3 damaged file (`recover` can save a
+    part). An error is one line on stderr. Results go to stdout, with --json as JSON only.
     """
     greet(context)
 

@@ -191,8 +191,8 @@ class ReadsMotions(ReadsRecordings):
 
     follow: str | None = setting(
         None,
-        "columns of a table that are the motion: joints, or pose, which plans it again for this "
-        "robot; default: both, which have to agree",
+        "a table's columns that are the motion: joints; or pose, planned again for this robot; "
+        "default: both, which must agree",
         choices=("joints", "pose"),
     )
 

@@ -83,8 +83,8 @@ class Calibrate(OfRobot, ReadsTables, BeyondLimitsToo, Accepts, Overwrites):
     )
     transmission: Transmission = setting(
         Transmission.AUTO,
-        "ratios of joint_map to fit: each, one shared factor, each with its change over travel, "
-        "none (file); auto: of sliding joints that have one",
+        "ratios of joint_map to fit: each; shared: one factor; travel: each and its change over "
+        "travel; file: none; auto: those that sliding joints have",
         choices={str(how): how for how in Transmission},
     )
     measure: tuple[str, ...] = setting(

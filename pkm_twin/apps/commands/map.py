@@ -58,8 +58,8 @@ class OfMap(Carries, Pages, Writes, Draws, Parallel):
     )
     singularity: float | None = setting(
         None,
-        "singularity index (0 to 1) below which a pose does not count; default: 0.05; of "
-        "`workspace` none",
+        "singularity index (0 to 1) below which a pose does not count; default: 0.05, for "
+        "`workspace` 0",
     )
     least_clearance: float = setting(
         0.0, "distance between limbs (m) below which a pose does not count"
