@@ -11,9 +11,9 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
 import pytest
-import yaml
 from hypothesis import settings
 
+from pkm_twin.mechanisms.catalogue import robot_of_data
 from test.support.command import Commands
 from test.support.robots import (  # noqa: F401
     LIMITED,
@@ -71,7 +71,6 @@ def pytest_collection_modifyitems(items):
 
 def pytest_collection_finish():
     """What is there by now stays: it is not looked through for garbage again and again."""
-    gc.collect()
     gc.freeze()
 
 
@@ -87,8 +86,8 @@ def twin(capsys):
 
 
 @pytest.fixture
-def variant(tmp_path):
-    """Load a shipped robot with some of its parameters changed: variant(name, geometry=...)."""
+def variant():
+    """Make a shipped robot with some of its parameters changed: variant(name, geometry=...)."""
 
     def make(name, **sections):
         data = parameters_of(name)
@@ -97,8 +96,6 @@ def variant(tmp_path):
                 data.setdefault(section, {}).update(values)
             else:
                 data[section] = values
-        path = tmp_path / f"{name}_variant.yaml"
-        path.write_text(yaml.safe_dump(data, sort_keys=False))
-        return load(path), data
+        return robot_of_data(data, name), data
 
     return make

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import yaml
 
 pytest.importorskip("mcap")
 from mcap.writer import Writer
@@ -200,8 +201,9 @@ class TestRobot:
         assert "'slider_1' is missing" in twin.refused("check", sample, "--robot", "prru")
 
     def test_another_robot_of_the_same_joints_is_bad(self, sample, variant, tmp_path):
-        variant("delta_cu", inertia={"platform_mass": 0.5})
-        report = checked(sample, robot=str(tmp_path / "delta_cu_variant.yaml"))
+        other = tmp_path / "other.yaml"
+        other.write_text(yaml.safe_dump(variant("delta_cu", inertia={"platform_mass": 0.5})[1]))
+        report = checked(sample, robot=str(other))
         assert report.code == 1
         assert "torque residual of arm_1" in report.answer
 

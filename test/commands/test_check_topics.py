@@ -3,6 +3,7 @@
 
 import numpy as np
 import pytest
+import yaml
 
 pytest.importorskip("mcap")
 from mcap.writer import Writer
@@ -56,7 +57,9 @@ class TestTopics:
     def test_joints_are_those_of_the_controller(self, twin, tmp_path, variant):
         """By name and number: the verdict and the table are those of the model's numbers."""
         both = sides("delta_cu")
-        variant("delta_cu", joint_map=both.data["joint_map"])
+        robot = tmp_path / "mapped.yaml"
+        changed = variant("delta_cu", joint_map=both.data["joint_map"])[1]
+        robot.write_text(yaml.safe_dump(changed))
 
         def plain(topic, message, time):
             return message if topic == JOINTS else None
@@ -76,7 +79,6 @@ class TestTopics:
 
         one = rewrite(DELTA, tmp_path / "plain.mcap", plain, seconds=0.3)
         bag = rewrite(DELTA, tmp_path / "mapped.mcap", mapped, seconds=0.3)
-        robot = tmp_path / "delta_cu_variant.yaml"
         result, expected = checked(bag, robot=str(robot)), checked(one)
         assert result.code == expected.code == 0
         kept = {what: x for what, x in items_of(expected).items() if "torque residual" in what}

@@ -5,7 +5,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.signal import lfilter
 
 from delta_dynamics import inverse_dynamics
 from pkm_twin.errors import ParameterError, PkmTwinError, UnknownNameError
@@ -105,6 +104,8 @@ def test_torque_constants_follow_from_known_masses(name, rng):
 
 
 def test_a_resonance_is_found_with_its_frequency_and_no_other(rng):
+    from scipy.signal import lfilter
+
     period, how = 1e-3, Filtering(7, (1e-6, 1e-6), 15.0, 10)
     count = 12000
     for _ in range(20):

@@ -89,10 +89,15 @@ some_robots = pytest.mark.parametrize("name", partly_long(robot_names(), *KINDS)
 """By default one of each kind."""
 
 
-def parameters_of(name: str) -> dict[str, Any]:
-    """The plain parameter mapping of a shipped robot."""
+@functools.cache
+def _read(name: str) -> dict[str, Any]:
     data: dict[str, Any] = yaml.safe_load((config_folder() / f"{name}.yaml").read_text())
     return data
+
+
+def parameters_of(name: str) -> dict[str, Any]:
+    """The plain parameter mapping of a shipped robot, the caller's own."""
+    return copy.deepcopy(_read(name))
 
 
 def without(entry: Any, *keys: str) -> Any:

@@ -1,11 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Meshes of a URDF are where its links are, in every state; unreadable ones are named."""
 
+from importlib.util import find_spec
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-pytest.importorskip("trimesh", reason="trimesh comes with viser: the extra view")
+if find_spec("trimesh") is None:
+    pytest.skip("trimesh comes with viser: the extra view", allow_module_level=True)
 
 from pkm_twin import load
 from pkm_twin.errors import RobotWarning
