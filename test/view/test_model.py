@@ -3,6 +3,7 @@
 
 from functools import cache
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -138,6 +139,17 @@ def test_a_dragged_platform_goes_where_it_can(name, rng):
             np.testing.assert_allclose(got, asked, atol=1e-6)
         position, rotation = model.robot.platform(state.q)
         assert model.to_platform(state, position + 100.0, rotation).q is state.q
+
+
+def test_zero_but_for_rounding_has_no_sign():
+    """Of a number on the page, of a link, of a slider."""
+    assert [texts.number(x) for x in (-0.0, -1e-13, 1e-13, -2.0)] == ["0", "0", "0", "-2"]
+    model = model_of("five_bar")
+    pushed = model.loaded(model.start, np.array([-0.0, 5.0, -1e-13, 0.0, 0.0, 0.0]))
+    assert model.link(pushed).endswith("load=0,5,0,0,0,0")
+    slider = SimpleNamespace(value=1.0, min=-100.0, max=100.0)
+    pytest.importorskip("pkm_twin.view.page")._put([slider], np.array([-1e-14]))
+    assert str(slider.value) == "0.0"
 
 
 def test_a_link_that_says_something_else_changes_nothing():
