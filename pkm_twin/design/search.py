@@ -323,7 +323,7 @@ def design(
     minimise: str | Sequence[str], subject_to: Sequence[str] = (), *, starts: int = STARTS,
     points: int = POINTS, seed: int = 0, progress: Callable[[int], None] = lambda _: None,
 ) -> Design:  # fmt: skip
-    """Numbers of a robot's file that make a quantity on a path least.
+    """Optimise numbers of a robot's file, for the least value of a quantity on a path.
 
     The platform's path stays the same; the joints follow it. Machines that cannot follow it are
     rejected. The search is local from several starts: an optimum that none of them leads to is not

@@ -112,7 +112,7 @@ def sweep(
     seed: int = 0, progress: Callable[[int], None] = lambda _: None,
     compute: Callable[[Box, Work], Iterable[tuple[int, Mapping[str, Array]]]] = here,
 ) -> Sweep:  # fmt: skip
-    """Quantities of machines of a box.
+    """Quantities of many machines whose numbers are within bounds.
 
     :param vary: as of :func:`pkm_twin.design.design`; also of the path.
     :param quantities: names; None: all that the robot's file and the path have data for.

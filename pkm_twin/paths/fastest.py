@@ -159,8 +159,8 @@ def fastest(
     """The shortest motion along a path, at rest at its ends, by the exact inverse dynamics.
 
     The limits hold at all times: between the points of the path the inverse dynamics checks them
-    as closely as needed (:func:`~pkm_twin.paths.motion.peaks`). Where one is passed, the path gets
-    more points, then smaller limits; where that is not enough, the whole motion slows down.
+    as closely as needed (:func:`~pkm_twin.paths.motion.peaks`). If one is exceeded, the path gets
+    more points, then smaller limits; if that is not enough, the whole motion slows down.
 
     :param robot: with the payload that it carries, ``robot.changed(payload=...)``.
     :param path: of ``paths.through``, ``lines``, ``cycle`` or ``circle``; or poses (k, m), through

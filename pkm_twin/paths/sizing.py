@@ -408,8 +408,8 @@ def size_drives(
     :param motors: candidates by name; each replaces the rotor of the robot's file.
     :param given: gears of joints without a ``drive`` in the file, one a type; the file's
         ``rotor_inertia`` is behind them.
-    :param choices: gears to choose from, one for a type, in place of the file's: for each motor
-        that whose greatest used part is least.
+    :param choices: gears to choose from, in place of the file's: of each type, every motor gets
+        the one that leaves the most margin.
     :raises ParameterError: fewer than two samples; motors for a joint without a gear; a gear for a
         joint that has one, or of another type.
     """
