@@ -175,8 +175,9 @@ def _effects(
             return _longer(robot, name, path), f"{name} longer", "m"
         case "joints", ("offset" | "backlash") as what:
             joint = graph.joints[name]
-            if not joint.actuated:
-                raise ParameterError(path, name, "an actuated joint")
+            if name not in graph.leads:
+                leads = f": {', '.join(graph.leads)} lead" if robot.redundant else ""
+                raise ParameterError(path, name, f"an actuated joint{leads}")
             size, word = (1.0, "zero") if what == "offset" else (HALF, what)
             unit_ = "m" if joint.slides else "rad"
             return {("offset", name): np.full(1, size)}, f"{word} of {name}", unit_
@@ -301,7 +302,6 @@ class Assembly:
     """
 
     def __init__(self, robot: Robot, q: Array) -> None:
-        robot.check_independent("errors of parts")
         self.robot, self.graph = robot, robot.graph
         self.at, self.size = robot.engine.tree.at, float(robot.graph.size)
         self.bodies = list(self.graph.bodies)
@@ -323,7 +323,7 @@ class Assembly:
         for joint in self.graph.joints.values():
             if joint.virtual or (only is not None and joint.name not in only):
                 continue
-            value = q[..., names.index(joint.name)] if joint.actuated else None
+            value = q[..., names.index(joint.name)] if joint.name in self.graph.leads else None
             found += self._joint(joint, placed, value, errors)
         for rod in self.graph.rods.values():
             if only is not None and rod.name not in only:

@@ -109,11 +109,15 @@ class Followed:
         """Pose rates per joint rate, shape (k, t, m, n); one where there is none."""
         found = self.many.jacobian(self.q)
         good = np.isfinite(found).all((-1, -2), keepdims=True)
-        return np.where(good, found, np.eye(found.shape[-1]))
+        return np.where(good, found, np.eye(*found.shape[-2:]))
 
     def _solved(self, right: Array) -> Array:
-        """J^-1 times vectors (k, t, m)."""
-        return _solve(self.jacobian, right)
+        """J^-1 times vectors (k, t, m); of drives that share efforts as ``inverse_jacobian``."""
+        robot = self.many.robot
+        if not robot.redundant:
+            return _solve(self.jacobian, right)
+        back = (self.jacobian / robot.effort_scale**2).swapaxes(-1, -2)
+        return np.asarray((back @ _solve(self.jacobian @ back, right)[..., None])[..., 0])
 
     @cached_property
     def qd(self) -> Array:
@@ -123,8 +127,11 @@ class Followed:
     @cached_property
     def qdd(self) -> Array:
         """Shape (k, t, n)."""
-        bent = self.many.pose_acceleration(self.q, self.qd, np.zeros_like(self.qd))
-        return self._solved(self._each(self.path.acceleration) - bent)
+        own = np.zeros_like(self.qd)
+        if self.many.robot.redundant:
+            own = self.many.agreeing(self.q, self.qd, own)[2]
+        bent = self.many.pose_acceleration(self.q, self.qd, own)
+        return own + self._solved(self._each(self.path.acceleration) - bent)
 
     @cached_property
     def efforts(self) -> Array:

@@ -38,6 +38,8 @@ KEPT: Final = 1e-6
 """Miss of a bound, over it, that counts as none."""
 SAME: Final = 1e-7
 """Relative gain below which the search ends."""
+DIFFERENCE: Final = 1e-4
+"""Steps on both sides for slopes by differences, part of a variable's range."""
 BATCH: Final = 200_000
 """Samples of all machines that are computed at a time."""
 
@@ -66,7 +68,6 @@ class Problem:
     """Machines of a box of variables (each 0 to 1) on a path."""
 
     def __init__(self, robot: Robot, variables: Variables, path: PosePath) -> None:
-        robot.check_independent("designs")
         self.robot, self.variables, self.path = robot, variables, path
         corners = variables.values(np.array([np.zeros(len(variables)), np.ones(len(variables))]))
         self._many = Variants(robot, dict(zip(variables.paths, corners.T, strict=True)))
@@ -259,7 +260,7 @@ class _Run:
         values, slopes = [], []
         many = problem.machines(y[None])
         for k, (quantity, chosen) in enumerate(zip(search._all, self.chosen, strict=True)):
-            found, by = _pieces_at(problem, quantity, chosen, many)
+            found, by = _pieces_at(problem, quantity, chosen, many, y)
             if not (np.isfinite(found).all() and np.isfinite(by).all()):
                 raise _OutsideError
             if k == 0:
@@ -278,19 +279,28 @@ class _Run:
 
 
 def _pieces_at(
-    problem: Problem, quantity: Quantity, chosen: Index, one: Variants
+    problem: Problem, quantity: Quantity, chosen: Index, one: Variants, y: Array
 ) -> tuple[Array, Array]:
-    """Chosen pieces of one machine and their slopes by the variables, shape (pieces, d)."""
-    if quantity.sampled:
-        width = quantity.width(problem.robot)
-        followed, places = Followed(one, problem.path.at(chosen // width)), chosen % width
-        found = quantity.of(followed)[0, np.arange(len(chosen)), places]
-    else:
-        followed, places = Followed(one, problem.path), chosen
-        found = quantity.pieces(followed)[0, chosen]
+    """Chosen pieces of one machine, at y, and their slopes by the variables, shape (pieces, d)."""
+    width = quantity.width(problem.robot) if quantity.sampled else 0
+    path = problem.path.at(chosen // width) if width else problem.path
+    places = chosen % width if width else chosen
+
+    def of(many: Variants) -> tuple[Followed, Array]:
+        followed = Followed(many, path)
+        if width:
+            return followed, quantity.of(followed)[:, np.arange(len(chosen)), places]
+        return followed, quantity.pieces(followed)[:, chosen]
+
+    followed, (found,) = of(one)
     if not np.isfinite(found).all():
         raise _OutsideError
-    return found, quantity.slopes(followed, places) @ problem.variables.slopes
+    if not problem.robot.redundant:
+        return found, quantity.slopes(followed, places) @ problem.variables.slopes
+    # What drives that share efforts need has no exact slopes.
+    steps = DIFFERENCE * np.eye(len(y))
+    ahead, behind = (of(problem.machines(y + side * steps))[1] for side in (1.0, -1.0))
+    return found, (ahead - behind).T / (2.0 * DIFFERENCE)
 
 
 STARTS: Final = 64

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How far errors of parts take the platform, the actuated joints held."""
+"""How far errors of parts take the platform, the actuated joints that lead held."""
 
 from __future__ import annotations
 
@@ -33,6 +33,8 @@ REGULAR: Final = 0.05
 """Least singularity index of joint states that stand for the workspace."""
 LARGEST: Final = 0.02
 """Standard deviation at most, rad, or part of the machine's extent: more is a wrong unit."""
+STAYS: Final = 1e-9
+"""Motion of the reference point that is rounding, m per rad of the platform's turn."""
 STATES: Final = 256
 """States whose bodies are solved for at a time: large tables for each."""
 
@@ -86,9 +88,19 @@ class Tolerances:
         return _root([self.part(path) for path in self.sigma])
 
     @cached_property
+    def only_turns(self) -> bool:
+        """Whether the errors turn the platform about its reference point, which stays."""
+        moves, turns = np.split(self.deviation, 2, -1)
+        return bool(np.linalg.norm(moves) < STAYS * np.linalg.norm(turns))
+
+    @cached_property
     def variance(self) -> dict[str, float]:
-        """Part of the variance of the position over all states that is each error's, 0 to 1."""
-        own = {path: float((self.part(path)[..., :3] ** 2).sum()) for path in self.sigma}
+        """Part of the variance of the position over all states that is each error's, 0 to 1.
+
+        Of the rotation where the platform's reference point stays.
+        """
+        counts = slice(3, 6) if self.only_turns else slice(0, 3)
+        own = {path: float((self.part(path)[..., counts] ** 2).sum()) for path in self.sigma}
         whole = sum(own.values())
         return {path: value / whole if whole > 0.0 else 0.0 for path, value in own.items()}
 
@@ -267,7 +279,10 @@ def drawn(
             for k, machine in enumerate(machines)
         ])  # fmt: skip
     else:
-        position, rotation = machines.platform(np.broadcast_to(states, (count, *states.shape)))
+        each = np.broadcast_to(states, (count, *states.shape))
+        if robot.redundant:
+            each = machines.agreeing(each, np.zeros_like(each), np.zeros_like(each))[0]
+        position, rotation = machines.platform(each)
         place, turn = robot.platform(states)
         turns = rotation_vector(rotation @ turn.swapaxes(-1, -2))
         found = np.concatenate([position - place, turns], -1)

@@ -173,6 +173,11 @@ class Variants:
         n = self.robot.joints_count
         return flat.reshape(*flat.shape[:-1], n, n)
 
+    def agreeing(self, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike) -> tuple[Array, Array, Array]:
+        """Shape (k, ..., n) each, see :meth:`Robot.agreeing`."""
+        first, second, third = self.run(programs.agreeing, q, qd, qdd)[0]
+        return first, second, third
+
     def forward(self, q: ArrayLike) -> Array:
         """Poses, shape (k, ..., m), see :meth:`Robot.forward`."""
         return self.run(programs.forward, q)[0][0]

@@ -275,6 +275,9 @@ def left_by_calibration(
     def slopes(rows: Array) -> Array:
         """By the numbers that it fits, and by the zeros of the joints."""
         zeros = robot.platform_jacobian(rows)
+        if robot.redundant:
+            back = robot.inverse_jacobian(rows)
+            zeros = zeros @ back @ np.linalg.inv(back[:, robot.graph.leading])
         if not paths:
             return zeros
         many = Variants(robot, {path: robot.number(path) for path in paths})

@@ -53,8 +53,9 @@ def joint_changes(
 def forward_derivatives(robot: Robot, q: ArrayLike, by: Sequence[str] = ()) -> Derivatives:
     """Derivatives of :meth:`Robot.forward`: ``state`` by q (..., m, n), ``by[path]`` (..., m).
 
-    Exact to rounding, by the implicit function theorem; the actuated joints are held where a number
-    of the file changes. Of an overconstrained machine the closures that determine it count.
+    Exact to rounding, by the implicit function theorem; the actuated joints that lead are held
+    where a number of the file changes. Of an overconstrained machine the closures that determine it
+    count.
 
     :param q: joint positions, shape (..., n), rad or m.
     :param by: dotted paths of numbers of the file, as :func:`pkm_twin.variants` takes them.
@@ -72,6 +73,8 @@ def inverse_derivatives(robot: Robot, pose: ArrayLike, by: Sequence[str] = ()) -
     :param pose: shape (..., m), m and rad.
     :raises ParameterError: a path that there is not. Other errors as of ``inverse``.
     """
+    if by:
+        robot.check_independent("derivatives by numbers of the file with the pose held")
     found = forward_derivatives(robot, robot.inverse(pose), by)
     back = robot.inverse_jacobian(robot.inverse(pose))
     return Derivatives(
@@ -130,7 +133,6 @@ def position_effects(robot: Robot, q: ArrayLike) -> Array:
 
 
 def _by_geometry(robot: Robot, q: ArrayLike, rows: Array) -> Array:
-    robot.check_independent("derivatives by numbers of the file")
     states = vectors(q, robot.joints_count, "q")[..., None, :]
     return robot.evaluate(platform_gradient(robot.engine), _NONE, states, rows)[0]
 

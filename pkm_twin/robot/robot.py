@@ -321,9 +321,13 @@ class Robot(Mechanism):
         if not self.redundant:
             return np.asarray(np.linalg.inv(jacobian), np.float64)
         # The Jacobian's transpose shares efforts by the squares of their limits.
-        limits = np.asarray(self.graph.sharing[1 : 1 + self.joints_count])
-        back = (jacobian / limits**2).swapaxes(-1, -2)
+        back = (jacobian / self.effort_scale**2).swapaxes(-1, -2)
         return np.asarray(back @ np.linalg.inv(jacobian @ back), np.float64)
+
+    @property
+    def effort_scale(self) -> Array:
+        """What efforts of drives that share are compared by, shape (n,)."""
+        return np.asarray(self.graph.sharing[1 : 1 + self.joints_count])
 
     def agreeing(
         self, q: ArrayLike, qd: ArrayLike | None = None, qdd: ArrayLike | None = None

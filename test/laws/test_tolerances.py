@@ -506,3 +506,13 @@ def test_a_zero_moves_the_platform_as_the_drive_does():
                 exact / exact[:, [np.abs(exact).max(0).argmax()]],
                 np.tile(found / found[np.abs(exact).max(0).argmax()], (3, 1)), atol=1e-3,
             )  # fmt: skip
+
+
+def test_a_platform_that_only_turns_has_shares_of_its_rotation():
+    robot = load("examples/machines/agile_eye.yaml")
+    sigma = {f"joints.motor_{k}.offset": k * 1e-4 for k in (1, 2, 3)}
+    found = tolerances(robot, sigma, robot.inverse([[0.1, -0.2, 0.0], [0.0, 0.1, 0.3]]))
+    own = {path: (found.part(path)[:, 3:] ** 2).sum() for path in sigma}
+    assert found.only_turns
+    for path, share in found.variance.items():
+        assert share == pytest.approx(own[path] / sum(own.values()), rel=1e-9)

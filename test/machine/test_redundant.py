@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.optimize import root
 
 from delta_dynamics import (
     dynamics_terms,
@@ -23,6 +24,7 @@ from delta_dynamics import (
 )
 from delta_dynamics.feedforward import Feedforward, Settings
 from pkm_twin import load
+from pkm_twin.design import PosePath, design, drawn, tolerances
 from pkm_twin.errors import (
     MessageError,
     MobilityError,
@@ -465,6 +467,85 @@ def test_exported_functions_share_alike(planar, tmp_path):
     status, found = package.run(program, "torques", q + 3e-3 * np.eye(4)[2], qd, qdd, wrench)
     assert (status == 1).all()
     assert np.isnan(found).all()
+
+
+def test_errors_of_parts_move_the_platform_with_the_leading_joints_held():
+    """Against circles that meet, by three of four limbs; machines drawn on exact geometry too."""
+    rng = np.random.default_rng(12)
+    plane = Planar(rng, 4, point=False, limits=LIMITS["unlike"][:4])
+    robot = robot_of_data(plane.file(), "plane")
+    leads = list(robot.graph.leading)
+    pose = np.array([0.01, -0.02, 0.1])
+    q = robot.inverse(pose)
+    first, second = plane.elbow - plane.base, plane.wrist - plane.elbow
+    paths = [
+        path for k in range(4) for path in
+        (f"bodies.crank_{k}.length", f"bodies.coupler_{k}.length", f"joints.motor_{k}.offset")
+        if k in leads or "offset" not in path
+    ]  # fmt: skip
+
+    def reached(errors):
+        longer = lambda kind: np.array([errors.get(f"{kind}_{k}", 0.0) for k in range(4)])  # noqa: E731
+        arm = first * (1 + longer("crank") / np.linalg.norm(first, axis=1))[:, None]
+        angle = q - plane.home + longer("motor")
+        elbow = plane.base + np.einsum("kij,kj->ki", turned(angle), arm)
+        apart = np.linalg.norm(second, axis=1) + longer("coupler")
+
+        def left(p):
+            ends = p[:2] + plane.wrist @ turned(p[2]).T
+            return (np.linalg.norm(ends - elbow, axis=1) - apart)[leads]
+
+        return root(left, pose, tol=1e-14).x
+
+    names = [path.split(".")[1] for path in paths]
+    found = tolerances(robot, dict.fromkeys(paths, 1e-4), q)
+    for path, name in zip(paths, names, strict=True):
+        slope = (reached({name: 1e-5}) - reached({name: -1e-5})) / 2e-5
+        np.testing.assert_allclose(found.sensitivity[path][[0, 1, 5]], slope, atol=1e-6)
+    draws = rng.normal(0.0, 1e-4, (400, len(paths)))
+    own = np.array([reached(dict(zip(names, row, strict=True))) for row in draws]) - pose
+    np.testing.assert_allclose(own.std(0), found.deviation[[0, 1, 5]], rtol=0.12)
+    exact = drawn(robot, dict.fromkeys(paths, 1e-4), q, 400, seed=1)[:, 0, [0, 1, 5]]
+    np.testing.assert_allclose(exact.std(0), found.deviation[[0, 1, 5]], rtol=0.12)
+    other = next(name for name in robot.joint_names if name not in robot.graph.leads)
+    with pytest.raises(ParameterError, match="lead"):
+        tolerances(robot, {f"joints.{other}.offset": 1e-4}, q)
+
+
+def test_a_number_of_the_file_is_off_with_the_leading_joints_held(planar):
+    q = planar.inverse([[0.02, -0.01, 0.1], [-0.02, 0.0, -0.1]])
+    path, step = "parameters.base_radius", 1e-5
+    placed = [
+        made.platform(made.agreeing(q)[0])[0]
+        for made in (planar.filed({path: 0.3 + side * step}) for side in (1, -1))
+    ]
+    slope = (placed[0] - placed[1]) / (2 * step)
+    found = tolerances(planar, {path: 1e-3}, q)
+    np.testing.assert_allclose(found.sensitivity[path][:, :3], slope, atol=1e-7)
+    exact = drawn(planar, {path: 1e-3}, q, 300)
+    np.testing.assert_allclose(exact[..., :3].std(0), found.deviation[:, :3], rtol=0.12, atol=1e-12)
+
+
+def test_a_design_has_less_effort_than_every_machine_of_a_grid(planar):
+    t = np.linspace(0.0, 0.5, 12)
+    size, rate = np.array([0.02, 0.015, 0.1]), np.array([9.0, 7.0, 8.0])
+    pose, speed = size * np.sin(np.outer(t, rate)), size * rate * np.cos(np.outer(t, rate))
+    change = -size * rate**2 * np.sin(np.outer(t, rate))
+    path = PosePath(t, pose, speed, change, np.tile([3.0, 0, 0, 0, 0, 0.1], (12, 1)))
+    name = "parameters.elbow_x"
+
+    def peak(value):
+        made = planar.filed({name: value})
+        q = made.inverse(pose)
+        efforts = inverse_dynamics(made, q, *joint_rates(made, q, speed, change), path.wrench)
+        return np.abs(efforts).max()
+
+    found = design(planar, {name: (0.18, 0.26)}, path, "peak-effort", starts=2).best
+    best = peak(found.numbers[name])
+    assert found.quantities["peak-effort"] == pytest.approx(best, rel=1e-9)
+    each = [peak(value) for value in np.linspace(0.18, 0.26, 7)]
+    assert 0.19 < found.numbers[name] < 0.25
+    assert best <= min(each) * (1 + 1e-6) < 0.99 * peak(0.22)
 
 
 def test_without_redundancy_nothing_moves_nothing():

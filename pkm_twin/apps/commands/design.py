@@ -394,7 +394,7 @@ def budget(given: Design) -> Report:
             given.path.name,
         )
     found = tolerances(robot, sigma, q, given.wrench)
-    left = after_calibration(robot, found, q)
+    left = {n: v.round(FILE_DIGITS) for n, v in after_calibration(robot, found, q).items()}
     shares = {
         name: sum(found.variance[path] for path in paths) for name, paths in found.together.items()
     }
@@ -421,7 +421,7 @@ def budget(given: Design) -> Report:
         Column("", text=" "),
     ]
     moves, turns = np.split(found.deviation.round(FILE_DIGITS), 2, -1)
-    most = np.linalg.norm(found.worst[:, :3], axis=-1)
+    most = np.linalg.norm(found.worst[:, :3].round(FILE_DIGITS), axis=-1)
     farthest = robot.forward(q[int(most.argmax())]).round(12) + 0.0
     worst = robot.forward(q[int(np.linalg.norm(moves, axis=-1).argmax())]).round(12) + 0.0
     at = _place(robot, worst)
@@ -462,9 +462,13 @@ def budget(given: Design) -> Report:
         bent = rms(found.deflection[..., :3])
         label = "deflection under the wrench, not in the table: RMS"
         facts.append(_length("rms_deflection_m", bent, label))
+    what = f"position {1e3 * rms(moves):.4g} mm"
+    if found.only_turns:
+        what = f"rotation {1e3 * rms(turns):.4g} mrad"
+    held = f"{', '.join(robot.graph.leads)}" if robot.redundant else "actuated joints"
     return Report(
-        f"{robot.name}: standard deviation of the platform's position {1e3 * rms(moves):.4g} mm "
-        f"RMS over {where}, {len(q)} states, actuated joints held",
+        f"{robot.name}: standard deviation of the platform's {what} RMS over {where}, "
+        f"{len(q)} states, {held} held",
         facts,
         [Table("contributions", columns, rows, head="error")],
     )
