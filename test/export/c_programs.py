@@ -24,7 +24,22 @@ from test.support.robots import has
 COMPILERS = [name for name in ("gcc", "clang") if shutil.which(name)]
 STRICT = ("-std=c++17", "-O0", "-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Werror")
 """Of C++."""
-glibc = pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="the hook is of glibc")
+ARM64 = ("aarch64-linux-gnu-gcc", "qemu-aarch64")
+"""Compiler and emulator."""
+REALTIME = next((name for k in range(29, 19, -1) if shutil.which(name := f"clang-{k}")), "")
+"""A compiler with RealtimeSanitizer."""
+blocking = pytest.mark.parametrize(
+    "watcher",
+    [
+        pytest.param("", marks=pytest.mark.skipif(
+            platform.libc_ver()[0] != "glibc", reason="the hook is of glibc"
+        )),
+        pytest.param(REALTIME, id="RealtimeSanitizer", marks=[
+            pytest.mark.long, pytest.mark.skipif(not REALTIME, reason="there is no clang 20")
+        ]),
+    ],
+)  # fmt: skip
+"""What watches calls: a hook of our own, or the compiler with RealtimeSanitizer."""
 SANITIZED = ("-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
 
 
@@ -101,12 +116,26 @@ int pthread_mutex_lock(pthread_mutex_t *m)
 __attribute__((destructor)) static void report(void) { fprintf(stderr, "%ld %ld", calls, seen); }
 """
 """Counts watched calls, and what they allocate, free and lock."""
+SANITIZER = r"""
+#include <stdio.h>
+void __rtsan_realtime_enter(void);
+void __rtsan_realtime_exit(void);
+static long calls;
+void watch(int on)
+{
+    calls += on;
+    if (on) { __rtsan_realtime_enter(); } else { __rtsan_realtime_exit(); }
+}
+__attribute__((destructor)) static void report(void) { fprintf(stderr, "%ld 0", calls); }
+"""
+"""Counts watched calls: the first one that may wait ends the program."""
 
 
-def hooked(folder: Path, call: str, program: str, *sources: str | Path) -> Path:
+def hooked(folder: Path, call: str, program: str, *sources: str | Path, watcher: str = "") -> Path:
     """A driver, in which ``call`` is watched: it writes its counts to the standard error.
 
     :param call: regular expression of an expression in ``program``, a file of C or C++.
+    :param watcher: compiler with RealtimeSanitizer; empty, the hook of this file watches.
     """
     linkage = '"C" ' if program.endswith("pp") else ""
     text = (folder / program).read_text()
@@ -114,9 +143,11 @@ def hooked(folder: Path, call: str, program: str, *sources: str | Path) -> Path:
     assert count
     changed = f"hooked_{program}"
     (folder / changed).write_text(f"extern {linkage}void watch(int);\n{watched}")
-    (folder / "hook.c").write_text(HOOK)
-    subprocess.run([COMPILERS[0], "-c", "hook.c", "-o", "hook.o"], cwd=folder, check=True)
-    compiler = ["g++", "-std=c++17"] if linkage else [COMPILERS[0], "-std=c99"]
+    (folder / "hook.c").write_text(SANITIZER if watcher else HOOK)
+    c, cpp = (watcher, watcher.replace("clang", "clang++")) if watcher else (COMPILERS[0], "g++")
+    subprocess.run([c, "-c", "hook.c", "-o", "hook.o"], cwd=folder, check=True)
+    compiler = [cpp, "-std=c++17"] if linkage else [c, "-std=c99"]
+    compiler += ["-fsanitize=realtime"] * bool(watcher)
     made = folder / "hooked"
     words = [*compiler, "-O0", changed, *map(str, sources), "hook.o", "-o", str(made), "-lm"]
     subprocess.run([*words, "-ldl"], cwd=folder, check=True)
@@ -204,6 +235,8 @@ class Package:
     def build(self, *flags: str, compiler: str = "") -> Path:
         """The driver's program with these flags; the same file for the same flags."""
         compiler = compiler or COMPILERS[0]
+        if compiler in ARM64:
+            flags = *flags, "-static"
         name = re.sub(r"\W", "_", " ".join((compiler, *flags)))
         program = self.folder / f"driver{name}"
         if not program.exists():
@@ -216,7 +249,8 @@ class Package:
         """Status (count,) and outputs side by side (count, size) of rows of inputs."""
         rows = np.ascontiguousarray(np.concatenate(inputs, 1), np.float64)
         number = list(self.heads).index(name)
-        command = [str(program), str(number), str(len(rows))]
+        emulator = ARM64[1:] if ARM64[0] in program.name.replace("_", "-") else ()
+        command = [*emulator, str(program), str(number), str(len(rows))]
         # The sanitizers' runtime has to be the first library.
         environment = {k: v for k, v in os.environ.items() if k != "LD_PRELOAD"}
         found = subprocess.run(

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import os
 import re
+import shutil
 import subprocess
 
 import numpy as np
@@ -29,11 +30,12 @@ from test.support.robots import (
 )
 
 from .c_programs import (
+    ARM64,
     COMPILERS,
     SANITIZED,
     Package,
+    blocking,
     functions,
-    glibc,
     hooked,
     inputs_of,
     watched,
@@ -74,11 +76,8 @@ def small(tmp_path_factory):
     return robot, Package(tmp_path_factory.mktemp("c"), c_package(robot))
 
 
-@pytest.mark.parametrize("count", often(200, 10_000))
-@pytest.mark.parametrize("flags", partly_long(dict.fromkeys(FLAGS), PLAIN), ids=" ".join)
-def test_numbers_are_those_of_python(exported, flags, count):
-    robot, package = exported
-    program = package.build(*flags)
+def check_numbers(robot, package, program, count):
+    """Results of a program and of Python, and that all states are valid."""
     asked = functions(robot)
     assert set(package.heads) == set(asked)
     motion = random_motion(robot, np.random.default_rng(5), count)
@@ -91,6 +90,38 @@ def test_numbers_are_those_of_python(exported, flags, count):
         assert not status.any(), name
         error = np.abs(found - right) / share
         assert error.max() <= CLOSE.get(name, 1e-12) * np.abs(right).max(), name
+
+
+def check_verdicts(robot, package, program, q):
+    """Statuses of positions, which are those of Python, and poses where Python has some."""
+    right, good = robot.try_forward(q)
+    status, found = package.run(program, "forward", q)
+    assert set(status) <= {0.0, 1.0}
+    np.testing.assert_array_equal(status == 0.0, good)
+    assert np.isnan(found[~good]).all()
+    # A state beside a singularity magnifies rounding.
+    clear = good & (robot.try_singularity(q)[0] > 1e-3)
+    np.testing.assert_allclose(found[clear], right[clear], 1e-9, 1e-9 * robot.graph.size)
+    return good
+
+
+@pytest.mark.parametrize("count", often(200, 10_000))
+@pytest.mark.parametrize("flags", partly_long(dict.fromkeys(FLAGS), PLAIN), ids=" ".join)
+def test_numbers_are_those_of_python(exported, flags, count):
+    robot, package = exported
+    check_numbers(robot, package, package.build(*flags), count)
+
+
+@pytest.mark.skipif(not all(map(shutil.which, ARM64)), reason="there is no emulated ARM64")
+@pytest.mark.parametrize("name", partly_long(robot_names(), "five_bar"))
+@pytest.mark.parametrize("flags", partly_long([PLAIN, ("-O2",)], PLAIN), ids=" ".join)
+@pytest.mark.parametrize("count", often(200, 2_000))
+def test_numbers_and_verdicts_on_an_emulated_arm64(name, flags, count, tmp_path, rng):
+    robot = loaded(name)
+    package = Package(tmp_path, c_package(robot))
+    program = package.build(*flags, compiler=ARM64[0])
+    check_numbers(robot, package, program, count)
+    check_verdicts(robot, package, program, wild(robot, rng, count))
 
 
 def wild(robot, rng, count):
@@ -118,14 +149,7 @@ def test_verdicts_are_those_of_python(exported, count, rng):
     robot, package = exported
     program = package.build(*PLAIN)
     q = wild(robot, rng, count)
-    right, good = robot.try_forward(q)
-    status, found = package.run(program, "forward", q)
-    assert set(status) <= {0.0, 1.0}
-    np.testing.assert_array_equal(status == 0.0, good)
-    assert np.isnan(found[~good]).all()
-    # A state beside a singularity magnifies rounding.
-    clear = good & (robot.try_singularity(q)[0] > 1e-3)
-    np.testing.assert_allclose(found[clear], right[clear], 1e-9, 1e-9 * robot.graph.size)
+    good = check_verdicts(robot, package, program, q)
     if not good.all():
         at_edge = edges(robot, q[~good][:100])
         status, _ = package.run(program, "forward", at_edge)
@@ -233,9 +257,9 @@ def test_nothing_undefined_happens(name, tmp_path):
         assert np.isfinite(found[status == 0.0]).all()
 
 
-@glibc
+@blocking
 @pytest.mark.parametrize("name", partly_long(NAMES, "bolted"))
-def test_no_call_allocates_or_locks(name, tmp_path, rng):
+def test_no_call_allocates_or_locks(name, watcher, tmp_path, rng):
     """In 200,000 calls with valid, impossible and infinite inputs; one that is spoilt is seen."""
     robot = robot_of(name)
     package = Package(tmp_path, c_package(robot))
@@ -245,7 +269,7 @@ def test_no_call_allocates_or_locks(name, tmp_path, rng):
     q[::97] = np.inf
     given = inputs_of(robot, (q, q, q, np.ones((count, 6))))
     call, source = r"status = \(double\)[^;]*", f"{package.prefix}.c"
-    program = hooked(tmp_path, call, "driver.c", source)
+    program = hooked(tmp_path, call, "driver.c", source, watcher=watcher)
     total = 0
     for name in asked:
         rows = np.ascontiguousarray(np.concatenate(given[name], 1))
@@ -256,8 +280,52 @@ def test_no_call_allocates_or_locks(name, tmp_path, rng):
     assert total >= 200_000
     driver = (tmp_path / "driver.c").read_text().replace("status =", "free(malloc(8)), status =")
     (tmp_path / "driver.c").write_text(driver)
-    spoilt = hooked(tmp_path, rf"free.*{call}", "driver.c", source)
-    assert watched(spoilt, q, str(list(package.heads).index("forward")), "9") == (9, 18)
+    spoilt = hooked(tmp_path, rf"free.*{call}", "driver.c", source, watcher=watcher)
+    words = str(list(package.heads).index("forward")), "9"
+    if watcher:
+        with pytest.raises(subprocess.CalledProcessError):
+            watched(spoilt, q, *words)
+    else:
+        assert watched(spoilt, q, *words) == (9, 18)
+
+
+ANALYSED = """
+#include <float.h>
+#include "__fc_builtin.h"
+#include "PREFIX.h"
+#define FILL(x) for (i = 0; i < (int)(sizeof(x) / sizeof(double)); i++) \\
+    { x[i] = Frama_C_double_interval(-DBL_MAX, DBL_MAX); }
+int main(void)
+{
+    double q[JOINTS], qd[JOINTS], qdd[JOINTS], wrench[6], tau[JOINTS];
+    int i;
+    FILL(q) FILL(qd) FILL(qdd) FILL(wrench)
+    return PREFIX_torques(q, qd, qdd, wrench, tau);
+}
+"""
+
+
+@pytest.mark.long
+@pytest.mark.skipif(not shutil.which("frama-c"), reason="there is no frama-c")
+def test_torques_of_any_finite_input_do_nothing_undefined(small):
+    """By abstract interpretation, over every number of Newton's corrections."""
+    robot, package = small
+    text = (package.folder / f"{package.prefix}.c").read_text()
+    # The analysis bounds what is compared, not what fabs is asked for: the same in other words.
+    text, found = re.subn(r"fabs\((x\[i\])\) < ([\d.]+)\)", r"\1 > -\2 && \1 < \2)", text)
+    assert found == 2
+    main = ANALYSED.replace("PREFIX", package.prefix).replace("JOINTS", str(robot.joints_count))
+    (package.folder / "main.c").write_text(main)
+    (spoilt, found) = re.subn(r"(i = 0; i <) 4;", r"\1= 4;", text)
+    assert found
+    for number, source in enumerate((text, spoilt)):
+        (package.folder / "analysed.c").write_text(source)
+        command = ["frama-c", "-eva", "-eva-precision", "1", "-warn-special-float", "none"]
+        command += [f"-cpp-extra-args=-I{package.folder}"]
+        command += [package.folder / "main.c", package.folder / "analysed.c"]
+        done = subprocess.run(command, capture_output=True, text=True, check=True)
+        assert "100% of the logical properties" in done.stdout
+        assert ("\n  0 alarms generated" in done.stdout) == (number == 0), done.stdout
 
 
 STREAM = r"""
@@ -326,11 +394,13 @@ def test_a_stream_has_the_results_of_its_samples(exported, rng):
         assert (state[1:200, 1 : 1 + n] == state[:199, 1 : 1 + n]).all(1).mean() > 0.5
 
 
-@glibc
-def test_a_stream_allocates_and_locks_nothing(small, rng):
+@blocking
+def test_a_stream_allocates_and_locks_nothing(small, watcher, rng):
     robot, package = small
     write_stream(package, robot.joints_count)
-    program = hooked(package.folder, r"status = [^;]*", "stream.c", f"{package.prefix}.c")
+    program = hooked(
+        package.folder, r"status = [^;]*", "stream.c", f"{package.prefix}.c", watcher=watcher
+    )
     rows = rng.normal(0.0, 0.3, (200_000, 3 * robot.joints_count + 6 + state_size(package)))
     assert watched(program, rows) == (len(rows), 0)
 

@@ -34,7 +34,7 @@ from test.support.robots import (
     random_motion,
 )
 
-from .c_programs import COMPILERS, STRICT, glibc, hooked, watched
+from .c_programs import COMPILERS, STRICT, blocking, hooked, watched
 
 ROS = [p for p in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep) if p]
 needs_ros2_control = pytest.mark.skipif(
@@ -205,13 +205,15 @@ class TestCore:
         np.testing.assert_allclose(effort, clipped(core, right), 0.0, scale)
         assert sound.all() and names == ["NONE"] * 30 + ["NOT_FINITE"]
 
-    @glibc
-    def test_no_update_allocates_or_locks(self, mapped, rng):
+    @blocking
+    def test_no_update_allocates_or_locks(self, mapped, watcher, rng):
         """Of 200,000, of which many are rejected."""
         _, core = mapped
         n, folder = core.n, core.program.parent
         sources = ("src/feedforward.cpp", "robot.o", "-Iinclude", "-Ic")
-        program = hooked(folder, r"const bool sound = [^;]*", "driver.cpp", *sources)
+        program = hooked(
+            folder, r"const bool sound = [^;]*", "driver.cpp", *sources, watcher=watcher
+        )
         start = core.robot.controller.controller_positions(core.robot.graph.home)
         head = np.concatenate([np.full(2 * n, 0.1), [0.1, np.inf, 1.0], start])
         rows = np.tile(start, 5) + rng.normal(0.0, 0.2, (200_000, 5 * n))
