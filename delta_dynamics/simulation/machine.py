@@ -289,9 +289,12 @@ class MachineSettings:
 def tuned(robot: Robot, bandwidth: float) -> tuple[Array, Array]:
     """Stiffness and damping of a position control, by the masses at the home pose, (n,) each.
 
+    Drives that share the effort share the masses.
+
     :param bandwidth: undamped natural frequency of each joint for itself, Hz; damped critically.
     """
     inertia = np.diag(mass_matrix(robot, robot.inverse(robot.home())))
+    inertia = inertia * robot.joints_count / len(robot.graph.leads)
     turn = 2.0 * np.pi * bandwidth
     return inertia * turn**2, 2.0 * inertia * turn
 

@@ -176,6 +176,11 @@ class Package:
                 "null_efforts", "Efforts that move nothing, of unit length over their limits, "
                 "row by row.", q, lambda: null_kernel(robot), n="efforts",
             )  # fmt: skip
+            add(
+                "agreeing", "Positions, rates and accelerations of all joints, by those that lead: "
+                f"{', '.join(robot.graph.leads)}.", rates | {"qdd": n},
+                lambda: robot.agreeing_kernel, positions="q", rates="qd", changes="qdd",
+            )  # fmt: skip
         if "terms" in self._names:
             add(
                 "terms", "Terms of the equations of motion: mass matrix, bias, energies, twists of "

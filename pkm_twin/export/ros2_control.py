@@ -32,6 +32,26 @@ GRAVITY: Final = "gravity_controller"
 TRAJECTORIES: Final = "joint_trajectory_controller"
 STOP: Final = 0.1
 """Time constant, s, of the damping of the gravity controller, by the masses at home."""
+SHARED: Final = {
+    "none idle": "  (void)q;\n  (void)n;\n  return 0;",
+    "idle": """\
+  const int status = pkm_{}_null_efforts(model_positions(q).data(), n.data());
+  for (std::size_t k = 0; k < n.size(); ++k) {{
+    n[k] /= DRIVES[k % JOINTS].factor;
+  }}
+  return status;""",
+    "straight": "  (void)q;\n  (void)qd;\n  qdd = {{}};\n  return 0;",
+    "bent": """\
+  const Vector x = model_positions(q), v = model_rates(qd), none{{}};
+  Vector positions, rates;
+  const int status = pkm_{}_agreeing(
+    x.data(), v.data(), none.data(), positions.data(), rates.data(), qdd.data());
+  for (std::size_t i = 0; i < JOINTS; ++i) {{
+    qdd[i] *= DRIVES[i].factor;
+  }}
+  return status;""",
+}
+"""Bodies of functions of the model: where drives share the effort, and where each has its own."""
 CLEAR: Final = 0.05
 """Least singularity index of the motions that the package's own test makes."""
 
@@ -50,7 +70,6 @@ def ros2_control_package(robot: Robot, bandwidth: float = 0.0) -> dict[str, str]
     """
     if bandwidth != 0.0:
         check_limit("bandwidth", bandwidth, "Hz")
-    robot.check_independent("controllers of ros2_control")
     robot.massive()
     package = package_name(robot)
     words = _words(robot, package)
@@ -109,6 +128,8 @@ def _words(robot: Robot, package: str) -> dict[str, str]:
         "MAXLENGTH": number(MAX_LENGTH),
         "START": _row(controller.controller_positions(home)),
         "RANGE": _row(steps),
+        "NULLEFFORTS": SHARED["idle" if robot.redundant else "none idle"].format(own),
+        "BENT": SHARED["bent" if robot.redundant else "straight"].format(own),
     }
 
 
@@ -125,7 +146,10 @@ def _directions(robot: Robot) -> list[int]:
     twist /= np.linalg.norm(twist, axis=0)
     choices = list(combinations(range(len(POSE)), len(names)))
     # Rounded: equals stay in their order, whatever the arithmetic.
-    sizes = [round(abs(np.linalg.det(twist[list(rows)])), 6) for rows in choices]
+    sizes = [
+        round(float(np.prod(np.linalg.svd(twist[list(rows)], compute_uv=False))), 6)
+        for rows in choices
+    ]
     return list(choices[int(np.argmax(sizes))])
 
 
@@ -168,6 +192,9 @@ def _start(robot: Robot) -> Array:
 def _range(robot: Robot, home: Array) -> Array:
     """How far every joint may go from home, all at once and in any direction, shape (n,)."""
     units = np.array([1.0 if unit == "rad" else robot.graph.size for unit in robot.joint_units])
+    if robot.redundant:
+        # Joints that move by themselves contradict each other.
+        return np.asarray(robot.graph.sharing[0] / 4.0 * units, np.float64)
     if robot.limits.position is not None:
         room = np.abs(robot.limits.position - home[:, None]).min(1)
         units = np.where(room > 0.0, np.minimum(units, room), units)

@@ -17,12 +17,13 @@ import numpy as np
 import pytest
 import yaml
 
-from delta_dynamics import inverse_dynamics, mass_matrix
+from delta_dynamics import dynamics_terms, inverse_dynamics, mass_matrix
 from pkm_twin import robot_names
 from pkm_twin.errors import ParameterError
 from pkm_twin.export.c_package import c_package
 from pkm_twin.export.ros2_control import package_name, ros2_control_package
 from pkm_twin.mechanisms.catalogue import robot_of_data
+from pkm_twin.robot.derivatives import joint_rates
 from test.support.mapped import sides
 from test.support.robots import (
     load,
@@ -244,6 +245,71 @@ class TestCore:
         assert core.run(row, both.positions(home))[1] == ["NONE"]
         _, names, effort, _ = core.run(row, both.positions(home), d=1.0)
         assert names == ["NO_STATE"] and np.isfinite(effort).all()
+
+
+SHARED = r"""
+#include <cstdio>
+#include "@/model.hpp"
+using namespace @;
+int main()
+{
+  Vector q, qd, change;
+  std::array<double, (JOINTS - FREEDOMS) * JOINTS> idle;
+  std::array<double, 6 * JOINTS> twist;
+  while (std::fread(q.data(), sizeof(double), JOINTS, stdin) == JOINTS &&
+    std::fread(qd.data(), sizeof(double), JOINTS, stdin) == JOINTS)
+  {
+    if (null_efforts(q, idle) || bent(q, qd, change) || platform_jacobian(q, twist)) { return 9; }
+    std::fwrite(idle.data(), sizeof(double), idle.size(), stdout);
+    std::fwrite(change.data(), sizeof(double), JOINTS, stdout);
+    std::fwrite(twist.data(), sizeof(double), twist.size(), stdout);
+  }
+  return 0;
+}
+"""
+
+
+@needs_compiler
+def test_drives_share_the_effort_in_the_controller_s_numbers(tmp_path):
+    """Four motors of three freedoms: efforts, and what the plugins compute velocities with."""
+    path = "examples/machines/rrr4_planar.yaml"
+    model, data = load(path), load(path).parameter_sections()
+    data["joint_map"] = {
+        f"motor_{k}": {"name": f"drive {k}", "sign": (-1) ** k, "offset": 0.1 * k, "ratio": 1.0 + k}
+        for k in (1, 2, 3, 4)
+    }
+    robot = robot_of_data(data, "four")
+    core, factors = Core(robot, tmp_path), robot.controller.factors
+    rng = np.random.default_rng(4)
+    q = model.inverse(rng.uniform(-0.03, 0.03, (40, 3)))
+    qd, qdd = joint_rates(model, q, *rng.uniform(-2, 2, (2, 40, 3)))
+    place = robot.controller.controller_positions(q)
+    motion = [place, factors * qd, factors * qdd]
+    sound, names, _, forward = core.run(np.hstack([*motion, *motion[:2]]), place[0])
+    right = inverse_dynamics(model, q, qd, qdd)
+    assert sound.all() and set(names) == {"NONE"}
+    np.testing.assert_allclose(forward * factors, right, 0.0, 1e-12 * np.abs(right).max())
+    # One motor contradicts the others: the last good position is held.
+    torn = np.hstack([*motion, *motion[:2]])[:2]
+    torn[1, 3] += factors[3] * 2e-3
+    assert core.run(torn, place[0])[1] == ["NONE", "NO_ASSEMBLY"]
+    (tmp_path / "shared.cpp").write_text(SHARED.replace("@", core.package))
+    build = ["g++", *STRICT, "-Iinclude", "-Ic", "shared.cpp", "robot.o", "-o", "shared", "-lm"]
+    subprocess.run(build, cwd=tmp_path, check=True)
+    given = np.hstack(motion[:2]).tobytes()
+    done = subprocess.run([tmp_path / "shared"], input=given, capture_output=True, check=True)
+    idle, change, twist = np.split(np.frombuffer(done.stdout).reshape(40, 32), [4, 8], 1)
+    square = np.concatenate([twist.reshape(40, 6, 4)[:, [0, 1, 5]], idle[:, None]], 1)
+    back = np.linalg.inv(square)[..., :3] / factors[:, None]
+    np.testing.assert_allclose(back, model.inverse_jacobian(q), atol=1e-9)
+    still = model.agreeing(q, qd)[2]
+    np.testing.assert_allclose(change / factors, still, atol=1e-9)
+    # As the solver splits efforts: what is left of a motion without accelerations of the leads.
+    split = dynamics_terms(model, q, qd, still).velocity
+    rest = inverse_dynamics(model, q, 0.0 * qd, 0.0 * qd)
+    moving = inverse_dynamics(model, q, qd, still) - dynamics_terms(model, q, qd, still).friction
+    inertia = np.einsum("kij,kj->ki", mass_matrix(model, q), still)
+    np.testing.assert_allclose(moving - rest - inertia, split, atol=1e-10)
 
 
 @needs_compiler

@@ -456,9 +456,13 @@ def test_exported_functions_share_alike(planar, tmp_path):
     q = planar.inverse(rng.uniform(-0.03, 0.03, (20, 3)))
     qd, qdd = joint_rates(planar, q, *rng.uniform(-2, 2, (2, 20, 3)))
     wrench = rng.uniform(-9, 9, (20, 6))
-    asked = functions(planar) | {"null_efforts": lambda q: null_efforts(planar, q).reshape(20, -1)}
+    asked = functions(planar) | {
+        "null_efforts": lambda q: null_efforts(planar, q).reshape(20, -1),
+        "agreeing": lambda *motion: np.hstack(planar.agreeing(*motion)),
+    }
     assert set(package.heads) == set(asked)
-    given = inputs_of(planar, (q, qd, qdd, wrench)) | {"null_efforts": (q,)}
+    given = inputs_of(planar, (q, qd, qdd, wrench))
+    given |= {"null_efforts": (q,), "agreeing": (q, qd, qdd)}
     for name, ask in asked.items():
         status, found = package.run(program, name, *given[name])
         right = ask(*given[name])

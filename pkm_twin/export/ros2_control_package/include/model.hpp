@@ -100,6 +100,18 @@ inline int platform_jacobian(const Vector & q, std::array<double, 6 * JOINTS> & 
   return status;
 }
 
+/// Efforts that move nothing, row by row: no motion of the machine has power in them.
+inline int null_efforts(const Vector & q, std::array<double, (JOINTS - FREEDOMS) * JOINTS> & n)
+{
+@NULLEFFORTS@
+}
+
+/// Accelerations of a motion in which the joints that lead have none: zero where all lead.
+inline int bent(const Vector & q, const Vector & qd, Vector & qdd)
+{
+@BENT@
+}
+
 /// Parameters of another payload: mass (kg), com (m) from the reference point, inertia (kg m2)
 /// about the com, row by row.
 inline int payload_parameters(

@@ -11,7 +11,7 @@
 
 namespace @PACKAGE@
 {
-constexpr std::size_t JOINTS = @MACRO@_JOINTS;
+constexpr std::size_t JOINTS = @MACRO@_JOINTS, FREEDOMS = @MACRO@_POSE;
 using Vector = std::array<double, JOINTS>;
 using Parameters = std::array<double, @MACRO@_PARAMETERS>;
 /// What one sample of a stream leaves to the next; zeros before the first one.
@@ -36,7 +36,7 @@ constexpr std::array<Drive, JOINTS> DRIVES{{
 }};
 
 /// Rows of the twist (x y z, then rotations about them) in which the joints move the platform.
-constexpr std::array<std::size_t, JOINTS> POSE{@POSE@};
+constexpr std::array<std::size_t, FREEDOMS> POSE{@POSE@};
 
 struct Payload
 {

@@ -56,8 +56,15 @@ public:
     const Eigen::VectorXd & joint_positions, const Eigen::VectorXd & joint_velocities) const
   override
   {
-    return getTorques(joint_positions, joint_velocities, Eigen::VectorXd::Zero(COUNT)) -
-           getGravityVector(joint_positions);
+    Vector change;
+    judge(bent(taken(joint_positions), taken(joint_velocities), change));
+    const Eigen::VectorXd own = given(change);
+    Eigen::VectorXd result =
+      getTorques(joint_positions, joint_velocities, own) - getGravityVector(joint_positions);
+    if (JOINTS > FREEDOMS) {
+      result -= getInertiaMatrix(joint_positions) * own;
+    }
+    return result;
   }
 
   Eigen::VectorXd getGravityVector(const Eigen::VectorXd & joint_positions) const override

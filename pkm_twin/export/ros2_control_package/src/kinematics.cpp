@@ -15,13 +15,13 @@
 
 namespace @PACKAGE@
 {
-constexpr int COUNT = static_cast<int>(JOINTS);
+constexpr int COUNT = static_cast<int>(JOINTS), MOBILE = static_cast<int>(FREEDOMS);
 constexpr double LEAST_PIVOT = 1e-9;
 
 /// The platform as the end effector of the actuated joints.
 ///
-/// Twists are those of the platform's reference point in base axes. A machine of n joints moves in
-/// n directions: those that its pose names. Cartesian differences in other directions follow from
+/// Twists are those of the platform's reference point in base axes. A machine of m
+/// freedoms moves in m directions: those that its pose names. Cartesian differences in other directions follow from
 /// these and are ignored by the inverse.
 class Kinematics : public kinematics_interface::KinematicsInterface
 {
@@ -172,7 +172,11 @@ private:
     const Eigen::VectorXd & joint_pos, const std::string & link_name, Inverse & inverse) const
   {
     Jacobian jacobian;
-    if (link_name != tip_ || !differentiate(joint_pos, link_name, jacobian)) {
+    Vector q;
+    std::array<double, (JOINTS - FREEDOMS) * JOINTS> idle;
+    if (link_name != tip_ || !differentiate(joint_pos, link_name, jacobian) ||
+      !take(joint_pos, q) || null_efforts(q, idle) != 0)
+    {
       return false;
     }
     // Equilibrated: metres and radians, motors and joints have sizes of their own.
@@ -180,7 +184,10 @@ private:
     Eigen::Matrix<double, COUNT, 1> columns;
     for (int j = 0; j < COUNT; ++j) {
       for (int i = 0; i < COUNT; ++i) {
-        square(i, j) = jacobian(static_cast<int>(POSE[static_cast<std::size_t>(i)]), j);
+        // Of drives that share the effort, velocities that belong to a motion.
+        square(i, j) = i < MOBILE ?
+          jacobian(static_cast<int>(POSE[static_cast<std::size_t>(i)]), j) :
+          idle[static_cast<std::size_t>((i - MOBILE) * COUNT + j)];
       }
       columns[j] = square.col(j).norm();
     }
@@ -201,7 +208,7 @@ private:
     const Eigen::Matrix<double, COUNT, COUNT> found = columns.cwiseInverse().asDiagonal() *
       lu.inverse() * rows.cwiseInverse().asDiagonal();
     inverse.setZero();
-    for (int i = 0; i < COUNT; ++i) {
+    for (int i = 0; i < MOBILE; ++i) {
       inverse.col(static_cast<int>(POSE[static_cast<std::size_t>(i)])) = found.col(i);
     }
     return true;
