@@ -13,9 +13,10 @@ from typing import Any, Final
 import numpy as np
 import scipy  # type: ignore[import-untyped]  # its parts come when they are asked for
 
-from delta_dynamics import inverse_dynamics, torque_deviation
+from delta_dynamics import torque_deviation
 from pkm_twin.codegen.arrays import Array, Mask
 from pkm_twin.errors import PkmTwinError, SingularityError, UnreachableError, one_line
+from pkm_twin.identification.causes import agrees, cause_of
 from pkm_twin.identification.compare import (
     LEAST,
     MAX_RESIDUAL,
@@ -30,18 +31,17 @@ from pkm_twin.identification.compare import (
     step_fault,
     steps_in,
 )
-from pkm_twin.identification.plausible import held_payload, wrenches
 from pkm_twin.identification.samples import usual_size
-from pkm_twin.recordings import Load, Recording
+from pkm_twin.recordings import Recording
 from pkm_twin.report import Fact, Verdict, judged
 from pkm_twin.robot.limits import ranges
 from pkm_twin.robot.plausibility import why_no_torques
-from pkm_twin.robot.robot import Robot
 from pkm_twin.streams.drives import COUNT, SAME
 from pkm_twin.streams.rates import BLOCK, STANDS, STEPS, RateAgreement, likely_cause, rms
 from pkm_twin.streams.rest import SIGMAS, noise
 from pkm_twin.streams.steps import GAP, Steps
 
+REJECTED: Final = "messages that a node rejects"
 POSITION_STEPS: Final = "position steps"
 VELOCITIES: Final = "velocities"
 RESIDUAL: Final = "torque residual"
@@ -49,6 +49,8 @@ MEASURED: Final = "measured efforts"
 COMPARED: Final = "compared efforts"
 IDLE: Final = "drives off or braked"
 COMPUTED: Final = "the efforts of this table are the model's; expected columns JOINT.measured"
+ROUNDING: Final = 1e-9
+"""Residual, part of the peak, that no measurement leaves."""
 STUCK: Final = 0.05
 """Time for which a signal stays the same before it counts as stuck, s,"""
 TICKS: Final = 10.0
@@ -101,6 +103,8 @@ class Checked:
             return f"nothing contradicts {r.robot.name}"
         part = c.rms / np.maximum(c.peak, 1e-12)
         worst = int(part.argmax())
+        if part[worst] < ROUNDING:
+            return f"the efforts are those that {r.robot.name} computes, none is measured"
         size = f"{100 * part[worst]:.2g} % of the peak effort of {r.robot.joint_names[worst]}"
         return f"the efforts agree with {r.robot.name}, largest residual {size}"
 
@@ -174,7 +178,7 @@ def _file(r: Recording) -> list[Fact]:
     value = f"{refused} of {total}" + (f" ({reasons}; first: {r.first_reject})" if refused else "")
     return [
         judged("file", text, "complete and consistent", False if report.miscounts else whole),
-        judged("messages that a node rejects", value, "at most 0 %", not refused),
+        judged(REJECTED, value, "at most 0 %", not refused, number=refused, limit=0),
     ]
 
 
@@ -185,12 +189,20 @@ def _motion(r: Recording, steps: Steps) -> list[Fact]:
     periods = np.diff(r.time)
     median, longest = float(np.median(periods)), float(periods.max())
     gap = f"{1e3 * longest:.3f} ms at {r.time[int(periods.argmax())]:.3f} s"
-    within = MAX_GAP * median
+    within, rate = MAX_GAP * median, f"{1 / median:.1f} Hz over {r.time[-1]:.3f} s"
     fault = step_fault(r, steps)
     items = [
-        judged("rate", f"{1 / median:.1f} Hz over {r.time[-1]:.3f} s", "", True),
+        judged("rate", rate, "", True, number=1 / median, unit="Hz"),
         missing_samples(r.time),
-        judged("longest gap", gap, f"at most {1e3 * within:.3f} ms", longest <= within),
+        judged(
+            "longest gap",
+            gap,
+            f"at most {1e3 * within:.3f} ms",
+            longest <= within,
+            number=longest,
+            limit=within,
+            unit="s",
+        ),
         judged(POSITION_STEPS, fault or "no jumps", "within rates and limits", not fault),
     ]
     return items if r.qd is None or steps.publishers else items + _velocities(r, r.qd, steps)
@@ -249,7 +261,9 @@ def _velocities(r: Recording, qd: Array, steps: Steps) -> list[Fact]:
     ]
     worst = int(np.argmax(part))
     value = ", ".join(texts) or f"{100 * part[worst]:.2g} %, {names[worst]}"
-    return [judged(VELOCITIES, f"RMS difference {value}", bound, not texts)]
+    number = float(part[worst])
+    text = f"RMS difference {value}"
+    return [judged(VELOCITIES, text, bound, not texts, number=number, limit=MAX_RATE)]
 
 
 def _limits(r: Recording) -> list[Fact]:
@@ -265,7 +279,9 @@ def _limits(r: Recording) -> list[Fact]:
         worst = {u: max(x for x, v in zip(used, units, strict=True) if v == u) for u in units}
         margins = ", ".join(f"{0.0 - most:.4g} {unit}" for unit, most in worst.items())
         good = bool((used <= 0).all())
-        items.append(judged(f"{what} limits", f"least margin {margins}", "0 or more", good))
+        text, only = f"least margin {margins}", [(0.0 - most, unit) for unit, most in worst.items()]
+        least = {"number": only[0][0], "limit": 0.0, "unit": only[0][1]} if len(only) == 1 else {}
+        items.append(judged(f"{what} limits", text, "0 or more", good, **least))
     return items
 
 
@@ -278,7 +294,8 @@ def _singularity(r: Recording) -> Fact:
         return judged(what, str(error), bound, False)
     worst = int(measure.argmin())
     value = f"{measure[worst]:.4f} at {r.time[worst]:.3f} s"
-    return judged(what, value, bound, bool(measure[worst] >= MIN_SINGULARITY))
+    least = float(measure[worst])
+    return judged(what, value, bound, least >= MIN_SINGULARITY, number=least, limit=MIN_SINGULARITY)
 
 
 def _shares(r: Recording, idle: Mask, compared: Compared | None) -> tuple[list[Fact], str]:
@@ -290,10 +307,11 @@ def _shares(r: Recording, idle: Mask, compared: Compared | None) -> tuple[list[F
     if idle.any():
         seconds = float(np.sum(np.gradient(r.time)[idle])) if len(r.time) > 1 else 0.0
         text = f"{seconds:.3f} s of {total:.3f} s, left out: efforts zero or constant at standstill"
-        items.append(judged(IDLE, text, "some efforts measured", enough or None))
+        some = "some efforts measured"
+        items.append(judged(IDLE, text, some, enough or None, number=seconds, unit="s"))
     text = f"{100 * share:.3g} % of {len(r.time)} samples"
     bound = f"at least {100 * MIN_COMPARED:g} %"
-    items.append(judged(COMPARED, text, bound, enough or None))
+    items.append(judged(COMPARED, text, bound, enough or None, number=share, limit=MIN_COMPARED))
     if enough:
         return items, ""
     near, within = near_change(r)
@@ -371,10 +389,11 @@ def _residuals(
         if not good[i]:
             text += f"; largest {worst[i]:.4g} {unit} at {at[i]:.3f} s"
             text += f", begins at {begins:.3f} s" if begins is not None else ""
-        items.append(judged(f"{RESIDUAL} of {name}", text, bound, bool(good[i])))
+        told = {"number": float(c.rms[i]), "limit": float(c.limit[i]), "unit": unit}
+        items.append(judged(f"{RESIDUAL} of {name}", text, bound, bool(good[i]), **told))
     if good.all() and abs(c.late) > 0.1 * c.period:
         late = f"{1e3 * abs(c.late):.3g} ms {'late' if c.late > 0.0 else 'early'}, taken out"
-        items.append(judged("efforts against positions", late, "", True))
+        items.append(judged("efforts against positions", late, "", True, number=c.late, unit="s"))
     return items
 
 
@@ -398,10 +417,6 @@ def _bands(r: Recording, c: Compared) -> dict[str, dict[str, Any]]:
     }
 
 
-SPANS: Final = 50
-"""Most times that a payload is picked."""
-LIGHTEST: Final = 1e-3
-"""Part of the machine's mass below which a payload is none."""
 BEFORE: Final = 0.2
 """Part of a recording that agrees before something else acts on the machine,"""
 MOVED: Final = 0.5
@@ -437,66 +452,15 @@ def _causes_of(found: Checked, thorough: bool) -> Explained:
     # Of positions that are none the efforts say nothing.
     if {POSITION_STEPS, VELOCITIES, MEASURED} & set(bad) or c is None or c.good.all():
         return (), ()
-    for text, other, without in _explanations(r, c, found.left_out):
-        if _agrees(other, without, c.bound):
-            return (text,), ()
+    cause = cause_of(r, c, found.left_out)
+    if cause is not None:
+        return (cause.text,), ()
     causes = _saturated(r, c) or tuple(
-        text for text, after in _contact(r, c) if _agrees(r, found.left_out | after, c.bound)
+        text for text, after in _contact(r, c) if agrees(r, found.left_out | after, c.bound)
     )
     if causes or not thorough:
         return causes, ()
     return _of_fit(found, c.bound)
-
-
-def _agrees(r: Recording, without: Mask, bound: float) -> bool:
-    try:
-        compared = compared_of(r, without, bound)
-    except (PkmTwinError, ValueError):
-        return False
-    return compared is not None and bool(compared.good.all())
-
-
-def _explanations(
-    r: Recording, c: Compared, left_out: Mask
-) -> Iterator[tuple[str, Recording, Mask]]:
-    """The recording without each fault that it may have, and the samples that are left out then."""
-    assert r.effort is not None  # noqa: S101
-    turned = ~c.good & (np.sum(c.measured * c.expected, 0) < 0.0)
-    if turned.any():
-        names = ", ".join(np.array(r.robot.joint_names)[turned].tolist())
-        effort = r.effort * np.where(turned, -1.0, 1.0)
-        yield f"efforts of {names} have the opposite sign", replace(r, effort=effort), left_out
-    for text, wrench in wrenches(r):
-        yield text, replace(r, wrench=wrench), left_out
-    for text, load in _payloads(r, c) if r.load is None else ():
-        near, _ = near_change(r, load)
-        # On these samples the efforts do not agree without it.
-        if not near.any() or not _agrees(r, left_out | near, c.bound):
-            yield text, replace(r, load=load), left_out | near
-
-
-def _payloads(r: Recording, c: Compared) -> Iterator[tuple[str, Load]]:
-    """The payload that explains most, while it is held."""
-
-    def more(robot: Robot, *motion: Array) -> Array:
-        heavy = robot.changed(payload={"mass": robot.payload.mass + 1.0})
-        return inverse_dynamics(heavy, *motion) - inverse_dynamics(robot, *motion)
-
-    try:
-        columns = [by_held(r, more, t.time, *t.joints, t.wrench) for t in c.tracks]
-    except PkmTwinError:
-        return
-    weight = 1.0 / c.limit**2
-    mass, spans, held = held_payload(c.time, c.filtered(columns), c.residual, weight)
-    total = sum(body.mass for body in r.robot.graph.bodies.values())
-    if not mass > LIGHTEST * total or len(spans) > SPANS:
-        return
-    times = () if held.all() else tuple(spans)
-    load = Load(float(f"{r.robot.payload.mass + mass:.3g}"), None, times)
-    text = f"a payload of {load.mass:g} kg explains the efforts: use --payload {load.mass:g}"
-    if times:
-        text += " --load-times " + ",".join(f"{edge:.2f}" for pair in times for edge in pair)
-    yield text, load
 
 
 def _contact(r: Recording, c: Compared) -> Iterator[tuple[str, Mask]]:
@@ -546,21 +510,18 @@ def _saturated(r: Recording, c: Compared) -> tuple[str, ...]:
 def _of_fit(found: Checked, bound: float) -> Explained:
     """Whether other friction, or all that a fit varies, explains the efforts; else its findings."""
     from pkm_twin.identification.fit import fit
-    from pkm_twin.identification.friction_laws import fit_with_laws
+    from pkm_twin.identification.friction_laws import fit_recordings
 
     r = found.recording
-    recorded = recorded_of(r, found.left_out)
     try:
-        first = fit(r.robot, [recorded], ("friction",), accept=True)
-        if first.accepted:
-            return (), (first.accepted[0].removeprefix(f"{recorded.name}: "),)
+        first = fit(r.robot, [recorded_of(r, found.left_out)], ("friction",), accept=True)
         rubbing = r.robot.filed({one.name: one.after for one in first.numbers})
-        if _agrees(replace(r, robot=rubbing), found.left_out, bound):
+        if not first.accepted and agrees(replace(r, robot=rubbing), found.left_out, bound):
             return ("friction other than the file's explains the efforts: `pkm-twin fit`",), ()
-        last = fit_with_laws(r.robot, [recorded], accept=True)[0]
+        last, *_ = fit_recordings(r.robot, [r], accept=True)
         verdict = last.verdict
         if last.accepted:
-            return (), (last.accepted[0].removeprefix(f"{recorded.name}: "),)
+            return (), (last.accepted[0].removeprefix(f"{r.name}: "),)
     except (PkmTwinError, ValueError, np.linalg.LinAlgError):
         return (), ()
     if verdict.answer == "explains":

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -224,13 +224,15 @@ def missing_samples(time: Array) -> Fact:
 
     :param time: rising, shape (k,), k 2 or more, s.
     """
-    sampling, good = sampling_of(time), None
+    sampling, good, numbers = sampling_of(time), None, dict[str, Any]()
     text = "the samples have no common period"
     if sampling.missing is not None:
         share = sampling.missing / sampling.expected
         text, good = f"{sampling.missing} of {sampling.expected}", share <= MAX_MISSING
+        numbers = {"number": share, "limit": MAX_MISSING}
         text += f" ({100 * share:.3g} %)" if sampling.missing else ""
-    return judged("missing samples", text, f"at most {100 * MAX_MISSING:g} %", good)
+    bound = f"at most {100 * MAX_MISSING:g} %"
+    return judged("missing samples", text, bound, good, **numbers)
 
 
 def step_fault(r: Recording, steps: Steps | None = None) -> str:

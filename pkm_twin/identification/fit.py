@@ -15,9 +15,10 @@ import numpy as np
 
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import PkmTwinError
+from pkm_twin.identification.causes import number_that_explains
 from pkm_twin.identification.estimation import Estimate, nearest, possible
 from pkm_twin.identification.identifiable import KINDS, Kind
-from pkm_twin.identification.judge import Verdict
+from pkm_twin.identification.judge import SIGMAS, Verdict
 from pkm_twin.identification.parameters import (
     FileParameters,
     Number,
@@ -25,9 +26,9 @@ from pkm_twin.identification.parameters import (
     numbers_of_group,
 )
 from pkm_twin.identification.plausible import recording_fault
-from pkm_twin.identification.rows import Problem, next_window
+from pkm_twin.identification.rows import Problem, Rows, next_window
 from pkm_twin.identification.samples import EXACT, Filtering
-from pkm_twin.identification.suspects import scaled_efforts, verdict_of
+from pkm_twin.identification.suspects import OFF, scaled_efforts, verdict_of
 from pkm_twin.recordings import Recording
 from pkm_twin.robot.robot import Robot
 
@@ -133,7 +134,7 @@ def fit(
         cannot have made.
     """
     problem = Problem.of(robot, recordings, what, progress=progress)
-    faults = faults_of(problem)
+    faults = [fault for made in problem.whole for fault in _faults(made)]
     refuse_faults(faults, accept)
     problem.check_count()
     faults = faults or _worse(problem)
@@ -186,10 +187,13 @@ def fitted(
     )  # fmt: skip
 
 
-def faults_of(problem: Problem) -> list[str]:
-    """Recordings that this machine cannot have made, in words."""
-    found = ((made.recording.name, recording_fault(made)) for made in problem.whole)
-    return [f"{name}: {fault}" for name, fault in found if fault is not None]
+def _faults(made: Rows) -> list[str]:
+    """Why this machine cannot have made a recording: no more than the number that explains it."""
+    cause = number_that_explains(replace(made.recording, robot=made.model.robot))
+    fault = recording_fault(made) if cause is None else cause.text
+    if cause is not None and abs(np.log(cause.scale)) < np.log1p(SIGMAS * OFF):
+        return []
+    return [] if fault is None else [f"{made.recording.name}: {fault}"]
 
 
 def _worse(problem: Problem) -> list[str]:

@@ -18,6 +18,7 @@ import numpy as np
 
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import BagError, ParameterError, PkmTwinError, UnknownNameError
+from pkm_twin.identification.causes import number_that_explains
 from pkm_twin.identification.compare import missing_samples, recorded_of, step_fault
 from pkm_twin.identification.drives import FIT, fitted_constants, given_constants
 from pkm_twin.identification.fit import Fit, fit, fitted, refuse_faults
@@ -159,7 +160,7 @@ def fit_recordings(
     """Fit recordings as they are read, as ``check`` takes them.
 
     Where a payload is fitted, that of the recordings is the one to start from, and says when it is
-    held.
+    held. Without one, that which explains the efforts is it.
 
     :param constant: of recordings of motor currents: N m or N per ampere, one number or one a joint
         with commas, or ``fit``, by the file's masses. ``laws``, ``accept``, ``progress`` and errors
@@ -183,6 +184,13 @@ def fit_recordings(
             gaps = missing_samples(r.time)
             notes.append(f"{r.name}: {gaps.text} {gaps.value}, {gaps.bound}: {gaps.verdict}")
     made = [recorded_of(r) for r in recordings]
+    for k, r in enumerate(made):
+        own = replace(r, robot=robot)
+        cause = None if constant is not None else number_that_explains(own)
+        if cause is not None and cause.recording.load is not None and r.load is None:
+            notes.append(f"{r.name}: {cause.text}")
+            # Of several recordings each has another estimate.
+            made[k] = cause.recording if len(made) == 1 and "payload" in what else r
     if "payload" in what:
         loads = [r.load for r in made if r.load is not None]
         # Two payloads are not one section of a file.

@@ -511,7 +511,7 @@ def _efforts(case: Case, joints: Sequence[str]) -> Iterator[tuple[str, Case, flo
         if not 1.0 / RANGE <= factor <= RANGE:
             names = _listed([j for j, one in zip(joints, which, strict=True) if one > 0.0], n)
             price = UNIT if factor > 0.0 else RARE + UNIT
-            yield _scale_text(names, 1.0 / factor), scaled(likely), price
+            yield scale_text(names, 1.0 / factor), scaled(likely), price
     orders = [(f"efforts of {joints[i]} and {joints[k]} are exchanged", _swap(n, i, k))
               for i, k in combinations(range(n), 2)]  # fmt: skip
     if n > 2:
@@ -578,13 +578,16 @@ def _delays(case: Case, joints: Sequence[str]) -> Iterator[tuple[str, Case]]:
         yield text, replace(case, effort=effort, late=change, **cut)
 
 
-def _scale_text(names: str, scale: float) -> str:
+def scale_text(names: str, scale: float, masses: float | None = None) -> str:
+    """Efforts of another scale, in words, or masses so many times as large."""
     sign = " and of the wrong sign" if scale < 0.0 else ""
+    alike = "; or all masses are {:.3g} times the file's, the recording cannot tell"
+    alike = "" if masses is None else alike.format(masses)
     near = sorted(UNITS, key=lambda unit: abs(np.log(abs(scale) / UNITS[unit])))[0]
     unit = f" ({near}?)" if 1.0 / LIKE_A_UNIT < abs(scale) / UNITS[near] < LIKE_A_UNIT else ""
     return (
         f"efforts of {names} are {abs(scale):.3g} times what the robot's file makes of the motion"
-        f"{sign}: units? N m and N{unit}"
+        f"{sign}: units? N m and N{unit}" + alike
     )
 
 

@@ -33,6 +33,7 @@ from pkm_twin.identification.judge import (
     judge,
 )
 from pkm_twin.identification.parameters import FileParameters
+from pkm_twin.identification.plausible import scale_text
 from pkm_twin.identification.rows import BLOCK, Problem, Rows
 from pkm_twin.identification.samples import Resonance, by_blocks
 from pkm_twin.machine.friction import turning_keys
@@ -309,54 +310,35 @@ def _simpler(verdict: Verdict, frozen: Verdict) -> Verdict:
 def scaled_efforts(problem: Problem, verdict: Verdict) -> str | None:
     """Efforts that are scaled beyond what a drive's constant may be off by, in words; or None.
 
-    A heavier machine has the friction of its file. Efforts of another scale do not: they need
-    friction, rotors and masses that are all the same multiple of the file's. Without friction in
-    the file, a gain that explains the efforts and heavier masses look alike.
+    A heavier machine has the friction of its file, efforts of another scale do not. Without
+    friction in the file both look alike.
     """
     gains = [one for one in verdict.findings if one.suspect.kind == GAIN and one.size < 1.0]
     gains = [g for g in gains if abs(g.size) > SIGMAS * np.hypot(OFF, g.deviation)]
+    if not gains:
+        return None
     if set(problem.what) != set(KINDS):
         # A payload, or other masses, may be what is there.
         whole = replace(problem, what=KINDS)
-        return scaled_efforts(whole, verdict_of(whole)) if gains else None
-    known = _factors(problem)
-    rubs = known.get("friction")
-    if gains:
-        factor, where = 1.0 / (1.0 - gains[0].size), gains[0].suspect.where
-        if where == ALL and rubs is not None and abs(rubs[0] - 1.0) < abs(rubs[0] - factor):
-            return None
-    elif rubs is not None and len(known) > 1:
-        each, deviations = np.array(list(known.values())).T
-        weights = 1.0 / (deviations**2 + OFF**2)
-        factor, where = float(weights @ each / weights.sum()), ALL
-        alike = weights @ (each - factor) ** 2 < HINT**2
-        if not alike or not abs(1.0 - 1.0 / factor) > SIGMAS * OFF:
-            return None
-    else:
+        return scaled_efforts(whole, verdict_of(whole))
+    factor, where = 1.0 / (1.0 - gains[0].size), gains[0].suspect.where
+    if where != ALL:
+        return scale_text(where, factor)
+    rubs = _friction(problem)
+    if rubs is not None and abs(rubs - 1.0) < abs(rubs - factor):
         return None
-    told = f"efforts scaled by {factor:.2g} ({'all drives' if where == ALL else where})"
-    told += f", a drive's constant is within {100 * SIGMAS * OFF:.2g} %"
-    if where == ALL and rubs is None:
-        told += f"; or all masses are {factor:.2g} times the file's, the recordings cannot tell"
-    return told
+    return scale_text("all joints", factor, None if rubs is not None else factor)
 
 
-def _factors(problem: Problem) -> dict[str, tuple[float, float]]:
-    """How many times the file's the fitted numbers are, by kind, with standard deviations.
-
-    Where the recordings tell it: friction, rotors, and all masses together.
-    """
-    kinds = [g.kind for g in problem.everything.groups for _ in g.names]
-    alike = np.array(["inertia" if kind == "payload" else kind for kind in kinds])
-    file, e, found = problem.everything.values, problem.estimate, {}
-    for kind in ("friction", "rotor", "inertia"):
-        some = (alike == kind) & (file != 0.0) & problem.chosen
-        own, rows = file[some], np.flatnonzero(some[problem.chosen])
-        known = np.linalg.pinv(e.covariance[np.ix_(rows, rows)], hermitian=True) @ own
-        sure = float(known @ own)
-        if sure > CLEAR**-2:
-            found[kind] = float(known @ problem.values[some]) / sure, float(sure**-0.5)
-    return found
+def _friction(problem: Problem) -> float | None:
+    """How many times the file's the fitted friction is; None where the recordings do not tell."""
+    file, e, chosen = problem.everything.values, problem.estimate, problem.chosen
+    kinds = np.array([g.kind for g in problem.everything.groups for _ in g.names])
+    some = (kinds == "friction") & (file != 0.0) & chosen
+    rows = np.flatnonzero(some[chosen])
+    known = np.linalg.pinv(e.covariance[np.ix_(rows, rows)], hermitian=True) @ file[some]
+    sure = float(known @ file[some])
+    return float(known @ problem.values[some]) / sure if sure > CLEAR**-2 else None
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,20 +3,23 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from delta_dynamics import inverse_dynamics
 from pkm_twin import Robot
 from pkm_twin.errors import PkmTwinError
 from pkm_twin.identification.check import check, recorded_of
 from pkm_twin.identification.compare import compare
 from pkm_twin.identification.fit import Fit, fit
+from pkm_twin.identification.friction_laws import fit_recordings
 from pkm_twin.recordings import Recording
 from pkm_twin.streams.rates import rms
 from test.identification.machines import IMPOSSIBLE, WRONG, machine, noisy, shifted
-from test.support.robots import load
+from test.support.robots import load, partly_long
 
 MACHINES = (
     "delta", "delta_cu", "five_bar", "linear_delta", "prru", "rps3", "stewart",
@@ -96,6 +99,40 @@ def test_drives_that_are_off_before_the_motion_are_left_out_of_both() -> None:
     assert check(recorded).answer == "good"
     result = fit(m.robot, [recorded_of(recorded)], ("friction", "payload"))
     assert result.verdict.answer == "explains"
+
+
+@pytest.mark.parametrize("name", partly_long(MACHINES, "delta_cu"))
+def test_fit_and_check_name_one_cause(name: str) -> None:
+    """The scale of all drives or of one, and a payload that is held throughout, in noise of 1 %."""
+    m = machine(load(path_of(name)), np.random.default_rng([3, *name.encode()]), 8.0, 200.0)
+    rubs = {key: getattr(m.truth.friction, key).tolist() for key in ("viscous", "coulomb")}
+    robot, rng = m.robot.changed(friction=rubs), np.random.default_rng(8)
+    m = replace(m, robot=robot)
+    sound = noisy(m.recorded(effort=inverse_dynamics(robot, m.q, m.qd, m.qdd)), rng)
+    assert check(sound).answer == "good"
+    whole, one = np.ones(robot.joints_count), np.eye(robot.joints_count)[0]
+    for factor in (0.5, 0.8, 1.25, 2.0):
+        for which in (whole, one):
+            made = replace(sound, effort=sound.effort * factor**which)
+            (cause,) = check(made).causes
+            told = re.search(r"efforts of (.*) are (.*) times what", cause)
+            assert told is not None and ("all" in told[1]) == bool(which.all())
+            assert float(told[2]) == pytest.approx(factor, rel=0.02)
+            with pytest.raises(PkmTwinError, match=re.escape(cause)):
+                fit_recordings(robot, [made])
+    for mass in (0.2, 5.0):
+        mass += robot.payload.mass
+        heavy = robot.changed(payload={"mass": mass})
+        made = noisy(m.recorded(effort=inverse_dynamics(heavy, m.q, m.qd, m.qdd)), rng)
+        judged = check(made)
+        if judged.answer == "good":
+            continue
+        (cause,) = judged.causes
+        found, _, notes = fit_recordings(robot, [made])
+        (payload,) = (n for n in found.numbers if n.name == "payload.mass")
+        assert float(cause.split()[-1]) == pytest.approx(mass, rel=0.05)
+        assert cause in notes[0] and found.verdict.answer == "explains"
+        assert abs(payload.after - mass) < 3.0 * payload.deviation
 
 
 @pytest.mark.long
