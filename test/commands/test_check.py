@@ -363,7 +363,7 @@ class TestCauses:
 
     def test_a_wrench_in_other_axes_or_of_the_other_sign(self, rng):
         robot = load("stewart")
-        m = machine(robot, rng, 4.0, 250.0)
+        m = machine(robot, rng, 4.0, 100.0)
         wrench = rng.normal(0.0, 200.0, 6) * np.sin(np.outer(m.time, rng.uniform(1.0, 3.0, 6)))
         wrench[:, 3:] *= 0.1
         efforts = inverse_dynamics(robot, m.q, m.qd, m.qdd, wrench)
@@ -372,7 +372,7 @@ class TestCauses:
             [np.einsum("kji,kj->ki", rotation, wrench[:, k : k + 3]) for k in (0, 3)], 1
         )
         made = recording_of(robot, m, efforts)
-        assert check(replace(made, wrench=wrench)).answer == "good"
+        assert check(replace(made, wrench=wrench), thorough=False).answer == "good"
         for given, word in ((-wrench, "opposite sign"), (turned, "axes")):
             wrong = replace(made, wrench=given)
             (text,) = self.cause(wrong)

@@ -15,6 +15,8 @@ SOFT = FOLDER / "upr_rpu_soft_joint.mcap"
 COLLISION = FOLDER / "delta_cu_collision.mcap"
 WRENCH = ("fx", "fy", "fz", "mx", "my", "mz")
 DEFLECTION = ("dx", "dy", "dz", "rx", "ry", "rz")
+THIRD = slice(None, None, 3)
+"""Samples of all loads: what those of a few leave open is searched for faults, which takes long."""
 
 
 def table(path, *, wrench=WRENCH, deflection=DEFLECTION, rows=slice(None)):
@@ -118,7 +120,7 @@ def test_refusals(twin, tmp_path, monkeypatch, without_wrench):
 )
 def test_numbers_that_are_no_recording_of_this_machine(twin, tmp_path, monkeypatch, columns, text):
     monkeypatch.chdir(tmp_path)
-    found = read_columns(table(tmp_path / "plain.csv", rows=slice(0, 90)))
+    found = read_columns(table(tmp_path / "plain.csv", rows=THIRD))
     found |= {name: how(found[name]) for name, how in columns.items()}
     path = write_columns(tmp_path / "changed.csv", found)
     assert text in twin.refused("fit", "upr_rpu", path, "--what", "compliance")
@@ -143,7 +145,7 @@ def test_beyond_limits_is_refused_or_marked_everywhere(twin, tmp_path, monkeypat
     robot = tmp_path / "short.yaml"
     source = (FOLDER.parent / "config" / "upr_rpu.yaml").read_text()
     robot.write_text(source.replace("limb_length: [0.300, 1.000]", "limb_length: [0.62, 1.0]"))
-    plain = table(tmp_path / "plain.csv", rows=slice(0, 90))
+    plain = table(tmp_path / "plain.csv", rows=THIRD)
     arguments = ("fit", robot, plain, "--what", "compliance")
     assert "--beyond-limits" in twin.refused(*arguments)
     (line, *_) = twin.told(*arguments, "--beyond-limits")["beyond_limits"]
@@ -156,7 +158,7 @@ def test_an_element_that_a_bound_holds_stays_a_compliance(twin, tmp_path, monkey
     """The written file can be read: zero is no compliance."""
     monkeypatch.chdir(tmp_path)
     recording = noisy(twin_recording({"1B": 0.02, "2B": 0.02}), np.random.default_rng(3), SENSORS)
-    data = np.concatenate([recording.q, recording.wrench, recording.deflection], -1)[:150]
+    data = np.concatenate([recording.q, recording.wrench, recording.deflection], -1)[::3]
     names = [f"{name}.position" for name in load("upr_rpu").joint_names]
     names += [*WRENCH, *DEFLECTION]
     write_columns(tmp_path / "stiff.csv", dict(zip(names, data.T, strict=True)))
@@ -206,7 +208,7 @@ def test_a_robots_own_numbers_are_read_as_the_twin_reads_them(twin, tmp_path, mo
     """1e-01 is a word for other readers of YAML; below a millionth no element is elastic."""
     monkeypatch.chdir(tmp_path)
     source = (FOLDER.parent / "config" / "upr_rpu.yaml").read_text()
-    plain = table(tmp_path / "plain.csv", rows=slice(0, 90))
+    plain = table(tmp_path / "plain.csv", rows=THIRD)
     for value, code in (("9e-1", 0), ("1e-300", 1), ("1e7", 1)):
         (tmp_path / "mine.yaml").write_text(f"{source}element_compliance: {{3R: {value}}}\n")
         line = ("fit", "mine.yaml", plain, "--what", "compliance", "--overwrite", "--no-report")

@@ -14,7 +14,7 @@ from pkm_twin.bags.reader import BagWriter, open_bag
 from pkm_twin.errors import BagError
 from pkm_twin.files import replace_file, replacing
 from test.bags.test_recordings import FOLDER
-from test.commands.test_fit_compliance import SOFT, table
+from test.commands.test_fit_compliance import SOFT, THIRD, table
 from test.support.command import forked
 from test.support.robots import load, partly_long
 
@@ -26,7 +26,7 @@ ODD = "a$\\x$ \udcff\nb"
 
 @pytest.fixture
 def deflections(tmp_path):
-    return table(tmp_path / "deflections.csv", rows=slice(0, 60))
+    return table(tmp_path / "deflections.csv", rows=THIRD)
 
 
 def commands(deflections, target):
@@ -188,15 +188,15 @@ def test_a_target_that_fails_stays_as_it_was(tmp_path):
     assert caught.value.filename == str(target)
 
 
-def test_a_full_disk_is_the_targets(tmp_path):
+def test_a_full_disk_is_the_targets(tmp_path, deflections):
     """Not the bag's that is read, and no half of a file stays."""
     done = forked(tmp_path, "recover", SOFT, "saved.mcap", limit=10_000)
     assert done.code == 1
     assert "saved.mcap: cannot be written: File too large" in done.one_line_error()
-    done = forked(tmp_path, "fit", "upr_rpu", SOFT, "--what", "compliance", limit=10_000)
+    done = forked(tmp_path, "fit", "upr_rpu", deflections, "--what", "compliance", limit=10_000)
     assert done.code == 1
     assert "fitted.html: File too large" in done.one_line_error()
-    assert [p.name for p in tmp_path.iterdir()] == ["fitted.yaml"]
+    assert {p.name for p in tmp_path.iterdir()} == {"fitted.yaml", deflections.name}
 
 
 def test_what_is_read_is_not_replaced(twin, tmp_path, deflections):

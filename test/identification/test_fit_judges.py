@@ -41,8 +41,8 @@ LIKELY = {
 
 
 @cache
-def drawn(name: str, seed: int) -> Drawn:
-    return machine(load(name), np.random.default_rng([seed, *name.encode()]))
+def drawn(name: str, seed: int, seconds: float = 12.0) -> Drawn:
+    return machine(load(name), np.random.default_rng([seed, *name.encode()]), seconds)
 
 
 def recorded(what: str, name: str, seed: int) -> Recording:
@@ -106,7 +106,7 @@ def test_a_recording_with_gaps_is_fitted_like_the_whole_one() -> None:
 
 @pytest.mark.parametrize(
     "what",
-    partly_long(COMMON, "one_joint_negated", "time_reversed", "milliseconds", "efforts_late"),
+    partly_long(COMMON, "time_reversed", "milliseconds", "efforts_late"),
 )
 def test_what_no_machine_of_the_file_makes_is_rejected(what: str) -> None:
     assert rejected(what, "linear_delta", 4)
@@ -130,8 +130,8 @@ def test_a_payload_that_is_on_the_platform_for_a_while_is_named(name: str) -> No
 
 def test_a_known_payload_that_the_efforts_do_not_show_is_rejected() -> None:
     """Also where time in another unit would ask for efforts beyond any number."""
-    m, record = drawn("delta_cu", 3), recorded("sound", "delta_cu", 3)
-    record = replace(record, load=Load(20.0))
+    m = drawn("delta_cu", 3, 6.0)
+    record = replace(noisy(m.recorded(), np.random.default_rng(7)), load=Load(20.0))
     rows = rows_of(m.robot, file_parameters(m.robot), record)
     assert recording_fault(rows) is not None
 
@@ -153,7 +153,7 @@ def test_a_cause_that_does_not_explain_the_efforts_is_not_named(wrong_way: bool)
     """A force that is not recorded looks like a payload that comes and goes; so does one that is
     recorded backwards, which is named.
     """
-    m = drawn("delta_cu", 4)
+    m = drawn("delta_cu", 4, 6.0)
     force = np.zeros((len(m.time), 6))
     force[:, 2] = -5.0 * np.sin(2.0 * np.pi * 0.7 * m.time)
     efforts = inverse_dynamics(m.truth, m.q, m.qd, m.qdd, force)
@@ -284,14 +284,12 @@ def test_it_is_found_or_within_the_standard_deviations(what: str, name: str) -> 
      *(pytest.param(*pair, marks=pytest.mark.long)
        for pair in (("delta", "delta_cu"), ("delta_cu", "rps3")))],
 )  # fmt: skip
-@pytest.mark.parametrize("duration", [1.2, 4.0])
+@pytest.mark.parametrize(("duration", "rate"), [(1.2, 300.0), (4.0, 100.0)])
 def test_another_machine_is_rejected_or_not_explained(
-    name: str, other: str, duration: float
+    name: str, other: str, duration: float, rate: float
 ) -> None:
-    m, rng = (
-        machine(load(other), np.random.default_rng(3), duration, 300.0),
-        np.random.default_rng(4),
-    )
+    m = machine(load(other), np.random.default_rng(3), duration, rate)
+    rng = np.random.default_rng(4)
     try:
         result, _ = fit_with_laws(load(name), [noisy(m.recorded(), rng)])
     except PkmTwinError:

@@ -264,9 +264,9 @@ from delta_dynamics import inverse_dynamics
 from pkm_twin.codegen.code import compiled
 from pkm_twin.errors import PkmTwinError
 from test.laws.test_arguments import functions, leaves
-from test.support.robots import MASSIVE, load
+from test.support.robots import KINDS, load
 found = {"compiled": compiled()}
-for name in MASSIVE:
+for name in KINDS:
     q = load(name).graph.home + 0.01
     found[name, "torques"] = [inverse_dynamics(load(name), q, 2 * q, 3 * q)]
 for name, far in json.loads(sys.stdin.read()).items():

@@ -95,9 +95,9 @@ def test_far_states_are_those_that_small_steps_lead_to(name, rng):
     engine, home = robot.engine, robot.graph.home
     slides = np.array([engine.graph.joints[joint].slides for joint in engine.graph.actuated])
     reach = np.where(slides, 0.4 * engine.tree.size, 4.0 if len(home) < 3 else 1.5)
-    q = home + rng.uniform(-1.0, 1.0, (400, len(home))) * reach
+    q = home + rng.uniform(-1.0, 1.0, (200, len(home))) * reach
     known = robot.try_forward(q)[1]
-    assert 20 < known.sum() < 395
+    assert 20 < known.sum() < 198
     least, x = led(engine, q, 200)
     # Beside a singularity by shorter ones.
     doubtful = np.flatnonzero(known & ~(least > CLEAR))
