@@ -58,7 +58,7 @@ def setpoint_correction(
     :raises UnreachableError: a joint state without an assembly, by limb, sample and miss.
     :raises ValueError: a wrong last axis, a value that is not finite, or a bound below zero.
     """
-    robot.check_independent("corrections of joints")
+    robot.check_independent("corrections of joints", "the others cannot be set")
     limit = doubles(bound, "the bound")
     if limit.shape not in ((), (robot.joints_count,)) or not (limit >= 0.0).all():
         raise ValueError(

@@ -25,6 +25,7 @@ from delta_dynamics.torques.uncertainty import (
 from delta_dynamics.torques.virtual_work import inverse_dynamics, mass_matrix
 from pkm_twin.codegen.arrays import Array, finite, later, one_vector, vectors
 from pkm_twin.messages.stamps import SECOND
+from pkm_twin.robot.mechanism import SHARED
 from pkm_twin.robot.robot import Robot
 from pkm_twin.streams.drives import RELEASE, DriveWatch
 from pkm_twin.streams.rest import RestWatch
@@ -58,7 +59,7 @@ class MomentumObserver:
         """
         if not 0.0 < bandwidth < np.inf:
             raise ValueError(f"bandwidth is {bandwidth:g} 1/s; expected more than 0")
-        robot.check_independent("contacts of measured efforts")
+        robot.check_independent("contacts of measured efforts", SHARED)
         self.robot = robot
         self.bandwidth = bandwidth
         self._still = np.zeros(robot.joints_count)
@@ -122,7 +123,7 @@ def platform_wrench(robot: Robot, q: ArrayLike, external: ArrayLike) -> Array:
     :param external: external efforts at the joints, shape (..., n):
         J' wrench with the platform's Jacobian J.
     """
-    robot.check_independent("wrenches of measured efforts")
+    robot.check_independent("wrenches of measured efforts", SHARED)
     lever = np.array([1.0, 1.0, 1.0, *(3 * [robot.size])])
     jacobian = robot.platform_jacobian(q) * lever[:, None]
     inverse = np.linalg.pinv(np.swapaxes(jacobian, -1, -2), rcond=RANK)

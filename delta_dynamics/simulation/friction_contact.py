@@ -7,6 +7,7 @@ Rows are the actuated joints, then the passive ones that have friction or a roto
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -185,9 +186,14 @@ class Law:
 
 
 class Resistance:
-    """Friction and stops of a robot, and which of its rows move."""
+    """Friction and stops of a robot, and which of its rows move.
 
-    def __init__(self, robot: Robot) -> None:
+    ``pushed``: passive joints that efforts act on, by their places among those with friction. These
+    efforts come after the wrench's six numbers, and their rates after the platform's twist.
+    """
+
+    def __init__(self, robot: Robot, pushed: Sequence[int] = ()) -> None:
+        self._pushed = list(pushed)
         n = robot.joints_count
         friction, passive = robot.friction, loaded_joints(robot.graph)
         self._offset = np.array(friction.offset, np.float64)
@@ -217,6 +223,8 @@ class Resistance:
         Errors as of :meth:`Equations.at`.
         """
         here = self._equations.at(q, qd)
+        if self._pushed:
+            here = here._replace(twists=np.concatenate([here.twists, here.rows[self._pushed]]))
         if not self._laws:
             return here
         at_place = parts(self._laws, self._numbers, q, np.zeros_like(q))[0]
@@ -294,7 +302,7 @@ class Resistance:
     # Laws.
 
     def law(self, here: Terms, effort: Array, wrench: Array | None) -> Law:
-        """What holds from here on, under efforts, shape (n,), and a wrench, shape (6,)."""
+        """What holds from here on, under efforts, shape (n,), and a wrench, (6,) and more."""
         law = self._law
         if law is not None:
             self._load(law, here, effort, wrench)

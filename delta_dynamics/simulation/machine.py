@@ -23,7 +23,8 @@ from delta_dynamics.simulation.friction_contact import Law, Resistance
 from delta_dynamics.torques.equations import Terms
 from delta_dynamics.torques.virtual_work import mass_matrix
 from pkm_twin.codegen.arrays import Array
-from pkm_twin.errors import MessageError, ParameterError, PkmTwinError
+from pkm_twin.errors import MessageError, ParameterError, PkmTwinError, UnreachableError
+from pkm_twin.machine.inertia import loaded_joints
 from pkm_twin.messages.reading import MAX_RATE, JointReader, as_message_error, read_wrench
 from pkm_twin.messages.stamps import SECOND, StampRules
 from pkm_twin.robot.robot import Robot
@@ -69,10 +70,26 @@ class Plant:
         self.change_robot(self.robot)
 
     def change_robot(self, robot: Robot) -> None:
-        """Go on as a robot of the same joints, with another payload."""
-        self.robot = robot
-        self._resistance = Resistance(robot)
+        """Go on as a robot of the same joints, with another payload.
+
+        Coordinates are the drives that lead; others push the joints where they stand.
+        """
+        self.robot, self._leading = robot, robot.graph.leading
+        self.others = [k for k in range(robot.joints_count) if k not in self._leading]
+        names = [joint.name for joint in loaded_joints(robot.led.graph)] if self.others else []
+        pushed = [names.index(robot.joint_names[k]) for k in self.others]
+        self._resistance = Resistance(robot.led, pushed)
         self._here: Terms | None = None
+
+    def _all(self, here: Terms) -> tuple[Array, Array]:
+        """Positions and rates of all drives."""
+        if not self.others:
+            return here.q.copy(), here.qd.copy()
+        q, qd = self.q.copy(), np.zeros_like(self.q)
+        q[self._leading], qd[self._leading] = here.q, here.qd
+        found = self.robot.agreeing(q, qd)
+        q[self.others], qd[self.others] = (rows[self.others] for rows in found[:2])
+        return q, qd
 
     def rest(self) -> None:
         """Stand still."""
@@ -91,11 +108,14 @@ class Plant:
         """
         effort = np.asarray(effort, np.float64)
         load = np.asarray(wrench, np.float64) if np.any(wrench) else None
+        if self.others:
+            apart = effort - self.robot.friction.offset
+            load = np.concatenate([wrench, apart[self.others]])
+            effort = effort[self._leading]
         here, left = self._here, step
-        if here is None or here.q.tobytes() + here.qd.tobytes() != (
-            self.q.tobytes() + self.qd.tobytes()
-        ):
-            here = self._resistance.arrive(self.q.copy(), self.qd.copy())
+        q, qd = self.q[self._leading], self.qd[self._leading]
+        if here is None or here.q.tobytes() + here.qd.tobytes() != q.tobytes() + qd.tobytes():
+            here = self._resistance.arrive(q, qd)
         at_once, crawled = 0, step * CRAWL
         for part in itertools.count():
             law = self._resistance.law(here, effort, load)
@@ -105,7 +125,7 @@ class Plant:
                 at_once, crawled = 0, 4.0 * crawled
             elif not law.stands:
                 here, taken = self._follow(here, law, left, step * RESOLVED)
-            self._here, self.q, self.qd = here, here.q.copy(), here.qd.copy()
+            self._here, (self.q, self.qd) = here, self._all(here)
             left -= taken
             if left <= 0.0:
                 return
@@ -309,17 +329,20 @@ def stable_share(robot: Robot, settings: MachineSettings) -> float:
     """
     q = np.vstack([settings.start, random_joints(robot, np.random.default_rng(0), POSES)])
     inertias = []
+    follow = robot.following(q)
     for event in settings.payloads or (None,):
         loaded = robot if event is None else robot.changed(payload=event.load)
-        inertia = mass_matrix(loaded, q)
+        inertia = mass_matrix(loaded.led, q[:, robot.graph.leading])
         gains = settings.damping + 0.5 * settings.period * settings.stiffness
-        speeds = np.abs(np.linalg.eigvals(np.linalg.solve(inertia, np.diag(gains)))).max(-1)
-        inertias += [inertia[0], inertia[int(speeds.argmax())]]
+        gains = follow.swapaxes(-1, -2) @ (gains[:, None] * follow)
+        speeds = np.abs(np.linalg.eigvals(np.linalg.solve(inertia, gains))).max(-1)
+        fastest = int(speeds.argmax())
+        inertias += [(inertia[0], follow[0]), (inertia[fastest], follow[fastest])]
 
     def stable(share: float) -> bool:
         return all(
-            error_growth(inertia, settings, gain * share**2, gain * share) <= 1.0 + NO_GROWTH
-            for inertia in inertias
+            error_growth(inertia, settings, gain * share**2, gain * share, rates) <= 1.0 + NO_GROWTH
+            for inertia, rates in inertias
             for gain in (1.0, MARGIN)
         )
 
@@ -333,26 +356,29 @@ def stable_share(robot: Robot, settings: MachineSettings) -> float:
 
 
 def error_growth(
-    inertia: Array, settings: MachineSettings, stiffness: float = 1.0, damping: float = 1.0
-) -> float:
+    inertia: Array, settings: MachineSettings, stiffness: float = 1.0, damping: float = 1.0,
+    follow: Array | None = None,
+) -> float:  # fmt: skip
     """Factor by which an error of the position control grows in a period, at most.
 
     The spectral radius of the loop that :meth:`Simulation.advance` closes: positions, rates, the
     positions a period before (rates of an encoder with steps are differences) and the efforts on
     their way. The mass matrix is constant, and efforts are constant in a period.
 
-    :param inertia: mass matrix, shape (n, n).
+    :param inertia: mass matrix of the drives that lead, shape (m, m).
+    :param follow: rates of all drives by these, shape (n, m); by default all lead.
     :param stiffness: factor of the settings' stiffness, ``damping``: of their damping.
     """
     n, s = len(inertia), settings
+    turn = np.eye(n) if follow is None else follow
     delay = math.ceil(s.delay / s.period)
     period = s.period if delay <= DELAYS else s.delay / DELAYS
     # Every row block of the unit matrix is one quantity, in terms of the state.
     unit = np.eye(n * (3 + min(delay, DELAYS)))
     q, qd, before, *waiting = unit.reshape(-1, n, len(unit))
-    rates = np.where(s.resolution[:, None] > 0.0, (q - before) / period, qd)
-    effort = -stiffness * s.stiffness[:, None] * q - damping * s.damping[:, None] * rates
-    waiting.append(effort)
+    rates = np.where(s.resolution[:, None] > 0.0, turn @ (q - before) / period, turn @ qd)
+    effort = -stiffness * s.stiffness[:, None] * (turn @ q) - damping * s.damping[:, None] * rates
+    waiting.append(turn.T @ effort)
     qdd = np.linalg.solve(inertia, waiting.pop(0))
     after = [q + period * qd + 0.5 * period**2 * qdd, qd + period * qdd, q, *waiting]
     return float(np.abs(np.linalg.eigvals(np.concatenate(after))).max())
@@ -379,7 +405,6 @@ class Simulation(Core):
     """
 
     def __init__(self, robot: Robot, settings: MachineSettings, start: int) -> None:
-        robot.check_independent("simulated motions")
         bounds = robot.limits.position
         if bounds is not None:
             places = zip(robot.joint_names, settings.start, bounds, strict=True)
@@ -513,6 +538,10 @@ class Simulation(Core):
         q = self.plant.q
         for _ in range(s.substeps):
             self.plant.advance(self._effort, wrench, s.period / s.substeps)
+        bounds = self.robot.limits.position
+        if bounds is not None:
+            for k in self.plant.others:
+                self._stops(k, *bounds[k])
         if not np.isfinite(self.plant.qd).all():
             raise MessageError("non-finite result", "the motion is not finite")
         try:
@@ -520,6 +549,13 @@ class Simulation(Core):
         except PkmTwinError:
             self.plant.q = q
             raise
+
+    def _stops(self, k: int, low: float, high: float) -> None:
+        """Reject a drive that follows beyond its limits, where it has no stop."""
+        name, here = self.robot.joint_names[k], float(self.plant.q[k])
+        if not low <= here <= high:
+            how = f"is at {here:.4g}, allowed {low:g} to {high:g}, and has no simulated stop"
+            raise UnreachableError("joint state", name, (), 0.0, how=how)
 
     def _tick(self) -> None:
         """The period's end: the clock, and what the encoders see."""

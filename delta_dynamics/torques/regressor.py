@@ -32,6 +32,7 @@ from pkm_twin.machine.inertia import (
     standard_parameters,
 )
 from pkm_twin.machine.schema import frozen
+from pkm_twin.robot.mechanism import SHARED
 from pkm_twin.robot.robot import Robot
 from pkm_twin.robot.workspace import random_joints
 
@@ -96,7 +97,7 @@ def regressor(
     :returns: Y, shape (..., n, p), N m or N per unit of the parameter; parameters and errors as of
         :func:`~delta_dynamics.inverse_dynamics`.
     """
-    robot.check_independent("parameters of efforts")
+    robot.check_independent("parameters of efforts", SHARED)
     load = np.zeros(6) if wrench is None else wrench
     kernel, gravity = robot.massive().kernel("regressor", _regressor), robot.gravity
     bodies, others = robot.evaluate(kernel, np.ascontiguousarray(gravity), q, qd, qdd, load)

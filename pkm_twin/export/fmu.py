@@ -68,7 +68,7 @@ class Fmu:
                 "--kind torques has every law"
             )  # fmt: skip
         if kind == "dynamics":
-            robot.check_independent("an FMU's dynamics")
+            robot.check_independent("an FMU's dynamics", "each joint is a state")
         self.robot, self.version, self.kind = robot, version, kind
         self.dynamic = kind == "dynamics"
         self.n = robot.joints_count

@@ -54,7 +54,7 @@ def moveit_package(robot: Robot, kinematics: str = "") -> dict[str, str]:
     :param kinematics: plugin of the planning group's inverse kinematics; empty: the package's own.
     :raises ParameterError: the robot has a ``joint_map``: plans are in the numbers of the URDF.
     """
-    robot.check_independent("plans of MoveIt")
+    robot.check_independent("plans of MoveIt", "it moves each joint by itself")
     if not robot.controller.plain or robot.controller.names != tuple(robot.joint_names):
         raise ParameterError(
             "joint_map", list(robot.controller.names), "none: MoveIt plans in the URDF's numbers"

@@ -274,10 +274,7 @@ def left_by_calibration(
 
     def slopes(rows: Array) -> Array:
         """By the numbers that it fits, and by the zeros of the joints."""
-        zeros = robot.platform_jacobian(rows)
-        if robot.redundant:
-            back = robot.inverse_jacobian(rows)
-            zeros = zeros @ back @ np.linalg.inv(back[:, robot.graph.leading])
+        zeros = robot.platform_jacobian(rows) @ robot.following(rows)
         if not paths:
             return zeros
         many = Variants(robot, {path: robot.number(path) for path in paths})
@@ -344,7 +341,7 @@ def calibrate(
     :raises ParameterError: too few poses, poses of another machine, unit or frame, poses that tell
         no number, or a fit that does not settle.
     """
-    robot.check_independent("calibrations")
+    robot.check_independent("calibrations", "a pose does not give the others' zeros")
     free, apart = Free(**options), None
     if isinstance(poses, Measured):
         learnt = poses

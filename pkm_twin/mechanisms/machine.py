@@ -70,6 +70,8 @@ from pkm_twin.robot.robot_urdf import robot_description
 
 M = TypeVar("M", bound="Machine")
 
+RUBS: Final = 1e-12
+"""Viscous friction that is none, N m s/rad or N s/m."""
 MOST_JOINTS: Final = 12
 """Most actuated joints."""
 
@@ -428,6 +430,36 @@ class Machine(TwinRobot):
                 if value is not None:
                     told[kind].setdefault(name, {})[word] = value
         return {kind: entries for kind, entries in told.items() if entries}
+
+    @cached_property
+    def led(self) -> Machine:
+        """Of drives that share the effort: those that lead; the others keep friction and rotor.
+
+        :raises ParameterError: a friction law that passive joints do not have.
+        """
+        if not self.redundant:
+            return self
+        if self.laws:
+            basic = "viscous, coulomb and offset where drives share the effort"
+            raise ParameterError("friction", self.laws[0], basic)
+        data = dict(self.parameter_sections())
+        for key in ("redundancy", "joint_map", "uncertainty", "tolerances"):
+            data.pop(key, None)
+        data["joints"] = dict(data["joints"])
+        for k, name in enumerate(self.joint_names):
+            if name in self.graph.leads:
+                continue
+            spec, joint = self.specs["joints"][name], dict(data["joints"][name])
+            for key in ("actuated", "limits", "drive"):
+                joint.pop(key, None)
+            if spec.drive is not None:
+                slides = self.graph.joints[name].slides
+                joint["rotor_inertia"] = spec.drive.reflected(slides, f"joints.{name}.drive")
+            # Its rate is asked for where there is friction.
+            viscous = max(float(self.friction.viscous[k]), RUBS)
+            joint["friction"] = {"viscous": viscous, "coulomb": float(self.friction.coulomb[k])}
+            data["joints"][name] = joint
+        return type(self).from_data(data, self.name)
 
     def sharing_entries(self) -> dict[str, Any]:
         """Of the file, with the joints that lead."""

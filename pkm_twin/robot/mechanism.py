@@ -11,7 +11,7 @@ import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, ClassVar, TypeVar
+from typing import Any, ClassVar, Final, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -50,6 +50,8 @@ from pkm_twin.machine.uncertainty import (
 from pkm_twin.machine.urdf_file import Visual
 from pkm_twin.settings import settings_of
 
+SHARED: Final = "a controller may share efforts in any way"
+"""Why measured efforts of drives that share them have no one explanation."""
 R = TypeVar("R", bound="Mechanism")
 
 
@@ -395,17 +397,22 @@ class Mechanism(Common):
         """Whether there are more actuated joints than degrees of freedom."""
         return len(self.graph.leads) < self.joints_count
 
-    def check_independent(self, what: str) -> None:
+    @property
+    def led(self: R) -> R:
+        """The machine whose leading drives are its only ones; the others are passive joints."""
+        return self
+
+    def check_independent(self, what: str, why: str = "they are not defined for more") -> None:
         """Reject what needs as many actuated joints as degrees of freedom.
 
-        :param what: in the plural, in words.
+        :param what: in the plural, in words; ``why``: the reason.
         :raises ParameterError: there are more.
         """
         if self.redundant:
             raise ParameterError(
                 "joints", self.joints_count,
-                f"{len(self.graph.leads)} actuated joints, the degrees of freedom: {what} are not "
-                "defined for more; leave out `actuated` of "
+                f"{len(self.graph.leads)} actuated joints, the degrees of freedom, for {what}: "
+                f"{why}; leave out `actuated` of "
                 f"{', '.join(n for n in self.joint_names if n not in self.graph.leads)}",
             )  # fmt: skip
 

@@ -324,6 +324,14 @@ class Robot(Mechanism):
         back = (jacobian / self.effort_scale**2).swapaxes(-1, -2)
         return np.asarray(back @ np.linalg.inv(jacobian @ back), np.float64)
 
+    def following(self, q: ArrayLike) -> Array:
+        """Rates of all drives by those that lead, shape (..., n, m); one where all lead."""
+        if not self.redundant:
+            n = self.joints_count
+            return np.broadcast_to(np.eye(n), (*np.shape(q)[:-1], n, n))
+        back = self.inverse_jacobian(q)
+        return np.asarray(back @ np.linalg.inv(back[..., self.graph.leading, :]))
+
     @property
     def effort_scale(self) -> Array:
         """What efforts of drives that share are compared by, shape (n,)."""
