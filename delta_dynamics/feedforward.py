@@ -388,8 +388,13 @@ class Feedforward(Core):
                 sure = rates[0]
                 if doubt is not None:
                     sure = moving_rates(sure, np.abs(sure) <= doubt, self._reach)
+                change = rates[1]
+                if self.robot.redundant:
+                    # Noise that is differentiated contradicts nothing: what is measured is judged.
+                    _, own, change = as_message_error(self.robot.agreeing, sample.q, sure, change)
+                    sure = own if sample.qd is None else sure
                 solved = as_message_error(
-                    inverse_dynamics, self.robot, sample.q, sure, rates[1], external
+                    inverse_dynamics, self.robot, sample.q, sure, change, external
                 )
                 effort, saturated = _gate(self.robot, self.settings.limit_policy, solved)
         except MessageError:
