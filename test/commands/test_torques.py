@@ -261,14 +261,6 @@ class TestPayload:
         assert np.allclose(later[held], always[held]) and np.allclose(later[~held], bare[~held])
         assert np.abs(always - bare).max() > 0.1
 
-    def test_its_centre_counts(self, twin, tmp_path):
-        source = write_columns(tmp_path / "m.csv", motion("prru"))
-        outs = [tmp_path / "a.csv", tmp_path / "b.csv"]
-        for out, payload in zip(outs, ("3", "3,0.1,0,0"), strict=True):
-            twin.good(*TABLE, "prru", source, "--out", out, "--payload", payload)
-        one, other = (joined(read_columns(out), load("prru"), "effort") for out in outs)
-        assert not np.allclose(one, other)
-
     def test_a_bags_own_is_part_of_the_table(self, twin, tmp_path):
         bag = rewrite(DELTA, tmp_path / "b.mcap", begin=8.0, seconds=0.6)
         # In this part the pick, at 8.275 s, is behind.

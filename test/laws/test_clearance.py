@@ -162,7 +162,7 @@ def thicker(robot, much):
 @pytest.mark.parametrize("name", partly_long(ROBOTS, "delta_cu", "upr_rpu"))
 def test_poses_where_limbs_meet_are_refused(name):
     shipped = load(name)
-    poses = box(shipped, 17)
+    poses = box(shipped, 11)
     free = clearance(shipped, poses[reachable(shipped, poses, -math.inf)])
     robot = thicker(shipped, float(np.median(free)) / 2)
     otherwise = reachable(robot, poses, -math.inf)
@@ -190,7 +190,7 @@ LEAST = {"delta": 0.026, "delta_cu": 0.026, "prru": 0.26, "upr_rpu": 0.23}
 def test_limbs_of_the_shipped_robots_never_meet(name):
     """In no pose that the other limits allow; the least is at the edge of these."""
     robot, at_least = load(name), LEAST[name]
-    poses = box(robot, 29)
+    poses = box(robot, 21)
     otherwise = reachable(robot, poses, -math.inf)
     assert otherwise.sum() > 1000
     assert at_least < clearance(robot, poses[otherwise]).min() < 1.1 * at_least
