@@ -188,12 +188,17 @@ def fitted(
 
 
 def _faults(made: Rows) -> list[str]:
-    """Why this machine cannot have made a recording: no more than the number that explains it."""
-    cause = number_that_explains(replace(made.recording, robot=made.model.robot))
+    """Why this machine cannot have made a recording.
+
+    Of efforts that one number explains: their scale, or a payload that is held for a while.
+    """
+    r = made.recording
+    cause = number_that_explains(replace(r, robot=made.model.robot))
     fault = recording_fault(made) if cause is None else cause.text
     if cause is not None and abs(np.log(cause.scale)) < np.log1p(SIGMAS * OFF):
-        return []
-    return [] if fault is None else [f"{made.recording.name}: {fault}"]
+        load = cause.recording.load
+        fault = fault if r.load is None and load is not None and load.times else None
+    return [] if fault is None else [f"{r.name}: {fault}"]
 
 
 def _worse(problem: Problem) -> list[str]:

@@ -135,6 +135,27 @@ def test_fit_and_check_name_one_cause(name: str) -> None:
         assert abs(payload.after - mass) < 3.0 * payload.deviation
 
 
+@pytest.mark.parametrize("name", partly_long(["delta_cu", "linear_delta"], "delta_cu"))
+def test_a_payload_that_is_picked_is_fitted_with_its_times(name: str) -> None:
+    m = machine(load(name), np.random.default_rng(4), 12.0, 200.0)
+    light, heavy = (m.robot.changed(payload={"mass": mass}) for mass in (0.0, 0.5))
+    held = (m.time > 4.0) & (m.time < 9.0)
+    efforts = [inverse_dynamics(one, m.q, m.qd, m.qdd) for one in (light, heavy)]
+    made = noisy(
+        m.recorded(effort=np.where(held[:, None], *efforts[::-1])), np.random.default_rng(7)
+    )
+    made = replace(made, robot=light)
+    (cause,) = check(made).causes
+    found, _, notes = fit_recordings(light, [made])
+    (payload,) = (n for n in found.numbers if n.name == "payload.mass")
+    assert cause in notes[0] and found.verdict.answer == "explains"
+    assert payload.after == pytest.approx(0.5, abs=3.0 * payload.deviation)
+    assert payload.deviation < 0.05
+    # Where no payload is fitted, nothing else takes its place.
+    with pytest.raises(PkmTwinError, match=re.escape(cause)):
+        fit_recordings(light, [made], ("friction",))
+
+
 @pytest.mark.long
 @pytest.mark.parametrize("name", MACHINES)
 def test_fit_and_check_agree(name: str) -> None:
