@@ -289,7 +289,9 @@ class JointReader:
         if qd.ndim == 1:
             # A stream's sample, without numpy.
             rates, seconds = map(abs, qd.tolist()), map(abs, qdd.tolist())
-            if all(map(le, rates, self.highest_velocity)) and max(seconds) <= MAX_ACCELERATION:
+            # NaN compares as false: max would hide one.
+            slow = all(map(le, rates, self.highest_velocity))
+            if slow and all(second <= MAX_ACCELERATION for second in seconds):
                 return
         for what, values, high in (
             ("velocity", qd, self._highest_velocity),

@@ -13,6 +13,7 @@ from pkm_twin.messages.reading import (
     MAX_LOAD,
     MAX_POINTS,
     JointReader,
+    read_deflection,
     read_wrench,
 )
 from pkm_twin.messages.stamps import MAX_DURATION, StampRules, stamp_of
@@ -182,6 +183,101 @@ def test_what_is_wrong_is_named(make, kind, changes, reason, words):
     assert all(word in text for word in words)
 
 
+def deflection(shift, turn=(0.0, 0.0, 0.0, 1.0)):
+    made = Maker(Plain())
+    fields = made.kind(
+        translation=made.kind(**dict(zip("xyz", shift, strict=True))),
+        rotation=made.kind(**dict(zip("xyzw", turn, strict=True))),
+    )
+    message = made.kind(header=made.header(NOW, "tool0"), transform=fields)
+    return read_deflection(message, NOW, RULES)
+
+
+def edges(limitless):
+    """Readers of one value, and the greatest and least that they accept."""
+    make, own, free = Maker(Plain()), JointReader(ROBOT), JointReader(limitless)
+    reach = 2000.0 * math.pi
+
+    def of_state(reader, what):
+        return lambda v: reader.joint_state(state(make, **{what: at(Q, 1, v)}), NOW, RULES)
+
+    def of_trajectory(reader, what):
+        return lambda v: reader.trajectory(
+            trajectory(make, **{what: at([Q] * 3, 1, at(Q, 2, v))}), NOW
+        )
+
+    for reader, low, high, fast in ((own, -0.9, 1.3, 15.0), (free, -reach, reach, 1e4)):
+        for of, end in ((of_state, ""), (of_trajectory, "s")):
+            yield of(reader, f"position{end}"), low, high
+            yield of(reader, "velocities" if end else "velocity"), -fast, fast
+        yield of_state(reader, "effort"), -1e7, 1e7
+        yield of_trajectory(reader, "accelerations"), -1e7, 1e7
+        yield lambda v, reader=reader: reader.commands(at(Q, 0, v)), -1e7, 1e7
+    for k in range(6):
+        yield (
+            lambda v, k=k: read_wrench(
+                make.wrench(at(WRENCH, k, v), NOW), NOW, RULES, "platform", False
+            ),
+            -1e7,
+            1e7,
+        )
+    for k in range(3):
+        yield lambda v, k=k: deflection(at([0.0] * 3, k, v)), -0.1, 0.1
+
+
+def test_bounds_are_accepted_and_the_next_number_is_not(limitless):
+    """Also those of the smallest numbers that are none of a damaged message."""
+    tiny = 2.0**-1022
+    for read, low, high in edges(limitless):
+        for good in (low, high, tiny, -tiny, 0.0, -0.0):
+            read(good)
+        below = math.nextafter(tiny, 0.0)
+        for bad in (math.nextafter(low, -math.inf), math.nextafter(high, math.inf), below, -below):
+            assert reject(read, bad)[0] in ("bounds", "limit")
+
+
+@pytest.mark.parametrize("joint", range(3))
+@pytest.mark.parametrize(
+    ("what", "value", "reason"),
+    [
+        ("velocity", 15.0, ""),
+        ("velocity", math.nextafter(15.0, 16.0), "limit"),
+        ("velocity", math.nan, "not finite"),
+        ("acceleration", 1e7, ""),
+        ("acceleration", math.nextafter(1e7, 1e8), "bounds"),
+        ("acceleration", math.nan, "not finite"),
+    ],
+)
+def test_derived_rates_have_the_bounds_of_measured_ones(reader, what, value, reason, joint):
+    """Of one sample as of many."""
+    for sign in (1.0, -1.0):
+        both = np.zeros((2, 4, 3))
+        both[int(what == "acceleration"), 3, joint] = sign * value
+        reader.check_derived(*both[:, 0])
+        for qd, qdd in (both, both[:, 3]):
+            if reason:
+                found, text = reject(reader.check_derived, qd, qdd)
+                assert found == reason and text.startswith(f"differentiated {what} of")
+                assert NAMES[joint] in text
+            else:
+                reader.check_derived(qd, qdd)
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-12, 1e-3, -0.05, 0.0999999, 0.1000001, 3.0])
+@pytest.mark.parametrize("length", [1.0, 1.00099, 0.99901, 1.00101, 0.99899, -1.0])
+def test_a_rotation_is_small_and_its_quaternion_has_length_one(angle, length):
+    """A quaternion and its negative are one rotation; of another length it is none."""
+    axis = np.array([2.0, -3.0, 6.0]) / 7.0
+    turn = length * np.array([*(math.sin(angle / 2.0) * axis), math.cos(angle / 2.0)])
+    shift = [0.01, -0.02, 0.1]
+    if abs(angle) <= 0.1 and abs(abs(length) - 1.0) <= 1e-3:
+        sample = deflection(shift, turn)
+        assert (sample.stamp, sample.frame) == (NOW, "tool0")
+        np.testing.assert_allclose(sample.values, [*shift, *(angle * axis)], 1e-9, 1e-15)
+    else:
+        assert reject(deflection, shift, turn)[0] == "bounds"
+
+
 class TestJointState:
     @pytest.mark.parametrize("absent", ["velocity", "effort"])
     @pytest.mark.parametrize("given", [(), (math.nan,) * 3])
@@ -214,12 +310,6 @@ class TestJointState:
             sample = reader.joint_state(message, NOW, RULES)
             assert sample.q.tolist() == list(Q)
             assert sample.qd is None if own != QD else sample.qd.tolist() == list(QD)
-
-    @pytest.mark.parametrize(("what", "value"), [("position", 6300.0), ("velocity", 1.1e4)])
-    def test_a_robot_without_limits_still_has_physical_bounds(self, make, limitless, what, value):
-        message = state(make, **{what: at(Q, 0, value)})
-        assert reject(JointReader(limitless).joint_state, message, NOW, RULES)[0] == "bounds"
-        assert JointReader(limitless).joint_state(state(make, position=(3, 3, 3)), NOW, RULES)
 
     def test_beyond_its_limits_a_machine_may_be_measured_and_no_farther_than_any_can_go(self, make):
         far = state(make, position=(3.0,) * 3, velocity=(20.0,) * 3)
