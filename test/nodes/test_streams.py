@@ -1,49 +1,69 @@
 # SPDX-License-Identifier: Apache-2.0
 """What is known of a stream: its pace, its losses, and whether rates and positions agree."""
 
+from collections import Counter
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from delta_dynamics.feedforward import Feedforward, Settings
-from pkm_twin.streams.monitor import MANY, Pace, StreamMonitor, TopicStatistics
+from pkm_twin.streams.monitor import Pace, StreamMonitor, TopicStatistics
 from pkm_twin.streams.rates import RateAgreement
 from test.nodes.harness import SECOND
 from test.support.robots import load
 
 
-def test_a_stop_holds_with_its_reason_until_enough_good_samples_in_a_row():
-    stream = StreamMonitor(trip_count=2, recovery_count=2)
-    assert not stream.reject("a", "1") and stream.accept()
-    assert not stream.reject("a", "2") and stream.reject("b", "3")
-    # It stops once.
-    assert not stream.stop("c", "4") and not stream.reject("d", "5")
-    assert (stream.stops, stream.rejected) == ({"b": 1}, {"a": 2, "b": 1, "d": 1})
-    assert [stream.accept(), stream.reject("d", "6"), stream.accept()] == [False] * 3
-    assert stream.stopped and stream.accept() and stream.accepted == 2
-    assert not stream.reject("a", "7") and stream.status == "a: 7"
-    assert stream.counts("x", "taken") == {
-        "x taken": 2, "x rejected: a": 3, "x rejected: b": 1, "x rejected: d": 2,
-    }  # fmt: skip
-    assert stream.stop("e", "8") and not stream.accept()
-    # By hand, it runs at once, and counts from there.
-    assert stream.resume() and not stream.resume()
-    assert stream.accept() and not stream.reject("a", "9") and stream.reject("a", "10")
-
-
-def test_the_status_has_the_rejects_since_the_stop_where_they_are_many():
-    stream = StreamMonitor(trip_count=1, recovery_count=1)
-    for reason in ("a", "b"):
-        stream.stop(reason, "1")
-        for _ in range(MANY - 1):
-            stream.reject(reason, "2")
-        assert stream.status == f"{reason}: 1"
-        stream.reject(reason, "3")
-        assert stream.status == f"{reason}: 1; rejected since then: {MANY}"
-        stream.reject("c", "4")
-        assert stream.status.endswith(f": {MANY + 1}, the last: c: 4")
-        stream.accept()
+@given(
+    st.integers(1, 4),
+    st.integers(1, 4),
+    st.lists(st.sampled_from(["good", "a", "b", "stop", "resume"]), max_size=60),
+)
+def test_a_stream_is_what_its_history_says(trip, recovery, events):
+    """Stopped from the trip-th reject in a row to the recovery-th good sample in a row."""
+    stream = StreamMonitor(trip, recovery)
+    stopped, bad, good, accepted, rejected, stops = False, 0, 0, 0, [], []
+    reason, since = "", []
+    for number, event in enumerate(events):
+        text = str(number)
+        if event == "good":
+            bad, good = 0, good + 1
+            if not stopped:
+                good = 0
+            stopped = stopped and good < recovery
+            accepted += not stopped
+            assert stream.accept() is not stopped
+        elif event == "resume":
+            assert stream.resume() is stopped
+            stopped, bad, good = False, 0, 0
+        else:
+            good = 0
+            if event != "stop":
+                bad += 1
+                rejected.append(event)
+                since.append(f"{event}: {text}")
+            begins = not stopped and (event == "stop" or bad >= trip)
+            if not stopped:
+                reason = f"{event}: {text}"
+            if begins:
+                stopped, since = True, []
+                stops.append(event)
+            ask = stream.stop if event == "stop" else stream.reject
+            assert ask(event, text) is begins
+        assert (stream.stopped, stream.accepted) == (stopped, accepted)
+        assert stream.stops == Counter(stops)
+        assert stream.counts("x", "taken") == {
+            "x taken": accepted,
+            **{f"x rejected: {why}": count for why, count in Counter(rejected).items()},
+        }
+        if not stopped:
+            since = []
+            continue
+        more = f"; rejected since then: {len(since)}" * (len(since) >= 5)
+        if more and since[-1].split(":")[0] != reason.split(":")[0]:
+            more += f", the last: {since[-1]}"
+        assert stream.status == reason + more
 
 
 def answered(pace, stamps):
