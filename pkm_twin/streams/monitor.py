@@ -28,8 +28,8 @@ class StreamMonitor:
     a row. Both stop reasons and rejects are counted by reason.
     """
 
-    trip_count: int = 5
-    recovery_count: int = 5
+    trip_count: int
+    recovery_count: int
     accepted: int = 0
     rejected: Counter[str] = field(default_factory=Counter)
     stops: Counter[str] = field(default_factory=Counter)
