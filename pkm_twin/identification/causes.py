@@ -26,7 +26,7 @@ from pkm_twin.identification.compare import (
     compared_of,
     near_change,
 )
-from pkm_twin.identification.plausible import held_payload, scale_text, wrenches
+from pkm_twin.identification.plausible import held_payload, listed, scale_text, wrenches
 from pkm_twin.recordings import Load, Recording
 from pkm_twin.robot.plausibility import why_no_torques
 from pkm_twin.robot.robot import Robot
@@ -97,9 +97,9 @@ def _turned(r: Recording, c: Compared, left_out: Mask) -> Iterator[Cause]:
     """Signs of efforts, and axes and sign of the wrench."""
     turned = ~c.good & (np.sum(c.measured * c.expected, 0) < 0.0)
     if turned.any():
-        names = ", ".join(np.array(r.robot.joint_names)[turned].tolist())
+        names = listed(np.array(r.robot.joint_names)[turned].tolist(), len(turned))
         effort = r.measured * np.where(turned, -1.0, 1.0)
-        text = f"efforts of {names} have the opposite sign"
+        text = f"efforts of {names} have the wrong sign"
         yield Cause(text, replace(r, effort=effort), left_out)
     for text, wrench in wrenches(r):
         yield Cause(text, replace(r, wrench=wrench), left_out)

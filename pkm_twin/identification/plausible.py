@@ -500,7 +500,7 @@ def _efforts(case: Case, joints: Sequence[str]) -> Iterator[tuple[str, Case, flo
 
     for signs in _signs(case.scales(np.eye(n))):
         negative = [joint for joint, sign in zip(joints, signs, strict=True) if sign < 0.0]
-        yield f"efforts of {_listed(negative, n)} have the wrong sign", scaled(signs), RARE
+        yield f"efforts of {listed(negative, n)} have the wrong sign", scaled(signs), RARE
     for which in [np.ones(n), *np.eye(n)] if n > 1 else [np.ones(1)]:
         # The likeliest scale is looked for, as the one of least squares is near it alone.
         near = case.scales(which[:, None])[int(np.argmax(which))]
@@ -509,7 +509,7 @@ def _efforts(case: Case, joints: Sequence[str]) -> Iterator[tuple[str, Case, flo
         likely = min(factors, key=lambda one: scaled(one).judged().cost)
         factor = float(likely[int(np.argmax(which))])
         if not 1.0 / RANGE <= factor <= RANGE:
-            names = _listed([j for j, one in zip(joints, which, strict=True) if one > 0.0], n)
+            names = listed([j for j, one in zip(joints, which, strict=True) if one > 0.0], n)
             price = UNIT if factor > 0.0 else RARE + UNIT
             yield scale_text(names, 1.0 / factor), scaled(likely), price
     orders = [(f"efforts of {joints[i]} and {joints[k]} are exchanged", _swap(n, i, k))
@@ -566,7 +566,7 @@ def _delays(case: Case, joints: Sequence[str]) -> Iterator[tuple[str, Case]]:
         step = steps[place]
         if abs(step) * case.period < SHORT:
             continue
-        names = _listed([joints[j] for j in which], n)
+        names = listed([joints[j] for j in which], n)
         late = step * case.period
         text = f"efforts of {names} are {abs(late):.2g} s {'late' if late > 0 else 'early'}"
         parts = ("rest", "columns", "counts", "time")
@@ -591,5 +591,6 @@ def scale_text(names: str, scale: float, masses: float | None = None) -> str:
     )
 
 
-def _listed(names: Sequence[Any], count: int) -> str:
+def listed(names: Sequence[Any], count: int) -> str:
+    """Names of joints, of so many, in words."""
     return "all joints" if len(names) == count > 1 else " and ".join(names)

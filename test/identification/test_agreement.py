@@ -111,6 +111,11 @@ def test_fit_and_check_name_one_cause(name: str) -> None:
     sound = noisy(m.recorded(effort=inverse_dynamics(robot, m.q, m.qd, m.qdd)), rng)
     assert check(sound).answer == "good"
     whole, one = np.ones(robot.joints_count), np.eye(robot.joints_count)[0]
+    for which in (whole, one):
+        made = replace(sound, effort=sound.effort * (-1.0) ** which)
+        (cause,) = check(made).causes
+        with pytest.raises(PkmTwinError, match=re.escape(cause)):
+            fit_recordings(robot, [made])
     for factor in (0.5, 0.8, 1.25, 2.0):
         for which in (whole, one):
             made = replace(sound, effort=sound.effort * factor**which)
