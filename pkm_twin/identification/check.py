@@ -214,6 +214,8 @@ def stuck_from(time: Array, values: Array, told: Array, count: int = 1) -> tuple
     :param values: shape (k,); ``told``: what it should be but for a constant, NaN where that is not
         known. ``count``: samples of it at least.
     """
+    if not np.isfinite(told).any():
+        return None
     steps = np.abs(np.diff(values))
     tick = steps[steps > 0.0].min(initial=np.inf)
     size = max(TICKS * tick, STANDS * float(np.ptp(told[np.isfinite(told)])))

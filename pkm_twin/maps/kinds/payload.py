@@ -3,12 +3,18 @@
 
 from __future__ import annotations
 
+from typing import Final
+
 import numpy as np
 
 from delta_dynamics import inverse_dynamics
 from pkm_twin.codegen.arrays import Array
+from pkm_twin.errors import ParameterError
 from pkm_twin.maps.kind import Case, Found, Kind, limits_of
 from pkm_twin.robot.robot import Robot
+
+STAYS: Final = 1e-12
+"""Motion, part of the machine's size, or effort, part of the limit, that is rounding."""
 
 
 class Payload(Kind):
@@ -36,14 +42,22 @@ class Payload(Kind):
 
         0 where the drives do not hold the machine without it; infinite where no drive feels the
         mass. The element is the drive at its limit.
+
+        :raises ParameterError: the mass stays where the platform turns about it.
         """
+        moved, com = robot.platform_jacobian(robot.graph.home)[:3], robot.payload.com
+        if not com.any() and np.abs(moved).max() < STAYS * robot.size:
+            bound = "--payload MASS,x,y,z, away from the point that the platform turns about"
+            raise ParameterError("payload.com", com.tolist(), bound)
         limits, still = limits_of(robot, "effort"), np.zeros_like(q)
         none = {"mass": 0.0, "inertia": np.zeros((3, 3)).tolist()}
         bare, loaded = (robot.changed(payload=none | {"mass": mass}) for mass in (0.0, 1.0))
         held = inverse_dynamics(bare, q, still, still, case.wrench)
         each = inverse_dynamics(loaded, q, still, still, case.wrench) - held
         with np.errstate(divide="ignore", invalid="ignore"):
-            room = np.where(each == 0.0, np.inf, (np.copysign(limits, each) - held) / each)
+            room = np.where(
+                np.abs(each) < STAYS * limits, np.inf, (np.copysign(limits, each) - held) / each
+            )
         over = np.abs(held) / limits
         fails = over.max(-1) > 1.0
         joint = np.where(fails, over.argmax(-1), room.argmin(-1))
