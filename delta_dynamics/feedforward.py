@@ -51,8 +51,8 @@ class Settings:
     )
     window: int = setting(
         25,
-        "samples in the window at 1 kHz; at a lower rate those of the same time, at least 24 ms "
-        "and 5 samples",
+        "samples in the window; below 1 kHz fewer, so that it spans at most this number of ms (24 "
+        "if that is more), but at least 5",
         name="differentiator.window",
         low=3,
         high=1000,
@@ -78,7 +78,7 @@ class Settings:
     )  # fmt: skip
     on_stop: OnStop = setting(
         "nothing",
-        "command sent once when the stream stops; required with publish_commands",
+        "command sent once when the stream stops; with publish_commands not nothing",
         choices=("nothing", "zeros", "gravity"),
     )
     singularity_warn: float = setting(0.05, "warn below this singularity index", **SHARE)

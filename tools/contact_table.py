@@ -148,8 +148,8 @@ def places(rows: list[dict[str, Any]]) -> str:
         return "no place is determined"
     miss = 100 * np.array([row["miss"] / row["size"] for row in near])
     return (
-        f"in {len(near)} of the {len(good)} contacts whose body is right, the standard deviation "
-        f"of the place is below 10 % of the machine's size. These places are "
+        f"in {len(good)} contacts class and body are right. In {len(near)} of these the node's "
+        f"standard deviation of the place is below 10 % of the machine's size; the place is "
         f"{np.median(miss):.1f} % of the size off (median; 95 %: {np.quantile(miss, 0.95):.0f} %)"
     )
 
@@ -165,9 +165,9 @@ def section(rows: list[dict[str, Any]]) -> str:
     )
 
 
-SECTION: Final = """Of {contacts} simulated contacts (`make contact-table`), with the class 30 ms after the detection:
+SECTION: Final = """{contacts} simulated contacts (`make contact-table`); the class is that 30 ms after the detection:
 
-| robot | detected in 0.3 s | after, ms (median, 95 %) | class unknown | right, of the others |
+| robot | detected in 0.3 s | after, ms (median, 95 %) | class unknown | class right, of the known |
 |---|---|---|---|---|
 {table}
 

@@ -79,7 +79,7 @@ class MachineSim(TwinNode):
             np.zeros_like(settings.start), np.zeros(6), settings.period / settings.substeps
         )
         self.core.restart()
-        self._frame = self.declare("wrench_frame", "platform", "frame id of ~/wrench")
+        self._frame = self.declare("wrench_frame", "platform", "frame id of wrench")
         self._base = self.declare("base_frame", "base_link", "frame of ~/applied_wrench")
         self._create_topics()
         self._due = time.monotonic()

@@ -34,11 +34,12 @@ TWIN: Final = table(
     Topic("out", "~/payload", _INERTIA,
           "mass and centre of mass of the load, from measured efforts", "`estimate_payload`"),
     Topic("out", "~/payload_deviation", _INERTIA,
-          "their standard deviations; infinite where the motion does not determine them",
+          "standard deviations of mass and centre; infinite where the motion does not "
+          "determine them",
           "`estimate_payload`"),
     Topic("out", "~/external_wrench", WRENCH,
           "the smallest wrench at the platform that explains the efforts, base axes", _OBSERVED),
-    Topic("out", "~/external_effort", JOINTS, "the same as joint efforts", _OBSERVED),
+    Topic("out", "~/external_effort", JOINTS, "the external efforts at the joints", _OBSERVED),
     Topic("out", "~/contact", "std_msgs/Bool",
           "whether an external effort exceeds its bound, published on change", _OBSERVED,
           latched=True),
@@ -58,7 +59,7 @@ GATE: Final = table(
           "the stamped torques; the publisher must offer deadline and lifespan"),
     Topic("in", "joint_states", JOINTS, "the measured position", "`on_stop` gravity"),
     Topic("out", "~/commands", NUMBERS, "for JointGroupEffortController, configured order"),
-    Topic("out", "~/commands_stamped", JOINTS, "the same with names and the time of sending"),
+    Topic("out", "~/commands_stamped", JOINTS, "the same, with joint names and time of sending"),
 )  # fmt: skip
 SIMULATION: Final = table(
     Topic("in", "~/commands", NUMBERS, "efforts in configured order, as for an effort controller"),

@@ -35,7 +35,8 @@ STATE: Final = table(
           "bars; under a load also colours by strain energy, deflected lines, the compliance "
           "ellipsoid, the wrench and the dominant element's name"),
     Topic("out", "robot_description", TEXT,
-          "the output of `pkm-twin export urdf` without its `ros2_control` element", latched=True),
+          "the output of `pkm-twin export urdf`, without a `ros2_control` element unless "
+          "`hardware_plugin` is set", latched=True),
     Topic("out", "/tf", _TRANSFORMS,
           "`base_frame` to `platform_frame`, if tf2_msgs is installed"),
     Topic("out", "/tf_static", _TRANSFORMS,

@@ -64,8 +64,8 @@ class WrenchSettings:
 
     wrench_frame: str = setting(
         PLATFORM,
-        "the only accepted frame of the wrench; every name except base_frame is "
-        "a frame that moves with the platform",
+        "the only accepted frame of the wrench; it is taken to move with the platform, unless it "
+        "is base_frame",
         fixed=True,
     )
     base_frame: str = setting("base_link", "frame id of the base", fixed=True)
@@ -80,8 +80,8 @@ class WrenchSettings:
         name="sensor.xyz", unit="m",
     )  # fmt: skip
     sensor_rpy: Triple = setting(
-        ZERO, "roll, pitch and yaw of the sensor relative to the platform; zeros for a wrench in "
-        "base_frame",
+        ZERO, "roll, pitch and yaw of the sensor relative to the platform; must be zeros for a "
+        "wrench in base_frame",
         name="sensor.rpy", unit="rad",
     )  # fmt: skip
 
