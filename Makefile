@@ -136,9 +136,11 @@ animation: $(VENV)/test.stamp
 docs: $(VENV)/docs.stamp
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
-# Each core without its nodes, in this process: what processes of nodes reach is not counted.
+# Processes of nodes count too.
 coverage: $(VENV)/test.stamp $(VENV)/coverage.stamp
+	$(BIN)/coverage erase
 	OMP_NUM_THREADS=1 $(BIN)/coverage run -m pytest -q -p no:xdist $(CORES:%=test/%) $(ENDLESS:%=--ignore=%)
+	$(BIN)/coverage combine --quiet
 	$(BIN)/python -m tools.coverage
 
 mutation: $(VENV)/test.stamp

@@ -116,7 +116,7 @@ setup(
         "fit": ["cvxpy>=1.4"],
         "mjcf": ["mujoco"],
         "audit": ["pip-audit"],
-        "coverage": ["coverage>=7.4"],
+        "coverage": ["coverage>=7.10"],
         "view": ["viser>=1.1"],
         "bench": ["pin", "pytest", "pytest-benchmark"],
     },

@@ -34,10 +34,8 @@ def main() -> int:
     """Print the tables: 1 where a core is below its bound."""
     folders = defaultdict(list)
     for name, file in measured().items():
-        # Nodes run in processes of their own.
-        nodes = "/nodes/" in name or Path(name).stem.endswith("node")
         for core in CORES:
-            if name.startswith(f"{core}/") and not nodes:
+            if name.startswith(f"{core}/"):
                 folders[core].append((name, file))
     missed = []
     for core, files in sorted(folders.items()):

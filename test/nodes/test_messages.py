@@ -2,6 +2,7 @@
 """Readers of messages: every fault is named, what comes through is finite and in order."""
 
 import math
+from dataclasses import replace
 from itertools import permutations, product
 
 import numpy as np
@@ -13,6 +14,7 @@ from pkm_twin.messages.reading import (
     MAX_LOAD,
     MAX_POINTS,
     JointReader,
+    TrajectoryFields,
     read_deflection,
     read_wrench,
 )
@@ -331,6 +333,13 @@ class TestJointState:
                 assert reject(reader.positions, message, NOW, RULES)[0] == "bounds"
 
 
+@pytest.mark.parametrize("values", [(), Q[:2], (*Q, 0.4), (math.nan,) * 3])
+def test_commands_are_one_for_each_joint(reader, values):
+    assert reader.commands(Q).tolist() == list(Q)
+    reason = "length" if len(values) != 3 else "not finite"
+    assert reject(reader.commands, values)[0] == reason
+
+
 class TestStamps:
     @pytest.mark.parametrize("stamp", [NOW - SECOND // 10, NOW, NOW + SECOND // 10])
     def test_stamps_at_the_tolerances_are_good(self, make, reader, stamp):
@@ -363,6 +372,29 @@ class TestTrajectory:
         assert t.times.tolist() == [0.0, 0.5, 1.0]
         assert np.allclose(t.q, [(0.1, 0.2, 0.3), (0.1, 0.3, 0.3), (0.1, 0.4, 0.3)])
         assert t.columns == (1, 2, 0)
+
+    def test_joints_that_the_model_lacks_are_left_out_where_allowed(self, make):
+        message = trajectory(
+            make,
+            names=("wrist", *NAMES),
+            positions=[(9.0, *Q)] * 3,
+            velocities=None,
+            accelerations=None,
+        )
+        t = JointReader(ROBOT, extra_joints="zero").trajectory(message, NOW)
+        assert t.columns == (-1, 0, 1, 2)
+        assert t.q.tolist() == [list(Q)] * 3
+
+    def test_fields_are_read_as_their_message(self, make, reader):
+        for kind, changes, word in wrong_lengths():
+            if kind == "trajectory":
+                fields = TrajectoryFields.of(trajectory(make, **changes))
+                reason, text = reject(reader.trajectory, fields, NOW)
+                assert reason == "length" and word in text
+        fields = TrajectoryFields.of(trajectory(make))
+        assert reader.trajectory(fields, NOW).q.tolist() == [list(Q)] * 3
+        narrow = replace(fields, columns=fields.columns | {"positions": np.zeros((3, 2))})
+        assert "point 0: 2 positions for 3" in reject(reader.trajectory, narrow, NOW)[1]
 
     def test_absent_derivatives_are_none(self, make, reader):
         message = trajectory(make, velocities=None, accelerations=None)

@@ -155,15 +155,18 @@ def test_the_period_is_a_mean():
     assert topic.overruns <= 1
 
 
-def test_a_silence_is_no_period():
-    """Batches of 20 at 1 kHz, a second apart."""
+@pytest.mark.parametrize("regular", [1, 4, 20])
+def test_a_silence_counts_as_two_periods(regular):
     topic = TopicStatistics()
-    sent = 0
-    for i in range(200):
-        sent += MILLISECOND * (1 if i % 20 else 1000)
-        topic.received(i, sent)
-        topic.handled(5e-3)
-    assert topic.overruns >= 190
+    topic.received(0, MILLISECOND)
+    topic.handled(1.0)
+    for i in range(1, regular + 1):
+        topic.received(i, (i + 1) * MILLISECOND)
+    topic.received(regular + 1, 100 * SECOND)
+    period = 1e-3 * (1.0 + max(0.1, 1.0 / (regular + 1)))
+    for took, overruns in ((0.999 * period, 0), (1.001 * period, 1)):
+        topic.handled(took)
+        assert topic.overruns == overruns
 
 
 def test_a_slower_stream_is_learned():
