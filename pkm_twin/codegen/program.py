@@ -36,10 +36,11 @@ AHEAD: Final = 0.1
 """The same of each of more steps, which begins where the ones before lead on."""
 NEXT: Final = 0.01
 """Most that the first correction of a stream's sample may be, which starts from the one before."""
-DIRECT: Final = 1e-3
-"""Least determinant, over the one at home, of a state that is reached in one step from home."""
-STEPPED: Final = 1e-8
-"""The same with more steps: no correction can step over a singularity then."""
+LEAST: Final = 1e-8
+"""Least determinant, over the one at home."""
+MARGIN: Final = 5.0
+"""Least determinant over a correction of a guess in one step: a longer one may step over two
+singularities, to a determinant of the same sign. Of more steps every first correction is short."""
 LARGE: Final = 1e300
 """Sum of the sizes of inputs and results from which on they count as infinite."""
 RESIDUAL: Final = 1e-10
@@ -204,8 +205,10 @@ class Equations:
         known = self.start is not None and not self.guessed
         x = self.size.tape.inputs(self.unknowns, len(self.home))
         new = (select(moving, a, b) for a, b in zip(self.corrected, x, strict=True))
-        least = STEPPED if known else select(once, DIRECT, STEPPED)
-        sound = both(less(size, CONTRACTION**2 * state[AT.size]), less(least, determinant))
+        sound = both(less(size, CONTRACTION**2 * state[AT.size]), less(LEAST, determinant))
+        if not known:
+            longest = select(once, MARGIN**2 * size, 0.0)
+            sound = both(sound, less(longest, determinant * determinant))
         moves = both(moving, both(sound, less(CLOSED**2, size)))
         return self._lift(*new, size, moves, select(moving, sound, state[AT.alive]))
 

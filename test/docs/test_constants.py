@@ -24,14 +24,11 @@ def test_newtons_judgement():
         program.MAX_ITERATIONS,
     ]
     assert word("at most a **{}** of the one before it") == program.CONTRACTION
-    assert numbers(ENGINE, r"stays above (\S+) \((\S+) from a closed form") == [
-        program.DIRECT,
-        program.STEPPED,
-    ]
+    pattern = r"stays above (\S+), and above (\S+) times the correction of a single step from home"
+    assert numbers(ENGINE, pattern) == [program.LEAST, program.MARGIN]
     assert numbers(ENGINE, r"redundant ones too, is at most (\S+) \(") == [program.RESIDUAL]
     pattern = r"tried again in (\d+), (\d+), (\d+), (\d+) and (\d+) \*\*steps"
     assert numbers(ENGINE, pattern) == list(STEPS)
-    assert numbers(ENGINE, r"determinant's least is then (\S+): short") == [program.STEPPED]
 
 
 def test_pivots():

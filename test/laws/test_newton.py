@@ -55,7 +55,7 @@ def program(kind):
 def solved(kind, steps, q, start, near, foreseen, pace, scale, gap, side):
     """By the rules: x, or NaN; and the part of the way that is sound."""
     ways = [1.0 - (1.0 - k / steps) ** 3 for k in range(steps + 1)]
-    least = 1e-8 if steps > 1 or kind.start == "form" else 1e-3
+    margin = 0.0 if steps > 1 or kind.start == "form" else 5.0
     x, before, first = 1.0, 1.0, inf
     for k in range(1, steps + 1):
         target = q if k == steps else 1.0 + ways[k] * (q - 1.0)
@@ -74,6 +74,7 @@ def solved(kind, steps, q, start, near, foreseen, pace, scale, gap, side):
         longest = first
         for _ in range(12):
             correction = pace * (x * x - target) / (2.0 * x)
+            least = max(1e-8, margin * abs(correction))
             if not (abs(correction) < longest and x * scale > least):
                 return np.nan, ways[k - 1]
             x, longest = x - correction, 0.25 * abs(correction)

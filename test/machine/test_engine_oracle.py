@@ -12,7 +12,7 @@ from pkm_twin.certify.maximal import Maximal, random_states
 from pkm_twin.errors import ParameterError, PkmTwinError
 from pkm_twin.mechanisms.catalogue import robot_of_data
 from test.laws.conftest import MISSING, changed
-from test.machine.random_machines import NAMES, plain, variant
+from test.machine.random_machines import FILES, NAMES, plain, variant
 from test.support.robots import load, partly_long
 
 pytestmark = pytest.mark.usefixtures("quickly_compiled")
@@ -74,11 +74,21 @@ def test_forward_dynamics_inverts(case):
     assert np.abs(back - s.qdd).max() < 1e-12 * condition * max(1.0, np.abs(tau).max())
 
 
-@pytest.mark.parametrize(("name", "q"), [("rps3", [0.3, 1.3, 0.3]), ("five_bar", [0.9, -0.9])])
+BEYOND = [
+    ("rps3", [0.3, 1.3, 0.3]),
+    ("five_bar", [0.9, -0.9]),
+    ("delta_rcu", [1.583, 0.792, -2.177]),
+]
+
+
+@pytest.mark.parametrize(("name", "q"), BEYOND)
 def test_what_no_way_from_home_reaches_is_told(name, q):
-    """The five-bar's elbows meet on the way: behind it all loops close, in no assembly of ours."""
+    """The five-bar's elbows meet on the way: behind it all loops close, in no assembly of ours.
+
+    On the delta's way are two singularities, and its determinant has the right sign behind both.
+    """
     with pytest.raises(PkmTwinError):
-        load(name).forward(q)
+        load(FILES[name]).forward(q)
 
 
 PENDULUM = {
