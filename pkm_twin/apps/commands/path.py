@@ -102,10 +102,9 @@ class Motion(Carries, ReadsTables, AwayFromSingular, Writes, Draws):
     force: float | None = setting(
         None, "of --slow-where-soft: cutting force per feed, N per m/s, against the motion", low=0.0
     )
-    tolerance: float | None = setting(
-        None, "of --slow-where-soft: largest deflection of the platform, m", name="deflection",
-        older=("--tolerance",),
-    )  # fmt: skip
+    deflection: float | None = setting(
+        None, "of --slow-where-soft: largest deflection of the platform, m", older=("--tolerance",)
+    )
     law: str = setting(
         "quintic", "motion law without --fastest: quintic or s-curve, from stop to stop"
     )
@@ -157,16 +156,16 @@ def path(given: Motion) -> Report:
 
     machine = given.machine()
     if given.slow_where_soft:
-        missing = [n for n in ("force", "tolerance", "speed") if getattr(given, n) is None]
+        missing = [n for n in ("force", "deflection", "speed") if getattr(given, n) is None]
         if missing:
             raise typer.BadParameter(f"--slow-where-soft needs --{' and --'.join(missing)}")
-        for name, unit in (("tolerance", "m"), ("speed", "m/s")):
+        for name, unit in (("deflection", "m"), ("speed", "m/s")):
             check_limit(name, getattr(given, name), unit)
-    elif given.force is not None or given.tolerance is not None:
+    elif given.force is not None or given.deflection is not None:
         raise typer.BadParameter("--force and --deflection are for --slow-where-soft")
     cut = None
     if given.slow_where_soft:
-        cut = SoftCut(machine, given.force or 0.0, given.tolerance or 0.0, given.speed or 0.0)
+        cut = SoftCut(machine, given.force or 0.0, given.deflection or 0.0, given.speed or 0.0)
     bounds: dict[str, Any] = {
         name: _limit(name, getattr(given, name), machine)
         for name in ("effort", "velocity", "acceleration", "jerk")
