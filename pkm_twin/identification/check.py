@@ -137,10 +137,6 @@ def checked(r: Recording, residual: float) -> Checked:
     left_out = np.zeros(len(r.time), np.bool_)
     bound = f"RMS below {100 * residual:g} % of peak"
     reason = why_no_torques(r.robot)
-    if r.robot.redundant:
-        reason = (
-            reason or "more motors than degrees of freedom share efforts as their controller says"
-        )
     if r.effort is None:
         reason = reason or (COMPUTED if r.efforts == "model" else "the bag carries no efforts")
     mixed = step_fault(r, steps) if steps.publishers else ""
@@ -347,6 +343,9 @@ def _rests(c: Compared) -> Mask:
 def _stuck_efforts(r: Recording, c: Compared) -> str:
     """Efforts that were not measured, or not all the time; saturated ones are no such; or empty."""
     assert r.effort is not None  # noqa: S101
+    if r.robot.redundant:
+        # One of the drives that share may stay as it is.
+        return ""
     rows = np.searchsorted(r.time, c.time).clip(0, len(r.time) - 1)
     texts, good, moved = [], c.good, np.where(_rests(c), np.nan, c.expected)
     for j, (joint, unit) in enumerate(zip(r.robot.joint_names, r.robot.effort_units, strict=True)):
@@ -484,6 +483,8 @@ def _contact(r: Recording, c: Compared) -> Iterator[tuple[str, Mask]]:
 def _saturated(r: Recording, c: Compared) -> tuple[str, ...]:
     """Joints whose effort stays at its greatest while the model needs more, and else agrees."""
     assert r.effort is not None  # noqa: S101
+    if r.robot.redundant:
+        return ()
     rows = np.searchsorted(r.time, c.time - 1e-9).clip(0, len(r.time) - 1)
     measured, limit = r.effort[rows], c.limit
     expected = measured - c.raw

@@ -14,7 +14,7 @@ from typing import Any, Final
 import numpy as np
 
 from delta_dynamics.torques.stiction import beyond_friction, friction_reach, moving_rates
-from delta_dynamics.torques.virtual_work import inverse_dynamics
+from delta_dynamics.torques.virtual_work import inverse_dynamics, null_efforts
 from pkm_twin.codegen.arrays import Array, Mask
 from pkm_twin.errors import PkmTwinError
 from pkm_twin.identification.estimation import estimate
@@ -34,6 +34,7 @@ from pkm_twin.identification.samples import (
 )
 from pkm_twin.recordings import Load, Recording, at_rest, by_load
 from pkm_twin.report import Fact, judged
+from pkm_twin.robot.robot import Robot
 from pkm_twin.streams.drives import idle_samples
 from pkm_twin.streams.rates import rms
 from pkm_twin.streams.steps import Steps, sampling_of, steps_of
@@ -150,10 +151,28 @@ def by_held(r: Recording, function: Callable[..., Array], time: Array, *motion: 
     return np.concatenate([function(robot, *(v[rows] for v in motion)) for robot, rows in parts])
 
 
+def moving(robot: Robot, q: Array) -> Array:
+    """What takes efforts to the least ones that move the machine alike, shape (k, n, n).
+
+    Least over their limits. Drives that share may do so otherwise than the model says: what they
+    give against each other moves nothing. One where no drives share.
+    """
+    one = np.eye(robot.joints_count)
+    if not robot.redundant:
+        return np.broadcast_to(one, (len(q), *one.shape))
+    rows = null_efforts(robot, q)
+    return one - rows.swapaxes(-1, -2) @ (rows / robot.effort_scale**2)
+
+
+def _each(matrices: Array, rows: Array) -> Array:
+    return np.asarray(np.einsum("kij,kj->ki", matrices, rows), np.float64)
+
+
 def compare(r: Recording, bound: float = MAX_RESIDUAL) -> Compared | None:
     """Compare a recording with the model; None where no piece of it is long enough.
 
-    Velocities and accelerations of a recording that has both are used as they are.
+    Velocities and accelerations of a recording that has both are used as they are. Of drives that
+    share, what moves nothing is in neither efforts.
 
     :param bound: of a good residual, RMS, as a part of the peak effort.
     """
@@ -165,13 +184,16 @@ def compare(r: Recording, bound: float = MAX_RESIDUAL) -> Compared | None:
 
     def efforts(track: Track) -> Array:
         qd = moving_rates(track.qd, ~track.moves(how), reach)
-        return by_held(r, inverse_dynamics, track.time, track.q, qd, track.qdd, track.wrench)
+        made = by_held(r, inverse_dynamics, track.time, track.q, qd, track.qdd, track.wrench)
+        return _each(moving(robot, track.q), made)
 
     period, how = pieces[0].period, replace(how, keep_every=1)
     sharp: list[dict[str, Array]] = []
     for track in pieces:
         expected = efforts(track)
-        left = beyond_friction(track.effort - expected, ~track.moves(how), reach)
+        alike = moving(robot, track.q)
+        slack = _each(np.abs(alike), np.where(track.moves(how), 0.0, reach))
+        left = beyond_friction(_each(alike, track.effort) - expected, slack > 0.0, slack)
         change = np.gradient(expected, period, axis=0)
         sharp.append({"expected": expected, "left": left, "change": change})
     smooth = filtered(sharp, period, how)

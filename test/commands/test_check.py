@@ -11,7 +11,7 @@ import yaml
 pytest.importorskip("mcap")
 from mcap.writer import Writer
 
-from delta_dynamics import inverse_dynamics
+from delta_dynamics import inverse_dynamics, null_efforts
 from pkm_twin.bags.reader import inspect, read_messages
 from pkm_twin.identification.check import MEASURED, check
 from pkm_twin.identification.parameters import file_parameters
@@ -461,6 +461,33 @@ class TestCauses:
         robot, m, efforts = drawn(rng, 6.0, 250.0)
         wave = np.abs(efforts).max(0) * np.sin(np.outer(m.time, [3.1, 4.3, 5.7]))
         assert self.cause(recording_of(robot, m, efforts + wave)) == ()
+
+
+@pytest.mark.parametrize(
+    ("inner", "factors", "cause"),
+    [
+        (0.0, 1.0, None),
+        (0.5, 1.0, None),
+        (0.0, -3.0, None),
+        (0.5, -3.0, None),
+        (0.5, 1.3, "all joints are 1.3 times"),
+        (0.0, [1.0, -1.0, 1.0, 1.0], "of motor_2 have the wrong sign"),
+        (0.5, [1.0, -1.0, 1.0, 1.0], None),
+    ],
+)
+def test_drives_that_share_are_judged_by_what_moves(inner, factors, cause):
+    """Inner forces, here parts of the limits, are the controller's to choose."""
+    robot = load("examples/machines/rrr4_planar.yaml")
+    time = np.arange(0.0, 4.0, 0.004)
+    q = robot.inverse(robot.home() + 0.02 * np.sin(np.outer(time, [5.0, 7.0, 9.0])))
+    qd = np.gradient(q, time, axis=0)
+    q, qd, qdd = robot.agreeing(q, qd, np.gradient(qd, time, axis=0))
+    efforts = inverse_dynamics(robot, q, qd, qdd)
+    efforts += inner * np.sin(2.0 * time)[:, None] * null_efforts(robot, q)[:, 0]
+    report = check(Recording(robot, time, q, qd, effort=factors * efforts), thorough=False)
+    assert report.answer == ("good" if factors == 1.0 else "bad")
+    assert len(report.causes) == (cause is not None)
+    assert all(cause in text for text in report.causes)
 
 
 def drawn(rng, seconds, rate):
