@@ -145,6 +145,10 @@ class TestFeedforward:
             for qd in (speed, -speed):
                 found = reader.joint_state(states(both, q, qd)[1], NOW, StampRules())
                 close(found.q, q, 1e-12)
+                if speed.any():
+                    with pytest.raises(MessageError, match="velocity of"):
+                        fast = states(both, q, (1.0 + 1e-9) * qd)[1]
+                        reader.joint_state(fast, NOW, StampRules())
             beyond = q + 1e-6 * (q - ends.mean(0))
             with pytest.raises(MessageError, match="position of"):
                 reader.joint_state(states(both, beyond)[1], NOW, StampRules())
