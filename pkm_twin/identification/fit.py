@@ -16,6 +16,7 @@ import numpy as np
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import PkmTwinError
 from pkm_twin.identification.causes import number_that_explains
+from pkm_twin.identification.compare import MAX_RESIDUAL
 from pkm_twin.identification.estimation import Estimate, nearest, possible
 from pkm_twin.identification.identifiable import KINDS, Kind
 from pkm_twin.identification.judge import SIGMAS, Verdict
@@ -202,7 +203,10 @@ def _faults(made: Rows) -> list[str]:
 
 
 def _worse(problem: Problem) -> list[str]:
-    """Recordings whose held-out part the fitted values predict worse than the file's."""
+    """Recordings whose held-out part the fitted values predict worse than the file's.
+
+    Where the file's explain it, the fitted follow noise: the machine is not at fault.
+    """
     robot, told = problem.robot, []
     values = problem.parameters.values, problem.estimate.values
     for end in problem.held_out:
@@ -211,10 +215,17 @@ def _worse(problem: Problem) -> list[str]:
         )
         j = int(np.argmax(new / np.maximum(old, 1e-300)))
         if new[j] > WORSE * old[j] and new[j] > EXACT * np.std(end.effort[:, j]):
+            why = "another machine, or a motion that is too short or changes?"
+            if (old <= MAX_RESIDUAL * np.abs(end.effort).max(0)).all():
+                why = (
+                    "these explain the recording; it does not excite the numbers enough, condition "
+                    f"number {problem.estimate.condition:.3g}: keep them, fit less with --what, or "
+                    "record a longer motion"
+                )
             told.append(
                 f"{end.recording.name}: the fitted values leave {new[j]:.3g} "
-                f"{robot.effort_units[j]} of the held-out efforts of {robot.joint_names[j]}, the "
-                f"file's {old[j]:.3g} (another machine, or a motion that is too short or changes?)"
+                f"{robot.effort_units[j]} of the held-out efforts of {robot.joint_names[j]}, "
+                f"the values before {old[j]:.3g} ({why})"
             )
     return told
 
