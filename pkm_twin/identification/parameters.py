@@ -42,6 +42,8 @@ UNSURE: Final = 0.98
 """One that is known no better than this is not excited."""
 NO_CHANGE: Final = 1e-3
 """Change over the standard deviation before that says nothing."""
+ROUNDING: Final = 1e-12
+"""Part of the greatest moment by which an inertia may be beyond what a body can have."""
 SHOWN: Final = 0.1
 """Part of the greatest weight below which an element is no part of a combination."""
 
@@ -182,6 +184,8 @@ def numbers_of_group(
 ) -> list[Number]:
     """A group's numbers of the file, their standard deviations by the derivatives of its keys.
 
+    An inertia that no body has with the file's value of what is not excited is fitted as a whole.
+
     :param covariances: of the values by the noise alone, and with what the model does not explain.
     """
     before, after = group.keys(group.values), group.keys(values)
@@ -189,12 +193,22 @@ def numbers_of_group(
     for step in np.diag(1e-6 * prior):
         high, low = group.keys(values + step), group.keys(values - step)
         columns.append([(high[key] - low[key]) / (2.0 * step.sum()) for key in after])
-    numbers = []
+    numbers, whole = list[Number](), list[Number]()
     each = zip(np.array(columns).T, after.items(), group.units, strict=True)
     for slope, (key, value), unit in each:
         plain, wide = (float(np.sqrt(max(slope @ one @ slope, 0.0))) for one in covariances)
         usual = float(np.linalg.norm(slope * prior))
         numbers.append(number_of(key, unit, before[key], value, (plain, wide), usual))
+        whole.append(Number(key, unit, before[key], value, wide, "combination"))
+    moments: dict[Keys, list[int]] = {}
+    for k, one in enumerate(numbers):
+        if isinstance(one.key[-1], int) and isinstance(one.key[-2], int):
+            moments.setdefault(_base(one.key), []).append(k)
+    for places in moments.values():
+        inertia = np.array([numbers[k].after for k in places])
+        off = np.abs(possible_inertia(inertia) - inertia).max()
+        for k in places if off > ROUNDING * np.abs(inertia).max() else ():
+            numbers[k] = numbers[k] if numbers[k].status != "not excited" else whole[k]
     return numbers
 
 
@@ -269,11 +283,7 @@ def fitted_yaml(text: str, fitted: Sequence[Number], recordings: Sequence[str]) 
     """
     groups: dict[Keys, list[Number]] = {}
     for number in fitted:
-        base: Keys = tuple(k for k in number.key if not isinstance(k, int))
-        # A section of a list is no place in a vector.
-        if number.key[:1] == ("limbs",) and isinstance(number.key[1], int):
-            base = (*number.key[:2], *base[1:])
-        groups.setdefault(base, []).append(number)
+        groups.setdefault(_base(number.key), []).append(number)
     values: dict[Keys, Any] = {}
     notes: dict[Keys, str] = {}
     source = ", ".join(recordings)
@@ -294,6 +304,13 @@ def fitted_yaml(text: str, fitted: Sequence[Number], recordings: Sequence[str]) 
     return edit_yaml(text, values, notes)
 
 
+def _base(key: Keys) -> Keys:
+    """Of the number, vector or matrix that a number stands in."""
+    base: Keys = tuple(k for k in key if not isinstance(k, int))
+    # A section of a list is no place in a vector.
+    return (*key[:2], *base[1:]) if key[:1] == ("limbs",) and isinstance(key[1], int) else base
+
+
 def _value(base: Keys, numbers: Sequence[Number]) -> Any:
     """A number, a list, or a matrix of what stands below one key."""
     tails = {n.key[len(base) :]: n.after for n in numbers}
@@ -303,10 +320,6 @@ def _value(base: Keys, numbers: Sequence[Number]) -> Any:
         return [tails[k,] for k in range(len(tails))]
     upper = np.triu_indices(3)
     inertia = np.array([tails.get((i, j), np.nan) for i, j in np.transpose(upper).tolist()])
-    near = possible_inertia(inertia) if np.isfinite(inertia).all() else inertia
-    # What keeps the file's value may leave the edge of what a body can be by a little.
-    if np.abs(near - inertia).max() <= NO_CHANGE * np.abs(inertia).max():
-        inertia = near
     matrix = np.zeros((3, 3))
     matrix[upper] = matrix[upper[::-1]] = inertia
     if not np.any(matrix - np.diag(np.diag(matrix))):

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import dataclasses
-from contextlib import nullcontext
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -17,12 +17,13 @@ from pkm_twin.errors import PkmTwinError
 from pkm_twin.identification.estimation import estimate, possible
 from pkm_twin.identification.fit import Fit, fit
 from pkm_twin.identification.identifiable import pseudo_inertia
-from pkm_twin.identification.parameters import Number, file_parameters, fitted_yaml
+from pkm_twin.identification.parameters import file_parameters, fitted_yaml
 from pkm_twin.machine.inertia import standard_parameters
 from pkm_twin.mechanisms.entries import write_edited
 from pkm_twin.recordings import Recording
+from test.identification.machines import noisy
 from test.laws.recordings import smooth_motion
-from test.support.robots import load, parameters_of
+from test.support.robots import load, parameters_of, partly_long
 
 TRUTH = {
     "friction": {"viscous": [40.0, 60.0, 55.0], "coulomb": [15.0, 22.0, 9.0]},
@@ -177,19 +178,33 @@ def test_the_nearest_possible_body_takes_an_impossible_one_s_place():
     assert apart[1] @ measure @ apart[1] <= apart[0] @ measure @ apart[0] * 1.2
 
 
-@pytest.mark.parametrize(("beyond", "written"), [(1e-6, True), (0.1, False)])
-def test_an_inertia_beyond_what_a_body_can_be_is_written_only_if_by_a_little(
-    tmp_path, beyond, written
-):
-    """As where one of its numbers keeps the file's value."""
-    entries = zip(*np.triu_indices(3), [1.0 + beyond, 0.0, 0.0, 0.0, 0.0, 1.0], strict=True)
-    numbers = [
-        Number(("payload", "inertia", int(i), int(j)), "kg m2", 0.0, value, 0.1, "combination")
-        for i, j, value in entries
-    ]
-    numbers.append(Number(("payload", "mass"), "kg", 0.0, 0.5, 0.1, "fitted"))
-    text = Path("config/five_bar.yaml").read_text()
-    out = tmp_path / "fitted.yaml"
-    with nullcontext() if written else pytest.raises(PkmTwinError, match="not a valid robot"):
-        write_edited(out, [], fitted_yaml(text, numbers, ["drawn"]), load("five_bar"))
-    assert out.exists() == written
+UPPER = np.triu_indices(3)
+PAYLOADS = list(product(("five_bar", "delta"), range(4)))
+
+
+@pytest.mark.parametrize("case", partly_long(PAYLOADS, ("five_bar", 0)))
+def test_what_is_fitted_of_a_payload_is_a_robot(tmp_path: Path, case: tuple[str, int]) -> None:
+    """An inertia of which some numbers keep the file's value is one that a body has."""
+    name, seed = case
+    robot, rng = load(name), np.random.default_rng([seed, *name.encode()])
+    time, *motion = smooth_motion(robot, rng, 8.0, 100.0)
+    text, out = Path(f"config/{name}.yaml").read_text(), tmp_path / "fitted.yaml"
+    for mass in np.geomspace(0.05, 1.0, 3).tolist():
+        efforts = inverse_dynamics(robot.changed(payload={"mass": mass}), *motion)
+        drawn = Recording(robot, time, motion[0], effort=efforts)
+        found = fit(robot, [noisy(drawn, rng)])
+        write_edited(out, [], fitted_yaml(text, found.numbers, ["drawn"]), robot)
+        told = {n.name: n.after for n in found.numbers}
+        inertia = [told[f"payload.inertia[{i}][{j}]"] for i, j in zip(*UPPER, strict=True)]
+        np.testing.assert_allclose(load(str(out)).payload.inertia[UPPER], inertia, atol=1e-15)
+
+
+def test_a_short_recording_of_the_file_s_own_machine_is_not_another_one_s() -> None:
+    """The fitted values follow its noise: worse than the file's where they were not fitted."""
+    robot, rng = load("delta"), np.random.default_rng([0, *b"delta"])
+    time, *motion = smooth_motion(robot, rng, 2.0, 200.0)
+    drawn = Recording(robot, time, motion[0], effort=inverse_dynamics(robot, *motion))
+    sound = noisy(drawn, rng)
+    with pytest.raises(PkmTwinError, match="does not excite the numbers enough"):
+        fit(robot, [sound])
+    assert not fit(robot, [sound], ("friction",)).accepted
