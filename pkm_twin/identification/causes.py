@@ -2,13 +2,14 @@
 """The one thing that explains efforts which contradict a robot's file, for ``check`` and ``fit``.
 
 A sign, the axes or the sign of the wrench, or one number: the scale of the efforts, of all drives
-or of one, or a payload. Of the numbers the one counts that leaves least.
+or of one, or a payload. Of the numbers the one counts that leaves least. If none does, it is two:
+a sign and a number, or a scale and a payload.
 What is put right has to make the efforts agree.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from itertools import chain
 from typing import Final
@@ -26,7 +27,9 @@ from pkm_twin.identification.compare import (
     compared_of,
     near_change,
 )
+from pkm_twin.identification.judge import SIGMAS
 from pkm_twin.identification.plausible import held_payload, listed, scale_text, wrenches
+from pkm_twin.identification.suspects import OFF
 from pkm_twin.recordings import Load, Recording
 from pkm_twin.robot.plausibility import why_no_torques
 from pkm_twin.robot.robot import Robot
@@ -36,9 +39,20 @@ SPANS: Final = 50
 LIGHTEST: Final = 1e-3
 """Part of the machine's mass below which a payload is none."""
 EXACT: Final = 0.2
-"""Part of the residual's bound that another scale leaves: of more, something else is wrong, too."""
+"""Part of the residual's bound that a number leaves: of more, something else is wrong, too."""
+SCALED: Final = 1.0 + SIGMAS * OFF
+"""Scale, or its inverse, beyond which efforts are not a machine's: less is a usual gain error."""
+BETTER: Final = 2.0
+"""How many times as much of the residual's square one number leaves that is not the whole cause."""
+BLOCK: Final = 0.25
+"""Around a pick or release neither mass nor scale is found, s."""
+PASSES: Final = 4
+"""How often the times of a payload and the scale of the efforts follow from each other."""
 ALIKE: Final = 4.0
 """How many times as much of the residual's square other masses leave that explain it as well."""
+
+Spans = list[tuple[float, float]]
+"""When a payload is held, s; empty: all the time."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,14 +60,25 @@ class Cause:
     """A cause in words, the recording put right, and samples that are left out then, (samples,).
 
     ``exact``: part of the residual's bound within which the efforts agree. ``scale``: how many
-    times too large they are.
+    times too large they are, negative with wrong signs.
     """
 
     text: str
     recording: Recording
     left_out: Mask
-    exact: float = 1.0
+    exact: float = EXACT
     scale: float = 1.0
+
+    @property
+    def possible(self) -> bool:
+        """Whether the efforts as recorded can be a machine's: their scale is nearly right."""
+        return 1.0 / SCALED < self.scale < SCALED
+
+    def then(self, others: Iterable[Cause]) -> Iterator[Cause]:
+        """Causes of the recording that this one puts right, each together with this one."""
+        for other in others:
+            text, scale = f"{self.text}; put right, {other.text}", self.scale * other.scale
+            yield replace(other, text=text, scale=scale)
 
     def agrees(self, bound: float) -> bool:
         """Whether the efforts agree with the model once this is put right."""
@@ -71,21 +96,21 @@ def agrees(r: Recording, without: Mask, bound: float) -> bool:
 
 def cause_of(r: Recording, c: Compared, left_out: Mask) -> Cause | None:
     """The first thing that makes the efforts agree; None where there is none."""
-    found = chain(_turned(r, c, left_out), number_of(r, c, left_out))
+    found = chain(_turned(r, c, left_out), _numbers(r, c, left_out))
     return next((cause for cause in found if cause.agrees(c.bound)), None)
 
 
 def number_that_explains(r: Recording) -> Cause | None:
-    """The number that makes a recording's efforts agree; without words where they do as they are.
+    """What `cause_of` finds of numbers; without words where the efforts agree as they are.
 
-    None where no number does.
+    None where no number makes them agree.
     """
     if r.robot.redundant or why_no_torques(r.robot):
         return None
     none = np.zeros(len(r.time), np.bool_)
     try:
         c = compare(r)
-        found = () if c is None or c.good.all() else tuple(number_of(r, c, none))
+        found = () if c is None or c.good.all() else tuple(_numbers(r, c, none))
     except (PkmTwinError, ValueError):
         return None
     if c is not None and replace(c, bound=EXACT * c.bound).good.all():
@@ -93,20 +118,34 @@ def number_that_explains(r: Recording) -> Cause | None:
     return next((cause for cause in found if cause.agrees(MAX_RESIDUAL)), None)
 
 
-def _turned(r: Recording, c: Compared, left_out: Mask) -> Iterator[Cause]:
-    """Signs of efforts, and axes and sign of the wrench."""
+def _numbers(r: Recording, c: Compared, left_out: Mask) -> Iterator[Cause]:
+    """One number or two, and one after efforts are given their signs."""
+    yield from _number_of(r, c, left_out)
+    for turned in _signs(r, c, left_out):
+        other = compared_of(turned.recording, left_out, c.bound)
+        if other is not None:
+            yield from turned.then(_number_of(turned.recording, other, left_out))
+
+
+def _signs(r: Recording, c: Compared, left_out: Mask) -> Iterator[Cause]:
+    """Efforts that oppose the expected ones."""
     turned = ~c.good & (np.sum(c.measured * c.expected, 0) < 0.0)
     if turned.any():
         names = listed(np.array(r.robot.joint_names)[turned].tolist(), len(turned))
         effort = r.measured * np.where(turned, -1.0, 1.0)
         text = f"efforts of {names} have the wrong sign"
-        yield Cause(text, replace(r, effort=effort), left_out)
+        yield Cause(text, replace(r, effort=effort), left_out, 1.0, -1.0)
+
+
+def _turned(r: Recording, c: Compared, left_out: Mask) -> Iterator[Cause]:
+    """Signs of efforts, and axes and sign of the wrench."""
+    yield from _signs(r, c, left_out)
     for text, wrench in wrenches(r):
-        yield Cause(text, replace(r, wrench=wrench), left_out)
+        yield Cause(text, replace(r, wrench=wrench), left_out, 1.0)
 
 
-def number_of(r: Recording, c: Compared, left_out: Mask) -> Iterator[Cause]:
-    """The number that leaves least of the residual: a scale or a payload."""
+def _number_of(r: Recording, c: Compared, left_out: Mask) -> Iterator[Cause]:
+    """The number that leaves least of the residual: a scale or a payload; then both together."""
     robot, weight, n = r.robot, 1.0 / c.limit**2, r.robot.joints_count
 
     change = np.gradient(c.expected, c.period, axis=0)
@@ -133,37 +172,74 @@ def number_of(r: Recording, c: Compared, left_out: Mask) -> Iterator[Cause]:
         return inverse_dynamics(heavy, *motion) - inverse_dynamics(one, *motion)
 
     each = [(name, row) for name, row in zip(robot.joint_names, np.eye(n), strict=True) if n > 1]
-    names, which = min(
-        [("all joints", np.ones(n)), *each], key=lambda one: left(one[1] * c.expected)[1]
-    )
+    drives = [("all joints", np.ones(n)), *each]
+    names, which = min(drives, key=lambda one: left(one[1] * c.expected)[1])
     scale, least = left(which * c.expected)
-    if r.load is None:
-        columns = [by_held(r, more, t.time, *t.joints, t.wrench) for t in c.tracks]
-        column = on_time(c.filtered(columns))
-        mass, spans, held = held_payload(c.time, column, residual, weight)
-        rest = residual - mass * held[:, None] * column
-        total = sum(body.mass for body in robot.graph.bodies.values())
-        if mass > LIGHTEST * total and np.sum(weight * rest**2) < least:
-            if len(spans) <= SPANS:
-                yield from _payload(r, c, left_out, mass, () if held.all() else tuple(spans))
-            return
-    if scale <= 0.0:
+
+    def scaled(names: str, which: Array, scale: float, masses: float | None = None) -> Cause:
+        other_units = replace(r, effort=r.measured / (1.0 + (scale - 1.0) * which))
+        return Cause(scale_text(names, scale, masses), other_units, left_out, EXACT, scale)
+
+    def alone() -> Iterator[Cause]:
+        """The scale, unless other masses explain more."""
+        masses = None
+        if which.all():
+            columns = [by_held(r, weighing, t.time, *t.joints, t.wrench) for t in c.tracks]
+            heavier, other = left(c.filtered(columns))
+            if other < least / ALIKE:
+                return
+            masses = heavier if other < ALIKE * least else None
+        if scale > 0.0:
+            yield scaled(names, which, scale, masses)
+
+    if r.load is not None:
+        yield from alone()
         return
-    masses = None
-    if which.all():
-        columns = [by_held(r, weighing, t.time, *t.joints, t.wrench) for t in c.tracks]
-        heavier, other = left(c.filtered(columns))
-        if other < least / ALIKE:
-            return
-        masses = heavier if other < ALIKE * least else None
-    factor = 1.0 + (scale - 1.0) * which
-    other_units = replace(r, effort=r.measured / factor)
-    yield Cause(scale_text(names, scale, masses), other_units, left_out, EXACT, scale)
+    columns = [by_held(r, more, t.time, *t.joints, t.wrench) for t in c.tracks]
+    column = c.filtered(columns)
+    total = sum(body.mass for body in robot.graph.bodies.values())
+
+    def loaded(which: Array) -> tuple[float, float, float, Spans]:
+        """The squares that remain, the mass, the scale of some drives and the payload's times."""
+        mass, size, missed, spans = 0.0, 0.0, np.inf, list[tuple[float, float]]()
+        for _ in range(PASSES if which.any() else 1):
+            heavy, own = (1.0 + size * which) * column, which * c.expected
+            rest = residual - size * on_time(own)
+            _, spans, held = held_payload(c.time, on_time(heavy), rest, weight)
+            spans = [] if held.all() else spans
+            steady = ~Load(1.0, None, tuple(spans)).near_change(c.time, BLOCK)
+            if not (held & steady).any():
+                return np.inf, 0.0, 1.0, []
+            table = np.stack([held[:, None] * heavy, own, change], -1)[steady]
+            roots = np.sqrt(weight) * np.ones_like(c.residual[steady])
+            target = (roots * c.residual[steady]).ravel()
+            table = (roots[..., None] * table).reshape(-1, 3)
+            found = np.linalg.lstsq(table, target)[0]
+            mass, size = found[:2].tolist()
+            missed = float(np.sum((target - table @ found) ** 2) / steady.mean())
+        return missed, mass, 1.0 + size, spans
+
+    missed, mass, _, spans = loaded(np.zeros(n))
+    lighter = mass <= LIGHTEST * total or missed >= least
+    one = alone() if lighter else _payload(r, c, left_out, mass, spans)
+    both = min(((*loaded(row), name, row) for name, row in drives), key=lambda found: found[0])
+    likely, added, size, times, drive, row = both
+    pair: Iterator[Cause] = iter(())
+    if added > LIGHTEST * total and size > 0.0:
+        other = scaled(drive, row, size)
+        if not other.possible:
+            pair = other.then(_payload(other.recording, c, left_out, added, times))
+    clear = likely < min(missed, least) / BETTER
+    yield from chain(pair, one) if clear else chain(one, pair)
 
 
 def _payload(
-    r: Recording, c: Compared, left_out: Mask, mass: float, times: tuple[tuple[float, float], ...]
+    r: Recording, c: Compared, left_out: Mask, mass: float, spans: Spans
 ) -> Iterator[Cause]:
+    """A payload that is held at some times, or all the time."""
+    if len(spans) > SPANS:
+        return
+    times = tuple(spans)
     load = Load(float(f"{r.robot.payload.mass + mass:.3g}"), None, times)
     text = f"a payload of {load.mass:g} kg explains the efforts: use --payload {load.mass:g}"
     if times:

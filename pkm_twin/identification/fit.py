@@ -19,7 +19,7 @@ from pkm_twin.identification.causes import number_that_explains
 from pkm_twin.identification.compare import MAX_RESIDUAL
 from pkm_twin.identification.estimation import Estimate, nearest, possible
 from pkm_twin.identification.identifiable import KINDS, Kind
-from pkm_twin.identification.judge import SIGMAS, Verdict
+from pkm_twin.identification.judge import Verdict
 from pkm_twin.identification.parameters import (
     FileParameters,
     Number,
@@ -29,7 +29,7 @@ from pkm_twin.identification.parameters import (
 from pkm_twin.identification.plausible import recording_fault
 from pkm_twin.identification.rows import Problem, Rows, next_window
 from pkm_twin.identification.samples import EXACT, Filtering
-from pkm_twin.identification.suspects import OFF, scaled_efforts, verdict_of
+from pkm_twin.identification.suspects import scaled_efforts, verdict_of
 from pkm_twin.recordings import Recording
 from pkm_twin.robot.robot import Robot
 
@@ -196,7 +196,7 @@ def _faults(made: Rows) -> list[str]:
     r = made.recording
     cause = number_that_explains(replace(r, robot=made.model.robot))
     fault = recording_fault(made) if cause is None else cause.text
-    if cause is not None and abs(np.log(cause.scale)) < np.log1p(SIGMAS * OFF):
+    if cause is not None and cause.possible:
         load = cause.recording.load
         fault = fault if r.load is None and load is not None and load.times else None
     return [] if fault is None else [f"{r.name}: {fault}"]

@@ -187,7 +187,8 @@ def fit_recordings(
     for k, r in enumerate(made):
         own = replace(r, robot=robot)
         cause = None if constant is not None else number_that_explains(own)
-        if cause is not None and cause.recording.load is not None and r.load is None:
+        held = cause is not None and cause.possible and cause.recording.load is not None
+        if cause is not None and held and r.load is None:
             notes.append(f"{r.name}: {cause.text}")
             # Of several recordings each has another estimate.
             made[k] = cause.recording if len(made) == 1 and "payload" in what else r

@@ -468,8 +468,8 @@ class TestCauses:
     [
         (0.0, 1.0, None),
         (0.5, 1.0, None),
-        (0.0, -3.0, None),
-        (0.5, -3.0, None),
+        (0.0, -3.0, "wrong sign; put right, efforts of all joints are 3 times"),
+        (0.5, -3.0, "wrong sign; put right, efforts of all joints are 3 times"),
         (0.5, 1.3, "all joints are 1.3 times"),
         (0.0, [1.0, -1.0, 1.0, 1.0], "of motor_2 have the wrong sign"),
         (0.5, [1.0, -1.0, 1.0, 1.0], None),
