@@ -11,6 +11,7 @@ import pytest
 
 from pkm_twin.codegen import expressions as ex
 from pkm_twin.codegen.program import STATE, Equations, Program, previous
+from pkm_twin.errors import PkmTwinError
 from test.support.bodies import PlainKernel
 
 INPUTS = ("q", "start", "near", "foreseen", "pace", "scale", "gap", "side")
@@ -121,3 +122,10 @@ def test_a_sample_is_valid_by_the_rules_alone(start, stream, steps, rng):
     # Many of both.
     good = status[:, 0] == 0.0
     assert 0.02 < good.mean() < 0.98
+
+
+@pytest.mark.parametrize(("name", "index"), [("z", 0), ("q", 1)])
+def test_a_program_reads_inputs_of_its_own_alone(name, index):
+    tape = ex.Tape()
+    with pytest.raises(PkmTwinError, match=rf"reads {name}\[{index}\]"):
+        Program({"q": 1}, 0, {"y": [tape.input("q", 0) + tape.input(name, index)]})
