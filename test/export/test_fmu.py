@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from delta_dynamics import inverse_dynamics
-from delta_dynamics.simulation.machine import Plant
+from delta_dynamics.simulation.plant import Plant
 from pkm_twin.export.fmu import KINDS, VERSIONS, Fmu, found_compiler
 from pkm_twin.mechanisms.machine import Machine
 from test.machine.random_machines import variant

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from delta_dynamics import inverse_dynamics
-from delta_dynamics.simulation.machine import Plant
+from delta_dynamics.simulation.plant import Plant
 from pkm_twin import robot_names
 from pkm_twin.apps.cli import main
 from pkm_twin.mechanisms.machine import Machine

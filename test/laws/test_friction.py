@@ -12,7 +12,7 @@ from delta_dynamics import (
     regressor,
     torque_derivatives,
 )
-from delta_dynamics.simulation.machine import Plant
+from delta_dynamics.simulation.plant import Plant
 from pkm_twin.certify.maximal import Maximal
 from pkm_twin.errors import ParameterError
 from pkm_twin.export.fmu import Fmu

@@ -9,7 +9,7 @@ import pytest
 
 from delta_dynamics import energy, inverse_dynamics, mass_matrix
 from delta_dynamics.simulation.friction_contact import resisting
-from delta_dynamics.simulation.machine import Plant
+from delta_dynamics.simulation.plant import Plant
 from delta_dynamics.torques.equations import Equations
 from pkm_twin.errors import PkmTwinError
 from pkm_twin.machine.inertia import loaded_joints

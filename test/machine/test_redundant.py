@@ -25,7 +25,8 @@ from delta_dynamics import (
     torque_derivatives,
 )
 from delta_dynamics.feedforward import Feedforward, Settings
-from delta_dynamics.simulation.machine import MachineSettings, Plant, Simulation, tuned
+from delta_dynamics.simulation.machine import MachineSettings, Simulation, tuned
+from delta_dynamics.simulation.plant import Plant
 from pkm_twin import load
 from pkm_twin.design import PosePath, design, drawn, tolerances
 from pkm_twin.errors import (
