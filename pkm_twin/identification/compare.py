@@ -182,16 +182,19 @@ def compare(r: Recording, bound: float = MAX_RESIDUAL) -> Compared | None:
     if not pieces:
         return None
 
-    def efforts(track: Track) -> Array:
+    def efforts(track: Track, alike: Array) -> Array:
         qd = moving_rates(track.qd, ~track.moves(how), reach)
         made = by_held(r, inverse_dynamics, track.time, track.q, qd, track.qdd, track.wrench)
-        return _each(moving(robot, track.q), made)
+        return _each(alike, made)
+
+    def moved(track: Track) -> Array:
+        return efforts(track, moving(robot, track.q))
 
     period, how = pieces[0].period, replace(how, keep_every=1)
     sharp: list[dict[str, Array]] = []
     for track in pieces:
-        expected = efforts(track)
         alike = moving(robot, track.q)
+        expected = efforts(track, alike)
         slack = _each(np.abs(alike), np.where(track.moves(how), 0.0, reach))
         left = beyond_friction(_each(alike, track.effort) - expected, slack > 0.0, slack)
         change = np.gradient(expected, period, axis=0)
@@ -209,7 +212,7 @@ def compare(r: Recording, bound: float = MAX_RESIDUAL) -> Compared | None:
     longest = max(pieces, key=lambda track: len(track.time))
     raw = [one["left"] for one in sharp]
     long = [one for one in raw if len(one) >= SEGMENT] or [max(raw, key=len)]
-    shaken = np.zeros_like(r.q) if rates is not None else shaken_efforts(r, longest, how, efforts)
+    shaken = np.zeros_like(r.q) if rates is not None else shaken_efforts(r, longest, how, moved)
     density = noise_of(long, shaken, period, how)
     size = np.abs(expected).max(0)
     units = np.array(robot.effort_units)
