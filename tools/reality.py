@@ -140,11 +140,11 @@ def _rolled(poses: Poses, by: int) -> Poses:
 
 
 def _row(name: str, errors: list[list[Errors]]) -> str:
-    """One fit's row: each part that was held out, and all of them; positions, perhaps rotations."""
+    """One fit's row: errors of the held-out poses, of positions and perhaps of rotations."""
     each = [one[0].rms for one in errors]
     angles = [one[1].rms for one in errors if len(one) > 1]
-    cells = [f"{1e3 * rms:.2f}" for rms in (*each, _rms(np.array(each)))]
-    cells += [f"{1e3 * max(one[0].worst for one in errors):.2f}"]
+    worst = max(one[0].worst for one in errors)
+    cells = [f"{1e3 * value:.2f}" for value in (_rms(np.array(each)), worst)]
     cells += [f"{1e3 * _rms(np.array(angles)):.2f}" if angles else ""]
     return f"| {name} | " + " | ".join(cells) + " |"
 
@@ -171,15 +171,15 @@ No public recording has the motor torques of a whole parallel machine, so torque
 ([source](https://github.com/Project-DeepBlue-Juggling/Jugglebot), MIT licence;
 [files](../examples/machines/hexapod)).
 
-**Poses**: {count} poses on a grid at one height, by motion capture. Each of four fits leaves out every fourth pose, starting
-at pose 1, 2, 3 or 4. The table has the RMS error of these poses, and of all {count}.
+**Poses**: {count} poses on a grid at one height, by motion capture. Each of four fits leaves out every fourth pose, so that each
+pose is left out once. The table has the errors of the poses left out:
 
-| held out | 1st, mm | 2nd, mm | 3rd, mm | 4th, mm | all, mm | worst, mm | all, mrad |
-|---|---|---|---|---|---|---|---|
+| model | RMS, mm | worst, mm | RMS, mrad |
+|---|---|---|---|
 {table}
 
-The last row is an independent fit with scipy of each leg by itself. Revolutions per metre of the two fits differ by up to
-{apart:.1f} combined standard deviations.
+The last row is an independent fit with scipy. Revolutions per metre of the two fits differ by up to {apart:.1f} combined
+standard deviations.
 
 After a calibration with the half of the grid at x < 0, the leg lengths of the other half are off by {halves} (one offset per
 leg removed). The recording has no other heights, tilts above 2 degrees, loads or days.

@@ -134,7 +134,7 @@ class TestErrataOfTheDeltaCu:
         used, source[3, 2] = source[3, 2], -10.80
         rms.append(delta_cu.differences(found, source)[0])
         pattern = (
-            r"(-10\.80) mm/s \| (\S+) mm/s, a digit is lost \| the model gives (\S+); "
+            r"(-10\.80) mm/s; here (\S+) mm/s, a digit is lost: the model gives (\S+); "
             r"velocity rms (\S+) instead of (\S+) mm/s"
         )
         assert_printed(PAGE, pattern, -10.80, used, found[3, 2], *rms)
@@ -147,7 +147,7 @@ class TestErrataOfTheDeltaCu:
         used, source[4, 2] = source[4, 2], 17.20
         rms.append(delta_cu.differences(found, source)[0])
         pattern = (
-            r"(17\.20) mm/s2 \| (\S+) mm/s2, two digits are exchanged \| the model gives (\S+); "
+            r"(17\.20) mm/s2; here (\S+) mm/s2, two digits are exchanged: the model gives (\S+); "
             r"acceleration rms (\S+) instead of (\S+) mm/s2"
         )
         assert_printed(PAGE, pattern, 17.20, used, found[4, 2], *rms)

@@ -70,8 +70,6 @@ class Swing:
     """Worst opening of a loop, m."""
     drift: float
     """Greatest change of the energy over the greatest kinetic energy."""
-    kinetic: float
-    """Greatest kinetic energy, J."""
 
 
 def starts() -> list[Start]:
@@ -201,4 +199,4 @@ def _summary(
         closure_error(start.data, at, *place) for at, place in zip(q, places, strict=True)
     )
     drift = float(np.abs(constant - constant[0]).max()) / kinetic
-    return Swing(start.title, route, q, qd, closure, drift, kinetic)
+    return Swing(start.title, route, q, qd, closure, drift)
