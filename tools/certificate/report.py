@@ -138,8 +138,8 @@ The table has the worst differences, relative to the largest effort (bound {EFFO
 States per robot: {states}. Positions of the platform differ by at most {furthest:.1e} m
 (bound {PLACE_BOUND:.0e}).
 
-| robot | {' | '.join(ROUTES)} |
-|---|{'---|' * len(ROUTES)}
+| robot | {" | ".join(ROUTES)} |
+|---|{"---|" * len(ROUTES)}
 {table}
 """
 
