@@ -15,6 +15,7 @@ from delta_dynamics.torques.stiction import friction_reach, moving_rates
 from delta_dynamics.torques.virtual_work import inverse_dynamics
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import MessageError, ParameterError
+from pkm_twin.machine.friction import KNOWN, Dahl, Memory
 from pkm_twin.machine.joint_map import ControllerNumbers
 from pkm_twin.messages.reading import (
     ExtraJoints,
@@ -123,6 +124,7 @@ class Torques(NamedTuple):
 
     ``wrench``: the one that they bear, base axes at the platform's reference point, shape (6,).
     ``doubt``: how far the rates may be off, shape (n,), where somebody asks for it.
+    ``memory``: the part of ``effort`` that friction with memory adds, shape (n,); 0 without.
     """
 
     stamp: int
@@ -133,6 +135,7 @@ class Torques(NamedTuple):
     saturated: bool
     wrench: Array | None = None
     doubt: Array | None = None
+    memory: Array | float = 0.0
 
     @property
     def residual(self) -> Array | None:
@@ -165,6 +168,8 @@ class Feedforward(Core):
         self._last_stamp = 0
         self._last_now = 0
         self._last_good: Array | None = None
+        self._memory: Memory | None = None
+        """Of the drives' friction; None before the stream's first answer."""
         self.differentiator = _differentiator(s, self.robot)
         self._window = s.window
         self._rest = RestWatch(_slope_gain(self.differentiator))
@@ -218,6 +223,14 @@ class Feedforward(Core):
     def singularity(self) -> float | None:
         """Distance of the last answered state from a singularity, 0 in one, 1 at best."""
         return None if self._last_good is None else float(self.robot.singularity(self._last_good))
+
+    def unknown_friction(self) -> list[str]:
+        """Joints whose friction depends on a way that the stream has not seen."""
+        distance, memory = self.robot.friction.presliding, self._memory
+        unknown = distance > 0.0
+        if memory is not None:
+            unknown &= memory.unknown > KNOWN
+        return [n for n, one in zip(self.robot.joint_names, unknown, strict=True) if one]
 
     def trajectory(self, message: Any, now: int) -> ControllerNumbers:
         """The controller's efforts for every point, (points, n), in the message's joint order.
@@ -328,6 +341,7 @@ class Feedforward(Core):
 
     def _begin_anew(self) -> None:
         self.near_singular = False
+        self._memory = None
         self._restart_fit()
         self._continuity.reset()
 
@@ -396,7 +410,8 @@ class Feedforward(Core):
                 solved = as_message_error(
                     inverse_dynamics, self.robot, sample.q, sure, change, external
                 )
-                effort, saturated = _gate(self.robot, self.settings.limit_policy, solved)
+                memory, added = self._remembered(sample.q, sure)
+                effort, saturated = _gate(self.robot, self.settings.limit_policy, solved + added)
         except MessageError:
             self.differentiator.retract()
             self._rest.retract()
@@ -411,8 +426,17 @@ class Feedforward(Core):
         self.near_singularities += near_singular
         if rates is None:
             return None
-        self._last_good = sample.q
-        return Torques(sample.stamp, motion, effort, measured, saturated, external, doubt)
+        self._last_good, self._memory = sample.q, memory
+        return Torques(sample.stamp, motion, effort, measured, saturated, external, doubt, added)
+
+    def _remembered(self, q: Array, rates: Array) -> tuple[Memory | None, Array | float]:
+        """Friction's memory with a sample more, and what it adds to the efforts, (n,)."""
+        friction = self.robot.friction
+        if not friction.presliding.any():
+            return None, 0.0
+        before = self._memory or Memory.begun(q)
+        memory = before.after(q[None], np.sign(rates), friction.presliding).last
+        return memory, Dahl.beyond(friction, memory.z, rates)
 
     def _differentiated(self, sample: JointSample) -> tuple[Array, Array] | None:
         """Rates and accelerations; what else looks through the window follows its length."""

@@ -137,9 +137,10 @@ class Estimates:
 
     def take(self, torques: Torques) -> None:
         """A sample whose torques were published; without measured efforts it gives nothing."""
-        effort = torques.measured
-        if effort is None:
+        if torques.measured is None:
             return
+        # The estimates' models have friction without memory.
+        effort = torques.measured - torques.memory
         # The stream may have begun anew at earlier stamps, as where a bag loops.
         if not 0 < torques.stamp - self._last <= GAP * SECOND:
             self.reset()

@@ -178,6 +178,8 @@ class DeltaDynamics(TwinNode):
             "acceleration delay (samples)": core.differentiator.delay,
             "acceleration window": self._window_text(),
         }
+        if core.robot.friction.presliding.any():
+            values["friction unknown before motion"] = " ".join(core.unknown_friction())
         values |= core.stream.counts("joint states", "answered")
         values |= core.trajectories.counts("trajectories", "answered")
         values |= {f"stopped: {k}": v for k, v in core.stream.stops.items()}

@@ -18,7 +18,7 @@ from scipy.linalg.lapack import dposv  # type: ignore[import-untyped]
 from delta_dynamics.simulation.exponential_integrator import Stepper, damped, undamped
 from delta_dynamics.torques.equations import Equations, Terms
 from pkm_twin.codegen.arrays import Array, Indices, Mask
-from pkm_twin.machine.friction import bounds, friction_values, parts, potential
+from pkm_twin.machine.friction import Memory, bounds, friction_values, parts, potential
 from pkm_twin.machine.inertia import loaded_joints
 from pkm_twin.robot.robot import Robot
 
@@ -190,9 +190,12 @@ class Resistance:
 
     ``pushed``: passive joints that efforts act on, by their places among those with friction. These
     efforts come after the wrench's six numbers, and their rates after the platform's twist.
+    ``memory``: of the drives' friction, at the start of the part of a step that goes on.
     """
 
-    def __init__(self, robot: Robot, pushed: Sequence[int] = ()) -> None:
+    def __init__(
+        self, robot: Robot, pushed: Sequence[int] = (), memory: Memory | None = None
+    ) -> None:
         self._pushed = list(pushed)
         n = robot.joints_count
         friction, passive = robot.friction, loaded_joints(robot.graph)
@@ -203,6 +206,11 @@ class Resistance:
         self._passive = bool(passive)
         self._dry = np.array([*friction.coulomb, *(joint.coulomb for joint in passive)])
         self._laws, self._numbers = robot.laws, friction_values(robot.laws, robot.friction)
+        # With memory it holds like a spring, and no joint sticks by it.
+        self._distance = np.array(friction.presliding)
+        self._level = np.where(self._distance > 0.0, friction.coulomb, 0.0)
+        self._dry[:n] -= self._level
+        self.memory = memory
         self._rubs = self._dry > 0.0
         if self._laws:
             _, dry, share = parts(self._laws, self._numbers, robot.graph.home, np.zeros(n))
@@ -227,9 +235,25 @@ class Resistance:
             here = here._replace(twists=np.concatenate([here.twists, here.rows[self._pushed]]))
         if not self._laws:
             return here
-        at_place = parts(self._laws, self._numbers, q, np.zeros_like(q))[0]
-        energy = float(np.sum(potential(self._laws, self._numbers, q)))
-        return here._replace(bias=here.bias + at_place, potential=here.potential + energy)
+        energy = np.sum(potential(self._laws, self._numbers, q))
+        energy += 0.5 * np.sum(self._level * self._distance * self._remembered(q).z ** 2)
+        bias, energy = here.bias + self._at_place(q), here.potential + float(energy)
+        return here._replace(bias=bias, potential=energy)
+
+    def _remembered(self, q: Array) -> Memory:
+        """Memory after a straight way to a place."""
+        before = self.memory = self.memory or Memory.begun(q)
+        return before.after(q[None], np.sign(q - before.q), self._distance).last
+
+    def passed(self, here: Terms) -> None:
+        """Remember the way to a part's end."""
+        if self._level.any():
+            self.memory = self._remembered(here.q)
+
+    def _at_place(self, q: Array) -> Array:
+        """What the drives' friction takes whatever the rates, shape (n,)."""
+        own = parts(self._laws, self._numbers, q, np.zeros_like(q))[0]
+        return np.asarray(own + self._level * self._remembered(q).z, np.float64)
 
     def _bounds(self, here: Terms, given: Array) -> tuple[Array, Array]:
         """Least and greatest dry friction of all rows at a state, shape (n + k,).
@@ -239,8 +263,8 @@ class Resistance:
         low, high = -self._dry, self._dry.copy()
         if self._laws:
             n = len(given)
-            at_place, dry, share = parts(self._laws, self._numbers, here.q, np.abs(here.qd))
-            held = given - at_place - self._viscous * here.qd
+            _, dry, share = parts(self._laws, self._numbers, here.q, np.abs(here.qd))
+            held = given - self._at_place(here.q) - self._viscous * here.qd
             low[:n], high[:n] = bounds(held, self._dry[:n] + dry, share)
         return low, high
 

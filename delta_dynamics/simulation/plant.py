@@ -64,7 +64,9 @@ class Plant:
         self.others = [k for k in range(robot.joints_count) if k not in self._leading]
         names = [joint.name for joint in loaded_joints(robot.led.graph)] if self.others else []
         pushed = [names.index(robot.joint_names[k]) for k in self.others]
-        self._resistance = Resistance(robot.led, pushed)
+        before: Resistance | None = vars(self).get("_resistance")
+        memory = None if before is None else before.memory
+        self._resistance = Resistance(robot.led, pushed, memory)
         self._here: Terms | None = None
 
     def _all(self, here: Terms) -> tuple[Array, Array]:
@@ -111,6 +113,7 @@ class Plant:
                 at_once, crawled = 0, 4.0 * crawled
             elif not law.stands:
                 here, taken = self._follow(here, law, left, step * RESOLVED)
+            self._resistance.passed(here)
             self._here, (self.q, self.qd) = here, self._all(here)
             left -= taken
             if left <= 0.0:

@@ -36,7 +36,8 @@ def inverse_dynamics(
     """Actuator efforts for a motion, exact rigid-body dynamics.
 
     tau = sum over bodies of Jv' m (a - g) + Jw' (I alpha + omega x I omega), less J' wrench, plus
-    friction: the principle of virtual work (Delta-CU paper, step 4; 3-PRRU paper, F_d).
+    friction: the principle of virtual work (Delta-CU paper, step 4; 3-PRRU paper, F_d). A sample
+    has no memory: Coulomb friction has the rate's sign, without ``presliding``.
 
     :param q: joint positions, shape (..., n), rad or m.
     :param qd: joint rates, shape (..., n).

@@ -24,7 +24,7 @@ from pkm_twin.codegen.arrays import Array
 from pkm_twin.codegen.expressions import GEOMETRY, PARAMETERS, Expression, edge
 from pkm_twin.codegen.kernels import Kernel
 from pkm_twin.codegen.program import LAST, MAX_ITERATIONS, Equations
-from pkm_twin.errors import ParameterError
+from pkm_twin.errors import ParameterError, warn
 from pkm_twin.export.c99 import CORRECTIONS, HEAD, HOT, LADDER, Folding, Routine, Unit, table
 from pkm_twin.export.c_templates import (
     ABOUT,
@@ -35,6 +35,7 @@ from pkm_twin.export.c_templates import (
     PARAMETERS_OF,
     PAYLOAD,
     README,
+    STATELESS,
     WORST,
 )
 from pkm_twin.machine.inertia import Layout
@@ -74,6 +75,9 @@ class Package:
 
     def __init__(self, robot: Robot, names: Collection[str] = ()) -> None:
         self.robot, self._names = robot, names
+        self._stateless = STATELESS if robot.friction.presliding.any() else ""
+        if self._stateless:
+            warn("friction", self._stateless)
         self.prefix = f"pkm_{identifier(robot.name)}"
         self.macro = self.prefix.upper()
         self.n, self.m = robot.joints_count, len(robot.pose_names)
@@ -326,7 +330,7 @@ int @_parameters(double mass, const double *com, const double *inertia, double *
                 f"{what}\nint @_parameters(double mass, const double *com, "
                 "const double *inertia, double *out);\n"
             )
-        about = _comment(ABOUT.format(joints=joints, pose=pose))
+        about = _comment(ABOUT.format(joints=joints, pose=pose) + self._stateless)
         text = "\n".join([
             "/* SPDX-License-Identifier: Apache-2.0 */", f"/* {self._title} */", f"#ifndef {guard}",
             f"#define {guard}", "", about, "", *lines, "",

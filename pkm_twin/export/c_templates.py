@@ -11,6 +11,7 @@ that the surroundings apply to the platform at its reference point. Every functi
 valid; 1: no assembly, or a singularity; 2: an input or a result is NaN or infinite. If it is not
 0, all outputs are NaN. The forms _with take parameters for another payload.
 """
+STATELESS: Final = "Friction has no state here: coulomb sign(rate), without presliding (dahl)."
 BESIDE: Final = """, found from the assembly of the sample before instead of from home: in less
 time. state[{size}] is the caller's, one of each stream. Fill it with zeros before the first sample;
 each call writes it. A sample that does not follow the one before is solved from home.

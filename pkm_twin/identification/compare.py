@@ -32,6 +32,7 @@ from pkm_twin.identification.samples import (
     tracks,
     usual_size,
 )
+from pkm_twin.machine.friction import Dahl
 from pkm_twin.recordings import Load, Recording, at_rest, by_load
 from pkm_twin.report import Fact, judged
 from pkm_twin.robot.robot import Robot
@@ -185,6 +186,7 @@ def compare(r: Recording, bound: float = MAX_RESIDUAL) -> Compared | None:
     def efforts(track: Track, alike: Array) -> Array:
         qd = moving_rates(track.qd, ~track.moves(how), reach)
         made = by_held(r, inverse_dynamics, track.time, track.q, qd, track.qdd, track.wrench)
+        made = made + Dahl.remembered(robot.friction, track.q, qd)
         return _each(alike, made)
 
     def moved(track: Track) -> Array:

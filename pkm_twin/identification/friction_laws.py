@@ -28,7 +28,7 @@ from pkm_twin.identification.parameters import Number
 from pkm_twin.identification.rows import Problem
 from pkm_twin.identification.samples import EXACT, Track, filtered
 from pkm_twin.identification.suspects import RESONANCE
-from pkm_twin.machine.friction import BASIC, LAWS, taken
+from pkm_twin.machine.friction import BASIC, LAWS, compiled, taken
 from pkm_twin.recordings import Recording
 from pkm_twin.robot.robot import Robot
 from pkm_twin.streams.steps import sampling_of
@@ -91,11 +91,11 @@ def laws_of(words: str) -> tuple[str, ...] | None:
 
     :raises UnknownNameError: another word.
     """
-    names = [word.strip() for word in words.split(",")]
+    names, laws = [word.strip() for word in words.split(",")], compiled(tuple(LAWS))
     for name in names:
-        if name not in (AUTO, BASIC.name, *LAWS):
-            raise UnknownNameError("--friction", name, (AUTO, BASIC.name, *LAWS))
-    return None if AUTO in names else tuple(name for name in LAWS if name in names)
+        if name not in (AUTO, BASIC.name, *laws):
+            raise UnknownNameError("--friction", name, (AUTO, BASIC.name, *laws))
+    return None if AUTO in names else tuple(name for name in laws if name in names)
 
 
 def fit_with_laws(
@@ -118,7 +118,7 @@ def fit_with_laws(
         return best, ()
     asked = [name for name in laws or () if name not in robot.laws]
     while asked if laws is not None else _unexplained(best):
-        names = asked[:1] or [name for name in LAWS if name not in best.robot.laws]
+        names = asked[:1] or [one for one in compiled(tuple(LAWS)) if one not in best.robot.laws]
         tried = []
         for name in names:
             try:

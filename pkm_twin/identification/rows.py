@@ -36,7 +36,7 @@ from pkm_twin.identification.samples import (
     tracks,
     usual_size,
 )
-from pkm_twin.machine.friction import LAWS, FrictionLaw, linear_keys
+from pkm_twin.machine.friction import KNOWN, LAWS, Dahl, FrictionLaw, Memory, linear_keys
 from pkm_twin.recordings.recording import Recording
 from pkm_twin.robot.robot import Robot
 
@@ -88,19 +88,31 @@ class Model:
         pairs = [name.rpartition(".")[::2] for name in self.parameters.names]
         return np.array([joint in drives and key in keys for joint, key in pairs])
 
-    def columns(self, motion: Motion) -> tuple[Array, Array]:
-        """The parameters' columns, (k, n, p), and what the others need, (k, n)."""
+    def columns(self, motion: Motion, memory: Memory | None = None) -> tuple[Array, Array]:
+        """The parameters' columns, (k, n, p), and what the others need, (k, n).
+
+        :param memory: of the drives' friction along the motion, (k, n); None: without.
+        """
 
         def block(rows: slice) -> Array:
             own, rest = self._columns(motion.part(rows))
             return np.concatenate([own, rest[..., None]], -1)
 
         both = by_blocks(len(motion.q), BLOCK, block)
+        if memory is not None:
+            for j in np.flatnonzero(self.robot.friction.presliding > 0.0):
+                coulomb = self.parameters.names.index(f"{self.robot.joint_names[j]}.coulomb")
+                both[:, j, coulomb] = memory.z[:, j]
         return both[..., :-1], both[..., -1]
 
-    def efforts(self, motion: Motion, values: Array) -> Array:
-        """With values of the parameters, (k, n)."""
-        table, rest = self.columns(motion)
+    def memory(self, track: Track, how: Filtering) -> Memory | None:
+        """Of the drives' friction along a track; None without."""
+        distance = self.robot.friction.presliding
+        return Dahl.states(track.q, track.sure(how), distance) if distance.any() else None
+
+    def efforts(self, motion: Motion, values: Array, memory: Memory | None = None) -> Array:
+        """With values of the parameters, (k, n); memory as of :meth:`columns`."""
+        table, rest = self.columns(motion, memory)
         return np.asarray(rest + table @ values, np.float64)
 
     def _columns(self, motion: Motion) -> tuple[Array, Array]:
@@ -242,7 +254,9 @@ def rows_of(
     f = filtered([part.columns(model, first, speed, how) for part in parts], pieces[0].period, how)
     left = [part.target - part.table @ first for part in parts]
     longest = max(pieces, key=lambda t: len(t.time))
-    shaken = shaken_efforts(r, longest, how, lambda track: model.efforts(track, first))
+    shaken = shaken_efforts(
+        r, longest, how, lambda track: model.efforts(track, first, model.memory(track, how))
+    )
     noise = noise_of(left, shaken, longest.period, how)
     size = np.sqrt(np.mean(np.concatenate([track.effort for track in pieces]) ** 2, 0))
     rings = resonances_of(left, longest.period, how, size)
@@ -294,14 +308,16 @@ class _Piece:
     target: Array
     rest: Array
     moves: Array
-    """1 where a joint moves, or where standing still is no matter, shape (k, n)."""
+    """1 where the direction of friction is known, shape (k, n)."""
 
     @classmethod
     def of(cls, model: Model, track: Track, how: Filtering) -> _Piece:
         """Of a track."""
-        table, rest = model.columns(track)
-        moves = track.moves(how).astype(np.float64)
-        return cls(track, table, track.effort - rest, rest, moves)
+        memory, moves = model.memory(track, how), track.moves(how)
+        table, rest = model.columns(track, memory)
+        if memory is not None:
+            moves = np.where(model.robot.friction.presliding > 0.0, memory.unknown < KNOWN, moves)
+        return cls(track, table, track.effort - rest, rest, moves.astype(np.float64))
 
     def columns(self, model: Model, first: Array, speed: Array, how: Filtering) -> dict[str, Array]:
         """All that is filtered, by name, (samples, ...) each.

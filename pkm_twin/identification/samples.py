@@ -75,6 +75,10 @@ class Track(Motion):
         rough = SIGMAS * np.abs(self.qd[1:-1] - mean).sum(0) / len(self.qd)
         return np.asarray(np.abs(self.qd) > np.maximum(np.maximum(rough, slow), 1e-9))
 
+    def sure(self, how: Filtering) -> Array:
+        """Rates, zero where noise may be all of them, shape (k, n)."""
+        return np.where(self.moves(how), self.qd, 0.0)
+
 
 @dataclass(frozen=True)
 class Filtering:

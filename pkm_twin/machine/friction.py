@@ -10,7 +10,8 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, Final
+from itertools import pairwise
+from typing import Any, ClassVar, Final, NamedTuple
 
 import numpy as np
 
@@ -24,6 +25,8 @@ Values = Mapping[str, Any]
 
 LEAST: Final = 1e-9
 """Divisor in place of a parameter that is not given: its law's effort is zero."""
+KNOWN: Final = 0.01
+"""Part of an unknown beginning below which a state is known: after five presliding distances."""
 
 
 @dataclass(frozen=True)
@@ -57,6 +60,8 @@ class FrictionLaw:
     parameters: ClassVar[Mapping[str, Parameter]]
     turns: ClassVar[bool] = True
     """Whether it turns round with the rate."""
+    memory: ClassVar[bool] = False
+    """Whether it depends on the way that the joint has come: it is in no compiled program."""
 
     @staticmethod
     def by_position(values: Values, q: Any) -> Any:
@@ -163,6 +168,94 @@ class Periodic(FrictionLaw):
 
 BASIC: Final = ViscousCoulomb
 """The law that every drive has."""
+
+
+class Memory(NamedTuple):
+    """State of friction with memory; shape (n,) each, or (k, n) along a motion.
+
+    ``z``: part of the Coulomb friction that is built up, -1 to 1. ``q``: the farthest place of the
+    motion one way. ``way``: its direction, 0 before a motion. ``unknown``: the part of the unknown
+    beginning that is left; z begins at zero.
+    """
+
+    z: Array
+    q: Array
+    way: Array
+    unknown: Array
+
+    @classmethod
+    def begun(cls, q: Array) -> Memory:
+        """Nothing is known."""
+        return cls(np.zeros_like(q), q, np.zeros_like(q), np.ones_like(q))
+
+    def after(self, q: Array, way: Array, distance: Array) -> Memory:
+        """After places (k, n) of a motion one way, +1, -1 or 0 for that before, shape (n,).
+
+        Exact, whatever the steps. What noise goes the other way does not count.
+
+        :param distance: of presliding, shape (n,), rad or m.
+        """
+        way = np.where(way == 0.0, self.way, way)
+        travel = np.maximum.accumulate(np.maximum(way * (q - self.q), 0.0))
+        left = np.exp(-travel / np.maximum(distance, LEAST))
+        z, unknown = way + (self.z - way) * left, self.unknown * left
+        return Memory(z, self.q + way * travel, np.broadcast_to(way, q.shape), unknown)
+
+    @property
+    def last(self) -> Memory:
+        """At a motion's end."""
+        return Memory(*(one[-1] for one in self))
+
+
+class Dahl(FrictionLaw):
+    """Coulomb friction that builds up over a presliding distance, and does so again at reversals.
+
+    The effort is coulomb z instead of coulomb sign(rate), dz = (sign(dq) - z) |dq| / presliding.
+    P. Dahl, A solid friction model, 1968, with the stiffness sigma0 = coulomb / presliding.
+    Only what follows a motion in time has z; all else takes coulomb sign(rate).
+    """
+
+    name = "dahl"
+    memory = True
+    parameters: ClassVar = {
+        "coulomb": BASIC.parameters["coulomb"],
+        "presliding": Parameter("{joint}", linear=False),
+    }
+
+    @staticmethod
+    def states(q: Array, rates: Array, distance: Array) -> Memory:
+        """States along a motion, shape (k, n).
+
+        :param rates: zero where their sign is not known: a joint turns at its farthest place there.
+        """
+        way, parts, here = np.sign(rates), [], Memory.begun(q[0])
+        for own, place in zip(way.T, q.T, strict=True):
+            sure = np.flatnonzero(own)
+            for k in np.flatnonzero(np.diff(own[sure])):
+                a, b = sure[k : k + 2]
+                own[a + np.argmax(own[a] * place[a:b]) + 1 : b] = own[b]
+        latest = np.maximum.accumulate(np.where(way, np.arange(len(q))[:, None], 0))
+        way = np.take_along_axis(way, latest, 0)
+        turns = np.flatnonzero((way[1:] != way[:-1]).any(1)) + 1
+        for a, b in pairwise([0, *turns.tolist(), len(q)]):
+            parts.append(here.after(q[a:b], way[a], distance))
+            here = parts[-1].last
+        return Memory(*(np.concatenate(each) for each in zip(*parts, strict=True)))
+
+    @staticmethod
+    def beyond(friction: Any, z: Array, rates: Array) -> Array:
+        """What memory changes in efforts with coulomb sign(rate), shape of z, N m or N."""
+        change = friction.coulomb * (z - np.sign(rates))
+        return np.where(friction.presliding > 0.0, change, 0.0)
+
+    @classmethod
+    def remembered(cls, friction: Any, q: Array, rates: Array) -> Array:
+        """The same along a motion from an unknown state, shape (k, n) as q and rates."""
+        if not friction.presliding.any():
+            return np.zeros_like(q)
+        return cls.beyond(friction, cls.states(q, rates, friction.presliding).z, rates)
+
+
 LAWS: Final[Mapping[str, type[FrictionLaw]]] = {
     law.name: law for law in FrictionLaw.__subclasses__() if law is not BASIC
 }
@@ -171,21 +264,27 @@ LAWS: Final[Mapping[str, type[FrictionLaw]]] = {
 
 def law_names(friction: Any, opened: Sequence[str] = ()) -> tuple[str, ...]:
     """Laws beside the basic one that a friction section states, or that are open to a fit."""
+
+    def given(law: type[FrictionLaw], *, linear: bool) -> list[bool]:
+        keys = [key for key, one in law.parameters.items() if one.linear == linear]
+        return [bool(np.any(references(getattr(friction, key)))) for key in keys]
+
     return tuple(
         name
         for name, law in LAWS.items()
-        if name in opened
-        or any(
-            np.any(references(getattr(friction, key)))
-            for key, one in law.parameters.items()
-            if one.linear
-        )
+        if name in opened or (any(given(law, linear=True)) and all(given(law, linear=False)))
     )
 
 
-def by_load(names: Sequence[str]) -> list[str]:
-    """Those of some laws whose effort grows with the load."""
-    return [name for name in names if LAWS[name].share is not FrictionLaw.share]
+def compiled(names: Sequence[str]) -> tuple[str, ...]:
+    """Those of some laws that programs have."""
+    return tuple(name for name in names if not LAWS[name].memory)
+
+
+def not_shared(names: Sequence[str]) -> list[str]:
+    """Those of some laws that follow the load or the way: no drives that share the effort."""
+    laws = {name: LAWS[name] for name in names}
+    return [n for n, law in laws.items() if law.memory or law.share is not FrictionLaw.share]
 
 
 def keys_of(names: Sequence[str]) -> dict[str, Parameter]:
@@ -215,7 +314,7 @@ def check_laws(friction: Any, path: str) -> None:
 
     :raises ParameterError: by the field.
     """
-    for law in LAWS.values():
+    for law in (LAWS[name] for name in compiled(tuple(LAWS))):
         linear = [key for key, one in law.parameters.items() if one.linear]
         used = np.any([references(getattr(friction, key)) != 0.0 for key in linear], axis=0)
         for key, one in law.parameters.items():

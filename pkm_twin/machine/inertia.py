@@ -109,6 +109,10 @@ class Coefficients(Protocol):
     def offset(self) -> Array:
         """What the drive needs beside, whatever the motion, N m or N."""
 
+    @property
+    def presliding(self) -> Array:
+        """Distance over which Coulomb friction builds up, rad or m; 0: at once."""
+
 
 @dataclass(frozen=True)
 class Layout:

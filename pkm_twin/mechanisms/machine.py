@@ -25,7 +25,7 @@ from pkm_twin.kinematics.pose import COORDINATES, Coordinate
 from pkm_twin.kinematics.scheme import check_masses, choose_coordinates, choose_leads
 from pkm_twin.machine import schema
 from pkm_twin.machine.formulas import PARAMETERS, Book
-from pkm_twin.machine.friction import by_load
+from pkm_twin.machine.friction import not_shared
 from pkm_twin.machine.graph import (
     BASE,
     Graph,
@@ -182,15 +182,15 @@ class Machine(TwinRobot):
         return made
 
     def check_laws(self) -> None:
-        """Reject friction by the load where drives share it.
+        """Reject friction by the load, or with memory, where drives share the effort.
 
         :raises ParameterError: by the law.
         """
-        if self.redundant and by_load(self.laws):
+        if self.redundant and (bad := not_shared(self.laws)):
             raise ParameterError(
-                "friction", by_load(self.laws)[0],
-                f"a law that does not grow with the load: {self.joints_count} actuated joints "
-                f"share that of {len(self.graph.leads)} degrees of freedom",
+                "friction", bad[0],
+                f"a law of position and rate alone: {self.joints_count} actuated joints "
+                f"share the effort of {len(self.graph.leads)} degrees of freedom",
             )  # fmt: skip
 
     def numbered(self, values: Mapping[str, Any]) -> Machine:

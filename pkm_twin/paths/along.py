@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Final
 
 import numpy as np
@@ -13,6 +13,7 @@ from delta_dynamics import dynamics_terms, inverse_dynamics, reactions, torque_d
 from delta_dynamics.torques.stiction import friction_reach, moving_rates
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError, PkmTwinError, SingularityError, UnreachableError
+from pkm_twin.machine.friction import Dahl
 from pkm_twin.paths.joint_path import only_turns
 from pkm_twin.recordings.payload import by_load, payload_columns
 from pkm_twin.recordings.recording import Recording
@@ -79,7 +80,7 @@ def model_efforts(m: Recording) -> Array:
     (q, _, qdd, wrench), rates, made = m.motion, _moving(m), np.empty_like(m.q)
     for robot, part in by_load(m.robot, m.load, m.time, BLOCK):
         made[part] = inverse_dynamics(robot, q[part], rates[part], qdd[part], wrench[part])
-    return made
+    return made + Dahl.remembered(m.robot.friction, q, rates)
 
 
 def _moving(m: Recording) -> Array:
@@ -142,11 +143,13 @@ def torque_table(m: Recording, progress: Callable[[int], None] | None = None) ->
     told = m.efforts == "measured" or (m.efforts == "effort" and m.bag is None)
     outside, _ = beyond_limits(m.robot, q, qd)
     rates = _moving(m)
+    memory = Dahl.remembered(m.robot.friction, q, rates)
     for robot, part in by_load(m.robot, m.load, m.time, BLOCK):
         begin = part.start
         state = (robot, q[part], rates[part], qdd[part], wrench[part])
         try:
             tau, terms, react = inverse_dynamics(*state), dynamics_terms(*state), reactions(*state)
+            tau, terms = tau + memory[part], replace(terms, friction=terms.friction + memory[part])
             spread = torque_deviation(*state) if robot.uncertainty else None
         except UnreachableError as e:
             at = (begin + e.index[0],)

@@ -23,7 +23,7 @@ from pkm_twin.kinematics.motion import Motion
 from pkm_twin.kinematics.pose import Coordinate
 from pkm_twin.machine import schema
 from pkm_twin.machine.formulas import Book
-from pkm_twin.machine.friction import law_names
+from pkm_twin.machine.friction import compiled, law_names
 from pkm_twin.machine.graph import Graph
 from pkm_twin.machine.inertia import Coefficients
 from pkm_twin.machine.joint_map import JointMap, JointMapEntry
@@ -301,7 +301,8 @@ class Mechanism(Common):
 
     def with_laws(self, graph: Graph) -> Graph:
         """A graph of this robot with its friction laws: what programs of efforts are made from."""
-        return dataclasses.replace(graph, laws=self.laws) if self.laws else graph
+        laws = compiled(self.laws)
+        return dataclasses.replace(graph, laws=laws) if laws else graph
 
     @cached_property
     def causes(self) -> Mapping[str, Mapping[str, float]]:

@@ -54,6 +54,7 @@ def rubbing(name, rng, *keys):
         "viscous": 0.2 * size / unit, "coulomb": 0.1 * size, "offset": 0.05 * size,
         "stribeck": 0.1 * size, "stribeck_speed": 0.3 * unit, "load_dependent": 0.3,
         "cogging_cos": 0.03 * size, "cogging_sin": 0.03 * size, "cogging_period": PERIOD * unit,
+        "presliding": 0.01 * unit,
     }  # fmt: skip
     drawn = {key: scale * rng.uniform(0.3, 1.0, n) for key, scale in scales.items()}
     chosen = {key: drawn[key].tolist() for key in keys or scales}
