@@ -78,7 +78,6 @@ bench: $(VENV)/bench.stamp
 	mkdir -p out
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest test/benchmarks -m benchmark_run --benchmark-disable-gc --benchmark-json=out/benchmarks.json
 	$(BIN)/python -m test.benchmarks.report out/benchmarks.json docs/benchmarks.md
-	OMP_NUM_THREADS=1 $(BIN)/python -m test.benchmarks.latency docs/benchmarks.md
 	OMP_NUM_THREADS=1 $(BIN)/python -m test.benchmarks.pinocchio_c docs/export_c.md
 	OMP_NUM_THREADS=1 $(BIN)/python -m test.export.c_table docs/export_c.md
 

@@ -78,6 +78,7 @@ def test_the_page_of_commands_has_all():
     from typer.main import get_command
 
     from pkm_twin.apps.cli import app
+    from tools.pages.commands import USUAL
 
     text = (REPOSITORY / "docs" / "commands.md").read_text(encoding="utf-8")
     written = dict(re.findall(r"^## `pkm-twin ([\w-]+)`\n(.*?)(?=^## |\Z)", text, re.M | re.S))
@@ -86,10 +87,13 @@ def test_the_page_of_commands_has_all():
     groups = re.findall(r"^\*\*(\w+ options)\*\*\n\n((?:\* .*\n)+)", text, re.M)
     for name, command in commands.items():
         inner = getattr(command, "commands", {}).values()
-        options = {o for c in (command, *inner) for p in c.params for o in p.opts if o[:2] == "--"}
+        params = [p for c in (command, *inner) for p in c.params]
+        options = {o for p in params for o in p.opts if o[:2] == "--"}
         told = written[name]
         told += "".join(those for group, those in groups if re.search(group, told, re.I))
-        assert options <= set(re.findall(r"--[\w-]+", told)) | {"--json"}, name
+        assert options <= {*re.findall(r"--[\w-]+", told), "--json", *USUAL}, name
+        robot = {"ROBOT", "SOURCE", "--robot"} & {*options, *(p.metavar for p in params)}
+        assert ("--platform" in options) == bool(robot), name
 
 
 def anchor(title):

@@ -22,6 +22,8 @@ GROUPS = {
     "--columns": "table", "--topic": "recording", "--picture": "picture", "--teeth": "milling",
 }  # fmt: skip
 """An option, and the name of those that the same commands have."""
+USUAL = ("--platform", "--overwrite")
+"""Options of every command that takes a robot, and of every command that writes a file."""
 
 
 @dataclass(frozen=True)
@@ -88,7 +90,8 @@ def page() -> str:
         lines += [f"* {task}: {links}"]
     lines += [
         "",
-        "Every command has `--json`, which prints JSON, and `--help`, which says more.",
+        "Every command has `--json`, which prints JSON, and `--help`, which says more. Every",
+        "command that takes a robot has `--platform`, every one that writes a file `--overwrite`.",
         "",
     ]
     lines += [f"## {SHARED}", ""]
@@ -122,7 +125,7 @@ class Groups:
     def named(self, there: Sequence[Word]) -> list[str]:
         """The line of a command that has some of them."""
         names = []
-        for word in [word for word in self.shared if word in there]:
+        for word in [w for w in self.shared if w in there and w.name not in USUAL]:
             group = [name for name, words in self.groups.items() if word in words]
             name = f"{group[0]} options" if group else f"`{word.name}`"
             if name not in names and word.name[0] == "-":
