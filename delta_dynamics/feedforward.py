@@ -25,6 +25,7 @@ from pkm_twin.messages.reading import (
     as_message_error,
 )
 from pkm_twin.messages.stamps import SECOND, StampRules
+from pkm_twin.robot.derivatives import nearest_motion
 from pkm_twin.robot.robot import Robot
 from pkm_twin.settings import COUNT, FUTURE, LATE, SECONDS, SHARE, ZERO_STAMP, setting
 from pkm_twin.streams.continuity import Continuity
@@ -396,17 +397,9 @@ class Feedforward(Core):
                 self.wrenches.push(sample, self.robot.platform(sample.q)[1], wrench)
             if rates is not None:
                 self._reader.check_derived(*rates)
-                motion = (sample.q, *rates)
                 if self.wrenches is not None:
                     external, measured = self.wrenches.through()
-                sure = rates[0]
-                if doubt is not None:
-                    sure = moving_rates(sure, np.abs(sure) <= doubt, self._reach)
-                change = rates[1]
-                if self.robot.redundant:
-                    # Noise that is differentiated contradicts nothing: what is measured is judged.
-                    _, own, change = as_message_error(self.robot.agreeing, sample.q, sure, change)
-                    sure = own if sample.qd is None else sure
+                motion, sure, change = as_message_error(self._moving, sample, rates, doubt)
                 solved = as_message_error(
                     inverse_dynamics, self.robot, sample.q, sure, change, external
                 )
@@ -437,6 +430,21 @@ class Feedforward(Core):
         before = self._memory or Memory.begun(q)
         memory = before.after(q[None], np.sign(rates), friction.presliding).last
         return memory, Dahl.beyond(friction, memory.z, rates)
+
+    def _moving(
+        self, sample: JointSample, rates: tuple[Array, Array], doubt: Array | None
+    ) -> tuple[tuple[Array, Array, Array], Array, Array]:
+        """The motion, and the rates and accelerations that efforts are of: zero rates at rest."""
+        # Noise that is differentiated contradicts nothing: what is measured is judged.
+        rate, change = nearest_motion(self.robot, sample.q, *rates)
+        motion = sample.q, rate, change
+        sure = rate if sample.qd is None else rates[0]
+        if doubt is not None:
+            sure = moving_rates(sure, np.abs(sure) <= doubt, self._reach)
+        if self.robot.redundant:
+            _, own, change = self.robot.agreeing(sample.q, sure, change)
+            sure = own if sample.qd is None else sure
+        return motion, sure, change
 
     def _differentiated(self, sample: JointSample) -> tuple[Array, Array] | None:
         """Rates and accelerations; what else looks through the window follows its length."""

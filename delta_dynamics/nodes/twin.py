@@ -197,7 +197,7 @@ class DeltaDynamics(TwinNode):
         length, error = fit.period * (fit.window - 1), 100.0 * fit.sine_error(1.0)
         text = (
             f"{fit.window} samples, {1e3 * length:.3g} ms: error for a sine of 1 Hz {error:.2g} % "
-            "of the peak acceleration"
+            f"of the peak acceleration; noise of a sample times {fit.noise_gain():.3g}"
         )
         if fit.window != self._reported_window:
             self._reported_window = fit.window

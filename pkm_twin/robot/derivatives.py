@@ -50,6 +50,22 @@ def joint_changes(
     return np.asarray(bent + (back @ own[..., None])[..., 0], np.float64)
 
 
+def nearest_motion(robot: Robot, q: Array, qd: Array, qdd: Array) -> tuple[Array, Array]:
+    """Rates and accelerations that all drives can have at q, nearest to these, shape (..., n) each.
+
+    By least squares over all of them, slides over the machine's size: noise by which drives that
+    share contradict each other is evened out. The same where there are no more than freedoms.
+    """
+    if not robot.redundant:
+        return qd, qdd
+    scale = np.where(np.array(robot.joint_units) == "m", robot.graph.size, 1.0)
+    back = robot.inverse_jacobian(q)
+    onto = back @ np.linalg.pinv(back / scale[:, None]) / scale
+    rate = (onto @ qd[..., None])[..., 0]
+    bent = robot.agreeing(q, rate)[2]
+    return rate, np.asarray(bent + (onto @ (qdd - bent)[..., None])[..., 0])
+
+
 def forward_derivatives(robot: Robot, q: ArrayLike, by: Sequence[str] = ()) -> Derivatives:
     """Derivatives of :meth:`Robot.forward`: ``state`` by q (..., m, n), ``by[path]`` (..., m).
 

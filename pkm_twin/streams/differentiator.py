@@ -109,11 +109,23 @@ class Differentiator:
         :param frequency: Hz.
         """
         turns = 2.0 * np.pi * frequency * self.period
-        back = np.arange(self.window) - (self.window - 1.0)
+        derivative, back, weights = self._weights()
+        return float(abs(weights @ np.exp(1j * turns * back) / (1j * turns) ** derivative - 1.0))
+
+    def noise_gain(self) -> float:
+        """Noise of the acceleration over that of the samples at the stream's period.
+
+        1/s^2 of positions, 1/s of velocities.
+        """
+        derivative, _, weights = self._weights()
+        return float(np.linalg.norm(weights)) / self.period**derivative
+
+    def _weights(self) -> tuple[int, Array, Array]:
+        """Which derivative the acceleration is; places of the window's samples; their weights."""
+        back: Array = np.arange(1.0 - self.window, 1.0)
         powers = np.vander(back, self.degree + 1, increasing=True)
         derivative = 1 if self._carries_velocity else 2
-        weights = derivative * np.linalg.pinv(powers)[derivative]
-        return float(abs(weights @ np.exp(1j * turns * back) / (1j * turns) ** derivative - 1.0))
+        return derivative, back, np.asarray(derivative * np.linalg.pinv(powers)[derivative])
 
     def _keep_time(self, end: int) -> None:
         """Fit fewer samples where the window, while it fills or later, is too long in time."""
