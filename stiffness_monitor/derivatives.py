@@ -34,7 +34,7 @@ def compliance_derivatives(robot: Robot, pose: ArrayLike, by: Sequence[str] = ()
     :param pose: shape (..., m), m and rad.
     :param by: dotted paths of numbers of the file, as :func:`pkm_twin.variants` takes them.
     :returns: ``state`` by the pose, shape (..., 6, 6, m), and ``by[path]`` (..., 6, 6).
-    :raises ParameterError: a path that there is not. Other errors as of ``compliance``.
+    :raises ParameterError: an unknown path. Other errors as of ``compliance``.
     """
     by_q, by_numbers = _tables(robot, pose, _entries)
     found: dict[str, Array] = {}

@@ -43,7 +43,7 @@ SHARE: Final = 0.01
 class PayloadEstimate:
     """Mass, kg, and centre of mass (3,), m from the platform's reference point, platform axes.
 
-    With standard deviations. If the motion does not determine the centre of mass, its standard
+    Both have standard deviations. If the motion does not determine the centre of mass, its standard
     deviation is infinite and its value is that of the robot's own payload. ``asked``: the estimate
     of the mass without the bound at zero; if it is negative, the mass is zero and its standard
     deviation covers the difference.

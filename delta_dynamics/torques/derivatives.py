@@ -51,7 +51,7 @@ def torque_derivatives(
     :param q: joint positions, shape (..., n), with rates ``qd`` and accelerations ``qdd``.
     :param wrench: as of :func:`delta_dynamics.inverse_dynamics`.
     :param by: dotted paths of numbers of the file, as :func:`pkm_twin.variants` takes them.
-    :raises ParameterError: a path that there is not. Other errors as of ``inverse_dynamics``.
+    :raises ParameterError: an unknown path. Other errors as of ``inverse_dynamics``.
     """
     return _derivatives(robot, (q, qd, qdd), wrench, np.eye(robot.joints_count), by, rows=True)
 

@@ -30,10 +30,10 @@ SOFT: Final = 1e-9
 def elastic_reactions(
     robot: Robot, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, wrench: ArrayLike | None = None
 ) -> Reactions:
-    """As :func:`~delta_dynamics.reactions`, indeterminate parts by the elastic model.
+    """As :func:`~delta_dynamics.reactions`, with indeterminate components by the elastic model.
 
-    What stores no energy in members or joints stays NaN, as all that is indeterminate of a robot
-    without elastic members. Not resolved are rods that stand for a pair.
+    Components that store no energy in members or joints stay NaN; in a robot without elastic
+    members these are all indeterminate ones. Rods that stand for a pair are not resolved.
     """
     found = balance(robot, q, qd, qdd, wrench)
     if not found.null.any():

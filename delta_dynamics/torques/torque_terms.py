@@ -21,8 +21,8 @@ class Terms:
     ``gravity``, ``inertia`` (linear in qdd) and ``velocity`` (quadratic in qd) are those of the
     robot without its payload; ``payload`` is the gravity, inertia and velocity part of the
     payload together; ``friction`` is viscous, Coulomb and offset; ``external`` balances
-    the wrench on the platform; ``preload`` is what drives that share the effort have besides:
-    efforts that move nothing.
+    the wrench on the platform; ``preload``: efforts that move nothing, of a machine with more
+    motors than degrees of freedom.
     """
 
     gravity: Array

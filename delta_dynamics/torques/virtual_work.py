@@ -100,8 +100,7 @@ def forward_dynamics(
     """Joint accelerations that efforts cause, shape (..., n): the inverse of inverse_dynamics.
 
     :param tau: efforts of the actuators, shape (..., n), N m or N. Other parameters and errors as
-        in
-        :func:`inverse_dynamics`.
+        in :func:`inverse_dynamics`.
     """
     load = _NO_WRENCH if wrench is None else wrench
 

@@ -312,7 +312,7 @@ POINTS: Final = 9
 
 @dataclass(frozen=True)
 class Design:
-    """The machine that was found, and what it was found among."""
+    """The best machine of a search, the machine before it, and the Pareto front, if any."""
 
     robot: Robot
     best: DesignPoint

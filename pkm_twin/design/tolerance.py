@@ -41,7 +41,7 @@ STATES: Final = 256
 
 @dataclass(frozen=True, eq=False)
 class Tolerances:
-    """What independent errors of parts do to the platform, to first order, actuated joints held.
+    """Effect of independent errors of parts on the platform, to first order, actuated joints held.
 
     All arrays (..., 6): displacement of the reference point and small turns, base axes, m and rad,
     against the machine without errors at the same joint positions. ``sigma``: standard deviation
@@ -173,9 +173,9 @@ def tolerances(
         is distributed.
     :param q: joint positions, shape (..., n), rad or m.
     :param wrench: on the platform, shape (6,) or (..., 6), N and N m, for ``deflection``.
-    :raises ParameterError: a path that there is not, a standard deviation that is none, a number
-        that moves nothing, or an error of an overconstrained machine's part after which rigid
-        parts cannot be assembled: clearance or deformation takes it up, which has no answer here.
+    :raises ParameterError: an unknown path, an invalid standard deviation, a number
+        that moves nothing, or an error with which the rigid parts of an overconstrained machine
+        cannot be assembled.
     :raises SingularityError: a state in which the loops do not determine the bodies. Others as of
         ``forward``.
     """
@@ -240,10 +240,9 @@ def _deflection(robot: Robot, q: Array, wrench: ArrayLike) -> Array | None:
 def drawn(
     robot: Robot, sigma: Mapping[str, float | Tolerance], q: ArrayLike, count: int, seed: int = 0
 ) -> Array:
-    """Errors of the platform of machines with random errors, on exact geometry.
+    """Errors of the platform of machines with random errors, by exact assembly in every state.
 
-    Every machine is assembled in every state, without a linear step: what
-    :func:`tolerances` gives to first order.
+    :func:`tolerances` gives them to first order.
 
     :param q: joint positions, shape (k, n). Other parameters and errors as there; paths are those
         of parts, or those of numbers of the file.

@@ -39,7 +39,7 @@ class Variables:
     def of(cls, robot: Robot, vary: Mapping[str, tuple[float, float]]) -> Variables:
         """Of names (see :func:`pkm_twin.design.search.design`) and their bounds.
 
-        :raises ParameterError: a path that there is not, one that is given twice, or bounds that
+        :raises ParameterError: an unknown path, one that is given twice, or bounds that
             are none.
         """
         if not vary:

@@ -427,6 +427,6 @@ def variants(robot: Robot, numbers: Mapping[str, ArrayLike]) -> Variants:
     :param numbers: by dotted path as docs/parameters.md has it (``geometry.arm_length``,
         ``joints.ball_1.at[0]``; ``limbs.joints.ball.at[0]`` for all copies of a limb), each an
         array of one number a machine, shape (k,), or one number for all; SI units.
-    :raises ParameterError: a path that there is not, or arrays of several lengths.
+    :raises ParameterError: an unknown path, or arrays of several lengths.
     """
     return Variants(robot, numbers)

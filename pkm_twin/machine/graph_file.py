@@ -108,19 +108,19 @@ class FrictionSpec(_Laws):  # type: ignore[misc]  # its fields are those of the 
 
 @dataclass(frozen=True, eq=False)
 class LimitSpec:
-    """Limits of one joint: position [min, max], rate, effort; or how far it swivels.
-
-    ``swivel``: of a spherical or universal joint, the largest angle between two directions that
-    are both along ``axis`` (base axes) at home, one fixed in the inner body, one in the outer.
-    ``axis``: default the direction of the member that the joint holds; of a universal joint the
-    normal of its axes.
-    """
+    """Limits of one joint: position [min, max], rate and effort, or ``swivel``."""
 
     position: Array | None = schema.interval(unit="{joint}", default=None)
     velocity: float | None = schema.number(above=0.0, high=math.inf, unit="{joint}/s", default=None)
     effort: float | None = schema.number(above=0.0, high=math.inf, unit="{effort}", default=None)
-    swivel: float | None = schema.number(above=0.0, high=np.pi, unit="rad", default=None)
-    axis: Array | None = schema.vector(3, default=None)
+    swivel: float | None = schema.number(
+        above=0.0, high=np.pi, unit="rad", default=None,
+        text="largest tilt of `axis` from its direction at home, seen from the other body",
+    )  # fmt: skip
+    axis: Array | None = schema.vector(
+        3, text="base axes; default: along the bar; of a universal joint, normal to both axes",
+        default=None,
+    )  # fmt: skip
 
     def verify(self, path: str) -> None:
         """An axis has a length, and is a swivel's."""
@@ -258,7 +258,7 @@ class JointSpec:
 class RodSpec:
     """A thin even straight bar with a ball joint at each end: points (m), mass (kg).
 
-    ``swivel``: how far it may lean from its direction at home, against each body, rad.
+    ``swivel``: largest tilt from its direction at home, seen from either body, rad.
     """
 
     between: tuple[str, ...] = schema.words(size=2)

@@ -39,9 +39,6 @@ class JointMapEntry:
     offset; efforts are divided by sign * ratio, so that power is the same. ``ratio_change``: the
     ratio is ratio * (1 + ratio_change * (model - ratio_at)), as of a spool; only ``calibrate`` and
     ``robot.controller.positions`` convert such a joint. ``unit``: the controller's, for tables.
-
-    Messages, bags and the table of poses for ``calibrate`` contain the controller's names and
-    values; everything else uses the model's.
     """
 
     name: str | None = schema.text(default=None)

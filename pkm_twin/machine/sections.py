@@ -131,18 +131,19 @@ class DriveSpec:
 
 @dataclass(frozen=True, eq=False)
 class Redundancy:
-    """Of more actuated joints than degrees of freedom, of which some lead and the others follow."""
+    """More actuated joints than degrees of freedom: some lead, the others follow."""
 
     leads: tuple[str, ...] | None = schema.words(
-        text="joints that determine the machine; by default the most independent", default=None
+        text="joints that determine the pose; default: the most independent", default=None
     )
     tolerance: float = schema.number(
         above=0.0, high=0.1, unit="rad", default=1e-3,
-        text="how far others may contradict them; of slides, parts of the size; of rates, in 10 ms",
+        text="largest difference of the other joints from the pose; sliding joints: parts of the "
+        "machine's size; rates: over 10 ms",
     )  # fmt: skip
     preload: Array = schema.vector(
-        0, unit="{effort}", text="efforts, one per joint, that shared ones come nearest to",
-        default=[],
+        0, unit="{effort}", default=[],
+        text="one effort per joint: the efforts of a motion are those nearest to these",
     )  # fmt: skip
 
 
@@ -150,7 +151,7 @@ class Redundancy:
 def friction_of(joints: int) -> Any:
     """Schema of friction at so many actuated joints: viscous per rate, Coulomb by its sign.
 
-    ``offset``: what the drive needs beside, whatever the motion; then the parameters of the other
+    ``offset``: a constant effort of the drive; then the parameters of the other
     laws of :mod:`~pkm_twin.machine.friction`.
     """
     fields = friction_fields(schema.vector, joints, spread=True, default=[0.0] * joints)

@@ -13,11 +13,10 @@ from pkm_twin.machine import schema
 
 @dataclass(frozen=True, eq=False)
 class UncertaintyEntry:
-    """How sure a number is, by its dotted path in this file, or all numbers below a name together.
+    """Standard deviation of the number at a path of this file, or of all numbers below it together.
 
-    Each entry is an independent cause, for ``torque_deviation`` and ``compliance_deviation``.
-    ``deviation``: the standard deviation, in the number's unit; or ``relative``: that of a common
-    factor.
+    Each entry is an independent cause. ``deviation``: in the number's unit; or ``relative``: that
+    of a common factor.
     """
 
     deviation: float | None = schema.number(low=0.0, unit="the number's", default=None)

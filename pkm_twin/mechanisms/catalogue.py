@@ -68,7 +68,7 @@ def load(robot: str | Path, *, platform: str | None = None) -> Robot:
     (:class:`pkm_twin.errors.RobotWarning`), each once.
 
     :param robot: a name such as ``"delta_cu"``, or a path to a YAML, URDF, MJCF or SDF file.
-    :param platform: of a URDF, MJCF or SDF the link that carries the tool; default by its name.
+    :param platform: link that carries the tool, of a URDF, MJCF or SDF; default: by usual names.
     :raises UnknownNameError: no such name; the closest one is named.
     :raises ParameterError: an invalid file, key, type or value, with its dotted name.
     """

@@ -176,10 +176,10 @@ def fastest(
     :param points: of the path, about; with a limit of jerk at most :data:`JERK_POINTS`.
     :param slowdown: divides ``speed`` at points of the path, by their joint positions (p, n) and
         the direction (p, 3) of the reference point, base axes: returns 1 or more, (p,).
-    :param payload: by waypoint, kg, from the moment on that it is reached: (waypoints,), None where
-        the robot's own is. Of ``lines``, a waypoint with a rounded corner is reached in its middle,
-        and one that is repeated after the rests of those before it. A cycle has 4 waypoints, with
-        the way back 7; a circle has its two ends. Default: the robot's throughout.
+    :param payload: mass from each waypoint on, kg, (waypoints,); None is the robot's own payload,
+        also the default. A waypoint with a rounded corner is reached in the middle of the rounding.
+        If a waypoint is repeated, its payload changes after the rests of the copies before it. A
+        cycle has 4 waypoints, with the way back 7; a circle has its two ends.
     :returns: the motion: ``.times``, ``.q``, ``.qd``, ``.qdd``, ``.effort`` and ``.pose`` at its
         points, the same of ``.uniform(rate)`` and ``.sample(times)``; ``.bounds``, which limit
         binds when; ``.duration``, s.

@@ -58,7 +58,7 @@ class Mark(NamedTuple):
 class Path:
     """Stretches in pose or joint coordinates; ``wait`` is the rest before the first, s.
 
-    ``marks``: where each waypoint is; one whose corner is rounded is in the middle of the rounding.
+    ``marks``: where each waypoint is; for a rounded corner, the middle of the rounding.
     """
 
     space: Space

@@ -349,7 +349,7 @@ class Samples:
     """A motion at times (k,), s: joint positions, rates, accelerations and efforts, shape (k, n),
     rad or m, per s and s2, N m or N; the pose (k, m); speed of the reference point (k,), m/s.
 
-    ``effort`` is None for a robot without masses. ``felt``: the speed that its limit is for, (k,).
+    ``effort`` is None for a robot without masses. ``felt``: the speed that has a limit, (k,).
     """
 
     time: Array

@@ -79,7 +79,7 @@ class Phase:
 
 @dataclass(frozen=True)
 class ShapedPath(TimedPath):
-    """A motion whose first mode is at rest at its stops; ``runs`` are those of the motion unshaped.
+    """A motion that leaves its first mode at rest at every stop; ``runs``: of the unshaped motion.
 
     ``phase``: of the first mode. ``amplitudes``: of the split motion, sum 1, each half a vibration
     after the one before. ``shaper``: ``zv`` or ``zvd``; ``frequencies``: lowest and highest, Hz;

@@ -69,13 +69,13 @@ def nearest_motion(robot: Robot, q: Array, qd: Array, qdd: Array) -> tuple[Array
 def forward_derivatives(robot: Robot, q: ArrayLike, by: Sequence[str] = ()) -> Derivatives:
     """Derivatives of :meth:`Robot.forward`: ``state`` by q (..., m, n), ``by[path]`` (..., m).
 
-    Exact to rounding, by the implicit function theorem; the actuated joints that lead are held
-    where a number of the file changes. Of an overconstrained machine the closures that determine it
-    count.
+    Exact to rounding, by the implicit function theorem. Where a number of the file changes, the
+    leading actuated joints are held. In an overconstrained machine only the closures that determine
+    its state count.
 
     :param q: joint positions, shape (..., n), rad or m.
     :param by: dotted paths of numbers of the file, as :func:`pkm_twin.variants` takes them.
-    :raises ParameterError: a path that there is not. Other errors as of ``forward``.
+    :raises ParameterError: an unknown path. Other errors as of ``forward``.
     """
     rows = np.eye(len(robot.pose_names), len(robot.pose_names) + 12)
     return Derivatives(robot.jacobian(q), _by_numbers(robot, q, rows, by))
@@ -87,7 +87,7 @@ def inverse_derivatives(robot: Robot, pose: ArrayLike, by: Sequence[str] = ()) -
     The pose is held where a number of the file changes.
 
     :param pose: shape (..., m), m and rad.
-    :raises ParameterError: a path that there is not. Other errors as of ``inverse``.
+    :raises ParameterError: an unknown path. Other errors as of ``inverse``.
     """
     if by:
         robot.check_independent("derivatives by numbers of the file with the pose held")

@@ -453,7 +453,7 @@ class Mechanism(Common):
     def numbered(self: R, values: Mapping[str, Any]) -> R:
         """A copy with other numbers or expressions at dotted paths of its file; nothing is checked.
 
-        :raises ParameterError: a path that there is not.
+        :raises ParameterError: an unknown path.
         """
         values = self.resolved(values)
         made = placed(self, {tuple(full_keys(path)): value for path, value in values.items()})
@@ -481,7 +481,7 @@ class Mechanism(Common):
     def number(self, path: str) -> float:
         """The number of the robot's file at a dotted path, as :meth:`numbered` takes it.
 
-        :raises ParameterError: a path that there is not.
+        :raises ParameterError: an unknown path.
         """
         keys = full_keys(path)
         if not keys or keys[0] not in settings_of(type(self)):
@@ -491,7 +491,7 @@ class Mechanism(Common):
     def filed(self: R, values: Mapping[str, Any]) -> R:
         """The robot of the same file with other numbers at dotted paths.
 
-        :raises ParameterError: a path that there is not, or a value that the file may not have.
+        :raises ParameterError: an unknown path, or a value that the file may not have.
         """
         data = given(self.numbered(values).parameter_sections())
         return type(self).from_data(data, self.name)

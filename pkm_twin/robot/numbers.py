@@ -27,7 +27,7 @@ class FileNumbers:
 
     :param paths: dotted, as of :meth:`Robot.numbered`.
     :param of: of a robot a row of numbers, or of expressions.
-    :raises ParameterError: a path that there is not.
+    :raises ParameterError: an unknown path.
     """
 
     def __init__(

@@ -293,7 +293,7 @@ class Robot(Mechanism):
         return self.platform(self.inverse(pose))[1]
 
     def home(self) -> Array:
-        """The home pose (not joint positions), shape (m,): the pose in which the graph is given."""
+        """The home pose (not joint positions), shape (m,), in which the file has the machine."""
         return self.engine.home_pose.copy()
 
     def jacobian(self, q: ArrayLike) -> Array:
@@ -310,7 +310,7 @@ class Robot(Mechanism):
         return [m.reshape(*m.shape[:-1], m.shape[-1] // n, n) for m in tables]
 
     def try_jacobian(self, q: ArrayLike) -> tuple[Array, Mask]:
-        """Pose rates per joint rate (..., m, n), NaN where there is no assembly; which are good."""
+        """Pose rates per joint rate (..., m, n), NaN without an assembly; which q are valid."""
         rates, good = _tried(self.engine.jacobian, q)
         n = self.joints_count
         return rates.reshape(*rates.shape[:-1], rates.shape[-1] // n, n), good
@@ -340,11 +340,11 @@ class Robot(Mechanism):
     def agreeing(
         self, q: ArrayLike, qd: ArrayLike | None = None, qdd: ArrayLike | None = None
     ) -> tuple[Array, Array, Array]:
-        """Positions, rates and accelerations of all actuated joints, by those that lead.
+        """Positions, rates and accelerations of all actuated joints, by the leading ones.
 
-        The same where there are no more than freedoms; errors as :meth:`forward`.
+        Unchanged where all joints lead; errors as :meth:`forward`.
 
-        :param q: joint positions, shape (..., n); ``qd``, ``qdd``: None is zero of those that lead.
+        :param q: joint positions, shape (..., n), with ``qd`` and ``qdd``; None: zero.
         :returns: shape (..., n) each.
         """
         still = np.zeros(self.joints_count)
@@ -386,7 +386,7 @@ class Robot(Mechanism):
         return singularity_kernel(self.engine)
 
     def try_singularity(self, q: ArrayLike) -> tuple[Array, Mask]:
-        """The measure (...), 0 where there is no assembly; which joint states have one."""
+        """The singularity index (...), 0 where there is no assembly; which q are valid, (...)."""
         measure, good = _tried(self.singularity_kernel(), q)
         return np.where(good, measure[..., 0], 0.0), good
 

@@ -21,7 +21,7 @@ TRANSFER = Case(
 
 @dataclass(frozen=True)
 class Isotropy(Kind):
-    """Kinetic energy and driving force in the worst direction."""
+    """Kinetic energy and driving force in the worst direction of motion."""
 
     energy: float = setting(ENERGY, "the platform's kinetic energy for the driving force (J)")
 
