@@ -9,9 +9,9 @@ What is put right has to make the efforts agree.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import chain
+from itertools import chain, product
 from typing import Final
 
 import numpy as np
@@ -28,7 +28,8 @@ from pkm_twin.identification.compare import (
     near_change,
 )
 from pkm_twin.identification.judge import SIGMAS
-from pkm_twin.identification.plausible import held_payload, listed, scale_text, wrenches
+from pkm_twin.identification.plausible import MASSES, held_payload, listed, scale_text, wrenches
+from pkm_twin.identification.samples import passed_band
 from pkm_twin.identification.suspects import OFF
 from pkm_twin.recordings import Load, Recording
 from pkm_twin.robot.plausibility import why_no_torques
@@ -51,7 +52,7 @@ PASSES: Final = 4
 ALIKE: Final = 4.0
 """How many times as much of the residual's square other masses leave that explain it as well."""
 
-Spans = list[tuple[float, float]]
+Spans = tuple[tuple[float, float], ...]
 """When a payload is held, s; empty: all the time."""
 
 
@@ -69,11 +70,6 @@ class Cause:
     exact: float = EXACT
     scale: float = 1.0
 
-    @property
-    def possible(self) -> bool:
-        """Whether the efforts as recorded can be a machine's: their scale is nearly right."""
-        return 1.0 / SCALED < self.scale < SCALED
-
     def then(self, others: Iterable[Cause]) -> Iterator[Cause]:
         """Causes of the recording that this one puts right, each together with this one."""
         for other in others:
@@ -83,6 +79,11 @@ class Cause:
     def agrees(self, bound: float) -> bool:
         """Whether the efforts agree with the model once this is put right."""
         return agrees(self.recording, self.left_out, self.exact * bound)
+
+
+def usual(scale: float) -> bool:
+    """Whether efforts of a scale can be a machine's: it is nearly right."""
+    return 1.0 / SCALED < scale < SCALED
 
 
 def agrees(r: Recording, without: Mask, bound: float) -> bool:
@@ -145,102 +146,145 @@ def _turned(r: Recording, c: Compared, left_out: Mask) -> Iterator[Cause]:
 
 
 def _number_of(r: Recording, c: Compared, left_out: Mask) -> Iterator[Cause]:
-    """The number that leaves least of the residual: a scale or a payload; then both together."""
-    robot, weight, n = r.robot, 1.0 / c.limit**2, r.robot.joints_count
+    """The number that leaves least of the residual: a scale or a payload; then both together.
 
-    change = np.gradient(c.expected, c.period, axis=0)
-    change[[row - k for row in c.starts for k in (0, 1)]] = 0.0
+    Two, or a payload with its times, come first where they leave clearly less.
+    """
+    numbers, order = _Numbers(r, c), list[_Found]()
+    found = [*numbers.scales(), *(numbers.payloads() if r.load is None else ())]
+    for count in (1, 2, 3):
+        alike = [one for one in found if one.count == count]
+        if alike:
+            one = min(alike, key=lambda each: each.left)
+            clear = not order or numbers.clear(one.left, order[0].left, BETTER)
+            order.insert(0 if clear else len(order), one)
+    for one in order:
+        yield from numbers.causes(one, found, left_out)
 
-    def on_time(column: Array) -> Array:
-        """Without what a delay explains: that which was taken out explains a scale in part."""
-        late = np.sum(weight * change * column) / max(np.sum(weight * change**2), 1e-300)
-        return np.asarray(column - late * change, np.float64)
 
-    residual = on_time(c.residual)
+@dataclass(frozen=True, eq=False)
+class _Found:
+    """A scale of the efforts of some drives, ``which`` (n,), and a payload that is held at times.
 
-    def left(column: Array) -> tuple[float, float]:
-        """The factor on a part of the expected efforts, and the squares of what remains."""
-        column = on_time(column)
-        size = np.sum(weight * column * residual) / max(np.sum(weight * column**2), 1e-300)
-        return 1.0 + float(size), float(np.sum(weight * (residual - size * column) ** 2))
+    ``left``: the mean square that they leave of the residual over its limit.
+    """
 
-    def weighing(one: Robot, *motion: Array) -> Array:
-        return inverse_dynamics(one, *motion[:3]) - dynamics_terms(one, *motion[:3]).friction
+    left: float
+    names: str
+    which: Array
+    scale: float
+    mass: float = 0.0
+    spans: Spans = ()
 
-    def more(one: Robot, *motion: Array) -> Array:
-        heavy = one.changed(payload={"mass": one.payload.mass + 1.0})
-        return inverse_dynamics(heavy, *motion) - inverse_dynamics(one, *motion)
+    @property
+    def count(self) -> int:
+        """Of numbers; all times are one."""
+        return bool(self.names) + bool(self.mass) + bool(self.spans)
 
-    each = [(name, row) for name, row in zip(robot.joint_names, np.eye(n), strict=True) if n > 1]
-    drives = [("all joints", np.ones(n)), *each]
-    names, which = min(drives, key=lambda one: left(one[1] * c.expected)[1])
-    scale, least = left(which * c.expected)
 
-    def scaled(names: str, which: Array, scale: float, masses: float | None = None) -> Cause:
-        other_units = replace(r, effort=r.measured / (1.0 + (scale - 1.0) * which))
-        return Cause(scale_text(names, scale, masses), other_units, left_out, EXACT, scale)
+class _Numbers:
+    """Numbers that make a recording's residual of parts of the expected efforts, by least squares.
 
-    def alone() -> Iterator[Cause]:
-        """The scale, unless other masses explain more."""
-        masses = None
-        if which.all():
-            columns = [by_held(r, weighing, t.time, *t.joints, t.wrench) for t in c.tracks]
-            heavier, other = left(c.filtered(columns))
-            if other < least / ALIKE:
+    Each with a delay: that which was taken out explains a scale in part.
+    """
+
+    def __init__(self, r: Recording, c: Compared) -> None:
+        self.r, self.c, robot, n = r, c, r.robot, r.robot.joints_count
+        each = [*zip(robot.joint_names, np.eye(n), strict=True)] if n > 1 else []
+        self.drives = [("all joints", np.ones(n)), *each]
+        self.change = np.gradient(c.expected, c.period, axis=0)
+        self.change[[row - k for row in c.starts for k in (0, 1)]] = 0.0
+        self.noise = float(np.mean((c.noise / c.limit) ** 2))
+        self.count = c.residual.size * passed_band(c.how, 1.0 / c.period)
+
+    def clear(self, least: float, other: float, times: float) -> bool:
+        """Whether so many times the least squares remain, beside noise, and not by chance."""
+        noise, chance = min(self.noise, least), SIGMAS**2 * least / self.count
+        return other - least > chance and other - noise > times * (least - noise)
+
+    def solved(self, *columns: Array, some: Mask | None = None) -> tuple[list[float], float]:
+        """The factors on columns (k, n), then the delay, s; the mean square that remains."""
+        table = np.stack([*columns, self.change, self.c.residual], -1) / self.c.limit[:, None]
+        table = (table if some is None else table[some]).reshape(-1, table.shape[-1])
+        sizes = np.linalg.lstsq(table[:, :-1], table[:, -1])[0]
+        return sizes.tolist(), float(np.mean((table[:, -1] - table[:, :-1] @ sizes) ** 2))
+
+    def efforts(self, function: Callable[..., Array]) -> Array:
+        """A function of the robot and the recorded motion, in its band, (k, n)."""
+        r, tracks = self.r, self.c.tracks
+        return self.c.filtered([by_held(r, function, t.time, *t.joints, t.wrench) for t in tracks])
+
+    def scales(self) -> Iterator[_Found]:
+        """The scale of the efforts of all drives, and of each."""
+        for names, which in self.drives:
+            (size, _), left = self.solved(which * self.c.expected)
+            yield _Found(left, names, which, 1.0 + size)
+
+    def payloads(self) -> Iterator[_Found]:
+        """A payload, throughout or at times, alone and with a scale that is not usual."""
+        c, kilogram = self.c, self.efforts(_kilogram)
+        lightest = LIGHTEST * sum(body.mass for body in self.r.robot.graph.bodies.values())
+        alone = ("", 0.0 * self.drives[0][1])
+        for (names, which), always in product([alone, *self.drives], [True, False]):
+            own, held, spans = which * c.expected, np.ones(len(c.time), np.bool_), Spans()
+            mass = size = late = left = 0.0
+            for _ in range(PASSES if which.any() else 1):
+                heavy = (1.0 + size * which) * kilogram
+                if not always:
+                    rest = c.residual - size * own - late * self.change
+                    weight = np.broadcast_to(c.limit**-2.0, rest.shape)
+                    _, times, held = held_payload(c.time, heavy, rest, weight)
+                    spans = tuple(times)
+                steady = ~Load(1.0, None, spans).near_change(c.time, BLOCK)
+                if not (held & steady).any() or held.all() > always:
+                    mass = 0.0
+                    break
+                (mass, size, late), left = self.solved(held[:, None] * heavy, own, some=steady)
+            scale = 1.0 + size
+            if mass > lightest and (not which.any() or (scale > 0.0 and not usual(scale))):
+                yield _Found(left, names, which, scale, mass, spans)
+
+    def causes(self, one: _Found, found: Sequence[_Found], left_out: Mask) -> Iterator[Cause]:
+        """What was found, in words; with a scale of all drives also what explains as much."""
+        r, whole, others = self.r, found[0], list[str]()
+        load = next((each for each in found if each.mass and each.count == 1), None)
+        if one is load and not usual(whole.scale) and not self.clear(one.left, whole.left, ALIKE):
+            one = whole
+        if one is whole:
+            (size, _), left = self.solved(self.efforts(_weighing))
+            if self.clear(left, one.left, ALIKE):
                 return
-            masses = heavier if other < ALIKE * least else None
-        if scale > 0.0:
-            yield scaled(names, which, scale, masses)
-
-    if r.load is not None:
-        yield from alone()
-        return
-    columns = [by_held(r, more, t.time, *t.joints, t.wrench) for t in c.tracks]
-    column = c.filtered(columns)
-    total = sum(body.mass for body in robot.graph.bodies.values())
-
-    def loaded(which: Array) -> tuple[float, float, float, Spans]:
-        """The squares that remain, the mass, the scale of some drives and the payload's times."""
-        mass, size, missed, spans = 0.0, 0.0, np.inf, list[tuple[float, float]]()
-        for _ in range(PASSES if which.any() else 1):
-            heavy, own = (1.0 + size * which) * column, which * c.expected
-            rest = residual - size * on_time(own)
-            _, spans, held = held_payload(c.time, on_time(heavy), rest, weight)
-            spans = [] if held.all() else spans
-            steady = ~Load(1.0, None, tuple(spans)).near_change(c.time, BLOCK)
-            if not (held & steady).any():
-                return np.inf, 0.0, 1.0, []
-            table = np.stack([held[:, None] * heavy, own, change], -1)[steady]
-            roots = np.sqrt(weight) * np.ones_like(c.residual[steady])
-            target = (roots * c.residual[steady]).ravel()
-            table = (roots[..., None] * table).reshape(-1, 3)
-            found = np.linalg.lstsq(table, target)[0]
-            mass, size = found[:2].tolist()
-            missed = float(np.sum((target - table @ found) ** 2) / steady.mean())
-        return missed, mass, 1.0 + size, spans
-
-    missed, mass, _, spans = loaded(np.zeros(n))
-    lighter = mass <= LIGHTEST * total or missed >= least
-    one = alone() if lighter else _payload(r, c, left_out, mass, spans)
-    both = min(((*loaded(row), name, row) for name, row in drives), key=lambda found: found[0])
-    likely, added, size, times, drive, row = both
-    pair: Iterator[Cause] = iter(())
-    if added > LIGHTEST * total and size > 0.0:
-        other = scaled(drive, row, size)
-        if not other.possible:
-            pair = other.then(_payload(other.recording, c, left_out, added, times))
-    clear = likely < min(missed, least) / BETTER
-    yield from chain(pair, one) if clear else chain(one, pair)
+            if not self.clear(one.left, left, ALIKE):
+                others.append(MASSES.format(1.0 + size))
+            if load is not None and not self.clear(one.left, load.left, ALIKE):
+                others.append(f"a payload of {r.robot.payload.mass + load.mass:.3g} kg is held")
+        if not one.which.any():
+            yield from _payload(r, self.c, left_out, one)
+        elif one.scale > 0.0:
+            effort = r.measured / (1.0 + (one.scale - 1.0) * one.which)
+            text = scale_text(one.names, one.scale, *others)
+            scaled = Cause(text, replace(r, effort=effort), left_out, EXACT, one.scale)
+            held = _payload(scaled.recording, self.c, left_out, one)
+            yield from scaled.then(held) if one.mass else (scaled,)
 
 
-def _payload(
-    r: Recording, c: Compared, left_out: Mask, mass: float, spans: Spans
-) -> Iterator[Cause]:
+def _weighing(robot: Robot, *motion: Array) -> Array:
+    """Efforts that grow with the masses."""
+    return inverse_dynamics(robot, *motion[:3]) - dynamics_terms(robot, *motion[:3]).friction
+
+
+def _kilogram(robot: Robot, *motion: Array) -> Array:
+    """Efforts of a kilogram more at the payload's centre."""
+    heavy = robot.changed(payload={"mass": robot.payload.mass + 1.0})
+    return inverse_dynamics(heavy, *motion) - inverse_dynamics(robot, *motion)
+
+
+def _payload(r: Recording, c: Compared, left_out: Mask, found: _Found) -> Iterator[Cause]:
     """A payload that is held at some times, or all the time."""
-    if len(spans) > SPANS:
+    if len(found.spans) > SPANS:
         return
-    times = tuple(spans)
-    load = Load(float(f"{r.robot.payload.mass + mass:.3g}"), None, times)
+    times = found.spans
+    load = Load(float(f"{r.robot.payload.mass + found.mass:.3g}"), None, times)
     text = f"a payload of {load.mass:g} kg explains the efforts: use --payload {load.mass:g}"
     if times:
         text += " --load-times " + ",".join(f"{edge:.2f}" for pair in times for edge in pair)

@@ -517,7 +517,8 @@ def _of_fit(found: Checked, bound: float) -> Explained:
 
     r = found.recording
     try:
-        first = fit(r.robot, [recorded_of(r, found.left_out)], ("friction",), accept=True)
+        part = [recorded_of(r, found.left_out)]
+        first = fit(r.robot, part, ("friction",), accept=True, causes=[None])
         rubbing = r.robot.filed({one.name: one.after for one in first.numbers})
         if not first.accepted and agrees(replace(r, robot=rubbing), found.left_out, bound):
             return ("friction other than the file's explains the efforts: `pkm-twin fit`",), ()

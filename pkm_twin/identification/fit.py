@@ -15,7 +15,7 @@ import numpy as np
 
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import PkmTwinError
-from pkm_twin.identification.causes import number_that_explains
+from pkm_twin.identification.causes import Cause, number_that_explains, usual
 from pkm_twin.identification.compare import MAX_RESIDUAL
 from pkm_twin.identification.estimation import Estimate, nearest, possible
 from pkm_twin.identification.identifiable import KINDS, Kind
@@ -125,17 +125,23 @@ def fit(
     *,
     accept: bool = False,
     progress: Callable[[int], None] | None = None,
+    causes: Sequence[Cause | None] | None = None,
 ) -> Fit:
     """Fit some kinds of numbers of a robot's file.
 
     :param what: of ``friction``, ``rotor``, ``payload``, ``inertia``.
     :param accept: fit recordings that this machine cannot have made, too.
     :param progress: called with the number of recordings that are worked on, twice each.
+    :param causes: what :func:`~pkm_twin.identification.causes.number_that_explains` says of each.
     :raises PkmTwinError: recordings that are too short, that show nothing, or that this machine
         cannot have made.
     """
     problem = Problem.of(robot, recordings, what, progress=progress)
-    faults = [fault for made in problem.whole for fault in _faults(made)]
+    if causes is None:
+        own = [replace(made.recording, robot=made.model.robot) for made in problem.whole]
+        causes = [number_that_explains(r) for r in own]
+    both = zip(problem.whole, causes, strict=True)
+    faults = [fault for made, cause in both for fault in _faults(made, cause)]
     refuse_faults(faults, accept)
     problem.check_count()
     faults = faults or _worse(problem)
@@ -188,15 +194,14 @@ def fitted(
     )  # fmt: skip
 
 
-def _faults(made: Rows) -> list[str]:
+def _faults(made: Rows, cause: Cause | None) -> list[str]:
     """Why this machine cannot have made a recording.
 
     Of efforts that one number explains: their scale, or a payload that is held for a while.
     """
     r = made.recording
-    cause = number_that_explains(replace(r, robot=made.model.robot))
     fault = recording_fault(made) if cause is None else cause.text
-    if cause is not None and cause.possible:
+    if cause is not None and usual(cause.scale):
         load = cause.recording.load
         fault = fault if r.load is None and load is not None and load.times else None
     return [] if fault is None else [f"{r.name}: {fault}"]

@@ -18,7 +18,7 @@ import numpy as np
 
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import BagError, ParameterError, PkmTwinError, UnknownNameError
-from pkm_twin.identification.causes import number_that_explains
+from pkm_twin.identification.causes import number_that_explains, usual
 from pkm_twin.identification.compare import missing_samples, recorded_of, step_fault
 from pkm_twin.identification.drives import FIT, fitted_constants, given_constants
 from pkm_twin.identification.fit import Fit, fit, fitted, refuse_faults
@@ -184,14 +184,16 @@ def fit_recordings(
             gaps = missing_samples(r.time)
             notes.append(f"{r.name}: {gaps.text} {gaps.value}, {gaps.bound}: {gaps.verdict}")
     made = [recorded_of(r) for r in recordings]
-    for k, r in enumerate(made):
-        own = replace(r, robot=robot)
-        cause = None if constant is not None else number_that_explains(own)
-        held = cause is not None and cause.possible and cause.recording.load is not None
-        if cause is not None and held and r.load is None:
-            notes.append(f"{r.name}: {cause.text}")
-            # Of several recordings each has another estimate.
-            made[k] = cause.recording if len(made) == 1 and "payload" in what else r
+    causes = None
+    if constant is None:
+        causes = [number_that_explains(replace(r, robot=robot)) for r in made]
+    for k, cause in enumerate(causes or ()):
+        if cause is None or not cause.text or not usual(cause.scale):
+            continue
+        notes.append(f"{made[k].name}: {cause.text}")
+        # Of several recordings each has another estimate.
+        if "payload" in what and len(made) == 1 and made[k].load is None and cause.recording.load:
+            made[k] = cause.recording
     if "payload" in what:
         loads = [r.load for r in made if r.load is not None]
         # Two payloads are not one section of a file.
@@ -214,7 +216,8 @@ def fit_recordings(
         else:
             constants = fitted_constants(robot, made)
         made, notes = [constants.applied(r) for r in made], constants.lines(robot) + notes
-    return *fit_with_laws(robot, made, what, laws, accept=accept, progress=progress), notes
+    options = {"accept": accept, "progress": progress, "causes": causes}
+    return *fit_with_laws(robot, made, what, laws, **options), notes
 
 
 def _unexplained(result: Fit) -> bool:

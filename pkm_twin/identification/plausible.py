@@ -92,6 +92,7 @@ BLOCKS: Final = 400
 """and at most so many of them in a recording."""
 SPANS: Final = 3
 """Most times that are named."""
+MASSES: Final = "all masses are {:.3g} times the file's"
 LIKE_A_UNIT: Final = 1.25
 """A scale that is so near to a unit's is named by it."""
 
@@ -578,11 +579,11 @@ def _delays(case: Case, joints: Sequence[str]) -> Iterator[tuple[str, Case]]:
         yield text, replace(case, effort=effort, late=change, **cut)
 
 
-def scale_text(names: str, scale: float, masses: float | None = None) -> str:
-    """Efforts of another scale, in words, or masses so many times as large."""
+def scale_text(names: str, scale: float, *others: str) -> str:
+    """Efforts of another scale, in words, or what else explains them as well."""
     sign = " and of the wrong sign" if scale < 0.0 else ""
-    alike = "; or all masses are {:.3g} times the file's, the recording cannot tell"
-    alike = "" if masses is None else alike.format(masses)
+    alike = "".join(f"; or {other}" for other in others)
+    alike += ", the recording cannot tell" if others else ""
     near = sorted(UNITS, key=lambda unit: abs(np.log(abs(scale) / UNITS[unit])))[0]
     unit = f" ({near}?)" if 1.0 / LIKE_A_UNIT < abs(scale) / UNITS[near] < LIKE_A_UNIT else ""
     return (

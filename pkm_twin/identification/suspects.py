@@ -33,7 +33,7 @@ from pkm_twin.identification.judge import (
     judge,
 )
 from pkm_twin.identification.parameters import FileParameters
-from pkm_twin.identification.plausible import scale_text
+from pkm_twin.identification.plausible import MASSES, scale_text
 from pkm_twin.identification.rows import BLOCK, Problem, Rows
 from pkm_twin.identification.samples import Resonance, by_blocks
 from pkm_twin.machine.friction import turning_keys
@@ -327,7 +327,8 @@ def scaled_efforts(problem: Problem, verdict: Verdict) -> str | None:
     rubs = _friction(problem)
     if rubs is not None and abs(rubs - 1.0) < abs(rubs - factor):
         return None
-    return scale_text("all joints", factor, None if rubs is not None else factor)
+    others = () if rubs is not None else (MASSES.format(factor),)
+    return scale_text("all joints", factor, *others)
 
 
 def _friction(problem: Problem) -> float | None:
