@@ -89,7 +89,7 @@ class Calibrate(OfRobot, ReadsTables, BeyondLimitsToo, Accepts, Overwrites):
     )
     measure: tuple[str, ...] = setting(
         (),
-        "what was measured, where not whole poses: height, distance, radius, range, plane, tilt, "
+        "what was measured, if not whole poses: height, distance, radius, range, plane, tilt, "
         "or of x, y, z, roll, pitch, yaw; separated by commas",
     )
     noise: tuple[str, ...] = setting(

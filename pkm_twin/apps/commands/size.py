@@ -86,12 +86,12 @@ class Size(CarriesAtTimes, ReadsMotions, AwayFromSingular, Draws):
         "worst direction at the worst pose", count=2, metavar="SPEED,ACCELERATION",
     )  # fmt: skip
     lever: float = setting(
-        0.3, "excludes poses near stretched limbs, where tool speed per joint speed is below this "
-        "fraction of its largest", low=0.0, high=1.0,
+        0.3, "excludes poses near stretched limbs, where the ratio of tool to joint speed is below "
+        "this fraction of the largest", low=0.0, high=1.0,
     )  # fmt: skip
     efforts: str | None = setting(
-        None, "efforts to use; default: the file's; with --payload the model's, unless the file's "
-        "are measured and near them", choices=("file", "model"),
+        None, "efforts to use; default: the file's; with --payload the model's, unless the file "
+        "has measured efforts near these", choices=("file", "model"),
     )  # fmt: skip
 
 

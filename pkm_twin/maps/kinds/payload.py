@@ -18,7 +18,7 @@ STAYS: Final = 1e-12
 
 
 class Payload(Kind):
-    """The largest mass that the drives hold at rest, weight included."""
+    """The largest mass that the drives hold at rest, with the machine's own weight."""
 
     name = "payload"
     question = "how much can it carry?"
