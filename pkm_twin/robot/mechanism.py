@@ -52,6 +52,8 @@ from pkm_twin.settings import settings_of
 
 SHARED: Final = "a controller may share efforts in any way"
 """Why measured efforts of drives that share them have no one explanation."""
+FREE_FALL: Final = (0.0, 0.0, -9.81)
+"""Of files without gravity, base axes, m/s2."""
 R = TypeVar("R", bound="Mechanism")
 
 
@@ -76,7 +78,7 @@ class Common:
     mechanism: str
     payload: Payload = schema.section(Payload, default={})
     gravity: Array = schema.vector(
-        3, unit="m/s2", text="free fall, base axes", default=[0, 0, -9.81]
+        3, unit="m/s2", text="free fall, base axes", default=list(FREE_FALL)
     )
     joint_map: Mapping[str, JointMapEntry] = schema.mapping(JointMapEntry, default={})
     uncertainty: Mapping[str, UncertaintyEntry] = schema.mapping(UncertaintyEntry, default={})

@@ -23,6 +23,7 @@ from pkm_twin.machine.sdf_write import write_sdf
 from pkm_twin.machine.urdf_control import Control, tree_names
 from pkm_twin.machine.urdf_write import GROUND, MOCK, PLATFORM, write_urdf
 from pkm_twin.machine.urdf_xml import plain_name
+from pkm_twin.robot.mechanism import FREE_FALL
 from pkm_twin.robot.outline import bars
 from pkm_twin.robot.robot import Robot
 
@@ -45,7 +46,7 @@ def robot_urdf(robot: Robot, hardware: str = MOCK, prefix: str = "") -> str:
     :param prefix: of the names of all links and joints.
     :raises ParameterError: hardware, and a ``joint_map`` with a ratio that changes with travel.
     """
-    _warn_of_laws(robot, "URDF")
+    _warn_of_losses(robot, "URDF")
     if hardware:
         robot.controller.check_even()
     return write_urdf(robot_tree(robot), hardware, prefix, _controls(robot))
@@ -70,36 +71,34 @@ def robot_mjcf(robot: Robot, efforts: Sequence[float] | None = None) -> str:
 
     :param efforts: of the actuators in the keyframe ``home``, shape (n,), N m or N.
     """
-    _warn_of_laws(robot, "MJCF")
-    tree = robot_tree(robot)
-    for name in tree.actuated:
-        if robot.friction.offset[tree.actuated.index(name)]:
-            warn(name, "MJCF has no constant friction of a drive: it is left out")
-    return write_mjcf(tree, robot.gravity, efforts)
+    _warn_of_losses(robot, "MJCF")
+    return write_mjcf(robot_tree(robot), robot.gravity, efforts)
 
 
 def robot_sdf(robot: Robot) -> str:
     """The robot as an SDF model, see docs/simulators.md; gravity is the world's."""
-    _warn_of_laws(robot, "SDF")
-    tree = robot_tree(robot)
-    left_out = [
-        f"{what} of {joint.name}"
-        for joint in tree.joints.values()
-        for what, value in (
-            ("the rotor inertia", joint.rotor_inertia),
-            ("the constant friction", joint.offset),
-        )
-        if value
-    ]
-    if left_out:
-        warn(tree.name, f"SDF has no place for {', '.join(left_out)}")
-    return write_sdf(tree)
+    _warn_of_losses(robot, "SDF")
+    return write_sdf(robot_tree(robot))
 
 
-def _warn_of_laws(robot: Robot, where: str) -> None:
-    """Of friction that a format has no place for."""
-    if robot.laws:
-        warn("friction", f"{where} has no {' or '.join(robot.laws)} friction: it is left out")
+def _warn_of_losses(robot: Robot, where: str) -> None:
+    """Of what efforts depend on and a format has no place for."""
+    lost = [f"{law} friction" for law in robot.laws]
+    if where != "MJCF":
+        lost += [
+            f"the rotor inertia of {joint.name}"
+            for joint in robot.graph.joints.values()
+            if joint.rotor_inertia and not (where == "URDF" and joint.actuated)
+        ]
+        if tuple(robot.gravity) != FREE_FALL:
+            lost.append(f"gravity {robot.gravity.tolist()}: it becomes {list(FREE_FALL)}")
+    if where != "URDF":
+        constant = zip(robot.joint_names, robot.friction.offset, strict=True)
+        lost += [f"the constant friction of {name}" for name, offset in constant if offset]
+    if robot.sharing_entries().get("redundancy", {}).get("preload") is not None:
+        lost.append("redundancy.preload")
+    if lost:
+        warn(robot.name or robot.mechanism, f"{where} has no place for {', '.join(lost)}")
 
 
 def robot_tree(robot: Robot) -> LoopTree:
@@ -141,7 +140,7 @@ def robot_tree(robot: Robot) -> LoopTree:
         joints[rod.name] = Joint(rod.name, "universal", inner, own, (start, start), axes)
         closures.append(Joint(f"{rod.name}_end", "spherical", own, outer, (end, end)))
     platform = names[graph.platform]
-    if load.mass > 0.0:
+    if load.mass > 0.0 or load.inertia.any():
         at = Pose(position=graph.origin + load.com)
         links[PAYLOAD] = Link(PAYLOAD, at, load.mass, at.position, load.inertia)
         label = f"{PAYLOAD}_frame"

@@ -8,6 +8,7 @@ import os
 import shutil
 import subprocess
 import sys
+import warnings
 import xml.etree.ElementTree as ET
 
 import numpy as np
@@ -30,6 +31,9 @@ NAMES = (*robot_names(), *RANDOM)
 FREEDOMS = {
     "fixed": 0, "revolute": 1, "prismatic": 1, "screw": 1, "universal": 2, "ball": 3,
 }  # fmt: skip
+
+
+FALL, ROTOR = "gravity [0.0, 3.0, 0.0]", "the rotor inertia of left"
 
 
 @functools.cache
@@ -57,6 +61,19 @@ def test_a_robot_there_and_back_has_its_torques(name, kind, tmp_path):
         own = getattr(robot.limits, limits)
         if own is not None:
             np.testing.assert_allclose(getattr(back.limits, limits), own, 1e-12, 1e-12)
+
+
+@pytest.mark.parametrize(
+    ("write", "lost"),
+    [(robot_urdf, {FALL}), (robot_mjcf, set()), (robot_sdf, {FALL, ROTOR})],
+)
+def test_a_format_names_what_efforts_need_and_it_has_no_place_for(write, lost):
+    robot = loaded("five_bar").changed(gravity=[0.0, 3.0, 0.0])
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        write(robot)
+    text = "".join(str(one.message) for one in told)
+    assert {word for word in (FALL, ROTOR) if word in text} == lost
 
 
 @pytest.mark.parametrize("name", partly_long(NAMES, "delta_cu"))
