@@ -234,7 +234,11 @@ def _angles(rotations: Array) -> Array:
 
 
 class Summary:
-    """What is kept of one joint's loads: peaks, sums of squares, reversals, and its bearing's."""
+    """What is kept of one joint's loads: peaks, sums of squares, reversals, and its bearing's.
+
+    ``peaks``, ``squares`` and ``sizes`` of force and moment are of their determined components.
+    ``known``: whether force and moment are determined in all samples.
+    """
 
     def __init__(self, robot: Robot, name: str, spec: BearingSpec | None) -> None:
         self.name, self.spec = name, spec
@@ -244,6 +248,7 @@ class Summary:
         self.samples, self.turned, self.travelled = 0, 0.0, 0.0
         self.peaks, self.squares = np.zeros(2), np.zeros(2)
         self.determined = np.ones(len(AXES), np.bool_)
+        self.known = np.ones(2, np.bool_)
         self.reversals = [Reversals() for _ in AXES]
         self.sizes: list[Array] = []
         self.bearing: list[tuple[Array, Array]] = []
@@ -251,7 +256,9 @@ class Summary:
     def add(self, load: JointLoad) -> None:
         """The next block."""
         fresh = slice(1 if self.samples else 0, None)
-        size = np.linalg.norm(load.wrench[fresh].reshape(-1, 2, 3), axis=-1)
+        parts = load.wrench[fresh].reshape(-1, 2, 3)
+        self.known &= np.isfinite(parts).all((0, 2))
+        size = np.sqrt(np.nansum(parts**2, -1))
         self.samples += len(size)
         self.turned += float(load.turned.sum())
         self.travelled += float(load.travelled.sum())
@@ -265,11 +272,6 @@ class Summary:
             amount = bearing_load(load.own[:, :3], self.spec, self.axis)
             moved = load.travelled if self.slides else load.turned
             self.bearing.append(((amount[1:] + amount[:-1]) / 2.0, moved))
-
-    @property
-    def known(self) -> bool:
-        """Whether its force is determined in all samples."""
-        return bool(np.isfinite(self.peaks[0]))
 
     def cycles(self, axis: int) -> Cycles:
         """Rainflow cycles of one component."""

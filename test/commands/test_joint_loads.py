@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Joint loads: rainflow by the standard's example, life by hand, open reactions by elasticity."""
 
+import re
+
 import numpy as np
 import pytest
 
@@ -176,6 +178,15 @@ def test_what_nothing_decides_is_named(twin, tmp_path):
     assert "fy" in told["tip"]["undetermined"]
     assert "fx" not in told["tip"]["undetermined"]
     assert told["tip"]["force_peak_N"] is None
+    # In the plane it is that of the machine with members.
+    motion = path(robot, tmp_path)
+    twin.good("loads", "five_bar", motion, "--out", tmp_path / "a.csv")
+    table = read_columns(tmp_path / "a.csv")
+    for name, entry in told.items():
+        force = np.hypot(table[f"{name}.fx"], table[f"{name}.fz"]).max()
+        assert entry["force_determined_peak_N"] == pytest.approx(force, rel=1e-3)
+    shown = twin.good("loads", tmp_path / "rigid.yaml", motion, "--picture", tmp_path / "b.png")
+    assert re.search(r"most of what is determined, a force of at least \d", shown.out)
 
 
 def test_turning_of_a_hinge_and_of_a_rod(rng):

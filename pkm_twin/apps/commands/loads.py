@@ -17,6 +17,7 @@ from pkm_twin.console import progress, writing
 from pkm_twin.files import replace_file
 from pkm_twin.recordings.tables import WRENCH
 from pkm_twin.report import Column, Fact, Report, Table, plots
+from pkm_twin.report.report import ROUNDING
 from pkm_twin.settings import setting
 
 if TYPE_CHECKING:
@@ -66,11 +67,12 @@ def loads(given: Loads) -> Report:
         replace_file(given.spectrum, spectra(found).encode())
     robot, duration = motion.robot, float(motion.time[-1] - motion.time[0])
     joints = {load.name: of_joint(load, given.exponent, duration) for load in found}
-    known = [load for load in found if load.known]
-    worst = max(known, key=lambda load: load.peaks[0], default=None)
+    worst = max(found, key=lambda load: load.peaks[0])
     answer = f"{robot.name}: no joint's force is determined"
-    if worst is not None:
-        answer = f"{robot.name}: {worst.name} bears most, a force of up to {worst.peaks[0]:.4g} N"
+    if worst.peaks[0] > 0.0:
+        part = "" if all(load.known[0] for load in found) else " of what is determined"
+        most = f"{'up to' if worst.known[0] else 'at least'} {worst.peaks[0]:.4g} N"
+        answer = f"{robot.name}: {worst.name} bears most{part}, a force of {most}"
     open_ = any(one["undetermined"] for one in joints.values())
     idle = [n for n, j in joints.items() if j.get("life") and math.isnan(j["life"]["L10_hours"])]
     return Report(
@@ -97,8 +99,10 @@ def of_joint(load: Summary, exponent: float, duration: float) -> dict[str, Any]:
     entry: dict[str, Any] = {"undetermined": open_axes, "turned_rad": load.turned}
     entry |= {"travelled_m": load.travelled} if load.slides else {}
     for k, (what, unit) in enumerate((("force", "N"), ("moment", "N_m"))):
-        rms = math.sqrt(load.squares[k] / load.samples)
-        entry |= {f"{what}_peak_{unit}": float(load.peaks[k]), f"{what}_rms_{unit}": rms}
+        peak, rms = float(load.peaks[k]), math.sqrt(load.squares[k] / load.samples)
+        whole = 1.0 if load.known[k] else math.nan
+        entry |= {f"{what}_peak_{unit}": whole * peak, f"{what}_rms_{unit}": whole * rms}
+        entry |= {f"{what}_determined_peak_{unit}": peak}
     entry["equivalent_range"] = {
         axis: load.cycles(k).equivalent_range(exponent)
         for k, axis in enumerate(WRENCH)
@@ -106,7 +110,7 @@ def of_joint(load: Summary, exponent: float, duration: float) -> dict[str, Any]:
     }
     if load.spec is not None:
         entry["life"] = None
-        if load.known:
+        if load.known[0]:
             life = load.life(duration)
             entry["life"] = {
                 "equivalent_load_N": life.load, "turns": life.moved, "L10_turns": life.life,
@@ -130,6 +134,10 @@ def _tables(joints: dict[str, Any]) -> list[Table]:
         worst = max(forces, key=lambda axis: forces[axis], default=None)
         ranges = "" if worst is None else f"{forces[worst]:.4g} ({worst})"
         values = [entry[column.name] for column in columns]
+        for k, key in enumerate(("force_determined_peak_N", "moment_determined_peak_N_m")):
+            most = max(other[key] for other in joints.values())
+            if math.isnan(values[2 * k]) and entry[key] > ROUNDING * most:
+                values[2 * k] = f"at least {entry[key]:.4g}"
         rows[name] = [*values, ranges, ", ".join(entry["undetermined"])]
     columns += [Column("", "N", "equivalent range"), Column("", "", "undetermined")]
     tables = [Table("", columns, rows, head="joint")]
@@ -144,14 +152,16 @@ def _tables(joints: dict[str, Any]) -> list[Table]:
 
 def draw(motion: Recording, loads: Sequence[Summary], title: str) -> Any:
     """Forces of the joints with the largest ones over time, and their rainflow spectra."""
-    shown = sorted((load for load in loads if load.known), key=lambda load: -load.peaks[0])[:SHOWN]
+    told = [load for load in loads if load.determined[:3].any()]
+    shown = sorted(told, key=lambda load: -load.peaks[0])
     figure, axes = plots.columns(2, 1)
     (force,), (counted,) = axes
-    for k, load in enumerate(shown):
+    for k, load in enumerate(shown[:SHOWN]):
         style = {"color": plots.COLOURS[k], "ls": plots.DASHES[k % 3], "lw": 1.2}
-        label = f"{load.name}: {load.peaks[0]:.4g} N"
+        label = f"{load.name}: {'' if load.known[0] else 'at least '}{load.peaks[0]:.4g} N"
         force.plot(motion.clock, np.concatenate(load.sizes), label=label, **style)
-        axis = max(range(3), key=lambda k: float(np.ptp(load.reversals[k].values)))
+        own = [k for k in range(3) if load.determined[k]]
+        axis = max(own, key=lambda k: float(np.ptp(load.reversals[k].values)))
         cycles = load.cycles(axis)
         down = np.argsort(-cycles.ranges)
         label = f"{load.name}, {WRENCH[axis]}"
