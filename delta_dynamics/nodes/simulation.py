@@ -197,7 +197,8 @@ class MachineSim(TwinNode):
             wrench=WrenchSignal(
                 self._row("wrench.constant", np.zeros(6), "wrench on the platform, N and N m, "
                 "base axes"),
-                self._row("wrench.amplitude", np.zeros(6), "amplitude of a sine added to it"),
+                self._row("wrench.amplitude", np.zeros(6), "amplitude of a sine added to "
+                "wrench.constant"),
                 self.declare(
                     "wrench.frequency", 1.0, "frequency of the "
                     "sine", unit="Hz", low=0.0, high=1e4
@@ -239,8 +240,8 @@ class MachineSim(TwinNode):
                 ),
                 ("payload.masses", [own.mass], "payload from each time on, kg", "the robot's"),
                 (
-                    "payload.coms", own.com.tolist(), "its centre of mass, m from the platform's "
-                    "reference point, three per time", "the robot's",
+                    "payload.coms", own.com.tolist(), "centre of mass of the payload, m from the "
+                    "platform's reference point, three numbers per time", "the robot's",
                 ),
             )
         )  # fmt: skip

@@ -105,8 +105,8 @@ class MachineSettings:
     )
     timeout_action: TimeoutAction = setting(
         "zeros",
-        "efforts of the drives after that gap: zeros, or hold, the last effort, as most "
-        "effort controllers do",
+        "efforts of the drives after deadline without commands: zeros, or hold (the last effort, "
+        "as most effort controllers do)",
         choices=("zeros", "hold"),
     )
     payloads: tuple[PayloadEvent, ...] = ()
