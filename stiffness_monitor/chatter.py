@@ -143,12 +143,12 @@ class Lobes:
         return int(np.flatnonzero(self.depths == self.depths.max())[-1])
 
     def steady(self, margin: float = MARGIN) -> tuple[float, float, bool]:
-        """The best speed (rpm) that may be off, its stable depth (m), whether that is open.
+        """The best speed (rpm) with a margin, its stable depth (m), and whether that is open.
 
-        The depth is that of all speeds within the margin, and of the next ones beyond on both
-        sides. Speeds have to rise. Of a range that is narrower, its middle with all of it.
+        The depth is stable at all speeds within the margin, and at the next ones on both sides. If
+        the range of speeds is narrower than the margin, its middle is taken. Speeds must rise.
 
-        :param margin: part of the speed.
+        :param margin: how far the speed may be off, as a part of it.
         """
         last = len(self.speeds) - 1
         low = np.searchsorted(self.speeds, self.speeds * (1.0 - margin), "right") - 1
@@ -330,14 +330,14 @@ def stability_lobes(
 ) -> Lobes:
     """Axial depths at which milling begins to chatter, over spindle speeds.
 
-    A pose's lowest modes count that move the tool point in the cutting plane, actuators locked.
+    The lowest modes that move the tool point in the cutting plane count, actuators locked.
 
     :param pose: shape (m,), the mechanism's pose coordinates, m and rad.
     :param speeds: spindle speeds, shape (k,), rpm.
     :param damping, tool: as of :func:`~stiffness_monitor.vibration.tool_modes`; so are errors.
     :param deepest: depth up to which to look, m; default :data:`DEEPEST` times the depth that is
         stable at every speed.
-    :raises ParameterError: a speed with more than :data:`WAVES` vibrations from tooth to tooth.
+    :raises ParameterError: a speed with more vibrations from tooth to tooth than :data:`WAVES`.
     """
     return lobes_of(tool_modes(robot, pose, damping=damping, tool=tool), milling, speeds, deepest)
 
@@ -427,8 +427,8 @@ def stable_depth(
 ) -> float:
     """The axial depth that is stable at every spindle speed in the zero-order approximation, m.
 
-    Teeth that cut by turns can chatter at less at some speeds, see :func:`lobes_between`. Infinite
-    where no depth is unstable. Parameters and errors as :func:`stability_lobes`.
+    An interrupted cut can chatter at a smaller depth at some speeds, see :func:`lobes_between`.
+    Infinite where no depth is unstable. Parameters and errors as :func:`stability_lobes`.
     """
     return stable_depth_of(tool_modes(robot, pose, damping=damping, tool=tool), milling)[0]
 

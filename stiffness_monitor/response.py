@@ -78,9 +78,9 @@ class ElementResponse:
         )
 
     def deflection(self, wrench: ArrayLike, factors: ArrayLike) -> tuple[Array, Array]:
-        """Of the platform under wrenches (..., 6): shape (..., 6), m and rad, base axes.
+        """Deflection of the platform under wrenches (..., 6): shape (..., 6), m and rad, base axes.
 
-        :returns: and its derivatives by the factors, shape (..., 6, elements).
+        :returns: the deflection, and its derivatives by the factors, shape (..., 6, elements).
         """
         loads = vectors(wrench, 6, "the wrench")[..., None]
         change, columns = self.columns(factors)

@@ -244,7 +244,7 @@ def energy_transfer_range(robot: Robot, pose: ArrayLike) -> Extremes:
     """Extremes of eta_KE over all directions, exact, from generalised eigenvalues.
 
     :param pose: shape (..., m).
-    :raises ParameterError: bodies without inertia against some direction.
+    :raises ParameterError: a direction of motion in which the bodies have no inertia.
     """
     platform, everything = energy_matrices(robot, pose)
     back = _inverse_root(robot, everything)

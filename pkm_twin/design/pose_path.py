@@ -52,7 +52,7 @@ class PosePath:
         cls, robot: Robot, time: ArrayLike, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike,
         wrench: ArrayLike | None = None,
     ) -> PosePath:  # fmt: skip
-        """The path that a robot's platform takes when its joints move so.
+        """The path of a robot's platform during a joint motion.
 
         :param time: shape (t,), s; ``q``, ``qd``, ``qdd``: shape (t, n).
         :param wrench: shape (t, 6) or (6,); None is none.

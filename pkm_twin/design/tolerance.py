@@ -71,7 +71,7 @@ class Tolerances:
 
     @cached_property
     def worst(self) -> Array:
-        """The most that all errors together do to each component, shape (..., 6)."""
+        """Largest effect of all errors together on each component, shape (..., 6)."""
         each = [
             _root([self.bounds[path] * self.sensitivity[path] for path in paths])
             for paths in self.together.values()

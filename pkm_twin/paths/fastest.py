@@ -173,7 +173,7 @@ def fastest(
     :param share: fraction of the robot file's efforts and velocities to use.
     :param singularity: least singularity index on the path, 0 to 1.
     :param wrench: constant external wrench on the platform, (6,), base axes.
-    :param points: of the path, about; with a limit of jerk at most :data:`JERK_POINTS`.
+    :param points: about how many points of the path; with a jerk limit at most :data:`JERK_POINTS`.
     :param slowdown: divides ``speed`` at points of the path, by their joint positions (p, n) and
         the direction (p, 3) of the reference point, base axes: returns 1 or more, (p,).
     :param payload: mass from each waypoint on, kg, (waypoints,); None is the robot's own payload,

@@ -267,7 +267,7 @@ def _shortened(piece: Piece, begin: float, end: float) -> list[Piece]:
 def circle(robot: Robot, centre: ArrayLike, radius: float, *, turns: float = 1.0) -> Path:
     """A circle of the platform's reference point about a pose, in the first two of x, y, z.
 
-    Of a pose without two of them, a circle of its first two angles.
+    For a pose without two of them, a circle of its first two angles.
 
     :param centre: the pose in the middle, shape (m,).
     :param radius: m, of angles rad.

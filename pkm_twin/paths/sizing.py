@@ -406,7 +406,7 @@ def size_drives(
 
     :param motion: with rates and accelerations; ``effort``: the joints' efforts, shape (k, n).
     :param motors: candidates by name; each replaces the rotor of the robot's file.
-    :param given: gears of joints without a ``drive`` in the file, one a type; the file's
+    :param given: gears of joints without a ``drive`` in the file, one per type; the file's
         ``rotor_inertia`` is behind them.
     :param choices: gears to choose from, in place of the file's: of each type, every motor gets
         the one that leaves the most margin.

@@ -152,8 +152,8 @@ def worst_over_workspace(
     """The largest efforts and speeds of the drives, for the worst directions of the tool point.
 
     Speed and acceleration are those of the position; the orientation stays constant. The
-    worst acceleration is exact; of the speed :data:`DIRECTIONS` are tried at all poses, and
-    :data:`MORE_DIRECTIONS` at the worst.
+    worst acceleration is exact; for the speed :data:`DIRECTIONS` directions are tried at all poses,
+    and :data:`MORE_DIRECTIONS` at the worst.
 
     :param speed: of the tool point, m/s; ``acceleration``: m/s2. Of a machine that only turns, of
         the platform's rotation, rad/s and rad/s2.
