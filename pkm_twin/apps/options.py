@@ -129,8 +129,8 @@ class ReadsTables:
     )
     units: str | None = setting(
         None,
-        "units of columns whose header has none: of rad, mrad, deg, rev, m, cm, mm, um, s, ms, us, "
-        "percent (of the motor's rated torque, with --side motor); default SI",
+        "units of columns read whose header has none: of rad, mrad, deg, rev, m, cm, mm, um, s, "
+        "ms, us, percent (of rated torque, with --side motor); default SI",
         older=("--unit",),
     )
     time: str | None = setting(None, "name of a table's column of times")

@@ -72,7 +72,8 @@ class Checked:
     """All items of a recording; the whole is good where it was judged and none is bad.
 
     ``bands``: by joint the residual against the standard deviation that the file's ``uncertainty``
-    gives, empty without one. ``unjudged``: why efforts have no verdict; empty where they have one.
+    gives, empty without one. ``unjudged``: why efforts have no verdict; empty where they have one,
+    or where the data for one are ``missing``, which is why.
     ``compared``: the efforts; ``left_out``: idle samples and those near jumps, (samples,).
     """
 
@@ -80,6 +81,7 @@ class Checked:
     items: list[Fact]
     bands: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     unjudged: str = ""
+    missing: str = ""
     compared: Compared | None = None
     left_out: Mask = field(default_factory=lambda: np.zeros(0, np.bool_))
     causes: tuple[str, ...] = ()
@@ -143,7 +145,8 @@ def checked(r: Recording, residual: float) -> Checked:
     if mixed or reason or r.effort is None:
         items.append(judged(RESIDUAL, mixed or reason, bound, None))
         unjudged = COMPUTED if reason == COMPUTED else ""
-        return Checked(r, items, unjudged=unjudged, causes=(mixed,) if mixed else ())
+        missing, causes = "" if unjudged else reason, (mixed,) if mixed else ()
+        return Checked(r, items, unjudged=unjudged, missing=missing, causes=causes)
     try:
         idle = idle_of(r)
         left_out = idle | near_jumps(steps, len(r.time))
@@ -159,7 +162,7 @@ def checked(r: Recording, residual: float) -> Checked:
         if stuck:
             items.append(judged(MEASURED, stuck, "change as the model's", False))
         items += _residuals(r, compared, bands, bound)
-    return Checked(r, items, bands, unjudged, compared, left_out)
+    return Checked(r, items, bands, unjudged, "", compared, left_out)
 
 
 def _file(r: Recording) -> list[Fact]:

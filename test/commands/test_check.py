@@ -223,9 +223,12 @@ class TestNoEvidence:
     def test_no_masses(self, tmp_path):
         bag = rewrite(STIFFNESS, tmp_path / "s.mcap", seconds=0.2)
         robot = str(massless(tmp_path / "light.yaml"))
-        item = items_of(checked(bag, robot=robot))["torque residual"]
-        assert item["verdict"] == "unknown"
+        report = checked(bag, robot=robot)
+        item = items_of(report)["torque residual"]
+        assert (report.code, item["verdict"]) == (0, "unknown")
         assert item["value"].startswith("inertia")
+        assert item["value"] == report.data["efforts_not_judged"]
+        assert f"not judged: torque residual ({item['value']})" in report.answer
         # With masses, what is missing is the measurement.
         item = items_of(checked(bag))["torque residual"]
         assert (item["verdict"], item["value"]) == ("unknown", "the bag carries no efforts")

@@ -97,6 +97,8 @@ def check_one(given: Check, path: Path, update: Any = None, thorough: bool = Tru
     if found.answer == "not judged":
         # The reason is in the answer.
         unknown = [what for what in unknown if what not in (COMPARED, IDLE, RESIDUAL)]
+    elif found.missing:
+        unknown = [f"{what} ({found.missing})" if what == RESIDUAL else what for what in unknown]
     why, findings = "; ".join(found.causes), "; ".join(found.findings)
     what = ", ".join(bad) or found.unjudged or found.agreement
     if why and found.compared is None:
@@ -114,7 +116,8 @@ def check_one(given: Check, path: Path, update: Any = None, thorough: bool = Tru
             payload_fact(r.load),
             *found.items,
             Fact("uncertainty", found.bands or None), Fact("answer", found.answer),
-            Fact("not_judged", found.unjudged or None), Fact("good", good),
+            Fact("not_judged", found.unjudged or None),
+            Fact("efforts_not_judged", found.unjudged or found.missing or None), Fact("good", good),
             Fact("residuals", found.residuals), Fact("samples", len(r.time)),
             Fact("duration_s", float(r.time[-1]), "s"),
             Fact("delay_s", None if found.compared is None else found.compared.late, "s"),
@@ -156,7 +159,7 @@ def _of_folder(given: Check) -> Report:
     notes = []
     for result in results:
         bad = [item["what"] for item in result.get("items", ()) if item["verdict"] == "bad"]
-        because = ", ".join(bad) or result.get("not_judged")
+        because = ", ".join(bad) or result.get("efforts_not_judged")
         why = result.get("error") or f"{result['answer']}{f': {because}' if because else ''}"
         notes.append(f"{result['bag']}: {why}")
     count = sum(not result["good"] for result in results)
