@@ -50,12 +50,13 @@ class Calibrate(OfRobot, ReadsTables, BeyondLimitsToo, Accepts, Overwrites):
     """Fit a robot's geometry and joint offsets to poses that an instrument measured.
 
     A robust least-squares fit with the machine's closures. A pose that does not fit the others gets
-    a small weight, and the report names its line. Changes of numbers that the poses do not
-    determine are listed and not made; a number in one may still change with others. The fit does
-    not use every fourth pose: the error there, before and after, is the calibration's accuracy.
+    a small weight, and the report names its line. Combinations of numbers that the poses do not
+    determine are listed and keep the file's value; a single number of one can still change. The fit
+    does not use every fourth pose: the error there, before and after, is the calibration's
+    accuracy.
 
     Poses that this machine cannot reach are rejected with the reason, and without --frame so are
-    poses in another frame than the base's. --accept calibrates anyway and marks the file.
+    poses that are not in base axes. --accept calibrates anyway and marks the file.
 
     With --measure, parts of the poses are enough, and cells may be empty. Each measurement is then
     compared with the fit to all others, and the report says whether the scale is determined.

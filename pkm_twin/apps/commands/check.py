@@ -29,8 +29,8 @@ class Check(CarriesAtTimes, ReadsRecordings):
     stay inside their limits and away from singularities, and that the measured efforts agree with
     the model. If they do not, an explanation is named only if it makes them agree. An item without
     data (no CRCs, no efforts, a robot without masses) is not judged, which is neither good nor bad.
-    The whole is not judged where there are efforts without a verdict: too few can be compared, or
-    they are the model's own, as those of a table of `torques`.
+    The recording is not judged if its efforts have no verdict: too few can be compared, or the
+    model computed them, as in a table of `torques`.
 
     Exit code 0: good. 1: bad, not judged, or no recording. 3: the file is damaged, but `pkm-twin
     recover` can save part of it.

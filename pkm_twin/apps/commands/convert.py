@@ -24,10 +24,10 @@ MAX_BYTES = 64 * 1024**2
 class Convert(OfPlatform, Writes):
     """Convert a robot, a URDF with its loops, or a printer's configuration to a YAML.
 
-    Of a robot it prints a commented YAML of bodies, joints and rods. It is a complete robot: edit
+    For a robot it prints a commented YAML of bodies, joints and rods. It is a complete robot: edit
     it, and use its path in place of a robot's name.
 
-    Of a linear Delta printer it writes the geometry and the probings, for `calibrate`. Klipper: a
+    For a linear Delta printer it writes the geometry and the probings, for `calibrate`. Klipper: a
     printer.cfg after DELTA_CALIBRATE or DELTA_ANALYZE and SAVE_CONFIG. Marlin: M665, M666 and the
     first table of G33. RepRapFirmware: M665, M666, and the `G30 P` lines of bed.g with the reply to
     G32, or heightmap.csv. Smoothieware: M665, M666, and the X, Y, Z lines of G29.1. Several files

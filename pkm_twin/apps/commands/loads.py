@@ -39,7 +39,7 @@ class Loads(CarriesAtTimes, ReadsMotions, Writes, Draws):
     For each joint it prints peak and RMS force and moment, and the equivalent load range: one cycle
     of this range does the same damage as all cycles of the motion (rainflow counting, in axes that
     turn with the joint's inner body). With --bearings also equivalent load and L10 life (ISO 281;
-    of sliding joints ISO 14728-1, C for 100 km).
+    for sliding joints ISO 14728-1, C for 100 km).
 
     In an overconstrained machine the elasticity of members and joints determines what rigid-body
     equations do not. Without elasticity these components are reported as undetermined.

@@ -46,9 +46,9 @@ class Size(CarriesAtTimes, ReadsMotions, AwayFromSingular, Draws):
     --drives compares each motor of a file with the needs of each drive, in percent of what the
     motor can do: peak torque against its torque curve, RMS torque against its continuous torque,
     and speed. The inertia ratio is that of load to rotor. The motor's rotor replaces the one in the
-    robot's file. --ratios, --leads, or gears in the drives file: each motor gets the gear
-    that leaves the most margin. The last lines name the smallest motor for all drives, with one
-    gear, and for each.
+    robot's file. With --ratios, --leads, or gears in the drives file, each motor gets the
+    gear that leaves the most margin. The last lines name the smallest motor for all drives, with
+    one gear, and for each.
 
     The motion is a table of `pkm-twin path` or `pkm-twin torques`, a recording of joint states, or
     a bag with a JointTrajectory.

@@ -26,8 +26,8 @@ SHOWN: Final = 4
 class Trend(Draws):
     """Report which values of a machine drift from night to night.
 
-    Residuals, friction, payload, compliance factors and frequencies of all recordings of a history,
-    each against control limits from its first recordings, and for a change of its mean.
+    Compares residuals, friction, payload, compliance factors and frequencies of all recordings of a
+    history with control limits from its first recordings, and tests each for a change of its mean.
 
     Exit code 0: nothing drifts. 1: something does, or the file is not a history.
     """

@@ -19,7 +19,7 @@ from stiffness_monitor.vibration import COUNT, tool_modes
 class CuttingDepth(Frequency):
     """The least axial depth of cut of the stability lobes, in the zero-order approximation.
 
-    At small immersions single speeds chatter below it: `lobes` is exact at one pose.
+    At small immersion some speeds chatter at a smaller depth: `lobes` is exact at one pose.
     """
 
     milling: Milling
