@@ -10,7 +10,9 @@ import pytest
 if not all(map(find_spec, ("xarray", "h5netcdf", "h5py"))):
     pytest.skip("maps need xarray, h5netcdf and h5py", allow_module_level=True)
 
+from pkm_twin.maps.kind import Kind
 from pkm_twin.maps.kinds import KINDS
+from pkm_twin.maps.kinds.frequency import Frequency
 from pkm_twin.maps.kinds.strain_energy import StrainEnergy
 from pkm_twin.maps.run import run
 from pkm_twin.maps.store import open_map
@@ -34,18 +36,34 @@ def same(one, other):
 POINTS = {"modes": 60, "frequency": 60, "workspace": 4000, "isotropy": 2000, "payload": 600}
 
 
-class Few(StrainEnergy):
-    """Many chunks and a short search."""
+def shorten(patch, chunk=Kind.chunk):
+    """Maps of a short search for the worst pose and of few circles, in chunks of so many poses."""
+    for name, most in {"samples": 256, "population": 24, "rounds": 20}.items():
+        patch.setattr(Kind, name, most)
+        patch.setattr(Frequency, name, most // 4)
+    patch.setattr(Kind, "chunk", chunk)
+    patch.setattr("pkm_twin.maps.kinds.workspace.LAYERS", 31)
 
-    chunk = 169
-    samples = 64
-    population = 8
-    rounds = 4
+
+@pytest.fixture
+def short(monkeypatch):
+    """Maps of a test that does not ask how far the search goes."""
+    shorten(monkeypatch)
+
+
+CHUNK = 100
+"""Poses of a chunk of the map ``few``."""
+
+
+@pytest.fixture
+def chunks(monkeypatch):
+    """The map ``few`` has many of them."""
+    shorten(monkeypatch, CHUNK)
 
 
 def few(points=2000):
-    """A map of many chunks under a force upwards."""
-    return map_of(load("upr_rpu"), Few(), points)
+    """A map under a force upwards."""
+    return map_of(load("five_bar"), StrainEnergy(), points)
 
 
 class Maps:
@@ -69,9 +87,11 @@ class Maps:
             if path.exists():
                 return pickle.loads(kept.read_bytes()), path
             kind, robot = name.split()
-            sweep = map_of(load(robot), KINDS[kind](), POINTS.get(kind, 3000))
-            kept.write_bytes(pickle.dumps(sweep))
-            return sweep, run(sweep, path, workers=1)
+            with pytest.MonkeyPatch.context() as patch:
+                shorten(patch)
+                sweep = map_of(load(robot), KINDS[kind](), POINTS.get(kind, 3000))
+                kept.write_bytes(pickle.dumps(sweep))
+                return sweep, run(sweep, path, workers=1)
 
 
 @pytest.fixture(scope="session")
@@ -87,5 +107,7 @@ def small_maps(tmp_path_factory):
 @pytest.fixture(scope="session")
 def strain(tmp_path_factory):
     """A strain-energy map of many chunks: its sweep and its file, computed alone."""
-    sweep = few()
-    return sweep, run(sweep, tmp_path_factory.mktemp("few") / "strain.nc", workers=1)
+    with pytest.MonkeyPatch.context() as patch:
+        shorten(patch, CHUNK)
+        sweep = few()
+        return sweep, run(sweep, tmp_path_factory.mktemp("few") / "strain.nc", workers=1)

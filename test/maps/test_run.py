@@ -22,9 +22,11 @@ from pkm_twin.errors import MissingExtraError, PkmTwinError
 from pkm_twin.maps import run as running
 from pkm_twin.maps.run import ClusterError, on_cluster, run
 from pkm_twin.maps.store import MapError, Parts, open_map
-from test.maps.conftest import few, same
+from test.maps.conftest import CHUNK, few, same
 from test.maps.scale import command
 from test.maps.test_commands import environment
+
+pytestmark = pytest.mark.usefixtures("chunks")
 
 
 @pytest.fixture(scope="module")
@@ -183,7 +185,7 @@ def test_chunks_of_another_sweep_are_refused(small, tmp_path):
     another = other(small)
     with pytest.raises(MapError, match="another sweep"):
         run(another, out, workers=1)
-    changed = small.robot.changed(members={"shear_factor": 1.1})
+    changed = small.robot.changed(gravity=[0.0, 0.0, -1.6])
     with pytest.raises(MapError, match="another sweep"):
         run(replace(small, robot=changed), out, workers=1)
     run(another, out, workers=1, overwrite=True)
@@ -256,7 +258,8 @@ def test_one_run_at_a_time_works_on_a_map(held):
 def test_the_lock_of_a_killed_process_is_nobodys(small, tmp_path):
     program = (
         "import pickle, sys, time; from pathlib import Path;"
-        "from pkm_twin.maps.store import Parts;"
+        "from pkm_twin.maps.kind import Kind; from pkm_twin.maps.store import Parts;"
+        f"Kind.chunk = {CHUNK};"
         "Parts(Path(sys.argv[1]), pickle.load(sys.stdin.buffer)).open();"
         "print('locked', flush=True); time.sleep(600)"
     )

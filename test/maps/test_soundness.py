@@ -110,7 +110,7 @@ def reverse(file):
         ("workspace delta_cu", put("plane_reach", (0, 0, 0, 0), 2), "plane_reach"),
         ("workspace delta_cu", put("value", (8, 8, 8, 1), math.inf), "value"),
         ("workspace delta_cu", put("volume", (), -1.0), "volume"),
-        ("workspace stewart", put("row_value", (0, 2, 3), math.inf), "row_value"),
+        ("workspace delta_cu", put("row_value", (0, 2, 3), math.inf), "row_value"),
         ("strain-energy upr_rpu", put("value", (4, 4, 4, 0), -1.0), "value"),
         ("strain-energy upr_rpu", put("dominant", (0, 0, 0, 0), -2), "dominant"),
         ("strain-energy upr_rpu", put("factor", (0, 0, 0, 0, 0), 1.1), "factor"),

@@ -18,6 +18,7 @@ from pkm_twin.robot.workspace import CLEAR, RAYS, singularity_at
 from stiffness_monitor import reachable
 from test.support.robots import load, parameters_of, partly_long
 
+pytestmark = pytest.mark.usefixtures("short")
 ROBOTS = ("prru", "delta_cu", "upr_rpu")
 TURN = np.linspace(0, 2 * np.pi, 1001)
 
