@@ -6,6 +6,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from operator import gt
 from typing import Any, Final, Literal, NamedTuple
 
@@ -26,6 +27,7 @@ from pkm_twin.messages.reading import (
 )
 from pkm_twin.messages.stamps import SECOND, StampRules
 from pkm_twin.robot.derivatives import nearest_motion
+from pkm_twin.robot.limits import first_beyond
 from pkm_twin.robot.robot import Robot
 from pkm_twin.settings import COUNT, FUTURE, LATE, SECONDS, SHARE, ZERO_STAMP, setting
 from pkm_twin.streams.continuity import Continuity
@@ -311,6 +313,13 @@ class Feedforward(Core):
             yield
             part = slice(first, first + SLICE)
             q = t.q[part]
+            beyond = _of_points(first, partial(first_beyond, actuated=False), robot, q)
+            if beyond is not None:
+                where = f"point {first + (beyond.index or 0)}: {beyond.joint}"
+                text = (
+                    f"is {beyond.value:g} {beyond.unit}, allowed {beyond.low:g} to {beyond.high:g}"
+                )
+                raise MessageError("limit", f"{where} {text}")
             self._check_singularity(_of_points(first, robot.singularity, q), first)
             solved = _of_points(first, inverse_dynamics, robot, q, qd[part], qdd[part])
             efforts[part], beyond = _gate(robot, settings.limit_policy, solved)

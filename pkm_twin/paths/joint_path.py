@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Final
@@ -16,8 +16,8 @@ from pkm_twin.errors import ParameterError, SingularityError, UnreachableError
 from pkm_twin.paths.carrying import Carried, efforts_of, robots_on
 from pkm_twin.paths.geometry import Path, Stretch
 from pkm_twin.robot.derivatives import joint_rates
+from pkm_twin.robot.limits import first_beyond
 from pkm_twin.robot.robot import Robot
-from pkm_twin.robot.workspace import passive_values
 
 Index = NDArray[np.int64]
 
@@ -28,8 +28,6 @@ LEAST_STEP: Final = 1e-5
 shorter one are rounding errors."""
 GRADE: Final = 1.5
 """Power of the distance from a stop by which points are set: speeds go by its root."""
-ROUNDING: Final = 1e-9
-"""A position this far beyond its limit, of unit one, is on it."""
 Slowdown = Callable[[Array, Array], Array]
 """Of joint positions (p, n) and the way that the reference point goes (p, 3): factors (p,)."""
 
@@ -262,20 +260,6 @@ def _place(robot: Robot, pose: Array, way: float) -> str:
     return f"{way:.4g} m after the start ({numbers})"
 
 
-def _bounded(robot: Robot, q: Array) -> Iterator[tuple[Sequence[str], Array, Array, Sequence[str]]]:
-    """What a file bounds at joint positions (p, n): names, values (p, k), bounds (k, 2), units."""
-    if robot.limits.position is not None:
-        yield robot.joint_names, q, robot.limits.position, robot.joint_units
-    most = getattr(robot.limits, "joint_angle", None)
-    angles = None if most is None else robot.limit_angles(robot.forward(q))
-    if angles is not None:
-        yield ["joint angle"], np.abs(angles).max(1)[:, None], np.array([[0.0, most]]), ["rad"]
-    if passive := robot.passive_limits:
-        bounds = np.array([[one.low, one.high] for one in passive])
-        units = ["m" if one.kind == "slide" else "rad" for one in passive]
-        yield [one.joint for one in passive], passive_values(robot, q), bounds, units
-
-
 def check_positions(robot: Robot, s: Array, q: Array, begin: float, singularity: float) -> None:
     """Check that a path keeps the limits of joints, passive ones too, and away from singularities.
 
@@ -284,18 +268,13 @@ def check_positions(robot: Robot, s: Array, q: Array, begin: float, singularity:
     :param singularity: least singularity index, 0 to 1.
     :raises ParameterError: by the first joint and place.
     """
-    for names, values, bounds, units in _bounded(robot, q):
-        excess = np.maximum(values - bounds[:, 1], bounds[:, 0] - values)
-        bad = excess > ROUNDING * np.maximum(1.0, np.abs(values))
-        if bad.any():
-            row = int(bad.any(1).argmax())
-            joint = int(excess[row].argmax())
-            where = place_at(robot, q[row], begin + float(s[row]))
-            low, high = bounds[joint]
-            raise ParameterError(
-                f"path: {names[joint]} {where}", round(float(values[row, joint]), 6),
-                f"{low:g} to {high:g} {units[joint]}",
-            )  # fmt: skip
+    if (beyond := first_beyond(robot, q)) is not None:
+        row = beyond.index or 0
+        where = place_at(robot, q[row], begin + float(s[row]))
+        raise ParameterError(
+            f"path: {beyond.joint} {where}", round(beyond.value, 6),
+            f"{beyond.low:g} to {beyond.high:g} {beyond.unit}",
+        )  # fmt: skip
     index = robot.singularity(q)
     row = int(index.argmin())
     if index[row] < singularity:

@@ -3,8 +3,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -12,7 +13,10 @@ from numpy.typing import ArrayLike, NDArray
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError
 from pkm_twin.robot.robot import Robot
+from pkm_twin.robot.workspace import passive_values
 
+ROUNDING: Final = 1e-9
+"""A position this far beyond its limit, of unit one, is on it."""
 OPTION = "--beyond-limits"
 
 
@@ -68,7 +72,7 @@ def beyond_limits(
         if quantity not in values:
             continue
         # A rounding's breadth is no fault: a pose on the limit itself is within it.
-        slack = 1e-9 * np.maximum(1.0, np.maximum(np.abs(low), np.abs(high)))
+        slack = ROUNDING * np.maximum(1.0, np.maximum(np.abs(low), np.abs(high)))
         excess = np.maximum(values[quantity] - high, low - values[quantity]) - slack
         outside |= (excess > 0).any(-1)
         rows = excess.reshape(-1, excess.shape[-1])
@@ -80,6 +84,40 @@ def beyond_limits(
                 bounds = float(low[i]), float(high[i])
                 found.append(Beyond(name, quantity, value, *bounds, units[i], at))
     return outside, found
+
+
+def first_beyond(robot: Robot, q: Array, *, actuated: bool = True) -> Beyond | None:
+    """The first of positions (p, n) where a joint is beyond its limit, a passive one too.
+
+    Errors as ``robot.forward``.
+
+    :param actuated: also judge the actuated joints.
+    """
+    for names, values, bounds, units in _bounded(robot, q, actuated):
+        excess = np.maximum(values - bounds[:, 1], bounds[:, 0] - values)
+        bad = excess > ROUNDING * np.maximum(1.0, np.abs(values))
+        if bad.any():
+            row = int(bad.any(1).argmax())
+            k = int(excess[row].argmax())
+            low, high = bounds[k].tolist()
+            return Beyond(names[k], "position", float(values[row, k]), low, high, units[k], row)
+    return None
+
+
+def _bounded(
+    robot: Robot, q: Array, actuated: bool
+) -> Iterator[tuple[Sequence[str], Array, Array, Sequence[str]]]:
+    """What a file bounds at joint positions (p, n): names, values (p, k), bounds (k, 2), units."""
+    if actuated and robot.limits.position is not None:
+        yield robot.joint_names, q, robot.limits.position, robot.joint_units
+    most = getattr(robot.limits, "joint_angle", None)
+    angles = None if most is None else robot.limit_angles(robot.forward(q))
+    if angles is not None:
+        yield ["joint angle"], np.abs(angles).max(1)[:, None], np.array([[0.0, most]]), ["rad"]
+    if passive := robot.passive_limits:
+        bounds = np.array([[one.low, one.high] for one in passive])
+        units = ["m" if one.kind == "slide" else "rad" for one in passive]
+        yield [one.joint for one in passive], passive_values(robot, q), bounds, units
 
 
 def refuse_beyond(found: list[Beyond], where: str = "") -> None:

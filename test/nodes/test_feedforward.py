@@ -7,8 +7,10 @@ import numpy as np
 import pytest
 
 from delta_dynamics import feedforward, inverse_dynamics
-from delta_dynamics.feedforward import SLICE, Settings
+from delta_dynamics.feedforward import SLICE, Feedforward, Settings
 from pkm_twin.errors import ParameterError, SingularityError
+from pkm_twin.mechanisms.catalogue import robot_of_data
+from pkm_twin.robot.workspace import passive_values
 from test.nodes.feedforward_core import (
     NAMES,
     NOW,
@@ -25,6 +27,7 @@ from test.nodes.feedforward_core import (
     trajectory,
 )
 from test.nodes.harness import SECOND, reject
+from test.support.robots import load, parameters_of
 
 pytestmark = pytest.mark.filterwarnings("error")
 
@@ -349,6 +352,25 @@ class TestSlices:
         reason, text = reject(core(limitless).trajectory, message, NOW)
         assert reason == "unreachable"
         assert f"in the points from point {SLICE} on: " in text and "sample 4" in text
+
+    def test_a_passive_joint_keeps_its_range(self, make):
+        data = parameters_of("linear_delta")
+        data["limbs"]["rods"]["left"]["swivel"] = 0.22
+        free = load("linear_delta")
+        count = SLICE + 50
+        away = np.linspace(0.0, 0.06, count)
+        q = free.inverse(free.home() + away[:, None] * [1.0, 0.0, 0.0])
+        zero = np.zeros_like(q)
+        message = make.trajectory(free.joint_names, [i * STEP for i in range(count)], q, zero, zero)
+        Feedforward(free).trajectory(message, NOW)
+        tight = robot_of_data(data, "tight")
+        turned = passive_values(tight, q)
+        first = int((turned > 0.22).any(1).argmax())
+        assert first > SLICE
+        reason, text = reject(Feedforward(tight).trajectory, message, NOW)
+        assert reason == "limit"
+        value = f"{turned[first].max():g} rad, allowed 0 to 0.22"
+        assert text.startswith(f"point {first}: left_") and value in text
 
 
 class TestLimits:
