@@ -71,7 +71,7 @@ def run(
 ) -> Path:
     """Compute a sweep into a NetCDF file; chunks that an earlier, stopped run finished are kept.
 
-    :param workers: processes on this machine; default one a core, 1 is this process alone.
+    :param workers: processes on this machine; default one per core, 1 is this process alone.
     :param scheduler: address of a Dask scheduler, which then does the work.
     :param overwrite: replace the target, and chunks of another sweep.
     :param progress: called with the number of points done.

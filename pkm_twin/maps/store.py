@@ -391,9 +391,9 @@ def _damage(error: Exception) -> str:
 def open_map(path: Path) -> Dataset:
     """A stored map, its checksum and the ranges of its numbers checked.
 
-    Large fields are read part by part for it, and again when they are used.
+    Large fields are read in parts for the check, and again when they are used.
 
-    :raises MapError: no map, a damaged one, or one with numbers that cannot be.
+    :raises MapError: no map, a damaged one, or one with impossible numbers.
     """
     xarray = require("xarray", "atlas")
     require("h5netcdf", "atlas")

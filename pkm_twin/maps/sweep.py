@@ -450,13 +450,13 @@ def map_of(
 ) -> Map:
     """The map of a kind over a robot's workspace.
 
-    :param points: poses of the grid, about; default by the kind.
+    :param points: about how many poses; default by the kind.
     :param cases: load cases (:meth:`Kind.loaded`); default the kind's own.
     :param at: the pose that the planes go through; default the worst.
     :param least_singularity: singularity index below which a pose does not count; default by kind.
-    :param least_clearance: distance of the limbs, m, that is too little.
-    :raises ParameterError: the robot's file lacks what the kind needs; no limits where the
-        workspace has no end without; a bound on a clearance that is not known.
+    :param least_clearance: distance between limbs, m, below which a pose does not count.
+    :raises ParameterError: the robot's file lacks what the kind needs, or limits without which
+        the workspace has no end; a bound on a clearance that is not known.
     :raises UnreachableError: ``at`` is none of the robot's poses.
     """
     cases = tuple(cases) or kind.cases(robot)
