@@ -120,10 +120,9 @@ def row(name):
     robot = load(name)
     with tempfile.TemporaryDirectory() as folder:
         package = Package(Path(folder), c_package(robot))
-        source = len((package.folder / f"{package.prefix}.c").read_text()) / 1e3
         code, own, most = frames(package)
         ns = times(robot, package)
-    cells = [f"`{name}`", f"{source:.0f}", f"{code:.0f}", f"{own:,}", f"{most:,}"]
+    cells = [f"`{name}`", f"{code:.0f}", f"{own:,}", f"{most:,}"]
     cells += [f"{ns[k]:.0f}" for k in (*BUILDS, "vectors")]
     return "| " + " | ".join(cells) + " |"
 
@@ -131,7 +130,7 @@ def row(name):
 if __name__ == "__main__":
     page = Path(sys.argv[1])
     lines = page.read_text(encoding="utf-8").splitlines()
-    at = next(k for k, line in enumerate(lines) if line.startswith("| robot | source")) + 2
+    at = next(k for k, line in enumerate(lines) if line.startswith("| robot | code")) + 2
     end = next(k for k in range(at, len(lines)) if not lines[k].startswith("| `"))
     lines[at:end] = [row(name) for name in robot_names()]
     page.write_text("\n".join([*lines, ""]), encoding="utf-8")
