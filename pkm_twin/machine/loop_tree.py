@@ -9,8 +9,9 @@ than on the other.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -214,4 +215,13 @@ def singles(joint: Joint, parent: str, child: str, taken: set[str]) -> list[Sing
     return [
         Single(name, kind, axis, ends[k], ends[k + 1], joint)
         for k, (name, (kind, axis)) in enumerate(zip(names, parts, strict=True))
+    ]
+
+
+def screws(parts: Sequence[Single]) -> list[tuple[str, str, float, float]]:
+    """Of each screw its slide, its turn, and the line between: slide = offset + factor turn."""
+    return [
+        (slide.name, turn.name, turn.joint.pitch, -turn.joint.pitch * turn.home)
+        for turn, slide in pairwise(parts)
+        if slide.joint.type.threaded() and not slide.whole
     ]

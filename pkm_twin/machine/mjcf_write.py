@@ -15,7 +15,7 @@ from typing import Final
 import numpy as np
 
 from pkm_twin.codegen.arrays import Array
-from pkm_twin.machine.loop_tree import Capsule, Hung, Joint, Link, LoopTree, Single, singles
+from pkm_twin.machine.loop_tree import Capsule, Hung, Joint, Link, LoopTree, Single, screws, singles
 from pkm_twin.machine.urdf_write import GROUND, PLATFORM, number_text
 
 TIMESTEP: Final = 1e-3
@@ -61,17 +61,16 @@ def write_mjcf(
     elements = {GROUND: ET.SubElement(top, "worldbody")}
     places = {GROUND: np.zeros(3)}
     home: list[float] = []
-    screws: list[tuple[Single, Single]] = []
+    parts: list[Single] = []
     for parent, child, row in rows(tree):
         link = tree.links[child]
         place = row[0].joint.at if row else link.frame.position
         elements[child] = _body(elements[parent], link, place, places[parent])
         places[child] = place
-        for k, part in enumerate(row):
+        for part in row:
             ET.SubElement(elements[child], "joint", _joint(part, place))
             home.append(part.home)
-            if part.joint.type.threaded() and not part.whole:
-                screws.append((row[k - 1], part))
+        parts += row
     for capsule in tree.capsules:
         if capsule.link in elements:
             _capsule(elements[capsule.link], capsule, places[capsule.link])
@@ -88,12 +87,9 @@ def write_mjcf(
             ET.SubElement(loops, "connect", {"name": closure.name, **ends, "anchor": at})
     for body, split in welds:
         ET.SubElement(loops, "weld", name=f"{split}_weld", body1=body, body2=split)
-    for turn, slide in screws:
-        pitch = turn.joint.pitch
-        fit = number_text([-pitch * turn.home, pitch, 0.0, 0.0, 0.0])
-        ET.SubElement(
-            loops, "joint", name=slide.name, joint1=slide.name, joint2=turn.name, polycoef=fit
-        )
+    for slide, turn, factor, offset in screws(parts):
+        fit = number_text([offset, factor, 0.0, 0.0, 0.0])
+        ET.SubElement(loops, "joint", name=slide, joint1=slide, joint2=turn, polycoef=fit)
     motors = ET.SubElement(top, "actuator")
     for name in tree.actuated:
         ET.SubElement(motors, "motor", name=name, joint=name)

@@ -20,7 +20,7 @@ import numpy as np
 
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.machine import rotations, urdf_xml
-from pkm_twin.machine.loop_tree import Joint, Link, LoopTree, Single, singles
+from pkm_twin.machine.loop_tree import Joint, Link, LoopTree, Single, screws, singles
 from pkm_twin.machine.rotations import Pose
 from pkm_twin.machine.urdf_control import DRIVE, Control, tree_names
 from pkm_twin.machine.urdf_xml import UNLIMITED
@@ -63,6 +63,8 @@ def write_urdf(
     elements = {part.name: _joint(robot, part, places) for part in parts}
     for name, element in elements.items():
         element.set("name", names[name])
+    for slide, turn, *line in screws(parts):
+        _follow(elements[slide], names[turn], *line)
     for closure in tree.closures:
         _closure(robot, closure, places)
     for part in parts:
@@ -175,8 +177,12 @@ def _drive(
     _joint(robot, Single(control.name, kind, part.axis, part.parent, link, joint), places)
     ET.SubElement(robot, "link", name=link)
     back = control.inverse()
-    numbers = {"multiplier": repr(back.factor), "offset": repr(back.offset + 0.0)}
-    ET.SubElement(follower, "mimic", {"joint": control.name, **numbers})
+    _follow(follower, control.name, back.factor, back.offset)
+
+
+def _follow(follower: ET.Element, joint: str, factor: float, offset: float) -> None:
+    numbers = {"multiplier": repr(factor), "offset": repr(offset + 0.0)}
+    ET.SubElement(follower, "mimic", {"joint": joint, **numbers})
 
 
 def _dynamics(element: ET.Element, joint: Joint) -> None:

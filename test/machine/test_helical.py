@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Screws: one whose nut is a carriage on a rail, and one that is driven itself."""
 
+from xml.etree import ElementTree as ET
+
 import numpy as np
 import pytest
 
@@ -8,7 +10,7 @@ from delta_dynamics import inverse_dynamics, least_norm_reactions, mass_matrix, 
 from pkm_twin import variants
 from pkm_twin.errors import ParameterError
 from pkm_twin.mechanisms.catalogue import robot_of_data
-from pkm_twin.robot.robot_urdf import robot_description
+from pkm_twin.robot.robot_urdf import robot_description, robot_urdf
 from stiffness_monitor import platform_response
 
 GRAVITY = 9.81
@@ -132,6 +134,15 @@ def test_it_is_written_out_and_read_again(rng):
     np.testing.assert_array_equal(
         inverse_dynamics(again, *motion), inverse_dynamics(robot, *motion)
     )
+
+
+def test_its_slide_follows_its_turn_in_a_urdf(rng):
+    robot = slide(0.012)
+    line = ET.fromstring(robot_urdf(robot)).find("joint[@name='nut_slide']/mimic").attrib
+    turn, slid = robot.passive(rng.normal(size=(5, 1))).T
+    assert line["joint"] == "nut"
+    along = float(line["offset"]) + float(line["multiplier"]) * turn
+    np.testing.assert_allclose(along, slid, atol=1e-15)
 
 
 def test_a_lead_stands_where_there_is_a_thread():
