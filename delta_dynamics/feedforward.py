@@ -56,7 +56,7 @@ class Settings:
     window: int = setting(
         25,
         "samples in the window; below 1 kHz fewer, so that it spans at most this number of ms (24 "
-        "if that is more), but at least 5",
+        "if that is more), but at least 5; a longer gap empties it",
         name="differentiator.window",
         low=3,
         high=1000,

@@ -127,6 +127,13 @@ class Differentiator:
         derivative = 1 if self._carries_velocity else 2
         return derivative, back, np.asarray(derivative * np.linalg.pinv(powers)[derivative])
 
+    def _apart(self, stamp: int) -> bool:
+        """Whether a live stream was silent for longer than its window: no polynomial spans that."""
+        if self._count < LEAST:
+            return False
+        newest = self._stamps.item((self._count - 1) % self._places)
+        return stamp - self._begin - newest > max(self._span, self.time * SECOND)
+
     def _keep_time(self, end: int) -> None:
         """Fit fewer samples where the window, while it fills or later, is too long in time."""
         held = min(self._count, self.window)
@@ -155,6 +162,8 @@ class Differentiator:
         carries = qd is not None
         values = q if qd is None else qd
         n = len(values)
+        if self._apart(stamp):
+            self.reset()
         if self._fit is None or carries is not self._carries_velocity or n != self._fit.joints:
             self.reset()
             self._carries_velocity = carries

@@ -247,3 +247,16 @@ def test_a_stream_that_slows_down_gets_a_shorter_window(rng):
         stamp += STEP if i < 100 else 5 * STEP
         assert (differentiator.push(stamp, np.zeros(3), np.zeros(3)) is None) == (i < 24)
     assert differentiator.window <= 10
+
+
+@pytest.mark.parametrize(("rate", "window"), [(1000, 25), (100, 5)])
+@pytest.mark.parametrize("longer", [False, True])
+def test_a_silence_longer_than_the_window_fills_it_anew(rate, window, longer):
+    differentiator = Differentiator(2, 25, time=0.024)
+
+    def fill(first):
+        stamps = [round((first + i) * SECOND / rate) for i in range(40)]
+        return [differentiator.push(at, np.zeros(3), np.zeros(3)) is None for at in stamps]
+
+    filling = sum(fill(0))
+    assert sum(fill(39 + window - 1 + longer)) == filling * longer

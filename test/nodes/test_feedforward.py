@@ -104,7 +104,10 @@ class TestStreams:
         # The window is filled, then recovery_count is 3.
         assert [result is None for result in results] == [True] * (WINDOW + 1) + [False]
         assert twin.stream.stops == {"stale input": 1}
-        assert running(make).joint_state(*sample(make, 10 + 99)) is not None
+        twin = running(make)
+        results = answers(twin, make, range(10 + 99, 10 + 99 + WINDOW))
+        assert [result is None for result in results] == [True] * (WINDOW - 1) + [False]
+        assert not twin.stream.stopped
 
     def test_differentiated_rates_keep_the_velocity_limit(self, make):
         twin = core(differentiate=True)
