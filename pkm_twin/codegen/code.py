@@ -26,7 +26,7 @@ from pkm_twin.errors import ParameterError
 
 SWITCH: Final = "PKM_TWIN_PLAIN"
 """Set to 1: plain Python, as on a machine without llvmlite."""
-STEPS: Final = (4, 16, 64, 256, 1024)
+STEPS: Final = (3, 9, 27, 81, 243, 1024)
 """Steps in which samples are tried again that one step does not reach."""
 
 

@@ -53,22 +53,25 @@ class Traced:
         self.q = self.tape.inputs(self.target, self.joints)
         """Of the drives that lead, all where there are no others."""
 
-    def solve(self) -> None:
-        """Take unknowns and closures."""
+    def _placed(self, unknowns: Numbers) -> tuple[Motion, list[LimbPose], Objects]:
+        """The motion and the limbs' turns by the unknowns of Newton's method, and all unknowns."""
         scheme, tree = self.scheme, self.tree
-        places, _ = scheme.solved
-        self.unknowns = self.tape.inputs(UNKNOWNS, len(places))
-        x: list[Any] = [0.0] * len(tree.home)
-        for k, value in zip(places, self.unknowns, strict=True):
-            x[k] = value
+        x = np.zeros(len(tree.home), dtype=object)
+        x[scheme.solved[0]] = unknowns
         inner = [body for limb in scheme.limbs for body in limb.bodies]
         motion = Motion(tree, x, self.q, [body for body in tree.links if body not in inner])
-        self.limbs = [LimbPose(motion, limb, self.q) for limb in scheme.limbs]
-        for limb in self.limbs:
+        limbs = [LimbPose(motion, limb, self.q) for limb in scheme.limbs]
+        for limb in limbs:
             for k, value in limb.unknowns().items():
                 x[k] = value
         motion.place(inner, x, self.q)
-        self.x, self.motion = np.array(x, dtype=object), motion
+        return motion, limbs, x
+
+    def solve(self) -> None:
+        """Take unknowns and closures."""
+        scheme, tree = self.scheme, self.tree
+        self.unknowns = self.tape.inputs(UNKNOWNS, len(scheme.solved[0]))
+        self.motion, self.limbs, self.x = self._placed(self.unknowns)
         self.rows = self.motion.closures()
         self.ju, self.jq = matrices(tree, self.rows)
         self.lu = SparseLU(self.ju[scheme.independent], scheme.pivots)
@@ -112,7 +115,7 @@ class Traced:
         for k, value in zip(rates, step, strict=True):
             rows[k] = value
         closed = scheme.closed.start
-        start = self._along() if closed is None else self._ordered(closed(self.closed, self.q))
+        start = self._guess() if closed is None else self._ordered(closed(self.closed, self.q))
         moved = self.motion.retracted(self.x, rows)
         before = self.tape.inputs(previous(UNKNOWNS), len(places))
         state = self.tape.inputs(STATE, len(AT))
@@ -120,7 +123,7 @@ class Traced:
         branch = [] if scheme.branch is None else self.lift(scheme.branch(self.motion))
         solved = Equations(
             self.target, self.lift([tree.home[k] for k in places]), self.lift(self.graph.lead_home),
-            self.lift([start[k] for k in places]), self.retracted(onward),
+            self.lift(start), self.retracted(onward),
             self.lift([moved[k] for k in places]),
             self.square(step, [tree.scales[k] for k in rates]), self.tape.lift(self._determinant()),
             self.square([r.value for r in self.rows], [r.scale for r in self.rows]),
@@ -140,13 +143,8 @@ class Traced:
 
     def _determinant(self) -> Any:
         """Of all closures, over that at home: of Newton's equations and of the limbs' turns."""
-        scheme, motion = self.scheme, self.home
-        limbs = [LimbPose(motion, limb, self.graph.lead_home) for limb in scheme.limbs]
-        lu = self._at_home[2]
-        if limbs:
-            table = self._table(scheme.solved_rows(motion.closures(), limbs))
-            lu = SparseLU(snapped_all(table), scheme.solved_pivots)
-        result = lu.inverse_determinant / self.newton.inverse_determinant
+        limbs, _, _, newton = self._at_home
+        result = newton.inverse_determinant / self.newton.inverse_determinant
         for here, there in zip(self.limbs, limbs, strict=True):
             result = result * (here.steepness / there.steepness)
         return result
@@ -157,24 +155,36 @@ class Traced:
         return Motion(self.tree, self.tree.home, self.graph.lead_home)
 
     @cached_property
-    def _at_home(self) -> tuple[Motion, Objects, SparseLU]:
-        """At home: the motion, derivatives of the kept closures by qd, factors of those by u."""
-        motion = self.home
-        ju, jq = (
-            snapped_all(m[self.scheme.independent]) for m in matrices(self.tree, motion.closures())
-        )
-        return motion, jq, SparseLU(ju, self.scheme.pivots)
+    def _at_home(self) -> tuple[list[LimbPose], Objects, SparseLU, SparseLU]:
+        """At home: limbs, the kept closures by qd, their factors by u, those of Newton's method."""
+        scheme, motion = self.scheme, self.home
+        limbs = [LimbPose(motion, limb, self.graph.lead_home) for limb in scheme.limbs]
+        closures = motion.closures()
+        ju, jq = (snapped_all(m[scheme.independent]) for m in matrices(self.tree, closures))
+        lu = newton = SparseLU(ju, scheme.pivots)
+        if limbs:
+            table = self._table(scheme.solved_rows(closures, limbs))
+            newton = SparseLU(snapped_all(table), scheme.solved_pivots)
+        return limbs, jq, lu, newton
 
-    def _along(self) -> list[Any]:
-        """Unknowns along the tangent at home: nearer than home itself."""
-        motion, jq, lu = self._at_home
+    def _guess(self) -> list[Expression]:
+        """Unknowns along the tangent at home, corrected once by its derivatives: to second order.
+
+        This costs less than a correction by derivatives there, and the guess is nearer.
+        """
+        scheme, home = self.scheme, self.tree.home
+        _, jq, lu, newton = self._at_home
         away = self.q - self.graph.lead_home
         # Solved per joint: a sample then only multiplies by what is prepared.
         columns = snapped_all([-lu.solve(jq[:, j]) for j in range(self.joints)])
-        return motion.retracted(self.tree.home, columns.T @ away)
+        moved = self.home.retracted(home, columns.T @ away)
+        tangent = [moved[k] for k in scheme.solved[0]]
+        motion, limbs, _ = self._placed(tangent)
+        solved = scheme.solved_rows(motion.closures(), limbs)
+        return self.retracted(tangent, -newton.solve([row.value for row in solved]))
 
     def _ordered(self, values: Mapping[str, Sequence[Any]]) -> list[Any]:
-        """Unknowns of joints' values."""
+        """Unknowns of Newton's method by joints' values."""
         result: list[Any] = list(self.tree.home)
         for link in self.tree.links.values():
             steps = link.steps
@@ -187,7 +197,7 @@ class Traced:
                         result[k : k + 2] = [cos(value), sin(value)]
                     else:
                         result[k] = value
-        return result
+        return [result[k] for k in self.scheme.solved[0]]
 
     def lift(self, values: Numbers) -> list[Expression]:
         """Results as expressions."""

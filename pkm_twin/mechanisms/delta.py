@@ -119,7 +119,6 @@ class Delta(TwinRobot):
     mobility: ClassVar[str] = "3: translations x, y, z"
     coordinates: ClassVar[tuple[Coordinate, ...]] = tuple(COORDINATES[c] for c in "xyz")
     limb_names: ClassVar[tuple[str, ...]] = tuple(f"limb {limb}" for limb in LIMBS)
-    has_start: ClassVar[bool] = True
     has_inverse: ClassVar[bool] = True
 
     @property
@@ -247,23 +246,15 @@ class Delta(TwinRobot):
         height = -sqrt(rest) * n[2] / maximum(absolute(n[2]), 1e-300)
         return centres[0] + middle + height * n
 
+    @property
+    def has_start(self) -> bool:
+        """With rods alone: an rcu's slide makes the spheres' meeting point a guess."""
+        return "rcu" not in self.geometry.closures
+
     def start(self, q: Objects) -> Mapping[str, Sequence[Any]]:
-        """The platform's place, and an rcu's slide and turn, beside home."""
-        home, platform = self._home
-        x = self._below(q)
-        values: dict[str, Sequence[Any]] = {"translation": x - platform}
-        for i, closure in enumerate(self.geometry.closures):
-            if closure != "rcu":
-                continue
-            _, along = self._directions[i]
-            span = self._forearm(i, q[i], x)
-            before = self._forearm(i, home[i], platform)
-            # The forearm is turned with the arm first.
-            c, s = cos(q[i] - home[i]), sin(q[i] - home[i])
-            carried = before * c + np.cross(along, before) * s
-            turn = atan2(cross(carried, span) @ along, carried @ span)
-            values[f"elbow {LIMBS[i]}"] = [(x - platform) @ along, turn]
-        return values
+        """The platform's place beside home."""
+        _, platform = self._home
+        return {"translation": self._below(q) - platform}
 
     def solved(self, pose: Objects) -> Inverse:
         """Arm angles, elbows outwards: a cos q - z sin q = g in each limb's plane."""

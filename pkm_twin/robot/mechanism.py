@@ -125,7 +125,6 @@ class Mechanism(Common):
     changeable: ClassVar[tuple[str, ...]] = (
         "payload", "friction", "gravity", "limits", "element_compliance", "modal_damping",
     )  # fmt: skip
-    has_start: ClassVar[bool] = False
     has_inverse: ClassVar[bool] = False
     has_branch: ClassVar[bool] = False
 
@@ -173,6 +172,11 @@ class Mechanism(Common):
     def make_graph(self) -> Graph:
         """Bodies, joints and rods at home."""
         raise NotImplementedError
+
+    @property
+    def has_start(self) -> bool:
+        """Whether :meth:`start` gives the assembly itself; a guess may be nearer to another."""
+        return False
 
     def start(self, q: Objects) -> Mapping[str, Sequence[Any]]:
         """Values of passive tree joints by q in closed form, where ``has_start``.

@@ -27,7 +27,7 @@ def test_newtons_judgement():
     pattern = r"stays above (\S+), and above (\S+) times the correction of a single step from home"
     assert numbers(ENGINE, pattern) == [program.LEAST, program.MARGIN]
     assert numbers(ENGINE, r"redundant ones too, is at most (\S+) \(") == [program.RESIDUAL]
-    pattern = r"tried again in (\d+), (\d+), (\d+), (\d+) and (\d+) \*\*steps"
+    pattern = r"tried again in (\d+), (\d+), (\d+), (\d+), (\d+) and (\d+) \*\*steps"
     assert numbers(ENGINE, pattern) == list(STEPS)
 
 
