@@ -30,6 +30,7 @@ from pkm_twin.identification.samples import (
     Track,
     by_blocks,
     filtered,
+    local_fit,
     noise_of,
     passed_band,
     resonances_of,
@@ -338,9 +339,7 @@ class _Piece:
         inner = slice(how.window // 2 + 3, len(load) - how.window // 2 - 3)
         missed = np.zeros((*load.shape, 2))
         for k in (1, 2):
-            rough = scipy.signal.savgol_filter(
-                motion[0], how.window, DEGREE, k, track.period, axis=0
-            )
+            rough = local_fit(motion[0], how.window, DEGREE, k, track.period)
             missed[inner, :, k - 1] = (rough - motion[k])[inner]
         return {
             "time": track.time, "table": self.table, "target": self.target, "rest": self.rest,
@@ -432,8 +431,7 @@ def calm(values: Array, period: float, cutoff: float | None) -> list[Array]:
 def derivative(values: Array, order: int, period: float) -> Array:
     """Along the first axis: central differences of sixth order, polynomials at the ends."""
     inner, ends = (
-        scipy.signal.savgol_filter(values, points, degree, order, period, axis=0, mode="interp")
-        for points, degree in (CENTRAL, ENDS)
+        local_fit(values, points, degree, order, period) for points, degree in (CENTRAL, ENDS)
     )
     beside = CENTRAL[0] // 2
     return np.concatenate([ends[:beside], inner[beside:-beside], ends[-beside:]])

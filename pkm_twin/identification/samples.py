@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from itertools import pairwise
 from typing import Final
 
@@ -92,7 +93,7 @@ class Filtering:
 
 def rate_noise(how: Filtering, period: float) -> Array:
     """Standard deviation that the positions' noise leaves in the differentiated rates, (n,)."""
-    weights = _derivative(how.window, DEGREE, 1, period)
+    weights = _weights(how.window, DEGREE, 1)[how.window // 2] / period
     return np.asarray(np.array(how.position_noise) * np.linalg.norm(weights), np.float64)
 
 
@@ -102,15 +103,15 @@ def choose_window(pieces: list[Array], period: float, noise: Array) -> int:
     for window in WINDOWS:
         if window > min(len(q) for q in pieces) // 4:
             break
-        change = _derivative(window, DEGREE, 2, period)
+        change = _weights(window, DEGREE, 2)[window // 2] / period**2
         error, size = np.zeros(noise.shape), np.zeros(noise.shape)
         for q in pieces:
-            rough = scipy.signal.savgol_filter(q, window, DEGREE, 2, period, axis=0)
+            rough = local_fit(q, window, DEGREE, 2, period)
             size += np.mean(rough**2, 0)
             if window > DEGREE + 3:
-                fine = scipy.signal.savgol_filter(q, window, DEGREE + 2, 2, period, axis=0)
+                fine = local_fit(q, window, DEGREE + 2, 2, period)
                 inner = slice(window, -window)
-                extra = _derivative(window, DEGREE + 2, 2, period) - change
+                extra = _weights(window, DEGREE + 2, 2)[window // 2] / period**2 - change
                 made = noise**2 * (extra @ extra)
                 error += np.maximum(np.mean((fine - rough)[inner] ** 2, 0) - made, 0.0)
         error += len(pieces) * noise**2 * (change @ change)
@@ -120,8 +121,29 @@ def choose_window(pieces: list[Array], period: float, noise: Array) -> int:
     return best
 
 
-def _derivative(window: int, degree: int, order: int, period: float) -> Array:
-    return np.asarray(scipy.signal.savgol_coeffs(window, degree, order, period), np.float64)
+@cache
+def _weights(window: int, degree: int, order: int) -> Array:
+    """Of a window's samples in the derivative of their polynomial at each of them, by the period.
+
+    Shape (window, window).
+    """
+    half, series = window // 2, np.polynomial.polynomial
+    places = np.arange(-half, half + 1) / half
+    changed = series.polyvander(places, degree - order) @ series.polyder(np.eye(degree + 1), order)
+    fitted = np.linalg.pinv(series.polyvander(places, degree))
+    return np.asarray(changed @ fitted / half**order, np.float64)
+
+
+def local_fit(values: Array, window: int, degree: int, order: int, period: float) -> Array:
+    """A derivative along the first axis, by a polynomial through the samples around each.
+
+    Savitzky and Golay's filter; its ends are those of the first and the last polynomial.
+    """
+    weights, half = _weights(window, degree, order) / period**order, window // 2
+    result = scipy.ndimage.correlate1d(values, weights[half], axis=0)
+    result[:half] = np.tensordot(weights[:half], values[:window], 1)
+    result[-half:] = np.tensordot(weights[-half:], values[-window:], 1)
+    return np.asarray(result, np.float64)
 
 
 def even_pieces(
@@ -176,10 +198,7 @@ def tracks(
         smooth, rate, second = (
             (place, *known)
             if known
-            else (
-                np.asarray(scipy.signal.savgol_filter(place, width, DEGREE, k, period, axis=0))
-                for k in range(3)
-            )
+            else (local_fit(place, width, DEGREE, k, period) for k in range(3))
         )
         cut = slice(width // 2, len(t) - width // 2)
         motion = Motion(smooth, rate, second, load, carried).part(cut)
