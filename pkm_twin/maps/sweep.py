@@ -474,7 +474,7 @@ def map_of(
         raise ParameterError("least_clearance", least_clearance, what)
     if at is not None:
         robot.inverse(at)
-    bounds = workspace_box(robot)
+    bounds = robot.made(workspace_box)
     count = len(bounds)
     ticks: tuple[Array, ...] = ()
     if count <= FULL:

@@ -284,7 +284,9 @@ def test_it_is_found_or_within_the_standard_deviations(what: str, name: str) -> 
      *(pytest.param(*pair, marks=pytest.mark.long)
        for pair in (("delta", "delta_cu"), ("delta_cu", "rps3")))],
 )  # fmt: skip
-@pytest.mark.parametrize(("duration", "rate"), [(1.2, 300.0), (4.0, 100.0)])
+@pytest.mark.parametrize(
+    ("duration", "rate"), [(1.2, 300.0), pytest.param(4.0, 100.0, marks=pytest.mark.long)]
+)
 def test_another_machine_is_rejected_or_not_explained(
     name: str, other: str, duration: float, rate: float
 ) -> None:
