@@ -97,52 +97,44 @@ def agrees(r: Recording, without: Mask, bound: float) -> bool:
 
 def cause_of(r: Recording, c: Compared, left_out: Mask) -> Cause | None:
     """The first thing that makes the efforts agree; None where there is none."""
-    found = chain(_turned(r, c, left_out), _numbers(r, c, left_out))
+    turned = (Cause(text, replace(r, wrench=w), left_out, 1.0) for text, w in wrenches(r))
+    found = chain(turned, _of_efforts(r, c, left_out))
     return next((cause for cause in found if cause.agrees(c.bound)), None)
 
 
 def number_that_explains(r: Recording) -> Cause | None:
-    """What `cause_of` finds of numbers; without words where the efforts agree as they are.
+    """What `cause_of` finds of efforts alone; without words where they agree as they are.
 
-    None where no number makes them agree.
+    None where nothing makes them agree.
     """
     if r.robot.redundant or why_no_torques(r.robot):
         return None
     none = np.zeros(len(r.time), np.bool_)
     try:
         c = compare(r)
-        found = () if c is None or c.good.all() else tuple(_numbers(r, c, none))
+        if c is None or replace(c, bound=EXACT * c.bound).good.all():
+            return None if c is None else Cause("", r, none)
+        found = () if c.good.all() else _of_efforts(r, c, none)
+        return next((cause for cause in found if cause.agrees(MAX_RESIDUAL)), None)
     except (PkmTwinError, ValueError):
         return None
-    if c is not None and replace(c, bound=EXACT * c.bound).good.all():
-        return Cause("", r, none)
-    return next((cause for cause in found if cause.agrees(MAX_RESIDUAL)), None)
 
 
-def _numbers(r: Recording, c: Compared, left_out: Mask) -> Iterator[Cause]:
-    """One number or two, and one after efforts are given their signs."""
+def _of_efforts(r: Recording, c: Compared, left_out: Mask) -> Iterator[Cause]:
+    """The signs of efforts that oppose the expected ones, one number or two; or both."""
+    opposed = ~c.good & (np.sum(c.measured * c.expected, 0) < 0.0)
+    if not opposed.any():
+        yield from _number_of(r, c, left_out)
+        return
+    names = listed(np.array(r.robot.joint_names)[opposed].tolist(), len(opposed))
+    effort = r.measured * np.where(opposed, -1.0, 1.0)
+    text = f"efforts of {names} have the wrong sign"
+    turned = Cause(text, replace(r, effort=effort), left_out, 1.0, -1.0)
+    yield turned
     yield from _number_of(r, c, left_out)
-    for turned in _signs(r, c, left_out):
-        other = compared_of(turned.recording, left_out, c.bound)
-        if other is not None:
-            yield from turned.then(_number_of(turned.recording, other, left_out))
-
-
-def _signs(r: Recording, c: Compared, left_out: Mask) -> Iterator[Cause]:
-    """Efforts that oppose the expected ones."""
-    turned = ~c.good & (np.sum(c.measured * c.expected, 0) < 0.0)
-    if turned.any():
-        names = listed(np.array(r.robot.joint_names)[turned].tolist(), len(turned))
-        effort = r.measured * np.where(turned, -1.0, 1.0)
-        text = f"efforts of {names} have the wrong sign"
-        yield Cause(text, replace(r, effort=effort), left_out, 1.0, -1.0)
-
-
-def _turned(r: Recording, c: Compared, left_out: Mask) -> Iterator[Cause]:
-    """Signs of efforts, and axes and sign of the wrench."""
-    yield from _signs(r, c, left_out)
-    for text, wrench in wrenches(r):
-        yield Cause(text, replace(r, wrench=wrench), left_out, 1.0)
+    other = compared_of(turned.recording, left_out, c.bound)
+    if other is not None:
+        yield from turned.then(_number_of(turned.recording, other, left_out))
 
 
 def _number_of(r: Recording, c: Compared, left_out: Mask) -> Iterator[Cause]:
@@ -225,9 +217,11 @@ class _Numbers:
         c, kilogram = self.c, self.efforts(_kilogram)
         lightest = LIGHTEST * sum(body.mass for body in self.r.robot.graph.bodies.values())
         alone = ("", 0.0 * self.drives[0][1])
+        mass = size = late = left = 0.0
         for (names, which), always in product([alone, *self.drives], [True, False]):
             own, held, spans = which * c.expected, np.ones(len(c.time), np.bool_), Spans()
-            mass = size = late = left = 0.0
+            # The times are looked for beside the scale with which a payload is held throughout.
+            size = 0.0 if always else size
             for _ in range(PASSES if which.any() else 1):
                 heavy = (1.0 + size * which) * kilogram
                 if not always:
@@ -289,6 +283,6 @@ def _payload(r: Recording, c: Compared, left_out: Mask, found: _Found) -> Iterat
     if times:
         text += " --load-times " + ",".join(f"{edge:.2f}" for pair in times for edge in pair)
     near, _ = near_change(r, load)
-    # On these samples the efforts do not agree without it.
-    if not near.any() or not agrees(r, left_out | near, c.bound):
+    # On the others the efforts do not agree without it.
+    if not near.any() or not agrees(r, left_out | near, EXACT * c.bound):
         yield Cause(text, replace(r, load=load), left_out | near)

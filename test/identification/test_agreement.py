@@ -140,7 +140,7 @@ def test_fit_and_check_name_one_cause(name: str) -> None:
         assert abs(payload.after - mass) < 3.0 * payload.deviation
 
 
-@pytest.mark.parametrize("name", partly_long(["delta", "five_bar"], "five_bar"))
+@pytest.mark.parametrize("name", partly_long(["delta", "five_bar", "stewart"], "stewart"))
 def test_two_numbers_are_not_told_as_one(name: str) -> None:
     """A payload, throughout or for a while, with a scale; a scale with a sign."""
     m = machine(load(name), np.random.default_rng(6), 8.0, 200.0)
