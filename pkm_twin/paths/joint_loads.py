@@ -199,23 +199,27 @@ def joint_loads(motion: Recording) -> Iterator[list[JointLoad]]:
     for robot, rows in by_load(motion.robot, motion.load, motion.time, BLOCK):
         q, *others = (values[rows] for values in motion.motion)
         found = elastic_reactions(robot, q, *others)
-        rotations, _ = motion.robot.placements(q)
+        rotations, origins = motion.robot.placements(q)
         turn = {BASE: np.broadcast_to(np.eye(3), (len(q), 3, 3)), **rotations}
         order = list(found.names)
         for rod in motion.robot.graph.rods.values():
             # What a rod turns is its direction; its spin is idle.
             start, end = (found.points[:, order.index(name)] for name in rod.joint_names)
             turn[rod.name] = _swung(rod.ends[1] - rod.ends[0], end - start)
-        values = dict(zip(motion.robot.joint_names, q.T, strict=True))
-        if any(not joint.actuated for joint in slides.values()):
-            passive = zip(motion.robot.passive_joints, motion.robot.passive(q).T, strict=True)
-            values = dict(passive) | values
         result = []
         for k, (name, (inner, outer)) in enumerate(zip(found.names, found.bodies, strict=True)):
             back = turn[inner].swapaxes(-1, -2)
             wrench = found.wrenches[:, k]
             own = np.concatenate([_times(back, wrench[:, :3]), _times(back, wrench[:, 3:])], -1)
-            place = values[slides[name].name] if name in slides else np.zeros(len(q))
+            place = np.zeros(len(q))
+            if name in slides:
+                joint, at = slides[name], motion.robot.engine.tree.at
+                # From the points of both bodies: of what closes a loop no value is kept.
+                ends = [
+                    origins[body] + turn[body] @ (joint.at - at[body]) if body != BASE else joint.at
+                    for body in (inner, outer)
+                ]
+                place = np.sum((turn[inner] @ joint.axes[0]) * (ends[1] - ends[0]), -1)
             parts: tuple[Array, ...] = (wrench, own, back @ turn[outer], place)
             if name in last:
                 parts = tuple(map(np.concatenate, zip(last[name], parts, strict=True)))

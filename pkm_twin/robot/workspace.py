@@ -338,11 +338,13 @@ def random_joints(robot: Robot, rng: np.random.Generator, count: int) -> Array:
         high = np.where(given[:, 1], robot.limits.position[:, 1], high)
     kept, share = np.empty((0, len(home))), 1.0
     middle, reach = (low + high) / 2, (high - low) / 2
+    # A machine with much gear has a small index everywhere.
+    least = min(INSIDE, 0.5 * float(robot.singularity(home)))
     while len(kept) < count:
         drawn = rng.uniform(middle - share * reach, middle + share * reach, (2 * count, len(home)))
         drawn = robot.try_agreeing(drawn)
         measure, good = robot.try_singularity(drawn)
-        good = good & (measure > INSIDE) & ((low <= drawn) & (drawn <= high)).all(-1)
+        good = good & (measure > least) & ((low <= drawn) & (drawn <= high)).all(-1)
         kept = np.concatenate([kept, drawn[good]])
         if good.mean() < 0.05:
             # Few joint positions together make an assembly: nearer to home more of them do.

@@ -18,6 +18,7 @@ from pkm_twin.paths.joint_loads import (
 )
 from pkm_twin.recordings import ReadOptions, Recording, read
 from stiffness_monitor import platform_response
+from test.machine.test_helical import slide
 from test.support.robots import SHIPPED, load, partly_long, random_joints, rigid
 from test.support.tables import joined, of_joints, read_columns, write_columns
 
@@ -209,3 +210,10 @@ def test_turning_of_a_hinge_and_of_a_rod(rng):
     angle = np.arccos(np.minimum((way[1:] * way[:-1]).sum(1), 1.0))
     own = next(j for j in loads if j.name == rod.joint_names[0])
     np.testing.assert_allclose(own.turned, angle, rtol=1e-2, atol=1e-6)
+
+
+def test_a_slide_that_closes_a_loop_travels_by_the_screw_s_lead():
+    q = np.linspace(0.0, 6.0 * np.pi, 7)[:, None]
+    motion = Recording(slide(0.02), np.arange(7.0), q, 0 * q, 0 * q)
+    rail = {load.name: load for load in next(joint_loads(motion))}["rail"]
+    np.testing.assert_allclose(rail.travelled, 0.01, atol=1e-12)

@@ -11,6 +11,7 @@ from pkm_twin import variants
 from pkm_twin.errors import ParameterError
 from pkm_twin.mechanisms.catalogue import robot_of_data
 from pkm_twin.robot.robot_urdf import robot_description, robot_urdf
+from pkm_twin.robot.workspace import INSIDE, random_joints
 from stiffness_monitor import platform_response
 
 GRAVITY = 9.81
@@ -94,6 +95,12 @@ def test_its_torque_is_that_of_a_screw(lead, rng):
     np.testing.assert_allclose(found.wrench("nut")[:, 2:3], axial, rtol=1e-11)
     # The thread: its moment about the axis is the axial force's.
     np.testing.assert_allclose(found.wrench("nut")[:, 5:6], -pitch * axial, rtol=1e-11)
+
+
+def test_a_fine_thread_has_random_states_though_its_index_is_small(rng):
+    robot = slide(0.001)
+    assert robot.singularity(robot.graph.home) < INSIDE
+    assert random_joints(robot, rng, 5).shape == (5, 1)
 
 
 def test_a_driven_screw_goes_its_lead_a_turn(rng):
