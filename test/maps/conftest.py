@@ -37,12 +37,16 @@ POINTS = {"modes": 60, "frequency": 60, "workspace": 4000, "isotropy": 2000, "pa
 
 
 def shorten(patch, chunk=Kind.chunk):
-    """Maps of a short search for the worst pose and of few circles, in chunks of so many poses."""
+    """Maps of a short search for the worst pose and for what planes reach, and of few circles.
+
+    In chunks of so many poses.
+    """
     for name, most in {"samples": 256, "population": 24, "rounds": 20}.items():
         patch.setattr(Kind, name, most)
         patch.setattr(Frequency, name, most // 4)
     patch.setattr(Kind, "chunk", chunk)
     patch.setattr("pkm_twin.maps.kinds.workspace.LAYERS", 31)
+    patch.setattr("pkm_twin.maps.sweep.COARSE", 21)
 
 
 @pytest.fixture
