@@ -186,7 +186,7 @@ def compare(r: Recording, bound: float = MAX_RESIDUAL) -> Compared | None:
     def efforts(track: Track, alike: Array) -> Array:
         qd = moving_rates(track.qd, ~track.moves(how), reach)
         made = by_held(r, inverse_dynamics, track.time, track.q, qd, track.qdd, track.wrench)
-        made = made + Dahl.remembered(robot.friction, track.q, qd)
+        made = made + Dahl.remembered(robot.friction, track.q, qd)[0]
         return _each(alike, made)
 
     def moved(track: Track) -> Array:
@@ -197,7 +197,8 @@ def compare(r: Recording, bound: float = MAX_RESIDUAL) -> Compared | None:
     for track in pieces:
         alike = moving(robot, track.q)
         expected = efforts(track, alike)
-        slack = _each(np.abs(alike), np.where(track.moves(how), 0.0, reach))
+        _, doubt = Dahl.remembered(robot.friction, track.q, track.sure(how))
+        slack = _each(np.abs(alike), np.where(track.moves(how), doubt, reach))
         left = beyond_friction(_each(alike, track.effort) - expected, slack > 0.0, slack)
         change = np.gradient(expected, period, axis=0)
         sharp.append({"expected": expected, "left": left, "change": change})

@@ -23,12 +23,12 @@ from pkm_twin.identification.compare import missing_samples, recorded_of, step_f
 from pkm_twin.identification.drives import FIT, fitted_constants, given_constants
 from pkm_twin.identification.fit import Fit, fit, fitted, refuse_faults
 from pkm_twin.identification.identifiable import KINDS, Kind, of_drives
-from pkm_twin.identification.judge import SIGMAS
+from pkm_twin.identification.judge import SIGMAS, Verdict, basis_of
 from pkm_twin.identification.parameters import Number
 from pkm_twin.identification.rows import Problem
-from pkm_twin.identification.samples import EXACT, Track, filtered
+from pkm_twin.identification.samples import EXACT, filtered
 from pkm_twin.identification.suspects import RESONANCE
-from pkm_twin.machine.friction import BASIC, LAWS, compiled, taken
+from pkm_twin.machine.friction import BASIC, KNOWN, LAWS, Dahl, compiled
 from pkm_twin.recordings import Recording
 from pkm_twin.robot.robot import Robot
 from pkm_twin.streams.steps import sampling_of
@@ -36,6 +36,8 @@ from pkm_twin.streams.steps import sampling_of
 AUTO: Final = "auto"
 SPEEDS: Final = np.geomspace(0.01, 1.0, 17)
 """Stribeck speeds that are tried, over the rms speed."""
+PARTS: Final = np.geomspace(1e-4, 0.1, 24)
+"""Presliding distances that are tried, over the travel."""
 WAVES: Final = 200.0
 """Most periods in the travel that are tried."""
 CHUNK: Final = 24
@@ -91,11 +93,11 @@ def laws_of(words: str) -> tuple[str, ...] | None:
 
     :raises UnknownNameError: another word.
     """
-    names, laws = [word.strip() for word in words.split(",")], compiled(tuple(LAWS))
+    names = [word.strip() for word in words.split(",")]
     for name in names:
-        if name not in (AUTO, BASIC.name, *laws):
-            raise UnknownNameError("--friction", name, (AUTO, BASIC.name, *laws))
-    return None if AUTO in names else tuple(name for name in laws if name in names)
+        if name not in (AUTO, BASIC.name, *LAWS):
+            raise UnknownNameError("--friction", name, (AUTO, BASIC.name, *LAWS))
+    return None if AUTO in names else tuple(name for name in LAWS if name in names)
 
 
 def fit_with_laws(
@@ -110,13 +112,21 @@ def fit_with_laws(
     :param laws: names; None: those that the held-out parts say.
     :param options: and errors as of :func:`~pkm_twin.identification.fit.fit`.
     """
-    best = fit(robot, recordings, what, **options)
+    if "friction" not in what:
+        return fit(robot, recordings, what, **options), ()
     choices: list[Choice] = []
     more: list[Number] = []
     wider: dict[tuple[str | int, ...], float] = {}
-    if "friction" not in what:
-        return best, ()
-    asked = [name for name in laws or () if name not in robot.laws]
+    asked = [name for name in laws or () if name not in robot.laws or LAWS[name].memory]
+    if Dahl.name in asked:
+        # Without memory slow reversals would be another machine's: faults are looked for with it.
+        asked.remove(Dahl.name)
+        before = Problem.of(robot, recordings, what)
+        best = fit(_remembering(before), recordings, what, **options | {"causes": None})
+        choice = _compared(Dahl.name, best.verdict, before, best.problem)
+        choices.append(replace(choice, taken=True, asked=True))
+    else:
+        best = fit(robot, recordings, what, **options)
     while asked if laws is not None else _unexplained(best):
         names = asked[:1] or [one for one in compiled(tuple(LAWS)) if one not in best.robot.laws]
         tried = []
@@ -129,7 +139,7 @@ def fit_with_laws(
                 if asked:
                     raise
                 continue
-            tried.append((_compared(name, best, one), found, opened))
+            tried.append((_compared(name, best.verdict, best.problem, one), found, opened))
         if not tried:
             break
         choice, found, opened = max(tried, key=lambda one: (one[0].taken, -one[0].after))
@@ -149,7 +159,10 @@ def fit_with_laws(
             for n in result.numbers
         )
         best = replace(result, numbers=(*own, *more))
-    return best, tuple(choices)
+    file = {robot.friction_key(joint, "presliding"): float(value) for joint, value in
+            zip(robot.joint_names, robot.friction.presliding, strict=True)}  # fmt: skip
+    numbers = tuple(replace(n, before=file.get(n.key, n.before)) for n in best.numbers)
+    return replace(best, numbers=numbers), tuple(choices)
 
 
 def fit_recordings(
@@ -231,15 +244,15 @@ def _unexplained(result: Fit) -> bool:
     )
 
 
-def _compared(name: str, before: Fit, after: Problem) -> Choice:
-    """Two fits by what was held out."""
-    band = np.array([max(channel.noise, 1e-300) for channel in before.verdict.channels])
+def _compared(name: str, verdict: Verdict, before: Problem, after: Problem) -> Choice:
+    """Two fits by what was held out, over the noise of a verdict."""
+    band = np.array([max(channel.noise, 1e-300) for channel in verdict.channels])
     parts = []
-    for end, other in zip(before.problem.held_out, after.held_out, strict=True):
+    for end, other in zip(before.held_out, after.held_out, strict=True):
         noise = np.maximum(end.signals.noise, EXACT * np.sqrt(np.mean(end.effort**2, 0)))
         old, new = (
             rows.target - rows.table @ problem.estimate.values
-            for rows, problem in ((end, before.problem), (other, after))
+            for rows, problem in ((end, before), (other, after))
         )
         change = old - new
         each = (old / band) ** 2, (new / band) ** 2
@@ -253,6 +266,24 @@ def _compared(name: str, before: Fit, after: Problem) -> Choice:
     return Choice(name, bool(good), float(before_rms), float(after_rms), float(sigmas))
 
 
+def _remembering(static: Problem) -> Robot:
+    """The robot with Dahl's law, open to a fit, about what the recordings show of its distance.
+
+    :raises PkmTwinError: their motion does not show it.
+    """
+    robot, recordings = static.robot, [rows.recording for rows in static.whole]
+    rough = _changed(robot, _Search(static, Dahl.name).found())
+    # Without a memory efforts near reversals are taken for outliers, and for noise.
+    again = Problem.of(rough, recordings, static.what)
+    found = _changed(robot, _Search(again, Dahl.name).found(judged=True))
+    return replace(found, open_laws=(*robot.open_laws, Dahl.name))
+
+
+def _changed(robot: Robot, found: dict[str, Searched]) -> Robot:
+    """The robot with what was found."""
+    return robot.changed(friction={key: one.value.tolist() for key, one in found.items()})
+
+
 def _opened(before: Problem, name: str) -> tuple[dict[str, Searched], Robot]:
     """The robot with one law more, and what was found of its parameters that are not linear.
 
@@ -260,8 +291,7 @@ def _opened(before: Problem, name: str) -> tuple[dict[str, Searched], Robot]:
     """
     robot = before.robot
     found = _Search(before, name).found()
-    if found:
-        robot = robot.changed(friction={key: one.value.tolist() for key, one in found.items()})
+    robot = _changed(robot, found) if found else robot
     return found, replace(robot, open_laws=(*robot.open_laws, name))
 
 
@@ -311,35 +341,43 @@ class _Search:
 
     def __init__(self, before: Problem, name: str) -> None:
         self.robot, self.law = before.robot, LAWS[name]
-        self._name, self._rows = name, before.rows
-        values, left, weight = before.estimate.values, [], []
-        for rows, delay in zip(self._rows, before.delays, strict=True):
-            some = rows.fitted
-            left.append(some.target - some.table @ values + delay * some.change)
-            weight.append(some.counts / np.maximum(some.signals.noise, 1e-300))
-        self._weight = np.concatenate(weight)
-        self._left = np.concatenate(left) * self._weight
-        rates = self._filtered(lambda t: np.stack([t.qd, np.sign(t.qd), 1.0 + 0.0 * t.qd], -1))
-        basic: Array = rates * self._weight[..., None]
-        self._basic = [np.linalg.qr(basic[:, j])[0] for j in range(self.robot.joints_count)]
+        self._rows = before.rows
+        parts = [rows.fitted for rows in self._rows]
         pieces = [t for rows in self._rows for t in rows.tracks]
         q, qd = (np.concatenate([getattr(t, word) for t in pieces]) for word in ("q", "qd"))
         self._speed, self._travel = np.sqrt(np.mean(qd**2, 0)), np.ptp(q, axis=0)
+        counts = np.concatenate([some.counts for some in parts])
+        if self.law.memory:
+            # It shows where joints turn round, at any rate, once the state is known.
+            most = PARTS[-1] * self._travel
+            unknown = self._filtered(lambda q, rates: Dahl.states(q, rates, most).unknown)
+            counts = (unknown < KNOWN).astype(np.float64)
+        noise = [np.broadcast_to(some.signals.noise, some.target.shape) for some in parts]
+        self._weight = counts / np.maximum(np.concatenate(noise), 1e-300)
+        self._left = np.concatenate([some.target for some in parts]) * self._weight
+        self._basic = []
+        for j, joint in enumerate(self.robot.joint_names):
+            # Whatever else is fitted may have taken a part of what the law does.
+            own = before.columns[:, j] * self._weight[:, j, None]
+            if self.law.memory:
+                own = np.delete(own, before.parameters.names.index(f"{joint}.coulomb"), -1)
+            self._basic.append(basis_of(own))
         cutoffs = [rows.how.cutoff for rows in self._rows if rows.how.cutoff is not None]
         fastest = self._travel * min(cutoffs, default=np.inf) / np.maximum(self._speed, 1e-300)
         self._waves = np.minimum(WAVES, fastest)
 
-    def _filtered(self, columns: Callable[[Track], Array]) -> Array:
-        """Columns of tracks, (samples, n, c), at the fitted rows."""
+    def _filtered(self, columns: Callable[[Array, Array], Array]) -> Array:
+        """Columns of positions and rates of tracks, (samples, n, c), at the fitted rows."""
         made = []
         for rows in self._rows:
-            parts = [{"": columns(track)} for track in rows.tracks]
+            parts = [{"": columns(t.q, t.sure(rows.how))} for t in rows.tracks]
             made.append(filtered(parts, rows.period, rows.how)[""][: rows.held_from])
         return np.concatenate(made)
 
-    def found(self) -> dict[str, Searched]:
+    def found(self, *, judged: bool = False) -> dict[str, Searched]:
         """By key what was found; nothing where all is linear.
 
+        :param judged: whether a memory has to be clear, joint by joint.
         :raises PkmTwinError: the residual shows no value.
         """
         keys = [key for key, one in self.law.parameters.items() if not one.linear]
@@ -352,8 +390,14 @@ class _Search:
         )
         best = gains.argmax(0)
         joints = np.arange(gains.shape[1])
-        if not (gains[best, joints] > 0.0).any():
-            raise PkmTwinError(f"no sign of {self.law.name} friction")
+        seen = gains[best, joints] > 0.0
+        if judged:
+            # Coulomb friction without one is the other hypothesis.
+            without = self._gains(key, np.zeros((1, len(joints))))[0][0]
+            seen = gains[best, joints] - without > SIGMAS**2
+        if not seen.any():
+            where = " at reversals: slow ones show it" if judged else ""
+            raise PkmTwinError(f"no sign of {self.law.name} friction{where}")
         low = np.log(grid[np.maximum(best - 1, 0), joints])
         high = np.log(grid[np.minimum(best + 1, len(grid) - 1), joints])
         low, high = np.minimum(low, high), np.maximum(low, high)
@@ -365,13 +409,15 @@ class _Search:
             low = np.where(left > right, low, pair[0])
         middle = 0.5 * (low + high)
         step = np.full(len(middle), 0.02)
-        if not self.law.parameters[key].unit.endswith("/s"):
+        if not self.law.turns:
             # A small part of a period over the travel.
             step = np.minimum(step, 0.15 * np.exp(middle) / np.maximum(self._travel, 1e-12))
         gains, sizes = self._gains(key, np.exp(middle + step * np.array([[0.0], [1.0], [-1.0]])))
         here, up, down = gains
         bend = np.maximum(2.0 * here - up - down, 1e-300) / step**2
         value = np.exp(middle)
+        if judged:
+            value = np.where(seen, value, getattr(self.robot.friction, key))
         relative = np.minimum(np.sqrt(2.0 / bend), 10.0)
         slopes = np.abs(sizes[1] - sizes[2]) * (relative / (2.0 * step))[:, None]
         words = [word for word, one in self.law.parameters.items() if one.linear]
@@ -379,6 +425,8 @@ class _Search:
 
     def _grid(self, key: str) -> Array:
         """Values to try, (values, n)."""
+        if self.law.memory:
+            return np.asarray(PARTS[:, None] * np.maximum(self._travel, 1e-12))
         if self.law.parameters[key].unit.endswith("/s"):
             return np.asarray(SPEEDS[:, None] * np.maximum(self._speed, 1e-12))
         waves = np.linspace(1.0, max(float(self._waves.max()), 2.0), 4 * int(WAVES))
@@ -393,12 +441,12 @@ class _Search:
             (word, one) for word, one in self.law.parameters.items() if one.linear
         ]  # fmt: skip
 
-        def columns(track: Track) -> Array:
+        def columns(q: Array, rates: Array) -> Array:
             made = []
             for values in grid:
                 for word, _ in linear:
                     given = {key: values} | {k: np.full(n, float(k == word)) for k, _ in linear}
-                    made.append(taken([self._name], given, track.q, track.qd, 0.0 * track.q))
+                    made.append(self.law.along(given, q, rates))
             return np.stack(made, -1)
 
         table = self._filtered(columns) * self._weight[..., None]

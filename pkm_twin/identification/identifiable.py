@@ -17,7 +17,7 @@ from typing import Any, Final, Literal
 import numpy as np
 
 from pkm_twin.codegen.arrays import Array, Indices
-from pkm_twin.machine.friction import all_keys, linear_keys
+from pkm_twin.machine.friction import LAWS, all_keys, linear_keys
 from pkm_twin.machine.inertia import change_of_frame, drive_units, matrix_of, standard_parameters
 from pkm_twin.machine.places import Keys, path_of
 from pkm_twin.robot.numbers import FileNumbers
@@ -93,10 +93,15 @@ def of_drives(robot: Robot) -> tuple[Identifiable, ...]:
     """Friction of each joint that has some, and the rotors, one for joints of one number."""
     graph, friction = robot.graph, robot.friction
     found, rotors = [], dict[Keys, list[str]]()
+    # A memory that is open to a fit has columns along a motion, which a regressor has not.
+    open_keys = [key for name in robot.open_laws if LAWS[name].memory
+                 for key in LAWS[name].parameters]  # fmt: skip
+    words = dict.fromkeys((*linear_keys(robot.laws), *open_keys))
 
     def number(kind: Kind, name: str, value: float, key: Keys, joints: Sequence[str]) -> None:
         word = name.rpartition(".")[2]
-        signed = word in all_keys() and all_keys()[word].low is None
+        rub = all_keys().get(word)
+        linear, signed = rub is None or rub.linear, rub is not None and rub.low is None
         # Of a rotor behind a gear the file has the inertia at the motor.
         drive = dict(zip(robot.joint_names, robot.drives, strict=True)).get(joints[0])
         less = drive.turns**-2 if drive is not None and kind == "rotor" else 1.0
@@ -104,7 +109,7 @@ def of_drives(robot: Robot) -> tuple[Identifiable, ...]:
             Identifiable(
                 kind, (name,), (drive_units(graph, joints[0])[word],), np.array([value]),
                 np.array([math.nan]), lambda new: {key: less * float(new[0])},
-                others={f"{joint}.{word}": np.ones(1) for joint in joints},
+                others={f"{joint}.{word}": np.ones(1) for joint in joints if linear},
                 cones=() if signed else (above_zero(0, 1),),
             )
         )  # fmt: skip
@@ -112,10 +117,10 @@ def of_drives(robot: Robot) -> tuple[Identifiable, ...]:
     for name, joint in graph.joints.items():
         if joint.actuated:
             k = graph.actuated.index(name)
-            values = {what: getattr(friction, what)[k] for what in linear_keys(robot.laws)}
+            values = {what: getattr(friction, what)[k] for what in words}
         else:
-            words = ("viscous", "coulomb") if joint.loaded else ()
-            values = {what: getattr(joint, what) for what in words}
+            own = ("viscous", "coulomb") if joint.loaded else ()
+            values = {what: getattr(joint, what) for what in own}
         for what, value in values.items():
             key = robot.friction_key(name, what)
             number("friction", f"{name}.{what}", float(value), key, [name])

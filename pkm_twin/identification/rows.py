@@ -37,7 +37,7 @@ from pkm_twin.identification.samples import (
     tracks,
     usual_size,
 )
-from pkm_twin.machine.friction import KNOWN, LAWS, Dahl, FrictionLaw, Memory, linear_keys
+from pkm_twin.machine.friction import KNOWN, Dahl, Memory, all_keys, compiled, not_shared
 from pkm_twin.recordings.recording import Recording
 from pkm_twin.robot.robot import Robot
 
@@ -85,7 +85,7 @@ class Model:
     @property
     def of_drives(self) -> Mask:
         """Which parameters are friction of the drives."""
-        keys, drives = linear_keys(self.robot.laws), set(self.robot.joint_names)
+        keys, drives = all_keys(), set(self.robot.joint_names)
         pairs = [name.rpartition(".")[::2] for name in self.parameters.names]
         return np.array([joint in drives and key in keys for joint, key in pairs])
 
@@ -101,14 +101,25 @@ class Model:
 
         both = by_blocks(len(motion.q), BLOCK, block)
         if memory is not None:
-            for j in np.flatnonzero(self.robot.friction.presliding > 0.0):
-                coulomb = self.parameters.names.index(f"{self.robot.joint_names[j]}.coulomb")
-                both[:, j, coulomb] = memory.z[:, j]
+            place = {name: k for k, name in enumerate(self.parameters.names)}
+            for j in np.flatnonzero(self._drives("presliding") > 0.0):
+                joint = self.robot.joint_names[j]
+                both[:, j, place[f"{joint}.coulomb"]] = memory.z[:, j]
+                if (k := place.get(f"{joint}.presliding")) is not None:
+                    both[:, j, k] = self._drives("coulomb")[j] * memory.slope[:, j]
+                    both[:, j, -1] -= both[:, j, k] * self._drives("presliding")[j]
         return both[..., :-1], both[..., -1]
+
+    def _drives(self, key: str) -> Array:
+        """A number of the drives' friction about which efforts are made linear, shape (n,)."""
+        p = self.parameters
+        known = {} if p.loads is None else dict(zip(p.names, p.loads.tolist(), strict=True))
+        own = zip(self.robot.joint_names, getattr(self.robot.friction, key), strict=True)
+        return np.array([known.get(f"{joint}.{key}", value) for joint, value in own])
 
     def memory(self, track: Track, how: Filtering) -> Memory | None:
         """Of the drives' friction along a track; None without."""
-        distance = self.robot.friction.presliding
+        distance = self._drives("presliding")
         return Dahl.states(track.q, track.sure(how), distance) if distance.any() else None
 
     def efforts(self, motion: Motion, values: Array, memory: Memory | None = None) -> Array:
@@ -126,7 +137,7 @@ class Model:
         for where, group in zip(parameters.slices, parameters.groups, strict=True):
             if group.kind == "payload":
                 own[..., where] *= held[:, None, None]
-        if parameters.loads is not None and robot.laws:
+        if parameters.loads is not None and law_keys(robot):
             rubs = self.of_drives
             load = rest + own[..., ~rubs] @ parameters.loads[~rubs]
             laws = law_columns(robot, motion.q, motion.qd, load)
@@ -437,8 +448,6 @@ def derivative(values: Array, order: int, period: float) -> Array:
     return np.concatenate([ends[:beside], inner[beside:-beside], ends[-beside:]])
 
 
-LOADED: Final = frozenset(name for name, law in LAWS.items() if law.share is not FrictionLaw.share)
-"""Laws that grow with the load."""
 LOAD_PASSES: Final = 2
 FEW: Final = 5.0
 """Independent measured values for each fitted number, below which there are too few."""
@@ -464,8 +473,8 @@ class Problem:
     ) -> Problem:  # fmt: skip
         """Filter recordings.
 
-        :param passes: in which friction that grows with the load is taken by the load of the
-            fitted machine, not of the file's.
+        :param passes: in which friction that grows with the load, or a memory that is open, is
+            taken by the fitted numbers, not by the file's.
         :param progress: called with the number of recordings that are done.
         """
         everything, whole = file_parameters(robot), []
@@ -479,7 +488,8 @@ class Problem:
             if progress is not None:
                 progress(i + 1)
         problem = cls(robot, tuple(what), everything, tuple(whole))
-        for _ in range(passes if set(robot.laws) & LOADED else 0):
+        laws = (*compiled(robot.laws), *robot.open_laws)
+        for _ in range(passes if not_shared(laws) else 0):
             problem = replace(problem, everything=replace(everything, loads=problem.values))
             problem = problem.again([made.how.window for made in problem.whole])
         return problem

@@ -90,6 +90,11 @@ class FrictionLaw:
         del values, q, speed
         return 0.0
 
+    @classmethod
+    def along(cls, values: Values, q: Array, rates: Array) -> Array:
+        """Effort along a motion in the order of time without load, shape (k, n) as q and rates."""
+        return np.asarray(taken([cls.name], values, q, rates, 0.0 * q), np.float64)
+
 
 class ViscousCoulomb(FrictionLaw):
     """Viscous friction, Coulomb friction and a constant effort: of every drive, zero by default.
@@ -175,18 +180,20 @@ class Memory(NamedTuple):
 
     ``z``: part of the Coulomb friction that is built up, -1 to 1. ``q``: the farthest place of the
     motion one way. ``way``: its direction, 0 before a motion. ``unknown``: the part of the unknown
-    beginning that is left; z begins at zero.
+    beginning that is left; z begins at zero. ``slope``: of z by the presliding distance, 1/rad or
+    1/m.
     """
 
     z: Array
     q: Array
     way: Array
     unknown: Array
+    slope: Array
 
     @classmethod
     def begun(cls, q: Array) -> Memory:
         """Nothing is known."""
-        return cls(np.zeros_like(q), q, np.zeros_like(q), np.ones_like(q))
+        return cls(np.zeros_like(q), q, np.zeros_like(q), np.ones_like(q), np.zeros_like(q))
 
     def after(self, q: Array, way: Array, distance: Array) -> Memory:
         """After places (k, n) of a motion one way, +1, -1 or 0 for that before, shape (n,).
@@ -197,9 +204,12 @@ class Memory(NamedTuple):
         """
         way = np.where(way == 0.0, self.way, way)
         travel = np.maximum.accumulate(np.maximum(way * (q - self.q), 0.0))
-        left = np.exp(-travel / np.maximum(distance, LEAST))
-        z, unknown = way + (self.z - way) * left, self.unknown * left
-        return Memory(z, self.q + way * travel, np.broadcast_to(way, q.shape), unknown)
+        widths = travel / np.maximum(distance, LEAST)
+        left = np.exp(-widths)
+        away = (self.z - way) * left
+        slope = self.slope * left + away * widths / np.maximum(distance, LEAST)
+        place, ways = self.q + way * travel, np.broadcast_to(way, q.shape)
+        return Memory(way + away, place, ways, self.unknown * left, slope)
 
     @property
     def last(self) -> Memory:
@@ -242,6 +252,12 @@ class Dahl(FrictionLaw):
             here = parts[-1].last
         return Memory(*(np.concatenate(each) for each in zip(*parts, strict=True)))
 
+    @classmethod
+    def along(cls, values: Values, q: Array, rates: Array) -> Array:
+        """From an unknown state."""
+        z = cls.states(q, rates, values["presliding"]).z
+        return np.asarray(values["coulomb"] * z, np.float64)
+
     @staticmethod
     def beyond(friction: Any, z: Array, rates: Array) -> Array:
         """What memory changes in efforts with coulomb sign(rate), shape of z, N m or N."""
@@ -249,11 +265,13 @@ class Dahl(FrictionLaw):
         return np.where(friction.presliding > 0.0, change, 0.0)
 
     @classmethod
-    def remembered(cls, friction: Any, q: Array, rates: Array) -> Array:
-        """The same along a motion from an unknown state, shape (k, n) as q and rates."""
+    def remembered(cls, friction: Any, q: Array, rates: Array) -> tuple[Array, Array]:
+        """The same along a motion from an unknown state, and its doubt, (k, n) as q and rates."""
         if not friction.presliding.any():
-            return np.zeros_like(q)
-        return cls.beyond(friction, cls.states(q, rates, friction.presliding).z, rates)
+            return np.zeros_like(q), np.zeros_like(q)
+        memory = cls.states(q, rates, friction.presliding)
+        doubt = np.where(friction.presliding > 0.0, friction.coulomb * memory.unknown, 0.0)
+        return cls.beyond(friction, memory.z, rates), doubt
 
 
 LAWS: Final[Mapping[str, type[FrictionLaw]]] = {

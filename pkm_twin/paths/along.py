@@ -80,7 +80,7 @@ def model_efforts(m: Recording) -> Array:
     (q, _, qdd, wrench), rates, made = m.motion, _moving(m), np.empty_like(m.q)
     for robot, part in by_load(m.robot, m.load, m.time, BLOCK):
         made[part] = inverse_dynamics(robot, q[part], rates[part], qdd[part], wrench[part])
-    return made + Dahl.remembered(m.robot.friction, q, rates)
+    return made + Dahl.remembered(m.robot.friction, q, rates)[0]
 
 
 def _moving(m: Recording) -> Array:
@@ -143,7 +143,7 @@ def torque_table(m: Recording, progress: Callable[[int], None] | None = None) ->
     told = m.efforts == "measured" or (m.efforts == "effort" and m.bag is None)
     outside, _ = beyond_limits(m.robot, q, qd)
     rates = _moving(m)
-    memory = Dahl.remembered(m.robot.friction, q, rates)
+    memory = Dahl.remembered(m.robot.friction, q, rates)[0]
     for robot, part in by_load(m.robot, m.load, m.time, BLOCK):
         begin = part.start
         state = (robot, q[part], rates[part], qdd[part], wrench[part])

@@ -1,16 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
 """Friction with memory (Dahl), against its differential equation solved by other programs."""
 
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
+from scipy.stats import chi2
 
 from delta_dynamics import forward_dynamics, inverse_dynamics
 from delta_dynamics.simulation.machine import Plant
-from pkm_twin.errors import ParameterError, RobotWarning
+from pkm_twin.errors import ParameterError, PkmTwinError, RobotWarning
 from pkm_twin.export.c_package import c_package
+from pkm_twin.identification.compare import compare
+from pkm_twin.identification.friction_laws import fit_with_laws
 from pkm_twin.machine.friction import Dahl, Memory
 from pkm_twin.paths.along import torque_table
 from pkm_twin.recordings import Recording
@@ -175,6 +179,63 @@ def test_the_simulated_machine_follows_the_equation():
             state = y + h / 6.0 * (a + 2.0 * (b + c) + change(y + h * c, effort))
         assert np.abs(plant.q - state[:n]).max() < 1e-5
     assert np.abs(state[:n] - q).max() > 5.0 * distance[0]
+
+
+def recorded(name, seed, reversals=True, memory=True):
+    """Slow swings with noise, of a robot that a fit does not know; Coulomb levels, distances."""
+    robot, rng = load(name), np.random.default_rng(seed)
+    n = robot.joints_count
+    swings = Swings(rng, n, robot.inverse(robot.home()))
+    coulomb, distance = rng.uniform(0.1, 0.4, n), 10.0 ** rng.uniform(-2.5, -1.9, n)
+    time = np.arange(0.0, 24.0, 0.02)
+    q, qd, qdd = swings.at(time)
+    if not reversals:
+        ramp = 0.01 * (time + 0.1 * np.sin(time))[:, None] * np.ones(n)
+        q, qd = swings.home + ramp, np.gradient(ramp, 0.02, axis=0)
+        qdd = np.gradient(qd, 0.02, axis=0)
+    solved = reversals and memory
+    z = swings.states(time, distance, rng.uniform(-1.0, 1.0, n)) if solved else np.sign(qd)
+    rubs = {"viscous": [0.1] * n, "coulomb": [0.0] * n}
+    effort = inverse_dynamics(robot.changed(friction=rubs), q, qd, qdd) + coulomb * z
+    noise = 0.01 * np.sqrt(np.mean(effort**2, 0)) * rng.normal(size=effort.shape)
+    q = np.round((q + 1e-5 * rng.normal(size=q.shape)) / 1e-5) * 1e-5
+    return Recording(robot, time, q, effort=effort + noise), coulomb, distance
+
+
+@pytest.mark.parametrize(
+    "name, seeds",
+    [("five_bar", 1), *(pytest.param(one, 20, marks=pytest.mark.long)
+                        for one in ("five_bar", "delta_cu"))],
+)  # fmt: skip
+def test_slow_reversals_give_level_and_distance_within_their_deviations(name, seeds):
+    away = []
+    for seed in range(seeds):
+        record, coulomb, distance = recorded(name, seed)
+        result, (choice,) = fit_with_laws(record.robot, [record], ("friction",), ["dahl"])
+        assert choice.sigmas > 4.5 and choice.after < 0.3 * choice.before
+        assert result.verdict.answer == "explains"
+        found = []
+        for key, exact in (("coulomb", coulomb), ("presliding", distance)):
+            own = [record.robot.friction_key(joint, key) for joint in record.robot.joint_names]
+            numbers = [n for n in result.numbers if n.key in own]
+            assert {n.status for n in numbers} == {"fitted"}
+            found.append([n.after for n in numbers])
+            away += [(n.after - e) / n.deviation for n, e in zip(numbers, exact, strict=True)]
+        assert (np.abs(np.array(found) / [coulomb, distance] - 1.0) < 0.05).all()
+    # Nearly all of so many normal numbers are below both.
+    assert np.sum(np.square(away)) < chi2.ppf(0.999, len(away)) and np.abs(away).max() < 4.0
+    friction = dict(zip(("coulomb", "presliding"), found, strict=True))
+    fitted = record.robot.changed(friction=friction | {"viscous": [0.1] * len(coulomb)})
+    static = fitted.changed(friction={"presliding": [0.0] * len(coulomb)})
+    good, bad = (compare(replace(record, robot=one)) for one in (fitted, static))
+    assert good.good.all() and (bad.rms > 2.0 * good.rms).all()
+
+
+@pytest.mark.parametrize("how", [{"reversals": False}, {"memory": False}])
+def test_without_reversals_or_a_memory_no_distance_is_found(how):
+    record, *_ = recorded("five_bar", 0, **how)
+    with pytest.raises(PkmTwinError, match="reversals"):
+        fit_with_laws(record.robot, [record], ("friction",), ["dahl"])
 
 
 def test_tables_along_a_motion_have_memory_and_what_has_no_state_says_so(rng):

@@ -89,7 +89,7 @@ class Fit(CarriesAtTimes, ReadsRecordings, BeyondLimitsToo, Accepts):
     friction: str = setting(
         "auto",
         "friction laws of the drives in addition to the file's: auto, coulomb (no other), "
-        "stribeck, load-dependent, periodic, several with commas",
+        "stribeck, load-dependent, periodic, dahl, several with commas",
     )
     torque_constant: str | None = setting(
         None,
