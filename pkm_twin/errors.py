@@ -181,12 +181,13 @@ class UnreachableError(PkmTwinError, ValueError):
         way = "" if reached is None else f", beyond {100 * reached:.3g} % of the way from home"
         way = question or way
         # A limb of no length at all misses nothing, and points nowhere.
-        how = how or (f"misses by {miss:.6g} m" if miss else "has no direction there")
-        super().__init__(f"{what}{where} is unreachable: {limb} {how}{way}")
+        gap = f"misses by {miss:.6g} m" if miss else "has no direction there"
+        super().__init__(f"{what}{where} is unreachable: {limb} {how or gap}{way}")
         self.reached = reached
         self.limb = limb
         self.index = index
         self.miss = miss
+        self.how = how
 
 
 class SingularityError(PkmTwinError, ValueError):

@@ -86,7 +86,13 @@ def model_efforts(m: Recording) -> Array:
 def _moving(m: Recording) -> Array:
     """The rates, without those that friction may not count."""
     qd = m.motion[1]
-    return qd if m.still is None else moving_rates(qd, m.still, friction_reach(m.robot))
+    if m.still is None:
+        return qd
+    rates = moving_rates(qd, m.still, friction_reach(m.robot))
+    # Drives that share the effort follow those at rest.
+    rests = (rates != qd).any(1)
+    rates[rests] = m.robot.agreeing(m.q[rests], rates[rests])[1]
+    return rates
 
 
 @dataclass(frozen=True)
@@ -153,7 +159,7 @@ def torque_table(m: Recording, progress: Callable[[int], None] | None = None) ->
             spread = torque_deviation(*state) if robot.uncertainty else None
         except UnreachableError as e:
             at = (begin + e.index[0],)
-            raise UnreachableError("joint state", e.limb, at, e.miss) from None
+            raise UnreachableError("joint state", e.limb, at, e.miss, how=e.how) from None
         except SingularityError as e:
             at = (begin + e.index[0],)
             raise SingularityError("joint state", at, e.measure, e.bound) from None

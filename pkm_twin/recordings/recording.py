@@ -16,6 +16,7 @@ from pkm_twin.errors import BagError, MessageError, ParameterError, PkmTwinError
 from pkm_twin.recordings.payload import Load
 from pkm_twin.recordings.tables import PLAIN, Dialect
 from pkm_twin.recordings.topics import COLUMNS, Topics
+from pkm_twin.robot.derivatives import nearest_motion
 from pkm_twin.robot.robot import Robot
 from pkm_twin.streams.differentiator import Differentiator
 from pkm_twin.streams.rest import SIGMAS, fit_gain, gradient_gain, noise, rate_doubt
@@ -200,8 +201,7 @@ class Recording:
                     f"{self.source}: too few joint states in a row to differentiate: "
                     f"{len(self.time)}"
                 )
-            still = at_rest(self, qd)
-            return replace(self, qd=qd, qdd=qdd, still=still).part(used)
+            return self._moving(qd, qdd, at_rest(self, qd), used)
         if len(self.time) < 3:
             raise PkmTwinError(f"{self.source}: {len(self.time)} rows; 3 or more to differentiate")
         qd = _differences(self.q, self.time) if self.qd is None else self.qd
@@ -209,7 +209,17 @@ class Recording:
         if self.qd is None:
             rest = np.abs(qd) <= rate_doubt(self.time, self.q, gradient_gain(self.time))
         qdd = _differences(qd, self.time) if self.qdd is None else self.qdd
-        return replace(self, qd=qd, qdd=qdd, still=rest)
+        return self._moving(qd, qdd, rest, slice(None))
+
+    def _moving(self, qd: Array, qdd: Array, still: Mask | None, rows: Any) -> Recording:
+        """Some samples with these rates and accelerations: what is measured stays as it is.
+
+        What is differentiated becomes a motion of all drives: noise contradicts nothing.
+        """
+        r = replace(self, qd=qd, qdd=qdd, still=still).part(rows)
+        rate, change = nearest_motion(r.robot, *r.motion[:3])
+        r = r if self.qd is not None else replace(r, qd=rate)
+        return r if self.qdd is not None else replace(r, qdd=change)
 
 
 def _differences(values: Array, time: Array) -> Array:

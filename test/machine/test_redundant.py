@@ -38,6 +38,8 @@ from pkm_twin.errors import (
 )
 from pkm_twin.export.c_package import c_package
 from pkm_twin.mechanisms.catalogue import robot_of_data
+from pkm_twin.paths.along import model_efforts, torque_table
+from pkm_twin.recordings import Recording
 from pkm_twin.robot.derivatives import joint_rates, nearest_motion
 from test.export.c_programs import Package, functions, inputs_of
 from test.nodes.harness import SECOND, Maker, Plain
@@ -574,6 +576,21 @@ def swung(robot, t):
     pose, speed = size * np.sin(turn), size * rate * np.cos(turn)
     q = robot.inverse(pose)
     return pose, q, *joint_rates(robot, q, speed, -size * rate**2 * np.sin(turn))
+
+
+def test_a_table_of_encoders_that_differ_has_efforts(planar, rng):
+    """Its differences are noisy; joints at rest are no reason to reject it, a slip is."""
+    t = np.arange(0.0, 1.0, 2e-3)
+    _, q, qd, qdd = swung(planar, t)
+    seen = q + 1e-4 * rng.uniform(-1, 1, q.shape)
+    moved = Recording(planar, t, seen).with_rates()
+    right = inverse_dynamics(planar, q, qd, qdd)
+    # Dry friction turns over within the noise.
+    apart = (model_efforts(moved) - right)[(np.abs(qd) > 0.2).all(1)]
+    assert np.sqrt(np.mean(apart**2)) < 0.2 * np.abs(right).max()
+    seen[300, 3] += 5e-3
+    with pytest.raises(UnreachableError, match=r"sample 300.*motor_4 .*redundancy\.tolerance"):
+        torque_table(Recording(planar, t, seen).with_rates())
 
 
 def test_a_plant_under_computed_efforts_follows_the_path(planar):
