@@ -74,12 +74,6 @@ def test_a_resumed_run_is_an_uninterrupted_one(strain, tmp_path):
     assert not Parts(out, sweep).folder.exists()
 
 
-@pytest.mark.long
-def test_processes_are_one_process(strain, tmp_path):
-    sweep, path = strain
-    assert same(path, run(sweep, tmp_path / "a.nc", workers=2))
-
-
 def test_a_killed_process_costs_time_not_results(strain, tmp_path):
     sweep, path = strain
     killed = []
@@ -119,13 +113,6 @@ def cluster():
     ) as made:
         made.wait_for_workers(2)
         yield made
-
-
-@pytest.mark.long
-def test_a_cluster_is_one_process(strain, tmp_path, cluster):
-    sweep, path = strain
-    out = run(sweep, tmp_path / "a.nc", scheduler=cluster.scheduler_address)
-    assert same(path, out)
 
 
 def test_a_sweep_of_a_design_is_computed_on_a_cluster(cluster):
