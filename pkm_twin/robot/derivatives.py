@@ -58,9 +58,9 @@ def nearest_motion(robot: Robot, q: Array, qd: Array, qdd: Array) -> tuple[Array
     """
     if not robot.redundant:
         return qd, qdd
-    scale = np.where(np.array(robot.joint_units) == "m", robot.graph.size, 1.0)
     back = robot.inverse_jacobian(q)
-    onto = back @ np.linalg.pinv(back / scale[:, None]) / scale
+    weighted = (back / robot.joint_scales[:, None] ** 2).swapaxes(-1, -2)
+    onto = back @ np.linalg.inv(weighted @ back) @ weighted
     rate = (onto @ qd[..., None])[..., 0]
     bent = robot.agreeing(q, rate)[2]
     return rate, np.asarray(bent + (onto @ (qdd - bent)[..., None])[..., 0])

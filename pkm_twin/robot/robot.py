@@ -332,6 +332,11 @@ class Robot(Mechanism):
         back = self.inverse_jacobian(q)
         return np.asarray(back @ np.linalg.inv(back[..., self.graph.leading, :]))
 
+    @cached_property
+    def joint_scales(self) -> Array:
+        """What makes positions of unit one, shape (n,): the size for slides."""
+        return np.where(np.array(self.joint_units) == "m", self.engine.tree.size, 1.0)
+
     @property
     def effort_scale(self) -> Array:
         """What efforts of drives that share are compared by, shape (n,)."""
@@ -462,7 +467,7 @@ class Robot(Mechanism):
         graph, leads = self.graph, ", ".join(self.graph.leads)
         still = np.zeros(self.joints_count)
         state = [given.get(name, still) for name in ("q", "qd", "qdd")]
-        scales = np.where(np.array(self.joint_units) == "m", self.engine.tree.size, 1.0)
+        scales = self.joint_scales
         ways = (
             ("is", "where {} put it", ""),
             ("has a velocity of {:.4g} {}, ", "what {} make it", "/s"),
