@@ -364,7 +364,7 @@ def _one(name: str, kind: Any, row: Setting, word: Any) -> Any:
         return kind(text[1:]) if re.match(r" -\.?\d", text) else word
     try:
         value = decimal(word)
-        value = int(word) if kind is int else value
+        value = int(word) if kind is int and math.isfinite(value) else value
     except ValueError:
         value = math.nan
     if not (row.allows(value) and math.isfinite(value)):

@@ -71,7 +71,9 @@ def test_words_become_values(run):
     )  # fmt: skip
     run("cart", "--out", "-1.csv", "--no-picture")
     assert SEEN[0].out == Path("-1.csv")
-    for wrong in (("--scale", "9"), ("--scale", "nan"), ("--at", "1"), ("--how", "well")):
+    for wrong in (
+        ("--scale", "9"), ("--scale", "nan"), ("--at", "1"), ("--how", "well"), ("-4", "9" * 400)
+    ):  # fmt: skip
         with pytest.raises(Exception, match=wrong[1]):
             run("cart", *wrong)
         assert not SEEN
