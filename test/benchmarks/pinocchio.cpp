@@ -60,7 +60,6 @@ struct Loops
   MatrixXd all, jp, ja, left, right;
   VectorXd error, drift;
   Eigen::PartialPivLU<MatrixXd> lu;
-  long turns = 0;
   int named = 0;
 
   FrameIndex frame(std::istream & in, bool whole)
@@ -193,7 +192,6 @@ struct Loops
       place();
       jacobian();
       lu.compute(jp);
-      turns++;
       const VectorXd step = lu.solve(chosen(error));
       for (std::size_t k = 0; k < passive.size(); k++) q[passive[k]] -= step[long(k)];
       if (step.cwiseAbs().maxCoeff() < 1e-9) break;
@@ -244,18 +242,22 @@ struct Loops
 // Four inputs and an output: torques and accelerations of the exported C.
 using Exported = int (*)(const double *, const double *, const double *, const double *, double *);
 
-// Words: the machine's numbers, the shared library of its exported C, and the prefix of its names.
+// Words: the machine's numbers, the shared library of its exported C, the prefix of its names, and
+// how many rounds are timed.
 int main(int, char ** words)
 {
   std::ifstream in(words[1]);
   void * library = dlopen(words[2], RTLD_NOW);
   const std::string prefix = words[3];
+  const int rounds = std::stoi(words[4]);
   const auto c_torques = Exported(dlsym(library, (prefix + "_torques").c_str()));
   const auto c_accelerations = Exported(dlsym(library, (prefix + "_accelerations").c_str()));
   Loops loops(in);
   const int n = int(loops.actuated.size());
   int count;
   in >> count;
+  const double wrench[6] = {0.0, 0.0, 0.0, 0.0, 0.0, 0.0};
+  double out[6], sum = 0.0, miss = 0.0, other = 0.0, size = 0.0;
   std::vector<VectorXd> q, qd, qdd, tau, load;
   for (int i = 0; i < count; i++) {
     q.push_back(numbers(in, n));
@@ -264,18 +266,17 @@ int main(int, char ** words)
     tau.push_back(numbers(in, n));
     load.push_back(numbers(in, n));
   }
-  double miss = 0.0, size = 0.0;
   for (int i = 0; i < count; i++) {
     const auto k = std::size_t(i);
     const double here = (loops.torques(q[k], qd[k], qdd[k]) - tau[k]).cwiseAbs().maxCoeff();
     if (!(here <= miss)) miss = here;
+    const bool failed = c_torques(q[k].data(), qd[k].data(), qdd[k].data(), wrench, out) != 0;
+    const double there = (Eigen::Map<VectorXd>(out, n) - load[k]).cwiseAbs().maxCoeff();
+    if (failed || !(there <= other)) other = failed ? INFINITY : there;
     size = std::max(size, tau[k].cwiseAbs().maxCoeff());
   }
-  const double wrench[6] = {0.0, 0.0, 0.0, 0.0, 0.0, 0.0};
   std::vector<std::vector<double>> times(4);
-  double out[6], sum = 0.0;
-  loops.turns = 0;
-  for (int round = 0; round < 15; round++) {
+  for (int round = 0; round < rounds; round++) {
     double begun = now();
     for (std::size_t k = 0; k < q.size(); k++) sum += loops.torques(q[k], qd[k], qdd[k])[0];
     times[0].push_back(now() - begun);
@@ -296,11 +297,10 @@ int main(int, char ** words)
     }
     times[3].push_back(now() - begun);
   }
-  std::cout << loops.model.nv << " " << miss / size << " "
-            << double(loops.turns) / double(15 * count);
+  std::cout << loops.model.nv << " " << miss / size << " " << other / size;
   for (auto & row : times) {
     std::sort(row.begin(), row.end());
-    std::cout << " " << (row.empty() ? 0.0 : 1e9 * row[7] / double(count));
+    std::cout << " " << (row.empty() ? 0.0 : 1e9 * row[row.size() / 2] / double(count));
   }
   std::cout << " " << sum << std::endl;
   return 0;
