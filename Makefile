@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 # make demo, make test: all that they need is python3 (3.11 or 3.12) with venv, and make.
 PYTHON ?= python3
 VENV ?= .venv

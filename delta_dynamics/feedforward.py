@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """The feedforward node's core: messages in, checked efforts out. Pure: time is an argument."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """What an effort controller gets: stamped torques while they come, zeros or gravity when not.
 
 A command of plain numbers has no stamp, so a controller that takes it cannot distinguish a live

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """A computed-torque controller that checks its input and sends zeros when a check fails.
 
 It holds the position of the first joint state, then follows a smooth path there and back:

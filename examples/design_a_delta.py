@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Variants, derivatives and design from Python: which arm is best for a pick-and-place cycle.
 
 Run it without ROS: python examples/design_a_delta.py

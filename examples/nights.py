@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """24 nights of a Delta whose first drive wears, for ``pkm-twin trend``: no ROS needed.
 
     python examples/nights.py simulated.db && pkm-twin trend simulated.db

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """A mechanism with a closed form: a Delta on three vertical rails, from a few lengths.
 
     python examples/rail_delta.py

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Sends a trajectory to delta_dynamics, forwards the answer with effort, and checks its end.
 
     ros2 run pkm_twin machine_sim --ros-args -p mechanism:=delta_cu

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """A robot under ros2_control: mock hardware, controllers, and the twin's efforts between.
 
 Trajectories go to ``delta_dynamics/joint_trajectory``, or as goals of the action

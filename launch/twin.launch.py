@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """The nodes of one robot, in one namespace. Every argument has a default.
 
 A node that ends is restarted. A node that rejects its configuration would reject it again, so it

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """View a robot: machine_state and, if they are installed, robot_state_publisher and rviz2.
 
 ``machine_state`` publishes every joint of the tree, also the passive ones; robot_state_publisher

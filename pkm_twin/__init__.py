@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """pkm_twin: the digital twin of parallel kinematic machines."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """What every command says and reads alike: progress, numbers with commas, JSON, ends of output."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Typed errors: each carries the value and the bound, as text and as attributes; and warnings."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Files that a user names: regular ones only, and written whole or not at all; numbers in them."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Settings as fields of a class: a node's parameters, a command's options, a robot file's keys."""
 
 from __future__ import annotations

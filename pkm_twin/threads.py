@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """One thread for linear algebra: matrices here are small, and threads cost more than they bring."""
 
 from __future__ import annotations

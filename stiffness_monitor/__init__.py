@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Elastostatics of parallel kinematic machines: compliance, strain energy, workspace."""
 
 from pkm_twin.robot.clearance import clearance

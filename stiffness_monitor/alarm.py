@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Which elastic element has departed from the file, by measured deflections under measured loads.
 
 A measured deflection is C(s) w + F u + z and noise: s multiplies the elements' compliances

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Measured deflections in, ``~/stiffness_alarm`` out.
 
 Only the node ``stiffness_monitor`` imports this module.

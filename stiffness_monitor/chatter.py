@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Regenerative chatter in milling: the axial depth of cut up to which a pose cuts stably.
 
 With the tool point's displacement u in the cutting plane, x along the feed and y to its left, the

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """What a wrench does to a robot's platform, and which element gives: of every elastic robot.
 
 Finite elements of its frame (:mod:`stiffness_monitor.structure`), actuators locked. One beam a

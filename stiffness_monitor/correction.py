@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Where to push: joint offsets that cancel what a wrench does to the tool point."""
 
 from __future__ import annotations

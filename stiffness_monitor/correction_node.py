@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Set points that cancel the tool point's deflection under the measured wrench.
 
 Only the node ``stiffness_monitor`` imports this module.

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Exact derivatives of the platform's compliance: by the joints, and by numbers of the file."""
 
 from __future__ import annotations

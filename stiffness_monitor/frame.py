@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Coordinates and elastic columns of a frame in a pose, on numbers and on expressions alike.
 
 Every displacement of a member's ends is written as that of the body it stands on plus what its

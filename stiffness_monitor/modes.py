@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Natural frequencies and mode shapes of a robot in a pose, its actuators locked.
 
 The robot is linear about the pose: elastic beams, joints with free and elastic directions, a rigid

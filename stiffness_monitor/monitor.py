@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """The stiffness node's core: messages in, compliance and strain energy out. Pure."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """The node ``stiffness_monitor``: wrenches in, compliance and dominant element out.
 
 With measured deflections, the elements that have departed from the file. In addition, the natural

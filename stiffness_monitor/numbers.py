@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """The numbers of a robot's elasticity in a row, and the same structure on expressions of them."""
 
 from __future__ import annotations

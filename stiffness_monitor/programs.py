@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """The elastic frame of a robot as compiled programs of q.
 
 K = sum of d b b' over the frame's columns is factorised once, the platform's six displacements

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """How the platform's compliance depends on the compliance of each elastic element, exactly.
 
 Element e gives by s_e times what the robot's file says. With K = sum of G_e G_e' / s_e over the

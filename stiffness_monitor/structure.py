@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """The structural model of a robot: elastic beams, joints, rigid bodies, locked actuators.
 
 It follows from the graph: every beam and every body that is no beam is carried by its parent

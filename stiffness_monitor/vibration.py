@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Frequency response of the tool point in a pose, actuators locked, by damped modes.
 
 The lowest modes of the elastic frame respond dynamically, the others as springs (static residual):

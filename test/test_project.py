@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """What holds for the whole tree: licences, sizes, and that the README is true."""
 
 import re
@@ -37,11 +37,12 @@ def test_files_are_small_and_name_no_machines_folder():
             assert found is None, f"{name}: {found}"
 
 
-def test_python_files_carry_the_licence():
+def test_source_files_name_holder_and_licence():
+    line = r"Copyright 20\d\d pkm_twin maintainers\. SPDX-License-Identifier: Apache-2\.0"
     for name in files():
-        if name.suffix == ".py" and (REPOSITORY / name).stat().st_size:
+        if name.suffix in (".py", ".c", ".cpp", ".hpp") and (REPOSITORY / name).stat().st_size:
             head = (REPOSITORY / name).read_text(encoding="utf-8")[:100]
-            assert "SPDX-License-Identifier: Apache-2.0" in head, name
+            assert re.search(line, head), name
 
 
 def section(title):

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """A robot's elastic frame as an input deck of CalculiX's beams.
 
 Joints are equations between displacements. CalculiX drops equations between rotations of beams

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """A robot's elastic frame as an input deck of CalculiX's solids, with round members.
 
 Joints are equations between weighted means of the displacements of the members' end sections.

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """The table of docs/nodes.md: simulated contacts with machines that depart from their models.
 
 ``make contact-table``. Results are kept in out/contact_table.jsonl; a second run continues there.

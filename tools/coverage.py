@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Branches and lines of the cores that tests reach, by folder, and what they do not reach."""
 
 from __future__ import annotations

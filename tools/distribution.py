@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Wheel and source distribution that are the same at every build, and a bill of materials.
 
 ``python -m tools.distribution dist``: both archives, and their hashes. Times in them are those of

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Break one rule at a time and see whether a test fails: ``make mutation``.
 
 A mutant is a module with one operator, number or statement changed. It is compiled in a process of

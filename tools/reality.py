@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """A part of docs/validation.md: public recordings of real machines. ``make reality``."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Record the bags anew: ``python -m bags.recording [--out DIRECTORY] [NAME ...]``."""
 
 from __future__ import annotations

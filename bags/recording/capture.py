@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """What the recordings have in common: parameters, clock, sensors, and the bag they end in.
 
 May import: numpy, yaml, pkm_twin.bags (the writer only), the standard library.

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """A machine under its controller: joint PID with the effort held between samples, and its drives.
 
 The plant is Pinocchio's constrained forward dynamics.

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Elastic frame of the 2UPR-RPU machine on PyNite: the displacement method.
 
 Each limb is one beam element of PyNite (exact for loads at its ends) whose drive is locked; each

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """A cutter's load on a platform: passes, tooth ripple, run-out and slow wander.
 
 May import: numpy, the standard library, its neighbours in this package.

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """The Delta on Pinocchio: a tree of platform, arms and forearms, and the loops that close it."""
 
 from __future__ import annotations

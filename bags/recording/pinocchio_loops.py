@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Multibody engines on Pinocchio: an open tree of bodies and the loops that close it.
 
 The bodies hang in a tree (every limb from the base, the platform from the base on its own free

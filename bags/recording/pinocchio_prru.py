@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """The 3-PRRU head on Pinocchio: a tree of sliders, links and platform, and its loops."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Record delta_cu_collision.mcap: the Delta-CU runs into a padded wall that it does not know of.
 
 The same machine, engine, controller and sensors as in the pick-and-place recording. From a time on

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Record delta_cu_pick_and_place.mcap: a Delta-CU that picks and places under its controller.
 
 The plant is Pinocchio's constrained forward dynamics. The controller is an ordinary one: joint

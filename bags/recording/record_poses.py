@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Measured poses of a Delta-CU that is not built as drawn, for ``pkm-twin calibrate``."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Record prru_milling.mcap: a 3-PRRU head that mills along a tilting path under its controller.
 
 The plant is Pinocchio's constrained forward dynamics with the cutter's load on the platform. The

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Record upr_rpu_soft_joint.mcap: the milling head with one joint three times softer.
 
 The same motion and cuts as in upr_rpu_milling.mcap, on the same frame engine; beside the sensors

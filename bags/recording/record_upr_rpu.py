@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Record upr_rpu_milling.mcap: a 2UPR-RPU head that mills while its platform moves slowly.
 
 Deflection and strain energy come from the finite-element frame, quasi-static and linear, at the

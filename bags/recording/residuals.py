@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """What is left of a recording's efforts when a model and a smooth acceleration are taken away.
 
 ``python -m bags.recording.residuals`` writes the figures into bags/README.md, a test compares them.

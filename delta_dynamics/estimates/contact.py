@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Whether there is a contact: external efforts beyond what model and noise leave open."""
 
 from __future__ import annotations

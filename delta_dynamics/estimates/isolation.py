@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Which body a contact strikes, and where along it, by the direction of the external efforts.
 
 A force F at a point p of a body causes the joint efforts J(p)' F, with the Jacobian J of that

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """What the platform carries, from the efforts that the model does not explain, sample by sample."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """The action FollowJointTrajectory, its goals filled with effort on their way to the controller.
 
 Motion planners send this action, not the trajectory's topic. Needs control_msgs, so only

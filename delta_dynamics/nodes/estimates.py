@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """What measured efforts show in addition to the torques: the load, contacts and their place.
 
 Only the node ``delta_dynamics`` imports this module.

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """The node ``command_gate``: stamped torques in, plain commands of an effort controller out."""
 
 from __future__ import annotations

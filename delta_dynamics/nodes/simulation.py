@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """The node ``machine_sim``: efforts or trajectories in, a simulated machine's joint states out."""
 
 from __future__ import annotations

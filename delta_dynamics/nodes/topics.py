@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Topics of the nodes ``delta_dynamics``, ``command_gate`` and ``machine_sim``."""
 
 from __future__ import annotations

@@ -1,2 +1,2 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """A simulated machine with drives, sensors, friction and stops."""

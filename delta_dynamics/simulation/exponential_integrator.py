@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Runge-Kutta steps that are exact in a linear damping, however stiff.
 
 The exponential method of order four of Cox and Matthews (2002, Exponential time differencing for

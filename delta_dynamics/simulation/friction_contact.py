@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Which joints of a machine stick, slide or stand at their stops, and what follows for its motion.
 
 Rows are the actuated joints, then the passive ones that have friction or a rotor.

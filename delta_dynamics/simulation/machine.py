@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """A simulated machine: drives and sensors around a plant, as a controller meets them.
 
 Times are integers in nanoseconds by the machine's own clock, which :meth:`Simulation.advance`

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Rigid bodies under efforts, with friction and stops, in the actuated joints' coordinates.
 
 So no loop can drift open.

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Joint reactions of overconstrained machines: what statics leaves open, elasticity decides.
 
 Of all reactions that balance the bodies the true ones have the least complementary energy of

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """The equations of motion in the actuated joints, all terms of one state at once.
 
 What a simulation asks for several thousand times a second: one program, one solved closure.

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Dynamic isotropy: how energy and driving force depend on the direction of the platform's motion.
 
 Two indices of the 3-PRRU paper, for every robot with masses, over the pose rates Xdot:

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Joint reactions by d'Alembert's principle: the force route in addition to the power route.
 
 Every body's force and moment balance, A lambda = b, over what the joints can transmit; the

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """The efforts as a linear function of the inertial and friction parameters, exactly.
 
 tau = Y(q, qd, qdd) pi: a column of Y is the efforts that a unit of one parameter needs, by the

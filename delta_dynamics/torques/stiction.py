@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Dry friction of joints that stand still: its direction is not known, its size is a bound.
 
 At rest friction is whatever holds the joint, up to the joint's dry friction either way. The model

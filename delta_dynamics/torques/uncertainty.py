@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """How sure the efforts are: by what the robot's file says of its numbers, and by learnt noise."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Rigid-body dynamics by virtual work, for every machine with masses."""
 
 from __future__ import annotations

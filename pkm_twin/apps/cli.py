@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """The command ``pkm-twin``. Exit codes: 0 good, 1 rejected, 2 usage, 3 damaged file."""
 
 import gc

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """What a fit says: its answer, numbers, verdict, what was held out, and pictures."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Commands: a class of settings is their options, and a function of it gives their report."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """The commands: one file each in ``pkm_twin.apps.commands``, loaded when it is asked for."""
 
 from __future__ import annotations

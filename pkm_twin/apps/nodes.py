@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """The nodes as commands: help without ROS, and one line where ROS is missing."""
 
 from __future__ import annotations

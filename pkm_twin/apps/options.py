@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Arguments and options that several commands of ``pkm-twin`` share."""
 
 from __future__ import annotations

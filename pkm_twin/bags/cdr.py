@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Messages as bytes: their CDR encoding. Imports the standard library only.
 
 Decoded messages have the attributes of live ones (``msg.header.stamp.sec``, ``msg.position``), so

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """ROS 2 message definitions: the fields of a type, from its text or from the message classes."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """The records of an MCAP file, read with every length and CRC checked. Imports no ROS."""
 
 from __future__ import annotations

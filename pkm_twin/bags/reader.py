@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Strict reading and safe writing of MCAP bags. Imports no ROS.
 
 Reading: the whole file is checked before the first message is handed out. Each record is read in

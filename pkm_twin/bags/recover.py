@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Saving what is whole of a damaged bag. Imports no ROS."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Where a bag's bytes are: one MCAP file, or a folder that rosbag2 wrote. Imports no ROS.
 
 rosbag2 writes a folder with ``metadata.yaml`` and one or more MCAP files (splits), each of which it

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """The strict pass over a whole MCAP file. Imports no ROS.
 
 Every statement that the file makes about itself (counts, times, indexes, offsets, CRCs) is compared

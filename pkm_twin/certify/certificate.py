@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """A robot's certificate: its torques and places beside other engines', over random states.
 
 The judges compute from the machine's description alone, see ``pkm_twin.certify``. One of

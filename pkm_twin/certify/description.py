@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """A machine's plain description, limbs written out, every vector in base axes at home.
 
 Of the twin it takes what a joint type is called, lets move and holds; what that means in equations

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Inverse dynamics in maximal coordinates: six for each body, every joint its rows.
 
 All bodies are free; every joint is equations between two of them, see ``rows``. Positions come

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """The same machine as a MuJoCo tree, its loops closed without MuJoCo's soft constraints.
 
 The tree is made of the joints that come last and leave most freedom, so it is another one than the

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """The same machine as a Pinocchio tree, its loops closed without Pinocchio's constraints.
 
 The tree is made of the actuated joints and of those that leave least freedom.

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """What every judge computes from how its engine moves bodies, and from the engine's forces.
 
 A joint is equations between points and directions of two bodies; each is a row with its change per

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """A machine as an engine's tree of joints with loops cut open: no closure is the engine's.
 
 A spanning tree, a rod as a body of its own on two hinges across it, positions by Newton's method in

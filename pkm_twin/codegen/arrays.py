@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Numbers that a caller gives, as arrays of doubles: whatever else it gives is an error.
 
 numpy converts more than can be meant: it drops the mask of a masked array and the imaginary part

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Text of LLVM's intermediate language, an instruction a line.
 
 Only what :mod:`pkm_twin.codegen.llvm` says of that language stands here. Types are texts; a

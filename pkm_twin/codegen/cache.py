@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Compiled programs on disk, named by digests. An optimisation: without it all works."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Sparse symmetric matrices that are not negative, as straight-line expressions."""
 
 from __future__ import annotations

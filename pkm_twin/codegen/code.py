@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """One program over batches of samples, of one machine or of many, by the best back end there is."""
 
 from __future__ import annotations

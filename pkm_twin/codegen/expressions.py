@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Scalar expressions with sharing: formulas run once on these give a program for any back end.
 
 Formulas are written for numbers and run on expressions too: numpy's object arrays of expressions

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Programs that run over leading batch axes, by the best back end that the machine has."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """What identifies a program: what it is made of, and the sources of those who write it."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Programs as vector machine code: LANES samples a turn, one sample is a batch of one.
 
 So one sample and a batch have the same bits: every lane computes the same operations, and a lane

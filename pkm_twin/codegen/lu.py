@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Sparse linear equations as straight-line expressions, pivots chosen beforehand on numbers."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Machine code for this processor, from text of LLVM's intermediate language."""
 
 from __future__ import annotations

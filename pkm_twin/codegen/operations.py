@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Every operation of programs in one place: on floats, arrays and vector lanes, in C, its slopes.
 
 An operation is called like a function, on numbers, arrays or expressions. Another one is a class

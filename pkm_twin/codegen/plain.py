@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Programs as plain Python, for machines without a compiler: floats one by one, arrays in batches.
 
 The same expressions, the same order of tests as the vector code; without fused products, so

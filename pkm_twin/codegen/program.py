@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """What a back end gets: results as expressions of inputs, and equations to be solved before."""
 
 from __future__ import annotations

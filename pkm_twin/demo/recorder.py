@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """What every stage of the demonstration needs: child processes, and a recorder of their topics."""
 
 from __future__ import annotations

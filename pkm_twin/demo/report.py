@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """What the demonstration found: figures, verdicts and a picture, read from its recording."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """The demonstration: every recorded bag through the real nodes over the real middleware.
 
 For each bag a node runs as a process of its own, then the twin with a simulated machine. This

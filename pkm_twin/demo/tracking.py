@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """The demonstration's closed loop: PD alone, then PD with feedforward, on the same path.
 
 machine_sim, whose parameters are drawn about the model's, keeps simulated time and follows a

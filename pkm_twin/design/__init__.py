@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """The machine as a function of its file's numbers: variants, design for a path, tolerances."""
 
 from pkm_twin.design.pose_path import PosePath

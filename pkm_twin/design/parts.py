@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Errors of a machine's parts, and where they take the bodies while the actuated joints are held.
 
 A part's error moves a joint's frame on one of its two bodies, or changes a length. Every body has

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """A path of the platform, and how machines of other numbers follow it.
 
 The pose p and its first and second derivatives in time stay the same. Joints follow:

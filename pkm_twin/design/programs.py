@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Programs that are asked of many machines, and what each takes of a machine's numbers."""
 
 from __future__ import annotations

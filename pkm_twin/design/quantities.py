@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """What a design is judged by: quantities of machines on a path, and their derivatives.
 
 A quantity is the greatest (of the singularity index the least) of several smooth pieces: of the

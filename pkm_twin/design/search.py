@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Numbers of a robot's file that are best for a path: a search from several starts.
 
 The starts of a Sobol sequence are computed as one batch; the search goes on from the best ones. The

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """All quantities of many machines in a box of numbers: on a grid, or on evenly spread points."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """How far errors of parts take the platform, the actuated joints that lead held."""
 
 from __future__ import annotations

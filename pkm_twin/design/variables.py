@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """What a design may change: numbers of the file, alone or several together, between bounds."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Many machines that differ in numbers of their file, asked at once.
 
 They share the programs of one robot; only what hangs on their numbers is computed for each. Where a

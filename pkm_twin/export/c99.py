@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Programs of one machine as C99: math.h only, no heap, no recursion, bounded loops.
 
 A machine's numbers are folded into its programs, so that the code has fewer operations than the

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """A robot as a package of C99: header, source, example, CMakeLists.txt and README."""
 
 from __future__ import annotations

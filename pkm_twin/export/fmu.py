@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """A robot as a Functional Mock-up Unit, FMI 2.0 or 3.0: model exchange and co-simulation."""
 
 from __future__ import annotations

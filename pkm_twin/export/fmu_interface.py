@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """The functions of FMI 2.0 and 3.0 in C99, with declarations of their own.
 
 The types are those of the standard's headers (fmi-standard.org), so that a binary fits every

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """An FMU's variables and its modelDescription.xml of FMI 2.0 and 3.0, always the same bytes."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """A MoveIt configuration of a robot: a ROS package with its URDF, SRDF and settings.
 
 MoveIt knows trees. Its planning group is the actuated joints; the passive joints of the tree are

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """A robot as a ROS package of plugins for ros2_control, on its exported C.
 
 The sources stand in ``ros2_control_package`` as they are written; words between two ``@`` stand for

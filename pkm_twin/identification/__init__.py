@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Numbers of a machine from recordings, and whether the recordings fit the machine at all.
 
 :mod:`~pkm_twin.identification.fit` fits masses, friction and rotors to efforts,

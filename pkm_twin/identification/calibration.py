@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Geometry from measurements of the platform: weighted least squares with the file as prior.
 
 Gauss and Newton's method on the machine itself, damped where it has to be: every step computes the

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """The fit of a calibration by damped steps of Gauss and Newton, and what speaks against it.
 
 Poses that no machine like the file's was in, and measurements that do not fit the others.

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """A machine that is being calibrated: its numbers as they are now, and what an instrument sees."""
 
 from __future__ import annotations

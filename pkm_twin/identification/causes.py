@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """The one thing that explains efforts which contradict a robot's file, for ``check`` and ``fit``.
 
 A sign, the axes or the sign of the wrench, or one number: the scale of the efforts, of all drives

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Judge a recording: its file, time stamps, motion, limits, and its efforts against the model.
 
 Efforts are compared by the derivative, filter and noise of `fit`, so that both never disagree.

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Measured efforts against the model's, by the derivative, filter and noise of a fit.
 
 Nothing is fitted but how late the efforts are against the positions, as in a fit.

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """The compliance of a robot's elastic elements from measured loads and deflections.
 
 delta = C(s) w + z: s multiplies each element's compliance of the file, z is a zero of the

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Drives: torque constants from motor currents, and friction from weights that hang from a drive.
 
 With the masses known, current = (load + friction) / constant is linear in one over the constant and

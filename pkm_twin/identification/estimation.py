@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Weighted linear least squares with a prior, robust, physically consistent, and how sure it is.
 
 Directions that the data tell less of than the prior keep the prior's values; the others are the

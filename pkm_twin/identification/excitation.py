@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """A trajectory that identifies well: finite Fourier series, D-optimal, within all limits.
 
 Swevers, Ganseman, Tukel, De Schutter, Van Brussel, Optimal robot excitation and identification,

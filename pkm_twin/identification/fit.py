@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """The numbers of a robot's file from recordings of its motion and efforts.
 
 The last third of every recording is held out: it is judged, not fitted. Two windows of the

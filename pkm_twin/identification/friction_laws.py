@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Which friction law the drives have, by what the recordings' held-out parts say.
 
 A law is tried where the fit without it leaves something unexplained. What efforts are not linear in

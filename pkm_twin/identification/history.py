@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """A machine's state from a recording, and an SQLite database with one row per recording."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Numbers of a robot's file that efforts identify, as linear parameters, by exact derivatives.
 
 Efforts are linear in ten numbers of each body about a fixed point. About the centre of mass that

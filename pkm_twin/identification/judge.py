@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """The verdict on a fit, from its residual.
 
 Noise is measured where the model cannot err: above the band of the motion. Inside the band the

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """What people measure of a platform: one class a kind, with its derivative; and its tables."""
 
 from __future__ import annotations

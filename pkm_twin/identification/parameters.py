@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """What a fit varies and how well it knows it: parameters of a file, numbers, combinations."""
 
 from __future__ import annotations

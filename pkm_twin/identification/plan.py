@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Which poses to measure next, and how well a machine will then be known (D-optimal, greedy)."""
 
 from __future__ import annotations

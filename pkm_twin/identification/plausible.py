@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Can this machine have made this recording? Asked before anything is fitted.
 
 The efforts are fitted by a machine as far from its file as one may be: friction, rotors, a payload,

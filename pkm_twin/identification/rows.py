@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """A recording as rows of a least-squares problem: regressor and efforts, filtered alike.
 
 With them the signals of the same rows that a fit's residual is held against.

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """A recording for identification: rates without delay, regressor and efforts filtered alike.
 
 Rates and accelerations are a Savitzky-Golay fit read off in the middle of its window: no phase

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Errors that a fit of efforts does not fit: what each would change in the measured efforts.
 
 Errors of the drives and the recording (a gain, a delay, an offset, an elastic drive, another

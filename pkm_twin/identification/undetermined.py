@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """What measured poses do not determine of a machine's geometry, in a few plain sentences.
 
 The directions that a fit leaves as they were span a space. Changes that mean something to whoever

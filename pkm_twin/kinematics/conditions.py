@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Conditions among the axes and points of a machine at home that its mobility may depend on.
 
 Parallel and perpendicular axes, axes and ball joints that meet, bars of one length and direction:

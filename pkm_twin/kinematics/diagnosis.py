@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Why a machine's mobility is not the number of its actuated joints.
 
 Conditions that hold nearly are made to hold exactly, from the least deviations on: where that gives

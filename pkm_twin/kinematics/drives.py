@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """All drives of a machine, of which there may be more than it has freedoms.
 
 As many as there are freedoms lead: the closures are solved for their m values, of which the others

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """One engine for every machine: the programs made of its graph, and why one finds no assembly.
 
 Newton's method on independent closures from a known state, judged by all of them, and behind it

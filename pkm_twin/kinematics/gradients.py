@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Gradients of programs as programs: by inputs, and by the machine's geometry."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Iterations on closures that are not compiled whole: Newton, and Levenberg and Marquardt.
 
 Values, columns and steps are of unit one.

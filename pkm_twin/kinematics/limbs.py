@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Limbs whose passive turns follow in closed form from the bodies at their ends.
 
 Such a limb hangs on the ground by a passive universal joint and ends in a ball joint; between the

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """A graph at home and near it, on numbers: closures, rank, mobility."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Placement, closures, velocities and accelerations of a tree, on numbers and expressions alike.
 
 Nothing is differentiated: columns of Jacobians are axes and levers, accelerations are the

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Values of the passive joints in a URDF's convention: one number a revolute or prismatic axis.
 
 A spherical joint and a free body's ball are three revolutes in a row (x, y and z at home), a

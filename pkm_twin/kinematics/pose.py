@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Pose coordinates of a platform, of its position and rotation, and their rates.
 
 A coordinate is a coordinate of the position, a turn atan2(a, b) or an elevation asin(s) of signed

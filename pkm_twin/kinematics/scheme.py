@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """What programs of a graph depend on: closures that are solved, their pivots, pose coordinates."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """How far a machine is from a singularity of any kind: 0 in one, 1 at best.
 
 The lesser of two numbers. Bodies move by (v, L omega): v of the middle of a body's joints, L how

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Parts that can turn about themselves while nothing else moves, and what holds them.
 
 A bar between two ball joints, a pin between two hinges of one axis, small spheres that a drawing

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """One sample of a stream next to the last: programs that are given what the last one left."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """A machine's motion on expressions, solved for its unknowns: what programs are written with."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Parameters of a machine file, and the expressions that stand for its numbers.
 
 An expression is a text of arithmetic: + - * / ** ( ), sqrt, sin, cos, tan, atan2, pi and the names

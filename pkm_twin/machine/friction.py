@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Friction laws of drives: one class a law, with its parameters and the effort that it takes.
 
 Schema, compiled dynamics, plant, regressor and fit read the classes; another law is one class in

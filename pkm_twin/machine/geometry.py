@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """The numbers of a graph's geometry in a row, and the same graph on other numbers or expressions.
 
 Masses and friction are apart, see ``machine.inertia``.

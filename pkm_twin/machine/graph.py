@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """A machine as a graph of bodies, joints and rods at its home pose, every vector in base axes."""
 
 from __future__ import annotations

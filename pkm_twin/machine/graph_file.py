@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """A machine's file as a graph, and back: bodies, joints, rods, limbs written out, and drives."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Run-time inputs of the dynamics: ten numbers a body, rods, gravity, friction, rotors.
 
 Efforts are linear in every one of them, so a payload or a mass changes no program.

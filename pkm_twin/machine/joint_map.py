@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Between a controller's joint numbers and the model's: name, sign, offset and ratio a joint.
 
 controller = offset + sign * ratio * model. So ``offset`` is what the controller reads where the

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Joint types: what each lets move and what it holds. A new type is a class and a line in TYPES.
 
 Everything else follows: the steps of the tree, the closures of a cut joint, the loads that a joint

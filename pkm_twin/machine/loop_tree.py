@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """A machine as description files have it: links on a tree of joints, and joints that close loops.
 
 URDF, MJCF and SDF are read into this one form, as drawn, and written from it, at home. Every point

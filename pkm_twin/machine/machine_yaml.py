@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """YAML files that people read and edit: a whole description, and new numbers in a file's text."""
 
 from __future__ import annotations

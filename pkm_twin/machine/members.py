@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Elastic members of a machine: round bars between points of its bodies, and their sections."""
 
 from __future__ import annotations

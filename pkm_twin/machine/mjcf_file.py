@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """An MJCF file as links, joints and loop closures, as MuJoCo compiles it.
 
 ``connect`` and ``weld`` constraints close loops, a ``joint`` constraint on one joint alone locks

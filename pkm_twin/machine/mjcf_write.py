@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """A robot's tree as an MJCF file, byte for byte the same.
 
 The model stands at home as it is: every body's frame is parallel to the base there, ``ref`` of a

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """How the poses of a machine are laid out: about an axis, or along its pose coordinates."""
 
 from __future__ import annotations

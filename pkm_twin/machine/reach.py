@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Bounds of a workspace: limits of slides and lengths of bodies, ranges of passive joints."""
 
 from __future__ import annotations

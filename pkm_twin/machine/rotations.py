@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Rotation matrices and frames; REP 103's rpy is Rz(yaw) Ry(pitch) Rx(roll)."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Parameter files: plain data to frozen dataclasses, each refusal naming field and bound.
 
 A mechanism declares its schema as frozen dataclasses whose fields are made by the functions below:

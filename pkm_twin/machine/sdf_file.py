@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """An SDF model as links, joints and loop closures, as the SDFormat specification reads it.
 
 Versions 1.4 to 1.12: poses relative to frames, nested models, axes in any frame. The model stands

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """A robot's tree and its loops as an SDF model, byte for byte the same.
 
 SDF has graphs of joints, so that a loop is closed by a joint as any other. The model stands at

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Plain YAML and nothing else: no tags, aliases, merges or duplicate keys."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """The spanning tree of a graph, and the coordinates of its joints.
 
 Actuated joints come first, then those of fewest freedoms, so that there are fewest unknowns; a body

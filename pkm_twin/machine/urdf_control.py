@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Which joints of a URDF or an SDF are actuated, and what a controller calls them.
 
 A joint for which the controller has a name or numbers of its own stands twice. The joint of the

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """A URDF file: links, joints and what closes loops, in three ways that people write it.
 
 ``<constraint>`` elements (urdfdom pull request 264), ``<loop>`` elements (Chignoli, Slotine,

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """A tree of links and joints as a URDF that every parser reads, byte for byte the same.
 
 The machine is drawn at home: every link's frame stands on its joint, parallel to the base there. A

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """XML from strangers: elements, numbers and frames of a URDF, every refusal by the field's name."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Workspace maps: one quantity over all poses, its worst pose, and planes through it.
 
 A kind is one file in ``kinds/``. ``sweep.py`` has the grid and the planes, ``search.py`` the worst

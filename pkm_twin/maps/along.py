@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """A kind of map along a path instead of over the workspace: values over time, and the worst."""
 
 from __future__ import annotations

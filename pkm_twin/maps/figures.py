@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Pictures of stored maps: planes through the worst pose, the answer in the title."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """What a kind of map states: a quantity of a pose, its unit, and which value is worst.
 
 Grid, search of the worst pose, storage, pictures, pages and commands are the same for all kinds.

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Pages of stored maps: one HTML file that needs no network, with the picture's star and value."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Computing a sweep: here in one process or on all cores, or on a Dask cluster.
 
 Chunks are independent, so the results are the same bit for bit wherever and in whatever order they

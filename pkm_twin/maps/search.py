@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """The box of all poses that a machine reaches, and the worst pose of a quantity in it."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Finished chunks in a folder beside the target, joined into one NetCDF file at the end.
 
 Everything is written under another name and renamed, so a stop at any time leaves whole files

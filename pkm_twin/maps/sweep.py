@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """A map: a kind's cases over all poses, the worst pose of each, and planes through it.
 
 Poses count where actuators and passive joints keep their limits, limbs stay apart, and the

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Delta robots: three arms, three forearms, a platform that only translates.
 
 Frame: origin at the centre of the base circle, z up, so the platform hangs at negative z. Pose:

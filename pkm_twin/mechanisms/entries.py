@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """The numbers of a robot's file, and the same robot or the same file with some of them changed."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Linear Delta as 3D printers have it: three towers, a rod pair from each carriage, a platform.
 
 Its numbers are those of a printer's firmware (Klipper, Marlin, RepRapFirmware). Frame: origin on

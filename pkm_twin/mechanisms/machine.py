@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Any parallel machine: its parameter file is the graph of bodies, joints and rods at home.
 
 Every vector stands in base axes at the home pose. ``forward`` gives the assembly that is connected

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """The 3-PRRU head: three vertical sliders, three limbs, a platform that lifts and tilts.
 
 Frame: origin at the centre of the base circle, z up. Pose: height z of the platform's centre (m),

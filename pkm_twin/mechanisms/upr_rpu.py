@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """The 2UPR-RPU machine: two UPR limbs and one RPU limb, all three driven along their length.
 
 Frame: O at the middle of B1 B2, X along B1 B2, Y along O B3, z up; the platform stands at negative

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """The nodes' hot paths straight from and to CDR, past the middleware's Python conversion.
 
 What comes out has the attributes of the live message, or is arrays at once; what goes in are

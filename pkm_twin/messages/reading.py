@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Messages to checked arrays, by attributes only: live messages and decoded ones alike.
 
 Joint states, trajectories, wrenches and measured deflections.

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Time stamps and durations of messages: nanoseconds, and which stamps are accepted."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Paths, motion laws, the fastest motion along a path, and the sizing of drives."""
 
 from pkm_twin.paths.constraints import Limits

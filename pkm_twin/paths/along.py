@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """The model along a recorded or planned motion: efforts, their terms and joint reactions."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Payloads that change at waypoints of a path: the model's efforts with the payload of each part.
 
 A path is cut where its payload changes, so that no interval of its points has two.

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Limits of a motion along a path as rows in the path's acceleration and speed.
 
 With v = ds/dt, x = v^2 and u = d2s/dt2 the efforts are exactly

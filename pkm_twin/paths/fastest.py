@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """The shortest motion along a path within the limits of drives, joints and tool, or one by a law:
 a quintic, or an S-curve of limited jerk.
 """

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Paths in pose or joint coordinates: lines, rounded corners, arcs and smooth curves.
 
 A path is a chain of stretches, each from rest to rest; a stretch is a chain of pieces that meet

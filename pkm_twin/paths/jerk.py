@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """The fastest speed along a path with limits on the joints' jerk, as a sequence of linear programs.
 
 A joint's jerk is v (q' du/ds + 3 q'' u + q''' x) with x = v^2, so a limit J on it is a bound

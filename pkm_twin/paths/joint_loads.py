@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Forces and moments in the joints along a motion, cycles and bearing life."""
 
 from __future__ import annotations

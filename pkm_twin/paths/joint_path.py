@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """A path as joint positions over its length: points with derivatives, and quintics between."""
 
 from __future__ import annotations

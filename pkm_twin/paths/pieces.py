@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Pieces of paths: curves p(s) with their first two derivatives."""
 
 from __future__ import annotations

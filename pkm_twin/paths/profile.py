@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """The fastest speed along a path within limits: reachability over a grid.
 
 Between two points of the path the acceleration u is constant, so x = v^2 is linear:

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Input shaping of a motion: the first mode, whose frequency depends on the pose, rests at its end.
 
 ZV and ZVD (Singer and Seering 1990) split a motion into two or three, half a damped vibration

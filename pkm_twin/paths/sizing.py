@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """What drives must give for a motion: efforts, speeds, power and energy, at joint and motor.
 
 At the joint power is effort times rate. With a drive of ``turns`` N (motor angle per joint motion),

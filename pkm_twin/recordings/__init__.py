@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Recordings and planned motions: one type, one reader of bags and tables."""
 
 from pkm_twin.recordings.payload import Load, by_load

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Recordings of bags as nodes read them; planned motions as bags, or as tables."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """The payload of a recording: as its bag or table tells it, or as it is asked for."""
 
 from __future__ import annotations

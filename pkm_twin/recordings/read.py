@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """One reader of recordings and planned motions: MCAP files, rosbag2 folders, tables."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """A recorded or planned motion of one robot as arrays, whatever file it is from."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Tables: files with a header row as other programs write them, as columns in SI units.
 
 What a header row makes certain (separator, decimal comma, units behind names) is found and

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Which topics of a bag are a machine's joint states, wrenches and deflections."""
 
 from __future__ import annotations

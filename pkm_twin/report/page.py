@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """A report as one HTML page that needs no network: answer, notes, facts, tables, pictures."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Pictures. matplotlib is imported on first use; every function draws on axes that it is given."""
 
 from __future__ import annotations

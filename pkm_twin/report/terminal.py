@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """A report as text: the answer first, then facts, tables, notes and files."""
 
 from __future__ import annotations

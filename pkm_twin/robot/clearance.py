@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """How far members of different limbs stay apart.
 
 A member is a straight round bar, taken as a capsule: all points within its radius of the segment

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Exact derivatives of pose and joints: by each other, and by any number of the robot's file."""
 
 from __future__ import annotations

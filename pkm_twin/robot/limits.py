@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """One rule for joint states outside the limits, as the nodes have it: refused, or marked."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """What every robot has of its file: parameters, the graph that follows, names and units.
 
 A mechanism is a schema, a function from its parameters to a graph, and, where they exist, closed

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """What programs take of a robot, as a function of some numbers of its file.
 
 The functions that make a robot's graph and masses of its file are run once on expressions of the

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """What a machine looks like: bars and faces between points of its bodies, all given at home.
 
 The one source of every picture: drawings, URDF visuals, the page of ``pkm-twin view``.

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Numbers of a robot's file that are possible and hardly meant, as millimetres for metres are.
 
 Each is compared with the machine itself, so that small and large machines are judged alike. What

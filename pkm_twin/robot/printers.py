@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Linear Delta printers: what their firmware prints and stores, read and written.
 
 Formats by the documentation of Klipper (``[delta_calibrate]``), Marlin (G33, M665, M666),

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """What every robot computes: kinematics by the engine of its graph, masses as run-time inputs."""
 
 from __future__ import annotations

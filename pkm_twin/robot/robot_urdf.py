@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """A robot as a URDF, MJCF, SDF, and as a ``mechanism: machine`` description."""
 
 from __future__ import annotations

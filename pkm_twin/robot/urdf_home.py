@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """The home of a tree with loop closures: which of its assemblies the robot starts from.
 
 The actuated joints stand where the file wants them: at the initial values of ``<ros2_control>``,

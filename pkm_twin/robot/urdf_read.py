@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """URDF, MJCF and SDF with loop closures as plain data of a ``mechanism: machine`` description."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """A machine beside its model: the same robot with parameters that differ by a stated spread."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Reachable workspace of a machine, and the regular one of a height and two tilts."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """How a node is: counts, log lines at a bounded rate, and its diagnostic status."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """What nodes publish: messages with a header, and joint numbers as the controller has them.
 
 A node publishes numbers of the actuated joints through these alone. They take

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """What every node of the suite shares: life cycle, parameters, guards, diagnostics.
 
 Nothing that runs while a node spins can end it: what a message, a request or a clock breaks is

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """A node's parameters: declared with bounds, whole numbers taken for floats, no others."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Replays a bag onto ROS topics, for machines without rosbag2.
 
 ROS is imported inside the functions, so that a command line can show its help without it.

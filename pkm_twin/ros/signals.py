@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Ending a process on the first signal: the next ones cannot tear its clean-up.
 
 A terminal sends Ctrl-C to every process in it and a launcher sends another, so signals come in

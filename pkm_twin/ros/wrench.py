@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Where a measured wrench is measured: parameters, or transforms where tf2 is installed."""
 
 from __future__ import annotations

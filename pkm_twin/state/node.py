@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """The node ``machine_state``: joint states in; all joints, the platform's motion, markers out."""
 
 from __future__ import annotations

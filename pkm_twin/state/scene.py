@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Shapes of a machine and of what a load does to it, to be drawn elsewhere. Pure.
 
 Shapes are in base axes, m. Results of elasticity come as numbers.

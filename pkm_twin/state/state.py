@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """The core of ``machine_state``: joint states in, the whole machine's state out. Pure."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Whether a stream of joint states is clear of singularities and moves without jumps."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Acceleration of a joint-state stream: Savitzky and Golay's fit, causal, for uneven stamps.
 
 A polynomial of degree ``order`` is fitted to the last ``window`` velocities (or one of degree

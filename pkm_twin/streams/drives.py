@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Drives that are off or braked: efforts that are zero, or do not change, while nothing moves.
 
 The effort of a drive that is off, or behind a closed brake, does not bear the machine. The effort

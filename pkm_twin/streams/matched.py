@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Wrenches and efforts seen through the window that gives a stream its acceleration.
 
 A differentiated acceleration is a weighted mean of the accelerations in its window: fast parts of

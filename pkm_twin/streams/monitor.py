@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Counts what is rejected, lost or late and latches the stop of a stream. Pure: no clock here."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """A joint trajectory between its points, as joint_trajectory_controller goes it."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Whether joints move as far as their measured velocities say.
 
 Positions of a wrong scale, unit or sign pass every limit, and so do velocities: their sum over time

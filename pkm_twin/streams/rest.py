@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """How far the rates of joints may be off, so that a joint at rest is known as one.
 
 The sign of a rate is the direction of dry friction, and of a joint at rest it is that of the noise.

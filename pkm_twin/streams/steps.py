@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Whether joints can have moved as their positions say: jumps, two publishers, missing samples.
 
 From one sample to the next a joint moves by its rate times the period. What it moves farther than

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Topics and services of a node as rows: what makes, documents and permits them. Needs no ROS."""
 
 from __future__ import annotations

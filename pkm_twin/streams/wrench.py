@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Measured wrenches: where they are measured, and what they are at the platform's reference point.
 
 Pure: times are arguments.

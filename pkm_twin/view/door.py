@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Who may enter: every request is judged before a byte of the page or of its data leaves.
 
 On the loopback any program of this machine may; a page of another site in this machine's browser

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """A picture of a robot at home: the scene of ``pkm-twin view``, drawn without a browser."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """What running nodes say, message by message: the latest of each, and traces of the torques.
 
 Messages are read by their attributes alone.

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Meshes of a robot's URDF, read and placed: what its links look like on the page."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """A robot under sliders: a state in, numbers out; what cannot be is refused in words."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """The page of ``pkm-twin view``: viser's sliders and numbers around the pure model.
 
 Callbacks only note what was asked for; one loop does it, the latest of each kind.

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """What moves the machine of a page by itself: a bag's time line, and running nodes."""
 
 from __future__ import annotations

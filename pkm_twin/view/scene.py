@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """A state as shapes: cylinders, balls and plates with their places and colours, in numbers."""
 
 from __future__ import annotations

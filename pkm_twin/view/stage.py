@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """The 3-D half of the page: a scene's shapes as viser draws them."""
 
 from __future__ import annotations

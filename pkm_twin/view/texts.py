@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """The page's numbers as HTML: every number has an id, a unit and, where it is judged, a colour."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """A recorded bag as a time line: poses, measured efforts and the torques of the model."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """What a browser may change on the page: the values of its inputs, within what each can take.
 
 All browsers share one page, and viser writes whatever property a message names. Of the others,

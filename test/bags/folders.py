@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Folders as rosbag2 writes them, made of a bag with another library than the package's own."""
 
 from __future__ import annotations

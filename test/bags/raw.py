@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Bags of another program, records by hand, and the memory that a process takes for them."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Strict reading: a damaged bag never gives a wrong value, a strange one never a traceback."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Recovery: whole chunks are saved, wherever the damage is, and the result is a sound bag."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Writing: what was accepted is in the file, also after a signal, a kill or a full disk."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Message definitions and their encoding, against rclpy and mcap_ros2 as independent readers."""
 
 from __future__ import annotations

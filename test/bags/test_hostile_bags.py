@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Sound CRCs around nonsense: a typed error in bounded time and memory, never a traceback."""
 
 from __future__ import annotations

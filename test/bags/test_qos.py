@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """What a bag says of its publishers is read, or refused by the field's name."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """The recordings in bags/: what bags/README.md says of them, and what the cores make of them.
 
 The replay here is the nodes' own cores fed with the recorded messages, without a middleware.

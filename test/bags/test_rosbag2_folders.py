@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Bags as rosbag2 writes them: folders with splits, packed by message, by chunk or by file."""
 
 from __future__ import annotations

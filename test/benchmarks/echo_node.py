@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """The bare echo that the feedforward node is measured against: the same message back.
 
 Its one argument is the executor: ``single`` or ``events``.

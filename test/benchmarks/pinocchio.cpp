@@ -1,4 +1,4 @@
-// SPDX-License-Identifier: Apache-2.0
+// Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 // Closed-loop torques and accelerations of one machine: Pinocchio and the exported C, in turns.
 //
 // The tree and its loops come as numbers from pinocchio_c.py. Inverse dynamics close the loops by

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Pinocchio in C++ and the exported C on the same machine, in one program, into docs/export_c.md.
 
 ``python -m test.benchmarks.pinocchio_c docs/export_c.md``: needs g++, Eigen's headers and the wheel

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """pytest-benchmark's JSON in docs/benchmarks.md: ``python -m test.benchmarks.report IN PAGE``."""
 
 import json

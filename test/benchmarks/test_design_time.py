@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """The design of a machine against an optimiser that compiles each machine, by processor time."""
 
 from time import process_time

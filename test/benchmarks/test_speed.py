@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Side-by-side timings, single thread, in one run: compare the ratios, not the machine.
 
 Run by ``make bench``, which turns the result into docs/benchmarks.md.

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Run `pkm-twin` in a process of its own, and cut or spoil recorded bags."""
 
 import os

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Every `pkm-twin` line of every page: it parses as it stands, and it runs as it stands."""
 
 import itertools

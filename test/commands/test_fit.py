@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """`pkm-twin fit` and `pkm-twin excite` as a user runs them."""
 
 import functools

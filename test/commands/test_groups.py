@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """``pkm-twin`` alone and ``--help``: every command once, by task, its purpose whole."""
 
 import re

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Joint loads: rainflow by the standard's example, life by hand, open reactions by elasticity."""
 
 import re

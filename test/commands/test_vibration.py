@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """``frf`` and ``lobes`` as commands: poses that the machine cannot have are rejected."""
 
 import pytest

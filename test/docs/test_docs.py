@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Pages that are generated are as their generators write them; blocks to type do what is said."""
 
 from __future__ import annotations

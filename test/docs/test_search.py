@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """The site's search index is short, and every page, heading, option and key stays in it."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Texts that users read keep to the field's terms: no banned word in pages, help and messages."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Exported C, compiled and run: a process of its own for each function of a package."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """The table of docs/export_c.md: ``python -m test.export.c_table docs/export_c.md``."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-// SPDX-License-Identifier: Apache-2.0
+// Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 // A stand-in for the headers of MoveIt 2 (Jazzy), rclcpp and pluginlib: the declarations that the
 // exported plugin uses, with MoveIt's signatures, so that it is compiled and run without ROS.
 #pragma once

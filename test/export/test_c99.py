@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """A robot in C: the same numbers and verdicts as in Python, and code that compilers accept."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Functional Mock-up Units: what fmpy accepts, and what it simulates against the plant."""
 
 from __future__ import annotations

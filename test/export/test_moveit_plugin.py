@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """The kinematics plugin of the MoveIt package, compiled against a stand-in for MoveIt's headers.
 
 ``moveit_stand_in.hpp`` has the declarations that the plugin uses; MoveIt itself is not here.

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """The package for ros2_control: its files, and its controller's core compiled without ROS.
 
 Its plugins are tested by the package's own test, where ros2_control is installed.

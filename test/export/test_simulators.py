@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """MJCF, SDF and URDF: there and back with the same torques, and MuJoCo's motion of the MJCF."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Run what the catalogue names and print it row by row into docs/errors.md: ``make faults``.
 
 ``python -m test.faults --again`` runs only the rows that did not pass the last time.

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """The catalogue of faults: what may go wrong, what then happens, and which tests show it."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Everything at random for as long as asked: ``python -m test.fuzz --seconds 60 --seed 1``.
 
 A kind holds when nothing but the package's own errors comes back, each of them one short printable

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Bags with damage, and nonsense in sound frames: never a value that was not recorded."""
 
 from __future__ import annotations

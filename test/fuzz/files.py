@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Parameter files, URDFs and tables that nobody would write: refused by the field, or sound."""
 
 from __future__ import annotations

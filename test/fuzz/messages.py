@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Messages that nobody would send, at the nodes' pure cores, judged by rules written here anew.
 
 What is answered must be a message without a fault, and its torque that of the model at the state

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Messages, bytes, clocks and parameters that nobody would send, at real nodes over DDS."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """What makes a message sound, written down anew: it shares nothing with the nodes' reading."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """What nobody would send, at real nodes, for ``FUZZ_SECONDS`` from ``FUZZ_SEED`` on.
 
 Where ``FUZZ_OUT`` names a folder, the figures go there.

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Recordings of drawn machines: sound ones, and such as no machine or another one makes."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Simulated partial measurements, and a printer's kinematics by trilateration alone."""
 
 from __future__ import annotations

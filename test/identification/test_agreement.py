@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """fit and check judge a recording alike: one filter, one noise model, one verdict."""
 
 from __future__ import annotations

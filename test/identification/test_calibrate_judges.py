@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Measured poses that are judged: outliers, other frames, other machines, and what stays open."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Recordings that a fit judges: sound ones, such as another machine makes, such as none makes."""
 
 from __future__ import annotations

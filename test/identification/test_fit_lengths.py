@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Lengths that a fit takes for certain: their derivatives, their sizes, slow motions."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Friction laws, torque constants and resonances of recordings; sweeps that show friction."""
 
 from dataclasses import replace

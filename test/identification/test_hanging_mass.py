@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """A drive's torque constant and friction law by weights: simulated drives, and a measured one."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Errors of usual size that a residual shows in part: how far the fitted numbers may be off."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Calibration from partial measurements: laws, recovery, and the algorithm that printers have."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Recordings of loads and deflections, for tests: of the independent frame, and of the twin."""
 
 from __future__ import annotations

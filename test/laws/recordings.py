@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Recordings for fits: smooth motions of a robot, and what engines that are not the twin's need."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Every function of numbers takes real ones in any layout, and refuses all else by a ValueError."""
 
 from __future__ import annotations

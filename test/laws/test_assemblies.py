@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Far from home a state is that to which the straight way leads, and no other assembly."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Beam elements and assembled frames against closed forms and a second way to assemble."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Laws of limb interference: distances of bars, and which poses they leave."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Programs: expressions, both back ends, the sparse factors, and the cache of compiled code."""
 
 import hashlib

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """A collision is seen, a motion is none: on recordings of another engine."""
 
 from __future__ import annotations

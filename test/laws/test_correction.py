@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Set points that cancel a deflection: exact to first order, within bounds, and on a recording."""
 
 from __future__ import annotations

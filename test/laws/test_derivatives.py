@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Derivatives of torques against differences of sixth order, by the motion and by file numbers."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Design for a path: gradients against differences, optima against grids of machines."""
 
 from __future__ import annotations

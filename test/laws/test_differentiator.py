@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """The causal differentiator: exact on polynomials, on any stamps, and never guessing."""
 
 import numpy as np

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Deltas, 3-PRRUs and 2UPR-RPUs of any dimensions: lengths of their limbs, assemblies, misses."""
 
 import itertools

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """The section ``drive`` of every mechanism: a rotor behind a gear, as the joint feels it."""
 
 import numpy as np

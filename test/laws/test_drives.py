@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Drives that are off or braked are known by efforts that are zero or constant at standstill."""
 
 from __future__ import annotations

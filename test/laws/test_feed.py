@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """A cut that is slower where the machine is softer keeps its tolerance, and no more than that."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Fits of what another engine needs: close to the truth, honest about the rest."""
 
 from __future__ import annotations

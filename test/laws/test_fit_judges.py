@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Fits of machines whose friction and payload are drawn at random, by maximal coordinates."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """The struck body by the direction of efforts: Jacobians by differences, classes by frequency."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Laws of the two isotropy indices, and the statements that the 3-PRRU paper makes of them."""
 
 import numpy as np

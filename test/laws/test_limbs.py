@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Limbs in closed form: of random hexapods, all closures hold and nothing else is accepted."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """The section `members` of a robot file: tubes, what follows from their masses, what is refused."""
 
 from __future__ import annotations

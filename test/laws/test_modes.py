@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Laws of natural frequencies and shapes, over all robots that have data for them."""
 
 from __future__ import annotations

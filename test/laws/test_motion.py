@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Kinematics of every robot by one engine: placements, closures, derivatives, passive joints."""
 
 from pathlib import Path

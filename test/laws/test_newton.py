@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Newton's method and its verdict, on one equation x x = q: the rules of docs/engine.md."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """External wrenches from momentum: against the filter that the observer says it is."""
 
 from __future__ import annotations

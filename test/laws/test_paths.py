@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Paths and motions along them: what they go through, and laws of the fastest motion."""
 
 from types import SimpleNamespace

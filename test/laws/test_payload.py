@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """A load found from efforts: on loads that are known, and on the recording of a pick."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """`inverse` answers the poses that `forward` gives, and no others; there is one home."""
 
 import numpy as np

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Friction with memory (Dahl), against its differential equation solved by other programs."""
 
 from dataclasses import replace

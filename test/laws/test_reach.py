@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """The box that a platform cannot leave: it holds every place, and follows the shortest chain."""
 
 from __future__ import annotations

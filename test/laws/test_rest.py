@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Joints at rest are known as such by the noise of their rates, and rub in no direction there."""
 
 from __future__ import annotations

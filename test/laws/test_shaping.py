@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Input shapers: an oscillator of the pose's frequency that the motion shakes comes to rest."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Laws of compliance and strain energy, over all robots with elastic members."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Steps that no motion makes, two publishers on one topic, and missing samples."""
 
 import numpy as np

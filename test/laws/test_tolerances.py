@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Errors of parts: each is an added drive of the same machine, in maximal coordinates."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Deviations of torques and compliance, against machines drawn at random; a stream's noise."""
 
 from __future__ import annotations

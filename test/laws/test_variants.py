@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Many machines at once give what each of them gives as a robot of its own file."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Frequency response and chatter: laws, and a stability analysis that shares no code with ours."""
 
 from __future__ import annotations

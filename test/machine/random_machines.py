@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Machines of the folder ``machines``, and shipped ones, of other dimensions and masses.
 
 What may move without costing a machine its mobility differs: a planar machine's joints may move

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Closed-loop machines as URDFs in four dialects, with link frames and joint zeros of any kind.
 
 Of two of them a YAML file tells the closures; ``spheres`` has a small sphere on a hinge at both

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Causes of a wrong mobility: joints that were moved on purpose are found, and by how much."""
 
 import copy

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Elastic machines in the graph form: beside the Delta's own file, and on springs in the drives."""
 
 import numpy as np

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Machines of the gallery: plausible, shown on their page, and right by other engines."""
 
 import numpy as np

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Screws: one whose nut is a carriage on a rail, and one that is driven itself."""
 
 from xml.etree import ElementTree as ET

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """The YAML of a description: the same numbers again, plain YAML, few long lines."""
 
 from __future__ import annotations

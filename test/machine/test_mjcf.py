@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """An MJCF file as a description, against MuJoCo's own positions, masses and inertias."""
 
 from __future__ import annotations

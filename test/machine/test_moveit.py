@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """A robot's MoveIt configuration: what it names is in its URDF, and its limits are the model's."""
 
 from xml.etree import ElementTree as ET

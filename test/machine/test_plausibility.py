@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Numbers of a file that are hardly meant: each kind by name, none of them in a sound machine."""
 
 import copy

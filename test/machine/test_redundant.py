@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """More actuated joints than degrees of freedom, against virtual work and a quadratic programme.
 
 The judge of planar n-RRR machines is written in pose coordinates: two circles that meet give a

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Shipped robots as URDFs: Pinocchio puts platform and loops where the robot says."""
 
 from __future__ import annotations

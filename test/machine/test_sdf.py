@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """SDF models with loops: every way of writing one drawing is the same machine."""
 
 from __future__ import annotations

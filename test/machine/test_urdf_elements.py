@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """What the elements of a URDF, and of the YAML file next to it, become in the description."""
 
 from __future__ import annotations

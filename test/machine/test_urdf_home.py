@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Where a URDF's machine starts from, and drawings with spheres, rounding and initial values."""
 
 import re

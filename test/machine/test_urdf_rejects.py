@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """URDFs that are rejected, and with what error; damaged ones; the work for long ones."""
 
 from __future__ import annotations

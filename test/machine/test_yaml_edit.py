@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """New numbers in a robot's own text: they are read back, and the rest stays."""
 
 import numpy as np

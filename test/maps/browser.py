@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """A real browser without a window, driven over its DevTools protocol: pages, mouse, scripts."""
 
 from __future__ import annotations

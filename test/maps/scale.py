@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """What sweeps cost, in docs/benchmarks.md: ``python -m test.maps.scale PAGE``."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """The default map of every robot holds all that it reaches, whatever its pose coordinates are."""
 
 from __future__ import annotations

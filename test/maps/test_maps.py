@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Maps of one quantity: equal to brute force pose by pose, and the worst pose is the worst."""
 
 from __future__ import annotations

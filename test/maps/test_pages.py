@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Pages in a real browser: the numbers under the cursor are the file's at the place they say."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Runs that are stopped, spread and killed give the file of an undisturbed one, bit for bit."""
 
 from __future__ import annotations

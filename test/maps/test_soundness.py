@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Damaged maps are rejected, whatever bit is another; numbers that cannot be, too."""
 
 import math

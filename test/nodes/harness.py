@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Messages for the pure cores, and node processes in a ROS domain of their own.
 
 Nothing here sleeps to synchronise: every wait is for a condition, with a deadline.

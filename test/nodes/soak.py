@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """What a long run of the nodes is made of: pace, weather, watching, and what is said of it.
 
 ``python -m test.nodes.soak FOLDER`` writes the figures of the last run there into the docs.

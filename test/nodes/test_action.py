@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """The action ~/follow_joint_trajectory, between a client and a controller of this process."""
 
 import numpy as np

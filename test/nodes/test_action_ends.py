@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """How goals of ~/follow_joint_trajectory end where the controller does not end them."""
 
 import importlib

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """What delta_dynamics tells beside the torques: load, push, reactions, and what a wrench needs."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """What the node delta_dynamics does about clocks, silence, bursts, and nodes that do not fit."""
 
 import contextlib

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """The nodes' cores on machines with one to six joints, with a joint map and without one.
 
 Every core that takes or sends joint numbers runs twice: a robot without a map on the model's

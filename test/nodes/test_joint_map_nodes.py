@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """All nodes of a machine whose controller has other names and numbers for every joint."""
 
 import numpy as np

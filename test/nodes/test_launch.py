@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """The launch files, read everywhere and run where launch is installed.
 
 Running needs what the wheels do not bring: ``ros2 launch``, and this package in a sourced

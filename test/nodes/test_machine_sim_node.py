@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """The running machine_sim: its topics are the core's numbers, and what it refuses."""
 
 import numpy as np

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """The node machine_state over the real middleware: its messages beside the core's numbers."""
 
 from importlib.util import find_spec

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """A node among others: life cycle, parameters, requests that cannot be, and drivers' messages."""
 
 import math

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """The stiffness core: a wrench and the pose beside it, to compliance and strain energy."""
 
 from dataclasses import replace

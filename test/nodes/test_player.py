@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """The player over the real middleware: a process of its own publishes, this one subscribes."""
 
 from __future__ import annotations

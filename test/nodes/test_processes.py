@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """The process of a node: signals, exceptions, priority, memory, a missing clock, its imports."""
 
 import errno

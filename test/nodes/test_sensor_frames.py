@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """A sensor that transforms tell of, where tf2 is installed."""
 
 from importlib.util import find_spec

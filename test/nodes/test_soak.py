@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """All nodes at full rate for minutes, in all kinds of weather: nothing grows, nothing ends.
 
 ``SOAK_MINUTES`` sets how long; the first fifth is warm-up. Where ``SOAK_OUT`` names a folder, the

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """The stiffness alarm of stiffness_monitor over the real middleware, fed with the recorded bag."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """The stiffness alarm's core: over the recorded bags and the frame engine, and what it refuses."""
 
 from __future__ import annotations

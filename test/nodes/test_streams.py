@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """What is known of a stream: its pace, its losses, and whether rates and positions agree."""
 
 from collections import Counter

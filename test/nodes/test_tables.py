@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """The tables of topics and parameters, and docs/nodes.md by them, are those of running nodes."""
 
 import re

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """The tutorial for ROS, from its first line to its last, in a shell with the wheels' commands."""
 
 import os

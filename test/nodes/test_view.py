@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """The layouts for RViz, Foxglove and PlotJuggler: files of their kind, with topics of the nodes."""
 
 import json

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """``pkm-twin view --live``: what a running node says reaches the page's model."""
 
 import numpy as np

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Wrenches measured anywhere, and torques that bear them, on the pure cores."""
 
 import itertools

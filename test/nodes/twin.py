@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """A running delta_dynamics and its topics, seen from the other side; needs rclpy."""
 
 import contextlib

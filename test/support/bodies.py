@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Motion of every body of a robot, and Newton's and Euler's laws on numbers.
 
 Masses and inertias are taken from the graph and handled here in numpy alone; where the bodies are

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Robots whose controller has other names and numbers for the joints than the model."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """The repository's pages: numbers in running text, and parts that programs write."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Robots that laws are held over, and random states of them.
 
 A law asks the robot what it is, so that a file added to ``config/`` joins all laws by itself.

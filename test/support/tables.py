@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Tables as a user's own program writes and reads them: CSV files by their columns."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """The strain-energy method of the 2UPR-RPU paper in closed form (equations 1 to 37), on numpy."""
 
 from __future__ import annotations

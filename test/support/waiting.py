@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Waiting for conditions: the condition decides, the clock only ends what never comes."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Platform compliance of the 2UPR-RPU with rigid joints against CalculiX, its bars as solids.
 
 The bars are quadratic bricks in the shape of a disc, pushed along the bar: no beam theory and no

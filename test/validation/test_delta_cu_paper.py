@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Tables 2 to 6 of the Delta-CU paper, decoded, within their printing accuracy.
 
 Digits of the source that are wrong: docs/validation.md.

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """The fastest motion against closed forms of one axis, and against linear programs.
 
 The programs share the inverse dynamics and the geometry alone: derivatives of the joints by

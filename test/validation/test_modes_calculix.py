@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Natural frequencies and a response against CalculiX, whose beams are solids with a round hole.
 
 CalculiX expands a B32R beam into quadratic bricks: no beam theory, no shear factor, another mass

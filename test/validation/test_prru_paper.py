@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Zhang, Wang, Wu: dynamic isotropy of a 3-PRRU manipulator (J. Tsinghua Univ. 57, 2017).
 
 The paper prints no numbers, so its equations themselves are the reference: written here in numpy in

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Joint reactions against Pinocchio: a recursive sweep over a tree, loops as external loads.
 
 The twin writes every body's balance and solves for all joints at once; Pinocchio finds the loops'

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """2UPR-RPU paper: tables 1 and 2, what its figures say, and its workspace."""
 
 from __future__ import annotations

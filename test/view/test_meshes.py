@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Meshes of a URDF are where its links are, in every state; unreadable ones are named."""
 
 from importlib.util import find_spec

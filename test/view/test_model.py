@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """The pure half of the page: sliders in, numbers out, on every robot and a URDF."""
 
 from functools import cache

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Every shipped bag, played by `ros2 bag play --clock` into its nodes: the share that is answered.
 
     python3 tools/cell_trial/bags.py [--rate 1.0] [-p NAME:=VALUE] [BAG ...]

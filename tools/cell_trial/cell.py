@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """What the trials share: processes in sessions of their own, and a node that hears and sends."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """What joint_trajectory_controller's effort does when goals end, and how long goals take to end.
 
     python3 tools/cell_trial/goals.py [--robot delta_cu] [--update-rate 500] [CASE ...]

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """How the nodes and launch files behave beside real ROS 2 tools: one line for each property.
 
     python3 tools/cell_trial/manners.py [CASE ...]

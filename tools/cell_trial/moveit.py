@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """The MoveIt configuration of every robot, loaded by the parsers that MoveIt uses.
 
     python3 tools/cell_trial/moveit.py [ROBOT ...]

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """The exported controller under joint_trajectory_controller: its efforts compared with the twin's.
 
     python3 tools/cell_trial/plugin.py [--robot delta_cu] [--bandwidth 2] [PART ...]

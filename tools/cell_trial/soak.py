@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """A cell for a while: two machines with all nodes and a recorder; one machine at 1 kHz; Ctrl-C.
 
     python3 tools/cell_trial/soak.py [--minutes 10] [--stops 20] [--part cell|kilohertz|stops|one]

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Compare the twin with other engines at length and write a part of docs/validation.md.
 
 Fails where a bound is exceeded; the part is written then too and says so.

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Actuator efforts from energies alone, in 50 digits.
 
 A machine here is points and directions: where the bodies' points are for given actuator positions,

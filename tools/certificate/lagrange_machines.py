@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Euler and Lagrange's equations of the two machines: their points, gaps and energies."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Platform compliance of the 2UPR-RPU: against CalculiX, and beside the paper's finite elements."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Ten seconds of free swing: the twin's forward dynamics beside Pinocchio's.
 
 The actuators hold constant efforts, those that balance the weight at a stable equilibrium, and the

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Which folder imports which, as a picture: ``python -m tools.pages.architecture OUT.png``."""
 
 from __future__ import annotations

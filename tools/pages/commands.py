@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Write docs/commands.md from the commands: ``python -m tools.pages.commands docs/commands.md``."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """The table of docs/engine.md: ``python -m tools.pages.engine docs/engine.md`` writes it anew."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """A part of docs/errors.md from the classes: ``python -m tools.pages.errors docs/errors.md``."""
 
 from __future__ import annotations

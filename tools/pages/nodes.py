@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Tables of docs/nodes.md, and the topics of docs/security/policy.xml, by the nodes' own tables.
 
 ``python -m tools.pages.nodes docs/nodes.md docs/security/policy.xml``

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Run notebooks and store what they show: ``python -m tools.pages.notebooks FILE...``."""
 
 from __future__ import annotations

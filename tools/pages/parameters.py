@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """docs/parameters.md from the schemas: ``python -m tools.pages.parameters docs/parameters.md``."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """The pictures that the pages' commands draw: ``python -m tools.pages.pictures docs/gallery``.
 
 Those of robots, recordings of nodes and the browser have their own programs.

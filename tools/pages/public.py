@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Write the public names: ``python -m tools.pages.public docs/public_names.txt``.
 
 Python names, the command line and exported C come from the code. Names of nodes, launch files and

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """The gallery's pictures of all robots: ``python -m tools.pages.robots docs/gallery``."""
 
 from __future__ import annotations

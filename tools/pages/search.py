@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """A hook of MkDocs: search that opens fast and without a network, and docstrings without roles.
 
 Every page and every heading stay findable. The index has text without markup and without code

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """A trend in docs/recordings.md and its picture: ``python -m tools.pages.trend PAGE``."""
 
 from __future__ import annotations

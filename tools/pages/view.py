@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """The gallery's pictures of ``pkm-twin view``: ``python -m tools.pages.view docs/gallery``.
 
 Needs a browser; where there is none it says so and leaves the pictures as they are.

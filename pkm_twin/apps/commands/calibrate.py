@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """``pkm-twin calibrate``: the geometry of one's own machine from measurements of its platform."""
 
 from __future__ import annotations

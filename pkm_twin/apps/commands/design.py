@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """``pkm-twin design``: numbers of a robot's file that are best for a path; sweeps, tolerances."""
 
 from __future__ import annotations

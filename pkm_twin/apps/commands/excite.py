@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """``pkm-twin excite``: a trajectory from which a fit learns much, as a bag and a table."""
 
 from __future__ import annotations

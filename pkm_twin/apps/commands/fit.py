@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """``pkm-twin fit``: a robot's file from recordings of its motion, efforts or deflections."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """``pkm-twin map ROBOT KIND``: a quantity over the workspace or along a path."""
 
 from __future__ import annotations

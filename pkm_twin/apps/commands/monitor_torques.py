@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """``pkm-twin monitor-torques``: a subscriber that judges torques as a controller would."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """``pkm-twin path``: a motion along waypoints, a cycle or a circle, as a trajectory or table."""
 
 from __future__ import annotations

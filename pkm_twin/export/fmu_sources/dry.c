@@ -1,4 +1,4 @@
-/* SPDX-License-Identifier: Apache-2.0 */
+/* Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0 */
 /* Rows with dry friction, and those that hold. */
 /* Modes of a row with dry friction: it slides; it holds; or it is still as others hold it. */
 enum { SLIDES, HOLDS, RESTS };

@@ -1,4 +1,4 @@
-/* SPDX-License-Identifier: Apache-2.0 */
+/* Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0 */
 /* An FMU of forward dynamics: terms of the equations of motion. */
 /* M a + bias = tau - friction + twists' wrench; rows: rates of passive joints by joint rates. */
 #define BIAS (N * N)

@@ -1,4 +1,4 @@
-/* SPDX-License-Identifier: Apache-2.0 */
+/* Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0 */
 /* Functions of FMI 3.0 that take no instance. */
 EXPORT const char *FMI(GetVersion)(void)
 {

@@ -1,4 +1,4 @@
-/* SPDX-License-Identifier: Apache-2.0 */
+/* Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0 */
 typedef void (*Logger)(void *, const char *, Status, const char *, const char *, ...);
 typedef struct {
     Logger logger;

@@ -1,4 +1,4 @@
-/* SPDX-License-Identifier: Apache-2.0 */
+/* Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0 */
 /* Variables of an FMU and its payload; @ stands for the exported C's prefix. */
 /* What a state of the FMU is: all variables by value reference, and what follows from events. */
 typedef struct {

@@ -1,4 +1,4 @@
-/* SPDX-License-Identifier: Apache-2.0 */
+/* Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0 */
 /* Accelerations. */
 /* Accelerations a, and event indicators z, which fall through zero where a mode ends. */
 static int accelerate(const Model *m, const double *x, double *a, double *z)

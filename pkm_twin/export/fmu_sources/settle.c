@@ -1,4 +1,4 @@
-/* SPDX-License-Identifier: Apache-2.0 */
+/* Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0 */
 /* What sticks and what slides. */
 /* Forces within bounds that resist the motions of rows z: w = motion - a force is zero where the
    force is between its bounds, else of its sign. Block pivoting (Judice and Pires 1994). */

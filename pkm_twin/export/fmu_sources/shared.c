@@ -1,4 +1,4 @@
-/* SPDX-License-Identifier: Apache-2.0 */
+/* Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0 */
 /* What both versions of FMI ask for; the types are those of the standard's headers. */
 #if defined(_WIN32)
 #define EXPORT __declspec(dllexport)

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """The least axial depth of cut of the stability lobes, in the zero-order approximation."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Dynamic isotropy: kinetic energy and drive force in the worst direction of the motion."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """The six lowest natural frequencies, actuators locked, and the shapes of their modes."""
 
 from __future__ import annotations

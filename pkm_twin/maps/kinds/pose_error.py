@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """The standard deviation of the platform's position, from the file's `uncertainty`."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Reach, singularities, limb interference, and the largest cylinder in the workspace."""
 
 from __future__ import annotations

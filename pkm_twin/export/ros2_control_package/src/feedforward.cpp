@@ -1,4 +1,4 @@
-// SPDX-License-Identifier: Apache-2.0
+// Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 // @ROBOT@: written by pkm-twin export ros2-control, which overwrites changes.
 #include "@PACKAGE@/feedforward.hpp"
 

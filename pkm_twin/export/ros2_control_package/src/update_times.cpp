@@ -1,4 +1,4 @@
-// SPDX-License-Identifier: Apache-2.0
+// Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 // @ROBOT@: written by pkm-twin export ros2-control, which overwrites changes.
 /// Update times of the controller: ros2 run @PACKAGE@ update_times [UPDATES] [PUBLISH_RATE]
 #include <algorithm>

@@ -1,4 +1,4 @@
-// SPDX-License-Identifier: Apache-2.0
+// Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 // Loads URDF and SRDF as MoveIt does: urdf::Model and srdf::Model. Ends with 1 if either reports
 // a warning or an error.
 #include <console_bridge/console.h>

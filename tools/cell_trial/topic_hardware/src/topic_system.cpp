@@ -1,4 +1,4 @@
-// SPDX-License-Identifier: Apache-2.0
+// Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 /// Hardware over topics: efforts to machine_sim, its joint states back. For trials: not real-time.
 #include <algorithm>
 #include <chrono>
