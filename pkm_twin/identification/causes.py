@@ -17,6 +17,7 @@ from typing import Final
 import numpy as np
 
 from delta_dynamics import dynamics_terms, inverse_dynamics
+from delta_dynamics.torques.stiction import friction_reach
 from pkm_twin.codegen.arrays import Array, Mask
 from pkm_twin.errors import PkmTwinError
 from pkm_twin.identification.compare import (
@@ -187,7 +188,9 @@ class _Numbers:
         self.change = np.gradient(c.expected, c.period, axis=0)
         self.change[[row - k for row in c.starts for k in (0, 1)]] = 0.0
         self.noise = float(np.mean((c.noise / c.limit) ** 2))
-        self.count = c.residual.size * passed_band(c.how, 1.0 / c.period)
+        # The residual of a joint at rest lacks what its friction may hold.
+        self.used = ~c.rests | (friction_reach(robot) == 0.0)
+        self.count = max(int(self.used.sum()), 1) * passed_band(c.how, 1.0 / c.period)
 
     def clear(self, least: float, other: float, times: float) -> bool:
         """Whether so many times the least squares remain, beside noise, and not by chance."""
@@ -196,10 +199,12 @@ class _Numbers:
 
     def solved(self, *columns: Array, some: Mask | None = None) -> tuple[list[float], float]:
         """The factors on columns (k, n), then the delay, s; the mean square that remains."""
+        used = self.used if some is None else self.used & some[:, None]
         table = np.stack([*columns, self.change, self.c.residual], -1) / self.c.limit[:, None]
-        table = (table if some is None else table[some]).reshape(-1, table.shape[-1])
+        table = table[used]
         sizes = np.linalg.lstsq(table[:, :-1], table[:, -1])[0]
-        return sizes.tolist(), float(np.mean((table[:, -1] - table[:, :-1] @ sizes) ** 2))
+        left = np.sum((table[:, -1] - table[:, :-1] @ sizes) ** 2)
+        return sizes.tolist(), float(left) / max(len(table), 1)
 
     def efforts(self, function: Callable[..., Array]) -> Array:
         """A function of the robot and the recorded motion, in its band, (k, n)."""

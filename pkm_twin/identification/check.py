@@ -11,7 +11,6 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
 import numpy as np
-import scipy  # type: ignore[import-untyped]  # its parts come when they are asked for
 
 from delta_dynamics import torque_deviation
 from pkm_twin.codegen.arrays import Array, Mask
@@ -20,6 +19,7 @@ from pkm_twin.identification.causes import agrees, cause_of
 from pkm_twin.identification.compare import (
     LEAST,
     MAX_RESIDUAL,
+    STUCK,
     Compared,
     by_held,
     compared_of,
@@ -51,10 +51,8 @@ IDLE: Final = "drives off or braked"
 COMPUTED: Final = "the efforts of this table are the model's; expected columns JOINT.measured"
 ROUNDING: Final = 1e-9
 """Residual, part of the peak, that no measurement leaves."""
-STUCK: Final = 0.05
-"""Time for which a signal stays the same before it counts as stuck, s,"""
 TICKS: Final = 10.0
-"""and by how many of its least steps it has to change meanwhile."""
+"""By how many of its least steps a signal has to change that is not stuck."""
 MAX_GAP: Final = 5.0
 """Longest good time between joint states, in median periods."""
 MIN_SINGULARITY: Final = 1e-3
@@ -330,19 +328,6 @@ def _shares(r: Recording, idle: Mask, compared: Compared | None) -> tuple[list[F
     return items, f"{told}; {100 * part:.3g} % {why}"
 
 
-def _rests(c: Compared) -> Mask:
-    """Where a joint rests, and where the filter mixes a rest with the motion, shape (k, n).
-
-    Dry friction holds any effort there, and a rest does not change it.
-    """
-    long, near = (np.ones((2 * round(s / c.period) + 1, 1)) for s in (0.5 * STUCK, c.edge))
-    parts = []
-    for track, rows in zip(c.tracks, c.inner, strict=True):
-        rests = scipy.ndimage.binary_opening(~track.moves(c.how), long)
-        parts.append(scipy.ndimage.binary_dilation(rests, near)[rows])
-    return np.concatenate(parts)
-
-
 def _stuck_efforts(r: Recording, c: Compared) -> str:
     """Efforts that were not measured, or not all the time; saturated ones are no such; or empty."""
     assert r.effort is not None  # noqa: S101
@@ -350,7 +335,7 @@ def _stuck_efforts(r: Recording, c: Compared) -> str:
         # One of the drives that share may stay as it is.
         return ""
     rows = np.searchsorted(r.time, c.time).clip(0, len(r.time) - 1)
-    texts, good, moved = [], c.good, np.where(_rests(c), np.nan, c.expected)
+    texts, good, moved = [], c.good, np.where(c.rests, np.nan, c.expected)
     for j, (joint, unit) in enumerate(zip(r.robot.joint_names, r.robot.effort_units, strict=True)):
         values = r.effort[:, j].copy()
         most, told = np.abs(values).max(), np.full(len(values), np.nan)

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
+import scipy  # type: ignore[import-untyped]  # its parts come when they are asked for
 
 from delta_dynamics.torques.stiction import beyond_friction, friction_reach, moving_rates
 from delta_dynamics.torques.virtual_work import inverse_dynamics, null_efforts
@@ -50,6 +51,8 @@ LOCAL: Final = 0.25
 """Time over which a residual is judged by itself, s: a collision is shorter than a recording."""
 MORE: Final = 3.0
 """And how many times the bound of the whole recording it may be there."""
+STUCK: Final = 0.05
+"""Time for which a joint, or an effort, stays the same before it counts as at rest, or stuck, s."""
 LIGHT: Final = 0.05
 """Part of the greatest peak effort of its unit that a joint's peak is taken for at least."""
 NEAR: Final = 0.5
@@ -96,6 +99,20 @@ class Compared:
     def edge(self) -> float:
         """How far the filter spreads a step in time, s."""
         return 0.0 if self.how.cutoff is None else 1.0 / self.how.cutoff
+
+    @property
+    def rests(self) -> Mask:
+        """Where a joint rests, and where the filter mixes a rest with the motion, (k, n).
+
+        Dry friction holds any effort there, and a rest does not change it.
+        """
+        spans = 0.5 * STUCK, self.edge
+        long, near = (np.ones((2 * round(span / self.period) + 1, 1)) for span in spans)
+        parts = []
+        for track, rows in zip(self.tracks, self.inner, strict=True):
+            rests = scipy.ndimage.binary_opening(~track.moves(self.how), long)
+            parts.append(scipy.ndimage.binary_dilation(rests, near)[rows])
+        return np.concatenate(parts)
 
     @property
     def rms(self) -> Array:

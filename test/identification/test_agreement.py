@@ -203,3 +203,22 @@ def test_fit_and_check_agree(name: str) -> None:
             continue
         made = noisy(WRONG[what](m, rng), rng) if what in WRONG else IMPOSSIBLE[what](sound, rng)
         agree(bare, made)
+
+
+def test_friction_that_may_hold_a_payload_at_rest_does_not_lighten_it() -> None:
+    """Strokes of 0.4 s, and rests as long where dry friction is larger than the payload's share."""
+    robot = load("delta").changed(friction={"coulomb": [1.0] * 3}, payload={"mass": 0.0})
+    time = np.arange(0.0, 8.0, 1e-3)
+    stroke = np.clip(np.abs((time + 0.4) % 1.6 - 0.8) / 0.4 - 0.5, 0.0, 1.0)
+    size = np.array([0.5, 0.3, -0.4])
+    q = (
+        robot.inverse(robot.home())
+        + size * (stroke**3 * (10 - stroke * (15 - 6 * stroke)))[:, None]
+    )
+    qd = np.gradient(q, time, axis=0)
+    made = inverse_dynamics(
+        robot.changed(payload={"mass": 0.5}), q, qd, np.gradient(qd, time, axis=0)
+    )
+    made += np.random.default_rng(1).normal(0.0, 0.02, made.shape)
+    (cause,) = check(Recording(robot, time, q, qd, effort=made), 0.02).causes
+    assert float(cause.split()[-1]) == pytest.approx(0.5, rel=0.01)
