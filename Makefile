@@ -120,7 +120,6 @@ pages: $(VENV)/test.stamp
 	$(BIN)/python -m tools.pages.commands docs/commands.md
 	$(BIN)/python -m tools.pages.errors docs/errors.md
 	$(BIN)/python -m tools.pages.nodes docs/nodes.md docs/security/policy.xml
-	$(BIN)/python -m tools.pages.engine docs/engine.md
 	$(BIN)/python -m tools.pages.public docs/public_names.txt
 	$(BIN)/python -m tools.pages.trend docs/recordings.md
 	$(BIN)/python -m tools.pages.notebooks examples/*.ipynb

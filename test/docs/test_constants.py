@@ -19,12 +19,12 @@ def word(pattern):
 
 
 def test_newtons_judgement():
-    assert numbers(ENGINE, r"until one is below (\S+) \(unit one; .*?\), at most (\d+)\.") == [
-        program.CLOSED,
+    assert numbers(ENGINE, r"at most (\d+) corrections .*? until one is below (\S+) \(") == [
         program.MAX_ITERATIONS,
+        program.CLOSED,
     ]
     assert word("at most a **{}** of the one before it") == program.CONTRACTION
-    pattern = r"stays above (\S+), and above (\S+) times the correction of a single step from home"
+    pattern = r"stays above (\S+); without a closed form, .*? above (\S+) times each correction"
     assert numbers(ENGINE, pattern) == [program.LEAST, program.MARGIN]
     assert numbers(ENGINE, r"redundant ones too, is at most (\S+) \(") == [program.RESIDUAL]
     pattern = r"tried again in (\d+), (\d+), (\d+), (\d+), (\d+) and (\d+) \*\*steps"
