@@ -102,7 +102,7 @@ def test_a_measured_hexapod_is_predicted_as_well_as_by_a_fit_of_each_leg(
     motors = q * factors + robot.controller.offsets + 0.2 * rng.normal(size=6)
     poses = Poses(motors, position, rotation)
     found = calibrate(robot, poses, geometric(robot, robot.controller.positions(motors)))
-    legs, _ = fit_a_leg(robot, poses.part(learnt))
+    legs = fit_a_leg(robot, poses.part(learnt))
     away = np.sqrt(np.mean(leg_poses(legs, poses.part(~learnt)) ** 2))
     assert found.agreements[0].held_out[1].rms < 1.02 * away
     by = {p.name: p for p in found.parameters}

@@ -41,37 +41,20 @@ class TestFrequenciesOfTheDeltaCu:
     def test_what_they_hang_on(self, variant):
         members = parameters_of("delta_cu")["members"]
         carbon = {k: members["forearm"][k] for k in ("youngs_modulus", "shear_modulus", "density")}
-        width = members["parallelogram_width"]
         rod, _ = variant("delta_cu", members={"rcu_forearm": members["rcu_forearm"] | carbon})
         own = self.first(self.robot)
         pattern = (
-            r"second axis is the limb's radial one \(first frequency (\d+) Hz; (\d+\.\d+) Hz with "
-            r"an axis across the forearm\) and its rod is of aluminium \((\d+) Hz of carbon\)"
+            r"first frequency is (\d+) Hz here; with the universal joint's second axis across the "
+            r"forearm it would be (\d+\.\d+) Hz, with a rod of carbon (\d+) Hz"
         )
         assert_printed(PAGE, pattern, own, self.first(self.across()), self.first(rod))
-        others = [
-            variant("delta_cu", members={"parallelogram_width": f * width})[0] for f in (0.5, 2.0)
-        ]
-        moved = [abs(self.first(robot) / own - 1) for robot in others]
-        pattern = r"half or twice the parallelograms' width moves it by (\d+) %"
-        assert_printed(PAGE, pattern, 100 * max(moved))
 
     def test_where_their_energy_is(self):
         found = modes(self.robot, self.pose)
         names, kinetic = found.energies.elements, found.energies.kinetic
-        share = [kinetic[:3, names.index(name)] for name in ("platform", "forearm III")]
-        pattern = (
-            r"in shapes 1 to 3 the platform has (\S+), (\S+) and (\S+) of the kinetic energy and "
-            r"forearm III (\S+), (\S+) and (\S+); "
-        )
-        assert_printed(PAGE, pattern, *share[0], *share[1])
-        size = np.linalg.norm(found.shapes[..., :3], axis=-1)
-        ends = [found.nodes[k] for k in size[:2].argmax(-1)]
-        # "in 1 and 2 that rod's elbow end moves the most"
-        assert ends == ["forearm III 0/8"] * 2
-        forearms = [k for k, name in enumerate(names) if name.startswith("forearm")]
-        pattern = r"4 to 6 the forearms bend \(at least (\d+) % of the kinetic energy\)"
-        assert_printed(PAGE, pattern, 100 * kinetic[3:][:, forearms].sum(1).min())
+        forearms = kinetic[:, [name.startswith("forearm") for name in names]].sum(1)
+        assert (kinetic[:3, names.index("platform")] + forearms[:3]).min() > 0.7
+        assert forearms[3:].min() > 0.85
 
 
 class TestTablesOfTheUprRpuPaper:
@@ -124,7 +107,7 @@ class TestErrataOfTheDeltaCu:
     def test_the_sign_is_that_of_arm_one(self):
         ours = delta_cu.differences(self.velocity(), delta_cu.VELOCITY)[0]
         theirs = self.velocity(np.array([1.0, -1.0, 1.0]))
-        pattern = r"velocity rms (\S+) mm/s instead of (\d+) mm/s"
+        pattern = r"from table 2 by (\S+) instead of (\d+) mm/s rms"
         assert_printed(PAGE, pattern, ours, delta_cu.differences(theirs, delta_cu.VELOCITY)[0])
 
     def test_a_digit_of_table_2_is_lost(self):
@@ -135,7 +118,7 @@ class TestErrataOfTheDeltaCu:
         rms.append(delta_cu.differences(found, source)[0])
         pattern = (
             r"(-10\.80) mm/s; here (\S+) mm/s, a digit is lost: the model gives (\S+); "
-            r"velocity rms (\S+) instead of (\S+) mm/s"
+            r"velocities differ by (\S+) instead of (\S+) mm/s rms"
         )
         assert_printed(PAGE, pattern, -10.80, used, found[3, 2], *rms)
 
@@ -148,7 +131,7 @@ class TestErrataOfTheDeltaCu:
         rms.append(delta_cu.differences(found, source)[0])
         pattern = (
             r"(17\.20) mm/s2; here (\S+) mm/s2, two digits are exchanged: the model gives (\S+); "
-            r"acceleration rms (\S+) instead of (\S+) mm/s2"
+            r"accelerations differ by (\S+) instead of (\S+) mm/s2 rms"
         )
         assert_printed(PAGE, pattern, 17.20, used, found[4, 2], *rms)
 
@@ -164,7 +147,7 @@ class TestErrataOfTheDeltaCu:
         away = [np.abs(np.array(t) @ across).max()
                 for t in (delta_cu.VELOCITY, delta_cu.ACCELERATION)]  # fmt: skip
         pattern = (
-            r"differ by up to (\S+) N m; at t = 0 they give (\S+) and (\S+) N m, where the model "
+            r"differ by up to (\S+) N m; at t = 0 they give (\S+) and (\S+) N m, where `delta` "
             r"gives (\S+) N m for both\. .* leave the plane by up to (\S+) mm/s and (\S+) mm/s2"
         )
         most = np.abs(second - third).max()
@@ -220,9 +203,8 @@ class TestErrataOfTheUprRpu:
         found = [
             100 * np.abs(d / self.theory - 1).max() for d in (along, self.deflection(self.pose))
         ]
-        pattern = r"within (\S+) % with the distance along Oo, within (\S+) % \((\d) units"
-        units = np.abs(self.deflection(self.pose) - self.theory).max() / upr_rpu.UNIT
-        assert_printed(PAGE, pattern, *found, units)
+        pattern = r"within (\S+) % with the distance, within (\S+) % with the coordinate"
+        assert_printed(PAGE, pattern, *found)
 
     def test_the_shear_factor(self):
         round_bar = upr_rpu.ROBOT.changed(members={"shear_factor": 1.127})

@@ -88,7 +88,7 @@ def test_table_2_velocity(motion):
     rms, worst = differences(velocity, VELOCITY)
     assert rms < 2.3
     assert worst < 4.9
-    pattern = r"velocity rms (\S+) mm/s of (\d+), torque"
+    pattern = r"velocities differ by (\S+) mm/s rms \(of (\d+)\)"
     assert_printed(PAGE, pattern, rms, np.abs(VELOCITY).max())
     pattern = r"not printed; here (\S+) rad, fitted to tables 2 and 3, and (\d+) N along z"
     assert_printed(PAGE, pattern, HOME_ANGLE, -LOAD[2])
@@ -120,7 +120,7 @@ def test_tables_4_to_6_torques(motion):
     rms, worst = differences(inverse_dynamics(robot, q, qd, qdd, LOAD), printed)
     assert rms < 0.175
     assert worst < 0.37
-    pattern = r"torque rms (\S+) N m of (\S+), worst (\d+\.\d+)"
+    pattern = r"torques by (\S+) N m rms \(of (\S+); worst (\d+\.\d+)\)"
     assert_printed(PAGE, pattern, rms, np.abs(printed).max(), worst)
 
 

@@ -157,7 +157,8 @@ def _balances(figures: dict[str, Figures], judge: Judge) -> str:
     table = "\n".join(rows)
     return f"""### Balances
 
-Worst relative differences of all robots at the same states; the last two at those of Lagrange.
+Worst relative differences of the three robots, at the states above; power and energy at those for
+Lagrange.
 
 | balance | | worst | bound |
 |---|---|---|---|
@@ -188,9 +189,10 @@ def _swings(swings: list[Swing], judge: Judge) -> str:
 Shipped robots without friction start away from a stable equilibrium; constant efforts balance the
 weight. DOP853 integrates `forward_dynamics` of both engines with tolerances of {TOLERANCE:.0e};
 Pinocchio's own step is RK4 at {1e3 * STEP:.0f} ms. The energy drift is relative to the largest
-kinetic energy (bound {SWING_BOUNDS["drift"]:.0e}). The bound of closure is
-{SWING_BOUNDS["closure"]:.0e} m, of the last column {SWING_BOUNDS["DOP853"]:.0e} with DOP853 and
-{SWING_BOUNDS["its own step"]:.0e} with the step (rad or m, and per second).
+kinetic energy (bound {SWING_BOUNDS["drift"]:.0e}); the closure is the largest opening of a loop
+(bound {SWING_BOUNDS["closure"]:.0e} m). The last column is the difference from the twin at the end,
+in rad or m, and per second (bound {SWING_BOUNDS["DOP853"]:.0e} with DOP853,
+{SWING_BOUNDS["its own step"]:.0e} with RK4).
 
 | robot | engine | energy drift | closure, m | difference of q, q' |
 |---|---|---|---|---|
@@ -241,8 +243,9 @@ def _paper_rows(rows: PaperRows, judge: Judge) -> str:
         Compared with pkm_twin and the shipped joint compliances, the finite elements of table 1 in
         the 2UPR-RPU paper are softer in {int((known > 0).sum())} of {known.size} components, by
         {_span(known)}. The worst difference relative to them is {worst}; the paper states
-        {PAPER_BOUND:g}. A common factor on the joints' compliances leaves
-        {_percent(rows.joints[1])}, one of {rows.bars[0]:.2f} on all bars {_percent(rows.bars[1])}.
+        {PAPER_BOUND:g}. If one factor multiplies all joints' compliances,
+        at least {_percent(rows.joints[1])} remains; with a factor of {rows.bars[0]:.2f} on all
+        bars' compliances, {_percent(rows.bars[1])}.
         The paper shows neither mesh nor contacts, so the cause cannot be determined.
     """)
     return f"""### The paper's finite elements
