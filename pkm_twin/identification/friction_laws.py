@@ -16,19 +16,21 @@ from typing import Any, Final
 
 import numpy as np
 
+from delta_dynamics.torques.regressor import parameter_names
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import BagError, ParameterError, PkmTwinError, UnknownNameError
 from pkm_twin.identification.causes import number_that_explains, usual
 from pkm_twin.identification.compare import missing_samples, recorded_of, step_fault
 from pkm_twin.identification.drives import FIT, fitted_constants, given_constants
 from pkm_twin.identification.fit import Fit, fit, fitted, refuse_faults
-from pkm_twin.identification.identifiable import KINDS, Kind, of_drives
+from pkm_twin.identification.identifiable import KINDS, LOAD, Kind, of_drives
 from pkm_twin.identification.judge import SIGMAS, Verdict, basis_of
 from pkm_twin.identification.parameters import Number
 from pkm_twin.identification.rows import Problem
 from pkm_twin.identification.samples import EXACT, filtered
 from pkm_twin.identification.suspects import RESONANCE
 from pkm_twin.machine.friction import BASIC, KNOWN, LAWS, Dahl, compiled
+from pkm_twin.machine.inertia import TEN, change_of_frame, standard_parameters
 from pkm_twin.recordings import Recording
 from pkm_twin.robot.robot import Robot
 from pkm_twin.streams.steps import sampling_of
@@ -186,7 +188,7 @@ def fit_recordings(
                 f"no wrench on {r.topics.wrench} is accepted: {r.first_reject}",
                 path=Path(r.source), reason="frames",
             )  # fmt: skip
-    found = ((r.name, step_fault(r)) for r in recordings)
+    file, found = robot, ((r.name, step_fault(r)) for r in recordings)
     faults = [
         f"{name}: position steps that are no motion: {fault}" for name, fault in found if fault
     ]
@@ -230,7 +232,31 @@ def fit_recordings(
             constants = fitted_constants(robot, made)
         made, notes = [constants.applied(r) for r in made], constants.lines(robot) + notes
     options = {"accept": accept, "progress": progress, "causes": causes}
-    return *fit_with_laws(robot, made, what, laws, **options), notes
+    result, choices = fit_with_laws(robot, made, what, laws, **options)
+    return result if robot is file else _beside(file, result), choices, notes
+
+
+def _beside(file: Robot, result: Fit) -> Fit:
+    """A fit that started with another payload than the file's, compared with the file's."""
+    robot, parameters = result.problem.robot, result.problem.parameters
+    graph, tree, loads = robot.graph, robot.engine.tree, (file.payload, robot.payload)
+    own, started = (standard_parameters(load.mass, load.com, load.inertia) for load in loads)
+    names, change = parameter_names(robot), np.zeros(len(parameters.names))
+    rows = [names.index(f"{graph.platform}.{word}") for word in TEN]
+    away = change_of_frame(np.eye(3), graph.origin - tree.at[graph.platform]) @ (own - started)
+    for group, k in zip(parameters.groups, parameters.slices, strict=True):
+        if group.kind == "payload":
+            change[k] = np.linalg.lstsq(parameters.mixing[rows, k], away)[0]
+    each = zip(result.judged, result.problem.held_out, strict=True)
+    judged = tuple(replace(one, before=one.before + end.table @ change) for one, end in each)
+    numbers = list[Number]()
+    for n in result.numbers:
+        if n.key[0] == LOAD and n.before != file.number(n.name):
+            # What is not excited is the start's, which the file gets with the rest.
+            status = "combination" if n.status == "not excited" else n.status
+            n = replace(n, before=file.number(n.name), status=status)
+        numbers.append(n)
+    return replace(result, numbers=tuple(numbers), judged=judged)
 
 
 def _unexplained(result: Fit) -> bool:
