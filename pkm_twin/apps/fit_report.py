@@ -10,6 +10,7 @@ from typing import Any, Final
 import numpy as np
 
 from pkm_twin.codegen.arrays import Array
+from pkm_twin.identification.compare import lateness
 from pkm_twin.identification.deflections import ElasticFit
 from pkm_twin.identification.drives import DriveFriction, Law
 from pkm_twin.identification.fit import Fit, Judged, Result
@@ -54,7 +55,11 @@ def report_of(result: Result, marks: Sequence[str] = ()) -> tuple[Report, list[T
         notes.append(f"not excited, the file's value stays: {', '.join(idle)}")
     if e.bound:
         what = "a negative compliance" if elastic else "negative friction or an impossible body"
-        notes.append(f"some values are at a physical bound: without it the fit would give {what}")
+        # Of a body, which several numbers give, its name.
+        which = ", ".join(dict.fromkeys(
+            names[k] if not more else names[k].rpartition(".")[0] for k, *more in e.bound
+        ))  # fmt: skip
+        notes.append(f"at a physical bound, without which the fit would give {what}: {which}")
     parameters = [
         {
             "key": n.name, **_of_number(n, elastic), "before": n.before, "value": n.after,
@@ -69,7 +74,7 @@ def report_of(result: Result, marks: Sequence[str] = ()) -> tuple[Report, list[T
             Fact("accepted", result.accepted),
             Fact("condition", e.condition, text="condition number"),
             Fact("combinations_determined", result.combinations, text="combinations identified"),
-            Fact("held_by_a_physical_bound", e.bound), Fact("samples_fitted", result.samples),
+            Fact("held_by_a_physical_bound", bool(e.bound)), Fact("samples_fitted", result.samples),
             Fact("parameters", parameters), Fact("not_excited", idle), *facts,
         ],
         [_numbers({label(n): n for n in shown}), _residual_table(held)],
@@ -155,10 +160,11 @@ def _channels(result: Result, units: Sequence[str]) -> Table:
 def _delays(result: Fit) -> list[str]:
     """What was done to the signals, by recording."""
     lines = []
-    for judged, how, delay in zip(result.judged, result.filtering, result.delays, strict=True):
+    for made, delay in zip(result.problem.whole, result.delays, strict=True):
+        how, late = made.how, lateness(delay, made.period)
         cutoff = "no low-pass" if how.cutoff is None else f"low-pass at {how.cutoff:.3g} Hz"
         lines.append(
-            f"{judged.name}: efforts are {1e3 * delay:.3g} ms later than the positions; "
+            f"{made.recording.name}: efforts are {late or 'on time'}; "
             f"differentiated over {how.window} samples, {cutoff}, "
             f"one of every {how.keep_every} samples used"
         )

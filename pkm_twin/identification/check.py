@@ -24,6 +24,7 @@ from pkm_twin.identification.compare import (
     by_held,
     compared_of,
     idle_of,
+    lateness,
     missing_samples,
     near_change,
     near_jumps,
@@ -380,8 +381,9 @@ def _residuals(
             text += f", begins at {begins:.3f} s" if begins is not None else ""
         told = {"number": float(c.rms[i]), "limit": float(c.limit[i]), "unit": unit}
         items.append(judged(f"{RESIDUAL} of {name}", text, bound, bool(good[i]), **told))
-    if good.all() and abs(c.late) > 0.1 * c.period:
-        late = f"{1e3 * abs(c.late):.3g} ms {'late' if c.late > 0.0 else 'early'}, taken out"
+    late = lateness(c.late, c.period)
+    if good.all() and late:
+        late += ", taken out"
         items.append(judged("efforts against positions", late, "", True, number=c.late, unit="s"))
     return items
 

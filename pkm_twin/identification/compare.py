@@ -253,6 +253,13 @@ def _late(left: Array, change: Array) -> float:
     return float(found) if abs(found) < LATEST else 0.0
 
 
+def lateness(late: float, period: float) -> str:
+    """How late efforts are against the positions, in words; empty within a tenth of a sample."""
+    if abs(late) <= 0.1 * period:
+        return ""
+    return f"{1e3 * abs(late):.3g} ms {'late' if late > 0.0 else 'early'}"
+
+
 def steps_in(r: Recording) -> Steps:
     """The steps by the measured velocities, or by the positions alone if these do not jump."""
     limit = r.robot.limits.velocity

@@ -22,6 +22,7 @@ from pkm_twin.identification.samples import huber
 from pkm_twin.streams.rest import ROBUST
 
 Cones = Sequence[tuple[slice, Array]]
+Bound = tuple[tuple[int, ...], ...]
 
 MAX_ITERATIONS: Final = 15
 DATA_RATIO: Final = 5.0
@@ -44,8 +45,9 @@ class Estimate:
     ``covariance``: shape (k, k), of data and prior together. ``prior``: deviations before, (k,).
     ``noise``: deviation of the efforts' residual by joint, (n,). ``directions``: how many
     combinations the data told. ``condition``: of the weighted regressor over those, columns
-    scaled by the prior. ``weights``: of the samples, shape (samples, n). ``bound``: whether a
-    physical bound holds the values. ``inverse``: of the information, over those directions, (k, k).
+    scaled by the prior. ``weights``: of the samples, shape (samples, n). ``bound``: columns of
+    the parameters that each physical bound holds. ``inverse``: of the information, over those
+    directions, (k, k).
     """
 
     values: Array
@@ -55,7 +57,7 @@ class Estimate:
     directions: int
     condition: float
     weights: Array
-    bound: bool
+    bound: Bound
     inverse: Array
 
     def response(self, table: Array, signal: Array) -> Array:
@@ -120,7 +122,7 @@ def estimate(
     factor = _factor(scaled, residual * weights, counts, noise, values, vectors, kept)
     spread = factor @ factor.T
     fitted = start + scales * z
-    bound = not possible(fitted, cones)
+    bound = beyond(fitted, cones)
     if bound:
         fitted = nearest(z, factor, start, scales, cones)
         # The bound is exact, but how far it moves the numbers beside it is an estimate.
@@ -191,13 +193,19 @@ def _factor(
     return np.concatenate([vectors[:, kept] @ root, vectors[:, ~kept]], 1)
 
 
-def possible(values: Array, cones: Cones) -> bool:
-    """Whether every cone's matrix is positive semidefinite, but for rounding."""
+def beyond(values: Array, cones: Cones) -> Bound:
+    """Columns of each cone whose matrix is not positive semidefinite, but for rounding."""
+    found = []
     for where, cone in cones:
         block = _equilibrated(cone @ values[where])
         if np.linalg.eigvalsh(block)[0] < -PSD:
-            return False
-    return True
+            found.append(tuple(np.arange(len(values))[where][cone.any((0, 1))].tolist()))
+    return tuple(found)
+
+
+def possible(values: Array, cones: Cones) -> bool:
+    """Whether every cone's matrix is positive semidefinite, but for rounding."""
+    return not beyond(values, cones)
 
 
 def _equilibrated(block: Array) -> Array:

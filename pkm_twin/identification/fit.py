@@ -17,7 +17,7 @@ from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import PkmTwinError
 from pkm_twin.identification.causes import Cause, number_that_explains, usual
 from pkm_twin.identification.compare import MAX_RESIDUAL
-from pkm_twin.identification.estimation import Estimate, nearest, possible
+from pkm_twin.identification.estimation import Estimate, beyond, nearest
 from pkm_twin.identification.identifiable import KINDS, Kind
 from pkm_twin.identification.judge import Verdict
 from pkm_twin.identification.parameters import (
@@ -252,7 +252,8 @@ def _corrected(parameters: FileParameters, result: Estimate, verdict: Verdict) -
     if verdict.answer == "does not explain":
         return result
     aim, cones = result.values - verdict.shift, parameters.cones
-    if possible(aim, cones):
+    bound = beyond(aim, cones)
+    if not bound:
         return replace(result, values=aim)
     covariance = verdict.widened(result.covariance) / np.outer(result.prior, result.prior)
     sizes, vectors = np.linalg.eigh(covariance)
@@ -261,4 +262,4 @@ def _corrected(parameters: FileParameters, result: Estimate, verdict: Verdict) -
     near = nearest((aim - start) / result.prior, factor, start, result.prior, cones)
     # How far a bound moves the numbers next to it is an estimate.
     moved = result.covariance + np.outer(near - aim, near - aim)
-    return replace(result, values=near, bound=True, covariance=moved)
+    return replace(result, values=near, bound=bound, covariance=moved)

@@ -16,7 +16,7 @@ from pkm_twin.identification.check import check, recorded_of
 from pkm_twin.identification.compare import compare
 from pkm_twin.identification.fit import Fit, fit
 from pkm_twin.identification.friction_laws import fit_recordings
-from pkm_twin.recordings import Recording
+from pkm_twin.recordings import Load, Recording
 from pkm_twin.streams.rates import rms
 from test.identification.machines import IMPOSSIBLE, WRONG, machine, noisy, shifted
 from test.support.robots import load, partly_long
@@ -222,3 +222,20 @@ def test_friction_that_may_hold_a_payload_at_rest_does_not_lighten_it() -> None:
     made += np.random.default_rng(1).normal(0.0, 0.02, made.shape)
     (cause,) = check(Recording(robot, time, q, qd, effort=made), 0.02).causes
     assert float(cause.split()[-1]) == pytest.approx(0.5, rel=0.01)
+
+
+def test_a_fit_is_compared_with_the_file_wherever_it_starts() -> None:
+    m = machine(load("delta"), np.random.default_rng(6), 8.0, 200.0)
+    light, heavy = (m.robot.changed(payload={"mass": mass}) for mass in (0.1, 0.5))
+    made = noisy(
+        m.recorded(effort=inverse_dynamics(heavy, m.q, m.qd, m.qdd)), np.random.default_rng(8)
+    )
+    sizes = []
+    for start in (None, Load(0.1), Load(0.4), Load(0.6, (0.05, 0.0, 0.02))):
+        found, *_ = fit_recordings(light, [replace(made, robot=light, load=start)], ("payload",))
+        (payload,) = (n for n in found.numbers if n.name == "payload.mass")
+        assert payload.before == 0.1
+        (judged,) = found.judged
+        sizes.append(judged.rms(judged.before))
+        assert (sizes[-1] > 5.0 * judged.rms(judged.after)).all()
+    np.testing.assert_allclose(sizes, np.broadcast_to(sizes[1], np.shape(sizes)), rtol=0.02)

@@ -348,6 +348,7 @@ def test_a_bound_that_is_active_counts_in_the_standard_deviations() -> None:
         found = estimate(table, target, np.ones(2), np.ones(2), cones)
         assert found.values[0] >= 0.0
         if found.bound:
+            assert found.bound == ((0,),)
             errors.append(found.values - [0.0, 1.0])
             deviations.append(np.sqrt(np.diag(found.covariance)))
     assert len(errors) > 20
