@@ -165,7 +165,7 @@ def section(rows: list[dict[str, Any]]) -> str:
     )
 
 
-SECTION: Final = """{contacts} simulated contacts (`make contact-table`); the class is that 30 ms after the detection:
+SECTION: Final = """{contacts} simulated contacts (`make contact-table`); the class is as estimated 30 ms after detection:
 
 | robot | detected in 0.3 s | after, ms (median, 95 %) | class unknown | class right, of the known |
 |---|---|---|---|---|
