@@ -240,7 +240,7 @@ def _paper_rows(rows: PaperRows, judge: Judge) -> str:
     known = rows.excess[RESOLVED]
     worst = judge(error(rows.twin), PAPER_BOUND, "table 1, finite elements")
     cause = _filled(f"""
-        Compared with pkm_twin and the shipped joint compliances, the finite elements of table 1 in
+        Compared with pkm_twin with the shipped joint compliances, the finite elements of table 1 in
         the 2UPR-RPU paper are softer in {int((known > 0).sum())} of {known.size} components, by
         {_span(known)}. The worst difference relative to them is {worst}; the paper states
         {PAPER_BOUND:g}. If one factor multiplies all joints' compliances,
