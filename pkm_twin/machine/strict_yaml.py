@@ -92,6 +92,12 @@ def parse_yaml(text: str, name: str) -> dict[str, Any]:
     except (yaml.YAMLError, RecursionError, ValueError) as error:
         if isinstance(error, ParameterError):
             raise
+        if str(getattr(error, "problem", "")).endswith("got '['"):
+            at = error.problem_mark  # type: ignore[union-attr]
+            key = re.split(r"[{,\s]", text[: at.index])[-1]
+            key += re.split(r":\s|[,}\s]", text[at.index :])[0]
+            quoted = f'quotes around brackets in braces: "{key}"'
+            raise ParameterError(f"{name}: line {at.line + 1}", key, quoted) from None
         raise FileError(name, error, "plain YAML") from None
     if not isinstance(data, dict):
         raise ParameterError(name, type(data).__name__, "a mapping of keys to values")

@@ -13,6 +13,7 @@ import numpy as np
 from delta_dynamics import reactions
 from pkm_twin.apps.frame import command
 from pkm_twin.apps.options import Draws, OfRobot
+from pkm_twin.errors import ParameterError
 from pkm_twin.machine.formulas import PARAMETERS
 from pkm_twin.report import Fact, Report, number
 from pkm_twin.robot.clearance import clearance, has_clearance
@@ -53,7 +54,7 @@ def info(given: Info) -> Report:
     assumed = [joint.name for joint in robot.graph.joints.values() if joint.virtual]
     undetermined = overconstraint(robot)
     gap = float(clearance(robot, home)) if has_clearance(robot) else None
-    odd = findings(robot)
+    odd, fault = findings(robot), members_fault(robot)
     equations = f"{engine.closures} equations of rank {engine.rank}, {engine.redundant} redundant"
     if engine.redundant and assumed and not undetermined:
         # A joint that stands for what several limbs hold repeats what one of them holds alone.
@@ -97,7 +98,8 @@ def info(given: Info) -> Report:
           or ["no: rigid-body equations determine every reaction"]),
         Fact("plausibility", [dataclasses.asdict(finding) for finding in odd]),
         *(Fact("", text, text="plausibility")
-          for text in [finding.text for finding in odd] or ["no implausible value"]),
+          for text in [finding.text for finding in odd] or ["no implausible value"] * (not fault)),
+        Fact("members_fault", fault or None, text="members" if fault else None, shown=fault),
         Fact("parameters", sections),
         Fact("parameter_units", units),
         *(Fact("", text, text="parameter") for text in robot.book.told(units.get(PARAMETERS))),
@@ -109,6 +111,15 @@ def info(given: Info) -> Report:
     return Report(
         f"{robot.name}: {robot.description}", facts, figures={"": lambda: _picture(robot)}
     )
+
+
+def members_fault(robot: Robot) -> str:
+    """Why maps reject the members that the file gives; empty where they do not, or it has none."""
+    try:
+        robot.structure()
+    except ParameterError as error:
+        return "" if error.value is None else str(error)
+    return ""
 
 
 def _picture(robot: Robot) -> Any:

@@ -66,5 +66,7 @@ def _moving(robot: Robot) -> NDArray[np.intp]:
     found = np.flatnonzero(position_effects(robot, robot.graph.home).any(0))
     if not len(found):
         what = "the standard deviation of a length or angle that moves the platform"
+        if robot.tolerances:
+            what += "; errors of the file's tolerances: pkm-twin design --tolerance file"
         raise ParameterError("uncertainty", None, what)
     return found
