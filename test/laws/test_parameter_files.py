@@ -75,6 +75,10 @@ class TestFiles:
     def test_what_is_not_one_plain_mapping_is_refused(self, load_text, addition):
         refusal(load_text, self.GOOD + addition)
 
+    def test_a_key_with_brackets_in_braces_is_named_with_its_quotes(self, load_text):
+        error = refusal(load_text, self.GOOD + "tolerances: {b: {}, joints.a.at[0]: {x: 1}}\n")
+        assert error.value == "joints.a.at[0]" and error.bound.endswith('"joints.a.at[0]"')
+
     @pytest.mark.parametrize(
         "content",
         [

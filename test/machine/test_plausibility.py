@@ -11,6 +11,7 @@ import pytest
 import yaml
 
 import pkm_twin
+from pkm_twin.apps.commands.info import members_fault
 from pkm_twin.certify.description import expand
 from pkm_twin.errors import ParameterError, RobotWarning
 from pkm_twin.mechanisms.machine import Machine
@@ -167,6 +168,16 @@ def test_each_kind_is_found_by_its_field_and_number(name, data):
     # A unit's mistake may show in what follows from it, and in nothing else.
     assert len(found) == 1 or name in ("millimetres", "microns")
     assert name != "millimetres" or "tonnes" not in str(found)
+
+
+def test_members_that_maps_reject_are_named_by_info(data):
+    """A hollow bar may be lighter than a solid one of its density, and not heavier."""
+    for density, field in ((1e5, ""), (1.0, "bodies.crank_2.member.section.density: 1.0")):
+        made = copy.deepcopy(data)
+        barred(density=density)(made)
+        del made["bodies"]["crank_2"]["member"]["section"]["inner_diameter"]
+        assert members_fault(machine(made)).partition(";")[0] == field
+    assert members_fault(machine(data)) == ""
 
 
 def legs(data, **more):

@@ -403,6 +403,13 @@ def test_what_a_file_lacks_is_named(kind, changes, field):
     assert caught.value.field == field
 
 
+def test_tolerances_without_an_uncertainty_are_another_command_s():
+    tolerances = {"bodies.arm.length": {"deviation": 1e-4}}
+    robot = robot_of_data(parameters_of("delta") | {"tolerances": tolerances}, "delta")
+    with pytest.raises(ParameterError, match="design --tolerance file"):
+        map_of(robot, KINDS["pose-error"]())
+
+
 def test_angular_acceleration_of_a_wrist(rng):
     """A pose of angles alone: every direction of the angular acceleration, base axes."""
     data = read_yaml(FILES["rrr3_spherical"])
