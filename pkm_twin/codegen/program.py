@@ -13,7 +13,6 @@ from pkm_twin.codegen.expressions import (
     PARAMETERS,
     Expression,
     Tape,
-    count,
     edge,
     ordered,
 )
@@ -288,10 +287,3 @@ class Program:
         for e, target in tape.assumed:
             total = total + (e - target) * (e - target)
         return tape.lift(total)
-
-    @property
-    def operations(self) -> tuple[int, int]:
-        """Operations of one correction, and of the outputs."""
-        newton = [e for q in self.equations for e in q.results]
-        rows = [e for row in self.outputs.values() for e in row]
-        return count(newton), count(rows)
