@@ -62,7 +62,7 @@ class Cause:
     """A cause in words, the recording put right, and samples that are left out then, (samples,).
 
     ``exact``: part of the residual's bound within which the efforts agree. ``scale``: how many
-    times too large they are, negative with wrong signs.
+    times too large they are, negative with wrong signs. ``late``: how late, s.
     """
 
     text: str
@@ -70,6 +70,7 @@ class Cause:
     left_out: Mask
     exact: float = EXACT
     scale: float = 1.0
+    late: float = 0.0
 
     def then(self, others: Iterable[Cause]) -> Iterator[Cause]:
         """Causes of the recording that this one puts right, each together with this one."""
@@ -93,7 +94,7 @@ def agrees(r: Recording, without: Mask, bound: float) -> bool:
         compared = compared_of(r, without, bound)
     except (PkmTwinError, ValueError):
         return False
-    return compared is not None and bool(compared.good.all())
+    return compared is not None and bool(compared.good.all()) and not compared.delayed
 
 
 def cause_of(r: Recording, c: Compared, left_out: Mask) -> Cause | None:
@@ -114,7 +115,7 @@ def number_that_explains(r: Recording) -> Cause | None:
     try:
         c = compare(r)
         if c is None or replace(c, bound=EXACT * c.bound).good.all():
-            return None if c is None else Cause("", r, none)
+            return None if c is None else Cause("", r, none, late=c.late)
         found = () if c.good.all() else _of_efforts(r, c, none)
         return next((cause for cause in found if cause.agrees(MAX_RESIDUAL)), None)
     except (PkmTwinError, ValueError):

@@ -33,6 +33,7 @@ from pkm_twin.identification.compare import (
     step_fault,
     steps_in,
 )
+from pkm_twin.identification.plausible import LATEST
 from pkm_twin.identification.samples import usual_size
 from pkm_twin.paths import along
 from pkm_twin.recordings import Recording
@@ -387,7 +388,9 @@ def _residuals(
     late = lateness(c.late, c.period)
     if good.all() and late:
         late += ", taken out"
-        items.append(judged("efforts against positions", late, "", True, number=c.late, unit="s"))
+        told = {"number": c.late, "limit": LATEST, "unit": "s"}
+        most = f"at most {1e3 * LATEST:g} ms"
+        items.append(judged("efforts against positions", late, most, not c.delayed, **told))
     return items
 
 
@@ -444,8 +447,10 @@ def _causes_of(found: Checked, thorough: bool) -> Explained:
     """The first cause that makes the efforts agree."""
     c, r, bad = found.compared, found.recording, found.named(Verdict.BAD)
     # Of positions that are none the efforts say nothing.
-    if {POSITION_STEPS, VELOCITIES, MEASURED} & set(bad) or c is None or c.good.all():
+    if {POSITION_STEPS, VELOCITIES, MEASURED} & set(bad) or c is None:
         return (), ()
+    if c.good.all():
+        return (c.delayed,) if c.delayed else (), ()
     cause = cause_of(r, c, found.left_out)
     if cause is not None:
         return (cause.text,), ()

@@ -20,7 +20,7 @@ from pkm_twin.codegen.arrays import Array, Mask
 from pkm_twin.errors import PkmTwinError
 from pkm_twin.identification.estimation import estimate
 from pkm_twin.identification.judge import LOUD
-from pkm_twin.identification.plausible import LATEST
+from pkm_twin.identification.plausible import LATEST, late_text
 from pkm_twin.identification.rows import BLOCK, shaken_efforts
 from pkm_twin.identification.samples import (
     SEGMENT,
@@ -63,6 +63,8 @@ SHOWN: Final = 4
 """Jumps that are listed."""
 CLEAR: Final = 4
 """Samples on each side of a jump that are left out: a gap that divides the recording."""
+PASSES: Final = 4
+"""How often late efforts are put on time: the delay is found to the first order."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,6 +164,11 @@ class Compared:
         """Which joints' efforts agree with the model, shape (n,)."""
         return np.asarray((self.rms <= self.limit) & (self.local()[0] <= MORE * self.limit))
 
+    @property
+    def delayed(self) -> str:
+        """Efforts that are later than a recording's may be, in words; or empty."""
+        return late_text("all joints", self.late) if abs(self.late) > LATEST else ""
+
 
 def by_held(r: Recording, function: Callable[..., Array], time: Array, *motion: Array) -> Array:
     """A function of the robot, with its payload while it is held, and of a motion, shape (k, n)."""
@@ -190,10 +197,23 @@ def compare(r: Recording, bound: float = MAX_RESIDUAL) -> Compared | None:
     """Compare a recording with the model; None where no piece of it is long enough.
 
     Velocities and accelerations of a recording that has both are used as they are. Of drives that
-    share, what moves nothing is in neither efforts.
+    share, what moves nothing is in neither efforts. Late efforts that agree once they are put on
+    time are put on time.
 
     :param bound: of a good residual, RMS, as a part of the peak effort.
     """
+    first, made = _compared(r, bound), r
+    c = first
+    for _ in range(PASSES):
+        if c is None or abs(c.late - made.late) <= c.period:
+            break
+        made = made.on_time(c.late - made.late)
+        c = _compared(made, bound) if len(made.time) >= LEAST else None
+    return first if c is None or not c.good.all() else c
+
+
+def _compared(r: Recording, bound: float) -> Compared | None:
+    """Compare a recording with the model, its delay to the first order."""
     robot, reach = r.robot, friction_reach(r.robot)
     rates = None if r.qd is None or r.qdd is None else (r.qd, r.qdd)
     pieces, how = tracks(r.time, r.q, r.measured, r.wrench, rates=rates, least=LEAST)
@@ -241,7 +261,7 @@ def compare(r: Recording, bound: float = MAX_RESIDUAL) -> Compared | None:
     return Compared(
         time, expected + residual, expected, residual, cut["left"] + late * cut["change"],
         density * np.sqrt(passed_band(how, 1.0 / period) / period),
-        np.maximum(size, LIGHT * greatest), late, period,
+        np.maximum(size, LIGHT * greatest), r.late + late, period,
         tuple(starts), tuple(pieces), tuple(inside), how, bound,
     )  # fmt: skip
 

@@ -16,17 +16,17 @@ import numpy as np
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import PkmTwinError
 from pkm_twin.identification.causes import Cause, number_that_explains, usual
-from pkm_twin.identification.compare import MAX_RESIDUAL
+from pkm_twin.identification.compare import MAX_RESIDUAL, PASSES
 from pkm_twin.identification.estimation import Estimate, beyond, nearest
 from pkm_twin.identification.identifiable import KINDS, Kind
-from pkm_twin.identification.judge import Verdict
+from pkm_twin.identification.judge import Verdict, basis_of
 from pkm_twin.identification.parameters import (
     FileParameters,
     Number,
     Status,
     numbers_of_group,
 )
-from pkm_twin.identification.plausible import recording_fault
+from pkm_twin.identification.plausible import LATEST, late_text, recording_fault
 from pkm_twin.identification.rows import Problem, Rows, next_window
 from pkm_twin.identification.samples import EXACT, Filtering
 from pkm_twin.identification.suspects import scaled_efforts, verdict_of
@@ -110,7 +110,7 @@ class Fit(Result):
     @property
     def delays(self) -> tuple[float, ...]:
         """How late the efforts are against the positions, s, by recording."""
-        return self.problem.delays
+        return delays(self.problem)
 
     @property
     def outliers(self) -> int:
@@ -140,8 +140,13 @@ def fit(
     if causes is None:
         own = [replace(made.recording, robot=made.model.robot) for made in problem.whole]
         causes = [number_that_explains(r) for r in own]
-    both = zip(problem.whole, causes, strict=True)
-    faults = [fault for made, cause in both for fault in _faults(made, cause)]
+    moved = on_time(problem)
+    faults = _faults_of(moved, causes)
+    if faults and moved is not problem:
+        # Of another machine's recording the delay says nothing.
+        faults = _faults_of(problem, causes)
+    problem = moved if not faults else problem
+    faults = faults or _late(problem, causes)
     refuse_faults(faults, accept)
     problem.check_count()
     faults = faults or _worse(problem)
@@ -152,6 +157,61 @@ def fit(
         return result
     refuse_faults([scaled], accept)
     return fitted(problem, (scaled,))
+
+
+def delays(problem: Problem) -> tuple[float, ...]:
+    """How late the efforts of each recording are against the positions, s."""
+    pairs = zip(problem.whole, problem.delays, strict=True)
+    return tuple(made.recording.late + late for made, late in pairs)
+
+
+def on_time(problem: Problem) -> Problem:
+    """The problem with late efforts put on time, where that leaves less of them unexplained.
+
+    Its delays are to the first order, good for a sample or so.
+    """
+    found = [
+        _searched(made, late, problem.both.noise)
+        for made, late in zip(problem.rows, problem.delays, strict=True)
+    ]
+    for _ in range(PASSES):
+        moved = [
+            made.recording.on_time(late) if abs(late) > made.period else made.recording
+            for made, late in zip(problem.whole, found, strict=True)
+        ]
+        if not any(
+            now is not made.recording and abs(now.late) < 2.0 * LATEST
+            for now, made in zip(moved, problem.whole, strict=True)
+        ):
+            break
+        try:
+            other = Problem.of(problem.robot, moved, problem.what)
+        except PkmTwinError:
+            break
+        if np.mean(other.both.noise / problem.both.noise) >= 1.0:
+            break
+        problem, found = other, list(other.delays)
+    return problem
+
+
+def _searched(rows: Rows, late: float, noise: Array) -> float:
+    """How late efforts are, s: as was found to the first order, or where they leave least.
+
+    :param noise: of the efforts, (n,).
+    """
+    period, count = rows.period * rows.how.keep_every, len(rows.time)
+    most = min(int(2.0 * LATEST / period), count // 4)
+    inner = slice(most, count - most)
+    weight = rows.counts[inner] / noise
+    table = rows.table[inner] * weight[..., None]
+    basis = basis_of(table.reshape(-1, table.shape[-1]))
+    left = []
+    for step in range(2 * most + 1):
+        target = rows.effort[step : count - 2 * most + step] - rows.rest[inner]
+        seen = (target * weight).ravel()
+        left.append(float(seen @ seen - np.sum((basis.T @ seen) ** 2)))
+    far = period * (int(np.argmin(left)) - most)
+    return far if abs(far - late) > period else late
 
 
 def fitted(
@@ -192,6 +252,23 @@ def fitted(
         numbers=tuple(numbers), judged=tuple(judged), verdict=verdict, accepted=accepted,
         samples=sum(made.held_from for made in problem.rows),
     )  # fmt: skip
+
+
+def _faults_of(problem: Problem, causes: Sequence[Cause | None]) -> list[str]:
+    """Why this machine cannot have made recordings."""
+    both = zip(problem.whole, causes, strict=True)
+    return [fault for made, cause in both for fault in _faults(made, cause)]
+
+
+def _late(problem: Problem, causes: Sequence[Cause | None]) -> list[str]:
+    """Efforts that are too late; as the file's machine says where it explains them."""
+    each = zip(problem.whole, delays(problem), causes, strict=True)
+    found = ((made, late if cause is None else cause.late) for made, late, cause in each)
+    return [
+        f"{made.recording.name}: {late_text('all joints', late)}"
+        for made, late in found
+        if abs(late) > LATEST
+    ]
 
 
 def _faults(made: Rows, cause: Cause | None) -> list[str]:

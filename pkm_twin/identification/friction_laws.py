@@ -22,7 +22,7 @@ from pkm_twin.errors import BagError, ParameterError, PkmTwinError, UnknownNameE
 from pkm_twin.identification.causes import number_that_explains, usual
 from pkm_twin.identification.compare import missing_samples, recorded_of, step_fault
 from pkm_twin.identification.drives import FIT, fitted_constants, given_constants
-from pkm_twin.identification.fit import Fit, fit, fitted, refuse_faults
+from pkm_twin.identification.fit import Fit, fit, fitted, on_time, refuse_faults
 from pkm_twin.identification.identifiable import KINDS, LOAD, Kind, of_drives
 from pkm_twin.identification.judge import SIGMAS, Verdict, basis_of
 from pkm_twin.identification.parameters import Number
@@ -123,12 +123,13 @@ def fit_with_laws(
     if Dahl.name in asked:
         # Without memory slow reversals would be another machine's: faults are looked for with it.
         asked.remove(Dahl.name)
-        before = Problem.of(robot, recordings, what)
+        before = on_time(Problem.of(robot, recordings, what))
         best = fit(_remembering(before), recordings, what, **options | {"causes": None})
         choice = _compared(Dahl.name, best.verdict, before, best.problem)
         choices.append(replace(choice, taken=True, asked=True))
     else:
         best = fit(robot, recordings, what, **options)
+    recordings = [made.recording for made in best.problem.whole]
     while asked if laws is not None else _unexplained(best):
         names = asked[:1] or [one for one in compiled(tuple(LAWS)) if one not in best.robot.laws]
         tried = []

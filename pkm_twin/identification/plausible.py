@@ -568,15 +568,18 @@ def _delays(case: Case, joints: Sequence[str]) -> Iterator[tuple[str, Case]]:
         if abs(step) * case.period < SHORT:
             continue
         names = listed([joints[j] for j in which], n)
-        late = step * case.period
-        text = f"efforts of {names} are {abs(late):.2g} s {'late' if late > 0 else 'early'}"
-        parts = ("rest", "columns", "counts", "time")
-        cut = {name: getattr(case, name)[inner] for name in parts}
+        cut = {name: getattr(case, name)[inner] for name in ("rest", "columns", "counts", "time")}
         effort, change = case.effort[inner].copy(), case.late[inner].copy()
         for j in which:
             there = slice(most + step, k - most + step)
             effort[:, j], change[:, j] = case.effort[there, j], case.late[there, j]
-        yield text, replace(case, effort=effort, late=change, **cut)
+        made = replace(case, effort=effort, late=change, **cut)
+        yield late_text(names, step * case.period + float(made._best[1][-1])), made
+
+
+def late_text(names: str, late: float) -> str:
+    """Efforts that belong to another time, in words."""
+    return f"efforts of {names} are {abs(late):.2g} s {'late' if late > 0 else 'early'}"
 
 
 def scale_text(names: str, scale: float, *others: str) -> str:

@@ -401,7 +401,8 @@ class _Court:
             few = case.thinned(step)
             weight, change = few.weight[..., None], few.nuisance[..., :1]
             late = -change * (np.arange(len(cases)) == i)
-            measured = few.residual[..., None] - one.delay * change
+            late_by = one.delay + one.rows.recording.late
+            measured = few.residual[..., None] - late_by * change
             columns = few.explained, few.nuisance[..., 1:], late, few.suspects[..., which], measured
             whole = np.concatenate(columns, -1) * weight
             parts.append(whole.reshape(-1, whole.shape[-1]))

@@ -20,6 +20,7 @@ from pkm_twin.robot.derivatives import nearest_motion
 from pkm_twin.robot.robot import Robot
 from pkm_twin.streams.differentiator import Differentiator
 from pkm_twin.streams.rest import SIGMAS, fit_gain, gradient_gain, noise, rate_doubt
+from pkm_twin.streams.steps import GAP
 from pkm_twin.streams.wrench import WrenchSettings
 
 BY_SAMPLE: Final = (
@@ -93,6 +94,8 @@ class Recording:
     efforts: str = "measured"
     """What the efforts are: ``measured``, the ``effort`` of a plan or of a table that does not
     tell, the ``model``'s, which only a plan has, or a ``current``, A."""
+    late: float = 0.0
+    """How late the efforts were against the positions, s: they are put on time."""
     source: str = ""
     """The file, as it was named."""
     notes: tuple[str, ...] = ()
@@ -183,6 +186,21 @@ class Recording:
         """Some of the samples, by a slice, mask or indices; times stay as they are."""
         values = {name: getattr(self, name) for name in BY_SAMPLE}
         return replace(self, **{k: v[rows] for k, v in values.items() if v is not None})
+
+    def on_time(self, late: float) -> Recording:
+        """Efforts that are so late, s, put on time by whole samples, where none is missing then.
+
+        A remainder of half a sample at most is left: copied efforts keep their noise.
+        """
+        period = float(np.median(np.diff(self.time)))
+        late = period * round(late / period)
+        there = self.time + late
+        ends = self.time[0] - 0.5 * period, self.time[-1] + 0.5 * period
+        after = np.searchsorted(self.time, there).clip(1, len(self.time) - 1)
+        known = (there > ends[0]) & (there < ends[1])
+        known &= np.diff(self.time)[after - 1] < GAP * period
+        effort = np.stack([np.interp(there, self.time, one) for one in self.measured.T], -1)
+        return replace(self, effort=effort, late=self.late + late).part(known)
 
     def with_rates(self) -> Recording:
         """The samples whose rates and accelerations are known, with these.

@@ -86,6 +86,31 @@ def test_efforts_that_are_late_leave_noise_alone() -> None:
         assert (found.rms < 2.0 * found.noise).all()
 
 
+@pytest.mark.parametrize("name", partly_long(["delta", "five_bar", "linear_delta"], "five_bar"))
+def test_fit_and_check_say_the_same_of_late_efforts(name: str) -> None:
+    """Up to 50 ms both take the delay out, and no friction is in its place; of more it is told."""
+    m = machine(load(name), np.random.default_rng([3, *name.encode()]), 10.0, 250.0)
+    for late in (-0.03, 0.045):
+        effort = shifted(m.efforts, m.time, late)
+        made = replace(noisy(m.recorded(effort=effort), np.random.default_rng(7)), robot=m.truth)
+        found, (result, *_) = check(made), fit_recordings(m.truth, [made])
+        assert found.answer == "good" and found.compared is not None
+        assert result.verdict.answer == "explains"
+        assert result.verdict.findings == result.verdict.hints == ()
+        deviation = np.sqrt(result.problem.both.covariance[-1, -1])
+        assert result.delays[0] == pytest.approx(late, abs=3.0 * deviation)
+        assert found.compared.late == pytest.approx(late, abs=3.0 * deviation)
+    for late, robot in ((0.054, m.truth), (0.08, m.robot)):
+        effort = shifted(m.efforts, m.time, late)
+        made = noisy(m.recorded(effort=effort), np.random.default_rng(7))
+        text = f"efforts of all joints are {late:g} s late"
+        judged = check(replace(made, robot=robot))
+        assert judged.answer == "bad"
+        assert (*judged.causes, *judged.findings)[0].startswith(text)
+        with pytest.raises(PkmTwinError, match=text):
+            fit_recordings(robot, [made])
+
+
 def test_drives_that_are_off_before_the_motion_are_left_out_of_both() -> None:
     """Else the efforts that are zero would be the fault of a mass."""
     rng = np.random.default_rng(5)
