@@ -104,6 +104,19 @@ def cause_of(r: Recording, c: Compared, left_out: Mask) -> Cause | None:
     return next((cause for cause in found if cause.agrees(c.bound)), None)
 
 
+def payload_hint(r: Recording, c: Compared) -> str:
+    """The payload that most of a residual within its bound is of, in words; empty: none is."""
+    if r.load is not None or r.robot.redundant:
+        return ""
+    numbers = _Numbers(r, c)
+    (mass, _), left = numbers.solved(numbers.efforts(_kilogram))
+    other = min(numbers.solved()[1], *(one.left for one in numbers.scales()))
+    if mass < numbers.lightest or not numbers.clear(left, other, ALIKE):
+        return ""
+    mass += r.robot.payload.mass
+    return f"a payload of {mass:.3g} kg explains most of the residual: --payload {mass:.3g}"
+
+
 def number_that_explains(r: Recording) -> Cause | None:
     """What `cause_of` finds of efforts alone; without words where they agree as they are.
 
@@ -186,6 +199,7 @@ class _Numbers:
         self.r, self.c, robot, n = r, c, r.robot, r.robot.joints_count
         each = [*zip(robot.joint_names, np.eye(n), strict=True)] if n > 1 else []
         self.drives = [("all joints", np.ones(n)), *each]
+        self.lightest = LIGHTEST * sum(body.mass for body in robot.graph.bodies.values())
         self.change = np.gradient(c.expected, c.period, axis=0)
         self.change[[row - k for row in c.starts for k in (0, 1)]] = 0.0
         self.noise = float(np.mean((c.noise / c.limit) ** 2))
@@ -221,7 +235,6 @@ class _Numbers:
     def payloads(self) -> Iterator[_Found]:
         """A payload, throughout or at times, alone and with a scale that is not usual."""
         c, kilogram = self.c, self.efforts(_kilogram)
-        lightest = LIGHTEST * sum(body.mass for body in self.r.robot.graph.bodies.values())
         alone = ("", 0.0 * self.drives[0][1])
         mass = size = late = left = 0.0
         for (names, which), always in product([alone, *self.drives], [True, False]):
@@ -241,7 +254,7 @@ class _Numbers:
                     break
                 (mass, size, late), left = self.solved(held[:, None] * heavy, own, some=steady)
             scale = 1.0 + size
-            if mass > lightest and (not which.any() or (scale > 0.0 and not usual(scale))):
+            if mass > self.lightest and (not which.any() or (scale > 0.0 and not usual(scale))):
                 yield _Found(left, names, which, scale, mass, spans)
 
     def causes(self, one: _Found, found: Sequence[_Found], left_out: Mask) -> Iterator[Cause]:

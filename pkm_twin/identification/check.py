@@ -16,7 +16,7 @@ import numpy as np
 from delta_dynamics import torque_deviation
 from pkm_twin.codegen.arrays import Array, Mask
 from pkm_twin.errors import PkmTwinError, SingularityError, UnreachableError, one_line
-from pkm_twin.identification.causes import agrees, cause_of
+from pkm_twin.identification.causes import agrees, cause_of, payload_hint
 from pkm_twin.identification.compare import (
     LEAST,
     MAX_RESIDUAL,
@@ -89,6 +89,8 @@ class Checked:
     compared, why they are not one machine's."""
     findings: tuple[str, ...] = ()
     """What `fit` says of them, where nothing explains them."""
+    hint: str = ""
+    """The payload that explains most of a good residual; empty: none does."""
 
     @property
     def answer(self) -> str:
@@ -435,6 +437,9 @@ def check(r: Recording, residual: float = MAX_RESIDUAL, thorough: bool = True) -
     found = checked(r, residual)
     if found.causes:
         return found
+    c = found.compared
+    if thorough and found.answer == "good" and c is not None:
+        return replace(found, hint=payload_hint(found.recording, c))
     causes, findings = _causes_of(found, thorough)
     return replace(found, causes=causes, findings=findings)
 

@@ -241,12 +241,18 @@ def test_friction_that_may_hold_a_payload_at_rest_does_not_lighten_it() -> None:
         + size * (stroke**3 * (10 - stroke * (15 - 6 * stroke)))[:, None]
     )
     qd = np.gradient(q, time, axis=0)
-    made = inverse_dynamics(
-        robot.changed(payload={"mass": 0.5}), q, qd, np.gradient(qd, time, axis=0)
-    )
-    made += np.random.default_rng(1).normal(0.0, 0.02, made.shape)
-    (cause,) = check(Recording(robot, time, q, qd, effort=made), 0.02).causes
-    assert float(cause.split()[-1]) == pytest.approx(0.5, rel=0.01)
+    heavy = robot.changed(payload={"mass": 0.5})
+    effort = inverse_dynamics(heavy, q, qd, np.gradient(qd, time, axis=0))
+    effort += np.random.default_rng(1).normal(0.0, 0.02, effort.shape)
+    made = Recording(robot, time, q, qd, effort=effort)
+    # Within the bound it is a hint.
+    told = check(made, 0.9)
+    assert told.answer == "good"
+    for text in (*check(made, 0.02).causes, told.hint):
+        assert float(text.split()[-1]) == pytest.approx(0.5, rel=0.01)
+    for gain in (0.97, 1.03):
+        whole = replace(made, robot=heavy, effort=gain * made.measured)
+        assert check(whole).answer == "good" and not check(whole).hint
 
 
 def test_a_fit_is_compared_with_the_file_wherever_it_starts() -> None:
