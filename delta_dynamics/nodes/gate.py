@@ -26,8 +26,8 @@ from pkm_twin.ros.joints import CommandPublisher, JointPublisher
 from pkm_twin.ros.node import TwinNode
 from pkm_twin.ros.run import run
 
-PAYLOAD: Final = ("payload.mass", "payload.com")
-"""What of the payload may change while the gate runs: the part that has a weight."""
+CHANGEABLE: Final = ("effort_limits", "payload.mass", "payload.com")
+"""What may change while the gate runs; of the payload the part that has a weight."""
 TORQUES = "delta_dynamics/joint_torques"
 MAX_DEADLINE = 3600.0
 """Longest deadline that a node of the suite promises, s; the middleware's "none" is longer."""
@@ -69,7 +69,7 @@ class CommandGate(TwinNode):
                 expected=True,
             )
         self.follow(
-            ["effort_limits", *PAYLOAD],
+            CHANGEABLE,
             lambda values: changed(self.core.robot, values),
             self.core.change_robot,
         )
@@ -144,11 +144,10 @@ class CommandGate(TwinNode):
         return ""
 
     def _declare_robot(self, settings: GateSettings) -> None:
-        """Effort limits of every robot; the payload where its weight is borne."""
+        """Effort limits, and the payload whose weight ``on_stop`` gravity bears."""
         robot = self.core.robot
-        names = ["effort_limits", *(PAYLOAD if settings.on_stop == "gravity" else ())]
         # Not every robot's file has a place for what is not given.
-        robot = changed(robot, declare_changes(self, robot, names))
+        robot = changed(robot, declare_changes(self, robot, CHANGEABLE))
         if settings.on_stop == "gravity":
             # Refused here where the robot has no masses; and compiled before it is needed.
             zeros = np.zeros(len(robot.joint_names))
