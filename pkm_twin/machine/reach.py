@@ -6,6 +6,7 @@ from __future__ import annotations
 import heapq
 import itertools
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -38,28 +39,30 @@ class PassiveLimit:
     far: Array | None = None
 
 
-def position_box(graph: Graph, limits: Array | None) -> Array:
+def position_box(graph: Graph, limits: Array | None, passive: Sequence[PassiveLimit] = ()) -> Array:
     """Bounds that the platform's reference point cannot leave, shape (3, 2), m.
 
     Every joint on the base is the centre of a ball: its radius is the length of the shortest chain
     of bodies from there to the reference point, slides at their limits. The box is where all
     the balls' boxes meet.
 
-    :param limits: of the actuated joints, shape (n, 2), or None.
+    :param limits: of the actuated joints, shape (n, 2), or None; ``passive``: of the others.
     :raises ParameterError: a slide without limits in every chain.
     """
+    ends = {one.joint: (one.low, one.high) for one in passive if one.kind == "slide"}
+    if limits is not None:
+        ends |= zip(graph.actuated, limits, strict=True)
     travel: dict[str, float] = {}
-    for k, name in enumerate(graph.actuated):
-        joint = graph.joints[name]
-        if joint.freedoms[0].slide:
-            ends = math.inf if limits is None else float(np.abs(limits[k] - joint.home).max())
-            travel[name] = abs(joint.freedoms[0].slide) * ends
+    for name, joint in graph.joints.items():
+        slides = [abs(freedom.slide) for freedom in joint.freedoms if freedom.slide]
+        known = len(slides) == 1 and name in ends
+        far = float(np.abs(np.subtract(ends[name], joint.home)).max()) if known else math.inf
+        if slides:
+            travel[name] = max(slides) * far
     # Points of bodies: where joints and rods' ends are, and the reference point.
     hops: list[tuple[tuple[str, Array], tuple[str, Array], float]] = []
     for joint in graph.joints.values():
         slack = travel.get(joint.name, 0.0)
-        if not joint.actuated and any(freedom.slide for freedom in joint.freedoms):
-            slack = math.inf
         hops.append(((joint.inner, joint.at), (joint.outer, joint.at), slack))
     for rod in graph.rods.values():
         length = float(np.linalg.norm(rod.ends[1] - rod.ends[0]))
@@ -72,11 +75,13 @@ def position_box(graph: Graph, limits: Array | None) -> Array:
                 box[:, 0] = np.maximum(box[:, 0], start[1] - radius)
                 box[:, 1] = np.minimum(box[:, 1], start[1] + radius)
     if not np.isfinite(box).all():
-        free = [name for name, way in travel.items() if math.isinf(way)]
-        named = f"joints.{free[0]}.limits.position" if free else "joints"
+        free = [graph.joints[name] for name, way in travel.items() if math.isinf(way)]
+        # A screw goes as far as its slide.
+        first = min(free, key=lambda joint: (len(joint.freedoms), joint.freedoms[0].turns))
         raise ParameterError(
-            named, None, "limits of the slides; without them the workspace is unbounded"
-        )
+            f"joints.{first.name}.limits.position", None,
+            "limits of the slides; without them the workspace is unbounded",
+        )  # fmt: skip
     return box
 
 

@@ -535,7 +535,7 @@ class Mechanism(Common):
 
         :raises ParameterError: a limit that would bound the workspace is missing.
         """
-        place = position_box(self.graph, self.limits.position)
+        place = position_box(self.graph, self.limits.position, self.passive_limits)
         rows = []
         for c in self.coordinates:
             if c.axis is not None:

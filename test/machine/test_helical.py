@@ -81,6 +81,16 @@ def test_a_ball_screw_moves_its_carriage_by_its_lead(lead):
     np.testing.assert_allclose(robot.passive_rates(q, q), np.hstack([-q, -pitch * q]), atol=1e-12)
 
 
+def test_its_rail_s_limits_bound_the_workspace():
+    robot = slide(0.01)
+    with pytest.raises(ParameterError) as caught:
+        robot.search_box()
+    assert caught.value.field == "joints.rail.limits.position"
+    joints = {"rail": {"limits": {"position": [-0.1, 0.3]}}}
+    low, high = robot.changed(joints=joints).search_box()[0]
+    assert low <= 0.3 and 0.7 <= high <= 1.2
+
+
 @pytest.mark.parametrize("lead", [0.01, -0.04])
 def test_its_torque_is_that_of_a_screw(lead, rng):
     robot, pitch = slide(lead), lead / (2 * np.pi)
