@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import pairwise, product
 from typing import Final
 
 import numpy as np
@@ -47,10 +47,12 @@ FASTEST: Final = 5.0
 """Highest frequency, Hz, whatever the limits."""
 SPEEDS: Final = (1.0, 4.0, 16.0)
 """Of the sweeps, over the slowest."""
+POINTS: Final = 10.0
+"""Least number of points of a ramp."""
 RAMP: Final = 0.1
 """Part of a full traverse that is accelerated, at each end."""
-LENGTH: Final = 4.0 + 6.0 * RAMP
-"""Time of a sweep, by that of half a traverse."""
+LENGTH: Final = 4.0 + 8.0 * RAMP
+"""Time of a sweep, up and down, by that of half a traverse."""
 SHRINKINGS: Final = 30
 """How often a range that is not clear is made smaller."""
 STATES: Final = 200
@@ -332,7 +334,7 @@ def clear(robot: Robot, keep: Bounds, q: Array, qd: Array, qdd: Array, margin: f
 
 @dataclass(frozen=True, eq=False)
 class Sweeps:
-    """Sweeps of every joint, one after the other, the other joints at their centres.
+    """Sweeps of one joint at a time, the other joints at their centres.
 
     ``reach``: half of each joint's travel, rad or m; ``speeds``: shape (n, speeds), rad/s or m/s.
     ``condition``: as of an :class:`Excitation`.
@@ -345,22 +347,24 @@ class Sweeps:
 
     @property
     def lengths(self) -> Array:
-        """Durations of the sweeps, s, shape (n, speeds): two half traverses and a whole one."""
-        return np.asarray(LENGTH * self.reach[:, None] / self.speeds)
+        """Durations from the centre to one end and back, s, shape (n, speeds)."""
+        return np.asarray(0.5 * LENGTH * self.reach[:, None] / self.speeds)
 
     @property
     def duration(self) -> float:
         """Of all sweeps, s."""
-        return float(self.lengths.sum())
+        return 2.0 * float(self.lengths.sum())
 
     def at(self, time: Array) -> tuple[Array, Array, Array]:
         """Positions, rates and accelerations, shape (k, n) each."""
         q = np.tile(self.centre, (len(time), 1))
         qd, qdd = np.zeros_like(q), np.zeros_like(q)
         start = 0.0
-        for (j, k), length in np.ndenumerate(self.lengths):
+        # All joints at all speeds upward, then downward: a fit and what it holds out have each.
+        for way, (k, j) in product((1.0, -1.0), np.ndindex(self.speeds.T.shape)):
+            length = float(self.lengths[j, k])
             inside = (time >= start) & (time <= start + length)
-            place, rate, change = _sweep(
+            place, rate, change = way * _sweep(
                 time[inside] - start, float(self.reach[j]), float(self.speeds[j, k])
             )
             q[inside, j] = self.centre[j] + place
@@ -369,16 +373,14 @@ class Sweeps:
         return q, qd, qdd
 
 
-def _sweep(time: Array, reach: float, speed: float) -> tuple[Array, Array, Array]:
-    """From the centre up, down across and back, at rest in between: (k,) each."""
+def _sweep(time: Array, reach: float, speed: float) -> Array:
+    """Position, rate and acceleration, (3, k), from the centre up and back, at rest in between."""
     ramp = RAMP * 2.0 * reach / speed
+    whole, wave = reach / speed + ramp, np.pi / ramp
     result = np.zeros((3, len(time)))
-    begin, place = 0.0, 0.0
-    for distance, way in ((reach, 1.0), (2.0 * reach, -1.0), (reach, 1.0)):
-        whole = distance / speed + ramp
+    for begin, place, way in ((0.0, 0.0, 1.0), (whole, reach, -1.0)):
         t = np.clip(time - begin, 0.0, whole)
         up, down = np.minimum(t, ramp), np.maximum(t - (whole - ramp), 0.0)
-        wave = np.pi / ramp
         x = t - up + (0.5 * (up - np.sin(wave * up) / wave))
         x -= 0.5 * (down - np.sin(wave * down) / wave)
         v = 0.5 * (1.0 - np.cos(wave * up)) - 0.5 * (1.0 - np.cos(wave * down))
@@ -386,8 +388,7 @@ def _sweep(time: Array, reach: float, speed: float) -> tuple[Array, Array, Array
         now = (time >= begin) & (time <= begin + whole)
         result[:, now] = (way * speed * np.stack([x, v, a]))[:, now]
         result[0, now] += place
-        begin, place = begin + whole, place + way * distance
-    return result[0], result[1], result[2]
+    return result
 
 
 def sweeps(judge: Judge, duration: float, bounds: Bounds | None = None) -> Sweeps:
@@ -405,7 +406,8 @@ def sweeps(judge: Judge, duration: float, bounds: Bounds | None = None) -> Sweep
 
     def slowest(j: int) -> float:
         """Speed of the slowest sweep: by the duration, and the limits of the fastest one."""
-        fastest = most[j]
+        # So many points a ramp: a faster one is a step of the written positions.
+        fastest = min(most[j], 2.0 * RAMP * reach[j] * keep.rate / POINTS)
         if keep.acceleration is not None:
             # A ramp of half a cosine has pi / 2 of its mean acceleration.
             change = keep.share * keep.acceleration
@@ -415,7 +417,7 @@ def sweeps(judge: Judge, duration: float, bounds: Bounds | None = None) -> Sweep
     for j in range(n):
         for _ in range(SHRINKINGS):
             alone = Sweeps(centre[j : j + 1], reach[j : j + 1], slowest(j) * ratios[None])
-            ends = np.append(0.0, np.cumsum(alone.lengths))
+            ends = np.append(0.0, np.cumsum(np.tile(alone.lengths, 2)))
             time = np.concatenate([np.linspace(*pair, STATES) for pair in pairwise(ends)])
             q = np.tile(centre, (len(time), 1))
             qd, qdd = np.zeros_like(q), np.zeros_like(q)

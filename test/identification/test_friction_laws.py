@@ -8,11 +8,14 @@ import pytest
 
 from delta_dynamics import inverse_dynamics
 from pkm_twin.errors import ParameterError, PkmTwinError, UnknownNameError
+from pkm_twin.identification.compare import step_fault
 from pkm_twin.identification.drives import fitted_constants, given_constants
 from pkm_twin.identification.excitation import Bounds, Judge, sweeps
+from pkm_twin.identification.fit import fit
 from pkm_twin.identification.friction_laws import fit_with_laws, laws_of
 from pkm_twin.identification.parameters import file_parameters
 from pkm_twin.identification.samples import Filtering, resonances_of
+from pkm_twin.recordings import Recording
 from pkm_twin.recordings.payload import Load
 from test.identification.machines import machine, noisy
 from test.support.robots import load, partly_long
@@ -155,3 +158,23 @@ def test_sweeps_stay_inside_the_limits_and_move_one_joint_at_a_time(name):
         for speed in row:
             for way in (1.0, -1.0):
                 assert (np.abs(qd[:, j] - way * speed) < 1e-9 * speed).any()
+    for third in np.array_split(qd, 3):
+        assert (np.abs(third) > 0.0).any(0).all()
+
+
+@pytest.mark.parametrize("name", partly_long(["five_bar", "upr_rpu"], "upr_rpu"))
+def test_sweeps_alone_show_the_friction_of_every_joint(name, rng):
+    robot = load(name)
+    found = sweeps(Judge.of(robot, file_parameters(robot, ("friction",))), 10.0, Bounds(rate=200.0))
+    time = np.arange(0.0, found.duration, 0.01)
+    motion = found.at(time)
+    size = np.abs(inverse_dynamics(robot, *motion)).max(0)
+    friction = {"viscous": 0.5 * size / np.abs(motion[1]).max(0), "coulomb": 0.3 * size}
+    truth = robot.changed(friction={key: value.tolist() for key, value in friction.items()})
+    effort = inverse_dynamics(truth, *motion) + 1e-3 * size * rng.normal(size=(len(time), 1))
+    record = Recording(robot, time, motion[0], effort=effort, source="sweeps")
+    assert step_fault(record) == ""
+    numbers = fit(robot, [record], ("friction",), causes=[None]).numbers
+    for key, values in friction.items():
+        after = [one.after for one in numbers if key in one.name][: len(values)]
+        np.testing.assert_allclose(after, values, rtol=0.1)
