@@ -31,7 +31,7 @@ class RecordKit(OfRobot, Overwrites):
     duration: float = setting(20.0, "duration of the exciting motion, s", low=1.0, high=600.0)
     friction_duration: float = setting(120.0, "duration of the slow sweeps, s", low=1.0, high=600.0)
     share: float = setting(0.9, "fraction of all limits to use", low=0.05, high=1.0)
-    trials: int = setting(300, "number of motions to try", low=10)
+    trials: int = setting(300, "number of motions to try", low=10, high=10**6)
 
 
 def record_kit(given: RecordKit) -> Report:
