@@ -41,9 +41,8 @@ from pkm_twin.report import Fact, Verdict, judged
 from pkm_twin.robot.limits import ranges
 from pkm_twin.robot.plausibility import why_no_torques
 from pkm_twin.streams.drives import COUNT, SAME
-from pkm_twin.streams.rates import BLOCK, STANDS, STEPS, RateAgreement, likely_cause, rms
-from pkm_twin.streams.rest import SIGMAS, noise
-from pkm_twin.streams.steps import GAP, Steps
+from pkm_twin.streams.rates import MAX_RATE, STANDS, rate_faults, rms
+from pkm_twin.streams.steps import Steps
 
 REJECTED: Final = "messages that a node rejects"
 POSITION_STEPS: Final = "position steps"
@@ -59,8 +58,6 @@ MAX_GAP: Final = 5.0
 """Longest good time between joint states, in median periods."""
 MIN_SINGULARITY: Final = 1e-3
 """Least good singularity index, 0 in a singularity, 1 at best."""
-MAX_RATE: Final = 0.15
-"""Difference of the measured velocities from the positions' rates, part of them, RMS."""
 MIN_COMPARED: Final = 0.1
 """Least part of the recording whose efforts are compared."""
 DEVIATIONS: Final = (1, 2, 3)
@@ -235,7 +232,6 @@ def stuck_from(time: Array, values: Array, told: Array, count: int = 1) -> tuple
 def _velocities(r: Recording, qd: Array, steps: Steps) -> list[Fact]:
     """How far measured velocities are from what the positions move by, over short times."""
     names, span = r.robot.joint_names, np.diff(r.time)
-    period = float(np.median(span))
     bound = f"RMS below {100 * MAX_RATE:g} % of the positions' rate"
     turned = np.cumsum(0.5 * (qd[1:] + qd[:-1]) * span[:, None], 0)
     for j, told in enumerate(np.concatenate([0.0 * turned[:1], turned]).T):
@@ -245,31 +241,14 @@ def _velocities(r: Recording, qd: Array, steps: Steps) -> list[Fact]:
             text = f"the position of {names[j]} stands still from {begin:.3f} s to {end:.3f} s"
             text += " while its velocity does not (encoder?)"
             return [judged(VELOCITIES, text, bound, False)]
-    agreement = RateAgreement(r.robot, blocks=None)
-    apart = np.concatenate([[False], (span > GAP * period) | steps.jumps.any(1)])
-    for stamp, q, rate, other in zip(r.stamps.tolist(), r.q, qd, apart.tolist(), strict=True):
-        if other:
-            agreement.skip()
-        agreement.push(stamp, q, rate)
-    moved, told = agreement.moves
-    if len(moved) < 2:
+    part, faults = rate_faults(r.robot, r.stamps, r.q, qd, steps.jumps)
+    if not len(part):
         return []
-    # A joint that hardly moves shows noise alone.
-    units, most = np.array(r.robot.joint_units), np.maximum(rms(moved), rms(told))
-    floor = np.array([STANDS * most[units == unit].max() for unit in units])
-    size, width = rms(told - moved), max(STEPS, BLOCK / period)
-    noisy = 2.0 * noise(r.time, r.q) + np.sqrt(width) * period * noise(r.time, qd)
-    part = size / np.maximum(np.maximum(most, floor), 1e-300)
-    bad = (part > MAX_RATE) & (size > SIGMAS * noisy)
-    texts = [
-        f"{names[j]} {100 * part[j]:.3g} %{likely_cause(moved[:, j], told[:, j])}"
-        for j in np.flatnonzero(bad)
-    ]
     worst = int(np.argmax(part))
-    value = ", ".join(texts) or f"{100 * part[worst]:.2g} %, {names[worst]}"
+    value = ", ".join(faults) or f"{100 * part[worst]:.2g} %, {names[worst]}"
     number = float(part[worst])
     text = f"RMS difference {value}"
-    return [judged(VELOCITIES, text, bound, not texts, number=number, limit=MAX_RATE)]
+    return [judged(VELOCITIES, text, bound, not faults, number=number, limit=MAX_RATE)]
 
 
 def _limits(r: Recording) -> list[Fact]:

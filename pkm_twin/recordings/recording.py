@@ -19,6 +19,7 @@ from pkm_twin.recordings.topics import COLUMNS, Topics
 from pkm_twin.robot.derivatives import nearest_motion
 from pkm_twin.robot.robot import Robot
 from pkm_twin.streams.differentiator import Differentiator
+from pkm_twin.streams.rates import rate_faults
 from pkm_twin.streams.rest import SIGMAS, fit_gain, gradient_gain, noise, rate_doubt
 from pkm_twin.streams.steps import GAP
 from pkm_twin.streams.wrench import WrenchSettings
@@ -205,11 +206,19 @@ class Recording:
     def with_rates(self) -> Recording:
         """The samples whose rates and accelerations are known, with these.
 
-        A recording that has both is left as it is. Those of a table are second-order differences,
+        A recording that has both keeps them; a note tells of velocities that contradict the
+        positions, by the bound of `check`. Those of a table are second-order differences,
         those of a bag are the ones that a node's differentiator finds in the middle of its window.
 
         :raises PkmTwinError: too few samples in a row.
         """
+        if self.qd is not None and len(self.time) > 2:
+            # What overflows is not finite, which the model refuses in one line.
+            with np.errstate(all="ignore"):
+                _, faults = rate_faults(self.robot, self.stamps, self.q, self.qd)
+            if faults:
+                text = f"velocities differ from the rate of the positions: {', '.join(faults)}"
+                self = replace(self, notes=(*self.notes, text))
         if self.qd is not None and self.qdd is not None:
             return self
         if self.bag is not None:
@@ -242,7 +251,6 @@ class Recording:
 
 def _differences(values: Array, time: Array) -> Array:
     """Second-order differences on uneven times, shape (samples, n)."""
-    # What overflows is not finite, which the model refuses in one line.
     with np.errstate(all="ignore"):
         return np.gradient(values, time, axis=0, edge_order=2)
 

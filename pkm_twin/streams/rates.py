@@ -9,13 +9,15 @@ make no difference. Pure.
 from __future__ import annotations
 
 from collections import deque
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
-from pkm_twin.codegen.arrays import Array
+from pkm_twin.codegen.arrays import Array, Mask
 from pkm_twin.messages.stamps import SECOND
 from pkm_twin.robot.robot import Robot
+from pkm_twin.streams.rest import SIGMAS, noise
+from pkm_twin.streams.steps import GAP
 
 BLOCK: Final = 0.05
 """Shortest time over which both are compared, s."""
@@ -31,6 +33,8 @@ MAX_ERROR: Final = 0.4
 late may have."""
 STANDS: Final = 0.03
 """Part of the other's motion below which positions, or velocities, stand still."""
+MAX_RATE: Final = 0.15
+"""The same of a whole recording, RMS."""
 LIKE: Final = 0.1
 """Relative difference below which a scale is named as a cause."""
 
@@ -126,3 +130,43 @@ class RateAgreement:
                 f"{self._names[j]}: velocities differ from the rate of the positions by "
                 f"{100 * error[j]:.2g} %{cause}"
             )
+
+
+def rate_faults(
+    robot: Robot,
+    stamps: np.ndarray[Any, np.dtype[np.int64]],
+    q: Array,
+    qd: Array,
+    jumps: Mask | None = None,
+) -> tuple[Array, list[str]]:
+    """How far the velocities of a recording are from the positions' rates, over short times.
+
+    :param stamps: rising, ns, shape (k,); q and qd, shape (k, n). ``jumps``: steps that are no
+        motion, (k - 1, n).
+    :returns: the difference, part of the motion, RMS, (n,), empty of a recording that is too short;
+        and the joints that disagree, in words.
+    """
+    names, time = robot.joint_names, 1e-9 * (stamps - stamps[0])
+    span = np.diff(time)
+    period = float(np.median(span))
+    apart = span > GAP * period
+    agreement = RateAgreement(robot, blocks=None)
+    skipped = [False, *(apart if jumps is None else apart | jumps.any(1)).tolist()]
+    for stamp, place, rate, other in zip(stamps.tolist(), q, qd, skipped, strict=True):
+        if other:
+            agreement.skip()
+        agreement.push(stamp, place, rate)
+    moved, told = agreement.moves
+    if len(moved) < 2:
+        return np.zeros(0), []
+    # A joint that hardly moves shows noise alone.
+    units, most = np.array(robot.joint_units), np.maximum(rms(moved), rms(told))
+    floor = np.array([STANDS * most[units == unit].max() for unit in units])
+    size, width = rms(told - moved), max(STEPS, BLOCK / period)
+    noisy = 2.0 * noise(time, q) + np.sqrt(width) * period * noise(time, qd)
+    part = size / np.maximum(np.maximum(most, floor), 1e-300)
+    bad = (part > MAX_RATE) & (size > SIGMAS * noisy)
+    return part, [
+        f"{names[j]} {100 * part[j]:.3g} %{likely_cause(moved[:, j], told[:, j])}"
+        for j in np.flatnonzero(bad)
+    ]

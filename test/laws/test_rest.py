@@ -15,9 +15,10 @@ from delta_dynamics.torques.stiction import beyond_friction, friction_reach, mov
 from pkm_twin import Robot
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.paths.along import torque_table
-from pkm_twin.recordings import ReadOptions, read
+from pkm_twin.recordings import ReadOptions, Recording, read
 from pkm_twin.streams.differentiator import Differentiator
 from pkm_twin.streams.rest import RestWatch, fit_gain, gradient_gain, noise, rate_doubt
+from test.laws.recordings import smooth_motion
 from test.nodes.harness import SECOND, Maker, Plain
 from test.support.robots import SHIPPED, joint_range, load, loaded_like, partly_long
 
@@ -205,3 +206,13 @@ def test_the_noise_of_a_machine_at_rest_makes_no_friction(name: str, measured: b
     rubs = np.abs(np.array(efforts)[20:] - held) > 0.8 * robot.friction.coulomb
     # Four standard deviations, of an estimate of some samples.
     assert rubs.mean() < 0.02
+
+
+def test_velocities_that_contradict_the_positions_are_noted():
+    robot = load("delta")
+    time, q, qd, qdd = smooth_motion(robot, np.random.default_rng(1), 4.0, 100.0)
+    for scale, wrong in ((1.0, False), (1.1, False), (-1.0, True), (0.0, True), (57.3, True)):
+        for change in (None, qdd):
+            motion = Recording(robot, time, q, scale * qd, change).with_rates()
+            assert bool(motion.notes) is wrong
+            np.testing.assert_array_equal(motion.qd, scale * qd)
