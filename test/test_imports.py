@@ -38,7 +38,7 @@ MAY = {
     "pkm_twin.design": CORE | TWINS,
     "pkm_twin.identification": RECORDINGS
     | TWINS
-    | {"pkm_twin.design", "pkm_twin.paths", "pkm_twin.recordings", "pkm_twin.report"},
+    | {"pkm_twin.design", "pkm_twin.recordings", "pkm_twin.report"},
     "pkm_twin.messages": CORE | {"pkm_twin.bags"},
     "pkm_twin.streams": CORE | {"pkm_twin.messages"},
     "pkm_twin.recordings": RECORDINGS,

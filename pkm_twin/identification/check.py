@@ -7,7 +7,6 @@ Efforts are compared by the derivative, filter and noise of `fit`, so that both 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
@@ -35,7 +34,6 @@ from pkm_twin.identification.compare import (
 )
 from pkm_twin.identification.plausible import LATEST
 from pkm_twin.identification.samples import usual_size
-from pkm_twin.paths import along
 from pkm_twin.recordings import Recording
 from pkm_twin.report import Fact, Verdict, judged
 from pkm_twin.robot.limits import ranges
@@ -52,6 +50,8 @@ MEASURED: Final = "measured efforts"
 COMPARED: Final = "compared efforts"
 IDLE: Final = "drives off or braked"
 COMPUTED: Final = "the efforts of this table are the model's; expected columns JOINT.measured"
+ROUNDING: Final = 1e-6
+"""Residual, part of the peak, that no measurement leaves."""
 TICKS: Final = 10.0
 """By how many of its least steps a signal has to change that is not stuck."""
 MAX_GAP: Final = 5.0
@@ -104,6 +104,8 @@ class Checked:
             return f"nothing contradicts {r.robot.name}"
         part = c.rms / np.maximum(c.peak, 1e-12)
         worst = int(part.argmax())
+        if part[worst] < ROUNDING:
+            return f"the efforts are those that {r.robot.name} computes, none is measured"
         size = f"{100 * part[worst]:.2g} % of the peak effort of {r.robot.joint_names[worst]}"
         return f"the efforts agree with {r.robot.name}, largest residual {size}"
 
@@ -136,11 +138,6 @@ def checked(r: Recording, residual: float) -> Checked:
     left_out = np.zeros(len(r.time), np.bool_)
     bound = f"RMS below {100 * residual:g} % of peak"
     reason = why_no_torques(r.robot)
-    with suppress(PkmTwinError, ValueError):
-        # What is no state of the machine is judged below.
-        if not reason and r.effort is not None and r.qdd is not None and r.qd is not None:
-            planned = along.compared(r).planned
-            r = replace(r, effort=None, efforts="model") if planned else r
     if r.effort is None:
         reason = reason or (COMPUTED if r.efforts == "model" else "the bag carries no efforts")
     mixed = step_fault(r, steps) if steps.publishers else ""

@@ -46,7 +46,7 @@ SLOWEST: Final = 20.0
 FASTEST: Final = 5.0
 """Highest frequency, Hz, whatever the limits."""
 SPEEDS: Final = (1.0, 4.0, 16.0)
-"""Of the sweeps, over the slowest."""
+"""Of the sweeps, over the slowest; ramps may ask for less."""
 POINTS: Final = 10.0
 """Least number of points of a ramp."""
 RAMP: Final = 0.1
@@ -394,7 +394,7 @@ def _sweep(time: Array, reach: float, speed: float) -> Array:
 def sweeps(judge: Judge, duration: float, bounds: Bounds | None = None) -> Sweeps:
     """Sweeps inside all limits.
 
-    :param duration: s; longer where limits of velocity or acceleration ask for it.
+    :param duration: s; longer where limits of velocity or acceleration, or ramps, ask for it.
     :raises PkmTwinError: a joint that cannot move alone.
     """
     robot, keep = judge.robot, bounds or Bounds()
@@ -404,19 +404,20 @@ def sweeps(judge: Judge, duration: float, bounds: Bounds | None = None) -> Sweep
     most = np.full(n, np.inf) if limits is None else keep.share * np.broadcast_to(limits, n)
     lengths = LENGTH * np.sum(1.0 / ratios) * n / duration
 
-    def slowest(j: int) -> float:
-        """Speed of the slowest sweep: by the duration, and the limits of the fastest one."""
-        # So many points a ramp: a faster one is a step of the written positions.
-        fastest = min(most[j], 2.0 * RAMP * reach[j] * keep.rate / POINTS)
+    def speeds(j: int) -> Array:
+        """By the duration, and the limits of the fastest sweep."""
+        fastest = most[j]
         if keep.acceleration is not None:
             # A ramp of half a cosine has pi / 2 of its mean acceleration.
             change = keep.share * keep.acceleration
             fastest = min(fastest, np.sqrt(4.0 * RAMP * reach[j] * change / np.pi))
-        return float(min(lengths * reach[j], fastest / ratios[-1]))
+        slowest = min(lengths * reach[j], fastest / ratios[-1])
+        # So many points a ramp: a faster one is a step of the written positions.
+        return np.asarray(np.minimum(slowest * ratios, 2.0 * RAMP * reach[j] * keep.rate / POINTS))
 
     for j in range(n):
         for _ in range(SHRINKINGS):
-            alone = Sweeps(centre[j : j + 1], reach[j : j + 1], slowest(j) * ratios[None])
+            alone = Sweeps(centre[j : j + 1], reach[j : j + 1], speeds(j)[None])
             ends = np.append(0.0, np.cumsum(np.tile(alone.lengths, 2)))
             time = np.concatenate([np.linspace(*pair, STATES) for pair in pairwise(ends)])
             q = np.tile(centre, (len(time), 1))
@@ -430,6 +431,6 @@ def sweeps(judge: Judge, duration: float, bounds: Bounds | None = None) -> Sweep
                 f"{robot.joint_names[j]} cannot move alone inside the limits; try a smaller "
                 "--singularity or wider limits.position"
             )
-    found = Sweeps(centre, reach, np.array([slowest(j) for j in range(n)])[:, None] * ratios)
+    found = Sweeps(centre, reach, np.array([speeds(j) for j in range(n)]))
     motion = found.at(np.linspace(0.0, found.duration, 3 * n * STATES))
     return Sweeps(centre, reach, found.speeds, judge.condition(*motion))

@@ -49,13 +49,6 @@ class Compared:
         return np.asarray(np.sqrt(squares / np.maximum((self.model**2).mean(0), 1e-24)))
 
     @property
-    def planned(self) -> bool:
-        """Whether a table's efforts are the model's: a plan of this machine, nothing measured."""
-        if self.motion.bag is not None or self.motion.efforts != "effort":
-            return False
-        return bool(np.abs(self.effort - self.model).max() <= SAME * np.abs(self.model).max())
-
-    @property
     def unlike(self) -> str:
         """Says of which joint the file's efforts are not the model's; empty where they are."""
         worst = int(self.difference.argmax())
@@ -195,8 +188,9 @@ def torque_table(m: Recording, progress: Callable[[int], None] | None = None) ->
         if progress is not None:
             progress(part.stop)
     whole = {name: np.concatenate(parts) for name, parts in columns.items()}
-    if m.effort is not None:
+    if m.effort is not None and m.efforts == "effort" and told:
         model = np.stack([whole[f"{joint}.effort"] for joint in m.robot.joint_names], -1)
-        if Compared(m, m.effort, "the file's", model).planned:
+        if np.abs(m.effort - model).max() <= SAME * np.abs(model).max():
+            # A plan of this machine: nothing was measured.
             whole = {name: v for name, v in whole.items() if not name.endswith(".measured")}
     return whole | payload_columns(m.robot, m.load, m.time)

@@ -165,7 +165,7 @@ def test_sweeps_stay_inside_the_limits_and_move_one_joint_at_a_time(name):
 @pytest.mark.parametrize("name", partly_long(["five_bar", "upr_rpu"], "upr_rpu"))
 def test_sweeps_alone_show_the_friction_of_every_joint(name, rng):
     robot = load(name)
-    found = sweeps(Judge.of(robot, file_parameters(robot, ("friction",))), 10.0, Bounds(rate=200.0))
+    found = sweeps(Judge.of(robot, file_parameters(robot, ("friction",))), 20.0, Bounds(rate=100.0))
     time = np.arange(0.0, found.duration, 0.01)
     motion = found.at(time)
     size = np.abs(inverse_dynamics(robot, *motion)).max(0)

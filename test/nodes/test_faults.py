@@ -303,9 +303,11 @@ class TestLoad:
         assert stamp not in map(stamp_of, torques)
 
     def test_torques_expire_when_their_stream_would_be_stale(self, quick):
+        node = quick.peer.node
+
         def offered(topic):
-            (info,) = quick.peer.node.get_publishers_info_by_topic(topic)
-            profile = info.qos_profile
+            quick.peer.until(lambda: node.count_publishers(topic) == 1)
+            profile = node.get_publishers_info_by_topic(topic)[0].qos_profile
             return profile.lifespan.nanoseconds, profile.deadline.nanoseconds
 
         for topic in ("joint_torques", "commands"):

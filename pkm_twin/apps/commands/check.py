@@ -30,7 +30,7 @@ class Check(CarriesAtTimes, ReadsRecordings):
     the model. If they do not, an explanation is named only if it makes them agree. An item without
     data (no CRCs, no efforts, a robot without masses) is not judged, which is neither good nor bad.
     The recording is not judged if its efforts have no verdict: too few can be compared, or the
-    model computed them, as in tables of `path` and `torques`.
+    model computed them, as in a table of `torques`.
 
     Exit code 0: good. 1: bad, not judged, or no recording. 3: the file is damaged, but `pkm-twin
     recover` can save part of it.
