@@ -261,13 +261,16 @@ def _faults_of(problem: Problem, causes: Sequence[Cause | None]) -> list[str]:
 
 
 def _late(problem: Problem, causes: Sequence[Cause | None]) -> list[str]:
-    """Efforts that are too late; as the file's machine says where it explains them."""
+    """Efforts that are too late; as the file's machine says where it explains them.
+
+    What was not put on time has no delay that the efforts show.
+    """
     each = zip(problem.whole, delays(problem), causes, strict=True)
     found = ((made, late if cause is None else cause.late) for made, late, cause in each)
     return [
         f"{made.recording.name}: {late_text('all joints', late)}"
         for made, late in found
-        if abs(late) > LATEST
+        if abs(late) > LATEST and made.recording.late
     ]
 
 

@@ -123,8 +123,9 @@ def fit_with_laws(
     if Dahl.name in asked:
         # Without memory slow reversals would be another machine's: faults are looked for with it.
         asked.remove(Dahl.name)
-        before = on_time(Problem.of(robot, recordings, what))
-        best = fit(_remembering(before), recordings, what, **options | {"causes": None})
+        static = on_time(Problem.of(robot, recordings, what))
+        best = fit(_remembering(static), recordings, what, **options | {"causes": None})
+        before = Problem.of(robot, [made.recording for made in best.problem.whole], what)
         choice = _compared(Dahl.name, best.verdict, before, best.problem)
         choices.append(replace(choice, taken=True, asked=True))
     else:
