@@ -16,7 +16,6 @@ from typing import Any, Final
 
 import numpy as np
 
-from delta_dynamics.torques.regressor import parameter_names
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import BagError, ParameterError, PkmTwinError, UnknownNameError
 from pkm_twin.identification.causes import number_that_explains, usual
@@ -25,12 +24,11 @@ from pkm_twin.identification.drives import FIT, fitted_constants, given_constant
 from pkm_twin.identification.fit import Fit, fit, fitted, on_time, refuse_faults
 from pkm_twin.identification.identifiable import KINDS, LOAD, Kind, of_drives
 from pkm_twin.identification.judge import SIGMAS, Verdict, basis_of
-from pkm_twin.identification.parameters import Number
+from pkm_twin.identification.parameters import Number, file_parameters
 from pkm_twin.identification.rows import Problem
 from pkm_twin.identification.samples import EXACT, filtered
 from pkm_twin.identification.suspects import RESONANCE
 from pkm_twin.machine.friction import BASIC, KNOWN, LAWS, Dahl, compiled
-from pkm_twin.machine.inertia import TEN, change_of_frame, standard_parameters
 from pkm_twin.recordings import Recording
 from pkm_twin.robot.robot import Robot
 from pkm_twin.streams.steps import sampling_of
@@ -240,16 +238,10 @@ def fit_recordings(
 
 def _beside(file: Robot, result: Fit) -> Fit:
     """A fit that started with another payload than the file's, compared with the file's."""
-    robot, parameters = result.problem.robot, result.problem.parameters
-    graph, tree, loads = robot.graph, robot.engine.tree, (file.payload, robot.payload)
-    own, started = (standard_parameters(load.mass, load.com, load.inertia) for load in loads)
-    names, change = parameter_names(robot), np.zeros(len(parameters.names))
-    rows = [names.index(f"{graph.platform}.{word}") for word in TEN]
-    away = change_of_frame(np.eye(3), graph.origin - tree.at[graph.platform]) @ (own - started)
-    for group, k in zip(parameters.groups, parameters.slices, strict=True):
-        if group.kind == "payload":
-            change[k] = np.linalg.lstsq(parameters.mixing[rows, k], away)[0]
-    each = zip(result.judged, result.problem.held_out, strict=True)
+    problem = result.problem
+    own = file_parameters(replace(problem.robot, payload=file.payload), problem.what)
+    change = own.values - problem.parameters.values
+    each = zip(result.judged, problem.held_out, strict=True)
     judged = tuple(replace(one, before=one.before + end.table @ change) for one, end in each)
     numbers = list[Number]()
     for n in result.numbers:
