@@ -206,9 +206,10 @@ class Recording:
     def with_rates(self) -> Recording:
         """The samples whose rates and accelerations are known, with these.
 
-        A recording that has both keeps them; a note tells of velocities that contradict the
-        positions, by the bound of `check`. Those of a table are second-order differences,
-        those of a bag are the ones that a node's differentiator finds in the middle of its window.
+        If the recording has both, they stay. If its velocities differ from the rate of the
+        positions by more than `check` allows, a note says so. In a table the missing ones are
+        second-order differences; in a bag, a node's differentiator gives them in the middle of
+        its window.
 
         :raises PkmTwinError: too few samples in a row.
         """
