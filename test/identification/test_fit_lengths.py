@@ -192,6 +192,5 @@ def test_a_motion_too_slow_for_inertia_explains_none(name: str, factor: float, s
     verdict = fit(robot, [record], KINDS).verdict
     assert verdict.slow == slow
     assert (verdict.answer == "explains") != slow
-    if slow:
-        # Friction does not need it.
-        assert not fit(robot, [record], ("friction",)).verdict.slow
+    # Friction does not need it.
+    assert not fit(robot, [record], ("friction",)).verdict.slow

@@ -193,6 +193,7 @@ def test_limbs_of_the_shipped_robots_never_meet(name):
     otherwise = reachable(robot, poses, -math.inf)
     assert otherwise.sum() > 1000
     assert at_least < clearance(robot, poses[otherwise]).min() < 1.1 * at_least
+    assert (reachable(robot, poses) == otherwise).all()
 
 
 def test_the_regular_workspace_is_that_without_interference(monkeypatch):
