@@ -20,7 +20,8 @@ truth: of a parallelogram also the couple that a pair of rods passes.
     moved = min over bodies sqrt(n) / |D T+|,          |D T+|^2 = tr((T'T)^-1 D'D)
 
 The platform is one of the bodies, hence the bound of 1. It is zero where joints move and the
-platform does not: at the edge of reach.
+platform does not: at the edge of reach. Where the pose has no angle, the platform is its reference
+point: T has the velocity alone, shape (3, n).
 """
 
 from __future__ import annotations
@@ -128,17 +129,19 @@ def _gradient(t: Traced) -> Program:
     return gradient_program(t, _singularity(t), by)
 
 
-def singularity_measure(t: Traced | _AtHome) -> Any:
+def singularity_measure(t: Traced) -> Any:
     """The measure of a solved motion, to write other programs with; rates are overwritten."""
-    return minimum(_held(t), _moved(t))
+    point = all(c.axis is not None for c in t.scheme.coordinates)
+    return minimum(_held(t), _moved(t, point))
 
 
 def singularity_at_home(graph: Graph) -> float:
-    """The measure at home, on numbers: nothing is compiled.
+    """The measure at home, on numbers: nothing is compiled. The platform's turns count.
 
     :raises SingularityError: something moves although the actuated joints are locked.
     """
-    return float(singularity_measure(_AtHome(Linkage(graph))))
+    home = _AtHome(Linkage(graph))
+    return float(minimum(_held(home), _moved(home, False)))
 
 
 class _AtHome:
@@ -179,10 +182,11 @@ def _held(t: Traced | _AtHome) -> Any:
     return minimum(1.0, 0.5 * unknown / np.sqrt(len(rows)) / sqrt(response))
 
 
-def _moved(t: Traced | _AtHome) -> Any:
+def _moved(t: Traced | _AtHome, point: bool) -> Any:
+    """``point``: the platform is its reference point."""
     n, graph = t.joints, t.graph
     rates = _Rates(t)
-    twist = rates.motion_of(graph.platform)
+    twist = rates.motion_of(graph.platform)[: 3 if point else 6]
     table = _gram([{("u", j): v for j, v in enumerate(row)} for row in twist], n)
     lower = {(a, b): table[a, b] for a in range(n) for b in range(a + 1)}
     # Pivots stay above zero where the platform stands still while a joint moves.
@@ -191,7 +195,7 @@ def _moved(t: Traced | _AtHome) -> Any:
     root = SparseCholesky(lower, [table[k, k] + length for k, length in enumerate(lengths)])
     farthest: Any = float(n)
     for name in graph.bodies:
-        if name != graph.platform:
+        if point or name != graph.platform:
             farthest = maximum(farthest, rates.response(name, root))
     return sqrt(n / farthest)
 

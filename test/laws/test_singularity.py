@@ -17,7 +17,7 @@ from pkm_twin.machine.graph_description import graph_description
 from pkm_twin.mechanisms.catalogue import robot_of_data
 from pkm_twin.robot.robot_urdf import robot_description
 from stiffness_monitor import compliance
-from test.machine.random_machines import NAMES, plain
+from test.machine.random_machines import NAMES, plain, variant
 from test.support.robots import joint_range, load, random_joints
 
 SURFACE = np.array([0.34222, -0.09515, -0.18159])
@@ -87,7 +87,9 @@ def expected(robot, judge, q):
         held = 0.5 * a.shape[1] / np.sqrt(len(a)) / response
     tangent = judge.tangent()
     k = list(graph.bodies).index(graph.platform)
-    inverse = np.linalg.pinv(bodies[6 * k : 6 * k + 6] @ tangent)
+    # A pose without an angle is one of a point.
+    count = 6 if "rad" in robot.pose_units else 3
+    inverse = np.linalg.pinv(bodies[6 * k : 6 * k + count] @ tangent)
     farthest = max(
         np.linalg.norm(body @ tangent @ inverse) for body in np.split(bodies, len(bodies) // 6)
     )
@@ -201,6 +203,17 @@ class TestWays:
         assert (np.diff(measure) > 0.0).all()
         # With the square root of what is left.
         assert np.diff(np.log10(measure[:3])) == pytest.approx([1.0, 1.0], abs=0.1)
+
+    @pytest.mark.parametrize("seed", range(3))
+    def test_a_point_that_joints_do_not_move_one_way(self, seed):
+        """The platform of a five-bar is a forearm: it turns where its point stands still."""
+        robot = robot_of_data(variant("five_bar", np.random.default_rng(seed)), "five_bar")
+        q = np.random.default_rng(seed).uniform(-3.0, 3.0, (20_000, 2))
+        measure, good = robot.try_singularity(q)
+        least = np.linalg.svd(robot.jacobian(q[good]), compute_uv=False)[:, -1]
+        near = least < 1e-3 * robot.engine.tree.size
+        assert near.sum() > 10
+        assert (measure[good][near] < 10.0 * least[near] / robot.engine.tree.size).all()
 
     def test_dead_points_of_one_joint(self):
         """One joint and one coordinate: no ratio of singular values tells anything there."""
