@@ -129,7 +129,7 @@ class ReadsTables:
     )
     units: str | None = setting(
         None,
-        "units of columns read whose header has none: of rad, mrad, deg, rev, m, cm, mm, um, s, "
+        "units of columns whose header has none: rad, mrad, deg, rev, m, cm, mm, um, s, "
         "ms, us, percent (of rated torque, with --side motor); default SI",
         older=("--unit",),
     )
@@ -191,7 +191,7 @@ class ReadsMotions(ReadsRecordings):
 
     follow: str | None = setting(
         None,
-        "a table's columns that are the motion: joints; or pose, planned again for this robot; "
+        "columns of a table that give the motion: joints, or pose (planned again for this robot); "
         "default: both, which must agree",
         choices=("joints", "pose"),
     )

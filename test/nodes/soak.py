@@ -309,8 +309,8 @@ Ages of answers at their publication, on two cores that did much other work:
 
 {ages}
 
-The node checks the age just before it publishes a torque; an older one left a process that the
-computer delayed after the check, and the topic's deadline reports it.
+The node checks a torque's age just before publication. The computer delayed older torques after
+this check; the topic's deadline reports them.
 """
 
 

@@ -25,12 +25,10 @@ HEAD = """# Robot files
 
 The keys of a robot's YAML with their valid values and defaults. SI units, angles in rad, z up.
 Anything else is rejected, with the name of the key. Of two units the first is for joints
-that turn, the second for those that slide. Brackets have defaults; `pkm-twin info ROBOT` prints all
-values.
+that turn, the second for joints that slide. Defaults are in brackets; `pkm-twin info ROBOT` prints
+all values.
 An inertia is three principal moments or a symmetric 3x3 matrix whose moments are not negative and
 keep the triangle rule.
-
-Written by `make pages`.
 """
 UNITS = {
     "{effort} per {joint}/s": "N m s/rad or N s/m",

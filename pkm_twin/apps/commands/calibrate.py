@@ -80,12 +80,12 @@ class Calibrate(OfRobot, ReadsTables, BeyondLimitsToo, Accepts, Overwrites):
     frame: bool = setting(False, "fit where the instrument stands: its six numbers")
     target: bool = setting(False, "fit where the target is on the platform: three numbers")
     prior: float = setting(
-        0.01, "how well lengths are known before, m (standard deviation)", low=1e-6, high=1.0
+        0.01, "standard deviation of lengths before the fit, m", low=1e-6, high=1.0
     )
     transmission: Transmission = setting(
         Transmission.AUTO,
         "ratios of joint_map to fit: each; shared: one factor; travel: each and its change over "
-        "travel; file: none; auto: those that sliding joints have",
+        "travel; file: none; auto: ratios of sliding joints other than 1",
         choices={str(how): how for how in Transmission},
     )
     measure: tuple[str, ...] = setting(
@@ -105,7 +105,7 @@ class Calibrate(OfRobot, ReadsTables, BeyondLimitsToo, Accepts, Overwrites):
     )
     count: int | None = setting(None, "poses of a plan", low=1, high=MAX_MEASUREMENTS)
     accuracy: float | None = setting(
-        None, "position's standard deviation that a plan is to reach, m", low=1e-9
+        None, "standard deviation of the position that ends a plan, m", low=1e-9
     )
     within: str | None = setting(
         None, "where a plan measures: x=-0.1:0.1,z=0 (m, rad); default: everywhere"

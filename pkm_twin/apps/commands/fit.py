@@ -94,7 +94,7 @@ class Fit(CarriesAtTimes, ReadsRecordings, BeyondLimitsToo, Accepts):
     torque_constant: str | None = setting(
         None,
         "efforts are motor currents, A: N m or N per ampere at the joint, one number or one per "
-        "joint with commas; `fit` takes it from the masses of the file",
+        "joint with commas; `fit` identifies it from the file's masses",
     )
     drive: Path | None = setting(None, "CSV of traverses with weights, one row per run")
     lever: float | None = setting(

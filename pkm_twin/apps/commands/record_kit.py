@@ -21,14 +21,14 @@ from pkm_twin.settings import setting
 class RecordKit(OfRobot, Overwrites):
     """Prepare the recording of a real machine.
 
-    Writes into a folder: the exciting motion and slow friction sweeps of `pkm-twin excite`
+    Writes into a folder: the excitation motion and slow friction sweeps of `pkm-twin excite`
     (excitation.mcap, friction.mcap, and a CSV of each), NOTES.md with what to note, and README.md
     with the commands that record and judge. `pkm-twin anonymise` removes names and dates from a
     recording.
     """
 
     out: Path = setting(Path("record_kit"), "folder to write")
-    duration: float = setting(20.0, "duration of the exciting motion, s", low=1.0, high=600.0)
+    duration: float = setting(20.0, "duration of the excitation motion, s", low=1.0, high=600.0)
     friction_duration: float = setting(120.0, "duration of the slow sweeps, s", low=1.0, high=600.0)
     share: float = setting(0.9, "fraction of all limits to use", low=0.05, high=1.0)
     trials: int = setting(300, "number of motions to try", low=10, high=10**6)
