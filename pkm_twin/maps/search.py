@@ -22,7 +22,7 @@ JOINT_STATES: Final = 2**14
 CLIMBERS: Final = 32
 """States from which the ends of a workspace of many coordinates are looked for."""
 COARSE: Final = 33
-"""Poses along each coordinate of the grid that bounds a workspace."""
+"""Poses along each coordinate of a grid that bounds a workspace, or what a plane shows of it."""
 FULL: Final = 3
 """Most pose coordinates of which a whole grid is made."""
 NEAR: Final = 64

@@ -42,7 +42,7 @@ from pkm_twin.maps.kind import (
     number,
     texts,
 )
-from pkm_twin.maps.search import FULL, badness, workspace_box, worst_of
+from pkm_twin.maps.search import COARSE, FULL, badness, workspace_box, worst_of
 from pkm_twin.robot.clearance import has_clearance, joint_clearance
 from pkm_twin.robot.robot import Robot
 from pkm_twin.robot.workspace import keeps_limits
@@ -55,8 +55,6 @@ ZOOMS: Final = 3
 """How often the part of a plane that is reachable is looked for, each time finer."""
 LEAST_VIEW: Final = 0.1
 """Part of a coordinate's range that a plane shows at least on each side of its pose."""
-COARSE: Final = 61
-"""Poses along a side of a plane for that."""
 SIDES: Final = (11, 151)
 """Fewest and most poses along a side of a plane."""
 

@@ -85,10 +85,11 @@ def test_on_the_axis_of_a_cylinder_the_azimuth_means_nothing(name):
         [n for n, robot in SHIPPED.items() if robot.grid().kind == "box"], "five_bar", "stewart"
     ),
 )
-def test_planes_of_every_number_of_coordinates(name, tmp_path):
+def test_planes_of_every_number_of_coordinates(name, tmp_path, monkeypatch):
     """Through the least singularity index: values are those of the poses that planes have."""
     from matplotlib import pyplot
 
+    monkeypatch.setattr("pkm_twin.maps.sweep.COARSE", 21)
     robot = load(name)
     size = len(robot.pose_names)
     with open_map(run(map_of(robot, Workspace(), 3000), tmp_path / "a.nc", workers=1)) as data:
