@@ -144,10 +144,10 @@ class Case:
     ``effort``: measured, (k, n); ``late``: its derivative in time. ``rest``: what is certain;
     ``columns``: by what is not, (k, n, c), about ``usual``, as far off as ``spread`` (infinite:
     nobody knows), between ``low`` and ``high``, (c,). ``friction``: which columns turn round with
-    time, (c,). ``counts``: 1 for what is judged. ``noise``: deviation of the rows, (n,).
-    ``time``: of the rows, s, (k,). ``payload``: which columns are the payload's, the first one a
-    mass at the platform's point, (c,). ``inertial``: the part of the columns that grows with the
-    square of the rate of time, (k, n, c); None where that is not asked.
+    time, (c,). ``counts``: 1 for what is judged. ``time``: of the rows, s, (k,). ``payload``: which
+    columns are the payload's, the first one a mass at the platform's point, (c,). ``inertial``: the
+    part of the columns that grows with the square of the rate of time, (k, n, c); None where that
+    is not asked.
     """
 
     effort: Array
@@ -160,7 +160,6 @@ class Case:
     usual: Array
     friction: Mask
     counts: Array
-    noise: Array
     time: Array
     payload: Mask
     inertial: Array | None = None
@@ -183,11 +182,6 @@ class Case:
     def variation(self) -> Array:
         """Standard deviation of the efforts, shape (n,)."""
         return np.asarray(np.maximum(np.std(self.effort, 0), 1e-300), np.float64)
-
-    @property
-    def noisy(self) -> float:
-        """The part of the variation that is noise."""
-        return float(np.sqrt(np.mean((self.noise / self.variation) ** 2)))
 
     def judged(self) -> Score:
         """How well, and how likely, the best of these machines explains the efforts."""
@@ -343,7 +337,10 @@ def recording_fault(rows: Rows) -> str | None:
     others = [*_efforts(case, joints), ("time runs backwards", case.backwards(), RARE)]
     others += [(*one, UNIT) for one in loaded]
     cause, best, gain = likeliest(told, ((t, other.judged, price) for t, other, price in others))
-    known = min(float(np.hypot(BESIDE_NOISE, case.noisy)), 2.0 * POOR)
+    # The part of the variation that is noise.
+    noise = rows.signals.noise * np.sqrt(rows.signals.band)
+    noisy = float(np.sqrt(np.mean((noise / case.variation) ** 2)))
+    known = min(float(np.hypot(BESIDE_NOISE, noisy)), 2.0 * POOR)
     unclear = bool(cause) and best.left > known
     first = int(np.searchsorted(time, _worst(case, SOME * period)))
     first = max(0, min(first, len(time) - SOME))
@@ -372,7 +369,7 @@ def recording_fault(rows: Rows) -> str | None:
             )
         return f"{cause}: as recorded, masses and payload would be far from the file's"
     # More than all of it: the efforts have nothing of the motion, however large their noise.
-    if cause or told.left**2 > min(POOR**2 + case.noisy**2, 1.0):
+    if cause or told.left**2 > min(POOR**2 + noisy**2, 1.0):
         return (
             "no machine like the file's explains the efforts, and no single mistake does: "
             f"{100 * told.left:.2g} % of their variation is left (another machine, another motion, "
@@ -478,7 +475,7 @@ def case_of(rows: Rows, inertial: Array | None = None) -> Case:
     return Case(
         rows.effort, rows.change, rows.rest, wholes[0], low, high, rows_of_prior,
         np.array([value / spread for _, value, spread in prior]), np.array(friction), rows.counts,
-        rows.signals.noise * np.sqrt(rows.signals.band), rows.time, np.array(payload),
+        rows.time, np.array(payload),
         None if inertial is None else wholes[1],
     )  # fmt: skip
 

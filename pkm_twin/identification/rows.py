@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cache, cached_property
 from typing import Final
 
 import numpy as np
@@ -174,8 +174,8 @@ class Rows:
     """Filtered rows of one recording: time (k,), table (k, n, parameters), target (k, n).
 
     ``rest``: what the parameters that stay need; ``counts``: what is judged; ``change``: of the
-    efforts in time, (k, n) each. ``signals``: of the same rows. ``tracks``: before the filter
-    ``how``. ``model``: of all parameters.
+    efforts in time, (k, n) each. ``tracks``: before the filter ``how``. ``model``: of all
+    parameters. ``make``: the signals of the same rows, once: most rows need none.
     """
 
     recording: Recording
@@ -189,7 +189,12 @@ class Rows:
     counts: Array
     change: Array
     outliers: int
-    signals: Signals
+    make: Callable[[], Signals]
+
+    @property
+    def signals(self) -> Signals:
+        """Of the same rows."""
+        return self.make()
 
     @property
     def period(self) -> float:
@@ -262,27 +267,38 @@ def rows_of(
     if all(not part.moves.any() for part in parts):
         raise PkmTwinError(f"{r.name}: no excitation, the joints stand still")
     first, outliers = _drop_outliers(parts, parameters, how.keep_every)
-    speed = np.sqrt(np.mean(np.concatenate([track.qd for track in pieces]) ** 2, 0))
-    f = filtered([part.columns(model, first, speed, how) for part in parts], pieces[0].period, how)
-    left = [part.target - part.table @ first for part in parts]
-    longest = max(pieces, key=lambda t: len(t.time))
-    shaken = shaken_efforts(
-        r, longest, how, lambda track: model.efforts(track, first, model.memory(track, how))
-    )
-    noise = noise_of(left, shaken, longest.period, how)
-    size = np.sqrt(np.mean(np.concatenate([track.effort for track in pieces]) ** 2, 0))
-    rings = resonances_of(left, longest.period, how, size)
-    rate = 1.0 / (longest.period * how.keep_every)
-    missed, load = (np.moveaxis(f[name], -1, 0) for name in ("missed", "load"))
-    signals = Signals(
-        Motion(f["q"], f["qd"], f["qdd"], f["wrench"], f["held"]), missed, load, f["effort"],
-        f["own"], noise * np.sqrt(rate), passed_band(how, rate), rings,
-    )  # fmt: skip
+    f = filtered([part.columns(first) for part in parts], pieces[0].period, how)
+    told = [part.told(model, first) for part in parts]
     # Where standing still is in the filter's reach, friction's sign is not known.
     counts = (f["moves"] > 0.8).astype(np.float64)
     return Rows(
         r, model, how, tuple(pieces), f["time"], f["table"], f["target"], f["rest"], counts,
-        f["change"], outliers, signals,
+        f["change"], outliers, cache(lambda: _signals(r, model, how, told, first)),
+    )  # fmt: skip
+
+
+def _signals(
+    r: Recording, model: Model, how: Filtering, told: Sequence[_Told], first: Array
+) -> Signals:
+    """The signals of a recording's rows.
+
+    :param told: by piece. ``first``: parameters of a first fit.
+    """
+    tracks, left = [one.track for one in told], [one.left for one in told]
+    longest = max(tracks, key=lambda t: len(t.time))
+    speed = np.sqrt(np.mean(np.concatenate([track.qd for track in tracks]) ** 2, 0))
+    f = filtered([one.columns(speed, how) for one in told], longest.period, how)
+    shaken = shaken_efforts(
+        r, longest, how, lambda track: model.efforts(track, first, model.memory(track, how))
+    )
+    noise = noise_of(left, shaken, longest.period, how)
+    size = np.sqrt(np.mean(np.concatenate([track.effort for track in tracks]) ** 2, 0))
+    rings = resonances_of(left, longest.period, how, size)
+    rate = 1.0 / (longest.period * how.keep_every)
+    missed, load = (np.moveaxis(f[name], -1, 0) for name in ("missed", "load"))
+    return Signals(
+        Motion(f["q"], f["qd"], f["qdd"], f["wrench"], f["held"]), missed, load, f["effort"],
+        f["own"], noise * np.sqrt(rate), passed_band(how, rate), rings,
     )  # fmt: skip
 
 
@@ -331,17 +347,45 @@ class _Piece:
             moves = np.where(model.robot.friction.presliding > 0.0, memory.unknown < KNOWN, moves)
         return cls(track, table, track.effort - rest, rest, moves.astype(np.float64))
 
-    def columns(self, model: Model, first: Array, speed: Array, how: Filtering) -> dict[str, Array]:
-        """All that is filtered, by name, (samples, ...) each.
+    def columns(self, first: Array) -> dict[str, Array]:
+        """What rows are made of, by name, (samples, ...) each.
+
+        :param first: parameters of a first fit.
+        """
+        change = np.gradient(self.rest + self.table @ first, self.track.period, axis=0)
+        return {
+            "time": self.track.time, "table": self.table, "target": self.target, "rest": self.rest,
+            "moves": self.moves, "change": change,
+        }  # fmt: skip
+
+    def told(self, model: Model, first: Array) -> _Told:
+        """What a first fit says of it."""
+        told, rubs = self.rest + self.table @ first, model.of_drives
+        load = told - self.table[..., rubs] @ first[rubs]
+        return _Told(self.track, told, load, self.target - self.table @ first)
+
+
+@dataclass(frozen=True, eq=False)
+class _Told:
+    """What a first fit says of a piece before the filter; its efforts also less friction, (k, n).
+
+    ``left``: what it leaves of the measured ones.
+    """
+
+    track: Track
+    efforts: Array
+    load: Array
+    left: Array
+
+    def columns(self, speed: Array, how: Filtering) -> dict[str, Array]:
+        """What signals are made of, by name, (samples, ...) each.
 
         Motion and load are those in the motion's own band, where nearly no noise is: noise in both
         of two columns would look like something in common.
 
-        :param first: parameters of a first fit. ``speed``: RMS rates, (n,).
+        :param speed: RMS rates, (n,).
         """
-        track, rubs = self.track, model.of_drives
-        told = self.rest + self.table @ first
-        load, sign = told - self.table[..., rubs] @ first[rubs], np.sign(track.qd)
+        track, load, sign = self.track, self.load, np.sign(self.track.qd)
         laws = [np.abs(load) * sign, track.qd * np.abs(track.qd)]
         for share in STRIBECK:
             laws.append(np.exp(-((track.qd / np.maximum(share * speed, 1e-300)) ** 2)) * sign)
@@ -353,12 +397,9 @@ class _Piece:
             rough = local_fit(motion[0], how.window, DEGREE, k, track.period)
             missed[inner, :, k - 1] = (rough - motion[k])[inner]
         return {
-            "time": track.time, "table": self.table, "target": self.target, "rest": self.rest,
-            "moves": self.moves, "effort": told,
-            "change": np.gradient(told, track.period, axis=0),
-            "q": motion[0], "qd": motion[1], "qdd": motion[2], "missed": missed,
-            "load": np.stack(force, -1), "own": np.stack(laws, -1), "wrench": track.wrench,
-            "held": track.held,
+            "effort": self.efforts, "q": motion[0], "qd": motion[1], "qdd": motion[2],
+            "missed": missed, "load": np.stack(force, -1), "own": np.stack(laws, -1),
+            "wrench": track.wrench, "held": track.held,
         }  # fmt: skip
 
 

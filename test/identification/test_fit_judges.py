@@ -302,10 +302,11 @@ def test_too_few_samples_for_the_numbers_are_rejected() -> None:
 
 
 def test_what_is_accepted_is_marked() -> None:
-    robot, record = load("linear_delta"), recorded("kgf_cm", "linear_delta", 4)
+    m, rng = drawn("five_bar", 4, 6.0), np.random.default_rng([4, 17])
+    record = IMPOSSIBLE["kgf_cm"](noisy(m.recorded(), rng), rng)
     with pytest.raises(PkmTwinError, match=r"kgf cm.*--accept"):
-        fit(robot, [record], KINDS)
-    result = fit(robot, [record], KINDS, accept=True)
+        fit(m.robot, [record], KINDS)
+    result = fit(m.robot, [record], KINDS, accept=True)
     assert len(result.accepted) == 1
     assert result.verdict.deviations == "withheld"
     assert all(np.isnan(n.deviation) for n in result.numbers if n.status != "not excited")
