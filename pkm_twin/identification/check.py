@@ -156,6 +156,9 @@ def checked(r: Recording, residual: float) -> Checked:
         return Checked(r, [*items, judged(RESIDUAL, one_line(str(error)), bound, False)])
     shares, unjudged = _shares(r, idle, compared)
     items += shares
+    if compared is not None and compared.hidden.any() and compared.good.all():
+        names = ", ".join(np.array(r.robot.joint_names)[compared.hidden])
+        unjudged = unjudged or f"noise, as of positions or stamps, hides the efforts of {names}"
     if compared is not None and not unjudged:
         stuck = _stuck_efforts(r, compared)
         if stuck:

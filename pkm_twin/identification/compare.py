@@ -55,6 +55,9 @@ STUCK: Final = 0.05
 """Time for which a joint, or an effort, stays the same before it counts as at rest, or stuck, s."""
 LIGHT: Final = 0.05
 """Part of the greatest peak effort of its unit that a joint's peak is taken for at least."""
+HIDES: Final = 0.5
+"""Part of the greatest effort of its unit, RMS, above which a residual of noise hides efforts that
+are twice the model's."""
 NEAR: Final = 0.5
 """Around a pick or release the payload is neither held nor gone, s, at most;"""
 LENGTHS: Final = 4.0
@@ -73,9 +76,10 @@ class Compared:
 
     ``time``: (k,), s; ``measured``, ``expected``, ``residual``: (k, n), N m or N; ``raw``: the
     residual before the filter. ``noise``: standard deviation in the band, ``peak``: of the model's
-    efforts, (n,). ``late``: of the efforts against the positions, taken out, s. ``starts``: the
-    first rows of the pieces. ``tracks``: their motion before the filter, and ``inner``, which part
-    of it has rows. ``bound``: of a good residual, RMS, as a part of the peak.
+    efforts, ``hidden``: whether noise hides them, (n,). ``late``: of the efforts against the
+    positions, taken out, s. ``starts``: the first rows of the pieces. ``tracks``: their motion
+    before the filter, and ``inner``, which part of it has rows. ``bound``: of a good residual, RMS,
+    as a part of the peak.
     """
 
     time: Array
@@ -85,6 +89,7 @@ class Compared:
     raw: Array
     noise: Array
     peak: Array
+    hidden: Mask
     late: float
     period: float
     starts: tuple[int, ...]
@@ -256,12 +261,16 @@ def _compared(r: Recording, bound: float) -> Compared | None:
     density = noise_of(long, shaken, period, how)
     size = np.abs(expected).max(0)
     units = np.array(robot.effort_units)
-    greatest = np.array([size[units == unit].max() for unit in units])
+
+    def greatest(sizes: Array) -> Array:
+        return np.array([sizes[units == unit].max() for unit in units])
+
     residual = left + late * change
+    noise = density * np.sqrt(passed_band(how, 1.0 / period) / period)
     return Compared(
         time, expected + residual, expected, residual, cut["left"] + late * cut["change"],
-        density * np.sqrt(passed_band(how, 1.0 / period) / period),
-        np.maximum(size, LIGHT * greatest), r.late + late, period,
+        noise, np.maximum(size, LIGHT * greatest(size)),
+        LOUD * noise > HIDES * greatest(rms(expected + residual)), r.late + late, period,
         tuple(starts), tuple(pieces), tuple(inside), how, bound,
     )  # fmt: skip
 

@@ -101,10 +101,12 @@ def read(
     if bag:
         if how.follow is not None:
             raise ParameterError("follow", how.follow, "no --follow: a bag has no pose columns")
-        return read_bag(path, robot, how, progress)
+        r = read_bag(path, robot, how, progress)
+        return r if how.deflected else r.without_repeats
     if how.topics:
         raise ParameterError("topic", how.topics[0], f"no --topic: {path} is a table")
-    return _of_table(path, robot, how)
+    r = _of_table(path, robot, how)
+    return r if how.deflected else r.without_repeats
 
 
 def _of_table(path: Path, name: str | Robot | None, how: ReadOptions) -> Recording:

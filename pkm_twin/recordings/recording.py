@@ -21,7 +21,7 @@ from pkm_twin.robot.robot import Robot
 from pkm_twin.streams.differentiator import Differentiator
 from pkm_twin.streams.rates import rate_faults
 from pkm_twin.streams.rest import SIGMAS, fit_gain, gradient_gain, noise, rate_doubt
-from pkm_twin.streams.steps import GAP
+from pkm_twin.streams.steps import GAP, repeats_of
 from pkm_twin.streams.wrench import WrenchSettings
 
 BY_SAMPLE: Final = (
@@ -187,6 +187,15 @@ class Recording:
         """Some of the samples, by a slice, mask or indices; times stay as they are."""
         values = {name: getattr(self, name) for name in BY_SAMPLE}
         return replace(self, **{k: v[rows] for k, v in values.items() if v is not None})
+
+    @property
+    def without_repeats(self) -> Recording:
+        """Without the samples that repeat the one before while a joint moves: they are missing."""
+        again = repeats_of(self.time, self.q)
+        if not again.any():
+            return self
+        text = f"{again.sum()} of {len(again)} samples repeat the one before: left out"
+        return replace(self, notes=(*self.notes, text)).part(~again)
 
     def on_time(self, late: float) -> Recording:
         """Efforts that are so late, s, put on time by whole samples, where none is missing then.

@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""Whether joints can have moved as their positions say: jumps, two publishers, missing samples.
+"""Whether joints can have moved as their positions say: jumps, repeats, two publishers, gaps.
 
 From one sample to the next a joint moves by its rate times the period. What it moves farther than
 its rates on both sides allow is a jump: a wrong sample of an encoder, or another publisher's. Where
@@ -49,6 +49,8 @@ ALTERNATING: Final = 16
 """Samples in a row that alternate between two publishers,"""
 ALTERNATING_PART: Final = 0.75
 """and part of them that must."""
+AGAIN: Final = 3
+"""Samples in a row that may repeat the one before: more are an encoder that stands still."""
 APART: Final = 0.25
 """By how much of a period a gap may miss a whole number of periods, where samples are missing."""
 
@@ -126,6 +128,30 @@ def steps_of(
             sizes = np.maximum(sizes, apart[1:])
             jumps, publishers = sizes > 0.0, (k - k // 2, k // 2)
     return Steps(jumps, sizes, publishers)
+
+
+def repeats_of(time: Array, q: Array) -> Mask:
+    """Samples that repeat the one before although a joint moves on, shape (k,).
+
+    Nothing was read at their time: they are off the cubic through two samples on each side. Slow
+    joints repeat the numbers of a coarse encoder.
+
+    :param time: rising, shape (k,), s; q, shape (k, n).
+    """
+    found, move = np.zeros(len(q), np.bool_), np.diff(q, axis=0)
+    apart = np.concatenate([np.ones_like(q[:1], np.bool_), move != 0.0])
+    own = [noise(time[new], one[new, None])[0] for one, new in zip(q.T, apart.T, strict=True)]
+    floor = 2.0 * SIGMAS * np.array(own) + 2.0 * _tick(np.abs(move))
+    for count in range(1, min(AGAIN, len(move) - 3) + 1):
+        around = np.array([0, 1, count + 2, count + 3])
+        apart_from = np.prod(count + 1 - around) / (count + 1 - around)
+        weights = apart_from / [np.prod([x - y for y in around if y != x]) for x in around]
+        rows = np.arange(len(q) - count - 3)[:, None] + around
+        away = np.abs(np.einsum("p,kpn->kn", weights, q[rows]) - q[count + 1 : -2])
+        same = ~sliding_window_view(apart[2:-2], count, axis=0).any(-1)
+        for k in np.flatnonzero((same & apart[1 : -count - 2] & (away > floor)).any(1)):
+            found[k + 2 : k + count + 2] = True
+    return found
 
 
 def _tick(steps: Array) -> Array:

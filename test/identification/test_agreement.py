@@ -126,6 +126,22 @@ def test_drives_that_are_off_before_the_motion_are_left_out_of_both() -> None:
     assert result.verdict.answer == "explains"
 
 
+def test_neither_stale_samples_nor_noise_make_twice_the_efforts_good() -> None:
+    """Stale samples are missing ones; where noise hides what efforts are, there is no verdict."""
+    rng = np.random.default_rng(8)
+    m = machine(load("delta"), rng, 8.0, 200.0)
+    sound = replace(noisy(m.recorded(), rng), robot=m.truth)
+    some = np.arange(len(m.time))
+    some[5:-5:40] -= 1
+    stale = replace(sound, q=m.q[some])
+    assert check(stale.without_repeats).answer == "bad"  # 2.5 % of the samples are missing
+    for scale, good in ((1.0, True), (2.0, False)):
+        found = compare(replace(stale, effort=scale * stale.measured).without_repeats)
+        assert found is not None and found.good.all() == good
+    shaken = replace(sound, q=0.3 * m.q + 0.7 * stale.q)
+    assert check(replace(shaken, effort=2.0 * shaken.measured)).answer == "not judged"
+
+
 @pytest.mark.parametrize("name", partly_long(MACHINES, "delta_cu"))
 def test_fit_and_check_name_one_cause(name: str) -> None:
     """The scale of all drives or of one, and a payload that is held throughout, in noise of 1 %."""

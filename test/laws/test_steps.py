@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from pkm_twin.streams.steps import sampling_of, steps_of
+from pkm_twin.streams.steps import repeats_of, sampling_of, steps_of
 
 LIMIT = (20.0, 20.0, 20.0)
 
@@ -38,6 +38,24 @@ def test_no_motion_jumps(rng, rate, measured):
         for case, (t, x, v) in enumerate(cases):
             found = steps_of(t, x, v if measured else None, LIMIT)
             assert not found.jumps.any() and found.publishers == (), case
+            assert not repeats_of(t, x).any(), case
+
+
+@pytest.mark.parametrize("part", [0.005, 0.1, 0.5])
+@pytest.mark.parametrize("noise", [0.0, 1e-5])
+def test_samples_that_repeat_the_one_before_are_found(rng, part, noise):
+    """All of them, but slow ones, whose numbers tell nothing, and none beside them."""
+    for _ in range(5):
+        time, q, qd = drawn(rng, 200.0)
+        q = q + noise * rng.normal(size=q.shape)
+        stale = np.zeros(len(time), bool)
+        stale[2:-2] = rng.random(len(time) - 4) < part
+        stale &= ~(np.roll(stale, 1) & np.roll(stale, 2) & np.roll(stale, 3))
+        source = np.maximum.accumulate(np.where(stale, 0, np.arange(len(time))))
+        found = repeats_of(time, q[source])
+        assert not found[~stale].any()
+        fast = np.abs(qd).max(1) > 1.0
+        assert found[stale & fast].mean() > 0.98
 
 
 @pytest.mark.parametrize("measured", [True, False])
