@@ -29,8 +29,8 @@ from pkm_twin.identification.compare import (
     near_change,
 )
 from pkm_twin.identification.judge import SIGMAS
-from pkm_twin.identification.plausible import MASSES, held_payload, listed, scale_text, wrenches
-from pkm_twin.identification.samples import passed_band
+from pkm_twin.identification.plausible import MASSES, listed, scale_text, wrenches
+from pkm_twin.identification.samples import held_payload, passed_band
 from pkm_twin.identification.suspects import OFF
 from pkm_twin.recordings import Load, Recording
 from pkm_twin.robot.plausibility import why_no_torques

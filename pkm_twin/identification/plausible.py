@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from pkm_twin.codegen.arrays import Array, Mask
 from pkm_twin.errors import PkmTwinError
 from pkm_twin.identification.rows import LARGEST, Rows, rows_of
+from pkm_twin.identification.samples import held_payload
 from pkm_twin.machine.friction import turning_keys
 from pkm_twin.machine.inertia import standard_parameters
 from pkm_twin.messages.reading import in_base_axes
@@ -86,10 +87,6 @@ MAX_SOLUTIONS: Final = 4
 """Most solutions for one recording, each with what the one before has left."""
 RATES: Final = (2.0, 0.5, 3.0, 1.0 / 3.0, 4.0, 0.25, 5.0, 0.2, 10.0, 0.1)
 """Of time steps that were taken for others'."""
-BLOCK: Final = 0.25
-"""Time over which a payload is held or is not, s,"""
-BLOCKS: Final = 400
-"""and at most so many of them in a recording."""
 SPANS: Final = 3
 """Most times that are named."""
 MASSES: Final = "all masses are {:.3g} times the file's"
@@ -97,51 +94,12 @@ LIKE_A_UNIT: Final = 1.25
 """A scale that is so near to a unit's is named by it."""
 
 
-def held_payload(
-    time: Array, column: Array, residual: Array, weight: Array
-) -> tuple[float, list[tuple[float, float]], Mask]:
-    """The mass that explains most of a residual while it is held, and when that is.
-
-    The block of times that explains most gives the mass; it is held where more than half of it is
-    seen, and from the samples on, and until those, that separate both best.
-
-    :param time: rising, shape (k,), s; the others (k, n): efforts of a kilogram, the residual, and
-        the weights of its squares.
-    :returns: kg, 0 where nothing is explained; spans of time, s; the samples of these, (k,).
-    """
-    span = max(BLOCK, float(time[-1] - time[0]) / BLOCKS)
-    block = np.floor((time - time[0]) / span).astype(np.int64)
-    rows = [np.sum(weight * column * one, 1) for one in (residual, column)]
-    pull, size = (np.bincount(block, one) for one in rows)
-    sums = [np.concatenate([[0.0], np.cumsum(one)]) for one in (pull, size)]
-    ahead, below = (one[None, :] - one[:, None] for one in sums)
-    gain = np.triu(np.maximum(ahead, 0.0) ** 2 / np.where(below > 0.0, below, np.inf), 1)
-    first, last = np.unravel_index(int(np.argmax(gain)), gain.shape)
-    mass = float(ahead[first, last] / max(below[first, last], 1e-300))
-    held = np.zeros(len(time), np.bool_)
-    if not mass > 0.0:
-        return 0.0, [], held
-    own = pull > 0.5 * mass * size
-    mass = float(pull[own].sum() / size[own].sum())
-    apart = np.cumsum(mass * (rows[0] - 0.5 * mass * rows[1]))
-    spans = []
-    for edges in np.flatnonzero(np.diff(own, prepend=False, append=False)).reshape(-1, 2):
-        ends = []
-        for edge, best in zip(edges.tolist(), (np.argmin, np.argmax), strict=True):
-            near = np.searchsorted(block, [edge - 1, edge + 1])
-            inside = 0 < edge < len(own)
-            place = near[0] + best(apart[slice(*near)]) if inside else edge * len(time)
-            ends.append(min(int(place), len(time) - 1))
-        spans.append((float(time[ends[0]]), float(time[ends[1]])))
-        held[ends[0] : ends[1] + 1] = True
-    return mass, spans, held
-
-
 @dataclass(frozen=True, eq=False)
 class Case:
     """A recording's efforts and the machines that may have made them: k rows, n joints.
 
-    ``effort``: measured, (k, n); ``late``: its derivative in time. ``rest``: what is certain;
+    ``effort``: measured, (k, n); ``late``: its derivative in time; ``variation``: its standard
+    deviation, (n,). ``rest``: what is certain;
     ``columns``: by what is not, (k, n, c), about ``usual``, as far off as ``spread`` (infinite:
     nobody knows), between ``low`` and ``high``, (c,). ``friction``: which columns turn round with
     time, (c,). ``counts``: 1 for what is judged. ``time``: of the rows, s, (k,). ``payload``: which
@@ -152,6 +110,7 @@ class Case:
 
     effort: Array
     late: Array
+    variation: Array
     rest: Array
     columns: Array
     low: Array
@@ -178,10 +137,27 @@ class Case:
         extra = 0.0 if self.inertial is None else (rate**2 - 1.0) * self.inertial
         return replace(self, columns=self.columns + extra)
 
-    @property
-    def variation(self) -> Array:
-        """Standard deviation of the efforts, shape (n,)."""
-        return np.asarray(np.maximum(np.std(self.effort, 0), 1e-300), np.float64)
+    @cached_property
+    def reduced(self) -> Case:
+        """The same by as few rows as columns: enough to judge it, and others of these columns."""
+        parts = [self.columns, *(one[..., None] for one in (self.effort, self.late, self.rest))]
+        parts += [] if self.inertial is None else [self.inertial]
+        table = np.concatenate(parts, -1) * self.counts[..., None]
+        rows = np.asarray(np.linalg.qr(table.swapaxes(0, 1), mode="r"), np.float64).swapaxes(0, 1)
+        columns, effort, late, rest, inertial = np.split(
+            rows, len(self.low) + np.arange(4), axis=-1
+        )
+        # Together they count as those that they stand for.
+        counts = np.full(effort.shape[:2], effort.size / max(float(self.counts.sum()), 1.0))
+        return replace(
+            self, columns=columns, effort=effort[..., 0], late=late[..., 0], rest=rest[..., 0],
+            counts=counts, inertial=None if self.inertial is None else inertial,
+        )  # fmt: skip
+
+    def scaled(self, factors: Array) -> Case:
+        """The same with each joint's efforts times a factor, (n,)."""
+        r, size = self.reduced, np.abs(factors) * self.variation
+        return replace(r, effort=factors * r.effort, late=factors * r.late, variation=size)
 
     def judged(self) -> Score:
         """How well, and how likely, the best of these machines explains the efforts."""
@@ -334,7 +310,7 @@ def recording_fault(rows: Rows) -> str | None:
     if told.cost < Score.of(0.0).cost + UNIT:
         return None
     loaded = (case.loaded_in_part(),) if case.payload.any() else ()
-    others = [*_efforts(case, joints), ("time runs backwards", case.backwards(), RARE)]
+    others = [*_efforts(case, joints), ("time runs backwards", case.reduced.backwards(), RARE)]
     others += [(*one, UNIT) for one in loaded]
     cause, best, gain = likeliest(told, ((t, other.judged, price) for t, other, price in others))
     # The part of the variation that is noise.
@@ -473,11 +449,16 @@ def case_of(rows: Rows, inertial: Array | None = None) -> Case:
     low, high = np.array(bounds).T
     wholes = [np.concatenate(each, -1) for each in zip(*parts, strict=True)]
     return Case(
-        rows.effort, rows.change, rows.rest, wholes[0], low, high, rows_of_prior,
-        np.array([value / spread for _, value, spread in prior]), np.array(friction), rows.counts,
-        rows.time, np.array(payload),
+        rows.effort, rows.change, _variation(rows.effort), rows.rest, wholes[0], low, high,
+        rows_of_prior, np.array([value / spread for _, value, spread in prior]),
+        np.array(friction), rows.counts, rows.time, np.array(payload),
         None if inertial is None else wholes[1],
     )  # fmt: skip
+
+
+def _variation(effort: Array) -> Array:
+    """Standard deviation of efforts, shape (n,)."""
+    return np.asarray(np.maximum(np.std(effort, 0), 1e-300), np.float64)
 
 
 def _points(reach: float) -> Array:
@@ -492,24 +473,20 @@ def _points(reach: float) -> Array:
 def _efforts(case: Case, joints: Sequence[str]) -> Iterator[tuple[str, Case, float]]:
     """Faults of the efforts, with their prices: signs, scales, columns, delays."""
     n = len(joints)
-
-    def scaled(factors: Array) -> Case:
-        return replace(case, effort=factors * case.effort, late=factors * case.late)
-
     for signs in _signs(case.scales(np.eye(n))):
         negative = [joint for joint, sign in zip(joints, signs, strict=True) if sign < 0.0]
-        yield f"efforts of {listed(negative, n)} have the wrong sign", scaled(signs), RARE
+        yield f"efforts of {listed(negative, n)} have the wrong sign", case.scaled(signs), RARE
     for which in [np.ones(n), *np.eye(n)] if n > 1 else [np.ones(1)]:
         # The likeliest scale is looked for, as the one of least squares is near it alone.
         near = case.scales(which[:, None])[int(np.argmax(which))]
         tried = [near * step for step in SCALES] + [1.0 / unit for unit in UNITS.values()]
         factors = [np.where(which > 0.0, one, 1.0) for one in tried if one != 0.0]
-        likely = min(factors, key=lambda one: scaled(one).judged().cost)
+        likely = min(factors, key=lambda one: case.scaled(one).judged().cost)
         factor = float(likely[int(np.argmax(which))])
         if not 1.0 / RANGE <= factor <= RANGE:
             names = listed([j for j, one in zip(joints, which, strict=True) if one > 0.0], n)
             price = UNIT if factor > 0.0 else RARE + UNIT
-            yield scale_text(names, 1.0 / factor), scaled(likely), price
+            yield scale_text(names, 1.0 / factor), case.scaled(likely), price
     orders = [(f"efforts of {joints[i]} and {joints[k]} are exchanged", _swap(n, i, k))
               for i, k in combinations(range(n), 2)]  # fmt: skip
     if n > 2:
@@ -517,13 +494,14 @@ def _efforts(case: Case, joints: Sequence[str]) -> Iterator[tuple[str, Case, flo
                    for s in (1, n - 1)]  # fmt: skip
         orders.append(("columns of the efforts are in another order", np.arange(n)[::-1]))
     for text, order in orders:
-        other = replace(case, effort=case.effort[:, order], late=case.late[:, order])
+        effort, late = case.effort[:, order], case.late[:, order]
+        other = replace(case, effort=effort, late=late, variation=case.variation[order])
         yield text, other, RARE
     yield from ((text, other, RARE) for text, other in _delays(case, joints))
     if case.inertial is not None:
         for rate in RATES:
             text = f"the motion was {rate:.2g} times as fast as its time stamps are (time steps?)"
-            yield text, case.faster(rate), UNIT
+            yield text, case.reduced.faster(rate), UNIT
 
 
 def _signs(scales: Array) -> list[Array]:
@@ -570,7 +548,8 @@ def _delays(case: Case, joints: Sequence[str]) -> Iterator[tuple[str, Case]]:
         for j in which:
             there = slice(most + step, k - most + step)
             effort[:, j], change[:, j] = case.effort[there, j], case.late[there, j]
-        made = replace(case, effort=effort, late=change, **cut)
+        size = _variation(effort)
+        made = replace(case, effort=effort, late=change, variation=size, **cut)
         yield late_text(names, step * case.period + float(made._best[1][-1])), made
 
 

@@ -401,3 +401,49 @@ def _spectrum(pieces: Sequence[Array], rate: float, segment: int) -> tuple[Array
     ]
     density = np.average([own for _, own in both], 0, [len(piece) for piece in used])
     return np.asarray(both[0][0], np.float64), np.asarray(0.5 * density, np.float64)
+
+
+BLOCK: Final = 0.25
+"""Time over which a payload is held or is not, s,"""
+BLOCKS: Final = 400
+"""and at most so many of them in a recording."""
+
+
+def held_payload(
+    time: Array, column: Array, residual: Array, weight: Array
+) -> tuple[float, list[tuple[float, float]], Mask]:
+    """The mass that explains most of a residual while it is held, and when that is.
+
+    The block of times that explains most gives the mass; it is held where more than half of it is
+    seen, and from the samples on, and until those, that separate both best.
+
+    :param time: rising, shape (k,), s; the others (k, n): efforts of a kilogram, the residual, and
+        the weights of its squares.
+    :returns: kg, 0 where nothing is explained; spans of time, s; the samples of these, (k,).
+    """
+    span = max(BLOCK, float(time[-1] - time[0]) / BLOCKS)
+    block = np.floor((time - time[0]) / span).astype(np.int64)
+    rows = [np.sum(weight * column * one, 1) for one in (residual, column)]
+    pull, size = (np.bincount(block, one) for one in rows)
+    sums = [np.concatenate([[0.0], np.cumsum(one)]) for one in (pull, size)]
+    ahead, below = (one[None, :] - one[:, None] for one in sums)
+    gain = np.triu(np.maximum(ahead, 0.0) ** 2 / np.where(below > 0.0, below, np.inf), 1)
+    first, last = np.unravel_index(int(np.argmax(gain)), gain.shape)
+    mass = float(ahead[first, last] / max(below[first, last], 1e-300))
+    held = np.zeros(len(time), np.bool_)
+    if not mass > 0.0:
+        return 0.0, [], held
+    own = pull > 0.5 * mass * size
+    mass = float(pull[own].sum() / size[own].sum())
+    apart = np.cumsum(mass * (rows[0] - 0.5 * mass * rows[1]))
+    spans = []
+    for edges in np.flatnonzero(np.diff(own, prepend=False, append=False)).reshape(-1, 2):
+        ends = []
+        for edge, best in zip(edges.tolist(), (np.argmin, np.argmax), strict=True):
+            near = np.searchsorted(block, [edge - 1, edge + 1])
+            inside = 0 < edge < len(own)
+            place = near[0] + best(apart[slice(*near)]) if inside else edge * len(time)
+            ends.append(min(int(place), len(time) - 1))
+        spans.append((float(time[ends[0]]), float(time[ends[1]])))
+        held[ends[0] : ends[1] + 1] = True
+    return mass, spans, held
