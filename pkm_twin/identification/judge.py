@@ -389,10 +389,12 @@ def _rows(
         tables.append(table.reshape(-1, table.shape[-1]))
         suspects.append((case.suspects * weight).reshape(-1, case.suspects.shape[-1]))
     change, scales, _ = prior
-    rest = np.zeros((len(change), tables[0].shape[1] - len(change)))
-    tables.append(np.concatenate([np.diag(1.0 / scales), rest], 1))
-    values.append(-change / scales)
-    suspects.append(np.zeros((len(change), suspects[0].shape[1])))
+    # Delays may be any; what the differentiation misses is about as large as it says.
+    sizes = [np.append(np.inf, np.ones(case.nuisance.shape[-1]))[:-1] for case in cases]
+    scales = np.concatenate([scales, *sizes])
+    tables.append(np.diag(1.0 / scales))
+    values.append(np.pad(-change, (0, len(scales) - len(change))) / scales)
+    suspects.append(np.zeros((len(scales), suspects[0].shape[1])))
     return np.concatenate(values), np.concatenate(tables), np.concatenate(suspects)
 
 

@@ -21,7 +21,7 @@ from pkm_twin.identification.estimation import Estimate, estimate
 from pkm_twin.identification.identifiable import Kind
 from pkm_twin.identification.parameters import FileParameters, file_parameters
 from pkm_twin.identification.samples import (
-    DEGREE,
+    EXACT,
     LEAST,
     WINDOWS,
     Filtering,
@@ -29,8 +29,9 @@ from pkm_twin.identification.samples import (
     Resonance,
     Track,
     by_blocks,
+    calm,
     filtered,
-    local_fit,
+    in_motion,
     noise_of,
     passed_band,
     resonances_of,
@@ -61,13 +62,6 @@ STRIBECK: Final = (0.05, 0.1, 0.2)
 """Speeds below which static friction shows, over the rms speed."""
 MOTION: Final = 0.4
 """Part of the filter's cut-off in which nearly all of the motion is."""
-SMOOTH: Final = 5
-"""Degree of the splines that have the motion below it."""
-CENTRAL: Final = (7, 6)
-"""Samples and degree of the polynomial whose derivatives in its middle are central differences of
-sixth order."""
-ENDS: Final = (9, 4)
-"""And of the one that is differentiated at the ends of a piece: there are no samples beyond."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -267,10 +261,18 @@ def rows_of(
     if all(not part.moves.any() for part in parts):
         raise PkmTwinError(f"{r.name}: no excitation, the joints stand still")
     first, outliers = _drop_outliers(parts, parameters, how.keep_every)
-    f = filtered([part.columns(first) for part in parts], pieces[0].period, how)
     told = [part.told(model, first) for part in parts]
+    both = zip(parts, told, strict=True)
+    f = filtered([part.columns(one) for part, one in both], pieces[0].period, how)
     # Where standing still is in the filter's reach, friction's sign is not known.
-    counts = (f["moves"] > 0.8).astype(np.float64)
+    moves, left = f["moves"] > 0.8, f["target"] - f["table"] @ first
+    usual = [
+        float(usual_size(one[some])) if some.any() else 0.0
+        for one, some in zip(left.T, moves.T, strict=True)
+    ]
+    # And what it may add is below what else is left.
+    least = np.maximum(usual, EXACT * np.sqrt(np.mean(f["target"] ** 2, 0)))
+    counts = (moves & (np.abs(f["doubt"]) < least)).astype(np.float64)
     return Rows(
         r, model, how, tuple(pieces), f["time"], f["table"], f["target"], f["rest"], counts,
         f["change"], outliers, cache(lambda: _signals(r, model, how, told, first)),
@@ -284,7 +286,8 @@ def _signals(
 
     :param told: by piece. ``first``: parameters of a first fit.
     """
-    tracks, left = [one.track for one in told], [one.left for one in told]
+    tracks = [one.track for one in told]
+    left = in_motion([one.left for one in told], [one.moves for one in told])
     longest = max(tracks, key=lambda t: len(t.time))
     speed = np.sqrt(np.mean(np.concatenate([track.qd for track in tracks]) ** 2, 0))
     f = filtered([one.columns(speed, how) for one in told], longest.period, how)
@@ -324,7 +327,8 @@ def shaken_efforts(
             least=min(LEAST // 2, len(track.time)),
         )
         told.append(np.concatenate([efforts(t) for t in pieces]))
-    return np.asarray(told[1] - told[0], np.float64)
+    change = told[1] - told[0]
+    return in_motion([change], [track.moves(how)[: len(change)]])[0]
 
 
 @dataclass(frozen=True, eq=False)
@@ -347,35 +351,33 @@ class _Piece:
             moves = np.where(model.robot.friction.presliding > 0.0, memory.unknown < KNOWN, moves)
         return cls(track, table, track.effort - rest, rest, moves.astype(np.float64))
 
-    def columns(self, first: Array) -> dict[str, Array]:
-        """What rows are made of, by name, (samples, ...) each.
-
-        :param first: parameters of a first fit.
-        """
-        change = np.gradient(self.rest + self.table @ first, self.track.period, axis=0)
+    def columns(self, told: _Told) -> dict[str, Array]:
+        """What rows are made of, by name, (samples, ...) each."""
         return {
             "time": self.track.time, "table": self.table, "target": self.target, "rest": self.rest,
-            "moves": self.moves, "change": change,
+            "moves": self.moves, "doubt": (1.0 - self.moves) * np.abs(told.efforts - told.load),
+            "change": np.gradient(told.efforts, self.track.period, axis=0),
         }  # fmt: skip
 
     def told(self, model: Model, first: Array) -> _Told:
         """What a first fit says of it."""
         told, rubs = self.rest + self.table @ first, model.of_drives
         load = told - self.table[..., rubs] @ first[rubs]
-        return _Told(self.track, told, load, self.target - self.table @ first)
+        return _Told(self.track, told, load, self.target - self.table @ first, self.moves)
 
 
 @dataclass(frozen=True, eq=False)
 class _Told:
     """What a first fit says of a piece before the filter; its efforts also less friction, (k, n).
 
-    ``left``: what it leaves of the measured ones.
+    ``left``: what it leaves of the measured ones; ``moves``: of the piece.
     """
 
     track: Track
     efforts: Array
     load: Array
     left: Array
+    moves: Array
 
     def columns(self, speed: Array, how: Filtering) -> dict[str, Array]:
         """What signals are made of, by name, (samples, ...) each.
@@ -391,14 +393,9 @@ class _Told:
             laws.append(np.exp(-((track.qd / np.maximum(share * speed, 1e-300)) ** 2)) * sign)
         cutoff = None if how.cutoff is None else MOTION * how.cutoff
         motion, force = (calm(values, track.period, cutoff) for values in (track.q, load))
-        inner = slice(how.window // 2 + 3, len(load) - how.window // 2 - 3)
-        missed = np.zeros((*load.shape, 2))
-        for k in (1, 2):
-            rough = local_fit(motion[0], how.window, DEGREE, k, track.period)
-            missed[inner, :, k - 1] = (rough - motion[k])[inner]
         return {
             "effort": self.efforts, "q": motion[0], "qd": motion[1], "qdd": motion[2],
-            "missed": missed, "load": np.stack(force, -1), "own": np.stack(laws, -1),
+            "missed": track.missed, "load": np.stack(force, -1), "own": np.stack(laws, -1),
             "wrench": track.wrench, "held": track.held,
         }  # fmt: skip
 
@@ -427,8 +424,9 @@ def _drop_outliers(
     table = np.concatenate([part.table[::every] for part in parts])
     target = np.concatenate([part.target[::every] for part in parts])
     rest = np.concatenate([part.rest[::every] for part in parts])
+    moves = np.concatenate([part.moves[::every] for part in parts])
     scales = prior_scales(parameters, table, target + rest)
-    first = estimate(table, target, parameters.values, scales).values
+    first = estimate(table, target, parameters.values, scales, judged=moves).values
     count = 0
     for part in parts:
         told = part.table @ first
@@ -462,31 +460,6 @@ def prior_scales(parameters: FileParameters, table: Array, effort: Array) -> Arr
         alike = [s for s, kind in zip(scales, kinds, strict=True) if kind == kinds[k] and s > 0.0]
         scales[k] = max(alike, default=1.0)
     return scales
-
-
-def calm(values: Array, period: float, cutoff: float | None) -> list[Array]:
-    """Signals (samples, n) below a frequency, Hz, with their first and second derivative.
-
-    A least-squares spline with two knots a period: unlike a filter's, its ends take nothing for
-    granted of what is beyond them, so that derivatives hold there too. None: as they are.
-    """
-    if cutoff is None:
-        return [values, *(derivative(values, order, period) for order in (1, 2))]
-    last = (len(values) - 1) * period
-    places = np.linspace(0.0, last, 1 + max(1, round(2.0 * cutoff * last)))
-    knots = np.concatenate([np.zeros(SMOOTH), places, np.full(SMOOTH, last)])
-    time = np.linspace(0.0, last, len(values))
-    spline = scipy.interpolate.make_lsq_spline(time, values, knots, SMOOTH)
-    return [np.asarray(spline(time, order), np.float64) for order in range(3)]
-
-
-def derivative(values: Array, order: int, period: float) -> Array:
-    """Along the first axis: central differences of sixth order, polynomials at the ends."""
-    inner, ends = (
-        local_fit(values, points, degree, order, period) for points, degree in (CENTRAL, ENDS)
-    )
-    beside = CENTRAL[0] // 2
-    return np.concatenate([ends[:beside], inner[beside:-beside], ends[-beside:]])
 
 
 LOAD_PASSES: Final = 2

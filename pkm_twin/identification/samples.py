@@ -36,6 +36,13 @@ BAND: Final = 10.0
 """Cut-off of the low-pass filter, by the motion's mean frequency."""
 LEAST: Final = 200
 """Samples that a recording needs."""
+SMOOTH: Final = 5
+"""Degree of the splines that have the motion below it."""
+CENTRAL: Final = (7, 6)
+"""Samples and degree of the polynomial whose derivatives in its middle are central differences of
+sixth order."""
+ENDS: Final = (9, 4)
+"""And of the one that is differentiated at the ends of a piece: there are no samples beyond."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,11 +70,15 @@ class Motion:
 
 @dataclass(frozen=True, eq=False)
 class Track(Motion):
-    """Evenly sampled motion of one piece of a recording: ``time`` (k,), s; effort (k, n)."""
+    """Evenly sampled motion of one piece of a recording: ``time`` (k,), s; effort (k, n).
+
+    ``missed``: by rates and accelerations, as a polynomial of two degrees more says, (k, n, 2).
+    """
 
     time: Array
     effort: Array
     period: float
+    missed: Array
 
     def moves(self, how: Filtering) -> Mask:
         """Where a joint moves, clear of what noise makes of its rates, shape (k, n)."""
@@ -146,6 +157,31 @@ def local_fit(values: Array, window: int, degree: int, order: int, period: float
     return np.asarray(result, np.float64)
 
 
+def calm(values: Array, period: float, cutoff: float | None) -> list[Array]:
+    """Signals (samples, n) below a frequency, Hz, with their first and second derivative.
+
+    A least-squares spline with two knots a period: unlike a filter's, its ends take nothing for
+    granted of what is beyond them, so that derivatives hold there too. None: as they are.
+    """
+    if cutoff is None:
+        return [values, *(derivative(values, order, period) for order in (1, 2))]
+    last = (len(values) - 1) * period
+    places = np.linspace(0.0, last, 1 + max(1, round(2.0 * cutoff * last)))
+    knots = np.concatenate([np.zeros(SMOOTH), places, np.full(SMOOTH, last)])
+    time = np.linspace(0.0, last, len(values))
+    spline = scipy.interpolate.make_lsq_spline(time, values, knots, SMOOTH)
+    return [np.asarray(spline(time, order), np.float64) for order in range(3)]
+
+
+def derivative(values: Array, order: int, period: float) -> Array:
+    """Along the first axis: central differences of sixth order, polynomials at the ends."""
+    inner, ends = (
+        local_fit(values, points, degree, order, period) for points, degree in (CENTRAL, ENDS)
+    )
+    beside = CENTRAL[0] // 2
+    return np.concatenate([ends[:beside], inner[beside:-beside], ends[-beside:]])
+
+
 def even_pieces(
     time: Array, columns: list[Array], least: int = LEAST // 2
 ) -> list[tuple[Array, list[Array]]]:
@@ -195,14 +231,16 @@ def tracks(
     width = window or choose_window(positions, period, noise)
     result = []
     for t, (place, force, load, carried, *known) in pieces:
-        smooth, rate, second = (
-            (place, *known)
-            if known
-            else (local_fit(place, width, DEGREE, k, period) for k in range(3))
+        rough, fine = (
+            known or [local_fit(place, width, degree, k, period) for k in (1, 2)]
+            for degree in (DEGREE, DEGREE + 2)
         )
         cut = slice(width // 2, len(t) - width // 2)
-        motion = Motion(smooth, rate, second, load, carried).part(cut)
-        result.append(Track(**vars(motion), time=t[cut], effort=force[cut], period=period))
+        smooth = place if known else local_fit(place, width, DEGREE, 0, period)
+        motion = Motion(smooth, rough[0], rough[1], load, carried).part(cut)
+        missed = np.stack(rough, -1)[cut] - np.stack(fine, -1)[cut]
+        result.append(Track(**vars(motion), time=t[cut], effort=force[cut], period=period,
+                            missed=missed))  # fmt: skip
     speed = np.sqrt(np.mean(np.concatenate([p.qd for p in result]) ** 2, 0))
     change = np.sqrt(np.mean(np.concatenate([p.qdd for p in result]) ** 2, 0))
     moving = speed > 0.0
@@ -295,6 +333,18 @@ def passed_band(how: Filtering, rate: float) -> float:
 def usual_size(residual: Array) -> Array:
     """Standard deviation of normal residuals (k, n) by the median of their sizes, (n,)."""
     return np.asarray(ROBUST * np.median(np.abs(residual), axis=0), np.float64)
+
+
+def in_motion(values: Sequence[Array], moves: Sequence[Array | Mask]) -> list[Array]:
+    """Noise of pieces, (samples, n) each, where the direction of friction is known; else zero.
+
+    Larger in turn, so that its power is that of a joint that moves all the time.
+
+    :param moves: where it is known, of the same shapes.
+    """
+    known = np.asarray(np.concatenate(moves), np.float64)
+    share = np.sqrt(np.maximum(np.mean(known, 0), 1e-300))
+    return [one * some / share for one, some in zip(values, moves, strict=True)]
 
 
 @dataclass(frozen=True)

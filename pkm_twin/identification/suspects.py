@@ -406,7 +406,9 @@ class _Court:
             columns = few.explained, few.nuisance[..., 1:], late, few.suspects[..., which], measured
             whole = np.concatenate(columns, -1) * weight
             parts.append(whole.reshape(-1, whole.shape[-1]))
-        table = np.concatenate(parts)
+        fitted, width = cases[0].explained.shape[-1], parts[0].shape[1]
+        known = np.eye(width)[fitted : fitted + len(self.problem.robot.joint_names)]
+        table = np.concatenate([*parts, known])
         split = table.shape[1] - len(cases) - len(which) - 1
         basis = basis_of(table[:, :split])
         left = table[:, split:] - basis @ (basis.T @ table[:, split:])

@@ -15,7 +15,8 @@ from pkm_twin import Robot
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.identification.fit import fit
 from pkm_twin.identification.parameters import file_parameters
-from pkm_twin.identification.rows import derivative, rows_of
+from pkm_twin.identification.rows import rows_of
+from pkm_twin.identification.samples import derivative
 from pkm_twin.identification.suspects import USUAL, Lengths
 from pkm_twin.mechanisms.catalogue import robot_of_data
 from pkm_twin.recordings import Load, Recording
