@@ -89,7 +89,7 @@ def test_efforts_that_are_late_leave_noise_alone() -> None:
 @pytest.mark.parametrize("name", partly_long(["delta", "five_bar", "linear_delta"], "five_bar"))
 def test_fit_and_check_say_the_same_of_late_efforts(name: str) -> None:
     """Up to 50 ms both take the delay out, and no friction is in its place; of more it is told."""
-    m = machine(load(name), np.random.default_rng([3, *name.encode()]), 10.0, 250.0)
+    m = machine(load(name), np.random.default_rng([3, *name.encode()]), 6.0, 250.0)
     for late in (-0.03, 0.045):
         effort = shifted(m.efforts, m.time, late)
         made = replace(noisy(m.recorded(effort=effort), np.random.default_rng(7)), robot=m.truth)
@@ -181,7 +181,7 @@ def test_fit_and_check_name_one_cause(name: str) -> None:
         assert abs(payload.after - mass) < 3.0 * payload.deviation
 
 
-@pytest.mark.parametrize("name", partly_long(["delta", "five_bar", "stewart"], "stewart"))
+@pytest.mark.parametrize("name", partly_long(["delta", "five_bar", "stewart"], "five_bar"))
 def test_two_numbers_are_not_told_as_one(name: str) -> None:
     """A payload, throughout or for a while, with a scale; a scale with a sign."""
     m = machine(load(name), np.random.default_rng(6), 8.0, 200.0)
@@ -278,7 +278,7 @@ def test_a_fit_is_compared_with_the_file_wherever_it_starts() -> None:
         m.recorded(effort=inverse_dynamics(heavy, m.q, m.qd, m.qdd)), np.random.default_rng(8)
     )
     sizes = []
-    for start in (None, Load(0.1), Load(0.4), Load(0.6, (0.05, 0.0, 0.02))):
+    for start in (None, Load(0.4), Load(0.6, (0.05, 0.0, 0.02))):
         found, *_ = fit_recordings(light, [replace(made, robot=light, load=start)], ("payload",))
         (payload,) = (n for n in found.numbers if n.name == "payload.mass")
         assert payload.before == 0.1
