@@ -25,7 +25,7 @@ from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import PkmTwinError, check_limit
 from pkm_twin.identification.parameters import FileParameters
 from pkm_twin.robot.robot import Robot
-from pkm_twin.robot.workspace import reachable
+from pkm_twin.robot.workspace import position_range, reachable
 
 SAMPLES: Final = 120
 """States of a trial at which the information is taken."""
@@ -173,7 +173,8 @@ def excite(
         points a second than it is written with.
     """
     robot, keep = judge.robot, bounds or Bounds()
-    centre, reach = position_range(robot, keep.share)
+    centre, reach = position_range(robot)
+    reach *= keep.share
     harmonics = _harmonics(robot, duration, terms, reach, keep)
     whole = _Fine.of(duration, harmonics)
     basis = _resting(harmonics)
@@ -215,18 +216,6 @@ def excite(
     few = whole.time[:: -(-len(whole.time) // (2 * DENSE))]
     condition = judge.condition(*_series(few, duration, harmonics, centre, final))
     return Excitation(duration, harmonics, centre, final[0], final[1], condition)
-
-
-def position_range(robot: Robot, share: float) -> tuple[Array, Array]:
-    """Middle and half width of the joints' positions that are used, shape (n,) each."""
-    home, size = robot.graph.home, robot.engine.tree.size
-    half = np.array([0.15 * size if unit == "m" else 0.3 for unit in robot.joint_units])
-    low, high = home - half, home + half
-    if robot.limits.position is not None:
-        given = np.isfinite(robot.limits.position).all(1)
-        low = np.where(given, robot.limits.position[:, 0], low)
-        high = np.where(given, robot.limits.position[:, 1], high)
-    return (low + high) / 2, share * (high - low) / 2
 
 
 def _harmonics(robot: Robot, duration: float, terms: int, reach: Array, keep: Bounds) -> Array:
@@ -398,7 +387,8 @@ def sweeps(judge: Judge, duration: float, bounds: Bounds | None = None) -> Sweep
     :raises PkmTwinError: a joint that cannot move alone.
     """
     robot, keep = judge.robot, bounds or Bounds()
-    centre, reach = position_range(robot, keep.share)
+    centre, reach = position_range(robot)
+    reach *= keep.share
     n, ratios = len(centre), np.array(SPEEDS)
     limits = robot.limits.velocity
     most = np.full(n, np.inf) if limits is None else keep.share * np.broadcast_to(limits, n)

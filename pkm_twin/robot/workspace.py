@@ -327,8 +327,8 @@ def causes(
     return f"{', '.join(texts)} of the joint states tried"
 
 
-def random_joints(robot: Robot, rng: np.random.Generator, count: int) -> Array:
-    """Joint positions clear of singularities, within limits where there are some, (count, n)."""
+def position_range(robot: Robot) -> tuple[Array, Array]:
+    """Middle and half width of the joints' positions, shape (n,) each: the limits, or near home."""
     home, size = robot.graph.home, robot.engine.tree.size
     half = np.array([0.15 * size if unit == "m" else 0.3 for unit in robot.joint_units])
     low, high = home - half, home + half
@@ -336,8 +336,14 @@ def random_joints(robot: Robot, rng: np.random.Generator, count: int) -> Array:
         given = np.isfinite(robot.limits.position)
         low = np.where(given[:, 0], robot.limits.position[:, 0], low)
         high = np.where(given[:, 1], robot.limits.position[:, 1], high)
+    return (low + high) / 2, (high - low) / 2
+
+
+def random_joints(robot: Robot, rng: np.random.Generator, count: int) -> Array:
+    """Joint positions clear of singularities, within limits where there are some, (count, n)."""
+    home, (middle, reach) = robot.graph.home, position_range(robot)
+    low, high = middle - reach, middle + reach
     kept, share = np.empty((0, len(home))), 1.0
-    middle, reach = (low + high) / 2, (high - low) / 2
     # A machine with much gear has a small index everywhere.
     least = min(INSIDE, 0.5 * float(robot.singularity(home)))
     while len(kept) < count:
