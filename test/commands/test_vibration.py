@@ -38,3 +38,15 @@ def test_a_platform_on_a_rigid_chain_is_rejected_with_the_joint_to_soften(twin, 
     data["joints"]["gimbal"]["compliance"] = elastic["gimbal"]
     file.write_text(yaml.safe_dump({**data, "modal_damping": [0.03]}))
     twin.good(name, file, *options)
+
+
+def test_natural_frequencies_need_no_damping(twin, tmp_path):
+    data = yaml.safe_load((REPOSITORY / "config/five_bar.yaml").read_text())
+    whole = twin.told("frf", "five_bar")["modes"]
+    del data["modal_damping"]
+    file = tmp_path / "five_bar.yaml"
+    file.write_text(yaml.safe_dump(data))
+    found = twin.told("frf", file)["modes"]
+    hertz = [[mode["frequency_hz"] for mode in modes] for modes in (found, whole)]
+    assert hertz[0] == pytest.approx(hertz[1], rel=1e-9)
+    assert "modal_damping" in twin.refused("frf", file, "--out", tmp_path / "frf.csv")

@@ -17,6 +17,7 @@ from pkm_twin.report import Fact, Report, plots
 from pkm_twin.settings import setting
 
 if TYPE_CHECKING:
+    from pkm_twin.codegen.arrays import Array
     from pkm_twin.robot.robot import Robot
     from stiffness_monitor.vibration import ToolModes
 
@@ -29,7 +30,8 @@ class FrequencyResponse(AtPose, OfTool, Writes, Draws):
 
     The response is the displacement per harmonic force (receptance), actuators locked, of the
     elastic frame with its masses and modal damping. The command prints natural frequencies, and the
-    frequency and direction in which the tool point responds most.
+    frequency and direction in which the tool point responds most. Without damping it prints natural
+    frequencies only.
 
     The table has the columns frequency (Hz) and, for each pair of directions in base axes,
     real and imaginary part (m/N): xx.real, xx.imag, xy.real, ... xy is the displacement along x per
@@ -48,10 +50,19 @@ class FrequencyResponse(AtPose, OfTool, Writes, Draws):
 
 def frf(given: FrequencyResponse) -> Report:
     """The modes at the tool point, and where it responds most."""
+    from stiffness_monitor.modes import natural_frequencies
     from stiffness_monitor.vibration import tool_modes
 
     machine = given.machine()
     pose = given.pose(machine)
+    damped = given.damping is not None or machine.modal_damping.size
+    if not damped and given.out is None and given.picture is None:
+        found = natural_frequencies(machine, pose)
+        return Report(
+            f"{machine.name}: lowest natural frequency {found[0]:.4g} Hz",
+            of_modes(machine, pose, found),
+            notes=["the response needs --damping, or modal_damping in the robot file"],
+        )
     modes = tool_modes(machine, pose, damping=given.damping, tool=given.tool)
     low, high = given.frequencies or (0.0, 1.2 * float(modes.frequencies[:6][-1]))
     if not 0.0 <= low < high:
@@ -77,7 +88,7 @@ def frf(given: FrequencyResponse) -> Report:
     return Report(
         answer,
         [
-            *of_modes(machine, pose, modes),
+            *of_modes(machine, pose, modes.frequencies, modes.damping),
             Fact("static_compliance_m_per_n", static),
             Fact("most", most),
         ],
@@ -86,15 +97,20 @@ def frf(given: FrequencyResponse) -> Report:
     )
 
 
-def of_modes(machine: Robot, pose: list[float], modes: ToolModes) -> list[Fact]:
+def of_modes(
+    machine: Robot, pose: list[float], frequencies: Array, damping: Array | None = None
+) -> list[Fact]:
     """The robot, the pose, and its lowest modes."""
-    pairs = list(zip(modes.frequencies.tolist(), modes.damping.tolist(), strict=True))[:6]
-    shown = ", ".join(f"{f:.4g} Hz ({100 * z:.3g} %)" for f, z in pairs)
-    found = [{"frequency_hz": f, "damping": z} for f, z in pairs]
+    found = [{"frequency_hz": f} for f in frequencies[:6].tolist()]
+    texts = [f"{f:.4g} Hz" for f in frequencies[:6].tolist()]
+    for k, ratio in enumerate([] if damping is None else damping[:6].tolist()):
+        found[k]["damping"] = ratio
+        texts[k] += f" ({100 * ratio:.3g} %)"
+    what = "modes" if damping is None else "modes (damping)"
     return [
         Fact("robot", machine.name),
         Fact("pose", dict(zip(machine.pose_names, pose, strict=True))),
-        Fact("modes", found, text="modes (damping)", shown=shown),
+        Fact("modes", found, text=what, shown=", ".join(texts)),
     ]
 
 

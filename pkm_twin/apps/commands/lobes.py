@@ -76,7 +76,7 @@ def lobes(given: Lobes) -> Report:
     return Report(
         answer,
         [
-            *of_modes(machine, pose, modes),
+            *of_modes(machine, pose, modes.frequencies, modes.damping),
             Fact("best", _place(*best) | {"speed_margin": MARGIN}),
             Fact("least", _place(*worst)),
             Fact("zero_order_depth_m", found.safe),
