@@ -48,6 +48,7 @@ class Along:
                 "case": case.name, "what": case.what, "answer": case.answer,
                 "value": float(one.value[k]), "unit": case.unit, "time_s": float(self.time[k]),
                 "pose": dict(zip(self.robot.pose_names, self.pose[k].tolist(), strict=True)),
+                "pose_units": dict(zip(self.robot.pose_names, self.robot.pose_units, strict=True)),
             }  # fmt: skip
             if one.direction is not None and axes:
                 answer |= {"direction": one.direction[k].tolist(), "axes": list(axes)}

@@ -86,6 +86,7 @@ def answers(data: Dataset) -> list[dict[str, Any]]:
             "value": float(part.worst_value),
             "unit": str(part.case_unit.values),
             "pose": dict(zip(names, part.worst_pose.values.tolist(), strict=True)),
+            "pose_units": units_of(data),
         }
         if "worst_bound" in data:
             answer["singularity"] = float(part.worst_singularity)
@@ -101,9 +102,9 @@ def answers(data: Dataset) -> list[dict[str, Any]]:
 
 
 def sentence(answer: dict[str, Any]) -> str:
-    """The worst of a case in words: "softest: 32.8 µm/N along y at (0, -0.16, -0.35), arm III".
+    """The worst of a case in words: "softest: 32.8 µm/N along y at (0, -0.16, -0.35) m, arm III".
 
-    The pose is in m and rad, as commands read it, with digits that keep its singularity index.
+    The pose is as commands read it, with digits that keep its singularity index.
     """
     pose = ", ".join(f"{_plain(v, NOISE):.6g}" for v in answer["pose"].values())
     text = f"{answer['answer']}: {shown(answer['value'], answer['unit'])}"
@@ -113,7 +114,9 @@ def sentence(answer: dict[str, Any]) -> str:
         alone = abs(way[axis]) > 0.9995
         words = ", ".join(f"{_plain(v):.3g}" for v in way)
         text += f" along {answer['axes'][axis] if alone else f'({words})'}"
-    text += f" at ({pose})" + (f", {answer['element']}" if "element" in answer else "")
+    units = list(answer["pose_units"].values())
+    text += f" at ({pose}) " + (units[0] if len(set(units)) == 1 else f"[{', '.join(units)}]")
+    text += f", {answer['element']}" if "element" in answer else ""
     if (bound := answer.get("singularity_bound")) is not None:
         text += f"; on the bound of the singularity index, {bound:g}: worse poses lie below it"
     return text

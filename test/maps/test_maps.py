@@ -222,9 +222,9 @@ def test_documented_worst_values():
     assert 1e6 * worst.found.value[0] == pytest.approx(softest, rel=0.01)
     assert worst.bounded and worst.index == pytest.approx(LEAST, rel=1e-3)
     # Also as it is printed.
-    printed = numbers(page, r"softest: .*? at \((\S+), (\S+), (\S+)\), arm III")
+    printed = numbers(page, r"softest: .*? at \((\S+), (\S+), (\S+)\) m, arm III")
     assert robot.singularity(robot.inverse(printed)) == pytest.approx(LEAST, rel=1e-3)
-    pattern = r"push: moves most: (\S+) µm .*? at \((\S+), (\S+), (\S+)\), arm I; .*?lift: moves "
+    pattern = r"push: moves most: (\S+) µm .*? at \((\S+), (\S+), (\S+)\) m, arm I; .*?lift: moves "
     push, x, y, z, lift = numbers(page, pattern + r"most: (\S+) µm")
     q = robot.inverse([[x, y, z]])
     for value, wrench in ((push, (30.0, 0, 0, 0, 0, 0)), (lift, (0, 0, 30.0, 0, 0, 0))):
@@ -280,7 +280,9 @@ def test_along_a_path_and_as_numbers(capsys, tmp_path, monkeypatch):
 
 def test_a_pose_in_a_sentence_is_as_commands_read_it():
     answer = {"answer": "softest", "value": 1e-5, "unit": "m/N", "pose": {"x": 0.7235, "b": 0.4552}}
-    assert figures.sentence(answer).endswith("(0.7235, 0.4552)")
+    for units, text in (("mm", "m"), (("m", "rad"), "[m, rad]")):
+        answer["pose_units"] = dict(zip("xb", units, strict=True))
+        assert figures.sentence(answer).endswith(f"(0.7235, 0.4552) {text}")
 
 
 def test_milling_depths_are_those_of_each_pose(capsys, tmp_path, monkeypatch):
