@@ -29,8 +29,6 @@ from pkm_twin.identification.compare import (
     near_change,
     near_jumps,
     recorded_of,
-    step_fault,
-    steps_in,
 )
 from pkm_twin.identification.plausible import LATEST
 from pkm_twin.identification.samples import usual_size
@@ -40,7 +38,6 @@ from pkm_twin.robot.limits import ranges
 from pkm_twin.robot.plausibility import why_no_torques
 from pkm_twin.streams.drives import COUNT, SAME
 from pkm_twin.streams.rates import MAX_RATE, STANDS, rate_faults, rms
-from pkm_twin.streams.steps import Steps
 
 REJECTED: Final = "messages that a node rejects"
 POSITION_STEPS: Final = "position steps"
@@ -133,14 +130,13 @@ def checked(r: Recording, residual: float) -> Checked:
 
     :param residual: largest good one, RMS, part of the peak effort.
     """
-    steps = steps_in(r)
-    items = [*_file(r), *_motion(r, steps), *_limits(r), _singularity(r)]
+    items = [*_file(r), *_motion(r), *_limits(r), _singularity(r)]
     left_out = np.zeros(len(r.time), np.bool_)
     bound = f"RMS below {100 * residual:g} % of peak"
     reason = why_no_torques(r.robot)
     if r.effort is None:
         reason = reason or (COMPUTED if r.efforts == "model" else "the bag carries no efforts")
-    mixed = step_fault(r, steps) if steps.publishers else ""
+    mixed = r.jumps if r.steps.publishers else ""
     if mixed or reason or r.effort is None:
         items.append(judged(RESIDUAL, mixed or reason, bound, None))
         unjudged = COMPUTED if reason == COMPUTED else ""
@@ -148,7 +144,7 @@ def checked(r: Recording, residual: float) -> Checked:
         return Checked(r, items, unjudged=unjudged, missing=missing, causes=causes)
     try:
         idle = idle_of(r)
-        left_out = idle | near_jumps(steps, len(r.time))
+        left_out = idle | near_jumps(r.steps, len(r.time))
         compared = compared_of(r, left_out, residual)
         bands = {} if compared is None else _bands(r, compared)
     # ValueError: numbers within bounds whose result is not finite.
@@ -183,7 +179,7 @@ def _file(r: Recording) -> list[Fact]:
     ]
 
 
-def _motion(r: Recording, steps: Steps) -> list[Fact]:
+def _motion(r: Recording) -> list[Fact]:
     """The items on time stamps, steps and velocities."""
     if len(r.time) < 3:
         return [judged("rate", f"{len(r.time)} joint states", "3 or more", None)]
@@ -191,7 +187,6 @@ def _motion(r: Recording, steps: Steps) -> list[Fact]:
     median, longest = float(np.median(periods)), float(periods.max())
     gap = f"{1e3 * longest:.3f} ms at {r.time[int(periods.argmax())]:.3f} s"
     within, rate = MAX_GAP * median, f"{1 / median:.1f} Hz over {r.time[-1]:.3f} s"
-    fault = step_fault(r, steps)
     items = [
         judged("rate", rate, "", True, number=1 / median, unit="Hz"),
         missing_samples(r.time),
@@ -204,9 +199,9 @@ def _motion(r: Recording, steps: Steps) -> list[Fact]:
             limit=within,
             unit="s",
         ),
-        judged(POSITION_STEPS, fault or "no jumps", "within rates and limits", not fault),
+        judged(POSITION_STEPS, r.jumps or "no jumps", "within rates and limits", not r.jumps),
     ]
-    return items if r.qd is None or steps.publishers else items + _velocities(r, r.qd, steps)
+    return items if r.qd is None or r.steps.publishers else items + _velocities(r, r.qd)
 
 
 def stuck_from(time: Array, values: Array, told: Array, count: int = 1) -> tuple[int, int] | None:
@@ -229,7 +224,7 @@ def stuck_from(time: Array, values: Array, told: Array, count: int = 1) -> tuple
     return None
 
 
-def _velocities(r: Recording, qd: Array, steps: Steps) -> list[Fact]:
+def _velocities(r: Recording, qd: Array) -> list[Fact]:
     """How far measured velocities are from what the positions move by, over short times."""
     names, span = r.robot.joint_names, np.diff(r.time)
     bound = f"RMS below {100 * MAX_RATE:g} % of the positions' rate"
@@ -241,7 +236,7 @@ def _velocities(r: Recording, qd: Array, steps: Steps) -> list[Fact]:
             text = f"the position of {names[j]} stands still from {begin:.3f} s to {end:.3f} s"
             text += " while its velocity does not (encoder?)"
             return [judged(VELOCITIES, text, bound, False)]
-    part, faults = rate_faults(r.robot, r.stamps, r.q, qd, steps.jumps)
+    part, faults = rate_faults(r.robot, r.stamps, r.q, qd, r.steps.jumps)
     if not len(part):
         return []
     worst = int(np.argmax(part))

@@ -39,7 +39,7 @@ from pkm_twin.report import Fact, judged
 from pkm_twin.robot.robot import Robot
 from pkm_twin.streams.drives import idle_samples
 from pkm_twin.streams.rates import rms
-from pkm_twin.streams.steps import Steps, sampling_of, steps_of
+from pkm_twin.streams.steps import Steps, sampling_of
 
 MAX_MISSING: Final = 0.01
 """Samples that may be missing, part of those that there should be."""
@@ -62,8 +62,6 @@ NEAR: Final = 0.5
 """Around a pick or release the payload is neither held nor gone, s, at most;"""
 LENGTHS: Final = 4.0
 """and so many lengths of the filter, which follows the motion: a short cycle has fast ones."""
-SHOWN: Final = 4
-"""Jumps that are listed."""
 CLEAR: Final = 4
 """Samples on each side of a jump that are left out: a gap that divides the recording."""
 PASSES: Final = 4
@@ -289,17 +287,6 @@ def lateness(late: float, period: float) -> str:
     return f"{1e3 * abs(late):.3g} ms {'late' if late > 0.0 else 'early'}"
 
 
-def steps_in(r: Recording) -> Steps:
-    """The steps by the measured velocities, or by the positions alone if these do not jump."""
-    limit = r.robot.limits.velocity
-    steps = steps_of(r.time, r.q, r.qd, limit)
-    if r.qd is None or not steps.jumps.any():
-        return steps
-    alone = steps_of(r.time, r.q, None, limit)
-    # What jumps by wrong velocities only is not the positions' fault.
-    return steps if alone.jumps.any() else alone
-
-
 def missing_samples(time: Array) -> Fact:
     """How many samples are missing, judged.
 
@@ -316,23 +303,6 @@ def missing_samples(time: Array) -> Fact:
     return judged("missing samples", text, bound, good, **numbers)
 
 
-def step_fault(r: Recording, steps: Steps | None = None) -> str:
-    """Jumps of the positions with their times; empty where there are none."""
-    steps = steps_in(r) if steps is None else steps
-    found = steps.first
-    if steps.publishers:
-        counts = " and ".join(map(str, steps.publishers))
-        jump = f"{len(found)} of {len(r.time) - 1} steps jump"
-        return f"two publishers interleaved, {counts} samples: {jump}"
-    texts = [
-        f"{r.robot.joint_names[j]} by {steps.sizes[k, j]:.3g} {r.robot.joint_units[j]} at "
-        f"{r.time[k + 1]:.3f} s"
-        for k, j in found[:SHOWN]
-    ]
-    more = f" and {len(found) - SHOWN} more" if len(found) > SHOWN else ""
-    return f"{len(found)} jumps: {', '.join(texts)}{more}" if found else ""
-
-
 def near_jumps(steps: Steps, count: int) -> Mask:
     """Samples so near to a jump that no derivative holds there, shape (count,)."""
     found = np.zeros(count, np.bool_)
@@ -347,7 +317,7 @@ def recorded_of(r: Recording, leave_out: Mask | None = None) -> Recording:
     :param leave_out: the latter two, (samples,), where they are known. A gap divides the recording.
     """
     if leave_out is None:
-        leave_out = near_jumps(steps_in(r), len(r.time))
+        leave_out = near_jumps(r.steps, len(r.time))
         # Currents are not compared with efforts, and what has no state is the fit's to reject.
         with suppress(PkmTwinError, ValueError):
             leave_out |= idle_of(r) & (r.efforts != "current")

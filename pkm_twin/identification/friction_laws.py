@@ -19,7 +19,7 @@ import numpy as np
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import BagError, ParameterError, PkmTwinError, UnknownNameError
 from pkm_twin.identification.causes import number_that_explains, usual
-from pkm_twin.identification.compare import missing_samples, recorded_of, step_fault
+from pkm_twin.identification.compare import missing_samples, recorded_of
 from pkm_twin.identification.drives import FIT, fitted_constants, given_constants
 from pkm_twin.identification.fit import Fit, fit, fitted, on_time, refuse_faults
 from pkm_twin.identification.identifiable import KINDS, LOAD, Kind, of_drives
@@ -188,7 +188,7 @@ def fit_recordings(
                 f"no wrench on {r.topics.wrench} is accepted: {r.first_reject}",
                 path=Path(r.source), reason="frames",
             )  # fmt: skip
-    file, found = robot, ((r.name, step_fault(r)) for r in recordings)
+    file, found = robot, ((r.name, r.jumps) for r in recordings)
     faults = [
         f"{name}: position steps that are no motion: {fault}" for name, fault in found if fault
     ]

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Final
 
@@ -19,9 +20,9 @@ from pkm_twin.recordings.topics import COLUMNS, Topics
 from pkm_twin.robot.derivatives import nearest_motion
 from pkm_twin.robot.robot import Robot
 from pkm_twin.streams.differentiator import Differentiator
-from pkm_twin.streams.rates import rate_faults
+from pkm_twin.streams.rates import MAX_RATE, rate_faults
 from pkm_twin.streams.rest import SIGMAS, fit_gain, gradient_gain, noise, rate_doubt
-from pkm_twin.streams.steps import GAP, repeats_of
+from pkm_twin.streams.steps import GAP, Steps, repeats_of, steps_of
 from pkm_twin.streams.wrench import WrenchSettings
 
 BY_SAMPLE: Final = (
@@ -30,6 +31,8 @@ BY_SAMPLE: Final = (
 """Fields with a row for each sample."""
 MAPPED: Final = "tables use the model's joint values; joint_map applies to messages and bags only"
 """Printed for a robot that has a map."""
+SHOWN: Final = 4
+"""Jumps that are listed."""
 # Of the differentiator: degree of the velocity's polynomial, samples.
 _ORDER, _WINDOW = 3, 9
 
@@ -125,6 +128,33 @@ class Recording:
         """Times as a table has them, s; of a bag since its first sample."""
         return self.time if self.bag is not None else self.time + self.start / 1e9
 
+    @cached_property
+    def steps(self) -> Steps:
+        """The steps by the measured velocities, or by the positions alone if these do not jump."""
+        limit = self.robot.limits.velocity
+        steps = steps_of(self.time, self.q, self.qd, limit)
+        if self.qd is None or not steps.jumps.any():
+            return steps
+        alone = steps_of(self.time, self.q, None, limit)
+        # What jumps by wrong velocities only is not the positions' fault.
+        return steps if alone.jumps.any() else alone
+
+    @property
+    def jumps(self) -> str:
+        """Jumps of the positions with their times; empty where there are none."""
+        steps, found = self.steps, self.steps.first
+        if steps.publishers:
+            counts = " and ".join(map(str, steps.publishers))
+            jump = f"{len(found)} of {len(self.time) - 1} steps jump"
+            return f"two publishers interleaved, {counts} samples: {jump}"
+        names, units = self.robot.joint_names, self.robot.joint_units
+        texts = [
+            f"{names[j]} by {steps.sizes[k, j]:.3g} {units[j]} at {self.time[k + 1]:.3f} s"
+            for k, j in found[:SHOWN]
+        ]
+        more = f" and {len(found) - SHOWN} more" if len(found) > SHOWN else ""
+        return f"{len(found)} jumps: {', '.join(texts)}{more}" if found else ""
+
     @property
     def message_count(self) -> int:
         """How many messages the chosen topics have; of a table its rows."""
@@ -215,20 +245,24 @@ class Recording:
     def with_rates(self) -> Recording:
         """The samples whose rates and accelerations are known, with these.
 
-        If the recording has both, they stay. If its velocities differ from the rate of the
-        positions by more than `check` allows, a note says so. In a table the missing ones are
-        second-order differences; in a bag, a node's differentiator gives them in the middle of
-        its window.
+        If the recording has both, they stay. In a table the missing ones are second-order
+        differences; in a bag, a node's differentiator gives them in the middle of its window.
 
-        :raises PkmTwinError: too few samples in a row.
+        :raises PkmTwinError: too few samples in a row, or velocities that differ from the rate of
+            the positions by more than `check` allows.
         """
         if self.qd is not None and len(self.time) > 2:
             # What overflows is not finite, which the model refuses in one line.
             with np.errstate(all="ignore"):
-                _, faults = rate_faults(self.robot, self.stamps, self.q, self.qd)
+                jumps = self.steps.jumps
+                _, faults = rate_faults(self.robot, self.stamps, self.q, self.qd, jumps)
             if faults:
-                text = f"velocities differ from the rate of the positions: {', '.join(faults)}"
-                self = replace(self, notes=(*self.notes, text))
+                raise PkmTwinError(
+                    f"{self.source}: velocities differ from the rate of the positions by "
+                    f"{', '.join(faults)}; expected at most {100 * MAX_RATE:g} %, or no velocities"
+                )
+            if self.jumps:
+                self = replace(self, notes=(*self.notes, f"positions jump: {self.jumps}"))
         if self.qd is not None and self.qdd is not None:
             return self
         if self.bag is not None:
