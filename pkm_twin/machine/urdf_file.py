@@ -13,6 +13,7 @@ import xml.etree.ElementTree as ET
 from collections import ChainMap
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -29,6 +30,8 @@ from pkm_twin.machine.urdf_control import actuated_joints, read_beside
 _PLACES: Final = ("axis", "parent_axis", "child_axis")
 LARGE: Final = 10.0
 """Offsets beyond this, m, look like millimetres."""
+ALIKE: Final = 1e-9
+"""Greatest difference of the axes of a screw's turn and slide."""
 
 JOINTS: Final = ("revolute", "continuous", "prismatic", "fixed", "spherical")
 CONSTRAINTS: Final = {
@@ -85,6 +88,8 @@ def read(path: Path, robot: ET.Element) -> LoopTree:
     for element in robot.findall("joint"):
         name = urdf_xml.name(element, joints)
         joints[name] = _joint(element, name, links)
+    for element in robot.findall("joint[mimic]"):
+        _take_screw(element, joints, links)
     root = _root(links, joints)
     for element in robot.findall("coupling"):
         raise ParameterError(
@@ -177,8 +182,6 @@ def _joint(element: ET.Element, name: str, links: dict[str, Link]) -> Joint:
         raise ParameterError(f"{where}.type", kind, "revolute and prismatic joints in its place")
     if kind not in JOINTS:
         raise UnknownNameError(f"{where}.type", kind, JOINTS)
-    if element.find("mimic") is not None:
-        raise ParameterError(f"{where}.mimic", "<mimic>", "joints without coupling")
     parent, child = (
         urdf_xml.reference(urdf_xml.single(element, end, where), f"{where}.{end}", links)
         for end in ("parent", "child")
@@ -196,6 +199,35 @@ def _joint(element: ET.Element, name: str, links: dict[str, Link]) -> Joint:
         name, kind, parent, child, (origin, Pose()), np.reshape(axes, (-1, 3)), limits=limits,
         viscous=viscous, coulomb=coulomb,
     )  # fmt: skip
+
+
+def _take_screw(element: ET.Element, joints: dict[str, Joint], links: dict[str, Link]) -> None:
+    """Make one screw of a slide and the turn that it follows, joined by a link without mass.
+
+    :raises ParameterError: any other joint that follows another one.
+    """
+    slide = joints[element.get("name", "")]
+    where, mimic = f"joint.{slide.name}.mimic", element.find("mimic")
+    assert mimic is not None  # noqa: S101
+    turn = joints.get(mimic.get("joint", ""), slide)
+    numbers = (mimic.get("multiplier", "1"), mimic.get("offset", "0"))
+    pitch, offset = (urdf_xml.number(number, where) for number in numbers)
+    between = [one.name for one in joints.values() if slide.inner in (one.inner, one.outer)]
+    pose, same = slide.frames[0], partial(np.allclose, atol=ALIKE)
+    if (
+        (turn.kind, turn.outer, slide.kind) != ("revolute", slide.inner, "prismatic")
+        or sorted(between) != sorted([turn.name, slide.name])
+        or any((links[slide.inner].mass, slide.viscous, slide.coulomb, slide.limits))
+        or not (same(turn.axes, slide.axes) and same(pose.rotation, np.eye(3)))
+        or not same(np.cross(pose.position, slide.axes[0]), 0.0)
+    ):
+        raise ParameterError(where, "<mimic>", "joints without coupling")
+    along = Pose(position=pose.position + offset * slide.axes[0])
+    joints[turn.name] = replace(
+        turn, kind="helical", outer=slide.outer, frames=(turn.frames[0] @ along, Pose()),
+        pitch=pitch,
+    )  # fmt: skip
+    del joints[slide.name], links[slide.inner]
 
 
 def _root(links: dict[str, Link], joints: dict[str, Joint]) -> str:

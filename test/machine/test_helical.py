@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from delta_dynamics import inverse_dynamics, least_norm_reactions, mass_matrix, reactions
-from pkm_twin import variants
+from pkm_twin import load, variants
 from pkm_twin.errors import ParameterError
 from pkm_twin.mechanisms.catalogue import robot_of_data
 from pkm_twin.robot.robot_urdf import robot_description, robot_urdf
@@ -160,6 +160,25 @@ def test_its_slide_follows_its_turn_in_a_urdf(rng):
     assert line["joint"] == "nut"
     along = float(line["offset"]) + float(line["multiplier"]) * turn
     np.testing.assert_allclose(along, slid, atol=1e-15)
+
+
+@pytest.mark.parametrize("lead", [0.012, -0.03, None])
+def test_a_urdf_is_read_again(rng, lead, tmp_path):
+    """Where the slide follows the turn that bears it; any other follower is rejected."""
+    robot = driven(0.02, [0.1, 0.02, 0.03]) if lead is None else slide(lead)
+    file, text = tmp_path / "screw.urdf", robot_urdf(robot)
+    file.write_text(text)
+    again, motion = load(file, platform="platform"), rng.normal(size=(3, 5, 1))
+    assert again.joint_names == robot.joint_names
+    np.testing.assert_allclose(again.platform(motion[0])[0], robot.platform(motion[0])[0])
+    np.testing.assert_allclose(inverse_dynamics(again, *motion), inverse_dynamics(robot, *motion))
+    for old, new in (
+        ("<mimic joint=", "<mimic other="),
+        ('slide" type="prismatic', 'slide" type="revolute'),
+    ):
+        file.write_text(text.replace(old, new))
+        with pytest.raises(ParameterError, match="mimic"):
+            load(file, platform="platform")
 
 
 def test_a_lead_stands_where_there_is_a_thread():
