@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from delta_dynamics import inverse_dynamics, mass_matrix
+from pkm_twin import Robot
 from pkm_twin.errors import PkmTwinError
 from pkm_twin.identification.compare import missing_samples
 from pkm_twin.identification.estimation import estimate
@@ -63,12 +64,14 @@ def worst(result: Fit, m: Drawn) -> float:
     return max(abs(n.after - true[n.name]) / n.deviation for n in result.numbers)
 
 
+def fault_of(robot: Robot, record: Recording) -> str | None:
+    """Why a machine cannot have made a recording."""
+    return recording_fault(rows_of(robot, file_parameters(robot), record))
+
+
 def rejected(what: str, name: str, seed: int) -> bool:
-    robot, record = load(name), recorded(what, name, seed)
-    everything = file_parameters(robot)
     try:
-        rows = rows_of(robot, everything, record)
-        return recording_fault(rows) is not None
+        return fault_of(load(name), recorded(what, name, seed)) is not None
     except PkmTwinError:
         return True
 
@@ -125,8 +128,7 @@ def test_a_known_payload_that_the_efforts_do_not_show_is_rejected() -> None:
     """Also where time in another unit would ask for efforts beyond any number."""
     m = drawn("delta_cu", 3, 6.0)
     record = replace(noisy(m.recorded(), np.random.default_rng(7)), load=Load(20.0))
-    rows = rows_of(m.robot, file_parameters(m.robot), record)
-    assert recording_fault(rows) is not None
+    assert fault_of(m.robot, record) is not None
 
 
 @pytest.mark.parametrize("who", [[0, 1, 2], [0]])
@@ -135,8 +137,7 @@ def test_a_short_delay_is_named_by_its_length(who: list[int]) -> None:
     efforts = m.efforts.copy()
     efforts[:, who] = shifted(m.efforts, m.time, 0.04)[:, who]
     record = noisy(m.recorded(effort=efforts), np.random.default_rng(7))
-    rows = rows_of(m.robot, file_parameters(m.robot), record)
-    fault = recording_fault(rows)
+    fault = fault_of(m.robot, record)
     names = "all joints" if len(who) > 1 else m.robot.joint_names[0]
     assert fault is not None and fault.startswith(f"efforts of {names} are 0.04 s late")
 
@@ -151,8 +152,7 @@ def test_a_cause_that_does_not_explain_the_efforts_is_not_named(wrong_way: bool)
     force[:, 2] = -5.0 * np.sin(2.0 * np.pi * 0.7 * m.time)
     efforts = inverse_dynamics(m.truth, m.q, m.qd, m.qdd, force)
     made = replace(m.recorded(effort=efforts), wrench=-force if wrong_way else None)
-    rows = rows_of(m.robot, file_parameters(m.robot), noisy(made, np.random.default_rng(7)))
-    fault = recording_fault(rows)
+    fault = fault_of(m.robot, noisy(made, np.random.default_rng(7)))
     named = "the wrench has the opposite sign" if wrong_way else "no machine like the file's "
     assert fault is not None and fault.startswith(named)
 
@@ -189,8 +189,7 @@ def test_a_drive_that_counts_the_wrong_way_is_named(case: tuple[str, bool, float
     q[:, -1] = 2.0 * middle - q[:, -1]
     effort[:, -1] *= way
     record = replace(sound, q=q, effort=effort)
-    rows = rows_of(m.robot, file_parameters(m.robot), record)
-    fault = recording_fault(rows)
+    fault = fault_of(m.robot, record)
     both = "positions and efforts of" if way < 0.0 else "positions of"
     assert fault is not None and fault.startswith(f"{both} {m.robot.joint_names[-1]} ")
 
@@ -225,8 +224,7 @@ def test_rotors_that_the_file_does_not_have_are_no_other_rate_of_time(
     home = m.robot.graph.home
     rotors = share * float(np.diag(mass_matrix(m.robot, home)).max()) * m.qdd
     record = noisy(m.recorded(effort=m.efforts + rotors), np.random.default_rng(7))
-    rows = rows_of(m.robot, file_parameters(m.robot), record)
-    assert recording_fault(rows) is None
+    assert fault_of(m.robot, record) is None
 
 
 @pytest.mark.parametrize(

@@ -51,6 +51,7 @@ def call(twin, tmp_path, monkeypatch):
     return called
 
 
+@pytest.mark.usefixtures("short")
 def test_a_map_to_pictures_and_shown_again(call, tmp_path):
     """The answer is the first line; the file says what made it; `atlas` is the older name."""
     pytest.importorskip("plotly")
@@ -70,6 +71,7 @@ def test_a_map_to_pictures_and_shown_again(call, tmp_path):
     assert "Plotly" in (tmp_path / "b.html").read_text()
 
 
+@pytest.mark.usefixtures("short")
 def test_planes_go_through_a_given_pose(call, tmp_path):
     call("map", "five_bar", "payload", "--points", "60", "--at", "0.05,0.3", "--out", "a.nc")
     with open_map(tmp_path / "a.nc") as data:
