@@ -30,6 +30,8 @@ from pkm_twin.identification.compare import (
     near_jumps,
     recorded_of,
 )
+from pkm_twin.identification.fit import Fit, fit
+from pkm_twin.identification.friction_laws import fit_recordings
 from pkm_twin.identification.plausible import LATEST
 from pkm_twin.identification.samples import usual_size
 from pkm_twin.recordings import Recording
@@ -489,16 +491,13 @@ def _saturated(r: Recording, c: Compared) -> tuple[str, ...]:
 
 def _of_fit(found: Checked, bound: float) -> Explained:
     """Whether other friction, or all that a fit varies, explains the efforts; else its findings."""
-    from pkm_twin.identification.fit import fit
-    from pkm_twin.identification.friction_laws import fit_recordings
-
     r = found.recording
     try:
         part = [recorded_of(r, found.left_out)]
         first = fit(r.robot, part, ("friction",), accept=True, causes=[None])
         rubbing = r.robot.filed({one.name: one.after for one in first.numbers})
         if not first.accepted and agrees(replace(r, robot=rubbing), found.left_out, bound):
-            return ("friction other than the file's explains the efforts: `pkm-twin fit`",), ()
+            return (_fitted("friction other than the file's explains", first),), ()
         last, *_ = fit_recordings(r.robot, [r], accept=True)
         verdict = last.verdict
         if last.accepted:
@@ -506,6 +505,12 @@ def _of_fit(found: Checked, bound: float) -> Explained:
     except (PkmTwinError, ValueError, np.linalg.LinAlgError):
         return (), ()
     if verdict.answer == "explains":
-        text = "friction, masses or payload other than the file's explain the efforts"
-        return (f"{text}: `pkm-twin fit`",), ()
+        text = "friction, masses or payload other than the file's explain"
+        return (_fitted(text, last),), ()
     return (), tuple(map(str, verdict.findings[:FOUND]))
+
+
+def _fitted(what: str, made: Fit) -> str:
+    """What explains the efforts, and how late they are then."""
+    late = lateness(made.delays[0], made.problem.whole[0].period)
+    return f"{what} the efforts" + (f", which are {late}" if late else "") + ": `pkm-twin fit`"

@@ -149,7 +149,7 @@ def fit(
     faults = faults or _late(problem, causes)
     refuse_faults(faults, accept)
     problem.check_count()
-    faults = faults or _worse(problem)
+    faults = faults or _worse(problem, causes)
     refuse_faults(faults, accept)
     result = fitted(problem, tuple(faults), progress)
     scaled = None if faults else scaled_efforts(problem, result.verdict)
@@ -287,20 +287,21 @@ def _faults(made: Rows, cause: Cause | None) -> list[str]:
     return [] if fault is None else [f"{r.name}: {fault}"]
 
 
-def _worse(problem: Problem) -> list[str]:
+def _worse(problem: Problem, causes: Sequence[Cause | None]) -> list[str]:
     """Recordings whose held-out part the fitted values predict worse than the file's.
 
     Where the file's explain it, the fitted follow noise: the machine is not at fault.
     """
     robot, told = problem.robot, []
     values = problem.parameters.values, problem.estimate.values
-    for end in problem.held_out:
+    for end, cause in zip(problem.held_out, causes, strict=True):
         old, new = (
             np.sqrt(np.mean(end.counts * (end.target - end.table @ v) ** 2, 0)) for v in values
         )
         j = int(np.argmax(new / np.maximum(old, 1e-300)))
         if new[j] > WORSE * old[j] and new[j] > EXACT * np.std(end.effort[:, j]):
-            why = "another machine, or a motion that is too short or changes?"
+            named = cause.text if cause is not None else ""
+            why = named or "another machine, or a motion that is too short or changes?"
             if (old <= MAX_RESIDUAL * np.abs(end.effort).max(0)).all():
                 why = (
                     "these explain the recording; it does not excite the numbers enough, condition "

@@ -100,6 +100,12 @@ def test_fit_and_check_say_the_same_of_late_efforts(name: str) -> None:
         deviation = np.sqrt(result.problem.both.covariance[-1, -1])
         assert result.delays[0] == pytest.approx(late, abs=3.0 * deviation)
         assert found.compared.late == pytest.approx(late, abs=3.0 * deviation)
+    # Also where the file has no friction.
+    bare = m.truth.changed(friction={"viscous": 0.0, "coulomb": 0.0})
+    made = replace(made, robot=bare)
+    (cause,), (result, *_) = check(made).causes, fit_recordings(bare, [made])
+    told = re.search(r"(\S+) ms late", cause)
+    assert told is not None and float(told[1]) == pytest.approx(1e3 * result.delays[0], abs=0.5)
     for late, robot in ((0.054, m.truth), (0.08, m.robot)):
         effort = shifted(m.efforts, m.time, late)
         made = noisy(m.recorded(effort=effort), np.random.default_rng(7))
@@ -157,15 +163,22 @@ def test_fit_and_check_name_one_cause(name: str) -> None:
         (cause,) = check(made).causes
         with pytest.raises(PkmTwinError, match=re.escape(cause)):
             fit_recordings(robot, [made])
-    for factor in (0.5, 0.8, 1.25, 2.0):
-        for which in (whole, one):
-            made = replace(sound, effort=sound.effort * factor**which)
-            (cause,) = check(made).causes
-            told = re.search(r"efforts of (.*) are (.*) times what", cause)
-            assert told is not None and ("all" in told[1]) == bool(which.all())
-            assert float(told[2]) == pytest.approx(factor, rel=0.02)
-            with pytest.raises(PkmTwinError, match=re.escape(cause)):
-                fit_recordings(robot, [made])
+    for factor, which in ((0.5, whole), (0.8, one), (1.25, whole), (2.0, one)):
+        made = replace(sound, effort=sound.effort * factor**which)
+        (cause,) = check(made).causes
+        told = re.search(r"efforts of (.*) are (.*) times what", cause)
+        assert told is not None and ("all" in told[1]) == bool(which.all())
+        assert float(told[2]) == pytest.approx(factor, rel=0.02)
+        with pytest.raises(PkmTwinError, match=re.escape(cause)):
+            fit_recordings(robot, [made])
+    # Less than what is no machine's, and more noise: fitted or not, both name the drive.
+    made = noisy(replace(made, effort=sound.effort * 0.85**one), np.random.default_rng(8), 0.05)
+    (cause,) = check(made).causes
+    try:
+        (note,) = fit_recordings(robot, [made])[-1]
+    except PkmTwinError as error:
+        note = str(error)
+    assert cause in note
     for mass in (0.2, 5.0):
         mass += robot.payload.mass
         heavy = robot.changed(payload={"mass": mass})
