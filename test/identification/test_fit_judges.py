@@ -302,6 +302,7 @@ def test_too_few_samples_for_the_numbers_are_rejected() -> None:
 def test_what_is_accepted_is_marked() -> None:
     m, rng = drawn("five_bar", 4, 6.0), np.random.default_rng([4, 17])
     record = IMPOSSIBLE["kgf_cm"](noisy(m.recorded(), rng), rng)
+    assert "(kgf cm?)" in (fault_of(m.robot, record) or "")
     with pytest.raises(PkmTwinError, match=r"kgf cm.*--accept"):
         fit(m.robot, [record], KINDS)
     result = fit(m.robot, [record], KINDS, accept=True)
