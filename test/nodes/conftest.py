@@ -2,6 +2,7 @@
 """A maker of messages, and per module a domain, a peer and processes."""
 
 import os
+import sys
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ import pytest
 from delta_dynamics import inverse_dynamics
 from pkm_twin.mechanisms.catalogue import robot_of_data
 from stiffness_monitor import compliance, strain_energy
-from test.nodes.harness import Domain, ForkedNode, Maker, NodeProcess, Peer, Plain
+from test.nodes.harness import Command, Domain, Forked, Maker, Peer, Plain, node_words
 from test.support.robots import load, parameters_of
 
 
@@ -72,16 +73,16 @@ def launch_alone(domain):
 def started(domain):
     """Gives a function that starts processes, then ends them.
 
-    A fork is cheaper; ``fresh`` asks for an interpreter of its own, code and scripts have it.
+    A fork is cheaper; ``fresh`` asks for an interpreter of its own, ``begin`` is called there.
     """
     processes = []
 
-    def start(module, *parameters, fresh=False, **options):
-        if fresh or options.get("code") or options.get("script"):
-            processes.append(NodeProcess(domain, module, *parameters, **options))
+    def start(module, *parameters, fresh=False, begin=lambda: None, **options):
+        words = node_words(module, *parameters, **options)
+        if fresh:
+            processes.append(Command(domain, [sys.executable, *words], begin))
         else:
-            options.pop("code", None)
-            processes.append(ForkedNode(domain, module, *parameters, **options))
+            processes.append(Forked(domain, words))
         return processes[-1]
 
     yield start

@@ -11,6 +11,7 @@ import importlib
 import multiprocessing
 import os
 import re
+import runpy
 import signal
 import subprocess
 import sys
@@ -223,22 +224,15 @@ class Command(Process):
         )
 
 
-class NodeProcess(Command):
-    """``python -m MODULE --ros-args -p ...``
+def node_words(module, *parameters, arguments=(), code=None, script=None):
+    """What Python gets to run a node: ``-m MODULE --ros-args -p ...``
 
     ``arguments`` are further ROS arguments; ``code`` is run instead of the module, or ``script``,
     a path and its own arguments.
     """
-
-    def __init__(self, domain, module, *parameters, arguments=(), code=None, script=None, **more):
-        run = script or (["-m", module] if code is None else ["-c", code])
-        super().__init__(domain, [sys.executable, *run, *flags(parameters, arguments)], **more)
-
-
-def flags(parameters, arguments):
-    """A node's words after its command."""
+    run = script or (["-m", module] if code is None else ["-c", code])
     pairs = [word for parameter in parameters for word in ("-p", parameter)]
-    return ["--ros-args", *pairs, *arguments]
+    return [*run, "--ros-args", *pairs, *arguments]
 
 
 def renamed(name, **topics):
@@ -256,8 +250,11 @@ NODES = (
 )
 
 
-def fork_of(module, words, environment, *outputs):
-    """Run a node, or ``main`` of a module, in this process, a fork of one that has imported all."""
+def fork_of(words, environment, *outputs):
+    """What Python would run by these words, in this process, a fork of one that has imported all.
+
+    Of a module that is a node, or its ``main``.
+    """
     os.setsid()
     end_with_parent()
     for output, stream in zip(outputs, (sys.stdout, sys.stderr), strict=True):
@@ -267,32 +264,39 @@ def fork_of(module, words, environment, *outputs):
     os.chdir(tempfile.gettempdir())
     os.environ.clear()
     os.environ.update(environment)
-    sys.argv = [module, *words]
-    entry = importlib.import_module(module)
-    if hasattr(entry, "NODE"):
+    how, *sys.argv = map(str, words)
+    if how == "-c":
+        code, sys.argv[0] = sys.argv[0], how
+        exec(code, {"__name__": "__main__"})
+    elif how != "-m":
+        sys.argv.insert(0, how)
+        sys.path.insert(0, str(Path(how).parent))
+        runpy.run_path(how, run_name="__main__")
+    elif hasattr(entry := importlib.import_module(sys.argv[0]), "NODE"):
         sys.exit(entry.run(entry.NODE))
-    entry.main()
+    else:
+        entry.main()
 
 
-class ForkedNode(Process):
-    """A node in a process that need not import anything: a third of the cost.
+class Forked(Process):
+    """Python in a process that need not import anything: a third of the cost.
 
-    It ends without the interpreter's own end: what a signal does there needs a NodeProcess.
+    It ends without the interpreter's own end: what a signal does there needs a Command.
     """
 
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload([__name__, "pkm_twin.codegen.llvm", *NODES])
 
-    def __init__(self, domain, module, *parameters, arguments=()):
-        given = module, flags(parameters, arguments), domain.environment()
-        super().__init__(lambda output: _Fork(*given, output.name, output.name))
+    def __init__(self, domain, words):
+        environment = domain.environment()
+        super().__init__(lambda output: _Fork(words, environment, output.name, output.name))
 
 
 class ForkedCommand(Process):
     """``pkm-twin WORDS`` in such a fork; ``errors`` is what it has said on standard error."""
 
     def __init__(self, domain, *words):
-        given = "pkm_twin.apps.cli", words, domain.environment()
+        given = ["-m", "pkm_twin.apps.cli", *words], domain.environment()
         self._errors = tempfile.NamedTemporaryFile("w+")  # noqa: SIM115
         super().__init__(lambda output: _Fork(*given, output.name, self._errors.name))
 
@@ -310,7 +314,7 @@ class _Fork:
     """A forked process with the methods of subprocess.Popen."""
 
     def __init__(self, *arguments):
-        context = ForkedNode.context
+        context = Forked.context
         self._process = context.Process(target=fork_of, args=arguments, daemon=True)
         self._process.start()
         self.pid = self._process.pid

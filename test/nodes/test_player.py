@@ -24,7 +24,7 @@ from pkm_twin.errors import BagError, ParameterError
 from pkm_twin.ros import player as player_module
 from pkm_twin.ros.player import play
 from test.bags.folders import make_folder
-from test.nodes.harness import DEADLINE, Command, Domain, Peer
+from test.nodes.harness import DEADLINE, Command, Domain, Forked, Peer, Process
 
 COUNT = 100
 PERIOD = 0.005
@@ -54,14 +54,16 @@ def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def player(domain: Domain) -> Iterator[Callable[..., Command]]:
+def player(domain: Domain) -> Iterator[Callable[..., Process]]:
     """Start players; whatever still runs at the end of the test is ended."""
-    started: list[Command] = []
+    started: list[Process] = []
 
-    def start(path: Path, **options: object) -> Command:
+    def start(path: Path, fresh: bool = False, **options: object) -> Process:
         options = {"wait_for_subscribers": DEADLINE, **options}
-        words = [sys.executable, "-c", PROGRAM, str(path), repr(options)]
-        started.append(Command(domain, words))
+        words = ["-c", PROGRAM, str(path), repr(options)]
+        started.append(
+            Command(domain, [sys.executable, *words]) if fresh else Forked(domain, words)
+        )
         return started[-1]
 
     yield start
@@ -78,7 +80,7 @@ def positions(peer: Peer) -> list[float]:
     return [message.position[0] for message in peer.received("/joint_states")]
 
 
-def test_order_count_and_timing(bag: Path, peer: Peer, player: Callable[..., Command]) -> None:
+def test_order_count_and_timing(bag: Path, peer: Peer, player: Callable[..., Process]) -> None:
     rate = 2.0
     peer.hear(JointState, "/joint_states", MANY)
     peer.hear(String, "/note", QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT))
@@ -97,7 +99,7 @@ def test_order_count_and_timing(bag: Path, peer: Peer, player: Callable[..., Com
 
 
 def test_recorded_durability_is_offered(
-    bag: Path, peer: Peer, player: Callable[..., Command]
+    bag: Path, peer: Peer, player: Callable[..., Process]
 ) -> None:
     """A subscriber that asks for latched messages matches, which a volatile offer would not."""
     latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -107,7 +109,7 @@ def test_recorded_durability_is_offered(
     assert process.wait() == 0
 
 
-def test_clock(bag: Path, peer: Peer, player: Callable[..., Command]) -> None:
+def test_clock(bag: Path, peer: Peer, player: Callable[..., Process]) -> None:
     """/clock runs at its rate in bag time and is there before the first message."""
     peer.hear(Clock, "/clock", MANY)
     peer.hear(JointState, "/joint_states", MANY)
@@ -120,10 +122,10 @@ def test_clock(bag: Path, peer: Peer, player: Callable[..., Command]) -> None:
     assert len(times) == pytest.approx(13, abs=2)
 
 
-def test_loop_ends_by_sigint(bag: Path, peer: Peer, player: Callable[..., Command]) -> None:
+def test_loop_ends_by_sigint(bag: Path, peer: Peer, player: Callable[..., Process]) -> None:
     peer.hear(JointState, "/joint_states", MANY)
     peer.hear(Clock, "/clock", MANY)
-    process = player(bag, loop=True, rate=4.0, clock=100.0, topics=["/joint_states"])
+    process = player(bag, fresh=True, loop=True, rate=4.0, clock=100.0, topics=["/joint_states"])
     peer.until(lambda: len(positions(peer)) > 2 * COUNT + 10)
     assert process.stop() == 0
     out = process.output
@@ -140,7 +142,7 @@ def test_loop_ends_by_sigint(bag: Path, peer: Peer, player: Callable[..., Comman
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_signal_during_a_long_pause(
-    tmp_path: Path, peer: Peer, player: Callable[..., Command], number: signal.Signals
+    tmp_path: Path, peer: Peer, player: Callable[..., Process], number: signal.Signals
 ) -> None:
     path = tmp_path / "pause.mcap"
     with BagWriter(path) as writer:
@@ -148,14 +150,14 @@ def test_signal_during_a_long_pause(
         writer.write("/pause", String(data="first"), FIRST)
         writer.write("/pause", String(data="an hour later"), FIRST + 3600 * 10**9)
     peer.hear(String, "/pause")
-    process = player(path)
+    process = player(path, fresh=True)
     peer.until(lambda: peer.received("/pause"))
     # An impatient person, or a terminal and a launcher both: handlers interrupt each other.
     assert process.stop(number, times=5) == 0
     assert "Traceback" not in process.output
 
 
-def test_missing_subscribers_are_named(bag: Path, player: Callable[..., Command]) -> None:
+def test_missing_subscribers_are_named(bag: Path, player: Callable[..., Process]) -> None:
     process = player(bag, rate=100.0, wait_for_subscribers=0.2, topics=["/note"], progress=False,
                      remap={"/note": "/nobody"})  # fmt: skip
     assert process.wait() == 0, process.output

@@ -54,7 +54,7 @@ node.DeltaDynamics.{callback} = interrupted
 raise SystemExit(node.run(node.NODE))
 """
         name = f"interrupted_{number}{callback}"
-        twin = launched(peer, launch, name, code=code)
+        twin = launched(peer, launch, name, code=code, fresh=True)
         process = twin.process
         twin.peer.until(
             lambda: not process.alive(), repeat=lambda: twin.send_state(state(twin.stamp()))
