@@ -82,9 +82,15 @@ class Package:
         self.macro = self.prefix.upper()
         self.n, self.m = robot.joints_count, len(robot.pose_names)
         self.massive = _has(robot.massive)
-        elastic = self._wants("compliance") or self._wants("strain_energy")
-        has = elastic and _has(robot.structure)
-        self.elastic: Elastic | None = robot.made(Elastic) if has else None
+        self.elastic: Elastic | None = None
+        if (self._wants("compliance") or self._wants("strain_energy")) and _has(robot.structure):
+            try:
+                made = robot.made(Elastic)
+                _ = made.response
+                self.elastic = made
+            except ParameterError as error:
+                # Elements of some parts alone are no elastic machine.
+                warn(robot.name, f"no functions of elasticity: {error}")
         self.fold = Folding()
         self.payload = self.fold.tape.inputs(PARAMETERS, 13)
         self.routines = self._routines()

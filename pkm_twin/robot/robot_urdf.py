@@ -95,7 +95,7 @@ def _warn_of_losses(robot: Robot, where: str) -> None:
     if where != "URDF":
         constant = zip(robot.joint_names, robot.friction.offset, strict=True)
         lost += [f"the constant friction of {name}" for name, offset in constant if offset]
-    if robot.sharing_entries().get("redundancy", {}).get("preload") is not None:
+    if np.any(robot.sharing_entries().get("redundancy", {}).get("preload", 0.0)):
         lost.append("redundancy.preload")
     if lost:
         warn(robot.name or robot.mechanism, f"{where} has no place for {', '.join(lost)}")

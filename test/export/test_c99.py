@@ -7,6 +7,7 @@ import os
 import re
 import shutil
 import subprocess
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ import pytest
 from delta_dynamics import inverse_dynamics
 from pkm_twin import robot_names
 from pkm_twin.codegen.program import MAX_ITERATIONS
-from pkm_twin.errors import ParameterError
+from pkm_twin.errors import ParameterError, RobotWarning
 from pkm_twin.export.c99 import CORRECTIONS
 from pkm_twin.export.c_package import c_package, identifier
 from test.machine.random_machines import FILES
@@ -560,6 +561,16 @@ def test_a_robot_without_masses_has_kinematics_and_elasticity(tmp_path):
     status, found = package.run(package.build("-O0"), "forward", q)
     assert not status.any()
     np.testing.assert_allclose(found, robot.forward(q), 1e-12, 1e-14)
+
+
+def test_a_compliance_that_is_missing_leaves_the_rest(tmp_path):
+    """Drives alone have one, and a rigid joint holds the platform."""
+    text = Path("examples/machines/rrr3_point.yaml").read_text()
+    text = text.replace("limits: {effort", "compliance: [0, 0, 0, 0, 0, 1.0e-5], limits: {effort")
+    (tmp_path / "point.yaml").write_text(text)
+    with pytest.warns(RobotWarning, match=r"elasticity: joints\.slide\.compliance: missing"):
+        made = c_package(load(tmp_path / "point.yaml"))
+    assert "_torques(" in made["pkm_point.h"] and "_compliance(" not in made["pkm_point.h"]
 
 
 def test_names_become_identifiers():
