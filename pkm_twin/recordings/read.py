@@ -272,13 +272,13 @@ def times_of(path: Path, values: Array) -> Array:
     # Between the greatest numbers there is none.
     with np.errstate(over="ignore"):
         time: Array = np.asarray(values - values[0], np.float64)
-        rising = bool((np.diff(values) >= SHORTEST_STEP).all())
-    if not rising or not time[-1] <= LONGEST:
+        flat = np.flatnonzero(~(np.diff(values) >= SHORTEST_STEP))
+    found = f"{values[flat[0]]}, then {values[flat[0] + 1]}" if len(flat) else ""
+    if found or not time[-1] <= LONGEST:
         raise ParameterError(
-            f"{path}: time",
-            f"{values[0]:g} to {values[-1]:g}" if rising else "not rising",
+            f"{path}: time", found or f"{values[0]:g} to {values[-1]:g}",
             f"rising times, {SHORTEST_STEP:g} s or more apart, up to {LONGEST:g} s in all",
-        )
+        )  # fmt: skip
     return time
 
 

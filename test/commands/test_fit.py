@@ -169,7 +169,7 @@ def test_copies_that_would_lose_elastic_members_are_refused_by_name(twin, tmp_pa
 @pytest.mark.parametrize(
     ("column", "how", "text"),
     [
-        ("time", lambda v: v * 1e-300, "time: 'not rising'"),
+        ("time", lambda v: v * 1e-300, "time: '0.0, then "),
         LONG("time", lambda v: v * 1e300, "1e+06 s in all"),
         ("effort", lambda v: v * 1e3, "times what the robot's file makes of the motion: units?"),
         LONG(

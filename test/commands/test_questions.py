@@ -219,6 +219,10 @@ def how_exact(a: Asked) -> None:
     squares = (twist**2).sum(-1)
     for key, rows in (("rms_position_m", squares[:, :3]), ("rms_angle_rad", squares[:, 3:])):
         assert told[key] == pytest.approx(np.sqrt(rows.sum(1).mean()), rel=1e-6, abs=1e-11)
+    turns = a.name == "agile_eye"
+    farthest = squares[:, 3:].sum(1) if turns else squares[:, :3].sum(1)
+    worst = [a.table[name][farthest.argmax()] for name in a.robot.pose_names]
+    assert list(told["worst_pose"]) == pytest.approx(worst, abs=1e-6)
     shares = [row["share"] for row in told["contributions"].values()]
     assert sum(shares) == pytest.approx(1.0, abs=1e-9)
 

@@ -151,6 +151,7 @@ def test_options_of_a_command_are_the_dialect(motion, twin):
     for words in (("a.csv",), ("b.csv", "--separator", ";", *given)):
         told.append(twin.told("size", "five_bar", *words)["energy_J"])
     assert told[1] == pytest.approx(told[0], rel=1e-6)
+    assert twin("check", "a.csv", "--robot", "five_bar", "--units", "inch").code == 2
 
 
 @pytest.mark.parametrize("name", ["five_bar", "linear_delta"])

@@ -69,6 +69,8 @@ def check(given: Check) -> Report:
         with progress("reading", None) as update:
             return check_one(given, given.bag, update)
     except PkmTwinError as error:
+        if isinstance(error, ParameterError) and error.field.startswith("--") and error.value:
+            raise  # words of an option are wrong, not the recording
         saved = error.salvageable if isinstance(error, DamagedBagError) else 0
         facts = [Fact("bag", str(given.bag)), Fact("good", False), Fact("salvageable", saved)]
         return Report(facts=facts, code=SALVAGED if saved else REFUSED, error=str(error))

@@ -421,23 +421,28 @@ def budget(given: Design) -> Report:
         Column("", text=" "),
     ]
     moves, turns = np.split(found.deviation.round(FILE_DIGITS), 2, -1)
-    most = np.linalg.norm(found.worst[:, :3].round(FILE_DIGITS), axis=-1)
-    farthest = robot.forward(q[int(most.argmax())]).round(12) + 0.0
-    worst = robot.forward(q[int(np.linalg.norm(moves, axis=-1).argmax())]).round(12) + 0.0
-    at = _place(robot, worst)
+    turning, bounds = found.only_turns, np.split(found.worst.round(FILE_DIGITS), 2, -1)
+    farthest, worst = (
+        robot.forward(q[int(np.linalg.norm(both[turning], axis=-1).argmax())]).round(12) + 0.0
+        for both in (bounds, (moves, turns))
+    )
+    at, bound_at = (f" at {_place(robot, pose)}" for pose in (worst, farthest))
+    most, bound, case = greatest(turns), greatest(bounds[1]), "worst case of all bounds"
     facts = [
         Fact("robot", robot.name),
         Fact("states", len(q)),
         Fact("path", None if given.path is None else str(given.path)),
         _length("rms_position_m", rms(moves)),
-        _length("greatest_position_m", greatest(moves), "largest position error", f" at {at}"),
+        _length("greatest_position_m", greatest(moves),
+                None if turning else "largest position error", at),
         Fact("rms_angle_rad", rms(turns), "rad", "RMS rotation",
              f"{1e3 * rms(turns):.4g} mrad"),
-        Fact("greatest_angle_rad", greatest(turns), "rad"),
+        Fact("greatest_angle_rad", most, "rad", "largest rotation" if turning else None,
+             f"{1e3 * most:.4g} mrad{at}"),
         Fact("worst_pose", worst),
-        _length("bound_position_m", float(most.max()), "worst case of all bounds",
-                f" at {_place(robot, farthest)}"),
-        Fact("bound_angle_rad", greatest(found.worst[:, 3:]), "rad"),
+        _length("bound_position_m", greatest(bounds[0]), None if turning else case, bound_at),
+        Fact("bound_angle_rad", bound, "rad", case if turning else None,
+             f"{1e3 * bound:.4g} mrad{bound_at}"),
         Fact("bound_pose", farthest),
         _length("rms_calibrated_position_m", rms(np.sqrt(sum(v**2 for v in left.values()))),
                 "RMS after a calibration without noise"),
