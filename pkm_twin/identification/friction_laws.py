@@ -121,8 +121,7 @@ def fit_with_laws(
     if Dahl.name in asked:
         # Without memory slow reversals would be another machine's: faults are looked for with it.
         asked.remove(Dahl.name)
-        static = on_time(Problem.of(robot, recordings, what))
-        best = fit(_remembering(static), recordings, what, **options | {"causes": None})
+        best = fit(_remembering(robot, recordings, what), recordings, what, **options)
         before = Problem.of(robot, [made.recording for made in best.problem.whole], what)
         choice = _compared(Dahl.name, best.verdict, before, best.problem)
         choices.append(replace(choice, taken=True, asked=True))
@@ -199,9 +198,12 @@ def fit_recordings(
             gaps = missing_samples(r.time)
             notes.append(f"{r.name}: {gaps.text} {gaps.value}, {gaps.bound}: {gaps.verdict}")
     made = [recorded_of(r) for r in recordings]
-    causes = None
+    causes, seen = None, robot
     if constant is None:
-        causes = [number_that_explains(replace(r, robot=robot)) for r in made]
+        if "friction" in what and Dahl.name in (laws or ()):
+            # What a memory does at reversals is no payload.
+            seen = _remembering(robot, made, what)
+        causes = [number_that_explains(replace(r, robot=seen)) for r in made]
     for k, cause in enumerate(causes or ()):
         if cause is None or not cause.text or not usual(cause.scale):
             continue
@@ -286,12 +288,13 @@ def _compared(name: str, verdict: Verdict, before: Problem, after: Problem) -> C
     return Choice(name, bool(good), float(before_rms), float(after_rms), float(sigmas))
 
 
-def _remembering(static: Problem) -> Robot:
+def _remembering(robot: Robot, recordings: Sequence[Recording], what: Sequence[Kind]) -> Robot:
     """The robot with Dahl's law, open to a fit, about what the recordings show of its distance.
 
     :raises PkmTwinError: their motion does not show it.
     """
-    robot, recordings = static.robot, [rows.recording for rows in static.whole]
+    static = on_time(Problem.of(robot, recordings, what))
+    recordings = [rows.recording for rows in static.whole]
     rough = _changed(robot, _Search(static, Dahl.name).found())
     # Without a memory efforts near reversals are taken for outliers, and for noise.
     again = Problem.of(rough, recordings, static.what)

@@ -16,6 +16,7 @@ from pkm_twin.identification.check import check, recorded_of
 from pkm_twin.identification.compare import compare
 from pkm_twin.identification.fit import Fit, fit
 from pkm_twin.identification.friction_laws import fit_recordings
+from pkm_twin.machine.friction import Dahl
 from pkm_twin.recordings import Load, Recording
 from pkm_twin.streams.rates import rms
 from test.identification.machines import IMPOSSIBLE, WRONG, machine, noisy, shifted
@@ -299,3 +300,22 @@ def test_a_fit_is_compared_with_the_file_wherever_it_starts() -> None:
         sizes.append(judged.rms(judged.before))
         assert (sizes[-1] > 5.0 * judged.rms(judged.after)).all()
     np.testing.assert_allclose(sizes, np.broadcast_to(sizes[1], np.shape(sizes)), rtol=0.02)
+
+
+def test_a_payload_is_looked_for_with_the_memory_of_friction() -> None:
+    """It is held throughout, though no effort tells at first what friction does."""
+    robot, rng = load("five_bar"), np.random.default_rng(5)
+    time = np.arange(0.0, 24.0, 0.005)
+    w = 2.0 * np.pi * np.array([[0.11, 0.23, 0.31], [0.13, 0.19, 0.37]])
+    turn = w * time[:, None, None] + rng.uniform(0.0, 6.0, (2, 3))
+    q = robot.inverse(robot.home()) + 0.05 * np.sin(turn).sum(-1)
+    motion = q, 0.05 * (w * np.cos(turn)).sum(-1), -0.05 * (w**2 * np.sin(turn)).sum(-1)
+    friction = {"coulomb": [3.9, 3.8], "viscous": [0.01, 0.01]}
+    file = robot.changed(friction=friction, payload={"mass": 0.0})
+    truth = file.changed(friction={"presliding": [0.02, 0.02]}, payload={"mass": 1.0})
+    effort = inverse_dynamics(truth, *motion) + Dahl.remembered(truth.friction, *motion[:2])[0]
+    made = noisy(Recording(file, time, q, effort=effort), rng, 0.005, 1e6)
+    found, _, (note,) = fit_recordings(file, [made], ("friction", "payload"), ("dahl",))
+    assert float(note.split()[-1]) == pytest.approx(1.0, rel=0.02)
+    (payload,) = (n for n in found.numbers if n.name == "payload.mass")
+    assert abs(payload.after - 1.0) < 3.0 * payload.deviation < 0.5
