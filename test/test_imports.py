@@ -6,11 +6,12 @@ import re
 import subprocess
 import sys
 from graphlib import TopologicalSorter
+from xml.etree import ElementTree
 
 import pytest
 
 from pkm_twin.apps.groups import commands, module_of
-from test.support.sources import ROOT, arrows, imports, room, sources, within
+from test.support.sources import ROOT, arrows, imports, nodes, room, sources, within
 
 OWN = {"pkm_twin.errors", "pkm_twin.files", "pkm_twin.threads", "pkm_twin.settings"}
 """Modules without a folder that all may import."""
@@ -63,7 +64,7 @@ MAY = {
     | {"pkm_twin.recordings", "pkm_twin.certify", "pkm_twin.view"},
 }
 """Rooms that each may import, beside itself and :data:`OWN`; so nobody imports apps or a node."""
-ROS = re.compile(r"rclpy|\w+_msgs|\w+_interfaces")
+ROS = re.compile(r"rclpy|\w+_(msgs|interfaces|srvs)")
 WITHOUT_ROS = {"pkm_twin.ros.arguments", "pkm_twin.ros.signals"}
 """Of the folder that is about ROS."""
 WITH_ROS = {
@@ -86,7 +87,7 @@ def test_packages_import_only_what_they_stand_on(importing):
 
 def private_reads(module):
     """Attributes with one underscore of other objects, by name."""
-    for node in ast.walk(ast.parse(sources()[module].read_text(encoding="utf-8"))):
+    for node in nodes(module):
         private = isinstance(node, ast.Attribute) and re.match(r"_[a-z]", node.attr)
         if private and getattr(node.value, "id", "") not in ("self", "cls"):
             yield node.attr
@@ -131,6 +132,14 @@ def test_only_nodes_and_the_ros_package_import_ros():
         if not (room(module).endswith(".node") or own or module in WITH_ROS):
             for name in imports(module):
                 assert not ROS.fullmatch(name.split(".")[0]), f"{module} imports {name}"
+
+
+def test_the_manifest_names_every_message_package_that_is_imported():
+    depends = {one.text for one in ElementTree.parse(ROOT / "package.xml").iter("depend")}
+    imported = {name.split(".")[0] for module in sources() for name in imports(module)}
+    ros = {name for name in imported if ROS.fullmatch(name)}
+    assert ros
+    assert ros <= depends
 
 
 def loaded_by(code):

@@ -301,21 +301,6 @@ class TestManifest:
         assert manifest.get_build_type() == "ament_python"
         assert (REPOSITORY / "resource" / manifest.name).is_file()
 
-    def test_names_every_message_package_that_is_imported(self, manifest):
-        depends = {depend.name for depend in manifest.exec_depends}
-        imported = set()
-        for name in modules():
-            for node in ast.walk(ast.parse((REPOSITORY / name).read_text(encoding="utf-8"))):
-                if isinstance(node, ast.ImportFrom) and not node.level:
-                    imported.add(node.module.split(".")[0])
-                elif isinstance(node, ast.Import):
-                    imported |= {alias.name.split(".")[0] for alias in node.names}
-        ros = {
-            name for name in imported if name == "rclpy" or name.endswith(("_msgs", "_interfaces"))
-        }
-        assert ros
-        assert ros <= depends
-
     def test_one_version_everywhere(self):
         found = {"pkm_twin": pkm_twin.__version__}
         found["package.xml"] = ElementTree.parse(REPOSITORY / "package.xml").findtext("version")

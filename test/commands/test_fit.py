@@ -198,6 +198,6 @@ def test_numbers_that_are_no_recording_of_this_machine(
         assert "units?" in reason and data["verdict"]["model"] != "explains"
         assert {p["standard_deviation"] for p in data["parameters"]} == {None}
     if column == "position":
-        done = twin(*line, "--beyond-limits", "--accept", "--json")
+        done = twin(*line, "--beyond-limits", "--accept", "--no-report", "--json")
         # Marked, or not reachable there at all: what moves so is no machine of this file.
         assert "beyond limits" in done.out or "unreachable" in done.err

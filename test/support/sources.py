@@ -28,13 +28,19 @@ def _module(path: Path) -> str:
 
 
 @cache
+def nodes(module: str) -> tuple[ast.AST, ...]:
+    """All of a module's syntax."""
+    return tuple(ast.walk(ast.parse(sources()[module].read_text(encoding="utf-8"))))
+
+
+@cache
 def imports(module: str) -> frozenset[str]:
     """What a module imports, wherever in it: modules, also where a name of one is imported.
 
     A text that names a module of another room, as ``import_module`` takes it, counts as well.
     """
     found = set()
-    for node in ast.walk(ast.parse(sources()[module].read_text(encoding="utf-8"))):
+    for node in nodes(module):
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
