@@ -281,8 +281,9 @@ class Variants:
             known = self.values[~out][:, columns]
             if len(known) and not self._box_fits(columns, known):
                 paths = [self.paths[column] for column in columns]
-                for k in np.flatnonzero(~out):
-                    out[k] = not self._fits(paths, self.values[k, columns].tolist())
+                rows, which = np.unique(known, axis=0, return_inverse=True)
+                fits = np.array([self._fits(paths, row) for row in rows.tolist()])
+                out[~out] = ~fits[which.ravel()]
         return out
 
     @property
