@@ -12,6 +12,7 @@ import pytest
 
 from pkm_twin.apps.groups import commands, module_of
 from test.support.sources import ROOT, arrows, imports, nodes, room, sources, within
+from tools.pages import architecture
 
 OWN = {"pkm_twin.errors", "pkm_twin.files", "pkm_twin.threads", "pkm_twin.settings"}
 """Modules without a folder that all may import."""
@@ -107,6 +108,13 @@ def test_nobody_reads_private_attributes_of_another_room():
     for module in sources():
         foreign = (everywhere & set(private_reads(module))) - own[room(module)]
         assert not foreign, module
+
+
+def test_the_picture_of_imports_has_every_folder():
+    places = architecture.places()
+    assert len({*places.values()}) == len(places) > 20
+    assert {name for pair in architecture.arrows() for name in pair} == set(places)
+    assert all(places[here][1] > places[there][1] for here, there in architecture.arrows())
 
 
 def test_codegen_names_nothing_above_it():

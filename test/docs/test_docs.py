@@ -19,7 +19,7 @@ from pkm_twin import design, paths, robot_names
 from pkm_twin import errors as module
 from test.support.command import typed_line
 from test.support.pages import assert_output, read_section
-from tools.pages import architecture, errors, notebooks, parameters, public, trend
+from tools.pages import errors, notebooks, parameters, public, trend
 
 DOCS = Path(__file__).parents[2] / "docs"
 
@@ -164,13 +164,6 @@ def test_the_output_of_the_trend_page_is_todays(tmp_path):
     page = (DOCS / "recordings.md").read_text(encoding="utf-8")
     assert trend.rewritten(page, tmp_path / "trend.png") == page
     assert (tmp_path / "trend.png").stat().st_size
-
-
-def test_the_picture_of_imports_has_every_folder():
-    places = architecture.places()
-    assert len({*places.values()}) == len(places) > 20
-    assert {name for pair in architecture.arrows() for name in pair} == set(places)
-    assert all(places[here][1] > places[there][1] for here, there in architecture.arrows())
 
 
 @pytest.mark.parametrize("package", [delta_dynamics, stiffness_monitor, paths, design])
