@@ -288,6 +288,7 @@ def left_by_calibration(
 
 def unknowns(robot: Robot, measured: Measured, paths: Sequence[str], free: Free) -> list[Parameter]:
     """What is fitted, as it is before: the machine's numbers, the instrument's, the kinds' own."""
+    robot.check_independent("calibrations", "a pose does not give the others' zeros")
     known, prior = robot.file_numbers(), free.prior
     angle = prior / robot.size
     mapped = free.mapped(robot, robot.controller.positions(measured.joints))
@@ -341,7 +342,6 @@ def calibrate(
     :raises ParameterError: too few poses, poses of another machine, unit or frame, poses that tell
         no number, or a fit that does not settle.
     """
-    robot.check_independent("calibrations", "a pose does not give the others' zeros")
     free, apart = Free(**options), None
     if isinstance(poses, Measured):
         learnt = poses

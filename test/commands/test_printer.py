@@ -11,6 +11,7 @@ import pytest
 
 from pkm_twin.errors import ParameterError
 from pkm_twin.robot.printers import read_printer
+from test.commands.conftest import REPOSITORY
 from test.identification.partial_cases import Towers
 from test.support.command import Commands
 from test.support.robots import partly_long
@@ -247,6 +248,10 @@ def test_a_plan_is_a_table_to_fill_in(twin: Commands, tmp_path: Path) -> None:
         line = ("calibrate", robot, "--measure", what, "--plan", tmp_path / "d.csv")
         twin.refused(*line, code=code)
     twin.refused("calibrate", robot)
+    # No calibration follows for drives that share.
+    line = ("calibrate", REPOSITORY / "examples/machines/rrr4_planar.yaml", "--measure", "distance")
+    line += ("--plan", tmp_path / "d.csv", "--within", "x=0:0.01,y=0:0.01,yaw=0:0.1")
+    assert "for calibrations" in twin.refused(*line)
 
 
 NAMED = {
