@@ -140,16 +140,18 @@ def repeats_of(time: Array, q: Array) -> Mask:
     """
     found, move = np.zeros(len(q), np.bool_), np.diff(q, axis=0)
     apart = np.concatenate([np.ones_like(q[:1], np.bool_), move != 0.0])
+    if apart.all():
+        return found
     own = [noise(time[new], one[new, None])[0] for one, new in zip(q.T, apart.T, strict=True)]
     floor = 2.0 * SIGMAS * np.array(own) + 2.0 * _tick(np.abs(move))
     for count in range(1, min(AGAIN, len(move) - 3) + 1):
         around = np.array([0, 1, count + 2, count + 3])
         apart_from = np.prod(count + 1 - around) / (count + 1 - around)
         weights = apart_from / [np.prod([x - y for y in around if y != x]) for x in around]
-        rows = np.arange(len(q) - count - 3)[:, None] + around
-        away = np.abs(np.einsum("p,kpn->kn", weights, q[rows]) - q[count + 1 : -2])
-        same = ~sliding_window_view(apart[2:-2], count, axis=0).any(-1)
-        for k in np.flatnonzero((same & apart[1 : -count - 2] & (away > floor)).any(1)):
+        same = ~sliding_window_view(apart[2:-2], count, axis=0).any(-1) & apart[1 : -count - 2]
+        rows = np.flatnonzero(same.any(1))
+        away = np.abs(np.einsum("p,kpn->kn", weights, q[rows[:, None] + around]) - q[rows + 1])
+        for k in rows[(same[rows] & (away > floor)).any(1)]:
             found[k + 2 : k + count + 2] = True
     return found
 
