@@ -426,7 +426,7 @@ def _verdict(
             Evidence(
                 np.where(counts, left, 0.0)[:, measured],
                 columns[:, measured], np.zeros((*own[:, measured].shape, 0)),
-                np.zeros(int(measured.sum())), np.stack(errors, -1)[:, measured],
+                np.stack(errors, -1)[:, measured],
                 _noise(left, own, columns.shape[-1])[measured], 1.0,
                 counts[:, measured].astype(np.float64), part.split,
                 np.sqrt(np.mean(own**2, 0))[measured], np.std(own, 0)[measured],

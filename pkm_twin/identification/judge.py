@@ -49,8 +49,6 @@ SEEN: Final = 1e-3
 """Part of its norm that a suspect keeps beside the fitted numbers, or it cannot be seen."""
 RANK: Final = 1e-7
 """Least singular value, of columns of norm one, that counts."""
-MISSED: Final = 0.5
-"""Part of what the differentiation misses that a finding has to exceed."""
 LOUD: Final = 1.5
 """Residual over noise, in the band of the motion, from which more than noise is left."""
 MAX_UNEXPLAINED: Final = 0.2
@@ -268,17 +266,16 @@ class Evidence:
 
     ``residual``: measured less fitted, (k, n). ``explained``: columns of the fitted parameters,
     (k, n, p). ``nuisance``: of what is no error of the model: delays that are fitted, what the
-    differentiation misses, (k, n, d); ``missed``: the rms of the latter, (n,). ``suspects``: by the
-    suspects' sizes, (k, n, s). ``noise``: deviation of a row's noise as if rows were independent,
-    (n,). ``band``: the part of the rows' rate that the filter passes. ``counts``: 1 for what is
-    judged, (k, n). ``fitted``: how many rows, the first ones, were fitted. ``size``: rms of the
-    measurements, ``variation``: about their mean, (n,).
+    differentiation misses, (k, n, d). ``suspects``: by the suspects' sizes, (k, n, s). ``noise``:
+    deviation of a row's noise as if rows were independent, (n,). ``band``: the part of the rows'
+    rate that the filter passes. ``counts``: 1 for what is judged, (k, n). ``fitted``: how many
+    rows, the first ones, were fitted. ``size``: rms of the measurements, ``variation``: about their
+    mean, (n,).
     """
 
     residual: Array
     explained: Array
     nuisance: Array
-    missed: Array
     suspects: Array
     noise: Array
     band: float
@@ -334,7 +331,7 @@ def judge(
     y, left = y - basis @ (basis.T @ y), left - basis @ (basis.T @ left)
     prior_sizes = np.array([one.usual or 0.0 if one.known else np.inf for one in suspects])
     positive = np.array([one.positive for one in suspects])
-    chosen, after = _select(y, left, seen, _least(few), prior_sizes, positive)
+    chosen, after = _select(y, left, seen, prior_sizes, positive)
     sizes = _sizes(y, left, prior_sizes, [one.index for one in chosen])
     found = [_finding(suspects, one, pair) for one, pair in zip(chosen, sizes, strict=True)]
     sure = sum(one.sigmas >= SIGMAS for one in chosen)
@@ -414,24 +411,12 @@ class _Chosen:
     near: tuple[int, ...]
 
 
-def _least(cases: Sequence[Evidence]) -> Array:
-    """Sizes below which a suspect may be what the differentiation misses, shape (s,)."""
-    missed, size = 0.0, 0.0
-    for case in cases:
-        weight = case.weight[..., None]
-        own = weight * (case.suspects != 0.0) * case.missed[:, None]
-        missed = missed + np.sum(own**2, (0, 1))
-        size = size + np.sum((weight * case.suspects) ** 2, (0, 1))
-    return np.asarray(MISSED * np.sqrt(missed / np.maximum(size, 1e-300)), np.float64)
-
-
 def _select(
-    y: Array, table: Array, seen: Array, least: Array, prior: Array, positive: Mask
+    y: Array, table: Array, seen: Array, prior: Array, positive: Mask
 ) -> tuple[list[_Chosen], Array]:
     """Suspects that the residual shows, the last perhaps not clearly; what stays of it.
 
     :param seen: norms of the suspects before the fitted numbers were taken out, (s,).
-    :param least: sizes from which they count, (s,).
     :param prior: standard deviations that are known of their sizes, else infinite, (s,).
     :param positive: which sizes cannot be below zero, (s,).
     """
@@ -443,7 +428,6 @@ def _select(
         good = norms > SEEN * np.maximum(seen, 1e-300)
         norms = np.where(good, norms, 1.0)
         scores = np.where(good, (rest @ left) / norms, 0.0)
-        scores = np.where(np.abs(scores) > least * norms, scores, 0.0)
         # What a size that is likely beforehand explains.
         share = np.where(known, norms * np.where(known, prior, 0.0), np.inf)
         share = 1.0 / (1.0 + np.maximum(share, 1e-300) ** -2.0)

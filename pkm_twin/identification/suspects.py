@@ -464,7 +464,6 @@ class _Court:
             effort - rows.rest - rows.table @ values + one.delay * rows.change,
             rows.table[..., free],
             np.concatenate([rows.change[..., None], one.missed], -1),
-            np.sqrt(np.sum(np.mean(one.missed**2, 0), -1)),
             np.concatenate([one.columns, others], -1),
             rows.signals.noise, rows.signals.band, rows.counts, rows.held_from,
             np.sqrt(np.mean(effort**2, 0)), np.std(effort, 0),

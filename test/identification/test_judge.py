@@ -19,7 +19,7 @@ def judged(
     found, covariance = inverse @ measured.ravel(), inverse @ inverse.T
     ones = np.ones(CHANNELS)
     case = Evidence(
-        measured - explained @ found, explained, np.zeros((ROWS, CHANNELS, 0)), 0.0 * ones, columns,
+        measured - explained @ found, explained, np.zeros((ROWS, CHANNELS, 0)), columns,
         ones, 1.0, np.ones((ROWS, CHANNELS)), ROWS, ones, ones,
     )  # fmt: skip
     suspects = [Suspect("length", str(k), "m", float(u), known=True) for k, u in enumerate(usual)]
