@@ -44,8 +44,6 @@ POINTS: Final = 1e-3 * np.array([-2.0, -1.0, 1.0, 2.0])
 WEIGHTS: Final = np.array([1.0, -8.0, 8.0, -1.0]) / 12e-3
 """Differences of fourth order: errors of a rigid part change its rows smoothly."""
 
-HALF: Final = 0.5
-"""Of a play that parts stand away from its middle at most."""
 CLEARANCE: Final = ("clearance[0]", "clearance[1]", "clearance[2]")
 """A joint's clearance, along each of the base axes at home."""
 ENDS: Final = {
@@ -178,17 +176,15 @@ def _effects(
             if name not in graph.leads:
                 leads = f": {', '.join(graph.leads)} lead" if robot.redundant else ""
                 raise ParameterError(path, name, f"an actuated joint{leads}")
-            size, word = (1.0, "zero") if what == "offset" else (HALF, what)
-            unit_ = "m" if joint.slides else "rad"
-            return {("offset", name): np.full(1, size)}, f"{word} of {name}", unit_
+            word, unit_ = "zero" if what == "offset" else what, "m" if joint.slides else "rad"
+            return {("offset", name): np.ones(1)}, f"{word} of {name}", unit_
         case "joints", ("at" | "axis" | "clearance") as what, int(k) if k < 3 - (what == "axis"):
             joint = graph.joints[name]
             if joint.virtual:
                 raise ParameterError(path, name, "a joint that does not stand for others")
             if what != "axis":
-                size, word = (1.0, "centre") if what == "at" else (HALF, what)
-                moved = np.asarray(size * turn @ np.eye(3)[k])
-                return {("inner", name): moved}, f"{word} of {name} on {joint.inner}", "m"
+                moved, text = np.asarray(turn @ np.eye(3)[k]), "centre" if what == "at" else what
+                return {("inner", name): moved}, f"{text} of {name} on {joint.inner}", "m"
             if not len(joint.axes):
                 raise ParameterError(path, joint.kind, "a joint with an axis")
             if name in robot.without_point:

@@ -45,9 +45,10 @@ class Tolerances:
 
     All arrays (..., 6): displacement of the reference point and small turns, base axes, m and rad,
     against the machine without errors at the same joint positions. ``sigma``: standard deviation
-    by path, m or rad, and ``bounds``: how far the error may go. ``sensitivity``: by path, per m or
-    rad of the error. ``texts``: what each error is, in words. ``deflection``: of the machine
-    without errors under the wrench, None without one: to first order an error does not change it.
+    by path, m or rad, and ``bounds``: how far the error may go, of a play half of it.
+    ``sensitivity``: by path, per m or rad of the error. ``texts``: what each error is, in words.
+    ``deflection``: of the machine without errors under the wrench, None without one: to first order
+    an error does not change it.
     """
 
     sigma: Mapping[str, float]
@@ -158,7 +159,7 @@ def tolerances(
     - ``joints.NAME.axis[0]``, ``[1]``: the joint's frame on its inner body turns about its centre
       and two axes across the joint's (first) axis;
     - ``joints.NAME.offset``: an actuated joint stands by this beyond its position;
-    - ``joints.NAME.backlash``: the play of an actuated joint, which stands half of it away at most;
+    - ``joints.NAME.backlash``: the play of an actuated joint, uniform within half of it either way;
     - ``joints.NAME.clearance``: the play of a joint, whose centre on the inner body is half of it
       away at most, in any direction;
     - ``limbs.`` in front, or ``limbs[0].`` where ``limbs`` is a list: all copies of a limb alike,
@@ -198,7 +199,11 @@ def tolerances(
         number = schema.number(low=0.0, high=most, unit=units[path])
         told = value.size if isinstance(value, Tolerance) else value
         size = schema.checked(number, f"tolerance {path}", told)
-        sizes[path] = value if isinstance(value, Tolerance) else Tolerance(deviation=size)
+        # Parts stand half of a play away from its middle at most.
+        sizes[path] = (
+            Tolerance(bound=size / 2.0) if is_play(path)
+            else value if isinstance(value, Tolerance) else Tolerance(deviation=size)
+        )  # fmt: skip
     for path in numbers:
         if states.size and not slopes[path].any():
             raise ParameterError(f"tolerance {path}", robot.number(path), "a length or an angle")
@@ -254,15 +259,16 @@ def drawn(
     rng = np.random.default_rng(seed)
     errors: dict[str, Array] = {}
     for paths in known.together.values():
-        bounds = [getattr(sizes[path], "bound", None) for path in paths]
-        if bounds[0] is None:
+        if getattr(sizes[paths[0]], "bound", None) is None:
             errors |= {path: known.sigma[path] * rng.normal(size=count) for path in paths}
         else:
             # The parts of a clearance touch somewhere: any direction, the bound's length.
             way = rng.normal(size=(len(paths), count)) if len(paths) > 1 else None
             unit = rng.uniform(-1.0, 1.0, (1, count)) if way is None else (
                 way / np.linalg.norm(way, axis=0))  # fmt: skip
-            errors |= {path: bounds[0] * row for path, row in zip(paths, unit, strict=True)}
+            errors |= {
+                path: known.bounds[path] * row for path, row in zip(paths, unit, strict=True)
+            }
     parts = [path for path in errors if part_of(robot, path) is not None]
     assembly = Assembly(robot, states)
     if len(parts) == len(errors):

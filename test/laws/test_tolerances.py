@@ -339,8 +339,9 @@ def test_bounds_hold_for_machines_that_are_drawn_within_them():
     # A play is the whole of it: parts stand half of it away at most.
     for play, part in (("backlash", "offset"), ("clearance[1]", "at[1]")):
         one, other = (f"joints.motor_1.{name}" for name in (play, part))
-        each = tolerances(robot, {one: Tolerance(bound=1e-4), other: 1e-5}, q).sensitivity
-        np.testing.assert_allclose(each[one], 0.5 * each[other], atol=1e-12)
+        each = tolerances(robot, {one: Tolerance(bound=1e-4), other: 1e-5}, q)
+        np.testing.assert_allclose(each.sensitivity[one], each.sensitivity[other], atol=1e-12)
+        assert each.bounds[one] == 5e-5 and each.sigma[one] == pytest.approx(1e-4 * 12**-0.5)
     for path, size in (("joints.motor_1.backlash", 1e-4), ("joints.motor_1.clearance", 1e-4),
                        ("joints.none*.offset", Tolerance(bound=1e-4))):  # fmt: skip
         with pytest.raises(ParameterError):
