@@ -11,6 +11,7 @@ import json
 import os
 import sys
 from collections import Counter, defaultdict
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,7 @@ from test.support.pages import FAULTS, write_section
 
 RESULTS = Path("out/faults.json")
 """Of every row, by its number, how many cases ran and what came of them."""
-PASS = "pass"
+PASS, NOT_RUN = "pass", "**not run**"
 INTRODUCTION = """Printed by `make faults`: {passed} of {total} rows passed.
 
 **R**: the message is rejected whole and counted in `/diagnostics`. **S**: as R, and the stream
@@ -48,7 +49,7 @@ def result(row: Row, outcomes: Outcomes) -> tuple[int, str]:
     cases = sum(count.total() for count in found)
     if any(set(count) - {"passed"} for count in found):
         return cases, "**fail**"
-    return cases, PASS if all(found) else "**not run**"
+    return cases, PASS if all(found) else NOT_RUN
 
 
 def section(results: dict[str, Any]) -> str:
@@ -71,16 +72,23 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--again", action="store_true", help="rows that did not pass")
     again = parser.parse_args().again
-    results: dict[str, Any] = json.loads(RESULTS.read_text()) if again else {}
-    asked = [row for row in rows() if results.get(str(row.number), (0, ""))[1] != PASS]
+    results: dict[str, Any] = {str(row.number): (0, NOT_RUN) for row in rows()}
+    results |= json.loads(RESULTS.read_text()) if again else {}
+    asked = [row for row in rows() if results[str(row.number)][1] != PASS]
     os.environ.setdefault("SOAK_MINUTES", "1")
     outcomes = Outcomes()
-    tests = sorted({str(TESTS / test) for row in asked for test in row.tests})
-    # A file's nodes are started once, for all of its tests in their order.
-    pytest.main(["-q", "-n", "2", "--dist", "loadfile", "-m", "", *tests], plugins=[outcomes])
-    results |= {str(row.number): result(row, outcomes) for row in asked}
     RESULTS.parent.mkdir(exist_ok=True)
-    RESULTS.write_text(json.dumps(results, indent=1) + "\n")
+    tests = sorted({test for row in asked for test in row.tests})
+    # A folder after the other, each kept: an interrupted run goes on with --again.
+    for _, folder in groupby(tests, key=lambda test: Path(test).parts[0]):
+        paths = [str(TESTS / test) for test in folder]
+        # A file's nodes are started once, for all of its tests in their order.
+        options = ["-q", "-n", "2", "--dist", "loadfile", "-m", ""]
+        ended = pytest.main([*options, *paths], plugins=[outcomes])
+        if ended == pytest.ExitCode.INTERRUPTED:
+            break
+        results |= {str(row.number): result(row, outcomes) for row in asked}
+        RESULTS.write_text(json.dumps(results, indent=1) + "\n")
     write_section("catalogue", section(results), FAULTS)
     return int(any(how != PASS for _, how in results.values()))
 
