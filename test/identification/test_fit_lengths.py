@@ -160,7 +160,7 @@ def errors_of(name: str, runs: range) -> tuple[Array, Array]:
 @pytest.mark.parametrize(
     ("name", "runs"),
     [("delta", range(2)),
-     *(pytest.param(name, range(200), marks=pytest.mark.long)
+     *(pytest.param(name, range(200), marks=[pytest.mark.long, pytest.mark.timeout(3600)])
        for name in ("delta", "linear_delta", "five_bar"))],
 )  # fmt: skip
 def test_numbers_of_machines_with_usual_lengths_are_as_sure_as_they_are_said(
