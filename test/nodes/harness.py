@@ -359,7 +359,7 @@ class Peer:
     def now(self):
         return self.node.get_clock().now().nanoseconds
 
-    def talk(self, kind, topic, qos=10):
+    def talk(self, kind, topic, qos=1000):
         self._publishers[topic] = self.node.create_publisher(kind, topic, qos)
 
     def hear(self, kind, topic, qos=100):

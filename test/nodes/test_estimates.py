@@ -67,7 +67,7 @@ class Swing:
 
 def test_a_load_and_a_push_are_told(peer, launch):
     launch("delta_dynamics.nodes.twin", *PARAMETERS)
-    peer.talk(JointState, "/joint_states", 1000)
+    peer.talk(JointState, "/joint_states")
     for topic, kind in OUTPUTS.items():
         peer.hear(kind, topic)
     peer.until(peer.matched)

@@ -67,7 +67,7 @@ def greet(peer):
 def test_a_joint_three_times_softer_is_found_by_name_live(peer, launch):
     process = launch("stiffness_monitor.node", "max_state_age:=600.0")
     for topic, kind in TOPICS.items():
-        peer.talk(kind, topic, 1000)
+        peer.talk(kind, topic)
     peer.hear(DiagnosticArray, ALARM)
     peer.hear(DiagnosticArray, "/diagnostics")
     greet(peer)
