@@ -19,7 +19,7 @@ from delta_dynamics.torques.virtual_work import inverse_dynamics, null_efforts
 from pkm_twin.codegen.arrays import Array, Mask
 from pkm_twin.errors import PkmTwinError
 from pkm_twin.identification.estimation import estimate
-from pkm_twin.identification.judge import LOUD
+from pkm_twin.identification.judge import LOUD, SIGMAS
 from pkm_twin.identification.plausible import LATEST, late_text
 from pkm_twin.identification.rows import BLOCK, shaken_efforts
 from pkm_twin.identification.samples import (
@@ -241,9 +241,11 @@ def _compared(r: Recording, bound: float) -> Compared | None:
         slack = _each(np.abs(alike), np.where(track.moves(how), doubt, reach))
         left = beyond_friction(_each(alike, track.effort) - expected, slack > 0.0, slack)
         change = np.gradient(expected, period, axis=0)
-        sharp.append({"expected": expected, "left": left, "change": change})
+        qd = moving_rates(track.qd, ~track.moves(how), reach)
+        rubs = np.concatenate([alike * part[:, None] for part in (qd, np.sign(qd))], -1)
+        sharp.append({"expected": expected, "left": left, "change": change, "rubs": rubs})
     smooth = filtered(sharp, period, how)
-    expected, left, change = (smooth[name] for name in ("expected", "left", "change"))
+    expected, left, change, rubs = smooth.values()
     inside = [kept_rows(len(track.time), period, how) for track in pieces]
     starts = np.cumsum([0, *(rows.stop - rows.start for rows in inside[:-1])]).tolist()
     time = np.concatenate([one.time[rows] for one, rows in zip(pieces, inside, strict=True)])
@@ -251,7 +253,7 @@ def _compared(r: Recording, bound: float) -> Compared | None:
         name: np.concatenate([one[name][rows] for one, rows in zip(sharp, inside, strict=True)])
         for name in ("left", "change")
     }
-    late = _late(left, change)
+    late = _late(left, change, rubs)
     longest = max(pieces, key=lambda track: len(track.time))
     raw = [one["left"] for one in sharp]
     long = [one for one in raw if len(one) >= SEGMENT] or [max(raw, key=len)]
@@ -273,11 +275,19 @@ def _compared(r: Recording, bound: float) -> Compared | None:
     )  # fmt: skip
 
 
-def _late(left: Array, change: Array) -> float:
-    """How late the efforts are, s, by residuals and the efforts' change (k, n) each."""
-    found = estimate(-change[..., None], left, np.zeros(1), np.full(1, LATEST)).values[0]
+def _late(left: Array, change: Array, rubs: Array) -> float:
+    """How late the efforts are, s; 0 where other friction of the drives explains it as well.
+
+    :param left: residuals, ``change``: the efforts', (k, n) each; ``rubs``: of friction, (k, n, f).
+    """
+    table = np.concatenate([-change[..., None], rubs], -1)
+    sizes = np.sqrt(np.mean(rubs**2, (0, 1)))
+    scales = rms(left).max() / np.where(sizes > 0.0, sizes, np.inf)
+    scales = np.where(scales > 0.0, scales, 1.0)
+    found = estimate(table, left, np.zeros(table.shape[-1]), np.array([LATEST, *scales]))
+    late, sure = float(found.values[0]), SIGMAS * np.sqrt(found.covariance[0, 0])
     # At the bound it is another error's.
-    return float(found) if abs(found) < LATEST else 0.0
+    return late if sure < abs(late) < LATEST else 0.0
 
 
 def lateness(late: float, period: float) -> str:

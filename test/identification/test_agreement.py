@@ -76,14 +76,19 @@ def test_an_encoder_s_noise_is_not_the_model_s_fault(name: str) -> None:
 
 
 def test_efforts_that_are_late_leave_noise_alone() -> None:
-    """Whatever the delay, it is found, and with it the residual is the noise of the efforts."""
+    """Whatever the delay, it is found, also beside other friction, and then only noise is left."""
     rng = np.random.default_rng(11)
     m = machine(load("delta"), rng, 8.0, 500.0)
-    for late in rng.uniform(-8e-3, 8e-3, 3):
+    friction = {
+        key: 1.2 * np.array(getattr(m.truth.friction, key)) for key in ("viscous", "coulomb")
+    }
+    rubbing = m.truth.changed(friction={key: each.tolist() for key, each in friction.items()})
+    for late in (0.0, *rng.uniform(-8e-3, 8e-3, 2)):
         made = noisy(m.recorded(effort=shifted(m.efforts, m.time, late)), rng)
-        found = compare(replace(made, robot=m.truth))
-        assert found is not None
+        found, other = (compare(replace(made, robot=robot)) for robot in (m.truth, rubbing))
+        assert found is not None and other is not None
         assert found.late == pytest.approx(late, abs=2e-4)
+        assert other.late == pytest.approx(late, abs=2e-4)
         assert (found.rms < 2.0 * found.noise).all()
 
 
