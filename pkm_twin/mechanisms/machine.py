@@ -533,20 +533,27 @@ class Machine(TwinRobot):
     def structure(self) -> Structure:
         """Bars with sections, and the compliance of joints.
 
-        :raises ParameterError: no body and no joint is elastic.
+        :raises ParameterError: no body and no joint is elastic; of bars that cannot be, all named.
         """
-        sections = {}
-        for name, body in self.specs["bodies"].items():
-            m = body.member
-            if m is not None and m.section is not None:
-                span = norm(plain(m.end - m.start))
-                sections[name] = m.section.section(
-                    body.mass / span, f"bodies.{name}.member.section"
-                )
-        for name, rod in self.specs["rods"].items():
-            if rod.section is not None:
-                span = norm(plain(rod.ends[1] - rod.ends[0]))
-                sections[name] = rod.section.section(rod.mass / span, f"rods.{name}.section")
+        bars = [
+            (name, m.section, body.mass, m.end - m.start, f"bodies.{name}.member.section")
+            for name, body in self.specs["bodies"].items()
+            if (m := body.member) is not None
+        ] + [
+            (name, rod.section, rod.mass, rod.ends[1] - rod.ends[0], f"rods.{name}.section")
+            for name, rod in self.specs["rods"].items()
+        ]
+        sections, faults = {}, []
+        for name, tube, mass, along, path in bars:
+            try:
+                if tube is not None:
+                    sections[name] = tube.section(mass / norm(plain(along)), path)
+            except ParameterError as error:
+                faults.append(error)
+        if faults:
+            first, *others = faults
+            more = "".join(f"; wrong too: {error.field}" for error in others)
+            raise ParameterError(first.field, first.value, f"{first.bound}{more}")
         compliances = {
             name: joint.compliance.tolist()
             for name, joint in self.specs["joints"].items()

@@ -178,6 +178,8 @@ def test_members_that_maps_reject_are_named_by_info(data):
         del made["bodies"]["crank_2"]["member"]["section"]["inner_diameter"]
         assert members_fault(machine(made)).partition(";")[0] == field
     assert members_fault(machine(data)) == ""
+    made["bodies"]["crank_3"]["member"] = made["bodies"]["crank_2"]["member"]
+    assert "bodies.crank_3.member.section.density" in members_fault(machine(made))
 
 
 def legs(data, **more):

@@ -98,8 +98,9 @@ def info(given: Info) -> Report:
           or ["no: rigid-body equations determine every reaction"]),
         Fact("plausibility", [dataclasses.asdict(finding) for finding in odd]),
         *(Fact("", text, text="plausibility")
-          for text in [finding.text for finding in odd] or ["no implausible value"] * (not fault)),
-        Fact("members_fault", fault or None, text="members" if fault else None, shown=fault),
+          for text in [*(finding.text for finding in odd), *filter(None, [fault])]
+          or ["no implausible value"]),
+        Fact("members_fault", fault or None),
         Fact("parameters", sections),
         Fact("parameter_units", units),
         *(Fact("", text, text="parameter") for text in robot.book.told(units.get(PARAMETERS))),
