@@ -178,7 +178,7 @@ def _of_table(path: Path, name: str | Robot | None, how: ReadOptions) -> Recordi
         robot, time, q, qd, qdd, effort, wrench, deflection, pose, held,
         efforts="model" if computed and word == "effort" else word, source=str(path), notes=(
             *notes,
-            *([f"joints have the {how.side}'s values"] if side is not None else []),
+            *([] if side is None else [f"values read as the {how.side}'s; results: the model's"]),
             *([] if robot.controller.plain or side is not None else [MAPPED]),
         ),
         start=round(1e9 * float(times[0])),
