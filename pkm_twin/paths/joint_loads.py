@@ -240,8 +240,9 @@ def _angles(rotations: Array) -> Array:
 class Summary:
     """What is kept of one joint's loads: peaks, sums of squares, reversals, and its bearing's.
 
-    ``peaks``, ``squares`` and ``sizes`` of force and moment are of their determined components.
-    ``known``: whether force and moment are determined in all samples.
+    ``peaks`` and ``squares`` are of force and moment, then of both without what an actuated joint's
+    drive bears: the moment about its axis, or the force along it. They, and ``sizes`` of the
+    latter force, are of determined components. ``known``: whether all are, in all samples.
     """
 
     def __init__(self, robot: Robot, name: str, spec: BearingSpec | None) -> None:
@@ -249,10 +250,13 @@ class Summary:
         joint = by_label(robot).get(name)
         self.slides = joint is not None and joint.slides
         self.axis = None if spec is None else bearing_axis(joint, name, spec)
+        self.across = np.broadcast_to(np.eye(3), (2, 3, 3)).copy()
+        if joint is not None and joint.actuated:
+            self.across[1 - self.slides] -= np.outer(joint.axes[0], joint.axes[0])
         self.samples, self.turned, self.travelled = 0, 0.0, 0.0
-        self.peaks, self.squares = np.zeros(2), np.zeros(2)
+        self.peaks, self.squares = np.zeros(4), np.zeros(4)
         self.determined = np.ones(len(AXES), np.bool_)
-        self.known = np.ones(2, np.bool_)
+        self.known = np.ones(4, np.bool_)
         self.reversals = [Reversals() for _ in AXES]
         self.sizes: list[Array] = []
         self.bearing: list[tuple[Array, Array]] = []
@@ -260,7 +264,8 @@ class Summary:
     def add(self, load: JointLoad) -> None:
         """The next block."""
         fresh = slice(1 if self.samples else 0, None)
-        parts = load.wrench[fresh].reshape(-1, 2, 3)
+        borne = _times(self.across, load.own[fresh].reshape(-1, 2, 3))
+        parts = np.concatenate([load.wrench[fresh].reshape(-1, 2, 3), borne], 1)
         self.known &= np.isfinite(parts).all((0, 2))
         size = np.sqrt(np.nansum(parts**2, -1))
         self.samples += len(size)
@@ -268,7 +273,7 @@ class Summary:
         self.travelled += float(load.travelled.sum())
         self.peaks = np.maximum(self.peaks, size.max(0))
         self.squares += (size**2).sum(0)
-        self.sizes.append(size[:, 0].astype(np.float32))
+        self.sizes.append(size[:, 2].astype(np.float32))
         self.determined &= np.isfinite(load.own).all(0)
         for k in np.flatnonzero(self.determined):
             self.reversals[k].add(load.own[fresh, k])

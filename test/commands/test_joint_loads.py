@@ -11,6 +11,7 @@ from delta_dynamics.torques.elastic_reactions import reaction_energies
 from delta_dynamics.torques.reactions import balance
 from pkm_twin.paths.joint_loads import (
     Reversals,
+    Summary,
     bearing_life,
     joint_loads,
     rainflow,
@@ -112,6 +113,8 @@ def test_life_of_a_sliding_joint_is_that_of_its_travel(name, twin, tmp_path):
     across = np.linalg.norm(np.cross(load_.own[:, :3], joint.axes[0]), axis=1)
     mean = np.average(((across[1:] + across[:-1]) / 2) ** 3, weights=steps) ** (1 / 3)
     assert 0.0 < mean < told["force_peak_N"]
+    borne = across.max() if joint.actuated else told["force_peak_N"]
+    assert told["bearing_force_peak_N"] == pytest.approx(borne)
     life = told["life"]
     assert life["equivalent_load_N"] == pytest.approx(mean)
     assert life["travel_m"] == pytest.approx(steps.sum())
@@ -196,6 +199,12 @@ def test_turning_of_a_hinge_and_of_a_rod(rng):
     q = robot.graph.home + 0.1 * np.outer(np.sin(7 * time), [1.0, -0.6])
     zero = np.zeros_like(q)
     found = {j.name: j for j in next(joint_loads(Recording(robot, time, q, zero, zero)))}
+    borne = Summary(robot, "left", None)
+    borne.add(found["left"])
+    # The drive alone bears the moment about its axis.
+    across = np.cross(found["left"].own[:, 3:], robot.graph.joints["left"].axes[0])
+    assert 10.0 * borne.peaks[3] < borne.peaks[1]
+    assert borne.peaks[3] == pytest.approx(np.linalg.norm(across, axis=1).max())
     np.testing.assert_allclose(found["left"].turned, np.abs(np.diff(q[:, 0])), atol=1e-12)
     elbow = robot.passive(q)[:, robot.passive_joints.index("elbow_right")]
     np.testing.assert_allclose(found["elbow_right"].turned, np.abs(np.diff(elbow)), atol=1e-12)

@@ -36,10 +36,11 @@ IDLE: Final = "no life, because the bearing bears a load and does not move"
 class Loads(CarriesAtTimes, ReadsMotions, Writes, Draws):
     """Report forces and moments in the joints along a motion.
 
-    For each joint it prints peak and RMS force and moment, and the equivalent load range: one cycle
-    of this range does the same damage as all cycles of the motion (rainflow counting, in axes that
-    turn with the joint's inner body). With --bearings also equivalent load and L10 life (ISO 281;
-    for sliding joints ISO 14728-1, C for 100 km).
+    For each joint it prints peak and RMS of force and moment, without what the drive bears: the
+    moment about an actuated joint's axis, or the force along it. One cycle of the equivalent load
+    range does the same damage as all cycles of the motion (rainflow counting, in axes that turn
+    with the joint's inner body). With --bearings also equivalent load and L10 life (ISO 281; for
+    sliding joints ISO 14728-1, C for 100 km).
 
     In an overconstrained machine the elasticity of members and joints determines what rigid-body
     equations do not. Without elasticity these components are reported as undetermined.
@@ -67,11 +68,11 @@ def loads(given: Loads) -> Report:
         replace_file(given.spectrum, spectra(found).encode())
     robot, duration = motion.robot, float(motion.time[-1] - motion.time[0])
     joints = {load.name: of_joint(load, given.exponent, duration) for load in found}
-    worst = max(found, key=lambda load: load.peaks[0])
+    worst = max(found, key=lambda load: load.peaks[2])
     answer = f"{robot.name}: no joint's force is determined"
-    if worst.peaks[0] > 0.0:
-        part = "" if all(load.known[0] for load in found) else " of what is determined"
-        most = f"{'up to' if worst.known[0] else 'at least'} {worst.peaks[0]:.4g} N"
+    if worst.peaks[2] > 0.0:
+        part = "" if all(load.known[2] for load in found) else " of what is determined"
+        most = f"{'up to' if worst.known[2] else 'at least'} {worst.peaks[2]:.4g} N"
         answer = f"{robot.name}: {worst.name} bears most{part}, a force of {most}"
     open_ = any(one["undetermined"] for one in joints.values())
     idle = [n for n, j in joints.items() if j.get("life") and math.isnan(j["life"]["L10_hours"])]
@@ -98,7 +99,8 @@ def of_joint(load: Summary, exponent: float, duration: float) -> dict[str, Any]:
     open_axes = [axis for axis, good in zip(WRENCH, load.determined, strict=True) if not good]
     entry: dict[str, Any] = {"undetermined": open_axes, "turned_rad": load.turned}
     entry |= {"travelled_m": load.travelled} if load.slides else {}
-    for k, (what, unit) in enumerate((("force", "N"), ("moment", "N_m"))):
+    kinds = ("force", "N"), ("moment", "N_m"), ("bearing_force", "N"), ("bearing_moment", "N_m")
+    for k, (what, unit) in enumerate(kinds):
         peak, rms = float(load.peaks[k]), math.sqrt(load.squares[k] / load.samples)
         whole = 1.0 if load.known[k] else math.nan
         entry |= {f"{what}_peak_{unit}": whole * peak, f"{what}_rms_{unit}": whole * rms}
@@ -125,8 +127,10 @@ def of_joint(load: Summary, exponent: float, duration: float) -> dict[str, Any]:
 def _tables(joints: dict[str, Any]) -> list[Table]:
     """Peaks, ranges and lives, as the terminal shows them."""
     columns = [
-        Column("force_peak_N", "N", "force peak"), Column("force_rms_N", "N", "RMS"),
-        Column("moment_peak_N_m", "N m", "moment peak"), Column("moment_rms_N_m", "N m", "RMS"),
+        Column("bearing_force_peak_N", "N", "force peak"),
+        Column("bearing_force_rms_N", "N", "RMS"),
+        Column("bearing_moment_peak_N_m", "N m", "moment peak"),
+        Column("bearing_moment_rms_N_m", "N m", "RMS"),
     ]  # fmt: skip
     rows: dict[str, list[Any]] = {}
     for name, entry in joints.items():
@@ -134,7 +138,9 @@ def _tables(joints: dict[str, Any]) -> list[Table]:
         worst = max(forces, key=lambda axis: forces[axis], default=None)
         ranges = "" if worst is None else f"{forces[worst]:.4g} ({worst})"
         values = [entry[column.name] for column in columns]
-        for k, key in enumerate(("force_determined_peak_N", "moment_determined_peak_N_m")):
+        for k, key in enumerate(
+            ("bearing_force_determined_peak_N", "bearing_moment_determined_peak_N_m")
+        ):
             most = max(other[key] for other in joints.values())
             if math.isnan(values[2 * k]) and entry[key] > ROUNDING * most:
                 values[2 * k] = f"at least {entry[key]:.4g}"
@@ -153,12 +159,12 @@ def _tables(joints: dict[str, Any]) -> list[Table]:
 def draw(motion: Recording, loads: Sequence[Summary], title: str) -> Any:
     """Forces of the joints with the largest ones over time, and their rainflow spectra."""
     told = [load for load in loads if load.determined[:3].any()]
-    shown = sorted(told, key=lambda load: -load.peaks[0])
+    shown = sorted(told, key=lambda load: -load.peaks[2])
     figure, axes = plots.columns(2, 1)
     (force,), (counted,) = axes
     for k, load in enumerate(shown[:SHOWN]):
         style = {"color": plots.COLOURS[k], "ls": plots.DASHES[k % 3], "lw": 1.2}
-        label = f"{load.name}: {'' if load.known[0] else 'at least '}{load.peaks[0]:.4g} N"
+        label = f"{load.name}: {'' if load.known[2] else 'at least '}{load.peaks[2]:.4g} N"
         force.plot(motion.clock, np.concatenate(load.sizes), label=label, **style)
         own = [k for k in range(3) if load.determined[k]]
         axis = max(own, key=lambda k: float(np.ptp(load.reversals[k].values)))
