@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import os
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Final
@@ -13,7 +14,14 @@ VARIABLES: Final = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"
 
 
 def one_blas_thread() -> None:
-    """For this process, from now on; without threadpoolctl nothing happens."""
+    """For this process, libraries that it loads later, and its children, unless told otherwise.
+
+    Of libraries that are loaded by now only with threadpoolctl.
+    """
+    for name in VARIABLES:
+        os.environ.setdefault(name, "1")
+    if "numpy" not in sys.modules:
+        return
     try:
         from threadpoolctl import threadpool_limits
     except ImportError:

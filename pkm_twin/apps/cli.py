@@ -15,6 +15,7 @@ from pkm_twin.console import flush_output, silence_output, system_error, tell
 from pkm_twin.errors import PkmTwinError, plain_warnings
 from pkm_twin.files import open_standard_streams
 from pkm_twin.ros.signals import INTERRUPTED, first_signal
+from pkm_twin.threads import one_blas_thread
 
 app = Commands(cls=Tasks, invoke_without_command=True, add_completion=True)
 
@@ -57,6 +58,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     # What is loaded stays: to look at it while it is loaded is a tenth of a short command's time.
     gc.disable()
     open_standard_streams()
+    one_blas_thread()
     try:
         with first_signal(lambda: SystemExit(INTERRUPTED)), plain_warnings():
             app(arguments, prog_name="pkm-twin")

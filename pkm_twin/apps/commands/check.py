@@ -17,7 +17,6 @@ from pkm_twin.console import progress
 from pkm_twin.errors import ParameterError, PkmTwinError, one_line
 from pkm_twin.report import Fact, Report, Verdict
 from pkm_twin.settings import setting
-from pkm_twin.threads import one_blas_thread_for_children
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -146,7 +145,7 @@ def _judged_all(given: Check, paths: Sequence[Path]) -> Iterator[dict[str, Any]]
         yield from map(each, paths)
         return
     context = multiprocessing.get_context("spawn")
-    with one_blas_thread_for_children(), ProcessPoolExecutor(jobs, mp_context=context) as pool:
+    with ProcessPoolExecutor(jobs, mp_context=context) as pool:
         yield from pool.map(each, paths)
 
 

@@ -20,7 +20,6 @@ from pkm_twin.maps.kinds.cutting_depth import CuttingDepth
 from pkm_twin.report import Fact, Report
 from pkm_twin.ros.signals import INTERRUPTED, first_signal
 from pkm_twin.settings import setting
-from pkm_twin.threads import one_blas_thread
 
 if TYPE_CHECKING:
     from xarray import Dataset
@@ -131,7 +130,6 @@ def compute(given: OfMap) -> Report:
 
     kind, machine = kind_of(given), given.machine()
     cases = given.cases(kind, machine)
-    one_blas_thread()
     if given.along is not None:
         return along_path(given, kind, machine, cases, given.along)
     names = machine.pose_names
