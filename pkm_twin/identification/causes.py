@@ -114,8 +114,8 @@ def payload_hint(r: Recording, c: Compared) -> str:
     other = min(numbers.solved()[1], *(one.left for one in numbers.scales()))
     if mass < numbers.lightest or not numbers.clear(left, other, ALIKE):
         return ""
-    mass += r.robot.payload.mass
-    return f"a payload of {mass:.3g} kg explains most of the residual: --payload {mass:.3g}"
+    text = _payload_text(r.robot, mass)
+    return f"{text} explains most of the residual: --payload {r.robot.payload.mass + mass:.3g}"
 
 
 def number_that_explains(r: Recording) -> Cause | None:
@@ -274,7 +274,7 @@ class _Numbers:
             if not self.clear(one.left, left, ALIKE):
                 others.append(MASSES.format(1.0 + size))
             if load is not None and not self.clear(one.left, load.left, ALIKE):
-                others.append(f"a payload of {r.robot.payload.mass + load.mass:.3g} kg is held")
+                others.append(f"{_payload_text(r.robot, load.mass)} is held")
         if not one.which.any():
             yield from _payload(r, self.c, left_out, one)
         elif one.scale > 0.0:
@@ -296,13 +296,20 @@ def _kilogram(robot: Robot, *motion: Array) -> Array:
     return inverse_dynamics(heavy, *motion) - inverse_dynamics(robot, *motion)
 
 
+def _payload_text(robot: Robot, more: float) -> str:
+    """The file's payload with so many kilograms more; the estimate assumes its centre."""
+    com = robot.payload.com
+    at = ", ".join(f"{v:g}" for v in com) + " m" if np.any(com) else "the reference point"
+    return f"a payload of {robot.payload.mass + more:.3g} kg with its centre at {at}"
+
+
 def _payload(r: Recording, c: Compared, left_out: Mask, found: _Found) -> Iterator[Cause]:
     """A payload that is held at some times, or all the time."""
     if len(found.spans) > SPANS:
         return
     times = found.spans
     load = Load(float(f"{r.robot.payload.mass + found.mass:.3g}"), None, times)
-    text = f"a payload of {load.mass:g} kg explains the efforts: use --payload {load.mass:g}"
+    text = f"{_payload_text(r.robot, found.mass)} explains the efforts: use --payload {load.mass:g}"
     if times:
         text += " --load-times " + ",".join(f"{edge:.2f}" for pair in times for edge in pair)
     near, _ = near_change(r, load)

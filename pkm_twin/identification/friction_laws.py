@@ -207,10 +207,13 @@ def fit_recordings(
     for k, cause in enumerate(causes or ()):
         if cause is None or not cause.text or not usual(cause.scale):
             continue
-        notes.append(f"{made[k].name}: {cause.text}")
+        note, load = cause.text, cause.recording.load
         # Of several recordings each has another estimate.
-        if "payload" in what and len(made) == 1 and made[k].load is None and cause.recording.load:
+        if "payload" in what and len(made) == 1 and made[k].load is None and load is not None:
             made[k] = cause.recording
+            spans = ", ".join(f"from {a:.2f} to {b:.2f} s" for a, b in load.times)
+            note = f"the payload is held {spans or 'throughout'}"
+        notes.append(f"{made[k].name}: {note}")
     if "payload" in what:
         loads = [r.load for r in made if r.load is not None]
         # Two payloads are not one section of a file.

@@ -196,7 +196,10 @@ def test_fit_and_check_name_one_cause(name: str) -> None:
         found, _, notes = fit_recordings(robot, [made])
         (payload,) = (n for n in found.numbers if n.name == "payload.mass")
         assert float(cause.split()[-1]) == pytest.approx(mass, rel=0.05)
-        assert cause in notes[0] and found.verdict.answer == "explains"
+        # The fit's mass is the one that is told.
+    assert "--payload" not in notes[0] and found.verdict.answer == "explains"
+    for edge in cause.rpartition(" --load-times ")[2].split(","):
+        assert f" {edge} " in notes[0]
         assert abs(payload.after - mass) < 3.0 * payload.deviation
 
 
@@ -240,7 +243,10 @@ def test_a_payload_that_is_picked_is_fitted_with_its_times(name: str) -> None:
     (cause,) = check(made).causes
     found, _, notes = fit_recordings(light, [made])
     (payload,) = (n for n in found.numbers if n.name == "payload.mass")
-    assert cause in notes[0] and found.verdict.answer == "explains"
+    # The fit's mass is the one that is told.
+    assert "--payload" not in notes[0] and found.verdict.answer == "explains"
+    for edge in cause.rpartition(" --load-times ")[2].split(","):
+        assert f" {edge} " in notes[0]
     assert payload.after == pytest.approx(0.5, abs=3.0 * payload.deviation)
     assert payload.deviation < 0.05
     # Where no payload is fitted, nothing else takes its place.
@@ -320,7 +326,8 @@ def test_a_payload_is_looked_for_with_the_memory_of_friction() -> None:
     truth = file.changed(friction={"presliding": [0.02, 0.02]}, payload={"mass": 1.0})
     effort = inverse_dynamics(truth, *motion) + Dahl.remembered(truth.friction, *motion[:2])[0]
     made = noisy(Recording(file, time, q, effort=effort), rng, 0.005, 1e6)
-    found, _, (note,) = fit_recordings(file, [made], ("friction", "payload"), ("dahl",))
-    assert float(note.split()[-1]) == pytest.approx(1.0, rel=0.02)
+    found, *_ = fit_recordings(file, [made], ("friction", "payload"), ("dahl",))
+    (start,) = (rows.recording.load for rows in found.problem.whole)
+    assert start is not None and start.mass == pytest.approx(1.0, rel=0.02)
     (payload,) = (n for n in found.numbers if n.name == "payload.mass")
     assert abs(payload.after - 1.0) < 3.0 * payload.deviation < 0.5
