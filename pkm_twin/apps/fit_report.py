@@ -44,7 +44,7 @@ def report_of(result: Result, marks: Sequence[str] = ()) -> tuple[Report, list[T
         names, facts = result.problem.parameters.names, _effort_facts(result)
         blind = verdict.blind_lines(names, result.problem.parameters.units)
         more = _delays(result)
-        more += [f"{result.outliers} efforts were outliers"] if result.outliers else []
+        more += [f"efforts replaced as outliers: {result.outliers}"] if result.outliers else []
     elif isinstance(result, ElasticFit):
         names = tuple(map(_element, result.numbers))
         factors = tuple(f"the factor of {name}" for name in names)
