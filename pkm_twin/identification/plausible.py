@@ -340,8 +340,8 @@ def recording_fault(rows: Rows) -> str | None:
     if cause and best.left <= known:
         if best.left < NAMED * told.left:
             return (
-                f"{cause}: put right, a machine like the file's leaves {100 * best.left:.2g} % of "
-                f"the efforts' variation unexplained, as recorded {100 * told.left:.2g} %"
+                f"{cause}: put right, {100 * best.left:.2g} % of the efforts' variation is "
+                f"unexplained, as recorded {100 * told.left:.2g} %"
             )
         return f"{cause}: as recorded, masses and payload would be far from the file's"
     # More than all of it: the efforts have nothing of the motion, however large their noise.

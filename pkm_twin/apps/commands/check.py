@@ -111,7 +111,7 @@ def check_one(given: Check, path: Path, update: Any = None, thorough: bool = Tru
         [
             Fact("causes", found.causes, text="explanation" if why else None, shown=why),
             Fact("findings", found.findings, shown=findings,
-                 text="no explanation; `fit` finds" if findings else None),
+                 text="`fit` finds" if findings else None),
             Fact("hint", found.hint or None, text="hint" if found.hint else None, shown=found.hint),
             Fact("bag", str(r.source)), Fact("robot", r.robot.name, text="robot"),
             Fact("topics", asdict(r.topics), text="topics", shown=str(r.topics)),
