@@ -12,7 +12,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from delta_dynamics import torque_deviation
+from delta_dynamics import inverse_dynamics, torque_deviation
 from pkm_twin.codegen.arrays import Array, Mask
 from pkm_twin.errors import PkmTwinError, SingularityError, UnreachableError, one_line
 from pkm_twin.identification.causes import agrees, cause_of, payload_hint
@@ -50,7 +50,7 @@ COMPARED: Final = "compared efforts"
 IDLE: Final = "drives off or braked"
 COMPUTED: Final = "the efforts of this table are the model's; expected columns JOINT.measured"
 ROUNDING: Final = 1e-6
-"""Residual, part of the peak, that no measurement leaves."""
+"""Part of the peak by which no sample of a plan differs from the model."""
 TICKS: Final = 10.0
 """By how many of its least steps a signal has to change that is not stuck."""
 MAX_GAP: Final = 5.0
@@ -96,15 +96,24 @@ class Checked:
         return "not judged" if self.unjudged else "good"
 
     @property
+    def planned(self) -> bool:
+        """Whether every effort is the model's, as in the table of a plan."""
+        r, c = self.recording, self.compared
+        if c is None or r.qd is None or r.qdd is None:
+            return False
+        away = np.abs(by_held(r, inverse_dynamics, r.time, *r.motion) - r.measured)
+        return bool((away <= ROUNDING * c.peak).all())
+
+    @property
     def agreement(self) -> str:
         """How well efforts and model agree, in words."""
         r, c = self.recording, self.compared
         if c is None:
             return f"nothing contradicts {r.robot.name}"
+        if self.planned:
+            return f"the efforts are those that {r.robot.name} computes, none is measured"
         part = c.rms / np.maximum(c.peak, 1e-12)
         worst = int(part.argmax())
-        if part[worst] < ROUNDING:
-            return f"the efforts are those that {r.robot.name} computes, none is measured"
         size = f"{100 * part[worst]:.2g} % of the peak effort of {r.robot.joint_names[worst]}"
         return f"the efforts agree with {r.robot.name}, largest residual {size}"
 

@@ -49,8 +49,8 @@ class ReadOptions:
     platform's or the base frame, whichever comes first. ``base_frame``: has base axes; every
     other frame turns with the platform. ``limited``: messages beyond the robot's limits are
     rejected, as a node does. ``planned``: the trajectory of a bag and the efforts of a plan are
-    read too. ``currents``: efforts of a table may be motor currents. ``deflected``: deflections
-    are needed, and a bag is read at their times.
+    read too; ``trajectory``: the former alone. ``currents``: efforts of a table may be motor
+    currents. ``deflected``: deflections are needed, and a bag is read at their times.
     """
 
     topics: tuple[str, ...] = ()
@@ -62,6 +62,7 @@ class ReadOptions:
     base_frame: str = WrenchSettings.base_frame
     limited: bool = False
     planned: bool = False
+    trajectory: bool = False
     currents: bool = False
     deflected: bool = False
 

@@ -86,7 +86,7 @@ def check_one(given: Check, path: Path, update: Any = None, thorough: bool = Tru
         if robot is None:
             raise ParameterError("--robot", None, "a file, for the platform that --platform names")
         robot = load(robot, platform=given.platform)
-    r = given.read(path, robot, update, limited=True)
+    r = given.read(path, robot, update, limited=True, trajectory=True)
     found = checked(r, given.residual, thorough)
     good = found.answer == "good"
     if given.history is not None:
