@@ -368,7 +368,7 @@ def _one(name: str, kind: Any, row: Setting, word: Any) -> Any:
     except ValueError:
         value = math.nan
     if not (row.allows(value) and math.isfinite(value)):
-        what = "a whole number" if kind is int else "a number"
+        what = "a whole number" if kind is int else "a number" + ", no commas" * ("," in word)
         raise typer.BadParameter(f"{name}: {word.strip()!r}; expected {what}{row.span}")
     return value
 

@@ -235,7 +235,7 @@ class AtPose(Carries, BeyondLimitsToo):
         names = machine.pose_names
         pose: list[float] = machine.home().tolist()
         if self.at is not None:
-            pose = numbers(self.at, len(names), f"a pose: {', '.join(names)}")
+            pose = numbers(self.at, len(names), f"a pose {','.join(names)}")
         for joint in self.admitted(machine, machine.inverse(pose)):
             typer.echo(f"outside the limits: {joint}", err=True)
         return pose

@@ -115,10 +115,10 @@ class LimitSpec:
     effort: float | None = schema.number(above=0.0, high=math.inf, unit="{effort}", default=None)
     swivel: float | None = schema.number(
         above=0.0, high=np.pi, unit="rad", default=None,
-        text="largest tilt of `axis` from its direction at home, seen from the other body",
+        text="largest angle of `axis` from its direction at home, in the other body's frame",
     )  # fmt: skip
     axis: Array | None = schema.vector(
-        3, text="base axes; default: along the bar; of a universal joint, normal to both axes",
+        3, text="base axes; default: the attached bar; of a universal joint the normal of its axes",
         default=None,
     )  # fmt: skip
 
@@ -139,12 +139,14 @@ class JointSpec:
     first fixed in the inner body, the second in the outer one. The value of a ``helical`` joint is
     its turn; ``lead`` is the travel per turn, negative for a left-handed thread. A ``translation``
     has three slides along base axes, a ``planar`` joint two slides across its axis and a turn about
-    it. ``limits``: a passive joint may have ``position`` and ``swivel``, which bound the workspace;
-    an actuated one all but ``swivel``. ``rotor_inertia`` is reflected to the joint and has no
-    weight. ``drive`` in its place has the rotor's own inertia, and the ``ratio`` of a gear (joints
-    that turn) or the ``lead`` of a screw or belt (joints that slide). ``compliance``: along u, v,
-    w, then about them. u is ``axis``, v is u times the base axis least along it, w is u times v.
-    For a universal joint u and v are its ``axes``; for a spherical one u, v, w are base axes.
+    it. ``limits``: ``position`` and ``swivel`` of a passive joint bound the workspace; an actuated
+    joint has all but ``swivel``. ``rotor_inertia`` is reflected to the joint and has no weight.
+    ``drive`` in its place has the rotor's own inertia, and the ``ratio`` of a gear (joints that
+    turn) or the ``lead`` of a screw or belt (joints that slide). ``compliance``: along u, v, w,
+    then about them; 0 or .inf where a passive joint is free. The entry of an actuated joint's own
+    motion is that of its gear or screw, with the motor locked. u is ``axis``, v = u x e with the
+    base axis e most nearly square to u, w = u x v. For a universal joint u and v are its ``axes``;
+    for a spherical one u, v, w are base axes.
     """
 
     type: str = schema.choice(*TYPES)
@@ -258,7 +260,7 @@ class JointSpec:
 class RodSpec:
     """A thin even straight bar with a ball joint at each end: points (m), mass (kg).
 
-    ``swivel``: largest tilt from its direction at home, seen from either body, rad.
+    ``swivel``: largest angle from its direction at home in the frame of either body, rad.
     """
 
     between: tuple[str, ...] = schema.words(size=2)

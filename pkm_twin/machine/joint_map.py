@@ -42,13 +42,13 @@ class JointMapEntry:
     """
 
     name: str | None = schema.text(default=None)
-    sign: float = schema.number(low=-1.0, high=1.0, default=1.0)
-    offset: float = schema.number(unit="the controller's", default=0.0)
+    sign: float = schema.number(text="1 or -1", default=1.0)
+    offset: float = schema.number(unit="controller units", default=0.0)
     ratio: float = schema.number(
-        low=1e-6, high=1e6, unit="the controller's per the model's", default=1.0
+        low=1e-6, high=1e6, unit="controller units per rad or m of the model", default=1.0
     )
-    ratio_change: float = schema.number(low=-1e3, high=1e3, unit="per the model's", default=0.0)
-    ratio_at: float = schema.number(unit="the model's", default=0.0)
+    ratio_change: float = schema.number(low=-1e3, high=1e3, unit="per rad or m", default=0.0)
+    ratio_at: float = schema.number(unit="rad or m of the model", default=0.0)
     unit: str | None = schema.text(default=None)
 
     def verify(self, path: str) -> None:

@@ -138,8 +138,8 @@ class Redundancy:
     )
     tolerance: float = schema.number(
         above=0.0, high=0.1, unit="rad", default=1e-3,
-        text="largest difference of the other joints from the pose; sliding joints: parts of the "
-        "machine's size; rates: over 10 ms",
+        text="how far other joints may be from where the leading ones put them; sliding joints: "
+        "times the machine's size; rates: this in 10 ms",
     )  # fmt: skip
     preload: Array = schema.vector(
         0, unit="{effort}", default=[],

@@ -85,11 +85,11 @@ class Common:
     tolerances: Mapping[str, Tolerance] = schema.mapping(Tolerance, default={})
     element_compliance: Mapping[str, float] = schema.mapping(
         schema.number(low=1e-6, high=1e6), default={},
-        text="factors on the compliance of elements, by the names of `strain_energy`; else 1",
+        text="factors on the compliance of elements, named as in `shares` of `compliance`; else 1",
     )  # fmt: skip
     modal_damping: Array = schema.vector(
         0, above=0.0, high=0.99, default=[],
-        text="damping ratios of modes from the lowest, for `frf`, `lobes`; the last: all others'",
+        text="damping ratios of modes from the lowest, for `frf`, `lobes`; the last: all higher",
     )  # fmt: skip
 
 

@@ -24,9 +24,9 @@ from pkm_twin.settings import settings_of
 HEAD = """# Robot files
 
 The keys of a robot's YAML with their valid values and defaults. SI units, angles in rad, z up.
-Anything else is rejected, with the name of the key. Of two units the first is for joints
-that turn, the second for joints that slide. Defaults are in brackets; `pkm-twin info ROBOT` prints
-all values.
+Anything else is rejected, with the name of the key. A unit such as `rad or m` is rad for joints
+that turn, m for joints that slide. Defaults are in brackets; `pkm-twin info ROBOT` prints all
+values.
 An inertia is three principal moments or a symmetric 3x3 matrix whose moments are not negative and
 keep the triangle rule.
 """

@@ -91,7 +91,7 @@ def compliance(given: Compliance) -> Report:
     if machine.uncertainty:
         doubt = deflection_deviation(machine, given.pose, given.wrench)
         doubts = _micro(np.where(doubt > 1e-12 * doubt.max(), doubt, 0.0), ".2g")
-        label = "standard deviation (from the robot file's uncertainty)"
+        label = "standard deviation (from the robot file's uncertainty)" if doubt.any() else None
         facts.insert(6, Fact("", doubts, text=label))
     size = np.sqrt(np.diag(c))
     # What is zero by symmetry is printed so, not as rounding.

@@ -135,7 +135,7 @@ def compute(given: OfMap) -> Report:
     names = machine.pose_names
     sweep = map_of(
         machine, kind, given.points, cases=cases,
-        at=None if given.at is None else numbers(given.at, len(names), f"a pose: {names}"),
+        at=None if given.at is None else numbers(given.at, len(names), f"a pose {','.join(names)}"),
         least_singularity=given.singularity, least_clearance=given.least_clearance,
     )  # fmt: skip
     target = given.target

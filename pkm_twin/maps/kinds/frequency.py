@@ -17,7 +17,7 @@ class Frequency(Kind):
 
     name = "frequency"
     question = "where does it ring lowest?"
-    answer = "rings lowest"
+    answer = "lowest frequency"
     what = "first natural frequency"
     unit = "Hz"
     largest = False

@@ -40,7 +40,7 @@ class Modes(Frequency):
     name = "modes"
     question = "how does it vibrate?"
     page_help = (
-        "Below: the frame at rest (grey) and in a mode, magnified, at the pose that rings lowest; "
+        "Below: the frame at rest (grey) and in a mode, magnified, at the map's worst pose; "
         "the button animates it."
     )
 
@@ -49,7 +49,7 @@ class Modes(Frequency):
         (first,) = super().cases(robot)
         numbers = range(1, COUNT + 1)
         return tuple(replace(first, name=f"mode {k}", what=f"frequency of mode {k}",
-                             answer="rings lowest" if k == 1 else "rings there")
+                             answer="lowest frequency" if k == 1 else "frequency there")
                      for k in numbers)  # fmt: skip
 
     def summaries(self, space: Space, counted: int, apart: int) -> dict[str, Variable]:
@@ -102,7 +102,7 @@ class Modes(Frequency):
         )
         plots.head(
             figure,
-            f"{data.attrs['robot']}: lowest modes where it rings lowest, actuators locked\n"
+            f"{data.attrs['robot']}: lowest modes at the map's worst pose, actuators locked\n"
             "grey: at rest; coloured: deformed, magnified; named: the parts with most energy",
             10,
         )
