@@ -201,8 +201,6 @@ class _Numbers:
         each = [*zip(robot.joint_names, np.eye(n), strict=True)] if n > 1 else []
         self.drives = [("all joints", np.ones(n)), *each]
         self.lightest = LIGHTEST * sum(body.mass for body in robot.graph.bodies.values())
-        self.change = np.gradient(c.expected, c.period, axis=0)
-        self.change[[row - k for row in c.starts for k in (0, 1)]] = 0.0
         self.noise = float(np.mean((c.noise / c.limit) ** 2))
         # The residual of a joint at rest, or of unknown memory, lacks what its friction may hold.
         doubt = [Dahl.remembered(robot.friction, t.q, t.sure(c.how))[1] for t in c.tracks]
@@ -219,7 +217,7 @@ class _Numbers:
     def solved(self, *columns: Array, some: Mask | None = None) -> tuple[list[float], float]:
         """The factors on columns (k, n), then the delay, s; the mean square that remains."""
         used = self.used if some is None else self.used & some[:, None]
-        table = np.stack([*columns, self.change, self.c.residual], -1) / self.c.limit[:, None]
+        table = np.stack([*columns, self.c.change, self.c.residual], -1) / self.c.limit[:, None]
         table = table[used]
         sizes = np.linalg.lstsq(table[:, :-1], table[:, -1])[0]
         left = np.sum((table[:, -1] - table[:, :-1] @ sizes) ** 2)
@@ -248,7 +246,7 @@ class _Numbers:
             for _ in range(PASSES if which.any() else 1):
                 heavy = (1.0 + size * which) * kilogram
                 if not always:
-                    rest = c.residual - size * own - late * self.change
+                    rest = c.residual - size * own - late * self.c.change
                     weight = np.broadcast_to(c.limit**-2.0, rest.shape)
                     _, times, held = held_payload(c.time, heavy, rest, weight)
                     spans = tuple(times)

@@ -358,8 +358,8 @@ def _residuals(
     for i, (name, unit) in enumerate(zip(r.robot.joint_names, r.robot.effort_units, strict=True)):
         share = 100 * c.rms[i] / max(c.peak[i], 1e-12)
         text = (
-            f"RMS {c.rms[i]:.4g} {unit}, {share:.2f} % of the model's peak {c.peak[i]:.4g}, noise "
-            f"{c.noise[i]:.2g}"
+            f"RMS {c.rms[i]:.4g} {unit}, {share:.2f} % of the model's filtered peak "
+            f"{c.peak[i]:.4g}, noise {c.noise[i]:.2g}"
         )
         if name in bands:
             inside = bands[name]["share_within_deviations"]

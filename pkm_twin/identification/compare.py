@@ -72,17 +72,18 @@ PASSES: Final = 4
 class Compared:
     """Efforts of a recording in the band of its motion, k rows, n joints.
 
-    ``time``: (k,), s; ``measured``, ``expected``, ``residual``: (k, n), N m or N; ``raw``: the
-    residual before the filter. ``noise``: standard deviation in the band, ``peak``: of the model's
-    efforts, ``hidden``: whether noise hides them, (n,). ``late``: of the efforts against the
-    positions, taken out, s. ``starts``: the first rows of the pieces. ``tracks``: their motion
-    before the filter, and ``inner``, which part of it has rows. ``bound``: of a good residual, RMS,
-    as a part of the peak.
+    ``time``: (k,), s; ``measured``, ``expected``, ``residual``: (k, n), N m or N; ``change``: of
+    the expected efforts, per s; ``raw``: the residual before the filter. ``noise``: standard
+    deviation in the band, ``peak``: of the model's efforts, ``hidden``: whether noise hides them,
+    (n,). ``late``: of the efforts against the positions, taken out, s. ``starts``: the first rows
+    of the pieces. ``tracks``: their motion before the filter, and ``inner``, which part of it has
+    rows. ``bound``: of a good residual, RMS, as a part of the peak.
     """
 
     time: Array
     measured: Array
     expected: Array
+    change: Array
     residual: Array
     raw: Array
     noise: Array
@@ -232,7 +233,7 @@ def _compared(r: Recording, bound: float) -> Compared | None:
     def moved(track: Track) -> Array:
         return efforts(track, moving(robot, track.q))
 
-    period, how = pieces[0].period, replace(how, keep_every=1)
+    period, every, how = pieces[0].period, how.keep_every, replace(how, keep_every=1)
     sharp: list[dict[str, Array]] = []
     for track in pieces:
         alike = moving(robot, track.q)
@@ -253,7 +254,7 @@ def _compared(r: Recording, bound: float) -> Compared | None:
         name: np.concatenate([one[name][rows] for one, rows in zip(sharp, inside, strict=True)])
         for name in ("left", "change")
     }
-    late = _late(left, change, rubs)
+    late = _late(*(one[::every] for one in (left, change, rubs)))
     longest = max(pieces, key=lambda track: len(track.time))
     raw = [one["left"] for one in sharp]
     long = [one for one in raw if len(one) >= SEGMENT] or [max(raw, key=len)]
@@ -268,8 +269,8 @@ def _compared(r: Recording, bound: float) -> Compared | None:
     residual = left + late * change
     noise = density * np.sqrt(passed_band(how, 1.0 / period) / period)
     return Compared(
-        time, expected + residual, expected, residual, cut["left"] + late * cut["change"],
-        noise, np.maximum(size, LIGHT * greatest(size)),
+        time, expected + residual, expected, change, residual,
+        cut["left"] + late * cut["change"], noise, np.maximum(size, LIGHT * greatest(size)),
         LOUD * noise > HIDES * greatest(rms(expected + residual)), r.late + late, period,
         tuple(starts), tuple(pieces), tuple(inside), how, bound,
     )  # fmt: skip
@@ -282,8 +283,7 @@ def _late(left: Array, change: Array, rubs: Array) -> float:
     """
     table = np.concatenate([-change[..., None], rubs], -1)
     sizes = np.sqrt(np.mean(rubs**2, (0, 1)))
-    scales = rms(left).max() / np.where(sizes > 0.0, sizes, np.inf)
-    scales = np.where(scales > 0.0, scales, 1.0)
+    scales = max(float(rms(left).max()), 1e-12) / np.maximum(sizes, 1e-12)
     found = estimate(table, left, np.zeros(table.shape[-1]), np.array([LATEST, *scales]))
     late, sure = float(found.values[0]), SIGMAS * np.sqrt(found.covariance[0, 0])
     # At the bound it is another error's.

@@ -46,8 +46,7 @@ def read_bag(
 ) -> Recording:  # fmt: skip
     """A bag's joint states and what was measured beside them; every message checked as by a node.
 
-    Of a bag without joint states, where ``how.trajectory`` or ``how.planned``, the motion of its
-    JointTrajectory.
+    Of a bag without joint states, where ``how`` takes it, the motion of its JointTrajectory.
 
     :param progress: called with the number of messages read so far.
     :raises BagError: the bag is damaged, names no robot, or lacks what is asked for.
@@ -56,8 +55,7 @@ def read_bag(
     machine = _robot_of(bag, robot)
     held = how.load or told_load(bag)
     kinds = {topic.type for topic in bag.report.topics.values()}
-    wanted = how.trajectory or how.planned
-    if wanted and JOINT_STATE not in kinds and TRAJECTORY in kinds:
+    if (how.trajectory or how.planned) and JOINT_STATE not in kinds and TRAJECTORY in kinds:
         plan = read_trajectory(bag, machine)
         if plan is not None:
             return replace(plan, load=held, source=str(path))
