@@ -159,8 +159,8 @@ class ReadsRecordings(ReadsTables):
     )  # fmt: skip
     wrench_frame: str | None = setting(
         None,
-        "only accepted frame of a bag's wrenches, which turns with the platform; default: platform "
-        "or --base-frame, as in the first wrench",
+        "frame of a bag's wrenches, if it turns with the platform; default: platform or "
+        "--base-frame, as in the first wrench",
     )
     base_frame: str = setting("base_link", "frame of a bag's wrenches with base axes")
 
@@ -291,7 +291,7 @@ class Accepts:
     """Data that the machine cannot have produced."""
 
     accept: bool = setting(
-        False, "also use data that this machine cannot have produced, and mark the results"
+        False, "also use a recording that contradicts the machine, and mark the results"
     )
 
 

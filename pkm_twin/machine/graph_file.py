@@ -140,13 +140,11 @@ class JointSpec:
     its turn; ``lead`` is the travel per turn, negative for a left-handed thread. A ``translation``
     has three slides along base axes, a ``planar`` joint two slides across its axis and a turn about
     it. ``limits``: ``position`` and ``swivel`` of a passive joint bound the workspace; an actuated
-    joint has all but ``swivel``. ``rotor_inertia`` is reflected to the joint and has no weight.
-    ``drive`` in its place has the rotor's own inertia, and the ``ratio`` of a gear (joints that
-    turn) or the ``lead`` of a screw or belt (joints that slide). ``compliance``: along u, v, w,
-    then about them; 0 or .inf where a passive joint is free. The entry of an actuated joint's own
-    motion is that of its gear or screw, with the motor locked. u is ``axis``, v = u x e with the
-    base axis e most nearly square to u, w = u x v. For a universal joint u and v are its ``axes``;
-    for a spherical one u, v, w are base axes.
+    joint has all but ``swivel``. ``rotor_inertia`` is reflected to the joint and has no weight;
+    ``drive`` replaces it. ``compliance``: along u, v, w, then about them; 0 or .inf where a passive
+    joint is free. Of an actuated joint's own motion it is that of gear or screw, with the motor
+    locked. u is ``axis``, v = u x e with the base axis e most nearly square to u, w = u x v. For a
+    universal joint u and v are its ``axes``; for a spherical one u, v, w are base axes.
     """
 
     type: str = schema.choice(*TYPES)

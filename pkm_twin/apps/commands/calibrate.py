@@ -84,8 +84,8 @@ class Calibrate(OfRobot, ReadsTables, BeyondLimitsToo, Accepts, Overwrites):
     )
     transmission: Transmission = setting(
         Transmission.AUTO,
-        "ratios of joint_map to fit: each; shared: one factor; travel: each and its change over "
-        "travel; file: none; auto: ratios of sliding joints other than 1",
+        "ratios of joint_map to fit: each by itself; shared: one factor for all; travel: each, and "
+        "its change over travel; file: none; auto: each of a sliding joint that is not 1",
         choices={str(how): how for how in Transmission},
     )
     measure: tuple[str, ...] = setting(

@@ -91,7 +91,7 @@ class Size(CarriesAtTimes, ReadsMotions, AwayFromSingular, Draws):
     )  # fmt: skip
     efforts: str | None = setting(
         None, "efforts to use; default: the file's; with --payload the model's, unless the file "
-        "has measured efforts near these", choices=("file", "model"),
+        "has measured efforts that agree with them", choices=("file", "model"),
     )  # fmt: skip
 
 
