@@ -199,11 +199,9 @@ def tolerances(
         number = schema.number(low=0.0, high=most, unit=units[path])
         told = value.size if isinstance(value, Tolerance) else value
         size = schema.checked(number, f"tolerance {path}", told)
+        one = value if isinstance(value, Tolerance) else Tolerance(deviation=size)
         # Parts stand half of a play away from its middle at most.
-        sizes[path] = (
-            Tolerance(bound=size / 2.0) if is_play(path)
-            else value if isinstance(value, Tolerance) else Tolerance(deviation=size)
-        )  # fmt: skip
+        sizes[path] = Tolerance(bound=size / 2.0) if is_play(path) else one
     for path in numbers:
         if states.size and not slopes[path].any():
             raise ParameterError(f"tolerance {path}", robot.number(path), "a length or an angle")
@@ -266,9 +264,7 @@ def drawn(
             way = rng.normal(size=(len(paths), count)) if len(paths) > 1 else None
             unit = rng.uniform(-1.0, 1.0, (1, count)) if way is None else (
                 way / np.linalg.norm(way, axis=0))  # fmt: skip
-            errors |= {
-                path: known.bounds[path] * row for path, row in zip(paths, unit, strict=True)
-            }
+            errors |= {one: known.bounds[one] * row for one, row in zip(paths, unit, strict=True)}
     parts = [path for path in errors if part_of(robot, path) is not None]
     assembly = Assembly(robot, states)
     if len(parts) == len(errors):

@@ -458,11 +458,7 @@ def _drive(
 ) -> DriveSpec:
     """The drive of a joint whose rotor has this inertia at the joint, kg m2 or kg."""
     if own is not None:
-        raise ParameterError(
-            f"drive of {joint}",
-            "in the file",
-            "no other ratio or lead; --ratios compares several",
-        )
+        raise ParameterError(f"drive of {joint}", "in the file", "no ratio or lead; or --ratios")
     gear = next((gear for gear in given if (gear.lead is not None) == slides), None)
     if gear is None:
         name = "lead" if slides else "ratio"

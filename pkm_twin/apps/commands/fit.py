@@ -96,9 +96,7 @@ class Fit(CarriesAtTimes, ReadsRecordings, BeyondLimitsToo, Accepts):
         "efforts are motor currents, A: N m or N per ampere at the joint, one number or one per "
         "joint with commas; `fit` identifies it from the file's masses",
     )
-    drive: Path | None = setting(
-        None, "fits one drive: CSV of traverses with weights, a row per run"
-    )
+    drive: Path | None = setting(None, "one drive: CSV of traverses with weights, a row per run")
     lever: float | None = setting(
         None, "with --drive, for mass_kg: travel per radian of the motor, m", name="spool-radius",
         older=("--lever",), low=1e-6, high=1e3,

@@ -98,7 +98,7 @@ def info(given: Info) -> Report:
           or ["no: rigid-body equations determine every reaction"]),
         Fact("plausibility", [dataclasses.asdict(finding) for finding in odd]),
         *(Fact("", text, text="plausibility")
-          for text in [*(finding.text for finding in odd), *filter(None, [fault])]
+          for text in [*(one.text for one in odd), *[fault] * bool(fault)]
           or ["no implausible value"]),
         Fact("members_fault", fault or None),
         Fact("parameters", sections),

@@ -138,9 +138,8 @@ def _tables(joints: dict[str, Any]) -> list[Table]:
         worst = max(forces, key=lambda axis: forces[axis], default=None)
         ranges = "" if worst is None else f"{forces[worst]:.4g} ({worst})"
         values = [entry[column.name] for column in columns]
-        for k, key in enumerate(
-            ("bearing_force_determined_peak_N", "bearing_moment_determined_peak_N_m")
-        ):
+        for k, unit in enumerate(("force_determined_peak_N", "moment_determined_peak_N_m")):
+            key = f"bearing_{unit}"
             most = max(other[key] for other in joints.values())
             if math.isnan(values[2 * k]) and entry[key] > ROUNDING * most:
                 values[2 * k] = f"at least {entry[key]:.4g}"

@@ -312,11 +312,8 @@ def over_workspace(given: Size) -> Report:
         + ("platform turns at {:g} rad/s and {:g} rad/s2" if turns else
            "tool point moves at {:g} m/s and {:g} m/s2").format(speed, change)
     )  # fmt: skip
-    columns = [
-        Column("", "", "largest"),
-        Column("", "", " "),
-        Column("", "", "pose (" + ", ".join(dict.fromkeys(robot.pose_units)) + ")"),
-    ]
+    pose = f"pose ({', '.join(dict.fromkeys(robot.pose_units))})"
+    columns = [Column("", "", text) for text in ("largest", " ", pose)]
     return Report(
         answer,
         [
