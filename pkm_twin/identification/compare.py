@@ -19,7 +19,7 @@ from delta_dynamics.torques.virtual_work import inverse_dynamics, null_efforts
 from pkm_twin.codegen.arrays import Array, Mask
 from pkm_twin.errors import PkmTwinError
 from pkm_twin.identification.estimation import estimate
-from pkm_twin.identification.judge import LOUD, SIGMAS
+from pkm_twin.identification.judge import HINT, LOUD
 from pkm_twin.identification.plausible import LATEST, late_text
 from pkm_twin.identification.rows import BLOCK, shaken_efforts
 from pkm_twin.identification.samples import (
@@ -285,7 +285,7 @@ def _late(left: Array, change: Array, rubs: Array) -> float:
     sizes = np.sqrt(np.mean(rubs**2, (0, 1)))
     scales = max(float(rms(left).max()), 1e-12) / np.maximum(sizes, 1e-12)
     found = estimate(table, left, np.zeros(table.shape[-1]), np.array([LATEST, *scales]))
-    late, sure = float(found.values[0]), SIGMAS * np.sqrt(found.covariance[0, 0])
+    late, sure = float(found.values[0]), HINT * np.sqrt(found.covariance[0, 0])
     # At the bound it is another error's.
     return late if sure < abs(late) < LATEST else 0.0
 
