@@ -243,18 +243,19 @@ class Map(Space):
     def _extent(self, plane: int, case: int) -> Array:
         """Ends of a plane's sides (2, 2), around what is reachable in it and its pose."""
         shown, pose = list(self.planes[plane]), self.through(case)
-        box = self.bounds[shown]
+        box = bounds = self.bounds[shown]
+        least, most = np.minimum(bounds[:, 0], pose[shown]), np.maximum(bounds[:, 1], pose[shown])
         for _ in range(ZOOMS):
             ticks = [_ticks(ends, pose[k], COARSE) for k, ends in zip(shown, box, strict=True)]
             poses = self._plane_poses(plane, case, ticks)
             q, _, known = self.of_poses(poses)
             reach = keeps_limits(self.robot, q, poses, -math.inf, known)
             seen = np.concatenate([poses[reach], pose[None]])[:, shown]
-            margin = 0.75 * np.array([np.diff(side).max() for side in ticks])
-            around = np.maximum(margin, LEAST_VIEW * np.ptp(self.bounds[shown], axis=1))
+            # More than a step: a tip between the poses of this grid is seen on the next.
+            margin = 1.5 * np.array([np.diff(side).max() for side in ticks])
+            around = np.maximum(margin, LEAST_VIEW * np.ptp(bounds, axis=1))
             low = np.minimum(seen.min(0) - margin, pose[shown] - around)
             high = np.maximum(seen.max(0) + margin, pose[shown] + around)
-            least, most = np.minimum(box[:, 0], pose[shown]), np.maximum(box[:, 1], pose[shown])
             box = np.stack([np.maximum(low, least), np.minimum(high, most)], -1)
         return np.concatenate([box, np.zeros((2 - len(box), 2))])
 
