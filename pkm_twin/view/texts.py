@@ -62,13 +62,18 @@ const plainly = () => {
   document.execCommand('copy'); text.remove(); done() };
 if (navigator.clipboard) navigator.clipboard.writeText(whole).then(done, plainly);
 else plainly()"""
+# A new size empties the scene until its next frame.
 _SAVE: Final = """
 const scene = document.querySelector('canvas[data-engine]'), sheet = scene.cloneNode();
-sheet.width = scene.width; sheet.height = scene.height;
 const pen = sheet.getContext('2d'), link = document.createElement('a');
-pen.fillStyle = '#fff'; pen.fillRect(0, 0, sheet.width, sheet.height);
-pen.drawImage(scene, 0, 0);
-link.href = sheet.toDataURL('image/png'); link.download = this.dataset.name; link.click()"""
+const take = left => requestAnimationFrame(() => {
+  sheet.width = scene.width; sheet.height = scene.height;
+  pen.fillStyle = '#fff'; pen.fillRect(0, 0, sheet.width, sheet.height);
+  pen.drawImage(scene, 0, 0);
+  const empty = pen.getImageData(0, 0, sheet.width, sheet.height).data.every(c => c === 255);
+  if (empty && left) return take(left - 1);
+  link.href = sheet.toDataURL('image/png'); link.download = this.dataset.name; link.click() });
+take(200)"""
 _MISSING: Final = "&ndash;"
 _STYLE: Final = "font-size:0.82em;line-height:1.5;padding:0.15em 0.9em 0.4em"
 

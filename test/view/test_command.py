@@ -240,6 +240,8 @@ def test_every_control_does_what_it_says(browser, tmp_path):
         assert browser.run("location.search") == ""
         clicked(browser, "Copy link")
         browser.until("[...document.querySelectorAll('#copy')].some(e => e.innerText === 'Copied')")
+        # Empty until the next frame, as after a new size.
+        browser.run("document.querySelector('canvas[data-engine]').width += 1")
         clicked(browser, "Save picture")
         wait_until(lambda: (tmp_path / "five_bar.png").exists(), lambda: browser.run("1"), 60.0, "")
         assert colours((tmp_path / "five_bar.png").read_bytes()) > 200
