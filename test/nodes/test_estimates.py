@@ -293,7 +293,7 @@ def test_torque_residual_and_stop(peer, launch):
 
     array = node.until(stopped, repeat=lambda: send(wrench=False))
     assert counts_of(array, "stopped")["no wrench"] >= 1
-    assert int(values_of(array)["wrenches accepted"]) > 3
+    assert int(values_of(array)["wrenches accepted"]) > 0
     # What is refused is counted, and no wrench.
     node.until(
         lambda: counts_of(node.diagnostics(), "wrenches rejected").get("future stamp"),
