@@ -102,10 +102,10 @@ def read(
         if how.follow is not None:
             raise ParameterError("follow", how.follow, "no --follow: a bag has no pose columns")
         r = read_bag(path, robot, how, progress)
-        return r if how.deflected else r.without_repeats
-    if how.topics:
+    elif how.topics:
         raise ParameterError("topic", how.topics[0], f"no --topic: {path} is a table")
-    r = _of_table(path, robot, how)
+    else:
+        r = _of_table(path, robot, how)
     return r if how.deflected else r.without_repeats
 
 
