@@ -147,7 +147,7 @@ def checked(r: Recording, residual: float) -> Checked:
     reason = why_no_torques(r.robot)
     if r.effort is None:
         reason = reason or (COMPUTED if r.efforts == "model" else "the bag carries no efforts")
-    mixed = r.jumps if r.steps.publishers else ""
+    mixed = r.step_fault if r.steps.publishers else ""
     if mixed or reason or r.effort is None:
         items.append(judged(RESIDUAL, mixed or reason, bound, None))
         unjudged = COMPUTED if reason == COMPUTED else ""
@@ -198,6 +198,7 @@ def _motion(r: Recording) -> list[Fact]:
     median, longest = float(np.median(periods)), float(periods.max())
     gap = f"{1e3 * longest:.3f} ms at {r.time[int(periods.argmax())]:.3f} s"
     within, rate = MAX_GAP * median, f"{1 / median:.1f} Hz over {r.time[-1]:.3f} s"
+    fault = r.step_fault
     items = [
         judged("rate", rate, "", True, number=1 / median, unit="Hz"),
         missing_samples(r.time),
@@ -210,7 +211,7 @@ def _motion(r: Recording) -> list[Fact]:
             limit=within,
             unit="s",
         ),
-        judged(POSITION_STEPS, r.jumps or "no jumps", "within rates and limits", not r.jumps),
+        judged(POSITION_STEPS, fault or "no jumps", "within rates and limits", not fault),
     ]
     return items if r.qd is None or r.steps.publishers else items + _velocities(r, r.qd)
 

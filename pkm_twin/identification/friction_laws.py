@@ -187,7 +187,7 @@ def fit_recordings(
                 f"no wrench on {r.topics.wrench} is accepted: {r.first_reject}",
                 path=Path(r.source), reason="frames",
             )  # fmt: skip
-    file, found = robot, ((r.name, r.jumps) for r in recordings)
+    file, found = robot, ((r.name, r.step_fault) for r in recordings)
     faults = [
         f"{name}: position steps that are no motion: {fault}" for name, fault in found if fault
     ]

@@ -140,8 +140,8 @@ class Recording:
         # What jumps by wrong velocities only is not the positions' fault.
         return steps if alone.jumps.any() else alone
 
-    @property
-    def jumps(self) -> str:
+    @cached_property
+    def step_fault(self) -> str:
         """Jumps of the positions with their times; empty where there are none."""
         steps, found = self.steps, self.steps.first
         if steps.publishers:
@@ -262,8 +262,8 @@ class Recording:
                     f"{self.source}: velocities differ from the rate of the positions by "
                     f"{', '.join(faults)}; expected at most {100 * MAX_RATE:g} %, or no velocities"
                 )
-            if self.jumps:
-                self = replace(self, notes=(*self.notes, f"positions jump: {self.jumps}"))
+            if self.step_fault:
+                self = replace(self, notes=(*self.notes, f"positions jump: {self.step_fault}"))
         if self.qd is not None and self.qdd is not None:
             return self
         if self.bag is not None:

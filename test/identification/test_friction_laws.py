@@ -177,7 +177,7 @@ def test_sweeps_alone_show_the_friction_of_every_joint(name):
         truth = robot.changed(friction={key: value.tolist() for key, value in friction.items()})
         effort = inverse_dynamics(truth, *motion)
         record = noisy(Recording(robot, time, motion[0], effort=effort), rng, 0.01, 1e4)
-        assert record.jumps == ""
+        assert record.step_fault == ""
         numbers = fit(robot, [record], ("friction",), causes=[None]).numbers
         for key, values in friction.items():
             own = [one for one in numbers if key in one.name][: len(values)]
