@@ -21,7 +21,7 @@ from pkm_twin.errors import PkmTwinError
 from pkm_twin.identification.estimation import estimate
 from pkm_twin.identification.judge import HINT, LOUD
 from pkm_twin.identification.plausible import LATEST, late_text
-from pkm_twin.identification.rows import BLOCK, shaken_efforts
+from pkm_twin.identification.rows import BLOCK
 from pkm_twin.identification.samples import (
     SEGMENT,
     Filtering,
@@ -30,6 +30,7 @@ from pkm_twin.identification.samples import (
     kept_rows,
     noise_of,
     passed_band,
+    shaken_efforts,
     tracks,
     usual_size,
 )

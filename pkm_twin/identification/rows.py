@@ -35,6 +35,7 @@ from pkm_twin.identification.samples import (
     noise_of,
     passed_band,
     resonances_of,
+    shaken_efforts,
     tracks,
     usual_size,
 )
@@ -55,8 +56,6 @@ LATE: Final = 2.0
 """Samples by which efforts may well be late."""
 HELD_OUT: Final = 1 / 3
 """Part of each recording, its end, that is judged and not fitted."""
-SHAKEN: Final = 3000
-"""Samples that show what the positions' noise does."""
 
 STRIBECK: Final = (0.05, 0.1, 0.2)
 """Speeds below which static friction shows, over the rms speed."""
@@ -303,32 +302,6 @@ def _signals(
         Motion(f["q"], f["qd"], f["qdd"], f["wrench"], f["held"]), missed, load, f["effort"],
         f["own"], noise * np.sqrt(rate), passed_band(how, rate), rings,
     )  # fmt: skip
-
-
-def shaken_efforts(
-    r: Recording, track: Track, how: Filtering, efforts: Callable[[Track], Array]
-) -> Array:
-    """What noise of the positions, as large as theirs, changes in the efforts, (samples, n).
-
-    :param efforts: of a motion, shape (samples, n).
-    """
-    noise, rng = np.array(how.position_noise), np.random.default_rng(0)
-    edge = (how.window // 2 + 0.5) * track.period
-    inside = (r.time > track.time[0] - edge) & (r.time < track.time[-1] + edge)
-    some = np.flatnonzero(inside)[:SHAKEN]
-    time, q = r.time[some], r.q[some]
-    told = []
-    for shake in (np.zeros_like(q), noise * rng.normal(size=q.shape)):
-        pieces, _ = tracks(
-            time,
-            q + shake,
-            np.zeros_like(q),
-            window=how.window,
-            least=min(LEAST // 2, len(track.time)),
-        )
-        told.append(np.concatenate([efforts(t) for t in pieces]))
-    change = told[1] - told[0]
-    return in_motion([change], [track.moves(how)[: len(change)]])[0]
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,6 +21,7 @@ import numpy as np
 import scipy  # type: ignore[import-untyped]  # its parts come when they are asked for
 
 from pkm_twin.codegen.arrays import Array, Mask
+from pkm_twin.recordings import Recording
 from pkm_twin.streams.rest import ROBUST, SIGMAS
 from pkm_twin.streams.rest import noise as noise_of_samples
 
@@ -451,6 +452,36 @@ def _spectrum(pieces: Sequence[Array], rate: float, segment: int) -> tuple[Array
     ]
     density = np.average([own for _, own in both], 0, [len(piece) for piece in used])
     return np.asarray(both[0][0], np.float64), np.asarray(0.5 * density, np.float64)
+
+
+SHAKEN: Final = 3000
+"""Samples that show what the positions' noise does."""
+
+
+def shaken_efforts(
+    r: Recording, track: Track, how: Filtering, efforts: Callable[[Track], Array]
+) -> Array:
+    """What noise of the positions, as large as theirs, changes in the efforts, (samples, n).
+
+    :param efforts: of a motion, shape (samples, n).
+    """
+    noise, rng = np.array(how.position_noise), np.random.default_rng(0)
+    edge = (how.window // 2 + 0.5) * track.period
+    inside = (r.time > track.time[0] - edge) & (r.time < track.time[-1] + edge)
+    some = np.flatnonzero(inside)[:SHAKEN]
+    time, q = r.time[some], r.q[some]
+    told = []
+    for shake in (np.zeros_like(q), noise * rng.normal(size=q.shape)):
+        pieces, _ = tracks(
+            time,
+            q + shake,
+            np.zeros_like(q),
+            window=how.window,
+            least=min(LEAST // 2, len(track.time)),
+        )
+        told.append(np.concatenate([efforts(t) for t in pieces]))
+    change = told[1] - told[0]
+    return in_motion([change], [track.moves(how)[: len(change)]])[0]
 
 
 BLOCK: Final = 0.25
