@@ -12,7 +12,7 @@ BIN := $(VENV)/bin
 # Tests of the cores.
 CORES := bags laws machine nodes validation commands/test_joint_loads.py export/test_simulators.py
 
-.PHONY: demo test lint types unit long bags bench certificate fuzz faults soak audit scale reality states contact-table pages pictures animation docs coverage mutation dist sbom clean help
+.PHONY: demo test lint types unit long bags bench certificate fuzz faults soak audit scale reality states contact-table pages papers pictures animation docs coverage mutation dist sbom clean help
 
 help:
 	@echo "make demo         set up .venv, run the main nodes on the recorded bags, table and picture in out/"
@@ -30,6 +30,7 @@ help:
 	@echo "make states       compare Python, exported C and Pinocchio at a million states"
 	@echo "make contact-table  simulate 1,000 contacts, into docs/nodes.md (an hour)"
 	@echo "make pages        write the generated pages of docs/"
+	@echo "make papers       compare with the three papers, into docs/papers.md, and draw their figures"
 	@echo "make pictures     draw the pictures of docs/"
 	@echo "make animation    draw the moving picture of the README, in a browser"
 	@echo "make docs         build the site, in out/site"
@@ -123,6 +124,9 @@ pages: $(VENV)/test.stamp
 	$(BIN)/python -m tools.pages.public docs/public_names.txt
 	$(BIN)/python -m tools.pages.trend docs/recordings.md
 	$(BIN)/python -m tools.pages.notebooks examples/*.ipynb
+
+papers: $(VENV)/test.stamp
+	$(BIN)/python -m tools.papers docs
 
 # Every picture of docs/ but that of a long run, which `make soak` draws; those of `view` need a browser.
 pictures: $(VENV)/test.stamp

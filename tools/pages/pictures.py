@@ -11,6 +11,7 @@ import io
 import shutil
 import sys
 import tempfile
+from collections.abc import Mapping, Set
 from pathlib import Path
 from typing import Final
 
@@ -35,14 +36,13 @@ PICTURES: Final = {
 """Commands by the picture's name; where one draws several, each has its own ending."""
 
 
-def main(gallery: Path) -> None:
-    """Run the commands in an empty folder, and keep those pictures that the gallery has.
+def draw_pictures(gallery: Path, commands: Mapping[str, str], wanted: Set[str]) -> None:
+    """Run the commands in an empty folder, and keep the pictures whose names are wanted.
 
     :raises SystemExit: a command failed.
     """
-    kept = {path.name for path in gallery.iterdir()}
     with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
-        for name, words in PICTURES.items():
+        for name, words in commands.items():
             table = f"{name}.nc" if words.startswith("map ") else f"{name}.csv"
             out = [] if " --out " in words or words.startswith("size") else ["--out", table]
             try:
@@ -52,9 +52,10 @@ def main(gallery: Path) -> None:
                 if end.code:
                     raise
         for found in Path().glob("*.png"):
-            if found.name in kept:
+            if found.name in wanted:
                 shutil.copy(found, gallery)
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]).resolve())
+    target = Path(sys.argv[1]).resolve()
+    draw_pictures(target, PICTURES, {path.name for path in target.iterdir()})

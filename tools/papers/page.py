@@ -1,0 +1,117 @@
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
+"""Write docs/papers.md from the rows of the papers' modules."""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, Final
+
+from tools.papers import prru, upr_rpu
+from tools.papers.rows import KINDS, Comparison, Paper, Printed, Row, heading_anchor
+
+ROOT: Final = Path(__file__).resolve().parents[2]
+MODULES: Final = (prru, upr_rpu)
+"""Each has ``find_rows``, which computes the paper's values and returns a ``Paper``."""
+HEAD: Final = """# The three papers, compared
+
+`make papers` writes this page. Differences are in units of the last printed digit.
+
+"""
+
+
+def find_function(name: str) -> Any:
+    """Return the function, method or class of a dotted name.
+
+    :raises AttributeError: the module has no such name.
+    """
+    parts = name.split(".")
+    for split in range(len(parts) - 1, 0, -1):
+        try:
+            found: Any = importlib.import_module(".".join(parts[:split]))
+        except ModuleNotFoundError:
+            continue
+        for part in parts[split:]:
+            found = getattr(found, part)
+        return found
+    raise AttributeError(name)
+
+
+def write_page(papers: tuple[Paper, ...]) -> str:
+    """Return the page's text."""
+    text = HEAD + "".join(f"- {line}\n" for paper in papers for line in paper.summary)
+    return text + "".join(map(_write_paper, papers))
+
+
+def _write_paper(paper: Paper) -> str:
+    parts = [f"\n## {paper.title}\n"]
+    for kind in KINDS:
+        rows = [row for row in paper.rows if row.kind == kind]
+        if not rows:
+            continue
+        parts.append(f"\n| {kind} | content | computed in | test | compared with print |\n")
+        parts.append("|---|---|---|---|---|\n")
+        parts += map(_write_row, rows)
+        for row in rows:
+            parts += [_write_comparison(one) for one in row.comparisons]
+            parts += [f"\n![{row.content}](gallery/{file})\n" for file in row.pictures]
+    return "".join(parts)
+
+
+def _write_row(row: Row) -> str:
+    cells = (
+        row.label,
+        row.content,
+        "<br>".join(_link_function(name) for name in row.functions),
+        "<br>".join(_link_test(name) for name in row.tests),
+        "; ".join(filter(None, (row.note, *map(_link_comparison, row.comparisons)))),
+    )
+    return f"| {' | '.join(cells)} |\n"
+
+
+def _link_function(name: str) -> str:
+    found = inspect.unwrap(find_function(name))
+    if isinstance(found, property):
+        found = found.fget
+    source = Path(inspect.getsourcefile(found) or "").resolve().relative_to(ROOT)
+    short = name.removeprefix(source.with_suffix("").as_posix().replace("/", ".") + ".")
+    return f"[`{short.rpartition('.')[2] if short == name else short}`](../{source})"
+
+
+def _link_test(name: str) -> str:
+    path, _, function = name.partition("::")
+    return f"[`{function}`](../{path})"
+
+
+def _link_comparison(one: Comparison) -> str:
+    far = max(abs(p.difference) for line in one.lines.values() for p in line)
+    return f"[{one.title}](#{heading_anchor(one.title)}): at most {far:.0f} units of the last digit"
+
+
+def _write_comparison(one: Comparison) -> str:
+    """Write the printed numbers, this package's, and the differences in printed digits."""
+
+    def line(name: str, kind: str, texts: Iterator[str]) -> str:
+        return f"| {name} | {kind} | {' | '.join(texts)} |\n"
+
+    parts = [f"\n### {one.title}\n\n", line("", "", iter(one.columns))]
+    parts.append("|---" * (2 + len(one.columns)) + "|\n")
+    for name, numbers in one.lines.items():
+        parts.append(line(name, "printed", (p.text for p in numbers)))
+        parts.append(line("", "computed", map(_write_value, numbers)))
+        parts.append(
+            line(
+                "", "difference", (f"{round(p.difference):+d}".replace("+0", "0") for p in numbers)
+            )
+        )
+    return "".join(parts)
+
+
+def _write_value(number: Printed) -> str:
+    """Write this package's value with one digit more than is printed."""
+    digits, letter, exponent = number.text.partition("e")
+    decimals = len(digits.partition(".")[2]) + 1
+    scaled = number.value / 10.0 ** int(exponent or 0)
+    return f"{scaled:.{decimals}f}{letter}{exponent}"
