@@ -23,6 +23,7 @@ from stiffness_monitor.derivatives import (
     compliance_deviation,
     deflection_deviation,
 )
+from stiffness_monitor.limbs import LimbStiffness, limb_stiffness
 from stiffness_monitor.response import ElementResponse, element_response
 from stiffness_monitor.vibration import frequency_response, tool_modes
 
@@ -31,6 +32,7 @@ __all__ = [
     "Correction",
     "Departure",
     "ElementResponse",
+    "LimbStiffness",
     "Lobes",
     "Milling",
     "PlatformResponse",
@@ -44,6 +46,7 @@ __all__ = [
     "deflection_deviation",
     "element_response",
     "frequency_response",
+    "limb_stiffness",
     "platform_response",
     "reachable",
     "regular_workspace",

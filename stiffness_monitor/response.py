@@ -98,22 +98,28 @@ def element_response(robot: Robot, pose: ArrayLike) -> ElementResponse:
     :raises UnreachableError: a pose that is none of the mechanism's.
     :raises SingularityError: a compliance that is not positive definite.
     """
-    elastic = robot.made(Elastic)
     q = robot.inverse(pose)
     whole = platform_response(robot, q, np.zeros(6)).compliance
-    (entries, *places), _ = elastic.columns(NONE, q)
-    rows, columns, owner = (np.atleast_2d(p)[0].astype(int) for p in places)
-    size = rows.max() + 1
-    both = np.zeros((*q.shape[:-1], size, PLATFORM + len(owner)))
-    # Unit wrenches of the platform, then the columns.
-    both[..., :PLATFORM, :PLATFORM] = np.eye(PLATFORM)
-    both[..., rows, PLATFORM + columns] = entries
-    own = both[..., PLATFORM:]
+    own, owner = elastic_columns(robot, q)
     root = np.linalg.cholesky(own @ np.swapaxes(own, -1, -2))
-    solved = np.linalg.solve(root, both)
-    platform, elements = solved[..., :PLATFORM], solved[..., PLATFORM:]
+    unit = np.broadcast_to(np.eye(own.shape[-2], PLATFORM), (*own.shape[:-1], PLATFORM))
+    platform, elements = (np.linalg.solve(root, side) for side in (unit, own))
     turned = np.swapaxes(elements, -1, -2)
     return ElementResponse(
-        elastic.names, owner, whole, np.swapaxes(platform, -1, -2) @ elements,
+        robot.made(Elastic).names, owner, whole, np.swapaxes(platform, -1, -2) @ elements,
         np.eye(len(owner)) - turned @ elements,
     )  # fmt: skip
+
+
+def elastic_columns(robot: Robot, q: Array) -> tuple[Array, Indices]:
+    """Return the frame's columns sqrt(d) b, whose squares sum to its stiffness, and their elements.
+
+    :param q: joint positions, shape (..., n).
+    :returns: columns, shape (..., size, r), the platform's six displacements first; and the element
+        of each column by index, shape (r,).
+    """
+    (entries, *places), _ = robot.made(Elastic).columns(NONE, q)
+    rows, columns, owner = (np.atleast_2d(p)[0].astype(int) for p in places)
+    own = np.zeros((*q.shape[:-1], rows.max() + 1, len(owner)))
+    own[..., rows, columns] = entries
+    return own, owner

@@ -363,14 +363,8 @@ class UprRpu(TwinRobot):
 
     def limit_angles(self, pose: ArrayLike) -> Array:
         """Angle of each limb to the vertical, then to the platform's normal, (..., 6), rad."""
-        z, beta, gamma = np.moveaxis(np.asarray(pose, np.float64), -1, 0)
         a, b = self._radii
-        zero = np.zeros_like(z)
-        origin = np.stack([zero, -z * np.tan(beta), z], -1)
-        x = np.stack(
-            [np.cos(gamma), np.sin(beta) * np.sin(gamma), -np.cos(beta) * np.sin(gamma)], -1
-        )
-        y = np.stack([zero, np.cos(beta), np.sin(beta)], -1)
+        origin, x, y = self._platform_axes(pose)
         normal = np.cross(x, y)
         angles = []
         for i in range(3):
@@ -381,6 +375,42 @@ class UprRpu(TwinRobot):
             along = np.clip((up * normal).sum(-1), -1.0, 1.0)
             angles.append(np.arccos(along))
         return np.stack(angles, -1)
+
+    def _platform_axes(self, pose: ArrayLike) -> tuple[Array, Array, Array]:
+        """Return o, and the platform's x and y in base axes, of poses (..., 3); (..., 3) each."""
+        z, beta, gamma = np.moveaxis(np.asarray(pose, np.float64), -1, 0)
+        zero = np.zeros_like(z)
+        origin = np.stack([zero, -z * np.tan(beta), z], -1)
+        x = np.stack(
+            [np.cos(gamma), np.sin(beta) * np.sin(gamma), -np.cos(beta) * np.sin(gamma)], -1
+        )
+        return origin, x, np.stack([zero, np.cos(beta), np.sin(beta)], -1)
+
+    def limb_wrenches(self, pose: ArrayLike) -> Array:
+        """Return the wrenches that each limb can apply to the platform, shape (..., 3, 6, 3).
+
+        The paper's J_i (equation 30): columns are the unit actuation force, the unit constraint
+        force and the unit constraint couple about tau = X x y, as force and moment at the
+        platform's reference point, base axes. UPR limbs (equation 1): forces along B_i A_i and y
+        through B_i. RPU limb (equation 19): forces along A_3 B_3 and X through A_3.
+
+        :param pose: shape (..., 3), m and rad.
+        """
+        a, b = self._radii
+        origin, x, y = self._platform_axes(pose)
+        axis = np.broadcast_to(_X, y.shape)
+        tau = np.cross(axis, y)
+        limbs = []
+        for i in range(3):
+            arm = a * (_PATTERN[i, 0] * x + _PATTERN[i, 1] * y)
+            foot = b * _PATTERN[i] - origin
+            along = (arm - foot) * (1.0 if i < 2 else -1.0)
+            along /= np.linalg.norm(along, axis=-1, keepdims=True)
+            point, forces = (foot, (along, y)) if i < 2 else (arm, (along, axis))
+            columns = [np.concatenate([f, np.cross(point, f)], -1) for f in forces]
+            columns.append(np.concatenate([np.zeros_like(tau), tau], -1))
+            limbs.append(np.stack(columns, -1))
+        return np.stack(limbs, -3)
 
     def grid(self) -> PoseGrid:
         """Tilts about the vertical axis, in the plane of beta and gamma."""

@@ -211,6 +211,14 @@ class Mechanism(Common):
         del pose
         return None
 
+    def limb_wrenches(self, pose: ArrayLike) -> Array | None:
+        """Return unit wrenches that each limb can apply, (..., limbs, 6, k), or None if not known.
+
+        Elastic elements are then in the order of the limbs, as many in each.
+        """
+        del pose
+        return None
+
     @property
     def passive_limits(self) -> tuple[PassiveLimit, ...]:
         """Ranges of passive joints that bound the workspace; none: the file states none."""

@@ -8,13 +8,17 @@ import math
 import numpy as np
 import pytest
 
+from pkm_twin.errors import ParameterError
 from stiffness_monitor import (
     compliance,
+    limb_stiffness,
     reachable,
     regular_workspace,
+    stiffness,
     strain_energy,
 )
 from test.support.robots import load
+from test.support.upr_rpu import limbs
 from test.support.workspaces import even_samples, polar_samples
 
 ROBOT = load("upr_rpu")
@@ -74,6 +78,28 @@ def test_table_1_finite_elements_within_the_papers_error(pose, theory, finite_el
     deflection = 1e6 * strain_energy(ROBOT, pose, LOAD).deflection
     error = np.abs(deflection - expected)
     assert (error <= np.maximum(0.078 * np.abs(expected), UNIT)).all(), error / np.abs(expected)
+
+
+def test_limb_stiffness_is_the_papers():
+    """J_i (equations 1, 19, 30), K_i (17, 28), K (34) and W_i (36) against closed forms."""
+    poses = np.random.default_rng(3).uniform((-0.8, -0.3, -0.3), (-0.4, 0.3, 0.3), (20, 3))
+    found = limb_stiffness(ROBOT, poses)
+    amplitudes = found.amplitudes(LOAD)
+    turned = np.swapaxes(found.wrenches, -1, -2)
+    whole = (found.wrenches @ found.stiffness @ turned).sum(-3)
+    assert whole == pytest.approx(stiffness(ROBOT, poses), rel=1e-11, abs=1e-9 * whole.max())
+    balance = (found.wrenches @ amplitudes[..., None])[..., 0].sum(-2)
+    assert balance == pytest.approx(np.broadcast_to(LOAD, (20, 6)), abs=1e-9)
+    for k, pose in enumerate(poses):
+        moved = compliance(ROBOT, pose) @ LOAD
+        for i, (unit, elements) in enumerate(limbs(ROBOT, pose)):
+            assert found.wrenches[k, i] == pytest.approx(unit, abs=1e-14)
+            expected = np.linalg.inv(sum(elements))
+            size = np.sqrt(np.outer(*[np.diag(expected)] * 2))
+            assert (np.abs(found.stiffness[k, i] - expected) <= 1e-11 * size).all()
+            assert amplitudes[k, i] == pytest.approx(expected @ unit.T @ moved, rel=1e-8, abs=1e-8)
+    with pytest.raises(ParameterError, match="limbs' wrenches"):
+        limb_stiffness(load("delta"), load("delta").home())
 
 
 @pytest.mark.parametrize("last", [1e-11, 3.22e-11])
