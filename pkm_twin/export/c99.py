@@ -8,6 +8,7 @@ as the other back ends.
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from textwrap import indent
@@ -245,6 +246,7 @@ class Routine:
 
 HOT: Final = "PKM_HOT "
 """Before the functions that a control loop calls."""
+_LARGE_BITS: Final = hex(struct.unpack("<Q", struct.pack("<d", LARGE))[0])
 _FIXED: Final = f"""\
 /* Where the compiler can, one form for this processor family's vector units, chosen at load. */
 #ifdef PKM_CLONES
@@ -253,14 +255,25 @@ _FIXED: Final = f"""\
 #define PKM_HOT
 #endif
 
+/* A double and its bits. What is not finite is found in the bits, because compilers may drop
+   comparisons with NaN (-fno-honor-nans); volatile, because they may know the bits' origin. */
+typedef union {{
+    double value;
+    unsigned long long bits;
+}} @_double;
+
+/* Whether all magnitudes are below {LARGE!r}: magnitudes are in the order of their bits. */
 static int @_finite(const double *values, int count)
 {{
-    double total = 0.0;
-    int i;
+    volatile @_double one;
+    int i, result = 1;
     for (i = 0; i < count; i++) {{
-        total += fabs(values[i]);
+        one.value = values[i];
+        if ((one.bits & 0x7fffffffffffffffULL) >= {_LARGE_BITS}ULL) {{
+            result = 0;
+        }}
     }}
-    return (total < {LARGE!r}) ? 1 : 0;
+    return result;
 }}
 
 /* Status of results r, behind which stands whether the closures hold. */
@@ -274,9 +287,15 @@ static int @_judged(const double *r, int results)
 
 static void @_give(int status, const double *values, double *out, int count)
 {{
+    volatile @_double none;
     int i;
+    none.bits = 0x7ff8000000000000ULL;
     for (i = 0; i < count; i++) {{
-        out[i] = (status == 0) ? values[i] : (double)NAN;
+        if (status == 0) {{
+            out[i] = values[i];
+        }} else {{
+            out[i] = none.value;
+        }}
     }}
 }}
 """
@@ -428,7 +447,7 @@ static int @_{name}({more}const double *{q.target}, int steps, double *h, double
             return 0;
         }}
     }}
-    return 1;
+    return @_finite({x}, {n});
 }}
 """)
 

@@ -281,7 +281,7 @@ int @_parameters(double mass, const double *com, const double *inertia, double *
         p[4 + i] = inertia[i];
     }}
     {call % "r"};
-    status = ((@_finite(p, 13) != 0) && (@_finite(r, {size}) != 0)) ? 0 : 2;
+    status = ((@_finite(p, 13) != 0) && (@_finite(r, {len(results)}) != 0)) ? 0 : 2;
     for (i = {size}; i < {len(results)}; i++) {{
         if (!(r[i] >= 0.0)) {{
             status = 2;

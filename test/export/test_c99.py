@@ -225,7 +225,11 @@ __attribute__((destructor)) static void report(void) { fprintf(stderr, "%ld 0", 
 
 def test_what_is_not_finite_has_status_2(exported):
     robot, package = exported
-    program = package.build(*PLAIN)
+    check_not_finite(robot, package, package.build(*PLAIN))
+
+
+def check_not_finite(robot, package, program):
+    """Check that each function rejects NaN and infinity in each of its inputs."""
     motion = random_motion(robot, np.random.default_rng(6), 1)
     for name, rows in inputs_of(robot, motion).items():
         for k, row in enumerate(rows):
@@ -235,6 +239,35 @@ def test_what_is_not_finite_has_status_2(exported):
                 status, found = package.run(program, name, *given)
                 assert (status == 2.0).all(), (name, k, bad)
                 assert np.isnan(found).all()
+
+
+WITHOUT_NAN = (
+    "-fno-honor-nans", "-fno-honor-infinities", "-ffinite-math-only", "-ffast-math", "-Ofast",
+    "-ffast-math -fno-finite-math-only", "-ffast-math -fhonor-infinities",
+    "-funsafe-math-optimizations", "-ffp-model=fast", "-ffp-model=aggressive", "-fp-model=fast=2",
+    "-Xclang -menable-no-nans",
+)  # fmt: skip
+"""Flags of gcc, clang and icx under which a comparison with NaN may be dropped."""
+
+
+@pytest.mark.parametrize("compiler", COMPILERS)
+@pytest.mark.parametrize("level", partly_long(("-O1", "-O2", "-O3"), "-O2"))
+def test_flags_that_ignore_nan_do_not_compile_or_change_no_status(small, compiler, level, rng):
+    robot, package = small
+    q = wild(robot, rng, 200)
+    good = robot.try_forward(q)[1]
+    judged = 0
+    for flags in WITHOUT_NAN:
+        try:
+            program = package.build(level, "-w", *flags.split(), compiler=compiler)
+        except subprocess.CalledProcessError:
+            continue
+        judged += 1
+        check_not_finite(robot, package, program)
+        status, found = package.run(program, "forward", q)
+        np.testing.assert_array_equal(status == 0.0, good, flags)
+        assert np.isnan(found[~good]).all() and np.isfinite(found[good]).all(), flags
+    assert judged >= 2
 
 
 @pytest.mark.parametrize("name", partly_long(NAMES, "five_bar", "bolted"))
