@@ -40,6 +40,7 @@ from pkm_twin.export.c_templates import (
 )
 from pkm_twin.machine.inertia import Layout
 from pkm_twin.machine.sections import MAX_LENGTH, MAX_MASS, payload_margins
+from pkm_twin.robot.mechanism import RigidError
 from pkm_twin.robot.robot import Robot
 from stiffness_monitor.compliance import HELD
 from stiffness_monitor.programs import Elastic
@@ -83,13 +84,15 @@ class Package:
         self.n, self.m = robot.joints_count, len(robot.pose_names)
         self.massive = _has(robot.massive)
         self.elastic: Elastic | None = None
-        if (self._wants("compliance") or self._wants("strain_energy")) and _has(robot.structure):
+        if self._wants("compliance") or self._wants("strain_energy"):
             try:
                 made = robot.made(Elastic)
                 _ = made.response
                 self.elastic = made
+            except RigidError:
+                pass
             except ParameterError as error:
-                # Elements of some parts alone are no elastic machine.
+                # Sections that contradict the masses, or of some parts alone.
                 warn(robot.name, f"no functions of elasticity: {error}")
         self.fold = Folding()
         self.payload = self.fold.tape.inputs(PARAMETERS, 13)

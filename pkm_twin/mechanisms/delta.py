@@ -39,7 +39,7 @@ from pkm_twin.machine.members import Beam, Structure, Tube, axial, disc
 from pkm_twin.machine.pose_grid import PoseGrid
 from pkm_twin.machine.sections import check_azimuths, length, mass, shared_middle
 from pkm_twin.mechanisms import TwinRobot
-from pkm_twin.robot.mechanism import Inverse
+from pkm_twin.robot.mechanism import Inverse, RigidError
 
 LIMBS: Final = ("I", "II", "III")
 MAX_ITERATIONS: Final = 12
@@ -416,11 +416,12 @@ class Delta(TwinRobot):
     def structure(self) -> Structure:
         """Arms clamped at their locked drives, rods between arms and platform.
 
-        :raises ParameterError: the file has no members, or no rod for the rcu limb.
+        :raises RigidError: the file has no members.
+        :raises ParameterError: it has no rod for the rcu limb, or sections that no bar has.
         """
         g, m, members = self.geometry, self.inertia, self.members
         if members is None:
-            raise ParameterError(
+            raise RigidError(
                 "members", None, "a section with the elastic members, arms and forearms"
             )
         if "rcu" in g.closures and members.rcu_forearm is None:

@@ -65,7 +65,7 @@ from pkm_twin.machine.places import (
 from pkm_twin.machine.reach import PassiveLimit
 from pkm_twin.machine.sections import DriveSpec, Redundancy
 from pkm_twin.mechanisms import TwinRobot
-from pkm_twin.robot.mechanism import Common
+from pkm_twin.robot.mechanism import Common, RigidError
 from pkm_twin.robot.robot_urdf import robot_description
 
 M = TypeVar("M", bound="Machine")
@@ -533,7 +533,8 @@ class Machine(TwinRobot):
     def structure(self) -> Structure:
         """Bars with sections, and the compliance of joints.
 
-        :raises ParameterError: no body and no joint is elastic; of bars that cannot be, all named.
+        :raises RigidError: no body and no joint is elastic.
+        :raises ParameterError: sections that no bar has, all named, or a rod without one.
         """
         bars = [
             (name, m.section, body.mass, m.end - m.start, f"bodies.{name}.member.section")
@@ -560,7 +561,7 @@ class Machine(TwinRobot):
             if joint.compliance is not None
         }
         if not sections and not compliances:
-            raise ParameterError(
+            raise RigidError(
                 "bodies.NAME.member.section", None,
                 "a member's section, rods.NAME.section or joints.NAME.compliance: "
                 "nothing is elastic",

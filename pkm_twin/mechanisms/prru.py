@@ -48,7 +48,7 @@ from pkm_twin.machine.members import Beam, Structure, Tube, axial, disc
 from pkm_twin.machine.pose_grid import PoseGrid
 from pkm_twin.machine.sections import check_azimuths, length, mass, shared_middle
 from pkm_twin.mechanisms import TwinRobot
-from pkm_twin.robot.mechanism import Inverse
+from pkm_twin.robot.mechanism import Inverse, RigidError
 from pkm_twin.robot.robot import SINGULARITY_BOUND
 
 LIMBS: Final = ("I", "II", "III")
@@ -360,10 +360,10 @@ class Prru(TwinRobot):
     def structure(self) -> Structure:
         """Limbs between locked sliders, which stand still, and the platform.
 
-        :raises ParameterError: the file has no members.
+        :raises RigidError: the file has no members.
         """
         if self.members is None:
-            raise ParameterError("members", None, "a section with the elastic members, the limbs")
+            raise RigidError("members", None, "a section with the elastic members, the limbs")
         m = self.inertia
         spread = (m.lower_link_mass + m.upper_link_mass) / self.geometry.limb_length
         section = self.members.limb.section(spread, "members.limb")

@@ -57,6 +57,10 @@ FREE_FALL: Final = (0.0, 0.0, -9.81)
 R = TypeVar("R", bound="Mechanism")
 
 
+class RigidError(ParameterError):
+    """Raised for a robot whose file makes nothing elastic."""
+
+
 @dataclass(frozen=True)
 class Inverse:
     """A mechanism's closed form of q by pose, as expressions.
@@ -231,9 +235,10 @@ class Mechanism(Common):
     def structure(self) -> Structure:
         """Elastic beams and joints.
 
-        :raises ParameterError: the robot's file lacks a section that elasticity needs.
+        :raises RigidError: the robot's file makes nothing elastic.
+        :raises ParameterError: its elastic sections are incomplete or contradict its masses.
         """
-        raise ParameterError("members", None, "a section with the elastic members")
+        raise RigidError("members", None, "a section with the elastic members")
 
     def elastic_entries(self) -> dict[str, dict[str, dict[str, Any]]]:
         """The elastic numbers of its file at bodies, joints and rods: plain data, kind and name.

@@ -17,6 +17,7 @@ from pkm_twin.errors import ParameterError
 from pkm_twin.machine.formulas import PARAMETERS
 from pkm_twin.report import Fact, Report, number
 from pkm_twin.robot.clearance import clearance, has_clearance
+from pkm_twin.robot.mechanism import RigidError
 from pkm_twin.robot.plausibility import findings, why_no_torques
 from pkm_twin.robot.robot import Robot
 
@@ -118,8 +119,10 @@ def members_fault(robot: Robot) -> str:
     """Why maps reject the members that the file gives; empty where they do not, or it has none."""
     try:
         robot.structure()
+    except RigidError:
+        return ""
     except ParameterError as error:
-        return "" if error.value is None else str(error)
+        return str(error)
     return ""
 
 
