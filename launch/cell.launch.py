@@ -3,19 +3,16 @@
 
 from pathlib import Path
 
-from launch.actions import (
-    DeclareLaunchArgument,
-    GroupAction,
-    IncludeLaunchDescription,
-    OpaqueFunction,
-)
+from launch.actions import DeclareLaunchArgument, OpaqueFunction
 from launch.launch_context import LaunchContext
-from launch.launch_description_sources import PythonLaunchDescriptionSource
+from launch_ros.actions import Node
 
 from launch import LaunchDescription
 from pkm_twin.ros.arguments import check_launch_arguments
+from pkm_twin.ros.launching import load_launch_file
+from pkm_twin.ros.signals import leave_interrupts_to_launch
 
-TWIN = str(Path(__file__).with_name("twin.launch.py"))
+TWIN = Path(__file__).with_name("twin.launch.py")
 
 MACHINES = "picker=delta_cu,head=prru"
 
@@ -43,8 +40,9 @@ def generate_launch_description() -> LaunchDescription:
     )
 
 
-def machines(context: LaunchContext) -> list[GroupAction]:
-    """A twin a machine, once the arguments have their values."""
+def machines(context: LaunchContext) -> list[Node]:
+    """The nodes of every machine, all checked before the first one starts."""
+    leave_interrupts_to_launch()
     check_launch_arguments(__file__, context.argv, ARGUMENTS)
     given = {name: context.launch_configurations[name] for name in ARGUMENTS}
     pairs = [pair.strip().partition("=") for pair in given.pop("machines").split(",")]
@@ -54,15 +52,10 @@ def machines(context: LaunchContext) -> list[GroupAction]:
     names = [namespace for namespace, _, _ in pairs]
     if len(set(names)) < len(names):
         raise RuntimeError(f"machines: {', '.join(names)}: two share a namespace")
-    # A group a machine: what one include sets, the next does not see.
+    twin = load_launch_file(TWIN)
+    defaults = {name: default for name, (default, _) in twin.ARGUMENTS.items()}
     return [
-        GroupAction(
-            [
-                IncludeLaunchDescription(
-                    PythonLaunchDescriptionSource(TWIN),
-                    launch_arguments={**given, "namespace": namespace, "robot": robot}.items(),
-                )
-            ]
-        )
+        node
         for namespace, _, robot in pairs
+        for node in twin.processes({**defaults, **given, "namespace": namespace, "robot": robot})
     ]

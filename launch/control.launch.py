@@ -22,8 +22,6 @@ from ament_index_python.packages import (
 )
 from launch.actions import (
     DeclareLaunchArgument,
-    GroupAction,
-    IncludeLaunchDescription,
     LogInfo,
     OpaqueFunction,
     RegisterEventHandler,
@@ -32,16 +30,21 @@ from launch.actions import (
 from launch.event_handlers import OnProcessExit, OnShutdown
 from launch.launch_context import LaunchContext
 from launch.launch_description_entity import LaunchDescriptionEntity
-from launch.launch_description_sources import PythonLaunchDescriptionSource
 from launch_ros.actions import Node
 
 from delta_dynamics.simulation.machine import tuned
 from launch import LaunchDescription
-from pkm_twin import Robot, load
-from pkm_twin.errors import PkmTwinError
+from pkm_twin import Robot
 from pkm_twin.export.ros2_control import CONTROLLER as FEEDFORWARD
 from pkm_twin.export.ros2_control import GRAVITY, TRAJECTORIES, package_name
 from pkm_twin.ros.arguments import check_launch_arguments
+from pkm_twin.ros.launching import (
+    check_executables,
+    load_launch_file,
+    load_robot,
+    read_choice,
+    read_flag,
+)
 from pkm_twin.ros.signals import leave_interrupts_to_launch
 
 HERE = Path(__file__).parent
@@ -67,6 +70,7 @@ ARGUMENTS = {
     "command_gate": ("false", f"true: torques through command_gate to {EFFORTS}"),
     "robot_state_publisher": ("true", "false if another node publishes robot_description"),
     "params_file": ("", "YAML file of parameters of delta_dynamics"),
+    "use_sim_time": ("false", "use simulated time, of a simulator that publishes /clock"),
     "log_level": ("info", "log level of delta_dynamics: debug, info, warn, error or fatal"),
 }
 
@@ -89,15 +93,21 @@ def control(context: LaunchContext) -> list[LaunchDescriptionEntity]:
     check_launch_arguments(__file__, context.argv, ARGUMENTS)
     given = {name: context.launch_configurations[name] for name in ARGUMENTS}
     namespace = given["namespace"]
-    gate = given["command_gate"].lower()
-    if gate not in ("true", "false"):
-        raise RuntimeError(f"command_gate: {given['command_gate']!r} is neither true nor false")
-    if given["use"] not in ("twin", "plugin"):
-        raise RuntimeError(f"use: {given['use']!r} is neither twin nor plugin")
-    plugin = given["use"] == "plugin"
-    if plugin and gate == "true":
+    gate = read_flag(given, "command_gate")
+    sim_time = {"use_sim_time": read_flag(given, "use_sim_time")}
+    plugin = read_choice(given, "use", ("twin", "plugin")) == "plugin"
+    if plugin and gate:
         raise RuntimeError("command_gate: with use:=plugin no torques pass through topics")
-    controller = EFFORTS if gate == "true" else TRAJECTORIES
+    described = read_flag(given, "robot_state_publisher")
+    check_executables(
+        [
+            ("controller_manager", "ros2_control_node"),
+            ("controller_manager", "spawner"),
+            *([("robot_state_publisher", "robot_state_publisher")] if described else []),
+            ("pkm_twin", "pkm-twin"),
+        ]
+    )
+    controller = EFFORTS if gate else TRAJECTORIES
     # Whose gains hold the machine.
     holding = FEEDFORWARD if plugin else controller
     space = f"/{namespace}".rstrip("/")
@@ -109,7 +119,7 @@ def control(context: LaunchContext) -> list[LaunchDescriptionEntity]:
         package="robot_state_publisher",
         executable="robot_state_publisher",
         namespace=namespace,
-        parameters=[{"robot_description": _description(given)}],
+        parameters=[{"robot_description": _description(given), **sim_time}],
     )
     settings = sections.get(f"{space}/{holding}", {}).get("ros__parameters", {})
     gains = settings.get("gains", {})
@@ -133,12 +143,12 @@ def control(context: LaunchContext) -> list[LaunchDescriptionEntity]:
     return [
         *([LogInfo(msg=warning)] if loose and holding != EFFORTS else []),
         RegisterEventHandler(OnShutdown(on_shutdown=lambda *_: folder.cleanup())),
-        *([publisher] if given["robot_state_publisher"] == "true" else []),
+        *([publisher] if described else []),
         Node(
             package="controller_manager",
             executable="ros2_control_node",
             namespace=namespace,
-            parameters=[str(file)],
+            parameters=[str(file), sim_time],
             output="screen",
             on_exit=Shutdown(reason="ros2_control_node has ended"),
         ),
@@ -147,7 +157,7 @@ def control(context: LaunchContext) -> list[LaunchDescriptionEntity]:
             for one, after in pairwise(spawners)
         ),
         spawners[0],
-        *([] if plugin else [_twin(given, controller)]),
+        *([] if plugin else _twin(given, controller)),
     ]
 
 
@@ -166,30 +176,26 @@ def _spawner(space: str, file: Path, *arguments: str) -> Node:
     )
 
 
-def _twin(given: dict[str, str], controller: str) -> LaunchDescriptionEntity:
+def _twin(given: dict[str, str], controller: str) -> list[Node]:
     """delta_dynamics, and the gate where there is one."""
-    return GroupAction(
-        [
-            IncludeLaunchDescription(
-                PythonLaunchDescriptionSource(str(HERE / "twin.launch.py")),
-                launch_arguments={
-                    "robot": given["robot"],
-                    "namespace": given["namespace"],
-                    "params_file": given["params_file"],
-                    "log_level": given["log_level"],
-                    "stiffness_monitor": "false",
-                    **(
-                        {"command_gate": "true", "commands": f"{EFFORTS}/commands"}
-                        if controller == EFFORTS
-                        else {
-                            "joint_trajectory_ff": f"{TRAJECTORIES}/joint_trajectory",
-                            "controller_action": f"{TRAJECTORIES}/follow_joint_trajectory",
-                        }
-                    ),
-                }.items(),
-            )
-        ]
+    twin = load_launch_file(HERE / "twin.launch.py")
+    names = ("robot", "namespace", "params_file", "use_sim_time", "log_level")
+    processes: list[Node] = twin.processes(
+        {
+            **{name: default for name, (default, _) in twin.ARGUMENTS.items()},
+            **{name: given[name] for name in names},
+            "stiffness_monitor": "false",
+            **(
+                {"command_gate": "true", "commands": f"{EFFORTS}/commands"}
+                if controller == EFFORTS
+                else {
+                    "joint_trajectory_ff": f"{TRAJECTORIES}/joint_trajectory",
+                    "controller_action": f"{TRAJECTORIES}/follow_joint_trajectory",
+                }
+            ),
+        }
     )
+    return processes
 
 
 def _description(given: dict[str, str]) -> str:
@@ -209,11 +215,11 @@ def _description(given: dict[str, str]) -> str:
 
 def _controllers(given: dict[str, str], space: str) -> dict[str, dict[str, dict[str, Any]]]:
     """The settings with the robot's joints, each section under its node's full name."""
+    robot = load_robot(given["robot"])
     try:
-        robot = load(given["robot"])
         strong, damped = tuned(robot, float(given["bandwidth"] or 0.0))
-    except (PkmTwinError, ValueError) as error:
-        raise RuntimeError(f"robot {given['robot']}, bandwidth: {error}") from None
+    except ValueError as error:
+        raise RuntimeError(f"bandwidth {given['bandwidth']!r}: {error}") from None
     path = Path(given["controllers"] or _settings_file(given, robot))
     sections = {
         name.removeprefix("/**/"): section

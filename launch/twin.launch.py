@@ -13,13 +13,7 @@ import time
 from pathlib import Path
 
 import yaml
-from launch.actions import (
-    DeclareLaunchArgument,
-    LogInfo,
-    OpaqueFunction,
-    SetEnvironmentVariable,
-    TimerAction,
-)
+from launch.actions import DeclareLaunchArgument, LogInfo, OpaqueFunction, TimerAction
 from launch.events.process import ProcessExited
 from launch.launch_context import LaunchContext
 from launch.launch_description_entity import LaunchDescriptionEntity
@@ -28,9 +22,14 @@ from launch_ros.actions import Node
 from delta_dynamics.feedforward import Settings
 from delta_dynamics.gate import GateSettings
 from launch import LaunchDescription
-from pkm_twin import load
-from pkm_twin.errors import PkmTwinError
 from pkm_twin.ros.arguments import check_launch_arguments
+from pkm_twin.ros.launching import (
+    LOG_LEVELS,
+    check_executables,
+    load_robot,
+    read_choice,
+    read_flag,
+)
 from pkm_twin.ros.signals import leave_interrupts_to_launch
 
 ROBOT = "delta_cu"
@@ -95,8 +94,6 @@ def generate_launch_description() -> LaunchDescription:
                 DeclareLaunchArgument(name, default_value=default, description=text)
                 for name, (default, text) in ARGUMENTS.items()
             ),
-            # Matrices here are small: threads cost more than they bring.
-            SetEnvironmentVariable("OMP_NUM_THREADS", "1"),
             OpaqueFunction(function=nodes),
         ]
     )
@@ -106,24 +103,34 @@ def nodes(context: LaunchContext) -> list[Node]:
     """The chosen nodes, once the arguments have their values."""
     leave_interrupts_to_launch()
     check_launch_arguments(__file__, context.argv, ARGUMENTS)
-    given = {name: context.launch_configurations[name] for name in ARGUMENTS}
+    return processes({name: context.launch_configurations[name] for name in ARGUMENTS})
+
+
+def processes(given: dict[str, str]) -> list[Node]:
+    """The processes of one robot, all arguments checked; none runs yet.
+
+    :raises RuntimeError: an argument is wrong, or a program is missing.
+    """
     file = given["params_file"]
     if file and not Path(file).is_file():
         raise RuntimeError(f"params_file: {file!r} is no file")
     if given["robot"]:
-        try:
-            load(given["robot"])
-        except PkmTwinError as error:
-            raise RuntimeError(f"robot: {error}") from None
-    for name in ("respawn", "use_sim_time"):
-        _flag(given, name)
-    chosen = [name for name in PARAMETERS if _flag(given, name)]
+        load_robot(given["robot"])
+    for name in ("respawn", "use_sim_time", *(["use_wrench"] if given["use_wrench"] else [])):
+        read_flag(given, name)
+    read_choice(given, "executor", ("events", "single"))
+    read_choice(given, "acceleration", ("trajectory", "differentiate", ""))
+    read_choice(given, "log_level", LOG_LEVELS)
+    chosen = [name for name in PARAMETERS if read_flag(given, name)]
+    if not chosen:
+        raise RuntimeError(f"nothing to run: {', '.join(PARAMETERS)} are all false")
     _check_deadline(given, chosen)
     together = [name for name in chosen if name != GATE]
-    if _flag(given, "composed") and together:
+    if read_flag(given, "composed") and together:
         groups = [[name] for name in chosen if name == GATE] + [together]
     else:
         groups = [[name] for name in chosen]
+    check_executables(("pkm_twin", _executable(names)) for names in groups)
     return [_process(names, given) for names in groups]
 
 
@@ -176,6 +183,11 @@ def _pattern(path: str) -> str:
     return re.escape(path).replace(r"/\*\*", "(/.*)?").replace(r"\*", "[^/]*")
 
 
+def _executable(names: list[str]) -> str:
+    """The program that runs one node, or several in one process."""
+    return names[0] if len(names) == 1 else "composed"
+
+
 def _process(names: list[str], given: dict[str, str], tries: int = 0) -> Node:
     """One node, or several in one process: a file of parameters has a section for each."""
     folder = tempfile.mkdtemp(prefix="pkm_twin_")
@@ -199,13 +211,15 @@ def _process(names: list[str], given: dict[str, str], tries: int = 0) -> Node:
     single = names[0] if len(names) == 1 else None
     return Node(
         package="pkm_twin",
-        executable=single or "composed",
+        executable=_executable(names),
         name=single,
         namespace=given["namespace"],
         arguments=[] if single else names,
         parameters=[*files, str(after)],
         ros_arguments=[*remappings, "--log-level", given["log_level"]],
         on_exit=_Again(names, given, tries),
+        # Matrices here are small: threads cost more than they bring.
+        additional_env={"OMP_NUM_THREADS": "1"},
         output="screen",
     )
 
@@ -217,8 +231,8 @@ def _parameters(name: str, given: dict[str, str]) -> dict[str, object]:
         chosen["mechanism"] = given["robot"]
     chosen["executor"] = given["executor"]
     if "use_wrench" in chosen:
-        chosen["use_wrench"] = _flag(given, "use_wrench")
-    return {**chosen, "use_sim_time": _flag(given, "use_sim_time")}
+        chosen["use_wrench"] = read_flag(given, "use_wrench")
+    return {**chosen, "use_sim_time": read_flag(given, "use_sim_time")}
 
 
 class _Again:
@@ -233,7 +247,7 @@ class _Again:
     ) -> list[LaunchDescriptionEntity]:
         names, given = self._names, self._given
         gate = names == [GATE]
-        if context.is_shutdown or not (gate or _flag(given, "respawn")):
+        if context.is_shutdown or not (gate or read_flag(given, "respawn")):
             return []
         if event.returncode != REJECTED or time.monotonic() - self._began > SETTLED:
             again = _process(names, given)
@@ -248,10 +262,3 @@ class _Again:
         pause = RESPAWN_DELAY * 2**self._tries
         again = _process(names, given, self._tries + 1)
         return [TimerAction(period=pause, actions=[again])]
-
-
-def _flag(given: dict[str, str], name: str) -> bool:
-    value = given[name].lower()
-    if value not in ("true", "false"):
-        raise RuntimeError(f"{name}: {given[name]!r} is neither true nor false")
-    return value == "true"

@@ -8,7 +8,6 @@ publishes the transforms of all links. Without it machine_state publishes that o
 import tempfile
 from pathlib import Path
 
-from ament_index_python.packages import PackageNotFoundError, get_package_prefix
 from launch.actions import DeclareLaunchArgument, OpaqueFunction, RegisterEventHandler
 from launch.event_handlers import OnShutdown
 from launch.launch_context import LaunchContext
@@ -16,9 +15,15 @@ from launch.launch_description_entity import LaunchDescriptionEntity
 from launch_ros.actions import Node
 
 from launch import LaunchDescription
-from pkm_twin import load
 from pkm_twin.robot.robot_urdf import robot_urdf
 from pkm_twin.ros.arguments import check_launch_arguments
+from pkm_twin.ros.launching import (
+    LOG_LEVELS,
+    check_executables,
+    is_installed,
+    load_robot,
+    read_choice,
+)
 from pkm_twin.ros.signals import leave_interrupts_to_launch
 
 HERE = Path(__file__).parent
@@ -58,6 +63,15 @@ def view(context: LaunchContext) -> list[LaunchDescriptionEntity]:
     prefix = f"{namespace}/" if namespace else ""
     sim_time = {"use_sim_time": _wanted(given, "use_sim_time")}
     links = _wanted(given, "robot_state_publisher", "robot_state_publisher")
+    rviz = _wanted(given, "rviz", "rviz2")
+    read_choice(given, "log_level", LOG_LEVELS)
+    if given["params_file"] and not Path(given["params_file"]).is_file():
+        raise RuntimeError(f"params_file: {given['params_file']!r} is no file")
+    robot = load_robot(given["robot"])
+    programs = {"robot_state_publisher": links, "rviz2": rviz}
+    check_executables(
+        [("pkm_twin", "machine_state"), *((name, name) for name, on in programs.items() if on)]
+    )
     actions: list[LaunchDescriptionEntity] = [
         Node(
             package="pkm_twin",
@@ -91,7 +105,7 @@ def view(context: LaunchContext) -> list[LaunchDescriptionEntity]:
                 namespace=namespace,
                 parameters=[
                     {
-                        "robot_description": robot_urdf(load(given["robot"]), ""),
+                        "robot_description": robot_urdf(robot, ""),
                         "frame_prefix": prefix,
                         "publish_frequency": 100.0,
                         **sim_time,
@@ -101,7 +115,7 @@ def view(context: LaunchContext) -> list[LaunchDescriptionEntity]:
                 output="screen",
             )
         )
-    if _wanted(given, "rviz", "rviz2"):
+    if rviz:
         actions += _rviz(prefix, sim_time)
     return actions
 
@@ -138,11 +152,7 @@ def _share() -> Path:
 def _wanted(given: dict[str, str], name: str, package: str = "") -> bool:
     value = given[name].lower()
     if value == "auto" and package:
-        try:
-            get_package_prefix(package)
-        except PackageNotFoundError:
-            return False
-        return True
+        return is_installed(package)
     if value not in ("true", "false"):
         words = "true, false or auto" if package else "true or false"
         raise RuntimeError(f"{name}: {given[name]!r} is not {words}")
