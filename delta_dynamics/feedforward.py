@@ -3,15 +3,14 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator
 from dataclasses import dataclass, field
 from functools import partial
-from operator import gt
 from typing import Any, Final, Literal, NamedTuple
 
 import numpy as np
 
+from delta_dynamics.holding import MeasuredPose, find_holding_effort
 from delta_dynamics.torques.stiction import friction_reach, moving_rates
 from delta_dynamics.torques.virtual_work import inverse_dynamics
 from pkm_twin.codegen.arrays import Array
@@ -27,6 +26,7 @@ from pkm_twin.messages.reading import (
 )
 from pkm_twin.messages.stamps import SECOND, StampRules
 from pkm_twin.robot.derivatives import nearest_motion
+from pkm_twin.robot.effort_limits import NON_FINITE, EffortLimits, LimitedEfforts, LimitPolicy
 from pkm_twin.robot.limits import first_beyond
 from pkm_twin.robot.robot import Robot
 from pkm_twin.settings import COUNT, FUTURE, LATE, SECONDS, SHARE, ZERO_STAMP, setting
@@ -37,7 +37,6 @@ from pkm_twin.streams.monitor import Core, StreamMonitor, counting, finished
 from pkm_twin.streams.rates import RateAgreement
 from pkm_twin.streams.rest import RestWatch, fit_gain, gradient_gain, rate_doubt
 
-LimitPolicy = Literal["warn", "reject", "clamp"]
 OnStop = Literal["nothing", "zeros", "gravity"]
 
 
@@ -82,7 +81,9 @@ class Settings:
     )  # fmt: skip
     on_stop: OnStop = setting(
         "nothing",
-        "command sent once when the stream stops; with publish_commands not nothing",
+        "command sent once when the stream stops: nothing, zeros, or gravity (the effort against "
+        "gravity at the last accepted position, but zeros if that position is older than "
+        "stale_after or the effort exceeds effort_limits); with publish_commands not nothing",
         choices=("nothing", "zeros", "gravity"),
     )
     singularity_warn: float = setting(0.05, "warn below this singularity index", **SHARE)
@@ -115,8 +116,7 @@ class Settings:
         )
 
 
-OVERFLOW: Final = "non-finite result"
-STOPPING: Final = (OVERFLOW, "singular", "jump", "no wrench")
+STOPPING: Final = (NON_FINITE, "singular", "jump", "no wrench")
 """Reasons for which one sample stops the stream: it is none that the model describes."""
 SLICE: Final = 256
 """Points of a trajectory that are answered in one go."""
@@ -134,6 +134,9 @@ class Torques(NamedTuple):
     motion: tuple[Array, Array, Array]
     """q, qd, qdd, shape (n,) each."""
     effort: Array
+    """Within the limits, shape (n,), N m or N."""
+    sent: LimitedEfforts
+    """The same in the controller's numbers."""
     measured: Array | None
     saturated: bool
     wrench: Array | None = None
@@ -171,6 +174,9 @@ class Feedforward(Core):
         self._last_stamp = 0
         self._last_now = 0
         self._last_good: Array | None = None
+        self.limits = EffortLimits(self.robot)
+        self.pose: MeasuredPose | None = None
+        """Of the last accepted joint state."""
         self._memory: Memory | None = None
         """Of the drives' friction; None before the stream's first answer."""
         self.differentiator = _differentiator(s, self.robot)
@@ -187,6 +193,7 @@ class Feedforward(Core):
     def change_robot(self, robot: Robot) -> None:
         """Take a robot with another payload, gravity, friction or limits, between two samples."""
         self.robot = robot
+        self.limits = EffortLimits(robot)
         self._reach = friction_reach(robot)
         self._reader = JointReader(robot, extra_joints=self.settings.extra_joints)
         self._continuity.robot = robot
@@ -211,11 +218,14 @@ class Feedforward(Core):
                 self.wrenches.change_fit(settings.order, settings.window)
 
     def reset(self) -> None:
-        """Forget the stream, as when the clock jumps: no torque across the seam."""
-        self._last_stamp = 0
-        if self.wrenches is not None:
-            self.wrenches.clear()
-        self._begin_anew()
+        """Forget the stream and the pose, as when the clock jumps: no torque across the seam."""
+        self.pose = None
+        self._forget_stream()
+
+    def stop(self, reason: str, text: str) -> None:
+        """Stop the stream, which begins anew with the next sample."""
+        if self.stream.stop(reason, text):
+            self._forget_stream()
 
     def time_jumped_forward(self) -> None:
         """The clock jumped forward: what was fresh is stale, so a running stream stops."""
@@ -235,32 +245,37 @@ class Feedforward(Core):
             unknown &= memory.unknown > KNOWN
         return [n for n, one in zip(self.robot.joint_names, unknown, strict=True) if one]
 
-    def trajectory(self, message: Any, now: int) -> ControllerNumbers:
+    def trajectory(self, message: Any, now: int) -> LimitedEfforts:
         """The controller's efforts for every point, (points, n), in the message's joint order.
 
         :raises MessageError: the message is rejected, and counted.
         """
         return finished(self.trajectory_steps(message, now))
 
-    def trajectory_steps(self, message: Any, now: int) -> Generator[None, None, ControllerNumbers]:
+    def trajectory_steps(
+        self, message: Any, now: int, *, holding: bool = False
+    ) -> Generator[None, None, LimitedEfforts]:
         """As :meth:`trajectory`, some points at a time: it yields between them.
 
         The robot and the settings are those of the beginning.
 
+        :param holding: the points stop the machine: as in :meth:`stop_effort`, efforts are zeros
+            at a point where one exceeds a limit.
         :returns: the generator's value, the efforts.
         """
         with self.refusing(self.trajectories):
-            efforts = yield from self._trajectory_steps(message, now)
+            efforts = yield from self._trajectory_steps(message, now, holding)
         self.trajectories.accept()
         return efforts
 
-    def joint_state(self, message: Any, now: int) -> Torques | None:
+    def joint_state(self, message: Any, now: int, steady: int | None = None) -> Torques | None:
         """Efforts for one joint state, or None while the window fills or a stop is latched.
 
+        :param now: the ROS clock, ns. ``steady``: the steady clock, ns; by default the same.
         :raises MessageError: the message is rejected, and counted.
         """
         with self.refusing(self.stream):
-            torques = self._joint_state(message, now)
+            torques = self._joint_state(message, now, now if steady is None else steady)
         if torques is None or not self.stream.accept():
             return None
         self.saturations += torques.saturated
@@ -272,7 +287,7 @@ class Feedforward(Core):
         A trajectory stops it where its input was finite: the model cannot be trusted then.
         """
         super().refuse(counts, error)
-        if error.reason in (STOPPING if counts is self.stream else (OVERFLOW,)):
+        if error.reason in (STOPPING if counts is self.stream else (NON_FINITE,)):
             self.stream.stop(error.reason, str(error))
 
     def check_age(self, torques: Torques, now: int) -> None:
@@ -289,17 +304,20 @@ class Feedforward(Core):
                     f"{self.settings.stale_after:g} s",
                 )
 
-    def stop_effort(self) -> Array | None:
-        """What is sent once on entering a stop, by the setting ``on_stop``; None is nothing."""
+    def stop_effort(self, steady: int) -> LimitedEfforts | None:
+        """Return what is sent once on entering a stop, by the setting ``on_stop``; None is nothing.
+
+        :param steady: the steady clock, ns: gravity is that of a pose within ``stale_after``.
+        """
         if self.settings.on_stop == "nothing":
             return None
-        zero = np.zeros(len(self.robot.joint_names))
-        if self.settings.on_stop == "zeros" or self._last_good is None:
-            return zero
-        return inverse_dynamics(self.robot, self._last_good, zero, zero)
+        pose = self.pose if self.settings.on_stop == "gravity" else None
+        return find_holding_effort(self.limits, pose, steady, self.settings.stale_after)
 
-    def _trajectory_steps(self, message: Any, now: int) -> Generator[None, None, ControllerNumbers]:
-        robot, settings, reader = self.robot, self.settings, self._reader
+    def _trajectory_steps(
+        self, message: Any, now: int, holding: bool
+    ) -> Generator[None, None, LimitedEfforts]:
+        robot, settings, reader, limits = self.robot, self.settings, self._reader, self.limits
         t = reader.trajectory(message, now)
         yield
         qd, qdd = _derivatives(t, settings.differentiate)
@@ -322,19 +340,16 @@ class Feedforward(Core):
                 raise MessageError("limit", f"{where} {text}")
             self._check_singularity(_of_points(first, robot.singularity, q), first)
             solved = _of_points(first, inverse_dynamics, robot, q, qd[part], qdd[part])
-            efforts[part], beyond = _gate(robot, settings.limit_policy, solved)
+            efforts[part], beyond = limits.apply(
+                robot.controller.controller_efforts(solved),
+                "zeros" if holding else settings.limit_policy,
+            )
             saturated |= beyond
         self.saturations += saturated
-        return self._for_joints(efforts, t.columns)
-
-    def sent(self, effort: Array) -> ControllerNumbers:
-        """Efforts of the model, shape (..., n), in the controller's numbers."""
-        return self.robot.controller.controller_efforts(effort)
-
-    def _for_joints(self, efforts: Array, columns: Sequence[int]) -> ControllerNumbers:
-        """Efforts (p, n) in a message's order, zero for joints that the model lacks."""
-        padded = np.hstack([self.sent(efforts), np.zeros((len(efforts), 1))])
-        return ControllerNumbers(np.ascontiguousarray(padded[:, columns]))
+        # In the message's order, zero for joints that the model lacks.
+        padded = np.hstack([efforts, np.zeros((len(efforts), 1))])
+        ordered = ControllerNumbers(np.ascontiguousarray(padded[:, t.columns]))
+        return LimitedEfforts(ordered)
 
     def _check_singularity(self, measures: Array, first: int) -> None:
         """Points of a trajectory from ``first`` on, shape (points,)."""
@@ -348,6 +363,12 @@ class Feedforward(Core):
                 f"{measures[worst]:.3g}, allowed {stop:g} or more (singularity_stop)",
             )
         self.near_singularities += int((measures < self.settings.singularity_warn).sum())
+
+    def _forget_stream(self) -> None:
+        self._last_stamp = 0
+        if self.wrenches is not None:
+            self.wrenches.clear()
+        self._begin_anew()
 
     def _begin_anew(self) -> None:
         self.near_singular = False
@@ -371,7 +392,7 @@ class Feedforward(Core):
             self.reset()
         self._last_now = now
 
-    def _joint_state(self, message: Any, now: int) -> Torques | None:
+    def _joint_state(self, message: Any, now: int, steady: int) -> Torques | None:
         """A refused sample leaves nothing behind that the next one is judged by."""
         self._take_time(now)
         sample = self._reader.joint_state(message, now, self._rules)
@@ -413,7 +434,12 @@ class Feedforward(Core):
                     inverse_dynamics, self.robot, sample.q, sure, change, external
                 )
                 memory, added = self._remembered(sample.q, sure)
-                effort, saturated = _gate(self.robot, self.settings.limit_policy, solved + added)
+                controller, effort = self.robot.controller, solved + added
+                sent, saturated = self.limits.apply(
+                    controller.controller_efforts(effort), self.settings.limit_policy
+                )
+                if saturated:
+                    effort = controller.efforts(sent)
         except MessageError:
             self.differentiator.retract()
             self._rest.retract()
@@ -422,6 +448,7 @@ class Feedforward(Core):
             self._continuity.retract()
             raise
         self._last_stamp = sample.stamp
+        self.pose = MeasuredPose.from_sample(sample.q, sample.stamp, now, steady)
         if sample.qd is not None:
             self.rates.push(sample.stamp, sample.q, sample.qd)
         self.near_singular = near_singular
@@ -429,7 +456,9 @@ class Feedforward(Core):
         if rates is None:
             return None
         self._last_good, self._memory = sample.q, memory
-        return Torques(sample.stamp, motion, effort, measured, saturated, external, doubt, added)
+        return Torques(
+            sample.stamp, motion, effort, sent, measured, saturated, external, doubt, added
+        )
 
     def _remembered(self, q: Array, rates: Array) -> tuple[Memory | None, Array | float]:
         """Friction's memory with a sample more, and what it adds to the efforts, (n,)."""
@@ -509,41 +538,6 @@ def _of_points(first: int, call: Callable[..., Any], *arguments: Any) -> Any:
         if first == 0:
             raise
         raise MessageError(error.reason, f"in the points from point {first} on: {error}") from error
-
-
-def _gate(robot: Robot, policy: LimitPolicy, effort: Array) -> tuple[Array, bool]:
-    """Effort limits by the declared policy, between two checks for finite values.
-
-    The first one keeps a clamp from making a limit of an infinity.
-    """
-    _require_finite(effort)
-    limits = robot.limits.effort
-    if limits is None or not _beyond(effort, limits):
-        return effort, False
-    if policy == "reject":
-        worst = np.unravel_index(np.argmax(np.abs(effort) / limits), effort.shape)
-        joint = int(worst[-1])
-        raise MessageError(
-            "effort limit",
-            f"effort of {robot.joint_names[joint]} is {effort[worst]:g}, allowed {limits[joint]:g}",
-        )
-    if policy == "clamp":
-        effort = np.clip(effort, -limits, limits)
-        _require_finite(effort)
-    return effort, True
-
-
-def _require_finite(effort: Array) -> None:
-    one = effort.ndim == 1
-    if not (all(map(math.isfinite, effort.tolist())) if one else np.isfinite(effort).all()):
-        raise MessageError(OVERFLOW, "the model gave a value that is not finite")
-
-
-def _beyond(effort: Array, limits: Array) -> bool:
-    """Whether an effort passes its limit; one sample, the stream's case, without numpy."""
-    if effort.ndim == 1:
-        return any(map(gt, map(abs, effort.tolist()), limits.tolist()))
-    return bool((np.abs(effort) > limits).any())
 
 
 def _derivatives(t: Trajectory, differentiate: bool) -> tuple[Array, Array]:

@@ -11,14 +11,11 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any, Final, Literal
 
-import numpy as np
-
-from delta_dynamics.torques.virtual_work import inverse_dynamics
-from pkm_twin.codegen.arrays import Array
-from pkm_twin.errors import MessageError, PkmTwinError
-from pkm_twin.machine.joint_map import ControllerNumbers
+from delta_dynamics.holding import MeasuredPose, find_holding_effort
+from pkm_twin.errors import MessageError
 from pkm_twin.messages.reading import JointReader
 from pkm_twin.messages.stamps import SECOND, StampRules
+from pkm_twin.robot.effort_limits import EffortLimits, LimitedEfforts
 from pkm_twin.robot.robot import Robot
 from pkm_twin.settings import COUNT, FUTURE, LATE, SECONDS, setting
 from pkm_twin.streams.monitor import Core, StreamMonitor, counting
@@ -72,24 +69,24 @@ class Gate(Core):
             max_age=round(s.deadline * SECOND),
         )
         self._reader = JointReader(self.robot)
-        self._limits = _sent_limits(self.robot)
+        self._limits = EffortLimits(self.robot)
         self._last_stamp = 0
         self._last_arrival = 0
-        self._state: tuple[int, Array] | None = None
+        self._pose: MeasuredPose | None = None
 
     def change_robot(self, robot: Robot) -> None:
         """Take a robot with another payload, gravity or limits, between two messages."""
         self.robot = robot
         self._reader = JointReader(robot)
-        self._limits = _sent_limits(robot)
+        self._limits = EffortLimits(robot)
 
     def reset(self) -> None:
         """The clock jumped: stamps of before say nothing about those to come."""
         self.stream.stop("clock jump", "the clock jumped")
         self._last_stamp = 0
-        self._state = None
+        self._pose = None
 
-    def torques(self, message: Any, now: int, steady: int) -> ControllerNumbers | None:
+    def torques(self, message: Any, now: int, steady: int) -> LimitedEfforts | None:
         """The command for one message of stamped torques, shape (n,), or None while closed.
 
         The numbers are those of the message, bit by bit, in the robot's joint order.
@@ -102,10 +99,11 @@ class Gate(Core):
         self.watch(steady)
         with self.refusing(self.stream):
             sample = self._reader.efforts(message, now, self._rules)
-            self._check(sample.stamp, sample.given)
+            self._check_order(sample.stamp)
+            efforts, _ = self._limits.apply(sample.given, "reject")
         self._last_stamp = sample.stamp
         self._last_arrival = steady
-        return sample.given if self.stream.accept() else None
+        return efforts if self.stream.accept() else None
 
     def joint_state(self, message: Any, now: int, steady: int) -> None:
         """Keep where the robot stands: gravity is that of a measured state, never of a guess.
@@ -113,8 +111,8 @@ class Gate(Core):
         :raises MessageError: the message is rejected, and counted.
         """
         with self.taking(self.states):
-            q = self._reader.joint_state(message, now, self._rules).q
-        self._state = steady, q
+            sample = self._reader.joint_state(message, now, self._rules)
+        self._pose = MeasuredPose.from_sample(sample.q, sample.stamp, now, steady)
 
     def watch(self, steady: int) -> None:
         """Close the gate where the torques have gone silent."""
@@ -122,58 +120,19 @@ class Gate(Core):
         if not self.stream.stopped and silent > self.settings.deadline:
             self.stream.stop("stale torques", f"no torque for {silent:.3f} s")
 
-    def stop_command(self, steady: int) -> ControllerNumbers:
+    def stop_command(self, steady: int) -> LimitedEfforts:
         """What is sent while the gate is closed, shape (n,): zeros, or what bears the weight.
 
-        In the controller's numbers.
-
-        Gravity needs a joint state within the deadline, a pose that the model has an answer
-        for, and an answer within the effort limits; without these it is zeros.
+        Gravity needs a pose measured within the deadline, an answer of the model for it, and an
+        answer within the effort limits; without these it is zeros.
         """
-        rest = np.zeros(self.robot.joints_count)
-        zeros = ControllerNumbers(rest)
-        if self.settings.on_stop == "zeros" or self._state is None:
-            return zeros
-        measured, q = self._state
-        if steady - measured > self.settings.deadline * SECOND:
-            return zeros
-        try:
-            effort = inverse_dynamics(self.robot, q, rest, rest)
-        except (PkmTwinError, ValueError):
-            return zeros
-        command = self.robot.controller.controller_efforts(effort)
-        return zeros if self._beyond(command) is not None else command
+        pose = self._pose if self.settings.on_stop == "gravity" else None
+        return find_holding_effort(self._limits, pose, steady, self.settings.deadline)
 
-    def _check(self, stamp: int, effort: ControllerNumbers) -> None:
+    def _check_order(self, stamp: int) -> None:
         if stamp <= self._last_stamp:
             behind = (self._last_stamp - stamp) / SECOND
             # Those after it are judged by it: a stop's torque is stamped later than the states are
             # that the next ones answer. Of two that take turns every other one is still behind.
             self._last_stamp = stamp
             raise MessageError("stamp order", f"the stamp is {behind:.6f} s before the last")
-        joint = self._beyond(effort)
-        if joint is not None:
-            raise MessageError(
-                "effort limit",
-                f"effort of {self.robot.controller.names[joint]} is {effort[joint]:g}, "
-                f"allowed {self._limits[joint]:g}",
-            )
-
-    def _beyond(self, effort: ControllerNumbers) -> int | None:
-        """The first joint whose effort is not finite or passes its limit."""
-        bad = ~(np.isfinite(effort) & (np.abs(effort) <= self._limits))
-        return int(bad.argmax()) if bad.any() else None
-
-
-def effort_limits(robot: Robot) -> Array:
-    """The robot's effort limits, shape (n,), infinite where it has none."""
-    efforts = getattr(getattr(robot, "limits", None), "effort", None)
-    return np.full(len(robot.joint_names), np.inf) if efforts is None else np.asarray(efforts)
-
-
-def _sent_limits(robot: Robot) -> Array:
-    """The same in the controller's numbers.
-
-    Converted as the torques are: one that was clamped to its limit does not pass it by rounding.
-    """
-    return np.abs(robot.controller.controller_efforts(effort_limits(robot)))

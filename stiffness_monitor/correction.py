@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 
 from pkm_twin.codegen.arrays import Array, Mask, doubles, finite, vectors
 from pkm_twin.machine.rotations import skew
+from pkm_twin.messages.stamps import SECOND
 from pkm_twin.robot.robot import Robot
 
 REACH: Final = 0.02
@@ -85,6 +86,48 @@ def setpoint_correction(
     return Correction(
         finite(given * share[..., None], cause), before, finite(left, cause), excess > 1.0
     )
+
+
+@dataclass
+class SetpointStream:
+    """Adds offsets to a stream of set points, within position limits and a rate.
+
+    ``rate``: largest rate of an offset, rad/s or m/s. ``max_elapsed``: longest time between two set
+    points for which the offset moves, s: a pause earns no jump.
+    """
+
+    robot: Robot
+    rate: float
+    max_elapsed: float
+    at_limit: int = 0
+    """Set points that a position limit bounded."""
+    at_rate: int = 0
+    """Set points whose offset the rate bounded."""
+    _last: tuple[int, Array] | None = field(default=None, init=False)
+    """Stamp of the last set point, ns, and its offset, shape (n,)."""
+
+    def correct(self, stamp: int, setpoint: Array, offset: Array) -> Array:
+        """Return the corrected set point, shape (n,), rad or m.
+
+        Each joint is bounded by itself: a common factor would change the offsets of all joints at
+        once where one reaches its limit.
+
+        :param stamp: of the set point, ns. ``offset``: of the last wrench, shape (n,), rad or m.
+        """
+        if self._last is not None:
+            before, current = self._last
+            elapsed = min(max(stamp - before, 0) / SECOND, self.max_elapsed)
+            step = np.clip(offset - current, -self.rate * elapsed, self.rate * elapsed)
+            self.at_rate += bool((current + step != offset).any())
+            offset = current + step
+        self._last = stamp, offset
+        corrected = setpoint + offset
+        limits = self.robot.limits.position
+        if limits is not None:
+            within = np.clip(corrected, limits[:, 0], limits[:, 1])
+            self.at_limit += bool((within != corrected).any())
+            corrected = within
+        return finite(corrected, "the corrected set point")
 
 
 def _least(matrix: Array, target: Array, best: Array) -> tuple[Array, Array]:

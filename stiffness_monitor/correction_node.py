@@ -6,6 +6,7 @@ Only the node ``stiffness_monitor`` imports this module.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -15,12 +16,13 @@ from pkm_twin.errors import MessageError, ParameterError
 from pkm_twin.messages.fast_decoder import JointStateView
 from pkm_twin.messages.reading import JointReader
 from pkm_twin.messages.stamps import SECOND, StampRules
+from pkm_twin.robot.effort_limits import EffortLimits
 from pkm_twin.robot.robot import Robot
 from pkm_twin.ros.joints import JointPublisher
 from pkm_twin.ros.node import TwinNode
 from pkm_twin.ros.wrench import triple
 from pkm_twin.streams.monitor import Core, counting
-from stiffness_monitor.correction import setpoint_correction
+from stiffness_monitor.correction import SetpointStream, setpoint_correction
 from stiffness_monitor.monitor import Answer
 
 MAX_BOUND = 1.0
@@ -41,7 +43,8 @@ class SetpointCorrection(Core):
 
         :param rules: what the stamps of set points have to keep to.
         """
-        self._node, self._robot, self._rules = node, robot, rules
+        self._node, self._robot = node, robot
+        self._limits = EffortLimits(robot)
         self._reader = JointReader(robot)
         self._offset: tuple[int, Any] | None = None
         self.bounded = 0
@@ -71,11 +74,26 @@ class SetpointCorrection(Core):
         self._age = node.declare(
             "correction_age",
             0.1,
-            "largest time from a wrench to the setpoint that it corrects",
+            "largest time from a wrench to the setpoint that it corrects, and largest age of "
+            "setpoints and torques",
             unit="s",
             low=0.0,
             high=3600.0,
         )
+        self._stream = SetpointStream(
+            robot,
+            node.declare(
+                "correction_rate",
+                0.01,
+                "largest rate of the offset from one corrected setpoint to the next: the default "
+                "reaches the default correction_bound in 0.1 s",
+                unit="rad/s or m/s",
+                low=1e-6,
+                high=MAX_BOUND,
+            ),
+            max_elapsed=self._age,
+        )
+        self.change_rules(rules)
         paired = node.declare(
             "pair_torques",
             False,
@@ -108,8 +126,12 @@ class SetpointCorrection(Core):
         self._waiting.clear()
 
     def change_rules(self, rules: StampRules) -> None:
-        """Judge stamps by other rules from the next set point on."""
-        self._rules = rules
+        """Judge stamps by other rules from the next set point on.
+
+        What is older than ``correction_age`` is rejected: after a suspension of the process the
+        machine is elsewhere.
+        """
+        self._rules = replace(rules, max_age=round(self._age * SECOND))
 
     def take(self, answer: Answer) -> None:
         """What a wrench did: how the joints undo it."""
@@ -132,7 +154,11 @@ class SetpointCorrection(Core):
         """Values of the node's diagnostic status."""
         if not self.wanted:
             return {}
-        values: dict[str, object] = {"corrections at their bound": self.bounded}
+        values: dict[str, object] = {
+            "corrections at their bound": self.bounded,
+            "set points at a position limit": self._stream.at_limit,
+            "set points at correction_rate": self._stream.at_rate,
+        }
         if self._paired:
             values["set points and torques without a pair"] = self.unpaired
         return values | self.setpoints.counts("set points", "corrected")
@@ -144,22 +170,24 @@ class SetpointCorrection(Core):
     def _correct(self, message: JointStateView) -> None:
         sample = self._reader.positions(message, self._node.now(), self._rules)
         if self._offset is None:
-            raise MessageError("no wrench", "no wrench to compute a correction from has arrived")
+            raise MessageError("no wrench", "none to compute a correction from has arrived")
         stamp, offset = self._offset
         age = abs(sample.stamp - stamp) / SECOND
         if age > self._age:
             raise MessageError(
                 "no wrench",
-                f"the last wrench is {age:.3f} s old, allowed {self._age:g} s",
+                f"the last one is {age:.3f} s from the set point, allowed {self._age:g} s",
             )
-        corrected = self._robot.controller.controller_positions(sample.q + offset)
+        position = self._stream.correct(sample.stamp, sample.q, offset)
+        corrected = self._robot.controller.controller_positions(position)
         self._corrected.publish(sample.stamp, corrected)
         if self._paired:
             self._pair(sample.stamp, "position", corrected)
 
     def _on_torques(self, message: JointStateView) -> None:
         sample = self._reader.efforts(message, self._node.now(), self._rules)
-        self._pair(sample.stamp, "effort", sample.given)
+        efforts, _ = self._limits.apply(sample.given, "reject")
+        self._pair(sample.stamp, "effort", efforts)
 
     def _pair(self, stamp: int, what: str, numbers: Any) -> None:
         """Publish both of a stamp, or keep one until the other arrives; the newest counts."""

@@ -31,7 +31,10 @@ STIFFNESS: Final = table(
     Topic("in", "setpoint", JOINTS, "commanded positions", _CORRECTED),
     Topic("out", "~/setpoint_offset", JOINTS,
           "offsets for the joints' setpoints that keep the tool point in place", _CORRECTED),
-    Topic("out", "~/corrected_setpoint", JOINTS, "`setpoint` with the last offset", _CORRECTED),
+    Topic("out", "~/corrected_setpoint", JOINTS,
+          "`setpoint` with the last offset, which moves at most at `correction_rate`, bounded at "
+          "the joints' position limits",
+          _CORRECTED),
     Topic("in", "torques", JOINTS, "efforts, as `~/joint_torques` of `delta_dynamics`",
           "`pair_torques`"),
     Topic("out", "~/setpoint_with_torques", JOINTS,

@@ -7,6 +7,7 @@ Motion planners send this action, not the trajectory's topic. Needs control_msgs
 
 from __future__ import annotations
 
+import math
 import os
 import time
 from collections.abc import Callable, Generator, Mapping, Sequence
@@ -22,11 +23,13 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from delta_dynamics.feedforward import SLICE
 from pkm_twin.errors import MessageError
+from pkm_twin.messages.stamps import SECOND
+from pkm_twin.robot.effort_limits import LimitedEfforts
 from pkm_twin.ros.node import TwinNode
 from pkm_twin.ros.turns import Task
 from pkm_twin.streams.monitor import finished
 
-Efforts = Callable[[Any], Generator[None, None, "np.ndarray[Any, Any]"]]
+Efforts = Callable[[Any], Generator[None, None, LimitedEfforts]]
 Place = Callable[[], "Mapping[str, float] | None"]
 Result = FollowJointTrajectory.Result
 
@@ -61,6 +64,8 @@ class _Goal:
     """The client's handle of it, once the controller has accepted it."""
     actual: dict[str, float] = field(default_factory=dict)
     """Joint positions of the newest feedback, by name."""
+    measured: float = -math.inf
+    """When they were measured, on the steady clock, s."""
     held: bool = False
     asked: bool = False
 
@@ -93,7 +98,15 @@ class EffortAction:
     """
 
     def __init__(
-        self, node: TwinNode, controller: str, efforts: Efforts, place: Place, hold: bool
+        self,
+        node: TwinNode,
+        controller: str,
+        efforts: Efforts,
+        place: Place,
+        hold: bool,
+        *,
+        hold_efforts: Efforts | None = None,
+        max_age: Callable[[], float] = lambda: math.inf,
     ) -> None:
         """Serve ``~/follow_joint_trajectory``.
 
@@ -102,10 +115,12 @@ class EffortAction:
             steps; raises MessageError.
         :param place: where the joints are now, by name, in the controller's numbers; None where
             that is not known.
-        :param hold: whether hold points are sent.
+        :param hold: whether hold points are sent. ``hold_efforts``: as ``efforts``, for them.
+        :param max_age: of the controller's feedback where ``place`` knows nothing, s.
         """
         self._node, self._controller, self._efforts = node, controller, efforts
-        self._place, self._hold = place, hold
+        self._place, self._max_age, self._hold = place, max_age, hold
+        self._hold_efforts = hold_efforts or efforts
         self._client = ActionClient(node, FollowJointTrajectory, controller)
         self._ping = node.create_client(CancelGoal, f"{controller}/_action/cancel_goal")
         self._goals: dict[bytes, _Goal] = {}
@@ -203,7 +218,6 @@ class EffortAction:
                 yield from self._fill(goal)
             except MessageError as error:
                 refused(error)
-                raise
 
         try:
             self._node.defer(NAME, steps())
@@ -238,6 +252,9 @@ class EffortAction:
             self._lives()
             told = message.feedback
             goal.actual = dict(zip(told.joint_names, told.actual.positions, strict=False))
+            stamp = told.header.stamp.sec * SECOND + told.header.stamp.nanosec
+            age = max(0, self._node.now() - stamp) / SECOND if stamp else 0.0
+            goal.measured = time.monotonic() - age
             if _key(goal.handle) in self._goals:
                 goal.handle.publish_feedback(told)
 
@@ -314,7 +331,9 @@ class EffortAction:
         """
         names = list(goal.handle.request.trajectory.joint_names)
         goal.held = True
-        return self._send_point(names, {**goal.actual, **(self._place() or {})}, then)
+        fresh = time.monotonic() - goal.measured <= self._max_age()
+        place = {**(goal.actual if fresh else {}), **(self._place() or {})}
+        return self._send_point(names, place, then)
 
     def _send_point(
         self, names: Sequence[str], place: Mapping[str, float], then: Callable[[Any], None]
@@ -326,7 +345,7 @@ class EffortAction:
             zeros = [0.0] * len(names)
             point = JointTrajectoryPoint(positions=positions, velocities=zeros, accelerations=zeros)
             trajectory = JointTrajectory(joint_names=names, points=[point])
-            point.effort = finished(self._efforts(trajectory))[0].tolist()
+            point.effort = finished(self._hold_efforts(trajectory))[0].tolist()
         except KeyError as error:
             self._node.log_throttled("hold", f"{NAME}: no hold point: {error} was not measured")
             return False

@@ -11,18 +11,17 @@ from functools import partial
 from typing import Final
 
 import numpy as np
-from rclpy.duration import Duration
 
 from delta_dynamics.gate import Gate, GateSettings
 from delta_dynamics.nodes.parameters import changed, declare_changes
 from delta_dynamics.nodes.topics import GATE
 from delta_dynamics.torques.virtual_work import inverse_dynamics
 from pkm_twin.errors import MessageError
-from pkm_twin.machine.joint_map import ControllerNumbers
 from pkm_twin.messages.fast_decoder import JointStateView
 from pkm_twin.messages.stamps import SECOND
+from pkm_twin.robot.effort_limits import LimitedEfforts
 from pkm_twin.ros import health
-from pkm_twin.ros.joints import CommandPublisher, JointPublisher
+from pkm_twin.ros.joints import EffortPublisher
 from pkm_twin.ros.node import TwinNode
 from pkm_twin.ros.run import run
 
@@ -49,9 +48,8 @@ class CommandGate(TwinNode):
         settings = self.declare_settings(GateSettings, fixed=True)
         self.core = Gate(robot, settings)
         self._closed = True
-        self._commands = CommandPublisher(self, robot, "~/commands")
-        # The same with names and a stamp, for recordings and plots.
-        self._stamped = JointPublisher(self, robot, "~/commands_stamped")
+        # With names and a stamp for recordings and plots.
+        self._commands = EffortPublisher(self, robot, "~/commands_stamped", "~/commands")
         self._declare_robot(settings)
         self.create_guarded_subscription(
             TORQUES,
@@ -102,7 +100,7 @@ class CommandGate(TwinNode):
     def shutdown(self) -> None:
         """As deactivated; and the controller has it before the process ends."""
         super().shutdown()
-        self._commands.publisher.wait_for_all_acked(Duration(seconds=LAST_WORD))
+        self._commands.wait_for_controllers(LAST_WORD)
 
     def reset_stop(self) -> str:
         """Open without waiting for good torques."""
@@ -122,7 +120,7 @@ class CommandGate(TwinNode):
         stream = self.core.stream
         return {
             "open": not stream.stopped,
-            "controllers": self._commands.publisher.get_subscription_count(),
+            "controllers": self._commands.controllers,
             **stream.counts("torques", "forwarded"),
             **self.core.states.counts("joint states"),
             **{f"closed: {k}": v for k, v in stream.stops.items()},
@@ -195,9 +193,8 @@ class CommandGate(TwinNode):
         else:
             self.get_logger().info("open: torques are forwarded")
 
-    def _send(self, command: ControllerNumbers) -> None:
-        self._commands.publish(command)
-        self._stamped.publish(self.now(), command)
+    def _send(self, command: LimitedEfforts) -> None:
+        self._commands.publish(self.now(), command)
 
 
 NODE = CommandGate

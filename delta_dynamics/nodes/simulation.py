@@ -17,7 +17,6 @@ from rosgraph_msgs.msg import Clock
 from std_msgs.msg import Float64MultiArray
 
 from delta_dynamics.feedforward import warm_up
-from delta_dynamics.gate import effort_limits
 from delta_dynamics.nodes.topics import SIMULATION
 from delta_dynamics.simulation.machine import (
     MachineSettings,
@@ -31,6 +30,7 @@ from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import MessageError, ParameterError, short
 from pkm_twin.messages.fast_decoder import DoublesTemplate, RawTrajectory
 from pkm_twin.messages.stamps import SECOND
+from pkm_twin.robot.effort_limits import effort_limits
 from pkm_twin.robot.robot import Robot
 from pkm_twin.robot.variation import KINDS, MAX_SPREAD, Variation, varied
 from pkm_twin.ros import health

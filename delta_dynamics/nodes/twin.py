@@ -11,7 +11,6 @@ from typing import Any, Final
 
 import numpy as np
 from geometry_msgs.msg import WrenchStamped
-from rclpy.duration import Duration
 
 from delta_dynamics.feedforward import Feedforward, Settings, Torques, warm_up
 from delta_dynamics.nodes.estimates import Estimates
@@ -23,7 +22,7 @@ from pkm_twin.messages.fast_decoder import JointStateView, RawTrajectory
 from pkm_twin.messages.stamps import SECOND
 from pkm_twin.robot.robot import Robot
 from pkm_twin.ros import health
-from pkm_twin.ros.joints import CommandPublisher, JointPublisher, wrench_stamped
+from pkm_twin.ros.joints import EffortPublisher, JointPublisher, wrench_stamped
 from pkm_twin.ros.node import TwinNode
 from pkm_twin.ros.run import run
 from pkm_twin.ros.turns import Task
@@ -61,11 +60,10 @@ class DeltaDynamics(TwinNode):
         self._trajectory = self.create_guarded_publisher("~/joint_trajectory_ff")
         # A torque is worth nothing once the stream that it answers would be stale.
         stale_after = self.core.settings.stale_after
-        self._torques = JointPublisher(self, robot, "~/joint_torques", expiry=stale_after)
-        self._residual = JointPublisher(self, robot, "~/torque_residual")
-        self._commands = (
-            CommandPublisher(self, robot, "~/commands", stale_after) if commands else None
+        self._torques = EffortPublisher(
+            self, robot, "~/joint_torques", "~/commands", stale_after, with_plain=bool(commands)
         )
+        self._residual = JointPublisher(self, robot, "~/torque_residual")
         self._reactions = self._create_reaction_publishers(robot)
         self._estimates = Estimates(self, lambda: self.core.robot, (self._base_frame, "platform"))
         self.core.uncertain = self._estimates.wanted
@@ -126,8 +124,7 @@ class DeltaDynamics(TwinNode):
         if self._action is not None:
             self._action.shutdown()
         super().shutdown()
-        if self._commands is not None:
-            self._commands.publisher.wait_for_all_acked(Duration(seconds=LAST_WORD))
+        self._torques.wait_for_controllers(LAST_WORD)
 
     @property
     def shutting_down(self) -> bool:
@@ -233,11 +230,16 @@ class DeltaDynamics(TwinNode):
             lambda trajectory: self.core.trajectory_steps(trajectory, self.now()),
             self._place,
             hold == "hold",
+            hold_efforts=lambda trajectory: self.core.trajectory_steps(
+                trajectory, self.now(), holding=True
+            ),
+            max_age=lambda: self.core.settings.stale_after,
         )
 
     def _place(self) -> dict[str, float] | None:
         """Where the joints are, by the controller's names and numbers; None where not measured."""
-        if self._accepted is None or self._silence() > self.core.settings.stale_after:
+        pose, stale_after = self.core.pose, self.core.settings.stale_after
+        if self._accepted is None or pose is None or pose.age(time.monotonic_ns()) > stale_after:
             return None
         state = self._accepted[1]
         return dict(zip(state.name, map(float, state.position), strict=True))
@@ -343,7 +345,7 @@ class DeltaDynamics(TwinNode):
     def _on_joint_state(self, message: JointStateView) -> None:
         core, came = self.core, time.monotonic_ns()
         with self._telling_stop():
-            torques = core.joint_state(message, self.now())
+            torques = core.joint_state(message, self.now(), came)
             if torques is not None:
                 # The process may have stood still since.
                 core.check_age(torques, self.now())
@@ -351,13 +353,11 @@ class DeltaDynamics(TwinNode):
             self._accepted = came, message
             if torques is None:
                 return
-        effort = core.sent(torques.effort)
-        self._torques.publish(torques.stamp, effort)
+        self._torques.publish(torques.stamp, torques.sent)
         residual = torques.residual
         if residual is not None:
-            self._residual.publish(torques.stamp, core.sent(residual))
-        if self._commands is not None:
-            self._commands.publish(effort)
+            own = core.robot.controller
+            self._residual.publish(torques.stamp, own.controller_efforts(residual))
         for tell in (self._estimates.take, self._tell_reactions):
             try:
                 tell(torques)
@@ -392,19 +392,15 @@ class DeltaDynamics(TwinNode):
 
     def _stop(self, reason: str, text: str) -> None:
         with self._telling_stop():
-            if self.core.stream.stop(reason, text):
-                self.core.reset()
+            self.core.stop(reason, text)
 
     def _send_stop(self) -> None:
         core = self.core
         self.log_throttled("stop", f"stopped: {core.stream.status}")
-        model = core.stop_effort()
-        if model is None:
-            return
-        effort = core.sent(model)
-        self._torques.publish(self.now(), effort)
-        if self._commands is not None:
-            self._commands.publish(effort)
+        stamp = self.now()
+        effort = core.stop_effort(time.monotonic_ns())
+        if effort is not None:
+            self._torques.publish(stamp, effort)
 
     def _prepare(self, values: dict[str, Any]) -> tuple[Robot, Settings]:
         """The robot and the settings with new values of parameters."""

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from geometry_msgs.msg import Vector3, Wrench, WrenchStamped
+from rclpy.duration import Duration
 from rclpy.time import Time
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Header
@@ -23,6 +24,7 @@ from pkm_twin.codegen.arrays import Array
 from pkm_twin.machine.joint_map import ControllerNumbers
 from pkm_twin.messages.fast_decoder import DoublesTemplate
 from pkm_twin.messages.stamps import SECOND
+from pkm_twin.robot.effort_limits import LimitedEfforts
 from pkm_twin.robot.robot import Robot
 
 if TYPE_CHECKING:
@@ -93,19 +95,48 @@ class JointPublisher:
         self._publisher.publish(self._template.fill(row, divmod(stamp, SECOND)))
 
 
-class CommandPublisher:
-    """Publishes std_msgs/Float64MultiArray, a number a joint, as effort controllers take it."""
+class EffortPublisher:
+    """Publishes efforts with names and a stamp, and as plain numbers for effort controllers.
+
+    Efforts leave a node through this class alone. It takes
+    :data:`~pkm_twin.robot.effort_limits.LimitedEfforts`, which only the limits make.
+    """
 
     def __init__(
-        self, node: TwinNode, robot: Robot, topic: str, expiry: float | None = None
+        self,
+        node: TwinNode,
+        robot: Robot,
+        stamped: str,
+        plain: str,
+        expiry: float | None = None,
+        *,
+        with_plain: bool = True,
     ) -> None:
-        """Create the topic; ``expiry`` as of ``create_guarded_publisher``, s."""
-        self.publisher = node.create_guarded_publisher(topic, expiry)
+        """Create the topics.
+
+        :param stamped: topic of sensor_msgs/JointState; ``plain``: topic of
+            std_msgs/Float64MultiArray, a number a joint, created where ``with_plain`` is true.
+        :param expiry: as of ``create_guarded_publisher``, s.
+        """
+        self._stamped = JointPublisher(node, robot, stamped, expiry=expiry)
+        self._plain = node.create_guarded_publisher(plain, expiry) if with_plain else None
         message = {"data": [0.0] * robot.joints_count}
         self._template = DoublesTemplate(
             NUMBERS, message_definition(NUMBERS), message, stamped=False
         )
 
-    def publish(self, efforts: ControllerNumbers) -> None:
-        """Send efforts, shape (n,)."""
-        self.publisher.publish(self._template.fill(efforts))
+    @property
+    def controllers(self) -> int:
+        """The number of subscribers of the plain numbers."""
+        return 0 if self._plain is None else self._plain.get_subscription_count()
+
+    def publish(self, stamp: int, efforts: LimitedEfforts) -> None:
+        """Send efforts, shape (n,); the stamp in ns."""
+        if self._plain is not None:
+            self._plain.publish(self._template.fill(efforts))
+        self._stamped.publish(stamp, efforts)
+
+    def wait_for_controllers(self, timeout: float) -> None:
+        """Wait until the controllers have acknowledged the last numbers, at most ``timeout`` s."""
+        if self._plain is not None:
+            self._plain.wait_for_all_acked(Duration(seconds=timeout))

@@ -7,6 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from pkm_twin import Robot
 from pkm_twin.bags.reader import read_messages
@@ -14,6 +16,7 @@ from pkm_twin.codegen.arrays import Array
 from pkm_twin.machine.rotations import skew
 from pkm_twin.recordings import read
 from stiffness_monitor import setpoint_correction, strain_energy
+from stiffness_monitor.correction import SetpointStream
 from test.support.robots import elastic, every_robot, joint_range, load
 
 BAGS = Path(__file__).resolve().parents[2] / "bags"
@@ -128,3 +131,45 @@ def test_what_cannot_be_corrected_is_refused(change: dict[str, object]) -> None:
     arguments = {"deflection": np.zeros(6), **change}
     with pytest.raises(ValueError, match=next(iter(change))):
         setpoint_correction(robot, robot.inverse(robot.home()), **arguments)  # type: ignore[arg-type]
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_a_corrected_set_point_keeps_the_limits_and_moves_at_most_at_its_rate(seed: int) -> None:
+    """Set points at the limits too, offsets that turn around at once, pauses and equal stamps."""
+    rng = np.random.default_rng(seed)
+    robot, rate, age = load("upr_rpu"), 0.01, 0.1
+    low, high = robot.limits.position.T
+    stream = SetpointStream(robot, rate, age)
+    stamp, before = 10**9, None
+    for _ in range(40):
+        elapsed = int(rng.choice([0, 10**6, 10**7, 10**10]))
+        stamp += elapsed
+        setpoint = np.clip(rng.uniform(low - 0.01, high + 0.01), low, high)
+        offset = rng.uniform(-1e-3, 1e-3, 3)
+        corrected = stream.correct(stamp, setpoint, offset)
+        assert ((corrected >= low) & (corrected <= high)).all()
+        wanted = setpoint + offset
+        if before is not None:
+            own = np.abs(setpoint - before[0]) + rate * min(elapsed / 1e9, age)
+            assert (np.abs(corrected - before[1]) <= own + 1e-15).all()
+        else:
+            assert (corrected == np.clip(wanted, low, high)).all()
+        before = setpoint, corrected
+    # A wrench that stays is corrected in the end.
+    for _ in range(3):
+        stamp += 10**8
+        corrected = stream.correct(stamp, setpoint, offset)
+    assert np.abs(corrected - np.clip(setpoint + offset, low, high)).max() < 1e-15
+
+
+def test_what_bounds_a_set_point_is_counted() -> None:
+    robot = load("upr_rpu")
+    assert robot.limits.position is not None
+    low = robot.limits.position[:, 0]
+    stream, push = SetpointStream(robot, 0.01, 0.1), np.full(3, -7.8e-4)
+    assert (stream.correct(10**9, low, push) == low).all()
+    assert (stream.at_limit, stream.at_rate) == (1, 0)
+    # The wrench turns around: 1.56 mm take 0.156 s.
+    turned = stream.correct(10**9 + 10**6, low + 0.1, -push)
+    assert np.abs(turned - (low + 0.1 + push)).max() < 1e-5 + 1e-12
+    assert (stream.at_limit, stream.at_rate) == (1, 1)

@@ -8,10 +8,23 @@ from types import ModuleType, SimpleNamespace
 import numpy as np
 import pytest
 
+from pkm_twin.errors import MessageError
+from test.nodes.harness import SECOND, Maker, Plain
+
 pytest.importorskip("rclpy", exc_type=ImportError)
 
 UNKNOWN, SUCCEEDED, CANCELED, ABORTED = 0, 4, 5, 6
 POINTS = 600
+NOW = 1000 * SECOND
+
+
+def told_of(names, positions, age=0.0):
+    """The controller's feedback, measured so long ago, s."""
+    return SimpleNamespace(
+        header=Maker(Plain()).header(NOW - round(age * SECOND)),
+        joint_names=names,
+        actual=SimpleNamespace(positions=positions),
+    )
 
 
 class Result(SimpleNamespace):
@@ -130,6 +143,9 @@ class Node:
     def defer(self, _, task):
         self.slices += sum(1 for _ in task)
 
+    def now(self):
+        return NOW
+
     def log_throttled(self, _, text):
         self.said.append(text)
 
@@ -188,7 +204,7 @@ def action(monkeypatch):
 def test_a_goal_whose_controller_was_killed_is_aborted_within_two_seconds(action, answered):
     goal = action.accept(Goal(1))
     handle = action.controller.take() if answered else Accepted()
-    feedback = SimpleNamespace(joint_names=[], actual=SimpleNamespace(positions=[]))
+    feedback = told_of([], [])
     for _ in range(3):
         action.node.look(action.code.GONE - 1)
         # Feedback is a sign of life, and so is an answer to a question.
@@ -268,11 +284,34 @@ def test_without_a_known_place_or_an_effort_the_controller_is_only_told_to_cance
     # The controller's own feedback has the place where no joint state has it.
     goal = action.accept(Goal(2))
     action.controller.take()
-    actual = SimpleNamespace(positions=[0.3, 0.4])
-    told = SimpleNamespace(joint_names=["a", "b"], actual=actual)
+    told = told_of(["a", "b"], [0.3, 0.4])
     action.controller.feedback(SimpleNamespace(feedback=told))
     action.cancel(goal)
     assert action.holds == [([0.3, 0.4], [5.3, 5.4])]
+
+
+@pytest.mark.parametrize(("age", "later", "held"), [(0.2, 0.29, True), (0.2, 0.31, False)])
+def test_feedback_from_before_a_suspension_is_no_place_to_hold(action, age, later, held):
+    action.served._max_age = lambda: 0.5
+    action.place = None
+    goal = action.accept(Goal(1))
+    action.controller.take()
+    told = told_of(["a", "b"], [0.3, 0.4], age)
+    action.controller.feedback(SimpleNamespace(feedback=told))
+    action.now += later
+    action.cancel(goal)
+    assert bool(action.holds) is held
+
+
+def test_a_rejected_goal_is_logged_once(action):
+    def rejected(trajectory):
+        yield
+        raise MessageError("limit", "arm_1 is at 3 rad")
+
+    action.served._efforts = rejected
+    goal = action.accept(Goal(1))
+    assert goal.how == ABORTED
+    assert len(action.node.said) == 1 and "arm_1 is at 3 rad" in action.node.said[0]
 
 
 @pytest.mark.parametrize(

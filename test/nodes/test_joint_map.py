@@ -17,12 +17,13 @@ import pytest
 
 from delta_dynamics import inverse_dynamics
 from delta_dynamics.feedforward import Feedforward, Settings
-from delta_dynamics.gate import Gate, GateSettings, effort_limits
+from delta_dynamics.gate import Gate, GateSettings
 from delta_dynamics.nodes.topics import GATE, SIMULATION, TWIN
 from delta_dynamics.simulation.machine import MachineSettings, Simulation, tuned
 from pkm_twin.errors import MessageError
 from pkm_twin.messages.reading import JointReader
 from pkm_twin.messages.stamps import StampRules
+from pkm_twin.robot.effort_limits import EffortLimits, effort_limits
 from pkm_twin.state.state import STATE, MachineState
 from pkm_twin.streams.topics import JOINTS, NUMBERS, TRAJECTORY
 from pkm_twin.streams.wrench import WrenchSettings
@@ -91,6 +92,11 @@ def torques(both, effort, stamp=NOW):
     return MAKE.joint_state(both.names, (), (), both.efforts(effort), stamp)
 
 
+def sent_by(robot, effort):
+    """The model's efforts as they leave a node."""
+    return EffortLimits(robot).apply(robot.controller.controller_efforts(effort), "reject")[0]
+
+
 class TestFeedforward:
     @pytest.mark.parametrize("rates", [True, False])
     def test_a_stream_with_residuals(self, both, rates):
@@ -106,8 +112,8 @@ class TestFeedforward:
                 for core, message in zip(cores, messages, strict=True)
             )
         # Differences over a millisecond enlarge what rounding leaves of positions.
-        close(cores[1].sent(mapped.effort), both.efforts(plain.effort), 1e-6)
-        missed = np.abs(cores[1].sent(mapped.residual) * both.factors - plain.residual)
+        close(mapped.sent, both.efforts(plain.effort), 1e-6)
+        missed = np.abs(mapped.residual - plain.residual)
         assert missed.max() < 1e-6 * np.abs(plain.effort).max()
         close(mapped.motion[0], plain.motion[0])
         close(mapped.motion[1], plain.motion[1], 1e-6)
@@ -133,7 +139,7 @@ class TestFeedforward:
         for i in range(6):
             core.joint_state(states(both, q, still, None, NOW + i * STEP)[1], NOW + i * STEP)
         held = inverse_dynamics(both.plain, q, still, still)
-        close(core.sent(core.stop_effort()), both.efforts(held))
+        close(core.stop_effort(NOW + 6 * STEP), both.efforts(held))
 
     def test_a_point_at_a_limit_is_within_it(self, both):
         if both.plain.limits.position is None:
@@ -165,7 +171,7 @@ class TestGate:
         rng = np.random.default_rng(1)
         limits = np.minimum(effort_limits(both.plain), 100.0)
         for k in range(1, 20):
-            sent = Feedforward(both.mapped).sent(rng.uniform(-1.0, 1.0, len(limits)) * limits)
+            sent = sent_by(both.mapped, rng.uniform(-1.0, 1.0, len(limits)) * limits)
             now = NOW + k * STEP
             message = MAKE.joint_state(both.names[::-1], (), (), sent[::-1], now)
             assert gate.torques(message, now, k * STEP).tobytes() == sent.tobytes()
@@ -176,7 +182,7 @@ class TestGate:
         limits = np.linspace(1.0, 3.0, len(both.names))
         robot = both.mapped.changed(limits={"effort": limits.tolist()})
         gate = self.opened(both, robot)
-        sent = Feedforward(robot).sent(limits)
+        sent = sent_by(robot, limits)
         message = MAKE.joint_state(both.names, (), (), sent, NOW + STEP)
         assert gate.torques(message, NOW + STEP, STEP).tobytes() == sent.tobytes()
         for k in range(len(limits)):
@@ -325,7 +331,7 @@ def test_joint_numbers_leave_through_the_publishers_that_ask_for_converted_ones(
                 argument
                 for call in calls
                 if ast.unparse(call.func).endswith(
-                    ("JointPublisher", "CommandPublisher", "create_guarded_subscription", "defer")
+                    ("JointPublisher", "EffortPublisher", "create_guarded_subscription", "defer")
                 )
                 for argument in call.args
             }
