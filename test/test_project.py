@@ -1,6 +1,7 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """What holds for the whole tree: licences, sizes, and that the README is true."""
 
+import os
 import re
 import subprocess
 from functools import cache
@@ -123,3 +124,43 @@ def test_the_readme_lists_every_robot_and_every_page():
     assert set(first_cells(section("Machines"), 1)) == set(robot_names())
     linked = set(re.findall(r"\]\((docs/\w+\.md)", README))
     assert linked == {name for name in pages() if name.startswith("docs/")}
+
+
+@pytest.mark.parametrize(("failing", "again", "code"), [(0, 0, 0), (2, 0, 0), (2, 1, 1), (3, 0, 1)])
+def test_the_run_names_tests_that_failed_once_and_fails_for_more_than_two(
+    failing, again, code, tmp_path
+):
+    """With programs in place of make and pytest that fail so many tests."""
+    names = [f"test/test_x.py::test_{k}" for k in range(failing)]
+    first = [f"FAILED {name} - assert 0" for name in names]
+    first.append(f"==== {failing} failed, 5 passed in 1.20s (0:00:01) ====")
+    words = ["FAILED"] * again + ["PASSED"] * (failing - again)
+    second = [f"{word} {name}" for word, name in zip(words, names, strict=True)]
+    second.append(f"==== {again} failed, {failing - again} passed in 0.10s ====")
+    stubs = {
+        "bin/make": (first, failing and '[ "$1" != test ] || exit 2'),
+        ".venv/bin/python": (second, again and "exit 1"),
+        "bin/ccx": ([], ""), "bin/chromium": ([], ""),
+    }  # fmt: skip
+    for path, (lines, end) in stubs.items():
+        stub = tmp_path / path
+        stub.parent.mkdir(parents=True, exist_ok=True)
+        text = "\n".join(lines)
+        stub.write_text(f"#!/bin/sh\n[ \"$1\" = lint ] || cat <<'END'\n{text}\nEND\n{end or ''}\n")
+        stub.chmod(0o755)
+    (tmp_path / ".ci").mkdir()
+    (tmp_path / ".ci/run").write_text((REPOSITORY / ".ci/run").read_text())
+    environment = os.environ | {"PATH": f"{tmp_path / 'bin'}:{os.environ['PATH']}"}
+    done = subprocess.run(
+        ["bash", tmp_path / ".ci/run"], env=environment, capture_output=True, text=True, check=False
+    )
+    lines = done.stdout.splitlines()
+    assert done.returncode == code, done.stderr
+    tried = 0 < failing <= 2
+    assert lines[-1] == (second if tried else first)[-1]
+    last = lines[-1 - failing : -1]
+    if tried:
+        passed = [f"failed once, passed alone: {name}" for name in names[again:]]
+        assert last[again:] == passed
+    elif failing:
+        assert last == first[:-1]
