@@ -26,6 +26,7 @@ from pkm_twin.export.c_package import c_package, identifier
 from pkm_twin.machine.graph import POSE
 from pkm_twin.machine.sections import MAX_LENGTH, MAX_MASS
 from pkm_twin.robot.robot import Robot
+from pkm_twin.streams.rest import FLOOR
 
 CONTROLLER: Final = "feedforward_controller"
 GRAVITY: Final = "gravity_controller"
@@ -40,18 +41,21 @@ SHARED: Final = {
     n[k] /= DRIVES[k % JOINTS].factor;
   }}
   return status;""",
-    "straight": "  (void)q;\n  (void)qd;\n  qdd = {{}};\n  return 0;",
-    "bent": """\
-  const Vector x = model_positions(q), v = model_rates(qd), none{{}};
-  Vector positions, rates;
+    "independent": "  (void)q;\n  (void)qd;\n  (void)qdd;\n  return 0;",
+    "agreeing": """\
+  const Vector x = model_positions(q), v = model_rates(qd), a = model_rates(qdd);
   const int status = pkm_{}_agreeing(
-    x.data(), v.data(), none.data(), positions.data(), rates.data(), qdd.data());
+    x.data(), v.data(), a.data(), q.data(), qd.data(), qdd.data());
   for (std::size_t i = 0; i < JOINTS; ++i) {{
+    q[i] = DRIVES[i].offset + DRIVES[i].factor * q[i];
+    qd[i] *= DRIVES[i].factor;
     qdd[i] *= DRIVES[i].factor;
   }}
   return status;""",
 }
 """Bodies of functions of the model: where drives share the effort, and where each has its own."""
+SHORTEST_PERIOD: Final = 1e-3
+"""Usual period of a fast control loop, s: rounding of positions over it is no motion."""
 CLEAR: Final = 0.05
 """Least singularity index of the motions that the package's own test makes."""
 
@@ -129,7 +133,7 @@ def _words(robot: Robot, package: str) -> dict[str, str]:
         "START": _row(controller.controller_positions(home)),
         "RANGE": _row(steps),
         "NULLEFFORTS": SHARED["idle" if robot.redundant else "none idle"].format(own),
-        "BENT": SHARED["bent" if robot.redundant else "straight"].format(own),
+        "AGREEING": SHARED["agreeing" if robot.redundant else "independent"].format(own),
     }
 
 
@@ -164,6 +168,7 @@ def _drives(robot: Robot) -> str:
     columns = (
         controller.factors, controller.offsets, ends[:, 0], ends[:, 1],
         effort / np.abs(controller.factors), friction.viscous, friction.coulomb, _damping(robot),
+        _rounding_rates(robot),
     )  # fmt: skip
     lines = [
         f"  {{{literal(name)}, {', '.join(number(column[k]) for column in columns)}}},"
@@ -178,6 +183,14 @@ def _damping(robot: Robot) -> Array:
     _, damping = tuned(robot, 1.0 / (4.0 * np.pi * STOP))
     # Digits that other arithmetic does not change.
     return np.array([float(f"{d:.6g}") for d in damping / robot.controller.factors**2])
+
+
+def _rounding_rates(robot: Robot) -> Array:
+    """Return the rates that rounding of the positions makes, in the controller's numbers, (n,)."""
+    controller = robot.controller
+    units = np.array([1.0 if unit == "rad" else robot.graph.size for unit in robot.joint_units])
+    largest = np.abs(controller.offsets) + np.abs(controller.factors) * units
+    return np.asarray(FLOOR * largest / SHORTEST_PERIOD, np.float64)
 
 
 def _start(robot: Robot) -> Array:

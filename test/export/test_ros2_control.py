@@ -58,6 +58,7 @@ template<std::size_t SIZE> bool take(std::array<double, SIZE> & row)
 int main()
 {
   Settings s;
+  Load load;
   Feedforward core;
   Vector position, velocity;
   std::array<double, 3> stops;
@@ -67,12 +68,12 @@ int main()
   for (std::size_t i = 0; i < JOINTS; ++i) {
     s.lower[i] = stops[2] > 0.0 ? DRIVES[i].lower : -UNLIMITED;
     s.upper[i] = stops[2] > 0.0 ? DRIVES[i].upper : UNLIMITED;
-    s.effort[i] = DRIVES[i].effort;
+    load.effort[i] = DRIVES[i].effort;
   }
-  if (payload_parameters(PAYLOAD.mass, PAYLOAD.com, PAYLOAD.inertia, s.parameters) != 0) {
+  if (payload_parameters(PAYLOAD.mass, PAYLOAD.com, PAYLOAD.inertia, load.parameters) != 0) {
     return 7;
   }
-  if (core.start(s, position) != REJECTIONS) { return 6; }
+  if (core.start(s, load, position) != REJECTIONS) { return 6; }
   Motion m;
   while (take(m.position) && take(m.velocity) && take(m.acceleration) && take(position) &&
     take(velocity))
@@ -206,6 +207,44 @@ class TestCore:
         np.testing.assert_allclose(effort, clipped(core, right), 0.0, scale)
         assert sound.all() and names == ["NONE"] * 30 + ["NOT_FINITE"]
 
+    def test_the_weight_is_carried_without_a_velocity_and_no_position_is_controlled_without(
+        self, mapped
+    ):
+        both, core = mapped
+        model = loaded(both.plain.name)
+        q, qd, _, _ = random_motion(model, np.random.default_rng(5), 1)
+        still = np.zeros_like(q)
+        row = np.hstack([both.positions(q), still, still, both.positions(q), both.rates(qd)])
+        rows = np.repeat(row, 40, 0)
+        rows[1:, -core.n] = np.nan
+        d = 0.07
+        weight = both.efforts(inverse_dynamics(model, q, still, still))[0]
+        damped = weight - d * both.rates(qd[0])
+        undamped = np.where(np.arange(core.n) == 0, weight, damped)
+        for p, sound_until, lost in ((0.0, 40, undamped), (0.3, 21, weight)):
+            sound, names, effort, _ = core.run(rows, rows[0, : core.n], p, d, hold=0.0205)
+            assert names == ["NONE"] + ["NO_STATE"] * 39
+            np.testing.assert_array_equal(sound, np.arange(40) < sound_until)
+            right = clipped(core, np.array([damped, *[lost] * 39]))
+            np.testing.assert_allclose(effort, right, 0.0, 1e-9 * np.abs(right).max())
+
+    def test_rates_of_rounding_size_have_no_dry_friction(self, mapped):
+        both, core = mapped
+        model = loaded(both.plain.name)
+        assert model.friction.coulomb.any()
+        q, _, _, _ = random_motion(model, np.random.default_rng(6), 4)
+        sides = np.array([[1.0], [-1.0], [1.0], [-1.0]])
+        # What a spline leaves at its end, and a motion that takes a year for a turn.
+        rates = sides * np.array([[6e-15], [6e-15], [1e-7], [1e-7]]) * np.ones(core.n)
+        still = np.zeros_like(q)
+        factors = core.robot.controller.factors
+        motion = [both.positions(q), factors * rates, still]
+        _, names, _, forward = core.run(np.hstack([*motion, *motion[:2]]), both.positions(q[0]))
+        assert set(names) == {"NONE"}
+        rates[:2] = 0.0
+        right = both.efforts(inverse_dynamics(model, q, rates, still))
+        np.testing.assert_allclose(forward, right, 0.0, 1e-9 * np.abs(right).max())
+
     @blocking
     def test_no_update_allocates_or_locks(self, mapped, watcher, rng):
         """Of 200,000, of which many are rejected."""
@@ -253,13 +292,15 @@ SHARED = r"""
 using namespace @;
 int main()
 {
-  Vector q, qd, change;
+  Vector q, qd, change{};
   std::array<double, (JOINTS - FREEDOMS) * JOINTS> idle;
   std::array<double, 6 * JOINTS> twist;
   while (std::fread(q.data(), sizeof(double), JOINTS, stdin) == JOINTS &&
     std::fread(qd.data(), sizeof(double), JOINTS, stdin) == JOINTS)
   {
-    if (null_efforts(q, idle) || bent(q, qd, change) || platform_jacobian(q, twist)) { return 9; }
+    change = {};
+    if (null_efforts(q, idle) || platform_jacobian(q, twist)) { return 9; }
+    if (make_agree(q, qd, change)) { return 8; }
     std::fwrite(idle.data(), sizeof(double), idle.size(), stdout);
     std::fwrite(change.data(), sizeof(double), JOINTS, stdout);
     std::fwrite(twist.data(), sizeof(double), twist.size(), stdout);
@@ -347,19 +388,18 @@ def test_files_are_complete_and_well_formed(files, tmp_path):
             plugin = rf"add_plugin\({Path(name).stem}\s"
             assert name in cmake or re.search(plugin, cmake), name
     for name, base in (
-        ("feedforward_controller", "controller_interface"),
-        ("gravity_controller", "controller_interface"),
+        ("controllers", "controller_interface"),
         ("kinematics", "kinematics_interface"),
         ("inverse_dynamics_solver", "inverse_dynamics_solver"),
     ):
         library = ElementTree.fromstring(files[f"{name}.xml"])
         assert library.get("path") == f"{package}_{name}"
-        (plugin,) = library
-        kind, parent = plugin.get("type"), plugin.get("base_class_type")
-        exported = rf"PLUGINLIB_EXPORT_CLASS\(\s*{kind}, {parent}\)"
-        assert re.search(exported, files[f"src/{name}.cpp"])
         assert f"pluginlib_export_plugin_description_file({base} {name}.xml)" in cmake
-        assert parent.startswith(f"{base}::")
+        for plugin in library:
+            kind, parent = plugin.get("type"), plugin.get("base_class_type")
+            exported = rf"PLUGINLIB_EXPORT_CLASS\(\s*{kind}, {parent}\)"
+            assert re.search(exported, files[f"src/{name}.cpp"])
+            assert parent.startswith(f"{base}::")
     for name, text in c_package(load("five_bar")).items():
         assert files[f"c/{name}"] == text
 
@@ -382,14 +422,14 @@ def test_settings_name_the_joints_and_have_the_gains_of_the_masses(files):
         for name, section in yaml.safe_load(files["config/controllers.yaml"]).items()
     }
     manager = sections["controller_manager"]
-    assert manager["feedforward_controller"]["type"] in files["feedforward_controller.xml"]
+    assert manager["feedforward_controller"]["type"] in files["controllers.xml"]
     trajectories = sections["joint_trajectory_controller"]
     assert trajectories["joints"] == list(robot.joint_names)
     assert trajectories["command_joints"] == [
         f"feedforward_controller/{name}" for name in robot.joint_names
     ]
     (fallback,) = manager["feedforward_controller"]["fallback_controllers"]
-    assert manager[fallback]["type"] in files["gravity_controller.xml"]
+    assert manager[fallback]["type"] in files["controllers.xml"]
     inertia = np.diag(mass_matrix(robot, robot.graph.home))
     damping = [sections[fallback]["gains"][name]["d"] for name in robot.joint_names]
     np.testing.assert_allclose(damping, inertia / 0.1, 1e-5)

@@ -48,7 +48,8 @@ public:
       controller_ = single_.createSharedInstance(plugin);
     }
     controller_interface::ControllerInterfaceParams params;
-    params.controller_name = "feedforward_controller";
+    params.controller_name = chained_.isClassAvailable(plugin) ?
+      "feedforward_controller" : "gravity_controller";
     params.update_rate = params.controller_manager_update_rate = 1000;
     params.node_options = controller_->define_custom_node_options();
     params.node_options.parameter_overrides() = std::move(parameters);

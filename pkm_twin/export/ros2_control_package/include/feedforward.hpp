@@ -25,12 +25,18 @@ enum Rejection : std::size_t {
   REJECTIONS,    // how many there are; none
 };
 
+/// What the machine carries and the drives may give, in the controller's numbers.
+struct Load
+{
+  Parameters parameters{};
+  Vector effort{};
+};
+
 /// All in the controller's numbers.
 struct Settings
 {
-  Parameters parameters{};
   Vector p{}, d{};
-  Vector lower{}, upper{}, effort{};
+  Vector lower{}, upper{};
   double singularity_stop = 0.01;
   double hold_time = 0.5;
 };
@@ -46,16 +52,18 @@ struct Counters
 ///
 /// Where the reference is rejected, the last good position is held: the effort that bears the
 /// weight there, and PD with zero velocity. After hold_time of rejected updates in a row the
-/// machine must not be trusted to this class any longer: update returns false.
+/// machine must not be trusted to this class any longer: update returns false. Without gains on
+/// the position, a velocity that is not finite ends only its joint's damping.
 class Feedforward
 {
 public:
   /// Hold the position where the machine is.
   /// Returns REJECTIONS, or why the position is rejected.
-  Rejection start(const Settings & settings, const Vector & position);
+  Rejection start(const Settings & settings, const Load & load, const Vector & position);
 
-  /// Take other settings between two updates.
+  /// Take other settings, or another load, between two updates.
   void change(const Settings & settings);
+  void change(const Load & load);
 
   /// Compute efforts for a reference, or to hold without one (nullptr).
   /// False: updates have been rejected for longer than hold_time.
@@ -71,6 +79,9 @@ public:
   const Counters & counters() const {return counters_;}
   /// Why the last update was rejected; REJECTIONS where it was not.
   Rejection verdict() const {return verdict_;}
+  /// The joint that it was rejected for, or JOINTS; and its position, or the singularity index.
+  std::size_t joint() const {return joint_;}
+  double found() const {return found_;}
 
 private:
   Rejection compute(const Motion & motion, Vector & effort);
@@ -78,11 +89,14 @@ private:
   void hold();
 
   Settings settings_;
+  Load load_;
   Counters counters_;
   Motion target_;
   State state_{};
   Vector feedforward_{}, effort_{};
   Rejection verdict_ = REJECTIONS;
+  std::size_t joint_ = JOINTS;
+  double found_ = 0.0;
   bool resting_ = true;
   double rejected_for_ = 0.0;
 };

@@ -6,6 +6,7 @@
 #include <algorithm>
 #include <array>
 #include <charconv>
+#include <chrono>
 #include <cmath>
 #include <cstdint>
 #include <limits>
@@ -20,10 +21,10 @@
 #include "diagnostic_msgs/msg/diagnostic_array.hpp"
 #include "hardware_interface/types/hardware_interface_type_values.hpp"
 #include "rclcpp/rclcpp.hpp"
-#include "realtime_tools/realtime_buffer.hpp"
 #include "realtime_tools/realtime_publisher.hpp"
 #include "trajectory_msgs/msg/joint_trajectory_point.hpp"
 
+#include "@PACKAGE@/carried.hpp"
 #include "@PACKAGE@/feedforward.hpp"
 #include "@PACKAGE@/parameters.hpp"
 
@@ -41,16 +42,26 @@ using PointMessage = trajectory_msgs::msg::JointTrajectoryPoint;
 /// For people: why an update is rejected, in the order of Rejection; then what a good one does.
 using Reasons = std::array<const char *, REJECTIONS + 1>;
 
+/// Of the measured position, at the start of each controller and in the gravity controller.
+constexpr Reasons MEASURED{
+  "the measured position is not finite",
+  "the measured position is beyond a limit",
+  "the machine cannot be assembled at the measured position",
+  "the measured position is too close to a singularity",
+  "a measured velocity is not finite, so the joint is not damped",
+  "carrying the weight",
+};
+
 constexpr std::array<const char *, 3> KINDS{
   hardware_interface::HW_IF_POSITION, hardware_interface::HW_IF_VELOCITY,
   hardware_interface::HW_IF_ACCELERATION};
 
-/// Settings as the control loop takes them, with a number that changes with them.
-struct Revision
-{
-  Settings settings;
-  std::uint64_t number = 0;
-};
+/// Longest pause, s, between the commands of two controllers of which one takes over from the other:
+/// a manager does that within one update, of 10 Hz or more.
+constexpr double LONGEST_TAKEOVER = 0.1;
+
+/// How often, s, parameters that are common to the controllers of a machine are brought up to date.
+constexpr double COMMON_PERIOD = 0.2;
 
 /// What the controllers of the package share: parameters, interfaces, state and diagnostics.
 /// Base: controller_interface::ControllerInterface or its chainable form.
@@ -70,36 +81,35 @@ public:
 
   CallbackReturn on_init() override
   {
+    const std::shared_ptr<Node> node = this->get_node();
     try {
-      joints_ = declare_parameters(*this->get_node(), role_);
+      joints_ = declare_parameters(*node, role_);
+      check_names(*node, joints_);
+      join_others();
+      settings_.write(read_settings(*node, joints_, {}));
     } catch (const std::exception & error) {
-      RCLCPP_ERROR(this->get_node()->get_logger(), "%s", error.what());
+      RCLCPP_ERROR(node->get_logger(), "%s", error.what());
       return CallbackReturn::ERROR;
     }
+    follow_parameters();
     return CallbackReturn::SUCCESS;
   }
 
   CallbackReturn on_configure(const rclcpp_lifecycle::State &) override
   {
     const std::shared_ptr<Node> node = this->get_node();
-    Revision first;
     try {
-      joints_ = declare_parameters(*node, role_);
-      check_names(*node, joints_);
-      first.settings = read_settings(*node, joints_, {});
       state_period_ = 1.0 / within(
         "state_publish_rate", number(node->get_parameter("state_publish_rate")), 0.0, UNLIMITED);
     } catch (const std::exception & error) {
       RCLCPP_ERROR(node->get_logger(), "%s", error.what());
       return CallbackReturn::FAILURE;
     }
-    first.number = settings_.readFromNonRT()->number + 1;
-    settings_.writeFromNonRT(first);
-    follow_parameters();
     make_publishers();
     return CallbackReturn::SUCCESS;
   }
 
+  /// Where there is nothing to start from, the controller stays inactive, to be activated later.
   CallbackReturn on_activate(const rclcpp_lifecycle::State &) override
   {
     const auto logger = this->get_node()->get_logger();
@@ -115,15 +125,29 @@ public:
       RCLCPP_ERROR(logger, "expected an effort command, a position and a velocity of each joint");
       return CallbackReturn::ERROR;
     }
-    const Revision & revision = *settings_.readFromNonRT();
-    revision_ = revision.number;
+    const Settings settings = settings_.read(settings_number_);
+    const Load load = carried_->load().read(load_number_);
     unwritten_ = last_bad_ = 0;
     state_age_ = counters_age_ = 0.0;
     measure();
-    const Rejection verdict = feedforward_.start(revision.settings, position_);
+    const Rejection verdict = feedforward_.start(settings, load, position_);
     if (verdict != REJECTIONS) {
-      RCLCPP_ERROR(logger, "not activated at the measured position: %s", reasons_[verdict]);
-      return CallbackReturn::ERROR;
+      const std::string reason = explain(verdict, MEASURED);
+      std::uint64_t number = 0;
+      const Held held = carried_->held().read(number);
+      const std::chrono::duration<double> pause = std::chrono::steady_clock::now() - held.time;
+      if (role_ != Role::CARRIES || number == 0 || pause.count() > LONGEST_TAKEOVER ||
+        feedforward_.start(settings, load, held.position) != REJECTIONS)
+      {
+        RCLCPP_ERROR(logger, "not activated: %s", reason.c_str());
+        return CallbackReturn::FAILURE;
+      }
+      RCLCPP_ERROR(logger, "%s: the last valid position counts for hold_time", reason.c_str());
+    }
+    if (role_ == Role::CARRIES) {
+      RCLCPP_WARN(
+        logger, "carrying the machine with a payload of %s kg",
+        carried_->values().at("payload.mass").value_to_string().c_str());
     }
     // From here on the machine is carried: the brakes may open before the first update.
     return command() ? CallbackReturn::SUCCESS : CallbackReturn::ERROR;
@@ -159,15 +183,19 @@ protected:
   return_type follow(
     const Motion * reference, const rclcpp::Time & time, const rclcpp::Duration & period)
   {
-    const Revision & revision = *settings_.readFromRT();
-    if (revision.number != revision_) {
-      revision_ = revision.number;
-      feedforward_.change(revision.settings);
+    Settings settings;
+    if (settings_.take(settings, settings_number_)) {
+      feedforward_.change(settings);
+    }
+    Load load;
+    if (carried_->load().take(load, load_number_)) {
+      feedforward_.change(load);
     }
     const bool sound = feedforward_.update(reference, position_, velocity_, period.seconds());
     if (!command()) {
       ++unwritten_;
     }
+    carried_->held().offer({feedforward_.target().position, std::chrono::steady_clock::now()});
     const double elapsed = period.seconds();
     state_age_ += elapsed;
     // The nearest update: periods of the loop vary, and a rate may be that of the loop.
@@ -177,6 +205,11 @@ protected:
     counters_age_ += elapsed;
     if (counters_age_ >= 1.0 || !sound) {
       publish_counters(time, reference != nullptr);
+    }
+    if (!sound) {
+      RCLCPP_ERROR(
+        this->get_node()->get_logger(), "rejected for longer than hold_time: %s",
+        explain(feedforward_.verdict(), reasons_).c_str());
     }
     return sound ? return_type::OK : return_type::ERROR;
   }
@@ -262,6 +295,59 @@ private:
 
   // Outside of it.
 
+  /// Why an update or the start is rejected, with the joint and its value.
+  std::string explain(Rejection verdict, const Reasons & reasons) const
+  {
+    const std::size_t i = feedforward_.joint();
+    std::string text = (i < JOINTS ? joints_[i] + ": " : "") + reasons[verdict];
+    if (verdict == BEYOND_LIMIT) {
+      const auto limit = [&](const char * end) {
+          return this->get_node()->get_parameter("limits." + joints_[i] + end).value_to_string();
+        };
+      text += " (" + std::to_string(feedforward_.found()) + ", limits " + limit(".lower") + " to " +
+        limit(".upper") + ")";
+    } else if (verdict == SINGULAR) {
+      text += " (index " + std::to_string(feedforward_.found()) + ")";
+    }
+    return text;
+  }
+
+  /// Take part in what the controllers of the machine have in common.
+  void join_others()
+  {
+    const std::shared_ptr<Node> node = this->get_node();
+    const auto & overrides = node->get_node_parameters_interface()->get_parameter_overrides();
+    Values own, given;
+    for (const std::string & name : node->list_parameters({"payload", "limits"}, 0).names) {
+      if (is_common(name)) {
+        own[name] = as_double(node->get_parameter(name));
+        if (overrides.count(name) > 0) {
+          given[name] = own[name];
+        }
+      }
+    }
+    carried_ = Carried::find(node->get_namespace(), joints_);
+    carried_->join(node->get_name(), own, given);
+    timer_ = node->create_wall_timer(
+      std::chrono::duration<double>(COMMON_PERIOD), [this] {copy_common_values();});
+  }
+
+  /// Show common values that another controller was given as this node's parameters.
+  void copy_common_values()
+  {
+    std::vector<rclcpp::Parameter> changes;
+    for (const auto & [name, value] : carried_->values()) {
+      if (as_double(this->get_node()->get_parameter(name)) != value) {
+        changes.push_back(value);
+      }
+    }
+    if (!changes.empty()) {
+      copying_ = true;
+      this->get_node()->set_parameters_atomically(changes);
+      copying_ = false;
+    }
+  }
+
   /// All callbacks for a set of parameters judge it before it takes effect.
   void follow_parameters()
   {
@@ -274,10 +360,11 @@ private:
           for (const rclcpp::Parameter & change : changes) {
             const std::string & name = change.get_name();
             if (name == "joints" || name == "reference_timeout" || name == "state_publish_rate") {
-              throw std::invalid_argument(name + ": cannot change after the configuration");
+              throw std::invalid_argument(name + ": cannot change after the controller is loaded");
             }
           }
           read_settings(*this->get_node(), joints_, changes);
+          read_load(carried_->values(changes), joints_);
         } catch (const std::exception & error) {
           result.successful = false;
           result.reason = error.what();
@@ -285,10 +372,12 @@ private:
         return result;
       });
     after_set_ = node->add_post_set_parameters_callback(
-      [this](const std::vector<rclcpp::Parameter> &) {
+      [this](const std::vector<rclcpp::Parameter> & changes) {
         try {
-          settings_.writeFromNonRT(
-            {read_settings(*this->get_node(), joints_, {}), settings_.readFromNonRT()->number + 1});
+          settings_.write(read_settings(*this->get_node(), joints_, {}));
+          if (!copying_) {
+            carried_->set(changes);
+          }
         } catch (const std::exception & error) {
           RCLCPP_ERROR(this->get_node()->get_logger(), "settings kept: %s", error.what());
         }
@@ -338,8 +427,11 @@ private:
   double state_period_ = 0.02;
   rclcpp::node_interfaces::OnSetParametersCallbackHandle::SharedPtr on_set_;
   rclcpp::node_interfaces::PostSetParametersCallbackHandle::SharedPtr after_set_;
-  realtime_tools::RealtimeBuffer<Revision> settings_;
-  std::uint64_t revision_ = 0;
+  rclcpp::TimerBase::SharedPtr timer_;
+  std::shared_ptr<Carried> carried_;
+  bool copying_ = false;
+  Mailbox<Settings> settings_;
+  std::uint64_t settings_number_ = 0, load_number_ = 0;
   std::unique_ptr<realtime_tools::RealtimePublisher<StateMessage>> state_publisher_;
   std::unique_ptr<realtime_tools::RealtimePublisher<DiagnosticArray>> counters_publisher_;
 

@@ -4,6 +4,7 @@
 #define @GUARD@__MODEL_HPP_
 
 #include <cmath>
+#include <cstdint>
 
 #include "@PACKAGE@/robot.hpp"
 
@@ -22,6 +23,15 @@ inline Vector model_positions(const Vector & q)
   return result;
 }
 
+/// Return whether a number is neither NaN nor infinite, by its bits: compilers may drop comparisons
+/// with NaN.
+inline bool finite(double value)
+{
+  union {double value; std::uint64_t bits;} volatile number;
+  number.value = value;
+  return (number.bits & 0x7ff0000000000000ULL) != 0x7ff0000000000000ULL;
+}
+
 /// Velocities or accelerations.
 inline Vector model_rates(const Vector & rates)
 {
@@ -32,13 +42,25 @@ inline Vector model_rates(const Vector & rates)
   return result;
 }
 
+/// Velocities, of which those of rounding size are zero: they are no direction of dry friction.
+inline Vector model_velocities(const Vector & qd)
+{
+  Vector result = model_rates(qd);
+  for (std::size_t i = 0; i < JOINTS; ++i) {
+    if (finite(qd[i]) && std::fabs(qd[i]) <= DRIVES[i].rest) {
+      result[i] = 0.0;
+    }
+  }
+  return result;
+}
+
 /// Efforts, and the singularity index: 0 in a singularity, 1 at best; of the stream's next sample.
 inline int efforts(
   const Parameters & parameters, State & state, const Vector & q, const Vector & qd,
   const Vector & qdd, Vector & tau, double & index)
 {
   constexpr std::array<double, 6> no_wrench{};
-  const Vector x = model_positions(q), v = model_rates(qd), a = model_rates(qdd);
+  const Vector x = model_positions(q), v = model_velocities(qd), a = model_rates(qdd);
   const int status = @PREFIX@_torques_and_singularity_next_with(
     parameters.data(), state.data(), x.data(), v.data(), a.data(), no_wrench.data(), tau.data(),
     &index);
@@ -60,7 +82,7 @@ inline int efforts(
 /// Friction of the drives. Dry friction is zero at rest.
 inline Vector drive_friction(const Vector & qd)
 {
-  const Vector rates = model_rates(qd);
+  const Vector rates = model_velocities(qd);
   Vector result;
   for (std::size_t i = 0; i < JOINTS; ++i) {
     const double direction = static_cast<double>((rates[i] > 0.0) - (rates[i] < 0.0));
@@ -106,10 +128,11 @@ inline int null_efforts(const Vector & q, std::array<double, (JOINTS - FREEDOMS)
 @NULLEFFORTS@
 }
 
-/// Accelerations of a motion in which the joints that lead have none: zero where all lead.
-inline int bent(const Vector & q, const Vector & qd, Vector & qdd)
+/// Make positions, velocities and accelerations those of a motion, by the joints that lead: all,
+/// unless drives share the effort.
+inline int make_agree(Vector & q, Vector & qd, Vector & qdd)
 {
-@BENT@
+@AGREEING@
 }
 
 /// Parameters of another payload: mass (kg), com (m) from the reference point, inertia (kg m2)
@@ -119,16 +142,6 @@ inline int payload_parameters(
   Parameters & parameters)
 {
   return @PREFIX@_parameters(mass, com.data(), inertia.data(), parameters.data());
-}
-
-inline bool finite(const Vector & values)
-{
-  for (const double value : values) {
-    if (!std::isfinite(value)) {
-      return false;
-    }
-  }
-  return true;
 }
 }  // namespace @PACKAGE@
 

@@ -6,6 +6,7 @@
 #include <algorithm>
 #include <cmath>
 #include <limits>
+#include <map>
 #include <stdexcept>
 #include <string>
 #include <vector>
@@ -53,6 +54,24 @@ std::array<double, SIZE> numbers(const rclcpp::Parameter & parameter)
   std::array<double, SIZE> result;
   std::copy(values.begin(), values.end(), result.begin());
   return result;
+}
+
+/// Parameters by name.
+using Values = std::map<std::string, rclcpp::Parameter>;
+
+/// Whether a parameter counts for all controllers of the machine: payload and effort limits.
+inline bool is_common(const std::string & name)
+{
+  const std::string end = ".effort";
+  return name.rfind("payload.", 0) == 0 || (name.rfind("limits.", 0) == 0 &&
+         name.size() > end.size() && name.compare(name.size() - end.size(), end.size(), end) == 0);
+}
+
+/// The parameter, a whole number as a float.
+inline rclcpp::Parameter as_double(const rclcpp::Parameter & parameter)
+{
+  return parameter.get_type() == rclcpp::ParameterType::PARAMETER_INTEGER ?
+         rclcpp::Parameter(parameter.get_name(), number(parameter)) : parameter;
 }
 
 constexpr double MOST = std::numeric_limits<double>::max();
@@ -150,7 +169,21 @@ inline Parameters read_payload(
   return result;
 }
 
-/// The settings, with changes that are not made yet.
+/// Payload and effort limits of the machine, by the values that its controllers have in common.
+inline Load read_load(const Values & values, const std::vector<std::string> & joints)
+{
+  Load result;
+  for (std::size_t i = 0; i < JOINTS; ++i) {
+    const std::string name = "limits." + joints[i] + ".effort";
+    result.effort[i] = within(name, number(values.at(name)), 0.0, UNLIMITED);
+  }
+  result.parameters = read_payload(
+    number(values.at("payload.mass")), numbers<3>(values.at("payload.com")),
+    numbers<9>(values.at("payload.inertia")));
+  return result;
+}
+
+/// A controller's own settings, with changes that are not made yet.
 inline Settings read_settings(
   const Node & node, const std::vector<std::string> & joints,
   const std::vector<rclcpp::Parameter> & changes)
@@ -172,7 +205,6 @@ inline Settings read_settings(
   for (std::size_t i = 0; i < JOINTS; ++i) {
     const std::string gains = "gains." + joints[i], limits = "limits." + joints[i];
     result.d[i] = bounded(gains + ".d", 0.0, MOST);
-    result.effort[i] = bounded(limits + ".effort", 0.0, UNLIMITED);
     if (node.has_parameter(gains + ".p")) {
       result.p[i] = bounded(gains + ".p", 0.0, MOST);
       result.lower[i] = bounded(limits + ".lower", -UNLIMITED, UNLIMITED);
@@ -181,9 +213,6 @@ inline Settings read_settings(
   }
   result.singularity_stop = bounded("singularity_stop", 0.0, 1.0);
   result.hold_time = bounded("hold_time", 0.0, UNLIMITED);
-  result.parameters = read_payload(
-    number(get("payload.mass")), numbers<3>(get("payload.com")),
-    numbers<9>(get("payload.inertia")));
   return result;
 }
 }  // namespace @PACKAGE@

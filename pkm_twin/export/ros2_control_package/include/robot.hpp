@@ -21,14 +21,15 @@ constexpr double UNLIMITED = std::numeric_limits<double>::infinity();
 
 /// An actuated joint. The controller's position is offset + factor * the model's.
 /// Limits are in the controller's numbers, friction is in the model's. damping, in the controller's
-/// numbers, stops the drive's mass at home with a time constant of @STOP@ s.
+/// numbers, stops the drive's mass at home with a time constant of @STOP@ s. Velocities up to rest
+/// are rounding.
 struct Drive
 {
   const char * name;
   double factor, offset;
   double lower, upper, effort;
   double viscous, coulomb;
-  double damping;
+  double damping, rest;
 };
 
 constexpr std::array<Drive, JOINTS> DRIVES{{

@@ -9,13 +9,14 @@
 #include <vector>
 
 #include "controller_interface/chainable_controller_interface.hpp"
+#include "controller_interface/controller_interface.hpp"
 #include "pluginlib/class_list_macros.hpp"
 
 #include "@PACKAGE@/loop.hpp"
 
 namespace @PACKAGE@
 {
-constexpr Reasons REASONS{
+constexpr Reasons FOLLOWING{
   "the reference is not finite",
   "the reference is beyond a position limit",
   "the machine cannot be assembled at the reference",
@@ -24,19 +25,12 @@ constexpr Reasons REASONS{
   "following",
 };
 
-/// A reference from the topic.
-struct Received
-{
-  Motion motion;
-  std::uint64_t number = 0;
-};
-
 /// Chainable controller: inverse dynamics at the reference plus PD.
 class FeedforwardController : public Loop<controller_interface::ChainableControllerInterface>
 {
 public:
   FeedforwardController()
-  : Loop(Role::FOLLOWS, "feedforward", REASONS) {}
+  : Loop(Role::FOLLOWS, "feedforward", FOLLOWING) {}
 
   CallbackReturn on_configure(const rclcpp_lifecycle::State &) override;
   CallbackReturn on_activate(const rclcpp_lifecycle::State &) override;
@@ -53,7 +47,7 @@ private:
   void read_reference();
 
   double reference_timeout_ = 0.1;
-  realtime_tools::RealtimeBuffer<Received> received_;
+  Mailbox<Motion> received_;
   std::uint64_t taken_ = 0;
   rclcpp::Subscription<PointMessage>::SharedPtr subscription_;
 
@@ -95,13 +89,11 @@ CallbackReturn FeedforwardController::on_configure(const rclcpp_lifecycle::State
           "joint_references: expected %zu positions, velocities and accelerations", JOINTS);
         return;
       }
-      Received received;
-      received.number = received_.readFromNonRT()->number + 1;
-      std::copy(m.positions.begin(), m.positions.end(), received.motion.position.begin());
-      std::copy(m.velocities.begin(), m.velocities.end(), received.motion.velocity.begin());
-      std::copy(
-        m.accelerations.begin(), m.accelerations.end(), received.motion.acceleration.begin());
-      received_.writeFromNonRT(received);
+      Motion received;
+      std::copy(m.positions.begin(), m.positions.end(), received.position.begin());
+      std::copy(m.velocities.begin(), m.velocities.end(), received.velocity.begin());
+      std::copy(m.accelerations.begin(), m.accelerations.end(), received.acceleration.begin());
+      received_.write(received);
     });
   return CallbackReturn::SUCCESS;
 }
@@ -123,7 +115,8 @@ FeedforwardController::on_export_reference_interfaces_list()
 CallbackReturn FeedforwardController::on_activate(const rclcpp_lifecycle::State & state)
 {
   constexpr double UNKNOWN = std::numeric_limits<double>::quiet_NaN();
-  taken_ = received_.readFromNonRT()->number;
+  // A reference of before the activation is not followed.
+  (void)received_.read(taken_);
   following_ = false;
   timeouts_ = 0;
   reference_age_ = 0.0;
@@ -139,10 +132,7 @@ CallbackReturn FeedforwardController::on_activate(const rclcpp_lifecycle::State 
 return_type FeedforwardController::update_reference_from_subscribers(
   const rclcpp::Time &, const rclcpp::Duration & period)
 {
-  const Received & received = *received_.readFromRT();
-  if (received.number != taken_) {
-    taken_ = received.number;
-    reference_ = received.motion;
+  if (received_.take(reference_, taken_)) {
     reference_age_ = 0.0;
     following_ = true;
     return return_type::OK;
@@ -182,7 +172,24 @@ return_type FeedforwardController::update_and_write_commands(
   measure();
   return follow(following_ ? &reference_ : nullptr, time, period);
 }
+
+/// Controller to fall back to: the effort that bears the weight at the measured position, and
+/// damping. It follows nothing and holds no position.
+class GravityController : public Loop<controller_interface::ControllerInterface>
+{
+public:
+  GravityController()
+  : Loop(Role::CARRIES, "gravity", MEASURED) {}
+
+  return_type update(const rclcpp::Time & time, const rclcpp::Duration & period) override
+  {
+    measure();
+    const Motion here{position_, {}, {}};
+    return follow(&here, time, period);
+  }
+};
 }  // namespace @PACKAGE@
 
 PLUGINLIB_EXPORT_CLASS(
   @PACKAGE@::FeedforwardController, controller_interface::ChainableControllerInterface)
+PLUGINLIB_EXPORT_CLASS(@PACKAGE@::GravityController, controller_interface::ControllerInterface)

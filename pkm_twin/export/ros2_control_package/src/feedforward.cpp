@@ -10,10 +10,12 @@
 
 namespace @PACKAGE@
 {
-Rejection Feedforward::start(const Settings & settings, const Vector & position)
+Rejection Feedforward::start(
+  const Settings & settings, const Load & load, const Vector & position)
 {
   Vector weight;
   settings_ = settings;
+  load_ = load;
   const Motion rest{position, {}, {}};
   const Rejection verdict = compute(rest, weight);
   if (verdict != REJECTIONS) {
@@ -26,39 +28,48 @@ Rejection Feedforward::start(const Settings & settings, const Vector & position)
   resting_ = true;
   rejected_for_ = 0.0;
   for (std::size_t i = 0; i < JOINTS; ++i) {
-    effort_[i] = std::fmax(-settings_.effort[i], std::fmin(settings_.effort[i], effort_[i]));
+    effort_[i] = std::fmax(-load_.effort[i], std::fmin(load_.effort[i], effort_[i]));
   }
   return REJECTIONS;
 }
 
-void Feedforward::change(const Settings & settings)
+void Feedforward::change(const Settings & settings) {settings_ = settings;}
+
+void Feedforward::change(const Load & load)
 {
-  settings_ = settings;
+  load_ = load;
   // Another payload has another weight.
   resting_ = false;
 }
 
 Rejection Feedforward::compute(const Motion & motion, Vector & effort)
 {
-  if (!finite(motion.position) || !finite(motion.velocity) || !finite(motion.acceleration)) {
-    return NOT_FINITE;
+  joint_ = JOINTS;
+  for (const Vector * row : {&motion.position, &motion.velocity, &motion.acceleration}) {
+    for (std::size_t i = 0; i < JOINTS; ++i) {
+      if (!finite((*row)[i])) {
+        joint_ = i;
+        return NOT_FINITE;
+      }
+    }
   }
-  double index;
   const int status = efforts(
-    settings_.parameters, state_, motion.position, motion.velocity, motion.acceleration, effort,
-    index);
+    load_.parameters, state_, motion.position, motion.velocity, motion.acceleration, effort,
+    found_);
   if (status != 0) {
     return status == 1 ? NO_ASSEMBLY : NOT_FINITE;
   }
-  return index < settings_.singularity_stop ? SINGULAR : REJECTIONS;
+  return found_ < settings_.singularity_stop ? SINGULAR : REJECTIONS;
 }
 
 Rejection Feedforward::judge(const Motion & reference, Vector & effort)
 {
   for (std::size_t i = 0; i < JOINTS; ++i) {
     const double position = reference.position[i];
-    if (position < settings_.lower[i] || position > settings_.upper[i]) {
-      return std::isfinite(position) ? BEYOND_LIMIT : NOT_FINITE;
+    if (finite(position) && (position < settings_.lower[i] || position > settings_.upper[i])) {
+      joint_ = i;
+      found_ = position;
+      return BEYOND_LIMIT;
     }
   }
   return compute(reference, effort);
@@ -72,7 +83,7 @@ void Feedforward::hold()
   target_.velocity = target_.acceleration = {};
   // The position was accepted before: settings that have changed since do not reject it.
   Vector weight;
-  if (efforts(settings_.parameters, target_.position, {}, {}, weight) == 0) {
+  if (efforts(load_.parameters, target_.position, {}, {}, weight) == 0) {
     feedforward_ = weight;
   }
   resting_ = true;
@@ -91,35 +102,43 @@ bool Feedforward::update(
   } else {
     hold();
   }
-  bool measured = true, saturated = false;
+  bool measured = true, controlled = false;
   for (std::size_t i = 0; i < JOINTS; ++i) {
-    measured = measured && (settings_.p[i] == 0.0 || std::isfinite(position[i])) &&
-      (settings_.d[i] == 0.0 || std::isfinite(velocity[i]));
+    controlled = controlled || settings_.p[i] != 0.0;
+    if ((settings_.p[i] != 0.0 && !finite(position[i])) ||
+      (settings_.d[i] != 0.0 && !finite(velocity[i])))
+    {
+      measured = false;
+      if (verdict_ == REJECTIONS) {
+        verdict_ = NO_STATE;
+        joint_ = i;
+      }
+    }
   }
-  if (!measured && verdict_ == REJECTIONS) {
-    verdict_ = NO_STATE;
-  }
+  bool saturated = false;
   for (std::size_t i = 0; i < JOINTS; ++i) {
     double effort = feedforward_[i];
     if (measured && settings_.p[i] != 0.0) {
       effort += settings_.p[i] * (target_.position[i] - position[i]);
     }
-    if (measured && settings_.d[i] != 0.0) {
+    if ((measured || (!controlled && finite(velocity[i]))) && settings_.d[i] != 0.0) {
       effort += settings_.d[i] * (target_.velocity[i] - velocity[i]);
     }
-    if (std::isnan(effort)) {
+    if (!finite(effort)) {
       effort = feedforward_[i];
     }
-    const double limit = settings_.effort[i];
+    const double limit = load_.effort[i];
     effort_[i] = std::fmax(-limit, std::fmin(limit, effort));
     saturated = saturated || effort_[i] != effort;
   }
   counters_.saturated += saturated ? 1 : 0;
-  if (verdict_ == REJECTIONS) {
+  if (verdict_ != REJECTIONS) {
+    ++counters_.rejected[verdict_];
+  }
+  if (verdict_ == REJECTIONS || (verdict_ == NO_STATE && !controlled)) {
     rejected_for_ = 0.0;
     return true;
   }
-  ++counters_.rejected[verdict_];
   rejected_for_ += period > 0.0 ? period : 0.0;
   return rejected_for_ <= settings_.hold_time;
 }

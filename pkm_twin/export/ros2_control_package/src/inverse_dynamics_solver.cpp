@@ -56,8 +56,8 @@ public:
     const Eigen::VectorXd & joint_positions, const Eigen::VectorXd & joint_velocities) const
   override
   {
-    Vector change;
-    judge(bent(taken(joint_positions), taken(joint_velocities), change));
+    Vector positions = taken(joint_positions), velocities = taken(joint_velocities), change{};
+    judge(make_agree(positions, velocities, change));
     const Eigen::VectorXd own = given(change);
     Eigen::VectorXd result =
       getTorques(joint_positions, joint_velocities, own) - getGravityVector(joint_positions);

@@ -41,6 +41,7 @@ Motion motion(int sample)
     result.velocity[i] = 3.0 * RANGE[i] * std::cos(phase);
     result.acceleration[i] = -9.0 * RANGE[i] * std::sin(2.0 * phase);
   }
+  EXPECT_EQ(make_agree(result.position, result.velocity, result.acceleration), 0);
   return result;
 }
 
@@ -276,6 +277,102 @@ TEST_F(Plugins, gravity_is_that_of_the_measured_position_with_damping)
   }
 }
 
+TEST_F(Plugins, payload_and_effort_limits_count_for_both_controllers)
+{
+  Bench feedforward, gravity({}, "GravityController");
+  ASSERT_TRUE(feedforward.activate(true));
+  ASSERT_TRUE(gravity.activate(false));
+  double mass = PAYLOAD.mass;
+  for (Bench * one : {&feedforward, &gravity}) {
+    mass += 1.0;
+    const double limit = 0.5 * mass * largest(weight_at(START));
+    const std::string name = std::string("limits.") + DRIVES[0].name + ".effort";
+    ASSERT_TRUE(one->node()->set_parameter({"payload.mass", mass}).successful);
+    ASSERT_TRUE(one->node()->set_parameter({name, limit}).successful);
+    Parameters parameters;
+    ASSERT_EQ(payload_parameters(mass, PAYLOAD.com, PAYLOAD.inertia, parameters), 0);
+    Vector wanted;
+    ASSERT_EQ(efforts(parameters, START, {}, {}, wanted), 0);
+    wanted[0] = std::fmax(-limit, std::fmin(limit, wanted[0]));
+    for (Bench * bench : {&feedforward, &gravity}) {
+      ASSERT_TRUE(bench->update(0.0, 1e-3));
+      expect_effort(*bench, wanted, largest(wanted));
+    }
+    // The nodes show the same numbers after a while.
+    rclcpp::executors::SingleThreadedExecutor executor;
+    Bench & other = one == &feedforward ? gravity : feedforward;
+    executor.add_node(other.node()->get_node_base_interface());
+    for (int k = 0; k < 500 && other.node()->get_parameter("payload.mass").as_double() != mass; ++k) {
+      executor.spin_once(std::chrono::milliseconds(20));
+    }
+    EXPECT_EQ(other.node()->get_parameter("payload.mass").as_double(), mass);
+    EXPECT_EQ(other.node()->get_parameter(name).as_double(), limit);
+  }
+  const rclcpp::Parameter heavy("payload.mass", PAYLOAD.mass + 9.0);
+  Bench given({heavy});
+  EXPECT_THROW(
+    Bench({rclcpp::Parameter("payload.mass", PAYLOAD.mass + 8.0)}, "GravityController"),
+    std::runtime_error);
+}
+
+TEST_F(Plugins, a_lost_position_is_bridged_from_controller_to_controller)
+{
+  std::vector<rclcpp::Parameter> parameters{{"hold_time", 0.1}};
+  for (const Drive & drive : DRIVES) {
+    parameters.emplace_back(std::string("gains.") + drive.name + ".p", 1e-3);
+  }
+  Bench feedforward(parameters), gravity({{"hold_time", 0.1}}, "GravityController");
+  gravity.measure(0, NaN, 0.0);
+  // There is nothing to take over from.
+  EXPECT_FALSE(gravity.activate(false));
+  ASSERT_TRUE(feedforward.activate(true));
+  ASSERT_TRUE(feedforward.node()->set_parameter({"payload.mass", PAYLOAD.mass + 1.0}).successful);
+  const Vector position = motion(2).position;
+  Parameters loaded;
+  ASSERT_EQ(payload_parameters(PAYLOAD.mass + 1.0, PAYLOAD.com, PAYLOAD.inertia, loaded), 0);
+  Vector wanted;
+  ASSERT_EQ(efforts(loaded, position, {}, {}, wanted), 0);
+  give(feedforward, {position, {}, {}});
+  for (std::size_t i = 0; i < JOINTS; ++i) {
+    feedforward.measure(i, position[i], 0.0);
+  }
+  ASSERT_TRUE(feedforward.update(0.0, 1e-3));
+  feedforward.measure(0, NaN, 0.0);
+  int bridged = 0;
+  while (bridged < 200 && feedforward.update(0.0, 1e-3)) {
+    ++bridged;
+    expect_effort(feedforward, wanted, largest(wanted));
+  }
+  EXPECT_NEAR(bridged, 100, 1);
+  feedforward.deactivate();
+  ASSERT_TRUE(gravity.activate(false));
+  expect_effort(gravity, wanted, largest(wanted));
+  int carried = 0;
+  while (carried < 200 && gravity.update(0.0, 1e-3)) {
+    ++carried;
+    expect_effort(gravity, wanted, largest(wanted));
+  }
+  EXPECT_NEAR(carried, 100, 1);
+  gravity.deactivate();
+  EXPECT_EQ(gravity.effort(0), 0.0);
+  // Both are inactive, and active again when the position is.
+  for (Bench * bench : {&feedforward, &gravity}) {
+    bench->measure(0, position[0], 0.0);
+    EXPECT_TRUE(bench->activate(true));
+  }
+}
+
+TEST_F(Plugins, the_weight_needs_no_velocity)
+{
+  Bench bench({{"hold_time", 0.01}}, "GravityController");
+  ASSERT_TRUE(bench.activate(false));
+  bench.measure(0, START[0], NaN);
+  for (int k = 0; k < 100; ++k) {
+    ASSERT_TRUE(bench.update(0.0, 1e-3));
+    expect_effort(bench, weight_at(START), largest(weight_at(START)));
+  }
+}
+
 TEST_F(Plugins, gravity_is_damped_without_settings)
 {
   Bench bench({}, "GravityController");
@@ -296,6 +393,8 @@ TEST_F(Plugins, what_cannot_be_assembled_is_not_activated)
   Bench bench;
   bench.measure(0, NaN, 0.0);
   EXPECT_FALSE(bench.activate(true));
+  bench.measure(0, START[0], 0.0);
+  EXPECT_TRUE(bench.activate(true));
 }
 
 TEST_F(Plugins, references_from_the_topic_are_held_after_the_timeout)
