@@ -116,6 +116,22 @@ class JointMap:
                 "0: only positions can be converted where the ratio changes with travel",
             )  # fmt: skip
 
+    def shown(
+        self, joint: int, quantity: str, value: float, low: float, high: float
+    ) -> tuple[float, float, float]:
+        """Return a model's value and its bounds as the controller has them, for a message.
+
+        :param quantity: position, velocity, acceleration or effort.
+        """
+        numbers = np.array([value, low, high])
+        factor, offset = float(self.factors[joint]), float(self.offsets[joint])
+        if quantity == "effort":
+            numbers /= factor
+        else:
+            numbers = factor * numbers + (offset if quantity == "position" else 0.0)
+        found, *ends = numbers.tolist()
+        return found, min(ends), max(ends)
+
     def positions(self, controller: Array) -> Array:
         """The model's positions of the controller's, shape (..., n).
 

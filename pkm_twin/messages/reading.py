@@ -384,12 +384,14 @@ class JointReader:
     def _refusal(
         self, what: str, joint: int, value: float, low: float, high: float
     ) -> MessageError:
-        name = self.robot.joint_names[joint]
+        # Whoever sent the message knows the controller's names and numbers.
+        name, quantity = self._names[joint], what.split()[-1]
+        value, low, high = self.robot.controller.shown(joint, quantity, value, low, high)
         if not math.isfinite(value):
             return MessageError("not finite", f"{what} of {name} is {value}")
         if low <= value <= high:
             return MessageError("bounds", f"{what} of {name} is {value:g}, a denormal number")
-        reason = "limit" if self._limited.get(what.split()[-1], False) else "bounds"
+        reason = "limit" if self._limited.get(quantity, False) else "bounds"
         return MessageError(reason, f"{what} of {name} is {value:g}, allowed {low:g} to {high:g}")
 
 

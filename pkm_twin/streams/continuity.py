@@ -91,11 +91,13 @@ class Continuity:
         for joint, (now, before, velocity) in enumerate(joints):
             bound = farthest(velocity, period)
             if not abs(now - before) <= bound:
-                unit = self.robot.joint_units[joint]
+                controller = self.robot.controller
+                unit = self.robot.joint_units[joint] if controller.plain else "of its units"
+                moved, _, most = controller.shown(joint, "velocity", now - before, -bound, bound)
                 raise MessageError(
                     "jump",
-                    f"{self.robot.joint_names[joint]} moved by {now - before:g} {unit} in "
-                    f"{period:g} s, allowed {bound:g}",
+                    f"{controller.names[joint]} moved by {moved:g} {unit} in "
+                    f"{period:g} s, allowed {most:g}",
                 )
         worst = max(beyond)
         if not worst <= self._largest:

@@ -97,6 +97,31 @@ def sent_by(robot, effort):
     return EffortLimits(robot).apply(robot.controller.controller_efforts(effort), "reject")[0]
 
 
+def test_rejections_have_the_names_and_numbers_of_the_sender(both):
+    """Of every joint, beyond a bound on either side, in a joint state and in a trajectory."""
+    robot = both.mapped
+    reader, rules = JointReader(robot), StampRules()
+    q = robot.graph.home
+    kinds = (("position", both.positions), ("velocity", both.rates), ("effort", both.efforts))
+    for joint in range(robot.joints_count):
+        for kind, convert in kinds:
+            for side in (-1.0, 1.0):
+                values = {"position": q, "velocity": 0.0 * q, "effort": 0.0 * q}
+                values[kind] = values[kind].copy()
+                values[kind][joint] = side * 2e7
+                sent = [conversion(values[name]) for name, conversion in kinds]
+                with pytest.raises(MessageError) as error:
+                    reader.joint_state(MAKE.joint_state(both.names, *sent, NOW), NOW, rules)
+                text = re.fullmatch(
+                    rf"{kind} of {both.names[joint]} is (\S+), allowed (\S+) to (\S+)",
+                    str(error.value),
+                )
+                assert text, error.value
+                value, low, high = map(float, text.groups())
+                np.testing.assert_allclose(value, convert(values[kind])[joint], 1e-5)
+                assert low < high and not low <= value <= high
+
+
 class TestFeedforward:
     @pytest.mark.parametrize("rates", [True, False])
     def test_a_stream_with_residuals(self, both, rates):
