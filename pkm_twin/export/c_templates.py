@@ -105,8 +105,7 @@ recursion, and bounded loops. All functions are reentrant. It also compiles as C
     cmake -B build && cmake --build build && ctest --test-dir build
 
 Without CMake: `cc -std=c99 -O2 -c {name}.c`. With `-mfma`, `-march=native` or the CMake option
-`PKM_NATIVE` it runs faster. `-ffast-math` is rejected, because the code tests for NaN and
-infinity.
+`PKM_NATIVE` it runs faster. `-ffast-math` and `-ffinite-math-only` are compile errors.
 
 Joints, in order: {joints}. Joint values are the model's; the robot file's `joint_map` is not
 applied. Units, arguments and sizes are in `{name}.h`. Every function returns a status:
