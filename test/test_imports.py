@@ -6,6 +6,7 @@ import re
 import subprocess
 import sys
 from graphlib import TopologicalSorter
+from importlib.util import find_spec
 from xml.etree import ElementTree
 
 import pytest
@@ -170,3 +171,15 @@ def test_a_command_and_a_node_start_without_what_they_may_never_need():
     # Masked arrays are a tenth of a short command's time.
     code = "from pkm_twin.mechanisms import catalogue; catalogue.findings(catalogue.load('delta'))"
     assert "numpy.ma" not in loaded_by(code)
+
+
+def test_the_nodes_start_without_mcap():
+    """They decode messages, but read no bag."""
+    pytest.importorskip("rclpy")
+    modules = [module for module in sources() if room(module).endswith(".node")]
+    if find_spec("control_msgs") is None:
+        modules.remove("delta_dynamics.nodes.action")
+    assert len(modules) > 5
+    loaded = loaded_by(f"import pkm_twin.apps.nodes, {', '.join(modules)}")
+    assert "rclpy" in loaded
+    assert not {name for name in loaded if name.split(".")[0] in ("mcap", "lz4", "zstandard")}

@@ -40,10 +40,16 @@ class MessageCodec:
         self.type_name = type_name
         self.definition = parse_definition(type_name, text)
         self._name = next(iter(self.definition))
-        self._classes = {
-            name: _value_class(name.split("/")[1], fields)
-            for name, fields in self.definition.items()
-        }
+        try:
+            self._classes: dict[str, Any] = {
+                name: dataclasses.make_dataclass(
+                    name.split("/")[1], [f.name for f in fields], slots=True
+                )
+                for name, fields in self.definition.items()
+            }
+        except TypeError as error:
+            text = f"fields of {type_name} cannot be attributes: {error}"
+            raise BagError(text, reason="schema") from error
         self._readers = {
             name: [self._reader(field) for field in fields]
             for name, fields in self.definition.items()
@@ -58,11 +64,9 @@ class MessageCodec:
         order = _ENDIANNESS.get(bytes(data[:2])) if len(data) >= 4 else None
         if order is None:
             head = bytes(data[:4]).hex(" ")
-            raise BagError(
-                f"{self.type_name} starts with [{head}]; expected plain CDR, 00 00 or 00 01 and "
-                "two option bytes",
-                reason="cdr",
-            )
+            expected = "plain CDR, 00 00 or 00 01 and two option bytes"
+            text = f"{self.type_name} starts with [{head}]; expected {expected}"
+            raise BagError(text, reason="cdr")
         source = _Source(self.type_name, data, order)
         # Bytes may be left: rclpy serializes into a buffer of estimated size and keeps it all.
         return self._decode(self._name, source)
@@ -91,7 +95,11 @@ class MessageCodec:
         if field.upto and count > size:
             raise source.error(f"field {field.name} has {count} items; at most {size}")
         if code is not None:
-            return _sequence_value(field.base, source.numbers(code, count))
+            # In a live message these two are lists, other numbers are arrays.
+            values = source.numbers(code, count)
+            if field.base == "bool":
+                return [value != 0 for value in values]
+            return [bytes((value,)) for value in values] if field.base == "byte" else values
         # Each item takes a byte at least: an absurd count ends here, not in memory.
         source.require(count)
         if field.base == "string":
@@ -160,24 +168,6 @@ class MessageCodec:
         if field.base in CODES:
             return 0
         return "" if field.base == "string" else {}
-
-
-def _value_class(name: str, fields: Sequence[Field]) -> Any:
-    try:
-        return dataclasses.make_dataclass(name, [(f.name, Any) for f in fields], slots=True)
-    except TypeError as error:
-        raise BagError(
-            f"fields of {name} cannot be attributes: {error}", reason="schema"
-        ) from error
-
-
-def _sequence_value(base: str, values: array.array[Any]) -> Any:
-    """Give a primitive array the form it has in a live message."""
-    if base == "bool":
-        return [value != 0 for value in values]
-    if base == "byte":
-        return [bytes((value,)) for value in values]
-    return values
 
 
 class _Source:
@@ -266,14 +256,11 @@ def _getter(message: object, fields: Sequence[Field], where: str) -> Callable[[s
     if isinstance(message, Mapping):
         unknown = sorted(str(key) for key in message if key not in names)
         if unknown:
-            raise BagError(
-                f"{where} has no field {', '.join(unknown)}; fields: {', '.join(names)}",
-                reason="message",
-            )
+            text = f"{where} has no field {', '.join(unknown)}; fields: {', '.join(names)}"
+            raise BagError(text, reason="message")
         return message.get
     missing = [name for name in names if not hasattr(message, name)]
     if missing:
-        raise BagError(
-            f"{where} is {brief(message)}, without {', '.join(missing)}", reason="message"
-        )
+        text = f"{where} is {brief(message)}, without {', '.join(missing)}"
+        raise BagError(text, reason="message")
     return lambda name: getattr(message, name)

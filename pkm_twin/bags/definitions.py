@@ -91,9 +91,8 @@ def message_class(type_name: str) -> Any:
     :raises BagError: the name is malformed, or its package is not installed here.
     """
     if not _TYPE_NAME.fullmatch(type_name):
-        raise BagError(
-            f"{type_name!r} is not a type name; expected package/msg/Type", reason="type"
-        )
+        text = f"{type_name!r} is not a type name; expected package/msg/Type"
+        raise BagError(text, reason="type")
     package, _, name = type_name.split("/")
     # A bag may name any package: only one of messages is imported.
     found = importlib.util.find_spec(package)
@@ -104,9 +103,8 @@ def message_class(type_name: str) -> Any:
     try:
         return getattr(importlib.import_module(f"{package}.msg"), name)
     except (ImportError, AttributeError) as error:
-        raise BagError(
-            f"message type {type_name} is not installed: {error}", reason="type"
-        ) from error
+        text = f"message type {type_name} is not installed: {error}"
+        raise BagError(text, reason="type") from error
 
 
 def message_definition(type_name: str) -> str:
@@ -139,9 +137,8 @@ def _short_name(type_name: str) -> str:
 def _checked_name(type_name: str) -> str:
     """The short name of a type that a file names."""
     if not _HELD_NAME.fullmatch(type_name):
-        raise BagError(
-            f"{brief(type_name)} is not a type name; expected package/msg/Type", reason="schema"
-        )
+        text = f"{brief(type_name)} is not a type name; expected package/msg/Type"
+        raise BagError(text, reason="schema")
     return _short_name(type_name)
 
 
@@ -171,11 +168,8 @@ def parse_definition(type_name: str, text: str) -> Definition:
         there is more than MAX_DEFINITION_CHARACTERS, MAX_FIELDS, MAX_NESTING or MAX_BOUND of it.
     """
     if len(text) > MAX_DEFINITION_CHARACTERS:
-        raise BagError(
-            f"the definition of {type_name} has {len(text)} characters; "
-            f"at most {MAX_DEFINITION_CHARACTERS}",
-            reason="schema",
-        )
+        error = f"the definition of {type_name} has {len(text)} characters"
+        raise BagError(f"{error}; at most {MAX_DEFINITION_CHARACTERS}", reason="schema")
     own = _checked_name(type_name)
     texts = dict(_BUILTIN)
     for index, part in enumerate(re.split(r"^={3,}[ \t]*$", text, flags=re.MULTILINE)):
@@ -184,11 +178,8 @@ def parse_definition(type_name: str, text: str) -> Definition:
         if index:
             heading, _, fields = part.strip().partition("\n")
             if not heading.startswith("MSG:"):
-                raise BagError(
-                    f"definition of {type_name}: part {index} starts with {brief(heading)}, "
-                    "not 'MSG:'",
-                    reason="schema",
-                )
+                error = f"definition of {type_name}: part {index} starts with {brief(heading)}"
+                raise BagError(f"{error}, not 'MSG:'", reason="schema")
             name = _checked_name(heading[4:].strip())
         texts[name] = fields
     definition: Definition = {}
@@ -207,16 +198,12 @@ def _resolve(
     if name not in texts:
         raise BagError(f"no definition of {name}, which {holders[-1]} contains", reason="schema")
     if len(holders) >= MAX_NESTING:
-        raise BagError(
-            f"{holders[0]} holds types {len(holders)} deep; at most {MAX_NESTING - 1}",
-            reason="schema",
-        )
+        text = f"{holders[0]} holds types {len(holders)} deep; at most {MAX_NESTING - 1}"
+        raise BagError(text, reason="schema")
     fields = tuple(_parse_fields(name, texts))
     if len(fields) + sum(map(len, definition.values())) > MAX_FIELDS:
-        raise BagError(
-            f"{(*holders, name)[0]} has more than {MAX_FIELDS} fields with all that it holds",
-            reason="schema",
-        )
+        text = f"{(*holders, name)[0]} has more than {MAX_FIELDS} fields with all that it holds"
+        raise BagError(text, reason="schema")
     for field in fields:
         if "/" in field.base:
             _resolve(field.base, texts, definition, (*holders, name))
@@ -230,9 +217,8 @@ def _parse_fields(name: str, texts: Mapping[str, str]) -> list[Field]:
         match = _FIELD.fullmatch(line.strip())
         if match is None or match["rest"].startswith("="):
             if match is None and line.split("#")[0].strip():
-                raise BagError(
-                    f"definition of {name}: {brief(line)} is not a field", reason="schema"
-                )
+                text = f"definition of {name}: {brief(line)} is not a field"
+                raise BagError(text, reason="schema")
             continue
         base = _base_type(match["base"], name.split("/", 1)[0], texts)
         where = f"definition of {name}: field {match['name']}"
@@ -246,9 +232,8 @@ def _bound(digits: str | None, where: str) -> int:
     """A size or bound as a definition writes it, 0 where it writes none."""
     # Python refuses to convert thousands of digits.
     if digits and (len(digits) > 20 or int(digits) > MAX_BOUND):
-        raise BagError(
-            f"{where} has the bound {brief(digits)}; at most {MAX_BOUND}", reason="schema"
-        )
+        text = f"{where} has the bound {brief(digits)}; at most {MAX_BOUND}"
+        raise BagError(text, reason="schema")
     return int(digits or 0)
 
 

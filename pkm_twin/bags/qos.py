@@ -23,11 +23,6 @@ MAX_NESTING: Final = 50
 _LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 _TOPIC = re.compile(r"(?:/[A-Za-z_][A-Za-z0-9_]*)+")
-# rosbag2 writes names since Jazzy, numbers before.
-_RELIABILITIES = {"1": "reliable", "2": "best_effort", "reliable": "reliable"}
-_RELIABILITIES |= {"best_effort": "best_effort"}
-_DURABILITIES = {"1": "transient_local", "2": "volatile", "volatile": "volatile"}
-_DURABILITIES |= {"transient_local": "transient_local"}
 
 
 @dataclass(frozen=True)
@@ -71,10 +66,8 @@ def parse_qos(topic: str, text: str) -> OfferedQos:
     """
 
     def refuse(field: str, value: object, expected: str) -> BagError:
-        return BagError(
-            f"topic {topic}: offered_qos_profiles: {field} is {value!r}; expected {expected}",
-            reason="qos",
-        )
+        error = f"topic {topic}: offered_qos_profiles: {field} is {value!r}; expected {expected}"
+        return BagError(error, reason="qos")
 
     if not text.strip():
         return OfferedQos()
@@ -92,13 +85,9 @@ def parse_qos(topic: str, text: str) -> OfferedQos:
     depth = offer.get("depth", 0)
     if isinstance(depth, bool) or not isinstance(depth, int) or not 0 <= depth <= MAX_DEPTH:
         raise refuse("depth", depth, f"0 to {MAX_DEPTH}")
-    reliability = str(offer.get("reliability", "reliable"))
-    durability = str(offer.get("durability", "volatile"))
-    return OfferedQos(
-        _RELIABILITIES.get(reliability, "reliable") == "reliable",
-        _DURABILITIES.get(durability, "volatile") == "transient_local",
-        depth,
-    )
+    # rosbag2 writes names since Jazzy, numbers before.
+    reliable = str(offer.get("reliability")) not in ("2", "best_effort")
+    return OfferedQos(reliable, str(offer.get("durability")) in ("1", "transient_local"), depth)
 
 
 def require_topic(name: str) -> str:
@@ -107,9 +96,7 @@ def require_topic(name: str) -> str:
     :raises BagError: it is another text.
     """
     if len(name) > MAX_TOPIC_CHARACTERS or not _TOPIC.fullmatch(name):
-        raise BagError(
-            f"{name!r} is no topic name; expected /names of letters, digits and _, none beginning "
-            f"with a digit, at most {MAX_TOPIC_CHARACTERS} characters",
-            reason="topic",
-        )
+        names = "/names of letters, digits and _, none beginning with a digit"
+        text = f"{name!r} is no topic name; expected {names}"
+        raise BagError(f"{text}, at most {MAX_TOPIC_CHARACTERS} characters", reason="topic")
     return name

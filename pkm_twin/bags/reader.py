@@ -20,20 +20,15 @@ from functools import cached_property, lru_cache, partial
 from pathlib import Path
 from typing import Any, Literal
 
+from mcap.records import Channel, Schema
+
 from pkm_twin.bags.cdr import MessageCodec
 from pkm_twin.bags.definitions import message_definition
-from pkm_twin.bags.format import (
-    TOTAL_CAP,
-    Channel,
-    FormatError,
-    RecordReader,
-    Schema,
-    message_data,
-    utf8,
-)
-from pkm_twin.bags.recover import RecoverResult, count_salvageable, recover
-from pkm_twin.bags.storage import METADATA_FILE, BagFile, Storage, find_storage
-from pkm_twin.bags.strict import BagReport, Check, Segment, TopicInfo, join_topic
+from pkm_twin.bags.format import FormatError, RecordReader
+from pkm_twin.bags.recover import RecoverResult, recover
+from pkm_twin.bags.report import BagReport, TopicInfo, make_report
+from pkm_twin.bags.storage import BagFile, find_storage
+from pkm_twin.bags.strict import Check, Segment, check_files
 from pkm_twin.bags.writer import BagWriter
 from pkm_twin.errors import BagError
 
@@ -119,19 +114,20 @@ def open_bag(path: str | Path) -> Bag:
     """
     path = Path(path)
     storage = find_storage(path)
-    parts = []
-    for file in storage.files:
-        with file.open() as reader:
-            check = Check(reader)
-            try:
-                check.run()
-            except FormatError as error:
-                damage = error
-            else:
-                parts.append(_Part(file, check))
-                continue
-        raise _bag_error(damage, file, storage)
-    return Bag(path, parts, storage)
+    found = check_files(storage.files)
+    checks = [check for check in found.values() if isinstance(check, Check)]
+    for file, check in found.items():
+        if isinstance(check, BagError):
+            raise check
+        if check.fault:
+            raise DamagedBagError(
+                check.fault.text,
+                path=file.path,
+                reason=check.fault.reason,
+                offset=check.fault.offset,
+                salvageable=sum(check.message_count for check in checks),
+            )
+    return Bag(path, list(map(_Part, storage.files, checks)), make_report(path, storage, checks))
 
 
 class _Part:
@@ -141,7 +137,6 @@ class _Part:
         self.file = file
         self.segments = check.segments
         self.records = check.records
-        self.report = check.report(file.path)
         self._decoders = {
             number: partial(_decode, channel, check.records.schemas.get(channel.schema_id))
             for number, channel in check.records.channels.items()
@@ -149,37 +144,36 @@ class _Part:
 
     def parse(
         self, segment: Segment, reader: RecordReader, topics: Container[str]
-    ) -> list[BagMessage]:
-        """The messages of the topics in a segment, in the order of the file."""
+    ) -> Iterator[BagMessage]:
+        """Yield the messages of the topics in a segment, in the order of the file."""
+        records, at = self.records, segment.offset
         try:
-            data = segment.read(reader)
-            return [
-                BagMessage(
+            for _, message in records.iterate_messages(segment.read(reader), at):
+                channel = records.channels[message.channel_id]
+                if channel.topic not in topics:
+                    continue
+                schema = records.schemas.get(channel.schema_id)
+                yield BagMessage(
                     channel.topic,
-                    self.records.types[head.channel],
-                    head.log_time,
-                    head.publish_time,
-                    head.sequence,
-                    message_data(data, start, end, channel.encoding, segment.offset, reader.budget),
-                    self._decoders[head.channel],
+                    schema.name if schema else "",
+                    message.log_time,
+                    message.publish_time,
+                    message.sequence,
+                    records.unpack_message(message, at, reader.budget),
+                    self._decoders[channel.id],
                 )
-                for head, start, end in self.records.messages(data, segment.offset)
-                if (channel := self.records.channels[head.channel]).topic in topics
-            ]
         except FormatError as error:
-            text = f"changed since it was checked: {error.text}"
-            raise BagError(
-                text, path=self.file.path, reason="changed", offset=error.offset
-            ) from None
+            path, text = self.file.path, f"changed since it was checked: {error.text}"
+            raise BagError(text, path=path, reason="changed", offset=error.offset) from None
 
 
 class Bag:
     """A bag that has been checked; ``report`` is what the check found."""
 
-    def __init__(self, path: Path, parts: list[_Part], storage: Storage) -> None:
+    def __init__(self, path: Path, parts: list[_Part], report: BagReport) -> None:
         self._path = path
         self._parts = parts
-        self.report = _joined(path, [part.report for part in parts], storage)
+        self.report = report
 
     def messages(
         self,
@@ -204,11 +198,8 @@ class Bag:
         )
         unknown = sorted(wanted - known.keys())
         if unknown:
-            raise BagError(
-                f"no topic {', '.join(unknown)}; topics: {', '.join(sorted(known))}",
-                path=self._path,
-                reason="no_topic",
-            )
+            text = f"no topic {', '.join(unknown)}; topics: {', '.join(sorted(known))}"
+            raise BagError(text, path=self._path, reason="no_topic")
         return self._ordered(wanted) if order == "log_time" else self._in_file(wanted)
 
     def _in_file(self, wanted: set[str]) -> Iterator[BagMessage]:
@@ -221,7 +212,7 @@ class Bag:
         waiting: list[tuple[int, int, int, int, BagMessage]] = []
         held = 0
         places = [(n, segment) for n, part in enumerate(self._parts) for segment in part.segments]
-        places.sort(key=lambda place: (place[1].start, place[0], place[1].offset))
+        places.sort(key=lambda place: (place[1].messages.start, place[0], place[1].offset))
         # Splits follow each other in time, so one is open at once.
         current = -1
         with ExitStack() as opened:
@@ -232,96 +223,43 @@ class Bag:
                     current = number
                 # Nothing from here on is earlier than this segment's start. A message of exactly
                 # that time stays, since the segment may stand before it in the file.
-                while waiting and waiting[0][0] < segment.start:
+                while waiting and waiting[0][0] < segment.messages.start:
                     message = heapq.heappop(waiting)[-1]
                     held -= len(message.data) + _MESSAGE_COST
                     yield message
-                found = self._parts[number].parse(segment, reader, wanted)
-                for index, message in enumerate(found):
+                for index, message in enumerate(self._parts[number].parse(segment, reader, wanted)):
                     entry = (message.log_time, number, segment.offset, index, message)
                     heapq.heappush(waiting, entry)
                     held += len(message.data) + _MESSAGE_COST
                 if held > MAX_WAITING_BYTES:
-                    raise BagError(
-                        f"more than {MAX_WAITING_BYTES} bytes of messages overlap in time: they "
-                        "cannot be put in order; read them in the order of the file",
-                        path=self._path,
-                        reason="overlap",
-                        offset=segment.offset,
-                    )
+                    text = f"more than {MAX_WAITING_BYTES} bytes of messages overlap in time"
+                    text += ": they cannot be put in order; read them in the order of the file"
+                    at = segment.offset
+                    raise BagError(text, path=self._path, reason="overlap", offset=at)
             while waiting:
                 yield heapq.heappop(waiting)[-1]
 
 
-def _joined(path: Path, reports: list[BagReport], storage: Storage) -> BagReport:
-    """One report of all the files of a bag."""
-    topics: dict[str, TopicInfo] = {}
-    for report in reports:
-        for name, info in report.topics.items():
-            join_topic(topics, name, info, report.path)
-    filled = [report for report in reports if report.message_count]
-    count = sum(report.message_count for report in reports)
-    warnings = list(dict.fromkeys(text for report in reports for text in report.warnings))
-    stated = {"": storage.message_count} if storage.message_count is not None else {}
-    stated |= {f" on {name}": number for name, number in storage.by_topic.items()}
-    stated |= {f" in {name}": number for name, number in storage.by_file.items()}
-    counts = {"": count} | {f" on {name}": info.count for name, info in topics.items()}
-    counts |= {f" in {report.path.name}": report.message_count for report in reports}
-    miscounts = tuple(
-        f"{METADATA_FILE} states {said} messages{where}, there are {counts.get(where, 0)}"
-        for where, said in stated.items()
-        if said != counts.get(where, 0)
-    )
-    return BagReport(
-        path=path,
-        profile=reports[0].profile,
-        library=reports[0].library,
-        topics=dict(sorted(topics.items())),
-        message_count=count,
-        start_time=min((report.start_time for report in filled), default=0),
-        end_time=max((report.end_time for report in filled), default=0),
-        has_crc=all(report.has_crc for report in reports),
-        has_index=all(report.has_index for report in reports),
-        has_summary=all(report.has_summary for report in reports),
-        warnings=(*warnings, *miscounts),
-        miscounts=miscounts,
-        out_of_order=sum(report.out_of_order for report in reports),
-        metadata={name: entries for r in reports for name, entries in r.metadata.items()},
-    )
-
-
 @lru_cache(maxsize=256)
-def _codec(schema: Schema) -> MessageCodec:
+def _codec(name: str, text: bytes) -> MessageCodec:
     """A type's codec, which may be long in the making."""
-    return MessageCodec(schema.name, utf8(schema.data, "schema", None))
+    try:
+        return MessageCodec(name, text.decode())
+    except UnicodeDecodeError:
+        raise BagError("the schema is not UTF-8", reason="schema") from None
 
 
 def _decode(channel: Channel, schema: Schema | None, data: bytes) -> Any:
     """Decode a message of the channel."""
     try:
         kind = f"type {schema.name if schema else 'no schema'}"
-        if channel.encoding != "cdr":
-            text = f"{kind} has the message encoding {channel.encoding!r}; expected 'cdr'"
+        if channel.message_encoding != "cdr":
+            text = f"{kind} has the message encoding {channel.message_encoding!r}; expected 'cdr'"
             raise BagError(text, reason="encoding")
         if schema is None or schema.encoding != "ros2msg":
             found = repr(schema.encoding) if schema else "none"
             text = f"{kind} has the schema encoding {found}; expected 'ros2msg'"
             raise BagError(text, reason="encoding")
-        return _codec(schema).decode(data)
-    except (BagError, FormatError) as error:
+        return _codec(schema.name, schema.data).decode(data)
+    except BagError as error:
         raise BagError(f"topic {channel.topic}: {error}", reason=error.reason) from error
-
-
-def _bag_error(error: FormatError, file: BagFile, storage: Storage) -> BagError:
-    """Turn a format error into the error a caller sees, with what could still be saved."""
-    # Of a bag of several files an empty one is damage to the bag.
-    alone = len(storage.files) == 1
-    if error.reason == TOTAL_CAP or (alone and error.reason in ("empty", "not_mcap")):
-        return BagError(error.text, path=file.path, reason=error.reason, offset=error.offset)
-    return DamagedBagError(
-        error.text,
-        path=file.path,
-        reason=error.reason,
-        offset=error.offset,
-        salvageable=count_salvageable(storage.files),
-    )

@@ -17,6 +17,8 @@ from functools import cached_property
 from pathlib import Path
 from typing import IO, Final
 
+import zstandard
+
 from pkm_twin.bags.format import ZSTD_MAGIC, Budget, FormatError, RecordReader
 from pkm_twin.bags.qos import load_plain
 from pkm_twin.errors import BagError
@@ -43,42 +45,29 @@ class BagFile:
                 size = os.fstat(file.fileno()).st_size
                 head = os.pread(file.fileno(), len(SQLITE_MAGIC), 0)
                 if head == SQLITE_MAGIC:
-                    raise BagError(
-                        f"this is an SQLite bag, not MCAP; {conversion(self.path)} converts it",
-                        path=self.path,
-                        reason="not_mcap",
-                    )
+                    text = f"this is an SQLite bag, not MCAP; {conversion(self.path)} converts it"
+                    raise BagError(text, path=self.path, reason="not_mcap")
                 if not head.startswith(ZSTD_MAGIC):
                     yield RecordReader(file)
                     return
             # The budget is that of the bytes on the disk.
             yield RecordReader(self._unpacked, Budget(size))
         except FileNotFoundError as error:
-            raise BagError(
-                "no such file; expected an MCAP file or a rosbag2 folder",
-                path=self.path,
-                reason="not_found",
-            ) from error
+            text = "no such file; expected an MCAP file or a rosbag2 folder"
+            raise BagError(text, path=self.path, reason="not_found") from error
         except OSError as error:
-            raise BagError(
-                f"cannot be read: {error.strerror or error}", path=self.path, reason="io"
-            ) from error
+            text = f"cannot be read: {error.strerror or error}"
+            raise BagError(text, path=self.path, reason="io") from error
 
     @cached_property
     def _unpacked(self) -> IO[bytes]:
         """The file's content. What does not unpack is missing at the end, and is found missing."""
-        try:
-            import zstandard
-        except ImportError:
-            text = "is packed with zstd; the Python package zstandard is missing"
-            raise BagError(text, path=self.path, reason="compression") from None
         # Closed, and so gone, with the bag that holds it.
         target = tempfile.TemporaryFile()  # noqa: SIM115
         with open_regular(self.path) as file:
             budget = Budget(os.fstat(file.fileno()).st_size)
-            with zstandard.ZstdDecompressor().stream_reader(
-                file, read_across_frames=True
-            ) as source:
+            unpacker = zstandard.ZstdDecompressor()
+            with unpacker.stream_reader(file, read_across_frames=True) as source:
                 try:
                     while block := source.read(_BLOCK_BYTES):
                         budget.spend(len(block), None)
@@ -131,11 +120,8 @@ def find_storage(path: Path) -> Storage:
     file = path / METADATA_FILE
     if not os.path.lexists(file):
         inside = ", ".join(p.name for p in files_by_name(path)) or "no .mcap file"
-        raise BagError(
-            f"is a folder without {METADATA_FILE}: no rosbag2 bag; name a file in it: {inside}",
-            path=path,
-            reason="folder",
-        )
+        text = f"is a folder without {METADATA_FILE}: no rosbag2 bag; name a file in it: {inside}"
+        raise BagError(text, path=path, reason="folder")
     return _described(path, _Field(file, "", _load(file)))
 
 
@@ -169,11 +155,8 @@ class _Field:
         self.value = value
 
     def error(self, expected: str) -> BagError:
-        return BagError(
-            f"{self.name or 'the file'} is {self.value!r}; expected {expected}",
-            path=self._path,
-            reason="metadata",
-        )
+        text = f"{self.name or 'the file'} is {self.value!r}; expected {expected}"
+        return BagError(text, path=self._path, reason="metadata")
 
     def get(self, key: str) -> _Field:
         """Return the entry ``key`` of a mapping, None where it is missing."""
@@ -206,11 +189,8 @@ def _described(folder: Path, root: _Field) -> Storage:
     facts = root.get("rosbag2_bagfile_information")
     storage = facts.get("storage_identifier")
     if storage.text() == "sqlite3":
-        raise BagError(
-            f"is an SQLite bag, not MCAP; {conversion(folder)} converts it",
-            path=folder,
-            reason="not_mcap",
-        )
+        text = f"is an SQLite bag, not MCAP; {conversion(folder)} converts it"
+        raise BagError(text, path=folder, reason="not_mcap")
     if storage.text() != "mcap":
         raise storage.error("'mcap'")
     packing = facts.get("compression_format")

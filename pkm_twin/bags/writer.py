@@ -10,41 +10,20 @@ import os
 import queue
 import threading
 import time
-import zlib
-from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import IO, Any, Self, cast
+
+from mcap.records import Channel, Schema
+from mcap.writer import Writer
 
 from pkm_twin.bags.cdr import MessageCodec
 from pkm_twin.bags.definitions import live_type_name, message_definition
-from pkm_twin.bags.format import (
-    CRC,
-    FRAME,
-    FREE_BYTES,
-    INDEX_ENTRY,
-    MAGIC,
-    MAX_CHUNK_BYTES,
-    MESSAGE_HEAD,
-    METADATA_CRC,
-    Channel,
-    Head,
-    Op,
-    Schema,
-    Span,
-    metadata_crc,
-    pack,
-)
+from pkm_twin.bags.format import FREE_BYTES, MAX_CHUNK_BYTES, METADATA_CRC, metadata_crc
 from pkm_twin.errors import BagError
 from pkm_twin.files import require_replaceable
-
-zstandard: Any
-try:
-    import zstandard
-except ImportError:
-    zstandard = None
 
 LIBRARY = "pkm_twin"
 """What the header of our own bags says wrote them."""
@@ -83,9 +62,8 @@ def offered_qos(reliability: str, durability: str, depth: int) -> str:
         ("reliability", "durability"), (reliability, durability), allowed, strict=True
     ):
         if value not in names:
-            raise BagError(
-                f"{what} is {value!r}; expected {' or '.join(sorted(names))}", reason="qos"
-            )
+            text = f"{what} is {value!r}; expected {' or '.join(sorted(names))}"
+            raise BagError(text, reason="qos")
     if depth < 1:
         raise BagError(f"depth is {depth}; at least 1", reason="qos")
     # RMW_DURATION_INFINITE: no deadline, no lifespan, no lease.
@@ -98,130 +76,52 @@ def offered_qos(reliability: str, durability: str, depth: int) -> str:
     )
 
 
-class McapWriter:
-    """Writes the records of one MCAP file so that a CRC covers every byte.
+class McapWriter(Writer):
+    """Writes one MCAP file so that a CRC covers every byte, and one type or topic once."""
 
-    Messages are gathered into chunks of ``chunk_size`` bytes. ``file`` is unbuffered: what has been
-    written, the system has. Without the package zstandard chunks are not packed.
+    def __init__(self, file: io.FileIO, path: Path, chunk_size: int, profile: str) -> None:
+        super().__init__(cast("IO[bytes]", _Target(file, path)), chunk_size, enable_data_crcs=True)
+        self._numbers: dict[str, Any] = {}
+        self.start(profile, LIBRARY)
 
-    :raises BagError: by each method, where the system cannot write ``path``.
-    """
-
-    def __init__(self, file: io.FileIO, path: Path, chunk_size: int) -> None:
-        self._file = file
-        self._path = path
-        self._chunk_size = chunk_size
-        self._position = self._crc = 0
-        self._numbers: dict[Op, dict[bytes, tuple[int, bytes]]] = {Op.SCHEMA: {}, Op.CHANNEL: {}}
-        self._metadata: set[bytes] = set()
-        self._counts: Counter[int] = Counter()
-        self._total, self._span = Span(), Span()
-        self._chunk = bytearray()
-        self._entries: dict[int, bytearray] = {}
-        self._indexes: dict[Op, list[bytes]] = {Op.CHUNK_INDEX: [], Op.METADATA_INDEX: []}
-
-    def start(self, profile: str) -> None:
-        """Write the opening mark and the header, unless they are there."""
-        if not self._position:
-            self._write(MAGIC + pack(Op.HEADER, profile, LIBRARY))
-
-    def add_metadata(self, name: str, entries: Mapping[str, str], verified: bool = True) -> None:
-        """Write texts by name, once, with a CRC of their own where they are ``verified``."""
-        crc = {METADATA_CRC: metadata_crc(name, entries)} if verified else {}
-        record = pack(Op.METADATA, name, {**entries, **crc})
-        if record in self._metadata:
-            return
-        self._metadata.add(record)
-        place = pack(Op.METADATA_INDEX, self._position, len(record), name)
-        self._indexes[Op.METADATA_INDEX].append(place)
-        self._write(record)
-
-    def channel(self, schema: Schema | None, channel: Channel) -> int:
-        """Return the number of a channel, whose own ``schema_id`` does not count."""
+    def register(self, schema: Schema | None, channel: Channel) -> int:
+        """Return the number of a channel, whose own numbers do not count."""
         number = 0
         if schema is not None:
-            number = self._number(Op.SCHEMA, schema.name, schema.encoding, schema.data)
-        own = (channel.topic, channel.encoding, channel.metadata)
-        return self._number(Op.CHANNEL, number, *own)
+            number = self._once(self.register_schema, schema.name, schema.encoding, schema.data)
+        facts = (channel.topic, channel.message_encoding, number, channel.metadata)
+        number = self._once(self.register_channel, *facts)
+        return int(number)
 
-    def _number(self, kind: Op, *fields: Any) -> int:
-        """The number of a schema or channel, which is written when it is first asked for."""
-        numbers, key = self._numbers[kind], pack(kind, 0, *fields)
-        if key not in numbers:
-            record = pack(kind, len(numbers) + 1, *fields)
-            numbers[key] = len(numbers) + 1, record
-            self._gather(record)
-        return numbers[key][0]
+    def _once(self, act: Callable[..., Any], *facts: Any) -> Any:
+        key = repr(facts)
+        if key not in self._numbers:
+            self._numbers[key] = act(*facts)
+        return self._numbers[key]
 
-    def add_message(self, head: Head, data: bytes) -> None:
-        """Write a message of a channel that :meth:`channel` has numbered."""
-        entry = INDEX_ENTRY.pack(head.log_time, len(self._chunk))
-        self._entries.setdefault(head.channel, bytearray()).extend(entry)
-        for span in (self._total, self._span):
-            span.add(head.log_time)
-        self._counts[head.channel] += 1
-        frame = FRAME.pack(Op.MESSAGE, MESSAGE_HEAD.size + len(data))
-        self._gather(frame + MESSAGE_HEAD.pack(*head) + data)
+    def put_metadata(self, name: str, entries: Mapping[str, str], verified: bool = True) -> None:
+        """Write texts by name, with a CRC of their own where they are ``verified``."""
+        crc = {METADATA_CRC: metadata_crc(name, entries)} if verified else {}
+        self._once(self.add_metadata, name, {**entries, **crc})
 
-    def _gather(self, record: bytes) -> None:
-        self._chunk += record
-        if len(self._chunk) > self._chunk_size:
-            self.flush()
 
-    def flush(self) -> None:
-        """Write what has been gathered as a chunk with its index, once it has a message."""
-        if not self._entries:
-            return
-        data, at = bytes(self._chunk), self._position
-        compression, packed = ("zstd", zstandard.compress(data)) if zstandard else ("", data)
-        times = self._span.start, self._span.end
-        crc = zlib.crc32(data)
-        self._write(pack(Op.CHUNK, *times, len(data), crc, compression, packed))
-        begin, places, indexes = self._position, [], b""
-        for number, entries in self._entries.items():
-            places.append((number, begin + len(indexes)))
-            indexes += pack(Op.MESSAGE_INDEX, number, bytes(entries))
-        self._write(indexes)
-        sizes = (compression, len(packed), len(data))
-        self._indexes[Op.CHUNK_INDEX].append(
-            pack(Op.CHUNK_INDEX, *times, at, begin - at, places, len(indexes), *sizes)
-        )
-        self._chunk, self._entries, self._span = bytearray(), {}, Span()
+class _Target:
+    """An unbuffered file: what has been written, the system has.
 
-    def finish(self) -> None:
-        """Write the open chunk, the summary and the closing mark."""
-        self.flush()
-        self._write(pack(Op.DATA_END, self._crc))
-        start, summary, offsets = self._position, b"", b""
-        for kind, records in self._summary():
-            group = b"".join(records)
-            offsets += pack(Op.SUMMARY_OFFSET, kind, start + len(summary), len(group))
-            summary += group
-        footer = pack(Op.FOOTER, start, start + len(summary), 0)
-        end = summary + offsets + footer[: -CRC.size]
-        self._write(end + CRC.pack(zlib.crc32(end)) + MAGIC)
+    :raises BagError: the system cannot write it.
+    """
 
-    def _summary(self) -> Iterator[tuple[Op, list[bytes]]]:
-        for kind, numbers in self._numbers.items():
-            yield kind, [record for _, record in numbers.values()]
-        places = [len(self._indexes[kind]) for kind in (Op.METADATA_INDEX, Op.CHUNK_INDEX)]
-        kinds = [len(self._numbers[kind]) for kind in (Op.SCHEMA, Op.CHANNEL)]
-        times = self._total.start, self._total.end
-        facts = (self._total.count, *kinds, 0, *places, *times, self._counts.items())
-        yield Op.STATISTICS, [pack(Op.STATISTICS, *facts)]
-        yield Op.CHUNK_INDEX, self._indexes[Op.CHUNK_INDEX]
-        yield Op.ATTACHMENT_INDEX, []
-        yield Op.METADATA_INDEX, self._indexes[Op.METADATA_INDEX]
+    def __init__(self, file: io.FileIO, path: Path) -> None:
+        self._file, self._path = file, path
+        self.tell, self.flush = file.tell, file.flush
 
-    def _write(self, data: bytes) -> None:
+    def write(self, data: bytes) -> None:
         view = memoryview(data)
         try:
             while view:
                 view = view[self._file.write(view) :]
         except OSError as error:
             raise write_error(error, self._path) from error
-        self._crc = zlib.crc32(data, self._crc)
-        self._position += len(data)
 
 
 class BagWriter:
@@ -253,9 +153,8 @@ class BagWriter:
         flush_period: float | None = FLUSH_PERIOD,
     ) -> None:
         if not 1 <= chunk_size <= FREE_BYTES:
-            raise BagError(
-                f"chunk_size is {chunk_size}; expected 1 to {FREE_BYTES}", reason="parameter"
-            )
+            text = f"chunk_size is {chunk_size}; expected 1 to {FREE_BYTES}"
+            raise BagError(text, reason="parameter")
         if flush_period is not None and not flush_period > 0:
             raise BagError(f"flush_period is {flush_period}; expected above 0", reason="parameter")
         for name, entries in (metadata or {}).items():
@@ -279,11 +178,10 @@ class BagWriter:
             self._file = self._path.open("xb", buffering=0)
         except OSError as error:
             raise write_error(error, self._path) from error
-        self._writer = McapWriter(self._file, self._path, chunk_size)
         try:
-            self._writer.start("ros2")
+            self._writer = McapWriter(self._file, self._path, chunk_size, "ros2")
             for name, entries in (metadata or {}).items():
-                self._writer.add_metadata(name, entries)
+                self._writer.put_metadata(name, entries)
         except BagError:
             self._file.close()
             raise
@@ -307,9 +205,8 @@ class BagWriter:
         """
         self._require_open()
         if topic in self._codecs:
-            raise BagError(
-                f"topic {topic} already exists in this bag", path=self._path, reason="topic"
-            )
+            text = f"topic {topic} already exists in this bag"
+            raise BagError(text, path=self._path, reason="topic")
         if not topic.startswith("/") or topic.endswith("/"):
             text = f"{topic!r} is not a full topic name, such as /joint_states"
             raise BagError(text, path=self._path, reason="topic")
@@ -342,7 +239,14 @@ class BagWriter:
         for value in (logged, published):
             if not 0 <= value < 2**64:
                 raise BagError(f"time {value} ns is outside 0 to 2^64", reason="time")
-        data = _encoded(codec, message)
+        if isinstance(message, bytes | bytearray | memoryview):
+            data = bytes(message)
+        else:
+            live = live_type_name(message)
+            if live not in (None, codec.type_name):
+                text = f"the message is a {live}; the topic has {codec.type_name}"
+                raise BagError(text, reason="type")
+            data = codec.encode(message)
         if len(data) > MAX_CHUNK_BYTES // 2:
             limit = MAX_CHUNK_BYTES // 2
             raise BagError(f"the message has {len(data)} bytes; at most {limit}", reason="size_cap")
@@ -395,12 +299,13 @@ class BagWriter:
     # From here on: the writer's thread.
 
     def _register(self, topic: str, type_name: str, text: str, qos: str) -> None:
-        schema = Schema(type_name, "ros2msg", text.encode())
-        channel = Channel(0, topic, "cdr", {"offered_qos_profiles": qos})
-        self._numbers[topic] = self._writer.channel(schema, channel)
+        schema = Schema(0, text.encode(), "ros2msg", type_name)
+        channel = Channel(0, topic, "cdr", {"offered_qos_profiles": qos}, 0)
+        self._numbers[topic] = self._writer.register(schema, channel)
 
     def _add(self, topic: str, log_time: int, data: bytes, published: int, sequence: int) -> None:
-        self._writer.add_message(Head(self._numbers[topic], sequence, log_time, published), data)
+        number = self._numbers[topic]
+        self._writer.add_message(number, log_time, data, published, sequence)
 
     def _work(self) -> None:
         try:
@@ -431,12 +336,3 @@ class BagWriter:
             job()
             if due is None and self._period is not None:
                 due = time.monotonic() + self._period
-
-
-def _encoded(codec: MessageCodec, message: object) -> bytes:
-    if isinstance(message, bytes | bytearray | memoryview):
-        return bytes(message)
-    live = live_type_name(message)
-    if live not in (None, codec.type_name):
-        raise BagError(f"the message is a {live}; the topic has {codec.type_name}", reason="type")
-    return codec.encode(message)

@@ -18,6 +18,7 @@ from mcap.writer import CompressionType, Writer
 from pkm_twin.bags.reader import inspect, read_messages
 from pkm_twin.bags.recover import recover
 from pkm_twin.errors import BagError
+from test.bags import raw
 from test.support.robots import often
 
 Rows = Callable[[Any], list[tuple[Any, ...]]]
@@ -144,6 +145,45 @@ def test_messages_without_crc_are_told(tmp_path: Path) -> None:
     assert (result.messages, result.unverified) == (1, 1)
     report = inspect(tmp_path / "saved.mcap")
     assert report.profile == "other" and report.metadata == {"plain": {"key": "value"}}
+
+
+@pytest.mark.parametrize("extra", ["attachment", "unknown", "unknown in a chunk"])
+def test_records_that_are_left_out_are_told(tmp_path: Path, extra: str) -> None:
+    source = raw.foreign_bag(tmp_path / "f.mcap", [1, 2], enable_crcs=False)
+    assert recover(source, tmp_path / "all.mcap").lossless
+    data = source.read_bytes()
+    if extra == "attachment":
+        record = raw.record(9, bytes(16) + raw.text(b"n") + raw.text(b"t") + bytes(8 + 4))
+    else:
+        record = raw.record(0x90, b"private")
+        record = record if extra == "unknown" else raw.chunk(record)
+    end = raw.record(15, bytes(4)) + raw.record(2, bytes(20)) + raw.MAGIC
+    source.write_bytes(data[: sum(chunks(data)[0])] + record + end)
+    assert inspect(source).message_count == 2
+    result = recover(source, tmp_path / "saved.mcap")
+    assert result.messages == 2 and not result.lossless
+    assert result.bytes_lost == (0 if "chunk" in extra else len(record))
+
+
+def test_an_index_that_looks_like_a_message_is_not_saved(bag: Path, tmp_path: Path) -> None:
+    """One bit makes a message of a message index, with a known channel and any content."""
+    data = bytearray(bag.read_bytes())
+    at = sum(chunks(bytes(data))[0])
+    assert data[at] == 7
+    data[at] = 5
+    (tmp_path / "d.mcap").write_bytes(data)
+    result = recover(tmp_path / "d.mcap", tmp_path / "saved.mcap")
+    assert (result.messages, result.unverified, result.lossless) == (72, 0, False)
+    assert result.bytes_lost == 9 + struct.unpack_from("<Q", data, at + 1)[0]
+
+
+def test_the_summary_s_types_replace_damaged_ones(bag: Path, tmp_path: Path) -> None:
+    source = raw.foreign_bag(tmp_path / "f.mcap", [1, 2, 3], use_chunking=False)
+    data = source.read_bytes()
+    source.write_bytes(data.replace(b"string data", b"string dama", 1))
+    result = recover(source, tmp_path / "saved.mcap")
+    assert (result.messages, result.lossless) == (3, False) and result.bytes_lost > 0
+    assert inspect(tmp_path / "saved.mcap").topics["/text"].definition == "string data"
 
 
 def test_refusals(bag: Path, tmp_path: Path) -> None:

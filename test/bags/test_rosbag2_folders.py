@@ -217,6 +217,9 @@ def test_recovery_of_a_folder(bag: Path, tmp_path: Path, rows: Rows, mode: str) 
     last.write_bytes(b"")
     empty = recover(folder, tmp_path / "empty.mcap")
     assert empty.messages == 48 and not empty.lossless
+    last.unlink()
+    lost = recover(folder, tmp_path / "lost.mcap")
+    assert lost.messages == 48 and "no such file" in lost.reason
 
 
 def test_a_damaged_packed_message_costs_itself_alone(bag: Path, tmp_path: Path) -> None:

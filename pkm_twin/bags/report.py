@@ -1,0 +1,185 @@
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
+"""What is known of a bag once it has been checked. Imports no ROS."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from pkm_twin.bags.definitions import parse_definition
+from pkm_twin.bags.storage import METADATA_FILE, Storage
+from pkm_twin.bags.strict import Check, Span
+from pkm_twin.errors import BagError
+
+
+@dataclass(frozen=True)
+class TopicInfo:
+    """One topic of a bag: log times in ns, 0 without messages; QoS as YAML, as in the file."""
+
+    type: str
+    count: int
+    start: int
+    end: int
+    offered_qos: str
+    definition: str
+    """The message definition in the file; empty where it has none."""
+    encoding: str
+    """How messages are encoded, ``cdr`` in ROS 2."""
+    schema_encoding: str
+    """What the definition is written in, ``ros2msg`` or ``ros2idl``; empty where there is none."""
+
+
+@dataclass(frozen=True)
+class BagReport:
+    """What a strict pass over a whole bag found. Times are log times in ns, 0 without messages."""
+
+    path: Path
+    profile: str
+    library: str
+    topics: Mapping[str, TopicInfo]
+    message_count: int
+    start_time: int
+    end_time: int
+    has_crc: bool
+    """Every message is covered by a CRC."""
+    has_index: bool
+    """Every chunk is listed in the summary."""
+    has_summary: bool
+    warnings: tuple[str, ...]
+    out_of_order: int
+    """Messages whose log time is before that of one earlier in the file."""
+    metadata: Mapping[str, Mapping[str, str]]
+    miscounts: tuple[str, ...] = ()
+    """Message counts of the bag's folder that its files contradict; they are warnings too."""
+
+    @property
+    def duration(self) -> float:
+        """Time from the first message to the last, s."""
+        return (self.end_time - self.start_time) * 1e-9
+
+
+def make_report(path: Path, storage: Storage, checks: Sequence[Check]) -> BagReport:
+    """Return the report of a sound bag by the checks of its files.
+
+    :raises BagError: a topic has two types, or forms of one.
+    """
+    topics: dict[str, TopicInfo] = {}
+    for file, check in zip(storage.files, checks, strict=True):
+        for name, info in _each_topic(check):
+            _join_topic(topics, name, info, file.path)
+    whole = Span()
+    for check in checks:
+        whole.join(check.total)
+    stated = {"": storage.message_count} if storage.message_count is not None else {}
+    stated |= {f" on {name}": number for name, number in storage.by_topic.items()}
+    stated |= {f" in {name}": number for name, number in storage.by_file.items()}
+    counts = {"": whole.count} | {f" on {name}": info.count for name, info in topics.items()}
+    for file, check in zip(storage.files, checks, strict=True):
+        counts[f" in {file.path.name}"] = check.message_count
+    miscounts = tuple(
+        f"{METADATA_FILE} states {said} messages{where}, there are {counts.get(where, 0)}"
+        for where, said in stated.items()
+        if said != counts.get(where, 0)
+    )
+    warnings = dict.fromkeys(text for check in checks for text in _find_warnings(check))
+    return BagReport(
+        path=path,
+        profile=checks[0].header.profile,
+        library=checks[0].header.library,
+        topics=dict(sorted(topics.items())),
+        message_count=whole.count,
+        start_time=whole.start,
+        end_time=whole.end,
+        has_crc=all(check.has_crc for check in checks),
+        has_index=all(check.has_index for check in checks),
+        has_summary=all(check.has_summary for check in checks),
+        warnings=(*warnings, *miscounts),
+        miscounts=miscounts,
+        out_of_order=sum(check.out_of_order for check in checks),
+        # rosbag2 writes its record anew when it closes a bag: the last one holds.
+        metadata={title: entries for check in checks for title, entries, _ in check.metadata},
+    )
+
+
+def _find_warnings(check: Check) -> Iterator[str]:
+    if not check.has_crc:
+        chunks = [part.has_crc for part in check.segments if part.is_chunk]
+        some = f"{chunks.count(False)} of {len(chunks)} chunks have no CRC"
+        yield (
+            f"{some if any(chunks) else 'the messages have no CRC'}, as rosbag2 writes by default: "
+            "lengths, counts, times and indexes agree, a changed value would go unseen"
+        )
+    elif not check.has_data_crc:
+        yield "the data section has no CRC of its own: metadata and record headers are unproven"
+    if check.has_crc and check.summary_without_crc:
+        yield "the summary has no CRC"
+    if not check.has_summary:
+        yield "there is no summary: read by a scan, the message count is unproven"
+    elif check.statistics is None:
+        yield "the summary has no statistics: the message count is unproven"
+    yield from check.notes
+    if check.out_of_order:
+        yield f"{check.out_of_order} messages are out of order by log time"
+    if unknown := check.records.passed_over.total():
+        yield f"{unknown} records of unknown kinds were passed over"
+
+
+def _each_topic(check: Check) -> Iterator[tuple[str, TopicInfo]]:
+    """Yield the topic of each channel."""
+    schemas = check.records.schemas
+    # Many channels may share one long definition.
+    texts = {number: schema.data.decode(errors="replace") for number, schema in schemas.items()}
+    for number, channel in check.records.channels.items():
+        schema = schemas.get(channel.schema_id)
+        span = check.spans.get(number, Span())
+        yield (
+            channel.topic,
+            TopicInfo(
+                type=schema.name if schema else "",
+                count=span.count,
+                start=span.start,
+                end=span.end,
+                offered_qos=channel.metadata.get("offered_qos_profiles", ""),
+                definition=texts.get(channel.schema_id, ""),
+                encoding=channel.message_encoding,
+                schema_encoding=schema.encoding if schema else "",
+            ),
+        )
+
+
+def _join_topic(topics: dict[str, TopicInfo], name: str, info: TopicInfo, path: Path) -> None:
+    """Add a channel of the topic ``name``: another publisher's, or of another file of the bag.
+
+    :raises BagError: it is not of the type, with the fields, that the topic has so far.
+    """
+    known = topics.get(name)
+    if known is None:
+        topics[name] = info
+        return
+    if known.type != info.type:
+        text = f"topic {name} has two types, {known.type} and {info.type}"
+        raise BagError(text, path=path, reason="type")
+    if not _one_form(known, info):
+        text = f"topic {name} has two forms of the type {info.type}: definition or encoding differ"
+        raise BagError(text, path=path, reason="type")
+    if not (known.count and info.count):
+        topics[name] = known if known.count or not info.count else info
+        return
+    start, end = min(known.start, info.start), max(known.end, info.end)
+    topics[name] = replace(known, count=known.count + info.count, start=start, end=end)
+
+
+def _one_form(one: TopicInfo, other: TopicInfo) -> bool:
+    """Whether messages of both can be read alike; definitions may differ in comments."""
+    if (one.encoding, one.schema_encoding) != (other.encoding, other.schema_encoding):
+        return False
+    if one.definition == other.definition:
+        return True
+    if one.schema_encoding != "ros2msg":
+        return False
+    try:
+        fields = [parse_definition(info.type, info.definition) for info in (one, other)]
+    except BagError:
+        return False
+    return fields[0] == fields[1]
