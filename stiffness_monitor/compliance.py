@@ -58,7 +58,10 @@ StrainEnergy = PlatformResponse
 
 
 def platform_response(robot: Robot, q: ArrayLike, wrench: ArrayLike) -> PlatformResponse:
-    """Compliance, deflection and strain energies at joint positions, from one factorisation.
+    """Return compliance, deflection and strain energies at joint positions, from one factorisation.
+
+    2UPR-RPU paper: C (equation 35), the total strain energy U = P' C P / 2 (equation 37), and the
+    local strain-energy factors mu_ij = U_ij / U (equation 38).
 
     :param q: joint positions, shape (..., n), rad or m; locked.
     :param wrench: external force and moment on the platform at its reference point, base axes,
@@ -152,8 +155,9 @@ def compliance(robot: Robot, pose: ArrayLike) -> Array:
 
 
 def stiffness(robot: Robot, pose: ArrayLike) -> Array:
-    """Stiffness of the platform at its reference point, (..., 6, 6): the compliance's inverse.
+    """Return the stiffness at the platform's reference point, (..., 6, 6): compliance inverted.
 
+    K of the 2UPR-RPU paper (equation 34).
     Exactly symmetric; base axes, N/m, N/rad, N m/m, N m/rad. Errors as in :func:`compliance`.
     """
     matrix = np.linalg.inv(compliance(robot, pose))

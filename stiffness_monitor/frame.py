@@ -93,7 +93,9 @@ def deformations(
     """Ways to deform of a beam along x: forms of its ends' 12 displacements, and rigidities.
 
     Stretch, twist, then of both planes circle and S. With phi = 12 E I / (G A_shear L^2) these
-    diagonalise Timoshenko's matrix (Friedman and Kosmatka 1993, equation 14).
+    diagonalise Timoshenko's matrix (Friedman and Kosmatka 1993). Of a bar between joints the energy
+    is that of the section's forces in the 2UPR-RPU paper's equation 2, and of its bar compliances
+    C_B (equations 3 and 20).
 
     :param stretch: EA. ``twist``: GJ. ``bend``: EI. ``shear``: phi L^2.
     """
@@ -153,7 +155,11 @@ class Frame:
         return Node(node.own, rigid_offset(at - node.at) @ node.map, at)
 
     def _let(self, support: Support) -> tuple[range, Array]:
-        """New coordinates of what a joint lets through, along its axes, shape (6, count)."""
+        """Return new coordinates of what a joint lets through, along its axes, shape (6, count).
+
+        A joint is elastic in its own axes: the 2UPR-RPU paper's D_i1 and D_i2, which project limb
+        wrenches to a joint's axes (equations 5 to 7, 11 to 13, 21 to 24), are columns here.
+        """
         kinds = [k for k, compliance in enumerate(support.compliance) if not is_zero(compliance)]
         lets = [np.eye(6)[k] for k in kinds]
         lets += [pitch * np.eye(6)[k] + np.eye(6)[3 + k] for k, pitch in support.screws]

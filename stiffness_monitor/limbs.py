@@ -41,6 +41,9 @@ class LimbStiffness:
 def limb_stiffness(robot: Robot, pose: ArrayLike) -> LimbStiffness:
     """Return K_i (equations 17 and 28), J_i (30) and the factor matrices of W_i (36) of the limbs.
 
+    With the limb's deformation delta_i = C_i W_i (equation 18) and its energy W_i' C_i W_i / 2,
+    C_i of equations 16 and 27, K_i is the inverse of C_i.
+
     The elastic frame's columns of one limb give its stiffness on the platform by condensation; on
     the limb's own wrenches J_i that is K_i = (C_B + D_1' C_1 D_1 + D_2' C_2 D_2)^-1 of the paper.
 

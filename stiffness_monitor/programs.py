@@ -203,7 +203,10 @@ class Solved:
         return column._replace(row={self.place[k]: value for k, value in row.items()})
 
     def factorise(self) -> None:
-        """The stiffness: ``compliance`` of the platform, ``measure`` of the frame."""
+        """Factorise the stiffness: ``compliance`` of the platform, ``measure`` of the frame.
+
+        The platform's K and C (2UPR-RPU paper, equations 33 to 35).
+        """
         n, first = len(self.place), len(self.place) - PLATFORM
         matrix: dict[tuple[int, int], Any] = {(i, i): 0.0 for i in range(n)}
         for column in self.columns:
@@ -230,7 +233,11 @@ class Solved:
                 self.compliance[i, j] = self.compliance[j, i] = value
 
     def load(self, wrench: Any) -> None:
-        """A wrench on the platform: coordinates ``x`` and the columns' ``amounts``."""
+        """Load the platform: coordinates ``x`` and the columns' ``amounts``.
+
+        Elements move with the platform, and their work is the wrench's (2UPR-RPU paper, equations
+        29, 31 and 32).
+        """
         root, x = self.root, [0.0] * len(self.place)
         x[-PLATFORM:] = self.compliance @ wrench
         for j in reversed(range(len(x) - PLATFORM)):
@@ -242,7 +249,10 @@ class Solved:
             self.x[k] = _dot(row.values(), [self.x[c] for c in row])
 
     def energies(self) -> list[Any]:
-        """Strain energies of the elements under the load, in their order."""
+        """Return the strain energies of the elements under the load, in their order.
+
+        Of bars and joints (2UPR-RPU paper, equations 4, 9, 14 and 26).
+        """
         found: dict[str, Any] = dict.fromkeys(self.elastic.names, 0.0)
         for column, amount in zip(self.columns, self.amounts, strict=True):
             found[column.element] += 0.5 * column.rigidity * (amount * amount)

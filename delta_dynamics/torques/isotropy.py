@@ -267,7 +267,7 @@ def max_driving_force(
 
     :param pose: shape (..., m).
     :param direction: of the pose rates, shape (..., m); their length follows from ``energy``.
-    :param energy: kinetic energy E_M of the platform, J.
+    :param energy: kinetic energy E_M of the platform, J; the default is that of equation 48.
     :param acceleration: Xddot, a number or shape (..., m).
     :returns: shape (...).
     """
@@ -409,7 +409,7 @@ def _form(matrix: Array, x: Array) -> Array:
 
 
 def _directions(directions: ArrayLike, size: int | None = None) -> Array:
-    """Unit vectors.
+    """Return unit vectors: xdot of Xdot = X xdot (equation 45).
 
     :raises ValueError: a vector of length zero or not finite, or a wrong last axis.
     """

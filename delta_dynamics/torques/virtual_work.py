@@ -36,8 +36,9 @@ def inverse_dynamics(
     """Actuator efforts for a motion, exact rigid-body dynamics.
 
     tau = sum over bodies of Jv' m (a - g) + Jw' (I alpha + omega x I omega), less J' wrench, plus
-    friction: the principle of virtual work (Delta-CU paper, step 4; 3-PRRU paper, F_d). A sample
-    has no memory: Coulomb friction has the rate's sign, without ``presliding``.
+    friction: the principle of virtual work (Delta-CU paper, step 4). Without friction it is the
+    3-PRRU paper's F_d = -J^-T (J_M' Q_M + sum of J_Hij' Q_Hij) - Q_S (equation 41). A sample has no
+    memory: Coulomb friction has the rate's sign, without ``presliding``.
 
     :param q: joint positions, shape (..., n), rad or m.
     :param qd: joint rates, shape (..., n).
@@ -155,8 +156,9 @@ class Forces:
         self.moment[body] = self.moment[body] + cross(self.motion.arm(body, point), force)
 
     def inertia(self, bodies: Objects, rods: Objects) -> None:
-        """Newton's and Euler's laws, for the accelerations that the motion has (less gravity).
+        """Add Newton's and Euler's laws, for the motion's accelerations (less gravity).
 
+        What a body needs is minus the 3-PRRU paper's Q_M, Q_S and Q_Hij (equations 32 to 37).
         Couples of bodies that share a rotation act on the first of them: generalised efforts are
         the same. For reactions take :meth:`body` of each.
         """
@@ -277,7 +279,11 @@ class Forces:
         self.moment[graph.platform] = self.moment[graph.platform] - six[3:]
 
     def generalised(self) -> tuple[Objects, Objects]:
-        """Down the tree: generalised forces of the unknown rates and of the drives that lead."""
+        """Return the generalised forces of the unknown rates and of the drives, down the tree.
+
+        The power of all wrenches per rate: J_M' Q_M + J' Q_S + sum of J_Hij' Q_Hij, with the other
+        sign (3-PRRU paper, equations 38 and 39).
+        """
         m, tree = self.motion, self.motion.tree
         unknown = np.zeros(tree.unknown_rates, dtype=object)
         driven = np.zeros(len(tree.graph.leads), dtype=object)
@@ -352,7 +358,11 @@ def _laws_of(t: Traced, parts: list[Objects]) -> list[dict[str, Any]]:
 
 
 def _loads(t: Traced, parts: list[Objects], qd: Objects, qdd: Objects) -> list[Any]:
-    """Efforts without the drives' friction and rotors."""
+    """Return the efforts without the drives' friction and rotors.
+
+    F_d = -J^-T (J_M' Q_M + sum of J_Hij' Q_Hij) - Q_S (3-PRRU paper, equations 40 and 41), on joint
+    rates: the closures' multipliers eliminate the unknown rates, which is the product with J^-T.
+    """
     bodies, rods, gravity, *_, passive = parts
     wrench = t.tape.inputs("wrench", 6)
     t.set_rates(qd)

@@ -162,7 +162,10 @@ class Motion:
     # Columns: velocity of a point of a body, and angular velocity, by rates.
 
     def linear_jacobian(self, body: str, at: Any) -> Columns:
-        """Velocity per rate of the point of a body that is at a place."""
+        """Return the velocity per rate of the point of a body that is at a place.
+
+        Linear rows of the 3-PRRU paper's velocity maps J_M and J_Hij (equations 18 and 26).
+        """
         out: Columns = {}
         while body != BASE:
             link, absolute = self.tree.links[body], False
@@ -187,7 +190,10 @@ class Motion:
         return out
 
     def angular_jacobian(self, body: str) -> Columns:
-        """Angular velocity of a body per rate."""
+        """Return the angular velocity of a body per rate.
+
+        Angular rows of the 3-PRRU paper's J_M and J_Hij (equations 19 to 21, and 27 to 29).
+        """
         out: Columns = {}
         while body != BASE:
             link = self.tree.links[body]
@@ -307,7 +313,10 @@ class Motion:
     # Velocities and accelerations.
 
     def set_rates(self, u: Numbers, qd: Numbers) -> None:
-        """Angular velocity, and velocity of the origin, of every body."""
+        """Compute the angular velocity, and the velocity of the origin, of every body.
+
+        With the pose's rates: 3-PRRU paper, equations 22 and 30.
+        """
         zero = np.zeros(3)
         self.omega: dict[str, Any] = {BASE: zero}
         self.speed: dict[str, Any] = {BASE: zero}
@@ -333,7 +342,10 @@ class Motion:
             self.omega[link.body], self.speed[link.body] = w, v
 
     def set_accelerations(self, du: Numbers, qdd: Numbers, gravity: Any | None = None) -> None:
-        """Angular acceleration, and acceleration of the origin less gravity, of every body."""
+        """Compute each body's angular acceleration, and its origin's acceleration less gravity.
+
+        Without the Hessians of the 3-PRRU paper's equations 23 and 31.
+        """
         zero = np.zeros(3)
         pull = zero if gravity is None else gravity
         self.alpha: dict[str, Any] = {BASE: zero}

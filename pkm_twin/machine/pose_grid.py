@@ -48,6 +48,20 @@ class PoseGrid:
         parts = dict(zip(self.lateral, across, strict=True)) | {self.height: z}
         return np.stack([parts[name] for name in self.names], -1)
 
+    def distance(self, pose: ArrayLike) -> Array:
+        """Return the distance from a cylinder's axis, m or rad, of poses (..., m); shape (...)."""
+        poses = np.asarray(pose, np.float64)
+        first, second = (poses[..., self.names.index(name)] for name in self.lateral)
+        if self.zero_torsion:
+            # The tilt, without the loss of digits that its cosine has near zero.
+            return np.asarray(
+                np.arctan2(
+                    np.hypot(np.sin(first) * np.cos(second), np.sin(second)),
+                    np.cos(first) * np.cos(second),
+                )
+            )
+        return np.asarray(np.hypot(first, second))
+
 
 def zero_torsion(tilt: ArrayLike, azimuth: ArrayLike) -> tuple[Array, Array]:
     """Angles (alpha, beta), rad, of Rx(alpha) Ry(beta) Rz(.) whose z axis leans by a tilt.

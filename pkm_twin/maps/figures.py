@@ -231,7 +231,7 @@ def planes(data: Dataset, case: int) -> Figure:
             if len(one["names"]) == 1:
                 _line(one, ax, scale, label)
                 continue
-            mesh = _panel(one, ax, scale, scale * low, scale * high, SHARES[count < PANELS])
+            mesh = draw_panel(one, ax, scale, scale * low, scale * high, SHARES[count < PANELS])
             over = kind.overlay(data, one["names"], one["through"], ax)
         if len(drawn[0]["names"]) > 1:
             bar = figure.colorbar(
@@ -274,9 +274,10 @@ def _line(one: dict[str, Any], ax: Axes, scale: float, label: str) -> None:
         ax.plot(one["star"][0], scale * one["values"][k, 0], "*", color="red", ms=12)
 
 
-def _panel(
+def draw_panel(
     one: dict[str, Any], ax: Axes, scale: float, low: float, high: float, shares: Sequence[float]
 ) -> Any:
+    """Draw a plane of :func:`plane_of` with contours below these shares of its values."""
     x, y = one["ticks"]
     values = scale * one["values"].T
     mesh = ax.pcolormesh(

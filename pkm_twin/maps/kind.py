@@ -227,7 +227,8 @@ class Space:
     otherwise empty, and ``samples`` joint positions are drawn. ``side``: poses along a side of a
     plane. ``least``: singularity index, and ``least_clearance``: distance of the limbs, m, below
     which a pose does not count. ``at``: the pose (m,) that planes go through, instead of the worst.
-    ``worst``: of each case, once they are known.
+    ``worst``: of each case, once they are known. ``circles``: heights and radii, shape (2, k), of
+    the circles about the axis that a pose has to be in; None for all poses.
     """
 
     robot: Robot
@@ -241,6 +242,7 @@ class Space:
     least_clearance: float
     at: Array | None = None
     worst: tuple[Worst, ...] = ()
+    circles: Array | None = None
 
     @property
     def by_joints(self) -> bool:
@@ -269,7 +271,18 @@ class Space:
     def counts(self, q: Array, pose: Array, known: Mask, case: Case) -> Mask:
         """Which joint positions (k, n) and poses (k, m) count, of those that are known."""
         bound = -math.inf if case.interfering else self.least_clearance
-        return counts(self.robot, q, pose, known, self.least, bound)
+        return counts(self.robot, q, pose, known & self.encircled(pose), self.least, bound)
+
+    def encircled(self, pose: Array) -> Mask:
+        """Return which poses (k, m) are inside the circles, linear between their heights."""
+        if self.circles is None:
+            return np.ones(len(pose), bool)
+        grid = self.robot.grid()
+        height = pose[:, self.robot.pose_names.index(grid.height)]
+        layers, radii = self.circles
+        radius = np.interp(height, layers, radii, left=np.nan, right=np.nan)
+        # NaN, where a circle is too small, is not above.
+        return np.asarray(radius >= grid.distance(pose))
 
     def through(self, case: int) -> Array:
         """The pose that the planes of a case go through, shape (m,)."""

@@ -329,7 +329,8 @@ def _join(sweep: Map, parts: Parts, sink: _Sink) -> None:
             fill = np.nan if np.dtype(field.dtype).kind == "f" else None
             shape = [sizes[dim] for dim in field.dims]
             # As large as what is written at once.
-            rows = (1, *shape[1:3], 1) if field.dims[0] == "plane" else (sweep.rows, *shape[1:])
+            planes = field.dims[0] == "plane"
+            rows = (1, *shape[1:3], 1, *shape[4:]) if planes else (sweep.rows, *shape[1:])
             chunks = tuple(min(sides) for sides in zip(rows, shape, strict=True))
             target = file.create_variable(
                 name, field.dims, field.dtype, fillvalue=fill, chunks=chunks, **_STORED

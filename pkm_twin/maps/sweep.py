@@ -42,10 +42,11 @@ from pkm_twin.maps.kind import (
     number,
     texts,
 )
+from pkm_twin.maps.kinds.workspace import LAYERS, circle_variables, circles
 from pkm_twin.maps.search import COARSE, FULL, badness, workspace_box, worst_of
 from pkm_twin.robot.clearance import has_clearance, joint_clearance
 from pkm_twin.robot.robot import Robot
-from pkm_twin.robot.workspace import keeps_limits
+from pkm_twin.robot.workspace import LEAST_TILT, distance_unit, keeps_limits
 
 LONGEST: Final = 2001
 """Most poses along one coordinate."""
@@ -127,13 +128,16 @@ class Map(Space):
             fields["direction"] = Field((*grid, "axis"), about("of the value", "", turn))
         if elements:
             fields["dominant"] = Field(grid, blame, "i2")
+        share = about("share of an element", "", SHARE)
         if self.kind.has_shares:
-            fields["factor"] = Field((*grid, "element"), about("share of an element", "", SHARE))
+            fields["factor"] = Field((*grid, "element"), share)
         if not self.ticks:
             fields["pose"] = Field(("sample", "coordinate"), about("pose of a sample, m and rad"))
         fields["plane_value"] = Field(plane, value)
         if elements:
             fields["plane_dominant"] = Field(plane, blame, "i2")
+        if self.kind.has_shares:
+            fields["plane_factor"] = Field((*plane, "element"), share)
         reach = about("1 where all limits are kept", "", FLAG)
         return fields | {"plane_reach": Field(plane, reach, "i1")}
 
@@ -167,6 +171,7 @@ class Map(Space):
             "points": math.prod(self.shape),
             "least_singularity": self.least,
             "least_clearance": self.least_clearance,
+            "regular": self.circles is not None,
             "at": None if self.at is None else self.at.tolist(),
             "wrenches": {case.name: case.wrench for case in self.cases},
             "options": self.kind.options,
@@ -316,7 +321,7 @@ class Map(Space):
     def _values(self, q: Array, pose: Array, known: Mask, cases: Sequence[Case]) -> Values:
         robot, count = self.robot, len(q)
         reach = keeps_limits(robot, q, pose, -math.inf, known)
-        inside = reach.copy()
+        inside = reach & self.encircled(pose)
         inside[inside] = robot.try_singularity(q[inside])[0] >= self.least
         apart = inside.copy()
         if has_clearance(robot):
@@ -382,6 +387,8 @@ class Map(Space):
         poses = np.array([self.through(k) for k in range(len(self.cases))])
         what = about("pose that the planes go through, m and rad")
         result["through"] = Variable(("case", "coordinate"), poses, what)
+        if self.circles is not None:
+            result |= circle_variables(self.robot, *self.circles)
         return result | self._worst() | self.kind.summaries(self, counted, apart)
 
     def _worst(self) -> dict[str, Variable]:
@@ -446,6 +453,7 @@ def map_of(
     at: Sequence[float] | None = None,
     least_singularity: float | None = None,
     least_clearance: float = 0.0,
+    regular: bool = False,
 ) -> Map:
     """The map of a kind over a robot's workspace.
 
@@ -454,8 +462,10 @@ def map_of(
     :param at: the pose that the planes go through; default the worst.
     :param least_singularity: singularity index below which a pose does not count; default by kind.
     :param least_clearance: distance between limbs, m, below which a pose does not count.
+    :param regular: count only poses inside the largest circles about the axis, of
+        ``LEAST_TILT`` or more where they are tilts (2UPR-RPU paper, figure 5).
     :raises ParameterError: the robot's file lacks what the kind needs, or limits without which
-        the workspace has no end; a bound on a clearance that is not known.
+        the workspace has no end; a bound on a clearance that is not known; no circle.
     :raises UnreachableError: ``at`` is none of the robot's poses.
     """
     cases = tuple(cases) or kind.cases(robot)
@@ -475,6 +485,10 @@ def map_of(
         robot.inverse(at)
     bounds = robot.made(workspace_box)
     count = len(bounds)
+    stack = None
+    if regular:
+        stack = find_circles(robot, bounds, least, least_clearance)
+        bounds = _bound_circles(robot, stack)
     ticks: tuple[Array, ...] = ()
     if count <= FULL:
         length = max(5, min(round(total ** (1 / count)), LONGEST))
@@ -488,8 +502,40 @@ def map_of(
     side = round(math.sqrt(total / (3 if count > 2 else 1))) if count > 1 else total
     return Map(
         robot, kind, cases, bounds, ticks, total, min(max(side, SIDES[0]), SIDES[1]), least,
-        least_clearance, None if at is None else np.array(at, np.float64),
+        least_clearance, None if at is None else np.array(at, np.float64), circles=stack,
     )  # fmt: skip
+
+
+def find_circles(robot: Robot, bounds: Array, least: float, least_clearance: float) -> Array:
+    """Return heights and radii, shape (2, k), of the largest circles about the axis that count.
+
+    Circles of tilts below ``LEAST_TILT`` are NaN.
+
+    :param bounds: of the pose coordinates, shape (m, 2).
+    :raises ParameterError: a machine whose poses lie about no axis, or that has no circle.
+    """
+    grid = robot.grid()
+    if grid.kind != "cylinder":
+        what = "a machine whose poses lie about an axis (as upr_rpu)"
+        raise ParameterError("regular", robot.name, what)
+    low, high = bounds[robot.pose_names.index(grid.height)].tolist()
+    heights = np.linspace(low, high, LAYERS)
+    radius = circles(robot, heights, least=least, least_clearance=least_clearance)
+    smallest = LEAST_TILT if distance_unit(robot) == "rad" else 0.0
+    kept = (radius >= smallest) & (radius > 0.0)
+    if not kept.any():
+        raise ParameterError("regular", float(radius.max()), f"a circle of {smallest:.4g} or more")
+    return np.stack([heights, np.where(kept, radius, np.nan)])
+
+
+def _bound_circles(robot: Robot, stack: Array) -> Array:
+    """Return the bounds of the poses inside circles, shape (m, 2)."""
+    kept = stack[:, np.isfinite(stack[1])]
+    wide = float(kept[1].max())
+    grid = robot.grid()
+    sides = {name: (-wide, wide) for name in grid.lateral}
+    sides[grid.height] = float(kept[0].min()), float(kept[0].max())
+    return np.array([sides[name] for name in robot.pose_names])
 
 
 def check(robot: Robot, kind: Kind, cases: Sequence[Case]) -> None:

@@ -162,7 +162,7 @@ class Prru(TwinRobot):
         return self._with(geometry=geometry)
 
     def _directions(self, i: int) -> tuple[Array, Array]:
-        """E and t of limb i."""
+        """Return e and t of limb i, whose azimuth phi_i gives C_i (equations 2 and 3)."""
         angle = self.geometry.azimuths[i]
         e = np.array([np.cos(angle), np.sin(angle), 0.0])
         return e, np.cross(UP, e)
@@ -179,8 +179,9 @@ class Prru(TwinRobot):
         return self._sign * sqrt(g.limb_length**2 - aside**2)
 
     def _corners(self, pose: Objects) -> tuple[Any, Any]:
-        """Platform joints U_i of a pose, (3, 3), and the norm that gamma is told by.
+        """Return the platform joints U_i of a pose, (3, 3), and the norm that gamma is told by.
 
+        U_i by the rotation of equation 1 (equations 6 and 7), in the limbs' planes (equation 10).
         With the upper left of Rx Ry = [[m, 0], [n, o]], sum w_i t_i . U_i = 0, where
         sum w_i t_i = 0 and sum w_i = 1, reads a cos gamma + b sin gamma = 0; b > 0 in the level
         pose. At 120 degrees it is equation 11: tan gamma = -n / (m + o). The centre's x and y are
@@ -232,7 +233,10 @@ class Prru(TwinRobot):
         return limb, float(-rises[limb])
 
     def solved(self, pose: Objects) -> Inverse:
-        """Slider heights (equation 9), and the closure's determinant by the swings, 1 at level."""
+        """Return the slider heights (equation 9), and the closure's determinant, 1 at level.
+
+        ``aside / l`` and ``rise / l`` are sine and cosine of the swing theta_i (equations 8, 12).
+        """
         g = self.geometry
         corners, norm = self._corners(pose)
         l, sign = g.limb_length, self._sign  # noqa: E741
@@ -287,7 +291,11 @@ class Prru(TwinRobot):
         return shared_middle(self.limits.position) or 0.0
 
     def make_graph(self) -> Graph:
-        """Sliders, links and platform, level."""
+        """Make sliders, links and platform, level.
+
+        The upper link turns about the limb (equation 4), by what the platform-fixed tangential axis
+        of its universal joint asks for (equations 13 to 17): the graph's closures find the angle.
+        """
         g = self.geometry
         m: Any = self.spelled.inertia
         height = self.chosen_home() if self.home_joint is None else self.home_joint

@@ -510,8 +510,10 @@ class UprRpu(TwinRobot):
         return tuple(beams)
 
     def structure(self) -> Structure:
-        """Bars between base and platform, joints elastic in their own axes, drives locked.
+        """Return bars between base and platform, joints elastic in their own axes, drives locked.
 
+        Joint compliances of equations 8, 15 and 25 act in the joints' axes (equations 10 and 14);
+        bar and joints of a limb in series have the compliance C_i (equations 16 and 27).
         A bar reaches from B to A, as in the paper, and its mass with it: a telescope's tubes that
         overlap are not told apart. Without inertia bars have no mass.
         """

@@ -297,11 +297,18 @@ class Robot(Mechanism):
         return self.engine.home_pose.copy()
 
     def jacobian(self, q: ArrayLike) -> Array:
-        """Pose rates per joint rate, shape (..., m, n)."""
+        """Return pose rates per joint rate, shape (..., m, n).
+
+        The inverse of the 3-PRRU paper's Jacobian J (equation 24).
+        """
         return self._jacobians(q)[0]
 
     def platform_jacobian(self, q: ArrayLike) -> Array:
-        """Platform twist (v at its reference point, omega; base axes) per rate, (..., 6, n)."""
+        """Return the platform's twist per joint rate, shape (..., 6, n).
+
+        Velocity of its reference point and angular velocity, base axes. On pose rates: the 3-PRRU
+        paper's J_M (equation 22).
+        """
         return self._jacobians(q)[1]
 
     def _jacobians(self, q: ArrayLike) -> list[Array]:

@@ -66,6 +66,8 @@ AT_ONCE: Final = 2**16
 """Poses, about, that are tried at a time."""
 CLEAR: Final = 0.01
 """Singularity measure (0 in one, 1 at best) that regular workspaces stay above."""
+LEAST_TILT: Final = math.radians(10.0)
+"""Radius, rad, below which a circle of tilts is left out (2UPR-RPU paper, section 4)."""
 INSIDE: Final = 0.05
 """The same of random joint positions."""
 
@@ -126,8 +128,9 @@ def within_limits(robot: Robot, q: ArrayLike) -> Mask:
 
 
 def reachable(robot: Robot, pose: ArrayLike, least_clearance: float = 0.0) -> Mask:
-    """Whether a pose is inside all joint limits and without limb interference, shape (...).
+    """Return whether a pose is inside all joint limits and without limb interference, shape (...).
 
+    Limits of limb lengths and passive joints: 2UPR-RPU paper, equation 40.
     A missing limit is no limit. A pose that is not finite raises an error.
 
     :param pose: shape (..., m), in the robot's pose coordinates, m and rad.
@@ -194,7 +197,7 @@ class RegularWorkspace:
 def regular_workspace(
     robot: Robot,
     z: ArrayLike,
-    least_radius: float = math.radians(10.0),
+    least_radius: float = LEAST_TILT,
     directions: int = 360,
     step: float = math.radians(0.25),
 ) -> RegularWorkspace:
@@ -204,6 +207,7 @@ def regular_workspace(
     left out (2UPR-RPU paper, section 4).
 
     :param z: heights, shape (n,), m.
+    :param least_radius: rad.
     :param directions: rays a circle.
     :param step: first search along a ray, rad; a bisection refines it to 1e-9 rad.
     """

@@ -4,6 +4,8 @@
 from __future__ import annotations
 
 import ast
+import inspect
+import re
 from functools import cache
 from pathlib import Path
 
@@ -26,7 +28,7 @@ def find_tests(path):
     return {node.name for node in tree.body if isinstance(node, ast.FunctionDef)}
 
 
-def test_functions_and_find_tests_each_row_exist(papers):
+def test_functions_and_tests_of_each_row_exist(papers):
     for row in (row for paper in papers for row in paper.rows):
         assert row.tests or row.note, f"{row.kind} {row.label} has neither a test nor a reason"
         for name in row.functions:
@@ -35,6 +37,35 @@ def test_functions_and_find_tests_each_row_exist(papers):
             assert name in find_tests(path), (path, name)
         for file in row.pictures:
             assert (ROOT / "docs/gallery" / file).stat().st_size
+
+
+def test_every_item_has_a_row(papers):
+    for paper in papers:
+        for kind, count in paper.counts.items():
+            found = [n for row in paper.rows if row.kind == kind for n in row.numbers]
+            assert sorted(found) == list(range(1, count + 1)), (paper.name, kind)
+
+
+def numbers_of(function):
+    """Return the equation numbers in the source of a function, and of its class or module's top."""
+    try:
+        source = inspect.getsource(inspect.unwrap(getattr(function, "fget", function)))
+    except TypeError:
+        return set()
+    text = " ".join(source.split())
+    found = set()
+    for words in re.findall(r"equations? ((?:\d+(?:, and |, | to | and )?)+)", text):
+        for first, last in re.findall(r"(\d+)(?: to (\d+))?", words):
+            found |= set(range(int(first), int(last or first) + 1))
+    return found | {int(n) for n in re.findall(r"\((\d+)(?= and \d+\)|\))", text)}
+
+
+def test_a_computed_equation_has_its_number_in_the_source(papers):
+    for paper in papers:
+        for row in paper.rows:
+            if row.kind == "equation" and row.functions:
+                stated = set().union(*(numbers_of(find_function(f)) for f in row.functions))
+                assert set(row.numbers) <= stated, (paper.name, row.label, sorted(stated))
 
 
 def test_the_page_is_todays(papers):

@@ -16,7 +16,6 @@ from test.support.pages import assert_printed, numbers
 from test.support.robots import parameters_of, partly_long
 from test.validation import test_delta_cu_paper as delta_cu
 from test.validation import test_upr_rpu_paper as upr_rpu
-from test.validation.test_prru_paper import paper, turn
 
 PAGE = "docs/validation.md"
 
@@ -152,61 +151,3 @@ class TestErrataOfTheDeltaCu:
         )
         most = np.abs(second - third).max()
         assert_printed(PAGE, pattern, most, second[0], third[0], efforts[0, 1], *away)
-
-
-class TestErrataOfThePrru:
-    robot = load("prru")
-
-    def test_equation_4_is_a_rotation_once_its_entry_is_corrected(self):
-        f, t, p = 0.3, -0.4, 0.7
-        c, s = np.cos, np.sin
-        right = turn(2, f) @ turn(1, t) @ turn(2, p)
-        assert right[0, 1] == pytest.approx(-c(f) * c(t) * s(p) - s(f) * c(p))
-        printed = right.copy()
-        printed[0, 1] = -c(f) * c(t) * c(p) - s(f) * c(p)
-        assert np.abs(right @ right.T - np.eye(3)).max() < 1e-15
-        assert np.abs(printed @ printed.T - np.eye(3)).max() > 0.1
-
-    def test_equation_11_holds_as_it_is_printed(self):
-        """Every joint U is in its limb's vertical plane (equation 10); with y halved it is not."""
-        g = self.robot.geometry
-        for pose in ((-0.5, 0.3, -0.4), (-0.5, 0.5, 0.45), (-0.4, -0.2, 0.6)):
-            here = paper(self.robot, np.array(pose))
-            for half, most in ((1.0, 1e-15), (0.5, np.inf)):
-                centre = here.centre * [1.0, half, 1.0]
-                off = [
-                    np.array([-np.sin(phi), np.cos(phi), 0.0])
-                    @ (centre - here.rotation @ (g.platform_radius * turn(2, phi)[:, 0]))
-                    for phi in g.azimuths
-                ]
-                assert np.abs(off).max() < most
-                assert half == 1.0 or np.abs(off).max() > 1e-3
-
-    def test_the_vector_of_equation_17_is_the_tangential_one(self):
-        """At the level pose a limb does not turn about itself."""
-        level = paper(self.robot, np.array([-0.5, 0.0, 0.0]))
-        np.testing.assert_allclose(level.spin, 0.0, atol=1e-15)
-        for phi, swing in zip(self.robot.geometry.azimuths, level.swing, strict=True):
-            radial = (turn(2, phi) @ turn(1, swing)).T @ -turn(2, phi)[:, 0]
-            assert abs(np.arctan2(-radial[0], radial[1])) == pytest.approx(np.pi / 2)
-
-
-class TestErrataOfTheUprRpu:
-    pose, theory, _ = upr_rpu.TABLE_1[1]
-
-    def deflection(self, pose, robot=upr_rpu.ROBOT):
-        return 1e6 * strain_energy(robot, pose, upr_rpu.LOAD).deflection
-
-    def test_z_is_the_coordinate(self):
-        z, beta, gamma = self.pose
-        along = self.deflection((z * np.cos(beta), beta, gamma))
-        found = [
-            100 * np.abs(d / self.theory - 1).max() for d in (along, self.deflection(self.pose))
-        ]
-        pattern = r"within (\S+) % with the distance, within (\S+) % with the coordinate"
-        assert_printed(PAGE, pattern, *found)
-
-    def test_the_shear_factor(self):
-        round_bar = upr_rpu.ROBOT.changed(members={"shear_factor": 1.127})
-        change = self.deflection(self.pose, round_bar) / self.deflection(self.pose) - 1
-        assert_printed(PAGE, r"changes it by up to (\S+) %", 100 * np.abs(change).max())

@@ -121,6 +121,8 @@ def test_interrupted_and_resumed(call, tmp_path):
         (["upr_rpu", "strain-energy", "--energy", "3"], 2, "--energy"),
         (["upr_rpu", "strain-energy", "--wrench", "0,0,0,0,0,0"], 2, "not all zero"),
         (["prru", "isotropy", "--energy", "nan"], 2, "energy"),
+        (["delta", "isotropy", "--spheres"], 1, "two tilts"),
+        (["stewart", "payload", "--regular"], 1, "about an axis"),
         (["delta", "payload", "--at", "1,2"], 2, "a pose"),
         (["delta", "payload", "--at", "5,5,5"], 1, "pose"),
         (["delta", "workspace", "--points", "9" * 18], 2, "--points"),
@@ -136,11 +138,20 @@ def test_refusals_are_one_line(words, code, text, call, tmp_path):
 
 
 def test_each_kind_says_its_own_options(call):
-    shared = {"--points", "--out", "--jobs", "--at", "--along", "--singularity", "--payload"}
+    shared = {
+        "--points",
+        "--regular",
+        "--out",
+        "--jobs",
+        "--at",
+        "--along",
+        "--singularity",
+        "--payload",
+    }
     own = {
         "workspace": set(),
-        "strain-energy": {"--wrench"},
-        "isotropy": {"--energy"},
+        "strain-energy": {"--wrench", "--elements"},
+        "isotropy": {"--energy", "--spheres"},
         "cutting-depth": {"--teeth", "--tangential", "--damping"},
     }
     assert all(kind in call("map", "delta", "--help").out for kind in KINDS)

@@ -16,7 +16,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from delta_dynamics import inverse_dynamics
+from delta_dynamics import (
+    energy_matrices,
+    energy_transfer,
+    inverse_dynamics,
+    max_driving_force,
+    sphere_directions,
+    tilted_pose,
+)
 from pkm_twin.mechanisms.prru import Prru
 from test.support.bodies import bodies
 from test.support.robots import load, partly_long
@@ -214,42 +221,125 @@ def test_velocity_maps(branch: str) -> None:
             np.testing.assert_allclose(angular[body], j.links[k] @ back, atol=1e-11)
 
 
+def driving_forces(
+    robot: Prru, pose: Array, rate: Array, twice: Array, wrench: Array
+) -> tuple[Array, tuple[Array, Array, Array]]:
+    """Equation 41: F_d = -J^-T (J_M' Q_M + sum J_Hij' Q_Hij) - Q_S; and q with derivatives."""
+    gravity = robot.gravity
+    m = robot.inertia
+    q, qd, qdd = sliders(robot, pose, rate, twice)
+    here, j = paper(robot, pose), maps(robot, pose)
+    bias = along(lambda x: maps(robot, x).flat(), pose, rate) @ rate
+    # Equations 32 and 33.
+    inertia = here.rotation @ np.array(INERTIA) @ here.rotation.T
+    w = j.platform @ rate
+    alpha = j.platform @ twice + bias[6:9]
+    force = wrench[:3] + m.platform_mass * (gravity - j.centre @ twice - bias[3:6])
+    couple = wrench[3:] - inertia @ alpha - np.cross(w, inertia @ w)
+    total = j.centre.T @ force + j.platform.T @ couple
+    # Equations 36 and 37, linear velocity of both links that of the slider (equation 26).
+    for k in range(6):
+        i, level = divmod(k, 2)
+        inertia = link_inertia(here, k)
+        w = j.links[k] @ rate
+        alpha = j.links[k] @ twice + bias[9 + 3 * k : 12 + 3 * k]
+        weight = (m.lower_link_mass, m.upper_link_mass)[level]
+        total += j.slider[i] * weight * (gravity[2] - qdd[i])
+        total += j.links[k].T @ (-inertia @ alpha - np.cross(w, inertia @ w))
+    # Equation 34, its g being the amount of gravity.
+    q_s = m.slider_mass * (gravity[2] - qdd)
+    return -np.linalg.solve(j.slider.T, total) - q_s, (q, qd, qdd)
+
+
+def link_inertia(here: Position, k: int) -> Array:
+    """Inertia of a link in base axes (equation 37)."""
+    i, level = divmod(k, 2)
+    moments, link = (LOWER, UPPER)[level], here.links[i][level]
+    return np.asarray(link @ np.diag([moments[0], moments[0], moments[1]]) @ link.T)
+
+
 @pytest.mark.parametrize("branch", ["below", "above"])
 @pytest.mark.parametrize("count", partly_long([5, 25], 5))
 def test_driving_forces_with_the_links_at_the_sliders(branch: str, count: int) -> None:
-    """Equation 41: F_d = -J^-T (J_M' Q_M + sum J_Hij' Q_Hij) - Q_S, every term as printed."""
+    """Equations 32 to 41, every term as printed."""
     robot = machine(branch, link_com=0.0)
-    gravity = robot.gravity
-    m = robot.inertia
     rng = np.random.default_rng(3)
     for pose, rate, twice in states(count, 3):
-        q, qd, qdd = sliders(robot, pose, rate, twice)
         wrench = rng.normal(size=6) * 200
-        here, j = paper(robot, pose), maps(robot, pose)
-        bias = along(lambda x: maps(robot, x).flat(), pose, rate) @ rate
-        # Equations 32 and 33.
-        inertia = here.rotation @ np.array(INERTIA) @ here.rotation.T
-        w = j.platform @ rate
-        alpha = j.platform @ twice + bias[6:9]
-        force = wrench[:3] + m.platform_mass * (gravity - j.centre @ twice - bias[3:6])
-        couple = wrench[3:] - inertia @ alpha - np.cross(w, inertia @ w)
-        total = j.centre.T @ force + j.platform.T @ couple
-        # Equations 36 and 37, linear velocity of both links that of the slider (equation 26).
-        for k in range(6):
-            i, level = divmod(k, 2)
-            moments = (LOWER, UPPER)[level]
-            link = here.links[i][level]
-            inertia = link @ np.diag([moments[0], moments[0], moments[1]]) @ link.T
-            w = j.links[k] @ rate
-            alpha = j.links[k] @ twice + bias[9 + 3 * k : 12 + 3 * k]
-            weight = (m.lower_link_mass, m.upper_link_mass)[level]
-            total += j.slider[i] * weight * (gravity[2] - qdd[i])
-            total += j.links[k].T @ (-inertia @ alpha - np.cross(w, inertia @ w))
-        # Equation 34, its g being the amount of gravity.
-        q_s = m.slider_mass * (gravity[2] - qdd)
-        force = -np.linalg.solve(j.slider.T, total) - q_s
-        twin = inverse_dynamics(robot, q, qd, qdd, wrench)
+        force, motion = driving_forces(robot, pose, rate, twice, wrench)
+        twin = inverse_dynamics(robot, *motion, wrench)
         np.testing.assert_allclose(twin, force, rtol=1e-10, atol=1e-9 * np.abs(force).max())
+
+
+def energies(robot: Prru, pose: Array) -> tuple[Array, Array]:
+    """Forms of E_M and E_all on the pose rates (equations 42 and 43), shape (3, 3) each."""
+    m, here, j = robot.inertia, paper(robot, pose), maps(robot, pose)
+    inertia = here.rotation @ np.array(INERTIA) @ here.rotation.T
+    own = m.platform_mass * j.centre.T @ j.centre + j.platform.T @ inertia @ j.platform
+    every = own + m.slider_mass * j.slider.T @ j.slider
+    for k in range(6):
+        weight = (m.lower_link_mass, m.upper_link_mass)[k % 2]
+        every += weight * np.outer(j.slider[k // 2], j.slider[k // 2])
+        every += j.links[k].T @ link_inertia(here, k) @ j.links[k]
+    return own, every
+
+
+def test_indices_of_isotropy() -> None:
+    """eta_KE (equations 42 to 46), and F_max at 100 J without acceleration (47 and 48)."""
+    robot = machine("below", link_com=0.0)
+    for pose, x, _ in states(5, 7):
+        own, every = energies(robot, pose)
+        for found, expected in zip(energy_matrices(robot, pose), (own, every), strict=True):
+            np.testing.assert_allclose(found, expected, rtol=1e-10, atol=1e-11 * every.max())
+        eta = (x @ own @ x) / (x @ every @ x)
+        assert float(energy_transfer(robot, pose, x)) == pytest.approx(eta, rel=1e-11)
+        rate = np.sqrt(2 * 100.0 / (x @ own @ x)) * x
+        force, _ = driving_forces(robot, pose, rate, np.zeros(3), np.zeros(6))
+        assert float(max_driving_force(robot, pose, x)) == pytest.approx(np.abs(force).max())
+
+
+def carried(robot: Prru, one: Array, other: Array, turn_by: float) -> Array:
+    """Pose rates at one pose to those of the same motion turned about the vertical at another."""
+    twists = []
+    for pose in (one, other):
+        q = robot.inverse(pose)
+        twists.append(robot.platform_jacobian(q) @ np.linalg.inv(robot.jacobian(q)))
+    turned = np.kron(np.eye(2), turn(2, turn_by)) @ twists[0]
+    found = np.linalg.pinv(twists[1]) @ turned
+    np.testing.assert_allclose(twists[1] @ found, turned, atol=1e-12)
+    return np.asarray(found)
+
+
+@pytest.mark.parametrize("azimuth", [20, 60])
+@pytest.mark.parametrize("tilt", [15, 45])
+def test_spheres_repeat_every_120_degrees(azimuth: float, tilt: float) -> None:
+    """Section 2.4: as at azimuth 60, 180 and 300 degrees; each direction turned with the pose."""
+    robot = load("prru")
+    assert isinstance(robot, Prru)
+    ways = sphere_directions(500)
+    poses = tilted_pose(0.85, np.radians(azimuth + np.array([0, 120, 240])), np.radians(tilt))
+    eta = energy_transfer(robot, poses[0], ways)
+    assert np.ptp(eta) > 0.05
+    for k in (1, 2):
+        turned = ways @ carried(robot, poses[0], poses[k], k * 2 * math.pi / 3).T
+        np.testing.assert_allclose(energy_transfer(robot, poses[k], turned), eta, rtol=1e-11)
+
+
+def test_spheres_become_uneven_with_the_tilt() -> None:
+    """Section 2.4: both indices differ more over the directions, the more the platform tilts.
+
+    With the shipped masses, as the paper prints none, at tilts of 30 and 45 degrees compared with
+    the level pose, at every azimuth.
+    """
+    robot, ways = load("prru"), sphere_directions(500)
+    azimuths = np.radians(np.arange(0, 360, 30))
+    for index in (energy_transfer, max_driving_force):
+        level, *tilted = (
+            np.ptp(index(robot, tilted_pose(0.85, azimuths, tilt)[:, None], ways), axis=-1)
+            for tilt in np.radians([0, 30, 45])
+        )
+        assert (tilted[1] > tilted[0]).all()
+        assert (tilted[1] > 1.3 * level).all()
 
 
 def test_forces_do_not_depend_on_the_height() -> None:
@@ -259,3 +349,41 @@ def test_forces_do_not_depend_on_the_height() -> None:
         q, qd, qdd = sliders(robot, pose, rate, twice)
         force = inverse_dynamics(robot, q, qd, qdd)
         np.testing.assert_allclose(inverse_dynamics(robot, q + 0.4, qd, qdd), force, rtol=1e-10)
+
+
+def test_equation_4_is_a_rotation_once_its_entry_is_corrected() -> None:
+    f, t, p = 0.3, -0.4, 0.7
+    c, s = np.cos, np.sin
+    right = turn(2, f) @ turn(1, t) @ turn(2, p)
+    assert right[0, 1] == pytest.approx(-c(f) * c(t) * s(p) - s(f) * c(p))
+    printed = right.copy()
+    printed[0, 1] = -c(f) * c(t) * c(p) - s(f) * c(p)
+    assert np.abs(right @ right.T - np.eye(3)).max() < 1e-15
+    assert np.abs(printed @ printed.T - np.eye(3)).max() > 0.1
+
+
+def test_equation_11_holds_as_it_is_printed() -> None:
+    """Every joint U is in its limb's vertical plane (equation 10); with y halved it is not."""
+    robot = machine("below", 0.5)
+    g = robot.geometry
+    for pose in ((-0.5, 0.3, -0.4), (-0.5, 0.5, 0.45), (-0.4, -0.2, 0.6)):
+        here = paper(robot, np.array(pose))
+        for half, most in ((1.0, 1e-15), (0.5, np.inf)):
+            centre = here.centre * [1.0, half, 1.0]
+            off = [
+                np.array([-np.sin(phi), np.cos(phi), 0.0])
+                @ (centre - here.rotation @ (g.platform_radius * turn(2, phi)[:, 0]))
+                for phi in g.azimuths
+            ]
+            assert np.abs(off).max() < most
+            assert half == 1.0 or np.abs(off).max() > 1e-3
+
+
+def test_the_vector_of_equation_17_is_the_tangential_one() -> None:
+    """At the level pose a limb does not turn about itself."""
+    robot = machine("below", 0.5)
+    level = paper(robot, np.array([-0.5, 0.0, 0.0]))
+    np.testing.assert_allclose(level.spin, 0.0, atol=1e-15)
+    for phi, swing in zip(robot.geometry.azimuths, level.swing, strict=True):
+        radial = (turn(2, phi) @ turn(1, swing)).T @ -turn(2, phi)[:, 0]
+        assert abs(np.arctan2(-radial[0], radial[1])) == pytest.approx(np.pi / 2)

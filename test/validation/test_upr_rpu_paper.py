@@ -20,42 +20,22 @@ from stiffness_monitor import (
 from test.support.robots import load
 from test.support.upr_rpu import limbs
 from test.support.workspaces import even_samples, polar_samples
+from tools.papers import upr_rpu
+from tools.papers.upr_rpu import HEIGHTS, LOAD
 
 ROBOT = load("upr_rpu")
 
-# Table 1, micrometres and microradians under this load, N and N m.
-LOAD = [30.0, -50.0, -40.0, 10.0, -20.0, 50.0]
 UNIT = 0.001
-TABLE_1 = [
-    (
-        (-0.6, 0.0, 0.0),
-        [3.400, -1.062, 0.006, 0.646, 2.671, 7.756],
-        [3.503, -1.137, 0.006, 0.701, 2.852, 8.287],
-    ),
-    (
-        (-0.6, math.radians(5), math.radians(-3)),
-        [3.627, -1.184, -0.119, 0.863, 2.170, 8.459],
-        [3.862, -1.265, -0.125, 0.911, 2.276, 8.924],
-    ),
-]
 
-# Table 2: load, then the global factors of 1R 1B 1U 2R 2B 2U 3R 3B 3U.
-TABLE_2 = {
-    "P1": (
-        [0, 0, 1, 0, 0, 0],
-        [0.044, 0.254, 0.146, 0.044, 0.254, 0.146, 0.007, 0.083, 0.023],
-    ),
-    "P2": (
-        [0.8, 0.3, 0.52, 0, 0, 0],
-        [1.39e-4, 0.036, 1.99e-4, 9.55e-4, 0.122, 6.06e-4, 0.007, 0.825, 0.008],
-    ),
-    "P3": (
-        [0.52, 0.3, 0.8, 0.5, 0.7, 0.51],
-        [0.002, 0.216, 0.003, 0.004, 0.194, 0.011, 0.007, 0.550, 0.012],
-    ),
-}
+
+def numbers(text):
+    """Return the numbers of a printed line."""
+    return [float(word) for word in text.split()]
+
+
+TABLE_1 = [(pose, *map(numbers, lines)) for pose, *lines in upr_rpu.TABLE_1.values()]
+TABLE_2 = {name: (load, numbers(line)) for name, (load, line) in upr_rpu.TABLE_2.items()}
 P1 = TABLE_2["P1"][0]
-HEIGHTS = np.arange(-1.0, -0.24, 0.05)
 
 
 @pytest.fixture(scope="module")

@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import contextlib
 import io
-import shutil
 import sys
 import tempfile
 from collections.abc import Mapping, Set
 from pathlib import Path
 from typing import Final
+
+from PIL import Image
 
 from pkm_twin.apps import cli
 
@@ -30,7 +31,7 @@ PICTURES: Final = {
     "map_upr_rpu_strain-energy": "map upr_rpu strain-energy",
     "map_delta_cu_workspace": "map delta_cu workspace --at 0,0,-0.35",
     "map_five_bar_speeds": "map five_bar speeds",
-    "map_prru_isotropy": "map prru isotropy",
+    "map_prru_isotropy": "map prru isotropy --spheres",
     "map_upr_rpu_modes": "map upr_rpu modes",
 }
 """Commands by the picture's name; where one draws several, each has its own ending."""
@@ -53,7 +54,8 @@ def draw_pictures(gallery: Path, commands: Mapping[str, str], wanted: Set[str]) 
                     raise
         for found in Path().glob("*.png"):
             if found.name in wanted:
-                shutil.copy(found, gallery)
+                # 256 colours: a tenth to a third of the size, without a visible difference.
+                Image.open(found).convert("RGB").quantize(256).save(gallery / found.name)
 
 
 if __name__ == "__main__":

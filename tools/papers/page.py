@@ -17,7 +17,8 @@ MODULES: Final = (prru, upr_rpu)
 """Each has ``find_rows``, which computes the paper's values and returns a ``Paper``."""
 HEAD: Final = """# The three papers, compared
 
-`make papers` writes this page. Differences are in units of the last printed digit.
+`make papers` writes this page, with values of today's code. Differences are in units of the last
+printed digit. "Computed in" links to the source, in which the equation's number stands.
 
 """
 
@@ -86,8 +87,8 @@ def _link_test(name: str) -> str:
 
 
 def _link_comparison(one: Comparison) -> str:
-    far = max(abs(p.difference) for line in one.lines.values() for p in line)
-    return f"[{one.title}](#{heading_anchor(one.title)}): at most {far:.0f} units of the last digit"
+    anchor = heading_anchor(one.title)
+    return f"[{one.title}](#{anchor}): at most {one.largest:.0f} units of the last digit"
 
 
 def _write_comparison(one: Comparison) -> str:

@@ -40,6 +40,11 @@ class Comparison:
     columns: tuple[str, ...]
     lines: Mapping[str, Sequence[Printed]]
 
+    @property
+    def largest(self) -> float:
+        """Largest difference, in units of the last printed digit."""
+        return max(abs(number.difference) for line in self.lines.values() for number in line)
+
 
 @dataclass(frozen=True)
 class Row:

@@ -63,6 +63,11 @@ class OfMap(Carries, Pages, Writes, Draws, Parallel):
     least_clearance: float = setting(
         0.0, "distance between limbs (m) below which a pose does not count"
     )
+    regular: bool = setting(
+        False,
+        "count only poses inside the largest circles about the axis, of 10 degrees or more if they "
+        "are tilts (2UPR-RPU paper, figure 5)",
+    )
     out: Path | None = setting(None, "file to write; default: ROBOT_KIND.nc", writes=True)
     scheduler: str | None = setting(None, "address of a Dask scheduler: tcp://HOST:8786")
 
@@ -137,6 +142,7 @@ def compute(given: OfMap) -> Report:
         machine, kind, given.points, cases=cases,
         at=None if given.at is None else numbers(given.at, len(names), f"a pose {','.join(names)}"),
         least_singularity=given.singularity, least_clearance=given.least_clearance,
+        regular=given.regular,
     )  # fmt: skip
     target = given.target
     with (

@@ -141,12 +141,19 @@ def regular(
     """The largest circles about the axis at heights (n,), m, and the cylinder, for a file."""
     radius = circles(robot, heights, least=least, least_clearance=least_clearance)
     best, unit = largest_cylinder(heights, radius), distance_unit(robot)
-    return {
-        "height": Variable(("height",), heights, about("height of the circles", "m")),
-        "circle": Variable(("height",), radius, about("largest circle, radius", unit, POSITIVE)),
+    return circle_variables(robot, heights, radius) | {
         "cylinder_low": number(best.low, "largest cylinder, low", "m"),
         "cylinder_high": number(best.high, "largest cylinder, high", "m"),
         "cylinder_radius": number(best.radius, "largest cylinder, radius", unit),
+    }
+
+
+def circle_variables(robot: Robot, heights: Array, radius: Array) -> dict[str, Variable]:
+    """Return circles about the axis at heights (n,), m, of radii (n,), for a file."""
+    what = about("largest circle, radius", distance_unit(robot), POSITIVE)
+    return {
+        "height": Variable(("height",), heights, about("height of the circles", "m")),
+        "circle": Variable(("height",), radius, what),
     }
 
 

@@ -1,0 +1,324 @@
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
+"""Spheres of directions on a polar plane of tilts: the 5-D image of the 3-PRRU paper, section 2.3.
+
+A sphere stands for a pose: around the plane the azimuth of the platform's tilt, outwards the tilt,
+without torsion. A point of a sphere is a unit vector of pose rates, and its colour is an index of
+isotropy in this direction of motion. An index is the same in opposite directions, so the visible
+half of a sphere shows all of them.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from delta_dynamics.torques.isotropy import (
+    energy_transfer,
+    max_driving_force,
+    sphere_directions,
+    tilted_pose,
+)
+from pkm_twin.codegen.arrays import Array
+from pkm_twin.errors import ParameterError, require
+from pkm_twin.maps.kind import FLAG, POSITIVE, SHARE, Space, Variable, about, number
+from pkm_twin.report import plots
+from pkm_twin.robot.robot import Robot
+from pkm_twin.robot.workspace import reachable
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+    from xarray import Dataset
+
+TILTS: Final = np.radians([0.0, 15.0, 30.0, 45.0])
+"""Tilts of the spheres, rad; the paper's images end at 45 degrees."""
+AZIMUTHS: Final = np.radians(np.arange(0.0, 360.0, 30.0))
+"""Azimuths of the spheres, rad; those of the paper's statement, 60, 180 and 300 degrees, too."""
+DIRECTIONS: Final = 1000
+"""Directions on a sphere, about 6 degrees apart."""
+LEAST_INDEX: Final = 1e-3
+"""Singularity index below which a pose has no sphere: efforts grow without bound there."""
+RADIUS: Final = math.radians(7.0)
+"""Radius of a drawn sphere, rad of tilt: neighbours on a ring and of the next ring stay apart."""
+VIEW: Final = np.array([0.5, math.sqrt(0.75), 0.0])
+"""Unit vector towards the viewer, in pose rates: the rate of the position points up, and that of a
+tilt to the right does so too."""
+BULK: Final = 0.995
+"""Part of the values below the end of a scale: a few near singularities share its last colour."""
+FLAT: Final = {
+    "eye": {"x": 0.0, "y": 0.0, "z": 1.25},
+    "up": {"x": 0.0, "y": 1.0, "z": 0.0},
+    "projection": {"type": "orthographic"},
+}
+"""Camera of the page: the picture, from above."""
+BEYOND: Final = "#D55E00"
+"""Colour of the rim of spheres whose pose is beyond the machine's limits."""
+
+
+def check_tilts(robot: Robot) -> None:
+    """Check that the pose is a coordinate of the position and two tilts.
+
+    :raises ParameterError: another pose.
+    """
+    if robot.pose_units != ("m", "rad", "rad"):
+        what = "a machine whose pose is a coordinate of the position and two tilts (as prru)"
+        raise ParameterError("spheres", ",".join(robot.pose_names), what)
+
+
+def find_spheres(space: Space, energy: float) -> dict[str, Variable]:
+    """Compute eta_KE (equation 44) and F_max (equation 47) on spheres of directions.
+
+    The height is that of the pose that the map's planes are asked to go through, or of home.
+
+    :param energy: the platform's kinetic energy, J.
+    :raises ParameterError: two angles that are no tilts about x and y.
+    """
+    robot = space.robot
+    height = float((robot.home() if space.at is None else space.at)[0])
+    azimuth, tilt = np.meshgrid(AZIMUTHS, TILTS, indexing="ij")
+    poses = tilted_pose(height, azimuth, tilt)
+    q, known = robot.try_inverse(poses)
+    lean = robot.platform(q[known])[1][:, 2, 2]
+    if not np.allclose(lean, np.cos(tilt[known]), rtol=0.0, atol=1e-9):
+        raise ParameterError("spheres", ",".join(robot.pose_names), "tilts about x and y (as prru)")
+    known[known] = robot.try_singularity(q[known])[0] >= LEAST_INDEX
+    directions = sphere_directions(DIRECTIONS)
+    share, force = np.full((2, *tilt.shape, len(directions)), np.nan)
+    at = poses[known][:, None]
+    share[known] = energy_transfer(robot, at, directions)
+    force[known] = max_driving_force(robot, at, directions, energy)
+    inside = known.copy()
+    inside[known] = reachable(robot, poses[known])
+    sphere = ("azimuth", "tilt", "way")
+    unit = robot.effort_unit
+    return {
+        "sphere_height": number(height, "position coordinate of the spheres", "m"),
+        "azimuth": Variable(("azimuth",), AZIMUTHS, about("towards which it tilts", "rad")),
+        "tilt": Variable(("tilt",), TILTS, about("tilt of the platform", "rad")),
+        "way": Variable(("way", "axis"), directions, about("unit vector of pose rates")),
+        "sphere_energy": Variable(
+            sphere, share, about("eta_KE, share of the kinetic energy in the platform", "", SHARE)
+        ),
+        "sphere_force": Variable(
+            sphere, force, about("F_max, largest effort of the drives", unit, POSITIVE)
+        ),
+        "sphere_inside": Variable(
+            sphere[:2], inside.astype(np.int8), about("1 where all limits are kept", "", FLAG)
+        ),
+    }
+
+
+def questions(data: Dataset) -> dict[str, tuple[str, str]]:
+    """Return of each index its question and the label of its scale."""
+    energy = json.loads(data.attrs["settings"])["options"]["energy"]
+    unit = str(data.sphere_force.attrs["units"])
+    what = "force" if unit == "N" else "torque"
+    return {
+        "energy": (
+            "which share of the kinetic energy is the platform's, in each direction of motion?",
+            "eta_KE: share of the kinetic energy in the platform (dimensionless)",
+        ),
+        "force": (
+            f"how much drive {what} does each direction of motion need, platform at {energy:g} J?",
+            f"F_max: largest driving {what} ({unit})",
+        ),
+    }
+
+
+def state_ranges(data: Dataset) -> list[str]:
+    """Return for each index its least and greatest value at the least and the largest tilt."""
+    lines = []
+    for index, (_, label) in questions(data).items():
+        values = data[f"sphere_{index}"].values
+        drawn = [k for k in range(len(TILTS)) if np.isfinite(values[:, k]).any()]
+        ranges = [
+            f"{np.nanmin(values[:, k]):.4g} to {np.nanmax(values[:, k]):.4g} at a tilt of "
+            f"{math.degrees(TILTS[k]):.0f} degrees"
+            for k in (drawn[0], drawn[-1])
+        ]
+        lines.append(f"spheres at {_height(data)}, {label}, {', '.join(ranges)}")
+    return lines
+
+
+def _limits(values: Array) -> tuple[float, float]:
+    """Return the ends of a scale: the least value, and one that few values exceed."""
+    return float(np.nanmin(values)), float(np.nanquantile(values, BULK))
+
+
+def _height(data: Dataset) -> str:
+    return f"{data.coordinate.values[0]} = {float(data.sphere_height):.4g} m"
+
+
+def _places(data: Dataset) -> list[tuple[int, int, Array]]:
+    """Return azimuth and tilt by index, and the centre (2,), of each sphere that is drawn.
+
+    The level pose has one sphere, and the first ring every other azimuth, for want of room.
+    """
+    known = np.isfinite(data.sphere_energy.values).all(-1)
+    return [
+        (a, t, tilt * np.array([math.cos(azimuth), math.sin(azimuth)]))
+        for t, tilt in enumerate(data.tilt.values.tolist())
+        for a, azimuth in enumerate(data.azimuth.values.tolist())
+        if known[a, t] and a % (len(data.azimuth), 2, 1)[min(t, 2)] == 0
+    ]
+
+
+def _triangles(ways: Array) -> NDArray[np.int64]:
+    """Return corners of triangles that cover the sphere, seen from outside, shape (k, 3)."""
+    from scipy.spatial import ConvexHull  # type: ignore[import-untyped]
+
+    corners = np.asarray(ConvexHull(ways).simplices, np.int64)
+    a, b, c = (ways[corners[:, k]] for k in range(3))
+    inward = (np.cross(b - a, c - a) * a).sum(-1) < 0.0
+    corners[inward] = corners[inward][:, ::-1]
+    return corners
+
+
+def _axes() -> tuple[Array, Array]:
+    """Return the picture's right and up in pose rates."""
+    right = np.cross([1.0, 0.0, 0.0], VIEW)
+    right /= np.linalg.norm(right)
+    return right, np.cross(VIEW, right)
+
+
+def draw_spheres(data: Dataset) -> dict[str, Figure]:
+    """Draw both indices on spheres at azimuth and tilt, each on one scale of colours."""
+    return {f"spheres_{index}": _draw(data, index) for index in questions(data)}
+
+
+def _draw(data: Dataset, index: str) -> Figure:
+    from matplotlib.patches import Circle
+
+    from pkm_twin.maps.figures import MAP
+
+    question, label = questions(data)[index]
+    values, inside = data[f"sphere_{index}"].values, data.sphere_inside.values
+    low, high = _limits(values)
+    ways = data.way.values
+    right, up = _axes()
+    flat = np.stack([ways @ right, ways @ up], -1)
+    corners = _triangles(ways)
+    front = corners[(ways @ VIEW)[corners].max(-1) > 0.0]
+    figure: Figure
+    figure, ((ax,),) = plots.columns(1, 1, 8.6)
+    mesh: Any = None
+    for a, t, centre in _places(data):
+        x, y = (centre + RADIUS * flat).T
+        mesh = ax.tripcolor(
+            x, y, front, values[a, t], shading="gouraud", cmap=MAP, vmin=low, vmax=high,
+            rasterized=True,
+        )  # fmt: skip
+        rim: dict[str, Any] = {"ec": "0.3", "lw": 0.6}
+        if not inside[a, t]:
+            rim = {"ec": BEYOND, "lw": 1.6, "ls": "--"}
+        circle = Circle((float(centre[0]), float(centre[1])), RADIUS, fill=False, zorder=3, **rim)
+        ax.add_patch(circle)
+        mesh.set_clip_path(circle)
+    _draw_polar_axes(data, ax)
+    _draw_rates(data, ax)
+    bar = figure.colorbar(mesh, ax=ax, aspect=32, pad=0.01, fraction=0.04, extend="max")
+    bar.set_label(label)
+    plots.head(figure, f"{data.attrs['robot']}, {_height(data)}: {question}", 10)
+    dashed = "; dashed rim: beyond the limits" if not inside.all() else ""
+    figure.supxlabel(
+        "a sphere is a pose: azimuth of the tilt around, tilt outwards; a point of it is a "
+        f"direction of motion{dashed}",
+        fontsize=8.5, color="0.3",
+    )  # fmt: skip
+    return figure
+
+
+def _draw_polar_axes(data: Dataset, ax: Any) -> None:
+    """Draw a circle for each tilt, with the names of tilts and azimuths."""
+    turn = np.linspace(0.0, 2 * np.pi, 181)
+    far = float(data.tilt.values[-1]) + 1.4 * RADIUS
+    for k, tilt in enumerate(data.tilt.values[1:].tolist()):
+        ax.plot(tilt * np.cos(turn), tilt * np.sin(turn), color="0.8", lw=0.8, zorder=0)
+        # Where no sphere is: on the first ring, inside the others.
+        at, angle = (tilt, math.pi / 6) if k == 0 else (tilt - 1.25 * RADIUS, math.pi / 12)
+        ax.text(
+            at * math.cos(angle), at * math.sin(angle), f"{math.degrees(tilt):.0f}°",
+            ha="center", va="center", fontsize=9, color="0.3", zorder=4,
+            bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.7, "pad": 0.6},
+        )  # fmt: skip
+    for azimuth in data.azimuth.values.tolist():
+        ax.text(
+            far * math.cos(azimuth), far * math.sin(azimuth), f"{math.degrees(azimuth):.0f}°",
+            ha="center", va="center", fontsize=10,
+        )  # fmt: skip
+    ax.set(xlim=(-1.06 * far, 1.06 * far), ylim=(-1.06 * far, 1.06 * far), xticks=[], yticks=[])
+    ax.set_aspect("equal")
+    ax.set_axis_off()
+
+
+def _draw_rates(data: Dataset, ax: Any) -> None:
+    """Draw in the lower left corner where the spheres' axes point."""
+    inset = ax.inset_axes((0.0, 0.0, 0.17, 0.17))
+    for k, name in enumerate(data.axis.values):
+        tip = np.array([side[k] for side in _axes()])
+        arrow = {"arrowstyle": "->", "color": "black", "lw": 1.0}
+        inset.annotate("", tuple(tip.tolist()), (0.0, 0.0), arrowprops=arrow)
+        side = "center" if abs(tip[0]) < 0.3 else "left" if tip[0] > 0.0 else "right"
+        inset.text(1.12 * tip[0], 1.25 * tip[1], name, ha=side, va="center", fontsize=9)
+    inset.set(xlim=(-1.9, 1.5), ylim=(-1.4, 1.8))
+    inset.set_aspect("equal")
+    inset.set_axis_off()
+
+
+def make_page(data: Dataset) -> Any:
+    """Return the spheres as a plotly figure to turn; a menu chooses the index."""
+    graph = require("plotly.graph_objects", "atlas")
+    from pkm_twin.maps.page import BAR, LIT, MARGIN, MENU, button, few
+
+    ways, places = data.way.values, _places(data)
+    corners = _triangles(ways)
+    vertices = np.concatenate([np.append(c, 0.0) + RADIUS * _scene(ways) for _, _, c in places])
+    every = np.concatenate([corners + k * len(ways) for k in range(len(places))])
+    poses = np.degrees([(data.azimuth.values[a], data.tilt.values[t]) for a, t, _ in places])
+    named = np.hstack((np.repeat(poses, len(ways), 0), np.tile(ways, (len(places), 1))))
+    where = "azimuth %{customdata[0]:.0f}°, tilt %{customdata[1]:.0f}°<br>"
+    for k, name in enumerate(data.axis.values, start=2):
+        where += f"{name} %{{customdata[{k}]:.2f}}<br>"
+    figure = graph.Figure()
+    figure.add_mesh3d(
+        **{axis: np.float32(vertices[:, k]) for k, axis in enumerate("xyz")},
+        **{corner: np.int32(every[:, k]) for k, corner in enumerate("ijk")},
+        customdata=np.float32(named), coloraxis="coloraxis", lighting=LIT,
+    )  # fmt: skip
+    buttons = []
+    for index, (_, label) in questions(data).items():
+        values = data[f"sphere_{index}"].values
+        low, high = _limits(values)
+        shown = np.concatenate([few(values[a, t]) for a, t, _ in places])
+        said = f"{where}{label.partition(':')[0]} %{{intensity:.4~g}}<extra></extra>"
+        layout = {"coloraxis.cmin": low, "coloraxis.cmax": high,
+                  "coloraxis.colorbar.title.text": label}  # fmt: skip
+        change = {"intensity": [shown.tolist()], "hovertemplate": [said]}
+        buttons.append(button(label.partition(":")[0], change, layout, [0]))
+    first, layout = buttons[0]["args"][:2]
+    figure.data[0].update({name: values[0] for name, values in first.items()})
+    edge = float(data.tilt.values[-1]) + 2.0 * RADIUS
+    figure.add_scatter3d(
+        x=[edge * math.cos(a) for a in data.azimuth.values],
+        y=[edge * math.sin(a) for a in data.azimuth.values],
+        z=[0.0] * len(data.azimuth), mode="text", hoverinfo="skip", showlegend=False,
+        text=[f"{math.degrees(a):.0f}°" for a in data.azimuth.values],
+    )  # fmt: skip
+    hidden = {"visible": False}
+    figure.update_layout(
+        coloraxis={"colorscale": "Viridis", "colorbar": BAR}, margin=MARGIN,
+        updatemenus=[{"buttons": buttons, **MENU}],
+        scene={"xaxis": hidden, "yaxis": hidden, "zaxis": hidden, "aspectmode": "data",
+               "camera": FLAT},
+    )  # fmt: skip
+    figure.update_layout(layout)
+    return figure
+
+
+def _scene(ways: Array) -> Array:
+    """Return directions in the scene's axes, in which the viewer of the picture looks down."""
+    right, up = _axes()
+    return np.asarray(ways @ np.stack([right, up, VIEW], -1), np.float64)
