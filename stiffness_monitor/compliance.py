@@ -36,8 +36,9 @@ class PlatformResponse:
     ``compliance``: C of the platform at its reference point, shape (..., 6, 6), exactly symmetric.
     ``deflection``: C P there, shape (..., 6), m and rad; base axes. ``elements``: the frame's
     members and elastic joints, of upr_rpu limb number and R joint, bar or U joint. ``energies``:
-    strain energy of each, shape (..., elements), J. ``factors``: its share of the total, sum 1; all
-    zero for a zero wrench. ``total``: P' C P / 2, shape (...), J.
+    strain energy of each, shape (..., elements), J. ``factors``: its share of the total, sum 1 (the
+    2UPR-RPU paper's local strain-energy factors); all zero for a zero wrench.
+    ``total``: P' C P / 2, shape (...), J.
     ``dominant``: name of the element with the largest factor, ``"none"`` for a zero wrench; a
     string for one sample, an array of strings for a batch. ``tie``: whether the largest two factors
     are within 1e-9 of each other; the dominant one is then the first in ``elements``.

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from test.support.pages import assert_printed
 from tools.papers.page import MODULES, find_function, write_page
 
 ROOT = Path(__file__).parents[2]
@@ -71,3 +72,12 @@ def test_a_computed_equation_has_its_number_in_the_source(papers):
 def test_the_page_is_todays(papers):
     """Else `make papers` writes it."""
     assert (ROOT / "docs/papers.md").read_text(encoding="utf-8") == write_page(papers)
+
+
+def test_other_pages_have_its_numbers(papers):
+    found = {one.title: one for p in papers for row in p.rows for one in row.comparisons}
+    page = "docs/validation.md"
+    assert_printed(page, r"table 1 within (\d+) units", found["2UPR-RPU, table 1, theory"].largest)
+    lines = found["2UPR-RPU, table 2, mean over the volume"].lines
+    most = max(abs(n.value - float(n.text)) for name in ("P2", "P3") for n in lines[name])
+    assert_printed(page, r"P2 and P3 within ([\d.]+),", most)

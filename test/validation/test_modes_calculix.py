@@ -51,7 +51,8 @@ def test_first_six_frequencies_of_the_robot(name, angles, isotropic, tmp_path):
     pose = robot.forward(angles)
     ours = natural_frequencies(robot, pose, elements=8)
     theirs = frequencies(structural_model(robot, robot.inverse(pose)), 6, tmp_path)
-    # CalculiX is the higher.
+    # CalculiX is the higher. pytest -rP shows the figure that the README has.
+    print(f"{name}: frequencies differ by {100 * np.abs(ours / theirs - 1).max():.2f} % at most")
     assert ours == pytest.approx(theirs, rel=CLOSE / 100)
 
 

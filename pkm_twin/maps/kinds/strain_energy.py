@@ -179,15 +179,17 @@ def _draw_planes(data: Dataset, case: str, elements: list[int]) -> dict[str, Fig
 
     k = [str(name) for name in data.case.values].index(case)
     upwards = data.attrs["height"]
-    planes = [
+    full = full_planes(data, k)
+    across = [
         p
-        for p in full_planes(data, k)
+        for p in full
         if upwards not in (str(data.row_name.values[p]), str(data.column_name.values[p]))
     ]
-    one = plane_of(data, k, planes[0])
+    plane = (across or full)[0]
+    one = plane_of(data, k, plane)
     if len(one["names"]) < 2:
         return {}
-    table = data.plane_factor.isel(plane=planes[0], case=k).values[..., elements]
+    table = data.plane_factor.isel(plane=plane, case=k).values[..., elements]
     high = float(np.nanmax(table))
     figure: Figure
     figure, columns = plots.columns(len(elements), 1, plots.WIDTH / PANELS + 0.9)
