@@ -161,6 +161,7 @@ def _draw_slices(data: Dataset, case: str, elements: list[int]) -> dict[str, Fig
         ax.locator_params(axis="y", nbins=3)
         ax.set_box_aspect((1.0, 1.0, 1.5), zoom=0.85)
         ax.tick_params(labelsize=8)
+        ax.tick_params(axis="z", pad=7)
         ax.view_init(elev=22, azim=-60)
         if elements:
             ax.set_title(str(data.element.values[n]))
