@@ -79,7 +79,7 @@ def test_pinocchio_closed_loop(benchmark, name):
 
     engine = DeltaEngine(parameters_of(name))
     q, qd, qdd = motion(load(name), 1)
-    benchmark.extra_info.update(what=f"Pinocchio, full closed-loop solution ({name})", samples=1)
+    benchmark.extra_info.update(what=f"Pinocchio, interpreted loop closure ({name})", samples=1)
     run(benchmark, 100, engine.inverse_dynamics, q, qd, qdd, np.zeros(6))
 
 
