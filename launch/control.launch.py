@@ -25,9 +25,9 @@ from launch.actions import (
     LogInfo,
     OpaqueFunction,
     RegisterEventHandler,
-    Shutdown,
 )
 from launch.event_handlers import OnProcessExit, OnShutdown
+from launch.events.process import ProcessExited
 from launch.launch_context import LaunchContext
 from launch.launch_description_entity import LaunchDescriptionEntity
 from launch_ros.actions import Node
@@ -150,7 +150,7 @@ def control(context: LaunchContext) -> list[LaunchDescriptionEntity]:
             namespace=namespace,
             parameters=[str(file), sim_time],
             output="screen",
-            on_exit=Shutdown(reason="ros2_control_node has ended"),
+            on_exit=_end_launch,
         ),
         *(
             RegisterEventHandler(OnProcessExit(target_action=one, on_exit=[after]))
@@ -159,6 +159,15 @@ def control(context: LaunchContext) -> list[LaunchDescriptionEntity]:
         spawners[0],
         *([] if plugin else _twin(given, controller)),
     ]
+
+
+def _end_launch(event: ProcessExited, context: LaunchContext) -> None:
+    """End the launch with exit code 1 when ros2_control_node ends before it.
+
+    :raises RuntimeError: it has.
+    """
+    if not context.is_shutdown:
+        raise RuntimeError(f"ros2_control_node has ended with exit code {event.returncode}")
 
 
 def _spawner(space: str, file: Path, *arguments: str) -> Node:

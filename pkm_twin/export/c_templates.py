@@ -12,8 +12,8 @@ valid; 1: no assembly, or a singularity; 2: an input or a result is NaN or infin
 0, all outputs are NaN. The forms _with take parameters for another payload.
 """
 STATELESS: Final = "Friction has no state here: coulomb sign(rate), without presliding (dahl)."
-BESIDE: Final = """, found from the assembly of the sample before instead of from home: in less
-time. state[{size}] is the caller's, one of each stream. Fill it with zeros before the first sample;
+BESIDE: Final = """, found from the assembly of the sample before instead of from home.
+state[{size}] is the caller's, one of each stream. Fill it with zeros before the first sample;
 each call writes it. A sample that does not follow the one before is solved from home.
 """
 WORST: Final = "At most {:,} operations, {:,} with PKM_ATTEMPTS=1."

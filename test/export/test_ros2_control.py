@@ -286,6 +286,77 @@ class TestCore:
         assert names == ["NO_STATE"] and np.isfinite(effort).all()
 
 
+COMMON = r"""
+#include <cstdio>
+#include "@/carried.hpp"
+using namespace @;
+int main()
+{
+  Node nodes[2];
+  std::vector<std::string> joints;
+  Values own[2];
+  for (int k = 0; k < 2; ++k) {
+    joints = declare_parameters(nodes[k], k ? Role::CARRIES : Role::FOLLOWS);
+    for (const auto & [name, value] : nodes[k].values) {
+      if (is_common(name)) { own[k][name] = value; }
+    }
+  }
+  const auto carried = Carried::find("/cell", joints);
+  if (carried != Carried::find("/cell", joints) || carried == Carried::find("/other", joints)) {
+    return 9;
+  }
+  const std::string mass = "payload.mass", limit = "limits." + joints[0] + ".effort";
+  carried->join("first", own[0], {{mass, {mass, 2.0}}});
+  carried->join("second", own[1], {});
+  try {
+    carried->join("second", own[1], {{mass, {mass, 3.0}}});
+    return 8;
+  } catch (const std::invalid_argument &) {
+  }
+  const auto show = [&] {
+      std::uint64_t number = 0;
+      const Load load = carried->load().read(number);
+      std::fwrite(load.parameters.data(), sizeof(double), load.parameters.size(), stdout);
+      std::fwrite(load.effort.data(), sizeof(double), JOINTS, stdout);
+    };
+  show();
+  carried->set({{mass, 5}, {limit, 0.25}, {"hold_time", 1.0}});
+  show();
+  try {
+    carried->set({{mass, -1.0}});
+    return 7;
+  } catch (const std::invalid_argument &) {
+  }
+  show();
+  std::uint64_t number = 0;
+  Load load;
+  // Once to each reader, and not again.
+  return carried->load().take(load, number) && !carried->load().take(load, number) ? 0 : 6;
+}
+"""
+
+
+@needs_compiler
+def test_payload_and_effort_limits_are_one_set_for_all_controllers(mapped):
+    _, core = mapped
+    folder = core.program.parent
+    stand_in = (Path(__file__).parent / "rclcpp_stand_in.hpp").read_text()
+    for name in ("rclcpp/rclcpp.hpp", "rclcpp_lifecycle/lifecycle_node.hpp"):
+        (folder / name).parent.mkdir(exist_ok=True)
+        (folder / name).write_text(stand_in)
+    (folder / "common.cpp").write_text(COMMON.replace("@", core.package))
+    build = ["g++", "-std=c++17", "-O0", "-Wall", "-Wextra", "-Werror", "-I.", "-Iinclude", "-Ic"]
+    build += ["common.cpp", "robot.o", "-o", "common", "-lm"]
+    subprocess.run(build, cwd=folder, check=True)
+    done = subprocess.run([folder / "common"], capture_output=True, check=False)
+    assert not done.returncode, done.returncode
+    first, second, third = np.frombuffer(done.stdout).reshape(3, -1)
+    np.testing.assert_array_equal(second, third)
+    assert (first[: -core.n] != second[: -core.n]).any()
+    assert second[-core.n] == 0.25
+    np.testing.assert_array_equal(first[1 - core.n :], second[1 - core.n :])
+
+
 SHARED = r"""
 #include <cstdio>
 #include "@/model.hpp"

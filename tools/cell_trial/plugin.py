@@ -7,18 +7,22 @@
 in tools/cell_trial/topic_hardware. Of both, the references that the controller has followed go to a
 running delta_dynamics as a JointTrajectory, and its efforts are compared with the controller's.
 ``beyond``: mock hardware, and a trajectory through a position limit: the controller holds, and
-after its hold_time the chain is deactivated and the gravity controller carries the machine.
-``fall``: the same with machine_sim, which moves. ``twin``: without the plugin, the trajectory goes
-through delta_dynamics, and the controller's effort is compared with the model's along it.
+after its hold_time the chain is deactivated and the gravity controller carries the machine, with a
+payload that was set at run time. ``fall``: the same with machine_sim, which moves. ``lost``: with
+machine_sim, a velocity and then a position of one joint become NaN, and good again. ``killed``:
+``kill -9`` of the manager. ``twin``: without the plugin, the trajectory goes through
+delta_dynamics, and the controller's effort is compared with the model's along it.
 
 Needs a sourced Jazzy workspace with pkm_twin, ros2_control, joint_trajectory_controller and the
-package that ``pkm-twin export ros2-control ROBOT`` wrote; for ``sim`` and ``fall`` also
+package that ``pkm-twin export ros2-control ROBOT`` wrote; for ``sim``, ``fall`` and ``lost`` also
 pkm_topic_hardware.
 """
 
 from __future__ import annotations
 
 import argparse
+import os
+import signal
 import subprocess
 import tempfile
 from pathlib import Path
@@ -30,19 +34,29 @@ from ament_index_python.packages import get_package_share_directory
 from builtin_interfaces.msg import Duration
 from cell import Peer, Process, closing, node, peer
 from control_msgs.msg import JointTrajectoryControllerState
+from controller_manager_msgs.srv import SwitchController
 from diagnostic_msgs.msg import DiagnosticArray
+from rcl_interfaces.srv import SetParameters
+from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
 from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from delta_dynamics import inverse_dynamics
+from delta_dynamics.simulation.machine import tuned
 from pkm_twin import Robot, load
 from pkm_twin.export.ros2_control import CONTROLLER, GRAVITY, TRAJECTORIES, package_name
+from pkm_twin.robot.effort_limits import effort_limits
 
 MOCK = "mock_components/GenericSystem"
 TOPICS = "pkm_topic_hardware/TopicSystem"
 KINDS = ("positions", "velocities", "accelerations")
-HARDWARE = {"mock": MOCK, "sim": TOPICS, "beyond": MOCK, "fall": TOPICS, "twin": MOCK}
+HARDWARE = {
+    "mock": MOCK, "sim": TOPICS, "beyond": MOCK, "fall": TOPICS, "lost": TOPICS, "killed": MOCK,
+    "twin": MOCK,
+}  # fmt: skip
+MORE = 0.5
+"""Payload that is added at run time, kg."""
 
 
 def stamped(seconds: float) -> Duration:
@@ -92,6 +106,7 @@ class Chain:
 
     def __init__(self, other: Peer, given: str, part: str, bandwidth: float) -> None:
         self.other, self.robot, self.part = other, load(given), part
+        self.bandwidth = bandwidth
         use, source, target = (
             ("twin", TRAJECTORIES, "delta_dynamics")
             if part == "twin"
@@ -185,9 +200,72 @@ class Chain:
             f"{[right[k, j].round(5).item() for j, k in enumerate(np.abs(right).argmax(0))]}"
         )
 
+    def set_parameter(self, name: str, parameter: str, value: Any) -> None:
+        """Set a parameter of a node."""
+        client = self.other.node.create_client(SetParameters, f"/{name}/set_parameters")
+        given = Parameter(parameter, value=value).to_parameter_msg()
+        answer = self._call(client, SetParameters.Request(parameters=[given]))
+        if not answer.results[0].successful:
+            raise RuntimeError(answer.results[0].reason)
+
+    def _call(self, client: Any, request: Any) -> Any:
+        self.other.until(client.service_is_ready, f"service {client.srv_name}")
+        future = client.call_async(request)
+        self.other.until(future.done, f"answer of {client.srv_name}")
+        return future.result()
+
+    def compare_control(self, states: list[Any]) -> None:
+        """Compare commands with feedforward plus PD within the limits, of the same updates."""
+        robot, scale = self.robot, self.robot.controller.factors**2
+        p, d = (gains / scale for gains in tuned(robot, self.bandwidth))
+        limits = np.abs(robot.controller.controller_efforts(effort_limits(robot)))
+        rows = [
+            np.array([values(s) for s in states])
+            for values in (
+                lambda s: s.reference.effort, lambda s: s.error.positions,
+                lambda s: s.error.velocities, lambda s: s.output.effort,
+            )
+        ]  # fmt: skip
+        wanted = rows[0] + p * rows[1] + d * rows[2]
+        beyond = int((np.abs(wanted) > limits).any(1).sum())
+        error = np.abs(rows[3] - np.clip(wanted, -limits, limits)).max()
+        part = np.abs(wanted - rows[0]).max()
+        print(
+            f"{self.part}: {len(states)} states, gains of {self.bandwidth:g} Hz: PD up to "
+            f"{part:.3g}, limited in {beyond} states; command less feedforward, PD and limits "
+            f"{error:.1e} at most"
+        )
+
+    def compare_gravity(self, what: str) -> None:
+        """Compare the gravity controller's commands with weight and damping at what is measured."""
+        robot = self.robot
+        share = Path(get_package_share_directory(package_name(robot)))
+        sections = yaml.safe_load((share / "config" / "controllers.yaml").read_text())
+        gains = sections[f"/**/{GRAVITY}"]["ros__parameters"]["gains"]
+        d = np.array([gains[name]["d"] for name in robot.controller.names])
+        states = [s for s in self.fallen if np.isfinite(s.feedback.positions).all()]
+        columns = [np.array([getattr(s.feedback, k) for s in states]) for k in KINDS[:2]]
+        at, still = robot.controller.positions(columns[0]), np.zeros_like(columns[0])
+        weight = robot.controller.controller_efforts(inverse_dynamics(robot, at, still, still))
+        carried = np.array([s.output.effort for s in states])
+        error = np.abs(carried - (weight - d * np.nan_to_num(columns[1]))).max()
+        lost = int(np.isnan(columns[1]).any(1).sum())
+        print(
+            f"{self.part}: {what}: {GRAVITY}, {len(states)} states, {lost} of them without a "
+            f"velocity: effort {carried[-1].tolist()}, less weight and damping at what is measured "
+            f"{error:.1e} at most; moved {np.abs(at - at[0]).max():.1e}"
+        )
+
     def beyond(self) -> None:
-        """A trajectory through the position limit of the first joint."""
-        robot, start = self.robot, self.start()
+        """A trajectory through the position limit of the first joint, with another payload."""
+        start, load = self.start(), self.robot.payload
+        self.set_parameter(CONTROLLER, "payload.mass", load.mass + MORE)
+        self.robot = robot = self.robot.changed(
+            payload={
+                "mass": load.mass + MORE, "com": load.com.tolist(),
+                "inertia": load.inertia.tolist(),
+            }
+        )  # fmt: skip
         aim = np.array(start)
         aim[0] = robot.limits.position[0, 1] + 0.2 * np.ptp(robot.limits.position[0])
         end, rest = robot.controller.controller_positions(aim)[None], np.zeros((1, len(start)))
@@ -198,31 +276,60 @@ class Chain:
         found = robot.controller.efforts(np.array(self.last.reference.effort))
         print(
             f"{self.part}: held {robot.limits.position[0, 1] - held[0]:.1e} before the limit, "
-            f"feedforward less that of the weight {np.abs(found - weight).max():.1e}"
+            f"feedforward less that of the weight {np.abs(found - weight).max():.1e}, 1 state"
         )
         self.fallen.clear()
         self.hardware.clear()
         self.other.until(lambda: self.fallen, GRAVITY)
         self.other.spin(3.0)
         self.report()
-        share = Path(get_package_share_directory(package_name(robot)))
-        sections = yaml.safe_load((share / "config" / "controllers.yaml").read_text())
-        gains = sections[f"/**/{GRAVITY}"]["ros__parameters"]["gains"]
-        d = np.array([gains[name]["d"] for name in robot.controller.names])
-        columns = [np.array([getattr(s.feedback, k) for s in self.fallen]) for k in KINDS[:2]]
-        at, still = robot.controller.positions(columns[0]), np.zeros_like(columns[0])
-        weight = robot.controller.controller_efforts(inverse_dynamics(robot, at, still, still))
-        carried = np.array([s.output.effort for s in self.fallen])
-        error = np.abs(carried - (weight - d * columns[1])).max()
-        print(
-            f"{self.part}: {GRAVITY}, {len(carried)} states: effort {carried[-1].tolist()}, less "
-            f"weight and damping at what is measured {error:.1e} at most; moved "
-            f"{np.abs(at - at[0]).max():.1e}, fastest {np.abs(columns[1]).max():.1e}, at the end "
-            f"{np.abs(columns[1][-1]).max():.1e}"
-        )
+        self.compare_gravity(f"payload {MORE:g} kg more at {CONTROLLER} alone")
         idle = [m for m in self.hardware if not any(m.effort)]
         print(f"{self.part}: {len(idle)} of {len(self.hardware)} joint states have no effort")
-        print(_output("ros2", "control", "list_controllers"))
+        said = [line for line in self.process.output.splitlines() if "hold_time" in line]
+        print(f"{self.part}: log: {said}")
+
+    def lost(self) -> None:
+        """A velocity and then the position of the first joint become NaN, and good again."""
+        self.start()
+        self.other.spin(1.0)
+        self.compare_control(self.states)
+        for what, seconds in (("velocity", 3.0), ("position", 0.0)):
+            self.fallen.clear()
+            self.set_parameter("topic_system", "lost", what)
+            self.other.until(lambda: self.fallen, GRAVITY)
+            self.other.spin(seconds)
+            if seconds:
+                self.compare_gravity(f"{what} lost")
+        before = len(self.fallen)
+        self.other.spin(2.0)
+        blind = [s for s in self.fallen[1:] if not np.isfinite(s.feedback.positions).all()]
+        efforts = np.array([s.output.effort for s in blind])
+        print(
+            f"{self.part}: position lost: {len(blind)} of {len(self.fallen)} states, {before} at "
+            f"once; effort changes by {np.ptp(efforts, axis=0).max():.1e}, then "
+            f"{list(self.hardware[-1].effort)}"
+        )
+        self.set_parameter("topic_system", "lost", "")
+        self.fallen.clear()
+        client = self.other.node.create_client(
+            SwitchController, "/controller_manager/switch_controller"
+        )
+        request = SwitchController.Request(activate_controllers=[GRAVITY], strictness=2)
+        print(f"{self.part}: activated again: {self._call(client, request).ok}")
+        self.other.until(lambda: self.fallen, GRAVITY)
+        self.other.spin(1.0)
+        self.compare_gravity("position good again")
+
+    def killed(self) -> None:
+        """``kill -9`` of the manager."""
+        self.start()
+        group = str(self.process.process.pid)
+        found = _output("pgrep", "-g", group, "-f", "lib/controller_manager/ros2_control_node")
+        for number in found.split():
+            os.kill(int(number), signal.SIGKILL)
+        self.other.until(lambda: not self.process.alive(), "the launch's end")
+        print(f"killed: the launch ended with exit code {self.process.process.returncode}")
 
     def report(self) -> None:
         """The last diagnostics of the controller, and of what is simulated."""
@@ -271,16 +378,18 @@ def show(other: Peer, given: str, part: str, bandwidth: float) -> None:
             )
         )
     with closing(*simulated):
-        # Mock hardware does not follow: gains would push against it.
-        chain = Chain(other, given, part, bandwidth if moves else 0.0)
+        # Mock hardware does not follow: the gains push against it, up to the limits.
+        chain = Chain(other, given, part, bandwidth)
         with closing(chain.process):
-            if part == "twin":
-                chain.through_the_twin()
-                return
-            if part in ("beyond", "fall"):
-                chain.beyond()
+            alone = {
+                "twin": chain.through_the_twin, "beyond": chain.beyond, "fall": chain.beyond,
+                "lost": chain.lost, "killed": chain.killed,
+            }  # fmt: skip
+            if part in alone:
+                alone[part]()
                 return
             states = chain.followed()
+            chain.compare_control(states)
     found = np.array([s.reference.effort for s in states])
     right = twin_s_efforts(other, robot, given, states)
     error = np.abs(found - right).max()
@@ -289,8 +398,13 @@ def show(other: Peer, given: str, part: str, bandwidth: float) -> None:
         f"{error:.2e} at most, {error / np.abs(right).max():.1e} of the peak"
     )
     if part == "sim":
-        miss = np.array([s.error.positions for s in states])
-        print(f"sim: tracking error {np.sqrt((miss**2).mean()):.2e} RMS, gains of {bandwidth:g} Hz")
+        miss = np.array([s.error.positions for s in states]) / robot.controller.factors
+        for unit in dict.fromkeys(robot.joint_units):
+            rows = miss[:, np.array(robot.joint_units) == unit]
+            print(
+                f"sim: tracking error {np.sqrt((rows**2).mean()):.2e} {unit} RMS, "
+                f"{rows.shape[1]} joints in {len(rows)} states, gains of {bandwidth:g} Hz"
+            )
 
 
 def main() -> None:

@@ -3,6 +3,7 @@
 #include <algorithm>
 #include <chrono>
 #include <cmath>
+#include <limits>
 #include <memory>
 #include <mutex>
 #include <string>
@@ -21,6 +22,10 @@ using hardware_interface::CallbackReturn;
 using hardware_interface::return_type;
 using sensor_msgs::msg::JointState;
 using std_msgs::msg::Float64MultiArray;
+using Clock = std::chrono::steady_clock;
+
+/// A joint state that is older than this, s, ends the hardware: the machine may be anywhere.
+constexpr std::chrono::duration<double> LARGEST_AGE{1.0};
 
 class TopicSystem : public hardware_interface::SystemInterface
 {
@@ -36,11 +41,14 @@ public:
   CallbackReturn on_configure(const rclcpp_lifecycle::State &) override
   {
     node_ = std::make_shared<rclcpp::Node>("topic_system");
+    // What the trial makes NaN at the first joint: position or velocity.
+    node_->declare_parameter("lost", "");
     commands_ = node_->create_publisher<Float64MultiArray>("/machine_sim/commands", 10);
     states_ = node_->create_subscription<JointState>(
       "/machine_sim/joint_states", 10, [this](const JointState::SharedPtr message) {
         const std::lock_guard<std::mutex> guard(mutex_);
         last_ = message;
+        received_ = Clock::now();
       });
     executor_.add_node(node_);
     thread_ = std::thread([this] {executor_.spin();});
@@ -62,6 +70,11 @@ public:
     if (!message) {
       return return_type::OK;
     }
+    const std::chrono::duration<double> age = Clock::now() - received();
+    if (age > LARGEST_AGE) {
+      RCLCPP_ERROR(node_->get_logger(), "the last joint state is %.3f s old", age.count());
+      return return_type::ERROR;
+    }
     for (const auto & joint : info_.joints) {
       const auto found = std::find(message->name.begin(), message->name.end(), joint.name);
       if (found == message->name.end()) {
@@ -71,6 +84,10 @@ public:
       set_state(joint.name + "/position", message->position.at(k));
       set_state(joint.name + "/velocity", message->velocity.at(k));
       set_state(joint.name + "/effort", message->effort.at(k));
+    }
+    const std::string lost = node_->get_parameter("lost").as_string();
+    if (!lost.empty()) {
+      set_state(info_.joints[0].name + "/" + lost, std::numeric_limits<double>::quiet_NaN());
     }
     return return_type::OK;
   }
@@ -97,6 +114,12 @@ private:
     return last_;
   }
 
+  Clock::time_point received()
+  {
+    const std::lock_guard<std::mutex> guard(mutex_);
+    return received_;
+  }
+
   rclcpp::Node::SharedPtr node_;
   rclcpp::executors::SingleThreadedExecutor executor_;
   std::thread thread_;
@@ -104,6 +127,7 @@ private:
   rclcpp::Subscription<JointState>::SharedPtr states_;
   std::mutex mutex_;
   JointState::SharedPtr last_;
+  Clock::time_point received_;
 };
 }  // namespace pkm_topic_hardware
 
