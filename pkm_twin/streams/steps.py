@@ -144,12 +144,15 @@ def repeats_of(time: Array, q: Array) -> Mask:
         return found
     own = [noise(time[new], one[new, None])[0] for one, new in zip(q.T, apart.T, strict=True)]
     floor = 2.0 * SIGMAS * np.array(own) + 2.0 * _tick(np.abs(move))
+    period = np.median(np.diff(time))
     for count in range(1, min(AGAIN, len(move) - 3) + 1):
         around = np.array([0, 1, count + 2, count + 3])
         apart_from = np.prod(count + 1 - around) / (count + 1 - around)
         weights = apart_from / [np.prod([x - y for y in around if y != x]) for x in around]
         same = ~sliding_window_view(apart[2:-2], count, axis=0).any(-1) & apart[1 : -count - 2]
-        rows = np.flatnonzero(same.any(1))
+        # The cubic is through samples at even times: none across a gap.
+        span = time[count + 3 :] - time[: -count - 3]
+        rows = np.flatnonzero(same.any(1) & (span < (count + GAP) * period))
         away = np.abs(np.einsum("p,kpn->kn", weights, q[rows[:, None] + around]) - q[rows + 1])
         for k in rows[(same[rows] & (away > floor)).any(1)]:
             found[k + 2 : k + count + 2] = True
