@@ -39,8 +39,8 @@ Array = NDArray[np.float64]
 NAME: Final = "delta_cu_collision"
 DURATION: Final = 4.0
 """Length of the recording, s."""
-WALL: Final = 0.06
-"""Where the obstacle begins, m along x; what is beyond is in it."""
+WALL: Final = -0.06
+"""Where the obstacle begins, m along x; what is at a smaller x is in it."""
 APPEARS: Final = 2.3
 VANISHES: Final = 3.4
 """When it stands there, s: the third crossing runs into it, the first does not."""
@@ -55,11 +55,11 @@ def plan() -> list[Move]:
     """Return the movements: out, to and fro across the place of the obstacle."""
     moves = []
     time, place = 0.4, np.array(HOME)
-    goal = np.array([PICK_X, 0.0, LEVEL])
+    goal = np.array([PLACE_X, 0.0, LEVEL])
     moves.append(Move(time, APPROACH, place, goal, 0.0, True))
     time, place = time + APPROACH + DWELL, goal
     for leg in range(4):
-        goal = np.array([PLACE_X if leg % 2 == 0 else PICK_X, 0.0, LEVEL])
+        goal = np.array([PICK_X if leg % 2 == 0 else PLACE_X, 0.0, LEVEL])
         moves.append(Move(time, MOVE, place, goal, LIFT, leg % 2 == 1))
         time, place = time + MOVE + DWELL, goal
     return moves
@@ -76,10 +76,10 @@ class Obstacle:
     def __call__(self, time: float, configuration: Array, velocity: Array) -> Array | None:
         """Force against the way in, world axes, (6,), None where they do not touch."""
         wrench = None
-        depth = configuration[self._places][0] - WALL
+        depth = WALL - configuration[self._places][0]
         if APPEARS <= time < VANISHES and depth > 0.0:
-            push = HARDNESS * depth + SOFTNESS * velocity[self._places][0]
-            wrench = np.array([-max(push, 0.0), 0.0, 0.0, 0.0, 0.0, 0.0])
+            push = HARDNESS * depth - SOFTNESS * velocity[self._places][0]
+            wrench = np.array([max(push, 0.0), 0.0, 0.0, 0.0, 0.0, 0.0])
             self.first = time if self.first is None else self.first
             self.greatest = max(self.greatest, float(np.abs(wrench).max()))
         now = round(time * 1e9)

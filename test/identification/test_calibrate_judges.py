@@ -77,7 +77,7 @@ def test_poses_in_another_frame_are_proposed_a_frame() -> None:
 def test_an_offset_that_no_number_takes_up_is_a_frame_too() -> None:
     """It then looks like noise, which is below what another machine would leave."""
     robot, _, poses = sound(1)
-    moved = Poses(poses.joints, poses.position + np.array([0.0, 0.008, 0.0]))
+    moved = Poses(poses.joints, poses.position + np.array([-0.008, 0.0, 0.0]))
     with pytest.raises(PkmTwinError, match="--frame"):
         calibrate(robot, moved, ["geometry.arm_length", "geometry.forearm_length"], offsets=True)
 

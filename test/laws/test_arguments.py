@@ -21,7 +21,7 @@ from test.support.robots import both_ways, load, massless, partly_long
 
 ROBOTS = ("delta_cu", "upr_rpu")
 """With elastic members: as a frame, and in closed form."""
-FAR = {"delta_cu": [0.8, -1.4, -2.8], "upr_rpu": [0.1] * 3}
+FAR = {"delta_cu": [-2.8, 0.8, -1.4], "upr_rpu": [0.1] * 3}
 """Joints that cannot be assembled."""
 WRENCH = np.array([1.0, 2.0, 3.0, 0.1, 0.2, 0.3])
 
@@ -348,7 +348,7 @@ class TestEstimators:
         times = np.arange(0.0, 0.4, 0.02)
         disturbed, quiet = self.pushed(kind, *times), self.pushed(kind, *times)
         q, qd, qdd = self.motion
-        nothing, far = np.full(3, np.nan), np.array([0.8, -1.4, -2.8])
+        nothing, far = np.full(3, np.nan), np.array([-2.8, 0.8, -1.4])
         wrongs = [
             (np.nan, self.motion, self.effort), (np.inf, self.motion, self.effort),
             (times[-1], self.motion, self.effort), (0.0, self.motion, self.effort),

@@ -105,7 +105,7 @@ VARIANTS = [
     (
         "delta_cu",
         {
-            "geometry": {"closures": ["rcu", "rod", "rod"]},
+            "geometry": {"closures": ["rod", "rod", "rcu"]},
             "members": {"rcu_forearm": tube(0.12), "arm": tube(0.02)},
         },
     ),

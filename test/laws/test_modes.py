@@ -270,15 +270,15 @@ def test_shapes_keep_what_joints_hold(rng):
     found = modes(robot, pose, elements=3)
     at = {node: k for k, node in enumerate(found.nodes)}
     platform = found.shapes[:, 0]
-    for rod in ("forearm I a", "forearm I b", "forearm II a", "forearm II b", "forearm III"):
+    for rod in ("forearm I", "forearm II a", "forearm II b", "forearm III a", "forearm III b"):
         lever = found.positions[at[f"{rod} 3/3"]] - pose
         expected = platform[:, :3] + np.cross(platform[:, 3:], lever)
         assert found.shapes[:, at[f"{rod} 3/3"], :3] == pytest.approx(expected, abs=1e-9)
     for limb in ("I", "II", "III"):
         assert not found.shapes[:, at[f"arm {limb} 0/3"]].any()
-    # The cylindrical joint of limb III lets its rod slide along t, and not across.
-    start, tip = at["forearm III 0/3"], at["arm III 3/3"]
-    angle = robot.geometry.azimuths[2]
+    # The cylindrical joint of limb I lets its rod slide along t, and not across.
+    start, tip = at["forearm I 0/3"], at["arm I 3/3"]
+    angle = robot.geometry.azimuths[0]
     r, t = np.array([[math.cos(angle), math.sin(angle), 0], [-math.sin(angle), math.cos(angle), 0]])
     lever = found.positions[start] - found.positions[tip]
     carried = found.shapes[:, tip, :3] + np.cross(found.shapes[:, tip, 3:], lever)

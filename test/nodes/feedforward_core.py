@@ -14,8 +14,8 @@ STEP = SECOND // 1000
 NAMES = ("arm_1", "arm_2", "arm_3")
 ROBOT = load("delta_cu")
 ORDERS = list(permutations(range(3)))
-UNREACHABLE = (1.3, 0.4, 2.0)
-"""No assembly: limb III is too short."""
+UNREACHABLE = (2.0, 1.3, 0.4)
+"""No assembly: limb I is too short."""
 WINDOW = 5
 """Samples of the stream's differentiator in these tests."""
 

@@ -2,6 +2,7 @@
 """The feedforward core: streams, trajectories, limits, stops, settings and clocks."""
 
 import math
+import re
 
 import numpy as np
 import pytest
@@ -121,7 +122,7 @@ class TestStreams:
         answers(twin, make, range(WINDOW))
         bad = sample(make, 10, position=UNREACHABLE)
         reason, text = reject(twin.joint_state, *bad)
-        assert (reason, "limb III" in text) == ("unreachable", True)
+        assert reason == "unreachable" and re.search(r"limb I\b", text)
 
     def test_a_singular_state_is_rejected_and_stops(self, make, monkeypatch):
         def singular(*arguments):
@@ -310,7 +311,7 @@ class TestTrajectories:
         message = make.trajectory(NAMES, [0, STEP], [good, bad], [[0.0] * 3] * 2, [[0.0] * 3] * 2)
         reason, text = reject(core(limitless).trajectory, message, NOW)
         assert reason == "unreachable"
-        assert "limb III" in text and "sample 1" in text
+        assert re.search(r"limb I\b", text) and "sample 1" in text
 
 
 class TestSlices:

@@ -207,9 +207,9 @@ class TestGravity:
         self.state(core, make, STEP)
         assert (core.stop_command(STEP) == 0.0).all()
         core = gate(on_stop="gravity")
-        # No assembly: limb III is too short.
+        # No assembly: limb I is too short.
         core.change_robot(ROBOT.changed(limits={"position": [[-3.0, 3.0]] * 3}))
-        self.state(core, make, STEP, position=(1.3, 0.4, 2.0))
+        self.state(core, make, STEP, position=(2.0, 1.3, 0.4))
         assert (core.stop_command(STEP) == 0.0).all()
 
     def test_a_refused_state_is_not_kept(self, make):
