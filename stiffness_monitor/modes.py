@@ -2,7 +2,7 @@
 """Natural frequencies and mode shapes of a robot in a pose, its actuators locked.
 
 The robot is linear about the pose: elastic beams, joints with free and elastic directions, a rigid
-platform (Delta-CU paper, modal analysis). K x = (2 pi f)^2 M x.
+platform (Delta-CU paper, figure 8). K x = (2 pi f)^2 M x.
 
 A member's inner nodes can be replaced by its lowest modes with held ends, in addition to the static
 shapes of its ends (Craig and Bampton 1968): statics stay exact, and a pose costs much less.

@@ -268,9 +268,10 @@ def reactions(
 ) -> Reactions:
     """Constraint forces and moments at every joint, for a motion.
 
-    Force and moment balance of each body (Delta-CU paper, d'Alembert's principle, section 3: at
-    A, B and C of each limb), the payload fixed to the platform. The actuated components are the
-    efforts on the bodies: motor effort minus the joint's friction and its rotor's inertial effort.
+    Force and moment balance of each body (d'Alembert's principle; Delta-CU paper, equations 17 to
+    21, at A, B and C of each limb), the payload fixed to the platform. The actuated components are
+    the efforts on the bodies: motor effort minus the joint's friction and its rotor's inertial
+    effort.
 
     The rank of the balance decides which components the mechanism's statics determines; the others
     are NaN, see ``Reactions.determinate`` and ``Reactions.indeterminate``.

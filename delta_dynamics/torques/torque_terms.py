@@ -66,11 +66,11 @@ def dynamics_terms(
 ) -> Terms:
     """Split the actuator efforts of a motion by cause, exactly.
 
-    Each term is the inverse dynamics (virtual work; Delta-CU paper, step 4; 3-PRRU paper, equation
-    41) with the other causes set to zero. The terms of payload and friction are differences of the
-    efforts with and without them. This is exact because the efforts are linear in gravity, qdd, the
-    masses, the basic friction's coefficients and the wrench; other friction laws are the difference
-    of all efforts with and without friction.
+    Each term is the inverse dynamics (virtual work; Delta-CU paper, equation 23; 3-PRRU paper,
+    equation 41) with the other causes set to zero. The terms of payload and friction are
+    differences of the efforts with and without them. This is exact because the efforts are linear
+    in gravity, qdd, the masses, the basic friction's coefficients and the wrench; other friction
+    laws are the difference of all efforts with and without friction.
 
     :returns: the terms, each of the common batch shape; parameters and errors as of
         :func:`~delta_dynamics.inverse_dynamics`.

@@ -36,9 +36,10 @@ def inverse_dynamics(
     """Actuator efforts for a motion, exact rigid-body dynamics.
 
     tau = sum over bodies of Jv' m (a - g) + Jw' (I alpha + omega x I omega), less J' wrench, plus
-    friction: the principle of virtual work (Delta-CU paper, step 4). Without friction it is the
-    3-PRRU paper's F_d = -J^-T (J_M' Q_M + sum of J_Hij' Q_Hij) - Q_S (equation 41). A sample has no
-    memory: Coulomb friction has the rate's sign, without ``presliding``.
+    friction: the principle of virtual work (Delta-CU paper, step 4, equations 22 and 23).
+    Without friction it is the 3-PRRU paper's F_d = -J^-T (J_M' Q_M + sum of J_Hij' Q_Hij) - Q_S
+    (equation 41). A sample has no memory: Coulomb friction has the rate's sign, without
+    ``presliding``.
 
     :param q: joint positions, shape (..., n), rad or m.
     :param qd: joint rates, shape (..., n).
@@ -142,7 +143,10 @@ def energy(robot: Robot, q: ArrayLike, qd: ArrayLike) -> Energy:
 
 
 class Forces:
-    """The wrench that every body needs at its origin, base axes; adds what acts on bodies."""
+    """The wrench that every body needs at its origin, base axes; adds what acts on bodies.
+
+    :meth:`generalised` sums up their virtual work (Delta-CU paper, step 4, equation 22).
+    """
 
     def __init__(self, motion: Motion) -> None:
         self.motion = motion
@@ -201,7 +205,7 @@ class Forces:
         """What the acceleration of a thin even rod needs.
 
         m (2 a + b) / 6 at its end of acceleration a and m (a + 2 b) / 6 at the other: its rotation
-        is in it.
+        is in it (Delta-CU paper, equations 15 and 16).
         """
         m = self.motion
         self._shared(rod, mass, m.acceleration)

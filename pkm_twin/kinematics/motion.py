@@ -56,7 +56,8 @@ def difference(b: Columns, a: Columns) -> Columns:
 class Row:
     """One scalar equation of a closure: ``value`` is zero, ``columns`` its derivatives by rates.
 
-    ``bias``: its second derivative in time at zero accelerations of the unknowns. ``scale`` makes
+    ``bias``: its second derivative in time at zero accelerations of the unknowns (Delta-CU paper,
+    equations 4 and 5). ``scale`` makes
     it of unit one; ``angle``: it is about directions. ``part``: the joint or rod. A unit of its
     multiplier is a force ``force`` and a moment ``moment`` on ``outer`` at ``point``, and the
     opposite on ``inner``.
@@ -302,7 +303,7 @@ class Motion:
         return replace(self.distance(rod.name, (a, xa), (b, xb), square), bias=bias)
 
     def distance(self, part: str, a: BodyPoint, b: BodyPoint, square: Any) -> Row:
-        """The points have a distance, m2; without a bias."""
+        """The points have a distance, m2; without a bias (Delta-CU paper, equations 1 and 2)."""
         apart = b[1] - a[1]
         columns = difference(self.linear_jacobian(*b), self.linear_jacobian(*a))
         return Row(
@@ -315,7 +316,8 @@ class Motion:
     def set_rates(self, u: Numbers, qd: Numbers) -> None:
         """Compute the angular velocity, and the velocity of the origin, of every body.
 
-        With the pose's rates: 3-PRRU paper, equations 22 and 30.
+        With the pose's rates: 3-PRRU paper, equations 22 and 30. Of a Delta: Delta-CU paper,
+        equations 10 to 12.
         """
         zero = np.zeros(3)
         self.omega: dict[str, Any] = {BASE: zero}
@@ -344,7 +346,8 @@ class Motion:
     def set_accelerations(self, du: Numbers, qdd: Numbers, gravity: Any | None = None) -> None:
         """Compute each body's angular acceleration, and its origin's acceleration less gravity.
 
-        Without the Hessians of the 3-PRRU paper's equations 23 and 31.
+        Without the Hessians of the 3-PRRU paper's equations 23 and 31. Of a Delta: Delta-CU paper,
+        equations 13, 14 and 16, without their misprints.
         """
         zero = np.zeros(3)
         pull = zero if gravity is None else gravity
@@ -374,11 +377,11 @@ class Motion:
             self._spin[link.body] = _spin(self.omega[link.body], al)
 
     def velocity(self, body: str, point: Array) -> Any:
-        """Velocity of a point of a body, given at home."""
+        """Velocity of a point of a body, given at home (Delta-CU paper, equations 7 and 8)."""
         return self.speed[body] + cross(self.omega[body], self.arm(body, point))
 
     def acceleration(self, body: str, point: Array) -> Any:
-        """Its acceleration, less gravity where that was given."""
+        """Its acceleration, less gravity where that was given (Delta-CU paper, equation 15)."""
         return self.change[body] + self._spin[body] @ self.arm(body, point)
 
     def spin(self, body: str) -> Any:

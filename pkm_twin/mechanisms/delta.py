@@ -13,7 +13,7 @@ where tan of the forearms' slope is the root of 2: within a degree of the paper'
 
 Branches: ``inverse`` takes the elbows outwards; ``forward`` takes the platform below the elbows.
 
-Source: Delta-CU paper (table 1; closure, velocity and acceleration equations).
+Source: Delta-CU paper (table 1; equations 1 to 16 are computed by ``pkm_twin.kinematics``).
 """
 
 from __future__ import annotations
@@ -166,7 +166,10 @@ class Delta(TwinRobot):
         return g.base_radius * out + g.arm_length * (cos(q) * out - sin(q) * UP)
 
     def _forearm(self, i: int, q: Any, platform: Any) -> Any:
-        """Forearm of limb i from elbow to platform joint; of an rcu, without its slide."""
+        """Forearm of limb i from elbow to platform joint; of an rcu, without its slide.
+
+        Delta-CU paper, equation 9.
+        """
         g, (out, along) = self.geometry, self._directions[i]
         span = platform + g.platform_radius * out - self._elbow(i, q)
         return span - (span @ along) * along if g.closures[i] == "rcu" else span
@@ -319,7 +322,10 @@ class Delta(TwinRobot):
         return box
 
     def make_graph(self) -> Graph:
-        """Arms on the base, forearms as parallelograms or on an rcu's joints, a platform."""
+        """Arms on the base, forearms as parallelograms or on an rcu's joints, a platform.
+
+        Each limb closes from base to platform (Delta-CU paper, equation 9).
+        """
         g = self.geometry
         m: Any = self.spelled.inertia
         q, platform = self._home

@@ -299,7 +299,7 @@ class Robot(Mechanism):
     def jacobian(self, q: ArrayLike) -> Array:
         """Return pose rates per joint rate, shape (..., m, n).
 
-        The inverse of the 3-PRRU paper's Jacobian J (equation 24).
+        Delta-CU paper, equation 3; the inverse of the 3-PRRU paper's Jacobian J (equation 24).
         """
         return self._jacobians(q)[0]
 
@@ -380,7 +380,7 @@ class Robot(Mechanism):
         return self.engine.kernel("agreeing", agreeing_program)
 
     def pose_acceleration(self, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike) -> Array:
-        """Second derivative of the pose in time, shape (..., m)."""
+        """Second derivative of the pose in time, shape (..., m) (Delta-CU paper, equation 6)."""
         return self.evaluate(self.engine.acceleration, _NONE, q, qd, qdd)[0]
 
     def singularity(self, q: ArrayLike) -> Array:

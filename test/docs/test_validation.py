@@ -11,11 +11,11 @@ import pytest
 from delta_dynamics import inverse_dynamics
 from pkm_twin import load
 from stiffness_monitor import strain_energy
-from stiffness_monitor.modes import modes, natural_frequencies
+from stiffness_monitor.modes import natural_frequencies
 from test.support.pages import assert_printed, numbers
 from test.support.robots import parameters_of, partly_long
-from test.validation import test_delta_cu_paper as delta_cu
 from test.validation import test_upr_rpu_paper as upr_rpu
+from tools.papers import delta_cu
 
 PAGE = "docs/validation.md"
 
@@ -31,29 +31,22 @@ class TestFrequenciesOfTheDeltaCu:
         """The same robot, the universal joint's second axis across its forearm."""
         robot = replace(self.robot, name="across")
         graph = self.robot.graph
-        joint = graph.joints["platform joint III"]
-        axis = np.cross(joint.axes[0], joint.at - graph.joints["elbow III"].at)
+        joint = graph.joints["platform joint I"]
+        axis = np.cross(joint.axes[0], joint.at - graph.joints["elbow I"].at)
         turned = replace(joint, axes=np.array([joint.axes[0], axis / np.linalg.norm(axis)]))
         vars(robot)["graph"] = replace(graph, joints=graph.joints | {joint.name: turned})
         return robot
 
-    def test_what_they_hang_on(self, variant):
+    def test_what_they_depend_on(self, variant):
         members = parameters_of("delta_cu")["members"]
         carbon = {k: members["forearm"][k] for k in ("youngs_modulus", "shear_modulus", "density")}
         rod, _ = variant("delta_cu", members={"rcu_forearm": members["rcu_forearm"] | carbon})
-        own = self.first(self.robot)
+        found = delta_cu.find_modes("delta_cu").frequencies
         pattern = (
-            r"first frequency is (\d+) Hz here; with the universal joint's second axis across the "
-            r"forearm it would be (\d+\.\d+) Hz, with a rod of carbon (\d+) Hz"
+            r"here (\S+), (\S+), (\S+), (\S+), (\S+) and (\S+) Hz, .*? across the forearm the "
+            r"first would be (\d+) Hz, with a rod of carbon (\d+) Hz"
         )
-        assert_printed(PAGE, pattern, own, self.first(self.across()), self.first(rod))
-
-    def test_where_their_energy_is(self):
-        found = modes(self.robot, self.pose)
-        names, kinetic = found.energies.elements, found.energies.kinetic
-        forearms = kinetic[:, [name.startswith("forearm") for name in names]].sum(1)
-        assert (kinetic[:3, names.index("platform")] + forearms[:3]).min() > 0.7
-        assert forearms[3:].min() > 0.85
+        assert_printed(PAGE, pattern, *found, self.first(self.across()), self.first(rod))
 
 
 class TestTablesOfTheUprRpuPaper:
@@ -90,31 +83,24 @@ def test_torques_of_random_machines(name, machine):
 
 
 class TestErrataOfTheDeltaCu:
-    robot = load("delta")
-    phase = delta_cu.RATE * delta_cu.TIME[:, None]
-
-    def motion(self, signs):
-        cosine, sine = np.cos(self.phase), np.sin(self.phase)
-        q = delta_cu.HOME_ANGLE + signs * cosine
-        return q, -signs * delta_cu.RATE * sine, -signs * delta_cu.RATE**2 * cosine
-
-    def velocity(self, signs=delta_cu.SIGNS):
-        """In the paper's axes, mm/s."""
-        q, qd, _ = self.motion(signs)
-        return np.einsum("nij,nj->ni", self.robot.jacobian(q), qd) * delta_cu.DOWN * 1e3
+    robot = load("delta_cu")
+    q, qd, qdd = delta_cu.find_motion()
+    velocity = delta_cu.read_numbers(delta_cu.TABLE_2)
 
     def test_the_sign_is_that_of_arm_one(self):
-        ours = delta_cu.differences(self.velocity(), delta_cu.VELOCITY)[0]
-        theirs = self.velocity(np.array([1.0, -1.0, 1.0]))
-        pattern = r"from table 2 by (\S+) instead of (\d+) mm/s rms"
-        assert_printed(PAGE, pattern, ours, delta_cu.differences(theirs, delta_cu.VELOCITY)[0])
+        rms = []
+        for signs in (delta_cu.SIGNS, np.array([1.0, -1.0, 1.0])):
+            q, qd, _ = delta_cu.find_motion(signs=signs)
+            found = delta_cu.find_velocity(load("delta"), q, qd)
+            rms.append(delta_cu.measure_difference(found, self.velocity)[0])
+        assert_printed(PAGE, r"from table 2 by (\S+) instead of (\d+) mm/s rms", *rms)
 
     def test_a_digit_of_table_2_is_lost(self):
-        found = self.velocity()
-        source = np.array(delta_cu.VELOCITY, float)
-        rms = [delta_cu.differences(found, source)[0]]
+        found = delta_cu.find_velocity(self.robot, self.q, self.qd)
+        source = self.velocity.copy()
+        rms = [delta_cu.measure_difference(found, source)[0]]
         used, source[3, 2] = source[3, 2], -10.80
-        rms.append(delta_cu.differences(found, source)[0])
+        rms.append(delta_cu.measure_difference(found, source)[0])
         pattern = (
             r"(-10\.80) mm/s; here (\S+) mm/s, a digit is lost: the model gives (\S+); "
             r"velocities differ by (\S+) instead of (\S+) mm/s rms"
@@ -122,12 +108,11 @@ class TestErrataOfTheDeltaCu:
         assert_printed(PAGE, pattern, -10.80, used, found[3, 2], *rms)
 
     def test_two_digits_of_table_3_are_exchanged(self):
-        q, qd, qdd = self.motion(delta_cu.SIGNS)
-        found = self.robot.pose_acceleration(q, qd, qdd) * delta_cu.DOWN * 1e3
-        source = np.array(delta_cu.ACCELERATION, float)
-        rms = [delta_cu.differences(found, source)[0]]
+        found = delta_cu.find_acceleration(self.robot, self.q, self.qd, self.qdd)
+        source = delta_cu.read_numbers(delta_cu.TABLE_3)
+        rms = [delta_cu.measure_difference(found, source)[0]]
         used, source[4, 2] = source[4, 2], 17.20
-        rms.append(delta_cu.differences(found, source)[0])
+        rms.append(delta_cu.measure_difference(found, source)[0])
         pattern = (
             r"(17\.20) mm/s2; here (\S+) mm/s2, two digits are exchanged: the model gives (\S+); "
             r"accelerations differ by (\S+) instead of (\S+) mm/s2 rms"
@@ -136,17 +121,14 @@ class TestErrataOfTheDeltaCu:
 
     def test_symmetry(self):
         """Of arms II and III in the tables, and of the platform's motion in arm I's plane."""
-        efforts = inverse_dynamics(self.robot, *self.motion(delta_cu.SIGNS), delta_cu.LOAD)
-        np.testing.assert_allclose(efforts[:, 1], efforts[:, 2], atol=1e-12)
-        second, third = (
-            np.array(table) @ axis / np.dot(axis, axis) * 1e-3
-            for table, axis in zip(delta_cu.TORQUES[1:], delta_cu.AXES[1:], strict=True)
-        )
+        efforts = inverse_dynamics(self.robot, self.q, self.qd, self.qdd, delta_cu.LOAD)
+        np.testing.assert_allclose(efforts[:, 1], efforts[:, 2], atol=1e-11)
+        _, second, third = delta_cu.find_printed_torques().T
         across = np.array([0.5, np.sqrt(0.75), 0.0])
-        away = [np.abs(np.array(t) @ across).max()
-                for t in (delta_cu.VELOCITY, delta_cu.ACCELERATION)]  # fmt: skip
+        tables = delta_cu.TABLE_2, delta_cu.TABLE_3
+        away = [np.abs(delta_cu.read_numbers(t) @ across).max() for t in tables]
         pattern = (
-            r"differ by up to (\S+) N m; at t = 0 they give (\S+) and (\S+) N m, where `delta` "
+            r"differ by up to (\S+) N m; at t = 0 they give (\S+) and (\S+) N m, where `delta_cu` "
             r"gives (\S+) N m for both\. .* leave the plane by up to (\S+) mm/s and (\S+) mm/s2"
         )
         most = np.abs(second - third).max()

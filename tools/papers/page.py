@@ -9,11 +9,11 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Final
 
-from tools.papers import prru, upr_rpu
+from tools.papers import delta_cu, prru, upr_rpu
 from tools.papers.rows import KINDS, Comparison, Paper, Printed, Row, heading_anchor
 
 ROOT: Final = Path(__file__).resolve().parents[2]
-MODULES: Final = (prru, upr_rpu)
+MODULES: Final = (delta_cu, prru, upr_rpu)
 """Each has ``find_rows``, which computes the paper's values and returns a ``Paper``."""
 HEAD: Final = """# The three papers, compared
 
