@@ -120,8 +120,6 @@ class Tasks(TyperGroup):
         """A command, by its name or an older one."""
         if args and args[0] in OLDER:
             args = [*OLDER[args[0]], *args[1:]]
-        if args[:1] == ["record-kit"] and "--anonymise" in args:
-            args = _anonymise(args)
         return super().parse_args(ctx, args)
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
@@ -142,16 +140,6 @@ class Tasks(TyperGroup):
             ]
             with formatter.section(title):
                 formatter.write_dl(rows)
-
-
-def _anonymise(args: list[str]) -> list[str]:
-    """The words of `anonymise` for the older `record-kit [ROBOT] --anonymise BAG`."""
-    place = args.index("--anonymise")
-    if args[-1] == "--anonymise":
-        raise UsageError("record-kit --anonymise needs a bag: pkm-twin anonymise BAG")
-    rest = [*args[1:place], *args[place + 2 :]]
-    robot = ["--robot", rest.pop(0)] if rest and not rest[0].startswith("-") else []
-    return ["anonymise", args[place + 1], *robot, *rest]
 
 
 def greet(ctx: typer.Context) -> None:

@@ -28,7 +28,7 @@ NOT_RUN = {
 ENDS = {"pkm-twin recover damaged.mcap saved.mcap": 3}
 """Exit codes other than 0, as the page says."""
 SLOW = (
-    r"pkm-twin (torques (\S+\.mcap|\S+ \S+\.mcap|better\.yaml)|map|design|excite|record-kit|"
+    r"pkm-twin (torques (\S+\.mcap|\S+ \S+\.mcap|better\.yaml)|map|design|excite|"
     r"path stewart|check (bags/\w+|\S+ --(robot|topic|payload|history))|trend|"
     r"fit (delta_cu|upr_rpu)|calibrate (delta_cu|examples/machines/hexapod|.*--plan)|"
     r"size (delta_cu bags/|\S+ large)|path \S+/delta_1130|.*\| pkm-twin|export fmu .*--kind|"

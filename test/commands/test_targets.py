@@ -109,7 +109,6 @@ def test_a_folder_that_is_not_there_is_told_before_the_work(twin, tmp_path, monk
         (("calibrate", "delta", "out.yaml", "--noise", "height=1e-4"), "--noise: 'height'"),
         (("calibrate", "delta"), "poses: missing"),
         (("convert", "nofile"), "SOURCE: 'nofile'"),
-        (("record-kit", "--anonymise"), "needs a bag"),
     ],
 )
 def test_a_wrong_input_is_told_before_a_target_that_is_there(
@@ -203,7 +202,6 @@ def test_what_is_read_is_not_replaced(twin, tmp_path, deflections):
     for line, name in (
         (("calibrate", "upr_rpu"), "a.yaml"),
         (("torques", "delta"), "b.csv"),
-        (("anonymise",), "c.mcap"),
     ):
         same, link = tmp_path / name, tmp_path / f"link_{name}"
         shutil.copy(deflections, same)
