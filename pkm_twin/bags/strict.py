@@ -182,9 +182,8 @@ class Check:
     def left_out(self) -> str:
         """What :func:`recover` loses: the fault with its place, or records that it leaves out."""
         if self.fault:
-            return self.fault.text + f" (byte {self.fault.offset})" * (
-                self.fault.offset is not None
-            )
+            at = self.fault.offset
+            return self.fault.text if at is None else f"{self.fault.text} (byte {at})"
         kinds = [Op.ATTACHMENT] if self._attachments else list(self.records.passed_over)
         return f"{opcode_name(kinds[0])} records are not carried over" if kinds else ""
 
