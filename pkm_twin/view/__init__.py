@@ -2,5 +2,5 @@
 """``pkm-twin view``: a robot in a browser. Pure parts, and the page that viser serves.
 
 ``model`` (sliders in, numbers out), ``scene`` (numbers to shapes), ``timeline`` (a bag), ``live``
-(messages) and ``texts`` know nothing of viser; ``door`` (who may enter) and ``page`` do.
+(messages) and ``texts`` know nothing of viser; ``page`` does.
 """

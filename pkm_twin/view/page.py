@@ -9,7 +9,6 @@ from __future__ import annotations
 import contextlib
 import io
 import logging
-import socket
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future
@@ -23,20 +22,23 @@ from scipy.spatial.transform import Rotation  # type: ignore[import-untyped]
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import PkmTwinError, one_line
 from pkm_twin.view import texts
-from pkm_twin.view.door import Door, behind
 from pkm_twin.view.model import Model, Range, State
 from pkm_twin.view.scene import DRIVE, Scene
 from pkm_twin.view.stage import Stage
-from pkm_twin.view.visitors import guard
 
 _LOG: Final = logging.getLogger("pkm_twin")
+ADDRESS: Final = "127.0.0.1"
+"""The only address that is listened on."""
 PERIOD: Final = 0.05
 """How often what moves by itself is drawn, s."""
 
 
 @contextmanager
-def serving(door: Door, listening: socket.socket) -> Iterator[Any]:
-    """A viser server on the socket, behind the door, and nothing that it prints."""
+def serving(port: int) -> Iterator[Any]:
+    """Run a viser server on this computer's own address; port 0 is any that is free.
+
+    :raises PkmTwinError: the port is another program's.
+    """
     import viser
 
     class Server(viser.ViserServer):
@@ -45,12 +47,15 @@ def serving(door: Door, listening: socket.socket) -> Iterator[Any]:
         def request_share_url(self, verbose: bool = True) -> None:
             """Share nothing."""
 
-    # A visitor that is sent away, or breaks off, is no error of this program's.
+    # A visitor that breaks off is no error of this program's.
     logging.getLogger("websockets").setLevel(logging.CRITICAL)
-    with contextlib.redirect_stdout(io.StringIO()), behind(door, listening):
-        server = Server(host=door.host, port=listening.getsockname()[1], verbose=False)
-        guard(server)
+    with contextlib.redirect_stdout(io.StringIO()):
+        server = Server(host=ADDRESS, port=port, verbose=False)
     try:
+        # viser takes the next port where one is in use.
+        if port not in (0, server.get_port()):
+            text = f"cannot listen on {ADDRESS} port {port}: it is in use; choose another --port"
+            raise PkmTwinError(text)
         yield server
     finally:
         with contextlib.redirect_stdout(io.StringIO()):

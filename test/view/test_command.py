@@ -8,6 +8,7 @@ import io
 import os
 import re
 import signal
+import socket
 import subprocess
 import sys
 import threading
@@ -37,13 +38,21 @@ def viser():
 @pytest.mark.parametrize(
     ("options", "told", "code"),
     [
-        (("--host", "0.0.0.0"), "--host: '0.0.0.0'; expected 127.0.0.1, or ", 2),
+        (("--port", "70000"), "65535", 2),
         (("--bag", "nothing.mcap", "--port", "0"), "nothing.mcap", 1),
     ],
 )
 @needs_viser
 def test_what_cannot_be_served_is_one_line(twin, options, told, code):
     assert told in twin.refused("view", "delta_cu", *options, code=code)
+
+
+@needs_viser
+def test_a_port_in_use_is_told(twin):
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        port = str(other.getsockname()[1])
+        told = twin.refused("view", "delta_cu", "--port", port)
+        assert f"127.0.0.1 port {port}: it is in use; choose another --port" in told
 
 
 @pytest.mark.parametrize(
@@ -279,15 +288,14 @@ def pressed(browser, selector, test):
 @pytest.fixture
 def page():
     """A page of this process, its loop in a thread."""
-    from pkm_twin.view.door import Door, listen
     from pkm_twin.view.model import Model
     from pkm_twin.view.page import Page, serving
     from pkm_twin.view.panels import ModePanel
 
-    with listen("127.0.0.1", 0) as socket, serving(Door("127.0.0.1"), socket) as server:
+    with serving(0) as server:
         page = Page(server, Model(load("delta_cu")))
         page.mode = ModePanel(page)
-        page.address = f"http://127.0.0.1:{socket.getsockname()[1]}/"
+        page.address = f"http://127.0.0.1:{server.get_port()}/"
         threading.Thread(target=page.run, daemon=True).start()
         yield page
 

@@ -18,7 +18,6 @@ from PIL import Image
 
 from pkm_twin import load
 from pkm_twin.recordings import read
-from pkm_twin.view.door import Door, listen
 from pkm_twin.view.model import Model
 from pkm_twin.view.page import Page, serving
 from pkm_twin.view.panels import BagPanel
@@ -74,13 +73,10 @@ FRAMES = 10
 def shown(browser: Browser, name: str) -> Iterator[Page]:
     """A page in the browser, as it is drawn in the end."""
     robot, prepare = PICTURES[name]
-    with (
-        listen("127.0.0.1", 0) as listening,
-        serving(Door("127.0.0.1"), listening) as server,
-    ):
+    with serving(0) as server:
         page = Page(server, Model(load(robot)), "Bag" if prepare is recorded else "")
         tab = prepare(page)
-        browser.visit(f"http://127.0.0.1:{listening.getsockname()[1]}/")
+        browser.visit(f"http://127.0.0.1:{server.get_port()}/")
         browser.until("!!document.getElementById('singularity')")
         time.sleep(SETTLED)
         if tab == "Load":

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import os
 import threading
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
@@ -31,29 +30,21 @@ class View(CarriesAtTimes, ReadsRecordings):
     limbs, and deflection and strain energy under a wrench. With --bag it replays a recording with
     the model's torques; with --live it follows running nodes. It loads nothing from other hosts.
 
-    Runs until Ctrl-C, and is reachable from this machine only, unless --host and --token are given.
+    Runs until Ctrl-C, and is reachable from this machine only; from another one, use ssh -L.
     """
 
     bag: Path | None = setting(None, "replay this recording on a timeline")
     live: bool = setting(False, "follow running nodes; needs ROS")
     namespace: str = setting("", "the robot's namespace, with --live")
-    host: str = setting(
-        "127.0.0.1", "address to listen on; every address except loopback needs --token"
-    )
-    port: int = setting(8080, "port to listen on; 0: any free port")
-    token: str | None = setting(
-        None,
-        "access token, at least 16 characters; safer in the environment variable PKM_TWIN_TOKEN",
-    )
+    port: int = setting(8080, "port to listen on; 0: any free port", low=0, high=65535)
 
 
 def view(given: View) -> Report:
     """Serve the page until a signal ends it.
 
-    :raises PkmTwinError: a recording that cannot be read, or an address that is not free.
+    :raises PkmTwinError: a recording that cannot be read, or a port that is not free.
     """
     from pkm_twin.errors import require
-    from pkm_twin.view.door import Door, listen
 
     bag = given.bag
     if bag is None and (given.topic or given.load is not None):
@@ -63,21 +54,18 @@ def view(given: View) -> Report:
     if given.namespace and not given.live:
         raise typer.BadParameter("--namespace needs --live")
     require("viser", "view")
-    token = given.token or os.environ.get("PKM_TWIN_TOKEN", "")
-    door = Door(given.host, token)
     from pkm_twin import load
     from pkm_twin.view.live import Live
     from pkm_twin.view.model import Model
-    from pkm_twin.view.page import Page, serving
+    from pkm_twin.view.page import ADDRESS, Page, serving
     from pkm_twin.view.panels import BagPanel, LivePanel, ModePanel
     from stiffness_monitor.modes import has_modes
 
     with ExitStack() as stack:
-        door_socket = stack.enter_context(listen(given.host, given.port))
         machine = load(given.robot, platform=given.platform)
         timeline = None if bag is None else _timeline(bag, given)
         model = Model(machine)
-        server = stack.enter_context(serving(door, door_socket))
+        server = stack.enter_context(serving(given.port))
         page = Page(server, model, "Bag" if timeline is not None else "Live" if given.live else "")
         if has_modes(machine):
             ModePanel(page)
@@ -87,10 +75,7 @@ def view(given: View) -> Report:
             heard = Live(machine)
             stack.enter_context(listening(heard, given.namespace))
             LivePanel(page, heard)
-        name, number = door_socket.getsockname()[:2]
-        shown = f"[{name}]" if ":" in name else name
-        asked = "?token=TOKEN" if token else ""
-        typer.echo(f"{machine.name}: http://{shown}:{number}/{asked}  (Ctrl-C ends)")
+        typer.echo(f"{machine.name}: http://{ADDRESS}:{server.get_port()}/  (Ctrl-C ends)")
         page.run()
     return Report()
 
