@@ -268,8 +268,8 @@ def find_rows() -> Paper:
     found = find_modes("delta_cu")
     frequencies = ", ".join(f"{f:.1f}" for f in found.frequencies)
     summary = (
-        "Delta-CU paper: its equations agree to rounding, but for misprints in 13 to 16.",
-        "Delta-CU paper, tables 2 to 6, with two numbers that were fitted to them: "
+        "Delta-CU paper: its equations agree to rounding, but for misprints in 13 to 16. "
+        "Tables 2 to 6, with two numbers that were fitted to them: "
         "velocities differ by {:.1f} mm/s rms, accelerations by {:.1f} mm/s², torques by "
         "{:.2f} N m, at most {:.2f}. ".format(*differences)
         + f"Statics alone differ by {measure_difference(still, printed)[0]:.2f} N m: "
