@@ -532,7 +532,9 @@ def test_what_a_robot_lacks_is_reported(tmp_path, capsys):
 
 @needs_ros2_control
 @pytest.mark.long
-@pytest.mark.parametrize("name", ["five_bar", "delta_cu", "rps3", "stewart"])
+@pytest.mark.parametrize(
+    "name", ["five_bar", "delta_cu", "rps3", "stewart", Path("examples/machines/rrr4_planar.yaml")]
+)
 def test_the_package_builds_and_its_own_test_passes(name, tmp_path):
     robot = loaded_like(sides(name).mapped)
     for path, text in ros2_control_package(robot).items():
