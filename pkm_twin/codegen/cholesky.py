@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 from pkm_twin.codegen.expressions import Objects
@@ -89,18 +89,18 @@ def _order(matrix: Mapping[tuple[int, int], Any], n: int, last: int) -> list[int
     return [*order, *near]
 
 
-def traces_over(numerators: Sequence[Objects], matrix: Objects) -> list[Any]:
-    """Trace of matrix^-1 numerator of each: what x' numerator x sums up to at x' matrix x = 1.
+def trace_over(numerator: Objects, matrix: Objects) -> Any:
+    """Return the trace of matrix^-1 numerator.
 
-    Of the inverse only the entries in the pattern of L (Takahashi, Fagan, Chen 1973). Where the
-    matrix has no inverse the result is large and finite.
+    With matrix = L D L' it is the sum of the diagonal of L^-1 numerator L^-T over the pivots D, so
+    the numerator goes through the elimination too. Where the matrix has no inverse the result is
+    large and finite.
 
-    :param numerators: symmetric, not negative, shape (n, n) each, expressions or numbers; the
-        diagonal of their sum is positive.
+    :param numerator: symmetric, not negative, with a positive diagonal, shape (n, n), expressions
+        or numbers.
     :param matrix: symmetric, not negative, the same shape and unit.
     """
     n = len(matrix)
-    numerator = sum(numerators[1:], numerators[0])
     lower = {
         (a, b): matrix[a][b]
         for a in range(n)
@@ -108,31 +108,20 @@ def traces_over(numerators: Sequence[Objects], matrix: Objects) -> list[Any]:
         if a == b or not (is_zero(matrix[a][b]) and is_zero(numerator[a][b]))
     }
     whole = SparseCholesky(lower, [numerator[a][a] for a in range(n)])
-    factors, below = whole.factors, whole.below
-    inverse: Entries = {}
-
-    def entry(i: int, j: int) -> Any:
-        return inverse[max(i, j), min(i, j)]
-
-    for j in reversed(range(n)):
-        for i in below[j]:
-            total: Any = 0.0
-            for k in below[j]:
-                total = total - entry(i, k) * factors[k, j]
-            inverse[i, j] = total
-        diagonal = whole.inverses[j]
-        for k in below[j]:
-            diagonal = diagonal - factors[k, j] * inverse[k, j]
-        inverse[j, j] = diagonal
-    return [_product(each, entry, whole.place) for each in numerators]
-
-
-def _product(numerator: Objects, entry: Callable[[int, int], Any], place: dict[int, int]) -> Any:
-    """Sum of the products of both matrices' entries."""
-    result: Any = 0.0
-    for a in range(len(numerator)):
-        result = result + numerator[a][a] * entry(place[a], place[a])
-        for b in range(a):
-            if not is_zero(numerator[a][b]):
-                result = result + 2.0 * (numerator[a][b] * entry(place[a], place[b]))
-    return result
+    left: Entries = {}
+    for a, b in lower:
+        if not is_zero(numerator[a][b]):
+            i, j = whole.place[a], whole.place[b]
+            left[max(i, j), min(i, j)] = numerator[a][b]
+    total: Any = 0.0
+    for j, rows in enumerate(whole.below):
+        total = total + left[j, j] * whole.inverses[j]
+        for k in rows:
+            far = whole.factors[k, j]
+            change = far * left[j, j] - left.get((k, j), 0.0)
+            for i in rows:
+                if i >= k:
+                    step = whole.factors[i, j] * change
+                    step = step - left[i, j] * far if (i, j) in left else step
+                    left[i, k] = left[i, k] + step if (i, k) in left else step
+    return total

@@ -1,9 +1,9 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """How far a machine is from a singularity of any kind: 0 in one, 1 at best.
 
-The lesser of two numbers. Bodies move by (v, L omega): v of the middle of a body's joints, L how
-far the farthest of them is from it, the platform's rim at least; of the platform by its reference
-point and rim. Closures err in lengths, angles times the rim. Hence no unit counts, and no scale.
+The lesser of two numbers. A body moves by (v, L omega): v of the middle of its joints, L the
+distance of the farthest of them from there, at least the platform's. Closures err in lengths,
+angles times the platform's L. Hence neither units, scale nor the reference point count.
 
 **Held**: the actuated joints are locked, and a closure errs by one. A = d(closures)/d(rates), k
 rates and r closures of which some may be redundant, B = d(bodies)/d(rates), all bodies':
@@ -13,7 +13,8 @@ rates and r closures of which some may be redundant, B = d(bodies)/d(rates), all
 An error of one needs motion of at least a half on each side of it, hence the bound of 1. It is zero
 where anything moves although the actuators are locked: where they lose the platform, and in every
 constraint singularity, of platform, limbs or bodies between. Here closures are all that holds in
-truth: of a parallelogram also the couple that a pair of rods passes.
+truth: of a parallelogram also the couple that a pair of rods passes. Which joints are closures
+follows from the structure, see :func:`find_carriers`.
 
 **Moved**: the platform's twist per joint rate T, shape (6, n), of each body's motion D:
 
@@ -33,7 +34,7 @@ from typing import Any
 import numpy as np
 
 from pkm_twin.codegen.arrays import Array
-from pkm_twin.codegen.cholesky import SparseCholesky, traces_over
+from pkm_twin.codegen.cholesky import SparseCholesky, trace_over
 from pkm_twin.codegen.expressions import Numbers, Objects, norm, plain
 from pkm_twin.codegen.kernels import Kernel
 from pkm_twin.codegen.operations import maximum, minimum, sqrt
@@ -52,7 +53,7 @@ from pkm_twin.kinematics.motion import (
     numbers,
 )
 from pkm_twin.kinematics.traced import Traced
-from pkm_twin.machine.graph import BASE, Graph, Rod
+from pkm_twin.machine.graph import BASE, Graph, Rod, groups
 from pkm_twin.machine.tree import Tree
 
 
@@ -66,6 +67,35 @@ def singularity_gradient(engine: Engine) -> Kernel:
     return engine.kernel("singularity gradient", _gradient, free=True)
 
 
+def find_carriers(graph: Graph) -> frozenset[str]:
+    """Return the joints on which bodies hang where the actuated joints are locked.
+
+    What locked, fixed and screw joints hold together is one part. A part hangs on the joint
+    through which it is nearest to the base, counted in joints. A part that has several such joints
+    hangs on none: all of them may err. So nothing depends on the order of entries.
+    """
+    rigid = [j for j in graph.joints.values() if j.actuated or not j.type.cost]
+    parts = groups([BASE, *graph.bodies], [(j.inner, j.outer) for j in rigid])
+    part = {body: k for k, bodies in enumerate(parts) for body in bodies}
+    doors: list[list[tuple[int, str]]] = [[] for _ in parts]
+    for joint in graph.joints.values():
+        inner, outer = part[joint.inner], part[joint.outer]
+        if inner != outer:
+            doors[inner].append((outer, joint.name))
+            doors[outer].append((inner, joint.name))
+    depth, front = {part[BASE]: 0}, [part[BASE]]
+    for here in front:
+        for there, _ in doors[here]:
+            if there not in depth:
+                depth[there] = depth[here] + 1
+                front.append(there)
+    carriers = {joint.name for joint in rigid}
+    for here in front[1:]:
+        near = [name for there, name in doors[here] if depth[there] < depth[here]]
+        carriers |= set(near if len(near) == 1 else ())
+    return frozenset(carriers)
+
+
 class Placed(Motion):
     """A tree of its own, with the places that another motion of the same bodies has found.
 
@@ -77,12 +107,16 @@ class Placed(Motion):
         # Locked are all drives, those that follow too.
         true = {n: replace(j, follows=False) for n, j in graph.joints.items() if not j.virtual}
         self.graph: Graph = replace(graph, joints=true)
-        self.tree = Tree(self.graph)
+        self.tree = Tree(self.graph, find_carriers(self.graph))
+        # Closures err in metres.
+        self.tree.size = 1.0
         self._found = motion
         self.origin: dict[str, Any] = {BASE: np.zeros(3)}
         self.axis: dict[int, Any] = {}
         for link in self.tree.links.values():
-            self.origin[link.body] = motion.point(link.body, self.tree.at[link.body])
+            free = link.joint is None
+            at = graph.frame(link.body)[0] if free else self.tree.at[link.body]
+            self.origin[link.body] = motion.point(link.body, at)
             for step in link.steps:
                 if not (step.ball or step.free):
                     body = link.body if step.beyond else link.parent
@@ -136,20 +170,32 @@ def singularity_measure(t: Traced) -> Any:
 
 
 def singularity_at_home(graph: Graph) -> float:
-    """The measure at home, on numbers: nothing is compiled. The platform's turns count.
+    """Return the measure at home, on numbers: nothing is compiled. The platform's turns count.
 
     :raises SingularityError: something moves although the actuated joints are locked.
     """
-    home = _AtHome(Linkage(graph))
-    return float(minimum(_held(home), _moved(home, False)))
+    return singularity_on_numbers(Linkage(graph), graph.lead_home)
 
 
-class _AtHome:
-    """What the measure asks of a traced machine, on numbers at home."""
+def singularity_on_numbers(linkage: Linkage, q: Array, *, point: bool = False) -> float:
+    """Return the measure at joint positions near home, on numbers: nothing is compiled.
 
-    def __init__(self, linkage: Linkage) -> None:
+    :param q: of the actuated joints that lead, shape (m,); ``point``: the pose has no angle.
+    :raises SingularityError: something moves although the actuated joints are locked.
+    """
+    state = _Numbers(linkage, q)
+    return float(minimum(_held(state), _moved(state, point)))
+
+
+class _Numbers:
+    """What the measure asks of a traced machine, on numbers."""
+
+    def __init__(self, linkage: Linkage, q: Array) -> None:
         self.graph, self.joints = linkage.graph, linkage.joints
-        self.motion, rows = linkage.at(linkage.tree.home, linkage.graph.lead_home)
+        x = linkage.close(q)
+        if x is None:
+            raise SingularityError("q", (), 0.0, 1e-9)
+        self.motion, rows = linkage.at(x, q)
         ju, jq = (numbers(m) for m in matrices(linkage.tree, rows))
         if ju.size and np.linalg.matrix_rank(ju, 1e-9) < ju.shape[1]:
             raise SingularityError("home", (), 0.0, 1e-9)
@@ -160,16 +206,16 @@ class _AtHome:
         return list(self._rates.T)
 
 
-def _held(t: Traced | _AtHome) -> Any:
+def _held(t: Traced | _Numbers) -> Any:
     placed = Placed(t.motion)
     unknown = placed.tree.unknown_rates
     if not unknown:
         return 1.0
-    rows = placed.closures()
-    rim, size = placed.graph.rim, placed.tree.size
+    _, radius = placed.graph.frame(placed.graph.platform)
     errors = [
-        {k: v * (rim if row.angle else row.scale * size) for k, v in row.columns.items()}
-        for row in rows
+        {key: v * (radius if row.angle else row.scale) for key, v in row.columns.items()}
+        for row in placed.closures()
+        if any(kind == "u" for kind, _ in row.columns)
     ]
     bodies = []
     for name in placed.graph.bodies:
@@ -178,15 +224,16 @@ def _held(t: Traced | _AtHome) -> Any:
         turning = placed.angular_jacobian(name)
         bodies += [{k: v[i] for k, v in linear.items()} for i in range(3)]
         bodies += [{k: reach * v[i] for k, v in turning.items()} for i in range(3)]
-    (response,) = traces_over([_gram(bodies, unknown)], _gram(errors, unknown))
-    return minimum(1.0, 0.5 * unknown / np.sqrt(len(rows)) / sqrt(response))
+    response = trace_over(_gram(bodies, unknown), _gram(errors, unknown))
+    return minimum(1.0, 0.5 * unknown / np.sqrt(len(errors)) / sqrt(response))
 
 
-def _moved(t: Traced | _AtHome, point: bool) -> Any:
+def _moved(t: Traced | _Numbers, point: bool) -> Any:
     """``point``: the platform is its reference point."""
     n, graph = t.joints, t.graph
     rates = _Rates(t)
-    twist = rates.motion_of(graph.platform)[: 3 if point else 6]
+    tool = (graph.origin, 0.0) if point else graph.frame(graph.platform)
+    twist = rates.motion_of(graph.platform, tool)[: 3 if point else 6]
     table = _gram([{("u", j): v for j, v in enumerate(row)} for row in twist], n)
     lower = {(a, b): table[a, b] for a in range(n) for b in range(a + 1)}
     # Pivots stay above zero where the platform stands still while a joint moves.
@@ -205,7 +252,7 @@ class _Rates:
     U these by the joint rates.
     """
 
-    def __init__(self, t: Traced | _AtHome) -> None:
+    def __init__(self, t: Traced | _Numbers) -> None:
         self.motion, self.graph, self.n = t.motion, t.graph, t.joints
         columns, own = t.rate_columns(), np.eye(t.joints)
         unknown = t.motion.tree.unknown_rates
@@ -215,9 +262,9 @@ class _Rates:
         self._halves: dict[tuple[str, int], list[Any]] = {}
         self._products: dict[tuple[tuple[str, int], tuple[str, int]], Any] = {}
 
-    def columns(self, name: str) -> dict[tuple[str, int], list[Any]]:
+    def columns(self, name: str, frame: tuple[Any, Any]) -> dict[tuple[str, int], list[Any]]:
         """S: by rate the velocity of a body's middle, and its angular velocity times its reach."""
-        middle, reach = self.graph.frame(name)
+        middle, reach = frame
         linear = self.motion.linear_jacobian(name, self.motion.point(name, middle))
         turning = self.motion.angular_jacobian(name)
         still = [0.0] * 3
@@ -226,10 +273,10 @@ class _Rates:
             for k in dict.fromkeys([*linear, *turning])
         }
 
-    def motion_of(self, name: str) -> list[list[Any]]:
+    def motion_of(self, name: str, frame: tuple[Any, Any]) -> list[list[Any]]:
         """D, six rows of the joints."""
         rows: list[list[Any]] = [[0.0] * self.n for _ in range(6)]
-        for key, six in self.columns(name).items():
+        for key, six in self.columns(name, frame).items():
             for row, value in zip(rows, six, strict=True):
                 for j, rate in enumerate(self._by_joints[key]):
                     row[j] = row[j] + value * rate
@@ -237,10 +284,11 @@ class _Rates:
 
     def response(self, name: str, root: SparseCholesky) -> Any:
         """tr((T'T)^-1 D'D), T'T = L E L': of D's rows, or of S'S and U (T'T)^-1 U', the shorter."""
-        columns = list(self.columns(name).items())
+        frame = self.graph.frame(name)
+        columns = list(self.columns(name, frame).items())
         total: Any = 0.0
         if len(columns) > self.n:
-            for row in self.motion_of(name):
+            for row in self.motion_of(name, frame):
                 half = root.forward(row)
                 total = total + sum(
                     (v * v * e for v, e in zip(half, root.inverses, strict=True)), 0.0

@@ -3,8 +3,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Iterable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Hashable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import reduce
 from typing import Any, Final, TypeVar
 
@@ -219,16 +219,22 @@ class Graph:
         return far if reference(far) > 1e-6 * reference(self.size) else 0.1 * self.size
 
     def frame(self, body: str) -> tuple[Array, float]:
-        """The point of a body at home whose velocity counts, and the length of its turning, m.
+        """Return the point of a body at home whose velocity counts, and the length of its turning.
 
-        Of the platform its reference point and rim, else the middle of its joints and how far the
-        farthest of them is from it.
+        The point, m, is the middle of the body's joints. The length, m, is the distance of the
+        farthest of them, or that of the platform where this is longer. Where the platform's joints
+        are one point, a tenth of the machine's stands for it.
         """
-        if body == self.platform:
-            return self.origin, self.rim
-        points = np.array(self.joint_points(body))
-        middle = plain(points.sum(0) / len(points))
-        return middle, reduce(maximum, [norm(plain(p - middle)) for p in points], self.rim)
+        middle, reach = _extent(self._held_points(body))
+        own = reach if body == self.platform else _extent(self._held_points(self.platform))[1]
+        whole = _extent([point for name in self.bodies for point in self._held_points(name)])[1]
+        own = own if reference(own) > 1e-6 * reference(whole) else 0.1 * whole
+        return middle, maximum(maximum(reach, own), MIN_LENGTH)
+
+    def _held_points(self, body: str) -> list[Array]:
+        """Return where joints and rods meet a body at home, m; virtual joints hold nothing."""
+        true = {name: joint for name, joint in self.joints.items() if not joint.virtual}
+        return replace(self, joints=true).joint_points(body) or self.joint_points(body)
 
     def joint_points(self, body: str) -> list[Array]:
         """Where joints and rods meet a body at home, m."""
@@ -333,6 +339,12 @@ class Graph:
                 raise ParameterError(
                     f"bodies.{name}", name, "a body that joints or rods connect to the base"
                 )
+
+
+def _extent(points: Sequence[Array]) -> tuple[Array, Any]:
+    """Return the middle of points, and the distance of the farthest of them from it."""
+    middle = plain(np.array(points).sum(0) / len(points))
+    return middle, reduce(maximum, [norm(plain(p - middle)) for p in points])
 
 
 def rotation_about_z(angle: Any) -> Array:

@@ -99,6 +99,7 @@ class Tree:
     """Links in an order in which parents come first, cut joints, and unknowns."""
 
     graph: Graph
+    carriers: frozenset[str] | None = None
     links: dict[str, Link] = field(default_factory=dict)
     cut: tuple[str, ...] = ()
     home: list[float] = field(default_factory=list)
@@ -153,8 +154,10 @@ class Tree:
 
     def _span(self) -> dict[str, list[tuple[str, str | None]]]:
         graph = self.graph
+        able = self.carriers
         order = sorted(
-            graph.joints.values(), key=lambda j: (not j.leads, not j.actuated, j.type.cost)
+            (j for j in graph.joints.values() if able is None or j.name in able),
+            key=lambda j: (not j.leads, not j.actuated, j.type.cost),
         )
         pairs: dict[str | tuple[str], tuple[str, str]]
         pairs = {joint.name: (joint.inner, joint.outer) for joint in order}

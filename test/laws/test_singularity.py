@@ -3,6 +3,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 import pytest
 from scipy.optimize import minimize_scalar
@@ -12,12 +15,13 @@ from pkm_twin import robot_names
 from pkm_twin.certify.maximal import Maximal
 from pkm_twin.certify.rows import stacked
 from pkm_twin.errors import SingularityError
-from pkm_twin.kinematics.singularity import Placed
+from pkm_twin.kinematics.linkage import Linkage
+from pkm_twin.kinematics.singularity import Placed, singularity_on_numbers
 from pkm_twin.machine.graph_description import graph_description
 from pkm_twin.mechanisms.catalogue import robot_of_data
 from pkm_twin.robot.robot_urdf import robot_description
 from stiffness_monitor import compliance
-from test.machine.random_machines import NAMES, plain, variant
+from test.machine.random_machines import GALLERY, NAMES, plain, rotation_of, variant
 from test.support.robots import joint_range, load, random_joints
 
 SURFACE = np.array([-0.08871, 0.34395, -0.18159])
@@ -31,7 +35,7 @@ MACHINES = [name for name in robot_names() if name not in ("delta", "delta_cu")]
 def with_both_rods(robot):
     """The robot's plain description with the rods of every pair, and nothing that stands for them.
 
-    Their distance is the platform's rim.
+    Their distance is the platform's reach.
     """
     graph = robot.graph
     data = graph_description(graph) | {"pose": ["x", "y", "z"]}
@@ -39,18 +43,24 @@ def with_both_rods(robot):
     for name, rod in graph.rods.items():
         whole = data["rods"].pop(name)
         for side, sign in (("left", 0.5), ("right", -0.5)):
-            ends = (rod.ends + sign * graph.rim * rod.pair).tolist()
+            ends = (rod.ends + sign * graph.frame(graph.platform)[1] * rod.pair).tolist()
             data["rods"][f"{name} {side}"] = {**whole, "ends": ends, "mass": whole["mass"] / 2}
     return data
 
 
 def frame(graph, body):
     """A body's point at home and the length of its turning, as the measure's definition has it."""
-    if body == graph.platform:
-        return graph.origin, graph.rim
-    points = np.array(graph.joint_points(body))
-    middle = points.mean(0)
-    return middle, max(graph.rim, np.linalg.norm(points - middle, axis=1).max())
+
+    def extent(name):
+        points = np.array(graph.joint_points(name))
+        middle = points.mean(0)
+        return middle, np.linalg.norm(points - middle, axis=1).max()
+
+    middle, reach = extent(body)
+    own = extent(graph.platform)[1]
+    every = np.vstack([graph.joint_points(name) for name in graph.bodies])
+    whole = np.linalg.norm(every - every.mean(0), axis=1).max()
+    return middle, max(reach, own if own > 1e-6 * whole else 0.1 * whole, 1e-6)
 
 
 def twists(judge, graph):
@@ -67,7 +77,7 @@ def expected(robot, judge, q):
     graph = robot.graph
     judge.assemble(q)
     placed = Placed(robot.engine.at(robot.engine.tree.home, graph.home)[0])
-    bodies, rim = twists(judge, graph), graph.rim
+    bodies, radius = twists(judge, graph), frame(graph, graph.platform)[1]
     exact = [judge.drives().columns]
     wrong = [judge.rod_rows(rod).columns / rod.length for rod in judge.machine.rods]
     for joint in judge.machine.joints:
@@ -77,7 +87,7 @@ def expected(robot, judge, q):
             continue
         # Rows without a velocity of the centres are about directions.
         angles = ~rows.reshape(len(rows), -1, 6)[..., :3].any((1, 2))
-        wrong.append(np.where(angles[:, None], rim * rows, rows))
+        wrong.append(np.where(angles[:, None], radius * rows, rows))
     held = 1.0
     _, s, vt = np.linalg.svd(np.vstack(exact))
     free = vt[int((s > 1e-9 * s[0]).sum()) :].T
@@ -87,9 +97,10 @@ def expected(robot, judge, q):
         held = 0.5 * a.shape[1] / np.sqrt(len(a)) / response
     tangent = judge.tangent()
     k = list(graph.bodies).index(graph.platform)
-    # A pose without an angle is one of a point.
-    count = 6 if "rad" in robot.pose_units else 3
-    inverse = np.linalg.pinv(bodies[6 * k : 6 * k + count] @ tangent)
+    # A pose without an angle is one of the reference point.
+    whole = "rad" in robot.pose_units
+    point = judge.point(graph.platform, graph.origin).columns
+    inverse = np.linalg.pinv((bodies[6 * k : 6 * k + 6] if whole else point) @ tangent)
     farthest = max(
         np.linalg.norm(body @ tangent @ inverse) for body in np.split(bodies, len(bodies) // 6)
     )
@@ -113,6 +124,92 @@ def test_the_definition_in_maximal_coordinates(name):
     by_judge = [expected(robot, judge, here) for here in q]
     assert by_twin == pytest.approx(by_judge, rel=1e-6)
     assert [float(robot.singularity(here)) for here in q] == by_twin.tolist()
+
+
+def replaced(graph, turn, scale, shift):
+    """The same machine elsewhere, turned and of another size."""
+    joints = {
+        name: replace(
+            joint, at=scale * turn @ joint.at + shift, axes=joint.axes @ turn.T,
+            pitch=scale * joint.pitch,
+        )
+        for name, joint in graph.joints.items()
+    }  # fmt: skip
+    rods = {
+        name: replace(
+            rod, ends=scale * rod.ends @ turn.T + shift,
+            pair=None if rod.pair is None else turn @ rod.pair,
+        )
+        for name, rod in graph.rods.items()
+    }  # fmt: skip
+    return replace(graph, joints=joints, rods=rods, origin=scale * turn @ graph.origin + shift)
+
+
+def shuffled(entries, rng):
+    names = list(entries)
+    rng.shuffle(names)
+    return {name: entries[name] for name in names}
+
+
+def law_machines():
+    """Shipped robots, templates of the gallery, machines of tests and random ones."""
+    yield from robot_names()
+    yield from sorted(GALLERY.glob("*.yaml"))
+    for k, name in enumerate(NAMES):
+        yield pytest.param(plain(name), id=name)
+        random = pytest.param(variant(name, np.random.default_rng(k)), id=f"random {name}")
+        yield pytest.param(*random.values, id=random.id, marks=pytest.mark.long)
+
+
+class TestOneMachineOneMeasure:
+    """However its file is written, where the reference point is, turned, or of another size."""
+
+    @staticmethod
+    def measures(graph, states, point):
+        """By joint positions by name, of the joints that lead."""
+        linkage = Linkage(graph)
+        rows = ([state[name] for name in graph.leads] for state in states)
+        return [singularity_on_numbers(linkage, np.array(row), point=point) for row in rows]
+
+    @pytest.mark.parametrize("machine", list(law_machines()), ids=lambda m: Path(m).stem)
+    def test_measure(self, machine):
+        data = isinstance(machine, dict)
+        robot = robot_of_data(machine, "machine") if data else load(machine)
+        graph, rng = robot.graph, np.random.default_rng(7)
+        point = "rad" not in robot.pose_units
+        slides = {name: graph.joints[name].slides for name in graph.leads}
+        home = {name: graph.joints[name].home for name in graph.leads}
+        # Translation joints slide along base axes.
+        turns = all(joint.kind != "translation" for joint in graph.joints.values())
+        scale, turn = rng.uniform(0.3, 3.0), rotation_of(rng.normal(size=3) * turns)
+        away = [
+            {n: rng.uniform(-1.0, 1.0) * (0.05 * graph.size if slides[n] else 0.1) for n in home}
+            for _ in range(2)
+        ]
+        away = [dict.fromkeys(home, 0.0), *away]
+        states = [{n: home[n] + move[n] for n in home} for move in away]
+        grown = [{n: home[n] + move[n] * scale ** slides[n] for n in home} for move in away]
+        expected = self.measures(graph, states, point)
+        assert all(0.0 < value <= 1.0 for value in expected)
+        order = replace(
+            graph, bodies=shuffled(graph.bodies, rng), joints=shuffled(graph.joints, rng),
+            rods=shuffled(graph.rods, rng),
+        )  # fmt: skip
+        elsewhere = replaced(graph, turn, scale, rng.normal(size=3))
+        cases = [(order, states), (elsewhere, grown)]
+        if not point:
+            moved = replace(graph, origin=graph.origin + graph.size * rng.normal(size=3))
+            cases.append((moved, states))
+        for same, there in cases:
+            assert self.measures(same, there, point) == pytest.approx(expected, rel=1e-10)
+
+    @pytest.mark.parametrize("name", ["prru", "rps3", "rrr3_planar"])
+    def test_on_numbers_and_compiled(self, name):
+        robot = load(name) if name in robot_names() else load(GALLERY / f"{name}.yaml")
+        q = random_joints(robot, np.random.default_rng(1), 4)
+        linkage = Linkage(robot.graph)
+        found = [singularity_on_numbers(linkage, here) for here in q]
+        assert robot.singularity(q) == pytest.approx(found, rel=1e-9)
 
 
 def test_both_rods_of_a_parallelogram_say_what_its_couple_says():

@@ -124,7 +124,7 @@ def test_no_cylinder_where_nothing_is_reachable():
 
 
 def test_a_bound_on_singularity_takes_away(small_maps, tmp_path):
-    sweep = map_of(load("upr_rpu"), Workspace(), 4000, least_singularity=0.2)
+    sweep = map_of(load("upr_rpu"), Workspace(), 4000, least_singularity=0.28)
     file = run(sweep, tmp_path / "a.nc", workers=1)
     with open_map(small_maps["workspace upr_rpu"]) as wide, open_map(file) as narrow:
         assert 0 < float(narrow.volume) < float(wide.volume)
