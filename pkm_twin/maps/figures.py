@@ -118,7 +118,8 @@ def sentence(answer: dict[str, Any]) -> str:
     text += f" at ({pose}) " + (units[0] if len(set(units)) == 1 else f"[{', '.join(units)}]")
     text += f", {answer['element']}" if "element" in answer else ""
     if (bound := answer.get("singularity_bound")) is not None:
-        text += f"; on the bound of the singularity index, {bound:g}: worse poses lie below it"
+        text += f"; uncertain: on the bound of the singularity index, {bound:g}"
+        text += ": worse poses lie below it"
     return text
 
 

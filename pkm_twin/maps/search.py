@@ -15,7 +15,7 @@ from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError
 from pkm_twin.maps.kind import Case, Kind, Space, Worst, found_of
 from pkm_twin.robot.robot import Robot
-from pkm_twin.robot.workspace import causes, reachable, try_forward
+from pkm_twin.robot.workspace import causes, passing_singularity, reachable, try_forward
 
 JOINT_STATES: Final = 2**14
 """Joint states, evenly spread between the limits, whose poses bound a workspace."""
@@ -27,6 +27,12 @@ FULL: Final = 3
 """Most pose coordinates of which a whole grid is made."""
 NEAR: Final = 64
 """Places next to the worst that show whether the singularity index excludes worse ones."""
+EDGE_WALKERS: Final = 1024
+"""Places nearest to the least singularity index that walk to it."""
+EDGE_STEPS: Final = 24
+"""Steps of their walk."""
+EDGE_STARTS: Final = 128
+"""Places on that border from which the worst pose is searched."""
 HALVINGS: Final = 12
 """Of the way to a place that does not count, to find where it still does."""
 INSIDE: Final = 1e-9
@@ -76,7 +82,17 @@ def worst_of(
         tried = np.concatenate([tried, more[order[: kind.samples]]])
     kept = inside if kind.screen is not None else None
     x, best = evolved(score, np.clip(tried, low, high), low, high, kind, rng, kept, tell)
+    if len(edge := _edge_states(space, tried, inside, low, high, rng)):
+        more, other = evolved(score, edge, low, high, kind, rng, inside)
+        x, best = (more, other) if other > best else (x, best)
     if not np.isfinite(best):
+        without = replace(space, least=0.0).counts(*space.state(tried), case)
+        if without.any() and not inside(tried).any():
+            best = float(robot.try_singularity(space.state(tried)[0][without])[0].max())
+            raise ParameterError(
+                "singularity", space.least, f"{passing_singularity(best).split()[1]} or less: "
+                f"no pose has a singularity index of {space.least:g} or more (best: {best:.3g})",
+            )  # fmt: skip
         why = "" if inside(tried).any() else causes(
             robot, *space.state(tried), space.least, space.least_clearance
         )  # fmt: skip
@@ -91,6 +107,47 @@ def worst_of(
     worse = badness(beyond.value, case.largest) > badness(found.value, case.largest)
     index = float(robot.try_singularity(q)[0][0])
     return Worst(pose[0], q[0], found, index, bool(worse.any()))
+
+
+def _edge_states(
+    space: Space,
+    tried: Array,
+    inside: Callable[[Array], NDArray[np.bool_]],
+    low: Array,
+    high: Array,
+    rng: np.random.Generator,
+) -> Array:
+    """Return places (k, n) all along the border on which the least singularity index ends a map.
+
+    Quantities that grow towards a singularity are worst there, and a workspace may end in several
+    separate narrow parts there. Places near the border walk to it; of those that arrive the ones
+    that are farthest from each other are taken.
+
+    :param tried: places (k, n), some of which count.
+    """
+
+    def index_at(x: Array) -> Array:
+        return space.robot.try_singularity(space.state(x)[0])[0]
+
+    x = tried[inside(tried)]
+    index = index_at(x)
+    if not len(x) or space.least <= 0.0 or not (index_at(tried) < space.least).any():
+        return x[:0]
+    order = np.argsort(index, kind="stable")[:EDGE_WALKERS]
+    x, index = x[order], index[order]
+    for size in np.geomspace(0.1, 1e-4, EDGE_STEPS):
+        moved = np.clip(x + size * (high - low) * rng.normal(size=x.shape), low, high)
+        moved = _bordered(x, moved, inside)
+        nearer = index_at(moved) < index
+        x = np.where(nearer[:, None], moved, x)
+        index = np.where(nearer, index_at(moved), index)
+    x = x[index < 2.0 * space.least]
+    chosen: list[int] = [0] if len(x) else []
+    apart = np.full(len(x), np.inf)
+    while chosen and len(chosen) < min(EDGE_STARTS, len(x)):
+        apart = np.minimum(apart, np.linalg.norm((x - x[chosen[-1]]) / (high - low), axis=1))
+        chosen.append(int(apart.argmax()))
+    return x[chosen]
 
 
 def badness(value: Array, largest: bool) -> Array:

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Final
 
@@ -18,6 +18,7 @@ from pkm_twin.paths.geometry import Path, Stretch
 from pkm_twin.robot.derivatives import joint_rates
 from pkm_twin.robot.limits import first_beyond
 from pkm_twin.robot.robot import Robot
+from pkm_twin.robot.workspace import passing_singularity
 
 Index = NDArray[np.int64]
 
@@ -82,7 +83,8 @@ class Curve:
         else:
             q = _joints(robot, place, self.begin + s)
             first, second = joint_rates(robot, q, slope, bend)
-        check_positions(robot, s, q, self.begin, self.singularity)
+        check_positions(robot, s, q, self.begin)
+        check_singularity(robot, self.begin + s, q, self.singularity)
         twist = velocity_of(robot, q, first)
         travel = np.linalg.norm(twist, axis=1)
         slower = np.ones(len(s))
@@ -255,17 +257,18 @@ def place_at(robot: Robot, q: Array, way: float) -> str:
 
 
 def _place(robot: Robot, pose: Array, way: float) -> str:
-    pairs = zip(robot.pose_names, (np.round(pose, 12) + 0.0).tolist(), strict=True)
-    numbers = ", ".join(f"{name} {value:.4g}" for name, value in pairs)
-    return f"{way:.4g} m after the start ({numbers})"
+    values = (np.round(pose, 12) + 0.0).tolist()
+    entries = zip(robot.pose_names, values, robot.pose_units, strict=True)
+    place = "at " + ", ".join(f"{name} {value:.4g} {unit}" for name, value, unit in entries)
+    # The length of a path in angles alone is no distance.
+    return f"{place}, {way:.4g} m after the start" if "m" in robot.pose_units else place
 
 
-def check_positions(robot: Robot, s: Array, q: Array, begin: float, singularity: float) -> None:
-    """Check that a path keeps the limits of joints, passive ones too, and away from singularities.
+def check_positions(robot: Robot, s: Array, q: Array, begin: float) -> None:
+    """Check that a path keeps the limits of joints, passive ones too.
 
     :param s: way within the stretch, shape (p,), m; ``q``: joint positions there, (p, n).
     :param begin: way up to the stretch, m.
-    :param singularity: least singularity index, 0 to 1.
     :raises ParameterError: by the first joint and place.
     """
     if (beyond := first_beyond(robot, q)) is not None:
@@ -275,13 +278,24 @@ def check_positions(robot: Robot, s: Array, q: Array, begin: float, singularity:
             f"path: {beyond.joint} {where}", round(beyond.value, 6),
             f"{beyond.low:g} to {beyond.high:g} {beyond.unit}",
         )  # fmt: skip
+
+
+def check_singularity(robot: Robot, way: Array, q: Array, singularity: float) -> None:
+    """Check that a path keeps away from singularities.
+
+    :param way: from the start, shape (p,), m; ``q``: joint positions there, (p, n).
+    :param singularity: least singularity index, 0 to 1.
+    :raises ParameterError: with the least index on the path, and its place.
+    """
+    if singularity <= 0.0:
+        return
     index = robot.singularity(q)
     row = int(index.argmin())
     if index[row] < singularity:
-        where = place_at(robot, q[row], begin + float(s[row]))
+        least = float(index[row])
         raise ParameterError(
-            f"path: singularity index {where}", round(float(index[row]), 6),
-            f"{singularity:g} or more",
+            f"path: singularity index {place_at(robot, q[row], float(way[row]))}",
+            round(least, 6), f"{singularity:g} or more; {passing_singularity(least)} passes",
         )  # fmt: skip
 
 
@@ -299,10 +313,13 @@ def joint_paths(
     for k, stretch in enumerate(path.stretches):
         share = max(2 * LEAST_POINTS, round(points * stretch.length / path.length))
         robots = robots_on(carried, k, len(stretch.pieces))
-        curve = Curve(robot, path, stretch, begin, singularity, robots, slowdown)
+        curve = Curve(robot, path, stretch, begin, 0.0, robots, slowdown)
         try:
             result.append(curve.at(curve.grid(share)))
         except (UnreachableError, SingularityError) as error:
             raise ParameterError("path", error, "joints that can be assembled") from None
         begin += stretch.length
-    return result
+    way = np.concatenate([part.curve.begin + part.s for part in result])
+    # After all stretches, so that the error names the path's least index.
+    check_singularity(robot, way, np.concatenate([part.q for part in result]), singularity)
+    return [replace(part, curve=replace(part.curve, singularity=singularity)) for part in result]

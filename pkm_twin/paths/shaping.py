@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike
 
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError, UnknownNameError
-from pkm_twin.paths.joint_path import check_positions, velocity_of
+from pkm_twin.paths.joint_path import check_positions, check_singularity, velocity_of
 from pkm_twin.paths.motion import Moments, Samples, TimedPath, peaks
 from pkm_twin.robot.derivatives import joint_rates
 from stiffness_monitor.modes import natural_frequencies
@@ -213,7 +213,8 @@ def shaped(
         if over <= 1.0 + ROUNDING:
             fine = result.fine
             way = np.cumsum(fine.speed * np.diff(fine.time, prepend=0.0))
-            check_positions(motion.robot, way, fine.q, 0.0, singularity)
+            check_positions(motion.robot, way, fine.q, 0.0)
+            check_singularity(motion.robot, way, fine.q, singularity)
             return result
         plain = replace(plain, runs=tuple(run.slower(over) for run in plain.runs))
     raise ParameterError("motion", f"{shaper} passes its limits", "wider limits, or no shaper")

@@ -297,6 +297,12 @@ def _first_rungs(
     return rung, left
 
 
+def passing_singularity(index: float) -> str:
+    """Return the option whose bound a singularity index passes: the index, rounded down."""
+    digits = 1 - math.floor(math.log10(index)) if index > 0.0 else 0
+    return f"--singularity {math.floor(index * 10**digits) / 10**digits:g}"
+
+
 def causes(
     robot: Robot, q: Array, pose: Array, known: Mask, least: float, least_clearance: float
 ) -> str:
@@ -317,7 +323,10 @@ def causes(
 
     judged("an actuator beyond its limits", within_limits(robot, q))
     judged("a passive joint beyond its limits", keeps_limits(robot, q, pose, -math.inf, left))
-    judged(f"a singularity index below {least:g}", robot.try_singularity(q)[0] >= least)
+    index = robot.try_singularity(q)[0]
+    best = float(index[left].max(initial=0.0))
+    hint = f" (best: {best:.3g}; {passing_singularity(best)} passes)" if best < least else ""
+    judged(f"a singularity index below {least:g}{hint}", index >= least)
     if has_clearance(robot):
         gap = joint_clearance(robot, q, refuse=False)
         home = float(joint_clearance(robot, robot.graph.home))
