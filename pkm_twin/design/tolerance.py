@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from itertools import product
 from typing import Final
 
 import numpy as np
@@ -35,6 +36,8 @@ LARGEST: Final = 0.02
 """Standard deviation at most, rad, or part of the machine's extent: more is a wrong unit."""
 STAYS: Final = 1e-9
 """Motion of the reference point that is rounding, m per rad of the platform's turn."""
+MAX_COMBINED_ERRORS: Final = 12
+"""Errors of which all combinations of signs are tried: 2,048 that differ."""
 STATES: Final = 256
 """States whose bodies are solved for at a time: large tables for each."""
 
@@ -78,6 +81,42 @@ class Tolerances:
             for paths in self.together.values()
         ]
         return np.asarray(sum(each), np.float64)
+
+    @cached_property
+    def is_exact(self) -> bool:
+        """Whether :attr:`farthest` is reached: few errors, and none of a free direction."""
+        single = all(len(paths) == 1 for paths in self.together.values())
+        return single and len(self.bounds) <= MAX_COMBINED_ERRORS
+
+    @cached_property
+    def farthest(self) -> Array:
+        """Greatest displacement (m) and rotation (rad) by all errors together, shape (..., 2).
+
+        A length is greatest with every error at one of its bounds: all combinations of signs are
+        tried if :attr:`is_exact`. Otherwise this is an upper bound: the lesser of the errors'
+        lengths added up, and of the length of the components' own worst cases.
+        """
+        shape = self.worst.shape[:-1]
+        if not self.is_exact:
+            lengths = [
+                np.linalg.norm(
+                    np.reshape([self.bounds[p] * self.sensitivity[p] for p in paths],
+                               (len(paths), *shape, 2, 3)),
+                    axis=(0, -1),
+                )
+                for paths in self.together.values()
+            ]  # fmt: skip
+            apart = np.linalg.norm(self.worst.reshape(*shape, 2, 3), axis=-1)
+            return np.minimum(sum(lengths), apart)
+        each = np.array([self.bounds[path] * self.sensitivity[path] for path in self.sigma])
+        # Opposite signs throughout give the same length.
+        signs = np.array([(1.0, *row) for row in product((1.0, -1.0), repeat=len(each) - 1)])
+        rows = each.reshape(len(each), -1, 6)
+        found = [
+            np.linalg.norm(np.tensordot(signs, state, 1).reshape(-1, 2, 3), axis=-1).max(0)
+            for state in rows.swapaxes(0, 1)
+        ]
+        return np.reshape(found, (*shape, 2))
 
     def part(self, path: str) -> Array:
         """Effect of one standard deviation of an error, shape (..., 6)."""

@@ -6,6 +6,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 
@@ -14,6 +15,10 @@ from pkm_twin.errors import ParameterError
 from pkm_twin.machine.formulas import PARAMETERS
 from pkm_twin.machine.uncertainty import Tolerance
 from pkm_twin.robot.robot import Robot
+
+MAX_RANGE: Final = 1e4
+"""Widest range of a variable over its value in the file, or the machine's size: in a wider one the
+search, which compares to a millionth of the range, loses the value."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,6 +66,15 @@ class Variables:
                 if f"{PARAMETERS}.{name}" in paths:
                     bound = "a parameter that a number of the file depends on"
                     raise ParameterError("vary", f"{PARAMETERS}.{name}", bound)
+            own_value = abs(robot.number(parts[0]))
+            unit = robot.file_numbers().get(parts[0], (0.0, ""))[1]
+            widest = MAX_RANGE * max(own_value, robot.graph.size if unit == "m" else 1.0)
+            if not high - low <= widest:
+                raise ParameterError(
+                    f"vary {text}", f"{low:g}:{high:g}",
+                    f"a range of at most {widest:.3g} {unit}; the file has "
+                    f"{robot.number(parts[0]):g}",
+                )  # fmt: skip
             names.append(parts[0])
             lows.append(low)
             highs.append(high)

@@ -374,8 +374,14 @@ class Mechanism(Common):
         return schema.units(type(self), self.parameter_sections(), words)
 
     def file_numbers(self) -> dict[str, tuple[float, str]]:
-        """Every number that the file gives, by dotted path, with its unit."""
-        return numbers_of(self.parameter_sections(), self.parameter_units())
+        """Every number that the file gives, by dotted path, with its unit.
+
+        Of a machine with a ``drive``, ``inertia.rotor_inertia`` is none: only 0 is valid.
+        """
+        found = numbers_of(self.parameter_sections(), self.parameter_units())
+        if self.drive is not None:
+            found.pop("inertia.rotor_inertia", None)
+        return found
 
     @cached_property
     def controller(self) -> JointMap:

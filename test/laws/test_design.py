@@ -200,6 +200,7 @@ def test_several_numbers_change_together(picking):
     [
         ({"geometry.arm": (0.1, 0.2)}, "mass", [], ParameterError),
         ({"geometry.arm_length": (0.2, 0.1)}, "mass", [], ParameterError),
+        ({"geometry.arm_length": (0.0, 1e308)}, "mass", [], ParameterError),
         (BOX, "torque", [], UnknownNameError),
         (BOX, "singularity", [], ParameterError),
         (BOX, "deflection", [], ParameterError),

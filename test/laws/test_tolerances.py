@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import copy
+import itertools
 
 import numpy as np
 import pytest
@@ -18,11 +19,12 @@ from pkm_twin.identification.calibration import calibrate, geometric, left_by_ca
 from pkm_twin.identification.calibration_state import Poses
 from pkm_twin.machine.uncertainty import Tolerance
 from pkm_twin.mechanisms.catalogue import robot_of_data
+from pkm_twin.robot.numbers import FileNumbers
 from stiffness_monitor import platform_response
 from test.machine.random_machines import NAMES, variant
 from test.machine.test_helical import driven, slide
 from test.machine.test_planar import puck
-from test.support.robots import load, partly_long
+from test.support.robots import load, parameters_of, partly_long, without
 
 PATHS = 6
 """Errors of a machine that are tried, of all that it may have."""
@@ -306,6 +308,24 @@ def test_one_longer_arm_and_all_arms_alike_or_by_themselves():
     assert alike == pytest.approx(4.3e-5, rel=0.02) and each == pytest.approx(6.8e-5, rel=0.02)
 
 
+def test_the_farthest_platform_is_that_of_one_combination_of_signs():
+    """All 64 machines of six rods, assembled exactly; a clearance has no finite number of them."""
+    robot, rods = pick_and_place_delta(), {"rods.*.length": Tolerance(bound=3e-5)}
+    for q in robot.graph.home + np.array([[0.0, 0.0, 0.0], [0.3, -0.2, 0.4]]):
+        found = tolerances(robot, rods, q)
+        effects = {}
+        signs = np.array(list(itertools.product((-1.0, 1.0), repeat=6)))
+        for path, column in zip(found.sigma, signs.T, strict=True):
+            for what, vector in part_of(robot, path).effects.items():
+                effects[what] = effects.get(what, 0.0) + 3e-5 * column[:, None] * vector
+        errors = Assembly(robot, q).displaced(effects).reshape(64, 2, 3)
+        assert found.is_exact
+        assert found.farthest == pytest.approx(np.linalg.norm(errors, axis=-1).max(0), rel=2e-3)
+        more = tolerances(robot, rods | {"joints.motor_3.clearance": Tolerance(bound=1e-9)}, q)
+        assert not more.is_exact and (more.farthest >= found.farthest).all()
+        assert (more.farthest <= 1.0001 * np.linalg.norm(found.worst.reshape(2, 3), axis=1)).all()
+
+
 def test_bounds_hold_for_machines_that_are_drawn_within_them():
     """Uniform errors, a backlash and a clearance: their spread, and the worst of all signs."""
     robot = pick_and_place_delta()
@@ -517,3 +537,23 @@ def test_a_platform_that_only_turns_has_shares_of_its_rotation():
     assert found.only_turns
     for path, share in found.variance.items():
         assert share == pytest.approx(own[path] / sum(own.values()), rel=1e-9)
+
+
+@pytest.mark.parametrize("name", ["delta", "delta_cu", "prru", "upr_rpu", "linear_delta"])
+def test_every_number_of_a_file_with_a_drive_is_a_variable(name):
+    """The drive has the rotor: the number in its place is none that errors are taken of."""
+    data = without(parameters_of(name), "rotor_inertia", "drive")
+    slides = load(name).joint_units[0] == "m"
+    drive = {"inertia": 5e-6, **({"lead": 0.01} if slides else {"ratio": 7.0})}
+    if data["mechanism"] == "machine":
+        joints = {**data.get("joints", {}), **data["limbs"]["joints"]}
+        for joint in joints.values():
+            joint |= {"drive": drive} if joint.get("actuated") else {}
+    else:
+        data["drive"] = drive
+    robot = robot_of_data(data, name)
+    paths = list(robot.file_numbers())
+    assert "inertia.rotor_inertia" not in paths
+    assert np.isfinite(FileNumbers(robot, paths, lambda made: made.graph.numbers).slopes).all()
+    part = f"joints.{robot.joint_names[0]}.offset"
+    assert tolerances(robot, {part: 1e-5}, robot.graph.home).deviation.any()

@@ -421,13 +421,17 @@ def budget(given: Design) -> Report:
         Column("", text=" "),
     ]
     moves, turns = np.split(found.deviation.round(FILE_DIGITS), 2, -1)
-    turning, bounds = found.only_turns, np.split(found.worst.round(FILE_DIGITS), 2, -1)
+    turning, bounds = found.only_turns, found.farthest.round(FILE_DIGITS)
     farthest, worst = (
-        robot.forward(q[int(np.linalg.norm(both[turning], axis=-1).argmax())]).round(12) + 0.0
-        for both in (bounds, (moves, turns))
+        robot.forward(q[int(sizes.argmax())]).round(12) + 0.0
+        for sizes in (
+            bounds[..., int(turning)],
+            np.linalg.norm((moves, turns)[turning], axis=-1),
+        )
     )
     at, bound_at = (f" at {_place(robot, pose)}" for pose in (worst, farthest))
-    most, bound, case = greatest(turns), greatest(bounds[1]), "worst case of all bounds"
+    most, (shift, bound) = greatest(turns), bounds.max(0).tolist()
+    case = "worst case of all bounds" if found.is_exact else "upper bound of the worst case"
     facts = [
         Fact("robot", robot.name),
         Fact("states", len(q)),
@@ -440,10 +444,11 @@ def budget(given: Design) -> Report:
         Fact("greatest_angle_rad", most, "rad", "largest standard deviation" if turning else None,
              f"{1e3 * most:.4g} mrad{at}"),
         Fact("worst_pose", worst),
-        _length("bound_position_m", greatest(bounds[0]), None if turning else case, bound_at),
+        _length("bound_position_m", shift, None if turning else case, bound_at),
         Fact("bound_angle_rad", bound, "rad", case if turning else None,
              f"{1e3 * bound:.4g} mrad{bound_at}"),
         Fact("bound_pose", farthest),
+        Fact("bound_is_reached", found.is_exact),
         _length("rms_calibrated_position_m", rms(np.sqrt(sum(v**2 for v in left.values()))),
                 "RMS after a calibration without noise"),
     ]  # fmt: skip
