@@ -107,7 +107,7 @@ class Tolerances:
                 for paths in self.together.values()
             ]  # fmt: skip
             apart = np.linalg.norm(self.worst.reshape(*shape, 2, 3), axis=-1)
-            return np.minimum(sum(lengths), apart)
+            return np.asarray(np.minimum(sum(lengths), apart), np.float64)
         each = np.array([self.bounds[path] * self.sensitivity[path] for path in self.sigma])
         # Opposite signs throughout give the same length.
         signs = np.array([(1.0, *row) for row in product((1.0, -1.0), repeat=len(each) - 1)])
