@@ -133,7 +133,7 @@ def test_a_bound_on_singularity_takes_away(small_maps, tmp_path):
         answer = figures.answers(narrow)[0]
         assert answer["value"] == pytest.approx(0.28, rel=1e-3)
         at = singularity_at(sweep.robot, list(answer["pose"].values()))
-        assert at == pytest.approx(answer["value"]) and answer["singularity_bound"] == 0.2
+        assert at == pytest.approx(answer["value"]) and answer["singularity_bound"] == 0.28
         assert (narrow.through.values[0] == list(answer["pose"].values())).all()
 
 
