@@ -65,18 +65,16 @@ def make_report(path: Path, storage: Storage, checks: Sequence[Check]) -> BagRep
     :raises BagError: a topic has two types, or forms of one.
     """
     topics: dict[str, TopicInfo] = {}
+    counts, whole = dict[str, int](), Span()
     for file, check in zip(storage.files, checks, strict=True):
         for name, info in _each_topic(check):
             _join_topic(topics, name, info, file.path)
-    whole = Span()
-    for check in checks:
+        counts[f" in {file.path.name}"] = check.message_count
         whole.join(check.total)
     stated = {"": storage.message_count} if storage.message_count is not None else {}
     stated |= {f" on {name}": number for name, number in storage.by_topic.items()}
     stated |= {f" in {name}": number for name, number in storage.by_file.items()}
-    counts = {"": whole.count} | {f" on {name}": info.count for name, info in topics.items()}
-    for file, check in zip(storage.files, checks, strict=True):
-        counts[f" in {file.path.name}"] = check.message_count
+    counts |= {"": whole.count} | {f" on {name}": info.count for name, info in topics.items()}
     miscounts = tuple(
         f"{METADATA_FILE} states {said} messages{where}, there are {counts.get(where, 0)}"
         for where, said in stated.items()
