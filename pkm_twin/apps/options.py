@@ -58,15 +58,6 @@ class OfRobot(OfPlatform):
 
 
 @dataclass(frozen=True, kw_only=True)
-class OfRecordedRobot(OfPlatform):
-    """A command on recordings, which may name their robot."""
-
-    robot: str | None = setting(
-        None, "a robot's name or file; default: the robot that the recording names"
-    )
-
-
-@dataclass(frozen=True, kw_only=True)
 class Carries(OfRobot):
     """A payload on the platform."""
 

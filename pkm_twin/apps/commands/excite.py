@@ -17,7 +17,7 @@ from pkm_twin.report import Fact, Report
 from pkm_twin.settings import setting
 
 if TYPE_CHECKING:
-    from pkm_twin.identification.excitation import Bounds, Judge
+    from pkm_twin.identification.excitation import Judge
     from pkm_twin.robot.robot import Robot
 
 LARGE: Final = 1e3
@@ -71,17 +71,32 @@ def excite(given: Excite) -> Report:
 
     :raises PkmTwinError: no trajectory keeps to the limits.
     """
-    from pkm_twin.identification.excitation import Bounds, Judge
+    from pkm_twin.identification.excitation import Bounds, Judge, sweeps
+    from pkm_twin.identification.excitation import excite as design
     from pkm_twin.identification.parameters import file_parameters, kinds_of
+    from pkm_twin.recordings import Recording
+    from pkm_twin.recordings.bags import write_motion
 
     machine = given.machine()
     judge = Judge.of(machine, file_parameters(machine, kinds_of(given.what)))
     other = None if given.beside is None else _condition_of(given.beside, judge)
     bounds = Bounds(given.share, given.acceleration, given.singularity, given.rate)
-    best, points = write_motion(
-        judge, given.out, bounds, given.duration, given.harmonics, trials=given.trials,
-        seed=given.seed, friction=given.friction, overwrite=given.overwrite,
-    )  # fmt: skip
+    best: Any
+    if given.friction:
+        best = sweeps(judge, given.duration, bounds)
+    else:
+        with progress("excite", given.trials) as update:
+            best = design(
+                judge, given.duration, given.harmonics, bounds, trials=given.trials,
+                seed=given.seed, progress=update,
+            )  # fmt: skip
+    time = np.arange(round(best.duration * bounds.rate) + 1) / bounds.rate
+    time = time[time <= best.duration]
+    plan = Recording(machine, time, *best.at(time))
+    with writing(given.files["table"]):
+        for file in given.files.values():
+            facts = {"source": "pkm-twin excite", "condition": best.condition}
+            write_motion(file, plan, facts, given.overwrite)
     notes = []
     if other is not None:
         told = f"{other:.4g}" if np.isfinite(other) else "infinite, it does not excite all of them"
@@ -97,7 +112,7 @@ def excite(given: Excite) -> Report:
         if given.friction
         else [Fact("frequencies_Hz", best.harmonics / best.duration)]
     )
-    size = f"{points} points in {best.duration:.4g} s"
+    size = f"{len(time)} points in {best.duration:.4g} s"
     return Report(
         f"{machine.name}: every joint alone moves up and down at {_span(machine, best.speeds)}, "
         f"{size}" if given.friction else
@@ -118,46 +133,6 @@ def _span(machine: Robot, speeds: Any) -> str:
     units = np.array(machine.joint_units)
     rows = {unit: speeds[units == unit] for unit in machine.joint_units}
     return " and ".join(f"{one.min():.2g} to {one.max():.2g} {u}/s" for u, one in rows.items())
-
-
-def write_motion(
-    judge: Judge,
-    out: Path,
-    bounds: Bounds,
-    duration: float,
-    harmonics: int = 6,
-    *,
-    trials: int,
-    seed: int = 0,
-    friction: bool = False,
-    overwrite: bool = False,
-) -> tuple[Any, int]:
-    """Design a motion, or slow sweeps with ``friction``, and write its bag and its table.
-
-    :returns: the motion, and how many points are written.
-    """
-    from pkm_twin.identification.excitation import excite as design
-    from pkm_twin.identification.excitation import sweeps
-    from pkm_twin.recordings import Recording
-    from pkm_twin.recordings import bags as plans
-
-    machine, table = judge.robot, out.with_suffix(".csv")
-    best: Any
-    if friction:
-        best = sweeps(judge, duration, bounds)
-    else:
-        with progress("excite", trials) as update:
-            best = design(
-                judge, duration, harmonics, bounds, trials=trials, seed=seed, progress=update
-            )
-    time = np.arange(round(best.duration * bounds.rate) + 1) / bounds.rate
-    time = time[time <= best.duration]
-    plan = Recording(machine, time, *best.at(time))
-    with writing(table):
-        for file in (out, table):
-            facts = {"source": "pkm-twin excite", "condition": best.condition}
-            plans.write_motion(file, plan, facts, overwrite)
-    return best, len(time)
 
 
 def _condition_of(path: Path, judge: Judge) -> float:
