@@ -6,8 +6,7 @@ from __future__ import annotations
 import contextlib
 import math
 from collections import deque
-from collections.abc import Mapping, Sequence
-from itertools import zip_longest
+from collections.abc import Mapping
 from typing import Any, Final
 
 import numpy as np
@@ -74,7 +73,8 @@ class Stage:
         size, draw = scene.size, server.scene
         self._named, self._element = True, ""
         self._places: dict[str, Array] = scene.shapes(q).drives
-        self._labels: dict[int, tuple[Any, list[Any]]] = {}
+        self._drives = tuple(self._places)
+        self._labels: dict[int, tuple[Any, dict[str, Any]]] = {}
         server.on_client_disconnect(lambda client: self._labels.pop(client.client_id, None))
         self._arrows = draw.add_arrows(
             "/wrench", np.zeros((2, 2, 3)), _linear(np.array([FORCE, MOMENT])),
@@ -120,8 +120,12 @@ class Stage:
         middle = np.array(start.look_at)
         begin = np.array(start.position) - middle
         placed: deque[float] = deque(maxlen=16)
-        count = len(self._places) + 1
-        labels = [client.scene.add_label(f"/names/{k}", "", visible=False) for k in range(count)]
+        # One label a name, and one for the element: a browser may show the text and the place of a
+        # change one after the other.
+        labels = {
+            name: client.scene.add_label(f"/names/{k}", name, visible=False)
+            for k, name in enumerate(["", *self._drives])
+        }
         self._labels[client.client_id] = client.camera, labels
 
         async def fit(camera: Any) -> None:
@@ -254,7 +258,7 @@ class Stage:
             with contextlib.suppress(ArithmeticError, TypeError, ValueError):
                 self._arrange(camera, labels)
 
-    def _arrange(self, camera: Any, labels: Sequence[Any]) -> None:
+    def _arrange(self, camera: Any, labels: Mapping[str, Any]) -> None:
         """Put labels beside what they name, so that none covers another in this window."""
         texts = [text for text in self._places if self._named or text == self._element]
         points = np.array([self._places[text] for text in texts]).reshape(-1, 3)
@@ -264,10 +268,12 @@ class Stage:
         sizes = np.array([[LETTER[0] * len(texts[k]) + 8.0, LETTER[1]] for k in order])
         window = camera.image_width, camera.image_height
         found = anchors(pixels[order], sizes.reshape(-1, 2), window)
-        for label, k, anchor in zip_longest(labels, order, found):
-            label.visible = bool(anchor)
-            if anchor:
-                label.text, label.anchor, label.position = texts[k], anchor, points[k]
+        placed = {texts[k]: anchor for k, anchor in zip(order, found, strict=True) if anchor}
+        for name, label in labels.items():
+            text = name or self._element
+            label.visible = text in placed
+            if label.visible:
+                label.text, label.anchor, label.position = text, placed[text], self._places[text]
 
     def draw_wrench(self, at: Array, part: Array) -> None:
         """Arrows of a wrench at the reference point: the force ends there, the moment begins.
