@@ -294,9 +294,14 @@ class Simulation(Core):
 
     def control_fault(self) -> str:
         """Why no trajectory is followed where :attr:`stable_share` is below 1."""
+        s, share = self.settings, self.stable_share
+        # Critically damped: stiffness m w^2 and damping 2 m w.
+        damped = s.damping > 0.0
+        bandwidth = (s.stiffness[damped] / s.damping[damped] / np.pi).max(initial=0.0)
+        right = f"{share * bandwidth:.2g} Hz" if bandwidth else f"stiffness times {share**2:.2g}"
         return (
-            f"the position control is unstable at period {self.settings.period:g} s with the "
-            f"machine's inertia; {self.stable_share:.2g} times its bandwidth is stable"
+            f"the position control is unstable at period {s.period:g} s with the machine's "
+            f"inertia; stable up to {right}"
         )
 
     def push(self, message: Any, frame: str) -> None:

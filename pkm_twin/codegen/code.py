@@ -63,6 +63,18 @@ def compiled() -> bool:
     return _llvm() is not None
 
 
+def slowness() -> str:
+    """Return why programs run as plain Python and what to do; empty where they are compiled."""
+    if compiled():
+        return ""
+    if os.environ.get(SWITCH, "0") not in ("", "0"):
+        return f"{SWITCH} is set: torques take about a thousand times longer"
+    return (
+        "llvmlite is not installed: torques take about a thousand times longer, too long for "
+        "1 kHz; install it with 'sudo apt install python3-llvmlite' or 'pip install llvmlite'"
+    )
+
+
 def _axes(array: Array) -> int:
     return array.ndim
 

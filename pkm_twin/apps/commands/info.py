@@ -13,6 +13,7 @@ import numpy as np
 from delta_dynamics import reactions
 from pkm_twin.apps.frame import command
 from pkm_twin.apps.options import Draws, OfRobot
+from pkm_twin.codegen.code import slowness
 from pkm_twin.errors import ParameterError
 from pkm_twin.machine.formulas import PARAMETERS
 from pkm_twin.report import Fact, Report, number
@@ -102,6 +103,7 @@ def info(given: Info) -> Report:
           for text in [*(one.text for one in odd), *[fault] * bool(fault)]
           or ["no implausible value"]),
         Fact("members_fault", fault or None),
+        Fact("speed", slowness() or None, text="speed" if slowness() else None),
         Fact("parameters", sections),
         Fact("parameter_units", units),
         *(Fact("", text, text="parameter") for text in robot.book.told(units.get(PARAMETERS))),
