@@ -223,7 +223,7 @@ class Feedforward(Core):
         self._forget_stream()
 
     def stop(self, reason: str, text: str) -> None:
-        """Stop the stream, which begins anew with the next sample."""
+        """Stop the stream; the next sample is the first of a new one."""
         if self.stream.stop(reason, text):
             self._forget_stream()
 
@@ -301,7 +301,7 @@ class Feedforward(Core):
                 raise MessageError(
                     "late answer",
                     f"the answer is ready {age / SECOND:.3f} s after the state's stamp, allowed "
-                    f"{self.settings.stale_after:g} s",
+                    f"{self.settings.stale_after:g} s; this computer is overloaded",
                 )
 
     def stop_effort(self, steady: int) -> LimitedEfforts | None:

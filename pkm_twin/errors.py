@@ -236,6 +236,16 @@ class MessageError(PkmTwinError, ValueError):
         super().__init__(text)
         self.reason = reason
 
+    @property
+    def labelled(self) -> str:
+        """The text with its reason in front, once."""
+        return label_reason(self.reason, str(self))
+
+
+def label_reason(reason: str, text: str) -> str:
+    """Return a text with its reason in front; a text that begins with it stays as it is."""
+    return text if text.startswith(f"{reason}: ") else f"{reason}: {text}"
+
 
 class BagError(PkmTwinError):
     """A bag that cannot be read or written.

@@ -211,7 +211,7 @@ class EffortAction:
         goal = self._goals[_key(handle)] = _Goal(handle)
 
         def refused(error: MessageError) -> None:
-            self._abort(goal, f"delta_dynamics rejected the trajectory, {error.reason}: {error}")
+            self._abort(goal, f"delta_dynamics rejected the trajectory, {error.labelled}")
 
         def steps() -> Task:
             try:
@@ -350,7 +350,7 @@ class EffortAction:
             self._node.log_throttled("hold", f"{NAME}: no hold point: {error} was not measured")
             return False
         except MessageError as error:
-            self._node.log_throttled("hold", f"{NAME}: no hold point, {error.reason}: {error}")
+            self._node.log_throttled("hold", f"{NAME}: no hold point, {error.labelled}")
             return False
         self._holding += 1
 

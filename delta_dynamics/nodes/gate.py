@@ -189,9 +189,9 @@ class CommandGate(TwinNode):
             return
         self._closed = stream.stopped
         if stream.stopped:
-            self.get_logger().warning(f"closed: {stream.status}")
+            self.log_throttled("closed", f"closed: {stream.status}")
         else:
-            self.get_logger().info("open: torques are forwarded")
+            self.log_throttled("open", "open: torques are forwarded")
 
     def _send(self, command: LimitedEfforts) -> None:
         self._commands.publish(self.now(), command)

@@ -217,8 +217,8 @@ class MachineSim(TwinNode):
         bandwidth = sim.stable_share * self.get_parameter("bandwidth").value
         for name, right in (
             ("bandwidth", f"at most {bandwidth:.2g} Hz"),
-            ("stiffness", f"gains of {sim.stable_share:.2g} times their bandwidth"),
-            ("damping", f"gains of {sim.stable_share:.2g} times their bandwidth"),
+            ("stiffness", f"at most {sim.stable_share**2:.2g} times this"),
+            ("damping", f"at most {sim.stable_share:.2g} times this"),
         ):
             if name in self.given:
                 value = self.get_parameter(name).value
@@ -290,7 +290,10 @@ class MachineSim(TwinNode):
         self._drawn = self.create_publisher(DiagnosticArray, "~/drawn", latched_qos())
         self._clock_topic = self.create_publisher(Clock, "/clock", 10) if self._simulated else None
         self._clock_due = 0
-        self.create_guarded_subscription("~/commands", self._on_commands)
+        # In lockstep each command is a step.
+        self.create_guarded_subscription(
+            "~/commands", self._on_commands, droppable=not self._lockstep
+        )
         self.create_guarded_subscription("~/joint_trajectory", self._on_trajectory, raw=True)
         self.create_guarded_subscription(
             "~/applied_wrench", lambda m: self.core.push(m, self._base)
@@ -347,7 +350,7 @@ class MachineSim(TwinNode):
         try:
             self.core.advance()
         except MessageError as error:
-            self.log_throttled(error.reason, f"the machine has failed: {error.reason}: {error}")
+            self.log_throttled(error.reason, f"the machine has failed: {error.labelled}")
         self._publish()
 
     def _publish(self) -> None:

@@ -30,6 +30,7 @@ from pkm_twin.ros.wrench import declare_mounts
 from pkm_twin.settings import SECONDS, changeable, with_parameters
 from pkm_twin.streams.matched import WrenchWindow
 from pkm_twin.streams.monitor import Pace
+from pkm_twin.streams.topics import topic_tokens
 from pkm_twin.streams.wrench import WrenchReader, WrenchSettings
 
 LAST_WORD: Final = 0.5
@@ -76,6 +77,7 @@ class DeltaDynamics(TwinNode):
             refuse=self._refuse_joint_state,
             expected=True,
             expires=lambda: self.core.settings.stale_after,
+            every=True,
         )
         self._action = self._create_action()
         self.follow(
@@ -276,7 +278,7 @@ class DeltaDynamics(TwinNode):
         mounts = declare_mounts(self)
         if not wanted:
             return None
-        self.create_guarded_subscription("wrench", self._on_wrench, expected=True)
+        self.create_guarded_subscription("wrench", self._on_wrench, expected=True, every=True)
         return WrenchWindow(
             WrenchReader(wrench, mounts),
             round(age * SECOND),
@@ -300,9 +302,10 @@ class DeltaDynamics(TwinNode):
         if not wanted:
             return {}
         rest = np.zeros((2, len(robot.joint_names)))
+        names = reactions(robot, robot.inverse(robot.home()), *rest).names
         return {
-            name: self.create_guarded_publisher("~/reactions/<joint>", joint=name.replace(" ", "_"))
-            for name in reactions(robot, robot.inverse(robot.home()), *rest).names
+            name: self.create_guarded_publisher("~/reactions/<joint>", joint=token)
+            for name, token in topic_tokens(names).items()
         }
 
     @contextmanager

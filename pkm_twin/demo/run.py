@@ -65,12 +65,19 @@ class Stage:
         """Of the node: no queue on the way overflows, whatever waits for a turn on this machine."""
         queues = [f"qos_overrides.{t}.subscription.reliability:=reliable" for t in self.inputs]
         queues += [f"qos_overrides.{t}.publisher.depth:={DEPTH}" for t in self.outputs]
-        given = ("use_sim_time:=true", "future_tolerance:=1.0", *self.parameters, *queues)
+        given = (
+            "use_sim_time:=true",
+            "future_tolerance:=1.0",
+            PATIENT_QUEUE,
+            *self.parameters,
+            *queues,
+        )
         return ["--ros-args", *(word for parameter in given for word in ("-p", parameter))]
 
 
 # Nobody is pushed by a late torque here.
 PATIENT = f"stale_after:={PATIENCE}"
+PATIENT_QUEUE = f"max_wait:={PATIENCE}"
 JOINTS = "/joint_states"
 DYNAMICS_OUTPUTS = {
     "/delta_dynamics/joint_torques": STATE,

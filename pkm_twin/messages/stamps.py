@@ -10,7 +10,8 @@ from pkm_twin.errors import MessageError
 
 SECOND: Final = 1_000_000_000
 
-
+REPLAYED: Final = 60 * SECOND
+"""Age of a stamp beyond which it is one of a recording, ns: no queue holds a message so long."""
 MAX_DURATION: Final = 1_000_000 * SECOND
 """Bounds beyond all machines of this kind, for values that no limit of the robot bounds."""
 
@@ -37,10 +38,16 @@ class StampRules:
                 f"allowed {self.future_tolerance / SECOND:g} s{hint}",
             )
         if self.max_age is not None and stamp < now - self.max_age:
+            age = now - stamp
+            cause = (
+                "a replayed bag needs use_sim_time and a /clock"
+                if age > REPLAYED
+                else "its sender, the network or this computer is overloaded, or clocks differ"
+            )
             raise MessageError(
                 "stale stamp",
-                f"the stamp is {(now - stamp) / SECOND:.3f} s old, allowed "
-                f"{self.max_age / SECOND:g} s; a replayed bag needs use_sim_time and a /clock",
+                f"the stamp is {age / SECOND:.3f} s old, allowed {self.max_age / SECOND:g} s; "
+                f"{cause}",
             )
         return stamp
 

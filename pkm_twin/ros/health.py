@@ -3,10 +3,12 @@
 
 from __future__ import annotations
 
+import math
 import time
 import traceback
 from collections.abc import Callable
 from copy import copy
+from dataclasses import dataclass
 from itertools import product
 from typing import Final, NamedTuple
 
@@ -15,7 +17,7 @@ from rclpy.lifecycle import LifecycleNode
 from rclpy.qos import QoSCompatibility, qos_check_compatible
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
-from pkm_twin.streams.monitor import TopicStatistics
+from pkm_twin.streams.monitor import Backlog, TopicStatistics
 
 OK: Final = DiagnosticStatus.OK
 WARN: Final = DiagnosticStatus.WARN
@@ -25,6 +27,9 @@ OVERRUN_SHARE: Final = 100
 """One callback in so many may take longer than its period before the diagnostics warn."""
 MAX_TEXT: Final = 500
 """Characters of a line in the log or of a value in the diagnostics."""
+MIN_PAUSE: Final = 1.0
+MAX_PAUSE: Final = 30.0
+"""Pauses between two lines of the same reason, s; after a longer silence they begin anew."""
 UNKNOWN_NODE: Final = "_NODE_NAME_UNKNOWN_"
 """What rmw calls a node of which only an endpoint has been discovered."""
 
@@ -43,6 +48,30 @@ class Incompatibility(NamedTuple):
         return f"{self.kind}: {self.detail}"
 
 
+@dataclass
+class _Repetition:
+    """When lines of one reason are logged."""
+
+    pause: float = 0.0
+    due: float = -math.inf
+    last: float = -math.inf
+    held: int = 0
+    """Lines that were not logged since the last one."""
+
+    def begin_line(self, now: float) -> int | None:
+        """Return how many lines were held back before this one, or None to hold it back too."""
+        if now - self.last > MAX_PAUSE:
+            self.pause = 0.0
+        self.last = now
+        if now < self.due:
+            self.held += 1
+            return None
+        self.pause = min(max(MIN_PAUSE, 2.0 * self.pause), MAX_PAUSE)
+        self.due = now + self.pause
+        held, self.held = self.held, 0
+        return held
+
+
 class Health:
     """What a node's callbacks met, and what is wrong around it.
 
@@ -56,14 +85,15 @@ class Health:
             ("messages", "exceptions", "requests rejected", "clock messages rejected"), 0
         )
         self.statistics: dict[str, TopicStatistics] = {}
+        self.backlogs: dict[str, Backlog] = {}
         self.expected: list[str] = []
         """Topics of which the diagnostics warn until the first message."""
         self.limitations: list[str] = []
         """What the node was asked for at start and could not have."""
-        self._logged: dict[str, float] = {}
+        self._logged: dict[str, _Repetition] = {}
         self._last_exception = ""
         self._last_kind = ""
-        self._reported = (0, 0, 0, 0)
+        self._reported = (0, 0, 0, 0, 0)
         self._watched: dict[str, list[Callable[[Incompatibility], None]]] = {}
         self._incompatible_ends: dict[str, dict[bytes, Incompatibility]] = {}
         self._incompatible = 0
@@ -81,11 +111,11 @@ class Health:
             )
 
     def log_throttled(self, reason: str, text: str) -> None:
-        """At most a line a second and reason; the counts are in the diagnostics."""
-        now = time.monotonic()
-        if now - self._logged.get(reason, -1.0) >= 1.0:
-            self._logged[reason] = now
-            self._node.get_logger().warning(cut(text))
+        """Log a line of a reason; while the reason goes on, the pauses between its lines double."""
+        held = self._logged.setdefault(reason, _Repetition()).begin_line(time.monotonic())
+        if held is not None:
+            more = f" ({held} more since the last line)" if held else ""
+            self._node.get_logger().warning(cut(text) + more)
 
     def watch(self, topic: str, tell: Callable[[Incompatibility], None] | None = None) -> None:
         """Report other nodes with which this one cannot exchange messages on a topic.
@@ -151,8 +181,16 @@ class Health:
         taken, clocks = self.seen["messages"], self.seen["clock messages rejected"]
         lost = sum(topic.missed for topic in self.statistics.values())
         overruns = sum(topic.overruns for topic in self.statistics.values())
-        before, self._reported = self._reported, (taken, lost, overruns, clocks)
-        taken, lost, overruns, clocks = (a - b for a, b in zip(self._reported, before, strict=True))
+        dropped = sum(backlog.dropped for backlog in self.backlogs.values())
+        before, self._reported = self._reported, (taken, lost, overruns, clocks, dropped)
+        taken, lost, overruns, clocks, dropped = (
+            a - b for a, b in zip(self._reported, before, strict=True)
+        )
+        if dropped:
+            found.append(
+                (WARN, f"the node is overloaded: {dropped} messages dropped in the last second")
+            )
+            self.log_throttled("overloaded", found[-1][1])
         if clocks:
             found.append(
                 (WARN, f"{clocks} messages of /clock had an invalid time in the last second")
@@ -187,6 +225,8 @@ class Health:
         values["incompatible QoS"] = self._incompatible
         for topic, statistics in self.statistics.items():
             values[f"lost: {topic}"] = statistics.missed
+            values[f"dropped by overload: {topic}"] = self.backlogs[topic].dropped
+            values[f"behind (ms): {topic}"] = f"{1e3 * self.backlogs[topic].take_longest():.3f}"
             values[f"overruns: {topic}"] = statistics.overruns
             values[f"longest callback (ms): {topic}"] = f"{1e3 * statistics.longest:.3f}"
         return self.array(max(level for level, _ in troubles), troubles[0][1], **values)

@@ -8,6 +8,7 @@ caught, counted and reported.
 from __future__ import annotations
 
 import inspect
+import math
 import os
 import threading
 import time
@@ -29,13 +30,14 @@ from rosgraph_msgs.msg import Clock as ClockMessage
 from std_srvs.srv import Trigger
 
 from pkm_twin.bags.definitions import message_definition
+from pkm_twin.codegen.code import slowness
 from pkm_twin.errors import MessageError, ParameterError
 from pkm_twin.messages.fast_decoder import JointStateDecoder
 from pkm_twin.messages.stamps import SECOND
 from pkm_twin.ros.health import OK, QOS, RELIABILITY, WARN, Health, Incompatibility, cut
 from pkm_twin.ros.parameters import ParameterNode
 from pkm_twin.ros.turns import LOW_RATE_PERIOD, LowRateGroup, Task, Tasks
-from pkm_twin.streams.monitor import TopicStatistics
+from pkm_twin.streams.monitor import Backlog, TopicStatistics
 from pkm_twin.streams.topics import JOINTS, Topic
 
 OVERRIDES: Final = (QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH, QoSPolicyKind.RELIABILITY)
@@ -104,6 +106,12 @@ class GuardedNode(ParameterNode):
             "queue_depth", 1000, "messages of a topic that can wait for the node",
             low=1, high=100_000
         )  # fmt: skip
+        self.max_wait: float = self.declare(
+            "max_wait", 0.05,
+            "longest time that a message of a stream may wait for the node: then waiting messages "
+            "are dropped, and counted, until the node has caught up", unit="s", low=1e-3,
+            high=3600.0
+        )  # fmt: skip
         self.thread_priority: int = self.declare(
             "thread_priority", 0,
             "real-time priority (SCHED_FIFO) of the process, with its memory locked; 0: none",
@@ -123,12 +131,12 @@ class GuardedNode(ParameterNode):
     def failed(self, where: str, error: Exception) -> None:
         """What a callback raised: a rejected message is no fault of the node."""
         if isinstance(error, MessageError):
-            self.log_throttled(error.reason, f"{where}: rejected, {error.reason}: {error}")
+            self.log_throttled(error.reason, f"{where}: rejected, {error.labelled}")
         else:
             self.caught(where, error)
 
     def log_throttled(self, reason: str, text: str) -> None:
-        """At most a line a second and reason; the counts are in the diagnostics."""
+        """Log a reason, with pauses that grow while it goes on; the diagnostics count."""
         self.health.log_throttled(reason, text)
 
     def now(self) -> int:
@@ -227,7 +235,9 @@ class GuardedSubscription:
     :param refuse: takes what is wrong with bytes that are no joint state.
     :param raw: the callback takes the message's bytes.
     :param expected: the diagnostics warn until the first message.
-    :param expires: how long a message may wait for the node, s; older ones count as lost.
+    :param expires: how long a message may wait for the node, s, if less than ``max_wait``.
+    :param every: the messages are differentiated: see :class:`Backlog`. ``droppable``: messages
+        are dropped where the node cannot keep pace; never of a topic that is ``whole``.
     :param expiry: lifespan and deadline that publishers have to offer, s; None is any.
     """
 
@@ -240,7 +250,9 @@ class GuardedSubscription:
         refuse: Callable[[MessageError], None] | None = None,
         raw: bool = False,
         expected: bool = False,
-        expires: Callable[[], float] | None = None,
+        expires: Callable[[], float] = lambda: math.inf,
+        every: bool = False,
+        droppable: bool = True,
         expiry: float | None = None,
     ) -> None:
         row = node.topics[topic]
@@ -253,6 +265,8 @@ class GuardedSubscription:
         self._raw, self._best_effort = raw or self._decode is not None, not row.whole
         self._expires, self._expiry = expires, expiry
         self._statistics = node.health.statistics[topic] = TopicStatistics()
+        self._backlog = node.health.backlogs[topic] = Backlog(every)
+        self._droppable = droppable and not row.whole
         self._name = node.resolve_topic_name(topic)
         self._given = f"qos_overrides.{self._name}.subscription.reliability" in node.given
         self._relaxed = False
@@ -295,11 +309,9 @@ class GuardedSubscription:
             came = info["received_timestamp"]
             if not node.active or 0 < came < node.active_since:
                 return
-            if self._expires is not None and came:
-                waited = time.time_ns() - came
-                if waited > self._expires() * SECOND:
-                    # More comes than can be answered: the newest are.
-                    statistics.missed += 1
+            if self._droppable and came:
+                waited = (time.time_ns() - came) / SECOND
+                if self._backlog.drop(waited, min(node.max_wait, self._expires()), began):
                     return
             node.health.seen["messages"] += 1
             self._callback(message if self._decode is None else self._decoded(message))
@@ -393,6 +405,9 @@ class TwinNode(GuardedNode):
         domain = os.environ.get("ROS_DOMAIN_ID", "0")
         reach = os.environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "SUBNET")
         self.get_logger().info(f"{self.summary()}; domain {domain}, discovery {reach}")
+        if slowness():
+            self.health.limitations.append(slowness())
+            self.get_logger().warning(slowness())
         if self.autostart:
             self.trigger_configure()
             self.trigger_activate()

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Final, TypeVar, cast
 
-from pkm_twin.errors import MessageError
+from pkm_twin.errors import MessageError, label_reason
 from pkm_twin.messages.stamps import SECOND
 
 V = TypeVar("V")
@@ -67,10 +67,10 @@ class StreamMonitor:
     @property
     def status(self) -> str:
         """Why the stream is stopped, and why messages are rejected since then, where many are."""
-        status, (count, reason, text) = f"{self.reason}: {self.text}", self._since
+        status, (count, reason, text) = label_reason(self.reason, self.text), self._since
         if count >= MANY:
             status += f"; rejected since then: {count}"
-            status += "" if reason == self.reason else f", the last: {reason}: {text}"
+            status += "" if reason == self.reason else f", the last: {label_reason(reason, text)}"
         return status
 
     def accept(self) -> bool:
@@ -185,6 +185,49 @@ class TopicStatistics:
         """The newest message took so long to handle, s."""
         self.longest = max(self.longest, took)
         self.overruns += 0.0 < self._period < took
+
+
+CAUGHT_UP: Final = 0.1
+"""Fraction of the longest wait below which a message counts as new."""
+RELIEF: Final = 1.0
+"""Time without a dropped message after which an overload is over, s."""
+
+
+@dataclass
+class Backlog:
+    """Decides which of the messages that wait for a node are dropped, so that it answers new ones.
+
+    ``every``: the messages are differentiated, so that gaps cost a window: once caught up, all are
+    taken again until one waits too long. Otherwise only new ones are taken while the overload
+    lasts. Pure: times are arguments.
+    """
+
+    every: bool = False
+    dropped: int = 0
+    longest: float = 0.0
+    """Longest wait since :meth:`take_longest`, s."""
+    _behind: bool = False
+    _last_drop: float = 0.0
+
+    def drop(self, waited: float, max_wait: float, now: float) -> bool:
+        """Return whether a message is dropped.
+
+        :param waited: since the middleware received it, s; ``max_wait``: longest wait of a message
+            that is answered, s; ``now``: the steady clock, s.
+        """
+        self.longest = max(self.longest, waited)
+        if waited > (CAUGHT_UP * max_wait if self._behind else max_wait):
+            self._behind, self._last_drop = True, now
+            self.dropped += 1
+            return True
+        if self.every or now - self._last_drop > RELIEF:
+            self._behind = False
+        return False
+
+    def take_longest(self) -> float:
+        """Return the longest wait since the last call, s."""
+        longest, self.longest = self.longest, 0.0
+        return longest
 
 
 class Pace:

@@ -3,6 +3,9 @@
 
 from __future__ import annotations
 
+import re
+import unicodedata
+from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from typing import Any, Final, Literal
@@ -30,6 +33,26 @@ class Topic:
         """The class of its messages."""
         package, kind = self.kind.split("/")
         return getattr(import_module(f"{package}.msg"), kind)
+
+
+def topic_tokens(names: Sequence[str]) -> dict[str, str]:
+    """Return for each name a different token of a ROS topic name.
+
+    ROS allows ASCII letters, digits and single underscores, and no digit in front. Accents go, any
+    other character becomes an underscore, and a token that is taken already gets a number.
+    """
+    tokens: dict[str, str] = {}
+    for name in names:
+        plain = unicodedata.normalize("NFKD", name).encode("ascii", "ignore").decode()
+        token = re.sub(r"[^A-Za-z0-9]+", "_", plain).strip("_")
+        if not token[:1].isalpha():
+            token = f"joint_{token}".rstrip("_")
+        taken, first, count = set(tokens.values()), token, 1
+        while token in taken:
+            count += 1
+            token = f"{first}_{count}"
+        tokens[name] = token
+    return tokens
 
 
 def table(*rows: Topic) -> dict[str, Topic]:

@@ -10,7 +10,7 @@ import pytest
 from delta_dynamics import inverse_dynamics
 from pkm_twin.mechanisms.catalogue import robot_of_data
 from stiffness_monitor import compliance, strain_energy
-from test.nodes.harness import Command, Domain, Forked, Maker, Peer, Plain, node_words
+from test.nodes.harness import NODES, Command, Domain, Forked, Maker, Peer, Plain, node_words
 from test.support.robots import load, parameters_of
 
 
@@ -73,11 +73,14 @@ def launch_alone(domain):
 def started(domain):
     """Gives a function that starts processes, then ends them.
 
-    A fork is cheaper; ``fresh`` asks for an interpreter of its own, ``begin`` is called there.
+    A fork is cheaper; ``fresh`` asks for an interpreter of its own, ``begin`` is called there. By
+    default no message is dropped however long this machine lets it wait.
     """
     processes = []
 
     def start(module, *parameters, fresh=False, begin=lambda: None, **options):
+        if module in NODES and not any(p.startswith("max_wait") for p in parameters):
+            parameters += ("max_wait:=600.0",)
         words = node_words(module, *parameters, **options)
         if fresh:
             processes.append(Command(domain, [sys.executable, *words], begin))

@@ -62,7 +62,7 @@ def node(request, peer, launch):
         "machine_state": (),
         "machine_sim": (),
     }
-    process = launch(MODULES[name], *options[name])
+    process = launch(MODULES[name], *options[name], "max_wait:=0.05")
 
     def found():
         assert process.alive(), process.output

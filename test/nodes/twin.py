@@ -216,9 +216,10 @@ class Twin(Running):
 
 
 def count_of(array):
-    """Joint states that the node took and that it says were lost."""
+    """Joint states that the node took, that it says were lost, and that it dropped."""
     values = values_of(array)
-    return sum(int(values[key]) for key in ("messages", "lost: joint_states"))
+    keys = ("messages", "lost: joint_states", "dropped by overload: joint_states")
+    return sum(int(values[key]) for key in keys)
 
 
 def trajectory(count=5, order=(0, 1, 2), stamp=0, **changes):
