@@ -13,7 +13,7 @@ import os
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from typing import Any, ClassVar, Final
 
@@ -24,6 +24,7 @@ from rclpy.clock import Clock, ClockChange, ClockType, JumpThreshold
 from rclpy.duration import Duration
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
+from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSPolicyKind, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rosgraph_msgs.msg import Clock as ClockMessage
@@ -387,7 +388,7 @@ class TwinNode(GuardedNode):
         self.create_service(Trigger, "~/reset", self._on_reset)
         for service in self.services:
             service.callback = guarded_service(
-                service.srv_type, service.callback, self.health, lambda: len(self.declared)
+                service.srv_type, service.callback, self.health, lambda: self.declared
             )
             service.callback_group = self.low_rate
             self.low_rate.add_entity(service)
@@ -525,22 +526,34 @@ class TwinNode(GuardedNode):
 
 
 def guarded_service(
-    kind: Any, callback: Callable[[Any, Any], Any], health: Health, parameters: Callable[[], int]
+    kind: Any,
+    callback: Callable[[Any, Any], Any],
+    health: Health,
+    declared: Callable[[], Mapping[str, Parameter]],
 ) -> Any:
     """A service callback, rclpy's own ones too, that rejects what it cannot take.
 
-    :param parameters: how many the node has.
+    A parameter that has its value already may be set to it, though it is read-only: a node takes
+    back its own dump.
+
+    :param declared: the node's parameters by name.
     """
 
     def guarded(request: Any, response: Any) -> Any:
         try:
-            _check_size(request, parameters())
+            _check_size(request, len(declared()))
             if kind is SetParameters and len(request.parameters) > 1:
                 # Each for itself, as rclpy does: what is refused does not hide what was set.
                 for parameter in request.parameters:
                     one = guarded(kind.Request(parameters=[parameter]), kind.Response())
                     response.results.extend(one.results)
                 return response
+            if kind in (SetParameters, SetParametersAtomically):
+                request.parameters = _changes(request.parameters, declared())
+                if not request.parameters:
+                    good = SetParametersResult(successful=True)
+                    one = kind is SetParametersAtomically
+                    return kind.Response(result=good) if one else kind.Response(results=[good])
             return callback(request, response)
         except Exception as error:
             health.seen["requests rejected"] += 1
@@ -555,6 +568,15 @@ def guarded_service(
         return response
 
     return guarded
+
+
+def _changes(asked: Sequence[Any], declared: Mapping[str, Parameter]) -> list[Any]:
+    """Return the parameters of a request that differ from the node's."""
+    return [
+        one
+        for one in asked
+        if one.name not in declared or declared[one.name].get_parameter_value() != one.value
+    ]
 
 
 def _check_size(request: Any, parameters: int) -> None:

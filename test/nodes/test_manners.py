@@ -239,14 +239,16 @@ class TestRequests:
         answered(twin)
 
     def test_all_parameters_at_once_are_one_request(self, twin):
-        """As ``ros2 param dump`` and ``load`` ask."""
+        """As ``ros2 param dump`` and ``load`` ask: a node takes back its own dump."""
         names = twin.call(ListParameters, "list_parameters").result.names
         values = twin.get(*names)
         assert len(values) == len(names) > 30
         given = [ParameterMessage(name=n, value=v) for n, v in zip(names, values, strict=True)]
         answer = twin.call(SetParameters, "set_parameters", parameters=given)
         assert len(answer.results) == len(names)
-        assert any(result.successful for result in answer.results)
+        assert [r.reason for r in answer.results if not r.successful] == []
+        assert twin.set_to(given).successful
+        assert not twin.set(mechanism="delta").successful
         answered(twin)
 
     def test_joints_of_others_are_answered_as_soon_as_the_parameter_says_so(self, twin):
