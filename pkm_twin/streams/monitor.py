@@ -187,8 +187,9 @@ class TopicStatistics:
         self.overruns += 0.0 < self._period < took
 
 
-CAUGHT_UP: Final = 0.1
-"""Fraction of the longest wait below which a message counts as new."""
+CAUGHT_UP: Final = 0.5
+"""Fraction of the longest wait below which a node has caught up: a busy computer lets every message
+wait for some milliseconds, and a bound near these would drop all."""
 RELIEF: Final = 1.0
 """Time without a dropped message after which an overload is over, s."""
 
