@@ -20,7 +20,7 @@ from pkm_twin.messages.stamps import SECOND
 from pkm_twin.robot.effort_limits import EffortLimits, effort_limits
 from pkm_twin.streams.matched import WrenchWindow
 from pkm_twin.streams.wrench import WrenchReader, WrenchSettings
-from test.nodes.feedforward_core import NOW, ROBOT, STEP, WINDOW, sample, trajectory
+from test.nodes.feedforward_core import NOW, ROBOT, STEP, UNREACHABLE, WINDOW, sample, trajectory
 from test.nodes.harness import Maker, Plain
 
 MAKE = Maker(Plain())
@@ -197,5 +197,5 @@ def test_every_policy_keeps_the_limits_and_changes_nothing_within_them(rows, map
 
 
 def test_where_the_model_has_no_answer_the_effort_is_zero():
-    far = MeasuredPose(np.array([1.3, 0.4, 2.0]), 0)
+    far = MeasuredPose(np.array(UNREACHABLE), 0)
     assert not find_holding_effort(EffortLimits(ROBOT), far, 0, STALE).any()
