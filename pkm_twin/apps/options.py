@@ -121,7 +121,7 @@ class ReadsTables:
     units: str | None = setting(
         None,
         "units of columns whose header has none: rad, mrad, deg, rev, m, cm, mm, um, s, "
-        "ms, us, percent (of rated torque, with --side motor); default SI",
+        "ms, us, ns, percent (of rated torque, with --side motor); default SI",
         older=("--unit",),
     )
     time: str | None = setting(None, "name of a table's column of times")
@@ -186,6 +186,17 @@ class ReadsMotions(ReadsRecordings):
         "default: both, which must agree",
         choices=("joints", "pose"),
     )
+
+    def read_motion(self, path: Path, robot: Robot) -> Recording:
+        """Return a recorded or planned motion with velocities and accelerations.
+
+        :raises ParameterError: its efforts were computed with what the file lacks, unless another
+            payload is asked for.
+        """
+        from pkm_twin.paths.along import check_computed, settle_rests
+
+        motion = settle_rests(self.read(path, robot, planned=True).with_rates())
+        return motion if getattr(self, "payload", None) is not None else check_computed(motion)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -15,7 +15,8 @@ from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError, PkmTwinError, SingularityError, UnreachableError
 from pkm_twin.machine.friction import Dahl
 from pkm_twin.paths.joint_path import only_turns
-from pkm_twin.recordings.payload import by_load, payload_columns
+from pkm_twin.recordings.origin import origin_columns
+from pkm_twin.recordings.payload import by_load
 from pkm_twin.recordings.recording import Recording
 from pkm_twin.recordings.tables import WRENCH
 from pkm_twin.robot.limits import beyond_limits
@@ -26,6 +27,8 @@ BLOCK: Final = 4096
 BEYOND_LIMITS: Final = "beyond_limits"
 SAME: Final = 1e-6
 """Relative difference of two computations of the same efforts."""
+SAME_NUMBERS: Final = 1e-3
+"""The same, of one robot, whose files have nine digits or more: beyond rounding, below any term."""
 UNLIKE: Final = 0.05
 """Difference between a file's efforts and the model's, over the RMS, from which it is reported."""
 
@@ -45,8 +48,7 @@ class Compared:
     @property
     def difference(self) -> Array:
         """RMS difference between efforts and model over the model's RMS, shape (n,)."""
-        squares = ((self.effort - self.model) ** 2).mean(0)
-        return np.asarray(np.sqrt(squares / np.maximum((self.model**2).mean(0), 1e-24)))
+        return relative_difference(self.effort, self.model)
 
     @property
     def unlike(self) -> str:
@@ -57,8 +59,38 @@ class Compared:
         return (
             f"the file's efforts of {self.motion.robot.joint_names[worst]} differ from the model's "
             f"by {100 * self.difference[worst]:.3g} % RMS: the file may be of another robot, "
-            "payload or rotor"
+            "payload or rotor, or under a wrench that it does not contain"
         )
+
+
+def relative_difference(efforts: Array, model: Array) -> Array:
+    """Return the RMS difference of efforts (k, n) from the model's over the model's RMS, (n,)."""
+    squares = ((efforts - model) ** 2).mean(0)
+    return np.asarray(np.sqrt(squares / np.maximum((model**2).mean(0), 1e-24)))
+
+
+def check_computed(motion: Recording) -> Recording:
+    """Check that the model computes the efforts that the motion's file says were computed.
+
+    :returns: the motion, with a note where another robot computed them.
+    :raises ParameterError: this robot computed them, or the file does not name its robot, and the
+        model computes others: the file lacks a wrench, payload or number that they rest on.
+    """
+    if motion.computed is None or not motion.robot.has_masses:
+        return motion
+    origin, away = motion.origin, relative_difference(motion.computed, model_efforts(motion))
+    other = "" if origin is None else origin.differs_from(motion.robot)
+    worst = int(away.argmax())
+    if away[worst] <= (UNLIKE if origin is None or other else SAME_NUMBERS):
+        return motion
+    if other:
+        return replace(motion, notes=(*motion.notes, other))
+    raise ParameterError(
+        f"{motion.source}: efforts of {motion.robot.joint_names[worst]}",
+        f"{100 * away[worst]:.3g} % RMS from those that {motion.robot.name} computes",
+        "a file with the wrench (fx ... mz) and payload that its efforts were computed with, or "
+        "without efforts",
+    )
 
 
 def compared(motion: Recording, efforts: str = "file") -> Compared:
@@ -81,6 +113,11 @@ def model_efforts(m: Recording) -> Array:
     for robot, part in by_load(m.robot, m.load, m.time, BLOCK):
         made[part] = inverse_dynamics(robot, q[part], rates[part], qdd[part], wrench[part])
     return made + Dahl.remembered(m.robot.friction, q, rates)[0]
+
+
+def settle_rests(m: Recording) -> Recording:
+    """Return the motion with zero velocities where efforts are computed for a joint at rest."""
+    return replace(m, qd=_moving(m), still=None)
 
 
 def _moving(m: Recording) -> Array:
@@ -173,7 +210,7 @@ def torque_table(m: Recording, progress: Callable[[int], None] | None = None) ->
             put(BEYOND_LIMITS, outside[part].astype(np.float64))
         for i, joint in enumerate(m.robot.joint_names):
             put(f"{joint}.position", q[part][:, i])
-            put(f"{joint}.velocity", qd[part][:, i])
+            put(f"{joint}.velocity", rates[part][:, i])
             put(f"{joint}.acceleration", qdd[part][:, i])
             put(f"{joint}.effort", tau[:, i])
             if spread is not None:
@@ -193,4 +230,4 @@ def torque_table(m: Recording, progress: Callable[[int], None] | None = None) ->
         if np.abs(m.effort - model).max() <= SAME * np.abs(model).max():
             # A plan of this machine: nothing was measured.
             whole = {name: v for name, v in whole.items() if not name.endswith(".measured")}
-    return whole | payload_columns(m.robot, m.load, m.time)
+    return whole | origin_columns(m)

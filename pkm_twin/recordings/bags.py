@@ -27,7 +27,8 @@ from pkm_twin.messages.reading import (
     read_wrench,
 )
 from pkm_twin.messages.stamps import SECOND, StampRules
-from pkm_twin.recordings.payload import load_facts, metadata_error, payload_columns, told_load
+from pkm_twin.recordings.origin import Origin, origin_columns, origin_facts
+from pkm_twin.recordings.payload import metadata_error, told_load
 from pkm_twin.recordings.recording import MAPPED, ReadOptions, Recording
 from pkm_twin.recordings.tables import write_table
 from pkm_twin.recordings.topics import DEFINITIONS, JOINT_STATE, TRAJECTORY, Topics, choose_topics
@@ -58,7 +59,11 @@ def read_bag(
     if (how.trajectory or how.planned) and JOINT_STATE not in kinds and TRAJECTORY in kinds:
         plan = read_trajectory(bag, machine)
         if plan is not None:
-            return replace(plan, load=held, source=str(path))
+            origin = Origin.of_bag(bag)
+            computed = None if origin is None else plan.effort
+            return replace(
+                plan, load=held, source=str(path), origin=origin, computed=computed
+            )  # fmt: skip
     topics = choose_topics(bag, machine, how.topics, how.deflected)
     found = _messages(bag, machine, topics, how, progress)
     frame = found.wrenches[0].frame if found.wrenches else ""
@@ -279,15 +284,16 @@ def write_motion(
 ) -> None:
     """Write a planned motion: a bag with one JointTrajectory, FILE.mcap, or a table.
 
-    A table has time, the joints' motion and efforts, the pose with its rates, and the payload. In a
-    bag numbers are the controller's, and a zero stamp means a start on receipt.
+    A table has time, the joints' motion and efforts, the pose with its rates, and what the efforts
+    rest on (``origin``). In a bag numbers are the controller's, and a zero stamp means a start on
+    receipt.
 
     :param r: with rates and accelerations.
     :param facts: of the bag's metadata, beside its robot and payload.
     :raises BagError: the bag exists or cannot be written.
     """
     if path.suffix != ".mcap":
-        write_table(_columns(r) | payload_columns(r.robot, r.load, r.time), path)
+        write_table(_columns(r) | origin_columns(r), path)
         return
     own = r.robot.controller
     q, qd, qdd, _ = r.motion
@@ -311,7 +317,7 @@ def write_motion(
         "joint_names": list(own.names),
         "points": points,
     }
-    told = {"robot": r.robot.name, **facts, **load_facts(r.load)}
+    told = {**facts, **origin_facts(r)}
     metadata = {"pkm_twin": {key: str(value) for key, value in told.items()}}
     with BagWriter(path, overwrite=overwrite, metadata=metadata, flush_period=None) as bag:
         bag.add_topic(TOPIC, TRAJECTORY, definition=DEFINITIONS[TRAJECTORY])

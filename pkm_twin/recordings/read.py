@@ -18,6 +18,7 @@ from pkm_twin.machine.sections import DriveSpec
 from pkm_twin.mechanisms.catalogue import load
 from pkm_twin.messages.reading import MAX_EFFORT, MAX_LOAD, MAX_SHIFT, MAX_TURN, TINY
 from pkm_twin.recordings.bags import read_bag
+from pkm_twin.recordings.origin import GRAVITY, Origin
 from pkm_twin.recordings.payload import load_of_table
 from pkm_twin.recordings.recording import MAPPED, ReadOptions, Recording
 from pkm_twin.recordings.tables import (
@@ -50,6 +51,8 @@ CONVERTED: Final[Mapping[str, Callable[[JointMap, Array], Array]]] = {
 """The joints' values of a controller's or motor's, by the column's word."""
 TERM: Final = "effort_gravity"
 """In every table that `torques` writes."""
+BASIS: Final = {"effort_external": ("a wrench", WRENCH), "effort_payload": ("a payload", PAYLOAD)}
+"""Terms of an effort, what each rests on, and the columns that have it."""
 POSE_MISS: Final = 1e-3
 """Difference between a table's pose and that of its joint positions, of the robot's size."""
 BLOCK: Final = 4096
@@ -66,6 +69,8 @@ LONGEST_STEP: Final = 0.2
 """Between two samples of a motion, s, from which on the times look like milliseconds."""
 SHORTEST_STEP: Final = 1e-9
 """Between two times, s: what a bag's stamps resolve."""
+SINCE_1970_NS: Final = 1e17
+"""Times above this are nanoseconds since 1970: it is the year 1973."""
 LONGEST: Final = 1e6
 """From the first time to the last, s; of a trajectory it is the same."""
 SOME: Final = 500
@@ -142,8 +147,11 @@ def _of_table(path: Path, name: str | Robot | None, how: ReadOptions) -> Recordi
         or_pose = f"; or time, {', '.join(robot.pose_names)}"
         raise ParameterError(str(path), ", ".join(table), f"columns time, {needed}{or_pose}")
     time, notes, effort, word = times_of(path, times), [], None, how.efforts[0]
+    origin = Origin.of_table(table)
     # Beside the terms of a model the efforts are their sum.
     computed = any(f"{joint}.{TERM}" in table for joint in robot.joint_names)
+    if computed:
+        _check_basis(table, robot, how)
     if posed:
         assert pose is not None  # noqa: S101  one of the two is there
         q, qd, qdd = _of_pose(table, robot, pose)
@@ -176,7 +184,9 @@ def _of_table(path: Path, name: str | Robot | None, how: ReadOptions) -> Recordi
     held = how.load or load_of_table(robot, table, time)
     return Recording(
         robot, time, q, qd, qdd, effort, wrench, deflection, pose, held,
-        efforts="model" if computed and word == "effort" else word, source=str(path), notes=(
+        efforts="model" if computed and word == "effort" else word,
+        computed=stack("effort") if (computed or origin is not None) and not posed else None,
+        origin=origin, source=str(path), notes=(
             *notes,
             *([] if side is None else [f"values read as the {how.side}'s; results: the model's"]),
             *([] if robot.controller.plain or side is not None else [MAPPED]),
@@ -242,7 +252,7 @@ def _refuse_misspelt(table: Table, robot: Robot, joints: Sequence[str], how: Rea
         for name in table:
             joint, dot, what = name.rpartition(".")
             computed = what in (*EFFORTS, *WRENCH) or what.startswith("effort_")
-            if dot and joint in joints and name not in inputs and not computed:
+            if dot and joint in joints and name not in (*inputs, *GRAVITY) and not computed:
                 raise UnknownNameError(f"{table.path}: column", name, inputs)
     if how.deflected:
         known = ("time", *SIZES, *PAYLOAD, *robot.pose_names, *inputs)
@@ -250,6 +260,24 @@ def _refuse_misspelt(table: Table, robot: Robot, joints: Sequence[str], how: Rea
             _, dot, what = name.rpartition(".")
             if name not in known and (not dot or what == "position"):
                 raise UnknownNameError(f"{table.path}: column", name, known)
+
+
+def _check_basis(table: Table, robot: Robot, how: ReadOptions) -> None:
+    """Reject computed efforts without the wrench or payload that they were computed with.
+
+    :raises ParameterError: by the term of the efforts that is not zero.
+    """
+    own = how.load is not None or robot.payload.mass > 0.0
+    for term, (what, columns) in BASIS.items():
+        if any(name in table for name in columns) or (columns is PAYLOAD and own):
+            continue
+        for joint in robot.joint_names:
+            most = np.abs(table.get(f"{joint}.{term}", np.zeros(1))).max()
+            if most > 0.0:
+                raise ParameterError(
+                    f"{table.path}: {joint}.{term}", float(most),
+                    f"{what} that the efforts were computed with: columns {', '.join(columns)}",
+                )  # fmt: skip
 
 
 def _of_pose(table: Table, robot: Robot, pose: Array) -> tuple[Array, Array | None, Array | None]:
@@ -277,7 +305,8 @@ def times_of(path: Path, values: Array) -> Array:
     if found or not time[-1] <= LONGEST:
         raise ParameterError(
             f"{path}: time", found or f"{values[0]:g} to {values[-1]:g}",
-            f"rising times, {SHORTEST_STEP:g} s or more apart, up to {LONGEST:g} s in all",
+            f"rising times, {SHORTEST_STEP:g} s or more apart, up to {LONGEST:g} s in all"
+            + ("; are these nanoseconds? --units ns" if values[0] > SINCE_1970_NS else ""),
         )  # fmt: skip
     return time
 

@@ -14,6 +14,7 @@ import numpy as np
 from pkm_twin.bags.reader import Bag
 from pkm_twin.codegen.arrays import Array, Mask
 from pkm_twin.errors import BagError, MessageError, ParameterError, PkmTwinError, one_line
+from pkm_twin.recordings.origin import Origin
 from pkm_twin.recordings.payload import Load
 from pkm_twin.recordings.tables import PLAIN, Dialect
 from pkm_twin.recordings.topics import COLUMNS, Topics
@@ -26,7 +27,7 @@ from pkm_twin.streams.steps import GAP, Steps, repeats_of, steps_of
 from pkm_twin.streams.wrench import WrenchSettings
 
 BY_SAMPLE: Final = (
-    "time", "q", "qd", "qdd", "effort", "wrench", "deflection", "pose", "still"
+    "time", "q", "qd", "qdd", "effort", "wrench", "deflection", "pose", "still", "computed"
 )  # fmt: skip
 """Fields with a row for each sample."""
 MAPPED: Final = "tables use the model's joint values; joint_map applies to messages and bags only"
@@ -99,6 +100,10 @@ class Recording:
     efforts: str = "measured"
     """What the efforts are: ``measured``, the ``effort`` of a plan or of a table that does not
     tell, the ``model``'s, which only a plan has, or a ``current``, A."""
+    computed: Array | None = None
+    """Efforts that the file says a model computed, shape (samples, n), beside what they rest on."""
+    origin: Origin | None = None
+    """The robot that computed them, where the file names it."""
     late: float = 0.0
     """How late the efforts were against the positions, s: they are put on time."""
     source: str = ""

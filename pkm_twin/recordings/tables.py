@@ -35,12 +35,18 @@ MAX_LINE: Final = 1024**2
 """Longest line of it, characters."""
 ENDINGS: Final = (".csv", ".parquet", ".mat")
 """Of tables that are written."""
+NOT_READ: Final = {
+    ".mat": "CSV or Parquet; in MATLAB: writetable(T, 'FILE.csv')",
+    ".gz": "the unpacked table; gunzip -k FILE.csv.gz",
+    ".xlsx": "CSV, as the spreadsheet saves it",
+}
+"""Endings of tables that are rejected, and what is read in their place."""
 SEPARATORS: Final = {",": ",", ";": ";", "tab": "\t", "\t": "\t"}
 UNITS: Final = {
     "rad": ("angle", 1.0), "mrad": ("angle", 1e-3), "deg": ("angle", math.pi / 180.0),
     "rev": ("angle", math.tau), "m": ("length", 1.0), "cm": ("length", 1e-2),
     "mm": ("length", 1e-3), "µm": ("length", 1e-6), "um": ("length", 1e-6), "s": ("time", 1.0),
-    "ms": ("time", 1e-3), "us": ("time", 1e-6), "percent": ("effort", 1e-2),
+    "ms": ("time", 1e-3), "us": ("time", 1e-6), "ns": ("time", 1e-9), "percent": ("effort", 1e-2),
 }  # fmt: skip
 """Units of a table: what they are of, and their size in SI."""
 RATES: Final = ("position", "velocity", "acceleration")
@@ -52,7 +58,7 @@ PAYLOAD: Final = ("payload.mass", "payload.x", "payload.y", "payload.z")
 OTHERS: Final = {"payload": PAYLOAD[0]}
 """Other names of columns."""
 _UNIT: Final = re.compile(
-    r"(.*?)(?:\s*[\[(]\s*(\w+)(?:/s2?)?\s*[\])]|_(mm|cm|[uµ]m|deg|mrad|ms|us))"
+    r"(.*?)(?:\s*[\[(]\s*(\w+)(?:/s2?)?\s*[\])]|_(mm|cm|[uµ]m|deg|mrad|ms|us|ns))"
 )
 
 
@@ -190,8 +196,10 @@ def read_table(
 ) -> Table:  # fmt: skip
     """Columns of a CSV or, by its ending, Parquet file with a header row, in SI units.
 
-    Lines above the header row that begin with # are comments. A column without any number is left
-    out: `torques` writes such reactions. A header may end in its unit: ``x [mm]``, ``x_mm``.
+    Lines above the header row that begin with # are comments. Left out are columns without any
+    number and, where ``kinds`` are known, other columns with a cell that is no number: a state in
+    words, a reaction that is undetermined for a while. A header may end in its unit: ``x [mm]``,
+    ``x_mm``.
 
     :param path: ``-`` is stdin.
     :param kinds: of known columns, what they measure; only these have units and other names.
@@ -201,6 +209,8 @@ def read_table(
     """
     if kinds is None and dialect.units:
         raise ParameterError("units", ", ".join(dialect.units.values()), "none for this table")
+    if path.suffix in NOT_READ:
+        raise ParameterError(str(path), f"a {path.suffix} file", NOT_READ[path.suffix])
     try:
         file: Any = nullcontext(sys.stdin.buffer)
         if str(path) != STANDARD:
@@ -210,7 +220,7 @@ def read_table(
                 raise ParameterError(str(path), f"{size} bytes", f"at most {MAX_BYTES}")
         with file as data:
             read = _parquet if path.suffix == ".parquet" else _csv
-            header, values, above = read(path, data, dialect)
+            header, values, above = read(path, data, dialect, kinds)
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise FileError(path, error, "a table, CSV or Parquet") from None
     names, sizes = _named(header, kinds or {}, dialect)
@@ -219,7 +229,7 @@ def read_table(
     table = Table(path, dict(zip(names, values, strict=True)), above)
     for cell, name, scale in zip(header, names, sizes, strict=True):
         empty = np.isnan(table[name])
-        if empty.all() and not blank:
+        if not blank and (empty.all() or (kinds and name not in kinds and empty.any())):
             del table[name]
         elif empty.any() and not blank:
             where = f"{table.line(int(empty.argmax()))}, column {cell}"
@@ -229,8 +239,13 @@ def read_table(
     return table
 
 
-def _csv(path: Path, data: BinaryIO, dialect: Dialect) -> tuple[list[str], Array, int]:
-    """Header cells, numbers (columns, rows), and how many lines are above the header."""
+def _csv(
+    path: Path, data: BinaryIO, dialect: Dialect, kinds: Mapping[str, str] | None
+) -> tuple[list[str], Array, int]:
+    """Return header cells, numbers (columns, rows), and how many lines are above the header.
+
+    NaN is an empty cell, and in columns beside ``kinds`` one that is no number.
+    """
     # Spreadsheets put a byte order mark before the header row.
     with io.TextIOWrapper(data, encoding="utf-8-sig", newline="") as text:
         lines, above = _lines(text, path), 0
@@ -238,14 +253,17 @@ def _csv(path: Path, data: BinaryIO, dialect: Dialect) -> tuple[list[str], Array
             above += 1
         rows = _cells(path, itertools.chain([first], lines), first, dialect)
         header = [name.strip() for name in next(rows, [])]
-        cells, number = array.array("d"), above + 1
+        cells, number, read = array.array("d"), above + 1, _needed(header, kinds, dialect)
         for number, row in enumerate(rows, above + 2):
             if len(row) != len(header):
                 raise ParameterError(f"{path}: line {number}", len(row), f"{len(header)} values")
-            for name, cell in zip(header, row, strict=True):
+            for name, cell, needed in zip(header, row, read, strict=True):
                 try:
                     cells.append(_number(cell))
                 except ValueError:
+                    if not needed:
+                        cells.append(math.nan)
+                        continue
                     where = f"{path}: line {number}, column {name}"
                     raise ParameterError(where, cell, "a finite number") from None
     if not cells:
@@ -254,16 +272,30 @@ def _csv(path: Path, data: BinaryIO, dialect: Dialect) -> tuple[list[str], Array
     return header, np.ascontiguousarray(table.T), above
 
 
-def _parquet(path: Path, data: BinaryIO, dialect: Dialect) -> tuple[list[str], Array, int]:
-    """As :func:`_csv`; no number is a cell without one."""
-    del dialect
+def _needed(header: list[str], kinds: Mapping[str, str] | None, dialect: Dialect) -> list[bool]:
+    """Return which columns must have numbers: all, or where ``kinds`` are given those of them."""
+    return [not kinds or name in kinds for name in _named(header, kinds or {}, dialect)[0]]
+
+
+def _parquet(
+    path: Path, data: BinaryIO, dialect: Dialect, kinds: Mapping[str, str] | None
+) -> tuple[list[str], Array, int]:
+    """Return what :func:`_csv` returns; a null is an empty cell."""
     require_pyarrow(path)
     import pyarrow
     from pyarrow import parquet
 
     try:
         table = parquet.read_table(data)
-        values = [column.cast("float64").to_numpy() for column in table.columns]
+        header, values = list(table.column_names), []
+        for column, needed in zip(table.columns, _needed(header, kinds, dialect), strict=True):
+            try:
+                cells = column.cast("float64").to_numpy()
+            except pyarrow.ArrowException:
+                if needed:
+                    raise
+                cells = np.full(len(table), np.nan)
+            values.append(cells if needed else np.where(np.isfinite(cells), cells, np.nan))
     except pyarrow.ArrowException as error:
         raise FileError(path, error, "a Parquet file of numbers") from None
     if not len(table):
@@ -271,9 +303,9 @@ def _parquet(path: Path, data: BinaryIO, dialect: Dialect) -> tuple[list[str], A
     numbers = np.array(values, np.float64)
     if np.isinf(numbers).any():
         column, row = np.argwhere(np.isinf(numbers))[0]
-        where = f"{path}: row {row + 1}, column {table.column_names[column]}"
+        where = f"{path}: row {row + 1}, column {header[column]}"
         raise ParameterError(where, numbers[column, row], "a finite number")
-    return list(table.column_names), numbers, 0
+    return header, numbers, 0
 
 
 def _lines(text: TextIO, path: Path) -> Iterator[str]:

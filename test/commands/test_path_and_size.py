@@ -51,7 +51,8 @@ def test_a_cycle_as_a_table_that_torques_reads(twin, tmp_path):
     words = ("position", "velocity", "acceleration", "effort")
     joints = [f"{joint}.{word}" for joint in robot.joint_names for word in words]
     pose = [f"{name}{word}" for word in ("", ".velocity", ".acceleration") for name in "xyz"]
-    assert list(columns) == ["time", *joints, *pose]
+    origin = ["computed_with.delta", *(f"gravity.{axis}" for axis in "xyz")]
+    assert list(columns) == ["time", *joints, *pose, *origin]
     q, qd, qdd, effort = (joined(columns, robot, word) for word in words)
     assert (np.abs(effort) <= robot.limits.effort).all()
     np.testing.assert_allclose(robot.inverse(np.stack([columns[n] for n in "xyz"], -1)), q)

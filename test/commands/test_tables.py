@@ -223,10 +223,45 @@ def test_columns_without_any_number_are_not_there(motion):
     table = "\n".join([f"{lines[0]},elbow.fx", *(f"{line}," for line in lines[1:])]) + "\n"
     Path("empty.csv").write_text(table)
     assert read("empty.csv", robot).q == pytest.approx(q, abs=1e-12)
-    # A cell that is empty in one row alone is an error.
+    # As are those that it does not determine for a while.
     Path("empty.csv").write_text(table.rstrip("\n") + "1.0\n")
-    with pytest.raises(ParameterError, match=r"line 2, column elbow\.fx"):
+    assert read("empty.csv", robot).q == pytest.approx(q, abs=1e-12)
+    # But of a column that is read every cell is needed.
+    needed = table.replace("elbow.fx", f"{robot.joint_names[0]}.effort")
+    Path("empty.csv").write_text(needed.rstrip("\n") + "1\n")
+    with pytest.raises(ParameterError, match=r"line 2, column .*\.effort"):
         read("empty.csv", robot)
+
+
+@pytest.mark.parametrize("kind", ["csv", "parquet"])
+def test_columns_that_nobody_asked_for_are_left_alone(kind, motion):
+    """A state in words, another machine's joint, a value that is not finite."""
+    robot, time, q = motion
+    path, joints = Path(f"a.{kind}"), [f"{joint}.position" for joint in robot.joint_names]
+    others = {"state": ["RUN"] * len(time), "wheel.position": [math.inf] * len(time)}
+    if kind == "parquet":
+        pyarrow = pytest.importorskip("pyarrow")
+        columns = dict(zip(["time", *joints], [time, *q.T], strict=True)) | others
+        pyarrow.parquet.write_table(pyarrow.table(columns), path)
+    else:
+        head, *lines = plain(*motion).splitlines()
+        more = [",".join(map(str, row)) for row in zip(*others.values(), strict=True)]
+        rows = [f"{head},{','.join(others)}", *map(",".join, zip(lines, more, strict=True))]
+        path.write_text("\n".join(rows))
+    assert read(path, robot).q == pytest.approx(q, abs=1e-12)
+    asked = Dialect.of(columns=f"{robot.joint_names[0]}.effort=state")
+    with pytest.raises(ParameterError, match=r"RUN|Parquet"):
+        read(path, robot, ReadOptions(dialect=asked))
+
+
+def test_times_in_nanoseconds_since_1970_are_read_or_named(motion):
+    robot, time, q = motion
+    joints = [f"{joint}.position" for joint in robot.joint_names]
+    Path("a.csv").write_text(written(["time", *joints], [1.7377e18 + 1e9 * time, *q.T]))
+    r = read("a.csv", robot, ReadOptions(dialect=Dialect.of(units="ns")))
+    np.testing.assert_allclose(r.time, time, atol=1e-6)
+    with pytest.raises(ParameterError, match="--units ns"):
+        read("a.csv", robot)
 
 
 @pytest.mark.parametrize("name", ["five_bar", "delta", "linear_delta"])
@@ -296,3 +331,10 @@ def test_pipes(tmp_path, monkeypatch):
     second = subprocess.run([*base, "size", "delta", "-", "--json"], input=first.stdout, **run)
     assert json.loads(second.stdout)["efforts"] == "the file's"
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("name", ["a.mat", "a.csv.gz", "a.xlsx"])
+def test_a_file_that_is_no_text_is_named_with_what_to_do(name, motion, twin):
+    Path(name).write_bytes(b"MATLAB 5.0 MAT-file\x00\x01\xff")
+    for command in (("torques", "five_bar", name), ("check", name, "--robot", "five_bar")):
+        assert "CSV" in (told := twin.refused(*command)) or "gunzip" in told

@@ -142,7 +142,7 @@ def read_path(given: Design, path: Path, *, efforts: bool = True) -> tuple[Robot
     from pkm_twin.paths.along import compared
 
     robot = given.machine()
-    motion = given.read(path, robot, planned=True).with_rates()
+    motion = given.read_motion(path, robot)
     if motion.load is not None and efforts:
         if motion.load.masses or not motion.load.held(motion.time).all():
             bound = "one that is held throughout; --payload gives one"

@@ -61,7 +61,7 @@ def loads(given: Loads) -> Report:
     """The loads of all joints, the largest first in the answer."""
     from pkm_twin.paths.joint_loads import spectra, summaries
 
-    motion = given.read(given.motion, given.machine(), planned=True).with_rates()
+    motion = given.read_motion(given.motion, given.machine())
     with progress("loads", len(motion.time)) as update, writing(given.out):
         found = summaries(motion, given.bearings, given.out, update)
     if given.spectrum is not None:

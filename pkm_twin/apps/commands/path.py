@@ -64,8 +64,9 @@ class Motion(Carries, ReadsTables, AwayFromSingular, Writes, Draws):
 
     The table that it writes has the columns time, JOINT.position, JOINT.velocity,
     JOINT.acceleration, JOINT.effort, the pose's coordinates with their velocity and acceleration,
-    and the payload (payload.mass, and payload.x, .y, .z where given). `pkm-twin torques`, `size`,
-    `loads` and `design` read it.
+    and what the efforts rest on: the payload (payload.mass, and payload.x, .y, .z where given),
+    gravity, and a number of all the robot's numbers (computed_with.ROBOT). `pkm-twin torques`,
+    `size`, `loads` and `design` read it, and reject efforts that the robot does not compute.
     """
 
     waypoints: Path | None = setting(

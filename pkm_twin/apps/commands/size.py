@@ -115,7 +115,7 @@ def size(given: Size) -> Report:
     if given.motion is None:
         return over_workspace(given)
     motors = {} if given.drives is None else read_motors(given.drives, given.motor)
-    motion = given.read(given.motion, given.machine(), planned=True).with_rates()
+    motion = given.read_motion(given.motion, given.machine())
     taken, notes = compared(motion, given.efforts or "file"), list(motion.notes)
     doubted = taken.unlike or motion.efforts != "measured"
     if given.payload is not None and given.efforts is None and doubted:

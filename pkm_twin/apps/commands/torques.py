@@ -48,7 +48,9 @@ class Torques(CarriesAtTimes, ReadsMotions, AtPose, Writes, Draws):
     dry friction is zero. The table that it writes has one row per sample: each joint's effort (N m
     or N), the terms that sum to it (JOINT.effort_gravity, _inertia, _velocity, _payload, _friction,
     _external, _preload), a recording's measured effort (JOINT.measured), and force and moment in
-    every joint. A reaction that rigid-body equations do not determine is empty.
+    every joint. A reaction that rigid-body equations do not determine is empty. The last columns
+    are what the efforts rest on: wrench, payload, gravity, and a number of all the robot's numbers
+    (computed_with.ROBOT).
     With --beyond-limits, the column beyond_limits is 1 where a joint is outside its limits.
     """
 
@@ -100,7 +102,7 @@ def torques(given: Torques) -> Report:
     else:
         if given.wrench is not None:
             raise typer.BadParameter("--wrench needs --at; a motion has it in columns fx ... mz")
-        motion = given.read(given.motion, given.machine(), planned=True).with_rates()
+        motion = given.read_motion(given.motion, given.machine())
     beyond = given.admitted(motion.robot, motion.q, motion.qd)
     with progress("torques", len(motion.time)) as update:
         columns = torque_table(motion, update)

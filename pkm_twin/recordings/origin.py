@@ -1,0 +1,121 @@
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
+"""What the efforts of a file rest on: robot, gravity, wrench and payload.
+
+A table has them as columns, so that every program reads it: those that do not vary by sample are
+constant. A bag has the robot, gravity and payload in its metadata.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from pkm_twin.bags.reader import Bag
+from pkm_twin.codegen.arrays import Array
+from pkm_twin.errors import ParameterError
+from pkm_twin.files import parse_numbers
+from pkm_twin.recordings.payload import load_facts, metadata_error, payload_columns
+from pkm_twin.recordings.tables import WRENCH, Table
+from pkm_twin.robot.robot import Robot
+
+if TYPE_CHECKING:
+    from pkm_twin.recordings.recording import Recording
+
+COMPUTED_WITH: Final = "computed_with"
+"""Key of the digest; the name of a table's column ends in the robot's name."""
+GRAVITY: Final = ("gravity.x", "gravity.y", "gravity.z")
+DIGEST_BYTES: Final = 6
+"""A table's number, of 53 bits, holds the digest exactly."""
+
+
+@dataclass(frozen=True)
+class Origin:
+    """The robot that computed a file's efforts.
+
+    ``digest``: of all numbers of the robot's file. ``gravity``: m/s2, base axes.
+    """
+
+    robot: str
+    digest: int
+    gravity: tuple[float, ...]
+
+    @classmethod
+    def of(cls, robot: Robot) -> Origin:
+        """Return the origin of what a robot computes."""
+        numbers = json.dumps([robot.mechanism, robot.parameter_sections()], sort_keys=True)
+        digest = hashlib.sha256(numbers.encode()).digest()[:DIGEST_BYTES]
+        return cls(robot.name, int.from_bytes(digest), tuple(robot.gravity.tolist()))
+
+    @classmethod
+    def of_table(cls, table: Table) -> Origin | None:
+        """Return the origin that a table's columns state; None where there are none.
+
+        :raises ParameterError: rows of several robots, or a column that is missing.
+        """
+        mark = f"{COMPUTED_WITH}."
+        names = [name for name in table if name.startswith(mark)]
+        if not names:
+            return None
+        values = table.stack([*names, *GRAVITY])
+        if len(names) > 1 or (values != values[0]).any():
+            raise ParameterError(
+                f"{table.path}: {', '.join([*names, *GRAVITY])}", "several values", "one robot"
+            )
+        digest, *gravity = values[0].tolist()
+        return cls(names[0].removeprefix(mark), int(digest), tuple(gravity))
+
+    @classmethod
+    def of_bag(cls, bag: Bag) -> Origin | None:
+        """Return the origin that a bag's metadata states; None where it states none.
+
+        :raises BagError: a value that is no number.
+        """
+        facts = bag.report.metadata.get("pkm_twin", {})
+        digest = facts.get(COMPUTED_WITH)
+        if digest is None:
+            return None
+        gravity = parse_numbers(facts.get("gravity", "").replace(" ", ","))
+        if not digest.isdecimal():
+            raise metadata_error(bag, COMPUTED_WITH, digest, "a whole number")
+        if len(gravity) != len(GRAVITY):
+            raise metadata_error(bag, "gravity", facts.get("gravity"), "x y z")
+        return cls(facts.get("robot", ""), int(digest), tuple(gravity))
+
+    def differs_from(self, robot: Robot) -> str:
+        """Say how the origin differs from a robot; empty where all numbers are the same."""
+        own = Origin.of(robot)
+        if self.digest == own.digest:
+            return ""
+        if self.gravity != own.gravity:
+            theirs, ours = (", ".join(f"{v:g}" for v in one.gravity) for one in (self, own))
+            return f"the file was computed with gravity {theirs}, {robot.name} has {ours} m/s2"
+        return f"the file was computed with other numbers of the robot {self.robot}"
+
+
+def origin_columns(r: Recording) -> dict[str, Array]:
+    """Return a table's columns of what the efforts rest on, shape (samples,) each."""
+    own, one = Origin.of(r.robot), np.ones(len(r.time))
+    columns = {} if r.wrench is None else dict(zip(WRENCH, r.wrench.T, strict=True))
+    columns |= payload_columns(r.robot, r.load, r.time)
+    columns |= {f"{COMPUTED_WITH}.{own.robot}": own.digest * one}
+    return columns | {name: v * one for name, v in zip(GRAVITY, own.gravity, strict=True)}
+
+
+def origin_facts(r: Recording) -> dict[str, Any]:
+    """Return a bag's metadata of what the efforts rest on.
+
+    :raises ParameterError: a wrench, for which a planned motion's bag has no message.
+    """
+    if r.wrench is not None and r.wrench.any():
+        raise ParameterError("out", "a bag of a motion under a wrench", "a table, which has it")
+    own = Origin.of(r.robot)
+    facts = {
+        "robot": own.robot,
+        COMPUTED_WITH: own.digest,
+        "gravity": "{} {} {}".format(*own.gravity),
+    }
+    return facts | load_facts(r.load)
