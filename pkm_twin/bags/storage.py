@@ -191,7 +191,8 @@ def _described(folder: Path, root: _Field) -> Storage:
     if storage.text() == "sqlite3":
         text = f"is an SQLite bag, not MCAP; {conversion(folder)} converts it"
         raise BagError(text, path=folder, reason="not_mcap")
-    if storage.text() != "mcap":
+    # `ros2 bag reindex` leaves it empty; what the files are is seen when they are opened.
+    if storage.text() != "mcap" and storage.value != "":
         raise storage.error("'mcap'")
     packing = facts.get("compression_format")
     if packing.text().lower() not in ("", "none", "zstd"):

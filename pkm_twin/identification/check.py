@@ -32,6 +32,7 @@ from pkm_twin.identification.compare import (
 )
 from pkm_twin.identification.fit import Fit, fit
 from pkm_twin.identification.friction_laws import fit_recordings
+from pkm_twin.identification.judge import LOUD
 from pkm_twin.identification.plausible import LATEST
 from pkm_twin.identification.samples import usual_size
 from pkm_twin.recordings import Recording
@@ -40,6 +41,7 @@ from pkm_twin.robot.limits import ranges
 from pkm_twin.robot.plausibility import why_no_torques
 from pkm_twin.streams.drives import COUNT, SAME
 from pkm_twin.streams.rates import MAX_RATE, STANDS, rate_faults, rms
+from pkm_twin.streams.steps import find_play
 
 REJECTED: Final = "messages that a node rejects"
 POSITION_STEPS: Final = "position steps"
@@ -68,8 +70,7 @@ class Checked:
     """All items of a recording; the whole is good where it was judged and none is bad.
 
     ``bands``: by joint the residual against the standard deviation that the file's ``uncertainty``
-    gives, empty without one. ``unjudged``: why efforts have no verdict; empty where they have one,
-    or where the data for one are ``missing``, which is why.
+    gives, empty without one. ``unjudged``: why efforts have no verdict; empty where they have one.
     ``compared``: the efforts; ``left_out``: idle samples and those near jumps, (samples,).
     """
 
@@ -77,7 +78,6 @@ class Checked:
     items: list[Fact]
     bands: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     unjudged: str = ""
-    missing: str = ""
     compared: Compared | None = None
     left_out: Mask = field(default_factory=lambda: np.zeros(0, np.bool_))
     causes: tuple[str, ...] = ()
@@ -90,7 +90,7 @@ class Checked:
 
     @property
     def answer(self) -> str:
-        """``bad`` where an item is, ``not judged`` where too few efforts were compared."""
+        """``bad`` where an item is, ``not judged`` where efforts have no verdict, else ``good``."""
         if self.named(Verdict.BAD):
             return "bad"
         return "not judged" if self.unjudged else "good"
@@ -108,8 +108,7 @@ class Checked:
     def agreement(self) -> str:
         """How well efforts and model agree, in words."""
         r, c = self.recording, self.compared
-        if c is None:
-            return f"nothing contradicts {r.robot.name}"
+        assert c is not None  # noqa: S101  without efforts no recording is good
         if self.planned:
             return f"the efforts are those that {r.robot.name} computes, none is measured"
         part = c.rms / np.maximum(c.peak, 1e-12)
@@ -144,15 +143,11 @@ def checked(r: Recording, residual: float) -> Checked:
     items = [*_file(r), *_motion(r), *_limits(r), _singularity(r)]
     left_out = np.zeros(len(r.time), np.bool_)
     bound = f"RMS below {100 * residual:g} % of peak"
-    reason = why_no_torques(r.robot)
-    if r.effort is None:
-        reason = reason or (COMPUTED if r.efforts == "model" else "the bag carries no efforts")
-    mixed = r.step_fault if r.steps.publishers else ""
-    if mixed or reason or r.effort is None:
-        items.append(judged(RESIDUAL, mixed or reason, bound, None))
-        unjudged = COMPUTED if reason == COMPUTED else ""
-        missing, causes = "" if unjudged else reason, (mixed,) if mixed else ()
-        return Checked(r, items, unjudged=unjudged, missing=missing, causes=causes)
+    reason = why_no_torques(r.robot) or _why_no_efforts(r)
+    fault = r.step_fault if r.steps.publishers else _play_of(r)
+    if fault or reason:
+        items.append(judged(RESIDUAL, fault or reason, bound, None))
+        return Checked(r, items, unjudged=reason, causes=(fault,) if fault else ())
     try:
         idle = idle_of(r)
         left_out = idle | near_jumps(r.steps, len(r.time))
@@ -171,7 +166,29 @@ def checked(r: Recording, residual: float) -> Checked:
         if stuck:
             items.append(judged(MEASURED, stuck, "change as the model's", False))
         items += _residuals(r, compared, bands, bound)
-    return Checked(r, items, bands, unjudged, "", compared, left_out)
+    return Checked(r, items, bands, unjudged, compared, left_out)
+
+
+def _why_no_efforts(r: Recording) -> str:
+    """Say why a recording has no measured efforts; empty where it has."""
+    if r.effort is not None:
+        return ""
+    if r.efforts == "model":
+        return COMPUTED
+    if r.bag is None:
+        return "the table has no columns JOINT.effort"
+    return "joint states without efforts: the bag has none, or NaN, in some or all of them"
+
+
+def _play_of(r: Recording) -> str:
+    """Say which joints cross play in their positions, and how far; empty where none does."""
+    names, units = r.robot.joint_names, r.robot.joint_units
+    found = [
+        f"the position of {name} steps by {size:.3g} {unit} {count} times, up and down in turn"
+        for name, unit, size, count in zip(names, units, *find_play(r.q), strict=True)
+        if count
+    ]
+    return f"{'; '.join(found)}: play between the joint and its encoder?" if found else ""
 
 
 def _file(r: Recording) -> list[Fact]:
@@ -198,7 +215,7 @@ def _motion(r: Recording) -> list[Fact]:
     median, longest = float(np.median(periods)), float(periods.max())
     gap = f"{1e3 * longest:.3f} ms at {r.time[int(periods.argmax())]:.3f} s"
     within, rate = MAX_GAP * median, f"{1 / median:.1f} Hz over {r.time[-1]:.3f} s"
-    fault = r.step_fault
+    fault = r.step_fault or _play_of(r)
     items = [
         judged("rate", rate, "", True, number=1 / median, unit="Hz"),
         missing_samples(r.time),
@@ -254,8 +271,13 @@ def _velocities(r: Recording, qd: Array) -> list[Fact]:
     worst = int(np.argmax(part))
     value = ", ".join(faults) or f"{100 * part[worst]:.2g} %, {names[worst]}"
     number = float(part[worst])
-    text = f"RMS difference {value}"
-    return [judged(VELOCITIES, text, bound, not faults, number=number, limit=MAX_RATE)]
+    text, good = (
+        f"RMS difference {value}",
+        False if faults else True if number <= MAX_RATE else None,
+    )
+    if good is None:
+        text += ", no more than noise"
+    return [judged(VELOCITIES, text, bound, good, number=number, limit=MAX_RATE)]
 
 
 def _limits(r: Recording) -> list[Fact]:
@@ -372,7 +394,10 @@ def _residuals(
             text += f"; largest {worst[i]:.4g} {unit} at {at[i]:.3f} s"
             text += f", begins at {begins:.3f} s" if begins is not None else ""
         told = {"number": float(c.rms[i]), "limit": float(c.limit[i]), "unit": unit}
-        items.append(judged(f"{RESIDUAL} of {name}", text, bound, bool(good[i]), **told))
+        used = bound
+        if c.limit[i] > c.bound * c.peak[i]:
+            used = f"RMS below {c.limit[i]:.3g} {unit}, {LOUD:g} times the noise"
+        items.append(judged(f"{RESIDUAL} of {name}", text, used, bool(good[i]), **told))
     late = lateness(c.late, c.period)
     if good.all() and late:
         late += ", taken out"

@@ -230,4 +230,4 @@ def torque_table(m: Recording, progress: Callable[[int], None] | None = None) ->
         if np.abs(m.effort - model).max() <= SAME * np.abs(model).max():
             # A plan of this machine: nothing was measured.
             whole = {name: v for name, v in whole.items() if not name.endswith(".measured")}
-    return whole | origin_columns(m)
+    return whole | origin_columns(m.robot, m.load, m.wrench, m.time)

@@ -13,6 +13,7 @@ import numpy as np
 from pkm_twin.errors import ParameterError, UnknownNameError
 from pkm_twin.files import parse_numbers
 from pkm_twin.paths.geometry import Path, Space, lines, through
+from pkm_twin.recordings.origin import states_origin
 from pkm_twin.recordings.payload import Load
 from pkm_twin.recordings.tables import (
     EFFORTS,
@@ -52,8 +53,8 @@ def read_waypoints(
         raise ParameterError(f"{file}: columns", ", ".join(table), known)
     points = table.stack(list(robot.pose_names) if space == "pose" else joints)
     other = {*WRENCH, *(name for name in kinds if name.rpartition(".")[2] in EFFORTS[1:])}
-    for name in table:
-        if name not in kinds or name in other:
+    for name in (*table, *table.left_out):
+        if (name not in kinds and not states_origin(name)) or name in other:
             where, few = f"{file}: column", robot.pose_names if space == "pose" else joints
             if space == "pose":
                 where = f"{file}: {robot.name} moves in {', '.join(few)}; column"

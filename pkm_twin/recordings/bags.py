@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from pkm_twin.bags.reader import Bag, BagWriter, open_bag
 from pkm_twin.bags.storage import METADATA_FILE
 from pkm_twin.codegen.arrays import Array
-from pkm_twin.errors import BagError, MessageError, one_line
+from pkm_twin.errors import BagError, MessageError, ParameterError, one_line
 from pkm_twin.mechanisms.catalogue import load, robot_names
 from pkm_twin.messages.reading import (
     DeflectionSample,
@@ -37,6 +37,11 @@ from pkm_twin.streams.wrench import PLATFORM
 
 Stamps = NDArray[np.int64]
 
+NO_STAMPS: Final = (
+    "expected joint states with the time of each sample in header.stamp; without them, record a "
+    "table with a column time"
+)
+"""What to do with a bag whose publisher sets no stamps: its log times are when it was written."""
 APART: Final = 0.02
 """Farthest that a wrench or a joint state may be from a deflection, s."""
 
@@ -72,6 +77,10 @@ def read_bag(
     if found.rejected:
         refused = ", ".join(f"{reason}: {count}" for reason, count in found.rejected.items())
         notes.append(f"rejected messages, left out: {refused}; first: {found.first_reject}")
+    if found.others:
+        notes.append(
+            f"left alone: {found.others} messages of other joints on {topics.joint_states}"
+        )
     if not machine.controller.plain:
         notes.append(MAPPED)
     stamps = np.array([s.stamp for s in found.samples], np.int64)
@@ -142,6 +151,7 @@ class _Found(NamedTuple):
     deflections: list[DeflectionSample]
     rejected: Counter[str]
     first_reject: str
+    others: int = 0
 
 
 def _messages(
@@ -156,11 +166,15 @@ def _messages(
     wrench_of = _wrench_reader(how, rules)
     found, first = _Found([], [], [], Counter(), ""), ""
     names = [topics.joint_states, topics.wrench, topics.deflection]
+    own, others = set(robot.controller.names), 0
     for i, message in enumerate(bag.messages([name for name in names if name is not None])):
         if progress is not None:
             progress(i + 1)
         try:
             if message.topic == topics.joint_states:
+                if own.isdisjoint(message.message.name) and message.message.name:
+                    others += 1  # another publisher's, such as wheels
+                    continue
                 sample = reader.joint_state(message.message, message.log_time, rules)
                 if found.samples and sample.stamp <= found.samples[-1].stamp:
                     raise MessageError("stamp order", f"stamp {sample.stamp} is not after the last")
@@ -172,6 +186,8 @@ def _messages(
                 found.deflections.append(moved)
         except MessageError as error:
             text = f"{message.topic}: {error}"
+            if error.reason == "zero stamp":
+                text = f"{message.topic}: the stamp is zero; {NO_STAMPS}"
             if how.deflected and error.reason == "frame" and message.topic == topics.wrench:
                 # Between wrenches of two frames there is no middle.
                 raise BagError(text, path=bag.report.path, reason="frames") from None
@@ -183,7 +199,7 @@ def _messages(
             path=bag.report.path,
             reason="no joint states",
         )
-    return found._replace(first_reject=first)
+    return found._replace(first_reject=first, others=others)
 
 
 def _wrench_reader(how: ReadOptions, rules: StampRules) -> Callable[[Any, int], WrenchSample]:
@@ -293,8 +309,10 @@ def write_motion(
     :raises BagError: the bag exists or cannot be written.
     """
     if path.suffix != ".mcap":
-        write_table(_columns(r) | origin_columns(r), path)
+        write_table(_columns(r) | origin_columns(r.robot, r.load, r.wrench, r.time), path)
         return
+    if r.wrench is not None and r.wrench.any():
+        raise ParameterError("out", str(path), "a table: a bag's trajectory has no wrench")
     own = r.robot.controller
     q, qd, qdd, _ = r.motion
     empty: list[list[float]] = [[]] * len(r.time)
@@ -317,7 +335,7 @@ def write_motion(
         "joint_names": list(own.names),
         "points": points,
     }
-    told = {**facts, **origin_facts(r)}
+    told = {**facts, **origin_facts(r.robot, r.load)}
     metadata = {"pkm_twin": {key: str(value) for key, value in told.items()}}
     with BagWriter(path, overwrite=overwrite, metadata=metadata, flush_period=None) as bag:
         bag.add_topic(TOPIC, TRAJECTORY, definition=DEFINITIONS[TRAJECTORY])

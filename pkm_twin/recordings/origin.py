@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import json
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -18,15 +18,13 @@ from pkm_twin.bags.reader import Bag
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError
 from pkm_twin.files import parse_numbers
-from pkm_twin.recordings.payload import load_facts, metadata_error, payload_columns
+from pkm_twin.recordings.payload import Load, load_facts, metadata_error, payload_columns
 from pkm_twin.recordings.tables import WRENCH, Table
 from pkm_twin.robot.robot import Robot
 
-if TYPE_CHECKING:
-    from pkm_twin.recordings.recording import Recording
-
 COMPUTED_WITH: Final = "computed_with"
 """Key of the digest; the name of a table's column ends in the robot's name."""
+MARK: Final = f"{COMPUTED_WITH}."
 GRAVITY: Final = ("gravity.x", "gravity.y", "gravity.z")
 DIGEST_BYTES: Final = 6
 """A table's number, of 53 bits, holds the digest exactly."""
@@ -56,8 +54,7 @@ class Origin:
 
         :raises ParameterError: rows of several robots, or a column that is missing.
         """
-        mark = f"{COMPUTED_WITH}."
-        names = [name for name in table if name.startswith(mark)]
+        names = [name for name in table if name.startswith(MARK)]
         if not names:
             return None
         values = table.stack([*names, *GRAVITY])
@@ -66,7 +63,7 @@ class Origin:
                 f"{table.path}: {', '.join([*names, *GRAVITY])}", "several values", "one robot"
             )
         digest, *gravity = values[0].tolist()
-        return cls(names[0].removeprefix(mark), int(digest), tuple(gravity))
+        return cls(names[0].removeprefix(MARK), int(digest), tuple(gravity))
 
     @classmethod
     def of_bag(cls, bag: Bag) -> Origin | None:
@@ -96,26 +93,29 @@ class Origin:
         return f"the file was computed with other numbers of the robot {self.robot}"
 
 
-def origin_columns(r: Recording) -> dict[str, Array]:
-    """Return a table's columns of what the efforts rest on, shape (samples,) each."""
-    own, one = Origin.of(r.robot), np.ones(len(r.time))
-    columns = {} if r.wrench is None else dict(zip(WRENCH, r.wrench.T, strict=True))
-    columns |= payload_columns(r.robot, r.load, r.time)
-    columns |= {f"{COMPUTED_WITH}.{own.robot}": own.digest * one}
+def states_origin(name: str) -> bool:
+    """Return whether a table's column states the robot that computed it."""
+    return name in GRAVITY or name.startswith(MARK)
+
+
+def origin_columns(
+    robot: Robot, load: Load | None, wrench: Array | None, time: Array
+) -> dict[str, Array]:
+    """Return a table's columns of what efforts rest on, shape (samples,) each.
+
+    :param wrench: shape (samples, 6); ``time``: (samples,), s.
+    """
+    own, one = Origin.of(robot), np.ones(len(time))
+    columns = {} if wrench is None else dict(zip(WRENCH, wrench.T, strict=True))
+    columns |= payload_columns(robot, load, time)
+    columns |= {MARK + own.robot: own.digest * one}
     return columns | {name: v * one for name, v in zip(GRAVITY, own.gravity, strict=True)}
 
 
-def origin_facts(r: Recording) -> dict[str, Any]:
-    """Return a bag's metadata of what the efforts rest on.
-
-    :raises ParameterError: a wrench, for which a planned motion's bag has no message.
-    """
-    if r.wrench is not None and r.wrench.any():
-        raise ParameterError("out", "a bag of a motion under a wrench", "a table, which has it")
-    own = Origin.of(r.robot)
+def origin_facts(robot: Robot, load: Load | None) -> dict[str, Any]:
+    """Return a bag's metadata of what efforts without a wrench rest on."""
+    own = Origin.of(robot)
     facts = {
-        "robot": own.robot,
-        COMPUTED_WITH: own.digest,
-        "gravity": "{} {} {}".format(*own.gravity),
-    }
-    return facts | load_facts(r.load)
+        "robot": own.robot, COMPUTED_WITH: own.digest, "gravity": " ".join(map(repr, own.gravity)),
+    }  # fmt: skip
+    return facts | load_facts(load)

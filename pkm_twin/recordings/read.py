@@ -18,7 +18,7 @@ from pkm_twin.machine.sections import DriveSpec
 from pkm_twin.mechanisms.catalogue import load
 from pkm_twin.messages.reading import MAX_EFFORT, MAX_LOAD, MAX_SHIFT, MAX_TURN, TINY
 from pkm_twin.recordings.bags import read_bag
-from pkm_twin.recordings.origin import GRAVITY, Origin
+from pkm_twin.recordings.origin import Origin, states_origin
 from pkm_twin.recordings.payload import load_of_table
 from pkm_twin.recordings.recording import MAPPED, ReadOptions, Recording
 from pkm_twin.recordings.tables import (
@@ -249,10 +249,11 @@ def _refuse_misspelt(table: Table, robot: Robot, joints: Sequence[str], how: Rea
     """
     inputs = [f"{joint}.{what}" for joint in joints for what in RATES]
     if how.planned:
-        for name in table:
+        for name in (*table, *table.left_out):
             joint, dot, what = name.rpartition(".")
             computed = what in (*EFFORTS, *WRENCH) or what.startswith("effort_")
-            if dot and joint in joints and name not in (*inputs, *GRAVITY) and not computed:
+            known = computed or name in inputs or states_origin(name)
+            if dot and joint in joints and not known:
                 raise UnknownNameError(f"{table.path}: column", name, inputs)
     if how.deflected:
         known = ("time", *SIZES, *PAYLOAD, *robot.pose_names, *inputs)

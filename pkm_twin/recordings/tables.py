@@ -123,6 +123,8 @@ class Table(dict[str, Array]):
     def __init__(self, path: Path, columns: Mapping[str, Array], above: int = 0) -> None:
         super().__init__(columns)
         self.path = path
+        self.left_out: list[str] = []
+        """Columns beside those that are known with cells that are no numbers."""
         self._first = 2 + above
 
     @property
@@ -229,7 +231,10 @@ def read_table(
     table = Table(path, dict(zip(names, values, strict=True)), above)
     for cell, name, scale in zip(header, names, sizes, strict=True):
         empty = np.isnan(table[name])
-        if not blank and (empty.all() or (kinds and name not in kinds and empty.any())):
+        if empty.all() and not blank:
+            del table[name]
+        elif empty.any() and not blank and kinds and name not in kinds:
+            table.left_out.append(name)
             del table[name]
         elif empty.any() and not blank:
             where = f"{table.line(int(empty.argmax()))}, column {cell}"

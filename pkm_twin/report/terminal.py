@@ -59,7 +59,8 @@ def text_of(report: Report) -> str:
 
 def _judged(facts: Sequence[Fact]) -> Iterator[str]:
     """Judged properties as a table."""
-    words = [fact.verdict.words if fact.verdict else "" for fact in facts]
+    # A verdict stays on its row's first line, where it is coloured.
+    words = [fact.verdict.words.replace(" ", BLANK) if fact.verdict else "" for fact in facts]
     rows = [
         (f.text or f.name, f.words, _words(f.bound), word)
         for f, word in zip(facts, words, strict=True)
@@ -68,7 +69,7 @@ def _judged(facts: Sequence[Fact]) -> Iterator[str]:
     yield next(lines)
     for fact, word, line in zip(facts, words, lines, strict=True):
         first, *rest = line.split("\n")
-        shown = typer.style(word, fg=COLOURS[fact.verdict or Verdict.UNKNOWN])
+        shown = typer.style(word.replace(BLANK, " "), fg=COLOURS[fact.verdict or Verdict.UNKNOWN])
         yield "\n".join([first[: -len(word)] + shown, *rest])
 
 

@@ -16,6 +16,7 @@ from typing import Final, TypeVar
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
+from numpy.typing import NDArray
 
 from pkm_twin.codegen.arrays import Array, Mask
 from pkm_twin.streams.rest import ROBUST, SIGMAS, noise
@@ -51,6 +52,16 @@ ALTERNATING_PART: Final = 0.75
 """and part of them that must."""
 AGAIN: Final = 3
 """Samples in a row that may repeat the one before: more are an encoder that stands still."""
+MIN_CROSSINGS: Final = 4
+"""Crossings of a joint's play that show it: so many equal steps in turn are no chance,"""
+CROSSING_SIGMAS: Final = 8.0
+"""from so many standard deviations of the other samples on, beyond all of 1e9 normal numbers,"""
+CROSSING_TICKS: Final = 10.0
+"""and so many steps of the encoder, whose rounding also goes up and down in turn."""
+CROSSING_SPREAD: Final = 0.15
+"""Median deviation of the crossings' sizes, as a share of their median,"""
+CROSSING_TURNS: Final = 0.75
+"""and share of them that are against the one before: two within three samples are not seen."""
 APART: Final = 0.25
 """By how much of a period a gap may miss a whole number of periods, where samples are missing."""
 
@@ -157,6 +168,35 @@ def repeats_of(time: Array, q: Array) -> Mask:
         for k in rows[(same[rows] & (away > floor)).any(1)]:
             found[k + 2 : k + count + 2] = True
     return found
+
+
+def find_play(q: Array) -> tuple[Array, NDArray[np.int64]]:
+    """Return the play that a joint crosses in its positions, and how often, shape (n,) each.
+
+    Where the load of a joint turns, play between it and its encoder is a step from one sample to
+    the next, up and down in turn, always by the same. A step b has third differences of b, and of
+    -b / 2 on both sides of it; a motion has none of both. Zero where there is no play.
+
+    :param q: positions at even times, shape (k, n).
+    """
+    size, count = np.zeros(q.shape[1]), np.zeros(q.shape[1], np.int64)
+    if len(q) < 6:
+        return size, count
+    bent = np.diff(q, 3, axis=0) / -2.0
+    floor = CROSSING_SIGMAS * ROBUST * np.median(np.abs(bent), axis=0)
+    floor = np.maximum(floor, CROSSING_TICKS * _tick(np.abs(np.diff(q, axis=0))))
+    middle, before, after = bent[1:-1], bent[:-2], bent[2:]
+    against = np.maximum(np.sign(middle) * before, np.sign(middle) * after)
+    sharp = (np.abs(middle) > floor) & (against < -0.25 * np.abs(middle))
+    for j in range(q.shape[1]):
+        steps = middle[sharp[:, j], j]
+        if len(steps) < MIN_CROSSINGS:
+            continue
+        usual = float(np.median(np.abs(steps)))
+        alike = float(np.median(np.abs(np.abs(steps) - usual))) <= CROSSING_SPREAD * usual
+        if alike and np.mean(steps[1:] * steps[:-1] < 0.0) >= CROSSING_TURNS:
+            size[j], count[j] = usual, len(steps)
+    return size, count
 
 
 def _tick(steps: Array) -> Array:

@@ -20,6 +20,8 @@ from pkm_twin.identification.rows import rows_of
 from pkm_twin.paths import cycle, timed
 from pkm_twin.recordings import Recording
 from pkm_twin.recordings.topics import JOINT_STATE
+from pkm_twin.robot.derivatives import nearest_motion
+from pkm_twin.streams.steps import find_play
 from test.bags.folders import make_folder, write_split
 from test.commands.conftest import (
     COLLISION,
@@ -55,6 +57,21 @@ def put(field, how, begin=0.0, end=9.0):
 
 
 SCALED = put("effort", lambda e: [1.2 * value for value in e])
+
+
+def planned(name):
+    """A recording of three seconds with exact efforts whose parts turn often, and its positions."""
+    robot = load(name)
+    time = np.arange(0.0, 3.0, 0.004)
+    n = robot.joints_count
+    w, step = 2.0 * np.pi * np.linspace(2.0, 3.0, n), 0.01 * robot.size
+    x = np.outer(time, w)
+    home = robot.inverse(robot.home())
+    q, qd, qdd = home + step * (1 - np.cos(x)), step * w * np.sin(x), step * w**2 * np.cos(x)
+    qd, qdd = nearest_motion(robot, q, qd, qdd)
+    return Recording(robot, time, q, qd, qdd, inverse_dynamics(robot, q, qd, qdd)), q
+
+
 REJECTED = "messages that a node rejects"
 ONCE = 0.9995, 1.0005
 """When one sample is."""
@@ -89,10 +106,9 @@ def stuck(topic, message, time):
     "bag", partly_long([DELTA, MILLING, STIFFNESS], STIFFNESS), ids=lambda path: path.stem
 )
 def test_recordings_are_good(twin, bag):
-    result = twin("check", bag)
-    assert (result.code, result.err) == (0, "")
-    assert result.out.startswith("good")
-    assert ("not judged: torque residual" in result.out) == (bag == STIFFNESS)
+    result, mute = twin("check", bag), bag == STIFFNESS
+    assert (result.code, result.err) == (4 if mute else 0, "")
+    assert result.out.startswith("not judged: joint states without efforts" if mute else "good")
 
 
 def test_a_cut_out_part_is_good(twin, sample):
@@ -168,7 +184,7 @@ def test_drives_that_are_off_or_braked_are_left_out(tmp_path, effort):
     assert sum("torque residual of" in what for what in items) == 3
     report = checked(rewrite(DELTA, tmp_path / "off.mcap", braked, seconds=0.29))
     # Without a share of the recording to compare there is no verdict.
-    assert (report.code, report.data["answer"]) == (1, "not judged")
+    assert (report.code, report.data["answer"]) == (4, "not judged")
     share = re.search(r"verdict; ([\d.]+) % have idle drives", report.data["not_judged"])
     assert float(share.group(1)) > 50.0
     items = items_of(report)
@@ -212,12 +228,17 @@ class TestRobot:
 class TestNoEvidence:
     """What cannot be judged is neither good nor bad."""
 
-    def test_no_efforts(self, tmp_path):
-        mute = rewrite(DELTA, tmp_path / "m.mcap", put("effort", lambda e: []), seconds=0.5)
-        report = checked(mute)
+    @pytest.mark.parametrize(
+        ("effort", "when"),
+        [([], (-1.0, 9.0)), ([np.nan] * 3, (-1.0, 9.0)), ([np.nan] * 3, (0.2, 0.21))],
+    )
+    def test_no_efforts_in_some_or_all_joint_states(self, tmp_path, effort, when):
+        change = put("effort", lambda e: effort, *when)
+        report = checked(rewrite(DELTA, tmp_path / "m.mcap", change, seconds=0.5))
         items = items_of(report)
-        assert (report.code, items["torque residual"]["verdict"]) == (0, "unknown")
-        assert "no efforts" in items["torque residual"]["value"]
+        assert (report.code, items["torque residual"]["verdict"]) == (4, "unknown")
+        assert not report.data["good"] and report.data["answer"] == "not judged"
+        assert "without efforts" in report.answer
         assert "effort limits" not in items
 
     def test_no_masses(self, tmp_path):
@@ -225,19 +246,19 @@ class TestNoEvidence:
         robot = str(massless(tmp_path / "light.yaml"))
         report = checked(bag, robot=robot)
         item = items_of(report)["torque residual"]
-        assert (report.code, item["verdict"]) == (0, "unknown")
+        assert (report.code, item["verdict"]) == (4, "unknown")
         assert item["value"].startswith("inertia")
-        assert item["value"] == report.data["efforts_not_judged"]
-        assert f"not judged: torque residual ({item['value']})" in report.answer
+        assert item["value"] == report.data["not_judged"]
+        assert report.answer.startswith(f"not judged: {item['value']}")
         # With masses, what is missing is the measurement.
         item = items_of(checked(bag))["torque residual"]
-        assert (item["verdict"], item["value"]) == ("unknown", "the bag carries no efforts")
+        assert item["verdict"] == "unknown" and "without efforts" in item["value"]
 
     def test_too_short(self, twin, tmp_path):
         bag = rewrite(DELTA, tmp_path / "s.mcap", seconds=0.002, topics=[JOINTS])
         report = checked(bag)
         items = items_of(report)
-        assert (report.code, report.data["answer"]) == (1, "not judged")
+        assert (report.code, report.data["answer"]) == (4, "not judged")
         assert items["rate"]["verdict"] == items["compared efforts"]["verdict"] == "unknown"
         assert twin("check", bag).out.startswith("not judged")
 
@@ -257,6 +278,49 @@ class TestNoEvidence:
         assert "no joint states" in error
         assert ("planned trajectory" in error) == bool(topics)
         assert topics or "no joint states" in twin.refused("check", bag)
+
+
+class TestPrintedBounds:
+    """What is good is within the bound that is printed."""
+
+    def test_a_bound_widened_by_noise_is_printed(self, rng):
+        r, _ = planned("five_bar")
+        loud = replace(
+            r, effort=r.effort + 0.4 * np.abs(r.effort).max(0) * rng.normal(size=r.q.shape)
+        )
+        found = check(loud)
+        seen = [i for i in found.items if str(i.text).startswith("torque residual of")]
+        assert found.compared is not None and len(seen) == r.robot.joints_count
+        for item, limit in zip(seen, found.compared.limit, strict=True):
+            assert f"{limit:.3g}" in item.bound and "noise" in item.bound
+
+    @pytest.mark.parametrize("name", ["five_bar", "linear_delta", "stewart"])
+    @pytest.mark.parametrize("noise", [0.0, 1e-6])
+    def test_play_between_joint_and_encoder_is_named_with_its_size(self, name, noise, rng):
+        r, q = planned(name)
+        play = 2e-3 * r.robot.size
+        turning = r.effort - np.median(r.effort, 0)
+        q = q + noise * r.robot.size * rng.normal(size=q.shape)
+        seen = q + 0.5 * play * np.sign(turning)
+        sizes, counts = find_play(seen)
+        crossings = np.count_nonzero(np.diff(np.sign(turning), axis=0), axis=0)
+        assert (crossings >= 4).any()
+        np.testing.assert_allclose(sizes[counts > 0], play, rtol=0.05)
+        assert (counts > 0).tolist() == (crossings >= 4).tolist()
+        assert not find_play(q)[1].any()
+        found = check(replace(r, q=seen, qd=None, qdd=None))
+        assert found.answer == "bad" and "play" in found.causes[0]
+
+    def test_motions_noise_and_coarse_encoders_are_no_play(self, rng):
+        time = np.linspace(0.0, 4.0, 2001)
+        cycle_ = timed(load("delta"), cycle(load("delta"), 0.025, 0.305, 0.025)).uniform(500).q
+        wave = 0.3 * np.sin(np.outer(time, [5.0, 7.0, 3.0]))
+        ramp = np.abs((time[:, None] * [1.0, 2.0, 0.5]) % 2.0 - 1.0)
+        for q in (np.tile(cycle_, (6, 1)), wave, ramp):
+            for tick in (0.0, 1e-5, 1e-3):
+                coarse = q if tick == 0.0 else tick * np.round(q / tick)
+                for noise in (0.0, 1e-5):
+                    assert not find_play(coarse + noise * rng.normal(size=q.shape))[1].any()
 
 
 class TestPayload:

@@ -11,6 +11,7 @@ from mcap.writer import Writer
 from pkm_twin.bags.reader import BagWriter, open_bag
 from pkm_twin.errors import BagError
 from pkm_twin.recordings import ReadOptions, read, read_table
+from pkm_twin.recordings.origin import states_origin
 from pkm_twin.recordings.topics import JOINT_STATE, WRENCH
 from test.commands.conftest import COLLISION, DELTA, JOINTS, MILLING, checked, items_of, rewrite
 from test.support.mapped import sides
@@ -92,7 +93,8 @@ class TestTopics:
         for name, source in (("delta_cu", one), (robot, bag)):
             out = tmp_path / f"{source.stem}.csv"
             twin.good("torques", name, source, "--no-picture", "--out", out)
-            tables.append(read_table(out))
+            table = read_table(out)
+            tables.append({n: v for n, v in table.items() if not states_origin(n)})
         assert list(tables[1]) == list(tables[0])
         for name, values in tables[0].items():
             np.testing.assert_allclose(tables[1][name], values, rtol=1e-6, atol=1e-6)
@@ -212,3 +214,32 @@ def test_another_encoding_is_named(tmp_path, kind):
         writer.finish()
     with pytest.raises(BagError, match="encoding is json"):
         read(path, "delta")
+
+
+def test_messages_of_other_joints_on_the_same_topic_are_left_alone(tmp_path):
+    """Wheels or a gripper publish on /joint_states, too, between the machine's own."""
+    bag, target = open_bag(DELTA), tmp_path / "wheels.mcap"
+    first = bag.report.start_time
+    with BagWriter(target, metadata=bag.report.metadata, flush_period=None) as writer:
+        writer.add_topic(JOINTS, JOINT_STATE, definition=bag.report.topics[JOINTS].definition)
+        for m in bag.messages(JOINTS):
+            if m.log_time - first > 5e8:
+                break
+            writer.write(JOINTS, m.data, m.log_time)
+            wheel = {"header": m.message.header, "name": ["wheel"], "position": [1.0]}
+            writer.write(JOINTS, wheel, m.log_time)
+    report = checked(target)
+    assert (report.code, report.data["answer"]) == (0, "good")
+    r = read(target)
+    assert not r.rejected and "of other joints" in r.notes[-1]
+
+
+@pytest.mark.parametrize("command", [("check",), ("torques", "delta_cu")])
+def test_a_bag_without_stamps_says_what_to_do(command, twin, tmp_path):
+    def unstamped(topic, message, time):
+        message.header.stamp.sec = message.header.stamp.nanosec = 0
+        return message
+
+    bag = rewrite(DELTA, tmp_path / "zero.mcap", unstamped, seconds=0.1, topics=[JOINTS])
+    line = twin.refused(*command, bag)
+    assert "accept_zero_stamp" not in line and "header.stamp" in line and "column time" in line

@@ -12,10 +12,16 @@ from pathlib import Path
 from typing import Any
 
 from pkm_twin.apps.frame import command
-from pkm_twin.apps.options import REFUSED, SALVAGED, CarriesAtTimes, ReadsRecordings, payload_fact
+from pkm_twin.apps.options import (
+    REFUSED,
+    SALVAGED,
+    CarriesAtTimes,
+    ReadsRecordings,
+    payload_fact,
+)
 from pkm_twin.console import progress
 from pkm_twin.errors import ParameterError, PkmTwinError, one_line
-from pkm_twin.report import Fact, Report, Verdict
+from pkm_twin.report import NOT_JUDGED, Fact, Report, Verdict
 from pkm_twin.settings import setting
 
 
@@ -27,12 +33,13 @@ class Check(CarriesAtTimes, ReadsRecordings):
     no samples are missing, that positions and velocities belong to one moving machine, that joints
     stay inside their limits and away from singularities, and that the measured efforts agree with
     the model. If they do not, an explanation is named only if it makes them agree. An item without
-    data (no CRCs, no efforts, a robot without masses) is not judged, which is neither good nor bad.
-    The recording is not judged if its efforts have no verdict: too few can be compared, or the
-    model computed them, as in a table of `torques`.
+    data, as of a bag without CRCs, is not judged, which is neither good nor bad. The recording is
+    not judged if its efforts have no verdict: there are none, they are NaN, too few can be
+    compared, the robot has no masses, or the model computed them, as in a table of `torques`.
 
-    Exit code 0: good. 1: bad, not judged, or no recording. 3: the file is damaged, but `pkm-twin
-    recover` can save part of it.
+    Exit code 0: good. 1: bad, or no recording. 3: the file is damaged, but `pkm-twin recover` can
+    save part of it. 4: not judged. Of a folder: 1 if a recording is bad, else 4 if one is not
+    judged.
     """
 
     bag: Path = setting(
@@ -98,8 +105,6 @@ def check_one(given: Check, path: Path, update: Any = None, thorough: bool = Tru
     if found.answer == "not judged":
         # The reason is in the answer.
         unknown = [what for what in unknown if what not in (COMPARED, IDLE, RESIDUAL)]
-    elif found.missing:
-        unknown = [f"{what} ({found.missing})" if what == RESIDUAL else what for what in unknown]
     why, findings = "; ".join(found.causes), "; ".join(found.findings)
     what = ", ".join(bad) or found.unjudged or found.agreement
     if why and found.compared is None:
@@ -118,15 +123,14 @@ def check_one(given: Check, path: Path, update: Any = None, thorough: bool = Tru
             payload_fact(r.load),
             *found.items,
             Fact("uncertainty", found.bands or None), Fact("answer", found.answer),
-            Fact("not_judged", found.unjudged or None),
-            Fact("efforts_not_judged", found.unjudged or found.missing or None), Fact("good", good),
+            Fact("not_judged", found.unjudged or None), Fact("good", good),
             Fact("residuals", found.residuals), Fact("samples", len(r.time)),
             Fact("duration_s", float(r.time[-1]), "s"),
             Fact("delay_s", None if found.compared is None else found.compared.late, "s"),
         ],
         notes=[] if r.robot.uncertainty else [none],
         verdict=Verdict.GOOD if good else Verdict.BAD if bad else Verdict.UNKNOWN,
-        code=0 if good else REFUSED,
+        code=0 if good else REFUSED if bad else NOT_JUDGED,
     )  # fmt: skip
 
 
@@ -161,7 +165,7 @@ def _of_folder(given: Check) -> Report:
     notes = []
     for result in results:
         bad = [item["what"] for item in result.get("items", ()) if item["verdict"] == "bad"]
-        because = ", ".join(bad) or result.get("efforts_not_judged")
+        because = ", ".join(bad) or result.get("not_judged")
         why = result.get("error") or f"{result['answer']}{f': {because}' if because else ''}"
         notes.append(f"{result['bag']}: {why}")
     count = sum(not result["good"] for result in results)
@@ -174,7 +178,7 @@ def _of_folder(given: Check) -> Report:
             Fact("folder", str(given.bag)), Fact("good", not count), Fact("recordings", results),
         ],
         notes=notes,
-        verdict=Verdict.BAD if count else Verdict.GOOD,
+        verdict=Verdict.BAD if count > unjudged else Verdict.UNKNOWN if count else Verdict.GOOD,
     )  # fmt: skip
 
 
