@@ -24,8 +24,8 @@ if TYPE_CHECKING:
     from pkm_twin.robot.robot import Robot
     from stiffness_monitor.chatter import Milling
 
-REFUSED, USAGE, SALVAGED = 1, 2, 3
-"""Exit codes: rejected; wrong usage; damaged, with messages that `recover` saves."""
+REFUSED, USAGE, SALVAGED, NOT_JUDGED = 1, 2, 3, 4
+"""Exit codes: rejected; wrong usage; damaged, with messages that `recover` saves; no verdict."""
 
 PICTURES = (".png", ".svg", ".pdf")
 """What a picture's name may end in."""

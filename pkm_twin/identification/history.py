@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pkm_twin.codegen.arrays import Array
-from pkm_twin.errors import FileError, PkmTwinError
+from pkm_twin.errors import FileError, ParameterError, PkmTwinError, one_line
 from pkm_twin.identification.compare import compared_of, idle_of
 from pkm_twin.identification.friction_laws import fit_recordings
 from pkm_twin.recordings import ReadOptions, Recording, read
@@ -27,6 +27,12 @@ WAIT: Final = 60.0
 """How long a writer waits for the others, s."""
 SINCE: Final = 1e17
 """Stamps above this, ns, are since 1970; smaller ones are since a start."""
+MAX_NUMBER: Final = 1e9
+"""Largest size of a number: N, N m, kg, Hz or a factor."""
+MAX_TIME: Final = 253_402_300_799.0
+"""Last second of the year 9999, s since 1970."""
+APPLICATION: Final = 0x706B6D74
+"""SQLite's application_id of a history: "pkmt"."""
 FEWEST: Final = 6
 """Recordings below which no series is judged."""
 HISTORY: Final = "a history that `pkm-twin check --history` wrote"
@@ -158,6 +164,37 @@ def _opened(path: Path) -> Iterator[sqlite3.Connection]:
         raise FileError(path, error, HISTORY) from None
 
 
+def _check_base(path: Path, base: sqlite3.Connection, new: bool) -> None:
+    """Reject a database that is no history; one without application_id has its two tables alone.
+
+    :param new: whether an empty database is good, too.
+    :raises ParameterError: by its tables.
+    """
+    own = base.execute("PRAGMA application_id").fetchone()[0]
+    rows = base.execute("SELECT name FROM sqlite_master WHERE type IN ('table', 'view')").fetchall()
+    tables = {str(name) for (name,) in rows}
+    if own == APPLICATION or (own == 0 and tables in [{"checks", "numbers"}, *([set()] * new)]):
+        return
+    found = f"a database with {len(tables)} tables: {', '.join(sorted(tables))}"
+    raise ParameterError(str(path), one_line(found, 100), HISTORY)
+
+
+def _check_row(where: str, time: Any, value: Any, deviation: Any) -> None:
+    """Reject numbers that no recording gives.
+
+    :param deviation: None or NaN where it is not known.
+    :raises ParameterError: by the number.
+    """
+    known = None if deviation is None or deviation != deviation else deviation
+    for what, number, low, high in (
+        ("time", time, 0.0, MAX_TIME), ("value", value, -MAX_NUMBER, MAX_NUMBER),
+        ("deviation", 0.0 if known is None else known, 0.0, MAX_NUMBER),
+    ):  # fmt: skip
+        if not isinstance(number, (int, float)) or not low <= number <= high:
+            shown = one_line(str(number), 40)
+            raise ParameterError(f"{where}: {what}", shown, f"a number, {low:g} to {high:g}")
+
+
 def append(
     path: Path,
     machine: str,
@@ -172,13 +209,17 @@ def append(
     One short transaction: any number of processes may write, also from other machines on a shared
     disk with locks.
 
-    :raises ParameterError: the file is no history, or stays locked.
+    :raises ParameterError: the file is no history, or stays locked; a number that is none.
     """
     when = datetime.now(UTC).isoformat(timespec="seconds")
     row = recorded, when, machine, robot, os.fspath(file), int(good)
+    for one in numbers:
+        _check_row(f"{one.quantity} of {one.part}", recorded, one.value, one.deviation)
     with _opened(path) as base:
         base.execute("PRAGMA foreign_keys = ON")
         base.execute("BEGIN IMMEDIATE")
+        _check_base(path, base, new=True)
+        base.execute(f"PRAGMA application_id = {APPLICATION}")
         for statement in _TABLES.split(";")[:-1]:
             base.execute(statement)
         key = base.execute(
@@ -197,17 +238,22 @@ def append(
 def read_history(path: Path, machine: str | None = None) -> list[Series]:
     """All series of a history, by machine, quantity and part, in the order of recording.
 
-    :raises ParameterError: no such file, or no history.
+    :raises ParameterError: no such file, no history, or a number that is none.
     """
     if not path.is_file():
         raise FileError(path, FileNotFoundError(), HISTORY)
     with _opened(path) as base:
+        _check_base(path, base, new=False)
         rows = base.execute(
             "SELECT machine, quantity, part, unit, recorded, value, deviation FROM numbers "
             "JOIN checks ON checks.id = check_id ORDER BY machine, quantity, part, unit, recorded"
         ).fetchall()
     grouped: dict[tuple[str, str, str, str], list[tuple[float, float, float]]] = {}
     for name, quantity, part, unit, time, value, deviation in rows:
+        where = one_line(f"{path}: {quantity} of {part}, {name}", 100)
+        if not all(isinstance(word, str) for word in (name, quantity, part, unit)):
+            raise ParameterError(where, "no text", "names and units as text")
+        _check_row(where, time, value, deviation)
         if machine is None or name == machine:
             known = np.nan if deviation is None else float(deviation)
             grouped.setdefault((name, quantity, part, unit), []).append((time, value, known))

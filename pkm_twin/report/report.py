@@ -10,8 +10,6 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Any, Final
 
-NOT_JUDGED: Final = 4
-"""Exit code of a command without enough evidence for a verdict."""
 ROUNDING: Final = 1e-9
 """What is below this part of the largest number of a column with a unit is shown as 0."""
 
@@ -158,10 +156,8 @@ class Report:
 
     @property
     def exit_code(self) -> int:
-        """Of the command: 0 good, 1 bad, 4 not judged."""
-        if self.code or self.verdict is None:
-            return self.code
-        return {Verdict.GOOD: 0, Verdict.BAD: 1, Verdict.UNKNOWN: NOT_JUDGED}[self.verdict]
+        """Of the command: 0 good, 1 bad."""
+        return self.code or int(self.verdict is Verdict.BAD)
 
     @property
     def data(self) -> dict[str, Any]:

@@ -1,6 +1,7 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """History and trend: many writers, what a night's recording tells, and what drifts."""
 
+import math
 import multiprocessing
 import runpy
 import sqlite3
@@ -9,6 +10,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from pkm_twin.errors import ParameterError
 from pkm_twin.identification.history import Measured, Series, append, judged, measure, read_history
 from pkm_twin.recordings import read
 from test.commands.conftest import REPOSITORY
@@ -139,4 +141,51 @@ def test_what_is_no_history(twin, tmp_path):
     other = tmp_path / "other.db"
     other.write_text("nothing of that kind, but long enough to be read as a file of a data base")
     for path in (other, tmp_path / "none.db"):
-        assert twin("trend", path).code == 1
+        twin.refused("trend", path)
+
+
+@pytest.mark.parametrize("tables", [["photos"], ["photos", "checks", "numbers"], ["checks"]])
+def test_another_program_s_database_is_rejected_and_stays_as_it_is(tables, twin, tmp_path, sample):
+    path = tmp_path / "photos.db"
+    with sqlite3.connect(path) as base:
+        for table in tables:
+            base.execute(f"CREATE TABLE {table} (a)")
+    before = path.read_bytes()
+    assert tables[0] in twin.refused("trend", path)
+    assert "history" in twin.refused("check", sample, "--history", path)
+    with sqlite3.connect(path) as base:
+        base.execute(f"PRAGMA application_id = {0x12345678}")
+    assert "history" in twin.refused("check", sample, "--history", path)
+    with sqlite3.connect(path) as base:
+        base.execute("PRAGMA application_id = 0")
+        assert {n for (n,) in base.execute("SELECT name FROM sqlite_master")} == {*tables}
+    assert len(path.read_bytes()) == len(before)
+
+
+@pytest.mark.parametrize("value", [math.inf, -math.inf, math.nan, 1e300])
+def test_a_number_that_no_recording_gives_is_not_written(value, tmp_path):
+    path = tmp_path / "nights.db"
+    for one in (
+        Measured("residual", "j", value, 0.1, "N m"), Measured("residual", "j", 0.1, -1.0, "N m")
+    ):  # fmt: skip
+        with pytest.raises(ParameterError, match="residual of j"):
+            append(path, "m", "delta", "1.mcap", DAY, True, [one])
+    assert not path.exists()
+
+
+@pytest.mark.parametrize(
+    ("column", "value"),
+    [
+        ("value", math.inf), ("value", "many"), ("value", b"\x01\xff"), ("value", 1e300),
+        ("deviation", math.inf), ("deviation", -1.0), ("deviation", "few"), ("unit", b"\xff"),
+    ],
+)  # fmt: skip
+def test_a_damaged_number_of_a_history_is_named(column, value, twin, tmp_path):
+    path = tmp_path / "nights.db"
+    for k in range(8):
+        _write((path, 3 * k))
+    twin.good("trend", path)
+    with sqlite3.connect(path) as base:
+        assert base.execute("PRAGMA application_id").fetchone()[0] != 0
+        base.execute(f"UPDATE numbers SET {column} = ? WHERE check_id = 4", (value,))
+    assert "residual of j" in twin.refused("trend", path)

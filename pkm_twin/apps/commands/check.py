@@ -13,6 +13,7 @@ from typing import Any
 
 from pkm_twin.apps.frame import command
 from pkm_twin.apps.options import (
+    NOT_JUDGED,
     REFUSED,
     SALVAGED,
     CarriesAtTimes,
@@ -21,7 +22,7 @@ from pkm_twin.apps.options import (
 )
 from pkm_twin.console import progress
 from pkm_twin.errors import ParameterError, PkmTwinError, one_line
-from pkm_twin.report import NOT_JUDGED, Fact, Report, Verdict
+from pkm_twin.report import Fact, Report, Verdict
 from pkm_twin.settings import setting
 
 
@@ -179,6 +180,7 @@ def _of_folder(given: Check) -> Report:
         ],
         notes=notes,
         verdict=Verdict.BAD if count > unjudged else Verdict.UNKNOWN if count else Verdict.GOOD,
+        code=NOT_JUDGED if count and count == unjudged else 0,
     )  # fmt: skip
 
 
