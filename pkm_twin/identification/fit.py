@@ -33,6 +33,8 @@ from pkm_twin.identification.suspects import scaled_efforts, verdict_of
 from pkm_twin.recordings import Recording
 from pkm_twin.robot.robot import Robot
 
+ROUNDING: Final = 1e-6
+"""Share of the efforts below which a residual is that of numbers in a file."""
 WORSE: Final = 1.2
 """Held-out residual of a joint over that of the file's values that a machine like the file's does
 not leave."""
@@ -314,6 +316,29 @@ def _worse(problem: Problem, causes: Sequence[Cause | None]) -> list[str]:
                 f"the values before {old[j]:.3g} ({why})"
             )
     return told
+
+
+def find_worse(result: Result) -> str:
+    """Say where a result predicts the held-out samples worse than the file, or return nothing.
+
+    By the mean over the channels of the squares' ratio, so that all have one weight.
+    """
+    sums = np.zeros((3, len(result.channels)))
+    for one in result.judged:
+        parts = one.measured - one.before, one.measured - one.after, ROUNDING * one.measured
+        sums += [np.nansum(part**2, 0) for part in parts]
+    before, after, floor = sums
+    some = before + after > 2.0 * floor
+    if not some.any() or np.mean((after / np.maximum(before, floor))[some]) <= 1.0:
+        return ""
+    worst = int(np.argmax(np.where(some, after / np.maximum(before, floor), 0.0)))
+    count = sum(np.isfinite(one.measured[:, worst]).sum() for one in result.judged)
+    new, old = (float(np.sqrt(part[worst] / count)) for part in (after, before))
+    return (
+        f"the fitted values predict the held-out samples worse than the file's: {new:.3g} "
+        f"{result.units[worst]} RMS for {old:.3g} on {result.channels[worst]}; the file's values "
+        "explain the recordings, or these excite too little: nothing is written"
+    )
 
 
 def refuse_faults(faults: Sequence[str], accept: bool) -> None:

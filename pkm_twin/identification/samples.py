@@ -395,18 +395,23 @@ def noise_of(residual: Sequence[Array], shaken: Array, period: float, how: Filte
 
 
 def resonances_of(
-    residual: Sequence[Array], period: float, how: Filtering, size: Array
+    residual: Sequence[Array], wrench: Array, period: float, how: Filtering, size: Array
 ) -> tuple[Resonance, ...]:
-    """The lowest clear peak above the motion's band of each joint's residual, where there is one.
+    """Find the lowest clear peak above the motion's band of each joint's residual, if any.
 
-    :param residual: measured less fitted, every sample, (samples, n) by piece. ``size``: RMS of
-        the measured efforts, (n,): a peak below :data:`EXACT` of it is rounding.
+    A frequency at which the measured wrench has a peak, too, is that of a force on the platform,
+    such as a cutter's, and no drive's.
+
+    :param residual: measured less fitted, every sample, (samples, n) by piece. ``wrench``: of the
+        longest piece, (samples, 6). ``size``: RMS of the measured efforts, (n,): a peak below
+        :data:`EXACT` of it is rounding.
     """
     whole, rate = max(residual, key=len), 1.0 / period
     segment = min(RESOLVED, len(whole) // 4)
     if segment < 64:
         return ()
     frequency, density = _spectrum([whole], rate, segment)
+    _, forces = _spectrum([wrench], rate, segment)
     # Segments overlap by half, with a Hann window: so many independent ones.
     freedoms = 2.0 * 0.95 * max(1.0, 2.0 * len(whole) / segment - 1.0)
     begin = UNFILTERED * rate if how.cutoff is None else PASSED * how.cutoff
@@ -414,13 +419,25 @@ def resonances_of(
     if len(inside) < 2 * AROUND:
         return ()
     step, found = frequency[1] - frequency[0], []
-    for j in range(whole.shape[1]):
-        own = density[inside, j]
+
+    def stand_out(own: Array) -> tuple[Array, Array, Array]:
+        """Return the surroundings' density, its ratio, and the logarithm of chance, (k,) each."""
         ground = scipy.ndimage.median_filter(own, 2 * AROUND + 1, mode="nearest")
         ratio = own / np.maximum(ground, 1e-300)
         # The mean of a chi square over its median.
         chance = scipy.stats.chi2.logsf(0.9 * ratio * freedoms, freedoms) + np.log(len(inside))
-        clear = np.flatnonzero((chance < LIKELY) & (ratio > PEAK))
+        return ground, ratio, chance
+
+    forced = np.zeros(len(inside), np.bool_)
+    for own in forces[inside].T:
+        _, ratio, chance = stand_out(own)
+        forced |= (chance < LIKELY) & (ratio > PEAK)
+    # The residual's peak may be a frequency of the spectrum beside the wrench's.
+    forced = scipy.ndimage.binary_dilation(forced)
+    for j in range(whole.shape[1]):
+        own = density[inside, j]
+        ground, ratio, chance = stand_out(own)
+        clear = np.flatnonzero((chance < LIKELY) & (ratio > PEAK) & ~forced)
         if not len(clear):
             continue
         last = clear[0]

@@ -42,7 +42,8 @@ class Fit(CarriesAtTimes, ReadsRecordings, BeyondLimitsToo, Accepts):
     mz. The last third of each recording is held out for validation.
 
     The YAML is the robot's file with the fitted values, each with its standard deviation in a
-    comment. The command lists the parameters that the motion does not excite; they keep the file's
+    comment; nothing is written where these predict the part held out worse than the file's values.
+    The command lists the parameters that the motion does not excite; they keep the file's
     value. A recording that this machine cannot have produced is rejected with the reason; --accept
     fits it nevertheless and marks the files. The verdict reports whether the model explains the
     recordings, what does not fit and which error is likely. If the model does not explain them,
@@ -139,6 +140,7 @@ def fit(given: Fit) -> Report:
     from pkm_twin import load
     from pkm_twin.apps.fit_report import report_of
     from pkm_twin.identification.deflections import fit_elements
+    from pkm_twin.identification.fit import find_worse, refuse_faults
     from pkm_twin.identification.friction_laws import fit_recordings
     from pkm_twin.identification.parameters import fitted_yaml
     from pkm_twin.mechanisms.entries import robot_text, write_edited
@@ -174,8 +176,10 @@ def fit(given: Fit) -> Report:
                 machine, read, kinds, laws, constant=given.torque_constant, progress=update,
                 **options,
             )  # fmt: skip
+    worse = find_worse(result)
+    refuse_faults([worse] if worse else [], given.accept)
     told = [note if len(read) == 1 else f"{r.name}: {note}" for r in read for note in r.notes]
-    accepted = [f"accepted by --accept: {line}" for line in result.accepted]
+    accepted = [f"accepted by --accept: {line}" for line in (*result.accepted, worse) if line]
     marks = [*map(str, choices), *accepted, *marks, *beyond, *told]
     report, more = report_of(result, marks)
     facts = [
