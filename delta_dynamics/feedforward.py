@@ -268,6 +268,14 @@ class Feedforward(Core):
         self.trajectories.accept()
         return efforts
 
+    def check_shape(self, message: Any) -> None:
+        """Check a trajectory's names and lengths, before its efforts are computed in steps.
+
+        :raises MessageError: the message is rejected, and counted.
+        """
+        with self.refusing(self.trajectories):
+            self._reader.check_shape(message)
+
     def joint_state(self, message: Any, now: int, steady: int | None = None) -> Torques | None:
         """Efforts for one joint state, or None while the window fills or a stop is latched.
 

@@ -9,8 +9,8 @@ import math
 import os
 import stat
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager, suppress
 from itertools import count
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -139,6 +139,16 @@ def replace_file(path: Path, data: bytes) -> None:
     """
     with replacing(path) as hidden:
         hidden.write_bytes(data)
+
+
+def replace_files(files: Mapping[Path, bytes]) -> None:
+    """Write small files all or none: each is whole before the first takes its place.
+
+    :raises OSError: as :func:`replace_file`.
+    """
+    with ExitStack() as stack:
+        for path, data in files.items():
+            stack.enter_context(replacing(path)).write_bytes(data)
 
 
 def open_standard_streams() -> None:

@@ -107,6 +107,7 @@ class EffortAction:
         *,
         hold_efforts: Efforts | None = None,
         max_age: Callable[[], float] = lambda: math.inf,
+        check: Callable[[Any], None] = lambda _: None,
     ) -> None:
         """Serve ``~/follow_joint_trajectory``.
 
@@ -117,10 +118,12 @@ class EffortAction:
             that is not known.
         :param hold: whether hold points are sent. ``hold_efforts``: as ``efforts``, for them.
         :param max_age: of the controller's feedback where ``place`` knows nothing, s.
+        :param check: rejects a malformed JointTrajectory at once; raises MessageError.
         """
         self._node, self._controller, self._efforts = node, controller, efforts
         self._place, self._max_age, self._hold = place, max_age, hold
         self._hold_efforts = hold_efforts or efforts
+        self._check = check
         self._client = ActionClient(node, FollowJointTrajectory, controller)
         self._ping = node.create_client(CancelGoal, f"{controller}/_action/cancel_goal")
         self._goals: dict[bytes, _Goal] = {}
@@ -137,10 +140,21 @@ class EffortAction:
             FollowJointTrajectory,
             NAME,
             execute_callback=self._never_begun,
-            goal_callback=lambda _: GoalResponse.ACCEPT if node.active else GoalResponse.REJECT,
+            goal_callback=self._judge,
             handle_accepted_callback=self._accepted,
             cancel_callback=self._cancel,
         )
+
+    def _judge(self, request: Any) -> GoalResponse:
+        """Accept a goal, unless the node is inactive or the trajectory malformed."""
+        if not self._node.active:
+            return GoalResponse.REJECT
+        try:
+            self._check(request.trajectory)
+        except MessageError as error:
+            self._node.log_throttled(NAME, f"{NAME}: rejected a goal, {error.reason}: {error}")
+            return GoalResponse.REJECT
+        return GoalResponse.ACCEPT
 
     def deactivated(self) -> None:
         """The node answers nothing more: goals that wait for their efforts end here.

@@ -236,6 +236,7 @@ class DeltaDynamics(TwinNode):
                 trajectory, self.now(), holding=True
             ),
             max_age=lambda: self.core.settings.stale_after,
+            check=self.core.check_shape,
         )
 
     def _place(self) -> dict[str, float] | None:

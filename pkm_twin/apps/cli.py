@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""The command ``pkm-twin``. Exit codes: 0 good, 1 rejected, 2 usage, 3 damaged file."""
+"""The command ``pkm-twin``. Exit codes: 0 good, 1 rejected, 2 usage, 3 damaged, 4 no verdict."""
 
 import gc
 import sys
@@ -48,7 +48,8 @@ def _application(
     monitor-torques and view --live need ROS.
 
     Exit codes: 0 good, 1 bad or invalid, 2 wrong usage, 3 damaged file (`recover` can save a
-    part). An error is one line on stderr. Results go to stdout, with --json as JSON only.
+    part), 4 not judged (`check`). An error is one line on stderr. Results go to stdout, with --json
+    as JSON only.
     """
     greet(context)
 

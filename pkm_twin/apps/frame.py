@@ -176,24 +176,33 @@ def execute(command: Command, name: str, given: Any, as_json: bool) -> None:
             raise
         raise typer.BadParameter(f"--{str(error).removeprefix('--')}") from None
     if hasattr(given, "drawing"):
-        report = _drawn(report, drawing)
+        report = _drawn(report, drawing, getattr(given, "overwrite", True))
     present(report, as_json, piped=piped)
     if report.exit_code:
         raise typer.Exit(report.exit_code)
 
 
-def _drawn(report: Report, drawing: Path | None) -> Report:
-    """Write the pictures of a report; the first is its ``picture``, ``pictures`` are all."""
+def _drawn(report: Report, drawing: Path | None, overwrite: bool) -> Report:
+    """Write the pictures of a report; the first is its ``picture``, ``pictures`` are all.
+
+    :raises PkmTwinError: one of them exists and ``overwrite`` is false: none is written.
+    """
     from pkm_twin.report import plots
 
     if drawing is not None and str(drawing) == STANDARD and len(report.figures) != 1:
         what = f"a file's name, for {len(report.figures)} pictures"
         raise ParameterError("--picture", STANDARD, what)
-    written = []
+    targets: dict[Path, Any] = {}
     for suffix, figure in report.figures.items() if drawing is not None else ():
         assert drawing is not None  # noqa: S101  the loop is empty without
         ending = re.sub(r"[^A-Za-z0-9_.-]+", "_", f"_{suffix}" if suffix else "")
-        written.append(plots.save(figure(), drawing.with_stem(f"{drawing.stem}{ending}")))
+        targets[drawing.with_stem(f"{drawing.stem}{ending}")] = figure
+    there = [str(target) for target in targets if os.path.lexists(target)]
+    if len(there) > 1 and not overwrite:
+        raise PkmTwinError(f"{', '.join(there)} exist; use --overwrite to replace them")
+    for target in targets:
+        refuse_existing(target, overwrite)
+    written = [plots.save(figure(), target) for target, figure in targets.items()]
     files = [*written, *(path for name, path in report.files.items() if name == "page" and path)]
     return dataclasses.replace(
         report,

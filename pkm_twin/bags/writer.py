@@ -10,8 +10,8 @@ import os
 import queue
 import threading
 import time
-from collections.abc import Callable, Mapping
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import TracebackType
 from typing import IO, Any, Self, cast
@@ -23,7 +23,7 @@ from pkm_twin.bags.cdr import MessageCodec
 from pkm_twin.bags.definitions import live_type_name, message_definition
 from pkm_twin.bags.format import FREE_BYTES, MAX_CHUNK_BYTES, METADATA_CRC, metadata_crc
 from pkm_twin.errors import BagError
-from pkm_twin.files import require_replaceable
+from pkm_twin.files import replacing, require_replaceable
 
 LIBRARY = "pkm_twin"
 """What the header of our own bags says wrote them."""
@@ -336,3 +336,28 @@ class BagWriter:
             job()
             if due is None and self._period is not None:
                 due = time.monotonic() + self._period
+
+
+@contextmanager
+def whole_bag(
+    path: Path, overwrite: bool, metadata: Mapping[str, Mapping[str, str]]
+) -> Iterator[BagWriter]:
+    """Write a bag that is made at once: it has its name only when it is complete.
+
+    :raises BagError: the file exists and ``overwrite`` is false, or it cannot be written.
+    """
+    refuse_existing(path, overwrite)
+    try:
+        with (
+            replacing(path) as hidden,
+            BagWriter(hidden, metadata=metadata, flush_period=None) as writer,
+        ):
+            yield writer
+    except OSError as error:
+        raise write_error(error, path) from error
+    except BagError as error:
+        # Of the hidden name nobody knows.
+        if error.path is None or error.path == path:
+            raise
+        text = str(error).removeprefix(f"{error.path}: ")
+        raise BagError(text, path=path, reason=error.reason) from error

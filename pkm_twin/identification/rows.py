@@ -295,7 +295,7 @@ def _signals(
     )
     noise = noise_of(left, shaken, longest.period, how)
     size = np.sqrt(np.mean(np.concatenate([track.effort for track in tracks]) ** 2, 0))
-    rings = resonances_of(left, longest.wrench, longest.period, how, size)
+    rings = resonances_of(left, longest.period, how, size, longest.wrench)
     rate = 1.0 / (longest.period * how.keep_every)
     missed, load = (np.moveaxis(f[name], -1, 0) for name in ("missed", "load"))
     return Signals(

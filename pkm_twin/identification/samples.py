@@ -220,6 +220,8 @@ def tracks(
     """
     wrench = np.zeros((len(time), 6)) if wrench is None else wrench
     held = np.ones(len(time)) if held is None else held
+    if len(time) < 2:
+        return [], Filtering(0, (), None, 1)
     period = float(np.median(np.diff(time)))
     pieces = even_pieces(time, [q, effort, wrench, held, *(rates or ())], least)
     if not pieces:
@@ -395,23 +397,26 @@ def noise_of(residual: Sequence[Array], shaken: Array, period: float, how: Filte
 
 
 def resonances_of(
-    residual: Sequence[Array], wrench: Array, period: float, how: Filtering, size: Array
+    residual: Sequence[Array],
+    period: float,
+    how: Filtering,
+    size: Array,
+    wrench: Array | None = None,
 ) -> tuple[Resonance, ...]:
     """Find the lowest clear peak above the motion's band of each joint's residual, if any.
 
     A frequency at which the measured wrench has a peak, too, is that of a force on the platform,
     such as a cutter's, and no drive's.
 
-    :param residual: measured less fitted, every sample, (samples, n) by piece. ``wrench``: of the
-        longest piece, (samples, 6). ``size``: RMS of the measured efforts, (n,): a peak below
-        :data:`EXACT` of it is rounding.
+    :param residual: measured less fitted, every sample, (samples, n) by piece. ``size``: RMS of
+        the measured efforts, (n,): a peak below :data:`EXACT` of it is rounding. ``wrench``: of the
+        longest piece, (samples, 6), where it is measured.
     """
     whole, rate = max(residual, key=len), 1.0 / period
     segment = min(RESOLVED, len(whole) // 4)
     if segment < 64:
         return ()
     frequency, density = _spectrum([whole], rate, segment)
-    _, forces = _spectrum([wrench], rate, segment)
     # Segments overlap by half, with a Hann window: so many independent ones.
     freedoms = 2.0 * 0.95 * max(1.0, 2.0 * len(whole) / segment - 1.0)
     begin = UNFILTERED * rate if how.cutoff is None else PASSED * how.cutoff
@@ -429,7 +434,8 @@ def resonances_of(
         return ground, ratio, chance
 
     forced = np.zeros(len(inside), np.bool_)
-    for own in forces[inside].T:
+    forces = () if wrench is None else _spectrum([wrench], rate, segment)[1][inside].T
+    for own in forces:
         _, ratio, chance = stand_out(own)
         forced |= (chance < LIKELY) & (ratio > PEAK)
     # The residual's peak may be a frequency of the spectrum beside the wrench's.

@@ -248,19 +248,7 @@ class JointReader:
         """
         given = message if isinstance(message, TrajectoryFields) else None
         names = given.names if given else tuple(message.joint_names)
-        points = given.times.shape[1] if given else len(message.points)
-        if not names or not points:
-            raise MessageError("empty", f"{len(names)} joint names and {points} points")
-        if points > MAX_POINTS:
-            raise MessageError("bounds", f"{points} points, at most {MAX_POINTS}")
-        unknown = [name for name in names if name not in self._names]
-        if unknown and self.extra_joints == "refuse":
-            raise MessageError(
-                "unknown joint",
-                f"joint {shown(unknown[0])} is not one of {', '.join(self._names)}; "
-                "set extra_joints to zero for joints that the model lacks",
-            )
-        index = self._match(names)
+        index = self._match_points(names, given.times.shape[1] if given else len(message.points))
         fields = given or TrajectoryFields.of(message)
         stamp = stamp_of(fields.header)
         nanoseconds = _times_from_start(fields.times)
@@ -283,6 +271,35 @@ class JointReader:
             tuple(self._names.index(n) if n in self._names else -1 for n in names),
             self._columns("effort", fields, index, self._effort) if self.with_effort else None,
         )
+
+    def check_shape(self, message: Any) -> None:
+        """Check a trajectory's joint names, and the lengths of its first and last point.
+
+        :raises MessageError: what :meth:`trajectory` rejects of these, however many points it has.
+        """
+        names, points = tuple(message.joint_names), message.points
+        self._match_points(names, len(points))
+        for point in (points[0], points[-1]):
+            for what in COLUMNS:
+                count = len(getattr(point, what))
+                if count != len(names) and (count or what == "positions"):
+                    text = f"{count} {what} for {len(names)} joints"
+                    raise MessageError("length" if count else "empty", text)
+
+    def _match_points(self, names: tuple[str, ...], points: int) -> list[int]:
+        """Return where each of the robot's joints stands among a trajectory's names."""
+        if not names or not points:
+            raise MessageError("empty", f"{len(names)} joint names and {points} points")
+        if points > MAX_POINTS:
+            raise MessageError("bounds", f"{points} points, at most {MAX_POINTS}")
+        unknown = [name for name in names if name not in self._names]
+        if unknown and self.extra_joints == "refuse":
+            raise MessageError(
+                "unknown joint",
+                f"joint {shown(unknown[0])} is not one of {', '.join(self._names)}; "
+                "set extra_joints to zero for joints that the model lacks",
+            )
+        return self._match(names)
 
     def check_derived(self, qd: Array, qdd: Array) -> None:
         """Differentiated rates and accelerations keep the bounds of measured ones, (..., n)."""

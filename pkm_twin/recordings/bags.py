@@ -12,8 +12,9 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pkm_twin.bags.reader import Bag, BagWriter, open_bag
+from pkm_twin.bags.reader import Bag, open_bag
 from pkm_twin.bags.storage import METADATA_FILE
+from pkm_twin.bags.writer import whole_bag
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import BagError, MessageError, ParameterError, one_line
 from pkm_twin.mechanisms.catalogue import load, robot_names
@@ -337,7 +338,7 @@ def write_motion(
     }
     told = {**facts, **origin_facts(r.robot, r.load)}
     metadata = {"pkm_twin": {key: str(value) for key, value in told.items()}}
-    with BagWriter(path, overwrite=overwrite, metadata=metadata, flush_period=None) as bag:
+    with whole_bag(path, overwrite, metadata) as bag:
         bag.add_topic(TOPIC, TRAJECTORY, definition=DEFINITIONS[TRAJECTORY])
         bag.write(TOPIC, message, 0)
 

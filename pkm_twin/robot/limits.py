@@ -22,7 +22,7 @@ OPTION = "--beyond-limits"
 
 @dataclass(frozen=True)
 class Beyond:
-    """A joint's position or velocity outside its range: the farthest of a motion.
+    """A joint's position, velocity or effort outside its range: the farthest of a motion.
 
     ``index`` is its sample, None of a single joint state.
     """
@@ -56,15 +56,14 @@ def ranges(robot: Robot) -> Iterator[tuple[str, Array, Array, list[str]]]:
 
 
 def beyond_limits(
-    robot: Robot, q: ArrayLike, qd: ArrayLike | None = None
+    robot: Robot, q: ArrayLike, qd: ArrayLike | None = None, effort: ArrayLike | None = None
 ) -> tuple[NDArray[np.bool_], list[Beyond]]:
     """Which joint states are outside the limits, shape (...), and the farthest of each joint.
 
-    q, qd: shape (..., n), rad or m and per s; at most one leading axis.
+    q, qd, effort: shape (..., n), rad or m, per s, N m or N; at most one leading axis.
     """
-    values = {"position": np.asarray(q, np.float64)}
-    if qd is not None:
-        values["velocity"] = np.asarray(qd, np.float64)
+    given = {"position": q, "velocity": qd, "effort": effort}
+    values = {k: np.asarray(v, np.float64) for k, v in given.items() if v is not None}
     single = values["position"].ndim == 1
     outside = np.zeros(values["position"].shape[:-1], np.bool_)
     found = []
@@ -130,7 +129,8 @@ def refuse_beyond(found: list[Beyond], where: str = "") -> None:
         return
     first = found[0]
     at = "" if first.index is None else f" at sample {first.index}"
-    others = f" ({len(found) - 1} more)" if len(found) > 1 else ""
+    more = len(found) - 1
+    others = f" (and {more} more joint limit{'s' * (more > 1)})" if more else ""
     raise ParameterError(
         f"{where}{': ' if where else ''}{first.joint}.{first.quantity}{at}",
         round(first.value, 9),

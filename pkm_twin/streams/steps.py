@@ -309,8 +309,10 @@ class Sampling:
 def sampling_of(time: Array) -> Sampling:
     """The period of the samples and how many are missing.
 
-    :param time: rising, shape (k,), k 2 or more, s.
+    :param time: rising, shape (k,), s.
     """
+    if len(time) < 2:
+        return Sampling(0.0, len(time), 0)
     spans = np.diff(time)
     short = spans[spans <= 1.5 * np.quantile(spans, 0.1)]
     period = float(np.median(short))

@@ -12,9 +12,10 @@ from delta_dynamics import inverse_dynamics
 from pkm_twin.apps.commands.excite import LARGE, Excite, excite
 from pkm_twin.bags.reader import open_bag
 from pkm_twin.identification.identifiable import identifiable
+from pkm_twin.identification.samples import Filtering, resonances_of
 from pkm_twin.mechanisms.entries import robot_text
 from stiffness_monitor import compliance
-from test.commands.conftest import DELTA, STIFFNESS, rewrite
+from test.commands.conftest import DELTA, MILLING, STIFFNESS, rewrite
 from test.laws.recordings import smooth_motion
 from test.support.robots import load, parameters_of
 from test.support.tables import of_joints, read_columns, write_columns
@@ -201,3 +202,33 @@ def test_numbers_that_are_no_recording_of_this_machine(
         done = twin(*line, "--beyond-limits", "--accept", "--no-report", "--json")
         # Marked, or not reachable there at all: what moves so is no machine of this file.
         assert "beyond limits" in done.out or "unreachable" in done.err
+
+
+@pytest.mark.parametrize("rows", [1, 2, 3])
+def test_a_table_of_few_rows_is_too_short_in_a_line(twin, tmp_path, rows):
+    columns = read_columns(table(tmp_path / "plain.csv", load("five_bar"), 3.0))
+    few = write_columns(tmp_path / "few.csv", {n: v[:rows] for n, v in columns.items()})
+    assert "too short" in twin.refused("fit", "five_bar", few, "--out", tmp_path / "out.yaml")
+    assert twin("check", few, "--robot", "five_bar").code == 4
+
+
+def test_values_that_predict_the_held_out_part_worse_are_not_written(twin, tmp_path):
+    """The shipped file explains the shipped recording, whose line at 47 Hz is the cutter's."""
+    out = tmp_path / "out.yaml"
+    line = "fit", "prru", MILLING, "--out", out, "--no-report"
+    assert "worse" in twin.refused(*line)
+    assert not out.exists()
+    data = twin.told(*line, "--accept")
+    assert out.exists() and "worse" in out.read_text()
+    assert not [one for one in data["verdict"]["findings"] if "resonance" in one["kind"]]
+
+
+@pytest.mark.parametrize("forced", [True, False])
+def test_a_line_of_the_measured_wrench_is_no_drive_s_resonance(forced, rng):
+    time, how = np.arange(8192) / 1000.0, Filtering(9, (), 5.0, 1)
+    line = np.sin(2.0 * np.pi * 47.3 * time)
+    residual = line[:, None] * [1.0, 0.0] + 0.1 * rng.normal(size=(len(time), 2))
+    wrench = rng.normal(size=(len(time), 6))
+    wrench[:, 1] += 30.0 * line * forced
+    found = resonances_of([residual], 1e-3, how, np.ones(2), wrench)
+    assert [ring.joint for ring in found] == ([] if forced else [0])

@@ -14,6 +14,7 @@ from pkm_twin.bags.reader import BagWriter, open_bag
 from pkm_twin.errors import BagError
 from pkm_twin.files import replace_file, replacing
 from test.bags.test_recordings import FOLDER
+from test.commands.conftest import DELTA
 from test.commands.test_fit_compliance import SOFT, THIRD, table
 from test.support.command import forked
 from test.support.robots import load, partly_long
@@ -269,3 +270,33 @@ def test_closed_outputs_lead_nowhere(tmp_path, closed):
     )  # fmt: skip
     assert done.returncode == 10
     assert done.stdout == "" and "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        ("path", "five_bar", "--circle", "0.02", "--out", "out.mcap", "--no-picture"),
+        ("path", "five_bar", "--circle", "0.02", "--out", "out.csv", "--no-picture"),
+        ("anonymise", "BAG", "--out", "out.mcap"),
+        ("export", "c", "delta", "--out", "c"),
+        ("export", "ros2-control", "five_bar", "--out", "control"),
+    ],
+    ids=lambda line: " ".join(line[:3]),
+)
+def test_a_full_disk_leaves_no_part_under_a_final_name(line, tmp_path):
+    """Neither of a file nor of a folder's files: what is there has all of it."""
+    words = [str(DELTA) if word == "BAG" else word for word in line]
+    program = (
+        "import resource, signal, sys\nfrom pkm_twin.apps import cli\n"
+        "signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (6000, 6000))\n"
+        "cli.main(sys.argv[1:])\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program, *words], cwd=tmp_path, capture_output=True, text=True,
+        env={**os.environ, "PYTHONPATH": str(REPOSITORY)}, check=False,
+    )  # fmt: skip
+    assert done.returncode == 1, done.stderr
+    assert done.stderr.strip().splitlines()[-1].startswith("pkm-twin: ")
+    assert "Traceback" not in done.stderr and ".tmp" not in done.stderr
+    assert not [path for path in tmp_path.rglob("*") if path.is_file()]

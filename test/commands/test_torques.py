@@ -6,11 +6,12 @@ import itertools
 
 import numpy as np
 import pytest
+import yaml
 
 from delta_dynamics import inverse_dynamics, reactions
 from test.commands.conftest import DELTA, MILLING, STIFFNESS, checked, rewrite
 from test.support.command import forked
-from test.support.robots import SHIPPED, load, massless, partly_long
+from test.support.robots import SHIPPED, load, massless, parameters_of, partly_long
 from test.support.tables import joined, of_joints, read_columns, write_columns
 
 TERMS = ("gravity", "inertia", "velocity", "payload", "friction", "external")
@@ -346,3 +347,22 @@ def test_a_bag_too_short_to_differentiate(twin, tmp_path):
     bag = rewrite(DELTA, tmp_path / "short.mcap", seconds=0.004)
     line = ("torques", "delta_cu", bag, "--out", tmp_path / "t.csv")
     assert "too few joint states" in twin.refused(*line)
+
+
+def test_efforts_beyond_the_file_s_limits_are_in_the_answer(twin, tmp_path):
+    """In the first line, and in JSON, of the joints that are beyond; the table is written."""
+    data = parameters_of("delta")
+    robot, columns = load("delta"), motion("delta")
+    states = [joined(columns, robot, what) for what in ("position", "velocity", "acceleration")]
+    peaks = np.abs(inverse_dynamics(robot, *states)).max(0)
+    data["limits"]["effort"] = (peaks * [0.5, 2.0, 0.9]).tolist()
+    (tmp_path / "weak.yaml").write_text(yaml.safe_dump(data))
+    write_columns(tmp_path / "a.csv", columns)
+    line = "torques", tmp_path / "weak.yaml", tmp_path / "a.csv", "--no-picture"
+    found = twin.told(*line, "--out", tmp_path / "b.csv")["beyond_limits"]
+    assert [one.split(".")[0] for one in found] == [robot.joint_names[k] for k in (0, 2)]
+    answer = twin.good(*line, "--out", tmp_path / "c.csv").out.splitlines()[0]
+    for k, named in enumerate((True, False, True)):
+        assert (f"{robot.joint_names[k]} {peaks[k]:.4g} of" in answer) == named
+    strong = twin.told("torques", "delta", tmp_path / "a.csv", "--out", tmp_path / "d.csv")
+    assert strong["beyond_limits"] == []

@@ -69,6 +69,16 @@ def test_a_map_to_pictures_and_shown_again(call, tmp_path):
     told = json.loads(call("atlas", "show", "a.nc", "--out", "b", "--html", "--json").out)
     assert all((tmp_path / name).exists() for name in told["pictures"])
     assert "Plotly" in (tmp_path / "b.html").read_text()
+    made = {name: (tmp_path / name).read_bytes() for name in (*told["pictures"], "b.html")}
+    for name in made:
+        (tmp_path / name).write_bytes(b"mine")
+        for other in made:
+            if other != name:
+                (tmp_path / other).unlink(missing_ok=True)
+        assert name in call("map", "show", "a.nc", "--out", "b", "--html", code=1).err
+        assert (tmp_path / name).read_bytes() == b"mine"
+        call("map", "show", "a.nc", "--out", "b", "--html", "--overwrite")
+        assert (tmp_path / name).read_bytes() != b"mine"
 
 
 @pytest.mark.usefixtures("short")

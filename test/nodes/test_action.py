@@ -115,13 +115,32 @@ def test_a_cancelled_goal_is_cancelled_at_the_controller(client, controller):
     assert client.ended()[0] == GoalStatus.STATUS_CANCELED
 
 
-def test_what_the_twin_refuses_never_reaches_the_controller(client, controller):
-    before = len(controller.goals)
-    client.send(trajectory(names=("arm_1", "arm_2", "wrist")))
+@pytest.mark.parametrize("spoil", ["another joint", "a length", "no points", "no positions"])
+def test_a_malformed_goal_is_rejected_and_never_reaches_the_controller(client, controller, spoil):
+    before, message = len(controller.goals), trajectory()
+    if spoil == "another joint":
+        message.joint_names[2] = "wrist"
+    elif spoil == "no points":
+        message.points = []
+    for point in message.points[-1:]:
+        point.velocities = point.velocities[:2] if spoil == "a length" else point.velocities
+        point.positions = [] if spoil == "no positions" else point.positions
+    client.peer.until(client.client.server_is_ready)
+    goal = FollowJointTrajectory.Goal(trajectory=message)
+    sent = client.client.send_goal_async(goal)
+    client.peer.until(sent.done)
+    assert not sent.result().accepted
+    assert len(controller.goals) == before
+
+
+def test_what_the_twin_refuses_of_a_well_formed_goal_is_aborted_with_the_reason(client, controller):
+    before, message = len(controller.goals), trajectory()
+    message.points[1].positions[0] = 9.0
+    client.send(message)
     status, result = client.ended()
     assert status == GoalStatus.STATUS_ABORTED
     assert result.error_code == FollowJointTrajectory.Result.INVALID_GOAL
-    assert "rejected the trajectory, unknown joint" in result.error_string
+    assert "rejected the trajectory, limit" in result.error_string
     assert len(controller.goals) == before
 
 

@@ -13,6 +13,9 @@ from test.nodes.harness import SECOND, Maker, Plain
 
 pytest.importorskip("rclpy", exc_type=ImportError)
 
+from delta_dynamics.feedforward import Feedforward, Settings
+from test.support.robots import load
+
 UNKNOWN, SUCCEEDED, CANCELED, ABORTED = 0, 4, 5, 6
 POINTS = 600
 NOW = 1000 * SECOND
@@ -400,3 +403,42 @@ def test_efforts_are_written_into_a_goal_in_slices(action):
     assert action.node.slices >= POINTS // 256
     assert all(point.effort == [5.0] * 2 for point in goal.request.trajectory.points)
     assert action.controller.sent == [goal.request]
+
+
+def test_a_malformed_goal_is_rejected_before_it_is_accepted(action):
+    """By what the node's core says of its shape; and every goal while the node is inactive."""
+    robot = load("delta")
+    core = Feedforward(robot, Settings())
+    served = action.code.EffortAction(
+        action.node, "/controller", None, lambda: None, True, check=core.check_shape
+    )
+    make, accept, reject = (
+        Maker(Plain()),
+        action.code.GoalResponse.ACCEPT,
+        action.code.GoalResponse.REJECT,
+    )
+    q = np.tile(robot.inverse(robot.home()), (3, 1))
+    times = [0, SECOND, 2 * SECOND]
+
+    def judge(**changes):
+        given = {"names": robot.joint_names, "times": times, "q": q, "qd": 0 * q, "qdd": 0 * q}
+        given |= changes
+        message = make.trajectory(*given.values())
+        return served._judge(SimpleNamespace(trajectory=message)), message
+
+    action.node.active = True
+    assert judge()[0] == accept
+    bad = (
+        {"names": ("arm_1", "arm_2", "wrist")}, {"names": ("arm_1", "arm_2", "arm_2")},
+        {"names": ("arm_1", "arm_2")}, {"names": ()},
+        {"times": []} | dict.fromkeys(("q", "qd", "qdd"), q[:0]),
+        {"q": q[:, :2]}, {"q": q[:, :0]}, {"qd": q[:, :2]}, {"qdd": q[:, :1]},
+    )  # fmt: skip
+    for changes in bad:
+        verdict, message = judge(**changes)
+        assert verdict == reject, changes
+        with pytest.raises(MessageError):
+            core.trajectory(message, 0)
+    assert len(action.node.said) == len(bad)
+    action.node.active = False
+    assert judge()[0] == reject

@@ -12,7 +12,7 @@ from pkm_twin.apps.frame import Group, command
 from pkm_twin.apps.options import OfRobot, Overwrites
 from pkm_twin.console import refuse_existing, tell
 from pkm_twin.errors import ParameterError
-from pkm_twin.files import replace_file
+from pkm_twin.files import replace_file, replace_files
 from pkm_twin.report import Fact, Report
 from pkm_twin.robot.printers import Firmware, printer_of, written
 from pkm_twin.settings import setting
@@ -30,8 +30,8 @@ class ToFolder(OfRobot, Overwrites):
         for path in paths:
             path.parent.mkdir(parents=True, exist_ok=True)
             refuse_existing(path, self.overwrite)
-        for path, text in zip(paths, files.values(), strict=True):
-            replace_file(path, text.encode())
+        texts = (text.encode() for text in files.values())
+        replace_files(dict(zip(paths, texts, strict=True)))
         written = list(map(str, paths))
         return Report(f"{self.out}: {len(written)} files", [Fact("files", written)], notes=written)
 

@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, get_type_hints
 
 from pkm_twin.apps.frame import Command, Group, command
-from pkm_twin.apps.options import Carries, Draws, OfMilling, OfTool, Parallel, Writes
-from pkm_twin.console import numbers, progress
+from pkm_twin.apps.options import Carries, Draws, OfMilling, OfTool, Overwrites, Parallel, Writes
+from pkm_twin.console import numbers, progress, refuse_existing
 from pkm_twin.errors import ParameterError
 from pkm_twin.files import replace_file
 from pkm_twin.maps.kinds import KINDS
@@ -109,7 +109,7 @@ class Loads:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Show(Pages):
+class Show(Pages, Overwrites):
     """Plot a stored map: PNGs, and with --html an offline interactive HTML page."""
 
     file: Path = setting(..., "a file that `pkm-twin map` wrote", argument=True)
@@ -122,7 +122,7 @@ class Show(Pages):
 
 def show(given: Show) -> Report:
     """What a stored map answers, with its pictures."""
-    return stored(given.file, given.drawing(""), given.html)
+    return stored(given.file, given.drawing(""), given.html, given.overwrite)
 
 
 def compute(given: OfMap) -> Report:
@@ -157,13 +157,14 @@ def compute(given: OfMap) -> Report:
         except KeyboardInterrupt:
             kept = f"stopped; finished parts are in {target}.parts, the same command continues"
             return Report(error=f"{kept} from there", code=INTERRUPTED)
-    return stored(target, given.drawing(""), given.html)
+    return stored(target, given.drawing(""), given.html, given.overwrite)
 
 
-def stored(file: Path, drawing: Path | None, html: bool) -> Report:
-    """What a stored map answers.
+def stored(file: Path, drawing: Path | None, html: bool, overwrite: bool) -> Report:
+    """Report what a stored map answers.
 
     :param drawing: the pictures' common name; None for none.
+    :raises PkmTwinError: the page exists and ``overwrite`` is false.
     """
     from pkm_twin.maps import figures
     from pkm_twin.maps.page import write_page
@@ -182,7 +183,9 @@ def stored(file: Path, drawing: Path | None, html: bool) -> Report:
         drawn = {} if drawing is None else figures.draw(data)
         page = None
         if html:
-            page = write_page(data, (drawing or file).with_suffix(".html"))
+            page = (drawing or file).with_suffix(".html")
+            refuse_existing(page, overwrite)
+            write_page(data, page)
         pictures = {name: lambda one=one: one for name, one in drawn.items()}
         return Report(
             first, facts, figures=pictures, notes=rest, files={"file": file, "page": page}

@@ -90,6 +90,7 @@ def torques(given: Torques) -> Report:
     """Peak and RMS effort of each joint, and the table."""
     from pkm_twin.paths.along import torque_table
     from pkm_twin.paths.sizing import integral
+    from pkm_twin.robot.limits import beyond_limits
 
     if given.out is not None:
         check_target(given.out)
@@ -110,6 +111,10 @@ def torques(given: Torques) -> Report:
         with writing(given.out):
             write_table(columns, given.out)
     robot, time = motion.robot, columns["time"]
+    efforts = np.stack([columns[f"{joint}.effort"] for joint in robot.joint_names], -1)
+    _, over = beyond_limits(robot, motion.q, effort=efforts)
+    over = [one for one in over if one.quantity == "effort"]
+    beyond += over
     units = dict(zip(robot.joint_names, robot.effort_units, strict=True))
     rows: dict[str, list[Any]] = {}
     for joint, unit in units.items():
@@ -134,6 +139,9 @@ def torques(given: Torques) -> Report:
         shown = [Column(name) for name in ("effort", "unit", *RESTING)]
         terms = {joint: [columns[f"{joint}.effort_{t}"].item() for t in RESTING] for joint in rows}
         rows = {joint: [rows[joint][1], units[joint], *terms[joint]] for joint in rows}
+    if over:
+        bounds = (f"{one.joint} {abs(one.value):.4g} of {one.high:g} {one.unit}" for one in over)
+        answer += f"; beyond the file's limits: {', '.join(bounds)}"
     return Report(
         answer,
         [
@@ -148,7 +156,7 @@ def torques(given: Torques) -> Report:
         notes=[
             *([f"table: {len(time)} rows, {len(columns)} columns"] if given.out else []),
             *motion.notes,
-            *(f"beyond limits: {item}" for item in beyond),
+            *(f"beyond limits: {item}" for item in beyond if item not in over),
         ],
         files={"out": given.out},
     )  # fmt: skip
