@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 
 from delta_dynamics.torques.elastic_reactions import elastic_reactions
 from pkm_twin.codegen.arrays import Array
-from pkm_twin.errors import ParameterError
+from pkm_twin.errors import ParameterError, warn
 from pkm_twin.files import replacing
 from pkm_twin.machine import schema
 from pkm_twin.machine.graph import BASE, Joint
@@ -310,18 +310,34 @@ def _swung(home: Array, now: Array) -> Array:
     return np.asarray(np.eye(3) + cross + cross @ cross / (1.0 + cosine)[:, None, None], np.float64)
 
 
-def read_bearings(path: Path, names: tuple[str, ...]) -> dict[str, BearingSpec]:
-    """Bearings by joint, of a YAML with a mapping ``bearings`` of names to data; * stands for any.
+def read_bearings(path: Path, names: tuple[str, ...], robot: Robot) -> dict[str, BearingSpec]:
+    """Read bearings by joint from a YAML with a mapping ``bearings`` of names to data.
 
-    :raises ParameterError: by the field; a name that no joint has.
+    A * in a name stands for any text; joints of such a name that the bearing does not fit are left
+    out, with a warning that names them.
+
+    :raises ParameterError: by the field; a name that no joint has, or a bearing that fits none.
     """
     found: dict[str, BearingSpec] = {}
+    joints = by_label(robot)
     for pattern, entry in read_entries(path, "bearings", "joints").items():
         fitting = fnmatch.filter(names, str(pattern))
         if not fitting:
-            raise ParameterError(f"{path}: bearings", pattern, f"of {', '.join(names)}")
+            raise ParameterError(
+                f"{path}: bearings", f"{pattern} matches no joint", f"of {', '.join(names)}"
+            )
         spec = schema.build(BearingSpec, entry, f"{path}: bearings.{pattern}")
-        found |= dict.fromkeys(fitting, spec)
+        left = {}
+        for name in fitting:
+            try:
+                bearing_axis(joints.get(name), name, spec)
+                found[name] = spec
+            except ParameterError as error:
+                left[name] = error
+        if left and (len(left) == len(fitting) or str(pattern) in names):
+            raise next(iter(left.values()))
+        if left:
+            warn(path, f"{path}: bearings.{pattern} does not fit {', '.join(left)}: no life there")
     return found
 
 
@@ -408,7 +424,7 @@ def summaries(
         for block in joint_loads(motion):
             if not result:
                 names = tuple(load.name for load in block)
-                fitted = {} if bearings is None else read_bearings(bearings, names)
+                fitted = {} if bearings is None else read_bearings(bearings, names, motion.robot)
                 result = [Summary(motion.robot, name, fitted.get(name)) for name in names]
                 if writer is not None:
                     writer.writerow(["time", *(f"{n}.{axis}" for n in names for axis in AXES)])

@@ -69,15 +69,25 @@ class Duty:
         return self.work - self.returned
 
     @classmethod
-    def of(cls, time: Array, effort: Array, rate: Array) -> Duty:
-        """Of a motion's samples (k,), by trapezoids."""
+    def of(cls, time: Array, effort: Array, rate: Array, net: Array) -> Duty:
+        """Integrate a motion's samples (k,) by trapezoids.
+
+        :param net: energy given in each interval less what comes back, shape (k - 1,), J. Where an
+            effort steps between two samples, trapezoids alone would not conserve energy.
+        """
         power = effort * rate
         whole = float(time[-1] - time[0])
+        given, back = (_areas(time, np.maximum(side * power, 0.0)) for side in (1.0, -1.0))
+        less = net < given - back
+        given, back = (
+            np.where(less, np.maximum(net + back, 0.0), np.maximum(given, net)),
+            np.where(less, np.maximum(back, -net), np.maximum(given - net, 0.0)),
+        )
         return cls(
             float(np.abs(effort).max()), rms(time, effort),
             float(np.abs(rate).max()), integral(time, np.abs(rate)) / whole,
             max(0.0, float(power.max())), max(0.0, -float(power.min())),
-            integral(time, np.maximum(power, 0.0)), integral(time, np.maximum(-power, 0.0)),
+            float(given.sum()), float(back.sum()),
         )  # fmt: skip
 
     def as_json(self, slides: bool) -> dict[str, float]:
@@ -92,8 +102,13 @@ class Duty:
 
 
 def integral(time: Array, values: Array) -> float:
-    """Trapezoids under values (k,) at times (k,)."""
-    return float(np.sum(0.5 * np.diff(time) * (values[:-1] + values[1:])))
+    """Integrate values (k,) at times (k,) by trapezoids."""
+    return float(_areas(time, values).sum())
+
+
+def _areas(time: Array, values: Array) -> Array:
+    """Return the trapezoid under each interval of values (k,), shape (k - 1,)."""
+    return np.asarray(0.5 * np.diff(time) * (values[:-1] + values[1:]), np.float64)
 
 
 @dataclass(frozen=True, eq=False)
@@ -417,23 +432,35 @@ def size_drives(
     if len(time) < LEAST:
         raise ParameterError("motion", f"{len(time)} samples", f"{LEAST} or more")
     loaded = by_load(robot, motion.load, time, BLOCK)
-    inertias = [mass_matrix(one, q[rows]) for one, rows in loaded]
-    masses = np.diagonal(np.concatenate(inertias), axis1=-2, axis2=-1)
+    inertias = np.concatenate([mass_matrix(one, q[rows]) for one, rows in loaded])
+    masses = np.diagonal(inertias, axis1=-2, axis2=-1)
+    # Positions and rates at an interval's ends give its exact mean rate and acceleration.
+    step, mean = np.diff(time)[:, None], 0.5 * (qd[:-1] + qd[1:])
+    change = np.diff(qd, axis=0) / step
+    middle = 0.5 * (inertias[:-1] + inertias[1:])
+    rest = effort - np.einsum("kij,kj->ki", inertias, qdd)
+    net = 0.5 * (rest[:-1] + rest[1:]) * np.diff(q, axis=0)
+    net = net + np.einsum("kij,kj->ki", middle, change) * mean * step
     duties, axes = [], []
     for i, (joint, own) in enumerate(zip(robot.joint_names, robot.drives, strict=True)):
         slides = robot.joint_units[i] == "m"
         rotor = robot.graph.joints[joint].rotor_inertia
         load = masses[:, i] - rotor
         span = (float(load.min()), float(load.max()))
-        duty = DriveDuty(joint, slides, Duty.of(time, effort[:, i], qd[:, i]), span)
+        duty = DriveDuty(joint, slides, Duty.of(time, effort[:, i], qd[:, i], net[:, i]), span)
         axis = _Axis(time, qd[:, i], qdd[:, i], effort[:, i] - rotor * qdd[:, i], span[1])
         drive = own if not given else _drive(joint, slides, rotor, own, given)
         if drive is not None:
             torques = axis.torques(drive.inertia, drive)
             speeds = drive.turns * axis.qd
+            losses = 0.5 * (axis.losses(drive)[:-1] + axis.losses(drive)[1:])
+            turning = (change * mean * step)[:, i]
+            own_net = drive.inertia * drive.turns**2 * turning
+            own_net = own_net + (net[:, i] - rotor * turning) * losses
             ratio = span[1] / drive.turns**2 / drive.inertia if drive.inertia > 0.0 else None
             duty = replace(
-                duty, drive=drive, at_motor=Duty.of(time, torques, speeds), inertia_ratio=ratio,
+                duty, drive=drive, at_motor=Duty.of(time, torques, speeds, own_net),
+                inertia_ratio=ratio,
                 torques=torques, speeds=speeds,
             )  # fmt: skip
         duties.append(duty)
@@ -495,9 +522,13 @@ class _Axis:
 
     def torques(self, inertia: float, drive: DriveSpec) -> Array:
         """Of the motor, shape (k,), N m, see the module; ``inertia``: at the motor, kg m2."""
-        share, turns = drive.efficiency, drive.turns
-        losses = np.where(self.through * self.qd < 0.0, share, 1.0 / share)
-        return np.asarray(inertia * turns * self.qdd + self.through * losses / turns)
+        turns = drive.turns
+        return np.asarray(inertia * turns * self.qdd + self.through * self.losses(drive) / turns)
+
+    def losses(self, drive: DriveSpec) -> Array:
+        """Return the factor by which the gear's efficiency changes the load, shape (k,)."""
+        back = self.through * self.qd < 0.0
+        return np.where(back, drive.efficiency, 1.0 / drive.efficiency)
 
     def fit(self, name: str, motor: Motor, gear: Gear) -> Fit:
         """How a motor with a gear suits the joint."""

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Final
 
@@ -15,7 +16,7 @@ from pkm_twin.errors import ParameterError
 from pkm_twin.paths.joint_path import only_turns
 from pkm_twin.robot.derivatives import joint_changes
 from pkm_twin.robot.robot import Robot
-from pkm_twin.robot.workspace import counts, try_inverse
+from pkm_twin.robot.workspace import causes, counts, try_inverse
 
 RAYS: Final = 1000
 """Rays from home on which poses of the workspace are taken."""
@@ -68,8 +69,22 @@ def workspace_poses(
     """
     least = np.zeros(robot.joints_count)
     if lever > 0.0:
-        least = lever * levers(robot, robot.inverse(_rays(robot, rays, singularity, least))).max(0)
+        largest = levers(robot, robot.inverse(_rays(robot, rays, singularity, least))).max(0)
+        home = robot.home()
+        share = levers(robot, robot.inverse(home[None]))[0] / largest
+        if share.min() < lever:
+            joint = robot.joint_names[int(share.argmin())]
+            raise ParameterError(
+                "lever", lever, f"{math.floor(100.0 * share.min()) / 100.0:g} or less: at home "
+                f"({_named(robot, home)}) the lever of {joint} is {share.min():.3g} of its largest "
+                "in the workspace",
+            )  # fmt: skip
+        least = lever * largest
     return _rays(robot, rays, singularity, least)
+
+
+def _named(robot: Robot, pose: Array) -> str:
+    return ", ".join(f"{n} {v + 0.0:.4g}" for n, v in zip(robot.pose_names, pose, strict=True))
 
 
 def levers(robot: Robot, q: Array) -> Array:
@@ -91,10 +106,9 @@ def _rays(robot: Robot, rays: int, singularity: float, least: Array) -> Array:
     # From home to the side of the box that the ray leaves it by.
     span = np.where(ways > 0.0, box[:, 1] - home, home - box[:, 0]) * ways
     if not _inside(robot, home[None], singularity, least)[0]:
-        raise ParameterError(
-            "workspace", dict(zip(robot.pose_names, home.tolist(), strict=True)),
-            "a home within the limits, clear of singularities and stretched limbs",
-        )  # fmt: skip
+        q, known = try_inverse(robot, home[None])
+        why = causes(robot, q, home[None], known, singularity, -math.inf)
+        raise ParameterError("workspace", f"home ({_named(robot, home)})", f"a home inside: {why}")
     low, high = np.zeros(len(span)), np.ones(len(span))
     for _ in range(HALVINGS):
         middle = 0.5 * (low + high)

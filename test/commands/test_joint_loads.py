@@ -9,16 +9,21 @@ import pytest
 from delta_dynamics import elastic_reactions, least_norm_reactions, reactions
 from delta_dynamics.torques.elastic_reactions import reaction_energies
 from delta_dynamics.torques.reactions import balance
+from pkm_twin.errors import ParameterError, RobotWarning
+from pkm_twin.mechanisms.catalogue import robot_of_data
 from pkm_twin.paths.joint_loads import (
     Reversals,
     Summary,
     bearing_life,
+    by_label,
     joint_loads,
     rainflow,
+    read_bearings,
     turning_points,
 )
 from pkm_twin.recordings import ReadOptions, Recording, read
 from stiffness_monitor import platform_response
+from test.machine.random_machines import plain
 from test.machine.test_helical import slide
 from test.support.robots import SHIPPED, load, partly_long, random_joints, rigid
 from test.support.tables import joined, of_joints, read_columns, write_columns
@@ -226,3 +231,18 @@ def test_a_slide_that_closes_a_loop_travels_by_the_screw_s_lead():
     motion = Recording(slide(0.02), np.arange(7.0), q, 0 * q, 0 * q)
     rail = {load.name: load for load in next(joint_loads(motion))}["rail"]
     np.testing.assert_allclose(rail.travelled, 0.01, atol=1e-12)
+
+
+def test_a_star_skips_joints_that_the_bearing_does_not_fit(tmp_path):
+    """A cylindrical joint takes no bearing; the warning names it."""
+    robot = robot_of_data(plain("rccc"), "rccc")
+    names = tuple(by_label(robot))
+    lines = "bearings: {'*': {C: 1000.0, p: 3}}"
+    (tmp_path / "b.yaml").write_text(lines)
+    left = [n for n, j in by_label(robot).items() if j.kind == "cylindrical"]
+    with pytest.warns(RobotWarning, match=", ".join(left)):
+        found = read_bearings(tmp_path / "b.yaml", names, robot)
+    assert set(found) == set(names) - set(left) and found
+    (tmp_path / "b.yaml").write_text(lines.replace("*", left[0]))
+    with pytest.raises(ParameterError, match="slides"):
+        read_bearings(tmp_path / "b.yaml", names, robot)

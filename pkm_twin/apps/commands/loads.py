@@ -27,7 +27,8 @@ if TYPE_CHECKING:
 SHOWN: Final = 6
 """Most joints in a picture."""
 UNDETERMINED: Final = (
-    "undetermined: neither rigid-body equations nor elastic members or joints determine it"
+    "undetermined: neither rigid-body equations nor elastic members or joints determine it; in a "
+    "planar linkage make one pin of a loop spherical and one cylindrical, or give compliances"
 )
 IDLE: Final = "no life, because the bearing bears a load and does not move"
 
