@@ -47,8 +47,9 @@ from stiffness_monitor.programs import Elastic
 
 
 def identifier(name: str) -> str:
-    """A robot's name as a part of a C identifier."""
-    return re.sub(r"[^A-Za-z0-9_]", "_", name) or "robot"
+    """Return a robot's name as a part of a C identifier; a letter beyond ASCII as its code."""
+    plain = "".join(c if c.isascii() else f"u{ord(c):04x}" for c in name)
+    return re.sub(r"[^A-Za-z0-9_]", "_", plain) or "robot"
 
 
 def c_package(robot: Robot) -> dict[str, str]:

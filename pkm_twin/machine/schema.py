@@ -98,9 +98,19 @@ def text(*, default: Any = MISSING, **more: Any) -> Any:
     def check(field: str, value: Any) -> str:
         if not isinstance(value, str) or not value:
             raise ParameterError(field, value, "a non-empty text")
+        _check_printable(field, value)
         return str(value)
 
     return key(check, "a non-empty text", default, **more)
+
+
+def _check_printable(field: str, name: str) -> None:
+    """Reject a name that XML, topics and tables have no place for.
+
+    :raises ParameterError: control characters, or others that cannot be printed.
+    """
+    if not name.isprintable():
+        raise ParameterError(field, name, "a name of printable characters")
 
 
 def mapping(entry: Any, *, default: Any = MISSING, **more: Any) -> Any:
@@ -116,6 +126,8 @@ def mapping(entry: Any, *, default: Any = MISSING, **more: Any) -> Any:
         named = isinstance(value, Mapping)
         if not named or not all(isinstance(name, str) and name for name in value):
             raise ParameterError(field, value, f"a mapping of names to {what}")
+        for name in value:
+            _check_printable(field, name)
         paths = {name: _join(field, name) for name in value}
         if section:
             return {name: build(entry, item, paths[name]) for name, item in value.items()}

@@ -616,6 +616,8 @@ def test_sections_that_contradict_masses_leave_elasticity_out_with_the_reason(va
 def test_names_become_identifiers():
     for name in ("my robot-2", "3rps", "größe", "a/b.c", "", "*/", "int"):
         assert re.fullmatch(r"[A-Za-z0-9_]+", identifier(name))
+    # Letters beyond ASCII tell names apart, and two packages can be linked into one program.
+    assert len({identifier(name) for name in ("é", "ü", "e", "_", "é_1", "ü_1")}) == 6
 
 
 def test_friction_laws_are_those_of_python(tmp_path, rng):
