@@ -239,9 +239,9 @@ class Frame:
             chain = self.rigid_chain
             raise ParameterError(
                 f"joints.{chain[0]}.compliance" if chain else "joints", None,
-                "a compliance of this joint: a chain of rigid bodies connects the base and the "
-                f"platform ({', '.join(chain) or 'closures'}), so the platform has directions "
-                "without compliance",
+                f"a compliance of {', '.join(chain) or 'what closes the loops'}, because these "
+                "hold the platform rigidly in some directions; in a direction that a joint holds, "
+                "for example 1e-9 m/N or 1e-7 rad/(N m)",
             )  # fmt: skip
         # First what closures let through, which is in one equation or two alone.
         weight = np.where(np.arange(PLATFORM, self.size) < self.last, 1.0, 10.0)

@@ -57,12 +57,10 @@ def info(given: Info) -> Report:
     undetermined = overconstraint(robot)
     gap = float(clearance(robot, home)) if has_clearance(robot) else None
     odd, fault = findings(robot), members_fault(robot)
-    equations = f"{engine.closures} equations of rank {engine.rank}, {engine.redundant} redundant"
+    equations = f"{engine.closures} loop equations, {engine.rank} independent"
     if engine.redundant and assumed and not undetermined:
         # A joint that stands for what several limbs hold repeats what one of them holds alone.
-        equations += (
-            f" in the model only, where joint {', '.join(assumed)} repeats constraints of the limbs"
-        )
+        equations += f"; in the model joint {', '.join(assumed)} repeats constraints of the limbs"
     sections, units = robot.parameter_sections(), robot.parameter_units()
     if robot.book.values:
         numbers = robot.file_numbers()
