@@ -40,16 +40,16 @@ class Condition:
     """One condition: ``text`` says how far it is from holding, by ``deviation`` (rad or m).
 
     ``parts``: the joints and rods. ``form``: ``"zero"``, or the product of the two sums that is
-    zero, ``"cross"`` or ``"dot"``. ``size``: of the deviation, angles and parts of the machine's
-    size alike.
+    zero, ``"cross"`` or ``"dot"``; empty where it is of no such form. ``size``: of the deviation,
+    angles and parts of the machine's size alike.
     """
 
     text: str
     parts: tuple[str, ...]
     deviation: float
     size: float
-    form: str
-    left: Sum
+    form: str = ""
+    left: Sum = ()
     right: Sum = ()
 
 

@@ -16,8 +16,8 @@ import numpy as np
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import MobilityError, ParameterError
 from pkm_twin.kinematics.conditions import Condition, Conditions
-from pkm_twin.kinematics.iterations import RANK
 from pkm_twin.kinematics.linkage import Linkage
+from pkm_twin.kinematics.rounding import repair
 from pkm_twin.kinematics.spins import idle_bodies, null
 from pkm_twin.machine.graph import Graph
 
@@ -29,8 +29,6 @@ _TRIED: Final = 40
 """Most conditions that are tried one by one."""
 _NONE: Final = 1e-6
 """Motions that are less are none."""
-_CLEAR: Final = 1e-5
-"""Singular values below this share of the greatest are those of deviations."""
 
 
 def mobility_error(linkage: Linkage, causes: Sequence[Condition] = ()) -> MobilityError:
@@ -86,11 +84,22 @@ def near_conditions(graph: Graph, freedoms: int = 0) -> list[Condition]:
                 dropped.append(condition)
         left = [c for c in missed if not any(c is d for d in dropped)]
         return sorted(left, key=lambda c: -c.size)
+    for tolerance in TOLERANCES:
+        moved = repair(graph, tolerance)
+        if moved and moved.largest < tolerance and is_right(moved.graph, freedoms):
+            return [
+                Condition(
+                    f"{name} is {size:.2g} (rad, or parts of the machine's size) from where all "
+                    "loops close in every position", (name,), size, size,
+                )
+                for name, size in sorted(moved.moves.items(), key=lambda move: -move[1])
+                if size > 0.1 * moved.largest
+            ]  # fmt: skip
     return []
 
 
 def is_right(graph: Graph | None, freedoms: int = 0) -> bool:
-    """Whether at home the actuated joints determine the machine and move independently.
+    """Whether at home the actuated joints determine the machine, and all can move.
 
     :param freedoms: whether it has as many at least, in place of that.
     """
@@ -101,14 +110,6 @@ def is_right(graph: Graph | None, freedoms: int = 0) -> bool:
         return linkage.mobility.freedoms >= freedoms
     ju, _ = linkage.scaled_at_home()
     return null(ju, _NONE).shape[1] == 0 and linkage.mobility.freedoms == linkage.joints
-
-
-def is_clear(graph: Graph) -> bool:
-    """Whether no closure at home holds by a small deviation alone, be it of rounding."""
-    both = np.hstack(Linkage(graph).scaled_at_home())
-    values = np.linalg.svd(both, compute_uv=False) if both.size else np.zeros(0)
-    share = values / max(1.0, float(values.max(initial=0.0)))
-    return not ((share > RANK) & (share < _CLEAR)).any()
 
 
 def _loose(linkage: Linkage) -> list[str]:

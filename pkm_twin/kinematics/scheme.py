@@ -31,6 +31,10 @@ from pkm_twin.machine.graph import BASE, Graph
 MOVES: Final = 1e-6
 """Motion of a drive at home, of unit one, and part of the best choice of drives, that is none."""
 
+POSE_MOVES: Final = (1e-3, 1e-6)
+"""Least motion of the platform along a pose coordinate, of unit one: more than any file's rounding,
+or, where that leaves too few coordinates, more than the computer's."""
+
 
 @dataclass(frozen=True, eq=False)
 class Closed:
@@ -241,14 +245,17 @@ def choose_coordinates(graph: Graph) -> tuple[str, ...]:
     ju, jq = (numbers(m) for m in matrices(scheme.tree, closed))
     independent = scheme.independent
     rates = np.vstack([-np.linalg.solve(ju[independent], jq[independent]), np.eye(scheme.joints)])
-    chosen: list[str] = []
-    table = np.zeros((0, scheme.joints))
     rows = numbers(scheme.pose_rows(motion, [0.0] * len(scheme.coordinates)))
-    for name, scale, row in zip(poses.COORDINATES, scheme._pose_scales, rows, strict=True):
-        extended = np.vstack([table, scale * row @ rates])
-        if np.linalg.matrix_rank(extended, 1e-6) == len(extended):
-            chosen.append(name)
-            table = extended
+    chosen: list[str] = []
+    for least in POSE_MOVES:
+        chosen, table = [], np.zeros((0, scheme.joints))
+        for name, scale, row in zip(poses.COORDINATES, scheme._pose_scales, rows, strict=True):
+            extended = np.vstack([table, scale * row @ rates])
+            if np.linalg.matrix_rank(extended, least) == len(extended):
+                chosen.append(name)
+                table = extended
+        if len(chosen) == scheme.joints:
+            break
     return tuple(chosen)
 
 

@@ -24,6 +24,10 @@ from pkm_twin.machine.urdf_xml import free_name, plain_name
 
 KINDS: Final[Mapping[str, type[JointType]]] = {**TYPES, Free.name: Free}
 """Types of joints, that of a body that closures alone hold among them."""
+ROUNDED_INERTIA: Final = 4.0
+"""How far rounding of a matrix of three rows may move a principal moment, rounding errors."""
+MAX_INERTIA_CHANGE: Final = 1e-2
+"""Part of a body's largest moment of which more is no rounding."""
 SINGLE: Final = tuple(name for name, kind in TYPES.items() if len(kind.steps) == 1)
 """Joint types of one degree of freedom."""
 
@@ -48,13 +52,30 @@ class Link:
         return Link(self.name, pose @ self.frame, self.mass, pose.point(self.com), inertia)
 
 
-def link_of(name: str, mass: float, pose: Pose, moment: Callable[[str], float]) -> Link:
-    """A link of its mass, kg, and its moments of inertia in the frame of its centre, ``ixx`` on."""
+def link_of(
+    name: str, mass: float, pose: Pose, moment: Callable[[str], float], rounding: float
+) -> Link:
+    """A link of its mass, kg, and its moments of inertia in the frame of its centre, ``ixx`` on.
+
+    ``rounding``: the largest rounding error of the file's moments of inertia, kg m2.
+    """
     if mass < 0.0:
         raise ParameterError(f"link.{name}.inertial.mass", mass, "zero or more, kg")
     xx, xy, xz, yy, yz, zz = (moment(key) for key in ("ixx", "ixy", "ixz", "iyy", "iyz", "izz"))
-    inertia = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+    inertia = _possible(np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]), rounding)
     return Link(name, pose.inverse(), mass, np.zeros(3), inertia).moved(pose)
+
+
+def _possible(inertia: Array, rounding: float) -> Array:
+    """Return the nearest inertia that a body can have, if rounding made it impossible.
+
+    Of a thin rod a second moment of mass, trace(I) / 2 - I, is zero, or by rounding less.
+    """
+    moments, axes = np.linalg.eigh(np.trace(inertia) / 2.0 * np.eye(3) - inertia)
+    if not -min(ROUNDED_INERTIA * rounding, MAX_INERTIA_CHANGE * moments[2]) <= moments[0] < 0.0:
+        return inertia
+    kept = (axes * np.maximum(moments, 0.0)) @ axes.T
+    return np.asarray(np.trace(kept) * np.eye(3) - kept, np.float64)
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,7 +144,8 @@ class LoopTree:
     """A machine; ``root``: the link that is the ground; ``gravity``: m/s2, if the file tells.
 
     ``initial``: values that ``<ros2_control>`` begins with, of the joints for which it has them.
-    ``accuracy``: half of the last digit of a file's places and directions, m or rad. What is
+    ``rounding``: the largest rounding error of a file's places and directions, m or rad.
+    ``marked``: what of the file marks the actuated joints. What is
     written has ``capsules`` too, a ``platform``, the link, and its reference point ``origin``.
     """
 
@@ -135,7 +157,8 @@ class LoopTree:
     actuated: tuple[str, ...]
     gravity: list[float] | None = None
     initial: Mapping[str, float] = field(default_factory=dict)
-    accuracy: float = 0.0
+    rounding: float = 0.0
+    marked: str = ""
     capsules: tuple[Capsule, ...] = ()
     platform: str = ""
     origin: Array = _zeros(3)

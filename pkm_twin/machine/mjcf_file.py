@@ -20,6 +20,7 @@ from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError, install, warn
 from pkm_twin.machine import urdf_xml
 from pkm_twin.machine.loop_tree import Joint, Link, LoopTree
+from pkm_twin.machine.precision import rounding_error
 from pkm_twin.machine.rotations import Pose, from_quaternion
 
 _ENDLESS: Final = re.compile(
@@ -37,9 +38,12 @@ IGNORED: Final = (
     ("damping", "TENDON", ("tendon_damping", "tendon_dampingpoly")),
     ("frictionloss", "TENDON", ("tendon_frictionloss",)),
     ("armature", "TENDON", ("tendon_armature",)),
+    ("the limit", "TENDON", ("tendon_limited",)),
     ("damping that is not linear", "ACTUATOR", ("actuator_dampingpoly",)),
 )
 """What is read of no part but acts in MuJoCo: in words, of what, and the model's arrays."""
+PLACES: Final = ("pos", "quat", "axis", "xyaxes", "zaxis", "anchor", "relpose")
+"""Attributes with places and directions; angles may be in degrees and are left out."""
 REPEATED: Final = ("count", "nrow", "ncol", "width", "height")
 MAX_PARTS: Final = 100_000
 """Most of anything that a file asks for by a number: elements, copies, pixels along a side."""
@@ -57,7 +61,7 @@ def read(path: Path, top: ET.Element) -> LoopTree:
         raise ParameterError(
             str(path), "an MJCF file without the mujoco package", install("mjcf")
         ) from None
-    _require_bounded(path, top, path.parent)
+    words = _require_bounded(path, top, path.parent)
     try:
         model = mujoco.MjModel.from_xml_path(str(path))
     except ValueError as error:
@@ -68,7 +72,7 @@ def read(path: Path, top: ET.Element) -> LoopTree:
                 str(path), ValueError(text), "a model that MuJoCo compiles"
             ) from None
         warn(path, f"read without its meshes, as its bodies have inertias: {text}")
-    return _Reader(mujoco, model, path).tree()
+    return _Reader(mujoco, model, path).tree(rounding_error(words))
 
 
 def _without_meshes(mujoco: Any, path: Path) -> Any:
@@ -89,10 +93,11 @@ def _without_meshes(mujoco: Any, path: Path) -> Any:
         return None
 
 
-def _require_bounded(path: Path, top: ET.Element, folder: Path, depth: int = 0) -> None:
+def _require_bounded(path: Path, top: ET.Element, folder: Path, depth: int = 0) -> list[str]:
     """Look at a file, and at what it includes, before MuJoCo does, which waits and counts for ever.
 
     :param folder: of the model; what is included is below it.
+    :returns: the numbers of all places and directions, as they are written.
     :raises ParameterError: something is named that is no regular file, or asked for too often.
     """
     if depth > MAX_INCLUDES:
@@ -102,6 +107,7 @@ def _require_bounded(path: Path, top: ET.Element, folder: Path, depth: int = 0) 
     for compiler in top.iter("compiler"):
         folders += [path.parent / value for key, value in compiler.items() if key.endswith("dir")]
     pairs = [(element, key, text) for element in top.iter() for key, text in element.items()]
+    words = [word for _, key, text in pairs if key in PLACES for word in text.split()]
     for element, key, text in pairs:
         # MuJoCo takes these for numbers; a part may be called so.
         if _ENDLESS.search(text) and key != "name" and text not in names:
@@ -117,11 +123,13 @@ def _require_bounded(path: Path, top: ET.Element, folder: Path, depth: int = 0) 
                 if not included.resolve().is_relative_to(folder.resolve()):
                     raise ParameterError("include.file", text, f"a file below {folder}")
                 if included.exists():
-                    _require_bounded(included, urdf_xml.elements(included), folder, depth + 1)
+                    inner = urdf_xml.elements(included)
+                    words += _require_bounded(included, inner, folder, depth + 1)
         if key in REPEATED and math.prod(map(_whole, text.split())) > MAX_PARTS:
             raise ParameterError(f"{element.tag}.{key}", text, f"at most {MAX_PARTS}")
     if _copies(top) > MAX_PARTS:
         raise ParameterError("replicate", "nested copies", f"at most {MAX_PARTS} bodies")
+    return words
 
 
 def _whole(text: str) -> int:
@@ -159,7 +167,8 @@ class _Reader:
             self.data.qpos[model.jnt_qposadr[joint]] = value
         mujoco.mj_kinematics(model, self.data)
 
-    def tree(self) -> LoopTree:
+    def tree(self, rounding: float) -> LoopTree:
+        """The machine; ``rounding``: the largest rounding error of the file's numbers."""
         self._warn()
         for body in range(1, self.model.nbody):
             self._body(body)
@@ -178,8 +187,10 @@ class _Reader:
             self.joints,
             tuple(self._closures()),
             actuated,
-            self.model.opt.gravity.tolist(),
+            [0.0, 0.0, 0.0] if self._disables("GRAVITY") else self.model.opt.gravity.tolist(),
             {name: self.joints[name].drawn for name in actuated},
+            rounding,
+            "an actuator",
         )
 
     def _named(self, **counts: int) -> set[str]:
@@ -290,20 +301,38 @@ class _Reader:
         m = self.model
         dof = m.jnt_dofadr[joint]
         dofs = slice(dof, dof + (6, 3, 1, 1)[int(m.jnt_type[joint])])
+        damps_not = self._disables("DAMPER", "PASSIVE")
+        rubs_not = self._disables("FRICTIONLOSS", "CONSTRAINT")
         found = {
-            "viscous": float(m.dof_damping[dofs].max()),
-            "coulomb": float(m.dof_frictionloss[dofs].max()),
+            "viscous": 0.0 if damps_not else float(m.dof_damping[dofs].max()),
+            "coulomb": 0.0 if rubs_not else float(m.dof_frictionloss[dofs].max()),
             "rotor_inertia": float(m.dof_armature[dofs].max()),
         }
         for key, own in (("viscous", "actuator_damping"), ("rotor_inertia", "actuator_armature")):
             values = getattr(m, own, None)
-            if values is not None:
+            if values is not None and not (key == "viscous" and damps_not):
                 gears = {i: float(m.actuator_gear[i][0]) for i in self._drives(joint)}
                 found[key] += sum(float(values[i]) * gear**2 for i, gear in gears.items())
         return found
 
+    def _disables(self, *flags: str) -> bool:
+        """Return whether the file's ``<flag>`` switches off what any of these bits stand for."""
+        bits = sum(int(getattr(self.mj.mjtDisableBit, f"mjDSBL_{flag}", 0)) for flag in flags)
+        return bool(int(self.model.opt.disableflags) & bits)
+
     def _warn(self) -> None:
-        """Of what acts in MuJoCo and not here."""
+        """Warn of what acts in MuJoCo and not here, and reject what makes another machine.
+
+        :raises ParameterError: loop closures that are switched off, or deformable bodies.
+        """
+        if self._disables("CONSTRAINT", "EQUALITY") and self.model.neq:
+            raise ParameterError("option.flag", "equality disabled", "closures that are enabled")
+        if self._disables("GRAVITY"):
+            warn(self.path, "gravity is switched off by <flag>")
+        if getattr(self.model, "nflex", 0):
+            raise ParameterError("flex", self._name("FLEX", 0), "a machine of rigid bodies")
+        if getattr(self.model, "nplugin", 0):
+            warn(self.path, "forces of plugins are ignored")
         held = {("JOINT", joint) for joint in self.locks}
         for what, kind, arrays in IGNORED:
             values = [np.abs(array) for name in arrays

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import re
 import xml.etree.ElementTree as ET
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -20,10 +20,12 @@ import numpy as np
 
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError, UnknownNameError, warn
-from pkm_twin.machine import urdf_xml
-from pkm_twin.machine.graph import groups, spanning
+from pkm_twin.machine import foreign, urdf_xml
+from pkm_twin.machine.foreign import gravity_of
+from pkm_twin.machine.graph import spanning
 from pkm_twin.machine.joints import TURN, TYPES
 from pkm_twin.machine.loop_tree import Joint, Link, LoopTree, hung, link_of
+from pkm_twin.machine.precision import rounding_error
 from pkm_twin.machine.rotations import Pose, from_rpy
 from pkm_twin.machine.urdf_control import actuated_joints, read_beside
 
@@ -39,8 +41,6 @@ KINDS: Final = {
     "screw": "helical", "universal": "universal", "revolute2": "universal", "ball": "spherical",
 }  # fmt: skip
 """SDF's joint types and ours."""
-FOREIGN: Final = re.compile(r"drake:.*(joint|constraint|bushing).*")
-"""Drake's own elements that make another machine."""
 WELDS: Final = {
     "DetachableJoint": ("parent_link", "child_link"), "AttachLinks": ("parent", "child")
 }  # fmt: skip
@@ -60,8 +60,12 @@ def read(path: Path, top: ET.Element) -> LoopTree:
     title, world = urdf_xml.name(element, ()), Model(outside, version)
     model = world.models[title]
     links = {WORLD: Link(WORLD)}
+    moments = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+    rounding = rounding_error((e.text or "").strip() for e in element.iter() if e.tag in moments)
+    foreign.check_elements(path, [element])
+    weight = {name: foreign.flag(part, "gravity", True) for name, part in model.all("link")}
     for name, part in model.all("link"):
-        links[name] = _link(path, part, name).moved(model.place(name))
+        links[name] = _link(path, part, name, rounding).moved(model.place(name))
     places = {name: link.frame for name, link in links.items()}
     joints: dict[str, Joint] = {}
     for joint in model.joints(path):
@@ -88,7 +92,7 @@ def read(path: Path, top: ET.Element) -> LoopTree:
     types = {name: joint.kind for name, joint in joints.items()}
     # Where only some joints have an effort limit, these are motors.
     limited = [name for name, joint in joints.items() if "effort" in joint.limits]
-    actuated = actuated_joints(path, top, read_beside(path), types, limited)
+    actuated, marked = actuated_joints(path, top, read_beside(path), types, limited)
 
     def rank(joint: Joint) -> tuple[bool, bool, int]:
         return joint.kind != "fixed", joint.name not in actuated, joint.type.cost
@@ -102,10 +106,10 @@ def read(path: Path, top: ET.Element) -> LoopTree:
     return LoopTree(
         title, WORLD, links, spanned,
         tuple(closing(joint) for name, joint in joints.items() if name not in tree), actuated,
-        _gravity(path, model, gravity, joints.values()), accuracy=urdf_xml.accuracy(
+        gravity_of(path, weight, links, WORLD, joints.values(), gravity), rounding=rounding_error(
             word for part in element.iter() if part.tag in ("pose", "xyz")
             for word in (part.text or "").split()
-        ),
+        ), marked=marked,
     )  # fmt: skip
 
 
@@ -141,7 +145,7 @@ def _model(path: Path, top: ET.Element) -> tuple[ET.Element, ET.Element, list[fl
         if stated is not None:
             gravity = urdf_xml.vector(stated.text, "world.gravity", 3).tolist()
     models = [(root, one) for root in (top, *worlds) for one in root.findall("model")]
-    moving = [(root, one) for root, one in models if not _flag(one, "static", False)]
+    moving = [(root, one) for root, one in models if not foreign.flag(one, "static", False)]
     if not moving:
         for included in top.iter("include"):
             raise _of_include(included)
@@ -156,31 +160,6 @@ def _of_include(element: ET.Element) -> ParameterError:
     return ParameterError("include", uri, "one file: `gz sdf -p FILE` writes includes out")
 
 
-def _gravity(
-    path: Path, model: Model, stated: list[float] | None, joints: Iterable[Joint]
-) -> list[float] | None:
-    """The world's gravity, or none where no link that can move has weight.
-
-    :raises ParameterError: only some have.
-    """
-    weight = {name: _flag(part, "gravity", True) for name, part in model.all("link")}
-    bolts = [(joint.inner, joint.outer) for joint in joints if joint.kind == "fixed"]
-    held = groups([WORLD, *weight], bolts)[0]
-    moving = [name for name in weight if name not in held]
-    off = [name for name in moving if not weight[name]]
-    if off and len(off) < len(moving):
-        raise ParameterError(f"link.{off[0]}.gravity", "false", "all moving links alike")
-    if not off:
-        return stated
-    warn(path, "gravity is switched off on every link that can move")
-    return [0.0, 0.0, 0.0]
-
-
-def _flag(element: ET.Element, tag: str, default: bool) -> bool:
-    text = element.findtext(tag)
-    return default if text is None else urdf_xml.boolean(text, f"{element.get('name')}.{tag}")
-
-
 class Model:
     """A model's frames by name, each relative to the model's own; ``::`` leads into nested ones.
 
@@ -192,7 +171,7 @@ class Model:
         own = element.get("name", "")
         self.prefix: str = f"{outer.prefix}{own}::" if outer and outer.outer else ""
         self.static: bool = outer is not None and (
-            outer.static or (outer.outer is None and _flag(element, "static", False))
+            outer.static or (outer.outer is None and foreign.flag(element, "static", False))
         )
         self.parts: dict[str, ET.Element] = {}
         for part in sorted(element, key=lambda part: part.tag == "joint"):
@@ -315,9 +294,6 @@ class Model:
         """The same, of no nested model."""
         for part in self.element.findall("joint"):
             yield _joint(path, part, self)
-        for part in self.element:
-            if FOREIGN.fullmatch(part.tag):
-                raise ParameterError(part.tag, part.get("name"), "joints and closures of SDF alone")
 
 
 def _end(joint: ET.Element, tag: str) -> str:
@@ -350,7 +326,7 @@ def _text(element: ET.Element | None, tag: str, where: str, default: float) -> f
     return urdf_xml.number((stated.text or "").strip(), f"{where}.{tag}")
 
 
-def _link(path: Path, element: ET.Element, name: str) -> Link:
+def _link(path: Path, element: ET.Element, name: str, rounding: float) -> Link:
     """Mass and inertia; what the file leaves out is 1 kg and 1 kg m2, as the format has it."""
     where = f"link.{name}.inertial"
     inertial = urdf_xml.single(element, "inertial", f"link.{name}")
@@ -365,7 +341,7 @@ def _link(path: Path, element: ET.Element, name: str) -> Link:
     at = pose(None if inertial is None else urdf_xml.single(inertial, "pose", where), where)
     return link_of(
         name, _text(inertial, "mass", where, 1.0), at,
-        lambda key: _text(moments, key, f"{where}.inertia", float(key[1] == key[2])),
+        lambda key: _text(moments, key, f"{where}.inertia", float(key[1] == key[2])), rounding,
     )  # fmt: skip
 
 
@@ -412,9 +388,6 @@ def joint_of(
     axes: list[Array] = []
     limits: dict[str, Any] = {}
     tags = ("axis", "axis2")[: 0 if kind == "spherical" else TYPES[kind].count]
-    for tag in ("gearbox_ratio", "mimic"):
-        if part.find(f".//{tag}") is not None:
-            raise ParameterError(f"{where}.{tag}", f"<{tag}>", "joints without coupling")
     viscous: list[float] = []
     coulomb: list[float] = []
     for tag in ("axis", "axis2"):
@@ -426,8 +399,6 @@ def joint_of(
             values.append(_text(dynamics, key, f"{where}.{tag}.dynamics", 0.0))
             if values[-1] < 0.0:
                 raise ParameterError(f"{where}.{tag}.{key}", values[-1], "zero or more")
-        if _text(dynamics, "spring_stiffness", where, 0.0):
-            warn(path, f"the spring of joint {name} is ignored")
         limit = None if element is None else urdf_xml.single(element, "limit", where)
         if limit is not None and tag == "axis" and kind in ("revolute", "prismatic", "helical"):
             stated = {child.tag: (child.text or "").strip() for child in limit}

@@ -31,8 +31,8 @@ BESIDE: Final = ("closed_loop", "type", "name_mot", "joint_name", "joint_type")
 DRIVEN: Final = re.compile(r"(ApplyJointForce|Joint(Position|Trajectory|Force)?Controller)$")
 """Names of Gazebo's plugins that move the joints they name."""
 WHERE: Final = (
-    "command interfaces in a <ros2_control> element, a <transmission>, a Gazebo plugin that moves "
-    "a joint, or name_mot in a YAML file next to it"
+    "a joint marked by a <command_interface> in <ros2_control>, a <transmission>, "
+    'independent="true", a Gazebo plugin that moves it, or name_mot in a YAML file next to it'
 )
 
 
@@ -101,12 +101,12 @@ def actuated_joints(
     top: ET.Element,
     beside: Mapping[str, Any],
     types: Mapping[str, str],
-    others: Sequence[str] = (),
-) -> tuple[str, ...]:
-    """The actuated joints in the order in which the file marks them.
+    others: Sequence[str] | None = None,
+) -> tuple[tuple[str, ...], str]:
+    """The actuated joints in the order in which the file marks them, and what marks them.
 
     :param beside: the YAML file's entries. ``types``: of all joints, by name.
-    :param others: joints that are taken where nothing is marked.
+    :param others: joints of an SDF that have an effort limit: taken where nothing is marked.
     :raises ParameterError: none is marked, or one that cannot be actuated.
     """
     names, source = [str(name) for name in beside.get("name_mot", [])], "name_mot"
@@ -114,9 +114,10 @@ def actuated_joints(
         if not names:
             names, source = marked(top), key
     if not names:
-        names, source = list(others), "limit.effort"
+        names, source = list(others or ()), "limit.effort"
     if not names:
-        raise ParameterError(str(path), "no actuated joint", WHERE)
+        way = WHERE if others is None else f"{WHERE}; or by an <effort> in its <limit>"
+        raise ParameterError(str(path), "no joint is marked as actuated", way)
     if len(set(names)) != len(names):
         raise ParameterError(source, names, "each joint once")
     for name in names:
@@ -124,7 +125,7 @@ def actuated_joints(
             raise UnknownNameError(source, name, types)
         if types[name] not in ("revolute", "prismatic", "helical"):
             raise ParameterError(f"{source}.{name}", types[name], "a revolute or prismatic joint")
-    return tuple(names)
+    return tuple(names), source
 
 
 @dataclass(frozen=True)

@@ -21,9 +21,10 @@ import numpy as np
 
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError, UnknownNameError, warn
-from pkm_twin.machine import sdf_file, urdf_xml
+from pkm_twin.machine import foreign, sdf_file, urdf_xml
 from pkm_twin.machine.joints import TYPES
 from pkm_twin.machine.loop_tree import Joint, Link, LoopTree, hung, link_of
+from pkm_twin.machine.precision import rounding_error
 from pkm_twin.machine.rotations import Pose
 from pkm_twin.machine.urdf_control import actuated_joints, read_beside
 
@@ -39,6 +40,11 @@ CONSTRAINTS: Final = {
     "continuous": "revolute",
     "link": "fixed",  # a link that was cut in two
 }
+READ: Final = (
+    "link", "joint", "constraint", "loop", "loop_joint", "gazebo", "ros2_control", "transmission",
+    "material", "sensor",
+)  # fmt: skip
+"""Elements of a robot that are read, or do not act on its motion."""
 PARTS: Final = (
     "parent",
     "parent_origin",
@@ -79,9 +85,10 @@ def read(path: Path, robot: ET.Element) -> LoopTree:
     if any(str(child.tag).startswith("xacro:") for child in robot):
         raise ParameterError(str(path), "xacro elements", "a URDF: run xacro on this file first")
     links: dict[str, Link] = {}
+    rounding = rounding_error(word for e in robot.iter("inertia") for word in e.attrib.values())
     for element in robot.findall("link"):
         name = urdf_xml.name(element, links)
-        links[name] = _link(element, name)
+        links[name] = _link(element, name, rounding)
     if not links:
         raise ParameterError(str(path), "no <link>", "a robot with links")
     joints: dict[str, Joint] = {}
@@ -91,10 +98,11 @@ def read(path: Path, robot: ET.Element) -> LoopTree:
     for element in robot.findall("joint[mimic]"):
         _take_screw(element, joints, links)
     root = _root(links, joints)
-    for element in robot.findall("coupling"):
-        raise ParameterError(
-            f"coupling.{element.get('name')}", "a gear", "a machine without coupled joints"
-        )
+    others = [element for element in robot if element.tag not in ("link", "joint")]
+    foreign.check_elements(path, others)
+    unknown = {str(element.tag) for element in others} - {*READ, *foreign.REJECTED}
+    if unknown:
+        warn(path, f"elements that are not read: {', '.join(sorted(unknown))}")
     beside = read_beside(path)
     joints = _retyped(joints, beside)
     closures = _closures(robot, beside, links, {n: joint.outer for n, joint in joints.items()})
@@ -108,7 +116,8 @@ def read(path: Path, robot: ET.Element) -> LoopTree:
         for some in (joints, closures)
     )
     closures |= _of_gazebo(path, robot, frames, {*joints, *closures})
-    actuated = actuated_joints(path, robot, beside, {n: joint.kind for n, joint in joints.items()})
+    types = {n: joint.kind for n, joint in joints.items()}
+    actuated, marked = actuated_joints(path, robot, beside, types)
     name = robot.get("name") or path.stem
     initial = _parameters(robot, actuated, "initial_value")
     rotors = _parameters(robot, actuated, "rotor_inertia")
@@ -119,12 +128,19 @@ def read(path: Path, robot: ET.Element) -> LoopTree:
             rotor_inertia=rotors.get(joint.name, 0.0),
             offset=offsets.get(joint.name, 0.0),
         )
+    weight = dict.fromkeys(links, True)
+    for element in robot.findall("gazebo"):
+        link = element.get("reference", "")
+        if link in links:
+            off = foreign.flag(element, "turnGravityOff", False)
+            weight[link] = foreign.flag(element, "gravity", not off)
+    gravity = foreign.gravity_of(path, weight, links, root, joints.values(), None)
     return LoopTree(
-        name, root, links, joints, tuple(closures.values()), actuated, initial=initial,
-        accuracy=urdf_xml.accuracy(
+        name, root, links, joints, tuple(closures.values()), actuated, gravity, initial=initial,
+        rounding=rounding_error(
             word for e in robot.iter() if e.tag in _PLACES or "origin" in e.tag
             for key in ("xyz", "rpy") for word in e.get(key, "").split()
-        ),
+        ), marked=marked,
     )  # fmt: skip
 
 
@@ -156,7 +172,7 @@ def _of_gazebo(
     return {joint.name: sdf_file.closing(joint) for joint in found}
 
 
-def _link(element: ET.Element, name: str) -> Link:
+def _link(element: ET.Element, name: str, rounding: float) -> Link:
     inertial = urdf_xml.single(element, "inertial", f"link.{name}")
     if inertial is None:
         return Link(name)
@@ -172,7 +188,7 @@ def _link(element: ET.Element, name: str) -> Link:
         stated = inertia.get(key, None if key[1] == key[2] else "0")
         return urdf_xml.number(stated, f"{where}.inertia.{key}")
 
-    return link_of(name, value, pose, moment)
+    return link_of(name, value, pose, moment, rounding)
 
 
 def _joint(element: ET.Element, name: str, links: dict[str, Link]) -> Joint:
@@ -290,6 +306,9 @@ def _closures(
     for element in robot.findall("loop"):
         name = urdf_xml.name(element, taken)
         found[name] = _loop(element, name, links)
+    for element in robot.findall("loop_joint"):
+        name = urdf_xml.name(element, taken)
+        found[name] = _loop_joint(element, name, links)
     for closure in _pairs(beside, links, joints):
         if closure.name in joints or closure.name in found:
             raise ParameterError("closed_loop", closure.name, "each pair once")
@@ -339,6 +358,20 @@ def _loop(element: ET.Element, name: str, links: Collection[str]) -> Joint:
         ends.append(urdf_xml.reference(end, f"{where}.{tags[0]}", links))
         origin = None if end is None else urdf_xml.single(end, "origin", f"{where}.{tags[0]}")
         frames.append(urdf_xml.origin(origin, f"{where}.{tags[0]}"))
+    axis = urdf_xml.axis(element, "axis", where)
+    return _closure(name, LOOPS[kind], ends, frames, (axis, axis))
+
+
+def _loop_joint(element: ET.Element, name: str, links: Collection[str]) -> Joint:
+    """A closure between two frames, as Isaac Sim and Drake write it."""
+    where, kind = f"loop_joint.{name}", element.get("type")
+    if kind not in LOOPS:
+        raise UnknownNameError(f"{where}.type", kind, LOOPS)
+    tags = ("link1", "link2")
+    urdf_xml.only(element, where, (*tags, "axis"))
+    parts = [urdf_xml.single(element, tag, where) for tag in tags]
+    ends = [urdf_xml.reference(p, f"{where}.{t}", links) for p, t in zip(parts, tags, strict=True)]
+    frames = [urdf_xml.origin(p, f"{where}.{t}") for p, t in zip(parts, tags, strict=True)]
     axis = urdf_xml.axis(element, "axis", where)
     return _closure(name, LOOPS[kind], ends, frames, (axis, axis))
 

@@ -6,7 +6,7 @@ from __future__ import annotations
 import math
 import re
 import xml.etree.ElementTree as ET
-from collections.abc import Collection, Container, Iterable, Mapping
+from collections.abc import Collection, Container, Mapping
 from pathlib import Path
 from typing import Any, Final
 from xml.parsers import expat
@@ -242,19 +242,3 @@ def _bound(text: str, where: str) -> float:
     """A limit, which alone of all numbers may be infinite."""
     endless = text.strip().lower().lstrip("+-") in ("inf", "infinity")
     return float(text) if endless else number(text, where)
-
-
-def accuracy(words: Iterable[str]) -> float:
-    """Half of the last digit of the longest of a file's numbers, m or rad; of whole ones none."""
-    longest = max(map(_decimals, words), default=0)
-    return 0.5 * 10.0**-longest if longest else 0.0
-
-
-def _decimals(word: str) -> int:
-    """How many digits stand behind the point."""
-    mantissa, _, exponent = word.lower().partition("e")
-    try:
-        places = len(mantissa.partition(".")[2]) - int(exponent or 0)
-    except ValueError:
-        return 0  # No number: rejected where it is read, if it is.
-    return min(max(places, 0), 18)

@@ -75,9 +75,17 @@ def load(robot: str | Path, *, platform: str | None = None) -> Robot:
     path = robot_path(robot)
     if path.suffix in TREES:
         reading = read_tree(path, platform=platform)
+        robot_read = robot_of_data(reading.description, path.stem)
+        graph = robot_read.graph
+        if robot_read.redundant:
+            follows = [name for name in graph.actuated if name not in graph.leads]
+            warn(
+                path, f"{len(graph.actuated)} actuated joints ({reading.marked}) for "
+                f"{len(graph.leads)} degrees of freedom: the positions of {', '.join(follows)} "
+                f"follow from {', '.join(graph.leads)}",
+            )  # fmt: skip
         for note in reading.notes:
             warn(path, note)
-        robot_read = robot_of_data(reading.description, path.stem)
         return _told(path, replace(robot_read, home_choice=reading.home, visuals=reading.visuals))
     if platform is not None:
         raise ParameterError("platform", platform, "none, because the file names its platform")

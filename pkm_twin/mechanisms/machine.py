@@ -20,8 +20,9 @@ import numpy as np
 
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.codegen.expressions import norm, plain, reference
-from pkm_twin.errors import ParameterError
+from pkm_twin.errors import ParameterError, warn
 from pkm_twin.kinematics.pose import COORDINATES, Coordinate
+from pkm_twin.kinematics.rounding import repair_rounded
 from pkm_twin.kinematics.scheme import check_masses, choose_coordinates, choose_leads
 from pkm_twin.machine import schema
 from pkm_twin.machine.formulas import PARAMETERS, Book
@@ -62,6 +63,7 @@ from pkm_twin.machine.places import (
     path_of,
     placed,
 )
+from pkm_twin.machine.precision import rounding_error
 from pkm_twin.machine.reach import PassiveLimit
 from pkm_twin.machine.sections import DriveSpec, Redundancy
 from pkm_twin.mechanisms import TwinRobot
@@ -128,9 +130,14 @@ class Machine(TwinRobot):
         """
         book = Book.of(data)
         file = schema.build(MachineFile, book.marked(data))
+        specs: Mapping[str, Mapping[str, Any]]
         specs, sources = written_out({kind: getattr(file, kind) for kind in KINDS}, file.limbs)
         graph = graph_of_entries(file.platform, specs, file.origin)
         graph.check()
+        # Numbers that follow from expressions are exact.
+        if not book.formulas:
+            specs = _without_rounding(data, graph, specs, name)
+            graph = graph_of_entries(file.platform, specs, file.origin)
         if len(graph.actuated) > MOST_JOINTS:
             raise ParameterError(
                 "joints", len(graph.actuated), f"at most {MOST_JOINTS} actuated joints"
@@ -305,7 +312,10 @@ class Machine(TwinRobot):
         counts = {"bodies": len(g.bodies), "joints": len(g.joints), "rods": len(g.rods)}
         parts = ", ".join(f"{count} {name}" for name, count in counts.items() if count)
         pose = ", ".join(self.pose)
-        return f"{len(g.actuated)} actuated joints, the platform moves in {pose}; {parts}"
+        drives = _counted(len(g.actuated), "actuated joint")
+        if self.redundant:
+            drives += f" for {_counted(len(g.leads), 'degree')} of freedom"
+        return f"{drives}, the platform moves in {pose}; {parts}"
 
     @property
     def mobility(self) -> str:
@@ -573,3 +583,49 @@ class Machine(TwinRobot):
             )
         beams = tuple(beam for beam in self.beams if beam.name in sections)
         return Structure(beams, sections, compliances)
+
+
+def _counted(count: int, name: str) -> str:
+    """Return a number of things in words: `1 joint`, `2 joints`."""
+    return f"{count} {name}{'' if count == 1 else 's'}"
+
+
+_GEOMETRY: Final = ("at", "axis", "axes", "ends", "azimuths")
+"""Keys of places and directions."""
+
+
+def _without_rounding(
+    data: Any, graph: Graph, specs: Mapping[str, Mapping[str, Any]], name: str
+) -> Mapping[str, Mapping[str, Any]]:
+    """Return the entries of a file with the vectors that a repair of its rounding gives.
+
+    Warns by how much vectors were moved. Entries that no small change repairs stay as they are.
+    """
+
+    def written(part: Any, inside: bool = False) -> Iterator[str]:
+        if isinstance(part, Mapping):
+            for key, one in part.items():
+                yield from written(one, inside or key in _GEOMETRY)
+        elif isinstance(part, (list, tuple)):
+            for one in part:
+                yield from written(one, inside)
+        elif inside and isinstance(part, float):
+            yield repr(part)
+
+    parts = [data.get(key) for key in ("joints", "rods", "limbs")]
+    repaired = repair_rounded(
+        graph, rounding_error(word for part in parts for word in written(part))
+    )
+    if repaired is None or not repaired.moves:
+        return specs
+    warn(name, repaired.text)
+    found = {kind: dict(entries) for kind, entries in specs.items()}
+    for key, joint in repaired.graph.joints.items():
+        spec = found["joints"][key]
+        own: dict[str, Any] = {} if spec.at is None else {"at": joint.at}
+        own |= {} if spec.axis is None else {"axis": joint.axes[0]}
+        own |= {} if spec.axes is None else {"axes": joint.axes}
+        found["joints"][key] = dataclasses.replace(spec, **own)
+    for key, rod in repaired.graph.rods.items():
+        found["rods"][key] = dataclasses.replace(found["rods"][key], ends=rod.ends)
+    return found

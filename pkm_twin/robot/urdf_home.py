@@ -13,18 +13,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
 
 from pkm_twin.codegen.arrays import Array, Mask
 from pkm_twin.errors import ParameterError, SingularityError
-from pkm_twin.kinematics.conditions import Conditions
-from pkm_twin.kinematics.diagnosis import is_clear, is_right
+from pkm_twin.kinematics.linkage import Linkage
 from pkm_twin.kinematics.motion import Motion, numbers
+from pkm_twin.kinematics.rounding import CHAIN, MAX_ROUNDING, Repair, repair_rounded
+from pkm_twin.kinematics.scheme import choose_leads
 from pkm_twin.kinematics.singularity import singularity_at_home
-from pkm_twin.kinematics.spins import hold, without_spins
+from pkm_twin.kinematics.spins import RANK, hold, null, without_spins
 from pkm_twin.machine import graph as graphs
 from pkm_twin.machine.graph import BASE, Graph
 from pkm_twin.machine.loop_tree import Joint, LoopTree
@@ -43,10 +44,10 @@ MAX_MISS: Final = 1e-2
 """A miss that no choice of directions makes good, m or rad."""
 EXACT: Final = 1e-9
 """Loops that miss by less are closed for all purposes, m or rad."""
-CLOSED: Final = (1e-5, 1e-4)
-"""A loop that misses by more is open, m or rad: at least the one, at most the other."""
-DIGITS: Final = 20.0
-"""In between, so many times the file's last digit: a loop is a chain of rounded places."""
+CLOSED: Final = 1e-5
+"""A loop that misses by more is open, m or rad, unless the file's rounding is coarser."""
+SLIGHT: Final = 1e-2
+"""Largest motion of a joint, rad or m, that closes a loop which is closed but for rounding."""
 DRAWN: Final = 0.1
 """A closed assembly is as drawn where no joint is farther from zero, rad or parts of the size."""
 SMALL: Final = 0.01
@@ -63,8 +64,8 @@ REACHES: Final = (0.05, 0.1, 0.2, 0.4, 0.8)
 """How far from the wanted values the actuated joints may be, rad or parts of the size."""
 TRIES: Final = 6
 """Random starts within each."""
-ROUNDED: Final = (1e-8, 1e-7, 1e-6, 1e-5, 1e-4)
-"""Deviations of axes and points that may be a file's rounding, rad and parts of the size."""
+LEAST_ROUNDING: Final = 1e-6
+"""Deviation of axes and points that is rounding in any file, rad or parts of the size."""
 TURNING: Final = 8
 """Steps in which a part that only spins is turned back to zero."""
 WORDS: Final = {
@@ -84,8 +85,9 @@ class Assembly:
 
     def __init__(self, tree: LoopTree) -> None:
         self.tree = tree
-        least, most = CLOSED
-        self.closed = min(most, max(least, DIGITS * tree.accuracy))
+        self.rounding = min(MAX_ROUNDING, CHAIN * tree.rounding)
+        """A loop that misses by less is drawn closed: the file has no more digits, m or rad."""
+        self.closed = max(CLOSED, self.rounding)
         """A loop that misses by more is open, m or rad."""
         self._bodies, self.steps = {tree.root: BASE}, list[str]()
         joints: dict[str, graphs.Joint] = {}
@@ -184,16 +186,18 @@ class Assembly:
         """Values that close the loops by least steps, and the greatest miss left.
 
         Redundant closures of a rounded file contradict each other by that rounding: directions that
-        only they have are left alone at first, as steps along them lead anywhere.
+        only they have are left alone at first, as steps along them lead anywhere, and are not taken
+        to close a loop that is closed but for rounding.
 
         :param held: steps that keep their values, shape (count,); by default none does.
         """
         best, miss = values, math.inf
         for rank in RANKS:
             new, left = self._close(best, rank, held)
-            if left < 0.5 * miss:
+            gone = float(np.abs(new - best).max(initial=0.0))
+            if left < 0.5 * miss and (miss > self.closed or gone < SLIGHT):
                 best, miss = new, left
-            if miss < 1e-14 or miss > MAX_MISS:
+            if miss < max(1e-14, self.rounding) or miss > MAX_MISS:
                 break
         self.place(best)
         return best, miss
@@ -312,8 +316,8 @@ class Home:
 
     ``how``: of WORDS; ``place``: where the actuated joints were wanted. ``graph``: idealised, with
     spins held by the joints ``held`` (each with the greatest mass times offset of what it holds,
-    kg m); None where its mobility is not right. ``rounding``: the
-    largest deviation that was removed, rad or parts of the size. ``index``: the singularity index.
+    kg m); None where its mobility is not right. ``repair``: of the file's rounding. ``index``: the
+    singularity index.
     """
 
     values: Array
@@ -322,7 +326,7 @@ class Home:
     place: str
     graph: Graph | None
     held: Mapping[str, float]
-    rounding: float
+    repair: Repair | None
     index: float
 
     @property
@@ -415,7 +419,7 @@ class HomeSearch:
         values = self.wanted.copy()
         self.assembly.place(values)
         miss = self.assembly.miss()
-        if miss > EXACT:
+        if miss > max(EXACT, self.assembly.rounding):
             values, miss = self.assembly.close(values, self.held)
         if miss > self.assembly.closed:
             return None
@@ -482,39 +486,46 @@ class HomeSearch:
     def _home(self, values: Array, miss: float, how: str) -> Home:
         self.assembly.place(values)
         try:
-            settled = self._settle(
-                self.graph(), max(ROUNDED[2], 10 * miss, DIGITS * self.assembly.tree.accuracy)
-            )
-            index = 0.0 if settled is None else singularity_at_home(settled[0])
+            settled = self._settle(self.graph(), miss)
+            index = 0.0 if settled is None else singularity_at_home(_led(settled[0]))
         except (ParameterError, SingularityError, np.linalg.LinAlgError):
             # The machine is looked at again by whoever makes a robot of it.
             settled, index = None, 0.0
-        sound, held, rounding = settled or (None, {}, 0.0)
-        return Home(values, miss, how, self.place, sound, held, rounding, index)
+        sound, held, repaired = settled or (None, {}, None)
+        return Home(values, miss, how, self.place, sound, held, repaired, index)
 
-    def _settle(self, graph: Graph, most: float) -> tuple[Graph, dict[str, float], float] | None:
-        """The graph without spins and without a file's rounding, as little of it as will do."""
-        fallback = None
+    def _settle(self, graph: Graph, miss: float) -> tuple[Graph, dict[str, float], Repair] | None:
+        """Return the graph without a file's rounding and spins, the joints that hold spins, and the
+        repair; None where the actuated joints do not determine the machine.
+        """
+        rounding = max(self.assembly.tree.rounding, miss)
+        repaired = repair_rounded(graph, rounding, LEAST_ROUNDING)
+        if repaired is None:
+            return None
         if self._hinges is not None:
-            sound = hold(graph, list(self._hinges))
-            if is_right(sound) and is_clear(sound):
-                return sound, self._hinges, 0.0
-        most = min(most, ROUNDED[-1])
-        for tolerance in (0.0, *(t for t in ROUNDED if t < most), most):
-            ideal: Graph | None = graph
-            rounding = 0.0
-            if tolerance:
-                conditions = Conditions(graph, tolerance)
-                rounding = max((c.size for c in conditions.missed), default=0.0)
-                ideal = conditions.idealized() if rounding else None
-            if ideal is None:
-                continue
-            sound, held = without_spins(ideal)
-            if is_right(sound):
-                result = sound, held, rounding
-                if is_clear(sound):
-                    if not tolerance and all(sound.joints[n].kind == "fixed" for n in held):
-                        self._hinges = result[1]
-                    return result
-                fallback = fallback or result
-        return fallback
+            sound = hold(repaired.graph, list(self._hinges))
+            if _is_driven(sound):
+                return sound, self._hinges, repaired
+        sound, held = without_spins(repaired.graph)
+        if not _is_driven(sound):
+            return None
+        if all(sound.joints[name].kind == "fixed" for name in held):
+            self._hinges = held
+        return sound, held, repaired
+
+
+def _is_driven(graph: Graph) -> bool:
+    """Return whether the actuated joints determine the machine at home, be it redundantly."""
+    linkage = Linkage(graph)
+    locked = null(linkage.scaled_at_home()[0], RANK, absolute=True)
+    return not locked.shape[1] and 0 < linkage.mobility.freedoms <= linkage.joints
+
+
+def _led(graph: Graph) -> Graph:
+    """The graph whose redundant drives follow those that lead."""
+    leads = choose_leads(graph)
+    joints = {
+        name: replace(joint, follows=joint.actuated and name not in leads)
+        for name, joint in graph.joints.items()
+    }
+    return replace(graph, joints=joints)

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -12,6 +12,8 @@ import numpy as np
 
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError, warn
+from pkm_twin.kinematics.linkage import Linkage
+from pkm_twin.kinematics.rounding import repair_rounded
 from pkm_twin.machine import graph as graphs
 from pkm_twin.machine import mjcf_file, sdf_file, urdf_file, urdf_xml
 from pkm_twin.machine.graph import Graph, groups
@@ -20,7 +22,7 @@ from pkm_twin.machine.loop_tree import SINGLE, Joint, LoopTree
 from pkm_twin.machine.rotations import Pose
 from pkm_twin.machine.urdf_control import take_drives
 from pkm_twin.machine.urdf_file import Visual, visuals
-from pkm_twin.robot.urdf_home import EXACT, Assembly, HomeSearch
+from pkm_twin.robot.urdf_home import EXACT, LEAST_ROUNDING, Assembly, HomeSearch
 
 PLATFORMS: Final = (
     "platform",
@@ -52,12 +54,13 @@ class UrdfReading:
     """A file as a ``mechanism: machine`` description, and how it came to be.
 
     ``home``: how the home was chosen, in words. ``notes``: what was done to the file's machine.
-    ``visuals``: the meshes of a URDF's links.
+    ``marked``: what of the file marks the actuated joints. ``visuals``: the meshes of its links.
     """
 
     description: dict[str, Any]
     home: str
     notes: tuple[str, ...]
+    marked: str = ""
     visuals: tuple[Visual, ...] = ()
 
 
@@ -100,8 +103,9 @@ def read_tree(
     tool = _platform(tree, platform)
     ground = tree.root if base is None else base
     ground = urdf_xml.known_link("base", ground, tree.links)
-    assembly = Assembly(tree)
     bodies = _bodies(tree, tool, ground)
+    _require_open(tree, bodies, tool, ground)
+    assembly = Assembly(tree)
     _require_moving(tree, bodies, tool)
     home = HomeSearch(assembly, lambda: _graph(assembly, bodies, tool, ground)).home()
     assembly.place(home.values)
@@ -110,11 +114,8 @@ def read_tree(
     notes = _left_out(tree)
     if home.miss > EXACT:
         notes.append(f"the loops close within {home.miss:.1g} only (m or rad)")
-    if home.rounding:
-        notes.append(
-            f"axes and points were moved by up to {home.rounding:.1g} (rad, or parts of the "
-            "machine's size), so that the machine can move: the file is rounded"
-        )
+    if home.repair and home.repair.moves:
+        notes.append(home.repair.text)
     if home.held:
         notes.append(f"held, as they only let a part spin about itself: {', '.join(home.held)}")
     heavy = {name: value for name, value in home.held.items() if value > BALANCED}
@@ -127,7 +128,7 @@ def read_tree(
         data["joint_map"] = controller
     frames = {name: move @ tree.links[name].frame for name, move in _seen(assembly, ground).items()}
     shown = () if top.tag in readers else visuals(path, top, frames, bodies)
-    return UrdfReading(data, home.text, tuple(notes), tuple(shown))
+    return UrdfReading(data, home.text, tuple(notes), tree.marked, tuple(shown))
 
 
 def _require_closed(path: Path, tree: LoopTree) -> None:
@@ -145,6 +146,23 @@ def _require_closed(path: Path, tree: LoopTree) -> None:
             f"no loop closure, and passive joints: {', '.join(idle)}",
             "<constraint> or <loop> elements, or closed_loop in a YAML file next to it",
         )
+
+
+def _require_open(tree: LoopTree, bodies: dict[str, str], tool: str, ground: str) -> None:
+    """Reject loops of which every joint is marked as actuated: the last one is a closure.
+
+    :raises ParameterError: the actuated joints and the degrees of freedom.
+    """
+    if all(joint.name not in tree.actuated for joint in tree.closures):
+        return
+    graph = _graph(Assembly(replace(tree, actuated=())), bodies, tool, ground)
+    repaired = repair_rounded(graph, tree.rounding, LEAST_ROUNDING)
+    freedoms = Linkage(graph if repaired is None else repaired.graph).mobility.freedoms
+    raise ParameterError(
+        tree.marked, f"{len(tree.actuated)} actuated joints: {', '.join(tree.actuated)}",
+        f"at most one a degree of freedom ({freedoms}), and in every loop a joint without a motor; "
+        "which of these are motors?",
+    )  # fmt: skip
 
 
 def _require_moving(tree: LoopTree, bodies: dict[str, str], tool: str) -> None:

@@ -294,7 +294,7 @@ def test_motors_without_a_plugin(mark, tmp_path):
 
 
 def test_a_model_without_motors_is_rejected(tmp_path):
-    with pytest.raises(ParameterError, match="no actuated joint"):
+    with pytest.raises(ParameterError, match="no joint is marked as actuated"):
         read_urdf(five_bar(tmp_path, motors=""))
 
 

@@ -62,7 +62,7 @@ REFUSED = {
     "no axis": ('xyz="0 0 2"', 'xyz="0 0 0"', "joint.motor.axis"),
     "limits": ('lower="-1"', 'lower="2"', r"joint.motor.limit: \[2.0, 1.0\]"),
     "negative effort": ('effort="3"', 'effort="-3"', "joint.motor.limit.effort"),
-    "nobody drives": ('<command_interface name="effort"/>', "", "no actuated joint"),
+    "nobody drives": ('<command_interface name="effort"/>', "", "no joint is marked as actuated"),
     "unknown motor": ('<joint name="motor">', '<joint name="moto">', "did you mean 'motor'"),
     "unnamed motor": ('<joint name="motor">', "<joint>", "joint: .*with a name"),
     "unnamed transmission": (

@@ -1,0 +1,107 @@
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
+"""Elements of URDF and SDF that act in a simulator and that no reader takes, by name.
+
+Elements of Gazebo, Drake and Isaac Sim inside these files are among them.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+import xml.etree.ElementTree as ET
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Final
+
+from pkm_twin.errors import ParameterError, warn
+from pkm_twin.machine import urdf_xml
+from pkm_twin.machine.graph import groups
+from pkm_twin.machine.loop_tree import Joint, Link
+
+IGNORED: Final = {
+    "spring_stiffness": "the spring", "springStiffness": "the spring",
+    "velocity_decay": "damping by the link's velocity", "dampingFactor": "damping by velocity",
+    "enable_wind": "wind", "drake:rotor_inertia": "the rotor inertia",
+    "drake:gear_ratio": "the gear of the rotor",
+}  # fmt: skip
+"""Elements that are left out with a warning where they are neither zero nor false."""
+REJECTED: Final = {
+    "kinematic": "links that forces move",
+    "coupling": "a machine without coupled joints",
+    "force_element": "a machine without springs and dampers beside its joints",
+    "gearbox_ratio": "joints without coupling", "mimic": "joints without coupling",
+    "drake:mimic": "joints without coupling",
+    "drake:joint": "joints and closures of the format alone",
+    "drake:ball_constraint": "joints and closures of the format alone",
+    "drake:distance_constraint": "joints and closures of the format alone",
+    "drake:linear_bushing_rpy": "joints and closures of the format alone",
+}  # fmt: skip
+"""Elements that make another machine, and what is expected in their place."""
+COUPLING: Final = re.compile(r"mimic", re.IGNORECASE)
+"""Names of plugins that couple joints."""
+FORCES: Final = re.compile(r"Buoyancy|Hydrodynamics|LiftDrag|Thruster|Wind|Spring|GravityComp")
+"""Names of plugins that apply forces."""
+
+
+def check_elements(path: Path, parts: Iterable[ET.Element], owner: str = "") -> None:
+    """Reject or warn of elements that act in a simulator and are not read, and of what is in them.
+
+    :param owner: what they belong to, for the error.
+    :raises ParameterError: one that makes another machine, by name.
+    """
+    for part in parts:
+        tag, name = str(part.tag), part.get("name") or part.get("reference")
+        where = ".".join(filter(None, (owner, tag, name)))
+        if tag in REJECTED and _acts(part):
+            raise ParameterError(where, f"<{tag}>", REJECTED[tag])
+        if tag in IGNORED and _acts(part):
+            warn(path, f"{where}: {IGNORED[tag]} is ignored")
+        if tag == "plugin":
+            plugin = f"{part.get('name', '')} {part.get('filename', '')}".strip()
+            if COUPLING.search(plugin):
+                raise ParameterError("plugin", plugin, "joints without coupling")
+            if FORCES.search(plugin):
+                warn(path, f"forces of the plugin {plugin} are ignored")
+        check_elements(path, part, f"{tag}.{name}" if name else owner)
+
+
+def _acts(part: ET.Element) -> bool:
+    """Return whether an element says more than zero or false."""
+    stated = [part.text, *part.attrib.values(), *(e.text for e in part.iter() if e is not part)]
+    words = [word for text in stated for word in (text or "").split()]
+    for word in words:
+        try:
+            if float(word) != 0.0 or math.isnan(float(word)):
+                return True
+        except ValueError:
+            if word.lower() != "false":
+                return True
+    return not words
+
+
+def gravity_of(
+    path: Path, weight: Mapping[str, bool], links: Mapping[str, Link], root: str,
+    joints: Iterable[Joint], stated: list[float] | None,
+) -> list[float] | None:  # fmt: skip
+    """The file's gravity, or none where no link that can move has weight.
+
+    :param weight: by link whether gravity acts on it. ``root``: the ground.
+    :raises ParameterError: only some links have weight.
+    """
+    bolts = [(joint.inner, joint.outer) for joint in joints if joint.kind == "fixed"]
+    held = groups(dict.fromkeys([root, *weight]), bolts)[0]
+    moving = [name for name in weight if name not in held and links[name].mass > 0.0]
+    off = [name for name in moving if not weight[name]]
+    if off and len(off) < len(moving):
+        raise ParameterError(f"link.{off[0]}.gravity", "false", "all moving links alike")
+    if not off:
+        return stated
+    warn(path, "gravity is switched off on every link that can move")
+    return [0.0, 0.0, 0.0]
+
+
+def flag(element: ET.Element, tag: str, default: bool) -> bool:
+    """A truth value in an element of its own."""
+    text = element.findtext(tag)
+    where = element.get("name") or element.get("reference")
+    return default if text is None else urdf_xml.boolean(text, f"{where}.{tag}")
