@@ -66,10 +66,10 @@ raise SystemExit(node.run(node.NODE))
         code = """
 import delta_dynamics.nodes.twin as node
 solve = node.Feedforward._joint_state
-def broken(self, message, now):
+def broken(self, message, *times):
     if message.position[0] == 0.125:
         raise ZeroDivisionError("made for the test")
-    return solve(self, message, now)
+    return solve(self, message, *times)
 node.Feedforward._joint_state = broken
 raise SystemExit(node.run(node.NODE))
 """
