@@ -219,6 +219,8 @@ BALANCE_BOUND: Final = 1e-6
 class Reactions:
     """The wrench that each joint's inner body (on the base's side) applies to its outer body.
 
+    The friction moment of a passive joint is not in its wrench.
+
     Arrays are read-only. Components that rigid-body statics does not determine are NaN, and False
     in the masks.
     """

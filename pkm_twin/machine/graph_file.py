@@ -143,8 +143,9 @@ class JointSpec:
     joint has all but ``swivel``. ``rotor_inertia`` is reflected to the joint and has no weight;
     ``drive`` replaces it. ``compliance``: along u, v, w, then about them; 0 or .inf where a passive
     joint is free. Of an actuated joint's own motion it is that of gear or screw, with the motor
-    locked. u is ``axis``, v = u x e with the base axis e most nearly square to u, w = u x v. For a
-    universal joint u and v are its ``axes``; for a spherical one u, v, w are base axes.
+    locked. u is ``axis``, v = u x e with e the base axis most nearly perpendicular to u,
+    w = u x v; v and w turn with the inner body. For a universal joint u and v are its ``axes``; for
+    a spherical one u, v, w are base axes.
     """
 
     type: str = schema.choice(*TYPES)
@@ -258,7 +259,7 @@ class JointSpec:
 class RodSpec:
     """A thin even straight bar with a ball joint at each end: points (m), mass (kg).
 
-    ``swivel``: largest angle from its direction at home in the frame of either body, rad.
+    ``swivel``: seen from each body, the rod may tilt by at most this from its home direction, rad.
     """
 
     between: tuple[str, ...] = schema.words(size=2)
