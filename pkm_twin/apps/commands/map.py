@@ -222,8 +222,12 @@ def along_path(
     bound = f", singularity index {least:g} or more" if least > 0.0 else ""
     notes = [*rest, f"{len(found.time)} samples of {path}{bound if not beyond else ''}"]
     if beyond:
-        near = f", below the singularity index {least:g}" if least > 0.0 else ""
-        notes.append(f"included: {beyond} beyond limits{near}, or where limbs interfere")
+        low = int((machine.try_singularity(motion.q)[0] < least).sum())
+        alone = f"{low} have a singularity index below {least:g}"
+        reason = alone if low == beyond else f"{alone}; others are beyond limits or limbs interfere"
+        notes.append(
+            f"{beyond} of {len(found.time)} samples would not count, but are included: {reason}"
+        )
     return Report(
         first,
         [
