@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""Numbers that a caller gives, as arrays of doubles: whatever else it gives is an error.
+"""Read a caller's numbers as arrays of doubles; reject anything else.
 
 numpy converts more than can be meant: it drops the mask of a masked array and the imaginary part
 of a complex one, reads text and dates as numbers, and makes NaN of None.
@@ -23,7 +23,7 @@ _F8: Final = np.dtype(np.float64)
 
 
 def doubles(values: ArrayLike, what: str = "values") -> Array:
-    """Real numbers as float64; the array itself where it is one already.
+    """Convert real numbers to an array of float64; return such an array itself, without a copy.
 
     :param what: name of the values, for errors.
     :raises ValueError: anything but real numbers, or masked ones.
@@ -39,7 +39,7 @@ def doubles(values: ArrayLike, what: str = "values") -> Array:
     except ValueError:
         raise ValueError(f"{what} are not an array: rows of different lengths") from None
     if array.dtype.kind == "O" and all(map(_is_real, array.flat)):
-        # Fractions, decimals, integers beyond 64 bits; too large a one is infinite.
+        # Fractions, decimals, integers beyond 64 bits; an overflow becomes infinity.
         array = np.array([_double(value) for value in array.flat]).reshape(array.shape)
     if array.dtype.kind not in "fiu":
         kind = type(values).__name__ if array.dtype.kind == "O" else array.dtype.name
@@ -60,10 +60,10 @@ def _double(value: Any) -> float:
 
 
 def vectors(values: ArrayLike, size: int, what: str) -> Array:
-    """Finite vectors of a length, shape (..., size).
+    """Convert values to finite vectors of length ``size``, shape (..., size).
 
-    :raises ValueError: as :func:`doubles`; another last axis; a value that is not finite, by
-        sample.
+    :raises ValueError: as :func:`doubles`; the last axis is not ``size``; a value is not finite
+        (the error names its sample).
     """
     array = doubles(values, what)
     if array.shape[-1:] != (size,):
@@ -76,10 +76,10 @@ def vectors(values: ArrayLike, size: int, what: str) -> Array:
 
 
 def finite(result: NDArray[Any], cause: str) -> Array:
-    """A result that is finite.
+    """Check that a result is finite and return it as float64.
 
-    :param cause: what may be too large, or not finite itself.
-    :raises ValueError: it is not.
+    :param cause: the input that would be to blame, for the error.
+    :raises ValueError: an entry is not finite.
     """
     if not np.isfinite(result).all():
         raise ValueError(f"{cause} is not finite, or leads to a result that is not")
@@ -87,7 +87,7 @@ def finite(result: NDArray[Any], cause: str) -> Array:
 
 
 def one_vector(values: ArrayLike, size: int, what: str) -> Array:
-    """One finite vector, shape (size,); errors as :func:`vectors`."""
+    """Convert values to one finite vector, shape (size,); raise the errors of :func:`vectors`."""
     array = vectors(values, size, what)
     if array.ndim != 1:
         raise ValueError(f"{what} have to be those of one sample, the shape is {array.shape}")
@@ -95,9 +95,10 @@ def one_vector(values: ArrayLike, size: int, what: str) -> Array:
 
 
 def later(time: float, last: float | None) -> float:
-    """The time of a sample, s.
+    """Check that the time of a sample is later than that of the sample before; return it, s.
 
-    :raises ValueError: it is not finite, or not later than the last one's.
+    :param last: time of the sample before, s; None for the first sample.
+    :raises ValueError: the time is not finite, or not later.
     """
     if not math.isfinite(time):
         raise ValueError(f"the time of a sample is {time}")

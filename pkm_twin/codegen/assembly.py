@@ -1,9 +1,8 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""Text of LLVM's intermediate language, an instruction a line.
+"""Write LLVM assembly as text, one instruction per line.
 
-Only what :mod:`pkm_twin.codegen.llvm` says of that language stands here. Types are texts; a
-:class:`Value` is the name of a result, or a constant, with its type. Products that are used once
-are fused with the sum that uses them where the processor can (FMA).
+Only the instructions that :mod:`pkm_twin.codegen.llvm` uses are here. Types are strings; a
+:class:`Value` is a constant or the name of a result, with its type.
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ BIT: Final = "i1"
 
 
 class Value:
-    """A result or a constant; of a pointer, ``target`` is the type that it points at."""
+    """A result or a constant; ``target`` is the type that a pointer points to."""
 
     __slots__ = ("kind", "name", "target")
 
@@ -30,12 +29,12 @@ class Value:
 
 
 def vector(kind: str, lanes: int) -> str:
-    """Type of a vector."""
+    """Return the type of a vector of ``lanes`` values."""
     return f"<{lanes} x {kind}>"
 
 
 def _lanes(kind: str) -> tuple[int, str]:
-    """How many lanes a type has, none if it is no vector, and of what."""
+    """Return the number of lanes of a type (0 for a scalar) and the type of a lane."""
     if not kind.startswith("<"):
         return 0, kind
     lanes, item = kind[1:-1].split(" x ")
@@ -43,30 +42,30 @@ def _lanes(kind: str) -> tuple[int, str]:
 
 
 def real(value: float) -> Value:
-    """A double, exactly."""
+    """Return a double constant by its exact bits."""
     (bits,) = struct.unpack("<Q", struct.pack("<d", value))
     return Value(DOUBLE, f"0x{bits:016X}")
 
 
 def whole(value: int, kind: str = INT64) -> Value:
-    """An integer."""
+    """Return an integer constant."""
     return Value(kind, str(value))
 
 
 def every(value: Value, lanes: int) -> Value:
-    """A vector of one constant."""
+    """Return a vector constant with the same value in every lane."""
     return Value(
         vector(value.kind, lanes), f"<{', '.join([f'{value.kind} {value.name}'] * lanes)}>"
     )
 
 
 def undefined(kind: str) -> Value:
-    """A value that is still to be filled."""
+    """Return an undefined value, to be filled lane by lane."""
     return Value(kind, "undef")
 
 
 class Block:
-    """Instructions in a row, the last of which leads elsewhere."""
+    """A basic block: instructions that end with a branch or a return."""
 
     __slots__ = ("lines", "name")
 
@@ -76,7 +75,7 @@ class Block:
 
 
 def _two(operation: str) -> Callable[[Function, Value, Value], Value]:
-    """An instruction of two values of one type, which is the result's, too."""
+    """Return a method that writes an instruction on two values of one type, its result's."""
 
     def add(self: Function, x: Value, y: Value) -> Value:
         return self.new(x.kind, f"{operation} {x.kind} {x.name}, {y.name}")
@@ -85,7 +84,7 @@ def _two(operation: str) -> Callable[[Function, Value, Value], Value]:
 
 
 def _compared(operation: str) -> Callable[[Function, str, Value, Value], Value]:
-    """A comparison, in each lane: a condition of this language (olt, sgt), then the values."""
+    """Return a method that compares two values lane by lane by an LLVM condition (olt, sgt)."""
 
     def add(self: Function, condition: str, x: Value, y: Value) -> Value:
         lanes, _ = _lanes(x.kind)
@@ -96,7 +95,7 @@ def _compared(operation: str) -> Callable[[Function, str, Value, Value], Value]:
 
 
 def _changed(operation: str) -> Callable[[Function, Value, str], Value]:
-    """A change of type."""
+    """Return a method that writes a type conversion."""
 
     def add(self: Function, x: Value, kind: str) -> Value:
         return self.new(kind, f"{operation} {x.kind} {x.name} to {kind}")
@@ -105,16 +104,16 @@ def _changed(operation: str) -> Callable[[Function, Value, str], Value]:
 
 
 class Function:
-    """A function of one pointer to 64-bit words that returns one; it grows where ``go_to`` led.
+    """An LLVM function that takes a pointer to 64-bit words and returns a 64-bit integer.
 
-    :param typed_pointers: as LLVM before 17 has them.
+    Instructions are appended to the block that :meth:`go_to` selected.
     """
 
     def __init__(self, name: str, *, typed_pointers: bool) -> None:
         self._name, self._typed = name, typed_pointers
         self._count = 0
         self.declared: dict[str, str] = {}
-        """Declarations of the intrinsic functions that it calls, by name."""
+        """Declarations of the intrinsic functions that are called, by name."""
         self._blocks: list[Block] = []
         self._room: list[str] = []
         self.words = Value(self.pointer(INT64), "%words", INT64)
@@ -129,16 +128,16 @@ class Function:
         return "\n".join([*lines, "}", ""])
 
     def pointer(self, target: str) -> str:
-        """Type of a pointer."""
+        """Return the type of a pointer to ``target``."""
         return f"{target}*" if self._typed else "ptr"
 
     def block(self, name: str) -> Block:
-        """A further block, numbered to be told from others of its name."""
+        """Add a block; its number makes its name unique."""
         self._blocks.append(Block(f"{name}{len(self._blocks)}"))
         return self._blocks[-1]
 
     def go_to(self, block: Block) -> None:
-        """What follows is added at the end of this block."""
+        """Append all further instructions to this block."""
         self._put = block.lines.append
 
     def _next(self) -> str:
@@ -146,7 +145,7 @@ class Function:
         return f"%v{self._count}"
 
     def new(self, kind: str, text: str, target: str = "") -> Value:
-        """An instruction with a result."""
+        """Append an instruction and return its result."""
         name = self._next()
         self._put(f"{name} = {text}")
         return Value(kind, name, target)
@@ -159,11 +158,11 @@ class Function:
     fptosi, sitofp = _changed("fptosi"), _changed("sitofp")
 
     def fneg(self, x: Value) -> Value:
-        """Minus x."""
+        """Negate x."""
         return self.new(x.kind, f"fneg {x.kind} {x.name}")
 
     def select(self, condition: Value, x: Value, y: Value) -> Value:
-        """X where the condition is true, else y."""
+        """Select x where the condition is true, else y."""
         return self.new(
             x.kind,
             f"select {condition.kind} {condition.name}, {x.kind} {x.name}, {y.kind} {y.name}",
@@ -171,7 +170,7 @@ class Function:
         )
 
     def call(self, name: str, kind: str, arguments: Sequence[Value]) -> Value:
-        """The result of an intrinsic function."""
+        """Call an intrinsic function."""
         if name not in self.declared:
             kinds = ", ".join(x.kind for x in arguments)
             self.declared[name] = f"declare {kind} @{name}({kinds})"
@@ -179,18 +178,18 @@ class Function:
         return self.new(kind, f"call {kind} @{name}({given})")
 
     def inttoptr(self, word: Value, target: str) -> Value:
-        """The pointer that a word is."""
+        """Convert a 64-bit word to a pointer."""
         kind = self.pointer(target)
         return self.new(kind, f"inttoptr {word.kind} {word.name} to {kind}", target)
 
     def alloca(self, kind: str, count: int = 1) -> Value:
-        """Room for values that live through a call, made at its begin."""
+        """Reserve stack memory for ``count`` values, in the function's first block."""
         name = self._next()
         self._room.append(f"{name} = alloca {kind}, {INT64} {count}")
         return Value(self.pointer(kind), name, kind)
 
     def gep(self, place: Value, index: Value) -> Value:
-        """The pointer so many values further on."""
+        """Advance a pointer by ``index`` values."""
         return self.new(
             place.kind,
             f"getelementptr {place.target}, {place.kind} {place.name}, {index.kind} {index.name}",
@@ -198,27 +197,27 @@ class Function:
         )
 
     def load(self, place: Value, align: int = 0) -> Value:
-        """What stands there; at a multiple of ``align`` bytes, by default of its own size."""
+        """Load a value; its address is a multiple of ``align`` bytes (0: of the type's size)."""
         side = f", align {align}" if align else ""
         return self.new(place.target, f"load {place.target}, {place.kind} {place.name}{side}")
 
     def store(self, x: Value, place: Value) -> None:
-        """Write x there."""
+        """Store x at an address."""
         self._put(f"store {x.kind} {x.name}, {place.kind} {place.name}")
 
     def extract_element(self, x: Value, lane: int) -> Value:
-        """One entry of a vector."""
+        """Extract one lane of a vector."""
         _, kind = _lanes(x.kind)
         return self.new(kind, f"extractelement {x.kind} {x.name}, {INT32} {lane}")
 
     def insert_element(self, x: Value, value: Value, lane: int) -> Value:
-        """The vector with one entry changed."""
+        """Replace one lane of a vector."""
         return self.new(
             x.kind, f"insertelement {x.kind} {x.name}, {value.kind} {value.name}, {INT32} {lane}"
         )
 
     def splat(self, value: Value, lanes: int) -> Value:
-        """A vector of one value."""
+        """Copy a value into every lane of a vector."""
         kind, order = vector(value.kind, lanes), vector(INT32, lanes)
         first = self.insert_element(undefined(kind), value, 0)
         return self.new(
@@ -227,66 +226,66 @@ class Function:
         )
 
     def branch(self, block: Block) -> None:
-        """Go on there."""
+        """Branch to a block."""
         self._put(f"br label %{block.name}")
 
     def cbranch(self, condition: Value, yes: Block, no: Block) -> None:
-        """Go on here or there."""
+        """Branch to ``yes`` if the condition is true, else to ``no``."""
         self._put(f"br {BIT} {condition.name}, label %{yes.name}, label %{no.name}")
 
     def ret(self, x: Value) -> None:
-        """End with this result."""
+        """Return from the function with this result."""
         self._put(f"ret {x.kind} {x.name}")
 
 
 LANES: Final = 4
 ALIGN: Final = 8
-"""Bytes that rows of what is prepared are aligned to."""
+"""Alignment of the prepared parameters' rows, bytes."""
 VECTOR: Final = vector(DOUBLE, LANES)
 INTEGERS: Final = vector(INT64, LANES)
 TRUE: Final = every(Value(BIT, "true"), LANES)
 
 
 class Lanes:
-    """Instructions on vectors, or on one double, as operations write them."""
+    """Instructions on vectors (``wide``) or single doubles, with which operations are written."""
 
     def __init__(self, function: Function, *, wide: bool) -> None:
         self.b, self.wide = function, wide
         self.type = VECTOR if wide else DOUBLE
         self.integer = INTEGERS if wide else INT64
         self.turned: dict[int, tuple[Value, Value]] = {}
-        """Cosines and sines by the number of their angle."""
+        """Cosine and sine by the angle's expression number."""
         self.masks: dict[int, Value] = {}
-        """Where expressions are above zero."""
+        """Masks of the lanes where an expression is positive, by expression number."""
         self.flags: set[int] = set()
-        """Expressions that are 1 there and 0 elsewhere."""
+        """Numbers of the expressions that equal 1.0 in their mask's lanes and 0.0 elsewhere."""
 
     def number(self, value: float) -> Value:
-        """A constant."""
+        """Return a floating-point constant in every lane."""
         return every(real(value), LANES) if self.wide else real(value)
 
     def whole(self, value: int) -> Value:
-        """A constant integer."""
+        """Return an integer constant in every lane."""
         return every(whole(value), LANES) if self.wide else whole(value)
 
     def call(self, name: str, *arguments: Value) -> Value:
-        """An intrinsic of LLVM."""
+        """Call LLVM's intrinsic function of this name for the lanes' type."""
         full = f"llvm.{name}.{f'v{LANES}f64' if self.wide else 'f64'}"
         return self.b.call(full, self.type, arguments)
 
     def operation(self, lanes: str | Callable[..., Value], e: Any, x: Sequence[Value]) -> Value:
-        """The instructions of an operation, ``e``, on its arguments."""
+        """Write the instructions of expression ``e``'s operation on its arguments."""
         if isinstance(lanes, str):
             known: Callable[..., Value] | None = getattr(self.b, lanes, None)
             return self.call(lanes, *x) if known is None else known(*x)
         return lanes(self, e, *x)
 
     def fused(self, x: Value, y: Value, z: Value) -> Value:
-        """X y + z."""
+        """Compute x y + z, in one instruction where the processor has one."""
         return self.call("fma", x, y, z) if FUSED else self.b.fadd(self.b.fmul(x, y), z)
 
     def polynomial(self, x: Value, coefficients: Sequence[float]) -> Value:
-        """By Horner's rule, the highest power first."""
+        """Evaluate a polynomial by Horner's rule, coefficients from the highest power down."""
         result = self.number(coefficients[0])
         for c in coefficients[1:]:
             result = self.fused(result, x, self.number(c))
@@ -294,7 +293,7 @@ class Lanes:
 
 
 def module(triple: str, functions: Sequence[Function]) -> str:
-    """The text of some functions."""
+    """Write a module of functions."""
     declared = {name: line for each in functions for name, line in each.declared.items()}
     head = [f'target triple = "{triple}"', *declared.values()]
     return "\n".join([*head, *(str(each) for each in functions)])

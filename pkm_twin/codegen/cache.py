@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""Compiled programs on disk, named by digests. An optimisation: without it all works."""
+"""Keep compiled programs on disk, named by digests; everything works without the cache, too."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from pathlib import Path
 from typing import Any, Final
 
 VARIABLE: Final = "PKM_TWIN_CACHE"
-"""Names the folder; empty switches the cache off."""
+"""Environment variable with the cache folder; an empty value turns the cache off."""
 _MARK: Final = b"pkm_twin compiled program 2\n"
 _ELF: Final = struct.Struct("<4s36xQ10xHH2x")
-"""Magic bytes, then where the table of sections begins, the size of an entry, their number."""
+"""ELF header: magic bytes, offset of the section table, size of an entry, number of entries."""
 _LARGEST: Final = 64 * 1024 * 1024
 MAX_BYTES: Final = 512 * 1024 * 1024
-"""Bytes of all programs above which those that were not used for the longest time are deleted."""
+"""Size of the cache, bytes, above which the least recently used programs are deleted."""
 LOCK_TIMEOUT: Final = 60.0
 """Seconds to wait for another process that compiles the same program; it may be suspended."""
 _LOCK_PERIOD: Final = 0.01
@@ -39,7 +39,7 @@ class _Said:
 
 
 def folder() -> Path | None:
-    """The folder of compiled programs, made if it has to be; None where there can be none."""
+    """Return the cache folder, made if needed; None if there can be none."""
     named = os.environ.get(VARIABLE)
     if named == "":
         return None
@@ -47,7 +47,7 @@ def folder() -> Path | None:
         base = os.environ.get("XDG_CACHE_HOME")
         place = Path(named or (Path(base) if base else Path.home() / ".cache") / "pkm_twin")
         place.mkdir(mode=0o700, parents=True, exist_ok=True)
-        # Code of another user's choice must not run.
+        # Code that another user could have placed there must not run.
         if place.stat().st_uid != os.geteuid() or place.stat().st_mode & 0o022:
             raise PermissionError(f"{place} can be written by others")
         if not os.access(place, os.W_OK):
@@ -59,7 +59,7 @@ def folder() -> Path | None:
 
 
 def say_once(error: BaseException) -> None:
-    """One line a process: programs are compiled in memory."""
+    """Warn once per process that programs are not cached."""
     if not _Said.once:
         _Said.once = True
         text = str(error) or type(error).__name__
@@ -67,25 +67,25 @@ def say_once(error: BaseException) -> None:
 
 
 def digest(*parts: str) -> str:
-    """Name of what hangs on these texts."""
+    """Return the cache name of an entry that these texts determine."""
     return hashlib.sha256("\0".join(parts).encode()).hexdigest()[:32]
 
 
 def read(name: str) -> tuple[dict[str, Any], bytes] | None:
-    """Header and code of a stored program; None if there is none, or it must not be run.
+    """Read the header and code of a stored program; None if there is none that may be run.
 
-    It must be this user's own, whole, and sealed under this very name.
+    The file must belong to this user, be complete, and carry the checksum of this name.
     """
     place = folder()
     if place is None or not _NAME.fullmatch(name):
         return None
     try:
-        # A FIFO in its place would wait for a writer, a device never end.
+        # Without O_NONBLOCK a FIFO of this name would block until somebody writes to it.
         with open(os.open(place / name, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb") as file:
             if not _own(os.fstat(file.fileno())):
                 return None
             data = file.read(_LARGEST)
-            # The time of the last use, by which old programs are deleted.
+            # The modification time is the time of the last use; :func:`_shrink` sorts by it.
             with suppress(OSError):
                 os.utime(file.fileno())
     except OSError:
@@ -107,7 +107,7 @@ def read(name: str) -> tuple[dict[str, Any], bytes] | None:
 
 
 def _own(status: os.stat_result) -> bool:
-    """Whether a file is a regular one that this user alone can have written."""
+    """Return whether a file is a regular file that only this user can have written."""
     return (
         stat.S_ISREG(status.st_mode)
         and status.st_uid == os.geteuid()
@@ -116,10 +116,10 @@ def _own(status: os.stat_result) -> bool:
 
 
 def is_object(code: bytes, symbol: str) -> bool:
-    """Whether code is an object file with this symbol, none of it missing.
+    """Return whether ``code`` is a complete object file that defines ``symbol``.
 
     LLVM's linker ends the process on anything else. On Linux LLVM writes ELF-64 (System V ABI,
-    chapter 4) with the table of sections last; elsewhere the name alone is looked for.
+    chapter 4) with the section table last; elsewhere only the name is looked for.
     """
     if symbol.encode() not in code or len(code) < _ELF.size:
         return False
@@ -129,7 +129,7 @@ def is_object(code: bytes, symbol: str) -> bool:
 
 
 def write(name: str, header: Mapping[str, Any], code: bytes) -> None:
-    """Store a program whole or not at all."""
+    """Store a program atomically: temporary file, then rename."""
     place = folder()
     if place is None:
         return
@@ -150,9 +150,9 @@ def write(name: str, header: Mapping[str, Any], code: bytes) -> None:
 
 @contextmanager
 def alone(name: str) -> Iterator[None]:
-    """Keep other processes from compiling the same program meanwhile.
+    """Hold a lock so that no other process compiles the same program meanwhile.
 
-    Where no lock can be had, or another process holds it for :data:`LOCK_TIMEOUT`, go on without.
+    Go on without the lock if it cannot be made or is not free within :data:`LOCK_TIMEOUT`.
     """
     place = folder()
     handle = None
@@ -177,7 +177,7 @@ def alone(name: str) -> Iterator[None]:
 
 
 def _shrink(place: Path) -> None:
-    """Delete what was not used for the longest time, down to half of :data:`MAX_BYTES`."""
+    """Delete the least recently used programs until half of :data:`MAX_BYTES` is left."""
     files = []
     with os.scandir(place) as entries:
         for entry in entries:
@@ -190,7 +190,7 @@ def _shrink(place: Path) -> None:
     for _, size, path in sorted(files):
         if left <= MAX_BYTES // 2:
             return
-        # Another process may have been faster.
+        # Another process may have deleted the file already.
         with suppress(OSError):
             os.unlink(path)
         left -= size

@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""Sparse symmetric matrices that are not negative, as straight-line expressions."""
+"""Factor sparse symmetric positive semidefinite matrices of expressions (L D L')."""
 
 from __future__ import annotations
 
@@ -11,22 +11,22 @@ from pkm_twin.codegen.lu import is_zero
 from pkm_twin.codegen.operations import maximum
 
 FLOOR: Final = 1e-20
-"""Least pivot, over what it is compared with: rounding ends far above it, so all stays finite."""
+"""Smallest pivot relative to its scale: far below rounding errors, it only avoids division by 0."""
 
 Entries = dict[tuple[int, int], Any]
-"""Lower triangle, by row and column, row >= column."""
+"""Entries of the lower triangle by (row, column), row >= column."""
 
 
 class SparseCholesky:
-    """L D L' without pivoting, which a positive matrix does not need, in the order of least degree.
+    """The factorisation L D L' of a positive definite matrix, eliminated in minimum-degree order.
 
-    Row and column k of the factors are those of ``order[k]`` of the matrix. ``factors``: L below
-    its diagonal; ``below``: by column the rows where it is not zero; ``pivots``: D; ``inverses``:
-    their reciprocals.
+    Row and column k of the factors belong to row ``order[k]`` of the matrix. ``factors``: entries
+    of L below the diagonal; ``below``: rows of these entries by column; ``pivots``: D;
+    ``inverses``: the reciprocals of D.
 
-    :param matrix: lower triangle with its whole diagonal; what is left out is zero.
-    :param scale: what pivots are compared with, of the matrix' diagonal.
-    :param last: how many of the first ones come last, in their order.
+    :param matrix: lower triangle including the whole diagonal; missing entries are zero.
+    :param scale: scales of the pivots, in the order of the matrix' diagonal.
+    :param last: number of leading rows that are eliminated last, in their own order.
     """
 
     def __init__(self, matrix: Mapping[tuple[int, int], Any], scale: Sequence[Any], last: int = 0):
@@ -55,7 +55,7 @@ class SparseCholesky:
             self.below.append(column)
 
     def forward(self, right: Sequence[Any]) -> list[Any]:
-        """Y of L y = right, shape (n,), in the order of the factors."""
+        """Solve L y = right, shape (n,); y is in the order of the factors."""
         b = [right[index] for index in self.order]
         for j, rows in enumerate(self.below):
             for i in rows:
@@ -63,7 +63,7 @@ class SparseCholesky:
         return b
 
     def solve(self, right: Sequence[Any]) -> list[Any]:
-        """X of A x = right, shape (n,)."""
+        """Solve A x = right, shape (n,)."""
         b = self.forward(right)
         for j in reversed(range(len(b))):
             b[j] = b[j] * self.inverses[j]
@@ -73,7 +73,7 @@ class SparseCholesky:
 
 
 def _order(matrix: Mapping[tuple[int, int], Any], n: int, last: int) -> list[int]:
-    """Least degree first, but the first ``last`` come last."""
+    """Return the elimination order: least degree first; the first ``last`` rows at the end."""
     near: dict[int, set[int]] = {a: set() for a in range(n)}
     for a, b in matrix:
         if a != b:
@@ -92,13 +92,13 @@ def _order(matrix: Mapping[tuple[int, int], Any], n: int, last: int) -> list[int
 def trace_over(numerator: Objects, matrix: Objects) -> Any:
     """Return the trace of matrix^-1 numerator.
 
-    With matrix = L D L' it is the sum of the diagonal of L^-1 numerator L^-T over the pivots D, so
-    the numerator goes through the elimination too. Where the matrix has no inverse the result is
-    large and finite.
+    With matrix = L D L' the trace is the sum of the diagonal of L^-1 numerator L^-T over D, so the
+    numerator is eliminated along with the matrix. For a singular matrix the result is large and
+    finite.
 
-    :param numerator: symmetric, not negative, with a positive diagonal, shape (n, n), expressions
-        or numbers.
-    :param matrix: symmetric, not negative, the same shape and unit.
+    :param numerator: symmetric positive semidefinite with a positive diagonal, shape (n, n),
+        expressions or numbers.
+    :param matrix: symmetric positive semidefinite, of the same shape and unit.
     """
     n = len(matrix)
     lower = {

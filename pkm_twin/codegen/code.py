@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""One program over batches of samples, of one machine or of many, by the best back end there is."""
+"""Run a program over batches of samples, for one machine or many: compiled, or as plain Python."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ from pkm_twin.codegen.program import Program
 from pkm_twin.errors import ParameterError
 
 SWITCH: Final = "PKM_TWIN_PLAIN"
-"""Set to 1: plain Python, as on a machine without llvmlite."""
+"""Environment variable: 1 runs programs as plain Python, as on a computer without llvmlite."""
 STEPS: Final = (3, 9, 27, 81, 243, 1024)
-"""Steps in which samples are tried again that one step does not reach."""
+"""Numbers of steps in which samples that a single step does not reach are tried again."""
 
 
 GOOD: Final = 0.0
@@ -38,9 +38,9 @@ NOT_FINITE: Final = 2.0
 MAX_NUMBERS: Final = 1_000_000
 """Upper limit of the numbers in an input, an output or the parameters."""
 SMALL: Final = 4096
-"""Samples of a batch that is copied into a room of its own."""
+"""Largest batch, samples, that is copied into a preallocated buffer."""
 KEPT_ROOMS: Final = 16
-"""Sizes of small batches whose rooms are kept."""
+"""Number of batch sizes whose buffers are kept."""
 
 
 _F8: Final = np.dtype(np.float64)
@@ -59,7 +59,7 @@ def _llvm() -> ModuleType | None:
 
 
 def compiled() -> bool:
-    """Whether programs are compiled; else they run as plain Python."""
+    """Return whether programs are compiled; otherwise they run as plain Python."""
     return _llvm() is not None
 
 
@@ -80,9 +80,10 @@ def _axes(array: Array) -> int:
 
 
 class Space:
-    """Room for samples of a kernel, with everything where the code looks for it.
+    """Preallocated inputs, outputs and status of a kernel, where compiled code expects them.
 
-    Inputs, outputs and status have shape (size,) each, or (samples, size) for several samples.
+    Each has shape (size,), or (samples, size) for several samples. ``words``: the argument of the
+    kernel, see :func:`.llvm.emit`.
     """
 
     def __init__(self, inputs: Sequence[int], outputs: Sequence[int], samples: int = 1) -> None:
@@ -105,22 +106,21 @@ class Space:
         self.prepared: Array | None = None
 
     def point_at(self, prepared: Array) -> None:
-        """Use what was prepared of these parameters; kept, so that its address stays its."""
+        """Use prepared parameters; hold a reference, so that their memory stays allocated."""
         self.prepared = prepared
         self.words[3] = prepared.ctypes.data
 
     def takers(self) -> list[memoryview]:
-        """Of one sample's inputs: each takes doubles of exactly its length and nothing else."""
+        """Return views of one sample's inputs; they accept only doubles of the exact length."""
         return [memoryview(view.data) for view in self.inputs]
 
 
 @remembered
 def caller(inputs: int, outputs: int) -> Callable[..., Any]:
-    """Makes the fast call of a number of inputs, without a loop over them.
+    """Write a maker of fast calls with this number of inputs, without a loop over them.
 
-    It gives the first output, or of ``outputs`` above zero a list of all, and None for the status.
-
-    A call takes its room from those that are free, so that threads do not share one.
+    A call returns the first output; with ``outputs`` above zero a list of all outputs, and None for
+    the status. Each call takes a free buffer, so that threads do not share one.
     """
     names = [f"a{k}" for k in range(inputs)]
     given, takers = ", ".join(names), ", ".join(f"t{k}" for k in range(inputs))
@@ -131,7 +131,7 @@ def caller(inputs: int, outputs: int) -> Callable[..., Any]:
         "    free = []",
         "    take, give = free.pop, free.append",
         f"    def call({given}):",
-        # A masked array is no array here: its buffer tells nothing of the mask.
+        # Masked arrays are excluded: their buffer does not show the mask.
         f"        if not ({' is '.join(['array', *(f'type({name})' for name in names)])})"
         " or a0.ndim != 1:",
         f"            return otherwise({given})",
@@ -160,18 +160,18 @@ def caller(inputs: int, outputs: int) -> Callable[..., Any]:
 
 
 def aligned(rows: int, size: int) -> Array:
-    """An empty array at a multiple of 64 bytes: no vector lies across two lines of the cache."""
+    """Allocate an array aligned to 64 bytes, so that no vector straddles two cache lines."""
     room = np.empty(rows * size + 8)
     start = -room.ctypes.data % 64 // 8
     return room[start : start + rows * size].reshape(rows, size)
 
 
 class Code:
-    """One program over batches, of one machine or of many.
+    """A program that runs over batches of samples, for one machine or many.
 
-    What hangs on parameters alone is prepared once a machine, see :meth:`prepare`.
+    Expressions of parameters alone are computed once per machine, see :meth:`prepare`.
 
-    :param build: writes the program; called only where no compiled one is stored.
+    :param build: writes the program; called only if no compiled program is cached.
     :param key: the program's identity.
     """
 
@@ -179,16 +179,16 @@ class Code:
         self.build, self.key = build, key
         self._lock = threading.Lock()
         self._spaces: dict[int, list[Space]] = {}
-        """Rooms that nobody uses, by their number of samples."""
+        """Free buffers by their number of samples."""
 
     @cached_property
     def program(self) -> Program:
-        """The program itself."""
+        """The program's expressions."""
         return self.build()
 
     @cached_property
     def _loaded(self) -> tuple[dict[str, Any], Any, Any, Any]:
-        """Sizes, then the code that prepares, that for batches and that for one sample."""
+        """Sizes, then the functions that prepare parameters, run batches and run one sample."""
         llvm = _llvm()
         with self._lock:
             if llvm is None:
@@ -202,9 +202,10 @@ class Code:
             return header, prepare, native.PROTOTYPE(address), native.LOCKED(address)
 
     def _compiled(self, llvm: ModuleType, native: ModuleType) -> tuple[dict[str, Any], bytes]:
-        """Sizes and object code: stored under the emitted text, which is stored under the key.
+        """Return sizes and object code from the cache, or compile them.
 
-        So a change of a source that changes no emitted text compiles nothing.
+        The key's digest leads to the digest of the LLVM assembly, and that to the object code: a
+        change of a source file that leaves the assembly unchanged compiles nothing.
         """
         source = self.key.digest(llvm.IDENTITY)
         match cache.read(source):
@@ -231,11 +232,11 @@ class Code:
         return tuple(header["inputs"]), tuple(header["outputs"])
 
     def prepare(self, p: Array) -> Array:
-        """What samples need of a machine's parameters.
+        """Compute the expressions of parameters alone.
 
-        :param p: parameters, shape (k, parameters), contiguous, or of one machine (parameters,).
-        :returns: shape (k, prepared), or (prepared,): last by how much the parameters miss
-            what the program takes for constant, squared.
+        :param p: parameters of k machines, shape (k, parameters), contiguous, or of one machine,
+            (parameters,).
+        :returns: shape (k, prepared) or (prepared,); the last entry is :attr:`.Program.missed`.
         """
         header, prepare, _, locked = self._loaded
         if p.shape[-1] != header["parameters"]:
@@ -250,23 +251,23 @@ class Code:
 
     @property
     def functions(self) -> tuple[Any, Any] | None:
-        """The code for batches and that for one sample, which holds the interpreter's lock."""
+        """The function for batches and that for one sample, which keeps the interpreter lock."""
         return None if self._loaded[3] is None else self._loaded[2:]
 
     @property
     def parameters(self) -> int:
-        """How many parameters there are."""
+        """Number of parameters."""
         return int(self._loaded[0]["parameters"])
 
     def run(self, prepared: Array, *inputs: ArrayLike) -> tuple[list[Array], Array | None]:
-        """Evaluate over leading batch axes.
+        """Evaluate the program over leading batch axes.
 
-        :param prepared: of one machine, contiguous.
-        :param inputs: one array an input, shape (..., size), broadcast against each other.
-        :returns: outputs, shape (..., size) each, NaN in refused samples; and the status, None
-            if all samples are good, else shape (..., 2): 0 good, 1 refused, 2 not finite; and the
-            part of the way from home that was reached.
-        :raises ValueError: an input that is no real numbers, or whose last axis has another size.
+        :param prepared: prepared parameters of one machine, contiguous.
+        :param inputs: one array per input, shape (..., size), broadcast against each other.
+        :returns: outputs, shape (..., size) each, NaN in refused samples; and the status: None if
+            all samples are good, else shape (..., 2): 0 good, 1 refused or 2 not finite, and the
+            fraction of the motion from home that was reached.
+        :raises ValueError: an input is not real numbers, or its last axis has another size.
         """
         arrays = self.checked(inputs)
         shape = max(arrays, key=_axes, default=_NO_INPUT).shape[:-1]
@@ -283,7 +284,7 @@ class Code:
             return [np.empty((*shape, size)) for size in self.sizes[1]], None
         _, _, code, locked = self._loaded
         if locked is not None and count <= SMALL:
-            # Copies into a room cost less than to find where arrays lie.
+            # Copying into a buffer costs less than reading the arrays' addresses.
             space = self._room(prepared, count)
             for view, a in zip(space.inputs, arrays, strict=True):
                 view[...] = a if a.ndim <= 2 else a.reshape(count, -1)
@@ -301,7 +302,7 @@ class Code:
         return outputs, None if status is None else status.reshape(*shape, 2)
 
     def _room(self, prepared: Array, count: int) -> Space:
-        """A room for so many samples of a machine, for :meth:`_give` to have back."""
+        """Take a buffer for ``count`` samples; :meth:`_give` returns it to the pool."""
         free = self._spaces.get(count)
         if free is None:
             if len(self._spaces) >= KEPT_ROOMS:
@@ -316,17 +317,17 @@ class Code:
         return space
 
     def _give(self, space: Space, count: int) -> None:
-        """Give a room back; one whose kind is not kept any more goes."""
+        """Return a buffer to the pool; drop it if the pool no longer keeps this size."""
         free = self._spaces.get(count)
         if free is not None:
             free.append(space)
 
     def run_each(self, prepared: Array, *inputs: Array) -> tuple[list[Array], Array | None]:
-        """The same of many machines.
+        """Evaluate the program for k machines, each with its own parameters.
 
         :param prepared: shape (k, prepared).
-        :param inputs: shape (k, samples, size), or (1, samples, size) for all machines alike, or
-            (k or 1, 1, size) for all samples alike.
+        :param inputs: shape (k, samples, size); the first axis may be 1 for equal inputs of all
+            machines, the second 1 for equal inputs of all samples.
         :returns: outputs, shape (k, samples, size) each, and the status, None or (k, samples, 2).
         """
         arrays = self.checked(inputs)
@@ -342,7 +343,7 @@ class Code:
         return shaped, None if status is None else status.reshape(machines, count, 2)
 
     def checked(self, inputs: Sequence[ArrayLike]) -> list[Array]:
-        """Inputs as arrays of doubles; errors as of :meth:`run`."""
+        """Convert inputs to doubles of the right sizes; raise the errors of :meth:`run`."""
         arrays = [doubles(value) for value in inputs]
         for array, size in zip(arrays, self.sizes[0], strict=True):
             if array.ndim == 0 or array.shape[-1] != size:
@@ -352,13 +353,13 @@ class Code:
     def bound(
         self, prepared: Array, otherwise: Callable[..., Any], outputs: int = 0
     ) -> Callable[..., Any]:
-        """The program of one machine as a function of its inputs.
+        """Return a fast function of the inputs for one machine.
 
-        One sample that is good at once takes the fastest way: arrays of doubles of exactly the
-        inputs' shapes, (size,) each. ``otherwise`` answers in any other case.
+        It is fast for a single sample that is good in the first attempt, with arrays of doubles of
+        exactly the inputs' shapes, (size,) each. All other calls go to ``otherwise``.
 
-        :param outputs: how many outputs there are, for all of them as of :meth:`run`; by default
-            it gives the first one alone.
+        :param outputs: number of outputs, to return all of them as :meth:`run` does; by default
+            only the first output is returned.
         """
         code = self._loaded[3]
         if code is None:
@@ -383,9 +384,9 @@ class Code:
         status: Array,
         count: int,
     ) -> Array | None:
-        """The status after samples that one step did not reach were tried in more and more.
+        """Solve refused samples again in more and more steps; return the status after it.
 
-        Their outputs are written in place; None if all samples are good.
+        Outputs are replaced in place; the status is None if all samples are good.
         """
         for steps in STEPS:
             left = np.flatnonzero(status[:, 0] == REFUSED)
@@ -426,19 +427,19 @@ class Code:
         status = np.empty((machines * count, 2))
 
         def part(begin: int, end: int) -> bool:
-            """Some of the machines, or of a single machine's samples; whether one is not good."""
+            """Compute some machines, or samples of a single one; return whether one failed."""
             many = machines > 1
             size = (end - begin, count) if many else (1, end - begin)
             own = prepared[begin:] if many else prepared
             words = [*size, steps, own.ctypes.data, prepared.shape[1]]
             for row in rows:
-                # One sample, or one machine, serves all.
+                # Stride 0: one sample, or one machine, for all.
                 leap, every = (row.strides[k] // 8 if row.shape[k] > 1 else 0 for k in (0, 1))
                 at = begin * (leap if many else every)
                 words += [row.ctypes.data + 8 * at, every, leap]
             at = begin * count if many else begin
             words += [array[at:].ctypes.data for array in [*outputs, status]]
-            # Named: its address alone would not keep it while the code reads it.
+            # The name keeps the array alive while the compiled code reads it.
             told = np.array(words, np.int64)
             return bool(code(told.ctypes.data))
 
@@ -448,7 +449,7 @@ class Code:
 
 
 def _rows(arrays: Sequence[Array], count: int) -> list[Array]:
-    """Doubles side by side, which a column of a table is not: shape (1, 1 or count, size)."""
+    """Convert arrays to contiguous rows, shape (1, 1 or count, size)."""
     return [
         np.ascontiguousarray(a).reshape(1, 1 if a.ndim == 1 else count, a.shape[-1]) for a in arrays
     ]
@@ -465,14 +466,14 @@ def _header(program: Program, lanes: int) -> dict[str, Any]:
 
 
 def _stored(name: str, symbol: str) -> tuple[dict[str, Any], bytes] | None:
-    """A stored program's sizes and object code; None where there is none that can run."""
+    """Read a cached program's sizes and object code; None if there is none that can run."""
     stored = cache.read(name)
     good = stored is not None and _sound(stored[0]) and cache.is_object(stored[1], symbol)
     return stored if good else None
 
 
 def _sound(header: dict[str, Any]) -> bool:
-    """Whether a stored header is one that `_header` can have written."""
+    """Return whether a cached header has the form that :func:`_header` writes."""
     match header:
         case {
             "inputs": [*taken],
@@ -487,15 +488,15 @@ def _sound(header: dict[str, Any]) -> bool:
 
 
 THREADS: Final = "PKM_TWIN_THREADS"
-"""How many threads a large batch may use: 1 unless set, 0 for all cores of this process."""
+"""Environment variable: threads for a large batch; 1 unless set, 0 for all cores."""
 WORTH: Final = 4096
-"""Samples for which it pays to start a thread."""
+"""Smallest number of samples for which starting a thread saves time."""
 
 
 def threads() -> int:
-    """What the environment says, read at every large batch.
+    """Read the number of threads from the environment, at every large batch.
 
-    :raises ParameterError: it is no number of threads.
+    :raises ParameterError: the variable is not a number of threads.
     """
     text = os.environ.get(THREADS, "").strip() or "1"
     if not text.isascii() or not text.isdigit() or int(text) > 1024:
@@ -504,9 +505,9 @@ def threads() -> int:
 
 
 def in_parts(part: Callable[[int, int], bool], whole: int, samples: int) -> bool:
-    """Compute ``part(begin, end)`` of all of ``whole``; whether any of them gives True.
+    """Compute ``part(begin, end)`` over range ``whole`` in threads; return whether any is True.
 
-    :param samples: how many samples there are in all.
+    :param samples: total number of samples, which decides the number of threads.
     """
     count = min(whole, samples // WORTH)
     if count > 1:
@@ -514,7 +515,7 @@ def in_parts(part: Callable[[int, int], bool], whole: int, samples: int) -> bool
     if count <= 1:
         return part(0, whole)
     ends = [whole * k // count for k in range(count + 1)]
-    # Threads of this call alone: those of a pool would be missing in a process that is forked.
+    # The threads belong to this call: a lasting pool would be missing in a forked process.
     with ThreadPoolExecutor(count - 1) as others:
         rest = [others.submit(part, *pair) for pair in pairwise(ends[1:])]
         bad = part(0, ends[1])

@@ -1,9 +1,9 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""Scalar expressions with sharing: formulas run once on these give a program for any back end.
+"""Record formulas as shared scalar expressions, from which every back end writes its program.
 
-Formulas are written for numbers and run on expressions too: numpy's object arrays of expressions
-add, multiply and take sines like arrays of floats. Equal expressions of one tape are one object,
-and what is zero, one or constant folds away while it is written.
+Formulas written for numbers run on expressions, too: numpy's object arrays of expressions add,
+multiply and take sines like arrays of floats. Equal expressions of one tape are one object, and
+operations on constants are folded while they are recorded.
 """
 
 from __future__ import annotations
@@ -35,12 +35,12 @@ Objects = NDArray[Any]
 """Array of expressions, of floats, or of both."""
 
 Numbers = Sequence[Any] | NDArray[Any]
-"""Some expressions or numbers in a row."""
+"""A sequence or array of expressions and numbers."""
 
 PARAMETERS: Final = "p"
 GEOMETRY: Final = "g"
-"""Names of the inputs that are the same for all samples of a machine: those of a program's own, and
-the machine's geometry."""
+"""Names of the inputs that are equal for all samples: a program's own parameters and the machine's
+geometry."""
 
 
 _number_of: Final = operator.attrgetter("number")
@@ -48,30 +48,30 @@ _level_of: Final = operator.attrgetter("level")
 
 
 class Tape:
-    """The expressions of one program.
+    """The expressions of one program, each recorded once.
 
-    :param reference: values of the geometry in a known case: what hangs on it alone has a value
-        there, and :func:`snapped` may take it for a constant.
-    :param free: nothing is taken for a constant, as where the geometry is differentiated by.
+    :param reference: reference values of the geometry. Expressions of the geometry alone have a
+        value there, and :func:`snapped` may replace them by a constant.
+    :param free: replace nothing by constants, as for derivatives with respect to the geometry.
     """
 
     def __init__(self, reference: Sequence[float] = (), *, free: bool = False) -> None:
         self._known: dict[tuple[Any, ...], Expression] = {}
         self.reference, self.free = reference, free
         self.assumed: list[tuple[Expression, float]] = []
-        """Expressions of parameters that are taken for a constant."""
+        """Expressions of parameters that were replaced by a constant, with this constant."""
 
     def __len__(self) -> int:
         return len(self._known)
 
     def constant(self, value: float) -> Expression:
-        """A number."""
-        # The sign of zero counts: it is a different number to atan2.
+        """Return the expression of a constant."""
+        # atan2 distinguishes 0.0 from -0.0.
         key = (None, value, math.copysign(1.0, value))
         return self._known.get(key) or self._new(key, None, (), CONSTANT, float(value))
 
     def input(self, name: str, index: int) -> Expression:
-        """Entry ``index`` of the input ``name``."""
+        """Return entry ``index`` of the input ``name``."""
         key = (name, index)
         known = self._known.get(key)
         if known is None:
@@ -82,17 +82,17 @@ class Tape:
         return known
 
     def inputs(self, name: str, size: int) -> Objects:
-        """All entries of an input, shape (size,)."""
+        """Return all entries of an input, shape (size,)."""
         array = np.empty(size, dtype=object)
         array[:] = [self.input(name, i) for i in range(size)]
         return array
 
     def lift(self, value: Any) -> Expression:
-        """An expression as it is, a number as a constant."""
+        """Convert a number to a constant; return an expression unchanged."""
         return value if isinstance(value, Expression) else self.constant(float(value))
 
     def make(self, op: Operation, *args: Expression) -> Expression:
-        """The operation on expressions, one object for equal ones."""
+        """Record an operation; return the same object for equal expressions."""
         if op.commutes and args[0].number > args[1].number:
             args = args[::-1]
         key = (op, *map(_number_of, args))
@@ -115,8 +115,9 @@ class Tape:
 class Expression:
     """A constant, an input or an operation on ``args``.
 
-    ``source``: name and index of an input. ``value``: of a constant, else in the tape's known case,
-    NaN where it hangs on the sample.
+    ``source``: name and index of an input. ``level``: what the expression depends on, CONSTANT,
+    PARAMETER or SAMPLE. ``value``: the constant, or the value at the tape's reference geometry; NaN
+    if the expression depends on the sample.
     """
 
     __slots__ = ("args", "level", "number", "op", "source", "tape", "value")
@@ -130,11 +131,11 @@ class Expression:
         self.source: tuple[str, int] | None = None
 
     def is_constant(self, value: float) -> bool:
-        """Whether it is this number."""
+        """Return whether the expression is this constant."""
         return self.level == CONSTANT and self.value == value
 
     def _with(self, op: Operation, other: Any, *, after: bool = False) -> Any:
-        """The operation on this and another value, or, ``after``, on that and this."""
+        """Apply an operation to this and another value, in reverse order with ``after``."""
         if other.__class__ is not Expression:
             if isinstance(other, np.ndarray):
                 return NotImplemented
@@ -179,18 +180,18 @@ class Expression:
             result = result * self
         return result
 
-    # As numpy calls them on arrays of objects.
+    # numpy calls these methods on the entries of object arrays.
 
     def sqrt(self) -> Any:
-        """Square root."""
+        """Return the square root."""
         return sqrt(self)
 
     def sin(self) -> Any:
-        """Sine."""
+        """Return the sine."""
         return sin(self)
 
     def cos(self) -> Any:
-        """Cosine."""
+        """Return the cosine."""
         return cos(self)
 
     def __repr__(self) -> str:
@@ -198,21 +199,21 @@ class Expression:
 
 
 SNAP: Final = 1e-14
-"""How far rounding leaves a number from 0, 1 or -1 that it is."""
+"""Largest rounding error of numbers that should be 0, 1 or -1: some fifty units of 2.2e-16."""
 
 
 def reference(value: Any) -> float:
-    """A number, or an expression's value in its tape's known case."""
+    """Return a number, or an expression's value at its tape's reference geometry."""
     return value.value if isinstance(value, Expression) else float(value)
 
 
 def number(value: Any) -> Any:
-    """A number as Python's own, an expression as it is."""
+    """Convert a number to a Python float; return an expression unchanged."""
     return value if isinstance(value, Expression) else float(value)
 
 
 def references(values: Any) -> NDArray[np.float64]:
-    """The same of every entry of an array."""
+    """Return :func:`reference` of every entry of an array."""
     array = np.asarray(values)
     if array.dtype != object:
         return np.asarray(array, np.float64)
@@ -220,7 +221,7 @@ def references(values: Any) -> NDArray[np.float64]:
 
 
 def plain(values: Any) -> NDArray[Any]:
-    """An array of floats where all are numbers, else of objects."""
+    """Convert values to an array of floats, or of objects if one is an expression."""
     if isinstance(values, np.ndarray) and values.dtype != object:
         return np.asarray(values, np.float64)
     objects = np.asarray(values, dtype=object)
@@ -230,14 +231,14 @@ def plain(values: Any) -> NDArray[Any]:
 
 
 def norm(vector: NDArray[Any]) -> Any:
-    """Length of a vector of numbers or expressions."""
+    """Return the Euclidean norm of a vector of numbers or expressions."""
     if vector.dtype != object:
         return float(np.linalg.norm(vector))
     return sqrt(vector @ vector)
 
 
 def snapped_all(values: Any) -> NDArray[Any]:
-    """Every entry as :func:`snapped`."""
+    """Apply :func:`snapped` to every entry."""
     array = plain(values)
     if array.dtype != object:
         near = np.rint(array).clip(-1.0, 1.0) + 0.0
@@ -246,10 +247,10 @@ def snapped_all(values: Any) -> NDArray[Any]:
 
 
 def snapped(value: Any) -> Any:
-    """A number beside 0, 1 or -1 as that: rounding left it there, and it folds away so.
+    """Replace a number within rounding of 0, 1 or -1 by that constant, so that it is folded.
 
-    An expression of parameters that is so in the known case is taken for the constant; the tape
-    notes that it was.
+    An expression of parameters with such a value at the reference geometry is replaced, too; the
+    tape records it as assumed.
     """
     if isinstance(value, Expression) and value.tape.free:
         return value
@@ -263,7 +264,7 @@ def snapped(value: Any) -> Any:
 
 
 def ordered(results: Iterable[Expression], known: Iterable[int] = ()) -> list[Expression]:
-    """Everything that the results depend on, arguments first; nothing below what is known."""
+    """List all expressions that the results depend on, arguments first; stop at known numbers."""
     seen: set[int] = set(known)
     order: list[Expression] = []
     for result in results:
@@ -287,7 +288,7 @@ def ordered(results: Iterable[Expression], known: Iterable[int] = ()) -> list[Ex
 
 
 def uses(results: Sequence[Expression]) -> dict[int, int]:
-    """How often each operation's value is used, by number; a result counts as used often."""
+    """Count the uses of each expression, by number; a result counts twice more."""
     counts: dict[int, int] = {}
     for e in ordered(results):
         for x in e.args:
@@ -298,12 +299,12 @@ def uses(results: Sequence[Expression]) -> dict[int, int]:
 
 
 def count(results: Iterable[Expression]) -> int:
-    """Operations a sample: without inputs, constants and what hangs on parameters alone."""
+    """Count the operations per sample; expressions of parameters alone are not among them."""
     return sum(e.level == SAMPLE and e.op is not None for e in ordered(results))
 
 
 def edge(results: Iterable[Expression]) -> list[Expression]:
-    """What hangs on parameters alone and is a result, or read by what hangs on samples."""
+    """List the expressions of parameters alone that are results or used by sample expressions."""
     results = list(results)
     found = {e.number: e for e in results if e.level == PARAMETER}
     for e in ordered(results):
@@ -313,12 +314,13 @@ def edge(results: Iterable[Expression]) -> list[Expression]:
 
 
 def adjoints(sums: Iterable[tuple[Any, Any]], by: Sequence[Expression]) -> list[Any]:
-    """Derivatives of a sum of products by inputs, as expressions, backwards.
+    """Differentiate a weighted sum of expressions by reverse-mode algorithmic differentiation.
 
-    Reverse mode of algorithmic differentiation, as :func:`tangents` is the forward mode (Griewank
-    and Walther 2008, chapter 3).
+    :func:`tangents` is the forward mode (Griewank and Walther 2008, chapter 3).
 
-    :param sums: expressions and what each is multiplied by, which is taken for constant.
+    :param sums: pairs of an expression and its weight; weights count as constant.
+    :param by: the inputs to differentiate with respect to.
+    :returns: one derivative per input.
     """
     bars: dict[int, Any] = {}
     pairs = [(e, weight) for e, weight in sums if isinstance(e, Expression)]
@@ -340,7 +342,7 @@ def adjoints(sums: Iterable[tuple[Any, Any]], by: Sequence[Expression]) -> list[
 
 
 def tangents(results: Sequence[Expression], by: Sequence[Expression]) -> list[list[Any]]:
-    """Derivatives of expressions by inputs as expressions, a row of them a result."""
+    """Differentiate expressions by forward mode; return one row per result, one entry per input."""
     rows: dict[int, dict[int, Any]] = {e.number: {k: 1.0} for k, e in enumerate(by)}
     for e in ordered(results):
         if e.op is None or e.number in rows or not any(rows[x.number] for x in e.args):

@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""Programs that run over leading batch axes, by the best back end that the machine has."""
+"""Evaluate a program for one machine over leading batch axes."""
 
 from __future__ import annotations
 
@@ -15,12 +15,13 @@ from pkm_twin.codegen.code import NOT_FINITE, Code, Space
 from pkm_twin.codegen.program import Program
 
 MISSED: Final = 1e-24
-"""Sum of squares by which a geometry may miss what a program takes for constant: rounding."""
+"""Largest sum of squared differences between a geometry and the constants that a program assumes:
+rounding errors of 1e-12."""
 _NO_GEOMETRY: Final = np.zeros(0)
 
 
 class Kernel:
-    """A program with the numbers of one machine's geometry: what hangs on them is prepared once."""
+    """A program with one machine's geometry; expressions of parameters alone are computed once."""
 
     def __init__(self, code: Code, geometry: Array = _NO_GEOMETRY) -> None:
         self.code, self.geometry = code, geometry
@@ -28,7 +29,7 @@ class Kernel:
 
     @property
     def program(self) -> Program:
-        """The program itself."""
+        """The program's expressions."""
         return self.code.program
 
     @property
@@ -38,16 +39,16 @@ class Kernel:
 
     @property
     def holds(self) -> bool:
-        """Whether the geometry is as the program takes it for constant."""
+        """Whether the geometry agrees with the constants that the program assumes."""
         p = np.zeros(self.code.parameters - len(self.geometry))
         return bool(self.code.prepare(np.concatenate([p, self.geometry]))[-1] <= MISSED)
 
     def prepared(self, p: Array) -> Array:
-        """What samples need of the program's own parameters and the geometry."""
+        """Compute the expressions of parameters and geometry alone, for all samples to use."""
         return self.code.prepare(np.concatenate([p, self.geometry]))
 
     def warm_up(self) -> None:
-        """Compile, or load what is stored, before the first sample is due."""
+        """Compile the program, or load it from the cache, before the first sample is due."""
         p = np.zeros(self.code.parameters - len(self.geometry))
         self(p, *[np.zeros(n) for n in self.sizes[0]])
 
@@ -66,10 +67,11 @@ class Kernel:
         return result
 
     def bound(self, p: Array, otherwise: Callable[..., Any] | None = None) -> Callable[..., Any]:
-        """The program on a machine's parameters, see :meth:`Code.bound`: inputs to first output.
+        """Return a fast function from the inputs to the first output, see :meth:`Code.bound`.
 
         :param p: the program's own parameters, shape (k,); not changed afterwards.
-        :param otherwise: by default the program, whatever its status.
+        :param otherwise: function for all but good single samples; default: the program, without
+            a check of its status.
         """
         return self.code.bound(
             self.prepared(p), otherwise or (lambda *inputs: self(p, *inputs)[0][0])
@@ -77,7 +79,7 @@ class Kernel:
 
 
 class BoundCall:
-    """A kernel on arrays of its own: shape (size,) each, or (samples, size) for several samples.
+    """A kernel with preallocated arrays: shape (size,), or (samples, size) for several samples.
 
     :param p: the program's own parameters, shape (k,).
     """
@@ -87,12 +89,12 @@ class BoundCall:
         self._space = space = Space(*kernel.sizes, samples)
         space.point_at(kernel.prepared(p))
         self.inputs, self.outputs, self._address = space.inputs, space.outputs, space.address
-        # Other threads may run while many samples are computed; one is over before they could.
+        # The interpreter lock is released for batches only: one sample is too short for it.
         code = kernel.code.functions
         self._code = None if code is None else code[samples == 1]
 
     def __call__(self) -> int:
-        """Compute the outputs: 0, or the greatest status of a sample."""
+        """Compute the outputs; return 0 if all samples are good, else the largest status."""
         if self._code is not None and not self._code(self._address):
             return 0
         outputs, status = self._kernel(self._p, *self.inputs)

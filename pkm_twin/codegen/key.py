@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""What identifies a program: what it is made of, and the sources of those who write it."""
+"""Identify a program by its content and by the source files of the functions that write it."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from uuid import uuid4
 from pkm_twin.codegen.cache import digest
 
 Module = tuple[str, str]
-"""Dotted name and file."""
+"""Dotted name and path of a module."""
 _IMPORT: Final = re.compile(rb"import[ \t]+(\([^)]*\)|.*)")
 _NAME: Final = re.compile(r"[\w.]+")
 _PACKAGE: Final = f"{os.sep}__init__.py"
@@ -25,34 +25,34 @@ _COMPILER: Final = "pkm_twin.codegen.code"
 
 @dataclass(frozen=True)
 class ProgramKey:
-    """A program's identity; keys that are equal are of one program.
+    """The identity of a program: equal keys stand for the same program.
 
-    ``text``: all of a program's content that its writers are given. ``writers``: modules whose
-    functions and classes write it.
+    ``text``: everything that the writing functions are given. ``writers``: the modules of these
+    functions and classes.
     """
 
     text: str = ""
     writers: frozenset[str] = frozenset()
 
     def also(self, text: str, *writers: Callable[..., Any]) -> ProgramKey:
-        """The key of what is made of this, of further content and by further writers."""
+        """Return the key of a program made from this one with further content and writers."""
         modules = (module for writer in writers for module in _modules(writer))
         return ProgramKey(f"{self.text} {text}", self.writers.union(modules))
 
     @property
     def sources(self) -> frozenset[str]:
-        """Files of the writers, of codegen, and of all that these import of their packages."""
+        """Source files of the writers and of codegen, and of all modules that these import."""
         return _sources(self.writers)
 
     def digest(self, *more: str) -> str:
-        """Name of the program that is stored; changes with its content and with any source."""
+        """Return the cache name of the program; it changes with the content and any source file."""
         writers = [name if _file(name) else f"{name} {_UNSAVED}" for name in sorted(self.writers)]
         return digest(self.text, *writers, *sorted(_read(file)[0] for file in self.sources), *more)
 
 
 EMPTY: Final = ProgramKey()
 _UNSAVED: Final = uuid4().hex
-"""Of writers without a file: another text in every process."""
+"""A text that differs in every process: stands for the source of writers without a file."""
 
 
 def _modules(writer: Callable[..., Any]) -> Iterator[str]:
@@ -65,7 +65,7 @@ def _modules(writer: Callable[..., Any]) -> Iterator[str]:
 
 
 def _file(module: str) -> str:
-    """The source of a loaded module; empty where there is none."""
+    """Return the source file of a loaded module; empty if it has none."""
     name = getattr(sys.modules.get(module), "__file__", None) or ""
     return name if name.endswith(".py") else ""
 
@@ -83,9 +83,9 @@ def _sources(writers: frozenset[str]) -> frozenset[str]:
 
 @cache
 def _imports(module: str, file: str) -> frozenset[Module]:
-    """What a file imports of its own package and of this one.
+    """Find the modules of its own package and of pkm_twin that a file imports.
 
-    Read from the text, so an import inside a function counts, and one for types too.
+    The text is searched, so imports inside functions and imports for type checking count, too.
     """
     homes = dict((_home(_COMPILER, _file(_COMPILER)), _home(module, file)))
     found = set()
@@ -102,26 +102,26 @@ def _imports(module: str, file: str) -> frozenset[Module]:
 
 
 def _home(module: str, file: str) -> tuple[str, str]:
-    """The package that a module is in, and the folder of that."""
+    """Return the top-level package of a module and the folder that contains the package."""
     depth = module.count(".") + 1 + file.endswith(_PACKAGE)
     return module.partition(".")[0], file.rsplit(os.sep, depth)[0]
 
 
 @cache
 def _place(folder: str, module: str) -> str:
-    """The file of a module below a folder; empty where there is none."""
+    """Find the file of a module below a folder; empty if there is none."""
     base = os.path.join(folder, *module.split("."))
     return next((file for file in (f"{base}.py", base + _PACKAGE) if os.path.isfile(file)), "")
 
 
 @cache
 def _read(file: str) -> tuple[str, list[tuple[str, list[str]]]]:
-    """Digest of a file's content, and its imports: modules, and the names taken from them."""
+    """Read a file's digest and its imports: each module with the names imported from it."""
     with open(file, "rb") as opened:
         data = opened.read()
     found = []
     for match in _IMPORT.finditer(data):
-        # What stands before it in its line: nothing, or the module.
+        # The line before "import": empty, or "from MODULE".
         before = data[data.rfind(b"\n", 0, match.start()) + 1 : match.start()].split()
         if not before or (len(before) == 2 and before[0] == b"from"):
             module = before[1].decode() if before else ""

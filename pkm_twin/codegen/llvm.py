@@ -1,9 +1,9 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""Programs as vector machine code: LANES samples a turn, one sample is a batch of one.
+"""Translate a program to vector code that computes LANES samples at a time.
 
-So one sample and a batch have the same bits: every lane computes the same operations, and a lane
-that has converged stands still. Products that are used once are fused with the sum that uses them
-where the processor can (FMA); where it cannot, the same program runs unfused.
+One sample and a batch have the same bits: every lane computes the same operations, and a lane that
+has converged keeps its values. A product that is used once is fused with the sum that uses it where
+the processor can (FMA).
 """
 
 from __future__ import annotations
@@ -48,20 +48,21 @@ from pkm_twin.codegen.program import (
 
 STATUS: Final = " status"
 LONG: Final = 100
-"""Entries of an output from which on they are stored in a loop."""
+"""Most entries of an output that are stored by straight-line code; more are stored in a loop."""
 
 ZERO: Final = whole(0)
 ONE: Final = whole(1)
 IDENTITY: Final = f"{llvmlite.__version__} {CPU} {FEATURES} {LANES} {OPTIMISATION} {QUICK}"
-"""What machine code hangs on beside the program."""
+"""Everything besides the program that the machine code depends on."""
 
 
 class Emitter(Lanes):
-    """Values of expressions at one place of the code, scalar or in lanes.
+    """Writes the values of expressions at one point of the code, as scalars or in lanes.
 
-    :param prepared: places of values in memory by expression's number. They are loaded where they
-        are used: held from one end of a program to the other, they would only be in the way of the
-        registers' allocation. ``base``: where they begin.
+    :param used: number of uses of each expression, see :func:`uses`.
+    :param prepared: index in memory of each expression of parameters alone. It is loaded at every
+        use: kept in a register through the whole program it would only occupy that register.
+    :param base: address of the prepared values; None for scalar code.
     """
 
     def __init__(
@@ -72,14 +73,14 @@ class Emitter(Lanes):
         self._known: dict[int, Value] = {}
 
     def known(self, e: Expression) -> Value:
-        """The value of an expression that was computed before."""
+        """Return the value of an expression that was computed before."""
         if self._base is None or e.number not in self._prepared:
             return self._known[e.number]
         place = self.b.gep(self._base, whole(self._prepared[e.number]))
         return self.b.load(place, ALIGN)
 
     def value(self, e: Expression, inputs: Mapping[str, Sequence[Value]]) -> Value:
-        """The instructions of one expression, its arguments known."""
+        """Write the instructions of one expression whose arguments were computed before."""
         if e.source is not None:
             name, index = e.source
             return inputs[name][index]
@@ -97,14 +98,14 @@ class Emitter(Lanes):
     def run(
         self, results: Sequence[Expression], inputs: Mapping[str, Sequence[Value]]
     ) -> list[Value]:
-        """Values of the results; every shared expression once."""
+        """Compute the results, every shared expression once."""
         for e in ordered(results, {**self._known, **self._prepared}):
             self._known[e.number] = self.value(e, inputs)
         return [self.known(e) for e in results]
 
 
 class _Counter:
-    """A loop: its index stands in a variable, from zero on."""
+    """A loop whose index counts from zero to ``end``."""
 
     def __init__(self, b: Function, name: str, end: Value, step: int = 1) -> None:
         self.b, self.end, self.step = b, end, step
@@ -112,7 +113,7 @@ class _Counter:
         self.head, self.body, self.after = (b.block(name) for _ in range(3))
 
     def begin(self) -> Value:
-        """Go into the loop; its index."""
+        """Enter the loop; return its index."""
         b = self.b
         b.store(ZERO, self._place)
         b.branch(self.head)
@@ -123,7 +124,7 @@ class _Counter:
         return index
 
     def close(self, more: Value | None = None) -> None:
-        """Go round, by default in any case, and on behind it."""
+        """End the body: repeat (only if ``more`` is true), then continue after the loop."""
         b = self.b
         b.store(b.add(b.load(self._place), whole(self.step)), self._place)
         if more is None:
@@ -142,8 +143,10 @@ def _word(b: Function, k: int) -> Value:
 
 
 def _preparation(program: Program) -> Function:
-    """What hangs on parameters alone, machine by machine; the words are machines, a pointer to
-    parameters and what they go on by, and a pointer to results, each in all lanes.
+    """Write the function that computes all expressions of parameters alone, for each machine.
+
+    Its words: number of machines; address of the parameters and their stride, doubles; address of
+    the results, each repeated in all lanes.
     """
     b = _function(PREPARE)
     count, stride = _word(b, 0), _word(b, 2)
@@ -170,7 +173,7 @@ def _preparation(program: Program) -> Function:
 
 
 class _Writer:
-    """The function of one program, see :func:`emit`."""
+    """Writes the function ``kernel`` of a program, see :func:`emit`."""
 
     def __init__(self, program: Program) -> None:
         self.program = program
@@ -181,7 +184,7 @@ class _Writer:
         self.flags = b.alloca(INT64)
         b.store(ZERO, self.flags)
         self.strides = {name: _word(b, 6 + 3 * k) for k, name in enumerate(names)}
-        # Pointers, and what each goes on by from one machine to the next.
+        # Addresses and their strides from one machine to the next, doubles.
         at = 5 + 3 * len(names)
         leaps = {"": (3, _word(b, 4))}
         leaps |= {name: (5 + 3 * k, _word(b, 7 + 3 * k)) for k, name in enumerate(names)}
@@ -198,7 +201,7 @@ class _Writer:
         self.prepared = {e.number: k for k, e in enumerate(program.prepared)}
         self._write()
         for name, (_, leap) in leaps.items():
-            # Pointers are bytes, leaps are doubles.
+            # Addresses count bytes, strides count doubles.
             b.store(b.add(b.load(places[name]), b.mul(leap, whole(8))), places[name])
         machines.close()
         b.ret(b.load(self.flags))
@@ -213,7 +216,7 @@ class _Writer:
         return self.b.fcmp("ogt", value, self.emitter().number(0.0))
 
     def _load(self, name: str, size: int) -> list[Value]:
-        """An input's entries, a vector each."""
+        """Load an input's entries, each as a vector over the samples."""
         base, stride = self.pointers[name], self.strides[name]
         b = self.b
         rows = [b.mul(place, stride) for place in self.places]
@@ -239,7 +242,7 @@ class _Writer:
                 b.store(b.extract_element(value, lane), at)
 
     def _save_long(self, base: Value, values: Sequence[Value]) -> None:
-        """The same in a loop: thousands of stores in a row take minutes to compile."""
+        """Store an output in a loop: thousands of straight-line stores take minutes to compile."""
         b = self.b
         size = whole(len(values))
         scratch = b.alloca(VECTOR, len(values))
@@ -254,11 +257,11 @@ class _Writer:
         entries.close()
 
     def _write(self) -> None:
-        """All samples of a machine."""
+        """Write the loop over the samples of a machine."""
         b, program = self.b, self.program
         samples = _Counter(b, "samples", self.count, LANES)
         i = samples.begin()
-        # Lanes beyond the last sample compute it once more, and store the same again.
+        # Lanes beyond the last sample repeat the last sample.
         last = b.sub(self.count, ONE)
         self.places = []
         for lane in range(LANES):
@@ -280,7 +283,7 @@ class _Writer:
         for row in rows.values():
             for value in row:
                 total = b.fadd(total, out.call("fabs", value))
-        # Inputs that no output hangs on have to be numbers, too.
+        # An input that is not finite is an error even if no output depends on it.
         for name in program.inputs:
             for value in values[name]:
                 total = b.fadd(total, out.call("fabs", value))
@@ -297,7 +300,7 @@ class _Writer:
         samples.close()
 
     def _store_progress(self, k: Value, n: Sequence[Value]) -> None:
-        """As :func:`.program.progress`, of step k + 1."""
+        """Compute :func:`.program.progress` of step k + 1."""
         b, parts = self.b, []
         for more in (-1, 0, 1):
             share = b.fdiv(b.sitofp(b.add(k, whole(more)), DOUBLE), b.sitofp(self.steps, DOUBLE))
@@ -308,7 +311,7 @@ class _Writer:
         b.store(b.splat(onward, LANES), n[AT.onward])
 
     def _solve(self, q: Equations, values: dict[str, list[Value]], n: list[Value]) -> list[Value]:
-        """Newton's method in steps; the unknowns. The state is made by the first equations."""
+        """Write Newton's method in steps, with the state n; return the unknowns."""
         b, number = self.b, self.emitter().number
         first = not n
         x, last, aim = ([b.alloca(VECTOR) for _ in row] for row in (q.home, q.home, q.origin))
@@ -323,12 +326,12 @@ class _Writer:
             moved: Mapping[str, Sequence[Value]] = MappingProxyType({}),
             first: Sequence[Expression] = (),
         ) -> None:
-            """Results of the state and of what has moved."""
+            """Compute results from the state and the inputs in ``moved``; store them in ``to``."""
             here = {name: [b.load(place) for place in row] for name, row in moved.items()}
             here[STATE] = [b.load(place) for place in n]
             out, given = self.emitter(), {**values, **here}
             out.masks |= uniform
-            # All of a correction before what is kept of it: fewer values wait in registers.
+            # Compute the whole correction before its selects: fewer values occupy registers.
             out.run(first, given)
             for place, e in zip(to, results, strict=True):
                 b.store(out.run([e], given)[0], place)
@@ -338,7 +341,7 @@ class _Writer:
             b.store(b.select(once, number(1.0), number(0.0)), n[AT.once])
             b.store(number(1.0), n[AT.alive])
             b.store(number(0.0), n[AT.reached])
-        # The same for all lanes: a jump, which is foreseen, instead of a choice by lane.
+        # The condition is equal in all lanes: a predictable branch instead of a select.
         uniform = {q.state[AT.once].number: once}
         run(q.home, last)
         steps = _Counter(b, "step", self.steps)
@@ -371,13 +374,16 @@ class _Writer:
 
 
 def emit(program: Program) -> str:
-    """The program as text of LLVM's intermediate language: two functions of one argument.
+    """Write a program as LLVM assembly: two functions that take the address of 64-bit words.
 
-    ``prepare``: see :func:`_preparation`. ``kernel``: the argument points at words: number of
-    machines, of samples of each, steps; pointer to what was prepared, and what it goes on by from a
-    machine to the next (doubles); of each input pointer, stride (0: one for all samples, else its
-    size) and what it goes on by; pointers to the outputs, row after row; pointer to the status, two
-    numbers a sample: 0 good, 1 refused, 2 not finite; and the part of the way that was reached. It
-    returns 0 if all samples are good.
+    ``prepare``: see :func:`_preparation`. ``kernel`` returns 0 if all samples are good. Its words:
+
+    - number of machines, samples per machine, steps;
+    - address of the prepared parameters and their stride from one machine to the next, doubles;
+    - for each input its address, its stride from sample to sample (0: one for all samples) and from
+      machine to machine, doubles;
+    - the address of each output, rows one after the other;
+    - the address of the status, two numbers per sample: 0 good, 1 refused, 2 not finite; and the
+      fraction of the motion from home that was reached.
     """
     return module(binding.get_default_triple(), [_preparation(program), _Writer(program).b])

@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""Sparse linear equations as straight-line expressions, pivots chosen beforehand on numbers."""
+"""Solve sparse linear equations of expressions by LU; pivots are chosen beforehand on samples."""
 
 from __future__ import annotations
 
@@ -12,17 +12,21 @@ from pkm_twin.codegen.expressions import Objects
 from pkm_twin.errors import SingularityError
 
 ZERO: Final = 1e-13
-"""Part of the largest entry below which one is zero in all states: rounding left it."""
+"""Entries below this fraction of the largest one, in all samples, are rounding errors of zero."""
 
 
 def independent_rows(matrices: Array, bound: float = 1e-9) -> list[int]:
-    """Rows that are independent in every one of some matrices, shape (k, rows, columns).
+    """Select rows that are linearly independent in every one of k matrices.
 
-    Greedy, by what of a row is left across those chosen before (QR with pivoting of the
-    transpose); ties take the earlier row. As many as the least rank of the matrices.
+    QR with column pivoting of the transpose: the next row has the largest component orthogonal to
+    the rows chosen before, the earlier row where two are equal.
+
+    :param matrices: shape (k, rows, columns).
+    :param bound: smallest orthogonal component of an independent row, relative to the largest row.
+    :returns: sorted indices, as many as the smallest rank of the matrices.
     """
     rest = matrices.astype(float).copy()
-    # Of a matrix of zeros no row is independent.
+    # 1e-300 avoids 0 / 0 for a matrix of zeros.
     scale = np.maximum(np.linalg.norm(rest, axis=-1).max(-1, initial=0.0), 1e-300)
     left = list(range(rest.shape[1]))
     chosen: list[int] = []
@@ -39,21 +43,21 @@ def independent_rows(matrices: Array, bound: float = 1e-9) -> list[int]:
 
 
 STRONG: Final = 0.3
-"""Part of a row's and a column's largest entry from which on pivots are as good as others."""
+"""Pivots above this fraction of their row's and column's largest entry count as equally good."""
 
 Order = tuple[tuple[int, int], ...]
-"""Pivots, by row and column, in the order in which they are taken."""
+"""Rows and columns of the pivots in order of elimination."""
 
 
 def pivot_order(samples: Array, share: float = 0.1) -> Order:
-    """Pivots of matrices of one pattern.
+    """Choose the pivots for matrices of one sparsity pattern.
 
-    Of those that are large enough in every sample the one with the least fill is taken (Markowitz's
-    rule with threshold pivoting; Duff, Erisman and Reid 1986). Where none holds in all samples, the
-    first half of them decides.
+    Among the entries that are large enough in every sample the one with the least fill-in is taken
+    (Markowitz's rule with threshold pivoting; Duff, Erisman and Reid 1986). If no entry is large
+    enough in all samples, only the first half of the samples is used.
 
-    :param samples: the matrix in some states, shape (k, n, n).
-    :param share: least part of a row's and a column's largest entry that a pivot may have.
+    :param samples: the matrix in k states, shape (k, n, n).
+    :param share: threshold: smallest pivot as a fraction of its row's and column's largest entry.
     :raises SingularityError: no pivot is left.
     """
     numbers = np.array(samples, float)
@@ -70,9 +74,9 @@ def pivot_order(samples: Array, share: float = 0.1) -> Order:
                 return pivot_order(samples[: len(samples) // 2], share)
             raise SingularityError("the sample states", (), float(scale), share)
         fill = np.multiply.outer(there.sum(1) - 1, there.sum(0) - 1)
-        # The first of the best: a finer choice would differ from machine to machine.
+        # Ties take the first entry: a finer criterion would depend on the processor's rounding.
         strong = ((block / np.maximum(large, 1e-300)).min(0) > STRONG)[good]
-        # The reciprocal of what is the same in all states is no sample's work.
+        # The reciprocal of a constant entry is computed once, not per sample.
         steady = (np.ptp(numbers[:, rows][:, :, columns], axis=0) < 1e-12 * scale)[good]
         best = int((fill[good] + 0.5 * ~strong + 0.6 * ~steady).argmin())
         i, j = (int(index[best]) for index in np.nonzero(good))
@@ -84,10 +88,10 @@ def pivot_order(samples: Array, share: float = 0.1) -> Order:
 
 
 class SparseLU:
-    """Factors of a square matrix of expressions.
+    """The LU factorisation of a square matrix of expressions.
 
     :param matrix: shape (n, n), expressions or numbers.
-    :param order: of pivots that are not zero, see :func:`pivot_order`.
+    :param order: the pivots, see :func:`pivot_order`.
     """
 
     def __init__(self, matrix: Objects, order: Order) -> None:
@@ -123,7 +127,7 @@ class SparseLU:
             self.inverse_determinant = inverse * self.inverse_determinant
 
     def solve(self, right: Any) -> Objects:
-        """X of A x = right, shape (n,)."""
+        """Solve A x = right, shape (n,)."""
         b = list(right)
         x: list[Any] = [0.0] * self.size
         for (row, _, _), lower in zip(self._pivots, self._lower, strict=True):
@@ -139,7 +143,7 @@ class SparseLU:
         return _objects(x)
 
     def solve_transposed(self, right: Any) -> Objects:
-        """Y of A' y = right, shape (n,)."""
+        """Solve A' y = right, shape (n,)."""
         b = list(right)
         y: list[Any] = [0.0] * self.size
         for (row, column, inverse), upper in zip(self._pivots, self._upper, strict=True):
@@ -153,7 +157,7 @@ class SparseLU:
 
 
 def is_zero(value: Any) -> bool:
-    """Whether an expression or a number is zero for all samples."""
+    """Return whether an expression or a number is the constant zero."""
     constant = getattr(value, "is_constant", None)
     return bool(constant(0.0)) if constant is not None else value == 0.0
 

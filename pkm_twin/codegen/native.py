@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""Machine code for this processor, from text of LLVM's intermediate language."""
+"""Compile LLVM assembly to machine code for this processor, and load it."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ import llvmlite.binding as binding
 SYMBOL: Final = "kernel"
 PREPARE: Final = "prepare"
 OPTIMISATION: Final = 1
-"""LLVM's level: the next one takes up to four times as long for code that is no faster."""
+"""LLVM's optimisation level: level 2 compiles up to four times as long for code no faster."""
 QUICK: Final = 0
-"""Of programs that are ``quick``: gradients, which take far longer to compile than to run."""
+"""Level for ``quick`` programs (gradients), which take far longer to compile than to run."""
 
 
 def _initialise() -> None:
-    # Older releases of llvmlite need it, newer ones refuse it.
+    # Older releases of llvmlite need this call, newer ones raise an error.
     with suppress(RuntimeError):
         binding.initialize()
     binding.initialize_native_target()
@@ -39,7 +39,7 @@ CPU: Final[str] = binding.get_host_cpu_name()
 def _features() -> str:
     try:
         text: str = binding.get_host_cpu_features().flatten()
-    except RuntimeError:  # not every processor tells
+    except RuntimeError:  # LLVM cannot read the features of every processor
         return ""
     return text
 
@@ -49,11 +49,10 @@ FUSED: Final = "+fma" in FEATURES.split(",") or "aarch64" in binding.get_process
 
 
 def compile_object(text: str, level: int = OPTIMISATION) -> bytes:
-    """Machine code for this processor."""
+    """Compile LLVM assembly to an object file for this processor."""
     module = binding.parse_assembly(text)
     module.verify()
-    # No passes before: of straight lines without repetition they make nothing faster, and take
-    # as long as all the rest.
+    # No optimisation passes before: straight-line code gains nothing, and they double the time.
     code: bytes = _machine(level).emit_object(module)
     return code
 
@@ -62,7 +61,7 @@ _ENGINES: Final[list[Any]] = []
 
 
 def load_object(code: bytes) -> tuple[Any, Any]:
-    """Addresses of both functions, to be called with the address of their words."""
+    """Load an object file; return the addresses of ``prepare`` and ``kernel``."""
     engine = binding.create_mcjit_compiler(binding.parse_assembly(""), _machine())
     engine.add_object_file(binding.ObjectFileRef.from_data(code))
     engine.finalize_object()
@@ -78,8 +77,8 @@ def _machine(level: int = OPTIMISATION) -> Any:
 
 
 PROTOTYPE: Final = ctypes.CFUNCTYPE(ctypes.c_int64, ctypes.c_void_p)
-"""For batches: other threads run meanwhile."""
+"""Function type for batches: releases the interpreter lock during the call."""
 
 
 LOCKED: Final = ctypes.PYFUNCTYPE(ctypes.c_int64, ctypes.c_void_p)
-"""For one sample: letting the lock go costs more than the sample."""
+"""Function type for one sample: keeps the lock, as releasing it costs more than the sample."""

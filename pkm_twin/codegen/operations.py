@@ -1,8 +1,8 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""Every operation of programs in one place: on floats, arrays and vector lanes, in C, its slopes.
+"""Define each operation of programs: on floats, arrays and vector lanes, in C, its derivatives.
 
-An operation is called like a function, on numbers, arrays or expressions. Another one is a class
-here: the back ends, the exported C and the derivatives take it from here.
+Operations are called like functions, on numbers, arrays or expressions. The back ends, the exported
+C and the derivatives read everything about an operation from its :class:`Operation`.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ if TYPE_CHECKING:
 CONSTANT: Final = 0
 PARAMETER: Final = 1
 SAMPLE: Final = 2
-"""What an expression hangs on: nothing, the parameters alone, or the sample."""
+"""Levels of an expression: it depends on nothing, on parameters alone, or on the sample."""
 
 MAX_ANGLE: Final = 1e6
-"""Sines and cosines of larger angles, rad, are NaN: the reduction by quarter turns loses digits."""
+"""Largest angle of sine and cosine, rad; beyond it the reduction by quarter turns loses digits."""
 QUARTERS: Final = 1048576
-"""More quarter turns than that angle has: what is above zero is truncated downwards."""
+"""More quarter turns than MAX_ANGLE has (2^20): added before truncation, it makes it a floor."""
 # Minimax polynomials of sine and cosine up to a quarter turn, and pi / 2 in three parts
 # (Cody and Waite 1980; coefficients of this file as in Cephes, public domain).
 SINE: Final = (
@@ -49,7 +49,7 @@ ATAN_Q: Final = (
     4.853903996359136964868e2, 1.945506571482613964425e2,
 )  # fmt: skip
 MORE: Final = 6.123233995736765886130e-17
-"""pi / 2 less its nearest double."""
+"""Difference between pi / 2 and its nearest double."""
 # The exponential function up to ln(2) / 2 as 1 + 2 x P(z) / (Q(z) - x P(z)), ln(2) in two parts.
 EXP_P: Final = (1.26177193074810590878e-4, 3.02994407707441961300e-2, 9.99999999999999999910e-1)
 EXP_Q: Final = (
@@ -57,14 +57,14 @@ EXP_Q: Final = (
 )  # fmt: skip
 LN2: Final = (6.93145751953125e-1, 1.42860682030941723212e-6)
 LARGEST_POWER: Final = 745.2
-"""The exponential function of more is infinite, of less than minus this zero."""
+"""Beyond this exponent (ln of the smallest double) the result is infinite, or zero if negative."""
 # Hyperbolic tangent up to 0.625 as x + x z P(z) / Q(z).
 TANH_P: Final = (-9.64399179425052238628e-1, -9.92877231001918586564e1, -1.61468768441708447952e3)
 TANH_Q: Final = (1.0, 1.12811678491632931402e2, 2.23548839060100448583e3, 4.84406305325125486048e3)
 
 
 def c_number(value: float) -> str:
-    """A double as C has it, exactly."""
+    """Write a double as a C constant of exactly this value."""
     if not math.isfinite(value):
         return {math.inf: "HUGE_VAL", -math.inf: "(-HUGE_VAL)"}.get(value, "((double)NAN)")
     text = repr(float(value))
@@ -113,11 +113,13 @@ static void @_turn(const double *x, double *s, double *c, int count)
 class Operation:
     """An operation on one to three arguments.
 
-    ``numbers``: on floats and arrays, while a program is written. ``one``, ``many``: on floats and
-    on arrays in a program, NaN or infinite without a result; by default the same. ``slopes``: its
-    derivatives, of its value and its arguments. ``lanes``: its instruction in LLVM's language, or a
-    function that writes some. ``infix``: of it on texts; else it is a function, in C math.h's, or
-    ``c``, or one that returns ``body``, of x, y and z. ``fold``: an expression of the same value.
+    ``numbers``: function of floats and arrays, used while a program is written. ``one``, ``many``:
+    functions of floats and of arrays in a plain Python program, NaN or infinite where undefined; by
+    default ``numbers``. ``slopes``: partial derivatives as a function of the result and the
+    arguments. ``lanes``: LLVM instruction, or a function that writes several. ``infix``: format of
+    the operation in Python and C; without it the operation is written as a function call: in C of
+    ``c``, of the function of x, y and z that returns ``body``, or of math.h. ``helper``: C function
+    that the call needs. ``folds``: simplification of the expression. ``commutes``: a op b = b op a.
     """
 
     name: str
@@ -134,7 +136,7 @@ class Operation:
     commutes: bool = False
 
     def __call__(self, *values: Any) -> Any:
-        """The operation on numbers, arrays or expressions."""
+        """Apply the operation to numbers, arrays or expressions."""
         for value in values:
             tape = getattr(value, "tape", None)
             if tape is not None:
@@ -145,11 +147,11 @@ class Operation:
         return self.numbers(*values)
 
     def fold(self, *given: Any) -> Any:
-        """An expression of the value, by default the operation itself."""
+        """Record the operation on expressions, simplified if ``folds`` is given."""
         return given[0].tape.make(self, *given) if self.folds is None else self.folds(*given)
 
     def text(self, texts: Sequence[str], *, in_c: bool = False) -> str:
-        """The operation on what these texts say, in Python or in C."""
+        """Write the operation on the texts of its arguments, in Python or in C."""
         infix = self.infix or (self.c if in_c and "{" in self.c else "")
         if infix:
             return infix.format(*texts)
@@ -158,7 +160,7 @@ class Operation:
 
     @property
     def helpers(self) -> str:
-        """C functions that its text calls."""
+        """C functions that the text of the operation calls."""
         names = ", ".join(f"double {x}" for x in "xyz" if re.search(rf"\b{x}\b", self.body))
         head = f"static double @_{self.name}({names})"
         return f"{head}\n{{\n    return {self.body};\n}}\n" if self.body else self.helper
@@ -206,7 +208,7 @@ def _negative(a: Any) -> Any:
 
 
 def _quotient(a: Any, b: Any) -> Any:
-    """A product with a reciprocal, which is shared."""
+    """Record a quotient as a product with the reciprocal, which other quotients share."""
     if a.is_constant(0.0):
         return a
     if a.op is neg:
@@ -215,7 +217,7 @@ def _quotient(a: Any, b: Any) -> Any:
 
 
 def _circle(e: Any) -> tuple[Any, Any] | None:
-    """Cosine and sine of an arctangent, or of a sum of arctangents, without computing an angle."""
+    """Return cosine and sine of a sum of arctangents in closed form; None for other expressions."""
     if e.op is atan2:
         y, x = e.args
         over = 1.0 / sqrt(x * x + y * y)
@@ -234,7 +236,7 @@ def _circle(e: Any) -> tuple[Any, Any] | None:
 
 
 def _turn(name: str, index: int, slope: Callable[[Any], Any]) -> Operation:
-    """Sine or cosine, each with the other computed at once."""
+    """Define sine or cosine; compiled code computes both together."""
     numbers, within = getattr(np, name), getattr(math, name)
 
     def folds(x: Any) -> Any:
@@ -257,7 +259,7 @@ def _turn(name: str, index: int, slope: Callable[[Any], Any]) -> Operation:
 
 
 def _turned(to: Lanes, x: Value) -> tuple[Value, Value]:
-    """Cosine and sine."""
+    """Write cosine and sine in lanes."""
     b, n = to.b, to.number
     quarters = to.call("rint", b.fmul(x, n(2 / math.pi)))
     y = b.select(b.fcmp("olt", to.call("fabs", x), n(MAX_ANGLE)), x, n(math.nan))
@@ -288,7 +290,7 @@ def _exponential(to: Lanes, x: Value) -> Value:
     odd = b.fmul(x, to.polynomial(z, EXP_P))
     ratio = b.fdiv(odd, b.fsub(to.polynomial(z, EXP_Q), odd))
     result = to.fused(ratio, n(2.0), n(1.0))
-    # In two parts: 2^k alone may be infinite, or zero, where the result is not.
+    # Scale in two steps: 2^k alone may overflow or underflow where the result does not.
     half = to.call("rint", b.fmul(twos, n(0.5)))
     for share in (half, b.fsub(twos, half)):
         bits = b.shl(b.add(b.fptosi(share, to.integer), to.whole(1023)), to.whole(52))
@@ -340,7 +342,7 @@ def _signed(to: Lanes, e: Any, x: Value) -> Value:
 
 
 def _flag(to: Lanes, e: Any, mask: Value) -> Value:
-    """1 or 0, for what selects by it the condition itself."""
+    """Return 1.0 or 0.0; a following ``select`` uses the mask itself."""
     to.masks[e.number] = mask
     to.flags.add(e.number)
     return to.b.select(mask, to.number(1.0), to.number(0.0))
@@ -365,13 +367,13 @@ def _choice(x: Any, y: Any, z: Any) -> Any:
 
 
 def _greater(a: Any, b: Any) -> Any:
-    """1 where a is greater than b, 0 where it is less, 1/2 where both are the same."""
+    """Return 1 where a > b, 0 where a < b, 1/2 where a = b."""
     return 0.5 + 0.5 * sign(a - b)
 
 
 def _steepness(e: Any, x: Any) -> tuple[Any, ...]:
-    # The length of a vector that is zero has no slope; where it counts, a greater length does.
-    # Of one that is zero in the known case, its square has none there either.
+    # d sqrt(x) / dx = 1 / (2 sqrt(x)) is infinite at 0. Where the root is zero at the reference
+    # geometry, x is a sum of squares with derivative 0 there: a bounded factor gives 0.
     return (0.5 / (maximum(e, 1e-150) if e.value == 0.0 else e),)
 
 
@@ -428,13 +430,13 @@ less: Final = Operation(
     "less", lambda x, y: np.where(x < y, 1.0, 0.0), _below,
     one=lambda x, y: 1.0 if x < y else 0.0, body="(x < y) ? 1.0 : 0.0",
 )  # fmt: skip
-"""1 where the first one is less than the second, else 0, also of NaN."""
+"""1 where x < y, else 0, also if one of them is NaN."""
 select: Final[Operation] = Operation(
     "select", lambda x, y, z: np.where(x > 0.0, y, z), _selected,
     lambda e, x, y, z: (0.0, select(x, 1.0, 0.0), select(x, 0.0, 1.0)),
     lambda x, y, z: y if x > 0.0 else z, body="(x > 0.0) ? y : z", folds=_choice,
 )  # fmt: skip
-"""The second one where the first one is above zero, else the third."""
+"""y where x > 0, else z."""
 OPERATIONS: Final = (
     add, sub, mul, neg, inv, sqrt, sin, cos, exp, tanh, absolute, sign, atan2, minimum, maximum,
     less, select,
@@ -442,15 +444,17 @@ OPERATIONS: Final = (
 
 
 def both(x: Any, y: Any) -> Any:
-    """1 where two conditions are met, 1 or 0 as they are, else 0."""
+    """Return 1 where both conditions (1 or 0) are 1, else 0."""
     return select(x, y, 0.0)
 
 
 def fused(e: Any, used: Mapping[int, int], known: Container[int]) -> tuple[bool, Any, Any] | None:
-    """A product that a sum or a difference is the only one to use: both are one instruction.
+    """Find a product that only the sum or difference ``e`` uses, so that both are one instruction.
 
-    :param used: how often a value is used, by number. ``known``: what is computed elsewhere.
-    :returns: whether the product is the first of both, itself, and the other one.
+    :param used: number of uses of each expression, see :func:`.expressions.uses`.
+    :param known: numbers of the expressions that are computed elsewhere.
+    :returns: whether the product is the first argument, the product, and the other argument; None
+        if there is no such product.
     """
     if e.op is not add and e.op is not sub:
         return None

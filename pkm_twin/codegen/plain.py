@@ -1,8 +1,8 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""Programs as plain Python, for machines without a compiler: floats one by one, arrays in batches.
+"""Run programs in plain Python where llvmlite is missing: one sample as floats, many as arrays.
 
-The same expressions, the same order of tests as the vector code; without fused products, so
-results agree to rounding, not to the bit.
+Expressions and the order of tests are those of the compiled code; products are not fused, so
+results agree to rounding, not bit by bit.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from pkm_twin.codegen.program import (
 )
 
 _LONGEST: Final = 200
-"""Characters of an expression that is written into another one."""
+"""Most characters of an expression that is written inline instead of as a variable."""
 
 
 _NUMBERS: Final = {"inf": math.inf, "nan": math.nan}
@@ -44,9 +44,9 @@ def source(
     inputs: Mapping[str, int],
     known: Mapping[int, str] | None = None,
 ) -> str:
-    """A function of the inputs' sequences that returns a tuple of the results.
+    """Write a Python function of the inputs' sequences that returns the results as a tuple.
 
-    :param known: texts of expressions that are given.
+    :param known: Python expressions, by number, of values that exist already.
     """
     counts = uses(results)
     text: dict[int, str] = dict(known or {})
@@ -80,7 +80,7 @@ def functions(
     inputs: Mapping[str, int],
     known: Mapping[int, str] | None = None,
 ) -> tuple[Callable[..., tuple[Any, ...]], Callable[..., tuple[Any, ...]]]:
-    """The function of :func:`source` on floats, and the same on arrays."""
+    """Compile the function of :func:`source` twice: for floats and for arrays."""
     code = compile(source(results, inputs, known), "<program>", "exec")
     made = []
     for library in (_ONE, _MANY):
@@ -91,7 +91,7 @@ def functions(
 
 
 class PlainCode:
-    """A program as functions of floats, for one sample, and of arrays, for many."""
+    """A program as Python functions: of floats for one sample, of arrays for many."""
 
     def __init__(self, program: Program) -> None:
         self.program = program
@@ -108,7 +108,7 @@ class PlainCode:
         self._prepare = functions([*program.prepared, program.missed], given)[0]
 
     def prepare(self, p: Array) -> Array:
-        """What hangs on parameters alone, of machines (k, parameters): shape (k, prepared + 1)."""
+        """Compute the expressions of parameters alone, (k, parameters) to (k, prepared + 1)."""
         own = self.program.parameters
         rows = [self._prepare(**{PARAMETERS: row[:own], GEOMETRY: row[own:]}) for row in p.tolist()]
         return np.array(rows, np.float64).reshape(len(p), -1)
@@ -116,7 +116,7 @@ class PlainCode:
     def run(
         self, p: Array, inputs: Sequence[Array], count: int, steps: int
     ) -> tuple[list[Array], Array]:
-        """Outputs (count, size) and status (count, 2), as the vector code gives them.
+        """Return outputs (count, size) and status (count, 2), as the compiled code gives them.
 
         :param inputs: shape (count, size), or (1, size) for all samples.
         """
@@ -152,7 +152,7 @@ class PlainCode:
     def _solve(
         self, q: Equations, named: dict[str, Any], n: list[Any], steps: int, *, many: bool
     ) -> None:
-        """Newton's method from the state n on; ``named`` gets the unknowns."""
+        """Solve equations by Newton's method from state n; store the unknowns in ``named``."""
         named[STATE] = n
         some: Callable[[Any], Any] = np.any if many else bool
 

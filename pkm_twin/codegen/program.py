@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""What a back end gets: results as expressions of inputs, and equations to be solved before."""
+"""Define a program: its results as expressions, and the equations to solve first."""
 
 from __future__ import annotations
 
@@ -20,47 +20,49 @@ from pkm_twin.codegen.operations import both, less, select
 from pkm_twin.errors import PkmTwinError
 
 UNKNOWNS: Final = "x"
-"""Name of the input that Newton's method finds."""
+"""Name of the input that holds the unknowns of Newton's method."""
 
 CLOSED: Final = 1e-8
-"""Newton's method ends with a correction below this: it converges quadratically, so its square, of
-unit one, is left: half a unit of rounding."""
+"""Largest last correction of Newton's method, of unit one. Convergence is quadratic, so the error
+left is its square: half a unit of rounding."""
 MAX_ITERATIONS: Final = 12
-"""Most corrections a step."""
+"""Most corrections of a step."""
 CONTRACTION: Final = 0.25
-"""Most that a correction may be of the one before it."""
+"""Largest ratio of a correction to the one before."""
 FIRST: Final = 0.3
-"""Most that the first correction of a guess may be, of unit one: a longer one may go elsewhere."""
+"""Largest first correction of a guess, of unit one: a longer one may lead to another root."""
 AHEAD: Final = 0.1
-"""The same of each of more steps, which begins where the ones before lead on."""
+"""Largest first correction of each of several steps, which starts at an extrapolated point."""
 NEXT: Final = 0.01
-"""Most that the first correction of a stream's sample may be, which starts from the one before."""
+"""Largest first correction of a stream's sample, which starts from the sample before."""
 LEAST: Final = 1e-8
-"""Least determinant, over the one at home."""
+"""Smallest determinant, relative to the determinant at home."""
 MARGIN: Final = 5.0
-"""Least determinant over a correction of a guess in one step: a longer one may step over two
-singularities, to a determinant of the same sign. Of more steps every first correction is short."""
+"""Smallest ratio of determinant to correction for a guess in a single step: a longer correction may
+cross two singularities, to a determinant of the same sign. In several steps the first corrections
+are short."""
 LARGE: Final = 1e300
-"""Sum of the sizes of inputs and results from which on they count as infinite."""
+"""Sum of the absolute inputs and results from which on they count as infinite."""
 RESIDUAL: Final = 1e-10
-"""Largest residual of all equations, those that were not solved too, lengths over the size."""
+"""Largest residual of all equations, including redundant ones; lengths relative to the size."""
 
 
 STATE: Final = "n"
-"""Name of the input that Newton's method keeps between corrections, see :class:`Places`."""
+"""Name of the input with the state of Newton's method, see :class:`Places`."""
 
 
 LAST: Final = "last"
-"""Name of the input that one sample of a stream leaves to the next; zeros before the first one."""
+"""Name of the input with the unknowns of the stream's sample before; zeros for the first one."""
 
 
 class Places(NamedTuple):
-    """Places in the state of Newton's method.
+    """Indices into the state of Newton's method.
 
-    ``once``: 1 in a single step, else 0. ``part``: of the way, to the target of a step. ``onward``:
-    length of the step over that of the one before it, 0 for the first one. ``size``: square of the
-    last correction. ``moving``, ``alive``: 1 as long as a sample is corrected, and as long as it is
-    not refused. ``reached``: part of the way.
+    ``once``: 1 for a solution in a single step, else 0. ``part``: fraction of the motion from the
+    known state to the target at the end of this step. ``onward``: length of the step relative to
+    the step before, 0 for the first. ``size``: square of the last correction. ``moving``: 1 while
+    corrections continue. ``alive``: 1 unless the sample is refused. ``reached``: fraction of the
+    motion that was reached.
     """
 
     once: int
@@ -76,74 +78,74 @@ AT: Final = Places(*range(7))
 
 
 def progress(k: int, steps: int) -> tuple[float, float]:
-    """Part of the way after step k of so many, and the length of this step over the one before it.
+    """Return the fraction of the motion after step k, and the ratio of steps k and k - 1.
 
-    The steps become short towards the end: next to a singularity only short ones contract.
+    Steps become shorter towards the end: near a singularity only short steps contract.
     """
     a, b, c = (1.0 - (1.0 - j / steps) ** 3 for j in (k - 2, k - 1, k))
     return c, (c - b) / (b - a)
 
 
 def previous(unknowns: str) -> str:
-    """Name of the input that is the unknowns a step before."""
+    """Return the name of the input with the unknowns of the step before."""
     return f"{unknowns}_before"
 
 
 PARTS: Final = ("home", "goal", "aim", "begin", "onward", "correct", "arrive")
-"""Of equations, what is computed while they are solved."""
+"""Attributes of :class:`Equations` that are computed while the equations are solved."""
 
 
 @dataclass(frozen=True, eq=False)
 class Equations:
-    """Unknowns x of the target q, found by Newton's method from a known state.
+    """Equations of unknowns x for a target q, solved by Newton's method from a known state.
 
     The target is an input of the program, or ``goal``: expressions of inputs and of the unknowns of
-    equations before these. ``stage``: how many those are.
+    equations that are solved before. ``stage``: the number of these equations.
 
-    One step goes from ``start`` (expressions of q; None: from home) to the target at once. In more
-    steps the target moves from ``origin`` to q by :func:`progress`, from the unknowns ``home``.
-    Every step begins where the one before it leads on straight: beyond a place where two assemblies
-    cross, the determinant there is below zero, while Newton's method from the side of the other one
-    would turn to that.
+    A single step goes from ``start`` (expressions of q; None: from ``home``) to the target. In
+    several steps the target moves from ``origin`` to q by :func:`progress`, beginning with the
+    unknowns ``home``. Each step starts at the linear extrapolation of the steps before. Beyond a
+    configuration where two assemblies cross, extrapolation stays on the same branch, where the
+    determinant is negative; Newton's method without it would change to the other branch.
 
-    A sample is refused where a correction does not contract, where the determinant is too small, or
-    where a residual stays: then it may be another root that was found.
+    A sample is refused if a correction does not contract, the determinant is too small or a
+    residual remains: the root found may belong to another assembly.
     """
 
     target: str
     home: Sequence[Expression]
     origin: Sequence[Expression]
-    """Unknowns and target of the known state: constants, or of parameters alone."""
+    """Target at the known state ``home``: constants or parameter expressions."""
     start: Sequence[Expression] | None
     onward: Sequence[Expression]
-    """Unknowns to begin a further step with: of the last ones, and of those a step before."""
+    """Unknowns to begin a further step with, from those of the last two steps."""
     corrected: Sequence[Expression]
-    """The unknowns after one correction."""
+    """Unknowns after one correction."""
     size: Expression
     """Square of the correction, of unit one."""
     determinant: Expression
-    """Of the equations, over that at home."""
+    """Determinant of the equations, relative to that at home."""
     residual: Expression
     """Square of the residual of all equations, of unit one."""
     guessed: bool = False
-    """Whether the start is a guess, that may be nearer to another root."""
+    """Whether ``start`` is a guess, which may be nearer to another root."""
     branch: Sequence[Expression] = ()
-    """Above zero in the mechanism's own branch, at the target."""
+    """Expressions that are positive at the target in the mechanism's own assembly."""
 
     unknowns: str = UNKNOWNS
-    """Name of the input that the method finds."""
+    """Name of the input that holds the unknowns."""
     goal: Sequence[Expression] = ()
     stage: int = 0
     near: Expression | None = None
-    """1 where a single step starts from ``foreseen``: of another sample's unknowns."""
+    """1 where a single step starts from ``foreseen``, unknowns predicted from another sample."""
     foreseen: Sequence[Expression] = ()
 
     lone: bool = False
-    """Whether a sample is solved alone: its state says nothing of whether it moves."""
+    """Whether samples are solved one by one, so that ``moving`` and ``alive`` need no selects."""
 
     @property
     def inputs(self) -> dict[str, int]:
-        """Sizes of the inputs that exist while it is solved, by name."""
+        """Sizes of the inputs that exist while the equations are solved, by name."""
         n = len(self.home)
         own = {self.unknowns: n, previous(self.unknowns): n}
         return own | {self.target: len(self.origin), STATE: len(AT)}
@@ -155,7 +157,7 @@ class Equations:
 
     @cached_property
     def state(self) -> list[Any]:
-        """:data:`STATE` as expressions."""
+        """The state of Newton's method as expressions."""
         state = list(self.size.tape.inputs(STATE, len(AT)))
         if self.lone:
             state[AT.moving] = state[AT.alive] = self.size.tape.constant(1.0)
@@ -166,7 +168,7 @@ class Equations:
 
     @cached_property
     def begin(self) -> list[Expression]:
-        """Unknowns to begin with, and the size that the first correction contracts from."""
+        """Unknowns to begin with, and the squared size that the first correction contracts from."""
         once, known = self.state[AT.once], self.start is not None and not self.guessed
         first: Sequence[Any] = self.start or self.home
         if known:
@@ -181,12 +183,12 @@ class Equations:
 
     @cached_property
     def underway(self) -> Expression:
-        """1 in a step that does not lead to the target, else 0."""
+        """1 in a step that ends before the target, else 0."""
         return self._lift(less(self.state[AT.part], 1.0))[0]
 
     @cached_property
     def aim(self) -> list[Expression]:
-        """The target of a step."""
+        """Target of a step."""
         part, more = self.state[AT.part], self.underway
         goal = self.size.tape.inputs(self.target, len(self.origin))
         ways = zip(self.origin, goal, strict=True)
@@ -194,10 +196,10 @@ class Equations:
 
     @cached_property
     def correct(self) -> list[Expression]:
-        """After a correction: the unknowns, then the state from size to alive.
+        """Unknowns after a correction, then the state from ``size`` to ``alive``.
 
-        A sample stays refused where a correction does not contract, or where the determinant is
-        too small. A closed form of the start is in the right assembly; a guess may lead to another.
+        A sample is refused if a correction does not contract or the determinant is too small. A
+        start in closed form is in the right assembly; a guess may lead to another.
         """
         state, size, determinant = self.state, self.size, self.determinant
         once, moving = state[AT.once], state[AT.moving]
@@ -213,14 +215,14 @@ class Equations:
 
     @cached_property
     def arrive(self) -> list[Expression]:
-        """After a step: the state's alive and reached. What still moves is refused."""
+        """``alive`` and ``reached`` after a step; a sample that is still moving is refused."""
         n = self.state
         alive = select(n[AT.moving], 0.0, n[AT.alive])
         return self._lift(alive, select(alive, n[AT.part] + float(self.stage), n[AT.reached]))
 
     @cached_property
     def held(self) -> Expression:
-        """1 where all equations hold, in the mechanism's own branch, else 0."""
+        """1 where all equations hold in the mechanism's own assembly, else 0."""
         held = less(self.residual, RESIDUAL**2)
         for value in self.branch:
             held = both(held, less(0.0, value))
@@ -228,7 +230,7 @@ class Equations:
 
 
 def holding(equations: Iterable[Equations]) -> list[Expression]:
-    """1 where all of these equations hold, else 0: in a list, empty where there are none."""
+    """Return one expression in a list, 1 where all equations hold; nothing without equations."""
     result: list[Expression] = []
     for q in equations:
         result = [both(result[0], q.held) if result else q.held]
@@ -237,11 +239,12 @@ def holding(equations: Iterable[Equations]) -> list[Expression]:
 
 @dataclass(frozen=True, eq=False)
 class Program:
-    """Outputs by name as expressions of the inputs, of the parameters and of solved unknowns.
+    """Named outputs as expressions of the inputs, the parameters and the solved unknowns.
 
-    ``inputs``: sizes by name, in the order of the call, without parameters and unknowns.
-    ``equations``: are solved one after the other.
-    ``quick``: better compiled in a tenth of the time than run in two thirds of it.
+    ``inputs``: sizes by name in the order of the call, without parameters and unknowns.
+    ``parameters``: number of the program's own parameters. ``equations``: solved in this order.
+    ``quick``: compile without optimisation, in a tenth of the time; the code takes 1.5 times as
+    long.
     """
 
     inputs: Mapping[str, int]
@@ -261,12 +264,12 @@ class Program:
 
     @property
     def geometry(self) -> int:
-        """How many numbers of the geometry it reads, behind its own parameters."""
+        """Number of geometry values that the program takes after its own parameters."""
         return len(self.results[0].tape.reference) if self.results else 0
 
     @property
     def results(self) -> list[Expression]:
-        """Every expression that is computed."""
+        """All expressions that are computed."""
         rows = [e for row in self.outputs.values() for e in row]
         for q in self.equations:
             rows += [e for name in PARTS for e in getattr(q, name)]
@@ -274,14 +277,12 @@ class Program:
 
     @cached_property
     def prepared(self) -> list[Expression]:
-        """What hangs on parameters alone and samples read: computed once a machine, by
-        :attr:`Program.preparation`, and given to every call.
-        """
+        """Expressions of parameters alone that samples use: computed once per machine."""
         return edge(self.results)
 
     @property
     def missed(self) -> Expression:
-        """By how much the parameters miss what the program takes for constant, squared."""
+        """Sum of squared differences between parameters and the constants assumed for them."""
         tape = self.results[0].tape if self.results else Tape()
         total: Any = 0.0
         for e, target in tape.assumed:
