@@ -1,2 +1,2 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""Messages to arrays and back, by attributes or bytes. Needs no ROS."""
+"""Convert messages to arrays and back, from attributes or bytes; needs no ROS."""

@@ -1,8 +1,9 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""The nodes' hot paths straight from and to CDR, past the middleware's Python conversion.
+"""Decode and encode the nodes' most frequent messages directly as CDR bytes.
 
-What comes out has the attributes of the live message, or is arrays at once; what goes in are
-templates with their numbers filled in. Every length is checked before it is used.
+This avoids the middleware's slow conversion to Python objects. Decoded messages have the attributes
+of live ones, or are arrays; encoded messages are templates with their numbers filled in. Every
+length is checked before it is used.
 """
 
 from __future__ import annotations
@@ -22,18 +23,19 @@ from pkm_twin.machine.joint_map import ControllerNumbers
 from pkm_twin.messages.reading import COLUMNS, Ragged, TrajectoryFields
 
 HEAD: Final = 4
-"""Bytes of the encapsulation; everything is aligned from behind it."""
+"""Length of the encapsulation header, bytes; alignment counts from its end."""
 STAMP: Final = slice(4, 12)
-"""Where the stamp of a message stands that begins with a header."""
+"""Byte range of the stamp in a message that begins with a header."""
 LITTLE: Final = b"\x00\x01"
 ENDIANNESS: Final = {b"\x00\x00": ">", LITTLE: "<"}
 MAX_JOINT_STATE: Final = 2**18
-"""Bytes of a joint state, and of a trajectory at most so many names: far beyond all robots, and
-little enough that a stranger's message takes no time of the stream."""
+"""Most bytes of a joint state: far beyond all robots, and few enough to decode in no time that the
+stream would notice."""
 MAX_NAMES: Final = 1000
+"""Most joint names of a trajectory, for the same reason."""
 POINT_ARRAYS: Final = tuple(COLUMNS)
 TIME: Final = len(POINT_ARRAYS)
-"""Place of a point's time behind its arrays."""
+"""Index of a point's time, which follows its arrays."""
 
 
 @dataclass(slots=True)
@@ -50,7 +52,7 @@ class _Header:
 
 @dataclass(slots=True)
 class JointStateView:
-    """What a sensor_msgs/JointState carries, under the same names."""
+    """The fields of a sensor_msgs/JointState, under the same names."""
 
     header: _Header
     name: tuple[str, ...]
@@ -61,7 +63,7 @@ class JointStateView:
 
 @dataclass(slots=True)
 class _Layout:
-    """Of a stream's last message: one that differs in numbers only is read in one step."""
+    """The byte layout of a stream's last message; an equal layout is unpacked in one call."""
 
     size: int
     names_end: int
@@ -73,7 +75,7 @@ class _Layout:
 
 
 class JointStateDecoder:
-    """Decodes sensor_msgs/JointState, quickly where names and lengths are those of the last.
+    """Decodes sensor_msgs/JointState, fast if names and lengths equal those of the last message.
 
     :param definition: as :func:`pkm_twin.bags.definitions.message_definition` gives it.
     """
@@ -126,7 +128,7 @@ def _layout(data: bytes, message: Any, arrays: Sequence[Sequence[float]]) -> _La
     for text in (message.header.frame_id, None, *message.name):
         end += -(end - HEAD) % 4 + 4
         if text is not None:
-            # An empty string may stand without its zero.
+            # An empty string may be sent without its terminating zero.
             end += struct.unpack_from("<I", data, end - 4)[0]
     code = ["<iI", f"{end - STAMP.stop}x"]
     at = end
@@ -150,7 +152,7 @@ def _layout(data: bytes, message: Any, arrays: Sequence[Sequence[float]]) -> _La
 
 
 def _doubles(value: Any) -> int:
-    """How many numbers a field has, 0 where it holds anything else."""
+    """Count the numbers in a field; 0 if it contains anything else."""
     if isinstance(value, float):
         return 1
     inner = value.values() if isinstance(value, dict) else value
@@ -159,17 +161,18 @@ def _doubles(value: Any) -> int:
 
 
 def _with(value: Any, number: float) -> Any:
-    """A field whose numbers are all this one."""
+    """Return a copy of a field with every number replaced by ``number``."""
     if isinstance(value, dict):
         return {name: _with(v, number) for name, v in value.items()}
     return [_with(v, number) for v in value] if isinstance(value, list) else number
 
 
 class DoublesTemplate:
-    """Messages that differ in their stamp and in the doubles of some fields.
+    """An encoded message whose stamp and double-valued fields are filled in for each sending.
 
-    :param message: fields of the message; those of nothing but doubles, in lists or in messages,
-        are filled. ``stamped``: it begins with a header.
+    :param message: fields of the message; fields of doubles only, also in lists or submessages,
+        are filled in.
+    :param stamped: whether the message begins with a header.
     """
 
     def __init__(
@@ -177,7 +180,7 @@ class DoublesTemplate:
     ) -> None:
         codec = MessageCodec(type_name, definition)
         arrays = {name: count for name, v in message.items() if (count := _doubles(v))}
-        # Eight bytes that no text in UTF-8 has.
+        # Each field is filled with eight equal bytes that never occur in UTF-8 text, to find it.
         marks = [bytes([0x80 + k] * 8) for k in range(len(arrays))]
         filled = {
             name: _with(message[name], struct.unpack("<d", mark)[0])
@@ -193,9 +196,10 @@ class DoublesTemplate:
         self._tail = rest
 
     def fill(self, values: Array, stamp: tuple[int, int] | None = None) -> bytes:
-        """The message with these values, and the stamp (sec, nanosec) where it has one.
+        """Encode the message with these values.
 
-        :param values: of all fields to fill, one after the other.
+        :param values: values of all filled fields, one field after the other.
+        :param stamp: seconds and nanoseconds, for a stamped message.
         """
         numbers = values.astype("<f8", copy=False).tobytes()
         parts, at = [self._head, b"" if stamp is None else struct.pack("<iI", *stamp)], 0
@@ -208,21 +212,21 @@ class DoublesTemplate:
 
 @dataclass(frozen=True)
 class RawTrajectory:
-    """A trajectory_msgs/JointTrajectory in its bytes, with the fields that are read here."""
+    """A trajectory_msgs/JointTrajectory as bytes, with its decoded fields."""
 
     data: bytes
     order: str
     begin: int
-    """Where the first point stands."""
+    """Offset of the first point, bytes."""
     fields: TrajectoryFields
     lengths: tuple[int, ...] = ()
-    """Of a point's arrays, by :data:`POINT_ARRAYS`."""
+    """Lengths of a point's arrays, in the order of :data:`POINT_ARRAYS`."""
 
     @classmethod
     def of(cls, data: bytes) -> RawTrajectory:
-        """Decode a message whose points are alike, as those of every good one are.
+        """Decode a message whose points all have arrays of the same lengths.
 
-        :raises MessageError: the bytes are no such message.
+        :raises MessageError: the bytes are not such a message.
         """
         order = ENDIANNESS.get(data[:2])
         if order is None or len(data) < STAMP.stop:
@@ -262,7 +266,7 @@ class RawTrajectory:
         return cls(data, order, begin, fields, tuple(lengths))
 
     def with_effort(self, efforts: ControllerNumbers) -> bytes:
-        """The message with these efforts, shape (points, n), and nothing else changed."""
+        """Encode the message with these efforts, shape (points, n), otherwise unchanged."""
         points, joints = efforts.shape
         before = _Points(self.begin, points, self.lengths)
         after = _Points(self.begin, points, (*self.lengths[:-1], joints))
@@ -274,7 +278,7 @@ class RawTrajectory:
             if POINT_ARRAYS[i] == "effort":
                 after.write(data, i, efforts, f"{order}f8")
             elif length:
-                # As they are, bit by bit.
+                # Copied as integers, so that no bit changes.
                 kept = before.read(self.data, i, "u8", length)
                 after.write(data, i, kept, "u8")
         after.write(data, TIME, before.read(self.data, TIME, "u4", 2), "u4")
@@ -282,10 +286,11 @@ class RawTrajectory:
 
 
 class _Points:
-    """Where the numbers of a trajectory's points stand, all of whose arrays are equally long.
+    """Strided views of a trajectory's points in CDR; all points have arrays of the same lengths.
 
-    How a point is padded depends on where it begins: at a multiple of eight, or four behind one.
-    So either all points but the first are padded alike, or every second one is.
+    A point's padding depends on its offset modulo eight, 0 or 4. So either all points but the first
+    have the same padding, or every second point has. Each group of points with the same padding has
+    a constant stride.
     """
 
     def __init__(self, begin: int, points: int, lengths: tuple[int, ...]) -> None:
@@ -310,7 +315,7 @@ class _Points:
     def read(
         self, data: Any, array: int, kind: str, columns: int, *, of_length: bool = False
     ) -> NDArray[Any]:
-        """All points' numbers of an array (or of :data:`TIME`), shape (points, columns)."""
+        """Read an array (or :data:`TIME`) of all points, shape (points, columns)."""
         values = np.empty((self.points, columns), np.dtype(kind).newbyteorder("="))
         for which, view in self._views(data, array, kind, columns, of_length):
             values[which] = view
@@ -325,12 +330,12 @@ class _Points:
         *,
         of_length: bool = False,
     ) -> None:
-        """Put all points' numbers of an array there."""
+        """Write an array of all points."""
         for which, view in self._views(data, array, kind, values.shape[1], of_length):
             view[...] = values[which]
 
     def check_lengths(self, data: bytes, order: str) -> None:
-        """Reject points whose arrays are not as long as the first one's."""
+        """Reject points whose arrays differ in length from those of the first point."""
         fitting = self
         while fitting.end > len(data) and fitting.points > 1:
             fitting = _Points(self._groups[0][1], (fitting.points + 1) // 2, self.lengths)
@@ -363,7 +368,7 @@ class _Points:
 
 
 def _places(begin: int, lengths: Sequence[int]) -> list[tuple[int, int]]:
-    """Where a point's arrays have their length and their first number; at last its time."""
+    """List the offsets of the length and first number of a point's arrays, then of its time."""
     places = []
     at = begin
     for length in lengths:
@@ -380,7 +385,7 @@ def _end(begin: int, lengths: Sequence[int]) -> int:
 
 
 def _number(data: bytes, at: int, order: str) -> tuple[int, int]:
-    """An unsigned number of four bytes at the next multiple of four, and where it ends."""
+    """Read the unsigned 32-bit number at the next multiple of four; return it and its end."""
     at += -(at - HEAD) % 4
     if at + 4 > len(data):
         raise MessageError("cdr", f"cut at byte {len(data)}")

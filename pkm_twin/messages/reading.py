@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""Messages to checked arrays, by attributes only: live messages and decoded ones alike.
+"""Convert messages, live or decoded, to checked arrays.
 
 Joint states, trajectories, wrenches and measured deflections.
 
@@ -27,23 +27,27 @@ from pkm_twin.messages.stamps import MAX_DURATION, SECOND, StampRules, stamp_of
 from pkm_twin.robot.robot import Robot
 
 TINY: Final = sys.float_info.min
-"""Smallest normal number: a value below it and not zero is a damaged one, not a measurement."""
+"""Smallest normal number: a smaller value that is not zero comes from damaged data."""
 
 MAX_RATE: Final = 1e4
+"""Largest joint velocity, rad/s or m/s, where the robot has no limit: beyond all machines."""
 MAX_ACCELERATION: Final = 1e7
+"""Largest joint acceleration, rad/s^2 or m/s^2: beyond all machines."""
 MAX_EFFORT: Final = 1e7
+"""Largest effort, N m or N: beyond all machines."""
 MAX_POINTS: Final = 100_000
+"""Most points of a trajectory."""
 ROUNDING: Final = 4.0 * sys.float_info.epsilon
-"""Of a number that is converted there and back, relative."""
+"""Relative rounding error of a number that is converted to other units and back."""
 MAX_SHOWN: Final = 80
-"""Characters of a foreign name that an error shows."""
+"""Most characters of a name from a message that an error shows."""
 COLUMNS: Final = {
     "positions": "position",
     "velocities": "velocity",
     "accelerations": "acceleration",
     "effort": "effort",
 }
-"""What a trajectory's point may carry that is read here, and the name of one such value."""
+"""Fields of a trajectory's points that are read, and the name of one of their values."""
 
 
 ExtraJoints = Literal["refuse", "zero"]
@@ -55,11 +59,11 @@ _MODEL: Final[Mapping[str, Callable[[JointMap, Array], Array]]] = {
     "acceleration": JointMap.rates,
     "effort": JointMap.efforts,
 }
-"""What makes the model's numbers of a controller's."""
+"""Conversions of a controller's numbers to the model's."""
 
 
 class JointSample(NamedTuple):
-    """One joint state in the robot's joint order; None where the message carries nothing."""
+    """One joint state in the robot's joint order; None for fields that the message leaves out."""
 
     stamp: int
     q: Array
@@ -71,7 +75,7 @@ class JointSample(NamedTuple):
 class EffortSample:
     """One message of stamped torques in the robot's joint order, shape (n,), N m or N.
 
-    ``given``: the same as they came, to be forwarded bit by bit.
+    ``given``: the same numbers in the controller's units, to be forwarded bit by bit.
     """
 
     stamp: int
@@ -81,7 +85,7 @@ class EffortSample:
 
 @dataclass(frozen=True)
 class Ragged:
-    """The first point whose array is not as long as it has to be, and how long it is."""
+    """The first point whose array has a wrong length, and this length."""
 
     point: int
     length: int
@@ -89,10 +93,10 @@ class Ragged:
 
 @dataclass(frozen=True)
 class TrajectoryFields:
-    """A trajectory as it came, its points as arrays: from attributes or from bytes.
+    """A trajectory's fields in the message's own order and units, points as arrays.
 
-    ``times``: seconds and nanoseconds of ``time_from_start``, shape (2, p). ``columns``: by
-    :data:`COLUMNS` the values in the message's order, shape (p, n); None where no point has any.
+    ``times``: seconds and nanoseconds of ``time_from_start``, shape (2, p). ``columns``: values of
+    each field of :data:`COLUMNS`, shape (p, n); None where no point has any.
     """
 
     header: Any
@@ -102,7 +106,7 @@ class TrajectoryFields:
 
     @classmethod
     def of(cls, message: Any) -> TrajectoryFields:
-        """The fields of a trajectory_msgs/JointTrajectory, live or decoded."""
+        """Read the fields of a trajectory_msgs/JointTrajectory, live or decoded."""
         points = message.points
         names = tuple(message.joint_names)
         durations = [point.time_from_start for point in points]
@@ -130,9 +134,9 @@ def _rows(rows: list[Sequence[float]], count: int) -> Array | Ragged | None:
 class Trajectory:
     """A joint trajectory in the robot's joint order.
 
-    ``stamp`` is zero where it starts on receipt. times (p,), s; q, qd, qdd (p, n); None where
-    absent. ``columns``: for every joint of the message, its place in the robot's order, -1 for one
-    that the model lacks.
+    ``stamp``: start, ns; zero for a start on receipt. ``times`` (p,), s; ``q``, ``qd``, ``qdd``
+    (p, n); None where absent. ``columns``: for each joint of the message its index in the robot's
+    order, -1 for a joint that the model lacks.
     """
 
     stamp: int
@@ -142,17 +146,17 @@ class Trajectory:
     qdd: Array | None
     columns: tuple[int, ...]
     effort: Array | None = None
-    """Shape (p, n), N m or N, where the reader takes efforts and every point has them."""
+    """Shape (p, n), N m or N, if the reader reads efforts and every point has them."""
 
 
 @dataclass
 class JointReader:
-    """Reads joint numbers of one robot: the controller's come in, the model's go out.
+    """Reads joint values of one robot from messages and converts them to the model's units.
 
-    ``limited``: positions and velocities beyond the robot's limits are rejected, else only those
-    beyond all machines. ``extra_joints``: a trajectory's joints that the model lacks, such as a
-    Delta's telescopic fourth axis: ``refuse`` the trajectory, or answer them with effort ``zero``.
-    ``with_effort``: a trajectory's efforts are read too, else whatever it brings is left alone.
+    ``limited``: reject positions and velocities beyond the robot's limits, otherwise only those
+    beyond all machines. ``extra_joints``: for joints of a trajectory that the model lacks, such as
+    a Delta's telescopic fourth axis, either ``refuse`` the trajectory or answer with effort
+    ``zero``. ``with_effort``: read a trajectory's efforts, too.
     """
 
     robot: Robot
@@ -176,7 +180,7 @@ class JointReader:
         )
         rates = [MAX_RATE] * joints if velocity is None else velocity.tolist()
         if self._map is not None:
-            # What is at its limit is there still after the conversion's rounding.
+            # A value at its limit must still be accepted after the rounding of the conversion.
             shift = np.abs(self._map.offsets / self._map.factors).tolist()
             self._position = [
                 (low - ROUNDING * (abs(low) + o), high + ROUNDING * (abs(high) + o))
@@ -190,11 +194,12 @@ class JointReader:
         self._effort = [(-MAX_EFFORT, MAX_EFFORT)] * joints
 
     def joint_state(self, message: Any, now: int, rules: StampRules) -> JointSample:
-        """A sensor_msgs/JointState, matched by name in any order; other joints are ignored.
+        """Read a sensor_msgs/JointState, matched by name in any order; ignore other joints.
 
         Velocity and effort may be absent: empty, or NaN for all of the robot's joints, as
-        joint_state_broadcaster sends what no interface measures. Where they are there, they are
-        checked and used.
+        joint_state_broadcaster sends quantities that no interface measures.
+
+        :raises MessageError: a joint is missing, or a value or the stamp is invalid.
         """
         stamp, index, q = self._positions(message, now, rules)
         count = len(message.name)
@@ -203,7 +208,7 @@ class JointReader:
         return JointSample(stamp, q, qd, effort)
 
     def positions(self, message: Any, now: int, rules: StampRules) -> JointSample:
-        """As :meth:`joint_state`, whatever the message carries in addition to positions."""
+        """Read only the positions of a sensor_msgs/JointState; errors as of :meth:`joint_state`."""
         stamp, _, q = self._positions(message, now, rules)
         return JointSample(stamp, q, None, None)
 
@@ -218,7 +223,7 @@ class JointReader:
         return stamp, index, q
 
     def efforts(self, message: Any, now: int, rules: StampRules) -> EffortSample:
-        """A sensor_msgs/JointState as a source of torques: names and efforts, nothing else."""
+        """Read only names and efforts of a sensor_msgs/JointState, a source of torques."""
         index = self._match(message.name)
         stamp = rules.check(stamp_of(message.header), now)
         count = len(message.name)
@@ -229,7 +234,7 @@ class JointReader:
         return EffortSample(stamp, effort, ControllerNumbers(given))
 
     def commands(self, values: Sequence[float]) -> Array:
-        """Efforts without names, as std_msgs/Float64MultiArray carries them: one per joint."""
+        """Read the efforts of a std_msgs/Float64MultiArray: one per joint, without names."""
         count = len(self._names)
         if len(values) != count:
             raise MessageError("length", f"{len(values)} efforts for {count} joints")
@@ -239,10 +244,10 @@ class JointReader:
         return effort
 
     def trajectory(self, message: Any, now: int) -> Trajectory:
-        """A trajectory_msgs/JointTrajectory with exactly the robot's joints, in any order.
+        """Read a trajectory_msgs/JointTrajectory with exactly the robot's joints, in any order.
 
-        A zero stamp means that it starts on receipt, as in ros2_controllers; a later start is
-        allowed, one whose end has passed is not. A derivative is all there or all absent.
+        A zero stamp means a start on receipt, as in ros2_controllers. The start may be in the
+        future, the end must not be in the past. All points have a derivative, or none has.
 
         :param message: the message, or its :class:`TrajectoryFields`.
         """
@@ -302,11 +307,11 @@ class JointReader:
         return self._match(names)
 
     def check_derived(self, qd: Array, qdd: Array) -> None:
-        """Differentiated rates and accelerations keep the bounds of measured ones, (..., n)."""
+        """Check differentiated velocities and accelerations (..., n) as if measured."""
         if qd.ndim == 1:
-            # A stream's sample, without numpy.
+            # For one sample Python floats are faster than numpy.
             rates, seconds = map(abs, qd.tolist()), map(abs, qdd.tolist())
-            # NaN compares as false: max would hide one.
+            # Comparisons are false for NaN, whereas max would hide it.
             slow = all(map(le, rates, self.highest_velocity))
             if slow and all(second <= MAX_ACCELERATION for second in seconds):
                 return
@@ -324,8 +329,8 @@ class JointReader:
                 )
 
     def _match(self, names: Sequence[str]) -> list[int]:
-        """Where each of the robot's joints stands among the names."""
-        # Of a tuple that is itself.
+        """Return the index of each of the robot's joints among the names."""
+        # tuple() of a tuple makes no copy.
         key = tuple(names)
         known = self._known.get(key)
         if known is not None:
@@ -340,7 +345,7 @@ class JointReader:
             if count > 1:
                 raise MessageError("duplicated joint", f"joint {joint!r} occurs {count} times")
         index = [key.index(joint) for joint in self._names]
-        # Few and short: what strangers send is not kept.
+        # The bounds keep unusual messages from filling the memory.
         if len(self._known) < 16 and sum(map(len, key)) < 4096:
             self._known[key] = index
         return index
@@ -401,7 +406,7 @@ class JointReader:
     def _refusal(
         self, what: str, joint: int, value: float, low: float, high: float
     ) -> MessageError:
-        # Whoever sent the message knows the controller's names and numbers.
+        # The sender knows the controller's names and units.
         name, quantity = self._names[joint], what.split()[-1]
         value, low, high = self.robot.controller.shown(joint, quantity, value, low, high)
         if not math.isfinite(value):
@@ -413,12 +418,12 @@ class JointReader:
 
 
 def shown(name: str) -> str:
-    """A foreign name between quotes, cut where it is long."""
+    """Quote a name from a message; cut it after MAX_SHOWN characters."""
     return repr(name if len(name) <= MAX_SHOWN else name[:MAX_SHOWN] + "...")
 
 
 def as_message_error(call: Callable[..., Any], *arguments: Any) -> Any:
-    """What the model answers to a message, its rejections as those of the message."""
+    """Call the model; convert its errors to a MessageError of the message that caused them."""
     try:
         return call(*arguments)
     except MessageError:
@@ -433,7 +438,7 @@ def as_message_error(call: Callable[..., Any], *arguments: Any) -> Any:
 
 
 def _times_from_start(times: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Nanoseconds of seconds and nanoseconds (2, p), which have to rise from zero or later."""
+    """Convert seconds and nanoseconds (2, p) to nanoseconds; check that they rise from zero."""
     bad = (times[1] < 0) | (times[1] >= SECOND)
     if bad.any():
         raise MessageError(
@@ -442,7 +447,7 @@ def _times_from_start(times: NDArray[np.int64]) -> NDArray[np.int64]:
     nanoseconds: NDArray[np.int64] = times[0] * SECOND + times[1]
     if nanoseconds[0] < 0:
         raise MessageError("time", f"time_from_start begins at {nanoseconds[0] / SECOND:g} s")
-    # Float seconds tell two nanoseconds apart up to here.
+    # Beyond MAX_DURATION seconds as floats do not resolve nanoseconds.
     if nanoseconds[-1] > MAX_DURATION:
         raise MessageError(
             "bounds",
@@ -461,12 +466,12 @@ def _times_from_start(times: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 MAX_LOAD: Final = 1e7
-"""Greatest force or moment, N or N m."""
+"""Largest component of a force, N, or moment, N m: beyond all sensors."""
 
 
 @dataclass(frozen=True)
 class WrenchSample:
-    """A wrench as it came: force and moment, shape (6,), N and N m, in ``frame``'s axes."""
+    """A wrench as received: force and moment, shape (6,), N and N m, in the axes of ``frame``."""
 
     stamp: int
     frame: str
@@ -474,7 +479,7 @@ class WrenchSample:
 
 
 def _check_numbers(labels: Sequence[str], values: Sequence[float], bound: float) -> None:
-    """Reject values that are not finite, beyond a bound, or denormal."""
+    """Reject values that are not finite, exceed a bound in size, or are denormal."""
     for label, value in zip(labels, values, strict=True):
         if not math.isfinite(value):
             raise MessageError("not finite", f"{label} is {value}")
@@ -487,7 +492,7 @@ def _check_numbers(labels: Sequence[str], values: Sequence[float], bound: float)
 def read_wrench(
     message: Any, now: int, rules: StampRules, frame: str, accept_empty: bool
 ) -> WrenchSample:
-    """A geometry_msgs/WrenchStamped in the expected frame; an empty frame only where allowed."""
+    """Read a geometry_msgs/WrenchStamped and check its frame; it may be empty only if allowed."""
     given = message.header.frame_id
     if given != frame and not (given == "" and accept_empty):
         hint = "; set accept_empty_frame to allow it" if given == "" else ""
@@ -502,9 +507,9 @@ def read_wrench(
 
 MAX_SHIFT: Final = 0.1
 MAX_TURN: Final = 0.1
-"""Greatest deflection that is one, m and rad: beyond, nothing is linear, or the pose is another."""
+"""Largest deflection, m and rad: larger ones are not small, or belong to another pose."""
 UNIT: Final = 1e-3
-"""By how much a quaternion's length may miss one."""
+"""Largest difference of a quaternion's length from one."""
 
 
 class DeflectionSample(NamedTuple):
@@ -516,10 +521,10 @@ class DeflectionSample(NamedTuple):
 
 
 def read_deflection(message: Any, now: int, rules: StampRules) -> DeflectionSample:
-    """A geometry_msgs/TransformStamped from the platform without load to the platform under it.
+    """Read a deflection: geometry_msgs/TransformStamped from the unloaded to the loaded platform.
 
-    :raises MessageError: a frame without a name, a bad stamp, a value that is not finite or no
-        deflection.
+    :raises MessageError: the frame has no name, the stamp is invalid, or a value is not finite or
+        too large for a deflection.
     """
     frame = message.header.frame_id
     if not frame:
@@ -535,7 +540,7 @@ def read_deflection(message: Any, now: int, rules: StampRules) -> DeflectionSamp
     length = math.hypot(*values[3:])
     if abs(length - 1.0) > UNIT:
         raise MessageError("bounds", f"the rotation's length is {length:g}, not 1")
-    # A quaternion and its negative are one rotation.
+    # A quaternion and its negative describe the same rotation.
     sign = math.copysign(1.0, turn.w)
     size = math.hypot(turn.x, turn.y, turn.z)
     angle = 2.0 * math.atan2(size, abs(turn.w))
@@ -547,6 +552,6 @@ def read_deflection(message: Any, now: int, rules: StampRules) -> DeflectionSamp
 
 
 def in_base_axes(values: Array, rotation: Array) -> Array:
-    """A deflection (..., 6) that was measured in platform axes, of rotations (..., 3, 3)."""
+    """Rotate deflections (..., 6) from platform axes to base axes by rotations (..., 3, 3)."""
     shift, turn = (rotation @ values[..., k : k + 3, None] for k in (0, 3))
     return np.asarray(np.concatenate([shift[..., 0], turn[..., 0]], -1), np.float64)

@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""Time stamps and durations of messages: nanoseconds, and which stamps are accepted."""
+"""Read time stamps of messages as nanoseconds and decide which stamps are accepted."""
 
 from __future__ import annotations
 
@@ -9,23 +9,27 @@ from typing import Any, Final
 from pkm_twin.errors import MessageError
 
 SECOND: Final = 1_000_000_000
+"""Nanoseconds per second."""
 
 REPLAYED: Final = 60 * SECOND
 """Age of a stamp beyond which it is one of a recording, ns: no queue holds a message so long."""
 MAX_DURATION: Final = 1_000_000 * SECOND
-"""Bounds beyond all machines of this kind, for values that no limit of the robot bounds."""
+"""Longest duration of a trajectory, ns: up to here seconds as floats resolve nanoseconds."""
 
 
 @dataclass(frozen=True)
 class StampRules:
-    """What a stamp has to keep to, relative to the node's clock; ns, None where unchecked."""
+    """Accepted differences between a stamp and the node's clock, ns; ``max_age`` None: any age."""
 
     accept_zero: bool = False
     future_tolerance: int = SECOND // 10
     max_age: int | None = None
 
     def check(self, stamp: int, now: int) -> int:
-        """The stamp to use: the message's, or the arrival time where zero is accepted."""
+        """Check a message's stamp; return it, or ``now`` for a zero stamp if that is accepted.
+
+        :raises MessageError: the stamp is zero, in the future or too old.
+        """
         if stamp == 0:
             if self.accept_zero:
                 return now
@@ -53,7 +57,7 @@ class StampRules:
 
 
 def stamp_of(header: Any) -> int:
-    """A header's stamp in nanoseconds, checked to be a valid time."""
+    """Return a header's stamp, ns, after checking that it is a valid time."""
     return _nanoseconds("stamp", header.stamp)
 
 

@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""What a command answers: facts, tables and figures, for the terminal, scripts and the browser."""
+"""Present a command's results: facts, tables and figures, as text, JSON or HTML."""
 
 from pkm_twin.report.report import Column, Fact, Report, Table, Verdict, judged, number, plain
 

@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""A report as one HTML page that needs no network: answer, notes, facts, tables, pictures."""
+"""Write a report as one HTML page without external files."""
 
 from __future__ import annotations
 
@@ -32,16 +32,16 @@ img {{ max-width: 100%; }}
 </html>
 """
 DPI: Final = 100
-"""Of its pictures: 900 pixels wide."""
+"""Resolution of the page's pictures, dots per inch: 900 pixels wide."""
 
 
 def page(
     title: str, report: Report, more: Sequence[Table] = (), figures: Sequence[str] = ()
 ) -> str:
-    """The whole page.
+    """Return the whole page as HTML.
 
     :param more: tables that the terminal does not show.
-    :param figures: interactive ones, as HTML.
+    :param figures: interactive figures as HTML.
     """
     notes = "".join(f"<li>{html.escape(note)}</li>" for note in report.notes)
     parts = [f"<p>{html.escape(report.answer)}</p>", f"<ul>{notes}</ul>"]

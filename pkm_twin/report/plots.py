@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""Pictures. matplotlib is imported on first use; every function draws on axes that it is given."""
+"""Draw pictures with matplotlib, which is imported on first use."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ STYLE: Final[Any] = {
 
 
 def pyplot() -> Any:
-    """Matplotlib's pyplot, drawing into files only."""
+    """Return matplotlib's pyplot, configured to draw into files only."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -46,7 +46,7 @@ def pyplot() -> Any:
 def columns(
     count: int, rows: int, height: float | None = None, **options: Any
 ) -> tuple[Any, list[Any]]:
-    """A figure of ``count`` columns with ``rows`` axes each; ``height``: inches."""
+    """Make a figure of ``count`` columns with ``rows`` axes each; ``height`` in inches."""
     figure, axes = pyplot().subplots(
         rows, count, figsize=(WIDTH, height or max(3 * rows, 4.2)), squeeze=False,
         layout="constrained", **options,
@@ -55,7 +55,7 @@ def columns(
 
 
 def label(ax: Any, x: str, y: str, title: str = "", size: float | None = None) -> None:
-    """Name the axes, and draw a grid; ``size``: of the title's letters."""
+    """Label the axes and draw a grid; ``size``: font size of the title, points."""
     ax.set_xlabel(x)
     ax.set_ylabel(y)
     if title:
@@ -64,9 +64,9 @@ def label(ax: Any, x: str, y: str, title: str = "", size: float | None = None) -
 
 
 def rendered(figure: Any, dpi: int, form: str = "png") -> bytes:
-    """A figure as an image; it is closed.
+    """Render a figure as an image and close it.
 
-    Names of files and joints may have a dollar in them: no text that is set here is a formula.
+    Texts are not parsed as formulas: names of files and joints may contain a dollar sign.
     """
     texts = [] if figure._suptitle is None else [figure._suptitle]
     for ax in figure.axes:
@@ -82,8 +82,8 @@ def rendered(figure: Any, dpi: int, form: str = "png") -> bytes:
 
 
 def head(figure: Any, text: str, size: float = STYLE["figure.titlesize"]) -> int:
-    """A title in as many lines as its letters need; returns how many."""
-    # A value and its unit stay together: the wrapping knows no hard space.
+    """Write the figure's title, wrapped; return the number of lines."""
+    # A no-break space keeps a value and its unit on one line.
     tied = re.sub(r"(?<=\d) (?=[^\W\d])|(?<=\bN) (?=m\b)", "\xa0", text)
     rows = [row for line in tied.splitlines() for row in textwrap.wrap(line, int(1050 / size))]
     figure.suptitle("\n".join(rows).replace("\xa0", " "), fontsize=size)
@@ -91,7 +91,7 @@ def head(figure: Any, text: str, size: float = STYLE["figure.titlesize"]) -> int
 
 
 def legend(ax: Any, below: bool = False) -> None:
-    """A legend beside the data, or below, where it hides none."""
+    """Place the legend to the right of the data, or below."""
     if below:
         ax.legend(ncol=2, loc="upper center", bbox_to_anchor=(0.5, -0.16))
     else:
@@ -110,9 +110,10 @@ def save(figure: Any, path: Path, dpi: int = DPI) -> Path:
 
 
 def torques(motion: Any, table: Mapping[str, Any], title: str) -> Any:
-    """Efforts and their terms, a row for each actuated joint; grey where beyond the limits.
+    """Draw efforts and their terms, one row per actuated joint; grey where beyond the limits.
 
-    Of a long motion the terms are those of the seconds about the largest effort, beside the whole.
+    For a motion longer than LONG the terms are drawn in a second column, one second before and
+    after the largest effort.
     """
     robot, time = motion.robot, np.asarray(table["time"])
     whole = time[-1] - time[0] <= LONG
@@ -132,7 +133,7 @@ def torques(motion: Any, table: Mapping[str, Any], title: str) -> Any:
 
 
 def _efforts(ax: Any, joint: str, table: Mapping[str, Any], terms: bool) -> None:
-    """A joint's efforts over time, and what they consist of."""
+    """Draw a joint's efforts over time, their terms and their standard deviation."""
     time, effort = table["time"], table[f"{joint}.effort"]
     measured = table.get(f"{joint}.measured")
     if measured is not None:

@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""The parts of a report, and the report as plain data."""
+"""Define the parts of a report and convert it to plain data."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from pathlib import Path
 from typing import Any, Final
 
 ROUNDING: Final = 1e-9
-"""What is below this part of the largest number of a column with a unit is shown as 0."""
+"""Numbers below this fraction of a column's largest number are shown as 0 (columns with a unit)."""
 
 
 class Verdict(StrEnum):
-    """Not enough evidence is a verdict of its own."""
+    """The judgement of a property: good, bad, or unknown for lack of evidence."""
 
     GOOD = "good"
     BAD = "bad"
@@ -23,7 +23,7 @@ class Verdict(StrEnum):
 
     @property
     def words(self) -> str:
-        """As the terminal shows it."""
+        """The verdict as the terminal shows it."""
         return "not judged" if self is Verdict.UNKNOWN else str(self)
 
 
@@ -31,10 +31,10 @@ class Verdict(StrEnum):
 class Fact:
     """A named value.
 
-    ``name``: its key in JSON; empty where JSON has the value elsewhere. ``value``: a number, word,
-    list or mapping, in SI units. ``text``: its label in the terminal; None where it is in JSON
-    alone. ``shown``: the value in words, by default its number. ``bound`` and ``verdict``: of a
-    judged property, with its ``numbers`` for JSON.
+    ``name``: key in JSON; empty if JSON has the value elsewhere. ``value``: a number, word, list or
+    mapping, in SI units. ``text``: label in the terminal; None for JSON alone. ``shown``: the value
+    as text, by default its number. ``bound``, ``verdict`` and ``numbers`` (for JSON) belong to a
+    judged property.
     """
 
     name: str
@@ -53,9 +53,10 @@ class Fact:
 
 
 def judged(what: str, value: str, bound: str, good: bool | None, **numbers: Any) -> Fact:
-    """A property in words against its bound; ``good``: None where nothing can be told.
+    """Make the fact of a property that is judged by a bound.
 
-    :param numbers: of the property, for JSON: ``number``, ``limit`` and ``unit``.
+    :param good: whether the property keeps the bound; None if this cannot be decided.
+    :param numbers: ``number``, ``limit`` and ``unit`` for JSON.
     """
     verdict = Verdict.UNKNOWN if good is None else Verdict.GOOD if good else Verdict.BAD
     return Fact("", value, text=what, bound=bound, verdict=verdict, numbers=numbers)
@@ -65,9 +66,9 @@ def judged(what: str, value: str, bound: str, good: bool | None, **numbers: Any)
 class Column:
     """A column of a table.
 
-    ``name``: its key in JSON; empty where it is only shown. ``text``: its heading, by default the
-    name, a blank for none; None where it is in JSON alone. ``scale``: what the terminal multiplies
-    a number by, so that it is in ``shown``, by default in ``unit``. ``form``: of numbers.
+    ``name``: key in JSON; empty if the column is only shown. ``text``: heading, by default the
+    name, a blank for none; None for JSON alone. ``scale``: factor from ``unit`` to the unit
+    ``shown`` in the terminal. ``form``: format of numbers.
     """
 
     name: str
@@ -79,12 +80,12 @@ class Column:
 
     @property
     def heading(self) -> str:
-        """What the terminal prints above it."""
+        """The heading with the unit, as the terminal prints it."""
         unit = self.shown or self.unit
         return f"{self.text or self.name}{f' ({unit})' if unit else ''}"
 
     def cell(self, value: Any, least: float = 0.0) -> str:
-        """A value as the terminal shows it; 0 where it is below a least one."""
+        """Format a value for the terminal; show 0 if it is smaller than ``least``."""
         if isinstance(value, float) and abs(value) < least:
             value = 0.0
         scales = self.scale != 1.0 and isinstance(value, int | float)
@@ -93,10 +94,10 @@ class Column:
 
 @dataclass(frozen=True)
 class Table:
-    """Rows by name, each with a value per column; JSON has ``{name: {row: {column: value}}}``.
+    """Rows by name, each with a value per column; in JSON ``{name: {row: {column: value}}}``.
 
-    ``name``: empty for a table of the terminal alone. ``head``: what the rows are. ``title``: the
-    line above it.
+    ``name``: key in JSON; empty for the terminal alone. ``head``: heading of the rows' names.
+    ``title``: the line above the table.
     """
 
     name: str
@@ -107,10 +108,10 @@ class Table:
 
     @property
     def cells(self) -> list[tuple[str, ...]]:
-        """Headings and rows as words, of the columns that have a text."""
+        """Headings and formatted rows of the columns that are shown as text."""
         shown = [(k, column) for k, column in enumerate(self.columns) if column.text is not None]
         rows = self.rows.items()
-        # Numbers of one unit: others have nothing to do with each other.
+        # Only numbers of the same unit can be compared with the largest.
         least = [
             ROUNDING * _largest(values[k] for _, values in rows) * bool(column.unit)
             for k, column in shown
@@ -125,7 +126,7 @@ class Table:
 
     @property
     def data(self) -> dict[str, dict[str, Any]]:
-        """As JSON has it."""
+        """The table as JSON data."""
         return {
             row: {c.name: v for c, v in zip(self.columns, values, strict=True) if c.name}
             for row, values in self.rows.items()
@@ -134,13 +135,13 @@ class Table:
 
 @dataclass(frozen=True)
 class Report:
-    """What a command found.
+    """The results of a command.
 
-    ``answer``: one sentence with units, the first line of the output. ``files``: written ones by
-    their keys in JSON, None where none was. ``figures``: by what is added to the picture's name,
-    functions that draw one each with matplotlib. ``verdict``: bad ends the command with code 1;
-    ``code``: another one. ``error``: a line on stderr. ``raw``: what the command prints as it is,
-    in place of the rest.
+    ``answer``: one sentence with units, the first line of the output. ``files``: written files by
+    their keys in JSON, None where none was written. ``figures``: functions that draw a picture each
+    with matplotlib, by the suffix of the picture's name. ``verdict``: bad ends the command with
+    exit code 1; ``code``: any other exit code. ``error``: a line on stderr. ``raw``: text that the
+    command prints instead of everything else.
     """
 
     answer: str = ""
@@ -156,14 +157,14 @@ class Report:
 
     @property
     def exit_code(self) -> int:
-        """Of the command: 0 good, 1 bad."""
+        """The command's exit code: 0 good, 1 bad."""
         return self.code or int(self.verdict is Verdict.BAD)
 
     @property
     def data(self) -> dict[str, Any]:
-        """Facts and tables as JSON has them, in SI units; what is not finite is None.
+        """Facts and tables as JSON data, in SI units; None for numbers that are not finite.
 
-        ``units`` has the units of facts, and of columns as TABLE.COLUMN; ``items`` the judged ones.
+        ``units``: units of facts, and of columns as TABLE.COLUMN; ``items``: the judged facts.
         """
         found = {fact.name: fact.value for fact in self.facts if fact.name}
         items = [
@@ -184,13 +185,13 @@ class Report:
 
 
 def _largest(values: Iterable[Any]) -> float:
-    """The largest size of the finite numbers; 0 where there is none."""
+    """Return the largest absolute value of the finite numbers; 0 if there is none."""
     sizes = [abs(v) for v in values if isinstance(v, int | float) and math.isfinite(v)]
     return float(max(sizes, default=0.0))
 
 
 def plain(value: Any) -> Any:
-    """Data that JSON can have: arrays are lists, and what is not finite is None."""
+    """Convert data for JSON: arrays become lists, numbers that are not finite None."""
     if hasattr(value, "tolist"):
         value = value.tolist()
     if isinstance(value, Mapping):
@@ -203,7 +204,7 @@ def plain(value: Any) -> Any:
 
 
 def number(value: Any, form: str = ".4g") -> str:
-    """A value in words: what is not known is a dash."""
+    """Format a value as text; None and NaN are a dash."""
     value = value.tolist() if hasattr(value, "tolist") else value
     if value is None or value != value:
         return "-"

@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""A report as text: the answer first, then facts, tables, notes and files."""
+"""Print a report as text: the answer first, then facts, tables, notes and files."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from pkm_twin.files import STANDARD
 from pkm_twin.report.report import Fact, Report, Table, Verdict
 
 WIDTH: Final = 100
-"""Of a table, letters."""
+"""Widest table, characters."""
 BLANK: Final = "\u00a0"
-"""Where no line breaks."""
+"""No-break space."""
 COLOURS: Final = {Verdict.GOOD: "green", Verdict.BAD: "red", Verdict.UNKNOWN: "yellow"}
 
 
 def present(report: Report, as_json: bool, *, piped: bool = False) -> None:
     """Print a report.
 
-    :param piped: stdout carries the file that the command writes; the report goes to stderr.
+    :param piped: print to stderr, as stdout carries the file that the command writes.
     """
     if as_json:
         print_json(report.data, err=piped)
@@ -40,7 +40,7 @@ def present(report: Report, as_json: bool, *, piped: bool = False) -> None:
 
 
 def text_of(report: Report) -> str:
-    """What the terminal shows, lines with newlines between."""
+    """Write the report as the terminal shows it."""
     found = [report.answer] if report.answer else []
     for fact in report.facts:
         if fact.text is not None and fact.verdict is None:
@@ -58,7 +58,7 @@ def text_of(report: Report) -> str:
 
 
 def _judged(facts: Sequence[Fact]) -> Iterator[str]:
-    """Judged properties as a table."""
+    """Lay out judged properties as a table with coloured verdicts."""
     # A verdict stays on its row's first line, where it is coloured.
     words = [fact.verdict.words.replace(" ", BLANK) if fact.verdict else "" for fact in facts]
     rows = [
@@ -78,7 +78,7 @@ def _words(bound: object) -> str:
 
 
 def table_lines(table: Table) -> list[str]:
-    """A table's title, headings and rows; columns of numbers end at the right."""
+    """Return a table's title, headings and rows; numeric columns are right-aligned."""
     head, *rows = table.cells
     shown = [k for k, column in enumerate(table.columns) if column.text is not None]
     words = [any(isinstance(row[k], str) for row in table.rows.values()) for k in shown]
@@ -89,15 +89,14 @@ def table_lines(table: Table) -> list[str]:
 
 
 def aligned(rows: Sequence[Sequence[str]], sides: str) -> Iterator[str]:
-    """Rows with their cells below each other; ``sides`` has < or > for each column.
+    """Align rows in columns; ``sides`` has < (left) or > (right) for each column.
 
-    The first row is the headings. Where the whole is wider than :data:`WIDTH`, headings are on
-    several lines, and if that is not enough words of other cells too. A list of names, each with a
-    sentence, keeps one line a name.
+    The first row is the headings. In a table wider than :data:`WIDTH` headings are wrapped, and if
+    that is not enough other cells, too. A table of two columns is not wrapped.
     """
     if not any(row[0] for row in rows):
         rows, sides = [row[1:] for row in rows], sides[1:]
-    # What is in brackets, a unit, stays on one line. A blank cell has no width to wrap to.
+    # Text in brackets (a unit) is not broken. A blank cell has no width to wrap to.
     rows = [[re.sub(r"\([^)]*\)", _glued, c) if c.strip() else "" for c in row] for row in rows]
     columns = list(zip(*rows, strict=True))
     widths = [max(map(len, column)) for column in columns]
