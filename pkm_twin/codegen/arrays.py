@@ -19,6 +19,9 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Indices = NDArray[np.intp]
 
+ROUNDING_NOISE: Final = 8.0 * float(np.finfo(np.float64).eps)
+"""Relative noise of computed numbers: rounding of the last digits in a few operations."""
+
 _F8: Final = np.dtype(np.float64)
 
 

@@ -20,13 +20,12 @@ import numpy as np
 import yaml
 
 from delta_dynamics.simulation.machine import tuned
-from pkm_twin.codegen.arrays import Array
+from pkm_twin.codegen.arrays import ROUNDING_NOISE, Array
 from pkm_twin.errors import check_limit
 from pkm_twin.export.c_package import c_package, identifier
 from pkm_twin.machine.graph import POSE
 from pkm_twin.machine.sections import MAX_LENGTH, MAX_MASS
 from pkm_twin.robot.robot import Robot
-from pkm_twin.streams.rest import FLOOR
 
 CONTROLLER: Final = "feedforward_controller"
 GRAVITY: Final = "gravity_controller"
@@ -190,7 +189,7 @@ def _rounding_rates(robot: Robot) -> Array:
     controller = robot.controller
     units = np.array([1.0 if unit == "rad" else robot.graph.size for unit in robot.joint_units])
     largest = np.abs(controller.offsets) + np.abs(controller.factors) * units
-    return np.asarray(FLOOR * largest / SHORTEST_PERIOD, np.float64)
+    return np.asarray(ROUNDING_NOISE * largest / SHORTEST_PERIOD, np.float64)
 
 
 def _start(robot: Robot) -> Array:

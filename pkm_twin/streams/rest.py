@@ -18,7 +18,7 @@ from typing import Final
 
 import numpy as np
 
-from pkm_twin.codegen.arrays import Array
+from pkm_twin.codegen.arrays import ROUNDING_NOISE, Array
 from pkm_twin.messages.stamps import SECOND
 
 SIGMAS: Final = 4.0
@@ -29,8 +29,6 @@ KEPT: Final = 15
 """Differences of a stream whose median is its noise."""
 ROBUST: Final = 1.4826
 """Standard deviation of a normal distribution over its median absolute deviation."""
-FLOOR: Final = 8.0 * float(np.finfo(np.float64).eps)
-"""Least noise of numbers, relative: that of their own digits."""
 BLOCK: Final = 4096
 
 
@@ -62,7 +60,7 @@ def noise(time: Array, values: Array) -> Array:
         left.append(np.abs(np.einsum("kp,kpn->kn", difference_weights(time[rows]), values[rows])))
     sizes = np.concatenate(left)
     # A joint that stands exactly still says nothing of its noise.
-    sizes[sizes <= FLOOR * np.abs(values).max(initial=0.0)] = np.nan
+    sizes[sizes <= ROUNDING_NOISE * np.abs(values).max(initial=0.0)] = np.nan
     known = np.isfinite(sizes).any(0)
     found = np.zeros(values.shape[1])
     found[known] = ROBUST * np.nanmedian(sizes[:, known], 0)
@@ -82,7 +80,7 @@ def rate_doubt(time: Array, q: Array, gain: Array | float, stride: int = 2) -> A
     """
     if len(time) < 3:
         return np.zeros_like(q)
-    size = noise(time, q) + FLOOR * np.abs(q).max(0)
+    size = noise(time, q) + ROUNDING_NOISE * np.abs(q).max(0)
     fine = np.gradient(q, time, axis=0, edge_order=2)
     coarse = np.gradient(q, time, axis=0)
     if len(time) >= 3 * stride:
@@ -170,7 +168,7 @@ class RestWatch:
         slack = SIGMAS * math.sqrt(sum(map(mul, slope, slope)))
         doubt = []
         for size, column, given in zip(sizes, columns, rate.tolist(), strict=True):
-            size += FLOOR * abs(column[-1])
+            size += ROUNDING_NOISE * abs(column[-1])
             # The fit lags where a motion begins or ends, the last three positions do not.
             apart = abs(given - sum(map(mul, slope, column[-3:])))
             late = apart if apart > slack * size else 0.0
