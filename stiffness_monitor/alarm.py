@@ -34,27 +34,27 @@ from stiffness_monitor.derivatives import compliance_effects, energy_effects
 from stiffness_monitor.monitor import Answer
 from stiffness_monitor.response import element_response
 
-LEAST_SAMPLES: Final = 20
+MIN_SAMPLES: Final = 20
 """Fewer loaded ones tell nothing."""
-MOST_SAMPLES: Final = 1000
-LOADED: Final = 0.05
+MAX_SAMPLES: Final = 1000
+LOADED_FRACTION: Final = 0.05
 """A sample is loaded whose predicted deflection is above this part of the window's greatest."""
-LOUD: Final = 10.0
+MIN_SIGNAL_TO_NOISE: Final = 10.0
 """Least change of the measured deflections over their noise: less is no load, but the noise of
 wrenches."""
-APART: Final = 4.0
+DISTINCT_SIGMAS: Final = 4.0
 """Deviations by which an element explains the samples worse than the best, to be ruled out."""
-SHARE: Final = 1e-3
+MIN_NOISE_FRACTION: Final = 1e-3
 """Least noise of a direction, as a share of the deflections' deviation there."""
-RANGE: Final = (0.05, 100.0)
+FACTOR_RANGE: Final = (0.05, 100.0)
 """Factors that are looked for."""
-STRIDE: Final = 3.0
+MAX_STEP_RATIO: Final = 3.0
 """By how much a step may multiply a factor."""
-STEPS: Final = 20
-SETTLED: Final = 1e-4
-NEAR: Final = 0.5
+MAX_ITERATIONS: Final = 20
+FACTOR_TOLERANCE: Final = 1e-4
+SCREENING_FRACTION: Final = 0.5
 """Part of its bound that some element alone has to miss 1 by, to first order, to be looked at."""
-MOST_ALIKE: Final = 0.95
+MAX_AUTOCORRELATION: Final = 0.95
 """Greatest correlation of one residual with the next that is taken for one."""
 
 
@@ -116,7 +116,7 @@ class _Sample:
 
 
 @dataclass(frozen=True, eq=False)
-class _Explained:
+class _Fit:
     """Factors of some elements, their variances by the noise alone, and the squares left."""
 
     factors: Array
@@ -144,7 +144,7 @@ class _Window:
     residual: Array
     prior: Array
 
-    def added(self, chosen: Sequence[int], factors: Array) -> tuple[Array, Array]:
+    def predict_change(self, chosen: Sequence[int], factors: Array) -> tuple[Array, Array]:
         """What chosen elements with factors add, (k, d), and its derivatives, (k, d, chosen)."""
         own = np.isin(self.owner, chosen)
         mine = np.equal.outer(self.owner[own], np.asarray(chosen)).astype(float)
@@ -157,9 +157,9 @@ class _Window:
         added = reach @ (change * amounts)[..., None]
         return added[..., 0], (columns * amounts[:, None]) @ mine
 
-    def alone(self, count: int) -> tuple[Array, Array]:
+    def estimate_each(self, count: int) -> tuple[Array, Array]:
         """Each element's factor alone, to first order, and its standard deviation, (elements,)."""
-        _, slopes = self.added(range(count), np.ones(count))
+        _, slopes = self.predict_change(range(count), np.ones(count))
         rows, columns = slopes.reshape(-1, count), self.common.reshape(-1, len(self.prior))
         columns = np.concatenate([columns, np.diag(np.sqrt(self.prior))])
         basis = np.linalg.qr(columns / np.maximum(np.linalg.norm(columns, axis=0), 1e-300))[0]
@@ -168,12 +168,12 @@ class _Window:
         information = np.maximum(np.sum(rows**2, 0), 1e-300)
         return 1.0 + rows.T @ self.residual.ravel() / information, 1.0 / np.sqrt(information)
 
-    def explained(self, chosen: Sequence[int], start: Array) -> _Explained:
+    def fit(self, chosen: Sequence[int], start: Array) -> _Fit:
         """The window by chosen elements, from factors to begin with."""
         factors, e = start, len(chosen)
         held = np.concatenate([np.zeros(e), self.prior])
-        for _ in range(STEPS):
-            added, slopes = self.added(chosen, factors)
+        for _ in range(MAX_ITERATIONS):
+            added, slopes = self.predict_change(chosen, factors)
             table = np.concatenate([slopes, self.common], -1).reshape(-1, len(held))
             target = (self.residual - added).ravel()
             information = table.T @ table + np.diag(held)
@@ -181,15 +181,18 @@ class _Window:
             scale = 1.0 / np.sqrt(np.maximum(np.diag(information), 1e-300))
             inverse = np.linalg.pinv(scale[:, None] * information * scale, 1e-12, hermitian=True)
             found = scale * (inverse @ (scale * (table.T @ target)))
-            bounds = np.maximum(factors / STRIDE, RANGE[0]), np.minimum(factors * STRIDE, RANGE[1])
+            bounds = (
+                np.maximum(factors / MAX_STEP_RATIO, FACTOR_RANGE[0]),
+                np.minimum(factors * MAX_STEP_RATIO, FACTOR_RANGE[1]),
+            )
             new = np.clip(factors + found[:e], *bounds)
             step, factors = np.abs(new - factors).max(initial=0.0), new
-            if step < SETTLED:
+            if step < FACTOR_TOLERANCE:
                 break
         left = target - table[:, e:] @ found[e:]
         squares = float(left @ left + held[e:] @ found[e:] ** 2)
         variances = (scale**2 * np.diag(inverse))[:e]
-        return _Explained(factors, variances, squares)
+        return _Fit(factors, variances, squares)
 
 
 @dataclass
@@ -203,7 +206,7 @@ class StiffnessAlarm:
     settings: AlarmSettings = field(default_factory=AlarmSettings)
 
     def __post_init__(self) -> None:
-        self._samples: deque[_Sample] = deque(maxlen=MOST_SAMPLES)
+        self._samples: deque[_Sample] = deque(maxlen=MAX_SAMPLES)
         self.names: tuple[str, ...] = ()
         # A machine may be singular at home; then the first sample's pose tells.
         with suppress(PkmTwinError, ValueError):
@@ -212,7 +215,7 @@ class StiffnessAlarm:
     def _prepare(self, pose: Array) -> None:
         """What the elements are, and how sure the file is of each."""
         response = element_response(self.robot, pose)
-        self._doubts = _doubts(self.robot, pose, len(response.names))
+        self._file_deviations = _file_deviations(self.robot, pose, len(response.names))
         self.names, self._owner = response.names, response.owner
 
     @property
@@ -253,34 +256,37 @@ class StiffnessAlarm:
         if not self._samples:
             return None
         sizes = np.array([np.linalg.norm(sample.moved[:3]) for sample in self._samples])
-        if int((sizes > LOADED * sizes.max()).sum()) < LEAST_SAMPLES or not sizes.max() > 0.0:
+        if (
+            int((sizes > LOADED_FRACTION * sizes.max()).sum()) < MIN_SAMPLES
+            or not sizes.max() > 0.0
+        ):
             return None
-        window, alike, loudest = self._window()
-        if loudest < LOUD:
+        window, alike, loudest = self._build_window()
+        if loudest < MIN_SIGNAL_TO_NOISE:
             return None
         yield
-        values, deviations = window.alone(len(self.names))
-        bounds = self._bounds(np.sqrt(alike) * deviations, range(len(self.names)))
-        if not (np.abs(values - 1.0) > NEAR * bounds).any():
+        values, deviations = window.estimate_each(len(self.names))
+        bounds = self._departure_bounds(np.sqrt(alike) * deviations, range(len(self.names)))
+        if not (np.abs(values - 1.0) > SCREENING_FRACTION * bounds).any():
             return ()
         yield
-        chosen = yield from self._chosen(window, alike)
-        return (yield from self._departures(window, alike, chosen))
+        chosen = yield from self._select_elements(window, alike)
+        return (yield from self._describe_departures(window, alike, chosen))
 
-    def _bounds(self, deviations: Array, elements: Sequence[int]) -> Array:
+    def _departure_bounds(self, deviations: Array, elements: Sequence[int]) -> Array:
         """How far from 1 a factor is no departure."""
         s = self.settings
-        doubts = self._doubts[list(elements)]
+        doubts = self._file_deviations[list(elements)]
         return np.asarray(
             np.maximum(s.min_departure, s.sigmas * np.hypot(deviations, doubts)), np.float64
         )
 
-    def _beyond(self, fit: _Explained, alike: float, elements: Sequence[int]) -> Array:
+    def _relative_departures(self, fit: _Fit, alike: float, elements: Sequence[int]) -> Array:
         """Departures from 1 over their bounds, (elements,)."""
-        bounds = self._bounds(fit.deviations(alike), elements)
+        bounds = self._departure_bounds(fit.deviations(alike), elements)
         return np.asarray(np.abs(fit.factors - 1.0) / bounds, np.float64)
 
-    def _chosen(self, window: _Window, alike: float) -> Generator[None, None, list[int]]:
+    def _select_elements(self, window: _Window, alike: float) -> Generator[None, None, list[int]]:
         """The fewest elements that explain the window: added one by one, then left out again."""
         chosen: list[int] = []
         factors = np.zeros(0)
@@ -288,17 +294,17 @@ class StiffnessAlarm:
             left = [k for k in range(len(self.names)) if k not in chosen]
             tried = {}
             for k in left:
-                tried[k] = window.explained([*chosen, k], np.append(factors, 1.0))
+                tried[k] = window.fit([*chosen, k], np.append(factors, 1.0))
                 yield
             best = min(left, key=lambda k: tried[k].squares)
-            if not self._beyond(tried[best], alike, [*chosen, best])[-1] > 1.0:
+            if not self._relative_departures(tried[best], alike, [*chosen, best])[-1] > 1.0:
                 break
             chosen.append(best)
             factors = tried[best].factors
         while chosen:
-            fit = window.explained(chosen, factors)
+            fit = window.fit(chosen, factors)
             yield
-            beyond = self._beyond(fit, alike, chosen)
+            beyond = self._relative_departures(fit, alike, chosen)
             least = int(beyond.argmin())
             if beyond[least] > 1.0:
                 break
@@ -306,15 +312,15 @@ class StiffnessAlarm:
             factors = np.delete(fit.factors, least)
         return chosen
 
-    def _departures(
+    def _describe_departures(
         self, window: _Window, alike: float, chosen: Sequence[int]
     ) -> Generator[None, None, tuple[Departure, ...]]:
         """What is told of the chosen elements, the surest first."""
         if not chosen:
             return ()
-        fit = window.explained(chosen, np.ones(len(chosen)))
-        deviations, beyond = fit.deviations(alike), self._beyond(fit, alike, chosen)
-        bounds = self._bounds(deviations, chosen)
+        fit = window.fit(chosen, np.ones(len(chosen)))
+        deviations, beyond = fit.deviations(alike), self._relative_departures(fit, alike, chosen)
+        bounds = self._departure_bounds(deviations, chosen)
         found = []
         for at in np.argsort(-beyond).tolist():
             others = []
@@ -323,9 +329,9 @@ class StiffnessAlarm:
                     continue
                 swapped, start = list(chosen), fit.factors.copy()
                 swapped[at], start[at] = k, 1.0
-                other = window.explained(swapped, start)
+                other = window.fit(swapped, start)
                 yield
-                if other.squares - fit.squares < APART**2 * alike:
+                if other.squares - fit.squares < DISTINCT_SIGMAS**2 * alike:
                     others.append((other.squares, self.names[k], float(other.factors[at])))
             found.append(
                 Departure(
@@ -335,7 +341,7 @@ class StiffnessAlarm:
             )  # fmt: skip
         return tuple(found)
 
-    def _window(self) -> tuple[_Window, float, float]:
+    def _build_window(self) -> tuple[_Window, float, float]:
         """The samples over their noise.
 
         :returns: and how many of them are one by their correlation, and by how much the
@@ -351,9 +357,11 @@ class StiffnessAlarm:
         common = np.concatenate([effects, zeros], -1)
         prior = np.repeat([1.0, 0.0], [effects.shape[-1], len(kept)])
         plain = _Window(self._owner, reach, rest, carried, common, residual, prior)
-        _, slopes = plain.added(range(len(self.names)), np.ones(len(self.names)))
+        _, slopes = plain.predict_change(range(len(self.names)), np.ones(len(self.names)))
         size = np.std(measured[:, kept], 0)
-        noise, alike = _noise(residual, np.concatenate([slopes, common], -1), SHARE * size)
+        noise, alike = _estimate_noise(
+            residual, np.concatenate([slopes, common], -1), MIN_NOISE_FRACTION * size
+        )
         loudest = float((size / noise).max())
         over = noise[:, None]
         scaled = _Window(
@@ -362,7 +370,7 @@ class StiffnessAlarm:
         return scaled, alike, loudest
 
 
-def _noise(residual: Array, table: Array, least: Array) -> tuple[Array, float]:
+def _estimate_noise(residual: Array, table: Array, least: Array) -> tuple[Array, float]:
     """Deviation by direction (d,) that no element explains, and the samples' correlation.
 
     :param table: all that may explain it, (k, d, p).
@@ -380,11 +388,11 @@ def _noise(residual: Array, table: Array, least: Array) -> tuple[Array, float]:
     scaled = left / size
     whole = float(np.sum(scaled**2))
     alike = float(np.sum(scaled[1:] * scaled[:-1])) / whole if whole > 0.0 else 0.0
-    alike = min(max(alike, 0.0), MOST_ALIKE)
+    alike = min(max(alike, 0.0), MAX_AUTOCORRELATION)
     return size, (1.0 + alike) / (1.0 - alike)
 
 
-def _doubts(robot: Robot, pose: Array, count: int) -> Array:
+def _file_deviations(robot: Robot, pose: Array, count: int) -> Array:
     """Relative deviation of each element's compliance by the causes, (elements,).
 
     Of its energy under six unit loads at one pose.
@@ -397,9 +405,9 @@ def _doubts(robot: Robot, pose: Array, count: int) -> Array:
     return np.asarray(changes / np.maximum(own, 1e-300), np.float64)
 
 
-WAITING: Final = 64
+MAX_WAITING: Final = 64
 """Deflections that wait for the wrench after them; of more the latest by their stamps go."""
-JUDGED: Final = 1.0
+EVALUATION_PERIOD: Final = 1.0
 """Between two judgements, s of stamps."""
 
 
@@ -454,7 +462,7 @@ class StiffnessWatch(Core):
         latest = self._answers.latest
         if latest is None or answer.stamp >= latest[0]:
             self._answers.push(answer.stamp, answer)
-        self._pair()
+        self._pair_waiting()
 
     def deflection(self, message: Any, now: int) -> None:
         """Take a geometry_msgs/TransformStamped, of the deflected platform.
@@ -468,10 +476,10 @@ class StiffnessWatch(Core):
                 raise MessageError("frame", f"frame is {shown(sample.frame)}, expected {told}")
             check_order(sample.stamp, self._last)
         insort(self._waiting, sample, key=lambda waiting: waiting.stamp)
-        self._pair()
-        if len(self._waiting) > WAITING:
+        self._pair_waiting()
+        if len(self._waiting) > MAX_WAITING:
             self._waiting.pop()
-            text = f"{WAITING} deflections are already waiting for the wrench after them"
+            text = f"{MAX_WAITING} deflections are already waiting for the wrench after them"
             self.refuse(self.taken, MessageError("no wrench", text))
 
     def judgement(self) -> Generator[None, None, bool] | None:
@@ -480,13 +488,13 @@ class StiffnessWatch(Core):
         One at a time. It ends with whether ``departures`` are new: not where all was forgotten
         meanwhile.
         """
-        if self._judging is not None or self._due - self._judged < JUDGED * SECOND:
+        if self._judging is not None or self._due - self._judged < EVALUATION_PERIOD * SECOND:
             return None
         self._judged = self._due
         self._judging = object()
-        return self._judge(self._judging)
+        return self._run_evaluation(self._judging)
 
-    def _judge(self, mine: object) -> Generator[None, None, bool]:
+    def _run_evaluation(self, mine: object) -> Generator[None, None, bool]:
         try:
             found = yield from self._alarm.judging()
             if self._judging is not mine:
@@ -497,21 +505,21 @@ class StiffnessWatch(Core):
             if self._judging is mine:
                 self._judging = None
 
-    def _pair(self) -> None:
+    def _pair_waiting(self) -> None:
         """Pair what waits and has a wrench behind it."""
         latest = self._answers.latest
         while self._waiting and latest is not None and self._waiting[0].stamp <= latest[0]:
             sample = self._waiting.pop(0)
             try:
-                self._take(sample)
+                self._use_pair(sample)
             except MessageError as error:
                 self.refuse(self.taken, error)
                 continue
             self._last = sample.stamp
             self.taken.accept()
 
-    def _take(self, sample: DeflectionSample) -> None:
-        before, after = self._around(sample.stamp)
+    def _use_pair(self, sample: DeflectionSample) -> None:
+        before, after = self._find_neighbours(sample.stamp)
         if sample.stamp - self._due < self.period * SECOND:
             return
         span = after.stamp - before.stamp
@@ -527,7 +535,7 @@ class StiffnessWatch(Core):
             raise MessageError("pose", str(error)) from error
         self._due = sample.stamp
 
-    def _around(self, stamp: int) -> tuple[Answer, Answer]:
+    def _find_neighbours(self, stamp: int) -> tuple[Answer, Answer]:
         """The wrenches on either side.
 
         :raises MessageError: there are none near.

@@ -39,7 +39,7 @@ class StiffnessAlarmTopics:
         :param frames: of the base, and of the platform as ``~/deflection`` names it.
         """
         self._node, self._robot, self._base = node, robot, frames[0]
-        self._told: tuple[str, ...] | None = None
+        self._reported: tuple[str, ...] | None = None
         self._core: StiffnessWatch | None = None
         wanted = node.declare(
             "watch_stiffness",
@@ -95,7 +95,7 @@ class StiffnessAlarmTopics:
         """What a wrench did by the model."""
         if self._core is not None:
             self._core.answer(answer)
-            self._judge(self._core)
+            self._start_evaluation(self._core)
 
     def warning(self) -> str:
         """What the diagnostics warn of; empty where nothing has departed."""
@@ -115,15 +115,15 @@ class StiffnessAlarmTopics:
     def _on_deflection(self, message: TransformStamped) -> None:
         if self._core is not None:
             self._core.deflection(message, self._node.now())
-            self._judge(self._core)
+            self._start_evaluation(self._core)
 
-    def _judge(self, core: StiffnessWatch) -> None:
+    def _start_evaluation(self, core: StiffnessWatch) -> None:
         """A judgement takes tens of milliseconds: no wrench shall wait so long."""
         work = core.judgement()
         if work is not None:
-            self._node.defer("measured_deflection", self._answer(core, work))
+            self._node.defer("measured_deflection", self._evaluate(core, work))
 
-    def _answer(self, core: StiffnessWatch, work: Generator[None, None, bool]) -> Task:
+    def _evaluate(self, core: StiffnessWatch, work: Generator[None, None, bool]) -> Task:
         if (yield from work):
             self._publish(core)
 
@@ -133,9 +133,9 @@ class StiffnessAlarmTopics:
         if found is None:
             return
         told = tuple(departure.candidates for departure in found)
-        if not told and self._told == ():
+        if not told and self._reported == ():
             return
-        self._told = told
+        self._reported = told
         own = header(core.stamp, self._base)
         self._alarm.publish(DiagnosticArray(header=own, status=self._statuses(found)))
 

@@ -23,40 +23,40 @@ from pkm_twin.errors import ParameterError, check_limit
 from pkm_twin.robot.robot import Robot
 from stiffness_monitor.vibration import Complex, ToolModes, responses, tool_modes
 
-SHARE: Final = 0.01
+MIN_PEAK_FRACTION: Final = 0.01
 """Least peak of a mode in the cutting plane, of the greatest, to count."""
-MOST_MODES: Final = 8
-WAVES: Final = 20.0
+MAX_MODES: Final = 8
+MAX_WAVES: Final = 20.0
 """Most vibrations of a mode from tooth to tooth; at so low speeds process damping governs."""
-SMOOTH: Final = 10
+BASE_DEGREE: Final = 10
 """Degree of a displacement from tooth to tooth beside four for each vibration."""
-STEPS: Final = 20
+STEPS_PER_WAVE: Final = 20
 """Steps of a vibration, and twice as many at least from tooth to tooth."""
-RATIO: Final = 1.25
+DEPTH_RATIO: Final = 1.25
 """Between two depths that are tried before the limit is bracketed."""
-LOWEST: Final = 0.4
+FIRST_DEPTH_RATIO: Final = 0.4
 """First depth that is tried, of the zero-order one that is stable at every speed."""
-DEEPEST: Final = 25.0
+DEFAULT_DEPTH_RATIO: Final = 25.0
 """Last depth by default, likewise."""
-BATCH: Final = 5
+DEPTHS_PER_BATCH: Final = 5
 """Depths that are tried at once."""
-CLOSE: Final = 2e-4
+DEPTH_TOLERANCE: Final = 2e-4
 """Relative width of the bracket that a limit is found in."""
-STEEP: Final = 1.25
+MAX_LIMIT_RATIO: Final = 1.25
 """Ratio of two neighbouring limits between which another speed is computed."""
-FLAT: Final = 1.001
+MAX_MINIMUM_RATIO: Final = 1.001
 """The same beside a minimum: it is known where both neighbours are as deep."""
-FINE: Final = 5e-4
+MIN_SPEED_STEP: Final = 5e-4
 """Relative distance of speeds below which none is computed between, as at a cliff."""
-SPACING: Final = 0.1
+MAX_WAVE_STEP: Final = 0.1
 """Most vibrations from tooth to tooth between speeds: one lobe is a vibration of a mode wide."""
-DENSE: Final = 1e-3
+MAX_BEST_SPEED_STEP: Final = 1e-3
 """Largest relative distance of speeds within the margin of the best one."""
-FASTEST: Final = 1e6
+MAX_SPINDLE_SPEED: Final = 1e6
 """Speed of a spindle at most, rpm."""
-DEPTHS: Final = (1e-6, 10.0)
+DEPTH_RANGE: Final = (1e-6, 10.0)
 """Depths of cut that may be given, m."""
-MARGIN: Final = 0.01
+SPEED_MARGIN: Final = 0.01
 """How far a spindle's speed may be off, part of it."""
 
 
@@ -142,7 +142,7 @@ class Lobes:
         """Index of the speed with the greatest depth, of equal ones the fastest."""
         return int(np.flatnonzero(self.depths == self.depths.max())[-1])
 
-    def steady(self, margin: float = MARGIN) -> tuple[float, float, bool]:
+    def steady(self, margin: float = SPEED_MARGIN) -> tuple[float, float, bool]:
         """The best speed (rpm) with a margin, its stable depth (m), and whether that is open.
 
         The depth is stable at all speeds within the margin, and at the next ones on both sides. If
@@ -173,18 +173,20 @@ class Lobes:
         before, after = np.append(1.0, ratio), np.append(ratio, 1.0)
         falls = np.append(True, np.diff(depth) <= 0.0)
         lowest = falls & np.append(np.diff(depth) >= 0.0, True)
-        unsure = lowest & (np.maximum(before, after) > FLAT)
-        split = (ratio > STEEP) | unsure[1:] | unsure[:-1]
-        split = (split & (np.diff(n) > FINE * n[1:])) | (waves[:-1] - waves[1:] > SPACING)
+        unsure = lowest & (np.maximum(before, after) > MAX_MINIMUM_RATIO)
+        split = (ratio > MAX_LIMIT_RATIO) | unsure[1:] | unsure[:-1]
+        split = (split & (np.diff(n) > MIN_SPEED_STEP * n[1:])) | (
+            waves[:-1] - waves[1:] > MAX_WAVE_STEP
+        )
         if not split.any():
             best = self.steady()[0]
-            near = (n[1:] > (1.0 - MARGIN) * best) & (n[:-1] < (1.0 + MARGIN) * best)
-            split = near & (np.diff(n) > DENSE * n[1:])
+            near = (n[1:] > (1.0 - SPEED_MARGIN) * best) & (n[:-1] < (1.0 + SPEED_MARGIN) * best)
+            split = near & (np.diff(n) > MAX_BEST_SPEED_STEP * n[1:])
         return np.asarray(split)
 
 
 @dataclass(frozen=True, eq=False)
-class _Plane:
+class _CuttingPlane:
     """Modes in the cutting plane: rad/s and damping ratios (m,), shapes (m, 2) of unit mass."""
 
     turn: Array
@@ -192,13 +194,13 @@ class _Plane:
     shapes: Array
 
     @classmethod
-    def of(cls, modes: ToolModes, milling: Milling) -> _Plane:
+    def of(cls, modes: ToolModes, milling: Milling) -> _CuttingPlane:
         c, s = np.cos(milling.feed), np.sin(milling.feed)
         axes = modes.rotation @ np.array([[c, -s], [s, c], [0.0, 0.0]])
         shapes, turn = modes.shapes[:, :3] @ axes, 2.0 * np.pi * modes.frequencies
         peak = (shapes**2).sum(1) / (2.0 * modes.damping * turn**2)
-        order = np.argsort(-peak)[:MOST_MODES]
-        kept = np.sort(order[peak[order] >= SHARE * peak.max()])
+        order = np.argsort(-peak)[:MAX_MODES]
+        kept = np.sort(order[peak[order] >= MIN_PEAK_FRACTION * peak.max()])
         return cls(turn[kept], modes.damping[kept], shapes[kept])
 
     def stable_depth(self, milling: Milling) -> tuple[float, float]:
@@ -207,16 +209,16 @@ class _Plane:
         near = np.concatenate([-far, np.linspace(-4.0, 4.0, 65), far])
         at = (self.turn[:, None] * (1.0 + self.damping[:, None] * near)).ravel()
         at = at[at > 0.0]
-        real = self._values(milling, at).real.min(1)
+        real = self._oriented_eigenvalues(milling, at).real.min(1)
         k = int(real.argmin())
         return (-0.5 / float(real[k]) if real[k] < 0.0 else np.inf), float(at[k])
 
-    def _values(self, milling: Milling, at: Array) -> Complex:
+    def _oriented_eigenvalues(self, milling: Milling, at: Array) -> Complex:
         """Eigenvalues of the mean cutting stiffness times the response at rad/s (k,), (k, 2)."""
         response = responses(at, self.turn, self.damping, self.shapes)
         return np.asarray(np.linalg.eigvals(milling.mean() @ response))
 
-    def lobes(self, milling: Milling, low: float, high: float) -> Array:
+    def lobe_speeds(self, milling: Milling, low: float, high: float) -> Array:
         """Speeds in a range at which lobes are lowest by the zero-order approximation, rpm, (k,).
 
         Of every mode near its worst frequency, where from tooth to tooth there is a whole number of
@@ -226,7 +228,7 @@ class _Plane:
         found: list[float] = []
         for w, z in zip(self.turn, self.damping, strict=True):
             at = w * (1.0 + z * np.linspace(-3.0, 3.0, 61))
-            values = self._values(milling, at)
+            values = self._oriented_eigenvalues(milling, at)
             k, i = np.unravel_index(int(values.real.argmin()), values.shape)
             phase = np.pi - 2.0 * float(np.angle(-1.0 / values[k, i]))
             flips = [(w * (1.0 + part * z), np.pi) for part in (-1.0, 0.0, 1.0)]
@@ -240,7 +242,7 @@ class _Plane:
         """Vibrations of the fastest mode from tooth to tooth at speeds, rpm."""
         return np.asarray(60.0 * self.turn.max() / (2.0 * np.pi * milling.teeth) / speeds)
 
-    def step(self, h: float) -> tuple[Array, Array, Array]:
+    def transition(self, h: float) -> tuple[Array, Array, Array]:
         """Of time h: the modes' map (m, 2, 2), what forces at its begin and end add, (m, 2)."""
         w, z = self.turn, self.damping
         root = w * np.sqrt(1.0 - z * z)
@@ -253,17 +255,19 @@ class _Plane:
         end = ramp / (w**2 * h)
         return np.moveaxis(free, -1, 0), (one - end).T, end.T
 
-    def growth(self, milling: Milling, speed: float, depths: Array) -> Array:
+    def spectral_radius(self, milling: Milling, speed: float, depths: Array) -> Array:
         """Largest size of an eigenvalue from tooth to tooth, of depths (k,), m, at a speed, rpm."""
         period = 60.0 / (speed * milling.teeth)
         waves = float(self.waves(milling, np.array(speed)))
-        count = max(2 * STEPS, int(np.ceil(STEPS * waves)))
+        count = max(2 * STEPS_PER_WAVE, int(np.ceil(STEPS_PER_WAVE * waves)))
         force = milling.steps(count)
-        free, begin, end = self.step(period / count)
+        free, begin, end = self.transition(period / count)
         # Only displacements at which a tooth cuts come back. They are smooth: polynomials of time.
         cut = np.flatnonzero(np.abs(force).max((1, 2)) > 1e-12 * milling.tangential)
         parts = np.split(cut, np.flatnonzero(np.diff(cut) > 1) + 1)
-        basis = scipy.linalg.block_diag(*(_polynomials(len(part), waves / count) for part in parts))
+        basis = scipy.linalg.block_diag(
+            *(_chebyshev_basis(len(part), waves / count) for part in parts)
+        )
         own = 2 * len(self.turn)
         n, b = own + 2 * basis.shape[1], depths[:, None, None]
         before = np.zeros((count, 2, n))
@@ -286,33 +290,35 @@ class _Plane:
         whole = np.concatenate([part.reshape(len(depths), -1, n) for part in (state, fitted)], 1)
         return np.asarray(np.abs(np.linalg.eigvals(whole)).max(-1))
 
-    def limit(self, milling: Milling, speed: float, low: float, deepest: float) -> float:
+    def find_limit(self, milling: Milling, speed: float, low: float, deepest: float) -> float:
         """The least depth that is unstable at a speed, m; infinite where the deepest is stable.
 
         :param low: depth to begin at.
         """
 
         def margin(depth: float) -> float:
-            return float(np.log(self.growth(milling, speed, np.array([depth]))[0]))
+            return float(np.log(self.spectral_radius(milling, speed, np.array([depth]))[0]))
 
         while margin(low) >= 0.0:
             low /= 4.0
-        count = max(2, int(np.ceil(np.log(deepest / low) / np.log(RATIO))) + 1)
+        count = max(2, int(np.ceil(np.log(deepest / low) / np.log(DEPTH_RATIO))) + 1)
         tried = np.geomspace(low, deepest, count)
-        for part in np.array_split(np.arange(1, count), max(1, count // BATCH)):
-            bad = self.growth(milling, speed, tried[part]) >= 1.0
+        for part in np.array_split(np.arange(1, count), max(1, count // DEPTHS_PER_BATCH)):
+            bad = self.spectral_radius(milling, speed, tried[part]) >= 1.0
             if bad.any():
                 k = int(part[bad.argmax()])
-                return float(scipy.optimize.brentq(margin, tried[k - 1], tried[k], rtol=CLOSE))
+                return float(
+                    scipy.optimize.brentq(margin, tried[k - 1], tried[k], rtol=DEPTH_TOLERANCE)
+                )
         return np.inf
 
 
-def _polynomials(count: int, waves: float) -> Array:
+def _chebyshev_basis(count: int, waves: float) -> Array:
     """Polynomials in even steps, shape (count, degree + 1); few steps stay as they are.
 
     :param waves: vibrations in a step.
     """
-    degree = SMOOTH + int(np.ceil(4.0 * waves * count))
+    degree = BASE_DEGREE + int(np.ceil(4.0 * waves * count))
     if count < 2 * degree:
         return np.eye(count)
     return np.asarray(np.polynomial.chebyshev.chebvander(np.linspace(-1.0, 1.0, count), degree))
@@ -335,9 +341,9 @@ def stability_lobes(
     :param pose: shape (m,), the mechanism's pose coordinates, m and rad.
     :param speeds: spindle speeds, shape (k,), rpm.
     :param damping, tool: as of :func:`~stiffness_monitor.vibration.tool_modes`; so are errors.
-    :param deepest: depth up to which to look, m; default :data:`DEEPEST` times the depth that is
-        stable at every speed.
-    :raises ParameterError: a speed with more vibrations from tooth to tooth than :data:`WAVES`.
+    :param deepest: depth up to which to look, m; default :data:`DEFAULT_DEPTH_RATIO` times the
+        depth that is stable at every speed.
+    :raises ParameterError: a speed with more than :data:`MAX_WAVES` vibrations from tooth to tooth.
     """
     return lobes_of(tool_modes(robot, pose, damping=damping, tool=tool), milling, speeds, deepest)
 
@@ -346,10 +352,10 @@ def lobes_of(
     modes: ToolModes, milling: Milling, speeds: ArrayLike, deepest: float | None = None
 ) -> Lobes:
     """The same of modes at the tool point, also measured ones; as :func:`stability_lobes`."""
-    plane = _Plane.of(modes, milling)
+    plane = _CuttingPlane.of(modes, milling)
     at = np.atleast_1d(np.asarray(speeds, np.float64))
-    last, safe = _bounds(plane, milling, at, deepest)
-    return _limits(plane, milling, at, last, safe)
+    last, safe = _check_range(plane, milling, at, deepest)
+    return _find_limits(plane, milling, at, last, safe)
 
 
 def lobes_between(
@@ -371,17 +377,17 @@ def lobes_between(
     :param low, high: rpm. ``points``: number of evenly spaced speeds. Others, and errors, as
         :func:`lobes_of`.
     """
-    plane = _Plane.of(modes, milling)
+    plane = _CuttingPlane.of(modes, milling)
     even = np.linspace(low, high, points)
-    last, safe = _bounds(plane, milling, even, deepest)
-    new = np.union1d(even, plane.lobes(milling, low, high))
-    found = _limits(plane, milling, new, last, safe)
+    last, safe = _check_range(plane, milling, even, deepest)
+    new = np.union1d(even, plane.lobe_speeds(milling, low, high))
+    found = _find_limits(plane, milling, new, last, safe)
     while True:
         n, depth = found.speeds, found.depths
         split = found.gaps(plane.waves(milling, n))
         if not split.any():
             return found
-        more = _limits(plane, milling, 0.5 * (n[1:] + n[:-1])[split], last, safe)
+        more = _find_limits(plane, milling, 0.5 * (n[1:] + n[:-1])[split], last, safe)
         order = np.argsort(np.concatenate([n, more.speeds]))
         found = Lobes(
             np.concatenate([n, more.speeds])[order],
@@ -390,30 +396,34 @@ def lobes_between(
         )  # fmt: skip
 
 
-def _bounds(
-    plane: _Plane, milling: Milling, at: Array, deepest: float | None
+def _check_range(
+    plane: _CuttingPlane, milling: Milling, at: Array, deepest: float | None
 ) -> tuple[float, float]:
     """The deepest depth to look at, and the zero-order one, m; errors as :func:`lobes_of`."""
     if at.ndim != 1:
         raise ParameterError("speeds", at.shape, "one speed after another")
     for speed in (at.min(), at.max()) if at.size else ():
-        check_limit("speeds", float(speed), "rpm", 1e-3, FASTEST)
+        check_limit("speeds", float(speed), "rpm", 1e-3, MAX_SPINDLE_SPEED)
     waves = plane.waves(milling, at)
-    if len(at) and waves.max() > WAVES * (1.0 + 1e-12):
-        bound = f"{at.min() * waves.max() / WAVES:.4g} rpm or more: process damping governs below"
+    if len(at) and waves.max() > MAX_WAVES * (1.0 + 1e-12):
+        bound = (
+            f"{at.min() * waves.max() / MAX_WAVES:.4g} rpm or more: process damping governs below"
+        )
         raise ParameterError("speeds", at.min(), bound)
     safe, _ = plane.stable_depth(milling)
     if deepest is None and not np.isfinite(safe):
         raise ParameterError("deepest", None, "a depth, m, as no depth is unstable in theory")
     if deepest is None:
-        return DEEPEST * safe, safe
-    check_limit("deepest", deepest, "m", *DEPTHS)
+        return DEFAULT_DEPTH_RATIO * safe, safe
+    check_limit("deepest", deepest, "m", *DEPTH_RANGE)
     return float(deepest), safe
 
 
-def _limits(plane: _Plane, milling: Milling, at: Array, last: float, safe: float) -> Lobes:
-    low = min(LOWEST * safe, 0.5 * last)
-    found = np.array([plane.limit(milling, float(speed), low, last) for speed in at])
+def _find_limits(
+    plane: _CuttingPlane, milling: Milling, at: Array, last: float, safe: float
+) -> Lobes:
+    low = min(FIRST_DEPTH_RATIO * safe, 0.5 * last)
+    found = np.array([plane.find_limit(milling, float(speed), low, last) for speed in at])
     return Lobes(at, np.minimum(found, last), found > last, safe)
 
 
@@ -435,5 +445,5 @@ def stable_depth(
 
 def stable_depth_of(modes: ToolModes, milling: Milling) -> tuple[float, int]:
     """The same of modes at the tool point; and the index of the mode nearest to the chatter."""
-    depth, turn = _Plane.of(modes, milling).stable_depth(milling)
+    depth, turn = _CuttingPlane.of(modes, milling).stable_depth(milling)
     return depth, int(np.abs(2.0 * np.pi * modes.frequencies - turn).argmin())

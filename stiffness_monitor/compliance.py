@@ -20,11 +20,11 @@ from pkm_twin.codegen.code import NOT_FINITE
 from pkm_twin.codegen.kernels import Kernel
 from pkm_twin.errors import SingularityError
 from pkm_twin.robot.robot import Robot
-from stiffness_monitor.programs import NONE, PARTS, Elastic
+from stiffness_monitor.programs import DEFLECTION_PARTS, NO_PARAMETERS, Elastic
 
-HELD: Final = 1e-10
+MIN_PIVOT_RATIO: Final = 1e-10
 """Least measure of a frame that holds: it goes with the square of the way to where it does not."""
-TIE: Final = 1e-9
+TIE_TOLERANCE: Final = 1e-9
 """Two energies tie where they differ by less than this part of the larger one."""
 _UNLOADED: Final = np.zeros(6)
 
@@ -73,7 +73,7 @@ def platform_response(robot: Robot, q: ArrayLike, wrench: ArrayLike) -> Platform
     :raises ValueError: a wrong last axis, or a value that is not finite.
     """
     names = robot.made(Elastic).names
-    row = _row(robot, q, wrench)
+    row = _evaluate(robot, q, wrench)
     row.setflags(write=False)
     n = len(names)
     factors, energies, deflection = row[..., :n], row[..., n : 2 * n], row[..., 2 * n : 2 * n + 6]
@@ -81,36 +81,36 @@ def platform_response(robot: Robot, q: ArrayLike, wrench: ArrayLike) -> Platform
     if row.ndim == 1:
         # One sample, without numpy.
         shares = factors.tolist()
-        bound = max(shares) * (1.0 - TIE)
+        bound = max(shares) * (1.0 - TIE_TOLERANCE)
         close = [k for k, share in enumerate(shares) if share > bound]
         dominant = names[close[0]] if close else "none"
         return PlatformResponse(
             names, matrix, factors, energies, float(row[2 * n + 6]), deflection, dominant,
             len(close) > 1,
         )  # fmt: skip
-    near = factors > factors.max(-1, keepdims=True) * (1.0 - TIE)
+    near = factors > factors.max(-1, keepdims=True) * (1.0 - TIE_TOLERANCE)
     # Index -1, without load, is the last name.
     first = np.where(near.any(-1), near.argmax(-1), -1)
     return PlatformResponse(
         names, matrix, factors, energies, np.ascontiguousarray(row[..., 2 * n + 6]), deflection,
-        _choices(names)[first], near.sum(-1) > 1,
+        _dominant_names(names)[first], near.sum(-1) > 1,
     )  # fmt: skip
 
 
-def _row(robot: Robot, q: ArrayLike, wrench: ArrayLike) -> Array:
+def _evaluate(robot: Robot, q: ArrayLike, wrench: ArrayLike) -> Array:
     """What the program answers, shape (..., size), rejected by sample."""
-    checked = partial(_checked, robot)
-    row = robot.bound(_response, otherwise=checked)(q, wrench)
-    return row if row.ndim > 1 or row[-1] > HELD else checked(q, wrench)
+    checked = partial(_evaluate_checked, robot)
+    row = robot.bound(_response_kernel, otherwise=checked)(q, wrench)
+    return row if row.ndim > 1 or row[-1] > MIN_PIVOT_RATIO else checked(q, wrench)
 
 
-def _response(robot: Robot) -> Kernel:
+def _response_kernel(robot: Robot) -> Kernel:
     return robot.made(Elastic).response
 
 
-def _checked(robot: Robot, q: ArrayLike, wrench: ArrayLike) -> Array:
+def _evaluate_checked(robot: Robot, q: ArrayLike, wrench: ArrayLike) -> Array:
     q, wrench = doubles(q, "joint positions"), vectors(wrench, 6, "the wrench")
-    (rows,), status = robot.made(Elastic).response(NONE, q, wrench)
+    (rows,), status = robot.made(Elastic).response(NO_PARAMETERS, q, wrench)
     check(robot, q, wrench, rows[..., -1], status)
     return rows
 
@@ -122,7 +122,7 @@ def check(
 
     :param measure: of the frame, 0 where it is a mechanism. ``status``: of the program.
     """
-    if status is None and (measure > HELD).all():
+    if status is None and (measure > MIN_PIVOT_RATIO).all():
         return
     codes = np.zeros(measure.shape) if status is None else status[..., 0]
     for index in np.ndindex(*measure.shape):
@@ -137,9 +137,9 @@ def check(
                     f"wrench, or its energy,{where} is not finite, or leads to a result that is not"
                 )
         found = 0.0 if codes[index] else float(measure[index])
-        if not found > HELD:
+        if not found > MIN_PIVOT_RATIO:
             frame = "the elastic frame of the pose"
-            raise SingularityError(frame, index, found, HELD)
+            raise SingularityError(frame, index, found, MIN_PIVOT_RATIO)
 
 
 def compliance(robot: Robot, pose: ArrayLike) -> Array:
@@ -181,10 +181,10 @@ def member_deflections(
         base axes.
     """
     elastic = robot.made(Elastic)
-    (rows, measure), status = elastic.deflections(NONE, q, wrench)
+    (rows, measure), status = elastic.deflections(NO_PARAMETERS, q, wrench)
     check(robot, q, wrench, measure[..., 0], status)
     names = [member.name for member in elastic.plan.members]
-    table = rows.reshape(*rows.shape[:-1], len(names), 2, PARTS + 1, 3)
+    table = rows.reshape(*rows.shape[:-1], len(names), 2, DEFLECTION_PARTS + 1, 3)
     return {name: (table[..., k, 0, :, :], table[..., k, 1, :, :]) for k, name in enumerate(names)}
 
 
@@ -197,5 +197,5 @@ def kernels(robot: Robot) -> tuple[Kernel, ...]:
 
 
 @lru_cache(maxsize=8)
-def _choices(names: tuple[str, ...]) -> NDArray[np.str_]:
+def _dominant_names(names: tuple[str, ...]) -> NDArray[np.str_]:
     return np.array([*names, "none"])

@@ -14,7 +14,7 @@ from pkm_twin.machine.rotations import skew
 from pkm_twin.messages.stamps import SECOND
 from pkm_twin.robot.robot import Robot
 
-REACH: Final = 0.02
+MIN_REACH_FRACTION: Final = 0.02
 """Directions in which the joints move the tool point less than this share of their best are left
 alone: they would cost offsets of fifty times the deflection."""
 
@@ -71,17 +71,17 @@ def setpoint_correction(
     lever = skew((rotation @ vectors(tool, 3, "the tool point")[..., None])[..., 0])
     twist = robot.platform_jacobian(q) / robot.joint_scales
     place, turn = twist[..., :3, :] - lever @ twist[..., 3:, :], twist[..., 3:, :]
-    there = moved[..., :3] - _times(lever, moved[..., 3:])
+    there = moved[..., :3] - _multiply(lever, moved[..., 3:])
     before = np.concatenate((there, np.broadcast_to(moved[..., 3:], there.shape)), -1)
-    offset, spare = _least(place, -there, place)
-    rest = moved[..., 3:] + _times(turn, offset)
-    offset = offset + _times(spare, _least(turn @ spare, -rest, turn)[0])
+    offset, spare = _solve_least_norm(place, -there, place)
+    rest = moved[..., 3:] + _multiply(turn, offset)
+    offset = offset + _multiply(spare, _solve_least_norm(turn @ spare, -rest, turn)[0])
     given = offset / robot.joint_scales
     with np.errstate(divide="ignore", invalid="ignore"):
         excess = np.where(given == 0.0, 0.0, np.abs(given) / limit).max(-1)
     share = 1.0 / np.maximum(excess, 1.0)
     both = np.concatenate((place, np.broadcast_to(turn, place.shape)), -2)
-    left = before + _times(both, offset * share[..., None])
+    left = before + _multiply(both, offset * share[..., None])
     cause = "the deflection or the tool point"
     return Correction(
         finite(given * share[..., None], cause), before, finite(left, cause), excess > 1.0
@@ -130,19 +130,19 @@ class SetpointStream:
         return finite(corrected, "the corrected set point")
 
 
-def _least(matrix: Array, target: Array, best: Array) -> tuple[Array, Array]:
+def _solve_least_norm(matrix: Array, target: Array, best: Array) -> tuple[Array, Array]:
     """Least solution in the directions within reach, and the projector on those that are not.
 
     :param best: the matrix whose greatest singular value is the measure of what is within reach.
     """
     u, values, vt = np.linalg.svd(matrix, full_matrices=False)
     greatest = np.linalg.svd(best, compute_uv=False)[..., :1]
-    held = values > REACH * greatest
-    along = np.where(held, _times(u.swapaxes(-1, -2), target) / np.where(held, values, 1.0), 0.0)
+    held = values > MIN_REACH_FRACTION * greatest
+    along = np.where(held, _multiply(u.swapaxes(-1, -2), target) / np.where(held, values, 1.0), 0.0)
     kept = np.where(held[..., None], vt, 0.0)
     spare = np.eye(matrix.shape[-1]) - kept.swapaxes(-1, -2) @ kept
-    return _times(vt.swapaxes(-1, -2), along), spare
+    return _multiply(vt.swapaxes(-1, -2), along), spare
 
 
-def _times(matrix: Array, vector: Array) -> Array:
+def _multiply(matrix: Array, vector: Array) -> Array:
     return np.asarray((matrix @ vector[..., None])[..., 0], np.float64)

@@ -27,7 +27,7 @@ from stiffness_monitor.monitor import Answer
 
 MAX_BOUND = 1.0
 """Largest bound of an offset, rad or m."""
-WAITING = 64
+MAX_WAITING = 64
 """Most set points and torques that wait for the other of their stamp."""
 
 
@@ -197,6 +197,6 @@ class SetpointCorrection(Core):
             self._both.publish(stamp, pair["position"], pair["effort"])
             return
         self._waiting[stamp] = (what, numbers)
-        if len(self._waiting) > WAITING:
+        if len(self._waiting) > MAX_WAITING:
             self._waiting.pop(next(iter(self._waiting)))
             self.unpaired += 1

@@ -19,10 +19,10 @@ from pkm_twin.robot.derivatives import Derivatives, geometry_numbers, pose_by_ge
 from pkm_twin.robot.numbers import CauseSlopes, FileNumbers
 from pkm_twin.robot.robot import Robot
 from stiffness_monitor.compliance import compliance
-from stiffness_monitor.numbers import numbers_of
-from stiffness_monitor.programs import NONE, Elastic, Solved
+from stiffness_monitor.numbers import list_numbers
+from stiffness_monitor.programs import NO_PARAMETERS, Elastic, SymbolicFrame
 
-Write = Callable[[Solved], Program]
+Write = Callable[[SymbolicFrame], Program]
 Chosen = tuple[int, ...] | None
 
 
@@ -36,35 +36,37 @@ def compliance_derivatives(robot: Robot, pose: ArrayLike, by: Sequence[str] = ()
     :returns: ``state`` by the pose, shape (..., 6, 6, m), and ``by[path]`` (..., 6, 6).
     :raises ParameterError: an unknown path. Other errors as of ``compliance``.
     """
-    by_q, by_numbers = _tables(robot, pose, _entries)
+    by_q, by_numbers = _evaluate_gradients(robot, pose, _write_compliance)
     found: dict[str, Array] = {}
     if by:
         slopes = robot.made(FileNumbers, tuple(by), elastic_numbers).slopes
-        table = _square(by_numbers @ slopes)
+        table = _unravel_square(by_numbers @ slopes)
         found = {path: np.ascontiguousarray(table[..., k]) for k, path in enumerate(by)}
     back = robot.inverse_jacobian(robot.inverse(pose))
-    return Derivatives(_square(by_q @ back), found)
+    return Derivatives(_unravel_square(by_q @ back), found)
 
 
 def compliance_effects(robot: Robot, pose: ArrayLike) -> Array:
     """What one standard deviation of each of the file's causes changes, (..., 6, 6, causes)."""
     if not robot.causes:
         return np.zeros((*compliance(robot, pose).shape, 0))
-    return _square(_effects(robot, pose, _entries))
+    return _unravel_square(_cause_effects(robot, pose, _write_compliance))
 
 
 def energy_effects(robot: Robot, pose: ArrayLike, wrench: ArrayLike) -> Array:
     """The same of strain energies under wrenches (..., 6), shape (..., elements, causes)."""
-    return _effects(robot, pose, _energies, np.asarray(wrench, np.float64)[..., None, :])
+    return _cause_effects(
+        robot, pose, _write_energies, np.asarray(wrench, np.float64)[..., None, :]
+    )
 
 
-def _effects(robot: Robot, pose: ArrayLike, write: Write, *loads: Array) -> Array:
+def _cause_effects(robot: Robot, pose: ArrayLike, write: Write, *loads: Array) -> Array:
     causes = robot.made(CauseSlopes, elastic_numbers)
-    table = _tables(robot, pose, write, causes.chosen, *loads)[1] @ causes.slopes
+    table = _evaluate_gradients(robot, pose, write, causes.chosen, *loads)[1] @ causes.slopes
     return np.asarray(table, np.float64)
 
 
-def _tables(
+def _evaluate_gradients(
     robot: Robot, pose: ArrayLike, write: Write, chosen: Chosen = None, *loads: Array
 ) -> tuple[Array, Array]:
     """Of a program's outputs by q, and by geometry and elasticity with the pose held.
@@ -74,9 +76,9 @@ def _tables(
     """
     compliance(robot, pose)  # its errors
     q = robot.inverse(pose)
-    kernel = _gradient_of(robot.made(Elastic), write, chosen)
+    kernel = _gradient_kernel(robot.made(Elastic), write, chosen)
     weights = np.eye(kernel.sizes[0][-1])
-    (by_q, by_numbers), _ = kernel(NONE, q[..., None, :], *loads, weights)
+    (by_q, by_numbers), _ = kernel(NO_PARAMETERS, q[..., None, :], *loads, weights)
     if by_q.shape[-1]:
         moved = pose_by_geometry(robot, q)
         geometry = np.arange(moved.shape[-1])
@@ -87,37 +89,37 @@ def _tables(
     return by_q, by_numbers
 
 
-def _square(table: Array) -> Array:
+def _unravel_square(table: Array) -> Array:
     return table.reshape(*table.shape[:-2], 6, 6, table.shape[-1])
 
 
 def elastic_numbers(robot: Robot) -> list[Any]:
     """Geometry, then the further inputs of elasticity: numbers or expressions."""
-    return [*geometry_numbers(robot), *numbers_of(robot.elastic)]
+    return [*geometry_numbers(robot), *list_numbers(robot.elastic)]
 
 
 def compliance_gradient(elastic: Elastic) -> Kernel:
     """Program of sums of C's entries: q and weights (36) to derivatives by q and all numbers."""
-    return _gradient_of(elastic, _entries, None)
+    return _gradient_kernel(elastic, _write_compliance, None)
 
 
-def _gradient_of(elastic: Elastic, write: Write, chosen: Chosen) -> Kernel:
+def _gradient_kernel(elastic: Elastic, write: Write, chosen: Chosen) -> Kernel:
     name = f"gradient{write.__name__} by {chosen}"
-    return elastic.kernel(name, partial(_gradient, write, chosen), free=True)
+    return elastic.kernel(name, partial(_write_gradient, write, chosen), free=True)
 
 
-def _entries(s: Solved) -> Program:
+def _write_compliance(s: SymbolicFrame) -> Program:
     s.factorise()
     return s.program({}, {"compliance": s.compliance.ravel()})
 
 
-def _energies(s: Solved) -> Program:
+def _write_energies(s: SymbolicFrame) -> Program:
     s.factorise()
     s.load(s.t.tape.inputs("wrench", 6))
     return s.program({"wrench": 6}, {"energies": s.energies()})
 
 
-def _gradient(write: Write, chosen: Chosen, s: Solved) -> Program:
+def _write_gradient(write: Write, chosen: Chosen, s: SymbolicFrame) -> Program:
     program, t = write(s), s.t
     numbers, q = [*t.geometry, *t.more], list(t.q)
     if chosen is not None:

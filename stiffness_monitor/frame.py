@@ -77,7 +77,7 @@ def turned(axes: Any, displacements: Any) -> Any:
     return (axes @ displacements.reshape(2, 3, -1)).reshape(6, -1)
 
 
-def combined(*terms: tuple[Iterable[int], Iterable[Any]]) -> Row:
+def sum_forms(*terms: tuple[Iterable[int], Iterable[Any]]) -> Row:
     """The sum of linear forms, each of coordinates and their factors."""
     row: Row = {}
     for own, values in terms:
@@ -108,7 +108,7 @@ def deformations(
     return found
 
 
-def bent(share: float, length: Any, phi: Any) -> tuple[tuple[Any, Any], tuple[Any, Any]]:
+def bending_shape(share: float, length: Any, phi: Any) -> tuple[tuple[Any, Any], tuple[Any, Any]]:
     """How far a beam is from its chord, and how it turns from it, by circle and S of a plane."""
     arc, bow = 0.5 * share * (1.0 - share), 1.0 / (1.0 + phi)
     across = -arc * length, arc * (1.0 - 2.0 * share) * length * bow
@@ -136,25 +136,25 @@ class Frame:
         self.held: list[Row] = []
         for part in model.parts:
             if isinstance(part, Carried):
-                self.nodes[part.name, 0] = self._stood(part.support, part.at)
+                self.nodes[part.name, 0] = self._point_by_joint(part.support, part.at)
             else:
-                self._bar(part)
+                self._add_member(part)
         self.last = self.size
         for closure in model.closures:
-            self._close(closure.support, closure.inner, closure.at)
+            self._add_closure(closure.support, closure.inner, closure.at)
 
-    def _new(self, count: int) -> range:
+    def _add_coordinates(self, count: int) -> range:
         self.size += count
         return range(self.size - count, self.size)
 
-    def _moved(self, body: str, end: int, at: Any) -> Node:
+    def _point_on_body(self, body: str, end: int, at: Any) -> Node:
         """The point of a body that is at a place."""
         if (body, end) not in self.nodes:
             raise ValueError(f"{body} is not connected to the base")
         node = self.nodes[body, end]
         return Node(node.own, rigid_offset(at - node.at) @ node.map, at)
 
-    def _let(self, support: Support) -> tuple[range, Array]:
+    def _add_joint(self, support: Support) -> tuple[range, Array]:
         """Return new coordinates of what a joint lets through, along its axes, shape (6, count).
 
         A joint is elastic in its own axes: the 2UPR-RPU paper's D_i1 and D_i2, which project limb
@@ -163,7 +163,7 @@ class Frame:
         kinds = [k for k, compliance in enumerate(support.compliance) if not is_zero(compliance)]
         lets = [np.eye(6)[k] for k in kinds]
         lets += [pitch * np.eye(6)[k] + np.eye(6)[3 + k] for k, pitch in support.screws]
-        own = self._new(len(lets))
+        own = self._add_coordinates(len(lets))
         self.springs += [
             Column(support.joint, {index: 1.0}, 1.0 / support.compliance[k])
             for index, k in zip(own, kinds, strict=False)
@@ -171,33 +171,36 @@ class Frame:
         ]
         return own, np.array(lets).reshape(-1, 6).T
 
-    def _stood(self, support: Support, at: Any) -> Node:
+    def _point_by_joint(self, support: Support, at: Any) -> Node:
         """A point that stands on a body by a joint."""
-        node = self._moved(support.body, support.end, at)
-        own, lets = self._let(support)
+        node = self._point_on_body(support.body, support.end, at)
+        own, lets = self._add_joint(support)
         return Node((*node.own, *own), np.hstack((node.map, turned(support.axes, lets))), at)
 
-    def _close(self, support: Support, inner: tuple[str, int], at: Any) -> None:
+    def _add_closure(self, support: Support, inner: tuple[str, int], at: Any) -> None:
         """Two points that stand on bodies and move apart by what a joint lets through."""
-        first, second = self._moved(*inner, at), self._moved(support.body, support.end, at)
-        own, lets = self._let(support)
+        first, second = (
+            self._point_on_body(*inner, at),
+            self._point_on_body(support.body, support.end, at),
+        )
+        own, lets = self._add_joint(support)
         minus, plus = (turned(support.axes.T, node.map) for node in (first, second))
         self.held += [
-            combined((first.own, -minus[k]), (second.own, plus[k]), (own, -lets[k]))
+            sum_forms((first.own, -minus[k]), (second.own, plus[k]), (own, -lets[k]))
             for k in range(6)
         ]
 
-    def _bar(self, member: Member) -> None:
+    def _add_member(self, member: Member) -> None:
         ends = []
         pairs = (member.inner, member.start), (member.outer, member.end)
         for k, (support, at) in enumerate(pairs):
             if support is None:
-                node = Node(self._new(6), turned(member.axes, np.eye(6)), at)
+                node = Node(self._add_coordinates(6), turned(member.axes, np.eye(6)), at)
                 ends.append(node._replace(map=np.eye(6)))
             else:
                 if self.static and member.strut:
                     support = replace(support, compliance=(support.compliance[0], *RIGID[1:]))
-                node = self._stood(support, at if support.at is None else support.at)
+                node = self._point_by_joint(support, at if support.at is None else support.at)
                 if support.at is not None:
                     node = Node(node.own, rigid_offset(at - node.at) @ node.map, at)
                 ends.append(node._replace(map=turned(member.axes.T, node.map)))
@@ -211,7 +214,7 @@ class Frame:
         return [
             Column(
                 member.body,
-                combined(
+                sum_forms(
                     *((ends[k // 6].own, f * ends[k // 6].map[k % 6]) for k, f in form.items())
                 ),
                 rigidity,

@@ -23,7 +23,7 @@ from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError, SingularityError
 from pkm_twin.machine.members import Section
 from pkm_twin.robot.robot import SINGULARITY_BOUND, Robot
-from stiffness_monitor.frame import PLANES, Frame, bent, deformations, rigid_offset
+from stiffness_monitor.frame import PLANES, Frame, bending_shape, deformations, rigid_offset
 from stiffness_monitor.structure import RigidBody, StructuralModel, structural_model
 
 
@@ -47,7 +47,7 @@ def element_matrices(section: Section, length: float) -> tuple[Array, Array]:
     for place, weight in zip(*np.polynomial.legendre.leggauss(4), strict=True):
         share = (1 + place) / 2
         shape = np.hstack(((1 - share) * np.eye(6), share * np.eye(6)))
-        across, along = bent(share, length, section.rigidities[3] / length**2)
+        across, along = bending_shape(share, length, section.rigidities[3] / length**2)
         for k, (move, turn, side) in enumerate(PLANES, start=1):
             shape[turn] = side * (chord[move] + along @ forms[2 * k : 2 * k + 2])
             shape[move] += across @ forms[2 * k : 2 * k + 2]
@@ -70,7 +70,7 @@ def member_matrices(section: Section, length: float, elements: int) -> tuple[Arr
 
 
 @lru_cache(maxsize=64)
-def _member(
+def _member_basis(
     section: Section, length: float, elements: int, kept: int | None
 ) -> tuple[Array, Array, Array]:
     """Basis, stiffness and mass of a member on its own coordinates.
@@ -184,7 +184,7 @@ def assemble(model: StructuralModel, elements: int, kept: int | None = None) -> 
     for member, ends in frame.bars:
         # Rounded: poses of one robot differ by less in a member that keeps its length.
         length = round(float(member.length), 12)
-        basis, stiffness, mass = _member(member.section, length, elements, kept)
+        basis, stiffness, mass = _member_basis(member.section, length, elements, kept)
         # Inside, coordinates are along the member's own axes.
         rows = len(mass)
         own = [*dict.fromkeys([*ends[0].own, *ends[1].own]), *range(size, size + rows - 12)]
@@ -229,7 +229,7 @@ def _null_space(frame: Frame, size: int) -> Array:
 
 ELEMENTS: Final = 8
 """Beam elements a member: the first six frequencies of the shipped robots to 0.1 %."""
-KEPT: Final = 8
+MEMBER_MODES: Final = 8
 """Modes with held ends that a member keeps, of more: the same frequencies to 0.01 %."""
 
 
@@ -276,7 +276,7 @@ def natural_frequencies(
     :raises SingularityError: a pose in which the frame is a mechanism, with locked actuators.
     :raises ValueError: a wrong last axis, a value that is not finite, too many modes.
     """
-    q = _joints(robot, pose)
+    q = _solve_joints(robot, pose)
     result = np.empty((*q.shape[:-1], count))
     for index in np.ndindex(*q.shape[:-1]):
         system = frame_system(robot, q[index], elements)
@@ -292,7 +292,7 @@ def modes(robot: Robot, pose: ArrayLike, count: int = 6, *, elements: int = ELEM
     :param pose: shape (..., m), the mechanism's pose coordinates, m and rad.
     :param elements: beam elements a member.
     """
-    q = _joints(robot, pose)
+    q = _solve_joints(robot, pose)
     batch = q.shape[:-1]
     frequencies: list[Array] = []
     positions: list[Array] = []
@@ -339,7 +339,7 @@ def has_modes(robot: Robot) -> bool:
     return True
 
 
-def _joints(robot: Robot, pose: ArrayLike) -> Array:
+def _solve_joints(robot: Robot, pose: ArrayLike) -> Array:
     """Joint positions of poses, of a robot with masses and elastic members."""
     robot.massive()
     _ = robot.elastic
@@ -354,7 +354,7 @@ def frame_system(robot: Robot, q: Array, elements: int) -> System:
     robot.massive()
     if elements < 1:
         raise ParameterError("elements", elements, "1 or more")
-    return assemble(structural_model(robot, q), elements, KEPT)
+    return assemble(structural_model(robot, q), elements, MEMBER_MODES)
 
 
 def stiffness_root(system: System, index: tuple[int, ...]) -> Array:
@@ -392,14 +392,14 @@ def solve_modes(
         values = scipy.linalg.eigh(
             matrix, eigvals_only=True, subset_by_index=chosen, check_finite=False, driver="evr"
         )
-        return _frequencies(values), np.empty((size, 0))
+        return _to_frequencies(values), np.empty((size, 0))
     values, own = scipy.linalg.eigh(
         matrix, subset_by_index=chosen, check_finite=False, driver="evr"
     )
     found = scipy.linalg.solve_triangular(root, own, lower=True, trans=1, check_finite=False)
-    return _frequencies(values), (found / np.sqrt(np.maximum(values, 1e-300)))[:, ::-1]
+    return _to_frequencies(values), (found / np.sqrt(np.maximum(values, 1e-300)))[:, ::-1]
 
 
-def _frequencies(values: Array) -> Array:
+def _to_frequencies(values: Array) -> Array:
     """Of values 1 / omega^2, rising, to Hz, rising."""
     return np.asarray(1.0 / (2 * np.pi * np.sqrt(values[::-1])), np.float64)

@@ -79,27 +79,27 @@ class Monitor(TimeSynchronizer):
         :raises MessageError: the message is rejected, and counted.
         """
         with self.taking(self.wrenches):
-            return self._wrench(message, now)
+            return self._take_wrench(message, now)
 
-    def _wrench(self, message: Any, now: int) -> Answer | None:
+    def _take_wrench(self, message: Any, now: int) -> Answer | None:
         sample, mount = self._wrench_reader.read(message, now)
         if not self.pace.due(sample.stamp):
             return None
-        q = self._nearest(sample.stamp)
-        answer: Answer = as_message_error(self._answer, sample, mount, q)
+        q = self._nearest_joints(sample.stamp)
+        answer: Answer = as_message_error(self._compute, sample, mount, q)
         found = answer.energy
         if not (np.isfinite(found.compliance).all() and np.isfinite(found.deflection).all()):
             raise MessageError("non-finite result", "the model gave a value that is not finite")
         self.pace.answered(sample.stamp)
         return answer
 
-    def _answer(self, sample: WrenchSample, mount: Mount, q: Array) -> Answer:
+    def _compute(self, sample: WrenchSample, mount: Mount, q: Array) -> Answer:
         pose, _, rotation = self.robot.placed(q)
         fixed = self._wrench_reader.at_reference(sample, mount, rotation)
         energy = platform_response(self.robot, q, fixed)
         return Answer(sample.stamp, q, pose, fixed, energy, rotation)
 
-    def _nearest(self, stamp: int) -> Array:
+    def _nearest_joints(self, stamp: int) -> Array:
         """Joint positions of the state nearest in time."""
         found = self._recent.nearest(stamp)
         if found is None:

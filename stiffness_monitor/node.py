@@ -36,8 +36,8 @@ from stiffness_monitor.monitor import Answer, Monitor, Settings
 from stiffness_monitor.topics import STIFFNESS
 
 AXES: Final = ("x", "y", "z", "rx", "ry", "rz")
-UPPER: Final = np.triu_indices(6)
-ENTRIES: Final = tuple(f"{AXES[i]}_{AXES[j]}" for i, j in zip(*UPPER, strict=True))
+UPPER_TRIANGLE: Final = np.triu_indices(6)
+ENTRIES: Final = tuple(f"{AXES[i]}_{AXES[j]}" for i, j in zip(*UPPER_TRIANGLE, strict=True))
 """Names of the compliance's entries: of the displacement, and of the force or moment."""
 
 
@@ -77,15 +77,15 @@ class StiffnessMonitor(TwinNode):
         self._outputs = [
             (self.create_guarded_publisher(topic), make)
             for topic, make in (
-                ("~/compliance", _matrix),
-                ("~/compliance_stamped", self._entries),
-                ("~/strain_energy", self._energies),
-                ("~/strain_energy_stamped", self._factors),
+                ("~/compliance", _compliance_message),
+                ("~/compliance_stamped", self._entries_message),
+                ("~/strain_energy", self._energies_message),
+                ("~/strain_energy_stamped", self._factors_message),
                 ("~/dominant_element", lambda answer: String(data=answer.energy.dominant)),
-                ("~/deflection", self._transform),
+                ("~/deflection", self._deflection_message),
             )
         ]
-        self._known = 0
+        self._published_stamp = 0
         """Stamp of the joint state whose frequencies were published last."""
         rate = self.declare(
             "frequencies_rate", 10.0, "largest rate of ~/natural_frequencies; 0: none",
@@ -122,7 +122,7 @@ class StiffnessMonitor(TwinNode):
         self.core.reset()
         self._correction.reset()
         self._alarm.reset()
-        self._known = 0
+        self._published_stamp = 0
 
     def judge(self) -> tuple[bytes, str]:
         """Level and message of the node's diagnostic status."""
@@ -171,12 +171,12 @@ class StiffnessMonitor(TwinNode):
     def _publish_frequencies(self) -> None:
         """Of the latest joint state: a pose costs milliseconds, so not of every one."""
         latest = self.core.latest
-        if not self.active or latest is None or latest[0] == self._known:
+        if not self.active or latest is None or latest[0] == self._published_stamp:
             return
         listeners = (self._frequencies, self._frequencies_stamped)
         if not any(publisher.get_subscription_count() for publisher in listeners):
             return
-        self._known, q = latest
+        self._published_stamp, q = latest
         robot = self.core.robot
         try:
             values = natural_frequencies(robot, robot.forward(q))
@@ -189,20 +189,22 @@ class StiffnessMonitor(TwinNode):
         ]
         self._frequencies.publish(message)
         names = [f"mode_{k + 1}" for k in range(len(values))]
-        self._frequencies_stamped.publish(named(header(self._known, ""), names, values.tolist()))
+        self._frequencies_stamped.publish(
+            named(header(self._published_stamp, ""), names, values.tolist())
+        )
 
     def _in_base(self, answer: Answer) -> Header:
         return header(answer.stamp, self.core.settings.base_frame)
 
-    def _entries(self, answer: Answer) -> JointState:
-        return named(self._in_base(answer), ENTRIES, answer.compliance[UPPER].tolist())
+    def _entries_message(self, answer: Answer) -> JointState:
+        return named(self._in_base(answer), ENTRIES, answer.compliance[UPPER_TRIANGLE].tolist())
 
-    def _factors(self, answer: Answer) -> JointState:
+    def _factors_message(self, answer: Answer) -> JointState:
         found = answer.energy
         factors, energies = found.factors.tolist(), found.energies.tolist()
         return named(self._in_base(answer), found.elements, factors, efforts=energies)
 
-    def _energies(self, answer: Answer) -> DiagnosticArray:
+    def _energies_message(self, answer: Answer) -> DiagnosticArray:
         """Factors, energy, pose and frame; factors are absent where no load makes energy."""
         robot, energy = self.core.robot, answer.energy
         pairs: dict[str, str] = {}
@@ -223,7 +225,7 @@ class StiffnessMonitor(TwinNode):
         )
         return DiagnosticArray(header=self._in_base(answer), status=[status])
 
-    def _transform(self, answer: Answer) -> TransformStamped:
+    def _deflection_message(self, answer: Answer) -> TransformStamped:
         """From the platform to the deflected platform, in the platform's axes."""
         shift = answer.rotation.T @ answer.energy.deflection[:3]
         turn = answer.rotation.T @ answer.energy.deflection[3:]
@@ -239,7 +241,7 @@ class StiffnessMonitor(TwinNode):
         return message
 
 
-def _matrix(answer: Answer) -> Float64MultiArray:
+def _compliance_message(answer: Answer) -> Float64MultiArray:
     rows, columns = answer.compliance.shape
     message = Float64MultiArray(data=array("d", answer.compliance.ravel()))
     message.layout.dim = [

@@ -17,14 +17,14 @@ from pkm_twin.machine.graph import Graph
 from pkm_twin.machine.members import Place, Structure
 from pkm_twin.machine.tree import Tree
 
-_LARGEST: Final = 1e300
+_MAX_COMPLIANCE: Final = 1e300
 """A compliance above it is infinite."""
 
 Rigidities = Mapping[str, Sequence[Any]]
 """By beam: EA, GJ, EI, and 12 E I over the shear rigidity."""
 
 
-def numbers_of(structure: Structure) -> list[Any]:
+def list_numbers(structure: Structure) -> list[Any]:
     """Ends and rigidities of every beam, then all compliances of joints; numbers or expressions."""
     row: list[Any] = []
     for beam in structure.beams:
@@ -34,21 +34,21 @@ def numbers_of(structure: Structure) -> list[Any]:
     return row
 
 
-def structure_on(
+def substitute_numbers(
     structure: Structure, graph: Graph, numbers: Numbers
 ) -> tuple[Structure, Rigidities]:
-    """Beams and compliances on expressions of other numbers, in the order of :func:`numbers_of`.
+    """Beams and compliances on expressions of other numbers, in the order of :func:`list_numbers`.
 
     What is so in the known case is taken for that: that a beam ends where a joint is, and which
     compliances are zero, finite or infinite.
     """
     left = iter(numbers)
-    places = list(_places(graph))
+    places = list(_end_points(graph))
 
     def end(place: Place) -> Place:
         values = np.empty(3, dtype=object)
         values[:] = [next(left) for _ in range(3)]
-        k = _known(places, values)
+        k = _find_point(places, values)
         # On a free tape the end is a number of its own: it may be differentiated by.
         if k is not None and not values[0].tape.free:
             for known, value in zip(places[k], values, strict=True):
@@ -69,18 +69,20 @@ def structure_on(
     return replace(structure, beams=tuple(beams), compliances=compliances), rigidities
 
 
-def pattern_of(structure: Structure, tree: Tree) -> str:
+def constant_pattern(structure: Structure, tree: Tree) -> str:
     """Text of what programs take for constant of a structure's numbers."""
-    places, parts = list(_places(tree.graph)), []
+    places, parts = list(_end_points(tree.graph)), []
     for beam in structure.beams:
         for body, at in (beam.inner, beam.outer):
             local = marks(tree.axes[body].T @ (at - tree.at[body]))
-            parts.append((beam.name, beam.element, beam.parts, body, _known(places, at), local))
+            parts.append(
+                (beam.name, beam.element, beam.parts, body, _find_point(places, at), local)
+            )
     flags = {n: [float(_is_finite(v)) for v in row] for n, row in structure.compliances.items()}
     return repr((parts, flags, structure.order))
 
 
-def _places(graph: Graph) -> Iterator[Array]:
+def _end_points(graph: Graph) -> Iterator[Array]:
     """Points of a graph in which beams may end."""
     yield graph.origin
     yield from (joint.at for joint in graph.joints.values())
@@ -88,7 +90,7 @@ def _places(graph: Graph) -> Iterator[Array]:
         yield from rod.ends
 
 
-def _known(places: Sequence[Array], at: Any) -> int | None:
+def _find_point(places: Sequence[Array], at: Any) -> int | None:
     """Which of some points a place is."""
     here = references(at)
     near = (k for k, one in enumerate(places) if np.abs(references(one) - here).max() < SNAP)
@@ -97,4 +99,4 @@ def _known(places: Sequence[Array], at: Any) -> int | None:
 
 def _is_finite(compliance: Any) -> Any:
     """One of a finite compliance above zero, else zero."""
-    return sign(compliance) * sign(maximum(0.0, _LARGEST - compliance))
+    return sign(compliance) * sign(maximum(0.0, _MAX_COMPLIANCE - compliance))

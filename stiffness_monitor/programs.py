@@ -27,21 +27,21 @@ from pkm_twin.codegen.program import Program
 from pkm_twin.kinematics.motion import Motion
 from pkm_twin.kinematics.traced import Traced
 from pkm_twin.robot.robot import Robot
-from stiffness_monitor.frame import PLATFORM, Column, Frame, Row, bent, combined
-from stiffness_monitor.numbers import numbers_of, pattern_of, structure_on
-from stiffness_monitor.structure import FREE, plan_of, posed
+from stiffness_monitor.frame import PLATFORM, Column, Frame, Row, bending_shape, sum_forms
+from stiffness_monitor.numbers import constant_pattern, list_numbers, substitute_numbers
+from stiffness_monitor.structure import FREE, place_plan, plan_structure
 
-PARTS: Final = 4
+DEFLECTION_PARTS: Final = 4
 """Parts that a member is divided into where its deflection is drawn."""
-NONE: Final = np.zeros(0)
+NO_PARAMETERS: Final = np.zeros(0)
 """The programs' parameters: all numbers are the kernels' own."""
 _TINY: Final = 1e-200
-_LEFT: Final = 1e-3
+_CLOSURE_SCALE: Final = 1e-3
 """What a closure may hold beside, over the bound of other numbers: a billionth."""
 
 
 @dataclass(frozen=True)
-class Followers:
+class DependentCoordinates:
     """Which coordinates of a frame follow from its closures: ``chosen``, by ``rows``.
 
     ``sample``: the engine's state in which closures hold the most; 0, home, wherever that is one.
@@ -62,14 +62,14 @@ class Elastic:
 
     def __init__(self, robot: Robot) -> None:
         self.robot, self.structure = robot, robot.elastic
-        self.plan = plan_of(robot.graph, self.structure)
+        self.plan = plan_structure(robot.graph, self.structure)
         soft = [v[0] for s in self.plan.supports for v in s.compliance if v.__class__ is tuple]
         bodies = [member.body for member in self.plan.members]
         self.names = self.structure.order or tuple(dict.fromkeys([*bodies, *soft]))
         self._kernels: dict[str, Kernel] = {}
 
     @cached_property
-    def followers(self) -> Followers | None:
+    def followers(self) -> DependentCoordinates | None:
         """Chosen by what closures hold at home and near it; None without closures.
 
         :raises ParameterError: they hold the platform itself.
@@ -84,11 +84,11 @@ class Elastic:
         most = ranks == ranks.max()
         rows, chosen = frames[0].dependents(tables[most])
         pivots = pivot_order(tables[most][:, rows][:, :, chosen])
-        return Followers(tuple(rows), tuple(chosen), pivots, int(most.argmax()))
+        return DependentCoordinates(tuple(rows), tuple(chosen), pivots, int(most.argmax()))
 
     def _frame(self, motion: Motion) -> Frame:
         """The frame in a state on numbers, every rigidity and compliance one."""
-        model = posed(
+        model = place_plan(
             self.plan, motion.point, motion.direction, lambda _: [1.0] * 4, lambda *_: 1.0
         )
         return Frame(model, static=True)
@@ -96,29 +96,29 @@ class Elastic:
     @cached_property
     def _key(self) -> str:
         tree, followers = self.robot.engine.tree, self.followers
-        pattern = pattern_of(self.structure, tree)
+        pattern = constant_pattern(self.structure, tree)
         own = self.robot.graph.key if followers is not None and followers.sample else ""
-        return repr((_text(self.plan), pattern, self.names, followers, own))
+        return repr((_plain_data(self.plan), pattern, self.names, followers, own))
 
     def kernel(
-        self, name: str, write: Callable[[Solved], Program], *, free: bool = False
+        self, name: str, write: Callable[[SymbolicFrame], Program], *, free: bool = False
     ) -> Kernel:
         """A program on all numbers of the machine, as of :meth:`Engine.kernel`."""
         known = self._kernels.get(name)
         if known is None:
-            numbers = np.array(numbers_of(self.structure), np.float64)
+            numbers = np.array(list_numbers(self.structure), np.float64)
             known = self._kernels[name] = self.robot.engine.kernel_with(
-                numbers, name, partial(self._written, write), self._key, free=free
+                numbers, name, partial(self._write_program, write), self._key, free=free
             )
         return known
 
-    def _written(self, write: Callable[[Solved], Program], t: Traced) -> Program:
-        return write(Solved(t, self))
+    def _write_program(self, write: Callable[[SymbolicFrame], Program], t: Traced) -> Program:
+        return write(SymbolicFrame(t, self))
 
     @cached_property
     def compliance(self) -> Kernel:
         """Q to C (36) of the platform, and the measure of :attr:`response`."""
-        return self.kernel("platform compliance", _compliance)
+        return self.kernel("platform compliance", _write_compliance)
 
     @cached_property
     def response(self) -> Kernel:
@@ -127,35 +127,35 @@ class Elastic:
         The measure is the least pivot over its diagonal entry, which no choice of units changes: 0
         where the frame is a mechanism. Factors are zero where the wrench is.
         """
-        return self.kernel("platform response", _response)
+        return self.kernel("platform response", _write_response)
 
     @cached_property
     def deflections(self) -> Kernel:
         """Q and wrench to points of every member and their moves, (members, 2, k, 3); measure."""
-        return self.kernel("member deflections", _deflections)
+        return self.kernel("member deflections", _write_deflections)
 
     @cached_property
     def columns(self) -> Kernel:
         """Q to the columns sqrt(d) b: entries, their rows, their columns; and columns' elements."""
-        return self.kernel("elastic columns", _columns)
+        return self.kernel("elastic columns", _write_columns)
 
 
-def _text(value: Any) -> Any:
+def _plain_data(value: Any) -> Any:
     """A plan as plain data, without what is a number of the machine."""
     if isinstance(value, np.ndarray):
         return None
     if isinstance(value, float):
         return value if value in (0.0, FREE) else None
     if is_dataclass(value):
-        return [_text(getattr(value, field.name)) for field in fields(value)]
-    return [_text(one) for one in value] if isinstance(value, tuple) else value
+        return [_plain_data(getattr(value, field.name)) for field in fields(value)]
+    return [_plain_data(one) for one in value] if isinstance(value, tuple) else value
 
 
 def _dot(a: Iterable[Any], b: Iterable[Any]) -> Any:
     return sum((x * y for x, y in zip(a, b, strict=True)), 0.0)
 
 
-class Solved:
+class SymbolicFrame:
     """The frame of a solved motion, as expressions.
 
     ``follow``: coordinates that closures make follow from others, by those. ``place``: the others,
@@ -165,41 +165,41 @@ class Solved:
     def __init__(self, t: Traced, elastic: Elastic) -> None:
         t.solve()
         self.t, self.elastic = t, elastic
-        self.structure, self.rigidities = structure_on(elastic.structure, t.graph, t.more)
-        self.plan = plan_of(t.graph, self.structure)
+        self.structure, self.rigidities = substitute_numbers(elastic.structure, t.graph, t.more)
+        self.plan = plan_structure(t.graph, self.structure)
         self.frame = frame = self._frame(t.motion)
         self.measure: Any = 1.0
-        self.follow = {} if elastic.followers is None else self._followers(elastic.followers)
+        self.follow = {} if elastic.followers is None else self._solve_closures(elastic.followers)
         left = (k for k in range(frame.size) if k not in self.follow)
         self.place = {k: i for i, k in enumerate(left)}
         columns = [column for bar in frame.bars for column in frame.columns(bar)]
-        self.columns = [self._free(column) for column in (*columns, *frame.springs)]
+        self.columns = [self._eliminate(column) for column in (*columns, *frame.springs)]
 
     def _frame(self, motion: Motion) -> Frame:
         compliances = self.structure.compliances
-        model = posed(
+        model = place_plan(
             self.plan, motion.point, motion.direction, self.rigidities.__getitem__,
             lambda joint, k: compliances[joint][k],
         )  # fmt: skip
         return Frame(model, static=True)
 
-    def _followers(self, chosen: Followers) -> dict[int, Row]:
+    def _solve_closures(self, chosen: DependentCoordinates) -> dict[int, Row]:
         t, assumed, known = self.t, self.t.tape.assumed, self.t.home
         if chosen.sample:
             known = Motion(t.tree, *self.elastic.robot.engine.samples[chosen.sample])
             # The state is one of this geometry alone.
             assumed += [(e, e.value) for e in t.tape.inputs(GEOMETRY, len(t.tape.reference))]
-        follow, inverse, _ = followed(self.frame, chosen)
-        _, there, left = followed(self._frame(known), chosen)
+        follow, inverse, _ = solve_dependents(self.frame, chosen)
+        _, there, left = solve_dependents(self._frame(known), chosen)
         # On other numbers a closure may hold more than what was chosen.
-        assumed += [(e * _LEFT, 0.0) for e in t.lift(left)]
+        assumed += [(e * _CLOSURE_SCALE, 0.0) for e in t.lift(left)]
         # Where they stop to determine what was chosen near home, nothing is known of the frame.
         self.measure = 1.0 / maximum(absolute(inverse / there), _TINY)
         return follow
 
-    def _free(self, column: Column) -> Column:
+    def _eliminate(self, column: Column) -> Column:
         """A column on the coordinates that closures leave."""
-        row = _reduced(column.row, self.follow)
+        row = _substitute(column.row, self.follow)
         return column._replace(row={self.place[k]: value for k, value in row.items()})
 
     def factorise(self) -> None:
@@ -266,7 +266,9 @@ class Solved:
         return Program(sizes, 0, rows, t.equations())
 
 
-def followed(frame: Frame, chosen: Followers) -> tuple[dict[int, Row], Any, list[Any]]:
+def solve_dependents(
+    frame: Frame, chosen: DependentCoordinates
+) -> tuple[dict[int, Row], Any, list[Any]]:
     """Of chosen coordinates, their rows of the others; the reciprocal determinant of what
     determines them; and what other closures hold in addition, which is zero.
     """
@@ -274,24 +276,24 @@ def followed(frame: Frame, chosen: Followers) -> tuple[dict[int, Row], Any, list
     lu = SparseLU(table[:, list(chosen.chosen)], chosen.pivots)
     rest = sorted({k for r in chosen.rows for k in frame.held[r]} - set(chosen.chosen))
     solved = [lu.solve(-table[:, k]) for k in rest]
-    follow = {c: combined((rest, [one[i] for one in solved])) for i, c in enumerate(chosen.chosen)}
+    follow = {c: sum_forms((rest, [one[i] for one in solved])) for i, c in enumerate(chosen.chosen)}
     others = (row for r, row in enumerate(frame.held) if r not in chosen.rows)
-    left = [value for row in others for value in _reduced(row, follow).values()]
+    left = [value for row in others for value in _substitute(row, follow).values()]
     return follow, lu.inverse_determinant, left
 
 
-def _reduced(row: Row, follow: dict[int, Row]) -> Row:
+def _substitute(row: Row, follow: dict[int, Row]) -> Row:
     """A linear form without the coordinates that follow from others."""
     terms = [(follow.get(k, {k: 1.0}), value) for k, value in row.items()]
-    return combined(*((own, [value * f for f in own.values()]) for own, value in terms))
+    return sum_forms(*((own, [value * f for f in own.values()]) for own, value in terms))
 
 
-def _compliance(s: Solved) -> Program:
+def _write_compliance(s: SymbolicFrame) -> Program:
     s.factorise()
     return s.program({}, {"compliance": s.compliance.ravel(), "measure": [s.measure]})
 
 
-def _response(s: Solved) -> Program:
+def _write_response(s: SymbolicFrame) -> Program:
     s.factorise()
     wrench = s.t.tape.inputs("wrench", 6)
     size: Any = 0.0
@@ -309,7 +311,7 @@ def _response(s: Solved) -> Program:
     )
 
 
-def _deflections(s: Solved) -> Program:
+def _write_deflections(s: SymbolicFrame) -> Program:
     s.factorise()
     s.load(s.t.tape.inputs("wrench", 6))
     amounts, rows = iter(s.amounts), []
@@ -321,16 +323,16 @@ def _deflections(s: Solved) -> Program:
             member.axes @ (node.map[:3] @ np.array([s.x[k] for k in node.own], dtype=object))
             for node in bar.ends
         ]
-        shares = np.arange(PARTS + 1) / PARTS
+        shares = np.arange(DEFLECTION_PARTS + 1) / DEFLECTION_PARTS
         rows += [member.start + (member.end - member.start) * share for share in shares]
         for share in shares:
-            across, _ = bent(share, member.length, phi)
+            across, _ = bending_shape(share, member.length, phi)
             own = [_dot(across, bends[k : k + 2]) for k in (0, 2)] if bends else [0.0, 0.0]
             rows.append(moved[0] + (moved[1] - moved[0]) * share + member.axes[:, 1:] @ own)
     return s.program({"wrench": 6}, {"rows": np.ravel(rows), "measure": [s.measure]})
 
 
-def _columns(s: Solved) -> Program:
+def _write_columns(s: SymbolicFrame) -> Program:
     entries = [
         (sqrt(column.rigidity) * value, i, j)
         for j, column in enumerate(s.columns)

@@ -23,7 +23,7 @@ from pkm_twin.codegen.arrays import Array, Indices, one_vector, vectors
 from pkm_twin.robot.robot import Robot
 from stiffness_monitor.compliance import platform_response
 from stiffness_monitor.frame import PLATFORM
-from stiffness_monitor.programs import NONE, Elastic
+from stiffness_monitor.programs import NO_PARAMETERS, Elastic
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,7 +118,7 @@ def elastic_columns(robot: Robot, q: Array) -> tuple[Array, Indices]:
     :returns: columns, shape (..., size, r), the platform's six displacements first; and the element
         of each column by index, shape (r,).
     """
-    (entries, *places), _ = robot.made(Elastic).columns(NONE, q)
+    (entries, *places), _ = robot.made(Elastic).columns(NO_PARAMETERS, q)
     rows, columns, owner = (np.atleast_2d(p)[0].astype(int) for p in places)
     own = np.zeros((*q.shape[:-1], rows.max() + 1, len(owner)))
     own[..., rows, columns] = entries

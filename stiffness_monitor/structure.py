@@ -7,8 +7,8 @@ its six displacements, and what closes a loop between bodies that hang already i
 
 What carries what is decided once, at home: that is the plan. In it a point or direction is a pair
 of its body and its vector at home, a section is its beam's name, and a compliance is 0, infinite or
-the joint's name and the entry. :func:`posed` puts numbers, or expressions, in their place. A plan
-of a geometry on expressions is that of its known case.
+the joint's name and the entry. :func:`place_plan` puts numbers, or expressions, in their place. A
+plan of a geometry on expressions is that of its known case.
 """
 
 from __future__ import annotations
@@ -195,14 +195,14 @@ def structural_model(robot: Robot, q: ArrayLike) -> StructuralModel:
     :raises UnreachableError: no assembly of the robot; a singularity as ``forward``.
     """
     structure, posture = robot.elastic, Posture(robot, q)
-    model = posed(
-        plan_of(robot.graph, structure), posture.place, posture.turn,
+    model = place_plan(
+        plan_structure(robot.graph, structure), posture.place, posture.turn,
         structure.sections.__getitem__, lambda joint, k: float(structure.compliances[joint][k]),
     )  # fmt: skip
-    return replace(model, bodies=tuple(_masses(robot, posture.place, posture.turn)))
+    return replace(model, bodies=tuple(_lumped_masses(robot, posture.place, posture.turn)))
 
 
-def posed(
+def place_plan(
     plan: StructuralModel,
     place: Callable[[str, Array], Any],
     turn: Turn,
@@ -217,7 +217,7 @@ def posed(
 
     def stood(support: Support, own: Any = None) -> Support:
         values = (v if isinstance(v, float) else compliance(*v) for v in support.compliance)
-        axes = own if support.axes is None else _axes(support.axes, turn)
+        axes = own if support.axes is None else _joint_axes(support.axes, turn)
         at = None if support.at is None else place(*support.at)
         return replace(support, axes=axes, compliance=tuple(values), at=at)
 
@@ -240,7 +240,7 @@ def posed(
     )
 
 
-def _axes(given: Sequence[tuple[str, Array]], turn: Turn) -> Any:
+def _joint_axes(given: Sequence[tuple[str, Array]], turn: Turn) -> Any:
     """Columns of three directions.
 
     Of two axes that a joint turns about, at right angles or not: the first axis, the one
@@ -254,7 +254,7 @@ def _axes(given: Sequence[tuple[str, Array]], turn: Turn) -> Any:
     return np.array(columns).T
 
 
-def plan_of(graph: Graph, structure: Structure) -> StructuralModel:
+def plan_structure(graph: Graph, structure: Structure) -> StructuralModel:
     """What carries what, by the graph at home."""
     return _Planner(graph, structure).plan()
 
@@ -273,60 +273,60 @@ class _Planner:
         rods = [beam for beam in self.structure.beams if beam.parts[0] in self.graph.rods]
         while True:
             # Bodies that one joint alone leads to come first, then whatever hangs.
-            ready = [j for j in left if self._hangs(j.inner) != self._hangs(j.outer)]
+            ready = [j for j in left if self._is_attached(j.inner) != self._is_attached(j.outer)]
             if not ready:
                 break
             left.remove(ready[0])
-            self._hang(ready[0], left)
+            self._attach(ready[0], left)
             for beam in list(rods):
-                if self._hangs(beam.inner[0]) and self._hangs(beam.outer[0]):
+                if self._is_attached(beam.inner[0]) and self._is_attached(beam.outer[0]):
                     rods.remove(beam)
-                    self._rod(beam)
+                    self._add_rod(beam)
         closures = tuple(
             Closure(
-                (joint.outer, joint.at), self._stand(joint.inner, joint.at),
-                self._support(joint, joint.outer, joint.at),
+                (joint.outer, joint.at), self._find_support(joint.inner, joint.at),
+                self._joint_support(joint, joint.outer, joint.at),
             )
             for joint in left
-            if not self._inside(joint)
+            if not self._is_inside_beam(joint)
         )  # fmt: skip
         for beam in rods:
-            self._rod(beam)
+            self._add_rod(beam)
         graph = self.graph
         origin = (graph.platform, graph.origin)
         return StructuralModel(origin, graph.platform, tuple(self.parts), closures)
 
-    def _inside(self, joint: Joint) -> bool:
+    def _is_inside_beam(self, joint: Joint) -> bool:
         """Whether a joint is within one beam: a telescope's."""
         a, b = self.beam_of.get(joint.inner), self.beam_of.get(joint.outer)
         return a is not None and a is b
 
-    def _part(self, body: str) -> str:
+    def _part_name(self, body: str) -> str:
         beam = self.beam_of.get(body)
         return body if beam is None else beam.name
 
-    def _hangs(self, body: str) -> bool:
-        return self._part(body) in self.points
+    def _is_attached(self, body: str) -> bool:
+        return self._part_name(body) in self.points
 
-    def _stand(self, body: str, at: Array) -> tuple[str, int]:
+    def _find_support(self, body: str, at: Array) -> tuple[str, int]:
         """What stands at a place on a body, and at which end."""
-        part = self._part(body)
+        part = self._part_name(body)
         if part not in self.points:
             raise ValueError(f"{part} is not connected to the base")
         apart = [reference(size(point - at)) for point in self.points[part]]
         return part, int(np.argmin(apart))
 
-    def _support(self, joint: Joint, body: str, at: Array) -> Support:
-        part, end = self._stand(body, at)
+    def _joint_support(self, joint: Joint, body: str, at: Array) -> Support:
+        part, end = self._find_support(body, at)
         name = joint.label or joint.name
         directions = reaction_directions(joint)
         vectors = np.array([d.vector for d in directions])
         axes: tuple[tuple[str, Array], ...] = tuple((d.body, d.vector) for d in directions)
-        values, screws = self._compliance(name), []
+        values, screws = self._joint_compliance(name), []
         if joint.type.count == 2:
             axes = (joint.inner, joint.axes[0]), (joint.outer, joint.axes[1])
             # Which given direction each is nearly along.
-            along = references(vectors @ _axes(axes, lambda _, vector: vector))
+            along = references(vectors @ _joint_axes(axes, lambda _, vector: vector))
             order = np.abs(along).argmax(0).tolist()
             values = [values[k] for k in order] + [values[3 + k] for k in order]
             values[3] = values[4] = FREE
@@ -339,51 +339,55 @@ class _Planner:
                     values[3 * freedom.turns + k] = FREE
         return Support(name, part, axes, tuple(values), end, tuple(screws))
 
-    def _at_joint(self, joint: Joint, body: str, end: tuple[str, Array]) -> Support:
+    def _member_support(self, joint: Joint, body: str, end: tuple[str, Array]) -> Support:
         """How a member's end stands on a body by a joint, which may be apart from that end."""
         lever = joint.at - end[1]
         # On a free tape either place may be differentiated by.
         apart = getattr(getattr(lever[0], "tape", None), "free", False)
         if not joint.type.placed or not (apart or np.abs(references(lever)).max() >= SNAP):
-            return self._support(joint, body, end[1])
+            return self._joint_support(joint, body, end[1])
         own = joint.outer if body == joint.inner else joint.inner
-        return replace(self._support(joint, body, joint.at), at=(own, joint.at))
+        return replace(self._joint_support(joint, body, joint.at), at=(own, joint.at))
 
-    def _compliance(self, name: str) -> list[Any]:
+    def _joint_compliance(self, name: str) -> list[Any]:
         """Of a joint in a plan; infinite in a file says what its freedoms say."""
         values = enumerate(self.structure.compliances.get(name, RIGID))
         return [(name, k) if 0.0 < reference(value) < FREE else 0.0 for k, value in values]
 
-    def _hang(self, joint: Joint, left: list[Joint]) -> None:
+    def _attach(self, joint: Joint, left: list[Joint]) -> None:
         known, new = joint.inner, joint.outer
-        if not self._hangs(known):
+        if not self._is_attached(known):
             known, new = new, known
         beam = self.beam_of.get(new)
         if beam is None:
-            self.parts.append(Carried(new, (new, joint.at), self._support(joint, known, joint.at)))
+            self.parts.append(
+                Carried(new, (new, joint.at), self._joint_support(joint, known, joint.at))
+            )
             self.points[new] = [joint.at]
             return
         ends = [beam.inner, beam.outer]
-        if _nearer(joint.at, ends[1][1], ends[0][1]):
+        if _is_nearer(joint.at, ends[1][1], ends[0][1]):
             ends.reverse()
-        support = self._at_joint(joint, known, ends[0])
-        for part in [j for j in left if self._inside(j)]:
+        support = self._member_support(joint, known, ends[0])
+        for part in [j for j in left if self._is_inside_beam(j)]:
             if self.beam_of[part.inner] is beam:
                 left.remove(part)
         closing = None
         for other in left:
             for body, there in ((other.inner, other.outer), (other.outer, other.inner)):
-                if body in beam.parts and self._hangs(there) and there not in beam.parts:
-                    near = _nearer(other.at, ends[1][1], ends[0][1])
+                if body in beam.parts and self._is_attached(there) and there not in beam.parts:
+                    near = _is_nearer(other.at, ends[1][1], ends[0][1])
                     if closing is None and near:
                         closing = other, there
         outer = None
         if closing is not None:
             left.remove(closing[0])
-            outer = self._at_joint(*closing, ends[1])
-        self._member(beam, ends, support, outer)
+            outer = self._member_support(*closing, ends[1])
+        self._add_member(beam, ends, support, outer)
 
-    def _member(self, beam: Beam, ends: list[Any], inner: Support, outer: Support | None) -> None:
+    def _add_member(
+        self, beam: Beam, ends: list[Any], inner: Support, outer: Support | None
+    ) -> None:
         strut = beam.parts[0] in self.graph.rods
         length = size(ends[1][1] - ends[0][1])
         if not reference(length) > 0.0:
@@ -397,25 +401,27 @@ class _Planner:
             )
         )  # fmt: skip
 
-    def _rod(self, beam: Beam) -> None:
+    def _add_rod(self, beam: Beam) -> None:
         """On a ball joint at each end; it would spin idly, so the inner one holds that spin."""
         rod = self.graph.rods[beam.parts[0]]
         supports = []
         for name, (body, at), spin in zip(
             rod.joint_names, (beam.inner, beam.outer), (0.0, FREE), strict=True
         ):
-            values = (*self._compliance(name)[:3], spin, FREE, FREE)
-            part, end = self._stand(body, at)
+            values = (*self._joint_compliance(name)[:3], spin, FREE, FREE)
+            part, end = self._find_support(body, at)
             supports.append(Support(name, part, None, values, end))
-        self._member(beam, [beam.inner, beam.outer], *supports)
+        self._add_member(beam, [beam.inner, beam.outer], *supports)
 
 
-def _nearer(at: Array, first: Array, second: Array) -> bool:
+def _is_nearer(at: Array, first: Array, second: Array) -> bool:
     """Whether a place is nearer to the first of two points."""
     return reference(size(at - first)) < reference(size(at - second))
 
 
-def _masses(robot: Robot, place: Callable[[str, Array], Array], turn: Turn) -> list[RigidBody]:
+def _lumped_masses(
+    robot: Robot, place: Callable[[str, Array], Array], turn: Turn
+) -> list[RigidBody]:
     """Of bodies that are no beams, and of the payload."""
     graph, load = robot.graph, robot.payload
     beams = {n for beam in robot.elastic.beams for n in (*beam.parts, *beam.carries)}

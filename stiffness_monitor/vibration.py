@@ -22,11 +22,11 @@ from stiffness_monitor.modes import ELEMENTS, frame_system, solve_modes, stiffne
 
 Complex = NDArray[np.complex128]
 
-COUNT: Final = 24
+DYNAMIC_MODES: Final = 24
 """Modes that respond dynamically."""
-FASTEST: Final = 1e6
+MAX_FREQUENCY: Final = 1e6
 """Frequency at most that is asked for, Hz."""
-LONGEST: Final = 10.0
+MAX_TOOL_DISTANCE: Final = 10.0
 """Distance of a tool point along an axis at most, in parts of the machine's extent."""
 DAMPING: Final = (1e-5, 0.99)
 """Damping ratios of modes that may be given."""
@@ -64,7 +64,7 @@ class ToolModes:
         if at.ndim != 1:
             raise ParameterError("frequencies", at.shape, "one frequency after another")
         for frequency in (at.min(), at.max()) if at.size else ():
-            check_limit("frequencies", float(frequency), "Hz", 0.0, FASTEST)
+            check_limit("frequencies", float(frequency), "Hz", 0.0, MAX_FREQUENCY)
         own = 2.0 * np.pi * self.frequencies
         return responses(2.0 * np.pi * at, own, self.damping, self.shapes) + self.rest
 
@@ -99,16 +99,16 @@ def tool_modes(
         modes; default the robot file's ``modal_damping``.
     :param tool: from the platform's reference point, platform axes, m.
     :raises ParameterError: no damping is given, a ratio beyond :data:`DAMPING`, or a tool point
-        farther off than :data:`LONGEST` times the machine's extent.
+        farther off than :data:`MAX_TOOL_DISTANCE` times the machine's extent.
     """
     q = robot.inverse(one_vector(pose, len(robot.pose_names), "the pose"))
     system = frame_system(robot, q, elements)
-    count = min(COUNT, len(system.mass))
+    count = min(DYNAMIC_MODES, len(system.mass))
     ratios = damping_ratios(robot, damping, count)
     frequencies, vectors = solve_modes(system, count, (), vectors=True)
     rotation = robot.platform(q)[1]
     point = one_vector(tool, 3, "the tool point")
-    far = LONGEST * robot.graph.size
+    far = MAX_TOOL_DISTANCE * robot.graph.size
     for value in point.tolist():
         check_limit("tool", value, "m", -far, far)
     moved = rigid_offset(rotation @ point)

@@ -21,7 +21,7 @@ from pkm_twin.robot.derivatives import geometry_numbers
 from pkm_twin.robot.numbers import FileNumbers, geometry_and_masses
 from pkm_twin.robot.robot import Robot
 from stiffness_monitor.derivatives import compliance_gradient
-from stiffness_monitor.numbers import numbers_of
+from stiffness_monitor.numbers import list_numbers
 from stiffness_monitor.programs import Elastic
 
 
@@ -42,7 +42,7 @@ class NumberFunctions:
     @cached_property
     def elastic(self) -> FileNumbers:
         """Inputs of elasticity in addition to the geometry."""
-        return FileNumbers(self.robot, self.paths, lambda made: numbers_of(made.elastic))
+        return FileNumbers(self.robot, self.paths, lambda made: list_numbers(made.elastic))
 
 
 class Rows(Protocol):

@@ -31,7 +31,7 @@ from pkm_twin.machine.places import keys_of
 from pkm_twin.machine.tree import Tree
 from pkm_twin.robot.derivatives import twist_rows
 from pkm_twin.robot.robot import Robot
-from stiffness_monitor.compliance import HELD
+from stiffness_monitor.compliance import MIN_PIVOT_RATIO
 from stiffness_monitor.programs import Elastic
 
 Mask = NDArray[np.bool_]
@@ -226,7 +226,7 @@ class Variants:
         """
         _ = Elastic(self.robot)
         (flat, measure), good = self.run(programs.compliance, self.inverse(pose))
-        found = np.where(good & (measure > HELD), flat, np.nan)
+        found = np.where(good & (measure > MIN_PIVOT_RATIO), flat, np.nan)
         return np.asarray(found.reshape(*flat.shape[:-1], 6, 6), np.float64)
 
     def with_values(self, values: Array, *, checked: bool = False) -> Variants:

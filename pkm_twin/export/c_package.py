@@ -42,7 +42,7 @@ from pkm_twin.machine.inertia import Layout
 from pkm_twin.machine.sections import MAX_LENGTH, MAX_MASS, payload_margins
 from pkm_twin.robot.mechanism import RigidError
 from pkm_twin.robot.robot import Robot
-from stiffness_monitor.compliance import HELD
+from stiffness_monitor.compliance import MIN_PIVOT_RATIO
 from stiffness_monitor.programs import Elastic
 
 
@@ -230,7 +230,7 @@ class Package:
         (row,) = rows.values()
         k = len(elastic.names)
         # No frame that is a mechanism.
-        sound = self.fold.tape.lift(row[-1] - HELD)
+        sound = self.fold.tape.lift(row[-1] - MIN_PIVOT_RATIO)
         equations = [replace(q, branch=[*q.branch, sound]) for q in equations]
         compliance = Routine(
             "compliance", {"q": self.n}, {"c": row[2 * k + 7 : 2 * k + 43]}, equations,

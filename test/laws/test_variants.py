@@ -21,7 +21,7 @@ from pkm_twin.machine.places import keys_of
 from pkm_twin.mechanisms.catalogue import robot_of_data
 from pkm_twin.robot.numbers import geometry_and_masses
 from stiffness_monitor import compliance, derivatives
-from stiffness_monitor.programs import Elastic, followed
+from stiffness_monitor.programs import Elastic, solve_dependents
 from test.machine.random_machines import plain
 from test.support.robots import (
     elastic,
@@ -436,11 +436,11 @@ def test_closures_that_are_left_out_follow_from_the_others():
     for x, q in engine.samples:
         frame = elastic._frame(Motion(engine.tree, x, q))
         assert len(chosen.rows) < len(frame.held)
-        assert np.abs(np.array(followed(frame, chosen)[2], float)).max() < 1e-12
+        assert np.abs(np.array(solve_dependents(frame, chosen)[2], float)).max() < 1e-12
         fewer = replace(chosen, rows=chosen.rows[1:], chosen=chosen.chosen[1:])
         square = frame.table()[list(fewer.rows)][:, list(fewer.chosen)].astype(float)
         fewer = replace(fewer, pivots=pivot_order(square[None]))
-        assert np.abs(np.array(followed(frame, fewer)[2], float)).max() > 1e-3
+        assert np.abs(np.array(solve_dependents(frame, fewer)[2], float)).max() > 1e-3
 
 
 def test_a_robot_that_is_rigid_has_no_compliance():

@@ -10,7 +10,7 @@ from pkm_twin.bags.reader import open_bag
 from pkm_twin.errors import MessageError
 from pkm_twin.messages.reading import in_base_axes, read_deflection
 from pkm_twin.messages.stamps import SECOND, StampRules
-from stiffness_monitor.alarm import WAITING, AlarmSettings, StiffnessAlarm, StiffnessWatch
+from stiffness_monitor.alarm import MAX_WAITING, AlarmSettings, StiffnessAlarm, StiffnessWatch
 from stiffness_monitor.monitor import Monitor
 from test.bags.test_recordings import FOLDER
 from test.laws.deflections import SENSORS, noisy, twin_recording
@@ -211,14 +211,14 @@ def test_a_deflection_waits_for_the_wrench_behind_it_and_is_refused_without_one_
     answers(watch, monitor, [3 * SECOND])
     assert watch.taken.rejected == {"stamp order": 1, "no wrench": 1}
     assert "1.000 s away" in watch.last_reject
-    for k in range(WAITING + 5):
+    for k in range(MAX_WAITING + 5):
         watch.deflection(deflection(4 * SECOND + k), SECOND)
     assert watch.taken.rejected["no wrench"] == 6
     watch.reset()
     assert watch.count == 0
 
 
-@pytest.mark.parametrize("count", [1, 3 * WAITING])
+@pytest.mark.parametrize("count", [1, 3 * MAX_WAITING])
 def test_a_deflection_that_is_refused_in_the_end_does_not_blind_the_good_ones(count):
     """Sound by itself and ahead of the clock: no wrench comes near it."""
     watch, monitor = StiffnessWatch(ROBOT, StampRules(), FRAMES), Monitor(ROBOT)

@@ -50,7 +50,7 @@ HEIGHTS: Final = np.arange(-1.0, -0.24, 0.05)
 MAXIMA: Final = {"1R": "0.08", "1B": "0.45", "1U": "0.25", "3R": "0.02", "3B": "0.5", "3U": "0.07"}
 """Largest factors that section 4 states for figure 7."""
 FRAME: Final = "stiffness_monitor.frame."
-SOLVED: Final = "stiffness_monitor.programs.Solved."
+SOLVED: Final = "stiffness_monitor.programs.SymbolicFrame."
 UPR_RPU: Final = "pkm_twin.mechanisms.upr_rpu.UprRpu."
 LIMBS: Final = "stiffness_monitor.limb_stiffness"
 RESPONSE: Final = "stiffness_monitor.platform_response"

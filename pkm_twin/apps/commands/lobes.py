@@ -52,7 +52,7 @@ class Lobes(OfMilling, AtPose, OfTool, Writes, Draws):
 
 def lobes(given: Lobes) -> Report:
     """The limits of stability over the spindle's speed."""
-    from stiffness_monitor.chatter import MARGIN, lobes_between
+    from stiffness_monitor.chatter import SPEED_MARGIN, lobes_between
     from stiffness_monitor.vibration import tool_modes
 
     low, high = given.speeds
@@ -68,7 +68,7 @@ def lobes(given: Lobes) -> Report:
     answer = (
         f"{machine.name}: stable up to {_depth(*worst)} at every speed from {low:g} to {high:g} "
         f"rpm (least at {worst[0]:.0f} rpm); up to {_depth(*best)} at {best[0]:.0f} rpm "
-        f"± {100 * MARGIN:g} %"
+        f"± {100 * SPEED_MARGIN:g} %"
     )
     if given.out is not None:
         columns = {"speed": found.speeds, "depth": found.depths, "open": found.open.astype(float)}
@@ -77,7 +77,7 @@ def lobes(given: Lobes) -> Report:
         answer,
         [
             *of_modes(machine, pose, modes.frequencies, modes.damping),
-            Fact("best", _place(*best) | {"speed_margin": MARGIN}),
+            Fact("best", _place(*best) | {"speed_margin": SPEED_MARGIN}),
             Fact("least", _place(*worst)),
             Fact("zero_order_depth_m", found.safe),
             Fact("speeds_rpm", found.speeds),

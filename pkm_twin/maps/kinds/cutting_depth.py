@@ -12,7 +12,7 @@ from pkm_twin.maps.kind import Found, size_and_direction
 from pkm_twin.maps.kinds.frequency import Frequency
 from pkm_twin.robot.robot import Robot
 from stiffness_monitor.chatter import Milling, stable_depth_of
-from stiffness_monitor.vibration import COUNT, tool_modes
+from stiffness_monitor.vibration import DYNAMIC_MODES, tool_modes
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class CuttingDepth(Frequency):
 
     def elements(self, robot: Robot) -> tuple[str, ...]:
         """Modes of the tool point, lowest first."""
-        return tuple(f"mode {k}" for k in range(1, COUNT + 1))
+        return tuple(f"mode {k}" for k in range(1, DYNAMIC_MODES + 1))
 
     def each(self, robot: Robot, q: Array, cases: object) -> list[Found]:
         """The zero-order depth, how the tool point swings in the mode that chatters, and which."""
