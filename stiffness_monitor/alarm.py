@@ -35,27 +35,33 @@ from stiffness_monitor.monitor import Answer
 from stiffness_monitor.response import element_response
 
 MIN_SAMPLES: Final = 20
-"""Fewer loaded ones tell nothing."""
+"""Loaded samples in the window below which nothing is evaluated."""
 MAX_SAMPLES: Final = 1000
+"""Samples kept in the window; older ones go first."""
 LOADED_FRACTION: Final = 0.05
-"""A sample is loaded whose predicted deflection is above this part of the window's greatest."""
+"""Predicted deflection, relative to the largest in the window, above which a sample counts as
+loaded."""
 MIN_SIGNAL_TO_NOISE: Final = 10.0
-"""Least change of the measured deflections over their noise: less is no load, but the noise of
-wrenches."""
+"""Standard deviation of the measured deflections over their noise, below which the wrenches are
+taken for sensor noise."""
 DISTINCT_SIGMAS: Final = 4.0
-"""Deviations by which an element explains the samples worse than the best, to be ruled out."""
+"""Standard deviations by which the residual of an element must exceed the best element's to rule it
+out."""
 MIN_NOISE_FRACTION: Final = 1e-3
-"""Least noise of a direction, as a share of the deflections' deviation there."""
+"""Smallest noise of a direction, relative to the standard deviation of its deflections."""
 FACTOR_RANGE: Final = (0.05, 100.0)
-"""Factors that are looked for."""
+"""Smallest and largest compliance factor of the search."""
 MAX_STEP_RATIO: Final = 3.0
-"""By how much a step may multiply a factor."""
+"""Largest ratio of a factor's values in consecutive Gauss-Newton steps."""
 MAX_ITERATIONS: Final = 20
+"""Largest number of Gauss-Newton steps."""
 FACTOR_TOLERANCE: Final = 1e-4
+"""Change of the factors at which Gauss-Newton iteration ends."""
 SCREENING_FRACTION: Final = 0.5
-"""Part of its bound that some element alone has to miss 1 by, to first order, to be looked at."""
+"""Fraction of its bound by which the first-order factor of some element must differ from 1 for the
+full search to start."""
 MAX_AUTOCORRELATION: Final = 0.95
-"""Greatest correlation of one residual with the next that is taken for one."""
+"""Largest correlation of consecutive residuals; more would make all variances infinite."""
 
 
 @dataclass(frozen=True)
@@ -104,7 +110,7 @@ class Departure:
 
 @dataclass(frozen=True, eq=False)
 class _Sample:
-    """A load in a pose, and what the model says of it; shapes as in :class:`_Window` without k."""
+    """Hold a load in a pose and the model's quantities for it; shapes as in :class:`_Window`."""
 
     time: float
     moved: Array
@@ -117,19 +123,20 @@ class _Sample:
 
 @dataclass(frozen=True, eq=False)
 class _Fit:
-    """Factors of some elements, their variances by the noise alone, and the squares left."""
+    """Hold factors of some elements, their variances by noise alone, and the squared residual."""
 
     factors: Array
     variances: Array
     squares: float
 
     def deviations(self, alike: float) -> Array:
+        """Return the factors' standard deviations; ``alike`` widens the variances."""
         return np.asarray(np.sqrt(alike * self.variances), np.float64)
 
 
 @dataclass(frozen=True, eq=False)
 class _Window:
-    """k samples in d measured directions, each over its noise.
+    """Hold k samples in d measured directions, each divided by its noise.
 
     ``owner``: (r,). ``reach``: (k, d, r), ``rest``: (k, r, r), ``carried``: (k, r) as in
     :mod:`stiffness_monitor.response`. ``common``: effects of the causes, then of the zeros,
@@ -145,7 +152,7 @@ class _Window:
     prior: Array
 
     def predict_change(self, chosen: Sequence[int], factors: Array) -> tuple[Array, Array]:
-        """What chosen elements with factors add, (k, d), and its derivatives, (k, d, chosen)."""
+        """Return the deflection change by elements' factors, (k, d), and its derivatives."""
         own = np.isin(self.owner, chosen)
         mine = np.equal.outer(self.owner[own], np.asarray(chosen)).astype(float)
         change = mine @ (factors - 1.0)
@@ -158,7 +165,7 @@ class _Window:
         return added[..., 0], (columns * amounts[:, None]) @ mine
 
     def estimate_each(self, count: int) -> tuple[Array, Array]:
-        """Each element's factor alone, to first order, and its standard deviation, (elements,)."""
+        """Return each element's factor alone to first order, and its deviation, (elements,)."""
         _, slopes = self.predict_change(range(count), np.ones(count))
         rows, columns = slopes.reshape(-1, count), self.common.reshape(-1, len(self.prior))
         columns = np.concatenate([columns, np.diag(np.sqrt(self.prior))])
@@ -169,7 +176,7 @@ class _Window:
         return 1.0 + rows.T @ self.residual.ravel() / information, 1.0 / np.sqrt(information)
 
     def fit(self, chosen: Sequence[int], start: Array) -> _Fit:
-        """The window by chosen elements, from factors to begin with."""
+        """Fit the factors of chosen elements to the window by Gauss-Newton, from ``start``."""
         factors, e = start, len(chosen)
         held = np.concatenate([np.zeros(e), self.prior])
         for _ in range(MAX_ITERATIONS):
@@ -177,7 +184,7 @@ class _Window:
             table = np.concatenate([slopes, self.common], -1).reshape(-1, len(held))
             target = (self.residual - added).ravel()
             information = table.T @ table + np.diag(held)
-            # Zeros and factors are of sizes that differ by the noise's.
+            # Scale the unknowns: zeros and factors differ by orders of magnitude.
             scale = 1.0 / np.sqrt(np.maximum(np.diag(information), 1e-300))
             inverse = np.linalg.pinv(scale[:, None] * information * scale, 1e-12, hermitian=True)
             found = scale * (inverse @ (scale * (table.T @ target)))
@@ -197,7 +204,7 @@ class _Window:
 
 @dataclass
 class StiffnessAlarm:
-    """Finds elements whose compliance differs from the file, from samples of load and deflection.
+    """Find elements whose compliance differs from the file, from loads and deflections.
 
     Times are arguments, s.
     """
@@ -208,12 +215,12 @@ class StiffnessAlarm:
     def __post_init__(self) -> None:
         self._samples: deque[_Sample] = deque(maxlen=MAX_SAMPLES)
         self.names: tuple[str, ...] = ()
-        # A machine may be singular at home; then the first sample's pose tells.
+        # A machine may be singular at home; then the first sample's pose is used.
         with suppress(PkmTwinError, ValueError):
             self._prepare(self.robot.home())
 
     def _prepare(self, pose: Array) -> None:
-        """What the elements are, and how sure the file is of each."""
+        """Store the elements' names and the standard deviations that the file gives them."""
         response = element_response(self.robot, pose)
         self._file_deviations = _file_deviations(self.robot, pose, len(response.names))
         self.names, self._owner = response.names, response.owner
@@ -228,7 +235,7 @@ class StiffnessAlarm:
         self._samples.clear()
 
     def push(self, time: float, pose: Array, wrench: Array, deflection: Array) -> None:
-        """Take a sample: pose (m,), wrench and deflection (6,) in base axes.
+        """Add a sample: pose (m,), wrench and deflection (6,) in base axes.
 
         :raises ValueError: a sample of another shape or that is not finite; it moves nothing.
         """
@@ -248,11 +255,11 @@ class StiffnessAlarm:
             self._samples.popleft()
 
     def judge(self) -> tuple[Departure, ...] | None:
-        """The elements with an alarm, the most certain first; None if too little is loaded."""
+        """Return the elements with an alarm, the most certain first; None without enough load."""
         return finished(self.judging())
 
     def judging(self) -> Generator[None, None, tuple[Departure, ...] | None]:
-        """The same in slices, of the samples that there are at the first."""
+        """Evaluate as :meth:`judge` in slices, with the samples of the first slice."""
         if not self._samples:
             return None
         sizes = np.array([np.linalg.norm(sample.moved[:3]) for sample in self._samples])
@@ -274,7 +281,7 @@ class StiffnessAlarm:
         return (yield from self._describe_departures(window, alike, chosen))
 
     def _departure_bounds(self, deviations: Array, elements: Sequence[int]) -> Array:
-        """How far from 1 a factor is no departure."""
+        """Return the differences from 1 of the factors that give no alarm."""
         s = self.settings
         doubts = self._file_deviations[list(elements)]
         return np.asarray(
@@ -282,12 +289,12 @@ class StiffnessAlarm:
         )
 
     def _relative_departures(self, fit: _Fit, alike: float, elements: Sequence[int]) -> Array:
-        """Departures from 1 over their bounds, (elements,)."""
+        """Return the factors' differences from 1 over their bounds, (elements,)."""
         bounds = self._departure_bounds(fit.deviations(alike), elements)
         return np.asarray(np.abs(fit.factors - 1.0) / bounds, np.float64)
 
     def _select_elements(self, window: _Window, alike: float) -> Generator[None, None, list[int]]:
-        """The fewest elements that explain the window: added one by one, then left out again."""
+        """Find the fewest elements that explain the window: add one by one, then drop some."""
         chosen: list[int] = []
         factors = np.zeros(0)
         while len(chosen) < len(self.names):
@@ -315,7 +322,7 @@ class StiffnessAlarm:
     def _describe_departures(
         self, window: _Window, alike: float, chosen: Sequence[int]
     ) -> Generator[None, None, tuple[Departure, ...]]:
-        """What is told of the chosen elements, the surest first."""
+        """Return the departures of the chosen elements, the most certain first."""
         if not chosen:
             return ()
         fit = window.fit(chosen, np.ones(len(chosen)))
@@ -342,10 +349,10 @@ class StiffnessAlarm:
         return tuple(found)
 
     def _build_window(self) -> tuple[_Window, float, float]:
-        """The samples over their noise.
+        """Divide the samples by their noise.
 
-        :returns: and how many of them are one by their correlation, and by how much the
-            deflections' changes are above the noise in the clearest direction.
+        :returns: the window, the factor by which autocorrelation widens variances, and the
+        deflections' standard deviation over their noise in the clearest direction.
         """
         kept = np.flatnonzero(self.settings.directions)
         moved, reach, rest, carried, effects, measured = (
@@ -371,10 +378,12 @@ class StiffnessAlarm:
 
 
 def _estimate_noise(residual: Array, table: Array, least: Array) -> tuple[Array, float]:
-    """Deviation by direction (d,) that no element explains, and the samples' correlation.
+    """Estimate the noise of each direction (d,), which no element explains.
 
-    :param table: all that may explain it, (k, d, p).
-    :returns: and by how much the residual's correlation in time widens variances.
+    :param table: columns of all effects that may explain the residual, (k, d, p).
+
+    :returns: the noise, and the factor by which the residual's correlation in time widens
+    variances.
     """
     size = np.maximum(least, 1e-30)
     left = residual
@@ -393,7 +402,9 @@ def _estimate_noise(residual: Array, table: Array, least: Array) -> tuple[Array,
 
 
 def _file_deviations(robot: Robot, pose: Array, count: int) -> Array:
-    """Relative deviation of each element's compliance by the causes, (elements,).
+    """Return the relative deviation of each element's compliance by the file, (elements,).
+
+    The elements' energies under six unit loads are compared at one pose.
 
     Of its energy under six unit loads at one pose.
     """
@@ -406,18 +417,18 @@ def _file_deviations(robot: Robot, pose: Array, count: int) -> Array:
 
 
 MAX_WAITING: Final = 64
-"""Deflections that wait for the wrench after them; of more the latest by their stamps go."""
+"""Deflections that wait for the wrench after them; the latest stamps are dropped first."""
 EVALUATION_PERIOD: Final = 1.0
-"""Between two judgements, s of stamps."""
+"""Time between two evaluations, s of stamps."""
 
 
 @dataclass
 class StiffnessWatch(Core):
-    """Pairs each measured deflection with the wrenches around it, and judges a window of pairs.
+    """Pair measured deflections with the wrenches around them, and evaluate a window of pairs.
 
-    ``frames``: of the base and of the platform: a deflection is along the axes of either.
-    ``max_age``: from a deflection to the wrench on either side, s. ``period``: least time between
-    two pairs that count, s.
+    ``frames``: names of the base frame and of the platform frame; a deflection is in either one's
+    axes. ``max_age``: largest time from a deflection to the wrench on either side, s. ``period``:
+    shortest time between two pairs that are used, s.
     """
 
     robot: Robot
@@ -430,11 +441,11 @@ class StiffnessWatch(Core):
     def __post_init__(self) -> None:
         self.taken = counting()
         self.departures: tuple[Departure, ...] | None = None
-        """What the last judgement found; None before there was one."""
+        """Departures of the last evaluation; None before the first."""
         self._alarm = StiffnessAlarm(self.robot, self.settings)
         self._answers: TimeCache[Answer] = TimeCache(1024)
         self._waiting: list[DeflectionSample] = []
-        """By their stamps: what is never paired does not stand before what is."""
+        """Sorted by stamp, so that a deflection without a pair does not block later ones."""
         self._last = self._due = self._judged = 0
         self._judging: object | None = None
 
@@ -445,11 +456,11 @@ class StiffnessWatch(Core):
 
     @property
     def stamp(self) -> int:
-        """Of the newest pair that was judged, ns."""
+        """Stamp of the newest pair that was evaluated, ns."""
         return self._judged
 
     def reset(self) -> None:
-        """Forget all pairs, as when the clock jumps or the machine was repaired."""
+        """Discard all pairs, as when the clock jumps or the machine was repaired."""
         self._alarm.reset()
         self._answers.clear()
         self._waiting.clear()
@@ -458,14 +469,14 @@ class StiffnessWatch(Core):
         self.departures = None
 
     def answer(self, answer: Answer) -> None:
-        """Take what the monitor made of a wrench."""
+        """Add the monitor's answer to a wrench."""
         latest = self._answers.latest
         if latest is None or answer.stamp >= latest[0]:
             self._answers.push(answer.stamp, answer)
         self._pair_waiting()
 
     def deflection(self, message: Any, now: int) -> None:
-        """Take a geometry_msgs/TransformStamped, of the deflected platform.
+        """Add a geometry_msgs/TransformStamped of the deflected platform.
 
         :raises MessageError: the message is rejected, and counted.
         """
@@ -483,10 +494,9 @@ class StiffnessWatch(Core):
             self.refuse(self.taken, MessageError("no wrench", text))
 
     def judgement(self) -> Generator[None, None, bool] | None:
-        """A judgement in slices, where it is time for one; else None.
+        """Start an evaluation in slices if one is due and none is running; else return None.
 
-        One at a time. It ends with whether ``departures`` are new: not where all was forgotten
-        meanwhile.
+        The generator returns whether ``departures`` are new; they are not after a :meth:`reset`.
         """
         if self._judging is not None or self._due - self._judged < EVALUATION_PERIOD * SECOND:
             return None
@@ -506,7 +516,7 @@ class StiffnessWatch(Core):
                 self._judging = None
 
     def _pair_waiting(self) -> None:
-        """Pair what waits and has a wrench behind it."""
+        """Pair the waiting deflections that have a wrench after them."""
         latest = self._answers.latest
         while self._waiting and latest is not None and self._waiting[0].stamp <= latest[0]:
             sample = self._waiting.pop(0)
@@ -519,6 +529,7 @@ class StiffnessWatch(Core):
             self.taken.accept()
 
     def _use_pair(self, sample: DeflectionSample) -> None:
+        """Push a deflection with the wrench interpolated at its stamp to the alarm."""
         before, after = self._find_neighbours(sample.stamp)
         if sample.stamp - self._due < self.period * SECOND:
             return
@@ -536,9 +547,9 @@ class StiffnessWatch(Core):
         self._due = sample.stamp
 
     def _find_neighbours(self, stamp: int) -> tuple[Answer, Answer]:
-        """The wrenches on either side.
+        """Return the wrenches before and after a stamp.
 
-        :raises MessageError: there are none near.
+        :raises MessageError: there is none on one side, or one is too old.
         """
         found = self._answers.around(stamp)
         if found is None:

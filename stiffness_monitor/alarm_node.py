@@ -28,14 +28,14 @@ DIRECTIONS = ("x", "y", "z", "rx", "ry", "rz")
 
 
 class StiffnessAlarmTopics:
-    """``measured_deflection`` in; ``~/stiffness_alarm`` says which elements have departed."""
+    """Subscribe to ``measured_deflection`` and publish ``~/stiffness_alarm``."""
 
     def __init__(
         self, node: TwinNode, robot: Robot, rules: StampRules, frames: tuple[str, str]
     ) -> None:
         """Declare the parameters and create the topics that they ask for.
 
-        :param rules: what the stamps of deflections have to keep to.
+        :param rules: for the stamps of deflections.
         :param frames: of the base, and of the platform as ``~/deflection`` names it.
         """
         self._node, self._robot, self._base = node, robot, frames[0]
@@ -78,35 +78,35 @@ class StiffnessAlarmTopics:
 
     @property
     def departures(self) -> tuple[Departure, ...]:
-        """What the last judgement found."""
+        """Departures of the last evaluation."""
         return (self._core.departures or ()) if self._core is not None else ()
 
     def reset(self) -> None:
-        """Forget all deflections, as when the clock jumps."""
+        """Discard all deflections, as when the clock jumps."""
         if self._core is not None:
             self._core.reset()
 
     def change_rules(self, rules: StampRules, frames: tuple[str, str]) -> None:
-        """Judge stamps and frames by other rules from the next deflection on."""
+        """Use new rules for stamps and frames from the next deflection on."""
         if self._core is not None:
             self._core.rules, self._core.frames = rules, frames
 
     def take(self, answer: Answer) -> None:
-        """What a wrench did by the model."""
+        """Use the model's answer to a wrench."""
         if self._core is not None:
             self._core.answer(answer)
             self._start_evaluation(self._core)
 
     def warning(self) -> str:
-        """What the diagnostics warn of; empty where nothing has departed."""
-        told = (
+        """Return the departures as a diagnostics message; empty without any."""
+        texts = (
             f"compliance of {d.candidates} is {d.factor:.3g} +- {d.deviation:.2g} times the file's"
             for d in self.departures
         )
-        return "; ".join(told)
+        return "; ".join(texts)
 
     def diagnose(self) -> dict[str, object]:
-        """Values of the node's diagnostic status."""
+        """Return values for the node's diagnostic status."""
         core = self._core
         if core is None or not (core.taken.accepted or core.taken.rejected):
             return {}
@@ -118,7 +118,7 @@ class StiffnessAlarmTopics:
             self._start_evaluation(self._core)
 
     def _start_evaluation(self, core: StiffnessWatch) -> None:
-        """A judgement takes tens of milliseconds: no wrench shall wait so long."""
+        """Start a due evaluation in slices: it takes tens of milliseconds, wrenches come sooner."""
         work = core.judgement()
         if work is not None:
             self._node.defer("measured_deflection", self._evaluate(core, work))
@@ -128,19 +128,19 @@ class StiffnessAlarmTopics:
             self._publish(core)
 
     def _publish(self, core: StiffnessWatch) -> None:
-        """Each judgement while something has departed; the first, and the first after, too."""
+        """Publish every evaluation with departures, and the first one without."""
         found = core.departures
         if found is None:
             return
-        told = tuple(departure.candidates for departure in found)
-        if not told and self._reported == ():
+        names = tuple(departure.candidates for departure in found)
+        if not names and self._reported == ():
             return
-        self._reported = told
+        self._reported = names
         own = header(core.stamp, self._base)
         self._alarm.publish(DiagnosticArray(header=own, status=self._statuses(found)))
 
     def _statuses(self, found: Sequence[Departure]) -> list[DiagnosticStatus]:
-        """One an element that has departed; where none has, one that says so."""
+        """Return one WARN status per departure, or one OK status without any."""
         name, hardware = f"{self._node.get_name()}: stiffness", self._robot.name
         if not found:
             return [
@@ -156,7 +156,7 @@ class StiffnessAlarmTopics:
                 "deviation": repr(departure.deviation),
                 "bound": repr(departure.bound),
             }
-            # What the loads do not tell apart from it.
+            # Elements that the loads do not distinguish from this one.
             pairs |= {f"or {other}": repr(factor) for other, factor in departure.others}
             statuses.append(
                 DiagnosticStatus(

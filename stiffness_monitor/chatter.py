@@ -24,45 +24,48 @@ from pkm_twin.robot.robot import Robot
 from stiffness_monitor.vibration import Complex, ToolModes, responses, tool_modes
 
 MIN_PEAK_FRACTION: Final = 0.01
-"""Least peak of a mode in the cutting plane, of the greatest, to count."""
+"""Peak of a mode in the cutting plane, relative to the largest peak, below which the mode is left
+out."""
 MAX_MODES: Final = 8
+"""Largest number of modes in the cutting plane."""
 MAX_WAVES: Final = 20.0
-"""Most vibrations of a mode from tooth to tooth; at so low speeds process damping governs."""
+"""Largest number of vibrations of a mode per tooth period; process damping governs below."""
 BASE_DEGREE: Final = 10
-"""Degree of a displacement from tooth to tooth beside four for each vibration."""
+"""Polynomial degree of the displacement over a tooth period, plus four per vibration."""
 STEPS_PER_WAVE: Final = 20
-"""Steps of a vibration, and twice as many at least from tooth to tooth."""
+"""Time steps per vibration; a tooth period has at least twice as many."""
 DEPTH_RATIO: Final = 1.25
-"""Between two depths that are tried before the limit is bracketed."""
+"""Ratio of consecutive depths that are tried until one is unstable."""
 FIRST_DEPTH_RATIO: Final = 0.4
-"""First depth that is tried, of the zero-order one that is stable at every speed."""
+"""First depth that is tried, over the zero-order depth that is stable at every speed."""
 DEFAULT_DEPTH_RATIO: Final = 25.0
-"""Last depth by default, likewise."""
+"""Default deepest depth that is tried, over the same zero-order depth."""
 DEPTHS_PER_BATCH: Final = 5
-"""Depths that are tried at once."""
+"""Depths that are evaluated in one batch."""
 DEPTH_TOLERANCE: Final = 2e-4
-"""Relative width of the bracket that a limit is found in."""
+"""Relative tolerance of a limit depth."""
 MAX_LIMIT_RATIO: Final = 1.25
-"""Ratio of two neighbouring limits between which another speed is computed."""
+"""Ratio of two neighbouring limit depths above which a speed between them is added."""
 MAX_MINIMUM_RATIO: Final = 1.001
-"""The same beside a minimum: it is known where both neighbours are as deep."""
+"""Ratio of limit depths next to a local minimum above which a speed between them is added."""
 MIN_SPEED_STEP: Final = 5e-4
-"""Relative distance of speeds below which none is computed between, as at a cliff."""
+"""Relative distance of speeds below which none is added between them, as at a discontinuity."""
 MAX_WAVE_STEP: Final = 0.1
-"""Most vibrations from tooth to tooth between speeds: one lobe is a vibration of a mode wide."""
+"""Largest difference of vibrations per tooth period between neighbouring speeds; a lobe is one
+vibration wide."""
 MAX_BEST_SPEED_STEP: Final = 1e-3
-"""Largest relative distance of speeds within the margin of the best one."""
+"""Largest relative distance of speeds within the margin of the best speed."""
 MAX_SPINDLE_SPEED: Final = 1e6
-"""Speed of a spindle at most, rpm."""
+"""Largest spindle speed, rpm."""
 DEPTH_RANGE: Final = (1e-6, 10.0)
-"""Depths of cut that may be given, m."""
+"""Valid range of ``deepest``, m."""
 SPEED_MARGIN: Final = 0.01
-"""How far a spindle's speed may be off, part of it."""
+"""Default relative error of the spindle's speed."""
 
 
 @dataclass(frozen=True)
 class Milling:
-    """A milling process; the tool's axis is the platform's z, its rotation clockwise from above.
+    """Describe a milling process; tool axis along the platform's z, clockwise from above.
 
     ``teeth``: number, evenly spaced, without helix. ``tangential``: cutting coefficient Kt, N/m2.
     ``radial``: force across over tangential force, Kr. ``immersion``: radial depth of cut over tool
@@ -102,7 +105,7 @@ class Milling:
         return (0.0, width) if self.up else (np.pi - width, np.pi)
 
     def primitive(self, angle: Array) -> Array:
-        """Integral of one tooth's W from 0 to angles (..., ) over the cut alone, (..., 2, 2)."""
+        """Integrate one tooth's W from 0 to angles (...), the cut alone, shape (..., 2, 2)."""
         a = np.clip(angle, *self.engaged)
         one, two = 0.5 * a - 0.25 * np.sin(2.0 * a), 0.5 * np.sin(a) ** 2
         rest, r = a - one, self.radial
@@ -110,12 +113,12 @@ class Milling:
         return self.tangential * np.moveaxis(np.array(rows), (0, 1), (-2, -1))
 
     def mean(self) -> Array:
-        """W averaged over time, shape (2, 2)."""
+        """Return W averaged over time, shape (2, 2)."""
         ends = self.primitive(np.array(self.engaged))
         return np.asarray(self.teeth / (2.0 * np.pi) * (ends[1] - ends[0]))
 
     def steps(self, count: int) -> Array:
-        """W from tooth to tooth, each step's mean about its time, shape (count, 2, 2)."""
+        """Return the mean of W in each of ``count`` steps of a tooth period, (count, 2, 2)."""
         pitch = 2.0 * np.pi / self.teeth
         edges = pitch / count * (np.arange(count + 1) - 0.5)
         whole = edges + pitch * np.arange(self.teeth)[:, None]
@@ -125,7 +128,7 @@ class Milling:
 
 @dataclass(frozen=True, eq=False)
 class Lobes:
-    """Limit depths over spindle speeds.
+    """Hold limit depths over spindle speeds.
 
     ``speeds``: (k,), rpm. ``depths``: (k,), m, the depth at which the cut becomes unstable.
     ``open``: (k,), where it is still stable at the deepest that was tried, which ``depths`` has.
@@ -143,9 +146,10 @@ class Lobes:
         return int(np.flatnonzero(self.depths == self.depths.max())[-1])
 
     def steady(self, margin: float = SPEED_MARGIN) -> tuple[float, float, bool]:
-        """The best speed (rpm) with a margin, its stable depth (m), and whether that is open.
+        """Return the speed (rpm) with the largest depth within a margin, that depth, its openness.
 
-        The depth is stable at all speeds within the margin, and at the next ones on both sides. If
+        The depth (m) is stable at all speeds within the margin, and at the next ones on both sides;
+        openness is whether it is the deepest that was tried. If
         the range of speeds is narrower than the margin, its middle is taken. Speeds must rise.
 
         :param margin: how far the speed may be off, as a part of it.
@@ -164,7 +168,7 @@ class Lobes:
         return float(self.speeds[at]), float(least[k]), whole
 
     def gaps(self, waves: Array) -> Mask:
-        """Which neighbouring speeds may have another limit between them, shape (k - 1,).
+        """Return between which neighbouring speeds another one is needed, shape (k - 1,).
 
         :param waves: vibrations of the fastest mode from tooth to tooth, by speed, shape (k,).
         """
@@ -187,7 +191,7 @@ class Lobes:
 
 @dataclass(frozen=True, eq=False)
 class _CuttingPlane:
-    """Modes in the cutting plane: rad/s and damping ratios (m,), shapes (m, 2) of unit mass."""
+    """Hold modes in the cutting plane: rad/s, damping ratios (m,), shapes (m, 2) of unit mass."""
 
     turn: Array
     damping: Array
@@ -195,6 +199,7 @@ class _CuttingPlane:
 
     @classmethod
     def of(cls, modes: ToolModes, milling: Milling) -> _CuttingPlane:
+        """Project tool-point modes onto the cutting plane, and drop the small ones."""
         c, s = np.cos(milling.feed), np.sin(milling.feed)
         axes = modes.rotation @ np.array([[c, -s], [s, c], [0.0, 0.0]])
         shapes, turn = modes.shapes[:, :3] @ axes, 2.0 * np.pi * modes.frequencies
@@ -204,7 +209,7 @@ class _CuttingPlane:
         return cls(turn[kept], modes.damping[kept], shapes[kept])
 
     def stable_depth(self, milling: Milling) -> tuple[float, float]:
-        """By the zero-order approximation, at the worst speed, m; and where it chatters, rad/s."""
+        """Return the zero-order depth stable at every speed, m, and where it chatters, rad/s."""
         far = np.geomspace(4.0, 100.0, 16)
         near = np.concatenate([-far, np.linspace(-4.0, 4.0, 65), far])
         at = (self.turn[:, None] * (1.0 + self.damping[:, None] * near)).ravel()
@@ -214,16 +219,16 @@ class _CuttingPlane:
         return (-0.5 / float(real[k]) if real[k] < 0.0 else np.inf), float(at[k])
 
     def _oriented_eigenvalues(self, milling: Milling, at: Array) -> Complex:
-        """Eigenvalues of the mean cutting stiffness times the response at rad/s (k,), (k, 2)."""
+        """Return the eigenvalues of mean W times the response at rad/s (k,), shape (k, 2)."""
         response = responses(at, self.turn, self.damping, self.shapes)
         return np.asarray(np.linalg.eigvals(milling.mean() @ response))
 
     def lobe_speeds(self, milling: Milling, low: float, high: float) -> Array:
-        """Speeds in a range at which lobes are lowest by the zero-order approximation, rpm, (k,).
+        """Return the speeds in a range at which zero-order lobes are lowest, rpm, (k,).
 
-        Of every mode near its worst frequency, where from tooth to tooth there is a whole number of
-        vibrations and the phase of the lobe; and about its own frequency half a vibration more,
-        where every second tooth cuts deeper.
+        For each mode, a whole number of vibrations plus the lobe's phase fits into a tooth period
+        at its worst frequency; for period doubling (every second tooth cuts deeper) half a
+        vibration more at its own frequency.
         """
         found: list[float] = []
         for w, z in zip(self.turn, self.damping, strict=True):
@@ -239,11 +244,17 @@ class _CuttingPlane:
         return np.array(found)
 
     def waves(self, milling: Milling, speeds: Array) -> Array:
-        """Vibrations of the fastest mode from tooth to tooth at speeds, rpm."""
+        """Return the fastest mode's vibrations per tooth period at speeds, rpm."""
         return np.asarray(60.0 * self.turn.max() / (2.0 * np.pi * milling.teeth) / speeds)
 
     def transition(self, h: float) -> tuple[Array, Array, Array]:
-        """Of time h: the modes' map (m, 2, 2), what forces at its begin and end add, (m, 2)."""
+        """Return a time step's transition matrices (m, 2, 2) and input gains (m, 2).
+
+        :param h: time of the step, s.
+
+        :returns: the matrices of position and velocity, then the gains of the forces at the step's
+        begin and end.
+        """
         w, z = self.turn, self.damping
         root = w * np.sqrt(1.0 - z * z)
         decay, c, s = np.exp(-z * w * h), np.cos(root * h), np.sin(root * h)
@@ -256,7 +267,7 @@ class _CuttingPlane:
         return np.moveaxis(free, -1, 0), (one - end).T, end.T
 
     def spectral_radius(self, milling: Milling, speed: float, depths: Array) -> Array:
-        """Largest size of an eigenvalue from tooth to tooth, of depths (k,), m, at a speed, rpm."""
+        """Return the largest eigenvalue size per tooth period, for depths (k,), m, at a speed."""
         period = 60.0 / (speed * milling.teeth)
         waves = float(self.waves(milling, np.array(speed)))
         count = max(2 * STEPS_PER_WAVE, int(np.ceil(STEPS_PER_WAVE * waves)))
@@ -291,7 +302,7 @@ class _CuttingPlane:
         return np.asarray(np.abs(np.linalg.eigvals(whole)).max(-1))
 
     def find_limit(self, milling: Milling, speed: float, low: float, deepest: float) -> float:
-        """The least depth that is unstable at a speed, m; infinite where the deepest is stable.
+        """Find the smallest unstable depth at a speed, m; infinite if the deepest is stable.
 
         :param low: depth to begin at.
         """
@@ -314,9 +325,9 @@ class _CuttingPlane:
 
 
 def _chebyshev_basis(count: int, waves: float) -> Array:
-    """Polynomials in even steps, shape (count, degree + 1); few steps stay as they are.
+    """Return polynomials at even steps, (count, degree + 1); the identity for few steps.
 
-    :param waves: vibrations in a step.
+    :param waves: vibrations per step.
     """
     degree = BASE_DEGREE + int(np.ceil(4.0 * waves * count))
     if count < 2 * degree:
@@ -334,7 +345,7 @@ def stability_lobes(
     tool: ArrayLike = (0.0, 0.0, 0.0),
     deepest: float | None = None,
 ) -> Lobes:
-    """Axial depths at which milling begins to chatter, over spindle speeds.
+    """Find the axial depths at which milling begins to chatter, over spindle speeds.
 
     The lowest modes that move the tool point in the cutting plane count, actuators locked.
 
@@ -351,7 +362,7 @@ def stability_lobes(
 def lobes_of(
     modes: ToolModes, milling: Milling, speeds: ArrayLike, deepest: float | None = None
 ) -> Lobes:
-    """The same of modes at the tool point, also measured ones; as :func:`stability_lobes`."""
+    """Find limit depths as :func:`stability_lobes`, from the tool point's modes."""
     plane = _CuttingPlane.of(modes, milling)
     at = np.atleast_1d(np.asarray(speeds, np.float64))
     last, safe = _check_range(plane, milling, at, deepest)
@@ -366,7 +377,7 @@ def lobes_between(
     points: int,
     deepest: float | None = None,
 ) -> Lobes:
-    """Limit depths over a range of speeds, close enough for its least depth and its best speed.
+    """Find limit depths over a speed range, dense enough for its smallest and best depth.
 
     Evenly spaced speeds, those where the zero-order approximation has its lobes, and further ones:
     ten for each vibration of the fastest mode from tooth to tooth; until both neighbours of every
@@ -399,7 +410,7 @@ def lobes_between(
 def _check_range(
     plane: _CuttingPlane, milling: Milling, at: Array, deepest: float | None
 ) -> tuple[float, float]:
-    """The deepest depth to look at, and the zero-order one, m; errors as :func:`lobes_of`."""
+    """Return the deepest depth to try and the zero-order depth, m; errors as :func:`lobes_of`."""
     if at.ndim != 1:
         raise ParameterError("speeds", at.shape, "one speed after another")
     for speed in (at.min(), at.max()) if at.size else ():
@@ -435,7 +446,7 @@ def stable_depth(
     damping: ArrayLike | None = None,
     tool: ArrayLike = (0.0, 0.0, 0.0),
 ) -> float:
-    """The axial depth that is stable at every spindle speed in the zero-order approximation, m.
+    """Return the axial depth that is stable at every spindle speed in zero order, m.
 
     An interrupted cut can chatter at a smaller depth at some speeds, see :func:`lobes_between`.
     Infinite where no depth is unstable. Parameters and errors as :func:`stability_lobes`.
@@ -444,6 +455,6 @@ def stable_depth(
 
 
 def stable_depth_of(modes: ToolModes, milling: Milling) -> tuple[float, int]:
-    """The same of modes at the tool point; and the index of the mode nearest to the chatter."""
+    """Return the modes' zero-order stable depth, m, and the index of the chattering mode."""
     depth, turn = _CuttingPlane.of(modes, milling).stable_depth(milling)
     return depth, int(np.abs(2.0 * np.pi * modes.frequencies - turn).argmin())

@@ -1,7 +1,7 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""What a wrench does to a robot's platform, and which element gives: of every elastic robot.
+"""Compute deflection and strain energies of a robot's elastic elements under a wrench.
 
-Finite elements of its frame (:mod:`stiffness_monitor.structure`), actuators locked. One beam a
+Finite elements of its frame (:mod:`stiffness_monitor.structure`), actuators locked. One beam per
 member is exact, because loads act at members' ends.
 """
 
@@ -23,15 +23,16 @@ from pkm_twin.robot.robot import Robot
 from stiffness_monitor.programs import DEFLECTION_PARTS, NO_PARAMETERS, Elastic
 
 MIN_PIVOT_RATIO: Final = 1e-10
-"""Least measure of a frame that holds: it goes with the square of the way to where it does not."""
+"""Smallest pivot over its diagonal entry at which the frame is stiff, not a mechanism: 0 at a
+singularity, growing with the square of the distance from it."""
 TIE_TOLERANCE: Final = 1e-9
-"""Two energies tie where they differ by less than this part of the larger one."""
+"""Relative difference below which two energies tie."""
 _UNLOADED: Final = np.zeros(6)
 
 
 @dataclass(frozen=True, eq=False)
 class PlatformResponse:
-    """Deflection and strain energy under a wrench; arrays are read-only.
+    """Hold deflection and strain energy under a wrench; arrays are read-only.
 
     ``compliance``: C of the platform at its reference point, shape (..., 6, 6), exactly symmetric.
     ``deflection``: C P there, shape (..., 6), m and rad; base axes. ``elements``: the frame's
@@ -98,7 +99,7 @@ def platform_response(robot: Robot, q: ArrayLike, wrench: ArrayLike) -> Platform
 
 
 def _evaluate(robot: Robot, q: ArrayLike, wrench: ArrayLike) -> Array:
-    """What the program answers, shape (..., size), rejected by sample."""
+    """Evaluate the response program, shape (..., size); errors name the sample."""
     checked = partial(_evaluate_checked, robot)
     row = robot.bound(_response_kernel, otherwise=checked)(q, wrench)
     return row if row.ndim > 1 or row[-1] > MIN_PIVOT_RATIO else checked(q, wrench)
@@ -120,7 +121,8 @@ def check(
 ) -> None:
     """Raise the typed error of the first rejected sample, if there is one.
 
-    :param measure: of the frame, 0 where it is a mechanism. ``status``: of the program.
+    :param measure: smallest pivot ratio of the frame, 0 if it is a mechanism. ``status``: the
+    program's status.
     """
     if status is None and (measure > MIN_PIVOT_RATIO).all():
         return
@@ -143,7 +145,7 @@ def check(
 
 
 def compliance(robot: Robot, pose: ArrayLike) -> Array:
-    """Compliance of the platform at its reference point; every matrix exactly symmetric, positive.
+    """Return the platform's compliance at its reference point, symmetric positive definite.
 
     :param pose: shape (..., m), the mechanism's pose coordinates, m and rad.
     :returns: shape (..., 6, 6), order x y z rx ry rz in base axes: m/N, rad/N, m/(N m),
@@ -156,7 +158,7 @@ def compliance(robot: Robot, pose: ArrayLike) -> Array:
 
 
 def stiffness(robot: Robot, pose: ArrayLike) -> Array:
-    """Return the stiffness at the platform's reference point, (..., 6, 6): compliance inverted.
+    """Return the stiffness at the platform's reference point, (..., 6, 6): inverse compliance.
 
     K of the 2UPR-RPU paper (equation 34).
     Exactly symmetric; base axes, N/m, N/rad, N m/m, N m/rad. Errors as in :func:`compliance`.
@@ -166,7 +168,7 @@ def stiffness(robot: Robot, pose: ArrayLike) -> Array:
 
 
 def strain_energy(robot: Robot, pose: ArrayLike, wrench: ArrayLike) -> PlatformResponse:
-    """:func:`platform_response` in poses, shape (..., m); errors also as :func:`compliance`."""
+    """Return :func:`platform_response` for poses (..., m); errors also as :func:`compliance`."""
     _ = robot.made(Elastic)
     return platform_response(robot, robot.inverse(pose), wrench)
 
@@ -174,9 +176,9 @@ def strain_energy(robot: Robot, pose: ArrayLike, wrench: ArrayLike) -> PlatformR
 def member_deflections(
     robot: Robot, q: ArrayLike, wrench: ArrayLike
 ) -> dict[str, tuple[Array, Array]]:
-    """Points along every member and their displacements under a wrench, by member.
+    """Return points along every member and their displacements under a wrench, by member.
 
-    :param q: as the wrench as in :func:`platform_response`; errors as there.
+    :param q, wrench: as in :func:`platform_response`; so are errors.
     :returns: points, shape (..., 5, 3), from start to end, and displacements of the same shape, m;
         base axes.
     """
@@ -189,7 +191,7 @@ def member_deflections(
 
 
 def kernels(robot: Robot) -> tuple[Kernel, ...]:
-    """The kernels to warm up before live use.
+    """Return the kernels to warm up before live use.
 
     :raises ParameterError: a robot without elastic members.
     """

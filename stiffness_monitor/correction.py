@@ -15,13 +15,13 @@ from pkm_twin.messages.stamps import SECOND
 from pkm_twin.robot.robot import Robot
 
 MIN_REACH_FRACTION: Final = 0.02
-"""Directions in which the joints move the tool point less than this share of their best are left
-alone: they would cost offsets of fifty times the deflection."""
+"""Singular value, relative to the largest, below which the joints hardly move the tool point in
+that direction: correcting there would cost offsets of fifty times the deflection."""
 
 
 @dataclass(frozen=True)
 class Correction:
-    """Joint offsets and the remaining displacement.
+    """Hold joint offsets and the remaining displacement.
 
     ``offset``: added to the joints' set points, shape (..., n), rad or m. ``before`` and ``left``:
     displacement of the tool point and rotation of the platform without and with the offset, base
@@ -43,7 +43,7 @@ def setpoint_correction(
     bound: ArrayLike = np.inf,
     rotation: Array | None = None,
 ) -> Correction:
-    """Joint offsets that move the tool point back to its position without load.
+    """Find joint offsets that move the tool point back to its position without load.
 
     To first order, the offsets move the tool point opposite to the deflection. The position of the
     tool point has priority; remaining joints rotate the platform back. A machine with fewer than
@@ -90,10 +90,10 @@ def setpoint_correction(
 
 @dataclass
 class SetpointStream:
-    """Adds offsets to a stream of set points, within position limits and a rate.
+    """Add offsets to a stream of set points, within position limits and a rate.
 
     ``rate``: largest rate of an offset, rad/s or m/s. ``max_elapsed``: longest time between two set
-    points for which the offset moves, s: a pause earns no jump.
+    points that the rate applies to, s, so that an offset does not jump after a pause.
     """
 
     robot: Robot
@@ -131,9 +131,9 @@ class SetpointStream:
 
 
 def _solve_least_norm(matrix: Array, target: Array, best: Array) -> tuple[Array, Array]:
-    """Least solution in the directions within reach, and the projector on those that are not.
+    """Return the least-norm solution within reach, and the projector on the other directions.
 
-    :param best: the matrix whose greatest singular value is the measure of what is within reach.
+    :param best: matrix whose largest singular value is the reference for reach.
     """
     u, values, vt = np.linalg.svd(matrix, full_matrices=False)
     greatest = np.linalg.svd(best, compute_uv=False)[..., :1]

@@ -28,11 +28,11 @@ from stiffness_monitor.monitor import Answer
 MAX_BOUND = 1.0
 """Largest bound of an offset, rad or m."""
 MAX_WAITING = 64
-"""Most set points and torques that wait for the other of their stamp."""
+"""Largest number of set points and torques that wait for their counterpart of the same stamp."""
 
 
 class SetpointCorrection(Core):
-    """``~/setpoint_offset`` of every wrench; ``setpoint`` with it is ``~/corrected_setpoint``.
+    """Publish ``~/setpoint_offset`` per wrench, and ``~/corrected_setpoint`` per setpoint.
 
     With ``pair_torques``, that and the ``torques`` of the same stamp are one message,
     ``~/setpoint_with_torques``.
@@ -41,7 +41,7 @@ class SetpointCorrection(Core):
     def __init__(self, node: TwinNode, robot: Robot, rules: StampRules) -> None:
         """Declare the parameters and create the topics that they ask for.
 
-        :param rules: what the stamps of set points have to keep to.
+        :param rules: for the stamps of set points.
         """
         self._node, self._robot = node, robot
         self._limits = EffortLimits(robot)
@@ -49,7 +49,7 @@ class SetpointCorrection(Core):
         self._offset: tuple[int, Any] | None = None
         self.bounded = 0
         self.setpoints = counting()
-        """Set points that were corrected, and those that were refused."""
+        """Counts of corrected and of rejected set points."""
         wanted = node.declare(
             "correct_setpoint",
             False,
@@ -121,12 +121,12 @@ class SetpointCorrection(Core):
             node.create_guarded_subscription("torques", self._on_torques)
 
     def reset(self) -> None:
-        """Forget the last wrench, as when the clock jumps."""
+        """Discard the last wrench, as when the clock jumps."""
         self._offset = None
         self._waiting.clear()
 
     def change_rules(self, rules: StampRules) -> None:
-        """Judge stamps by other rules from the next set point on.
+        """Use new stamp rules from the next set point on.
 
         What is older than ``correction_age`` is rejected: after a suspension of the process the
         machine is elsewhere.
@@ -134,7 +134,7 @@ class SetpointCorrection(Core):
         self._rules = replace(rules, max_age=round(self._age * SECOND))
 
     def take(self, answer: Answer) -> None:
-        """What a wrench did: how the joints undo it."""
+        """Compute and publish the joint offsets that undo a wrench's deflection."""
         if not self.wanted:
             return
         found = setpoint_correction(
@@ -151,7 +151,7 @@ class SetpointCorrection(Core):
         self._offsets.publish(answer.stamp, own.controller_rates(found.offset))
 
     def diagnose(self) -> dict[str, object]:
-        """Values of the node's diagnostic status."""
+        """Return values for the node's diagnostic status."""
         if not self.wanted:
             return {}
         values: dict[str, object] = {
@@ -190,7 +190,7 @@ class SetpointCorrection(Core):
         self._pair(sample.stamp, "effort", efforts)
 
     def _pair(self, stamp: int, what: str, numbers: Any) -> None:
-        """Publish both of a stamp, or keep one until the other arrives; the newest counts."""
+        """Publish set point and torques of one stamp, or keep the first until the other arrives."""
         other = self._waiting.pop(stamp, None)
         if other is not None and other[0] != what:
             pair = dict([other, (what, numbers)])

@@ -27,7 +27,9 @@ Chosen = tuple[int, ...] | None
 
 
 def compliance_derivatives(robot: Robot, pose: ArrayLike, by: Sequence[str] = ()) -> Derivatives:
-    """Derivatives of :func:`stiffness_monitor.compliance`, the pose held for those by numbers.
+    """Return derivatives of the compliance by the pose and by numbers of the file.
+
+    Derivatives by numbers hold the pose constant.
 
     Exact to rounding.
 
@@ -47,20 +49,24 @@ def compliance_derivatives(robot: Robot, pose: ArrayLike, by: Sequence[str] = ()
 
 
 def compliance_effects(robot: Robot, pose: ArrayLike) -> Array:
-    """What one standard deviation of each of the file's causes changes, (..., 6, 6, causes)."""
+    """Return the change of C per standard deviation of each cause, (..., 6, 6, causes)."""
     if not robot.causes:
         return np.zeros((*compliance(robot, pose).shape, 0))
     return _unravel_square(_cause_effects(robot, pose, _write_compliance))
 
 
 def energy_effects(robot: Robot, pose: ArrayLike, wrench: ArrayLike) -> Array:
-    """The same of strain energies under wrenches (..., 6), shape (..., elements, causes)."""
+    """Return the energies' change per standard deviation of causes, (..., elements, causes).
+
+    :param wrench: shape (..., 6).
+    """
     return _cause_effects(
         robot, pose, _write_energies, np.asarray(wrench, np.float64)[..., None, :]
     )
 
 
 def _cause_effects(robot: Robot, pose: ArrayLike, write: Write, *loads: Array) -> Array:
+    """Return the change of a program's outputs per standard deviation of each cause."""
     causes = robot.made(CauseSlopes, elastic_numbers)
     table = _evaluate_gradients(robot, pose, write, causes.chosen, *loads)[1] @ causes.slopes
     return np.asarray(table, np.float64)
@@ -69,7 +75,7 @@ def _cause_effects(robot: Robot, pose: ArrayLike, write: Write, *loads: Array) -
 def _evaluate_gradients(
     robot: Robot, pose: ArrayLike, write: Write, chosen: Chosen = None, *loads: Array
 ) -> tuple[Array, Array]:
-    """Of a program's outputs by q, and by geometry and elasticity with the pose held.
+    """Return a program's derivatives by q, and by geometry and elasticity at constant pose.
 
     :param chosen: places of the numbers that are needed; without geometry q is left out.
     :returns: shape (..., outputs, k) each.
@@ -90,20 +96,25 @@ def _evaluate_gradients(
 
 
 def _unravel_square(table: Array) -> Array:
+    """Reshape (..., 36, k) to (..., 6, 6, k)."""
     return table.reshape(*table.shape[:-2], 6, 6, table.shape[-1])
 
 
 def elastic_numbers(robot: Robot) -> list[Any]:
-    """Geometry, then the further inputs of elasticity: numbers or expressions."""
+    """Return the geometry, then the further inputs of elasticity: numbers or expressions."""
     return [*geometry_numbers(robot), *list_numbers(robot.elastic)]
 
 
 def compliance_gradient(elastic: Elastic) -> Kernel:
-    """Program of sums of C's entries: q and weights (36) to derivatives by q and all numbers."""
+    """Return the program of derivatives of a weighted sum of C's entries.
+
+    Inputs: q and 36 weights; outputs: derivatives by q and by all numbers.
+    """
     return _gradient_kernel(elastic, _write_compliance, None)
 
 
 def _gradient_kernel(elastic: Elastic, write: Write, chosen: Chosen) -> Kernel:
+    """Return the compiled gradient of the program that ``write`` writes."""
     name = f"gradient{write.__name__} by {chosen}"
     return elastic.kernel(name, partial(_write_gradient, write, chosen), free=True)
 
@@ -129,9 +140,9 @@ def _write_gradient(write: Write, chosen: Chosen, s: SymbolicFrame) -> Program:
 
 
 def compliance_deviation(robot: Robot, pose: ArrayLike) -> Array:
-    """Standard deviation of :func:`compliance`, propagated from ``uncertainty``, (..., 6, 6).
+    """Return the standard deviation of the compliance by ``uncertainty``, (..., 6, 6).
 
-    To first order in the standard deviations, independent causes. Zero for a file that names none.
+    To first order in the standard deviations, independent causes. Zero for a file without causes.
 
     :param pose: shape (..., m), the mechanism's pose coordinates, m and rad.
     """
@@ -140,6 +151,6 @@ def compliance_deviation(robot: Robot, pose: ArrayLike) -> Array:
 
 
 def deflection_deviation(robot: Robot, pose: ArrayLike, wrench: ArrayLike) -> Array:
-    """Standard deviation of the deflection under a wrench by the same, shape (..., 6)."""
+    """Return the standard deviation of the deflection under a wrench, shape (..., 6)."""
     effects = np.einsum("...ijk,...j->...ik", compliance_effects(robot, pose), np.asarray(wrench))
     return np.asarray(np.sqrt((effects**2).sum(-1)), np.float64)

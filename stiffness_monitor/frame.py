@@ -39,11 +39,12 @@ Row = dict[int, Any]
 PLATFORM: Final = 6
 """The platform's displacements are the first six coordinates."""
 PLANES: Final = ((1, 5, 1.0), (2, 4, -1.0))
-"""Of bending: deflection, turn, and its sign: in the plane x z a positive one lowers the slope."""
+"""Bending planes: index of the deflection, of the rotation, and its sign; in the plane x z a
+positive rotation lowers the slope."""
 
 
 class Node(NamedTuple):
-    """A point at ``at``, whose displacement (6,) is ``map`` times the coordinates ``own``."""
+    """Describe a point at ``at`` with displacements (6,) ``map`` times the coordinates ``own``."""
 
     own: Sequence[int]
     map: Any
@@ -51,7 +52,7 @@ class Node(NamedTuple):
 
 
 class Column(NamedTuple):
-    """A way to deform of one element: its amount by the coordinates, and its rigidity."""
+    """Describe a deformation mode of an element: its amount by coordinates, and its rigidity."""
 
     element: str
     row: Row
@@ -59,26 +60,29 @@ class Column(NamedTuple):
 
 
 class Bar(NamedTuple):
-    """A member with its ends' displacements along its own axes."""
+    """Hold a member with its ends' displacements along its own axes."""
 
     member: Member
     ends: tuple[Node, ...]
 
 
 def rigid_offset(arm: Any) -> Any:
-    """Displacement of a point of a rigid body by that of another, ``arm`` away; shape (6, 6)."""
+    """Return the map of displacements between two points of a rigid body, shape (6, 6).
+
+    ``arm``: from the point whose displacement is known to the other one.
+    """
     x, y, z = arm.tolist()
     turned = [[1.0, 0, 0, 0, z, -y], [0, 1.0, 0, -z, 0, x], [0, 0, 1.0, y, -x, 0]]
     return np.array([*turned, *np.eye(6)[3:].tolist()])
 
 
 def turned(axes: Any, displacements: Any) -> Any:
-    """Displacements, shape (6, k), whose both halves are multiplied by a matrix (3, 3)."""
+    """Multiply both halves of displacements, shape (6, k), by a matrix (3, 3)."""
     return (axes @ displacements.reshape(2, 3, -1)).reshape(6, -1)
 
 
 def sum_forms(*terms: tuple[Iterable[int], Iterable[Any]]) -> Row:
-    """The sum of linear forms, each of coordinates and their factors."""
+    """Add linear forms, each given by coordinates and their factors."""
     row: Row = {}
     for own, values in terms:
         for k, value in zip(own, values, strict=True):
@@ -90,12 +94,12 @@ def sum_forms(*terms: tuple[Iterable[int], Iterable[Any]]) -> Row:
 def deformations(
     length: Any, stretch: Any, twist: Any, bend: Any, shear: Any
 ) -> list[tuple[dict[int, Any], Any]]:
-    """Ways to deform of a beam along x: forms of its ends' 12 displacements, and rigidities.
+    """Return the deformation modes of a beam along x: 12 end factors, and rigidity, each.
 
-    Stretch, twist, then of both planes circle and S. With phi = 12 E I / (G A_shear L^2) these
-    diagonalise Timoshenko's matrix (Friedman and Kosmatka 1993). Of a bar between joints the energy
-    is that of the section's forces in the 2UPR-RPU paper's equation 2, and of its bar compliances
-    C_B (equations 3 and 20).
+    The modes are stretch, twist, then in both planes a circle and an S. With phi = 12 E I / (G
+    A_shear L^2) these diagonalise Timoshenko's matrix (Friedman and Kosmatka 1993). For a bar
+    between joints the energy is that of the section's forces in the 2UPR-RPU paper's equation 2,
+    and of its bar compliances C_B (equations 3 and 20).
 
     :param stretch: EA. ``twist``: GJ. ``bend``: EI. ``shear``: phi L^2.
     """
@@ -109,20 +113,20 @@ def deformations(
 
 
 def bending_shape(share: float, length: Any, phi: Any) -> tuple[tuple[Any, Any], tuple[Any, Any]]:
-    """How far a beam is from its chord, and how it turns from it, by circle and S of a plane."""
+    """Return a beam's deflection and rotation relative to its chord, for circle and S."""
     arc, bow = 0.5 * share * (1.0 - share), 1.0 / (1.0 + phi)
     across = -arc * length, arc * (1.0 - 2.0 * share) * length * bow
     return across, (share - 0.5, 0.5 - 6.0 * arc * bow)
 
 
 class Frame:
-    """The coordinates of a model in a pose.
+    """Set up the coordinates of a structural model in a pose.
 
-    ``nodes``: what others stand on, by name and end. ``bars``: members. ``springs``: columns of
-    joints. ``held``: linear forms that are zero, of closures; coordinates from ``last`` on are
-    closures'.
+    ``nodes``: points that other parts attach to, by name and end. ``bars``: members. ``springs``:
+    columns of joints. ``held``: linear forms that closures keep zero; coordinates from ``last`` on
+    belong to closures.
 
-    :param static: for loads on the platform alone: a strut is stretched and no more.
+    :param static: loads act on the platform alone, so that a strut only stretches.
     """
 
     def __init__(self, model: StructuralModel, *, static: bool = False) -> None:
@@ -148,17 +152,18 @@ class Frame:
         return range(self.size - count, self.size)
 
     def _point_on_body(self, body: str, end: int, at: Any) -> Node:
-        """The point of a body that is at a place."""
+        """Return the point of a body at a position."""
         if (body, end) not in self.nodes:
             raise ValueError(f"{body} is not connected to the base")
         node = self.nodes[body, end]
         return Node(node.own, rigid_offset(at - node.at) @ node.map, at)
 
     def _add_joint(self, support: Support) -> tuple[range, Array]:
-        """Return new coordinates of what a joint lets through, along its axes, shape (6, count).
+        """Add coordinates for the directions that a joint does not hold; return their map.
 
-        A joint is elastic in its own axes: the 2UPR-RPU paper's D_i1 and D_i2, which project limb
-        wrenches to a joint's axes (equations 5 to 7, 11 to 13, 21 to 24), are columns here.
+        The map has shape (6, count). A joint is elastic in its own axes: the 2UPR-RPU paper's D_i1
+        and D_i2, which project limb wrenches to a joint's axes (equations 5 to 7, 11 to 13, 21 to
+        24), are columns here.
         """
         kinds = [k for k, compliance in enumerate(support.compliance) if not is_zero(compliance)]
         lets = [np.eye(6)[k] for k in kinds]
@@ -172,13 +177,13 @@ class Frame:
         return own, np.array(lets).reshape(-1, 6).T
 
     def _point_by_joint(self, support: Support, at: Any) -> Node:
-        """A point that stands on a body by a joint."""
+        """Return a point that is attached to a body by a joint."""
         node = self._point_on_body(support.body, support.end, at)
         own, lets = self._add_joint(support)
         return Node((*node.own, *own), np.hstack((node.map, turned(support.axes, lets))), at)
 
     def _add_closure(self, support: Support, inner: tuple[str, int], at: Any) -> None:
-        """Two points that stand on bodies and move apart by what a joint lets through."""
+        """Add the constraints between two attached bodies that a joint connects."""
         first, second = (
             self._point_on_body(*inner, at),
             self._point_on_body(support.body, support.end, at),
@@ -191,6 +196,7 @@ class Frame:
         ]
 
     def _add_member(self, member: Member) -> None:
+        """Add a member with its supports at both ends."""
         ends = []
         pairs = (member.inner, member.start), (member.outer, member.end)
         for k, (support, at) in enumerate(pairs):
@@ -208,7 +214,7 @@ class Frame:
         self.bars.append(Bar(member, tuple(ends)))
 
     def columns(self, bar: Bar) -> list[Column]:
-        """Of a member whose section is the rigidities of :func:`deformations`."""
+        """Return a member's stiffness columns, with rigidities of :func:`deformations`."""
         member, ends = bar
         ways = deformations(member.length, *member.section)
         return [
@@ -223,19 +229,19 @@ class Frame:
         ]
 
     def table(self) -> Any:
-        """What closures hold, shape (rows, size)."""
+        """Return the closures' constraint matrix, shape (rows, size)."""
         table = np.zeros((len(self.held), self.size), dtype=object)
         for line, row in zip(table, self.held, strict=True):
             line[list(row)] = list(row.values())
         return table
 
     def dependents(self, tables: Array) -> tuple[list[int], list[int]]:
-        """Rows that say all that closures hold, and as many coordinates that follow from the rest.
+        """Choose independent constraint rows, and as many coordinates that depend on the others.
 
-        Dependent equations, of an overconstrained machine, count once.
+        Redundant equations of an overconstrained machine are left out.
 
-        :param tables: in some poses, shape (k, rows, size).
-        :raises ParameterError: they hold the platform itself.
+        :param tables: constraint matrices of k poses, shape (k, rows, size).
+        :raises ParameterError: the constraints hold the platform itself.
         """
         rows = independent_rows(tables[..., PLATFORM:])
         if len(independent_rows(tables)) > len(rows):
@@ -246,7 +252,7 @@ class Frame:
                 "hold the platform rigidly in some directions; in a direction that a joint holds, "
                 "for example 1e-9 m/N or 1e-7 rad/(N m)",
             )  # fmt: skip
-        # First what closures let through, which is in one equation or two alone.
+        # Prefer the closures' own coordinates: each is in one or two equations only.
         weight = np.where(np.arange(PLATFORM, self.size) < self.last, 1.0, 10.0)
         chosen = independent_rows((tables[:, rows, PLATFORM:] * weight).swapaxes(-1, -2))
         return rows, [PLATFORM + k for k in chosen]

@@ -19,7 +19,7 @@ from stiffness_monitor.response import elastic_columns
 
 @dataclass(frozen=True, eq=False)
 class LimbStiffness:
-    """Stiffness of the limbs in poses (...), limb by limb; base axes, SI units.
+    """Hold the stiffness of the limbs in poses (...), limb by limb; base axes, SI units.
 
     ``wrenches``: the paper's J_i, shape (..., limbs, 6, 3): unit actuation force, constraint force
     and constraint couple at the platform's reference point. ``stiffness``: K_i on the amplitudes of

@@ -29,7 +29,7 @@ from stiffness_monitor.structure import RigidBody, StructuralModel, structural_m
 
 @lru_cache(maxsize=64)
 def element_matrices(section: Section, length: float) -> tuple[Array, Array]:
-    """Stiffness and consistent mass of one beam element along its own x axis, shape (12, 12) each.
+    """Return stiffness and consistent mass of a beam element along x, (12, 12) each.
 
     Shape functions are the exact static ones of a beam loaded at its ends (Friedman and Kosmatka
     1993); mass of cross sections in translation and in rotation. Read-only.
@@ -43,7 +43,7 @@ def element_matrices(section: Section, length: float) -> tuple[Array, Array]:
     inertia = length / 2 * np.array([*[section.mass_per_length] * 3, *turning])
     chord = np.hstack((-np.eye(6), np.eye(6))) / length
     mass = np.zeros((12, 12))
-    # Polynomials of the sixth degree, exactly.
+    # Four points integrate polynomials of the sixth degree exactly.
     for place, weight in zip(*np.polynomial.legendre.leggauss(4), strict=True):
         share = (1 + place) / 2
         shape = np.hstack(((1 - share) * np.eye(6), share * np.eye(6)))
@@ -58,7 +58,7 @@ def element_matrices(section: Section, length: float) -> tuple[Array, Array]:
 
 
 def member_matrices(section: Section, length: float, elements: int) -> tuple[Array, Array]:
-    """Stiffness and mass of a chain of equal elements, shape (6 (elements + 1),) * 2."""
+    """Return stiffness and mass of a chain of equal elements, (6 (elements + 1),) * 2."""
     one, weight = element_matrices(section, length / elements)
     size = 6 * (elements + 1)
     stiffness, mass = np.zeros((size, size)), np.zeros((size, size))
@@ -73,7 +73,7 @@ def member_matrices(section: Section, length: float, elements: int) -> tuple[Arr
 def _member_basis(
     section: Section, length: float, elements: int, kept: int | None
 ) -> tuple[Array, Array, Array]:
-    """Basis, stiffness and mass of a member on its own coordinates.
+    """Return basis, stiffness and mass of a member on its own coordinates.
 
     Coordinates: six displacements of the start, six of the end, then those inside. ``basis``,
     shape (6 (elements + 1), coordinates), gives the nodes' displacements.
@@ -86,11 +86,11 @@ def _member_basis(
     own = np.eye(len(inside))
     if kept is not None and kept < len(inside):
         held = stiffness[np.ix_(inside, inside)]
-        # The static shapes take no share of the modes' stiffness.
+        # Static shapes decouple the ends from the modes in the stiffness matrix.
         basis[inside] = -np.linalg.solve(held, stiffness[np.ix_(inside, ends)])
         root = np.linalg.inv(np.linalg.cholesky(mass[np.ix_(inside, inside)]))
         values, vectors = np.linalg.eigh(root @ held @ root.T)
-        # Equal ones stay together: one of a pair would make a round bar uneven.
+        # Keep equal eigenvalues together: half a pair would make a round bar anisotropic.
         while kept < len(values) and values[kept] < values[kept - 1] * (1 + 1e-6):
             kept += 1
         own = root.T @ vectors[:, :kept]
@@ -104,7 +104,7 @@ def _member_basis(
 
 
 def body_mass(body: RigidBody, at: Array) -> Array:
-    """Mass matrix of a rigid body at a point that moves with it, shape (6, 6)."""
+    """Return the mass matrix of a rigid body at a point that moves with it, shape (6, 6)."""
     about_com = np.zeros((6, 6))
     about_com[:3, :3] = body.mass * np.eye(3)
     about_com[3:, 3:] = body.inertia
@@ -114,7 +114,7 @@ def body_mass(body: RigidBody, at: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """One element of the energy shares: matrices on its own displacements.
+    """Hold one element of the energy shares: matrices on its own displacements.
 
     ``own`` (k,) of the system's coordinates move it, by ``map``, shape (rows, k).
     """
@@ -128,7 +128,7 @@ class Part:
 
 @dataclass(frozen=True, eq=False)
 class System:
-    """An assembled frame of n coordinates.
+    """Hold an assembled frame of n coordinates.
 
     ``stiffness``, ``mass``: shape (n, n). The platform's six displacements are the first six
     coordinates. ``nodes``: names, at ``positions``, shape (nodes, 3), m: the platform, then
@@ -143,7 +143,7 @@ class System:
     members: tuple[tuple[int, Array, Array], ...]
 
     def displacements(self, shape: Array) -> Array:
-        """World displacements of the named nodes, shape (nodes, 6), of coordinates (n,)."""
+        """Return the base-axes displacements of the nodes, (nodes, 6), for coordinates (n,)."""
         rows = [shape[None, :6]]
         for index, basis, axes in self.members:
             part = self.parts[index]
@@ -152,9 +152,9 @@ class System:
         return np.concatenate(rows)
 
     def energies(self, shape: Array) -> tuple[tuple[str, ...], Array, Array]:
-        """Names, then twice the strain energy and twice the kinetic one at unit rate, by part.
+        """Return the parts' names, twice their strain and twice their kinetic energy at unit rate.
 
-        Parts of one name are added up.
+        Parts with the same name are summed.
         """
         strain: dict[str, float] = {}
         kinetic: dict[str, float] = {}
@@ -166,11 +166,11 @@ class System:
 
 
 def assemble(model: StructuralModel, elements: int, kept: int | None = None) -> System:
-    """Stiffness and mass of a structural model, each member divided into ``elements`` beams.
+    """Assemble stiffness and mass of a structural model; ``elements`` beams per member.
 
-    :param kept: modes with held ends that a member keeps; None keeps all its nodes.
+    :param kept: fixed-end modes that a member keeps; None keeps all its nodes.
 
-    :raises ValueError: a part stands on a body that hangs nowhere, or closures hold the platform.
+    :raises ValueError: a part is attached to an unconnected body, or closures hold the platform.
     """
     frame = Frame(model)
     names, positions = [model.platform], [model.origin[None]]
@@ -182,10 +182,10 @@ def assemble(model: StructuralModel, elements: int, kept: int | None = None) -> 
     members: list[tuple[int, Array, Array]] = []
     size = frame.size
     for member, ends in frame.bars:
-        # Rounded: poses of one robot differ by less in a member that keeps its length.
+        # Rounded, so that a member of constant length hits the cache in every pose.
         length = round(float(member.length), 12)
         basis, stiffness, mass = _member_basis(member.section, length, elements, kept)
-        # Inside, coordinates are along the member's own axes.
+        # Inner coordinates are along the member's own axes.
         rows = len(mass)
         own = [*dict.fromkeys([*ends[0].own, *ends[1].own]), *range(size, size + rows - 12)]
         size += rows - 12
@@ -217,7 +217,7 @@ def assemble(model: StructuralModel, elements: int, kept: int | None = None) -> 
 
 
 def _null_space(frame: Frame, size: int) -> Array:
-    """Coordinates that keep what closures hold, shape (size, fewer); the first six are the same."""
+    """Return a basis of the closures' null space, (size, fewer); the first six rows are unit."""
     table = np.zeros((len(frame.held), size))
     table[:, : frame.size] = frame.table()
     rows, chosen = frame.dependents(table[None, :, : frame.size])
@@ -228,14 +228,14 @@ def _null_space(frame: Frame, size: int) -> Array:
 
 
 ELEMENTS: Final = 8
-"""Beam elements a member: the first six frequencies of the shipped robots to 0.1 %."""
+"""Beam elements per member: the first six frequencies of the shipped robots to 0.1 %."""
 MEMBER_MODES: Final = 8
-"""Modes with held ends that a member keeps, of more: the same frequencies to 0.01 %."""
+"""Fixed-end modes that a member keeps: the same frequencies to 0.01 %."""
 
 
 @dataclass(frozen=True, eq=False)
 class Energies:
-    """Where a mode's energy is: parts of the whole, shape (..., count, elements), sum 1.
+    """Hold the distribution of a mode's energy: fractions, (..., count, elements), sum 1.
 
     ``elements``: names of the bodies and of the joints that have elasticity. ``strain``: parts of
     the strain energy; ``kinetic``: of the kinetic energy. In a mode both totals are the same.
@@ -248,7 +248,7 @@ class Energies:
 
 @dataclass(frozen=True, eq=False)
 class Modes:
-    """Natural modes of a robot, lowest first; arrays are read-only.
+    """Hold natural modes of a robot, lowest first; arrays are read-only.
 
     ``frequencies``: shape (..., count), Hz. ``nodes``: names of the points whose motion is given,
     the platform's reference point first, then each member's points from its inner to its outer end.
@@ -267,7 +267,7 @@ class Modes:
 def natural_frequencies(
     robot: Robot, pose: ArrayLike, count: int = 6, *, elements: int = ELEMENTS
 ) -> Array:
-    """Lowest natural frequencies with locked actuators, shape (..., count), Hz, lowest first.
+    """Return the lowest natural frequencies with locked actuators, (..., count), Hz.
 
     :param pose: shape (..., m), the mechanism's pose coordinates, m and rad.
     :param elements: beam elements a member.
@@ -285,9 +285,9 @@ def natural_frequencies(
 
 
 def modes(robot: Robot, pose: ArrayLike, count: int = 6, *, elements: int = ELEMENTS) -> Modes:
-    """Lowest natural modes with locked actuators; errors as :func:`natural_frequencies`.
+    """Return the lowest natural modes with locked actuators; errors as natural_frequencies.
 
-    Frequencies that are equal, as a symmetric robot's, have shapes that are any basis of theirs.
+    Equal frequencies, as of a symmetric robot, have any basis of their subspace as shapes.
 
     :param pose: shape (..., m), the mechanism's pose coordinates, m and rad.
     :param elements: beam elements a member.
@@ -330,7 +330,7 @@ def modes(robot: Robot, pose: ArrayLike, count: int = 6, *, elements: int = ELEM
 
 
 def has_modes(robot: Robot) -> bool:
-    """Whether the robot's file has what natural frequencies need."""
+    """Return whether the robot's file has all data for natural frequencies."""
     try:
         robot.massive()
         robot.structure()
@@ -340,14 +340,14 @@ def has_modes(robot: Robot) -> bool:
 
 
 def _solve_joints(robot: Robot, pose: ArrayLike) -> Array:
-    """Joint positions of poses, of a robot with masses and elastic members."""
+    """Return joint positions of poses, for a robot with masses and elastic members."""
     robot.massive()
     _ = robot.elastic
     return robot.inverse(pose)
 
 
 def frame_system(robot: Robot, q: Array, elements: int) -> System:
-    """The frame in a pose by its joint positions (n,).
+    """Assemble the frame at joint positions (n,).
 
     :raises ParameterError: a robot without masses or elastic members, or no elements.
     """
@@ -358,9 +358,9 @@ def frame_system(robot: Robot, q: Array, elements: int) -> System:
 
 
 def stiffness_root(system: System, index: tuple[int, ...]) -> Array:
-    """Lower Cholesky factor of the stiffness; not positive definite is a mechanism.
+    """Return the lower Cholesky factor of the stiffness.
 
-    :raises SingularityError: by the sample's index.
+    :raises SingularityError: the stiffness is not positive definite, so the frame is a mechanism.
     """
     measure = 0.0
     try:
@@ -376,10 +376,10 @@ def stiffness_root(system: System, index: tuple[int, ...]) -> Array:
 def solve_modes(
     system: System, count: int, index: tuple[int, ...], *, vectors: bool
 ) -> tuple[Array, Array]:
-    """Frequencies (count,), Hz, and vectors (n, count) of unit generalised mass.
+    """Return frequencies (count,), Hz, and vectors (n, count) of unit generalised mass.
 
-    Of the inverse problem L^-1 M L^-T y = y / omega^2 with K = L L': its largest values are
-    the lowest frequencies, so these have all digits next to stiff joints.
+    Solves the inverse problem L^-1 M L^-T y = y / omega^2 with K = L L': its largest values are the
+    lowest frequencies, so these are accurate even with stiff joints.
     """
     size = len(system.mass)
     if not 1 <= count <= size:
@@ -401,5 +401,5 @@ def solve_modes(
 
 
 def _to_frequencies(values: Array) -> Array:
-    """Of values 1 / omega^2, rising, to Hz, rising."""
+    """Convert rising values 1 / omega^2 to rising frequencies, Hz."""
     return np.asarray(1.0 / (2 * np.pi * np.sqrt(values[::-1])), np.float64)

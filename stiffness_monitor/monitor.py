@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""The stiffness node's core: messages in, compliance and strain energy out. Pure."""
+"""Compute compliance and strain energy from messages: the stiffness node's core, without ROS."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from pkm_twin.streams.wrench import Mount, TimeCache, TimeSynchronizer, WrenchSe
 from stiffness_monitor.compliance import PlatformResponse, platform_response
 
 Settings = WrenchSettings
-"""How the node pairs and accepts messages."""
+"""Settings for how the node pairs and accepts messages."""
 
 
 @dataclass(frozen=True)
 class Answer:
-    """What one wrench did to the platform.
+    """Hold the platform's response to one wrench.
 
     ``energy`` and ``wrench`` (6,) in base axes at the platform's reference point; ``rotation`` (3,
     3) turns platform axes into fixed ones.
@@ -37,13 +37,13 @@ class Answer:
 
     @property
     def compliance(self) -> Array:
-        """Of the platform, shape (6, 6)."""
+        """Compliance of the platform, shape (6, 6)."""
         return self.energy.compliance
 
 
 @dataclass
 class Monitor(TimeSynchronizer):
-    """Pairs each wrench with the joint state nearest to it in time."""
+    """Pair each wrench with the joint state nearest to it in time."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -56,12 +56,12 @@ class Monitor(TimeSynchronizer):
         return self._recent.latest
 
     def reset(self) -> None:
-        """Forget all joint states, as when the clock jumps."""
+        """Discard all joint states, as when the clock jumps."""
         self._recent.clear()
         self.pace.reset()
 
     def joint_state(self, message: Any, now: int) -> None:
-        """Take a joint state's positions; an older one than the last is dropped and counted.
+        """Add a joint state's positions; drop and count one that is older than the last.
 
         :raises MessageError: the message is rejected, and counted.
         """
@@ -70,11 +70,11 @@ class Monitor(TimeSynchronizer):
             self._recent.push(sample.stamp, sample.q)
 
     def wrench(self, message: Any, now: int) -> Answer | None:
-        """Answer a wrench; None where ``pace`` leaves it out.
+        """Compute the response to a wrench; None if ``pace`` skips it.
 
         A wrench in the base frame has base axes; one in any other frame has the platform's, as a
-        force-torque sensor mounted there measures it. From where the settings, or transforms, say
-        that it was measured it is moved to the platform's reference point.
+        force-torque sensor mounted there measures it. It is moved from its measuring point, given
+        by the settings or transforms, to the platform's reference point.
 
         :raises MessageError: the message is rejected, and counted.
         """
@@ -100,7 +100,7 @@ class Monitor(TimeSynchronizer):
         return Answer(sample.stamp, q, pose, fixed, energy, rotation)
 
     def _nearest_joints(self, stamp: int) -> Array:
-        """Joint positions of the state nearest in time."""
+        """Return the joint positions of the state nearest in time."""
         found = self._recent.nearest(stamp)
         if found is None:
             raise MessageError("no pose", "no pose: no joint state has arrived")

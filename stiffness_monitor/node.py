@@ -38,11 +38,11 @@ from stiffness_monitor.topics import STIFFNESS
 AXES: Final = ("x", "y", "z", "rx", "ry", "rz")
 UPPER_TRIANGLE: Final = np.triu_indices(6)
 ENTRIES: Final = tuple(f"{AXES[i]}_{AXES[j]}" for i, j in zip(*UPPER_TRIANGLE, strict=True))
-"""Names of the compliance's entries: of the displacement, and of the force or moment."""
+"""Names of the compliance's entries: displacement, then force or moment."""
 
 
 class StiffnessMonitor(TwinNode):
-    """Live compliance and strain energy of any robot with elastic members."""
+    """Publish live compliance and strain energy of any robot with elastic members."""
 
     topics = STIFFNESS
 
@@ -73,7 +73,7 @@ class StiffnessMonitor(TwinNode):
             self, robot, settings.stamp_rules,
             (settings.base_frame, self._platform_frame or settings.platform_frame),
         )  # fmt: skip
-        # What has no stamp, or texts for numbers, has a sibling that plots can draw.
+        # Messages without stamp or with text values have a second topic that plots can draw.
         self._outputs = [
             (self.create_guarded_publisher(topic), make)
             for topic, make in (
@@ -92,7 +92,7 @@ class StiffnessMonitor(TwinNode):
             unit="Hz", low=0.0, high=1000.0
         )  # fmt: skip
         if rate > 0.0 and has_modes(robot):
-            # What the first call loads and compiles is not waited for in a callback.
+            # Compile now: the first call would block a callback.
             natural_frequencies(robot, robot.home())
             self._frequencies = self.create_guarded_publisher("~/natural_frequencies")
             self._frequencies_stamped = self.create_guarded_publisher(
@@ -114,24 +114,24 @@ class StiffnessMonitor(TwinNode):
         self.start()
 
     def details(self) -> str:
-        """Where the wrench is measured."""
+        """Return the wrench's frame, for the start message."""
         return f", wrench in {self.core.settings.wrench_frame}"
 
     def time_jumped_backward(self) -> None:
-        """No pose across the seam."""
+        """Discard all stored samples."""
         self.core.reset()
         self._correction.reset()
         self._alarm.reset()
         self._published_stamp = 0
 
     def judge(self) -> tuple[bytes, str]:
-        """Level and message of the node's diagnostic status."""
+        """Return level and message of the node's diagnostic status."""
         if self._alarm.departures:
             return health.WARN, self._alarm.warning()
         return super().judge()
 
     def values(self) -> dict[str, object]:
-        """Values of the node's diagnostic status."""
+        """Return the values of the node's diagnostic status."""
         core = self.core
         return {
             "older stamps dropped": core.dropped,
@@ -142,12 +142,12 @@ class StiffnessMonitor(TwinNode):
         }
 
     def activated(self) -> None:
-        """No pose from before."""
+        """Discard samples from before the activation."""
         self.core.reset()
         self._alarm.reset()
 
     def _change_settings(self, settings: Settings) -> None:
-        """What the stamps of set points and deflections have to keep to, too."""
+        """Apply new settings to the monitor, the correction and the alarm."""
         self.core.change_settings(settings)
         self._correction.change_rules(settings.stamp_rules)
         platform = self._platform_frame or settings.platform_frame
@@ -165,11 +165,11 @@ class StiffnessMonitor(TwinNode):
             try:
                 take(answer)
             except (PkmTwinError, ValueError) as error:
-                # Close to a singularity, say: the compliance is sound all the same.
+                # The compliance is still valid, for example close to a singularity.
                 self.log_throttled("beside", f"no correction or alarm: {error}")
 
     def _publish_frequencies(self) -> None:
-        """Of the latest joint state: a pose costs milliseconds, so not of every one."""
+        """Publish the frequencies of the latest joint state, at most at ``frequencies_rate``."""
         latest = self.core.latest
         if not self.active or latest is None or latest[0] == self._published_stamp:
             return
@@ -205,7 +205,7 @@ class StiffnessMonitor(TwinNode):
         return named(self._in_base(answer), found.elements, factors, efforts=energies)
 
     def _energies_message(self, answer: Answer) -> DiagnosticArray:
-        """Factors, energy, pose and frame; factors are absent where no load makes energy."""
+        """Return factors, energy, pose and frame; no factors without load."""
         robot, energy = self.core.robot, answer.energy
         pairs: dict[str, str] = {}
         if energy.dominant != "none":
@@ -226,7 +226,7 @@ class StiffnessMonitor(TwinNode):
         return DiagnosticArray(header=self._in_base(answer), status=[status])
 
     def _deflection_message(self, answer: Answer) -> TransformStamped:
-        """From the platform to the deflected platform, in the platform's axes."""
+        """Return the transform from platform to deflected platform, in platform axes."""
         shift = answer.rotation.T @ answer.energy.deflection[:3]
         turn = answer.rotation.T @ answer.energy.deflection[3:]
         angle = math.sqrt(float(turn @ turn))

@@ -18,14 +18,14 @@ from pkm_twin.machine.members import Place, Structure
 from pkm_twin.machine.tree import Tree
 
 _MAX_COMPLIANCE: Final = 1e300
-"""A compliance above it is infinite."""
+"""Compliance above which a joint direction counts as free."""
 
 Rigidities = Mapping[str, Sequence[Any]]
-"""By beam: EA, GJ, EI, and 12 E I over the shear rigidity."""
+"""EA, GJ, EI, and 12 E I over the shear rigidity, by beam."""
 
 
 def list_numbers(structure: Structure) -> list[Any]:
-    """Ends and rigidities of every beam, then all compliances of joints; numbers or expressions."""
+    """List ends and rigidities of every beam, then all joint compliances."""
     row: list[Any] = []
     for beam in structure.beams:
         row += [*beam.inner[1], *beam.outer[1], *structure.sections[beam.name].rigidities]
@@ -37,9 +37,9 @@ def list_numbers(structure: Structure) -> list[Any]:
 def substitute_numbers(
     structure: Structure, graph: Graph, numbers: Numbers
 ) -> tuple[Structure, Rigidities]:
-    """Beams and compliances on expressions of other numbers, in the order of :func:`list_numbers`.
+    """Return beams and compliances with other numbers, in the order of :func:`list_numbers`.
 
-    What is so in the known case is taken for that: that a beam ends where a joint is, and which
+    Properties of the known case are kept as assumptions: that a beam ends at a joint, and which
     compliances are zero, finite or infinite.
     """
     left = iter(numbers)
@@ -70,7 +70,7 @@ def substitute_numbers(
 
 
 def constant_pattern(structure: Structure, tree: Tree) -> str:
-    """Text of what programs take for constant of a structure's numbers."""
+    """Return a text of the structure's properties that programs take as constant."""
     places, parts = list(_end_points(tree.graph)), []
     for beam in structure.beams:
         for body, at in (beam.inner, beam.outer):
@@ -83,7 +83,7 @@ def constant_pattern(structure: Structure, tree: Tree) -> str:
 
 
 def _end_points(graph: Graph) -> Iterator[Array]:
-    """Points of a graph in which beams may end."""
+    """Yield the points of a graph at which beams may end."""
     yield graph.origin
     yield from (joint.at for joint in graph.joints.values())
     for rod in graph.rods.values():
@@ -91,12 +91,12 @@ def _end_points(graph: Graph) -> Iterator[Array]:
 
 
 def _find_point(places: Sequence[Array], at: Any) -> int | None:
-    """Which of some points a place is."""
+    """Return the index of the point that coincides with a position; None without one."""
     here = references(at)
     near = (k for k, one in enumerate(places) if np.abs(references(one) - here).max() < SNAP)
     return next(near, None)
 
 
 def _is_finite(compliance: Any) -> Any:
-    """One of a finite compliance above zero, else zero."""
+    """Return an expression: 1 if a compliance is above zero and finite, else 0."""
     return sign(compliance) * sign(maximum(0.0, _MAX_COMPLIANCE - compliance))

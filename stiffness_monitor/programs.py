@@ -32,19 +32,21 @@ from stiffness_monitor.numbers import constant_pattern, list_numbers, substitute
 from stiffness_monitor.structure import FREE, place_plan, plan_structure
 
 DEFLECTION_PARTS: Final = 4
-"""Parts that a member is divided into where its deflection is drawn."""
+"""Parts that a member is divided into to draw its deflection."""
 NO_PARAMETERS: Final = np.zeros(0)
-"""The programs' parameters: all numbers are the kernels' own."""
+"""Empty parameters of the programs: kernels hold all numbers."""
 _TINY: Final = 1e-200
 _CLOSURE_SCALE: Final = 1e-3
-"""What a closure may hold beside, over the bound of other numbers: a billionth."""
+"""Weight of dependent closures' residuals: times it they must be below the tolerance of other
+numbers, a billionth."""
 
 
 @dataclass(frozen=True)
 class DependentCoordinates:
-    """Which coordinates of a frame follow from its closures: ``chosen``, by ``rows``.
+    """Hold which frame coordinates depend on others by closures: ``chosen``, by ``rows``.
 
-    ``sample``: the engine's state in which closures hold the most; 0, home, wherever that is one.
+    ``sample``: index of the engine state at which the closures' rank is largest; 0, home, if
+    possible.
     """
 
     rows: tuple[int, ...]
@@ -54,10 +56,10 @@ class DependentCoordinates:
 
 
 class Elastic:
-    """A robot's elastic frame: its plan, its numbers and its programs.
+    """Build a robot's elastic frame: its plan, its numbers and its programs.
 
     Machines of one structure share the programs: all numbers are run-time inputs. ``names``: of the
-    elements, as energies have them.
+    elements, in the order of energies.
     """
 
     def __init__(self, robot: Robot) -> None:
@@ -70,9 +72,9 @@ class Elastic:
 
     @cached_property
     def followers(self) -> DependentCoordinates | None:
-        """Chosen by what closures hold at home and near it; None without closures.
+        """Dependent coordinates, from the closures' ranks at and near home; None without closures.
 
-        :raises ParameterError: they hold the platform itself.
+        :raises ParameterError: the closures hold the platform itself.
         """
         if not self.plan.closures:
             return None
@@ -87,7 +89,7 @@ class Elastic:
         return DependentCoordinates(tuple(rows), tuple(chosen), pivots, int(most.argmax()))
 
     def _frame(self, motion: Motion) -> Frame:
-        """The frame in a state on numbers, every rigidity and compliance one."""
+        """Return the frame in a numeric state, every rigidity and compliance one."""
         model = place_plan(
             self.plan, motion.point, motion.direction, lambda _: [1.0] * 4, lambda *_: 1.0
         )
@@ -103,7 +105,7 @@ class Elastic:
     def kernel(
         self, name: str, write: Callable[[SymbolicFrame], Program], *, free: bool = False
     ) -> Kernel:
-        """A program on all numbers of the machine, as of :meth:`Engine.kernel`."""
+        """Return the compiled program of all numbers of the machine, as :meth:`Engine.kernel`."""
         known = self._kernels.get(name)
         if known is None:
             numbers = np.array(list_numbers(self.structure), np.float64)
@@ -117,12 +119,12 @@ class Elastic:
 
     @cached_property
     def compliance(self) -> Kernel:
-        """Q to C (36) of the platform, and the measure of :attr:`response`."""
+        """Program from q to C (36) of the platform and the pivot ratio of :attr:`response`."""
         return self.kernel("platform compliance", _write_compliance)
 
     @cached_property
     def response(self) -> Kernel:
-        """Q and wrench to a row: factors, energies, deflection (6), energy, C (36), measure.
+        """Program from q and wrench to factors, energies, deflection, energy, C, pivot ratio.
 
         The measure is the least pivot over its diagonal entry, which no choice of units changes: 0
         where the frame is a mechanism. Factors are zero where the wrench is.
@@ -131,17 +133,17 @@ class Elastic:
 
     @cached_property
     def deflections(self) -> Kernel:
-        """Q and wrench to points of every member and their moves, (members, 2, k, 3); measure."""
+        """Program from q and wrench to members' points and displacements, (members, 2, k, 3)."""
         return self.kernel("member deflections", _write_deflections)
 
     @cached_property
     def columns(self) -> Kernel:
-        """Q to the columns sqrt(d) b: entries, their rows, their columns; and columns' elements."""
+        """Program from q to the columns sqrt(d) b: entries, rows, columns, columns' elements."""
         return self.kernel("elastic columns", _write_columns)
 
 
 def _plain_data(value: Any) -> Any:
-    """A plan as plain data, without what is a number of the machine."""
+    """Convert a plan to plain data, without the machine's numbers."""
     if isinstance(value, np.ndarray):
         return None
     if isinstance(value, float):
@@ -156,10 +158,11 @@ def _dot(a: Iterable[Any], b: Iterable[Any]) -> Any:
 
 
 class SymbolicFrame:
-    """The frame of a solved motion, as expressions.
+    """Express the elastic frame of a solved motion.
 
-    ``follow``: coordinates that closures make follow from others, by those. ``place``: the others,
-    numbered. ``columns``: on these, those of the members in order, then those of joints.
+    ``follow``: rows of the coordinates that closures determine, by the others. ``place``: numbers
+    of the others. ``columns``: on the others, first those of the members in order, then those of
+    joints.
     """
 
     def __init__(self, t: Traced, elastic: Elastic) -> None:
@@ -187,23 +190,23 @@ class SymbolicFrame:
         t, assumed, known = self.t, self.t.tape.assumed, self.t.home
         if chosen.sample:
             known = Motion(t.tree, *self.elastic.robot.engine.samples[chosen.sample])
-            # The state is one of this geometry alone.
+            # The sample state belongs to this geometry only.
             assumed += [(e, e.value) for e in t.tape.inputs(GEOMETRY, len(t.tape.reference))]
         follow, inverse, _ = solve_dependents(self.frame, chosen)
         _, there, left = solve_dependents(self._frame(known), chosen)
-        # On other numbers a closure may hold more than what was chosen.
+        # With other numbers a redundant closure could become independent.
         assumed += [(e * _CLOSURE_SCALE, 0.0) for e in t.lift(left)]
-        # Where they stop to determine what was chosen near home, nothing is known of the frame.
+        # Zero where the closures no longer determine the chosen coordinates.
         self.measure = 1.0 / maximum(absolute(inverse / there), _TINY)
         return follow
 
     def _eliminate(self, column: Column) -> Column:
-        """A column on the coordinates that closures leave."""
+        """Express a column by the coordinates that closures leave independent."""
         row = _substitute(column.row, self.follow)
         return column._replace(row={self.place[k]: value for k, value in row.items()})
 
     def factorise(self) -> None:
-        """Factorise the stiffness: ``compliance`` of the platform, ``measure`` of the frame.
+        """Factorise the stiffness; set the platform's ``compliance`` and the frame's ``measure``.
 
         The platform's K and C (2UPR-RPU paper, equations 33 to 35).
         """
@@ -233,7 +236,7 @@ class SymbolicFrame:
                 self.compliance[i, j] = self.compliance[j, i] = value
 
     def load(self, wrench: Any) -> None:
-        """Load the platform: coordinates ``x`` and the columns' ``amounts``.
+        """Apply a wrench to the platform; set coordinates ``x`` and the columns' ``amounts``.
 
         Elements move with the platform, and their work is the wrench's (2UPR-RPU paper, equations
         29, 31 and 32).
@@ -259,7 +262,7 @@ class SymbolicFrame:
         return list(found.values())
 
     def program(self, inputs: dict[str, int], outputs: dict[str, Any]) -> Program:
-        """These outputs of q and further inputs."""
+        """Return the program from q and further inputs to these outputs."""
         t = self.t
         rows = {name: t.lift(row) for name, row in outputs.items()}
         sizes = t.inputs("q") | inputs
@@ -269,8 +272,10 @@ class SymbolicFrame:
 def solve_dependents(
     frame: Frame, chosen: DependentCoordinates
 ) -> tuple[dict[int, Row], Any, list[Any]]:
-    """Of chosen coordinates, their rows of the others; the reciprocal determinant of what
-    determines them; and what other closures hold in addition, which is zero.
+    """Solve the closures for the chosen coordinates.
+
+    :returns: their rows of the other coordinates, the reciprocal determinant of the system, and the
+    residuals of the redundant closures, which must be zero.
     """
     table = frame.table()[list(chosen.rows)]
     lu = SparseLU(table[:, list(chosen.chosen)], chosen.pivots)
@@ -283,7 +288,7 @@ def solve_dependents(
 
 
 def _substitute(row: Row, follow: dict[int, Row]) -> Row:
-    """A linear form without the coordinates that follow from others."""
+    """Eliminate dependent coordinates from a linear form."""
     terms = [(follow.get(k, {k: 1.0}), value) for k, value in row.items()]
     return sum_forms(*((own, [value * f for f in own.values()]) for own, value in terms))
 
@@ -299,7 +304,7 @@ def _write_response(s: SymbolicFrame) -> Program:
     size: Any = 0.0
     for value in wrench:
         size = maximum(size, absolute(value))
-    # Of unit size, so that squares of tiny and huge loads neither vanish nor overflow.
+    # Scaled to unit size, so that squares of tiny or huge loads do not under- or overflow.
     s.load(wrench / maximum(size, 1e-300))
     energies = s.energies()
     total, square = sum(energies, 0.0), size * size

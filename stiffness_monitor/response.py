@@ -1,7 +1,7 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""How the platform's compliance depends on the compliance of each elastic element, exactly.
+"""Compute how the platform's compliance depends on each elastic element's compliance.
 
-Element e gives by s_e times what the robot's file says. With K = sum of G_e G_e' / s_e over the
+Element e's compliance is s_e times the file's. With K = sum of G_e G_e' / s_e over the
 elements (columns G of their own stiffness on the frame's coordinates) and the platform's E,
 
     C(s) = C + A S (I + M S)^-1 A',   S = diag(s - 1),   A = E' K^-1 G,   M = I - G' K^-1 G
@@ -28,7 +28,7 @@ from stiffness_monitor.programs import NO_PARAMETERS, Elastic
 
 @dataclass(frozen=True, eq=False)
 class ElementResponse:
-    """The platform's compliance by the elements' factors, which multiply the file's compliances.
+    """Hold the platform's compliance as a function of the elements' compliance factors.
 
     ``names``: of the elements, as ``strain_energy`` has them. ``owner``: shape (r,), which element
     a column is of. ``compliance``: of the file, (..., 6, 6). ``reach``: A, (..., 6, r), and
@@ -42,14 +42,14 @@ class ElementResponse:
     rest: Array
 
     def columns(self, factors: ArrayLike) -> tuple[Any, Any]:
-        """S as a vector (r,), and Z as its transpose (..., 6, r); complex factors are allowed."""
+        """Return S as a vector (r,), and Z' (..., 6, r); factors may be complex."""
         change = (self._checked(factors) - 1.0)[self.owner]
         matrix = np.eye(len(self.owner)) + self.rest * change
         columns = np.linalg.solve(matrix, np.swapaxes(self.reach, -1, -2))
         return change, np.swapaxes(columns, -1, -2)
 
     def _checked(self, factors: ArrayLike) -> Any:
-        """Factors, shape (elements,); complex ones as they are, for derivatives by a complex step.
+        """Check factors, shape (elements,); complex ones serve complex-step derivatives.
 
         :raises ValueError: another shape, or a factor that is not finite.
         """
@@ -62,12 +62,12 @@ class ElementResponse:
         return array
 
     def compliance_at(self, factors: ArrayLike) -> Any:
-        """Compliance with factors (elements,), shape (..., 6, 6)."""
+        """Return the compliance with factors (elements,), shape (..., 6, 6)."""
         change, columns = self.columns(factors)
         return self.compliance + self.reach @ np.swapaxes(change * columns, -1, -2)
 
     def derivatives(self, factors: ArrayLike | None = None) -> Array:
-        """Of the compliance by each factor, shape (..., elements, 6, 6): positive semidefinite."""
+        """Return the compliance's derivatives by the factors, (..., elements, 6, 6)."""
         columns = self.reach if factors is None else self.columns(factors)[1]
         return np.stack(
             [
@@ -78,7 +78,7 @@ class ElementResponse:
         )
 
     def deflection(self, wrench: ArrayLike, factors: ArrayLike) -> tuple[Array, Array]:
-        """Deflection of the platform under wrenches (..., 6): shape (..., 6), m and rad, base axes.
+        """Return the platform's deflection under wrenches (..., 6): m and rad, base axes.
 
         :returns: the deflection, and its derivatives by the factors, shape (..., 6, elements).
         """
@@ -92,7 +92,7 @@ class ElementResponse:
 
 
 def element_response(robot: Robot, pose: ArrayLike) -> ElementResponse:
-    """The platform's compliance in poses (..., m), by the elements' factors; errors as compliance.
+    """Return the platform's compliance in poses (..., m) as a function of element factors.
 
     :raises ParameterError: a robot without elastic members.
     :raises UnreachableError: a pose that is none of the mechanism's.

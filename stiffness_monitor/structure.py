@@ -32,7 +32,7 @@ from pkm_twin.robot.outline import Posture
 from pkm_twin.robot.robot import Robot
 
 Vector = Any
-"""In a plan the body and the vector at home, in a pose three numbers or expressions."""
+"""Body and vector at home in a plan; three numbers or expressions in a pose."""
 Turn = Callable[[str, Array], Any]
 
 RIGID: Final = (0.0,) * 6
@@ -41,21 +41,21 @@ FREE: Final = math.inf
 
 
 def cross(a: Any, b: Any) -> Any:
-    """Vector product of two vectors, shape (3,): numpy's costs ten times as much."""
+    """Return the vector product of two vectors, (3,), ten times faster than numpy's."""
     ax, ay, az = a.tolist()
     bx, by, bz = b.tolist()
     return np.array([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])
 
 
 def size(vector: Any) -> Any:
-    """Length of a vector, shape (3,)."""
+    """Return the length of a vector, shape (3,)."""
     return sqrt(vector @ vector)
 
 
 def local_axes(along: Any) -> Any:
-    """Right-handed axes whose first is the unit vector ``along``; columns, shape (3, 3).
+    """Return right-handed axes, columns (3, 3), whose first is the unit vector ``along``.
 
-    Without a case that divides by next to nothing (Duff et al. 2017).
+    No case divides by a small number (Duff et al. 2017).
     """
     x, y, z = along.tolist()
     side = 1.0 - 2.0 * maximum(0.0, -1.0 * sign(z))
@@ -68,7 +68,7 @@ def local_axes(along: Any) -> Any:
 
 @dataclass(frozen=True, eq=False)
 class Support:
-    """How one end of a member, or a body, stands on another.
+    """Describe how one end of a member, or a body, is attached to another body.
 
     ``joint``: its name; joints of one name are one element of the energy shares. ``body``: the
     base, the platform, a rigid body, or a member, then at its start (``end`` 0) or its end (1).
@@ -89,10 +89,10 @@ class Support:
 
 @dataclass(frozen=True, eq=False)
 class Member:
-    """A straight beam from ``start`` to ``end``, shape (3,), m.
+    """Describe a straight beam from ``start`` to ``end``, shape (3,), m.
 
     ``body`` is the name that it has in the energy shares: two rods can be one forearm. A member
-    whose ``outer`` is None ends free, and others can stand there. ``strut``: held by a ball joint
+    whose ``outer`` is None ends free; other parts can attach there. ``strut``: held by a ball joint
     at each end, so that a load at its ends goes along it. ``constant``: its length where that is
     the same in every pose.
     """
@@ -120,7 +120,7 @@ class Member:
 
 @dataclass(frozen=True, eq=False)
 class Carried:
-    """A rigid body that stands on another at ``at``, m."""
+    """Describe a rigid body that is attached to another at ``at``, m."""
 
     name: str
     at: Vector
@@ -129,7 +129,10 @@ class Carried:
 
 @dataclass(frozen=True, eq=False)
 class Closure:
-    """A joint at ``at`` between two bodies that both hang already; ``inner`` as a support's."""
+    """Describe a joint at ``at`` between two bodies that are already attached.
+
+    ``inner``: name and end of the first body, as in a support.
+    """
 
     at: Vector
     inner: tuple[str, int]
@@ -138,7 +141,7 @@ class Closure:
 
 @dataclass(frozen=True, eq=False)
 class RigidBody:
-    """Mass of a body: mass (kg), centre of mass ``at`` (m).
+    """Describe the mass of a body: mass (kg), centre of mass ``at`` (m).
 
     ``inertia`` about its centre of mass, shape (3, 3), kg m2; both along the base axes. ``body``:
     what it moves with.
@@ -153,7 +156,7 @@ class RigidBody:
 
 @dataclass(frozen=True, eq=False)
 class StructuralModel:
-    """The elastic machine; ``origin``: the platform's reference point, shape (3,)."""
+    """Describe the elastic machine; ``origin``: the platform's reference point, shape (3,)."""
 
     origin: Vector
     platform: str
@@ -176,7 +179,7 @@ class StructuralModel:
 
     @property
     def rigid_chain(self) -> tuple[str, ...]:
-        """Joints between the base and the platform with rigid bodies alone; empty without one."""
+        """Joints that connect base and platform by rigid bodies alone; empty without a chain."""
         edges = [(p.support.body, p.name, p.support) for p in self.parts if isinstance(p, Carried)]
         edges += [(c.inner[0], c.support.body, c.support) for c in self.closures]
         chains: dict[str, tuple[str, ...]] = {BASE: ()}
@@ -189,7 +192,7 @@ class StructuralModel:
 
 
 def structural_model(robot: Robot, q: ArrayLike) -> StructuralModel:
-    """The model at joint positions, shape (n,), on numbers.
+    """Return the structural model at joint positions, shape (n,), on numbers.
 
     :raises ParameterError: the robot's file lacks a section that elasticity needs.
     :raises UnreachableError: no assembly of the robot; a singularity as ``forward``.
@@ -209,7 +212,7 @@ def place_plan(
     section: Callable[[str], Any],
     compliance: Callable[[str, int], Any],
 ) -> StructuralModel:
-    """A plan in a pose, on numbers or on expressions.
+    """Evaluate a plan in a pose, on numbers or on expressions.
 
     :param place: where a point of a body is, given at home. ``turn``: where a direction points.
     :param section: of a beam by its name. ``compliance``: of a joint by its name and entry.
@@ -241,10 +244,10 @@ def place_plan(
 
 
 def _joint_axes(given: Sequence[tuple[str, Array]], turn: Turn) -> Any:
-    """Columns of three directions.
+    """Return the columns of three directions.
 
-    Of two axes that a joint turns about, at right angles or not: the first axis, the one
-    perpendicular to it in the plane of both, and that plane's normal.
+    For two rotation axes, at any angle: the first axis, the one perpendicular to it in the plane of
+    both, and that plane's normal.
     """
     columns = [turn(*one) for one in given]
     if len(columns) == 2:
@@ -255,24 +258,26 @@ def _joint_axes(given: Sequence[tuple[str, Array]], turn: Turn) -> Any:
 
 
 def plan_structure(graph: Graph, structure: Structure) -> StructuralModel:
-    """What carries what, by the graph at home."""
+    """Decide which part is attached to which, from the graph at home."""
     return _Planner(graph, structure).plan()
 
 
 class _Planner:
+    """Attach bodies, beams and rods to each other, beginning at base and platform."""
+
     def __init__(self, graph: Graph, structure: Structure) -> None:
         self.graph, self.structure = graph, structure
         self.beam_of = {part: beam for beam in structure.beams for part in beam.parts}
         self.beam_of.pop(graph.platform, None)
         self.points: dict[str, list[Array]] = {BASE: [np.zeros(3)], graph.platform: [graph.origin]}
-        """Where others can stand, at home, of all that hangs."""
+        """Points at home at which others can attach, by attached part."""
         self.parts: list[Member | Carried] = []
 
     def plan(self) -> StructuralModel:
         left = [joint for joint in self.graph.joints.values() if not joint.virtual]
         rods = [beam for beam in self.structure.beams if beam.parts[0] in self.graph.rods]
         while True:
-            # Bodies that one joint alone leads to come first, then whatever hangs.
+            # Joints between an attached and an unattached body, in order.
             ready = [j for j in left if self._is_attached(j.inner) != self._is_attached(j.outer)]
             if not ready:
                 break
@@ -297,7 +302,7 @@ class _Planner:
         return StructuralModel(origin, graph.platform, tuple(self.parts), closures)
 
     def _is_inside_beam(self, joint: Joint) -> bool:
-        """Whether a joint is within one beam: a telescope's."""
+        """Return whether a joint is within one beam: a telescope's."""
         a, b = self.beam_of.get(joint.inner), self.beam_of.get(joint.outer)
         return a is not None and a is b
 
@@ -309,7 +314,7 @@ class _Planner:
         return self._part_name(body) in self.points
 
     def _find_support(self, body: str, at: Array) -> tuple[str, int]:
-        """What stands at a place on a body, and at which end."""
+        """Return the attached part of a body, and the end nearest to a position."""
         part = self._part_name(body)
         if part not in self.points:
             raise ValueError(f"{part} is not connected to the base")
@@ -325,7 +330,7 @@ class _Planner:
         values, screws = self._joint_compliance(name), []
         if joint.type.count == 2:
             axes = (joint.inner, joint.axes[0]), (joint.outer, joint.axes[1])
-            # Which given direction each is nearly along.
+            # Match each axis with the given direction that is nearly parallel.
             along = references(vectors @ _joint_axes(axes, lambda _, vector: vector))
             order = np.abs(along).argmax(0).tolist()
             values = [values[k] for k in order] + [values[3 + k] for k in order]
@@ -340,7 +345,7 @@ class _Planner:
         return Support(name, part, axes, tuple(values), end, tuple(screws))
 
     def _member_support(self, joint: Joint, body: str, end: tuple[str, Array]) -> Support:
-        """How a member's end stands on a body by a joint, which may be apart from that end."""
+        """Return the support of a member's end by a joint, which may be away from that end."""
         lever = joint.at - end[1]
         # On a free tape either place may be differentiated by.
         apart = getattr(getattr(lever[0], "tape", None), "free", False)
@@ -350,7 +355,7 @@ class _Planner:
         return replace(self._joint_support(joint, body, joint.at), at=(own, joint.at))
 
     def _joint_compliance(self, name: str) -> list[Any]:
-        """Of a joint in a plan; infinite in a file says what its freedoms say."""
+        """Return a joint's compliance in a plan; infinite entries are set by its freedoms."""
         values = enumerate(self.structure.compliances.get(name, RIGID))
         return [(name, k) if 0.0 < reference(value) < FREE else 0.0 for k, value in values]
 
@@ -402,7 +407,7 @@ class _Planner:
         )  # fmt: skip
 
     def _add_rod(self, beam: Beam) -> None:
-        """On a ball joint at each end; it would spin idly, so the inner one holds that spin."""
+        """Add a rod with a ball joint at each end; the inner one holds the rod's idle spin."""
         rod = self.graph.rods[beam.parts[0]]
         supports = []
         for name, (body, at), spin in zip(
@@ -415,14 +420,14 @@ class _Planner:
 
 
 def _is_nearer(at: Array, first: Array, second: Array) -> bool:
-    """Whether a place is nearer to the first of two points."""
+    """Return whether a position is nearer to the first of two points."""
     return reference(size(at - first)) < reference(size(at - second))
 
 
 def _lumped_masses(
     robot: Robot, place: Callable[[str, Array], Array], turn: Turn
 ) -> list[RigidBody]:
-    """Of bodies that are no beams, and of the payload."""
+    """Return the rigid bodies (not modelled as beams) and the payload, with their inertia."""
     graph, load = robot.graph, robot.payload
     beams = {n for beam in robot.elastic.beams for n in (*beam.parts, *beam.carries)}
     found = [

@@ -23,17 +23,17 @@ from stiffness_monitor.modes import ELEMENTS, frame_system, solve_modes, stiffne
 Complex = NDArray[np.complex128]
 
 DYNAMIC_MODES: Final = 24
-"""Modes that respond dynamically."""
+"""Modes that respond dynamically; the others respond statically."""
 MAX_FREQUENCY: Final = 1e6
-"""Frequency at most that is asked for, Hz."""
+"""Largest valid frequency, Hz."""
 MAX_TOOL_DISTANCE: Final = 10.0
-"""Distance of a tool point along an axis at most, in parts of the machine's extent."""
+"""Largest distance of a tool point along an axis, over the machine's extent."""
 DAMPING: Final = (1e-5, 0.99)
-"""Damping ratios of modes that may be given."""
+"""Valid range of modal damping ratios."""
 
 
 def responses(at: Array, turn: Array, damping: Array, shapes: Array) -> Complex:
-    """Sum of the modes' responses p p' / (w^2 - W^2 + 2 i z w W), shape (k, d, d).
+    """Sum the modes' responses p p' / (w^2 - W^2 + 2 i z w W), shape (k, d, d).
 
     :param at: W, shape (k,), and ``turn``, w, shape (m,), rad/s. ``damping``: z, shape (m,).
     :param shapes: p of unit generalised mass, shape (m, d).
@@ -45,7 +45,7 @@ def responses(at: Array, turn: Array, damping: Array, shapes: Array) -> Complex:
 
 @dataclass(frozen=True, eq=False)
 class ToolModes:
-    """Modes of a robot in a pose at its tool point, lowest first.
+    """Hold modes of a robot in a pose at its tool point, lowest first.
 
     ``frequencies``: (count,), Hz. ``damping``: ratios (count,). ``shapes``: displacement and
     rotation of the tool point in base axes, of unit generalised mass, (count, 6). ``rest``: static
@@ -59,7 +59,7 @@ class ToolModes:
     rotation: Array
 
     def receptance(self, frequencies: ArrayLike) -> Complex:
-        """Displacement per force at frequencies (k,), Hz; shape (k, 6, 6), m and rad per N, N m."""
+        """Return displacement per force at frequencies (k,), Hz: (k, 6, 6), m, rad per N, N m."""
         at = doubles(frequencies, "frequencies")
         if at.ndim != 1:
             raise ParameterError("frequencies", at.shape, "one frequency after another")
@@ -69,7 +69,7 @@ class ToolModes:
         return responses(2.0 * np.pi * at, own, self.damping, self.shapes) + self.rest
 
     def strongest(self, frequencies: ArrayLike) -> tuple[float, float, Array]:
-        """Where the tool point moves most per force, between the first and last frequency.
+        """Find where the tool point moves most per force, between first and last frequency.
 
         Returns the frequency, Hz, the displacement per force, m/N, and its direction (3,), base
         axes. Peaks are checked too: they may be narrower than the steps of the frequencies.
@@ -92,7 +92,9 @@ def tool_modes(
     tool: ArrayLike = (0.0, 0.0, 0.0),
     elements: int = ELEMENTS,
 ) -> ToolModes:
-    """Modes at the tool point; errors as :func:`~stiffness_monitor.modes.natural_frequencies`.
+    """Compute the modes at the tool point.
+
+    Other errors as :func:`~stiffness_monitor.modes.natural_frequencies`.
 
     :param pose: shape (m,), the mechanism's pose coordinates, m and rad.
     :param damping: ratio of all modes, or of each from the lowest on, the last one of all further
@@ -128,7 +130,7 @@ def frequency_response(
     damping: ArrayLike | None = None,
     tool: ArrayLike = (0.0, 0.0, 0.0),
 ) -> Complex:
-    """Receptance of the tool point, actuators locked: displacement per harmonic force.
+    """Return the tool point's receptance, actuators locked: displacement per harmonic force.
 
     :param pose: shape (..., m), the mechanism's pose coordinates, m and rad.
     :param frequencies: shape (k,), Hz.
@@ -147,7 +149,7 @@ def frequency_response(
 
 
 def damping_ratios(robot: Robot, given: ArrayLike | None, count: int) -> Array:
-    """Damping ratios of modes, shape (count,); parameters and errors as :func:`tool_modes`."""
+    """Return the damping ratios of modes, (count,); parameters and errors as :func:`tool_modes`."""
     field = "modal_damping" if given is None else "damping"
     values = np.atleast_1d(doubles(robot.modal_damping if given is None else given, field))
     if not values.size:

@@ -81,7 +81,7 @@ EQUATIONS: Final = (
     _equation((4, 9, 14, 26), "strain energies", (SOLVED + "energies",), CLOSED),
     _equation(
         (5, 6, 7, 11, 12, 13, 21, 22, 23, 24), "limb wrenches in a joint's axes",
-        (FRAME + "Frame._let",), CLOSED,
+        (FRAME + "Frame._add_joint",), CLOSED,
     ),
     _equation((8, 25), "joint compliances", (UPR_RPU + "structure",), CLOSED),
     _equation(
