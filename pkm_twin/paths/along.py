@@ -22,19 +22,19 @@ from pkm_twin.recordings.tables import WRENCH
 from pkm_twin.robot.limits import beyond_limits
 from pkm_twin.robot.robot import Robot
 
-BLOCK: Final = 4096
+SAMPLES_PER_BLOCK: Final = 4096
 """Samples computed at a time, so that memory stays flat."""
 BEYOND_LIMITS: Final = "beyond_limits"
-SAME: Final = 1e-6
+EFFORT_TOLERANCE: Final = 1e-6
 """Relative difference of two computations of the same efforts."""
 SAME_NUMBERS: Final = 1e-3
 """The same, of one robot, whose files have nine digits or more: beyond rounding, below any term."""
-UNLIKE: Final = 0.05
+MAX_EFFORT_DIFFERENCE: Final = 0.05
 """Difference between a file's efforts and the model's, over the RMS, from which it is reported."""
 
 
 @dataclass(frozen=True)
-class Compared:
+class EffortComparison:
     """A motion with the efforts that are sized, shape (k, n), and where these are from.
 
     ``model``: what the robot's model computes for the motion, shape (k, n).
@@ -54,7 +54,7 @@ class Compared:
     def unlike(self) -> str:
         """Says of which joint the file's efforts are not the model's; empty where they are."""
         worst = int(self.difference.argmax())
-        if not self.difference[worst] > UNLIKE:
+        if not self.difference[worst] > MAX_EFFORT_DIFFERENCE:
             return ""
         return (
             f"the file's efforts of {self.motion.robot.joint_names[worst]} differ from the model's "
@@ -81,7 +81,7 @@ def check_computed(motion: Recording) -> Recording:
     origin, away = motion.origin, relative_difference(motion.computed, model_efforts(motion))
     other = "" if origin is None else origin.differs_from(motion.robot)
     worst = int(away.argmax())
-    if away[worst] <= (UNLIKE if origin is None or other else SAME_NUMBERS):
+    if away[worst] <= (MAX_EFFORT_DIFFERENCE if origin is None or other else SAME_NUMBERS):
         return motion
     if other:
         return replace(motion, notes=(*motion.notes, other))
@@ -93,15 +93,15 @@ def check_computed(motion: Recording) -> Recording:
     )
 
 
-def compared(motion: Recording, efforts: str = "file") -> Compared:
+def compare_efforts(motion: Recording, efforts: str = "file") -> EffortComparison:
     """A motion with the file's efforts where it has them and they are asked for, else the model's.
 
     :raises ParameterError: a robot without masses.
     """
     model = model_efforts(motion)
     if motion.effort is not None and efforts == "file":
-        return Compared(motion, motion.effort, "the file's", model)
-    return Compared(motion, model, "the model's", model)
+        return EffortComparison(motion, motion.effort, "the file's", model)
+    return EffortComparison(motion, model, "the model's", model)
 
 
 def model_efforts(m: Recording) -> Array:
@@ -109,18 +109,18 @@ def model_efforts(m: Recording) -> Array:
 
     Where a joint stands still dry friction has no direction, and the model none of it.
     """
-    (q, _, qdd, wrench), rates, made = m.motion, _moving(m), np.empty_like(m.q)
-    for robot, part in by_load(m.robot, m.load, m.time, BLOCK):
+    (q, _, qdd, wrench), rates, made = m.motion, _friction_rates(m), np.empty_like(m.q)
+    for robot, part in by_load(m.robot, m.load, m.time, SAMPLES_PER_BLOCK):
         made[part] = inverse_dynamics(robot, q[part], rates[part], qdd[part], wrench[part])
     return made + Dahl.remembered(m.robot.friction, q, rates)[0]
 
 
 def settle_rests(m: Recording) -> Recording:
     """Return the motion with zero velocities where efforts are computed for a joint at rest."""
-    return replace(m, qd=_moving(m), still=None)
+    return replace(m, qd=_friction_rates(m), still=None)
 
 
-def _moving(m: Recording) -> Array:
+def _friction_rates(m: Recording) -> Array:
     """The rates, without those that friction may not count."""
     qd = m.motion[1]
     if m.still is None:
@@ -149,7 +149,7 @@ class SoftCut:
         if only_turns(self.robot):
             raise ParameterError("slow-where-soft", self.robot.name, "a pose with x, y or z")
 
-    def bends(self, q: Array, way: Array) -> Array:
+    def deflection_per_feed(self, q: Array, way: Array) -> Array:
         """Deflection of the reference point per feed, m per m/s, shape (p,).
 
         :param q: joint positions (p, n); ``way``: directions of the motion (p, 3), base axes.
@@ -162,7 +162,7 @@ class SoftCut:
 
     def slowdown(self, q: Array, way: Array) -> Array:
         """What divides the feed so that the deflection stays within the tolerance, (p,)."""
-        return np.maximum(1.0, self.feed / self.tolerance * self.bends(q, way))
+        return np.maximum(1.0, self.feed / self.tolerance * self.deflection_per_feed(q, way))
 
 
 def torque_table(m: Recording, progress: Callable[[int], None] | None = None) -> dict[str, Array]:
@@ -185,9 +185,9 @@ def torque_table(m: Recording, progress: Callable[[int], None] | None = None) ->
     q, qd, qdd, wrench = m.motion
     told = m.efforts == "measured" or (m.efforts == "effort" and m.bag is None)
     outside, _ = beyond_limits(m.robot, q, qd)
-    rates = _moving(m)
+    rates = _friction_rates(m)
     memory = Dahl.remembered(m.robot.friction, q, rates)[0]
-    for robot, part in by_load(m.robot, m.load, m.time, BLOCK):
+    for robot, part in by_load(m.robot, m.load, m.time, SAMPLES_PER_BLOCK):
         begin = part.start
         state = (robot, q[part], rates[part], qdd[part], wrench[part])
         try:
@@ -227,7 +227,7 @@ def torque_table(m: Recording, progress: Callable[[int], None] | None = None) ->
     whole = {name: np.concatenate(parts) for name, parts in columns.items()}
     if m.effort is not None and m.efforts == "effort" and told:
         model = np.stack([whole[f"{joint}.effort"] for joint in m.robot.joint_names], -1)
-        if np.abs(m.effort - model).max() <= SAME * np.abs(model).max():
+        if np.abs(m.effort - model).max() <= EFFORT_TOLERANCE * np.abs(model).max():
             # A plan of this machine: nothing was measured.
             whole = {name: v for name, v in whole.items() if not name.endswith(".measured")}
     return whole | origin_columns(m.robot, m.load, m.wrench, m.time)

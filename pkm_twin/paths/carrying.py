@@ -15,14 +15,14 @@ from numpy.typing import NDArray
 from delta_dynamics import inverse_dynamics
 from pkm_twin.codegen.arrays import Array, doubles
 from pkm_twin.errors import ParameterError
-from pkm_twin.paths.geometry import SHORTEST, Path, Stretch
-from pkm_twin.paths.pieces import Cut
+from pkm_twin.paths.geometry import MIN_DISTANCE, Path, Stretch
+from pkm_twin.paths.pieces import SubPiece
 from pkm_twin.recordings.payload import Load
 from pkm_twin.robot.robot import Robot
 
 
 @dataclass(frozen=True)
-class Carried:
+class PayloadChange:
     """A payload from a place of a path on: the begin of a piece of a stretch (the stretch's end
     where it has no such piece; stretch -1: the rest before the first), after a rest there, s.
 
@@ -36,16 +36,16 @@ class Carried:
     rest: float = 0.0
 
 
-def carry(
+def split_at_payloads(
     robot: Robot, path: Path, payload: Sequence[float | None] | None
-) -> tuple[Path, tuple[Carried, ...]]:
+) -> tuple[Path, tuple[PayloadChange, ...]]:
     """A path with pieces that end where its payload changes, and what is carried from where on.
 
     :param payload: from each waypoint on, kg, (waypoints,); None is the robot's own.
     :raises ParameterError: not one for each waypoint, or a mass that the robot cannot carry.
     """
     if payload is None:
-        return path, (Carried(robot),)
+        return path, (PayloadChange(robot),)
     expected = f"{len(path.marks)} masses (kg) or None, one for each waypoint"
     if isinstance(payload, str | Mapping) or np.ndim(np.asarray(payload, object)) != 1:
         raise ParameterError("payload", payload, expected)
@@ -58,32 +58,32 @@ def carry(
         raise ParameterError("payload", payload, expected) from None
     masses = [None if mass == own else mass for mass in given]
     robots = {m: robot if m is None else Load(m).on(robot) for m in dict.fromkeys(masses)}
-    result = [Carried(robots[masses[0]], masses[0])]
+    result = [PayloadChange(robots[masses[0]], masses[0])]
     stretches = list(path.stretches)
     for mark, mass in zip(path.marks[1:], masses[1:], strict=True):
         if mass == result[-1].mass:
             continue
         piece = 0
         if mark.stretch >= 0:
-            stretches[mark.stretch], piece = _cut(stretches[mark.stretch], mark.way)
-        result.append(Carried(robots[mass], mass, mark.stretch, piece, mark.rest))
+            stretches[mark.stretch], piece = _split_piece(stretches[mark.stretch], mark.way)
+        result.append(PayloadChange(robots[mass], mass, mark.stretch, piece, mark.rest))
     return replace(path, stretches=tuple(stretches)), tuple(result)
 
 
-def _cut(stretch: Stretch, way: float) -> tuple[Stretch, int]:
+def _split_piece(stretch: Stretch, way: float) -> tuple[Stretch, int]:
     """A stretch with a piece that begins there, and its number."""
     for k, piece in enumerate(stretch.pieces):
-        if way <= SHORTEST:
+        if way <= MIN_DISTANCE:
             return stretch, k
-        if way < piece.length - SHORTEST:
-            parts = Cut(piece, 0.0, way), Cut(piece, way, piece.length)
+        if way < piece.length - MIN_DISTANCE:
+            parts = SubPiece(piece, 0.0, way), SubPiece(piece, way, piece.length)
             pieces = (*stretch.pieces[:k], *parts, *stretch.pieces[k + 1 :])
             return replace(stretch, pieces=pieces), k + 1
         way -= piece.length
     return stretch, len(stretch.pieces)
 
 
-def robots_on(carried: Sequence[Carried], stretch: int, pieces: int) -> tuple[Robot, ...]:
+def loaded_robots(carried: Sequence[PayloadChange], stretch: int, pieces: int) -> tuple[Robot, ...]:
     """The robot with its payload on each piece of a stretch."""
     return tuple(
         next(c.robot for c in reversed(carried) if (c.stretch, c.piece) <= (stretch, k))
@@ -91,7 +91,7 @@ def robots_on(carried: Sequence[Carried], stretch: int, pieces: int) -> tuple[Ro
     )
 
 
-def efforts_of(
+def compute_efforts(
     robots: Sequence[Robot], which: NDArray[np.int64], q: Array, qd: Array, qdd: Array,
     wrench: Array | None,
 ) -> Array:  # fmt: skip

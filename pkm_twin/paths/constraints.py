@@ -19,10 +19,10 @@ from numpy.typing import ArrayLike
 
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError, check_limit
-from pkm_twin.paths.joint_path import Index, JointPath, place_at
+from pkm_twin.paths.joint_path import Index, JointPath, describe_place
 from pkm_twin.robot.robot import Robot
 
-NOTHING: Final = 1e-12
+MIN_RATE_FRACTION: Final = 1e-12
 """Part of the greatest rate below which a joint does not move."""
 
 
@@ -190,37 +190,37 @@ class Rows:
             fixed.append(drag[-1])
             dry.append(drag[-1])
         a, b, w, g, k = (np.concatenate(rows, 1) for rows in (alpha, beta, drag, fixed, dry))
-        most = _most(part, limits)
-        return cls(a, b, w, g, k, np.minimum(most, _fast(part, a, most)))
+        most = _velocity_bound(part, limits)
+        return cls(a, b, w, g, k, np.minimum(most, _unreachable_bound(part, a, most)))
 
 
-def _fast(part: JointPath, alpha: Array, most: Array) -> float:
+def _unreachable_bound(part: JointPath, alpha: Array, most: Array) -> float:
     """An x that no motion reaches: ten times what the hardest acceleration all the way gives."""
     size = np.abs(alpha).max(1, initial=0.0)
-    pushed = size > NOTHING * size.max()
+    pushed = size > MIN_RATE_FRACTION * size.max()
     if not pushed.any():
         return float(most[np.isfinite(most)].max())
     return float(10.0 * 2.0 * part.s[-1] * (2.0 / size[pushed]).max())
 
 
-def _most(part: JointPath, limits: Limits) -> Array:
+def _velocity_bound(part: JointPath, limits: Limits) -> Array:
     """Greatest x by joint velocities and the tool's speed, shape (p,)."""
     rates = np.abs(part.first)
-    least = NOTHING * max(float(rates.max()), 1e-300)
+    least = MIN_RATE_FRACTION * max(float(rates.max()), 1e-300)
     with np.errstate(divide="ignore"):
         fastest = np.where(rates > least, limits.velocity / np.maximum(rates, least), np.inf)
         tool = limits.speed / np.maximum(part.felt, 1e-300)
     return np.asarray(np.minimum(fastest.min(1), tool) ** 2, np.float64)
 
 
-def names_of(robot: Robot) -> list[str]:
-    """What may bind, in the order of :func:`shares`."""
+def limit_names(robot: Robot) -> list[str]:
+    """What may bind, in the order of :func:`limit_usage`."""
     joints = robot.joint_names
     words = ("effort", "velocity", "acceleration", "jerk")
     return [f"{word} {joint}" for word in words for joint in joints] + ["speed"]
 
 
-def shares(
+def limit_usage(
     limits: Limits, effort: Array | None, qd: Array, qdd: Array, qddd: Array, speed: Array
 ) -> Array:
     """Each limit's used part with its sign, (k, 4 n + 1), 1 at the limit; 0 where there is none."""
@@ -245,7 +245,7 @@ def check_rest(part: JointPath, rows: Rows, limits: Limits) -> None:
         return
     row, column = np.unravel_index(int(size.argmax()), size.shape)
     robot = part.curve.robot
-    where = place_at(robot, part.q[row], part.curve.begin + float(part.s[row]))
+    where = describe_place(robot, part.q[row], part.curve.begin + float(part.s[row]))
     bounded = np.flatnonzero(np.isfinite(limits.effort))
     name = robot.joint_names[bounded[column]]
     raise ParameterError(

@@ -14,12 +14,12 @@ from numpy.typing import ArrayLike
 
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError, UnknownNameError
-from pkm_twin.paths.carrying import carry
+from pkm_twin.paths.carrying import split_at_payloads
 from pkm_twin.paths.constraints import Forces, Limits, Rows, check_rest
 from pkm_twin.paths.geometry import Path, through
-from pkm_twin.paths.jerk import PROGRAMS, smooth_profile, smooth_run
+from pkm_twin.paths.jerk import MAX_PROGRAMS, smooth_profile, smooth_run
 from pkm_twin.paths.joint_path import JointPath, Slowdown, joint_paths
-from pkm_twin.paths.motion import Run, TimedPath, moving, needs_forces, run_peaks
+from pkm_twin.paths.motion import Run, TimedPath, needs_forces, run_peaks, sample_run
 from pkm_twin.paths.profile import fastest_profile
 from pkm_twin.robot.robot import Robot
 
@@ -62,7 +62,7 @@ def s_curve(cruise: float, smooth: float) -> Law:
     return Law(np.concatenate([[0.0], np.cumsum(steps)]), np.array(rows).T)
 
 
-SHORTEST: Final = 1e-6
+MIN_DURATION: Final = 1e-6
 """Duration of a stretch that nothing limits, s."""
 LAWS: Final[Mapping[str, Sequence[Law]]] = {
     "quintic": (QUINTIC,),
@@ -75,14 +75,14 @@ LAWS: Final[Mapping[str, Sequence[Law]]] = {
 """Laws by name: of several the one that is fastest within the limits."""
 
 
-def shortest(part: JointPath, law: Law, limits: Limits, wrench: Array | None) -> Run:
+def run_by_law(part: JointPath, law: Law, limits: Limits, wrench: Array | None) -> Run:
     """A stretch by a law, the shortest within the limits at as many times as it has points."""
     run = law.on(part, 1.0)
     time = np.linspace(0.0, 1.0, len(part.ends))
     interval, share, v, u = run.at(time)
     _, qd, qdd = part.motion(interval, share, v, u)
     jerk = np.gradient(qdd, time, axis=0)
-    travel = moving(run, time).felt
+    travel = sample_run(run, time).felt
     duration = max(
         float((np.abs(qd) / limits.velocity).max()),
         float((travel / limits.speed).max()),
@@ -106,37 +106,37 @@ def shortest(part: JointPath, law: Law, limits: Limits, wrench: Array | None) ->
             hits = (sign * linear) ** 2 + 4.0 * sign * square * rest >= 0.0
             slowest = np.where(hits, (sign * linear + root) / (2.0 * rest), 0.0)
             duration = max(duration, float(slowest.max()))
-    return run.slower(max(duration, SHORTEST))
+    return run.slower(max(duration, MIN_DURATION))
 
 
-POINTS: Final = 1000
+DEFAULT_POINTS: Final = 1000
 """Points of a path."""
-JERK_POINTS: Final = 400
+MAX_JERK_POINTS: Final = 400
 """The same where jerks are limited: each is a variable of linear programs."""
-SINGULARITY: Final = 0.01
+MIN_SINGULARITY_INDEX: Final = 0.01
 """Least singularity index of a path, by default the nodes' ``singularity_stop``."""
-KEPT: Final = 1e-4
+LIMIT_RESERVE: Final = 1e-4
 """Part of each limit that the points of a path leave to what is between them."""
-SMALL: Final = 3e-4
+MAX_EXCESS: Final = 3e-4
 """Part of a limit passed between the points that slowing the whole down makes good."""
-COARSE: Final = 1e-3
+REFINEMENT_EXCESS: Final = 1e-3
 """Part of a limit passed from which on intervals are divided, and of the duration, with limits of
 jerk, that is worth another program."""
-LITTLE: Final = 1e-5
+SLOWDOWN_RESERVE: Final = 1e-5
 """By what part more than is needed a motion is slowed down; each time four times as much."""
-SLOWER: Final = 12
+MAX_SLOWDOWNS: Final = 12
 """How often a motion that passes a limit is slowed down."""
-ROUNDS: Final = 4
+MAX_TIGHTENINGS: Final = 4
 """How often limits are tightened where they are passed between the points."""
-DIVISIONS: Final = 5
+MAX_REFINEMENTS: Final = 5
 """How often intervals in which they are passed are divided before that."""
-MOST_PARTS: Final = 8
+MAX_PARTS: Final = 8
 """Most parts of an interval each time."""
-JERK_DIVISIONS: Final = 4
+MAX_JERK_REFINEMENTS: Final = 4
 """How often intervals are divided where jerks are limited."""
-STEEP: Final = 2.0
+MAX_SPEED_RATIO: Final = 2.0
 """Ratio of squared speeds at the ends of an interval from which on it is divided then."""
-ENDS: Final = 8
+UNDIVIDED_ENDS: Final = 8
 """Intervals next to a stop that are not divided: their points are set closer already."""
 
 
@@ -150,9 +150,9 @@ def fastest(
     jerk: ArrayLike | None = None,
     speed: float | None = None,
     share: float = 1.0,
-    singularity: float = SINGULARITY,
+    singularity: float = MIN_SINGULARITY_INDEX,
     wrench: ArrayLike | None = None,
-    points: int = POINTS,
+    points: int = DEFAULT_POINTS,
     slowdown: Slowdown | None = None,
     payload: Sequence[float | None] | None = None,
 ) -> TimedPath:
@@ -173,7 +173,7 @@ def fastest(
     :param share: fraction of the robot file's efforts and velocities to use.
     :param singularity: least singularity index on the path, 0 to 1.
     :param wrench: constant external wrench on the platform, (6,), base axes.
-    :param points: about how many points of the path; with a jerk limit at most :data:`JERK_POINTS`.
+    :param points: about how many points of the path; with a jerk limit at most :data:`MAX_JERK_POINTS`.
     :param slowdown: divides ``speed`` at points of the path, by their joint positions (p, n) and
         the direction (p, 3) of the reference point, base axes: returns 1 or more, (p,).
     :param payload: mass from each waypoint on, kg, (waypoints,); None is the robot's own payload,
@@ -199,9 +199,9 @@ def timed(
     law: str = "fastest",
     *,
     duration: float | None = None,
-    singularity: float = SINGULARITY,
+    singularity: float = MIN_SINGULARITY_INDEX,
     wrench: ArrayLike | None = None,
-    points: int = POINTS,
+    points: int = DEFAULT_POINTS,
     slowdown: Slowdown | None = None,
     payload: Sequence[float | None] | None = None,
     **bounds: Any,
@@ -216,20 +216,20 @@ def timed(
     if law not in ("fastest", *LAWS):
         raise UnknownNameError("law", law, ("fastest", *LAWS))
     made = path if isinstance(path, Path) else through(robot, path)
-    made, carried = carry(robot, made, payload)
+    made, carried = split_at_payloads(robot, made, payload)
     robot = carried[0].robot
     limits = Limits.of(robot, **bounds)
     if law == "fastest" or duration is None:
         limits.check()
     load = None if wrench is None else np.asarray(wrench, float)
     jerks = law == "fastest" and np.isfinite(limits.jerk).any()
-    points = min(points, JERK_POINTS) if jerks else points
+    points = min(points, MAX_JERK_POINTS) if jerks else points
 
     def plan(part: JointPath) -> Run:
         if law == "fastest":
-            return (_smooth if jerks else _run)(part, limits, load)
-        runs = (shortest(part, one, limits, load) for one in LAWS[law])
-        return kept(min(runs, key=lambda run: run.duration), limits, load)
+            return (_solve_with_jerk if jerks else _solve_stretch)(part, limits, load)
+        runs = (run_by_law(part, one, limits, load) for one in LAWS[law])
+        return slow_within_limits(min(runs, key=lambda run: run.duration), limits, load)
 
     parts = joint_paths(made, carried, points, singularity, slowdown)
     rests = (made.wait, *(stretch.dwell for stretch in made.stretches))
@@ -246,56 +246,56 @@ def timed(
     factor = (duration - sum(result.rests)) / moving
     result = replace(result, runs=tuple(run.slower(factor) for run in result.runs))
     over = max(result.worst.values(), default=0.0)
-    if over > 1.0 + KEPT:
+    if over > 1.0 + LIMIT_RESERVE:
         # Speed can carry a load that the drives alone do not hold.
         raise ParameterError("duration", duration, f"a motion within limits, not {over:.4g} of one")
     return result
 
 
-def _run(part: JointPath, limits: Limits, wrench: Array | None) -> Run:
+def _solve_stretch(part: JointPath, limits: Limits, wrench: Array | None) -> Run:
     """One stretch, its limits kept between the points too.
 
     Intervals within which a limit is passed are divided, and at last use less of the limits.
     """
     share = np.ones(len(part.left))
-    rows = _rows(part, limits, wrench)
+    rows = _limit_rows(part, limits, wrench)
     x: Array | None = None
-    for count in range(DIVISIONS + ROUNDS):
+    for count in range(MAX_REFINEMENTS + MAX_TIGHTENINGS):
         x = fastest_profile(rows, part.left, part.steps, share, x)
-        _check_moves(part, x)
+        _check_no_stop(part, x)
         run = Run.of(part, x)
         used = run_peaks(run, limits, wrench)
         over = used.max(1)
-        bad = over > 1.0 + SMALL
+        bad = over > 1.0 + MAX_EXCESS
         if not bad.any():
             break
         parts = np.ones(len(bad), np.int64)
-        if count < DIVISIONS:
+        if count < MAX_REFINEMENTS:
             # What a limit is passed by between two points goes by the square of their distance.
-            wanted = np.ceil(np.sqrt(np.maximum(over - 1.0, 0.0) / SMALL))
-            most = np.minimum(part.steps / part.curve.least_step, MOST_PARTS)
-            coarse = over > 1.0 + COARSE
+            wanted = np.ceil(np.sqrt(np.maximum(over - 1.0, 0.0) / MAX_EXCESS))
+            most = np.minimum(part.steps / part.curve.least_step, MAX_PARTS)
+            coarse = over > 1.0 + REFINEMENT_EXCESS
             parts[coarse] = np.maximum(np.minimum(wanted, most)[coarse], 1.0)
         tight = bad & (parts == 1)
         share[tight] /= over[tight]
         if (parts > 1).any():
             ends, part, share = part.ends, part.refined(parts), np.repeat(share, parts)
-            rows = _rows(part, limits, wrench)
+            rows = _limit_rows(part, limits, wrench)
             x = np.interp(part.ends, ends, x)
-    return kept(run, limits, wrench, used.max(0))
+    return slow_within_limits(run, limits, wrench, used.max(0))
 
 
-def _smooth(part: JointPath, limits: Limits, wrench: Array | None) -> Run:
+def _solve_with_jerk(part: JointPath, limits: Limits, wrench: Array | None) -> Run:
     """The same with limits of jerk: the best of several profiles, or a quintic."""
-    rows = _rows(part, limits, wrench)
-    slow = shortest(part, QUINTIC, limits, wrench)
+    rows = _limit_rows(part, limits, wrench)
+    slow = run_by_law(part, QUINTIC, limits, wrench)
     best: Run = slow
-    least = needed(run_peaks(slow, limits, wrench).max(0)) * slow.duration
-    x = slow.profile() * (1.0 - KEPT)
+    least = slowdown_factor(run_peaks(slow, limits, wrench).max(0)) * slow.duration
+    x = slow.profile() * (1.0 - LIMIT_RESERVE)
     share, jerks = np.ones((2, len(part.left)))
     n = len(limits.jerk)
-    programs, improved = PROGRAMS, 0
-    for count in range(JERK_DIVISIONS + ROUNDS):
+    programs, improved = MAX_PROGRAMS, 0
+    for count in range(MAX_JERK_REFINEMENTS + MAX_TIGHTENINGS):
         found = smooth_profile(part, rows, limits, x, share, jerks, programs)
         if found is None:
             break
@@ -304,12 +304,12 @@ def _smooth(part: JointPath, limits: Limits, wrench: Array | None) -> Run:
         if run is None:
             break
         used = run_peaks(run, limits, wrench)
-        factor = needed(used.max(0))
-        if factor * run.duration < (1.0 - COARSE) * least:
+        factor = slowdown_factor(used.max(0))
+        if factor * run.duration < (1.0 - REFINEMENT_EXCESS) * least:
             improved = count
         if factor * run.duration < least:
             best, least = run, factor * run.duration
-        if factor <= 1.0 + COARSE or count >= improved + 2:
+        if factor <= 1.0 + REFINEMENT_EXCESS or count >= improved + 2:
             break
         over = np.ones((2, len(share)))
         interval = run.at(0.5 * (run.times[1:] + run.times[:-1]))[0]
@@ -317,36 +317,36 @@ def _smooth(part: JointPath, limits: Limits, wrench: Array | None) -> Run:
         np.maximum.at(over[1], interval, used[:, 3 * n : 4 * n].max(1))
         # Where the speed changes by much within an interval, the programs say little of it.
         parts = np.ones(len(share), np.int64)
-        if count < JERK_DIVISIONS:
-            steep = np.maximum(x[1:], x[:-1]) > STEEP * np.minimum(x[1:], x[:-1])
-            steep[:ENDS] = steep[-ENDS:] = False
-            long = part.steps > MOST_PARTS * part.curve.least_step
-            parts[steep & long & (over.max(0) > 1.0 + COARSE)] = MOST_PARTS
+        if count < MAX_JERK_REFINEMENTS:
+            steep = np.maximum(x[1:], x[:-1]) > MAX_SPEED_RATIO * np.minimum(x[1:], x[:-1])
+            steep[:UNDIVIDED_ENDS] = steep[-UNDIVIDED_ENDS:] = False
+            long = part.steps > MAX_PARTS * part.curve.least_step
+            parts[steep & long & (over.max(0) > 1.0 + REFINEMENT_EXCESS)] = MAX_PARTS
         divided = bool((parts > 1).any())
         share, jerks = (
             np.repeat(np.where(parts > 1, 1.0, old / own), parts)
             for old, own in zip((share, jerks), over, strict=True)
         )
-        programs = PROGRAMS if divided else 1
+        programs = MAX_PROGRAMS if divided else 1
         if divided:
             ends, part = part.ends, part.refined(parts)
-            rows = _rows(part, limits, wrench)
+            rows = _limit_rows(part, limits, wrench)
             x = np.interp(part.ends, ends, x**0.75) ** (4 / 3)
-    return kept(best, limits, wrench)
+    return slow_within_limits(best, limits, wrench)
 
 
-def _rows(part: JointPath, limits: Limits, wrench: Array | None) -> Rows:
-    """The limits at the points of a stretch, smaller by :data:`KEPT`."""
+def _limit_rows(part: JointPath, limits: Limits, wrench: Array | None) -> Rows:
+    """The limits at the points of a stretch, smaller by :data:`LIMIT_RESERVE`."""
     forces = None
     if needs_forces(part, limits):
         points = np.arange(len(part.s))
         forces = Forces.of(part, points, part.q, part.first, part.second, wrench)
-    rows = Rows.of(part, forces, limits.part(1.0 - KEPT))
+    rows = Rows.of(part, forces, limits.part(1.0 - LIMIT_RESERVE))
     check_rest(part, rows, limits)
     return rows
 
 
-def _check_moves(part: JointPath, x: Array) -> None:
+def _check_no_stop(part: JointPath, x: Array) -> None:
     """Reject a profile that stands still on its way."""
     slow = (x[:-1] + x[1:]) <= 0.0
     if slow.any():
@@ -356,7 +356,7 @@ def _check_moves(part: JointPath, x: Array) -> None:
         )
 
 
-def needed(used: Array) -> float:
+def slowdown_factor(used: Array) -> float:
     """By what a motion has to be slowed down, about, from its used parts of limits (4 n + 1,).
 
     Rates go by the speed, accelerations by its square, jerks by its cube. What moves of an effort
@@ -367,19 +367,21 @@ def needed(used: Array) -> float:
     return float((used ** (1.0 / powers)).max())
 
 
-def kept(run: Run, limits: Limits, wrench: Array | None, used: Array | None = None) -> Run:
+def slow_within_limits(
+    run: Run, limits: Limits, wrench: Array | None, used: Array | None = None
+) -> Run:
     """A run, slower by as much as its limits need.
 
     :param used: greatest used part of each limit, where it is known, shape (4 n + 1,).
     :raises ParameterError: no speed keeps them.
     """
     factor = 1.0
-    for more in LITTLE * 4.0 ** np.arange(SLOWER):
+    for more in SLOWDOWN_RESERVE * 4.0 ** np.arange(MAX_SLOWDOWNS):
         slower = run if factor == 1.0 else run.slower(factor)
         if used is None:
             used = run_peaks(slower, limits, wrench).max(0)
         if used.max() <= 1.0:
             return slower
-        factor *= max(needed(used), 1.0) + more
+        factor *= max(slowdown_factor(used), 1.0) + more
         used = None
     raise ParameterError("path", "any speed", "limits that a slow motion meets")

@@ -23,11 +23,11 @@ from pkm_twin.robot.robot import Robot
 
 Space = Literal["pose", "joint"]
 
-SHORTEST: Final = 1e-9
+MIN_DISTANCE: Final = 1e-9
 """Distance below which two waypoints are one, m."""
-SHARPEST: Final = -0.985
+REVERSAL_COSINE: Final = -0.985
 """Cosine of the turn from which on a corner is a reversal (170 degrees) and cannot be rounded."""
-TANGENT: Final = 1e-6
+TANGENT_TOLERANCE: Final = 1e-6
 """Difference of two unit directions below which a path passes from one to the other at speed."""
 
 
@@ -41,7 +41,7 @@ class Stretch:
     @property
     def length(self) -> float:
         """Range of s."""
-        return _length(self.pieces)
+        return _total_length(self.pieces)
 
 
 class Mark(NamedTuple):
@@ -80,7 +80,7 @@ def scales_of(robot: Robot, space: Space) -> Array:
     return np.array([1.0 if unit == "m" else robot.size for unit in robot.joint_units])
 
 
-def _points(robot: Robot, points: ArrayLike, space: Space) -> tuple[Array, Array]:
+def _check_waypoints(robot: Robot, points: ArrayLike, space: Space) -> tuple[Array, Array]:
     """Way-points (k, m), and which of them differ from the one before.
 
     :raises ParameterError: a wrong shape, no number, or no way at all.
@@ -95,9 +95,9 @@ def _points(robot: Robot, points: ArrayLike, space: Space) -> tuple[Array, Array
         row = int(np.argwhere(~np.isfinite(values))[0, 0])
         raise ParameterError(f"waypoint {row}", values[row].tolist(), "finite numbers")
     steps = np.linalg.norm(np.diff(values, axis=0) * scales_of(robot, space), axis=1)
-    if not (steps > SHORTEST).any():
+    if not (steps > MIN_DISTANCE).any():
         raise ParameterError("waypoints", "all equal", "two or more different waypoints")
-    return values, np.concatenate([[True], steps > SHORTEST])
+    return values, np.concatenate([[True], steps > MIN_DISTANCE])
 
 
 def through(robot: Robot, points: ArrayLike, *, space: Space = "pose") -> Path:
@@ -106,7 +106,7 @@ def through(robot: Robot, points: ArrayLike, *, space: Space = "pose") -> Path:
     :param points: shape (k, m), coordinates of the pose, or joint positions (k, n).
     :raises ParameterError: fewer than two different waypoints, or values that are not finite.
     """
-    values, new = _points(robot, points, space)
+    values, new = _check_waypoints(robot, points, space)
     values = values[new]
     steps = np.linalg.norm(np.diff(values, axis=0) * scales_of(robot, space), axis=1)
     knots = np.concatenate([[0.0], np.cumsum(steps)])
@@ -138,7 +138,7 @@ def lines(
         to the one behind. An arc and a tangent line meet without a stop.
     :raises ParameterError: with the waypoint.
     """
-    values, new = _points(robot, points, space)
+    values, new = _check_waypoints(robot, points, space)
     count = len(values)
     blends, dwells = (np.broadcast_to(np.asarray(v, float), count).copy() for v in (blend, dwell))
     arcs = np.broadcast_to(np.asarray(arc, bool), count).copy()
@@ -172,7 +172,7 @@ class _Lines:
         self.scales = scales_of(robot, space)
 
     def path(self) -> Path:
-        moves = list(self._moves())
+        moves = list(self._make_pieces())
         pieces: list[Piece] = []
         stretches: list[Stretch] = []
         marks = [Mark(-1, 0.0)]
@@ -180,25 +180,25 @@ class _Lines:
         cut = 0.0
         for k, (piece, end) in enumerate(moves):
             following = moves[k + 1][0] if k < last else None
-            radius = 0.0 if following is None else self._radius(end, piece, following)
+            radius = 0.0 if following is None else self._blend_radius(end, piece, following)
             if isinstance(piece, Arc):
-                middle = _length(pieces) + piece.to(self.points[end - 1])
+                middle = _total_length(pieces) + piece.to(self.points[end - 1])
                 marks.append(Mark(len(stretches), middle))
-            pieces += _shortened(piece, cut, radius)
-            marks.append(Mark(len(stretches), _length(pieces) + radius))
+            pieces += _shorten(piece, cut, radius)
+            marks.append(Mark(len(stretches), _total_length(pieces) + radius))
             cut = radius
-            out = _end(piece)
+            out = _end_direction(piece)
             into = out if following is None else following.at(np.zeros(1))[1][0]
             if radius > 0.0:
                 pieces.append(Corner(self.points[end], out, into, radius))
                 continue
             apart = float(np.linalg.norm((out - into) * self.scales))
-            if k == last or apart > TANGENT or self.dwells[end] > 0.0:
+            if k == last or apart > TANGENT_TOLERANCE or self.dwells[end] > 0.0:
                 stretches.append(Stretch(tuple(pieces), float(self.dwells[end])))
                 pieces = []
         return Path(self.space, tuple(stretches), float(self.dwells[0]), "lines", tuple(marks))
 
-    def _moves(self) -> Sequence[tuple[Piece, int]]:
+    def _make_pieces(self) -> Sequence[tuple[Piece, int]]:
         """Each line or arc, and the waypoint that it ends in."""
         result: list[tuple[Piece, int]] = []
         k, last = 0, len(self.points) - 1
@@ -212,7 +212,7 @@ class _Lines:
                     raise ParameterError(
                         f"waypoint {k + 2}: arc", 1, "only one point between the ends of an arc"
                     )
-                result.append((self._arc(k), k + 2))
+                result.append((self._make_arc(k), k + 2))
                 k += 2
                 continue
             way = self.points[k + 1] - self.points[k]
@@ -221,7 +221,7 @@ class _Lines:
             k += 1
         return result
 
-    def _radius(self, k: int, piece: Piece, following: Piece) -> float:
+    def _blend_radius(self, k: int, piece: Piece, following: Piece) -> float:
         """Where a corner is left, m; 0 where it is passed with a stop or is none."""
         wanted = float(self.blends[k])
         if wanted == 0.0 or self.dwells[k] > 0.0:
@@ -231,11 +231,11 @@ class _Lines:
                 f"waypoint {k}: blend", wanted, "0 where an arc begins or ends (make it tangent)"
             )
         turn = float(np.sum(piece.slope * following.slope * self.scales**2))
-        if turn <= SHARPEST or turn >= 1.0 - TANGENT**2:
+        if turn <= REVERSAL_COSINE or turn >= 1.0 - TANGENT_TOLERANCE**2:
             return 0.0
         return min(wanted, 0.5 * piece.length, 0.5 * following.length)
 
-    def _arc(self, k: int) -> Arc:
+    def _make_arc(self, k: int) -> Arc:
         """The arc from waypoint k through the next one to the one behind."""
         names = self.robot.pose_names if self.space == "pose" else ()
         places = [i for i, name in enumerate(names) if name in ("x", "y", "z")]
@@ -246,18 +246,18 @@ class _Lines:
         return arc_through(*self.points[k : k + 3], places=places, where=f"waypoint {k + 1}")
 
 
-def _length(pieces: Sequence[Piece]) -> float:
+def _total_length(pieces: Sequence[Piece]) -> float:
     return sum(piece.length for piece in pieces)
 
 
-def _end(piece: Piece) -> Array:
+def _end_direction(piece: Piece) -> Array:
     return np.asarray(piece.at(np.array([piece.length]))[1][0], np.float64)
 
 
-def _shortened(piece: Piece, begin: float, end: float) -> list[Piece]:
+def _shorten(piece: Piece, begin: float, end: float) -> list[Piece]:
     """A line without its first and last parts; nothing where nothing is left."""
     length = piece.length - begin - end
-    if not length > SHORTEST:
+    if not length > MIN_DISTANCE:
         return []
     if begin == end == 0.0 or not isinstance(piece, Line):
         return [piece]

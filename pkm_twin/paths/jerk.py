@@ -24,21 +24,21 @@ from pkm_twin.paths.profile import interval_rows
 
 Index = NDArray[np.int64]
 
-PROGRAMS: Final = 20
+MAX_PROGRAMS: Final = 20
 """Most linear programs."""
-SETTLED: Final = 1e-4
+DURATION_TOLERANCE: Final = 1e-4
 """Relative change of the duration that ends them."""
-LEAST: Final = 1e-9
+MIN_PROFILE_FRACTION: Final = 1e-9
 """Part of the greatest x below which a machine does not slow down on its way."""
-SLOWER: Final = 6
+MAX_SLOWDOWNS: Final = 6
 """How often a start is slowed down until a program has a solution."""
-RAISED: Final = 20
+MAX_RAISES: Final = 20
 """How often a profile is raised where it would go back."""
-ROUNDED: Final = 1e-12
+ROUNDING: Final = 1e-12
 """Part of the greatest speed below rest that is rounding."""
 
 
-def _least(knots: Array, v: Array, u: Array) -> Array:
+def _min_speed(knots: Array, v: Array, u: Array) -> Array:
     """Least speed between knots, where it turns too, by v and u there, (k,); shape (k - 1,)."""
     span, change = np.diff(knots), np.diff(u)
     rises = (u[:-1] < 0.0) & (u[1:] > 0.0)
@@ -47,7 +47,7 @@ def _least(knots: Array, v: Array, u: Array) -> Array:
     return np.minimum(np.minimum(v[:-1], v[1:]), v[:-1] + dip)
 
 
-def _sides(part: JointPath) -> tuple[Array, Array, tuple[Array, Array]]:
+def _boundary_derivatives(part: JointPath) -> tuple[Array, Array, tuple[Array, Array]]:
     """The first two derivatives at the points between two intervals, and the third on both sides.
 
     Shape (i - 1, n) each; where two pieces meet the third jumps.
@@ -61,7 +61,7 @@ def _sides(part: JointPath) -> tuple[Array, Array, tuple[Array, Array]]:
 
 def smooth_profile(
     part: JointPath, rows: Rows, limits: Limits, start: Array, share: Array, jerks: Array,
-    programs: int = PROGRAMS,
+    programs: int = MAX_PROGRAMS,
 ) -> Array | None:  # fmt: skip
     """The greatest x at the intervals' ends, (i + 1,), with the joints' jerks within limits.
 
@@ -83,7 +83,7 @@ def smooth_profile(
     count = slower = 0
     while count < programs:
         *table, most = interval_rows(rows, part.left, h, x, share)
-        own, bound = _rows(*table)
+        own, bound = _program_rows(*table)
         more, top = _jerk_rows(part, jerk, h, x, jerks)
         v = np.sqrt(np.maximum(x, 1e-12 * x.max()))
         weight = np.zeros(len(x))
@@ -93,10 +93,10 @@ def smooth_profile(
         answer = scipy.optimize.linprog(
             -weight / weight[1:-1].max(),
             A_ub=scipy.sparse.vstack([own, more]).tocsr(), b_ub=np.concatenate([bound, top]),
-            bounds=np.stack([np.zeros(len(x)), _from_rest(part, jerk, most)], 1),
+            bounds=np.stack([np.zeros(len(x)), _bound_from_rest(part, jerk, most)], 1),
             method="highs",
         )  # fmt: skip
-        if answer.status != 0 and count == 0 and slower < SLOWER:
+        if answer.status != 0 and count == 0 and slower < MAX_SLOWDOWNS:
             # A slower motion has smaller jerks, so that the bounds' tangents there leave room.
             x, slower = 0.25 * x, slower + 1
             continue
@@ -107,15 +107,15 @@ def smooth_profile(
         duration = float(np.sum(2.0 * h / np.maximum(v[:-1] + v[1:], 1e-300)))
         if not duration < best:
             break
-        settled = duration > best * (1.0 - SETTLED)
+        settled = duration > best * (1.0 - DURATION_TOLERANCE)
         best, x, count = duration, new, count + 1
         if settled:
             break
-    x[1:-1] = np.maximum(x[1:-1], LEAST * x.max())
+    x[1:-1] = np.maximum(x[1:-1], MIN_PROFILE_FRACTION * x.max())
     return unit * x
 
 
-def _from_rest(part: JointPath, jerk: Array, most: Array) -> Array:
+def _bound_from_rest(part: JointPath, jerk: Array, most: Array) -> Array:
     """Greatest x at the intervals' ends, (i + 1,), also by the jerk from rest and to it."""
     most = most.copy()
     most[0] = most[-1] = 0.0
@@ -128,18 +128,20 @@ def _from_rest(part: JointPath, jerk: Array, most: Array) -> Array:
     return most
 
 
-def _triplets(rows: list[tuple[Any, Any, Any]], shape: tuple[int, int]) -> scipy.sparse.csr_matrix:
+def _sparse_matrix(
+    rows: list[tuple[Any, Any, Any]], shape: tuple[int, int]
+) -> scipy.sparse.csr_matrix:
     values, row, column = (np.concatenate([np.ravel(r[k]) for r in rows]) for k in range(3))
     return scipy.sparse.coo_matrix((values, (row, column)), shape=shape).tocsr()
 
 
-def _rows(
+def _program_rows(
     p: Array, q: Array, least: Array, greatest: Array
 ) -> tuple[scipy.sparse.csr_matrix, Array]:
     """Rows least <= p x + q x' <= greatest of all intervals, (i, r), as a program has them."""
     count, width = p.shape
     number, column = np.arange(p.size), np.repeat(np.arange(count), width)
-    made = _triplets([(p, number, column), (q, number, column + 1)], (p.size, count + 1))
+    made = _sparse_matrix([(p, number, column), (q, number, column + 1)], (p.size, count + 1))
     return scipy.sparse.vstack([made, -made]), np.concatenate([greatest.ravel(), -least.ravel()])
 
 
@@ -148,7 +150,7 @@ def _jerk_rows(
 ) -> tuple[scipy.sparse.csr_matrix, Array]:
     """Jerks at the points between two intervals, their bound's tangent at a profile."""
     used = np.isfinite(jerk)
-    first, second, sides = _sides(part)
+    first, second, sides = _boundary_derivatives(part)
     # As fractions of the limits.
     first, second = first[:, used] / jerk[used], second[:, used] / jerk[used]
     most = np.minimum(share[1:], share[:-1])[:, None]
@@ -176,7 +178,7 @@ def _jerk_rows(
         made.append((sign * after, number, point + 2))
         at += count * width
     bound = np.ravel(np.broadcast_to(top, (count, width)))
-    return _triplets(made, (at, len(x))), np.tile(bound, 4)
+    return _sparse_matrix(made, (at, len(x))), np.tile(bound, 4)
 
 
 def smooth_run(part: JointPath, x: Array) -> Run | None:
@@ -186,11 +188,11 @@ def smooth_run(part: JointPath, x: Array) -> Run | None:
     profile is raised there.
     """
     x = x.copy()
-    for count in range(RAISED):
-        knots, way, v, u = _joined(part, x)
-        below = -_least(knots, v, u)
+    for count in range(MAX_RAISES):
+        knots, way, v, u = _integrate_profile(part, x)
+        below = -_min_speed(knots, v, u)
         # Between two middles of intervals lies the point of their common end.
-        low = np.flatnonzero(below > ROUNDED * v.max())
+        low = np.flatnonzero(below > ROUNDING * v.max())
         if not len(low):
             jerk = np.diff(u) / np.diff(knots)
             return Run(part, knots, np.stack([way[:-1], v[:-1], u[:-1] / 2, jerk / 6]))
@@ -199,7 +201,7 @@ def smooth_run(part: JointPath, x: Array) -> Run | None:
     return None
 
 
-def _joined(part: JointPath, x: Array) -> tuple[Array, Array, Array, Array]:
+def _integrate_profile(part: JointPath, x: Array) -> tuple[Array, Array, Array, Array]:
     """A profile in time: its mean accelerations, joined by lines in time; times, way, v and u.
 
     Between points y = x^(3/4) is linear in s, as it is from rest with even jerk. What the lines

@@ -28,10 +28,10 @@ from pkm_twin.recordings import Recording, by_load
 from pkm_twin.recordings.tables import WRENCH as AXES
 from pkm_twin.robot.robot import Robot
 
-MILLION: Final = 1e6
-TRAVEL: Final = 1e5
+RATED_TURNS: Final = 1e6
+RATED_TRAVEL: Final = 1e5
 """Of a linear bearing, m, for which its C holds."""
-STILL: Final = 1e-12
+MIN_STEP: Final = 1e-12
 """Mean step of a bearing that does not move, rad or m: rounding."""
 
 
@@ -141,20 +141,20 @@ def bearing_life(
     """
     force, steps = np.asarray(load, np.float64), np.abs(np.asarray(moved, np.float64))
     whole = float(steps.sum())
-    still = whole <= STILL * len(steps)
+    still = whole <= MIN_STEP * len(steps)
     mean = float(np.mean(force**exponent) if still else np.sum(force**exponent * steps) / whole)
     equivalent, amount = mean ** (1.0 / exponent), whole if slides else whole / math.tau
     if still or not equivalent > 0.0:
         life = math.nan if equivalent > 0.0 else math.inf
         return Life(equivalent, amount, life, life)
-    life = (TRAVEL if slides else MILLION) * (rating / equivalent) ** exponent
+    life = (RATED_TRAVEL if slides else RATED_TURNS) * (rating / equivalent) ** exponent
     return Life(equivalent, amount, life, life / amount * duration / 3600.0)
 
 
-BLOCK: Final = 512
+SAMPLES_PER_BLOCK: Final = 512
 """Samples at once: each has matrices of all unknowns."""
-CLASSES: Final = 32
-ALONG: Final = 1e-9
+SPECTRUM_CLASSES: Final = 32
+ZERO_COMPONENT: Final = 1e-9
 """Part of a direction below which it is across another."""
 
 
@@ -195,8 +195,8 @@ def joint_loads(motion: Recording) -> Iterator[list[JointLoad]]:
     Errors as ``reactions``.
     """
     last: dict[str, tuple[Array, ...]] = {}
-    slides = {name: joint for name, joint in by_label(motion.robot).items() if joint.slides}
-    for robot, rows in by_load(motion.robot, motion.load, motion.time, BLOCK):
+    slides = {name: joint for name, joint in joints_by_label(motion.robot).items() if joint.slides}
+    for robot, rows in by_load(motion.robot, motion.load, motion.time, SAMPLES_PER_BLOCK):
         q, *others = (values[rows] for values in motion.motion)
         found = elastic_reactions(robot, q, *others)
         rotations, origins = motion.robot.placements(q)
@@ -205,12 +205,14 @@ def joint_loads(motion: Recording) -> Iterator[list[JointLoad]]:
         for rod in motion.robot.graph.rods.values():
             # What a rod turns is its direction; its spin is idle.
             start, end = (found.points[:, order.index(name)] for name in rod.joint_names)
-            turn[rod.name] = _swung(rod.ends[1] - rod.ends[0], end - start)
+            turn[rod.name] = _minimal_rotation(rod.ends[1] - rod.ends[0], end - start)
         result = []
         for k, (name, (inner, outer)) in enumerate(zip(found.names, found.bodies, strict=True)):
             back = turn[inner].swapaxes(-1, -2)
             wrench = found.wrenches[:, k]
-            own = np.concatenate([_times(back, wrench[:, :3]), _times(back, wrench[:, 3:])], -1)
+            own = np.concatenate(
+                [_multiply(back, wrench[:, :3]), _multiply(back, wrench[:, 3:])], -1
+            )
             place = np.zeros(len(q))
             if name in slides:
                 joint, at = slides[name], motion.robot.engine.tree.at
@@ -225,11 +227,11 @@ def joint_loads(motion: Recording) -> Iterator[list[JointLoad]]:
                 parts = tuple(map(np.concatenate, zip(last[name], parts, strict=True)))
             last[name] = tuple(part[-1:] for part in parts)
             travelled = np.abs(np.diff(parts[3]))
-            result.append(JointLoad(name, parts[0], parts[1], _angles(parts[2]), travelled))
+            result.append(JointLoad(name, parts[0], parts[1], _step_angles(parts[2]), travelled))
         yield result
 
 
-def _angles(rotations: Array) -> Array:
+def _step_angles(rotations: Array) -> Array:
     """Angles between neighbouring rotations (k, 3, 3), shape (k - 1,), rad."""
     step = rotations[:-1].swapaxes(-1, -2) @ rotations[1:]
     skew = np.stack([step[:, i, j] - step[:, j, i] for i, j in ((2, 1), (0, 2), (1, 0))], -1)
@@ -247,7 +249,7 @@ class Summary:
 
     def __init__(self, robot: Robot, name: str, spec: BearingSpec | None) -> None:
         self.name, self.spec = name, spec
-        joint = by_label(robot).get(name)
+        joint = joints_by_label(robot).get(name)
         self.slides = joint is not None and joint.slides
         self.axis = None if spec is None else bearing_axis(joint, name, spec)
         self.across = np.broadcast_to(np.eye(3), (2, 3, 3)).copy()
@@ -264,7 +266,7 @@ class Summary:
     def add(self, load: JointLoad) -> None:
         """The next block."""
         fresh = slice(1 if self.samples else 0, None)
-        borne = _times(self.across, load.own[fresh].reshape(-1, 2, 3))
+        borne = _multiply(self.across, load.own[fresh].reshape(-1, 2, 3))
         parts = np.concatenate([load.wrench[fresh].reshape(-1, 2, 3), borne], 1)
         self.known &= np.isfinite(parts).all((0, 2))
         size = np.sqrt(np.nansum(parts**2, -1))
@@ -293,13 +295,13 @@ class Summary:
         return bearing_life(load, moved, duration, self.spec.C, self.spec.p, self.slides)
 
 
-def _times(matrices: Array, vectors: Array) -> Array:
+def _multiply(matrices: Array, vectors: Array) -> Array:
     # What is undetermined leaves the directions across it alone.
-    products = np.where(np.abs(matrices) > ALONG, matrices * vectors[..., None, :], 0.0)
+    products = np.where(np.abs(matrices) > ZERO_COMPONENT, matrices * vectors[..., None, :], 0.0)
     return np.asarray(products.sum(-1), np.float64)
 
 
-def _swung(home: Array, now: Array) -> Array:
+def _minimal_rotation(home: Array, now: Array) -> Array:
     """The least rotations that turn a direction to others, shape (k, 3, 3)."""
     a = home / np.linalg.norm(home)
     b = now / np.linalg.norm(now, axis=-1, keepdims=True)
@@ -319,7 +321,7 @@ def read_bearings(path: Path, names: tuple[str, ...], robot: Robot) -> dict[str,
     :raises ParameterError: by the field; a name that no joint has, or a bearing that fits none.
     """
     found: dict[str, BearingSpec] = {}
-    joints = by_label(robot)
+    joints = joints_by_label(robot)
     for pattern, entry in read_entries(path, "bearings", "joints").items():
         fitting = fnmatch.filter(names, str(pattern))
         if not fitting:
@@ -341,7 +343,7 @@ def read_bearings(path: Path, names: tuple[str, ...], robot: Robot) -> dict[str,
     return found
 
 
-def by_label(robot: Robot) -> dict[str, Joint]:
+def joints_by_label(robot: Robot) -> dict[str, Joint]:
     """The joints by their names among the reactions."""
     return {joint.label or joint.name: joint for joint in robot.graph.joints.values()}
 
@@ -389,7 +391,7 @@ def write_rows(writer: Any, time: Array, loads: Sequence[JointLoad]) -> None:
     writer.writerows([["" if v != v else v for v in row] for row in rows.tolist()])
 
 
-def spectra(loads: Sequence[Summary]) -> str:
+def format_spectra(loads: Sequence[Summary]) -> str:
     """Rainflow counts by joint, component and class of range, as CSV."""
     text = io.StringIO()
     writer = csv.writer(text)
@@ -398,12 +400,12 @@ def spectra(loads: Sequence[Summary]) -> str:
         for k, axis in enumerate(AXES):
             cycles = load.cycles(k)
             if load.determined[k] and len(cycles.ranges):
-                for end, count in zip(*cycles.spectrum(CLASSES), strict=True):
+                for end, count in zip(*cycles.spectrum(SPECTRUM_CLASSES), strict=True):
                     writer.writerow([load.name, axis, float(end), float(count)])
     return text.getvalue()
 
 
-def summaries(
+def summarise_loads(
     motion: Recording, bearings: Path | None, out: Path | None,
     progress: Callable[[int], None] | None = None,
 ) -> list[Summary]:  # fmt: skip

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError, SingularityError, UnreachableError
-from pkm_twin.paths.carrying import Carried, efforts_of, robots_on
+from pkm_twin.paths.carrying import PayloadChange, compute_efforts, loaded_robots
 from pkm_twin.paths.geometry import Path, Stretch
 from pkm_twin.robot.derivatives import joint_rates
 from pkm_twin.robot.limits import first_beyond
@@ -22,12 +22,12 @@ from pkm_twin.robot.workspace import passing_singularity
 
 Index = NDArray[np.int64]
 
-LEAST_POINTS: Final = 16
+MIN_POINTS: Final = 16
 """Intervals of the shortest piece."""
-LEAST_STEP: Final = 1e-5
+MIN_STEP_FRACTION: Final = 1e-5
 """Shortest interval, as a fraction of the robot's size: the second derivatives of a quintic over a
 shorter one are rounding errors."""
-GRADE: Final = 1.5
+GRADING_EXPONENT: Final = 1.5
 """Power of the distance from a stop by which points are set: speeds go by its root."""
 Slowdown = Callable[[Array, Array], Array]
 """Of joint positions (p, n) and the way that the reference point goes (p, 3): factors (p,)."""
@@ -52,16 +52,16 @@ class Curve:
     @property
     def least_step(self) -> float:
         """Shortest interval, m."""
-        return LEAST_STEP * self.robot.size
+        return MIN_STEP_FRACTION * self.robot.size
 
     def grid(self, points: int) -> list[Array]:
         """About so many points, of each piece: half by the pieces' lengths, half alike for all."""
         pieces, result = self.stretch.pieces, []
         for k, piece in enumerate(pieces):
             share = piece.length / self.stretch.length + 1.0 / len(pieces)
-            count = max(LEAST_POINTS, len(piece.knots), round(0.5 * points * share))
-            even = _graded(count, begins=k == 0, ends=k == len(pieces) - 1)
-            result.append(_with_knots(piece.length * even, piece.knots, self.least_step))
+            count = max(MIN_POINTS, len(piece.knots), round(0.5 * points * share))
+            even = _grade_points(count, begins=k == 0, ends=k == len(pieces) - 1)
+            result.append(_insert_knots(piece.length * even, piece.knots, self.least_step))
         return result
 
     def at(self, grid: list[Array]) -> JointPath:
@@ -81,11 +81,11 @@ class Curve:
             q, first, second = place, slope, bend
             robot.forward(q)
         else:
-            q = _joints(robot, place, self.begin + s)
+            q = _solve_inverse(robot, place, self.begin + s)
             first, second = joint_rates(robot, q, slope, bend)
         check_positions(robot, s, q, self.begin)
         check_singularity(robot, self.begin + s, q, self.singularity)
-        twist = velocity_of(robot, q, first)
+        twist = reference_velocity(robot, q, first)
         travel = np.linalg.norm(twist, axis=1)
         slower = np.ones(len(s))
         if self.slowdown is not None:
@@ -140,7 +140,7 @@ class JointPath:
         self, points: Index, q: Array, qd: Array, qdd: Array, wrench: Array | None
     ) -> Array:
         """Efforts with the payloads of the pieces that points (k,) are of, shape (k, n)."""
-        return efforts_of(self.curve.robots, self.piece[points], q, qd, qdd, wrench)
+        return compute_efforts(self.curve.robots, self.piece[points], q, qd, qdd, wrench)
 
     @cached_property
     def _quintics(self) -> Array:
@@ -193,7 +193,7 @@ class JointPath:
         return self.curve.at(grid)
 
 
-def velocity_of(robot: Robot, q: Array, qd: Array) -> Array:
+def reference_velocity(robot: Robot, q: Array, qd: Array) -> Array:
     """Velocity of the reference point, base axes, shape (k, 3), m/s, of joint rates (k, n).
 
     Of a machine that only turns, the platform's angular velocity, rad/s.
@@ -207,7 +207,7 @@ def only_turns(robot: Robot) -> bool:
     return not {"x", "y", "z"} & set(robot.pose_names)
 
 
-def _joints(robot: Robot, places: Array, way: Array) -> Array:
+def _solve_inverse(robot: Robot, places: Array, way: Array) -> Array:
     """Joint positions of poses (k, m).
 
     :raises ParameterError: by the first pose out of reach, its way along the path (k,).
@@ -216,7 +216,7 @@ def _joints(robot: Robot, places: Array, way: Array) -> Array:
     if good.all():
         return q
     row = int(np.argmin(good))
-    where = _place(robot, places[row], float(way[row]))
+    where = _format_place(robot, places[row], float(way[row]))
     try:
         robot.inverse(places[row])
     except (UnreachableError, SingularityError) as error:
@@ -224,7 +224,7 @@ def _joints(robot: Robot, places: Array, way: Array) -> Array:
     return robot.inverse(places)
 
 
-def _with_knots(s: Array, knots: Array, least: float) -> Array:
+def _insert_knots(s: Array, knots: Array, least: float) -> Array:
     """Points of a piece, those next to a knot moved there; no two closer than ``least``."""
     inner: list[float] = []
     for knot in knots.tolist():
@@ -240,23 +240,23 @@ def _with_knots(s: Array, knots: Array, least: float) -> Array:
     return np.sort(np.concatenate([s[free], at]))
 
 
-def _graded(count: int, *, begins: bool, ends: bool) -> Array:
+def _grade_points(count: int, *, begins: bool, ends: bool) -> Array:
     """Points from 0 to 1, shape (count + 1,), closer where the machine is slow: at a stop."""
     t = np.linspace(0.0, 1.0, count + 1)
     if begins and ends:
-        half = 0.5 * (2.0 * np.minimum(t, 1.0 - t)) ** GRADE
+        half = 0.5 * (2.0 * np.minimum(t, 1.0 - t)) ** GRADING_EXPONENT
         return np.where(t < 0.5, half, 1.0 - half)
     if begins:
-        return np.asarray(t**GRADE)
-    return np.asarray(1.0 - (1.0 - t) ** GRADE if ends else t)
+        return np.asarray(t**GRADING_EXPONENT)
+    return np.asarray(1.0 - (1.0 - t) ** GRADING_EXPONENT if ends else t)
 
 
-def place_at(robot: Robot, q: Array, way: float) -> str:
+def describe_place(robot: Robot, q: Array, way: float) -> str:
     """A place of a path by its joint positions (n,): the way to it, m, and the pose."""
-    return _place(robot, robot.forward(q), way)
+    return _format_place(robot, robot.forward(q), way)
 
 
-def _place(robot: Robot, pose: Array, way: float) -> str:
+def _format_place(robot: Robot, pose: Array, way: float) -> str:
     values = (np.round(pose, 12) + 0.0).tolist()
     entries = zip(robot.pose_names, values, robot.pose_units, strict=True)
     place = "at " + ", ".join(f"{name} {value:.4g} {unit}" for name, value, unit in entries)
@@ -273,7 +273,7 @@ def check_positions(robot: Robot, s: Array, q: Array, begin: float) -> None:
     """
     if (beyond := first_beyond(robot, q)) is not None:
         row = beyond.index or 0
-        where = place_at(robot, q[row], begin + float(s[row]))
+        where = describe_place(robot, q[row], begin + float(s[row]))
         raise ParameterError(
             f"path: {beyond.joint} {where}", round(beyond.value, 6),
             f"{beyond.low:g} to {beyond.high:g} {beyond.unit}",
@@ -294,13 +294,13 @@ def check_singularity(robot: Robot, way: Array, q: Array, singularity: float) ->
     if index[row] < singularity:
         least = float(index[row])
         raise ParameterError(
-            f"path: singularity index {place_at(robot, q[row], float(way[row]))}",
+            f"path: singularity index {describe_place(robot, q[row], float(way[row]))}",
             round(least, 6), f"{singularity:g} or more; {passing_singularity(least)} passes",
         )  # fmt: skip
 
 
 def joint_paths(
-    path: Path, carried: Sequence[Carried], points: int, singularity: float,
+    path: Path, carried: Sequence[PayloadChange], points: int, singularity: float,
     slowdown: Slowdown | None = None,
 ) -> list[JointPath]:  # fmt: skip
     """All stretches of a path, checked; ``points`` shared by their lengths.
@@ -311,8 +311,8 @@ def joint_paths(
     result = []
     begin, robot = 0.0, carried[0].robot
     for k, stretch in enumerate(path.stretches):
-        share = max(2 * LEAST_POINTS, round(points * stretch.length / path.length))
-        robots = robots_on(carried, k, len(stretch.pieces))
+        share = max(2 * MIN_POINTS, round(points * stretch.length / path.length))
+        robots = loaded_robots(carried, k, len(stretch.pieces))
         curve = Curve(robot, path, stretch, begin, 0.0, robots, slowdown)
         try:
             result.append(curve.at(curve.grid(share)))

@@ -14,30 +14,30 @@ from numpy.typing import ArrayLike, NDArray
 
 from pkm_twin.codegen.arrays import Array, Mask
 from pkm_twin.errors import ParameterError
-from pkm_twin.paths.carrying import Carried, efforts_of
-from pkm_twin.paths.constraints import Limits, names_of, shares
+from pkm_twin.paths.carrying import PayloadChange, compute_efforts
+from pkm_twin.paths.constraints import Limits, limit_names, limit_usage
 from pkm_twin.paths.geometry import Path
-from pkm_twin.paths.joint_path import JointPath, velocity_of
+from pkm_twin.paths.joint_path import JointPath, reference_velocity
 from pkm_twin.recordings.payload import Load
 from pkm_twin.robot.robot import Robot
 
 Index = NDArray[np.int64]
 
-BINDS: Final = 0.98
+BINDING_USE: Final = 0.98
 """Used part of a limit from which on it binds."""
-HALVINGS: Final = 60
+BISECTIONS: Final = 60
 """Steps of the search for the time of a place."""
-CREEP: Final = 1e-9
+MIN_SPEED_FRACTION: Final = 1e-9
 """Least speed along the path of a machine that moves, of its mean speed."""
-MOST_SAMPLES: Final = 10_000_000
+MAX_SAMPLES: Final = 10_000_000
 """Of a motion at a rate."""
-CELLS: Final = (4, 16, 64, 256)
+PARTS_PER_INTERVAL: Final = (4, 16, 64, 256)
 """Parts of an interval at whose ends limits are checked, more where it is needed."""
-INSET: Final = 1e-6
+JUMP_CLEARANCE: Final = 1e-6
 """Part of an interval that its first and last samples stay away from jumps at its ends."""
-RESOLVED: Final = 2e-5
+PEAK_TOLERANCE: Final = 2e-5
 """Part of a limit between samples that is added to them; above it, they are closer."""
-BRIEF: Final = 0.01
+MIN_BOUND_FRACTION: Final = 0.01
 """Part of the duration: a stretch shorter than it joins the one before it."""
 
 
@@ -89,7 +89,7 @@ class Run:
         powers = np.arange(len(self.way))[:, None]
         return Run(self.part, factor * self.knots, self.way / factor**powers)
 
-    def moved(self, k: Index, time: Array) -> tuple[Array, Array, Array]:
+    def evaluate(self, k: Index, time: Array) -> tuple[Array, Array, Array]:
         """Way, v and u at times after knots k."""
         t = np.clip(time - self.knots[k], 0.0, self.knots[k + 1] - self.knots[k])
         way, v, u = np.zeros((3, len(t)))
@@ -97,7 +97,7 @@ class Run:
             way, v, u = way * t + row, v * t + way, u * t + 2.0 * v
         return way, v, u
 
-    def _since(self, time: Array) -> Index:
+    def _last_knot(self, time: Array) -> Index:
         """The last knot before times (k,)."""
         last = len(self.knots) - 2
         return np.clip(np.searchsorted(self.knots, time, side="right") - 1, 0, last)
@@ -108,9 +108,9 @@ class Run:
         way, begins = self.part.ends[1:-1], self.way[0]
         k = np.clip(np.searchsorted(begins, way, side="right") - 1, 0, len(begins) - 1)
         low, high = self.knots[k], self.knots[k + 1]
-        for _ in range(HALVINGS):
+        for _ in range(BISECTIONS):
             middle = 0.5 * (low + high)
-            before = self.moved(k, middle)[0] < way
+            before = self.evaluate(k, middle)[0] < way
             low, high = np.where(before, middle, low), np.where(before, high, middle)
         inner = np.where(begins[k] == way, self.knots[k], high)
         return np.concatenate([self.knots[:1], inner, self.knots[-1:]])
@@ -122,13 +122,13 @@ class Run:
 
     def profile(self) -> Array:
         """v^2 at the intervals' ends, shape (i + 1,)."""
-        x = self.moved(self._since(self.ends), self.ends)[1] ** 2
+        x = self.evaluate(self._last_knot(self.ends), self.ends)[1] ** 2
         x[[0, -1]] = 0.0
         return x
 
     def at(self, time: Array) -> tuple[Index, Array, Array, Array]:
         """Interval, part of it, v and u at times (k,)."""
-        way, v, u = self.moved(self._since(time), time)
+        way, v, u = self.evaluate(self._last_knot(time), time)
         s = self.part.ends
         j = np.clip(np.searchsorted(s, way, side="right") - 1, 0, len(s) - 2)
         return j, np.clip((way - s[j]) / (s[j + 1] - s[j]), 0.0, 1.0), v, u
@@ -148,7 +148,7 @@ class TimedPath:
     runs: tuple[Run, ...]
     rests: tuple[float, ...]
     law: str
-    carried: tuple[Carried, ...]
+    carried: tuple[PayloadChange, ...]
     wrench: Array | None = None
 
     @property
@@ -195,10 +195,10 @@ class TimedPath:
         if not self.robot.has_masses:
             return None
         which = np.searchsorted(self.switches, t, side="right")
-        return efforts_of([one.robot for one in self.carried], which, q, qd, qdd, self.wrench)
+        return compute_efforts([one.robot for one in self.carried], which, q, qd, qdd, self.wrench)
 
     @cached_property
-    def _points(self) -> Array:
+    def _sample_times(self) -> Array:
         """Times of all intervals' ends, middles of intervals between, s."""
         times = []
         for begin, run in zip(self.begins, self.runs, strict=True):
@@ -218,7 +218,7 @@ class TimedPath:
             if len(mine):
                 # At its end the machine rests; at its beginning it has its friction already.
                 moves = (t[mine] >= begin) & (t[mine] - begin < run.duration * (1.0 - 1e-12))
-                own = moving(run, t[mine] - begin, moves)
+                own = sample_run(run, t[mine] - begin, moves)
                 q[mine], qd[mine], qdd[mine], travel[mine], felt[mine] = own[:5]
         return Samples(t, q, qd, qdd, self._efforts(t, q, qd, qdd), robot.forward(q), travel, felt)
 
@@ -226,12 +226,12 @@ class TimedPath:
         """The motion at ``rate`` samples a second; the last is its end, half to three halves of a
         period after the one before.
 
-        :raises ParameterError: more than :data:`MOST_SAMPLES`.
+        :raises ParameterError: more than :data:`MAX_SAMPLES`.
         """
-        if not self.duration * rate <= MOST_SAMPLES:
+        if not self.duration * rate <= MAX_SAMPLES:
             raise ParameterError(
-                "rate", rate, f"{MOST_SAMPLES / self.duration:.4g} or less, for "
-                f"{MOST_SAMPLES} samples of a motion of {self.duration:.4g} s",
+                "rate", rate, f"{MAX_SAMPLES / self.duration:.4g} or less, for "
+                f"{MAX_SAMPLES} samples of a motion of {self.duration:.4g} s",
             )  # fmt: skip
         count = max(1, round(self.duration * rate))
         return self.sample(np.append(np.arange(count) / rate, self.duration))
@@ -274,7 +274,7 @@ class TimedPath:
     @cached_property
     def fine(self) -> Samples:
         """The motion at all points of the path and in the middle between them."""
-        return self.sample(self._points)
+        return self.sample(self._sample_times)
 
     @cached_property
     def peaks(self) -> dict[str, dict[str, dict[str, Any]]]:
@@ -297,49 +297,51 @@ class TimedPath:
         jerk = np.zeros_like(s.q)
         if np.isfinite(self.limits.jerk).any() and len(s.time) > 2:
             jerk = np.gradient(s.qdd, s.time, axis=0)
-        return np.abs(shares(self.limits, s.effort, s.qd, s.qdd, jerk, s.felt))
+        return np.abs(limit_usage(self.limits, s.effort, s.qd, s.qdd, jerk, s.felt))
 
     @cached_property
     def bounds(self) -> list[Bound]:
         """Which limit binds when, in order."""
-        return merged(self.fine.time, binding(self.used), names_of(self.robot), self.used)
+        return merge_bounds(
+            self.fine.time, find_binding(self.used), limit_names(self.robot), self.used
+        )
 
     def check_rests(self) -> None:
         """Reject payloads that the drives cannot hold where the machine rests.
 
         :raises ParameterError: by the joint and time.
         """
-        times, used = self._held
+        times, used = self._rest_usage
         row, column = np.unravel_index(int(used.argmax()), used.shape)
         if used[row, column] > 1.0 and len(self.carried) > 1:
             raise ParameterError(
-                f"path: {names_of(self.robot)[column]} at rest at {times[row]:.4g} s",
+                f"path: {limit_names(self.robot)[column]} at rest at {times[row]:.4g} s",
                 f"{100 * used[row, column]:.4g} % of its limit",
                 "a payload that the drives can hold there",
             )  # fmt: skip
 
     @property
-    def _held(self) -> tuple[Array, Array]:
+    def _rest_usage(self) -> tuple[Array, Array]:
         """Times of rests, (k,), and the used part of each limit there, shape (k, 4 n + 1)."""
         times = np.concatenate([np.nextafter(self.begins, -1.0), self.switches, [self.duration]])
         rests = self.sample(times)
         zero = np.zeros_like(rests.q)
         resting = np.abs(rests.qd).max(1) == 0.0
-        used = np.abs(shares(self.limits, rests.effort, zero, zero, zero, rests.felt))
+        used = np.abs(limit_usage(self.limits, rests.effort, zero, zero, zero, rests.felt))
         return times[resting], used[resting]
 
     @cached_property
-    def _peaks(self) -> Array:
+    def _peak_usage(self) -> Array:
         """Greatest used part of each limit at all times, shape (4 n + 1,)."""
         moved = [run_peaks(run, self.limits, self.wrench).max(0) for run in self.runs]
-        return np.asarray(np.concatenate([self._held[1], moved]).max(0), np.float64)
+        return np.asarray(np.concatenate([self._rest_usage[1], moved]).max(0), np.float64)
 
     @property
     def worst(self) -> dict[str, float]:
         """Greatest used part of each limit that there is, between points too; 1 is the limit."""
         return {
             name: float(value)
-            for name, value in zip(names_of(self.robot), self._peaks, strict=True)
+            for name, value in zip(limit_names(self.robot), self._peak_usage, strict=True)
             if value > 0.0
         }
 
@@ -362,7 +364,7 @@ class Samples:
     felt: Array
 
 
-class Moving(NamedTuple):
+class RunSamples(NamedTuple):
     """A run at times: q, qd, qdd (k, n); the reference point's speed and what its limit is for,
     (k,); the interval, (k,).
     """
@@ -375,19 +377,19 @@ class Moving(NamedTuple):
     interval: Index
 
 
-def moving(run: Run, time: Array, moves: Mask | bool = True, tool: bool = True) -> Moving:
+def sample_run(run: Run, time: Array, moves: Mask | bool = True, tool: bool = True) -> RunSamples:
     """A run at times (k,).
 
     :param moves: at which times the machine moves; it rests at the others.
     :param tool: whether the speeds are asked for; otherwise they are zero.
     """
     interval, part, v, u = run.at(time)
-    creep = CREEP * run.part.ends[-1] / run.duration
+    creep = MIN_SPEED_FRACTION * run.part.ends[-1] / run.duration
     v, u = np.where(moves, np.maximum(v, creep), 0.0), np.where(moves, u, 0.0)
     q, qd, qdd = run.part.motion(interval, part, v, u)
     robot = run.part.curve.robot
-    speed = np.linalg.norm(velocity_of(robot, q, qd), axis=1) if tool else np.zeros(len(q))
-    return Moving(q, qd, qdd, speed, speed * run.part.slowed(interval, part), interval)
+    speed = np.linalg.norm(reference_velocity(robot, q, qd), axis=1) if tool else np.zeros(len(q))
+    return RunSamples(q, qd, qdd, speed, speed * run.part.slowed(interval, part), interval)
 
 
 Moments = tuple[Array | None, Array, Array, Array]
@@ -398,7 +400,7 @@ def peaks(limits: Limits, times: Array, sample: Callable[[Array], Moments]) -> A
     """Greatest used part of each limit between neighbouring times, (i, 4 n + 1).
 
     Each interval is sampled, and a parabola through three samples says how much more there can be
-    between them. Where that is more than :data:`RESOLVED` and could pass a limit or what is the
+    between them. Where that is more than :data:`PEAK_TOLERANCE` and could pass a limit or what is the
     greatest so far, the interval is sampled more closely.
 
     :param times: the motion is smooth between two of them, shape (i + 1,), s.
@@ -408,19 +410,19 @@ def peaks(limits: Limits, times: Array, sample: Callable[[Array], Moments]) -> A
     n = len(limits.jerk)
     result = np.zeros((len(spans), 4 * n + 1))
     todo = np.arange(len(spans))
-    for cells in CELLS:
-        parts = INSET + (1.0 - 2.0 * INSET) * np.linspace(0.0, 1.0, cells + 1)
+    for cells in PARTS_PER_INTERVAL:
+        parts = JUMP_CLEARANCE + (1.0 - 2.0 * JUMP_CLEARANCE) * np.linspace(0.0, 1.0, cells + 1)
         effort, qd, qdd, felt = sample((times[todo, None] + spans[todo, None] * parts).ravel())
         jerk = np.zeros_like(qd)
         if jerks:
             own = qdd.reshape(len(todo), cells + 1, n)
             changes = np.gradient(own, parts, axis=1, edge_order=2)
             jerk = (changes / spans[todo, None, None]).reshape(jerk.shape)
-        used = shares(limits, effort, qd, qdd, jerk, felt).reshape(len(todo), cells + 1, -1)
+        used = limit_usage(limits, effort, qd, qdd, jerk, felt).reshape(len(todo), cells + 1, -1)
         more = np.abs(np.diff(used, 2, axis=1)).max(1) / 8.0
         top = np.abs(used).max(1)
-        result[todo] = top + np.minimum(more, RESOLVED)
-        matters = (more > RESOLVED) & (top + 4.0 * more > np.minimum(1.0, result.max(0)))
+        result[todo] = top + np.minimum(more, PEAK_TOLERANCE)
+        matters = (more > PEAK_TOLERANCE) & (top + 4.0 * more > np.minimum(1.0, result.max(0)))
         todo = todo[matters.any(1)]
         if not len(todo):
             break
@@ -433,19 +435,19 @@ def run_peaks(run: Run, limits: Limits, wrench: Array | None) -> Array:
     needs = needs_forces(part, limits)
 
     def sample(time: Array) -> Moments:
-        q, qd, qdd, _, felt, interval = moving(run, time, tool=np.isfinite(limits.speed))
+        q, qd, qdd, _, felt, interval = sample_run(run, time, tool=np.isfinite(limits.speed))
         effort = part.efforts(part.left[interval], q, qd, qdd, wrench) if needs else None
         return effort, qd, qdd, felt
 
     return peaks(limits, run.times, sample)
 
 
-def binding(used: Array) -> list[int]:
+def find_binding(used: Array) -> list[int]:
     """The column of each row of used parts (k, l) that binds, -1 for none.
 
     As few changes as can be: of several that bind, the one that binds longest from there.
     """
-    active = used >= BINDS
+    active = used >= BINDING_USE
     lasts = np.zeros(used.shape, np.int64)
     count = np.zeros(used.shape[1], np.int64)
     for row in range(len(used) - 1, -1, -1):
@@ -460,11 +462,11 @@ def binding(used: Array) -> list[int]:
     return result
 
 
-def merged(time: Array, columns: list[int], names: list[str], used: Array) -> list[Bound]:
-    """Parts of one binding limit; one shorter than :data:`BRIEF` of all joins the one before it."""
+def merge_bounds(time: Array, columns: list[int], names: list[str], used: Array) -> list[Bound]:
+    """Parts of one binding limit; one shorter than :data:`MIN_BOUND_FRACTION` of all joins the one before it."""
     if len(time) < 2:
         return []
-    brief = BRIEF * float(time[-1] - time[0])
+    brief = MIN_BOUND_FRACTION * float(time[-1] - time[0])
     changes = (i for i in range(1, len(columns)) if columns[i] != columns[i - 1])
     edges = [0, *changes, len(columns) - 1]
     spans = [(b, e, columns[b]) for b, e in pairwise(edges) if e > b]

@@ -13,7 +13,7 @@ import scipy  # type: ignore[import-untyped]  # its parts come when they are ask
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError
 
-NONE: Final = np.empty(0)
+NO_KNOTS: Final = np.empty(0)
 
 
 class Piece(Protocol):
@@ -38,7 +38,7 @@ class Line:
     begin: Array
     slope: Array
     length: float
-    knots = NONE
+    knots = NO_KNOTS
 
     def at(self, s: Array) -> tuple[Array, Array, Array]:
         """See :class:`Piece`."""
@@ -59,7 +59,7 @@ class Corner:
     before: Array
     behind: Array
     radius: float
-    knots = NONE
+    knots = NO_KNOTS
 
     @property
     def length(self) -> float:
@@ -78,7 +78,7 @@ class Corner:
 
 
 @dataclass(frozen=True)
-class Cut:
+class SubPiece:
     """A part of another piece, from ``begin`` to ``end`` in its s."""
 
     whole: Piece
@@ -115,7 +115,7 @@ class Arc:
     rest: Array
     radius: float
     angle: float
-    knots = NONE
+    knots = NO_KNOTS
 
     @property
     def length(self) -> float:

@@ -23,15 +23,15 @@ from pkm_twin.paths.constraints import Rows
 
 Index = NDArray[np.int64]
 
-STEPS: Final = 50
+MAX_NEWTON_STEPS: Final = 50
 """Most steps to an interval's greatest x; two or three are usual."""
-SMALL: Final = 1e-12
+ZERO_COEFFICIENT: Final = 1e-12
 """Of a row's greatest coefficient, what counts as none."""
-SETTLED: Final = 3e-4
+SPEED_TOLERANCE: Final = 3e-4
 """Relative change of the speeds at which viscous friction is settled."""
-ROUNDS: Final = 8
+MAX_ITERATIONS: Final = 8
 """Most solutions for viscous friction."""
-SLOW: Final = 0.01
+MIN_SPEED_FRACTION: Final = 0.01
 """Part of the greatest speed below which viscous friction is taken as at this speed."""
 
 
@@ -39,7 +39,7 @@ Numbers = list[float]
 
 
 @dataclass(frozen=True)
-class Programs:
+class IntervalPrograms:
     """The intervals' linear programs in x and x', a list of rows for each interval.
 
     x <= ``most``, and low + slope x <= x' <= high + slope x.
@@ -51,9 +51,9 @@ class Programs:
     most: Numbers
 
     @classmethod
-    def of(cls, p: Array, q: Array, least: Array, greatest: Array, most: Array) -> Programs:
+    def of(cls, p: Array, q: Array, least: Array, greatest: Array, most: Array) -> IntervalPrograms:
         """Of rows least <= p x + q x' <= greatest, (i, r); ``most`` at the ends, (i + 1,)."""
-        level = np.abs(q) <= SMALL * np.abs(p)
+        level = np.abs(q) <= ZERO_COEFFICIENT * np.abs(p)
         with np.errstate(divide="ignore", invalid="ignore"):
             one, other, slope = least / q, greatest / q, -p / q
             cap = np.where(level & (p != 0.0), np.maximum(least / p, greatest / p), np.inf)
@@ -64,13 +64,13 @@ class Programs:
         most[:-1] = np.minimum(most[:-1], cap.min(1, initial=np.inf))
         return cls(low.tolist(), high.tolist(), slope.tolist(), most.tolist())
 
-    def passes(self) -> Array:
+    def solve(self) -> Array:
         """The greatest x at the intervals' ends, shape (i + 1,), from rest to rest."""
         count = len(self.low)
         reachable = [0.0] * (count + 1)
         value = 0.0
         for i in range(count - 1, -1, -1):
-            value = reachable[i] = _before(
+            value = reachable[i] = _largest_start(
                 self.low[i], self.high[i], self.slope[i], self.most[i], value
             )
         result = [0.0] * (count + 1)
@@ -85,13 +85,13 @@ class Programs:
         return np.array(result)
 
 
-def _before(low: Numbers, high: Numbers, slopes: Numbers, x: float, after: float) -> float:
+def _largest_start(low: Numbers, high: Numbers, slopes: Numbers, x: float, after: float) -> float:
     """Greatest x of an interval from which some x' up to ``after`` is reached.
 
     Where the gap between the greatest lower and the least upper line on x' closes: the gap is
     convex in x and open at 0, so Newton's steps from the right end there, on a line each.
     """
-    for _ in range(STEPS):
+    for _ in range(MAX_NEWTON_STEPS):
         least, rise, most, fall = 0.0, 0.0, after, 0.0
         for c, e, d in zip(low, high, slopes, strict=True):
             way = d * x
@@ -132,7 +132,7 @@ def interval_rows(
         beta, fixed = rows.beta[k], rows.fixed[k]
         if x is not None:
             v = np.sqrt(x)
-            about = np.maximum(v[end], SLOW * v.max())[:, None]
+            about = np.maximum(v[end], MIN_SPEED_FRACTION * v.max())[:, None]
             beta = beta + rows.drag[k] / (2.0 * about)
             fixed = fixed + 0.5 * rows.drag[k] * about
         alphas.append(rows.alpha[k] / double)
@@ -161,13 +161,13 @@ def fastest_profile(
     :param about: a profile close to the result, about which viscous friction is linear first.
     """
     x = about if rows.drag.any() else None
-    for _ in range(ROUNDS):
-        new = Programs.of(*interval_rows(rows, left, steps, x, part)).passes()
+    for _ in range(MAX_ITERATIONS):
+        new = IntervalPrograms.of(*interval_rows(rows, left, steps, x, part)).solve()
         if not rows.drag.any():
             return new
         before, x = x, new
         if before is not None:
             change = np.abs(np.sqrt(x) - np.sqrt(before)).max()
-            if change <= SETTLED * np.sqrt(x.max()):
+            if change <= SPEED_TOLERANCE * np.sqrt(x.max()):
                 break
     return new

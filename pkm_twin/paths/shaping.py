@@ -20,24 +20,24 @@ from numpy.typing import ArrayLike
 
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError, UnknownNameError
-from pkm_twin.paths.joint_path import check_positions, check_singularity, velocity_of
+from pkm_twin.paths.joint_path import check_positions, check_singularity, reference_velocity
 from pkm_twin.paths.motion import Moments, Samples, TimedPath, peaks
 from pkm_twin.robot.derivatives import joint_rates
 from stiffness_monitor.modes import natural_frequencies
 from stiffness_monitor.vibration import damping_ratios
 
-DELAYS: Final = {"zv": 1, "zvd": 2}
+HALF_PERIODS: Final = {"zv": 1, "zvd": 2}
 """Half vibrations that each shaper takes."""
-KNOTS: Final = 16
+POSES_PER_STRETCH: Final = 16
 """Poses of a stretch whose frequency is computed."""
-LOOKS: Final = 3
+MAX_ITERATIONS: Final = 3
 """How often: on the motion, then on what was shaped before."""
-CLOSEST: Final = 1e-9
+MIN_TIME_STEP: Final = 1e-9
 """Times that are closer are one, s."""
-POINTS: Final = 4001
+CHECKED_TIMES: Final = 4001
 """Times at which a shaped motion is compared with its limits."""
 ROUNDING: Final = 1e-9
-ROUNDS: Final = 8
+MAX_SLOWDOWNS: Final = 8
 """How often a motion that passes a limit is slowed down."""
 
 
@@ -63,7 +63,7 @@ class Phase:
         slope = np.where(inside == time, self._curve(inside, 1), 0.0)
         return self._whole(inside) + rate * (time - inside), rate, slope
 
-    def before(self, time: Array, phase: float) -> tuple[Array, Array, Array]:
+    def earlier(self, time: Array, phase: float) -> tuple[Array, Array, Array]:
         """Times at which the phase was so much less, and their first and second derivatives."""
         now, rate, slope = self.at(time)
         found = time - phase / rate
@@ -93,21 +93,21 @@ class ShapedPath(TimedPath):
     added: float = 0.0
 
     @cached_property
-    def _points(self) -> Array:
-        return np.linspace(0.0, self.duration, POINTS)
+    def _sample_times(self) -> Array:
+        return np.linspace(0.0, self.duration, CHECKED_TIMES)
 
     @cached_property
-    def _peaks(self) -> Array:
+    def _peak_usage(self) -> Array:
         """Greatest used part of each limit at all times, shape (4 n + 1,)."""
         assert self.phase is not None  # noqa: S101  shaped() gives it
         plain = np.concatenate(
             [begin + run.times for begin, run in zip(self.begins, self.runs, strict=True)]
         )
         # Each part of the split motion jumps where the plain one does, later.
-        late = [self.phase.before(plain, -k * np.pi)[0] for k in range(len(self.amplitudes))]
-        even = np.linspace(0.0, self.duration, KNOTS)
+        late = [self.phase.earlier(plain, -k * np.pi)[0] for k in range(len(self.amplitudes))]
+        even = np.linspace(0.0, self.duration, POSES_PER_STRETCH)
         times = np.unique(np.clip(np.concatenate([even, *late]), 0.0, self.duration))
-        times = times[np.diff(times, prepend=-1.0) > CLOSEST]
+        times = times[np.diff(times, prepend=-1.0) > MIN_TIME_STEP]
 
         def sample(time: Array) -> Moments:
             s = self.sample(time)
@@ -122,7 +122,7 @@ class ShapedPath(TimedPath):
         pose, rate, change = (np.zeros((len(t), len(robot.pose_names))) for _ in range(3))
         for k, amplitude in enumerate(self.amplitudes):
             assert self.phase is not None  # noqa: S101  shaped() gives it
-            when, first, second = self.phase.before(t, k * np.pi)
+            when, first, second = self.phase.earlier(t, k * np.pi)
             own = super().sample(when)
             jacobian = robot.jacobian(own.q)
             own_rate = (jacobian @ own.qd[..., None])[..., 0]
@@ -133,7 +133,7 @@ class ShapedPath(TimedPath):
         q = robot.inverse(pose)
         qd, qdd = joint_rates(robot, q, rate, change)
         effort = self._efforts(t, q, qd, qdd)
-        speed = np.linalg.norm(velocity_of(robot, q, qd), axis=1)
+        speed = np.linalg.norm(reference_velocity(robot, q, qd), axis=1)
         return Samples(t, q, qd, qdd, effort, pose, speed, speed)
 
 
@@ -157,8 +157,8 @@ def shaped(
     :param singularity: least singularity index of the shaped motion, 0 to 1.
     :raises ParameterError: no such shaper, damping or frequency, or limits that cannot be kept.
     """
-    if shaper not in DELAYS:
-        raise UnknownNameError("shaper", shaper, tuple(DELAYS))
+    if shaper not in HALF_PERIODS:
+        raise UnknownNameError("shaper", shaper, tuple(HALF_PERIODS))
     if len(motion.carried) > 1:
         raise ParameterError("shaper", shaper, "one payload on the whole path")
     robot = motion.robot
@@ -175,27 +175,30 @@ def shaped(
     weights *= float(np.exp(-np.pi * damping / root)) ** np.arange(len(weights))
     amplitudes = tuple((weights / weights.sum()).tolist())
 
-    def settled(plain: TimedPath, phase: Phase) -> TimedPath:
+    def add_settling_rests(plain: TimedPath, phase: Phase) -> TimedPath:
         """With rests in which all parts of the split motion arrive."""
         rests, end = [plain.rests[0]], 0.0
         for run, rest in zip(plain.runs, plain.rests[1:], strict=True):
             end += rests[-1] + run.duration
-            arrived = phase.before(np.array([end]), -DELAYS[shaper] * np.pi)[0]
+            arrived = phase.earlier(np.array([end]), -HALF_PERIODS[shaper] * np.pi)[0]
             rests.append(float(arrived[0]) - end + rest)
         return replace(plain, rests=tuple(rests))
 
-    def made(plain: TimedPath) -> ShapedPath:
+    def shape_path(plain: TimedPath) -> ShapedPath:
         looked, tails = plain, np.zeros(len(plain.runs))
-        for _ in range(LOOKS):
+        for _ in range(MAX_ITERATIONS):
             # The shaped motion is later than the plain one, and so are its frequencies.
             spans = zip(looked.begins, looked.runs, tails, strict=True)
             times = np.concatenate(
-                [begin + np.linspace(0.0, run.duration + tail, KNOTS) for begin, run, tail in spans]
+                [
+                    begin + np.linspace(0.0, run.duration + tail, POSES_PER_STRETCH)
+                    for begin, run, tail in spans
+                ]
             )
-            times = times[np.diff(times, prepend=-1.0) > CLOSEST]
-            rate = _rates(looked, times, frequency, root)
+            times = times[np.diff(times, prepend=-1.0) > MIN_TIME_STEP]
+            rate = _damped_frequencies(looked, times, frequency, root)
             phase = Phase(times, rate)
-            base = settled(plain, phase)
+            base = add_settling_rests(plain, phase)
             tails = np.array(base.rests[1:]) - plain.rests[1:]
             low, high = float(rate.min()), float(rate.max())
             looked = shaped_path = ShapedPath(
@@ -207,8 +210,8 @@ def shaped(
         return shaped_path
 
     plain = motion
-    for _ in range(ROUNDS):
-        result = made(plain)
+    for _ in range(MAX_SLOWDOWNS):
+        result = shape_path(plain)
         over = max(result.worst.values(), default=0.0)
         if over <= 1.0 + ROUNDING:
             fine = result.fine
@@ -220,7 +223,7 @@ def shaped(
     raise ParameterError("motion", f"{shaper} passes its limits", "wider limits, or no shaper")
 
 
-def _rates(
+def _damped_frequencies(
     motion: TimedPath, times: Array, frequency: Callable[[Array], Array], root: float
 ) -> Array:
     """Damped angular frequency of the first mode at times of a motion, rad/s."""

@@ -33,15 +33,15 @@ from pkm_twin.mechanisms.catalogue import config_folder
 from pkm_twin.recordings.payload import by_load
 from pkm_twin.recordings.recording import Recording
 
-BLOCK: Final = 4096
+SAMPLES_PER_BLOCK: Final = 4096
 """Samples computed at a time, so that memory stays flat."""
-LEAST: Final = 2
+MIN_SAMPLES: Final = 2
 """Samples of a motion."""
 SHIPPED: Final = "shipped"
 RPM: Final = 2 * math.pi / 60
-STEPS: Final = 33
+GEARS_PER_ROUND: Final = 33
 """Gears of a range that are tried at a time,"""
-ROUNDS: Final = 4
+REFINEMENTS: Final = 4
 """and how often: each time between the neighbours of the best."""
 
 
@@ -127,7 +127,7 @@ class Motor:
     cost: float | None = schema.number(low=0.0, default=None)
     source: str = schema.text(default="")
     curve: Any = schema.key(
-        lambda field, value: _curve(field, value), "rows of speed and torque", default=None
+        lambda field, value: _read_curve(field, value), "rows of speed and torque", default=None
     )
 
     def verify(self, path: str) -> None:
@@ -159,7 +159,7 @@ class Motor:
         return np.where(amount > speeds[-1], 0.0, np.interp(amount, speeds, torques))
 
 
-def _curve(field: str, value: Any) -> Array:
+def _read_curve(field: str, value: Any) -> Array:
     try:
         rows = np.array(value, float)
     except (TypeError, ValueError):
@@ -258,14 +258,14 @@ class Gears:
         if not values or not all(1e-6 <= v <= most for v in values) or (span and not low_first):
             bound = f"LOW:HIGH or numbers with commas, 1e-6 to {most:g}{unit}"
             raise ParameterError(f"--{key}s", text, bound)
-        steps = np.geomspace(values[0], values[1], STEPS).tolist() if span else values
+        steps = np.geomspace(values[0], values[1], GEARS_PER_ROUND).tolist() if span else values
         own = Gear(efficiency=efficiency)
         return cls(tuple(own.sized(key, value) for value in steps), span)
 
     def near(self, k: int) -> Gears:
         """Those about one of a span."""
         low, high = self.gears[max(0, k - 1)], self.gears[min(k + 1, len(self.gears) - 1)]
-        steps = np.geomspace(low.size, high.size, STEPS).tolist()
+        steps = np.geomspace(low.size, high.size, GEARS_PER_ROUND).tolist()
         key = "ratio" if low.lead is None else "lead"
         return replace(self, gears=tuple(low.sized(key, size) for size in steps))
 
@@ -275,7 +275,7 @@ def read_motors(path: Path, names: Sequence[str] = ()) -> dict[str, Motor]:
 
     :raises ParameterError: by the field.
     """
-    path = _found(path)
+    path = _resolve_file(path)
     entries = read_entries(path, "drives", "names")
     for name in names:
         if name not in entries:
@@ -292,14 +292,14 @@ def read_gears(path: Path) -> tuple[Gear, ...]:
 
     :raises ParameterError: by the field.
     """
-    path = _found(path)
+    path = _resolve_file(path)
     return tuple(
         replace(schema.build(Gear, entry, f"{path}: gears.{name}"), name=str(name))
         for name, entry in read_entries(path, "gears", "names", needed=False).items()
     )
 
 
-def _found(path: Path) -> Path:
+def _resolve_file(path: Path) -> Path:
     if str(path) == SHIPPED:
         return config_folder() / "drives" / "servos.yaml"
     if not path.suffix and not path.exists():
@@ -355,9 +355,9 @@ class Fit:
     def as_json(self) -> dict[str, Any]:
         """Plain data; parts are 1 at the bound."""
         return {
-            "good": self.good, "used_torque": _finite(self.torque),
+            "good": self.good, "used_torque": _none_if_infinite(self.torque),
             "used_continuous_torque": self.thermal, "used_speed": self.speed,
-            "inertia_ratio": _finite(self.inertia_ratio), "source": self.motor.source,
+            "inertia_ratio": _none_if_infinite(self.inertia_ratio), "source": self.motor.source,
             **self.choice, "used_gear_torque": self.geared, "rms_torque_N_m": self.rms,
             "peak_torque_N_m": float(np.abs(self.torques).max()),
             "peak_speed_rad_s": float(np.abs(self.speeds).max()), "cost": self.cost,
@@ -429,9 +429,9 @@ def size_drives(
         joint that has one, or of another type.
     """
     robot, time, (q, qd, qdd, _) = motion.robot, motion.time, motion.motion
-    if len(time) < LEAST:
-        raise ParameterError("motion", f"{len(time)} samples", f"{LEAST} or more")
-    loaded = by_load(robot, motion.load, time, BLOCK)
+    if len(time) < MIN_SAMPLES:
+        raise ParameterError("motion", f"{len(time)} samples", f"{MIN_SAMPLES} or more")
+    loaded = by_load(robot, motion.load, time, SAMPLES_PER_BLOCK)
     inertias = np.concatenate([mass_matrix(one, q[rows]) for one, rows in loaded])
     masses = np.diagonal(inertias, axis1=-2, axis2=-1)
     # Positions and rates at an interval's ends give its exact mean rate and acceleration.
@@ -449,7 +449,7 @@ def size_drives(
         span = (float(load.min()), float(load.max()))
         duty = DriveDuty(joint, slides, Duty.of(time, effort[:, i], qd[:, i], net[:, i]), span)
         axis = _Axis(time, qd[:, i], qdd[:, i], effort[:, i] - rotor * qdd[:, i], span[1])
-        drive = own if not given else _drive(joint, slides, rotor, own, given)
+        drive = own if not given else _drive_with_gear(joint, slides, rotor, own, given)
         if drive is not None:
             torques = axis.torques(drive.inertia, drive)
             speeds = drive.turns * axis.qd
@@ -467,20 +467,22 @@ def size_drives(
         axes.append(axis)
     if not motors:
         return duties
-    chosen = [_choice(robot.name, duty, choices) for duty in duties]
+    chosen = [_allowed_gears(robot.name, duty, choices) for duty in duties]
     for choice in dict.fromkeys(chosen):
         rows = [i for i, one in enumerate(chosen) if one == choice]
-        alike = [_best([axes[i] for i in rows], n, m, choice) for n, m in motors.items()]
+        alike = [_fit_best_gear([axes[i] for i in rows], n, m, choice) for n, m in motors.items()]
         for column, i in enumerate(rows):
             shared = tuple(row[column] for row in alike)
             own_fits = shared
             if len(choice.gears) > 1 and len(rows) > 1:
-                own_fits = tuple(_best([axes[i]], n, m, choice)[0] for n, m in motors.items())
+                own_fits = tuple(
+                    _fit_best_gear([axes[i]], n, m, choice)[0] for n, m in motors.items()
+                )
             duties[i] = replace(duties[i], fits=own_fits, alike=shared)
     return duties
 
 
-def _drive(
+def _drive_with_gear(
     joint: str, slides: bool, rotor: float, own: DriveSpec | None, given: Sequence[Gear]
 ) -> DriveSpec:
     """The drive of a joint whose rotor has this inertia at the joint, kg m2 or kg."""
@@ -493,7 +495,7 @@ def _drive(
     return gear.drive(rotor / gear.drive().turns ** 2)
 
 
-def _choice(robot: str, duty: DriveDuty, choices: Sequence[Gears]) -> Gears:
+def _allowed_gears(robot: str, duty: DriveDuty, choices: Sequence[Gears]) -> Gears:
     """The gears that a drive may have."""
     for choice in choices:
         if (choice.gears[0].lead is not None) == duty.slides:
@@ -548,21 +550,21 @@ class _Axis:
         )  # fmt: skip
 
 
-def _best(axes: Sequence[_Axis], name: str, motor: Motor, choice: Gears) -> list[Fit]:
+def _fit_best_gear(axes: Sequence[_Axis], name: str, motor: Motor, choice: Gears) -> list[Fit]:
     """Fits of joints with one gear: of the least greatest used part of all."""
-    for _ in range(ROUNDS if choice.span else 1):
+    for _ in range(REFINEMENTS if choice.span else 1):
         rows = [[axis.fit(name, motor, gear) for axis in axes] for gear in choice.gears]
-        k = min(range(len(rows)), key=lambda i: _worst(rows[i]))
+        k = min(range(len(rows)), key=lambda i: _ranking(rows[i]))
         choice = choice.near(k) if choice.span else choice
     return rows[k]
 
 
-def _worst(fits: Sequence[Fit]) -> tuple[float, float]:
+def _ranking(fits: Sequence[Fit]) -> tuple[float, float]:
     """What counts of joints together; beyond the curve, where a torque is infinite, the rest."""
     return max(f.used for f in fits), max(max(f.thermal, f.speed) for f in fits)
 
 
-def smallest(fits: Sequence[Sequence[Fit]]) -> int | None:
+def find_smallest(fits: Sequence[Sequence[Fit]]) -> int | None:
     """Which motor of the least continuous torque suits all drives, of their fits in one order."""
     good = [k for k, row in enumerate(zip(*fits, strict=True)) if all(fit.good for fit in row)]
     return min(good, key=lambda k: fits[0][k].motor.continuous_torque, default=None)
@@ -573,5 +575,5 @@ def rms(time: Array, values: Array) -> float:
     return math.sqrt(integral(time, values**2) / float(time[-1] - time[0]))
 
 
-def _finite(value: float) -> float | None:
+def _none_if_infinite(value: float) -> float | None:
     return value if math.isfinite(value) else None

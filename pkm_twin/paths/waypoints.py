@@ -27,7 +27,7 @@ from pkm_twin.recordings.tables import (
 )
 from pkm_twin.robot.robot import Robot
 
-OPTIONS: Final = ("blend", "dwell", "arc")
+PATH_COLUMNS: Final = ("blend", "dwell", "arc")
 """Columns of waypoints beside their coordinates."""
 
 
@@ -39,7 +39,7 @@ def read_waypoints(
 ) -> tuple[Path, list[float] | None]:
     """The path of a table of waypoints: the pose's coordinates, or JOINT.position of every joint.
 
-    A smooth curve; with ``blend`` (m) or one of the columns :data:`OPTIONS`, lines and arcs.
+    A smooth curve; with ``blend`` (m) or one of the columns :data:`PATH_COLUMNS`, lines and arcs.
 
     :returns: the path, and the payload from each waypoint on, kg, where the table has it.
     :raises ParameterError: a column is missing, unknown, or a number is out of range.
@@ -58,9 +58,9 @@ def read_waypoints(
             where, few = f"{file}: column", robot.pose_names if space == "pose" else joints
             if space == "pose":
                 where = f"{file}: {robot.name} moves in {', '.join(few)}; column"
-            raise UnknownNameError(where, name, (*few, *OPTIONS, "payload"))
-    masses = _masses(table, robot)
-    given = {name: table[name] for name in OPTIONS if name in table}
+            raise UnknownNameError(where, name, (*few, *PATH_COLUMNS, "payload"))
+    masses = _read_payloads(table, robot)
+    given = {name: table[name] for name in PATH_COLUMNS if name in table}
     if blend is None and not given:
         return through(robot, points, space=space), masses
     if "arc" in given and not np.isin(given["arc"], (0.0, 1.0)).all():
@@ -80,7 +80,7 @@ def read_waypoints(
     return made, masses
 
 
-def _masses(table: Table, robot: Robot) -> list[float] | None:
+def _read_payloads(table: Table, robot: Robot) -> list[float] | None:
     """The payload from each waypoint on, kg, with the centre of mass of the robot's file."""
     if PAYLOAD[0] not in table:
         return None

@@ -18,23 +18,23 @@ from pkm_twin.robot.derivatives import joint_changes
 from pkm_twin.robot.robot import Robot
 from pkm_twin.robot.workspace import causes, counts, try_inverse
 
-RAYS: Final = 1000
+DEFAULT_RAYS: Final = 1000
 """Rays from home on which poses of the workspace are taken."""
-PARTS: Final = (1.0, 0.8, 0.5)
+RAY_FRACTIONS: Final = (1.0, 0.8, 0.5)
 """Of a ray's length at which poses are taken."""
-HALVINGS: Final = 14
+BISECTIONS: Final = 14
 """Of the search for a ray's end."""
-DIRECTIONS: Final = 32
+COARSE_DIRECTIONS: Final = 32
 """Of the tool point's speed, at all poses."""
-MORE_DIRECTIONS: Final = 2000
+FINE_DIRECTIONS: Final = 2000
 """The same at each drive's worst poses."""
-WORST: Final = 8
+REFINED_POSES: Final = 8
 """Worst poses of each drive that are looked at closely."""
-SINGULARITY: Final = 0.05
+MIN_SINGULARITY_INDEX: Final = 0.05
 """Least singularity index of a pose that counts."""
-LEVER: Final = 0.3
+MIN_LEVER: Final = 0.3
 """Least lever of a drive where a pose counts, against its greatest."""
-STEP: Final = 1e-4
+DIFFERENCE_STEP: Final = 1e-4
 """Joint motion of a difference, rad or m."""
 
 
@@ -55,8 +55,8 @@ class Worst:
 
 def workspace_poses(
     robot: Robot,
-    rays: int = RAYS,
-    singularity: float = SINGULARITY,
+    rays: int = DEFAULT_RAYS,
+    singularity: float = MIN_SINGULARITY_INDEX,
     lever: float = 0.0,
 ) -> Array:
     """Poses of the workspace, shape (k, m): in reach, within limits, clear of singularities.
@@ -69,7 +69,9 @@ def workspace_poses(
     """
     least = np.zeros(robot.joints_count)
     if lever > 0.0:
-        largest = levers(robot, robot.inverse(_rays(robot, rays, singularity, least))).max(0)
+        largest = levers(robot, robot.inverse(_poses_on_rays(robot, rays, singularity, least))).max(
+            0
+        )
         home = robot.home()
         share = levers(robot, robot.inverse(home[None]))[0] / largest
         if share.min() < lever:
@@ -80,7 +82,7 @@ def workspace_poses(
                 "in the workspace",
             )  # fmt: skip
         least = lever * largest
-    return _rays(robot, rays, singularity, least)
+    return _poses_on_rays(robot, rays, singularity, least)
 
 
 def _named(robot: Robot, pose: Array) -> str:
@@ -97,7 +99,7 @@ def levers(robot: Robot, q: Array) -> Array:
         return np.asarray(1.0 / size)
 
 
-def _rays(robot: Robot, rays: int, singularity: float, least: Array) -> Array:
+def _poses_on_rays(robot: Robot, rays: int, singularity: float, least: Array) -> Array:
     home, box = robot.home(), robot.search_box()
     rng = np.random.default_rng(0)
     ways = rng.normal(size=(rays, len(home)))
@@ -105,21 +107,21 @@ def _rays(robot: Robot, rays: int, singularity: float, least: Array) -> Array:
     ways = np.concatenate([np.eye(len(home)), -np.eye(len(home)), ways])
     # From home to the side of the box that the ray leaves it by.
     span = np.where(ways > 0.0, box[:, 1] - home, home - box[:, 0]) * ways
-    if not _inside(robot, home[None], singularity, least)[0]:
+    if not _are_in_workspace(robot, home[None], singularity, least)[0]:
         q, known = try_inverse(robot, home[None])
         why = causes(robot, q, home[None], known, singularity, -math.inf)
         raise ParameterError("workspace", f"home ({_named(robot, home)})", f"a home inside: {why}")
     low, high = np.zeros(len(span)), np.ones(len(span))
-    for _ in range(HALVINGS):
+    for _ in range(BISECTIONS):
         middle = 0.5 * (low + high)
-        good = _inside(robot, home + middle[:, None] * span, singularity, least)
+        good = _are_in_workspace(robot, home + middle[:, None] * span, singularity, least)
         low, high = np.where(good, middle, low), np.where(good, high, middle)
-    rows = [home + (part * low)[:, None] * span for part in PARTS]
+    rows = [home + (part * low)[:, None] * span for part in RAY_FRACTIONS]
     found = np.concatenate([home[None], *rows])
-    return np.asarray(found[_inside(robot, found, singularity, least)], np.float64)
+    return np.asarray(found[_are_in_workspace(robot, found, singularity, least)], np.float64)
 
 
-def _inside(robot: Robot, poses: Array, singularity: float, least: Array) -> Mask:
+def _are_in_workspace(robot: Robot, poses: Array, singularity: float, least: Array) -> Mask:
     """Which poses (k, m) are of the workspace."""
     q, known = try_inverse(robot, poses)
     inside = counts(robot, q, poses, known, singularity, -np.inf)
@@ -135,23 +137,23 @@ def _joint_rates(robot: Robot, q: Array) -> Array:
     """
     if only_turns(robot):
         robot.check_independent("worst directions of a rotation")
-        return np.asarray(np.linalg.inv(np.linalg.qr(_turning(robot, q))[1]), np.float64)
+        return np.asarray(np.linalg.inv(np.linalg.qr(_rotation_jacobian(robot, q))[1]), np.float64)
     places = [i for i, name in enumerate(robot.pose_names) if name in ("x", "y", "z")]
     return robot.inverse_jacobian(q)[..., places]
 
 
-def _turning(robot: Robot, q: Array) -> Array:
+def _rotation_jacobian(robot: Robot, q: Array) -> Array:
     return robot.platform_jacobian(q)[..., 3:, :]
 
 
-def _steady(robot: Robot, q: Array, qd: Array) -> Array:
+def _steady_accelerations(robot: Robot, q: Array, qd: Array) -> Array:
     """Joint accelerations at which the tool point, or the platform's turn, keeps its velocity."""
     if not only_turns(robot):
         return joint_changes(robot, q, qd, robot.inverse_jacobian(q))
-    step = STEP / np.maximum(np.abs(qd).max(-1, keepdims=True), STEP)
-    ahead, behind = (_turning(robot, q + way * step * qd) for way in (1.0, -1.0))
+    step = DIFFERENCE_STEP / np.maximum(np.abs(qd).max(-1, keepdims=True), DIFFERENCE_STEP)
+    ahead, behind = (_rotation_jacobian(robot, q + way * step * qd) for way in (1.0, -1.0))
     own = (ahead - behind) @ qd[..., None] / (2.0 * step[..., None])
-    return np.asarray(-(np.linalg.pinv(_turning(robot, q)) @ own)[..., 0], np.float64)
+    return np.asarray(-(np.linalg.pinv(_rotation_jacobian(robot, q)) @ own)[..., 0], np.float64)
 
 
 def worst_over_workspace(
@@ -159,15 +161,15 @@ def worst_over_workspace(
     speed: float,
     acceleration: float,
     *,
-    singularity: float = SINGULARITY,
-    lever: float = LEVER,
-    rays: int = RAYS,
+    singularity: float = MIN_SINGULARITY_INDEX,
+    lever: float = MIN_LEVER,
+    rays: int = DEFAULT_RAYS,
 ) -> Worst:
     """The largest efforts and speeds of the drives, for the worst directions of the tool point.
 
     Speed and acceleration are those of the position; the orientation stays constant. The
-    worst acceleration is exact; for the speed :data:`DIRECTIONS` directions are tried at all poses,
-    and :data:`MORE_DIRECTIONS` at the worst.
+    worst acceleration is exact; for the speed :data:`COARSE_DIRECTIONS` directions are tried at all poses,
+    and :data:`FINE_DIRECTIONS` at the worst.
 
     :param speed: of the tool point, m/s; ``acceleration``: m/s2. Of a machine that only turns, of
         the platform's rotation, rad/s and rad/s2.
@@ -181,10 +183,12 @@ def worst_over_workspace(
     k, n = q.shape
     zero = np.zeros_like(q)
     holding = np.abs(inverse_dynamics(robot, q, zero, zero))
-    greatest = _efforts(robot, q, back, speed, acceleration, DIRECTIONS).max(1)
+    greatest = _efforts_by_direction(robot, q, back, speed, acceleration, COARSE_DIRECTIONS).max(1)
     for joint in range(n):
-        close = np.argsort(-greatest[:, joint])[:WORST]
-        finer = _efforts(robot, q[close], back[close], speed, acceleration, MORE_DIRECTIONS).max(1)
+        close = np.argsort(-greatest[:, joint])[:REFINED_POSES]
+        finer = _efforts_by_direction(
+            robot, q[close], back[close], speed, acceleration, FINE_DIRECTIONS
+        ).max(1)
         greatest[close] = np.maximum(greatest[close], finer)
     rates = speed * np.linalg.norm(back, axis=-1)
 
@@ -195,7 +199,7 @@ def worst_over_workspace(
     return Worst(*pick(greatest), *pick(holding), *pick(rates), poses=k)
 
 
-def _efforts(
+def _efforts_by_direction(
     robot: Robot, q: Array, back: Array, speed: float, acceleration: float, count: int
 ) -> Array:
     """Greatest efforts by direction of the speed, shape (k, count + 1, n); the last is rest.
@@ -203,12 +207,12 @@ def _efforts(
     :param back: joint rates by the position's, shape (k, n, size).
     """
     k, n, size = back.shape
-    ways = _directions(size, count)
+    ways = _unit_vectors(size, count)
     ways = np.concatenate([speed * ways, np.zeros((1, size))])
     wide = (k, len(ways), n)
     qd = np.einsum("knj,dj->kdn", back, ways).reshape(-1, n)
     qs = np.broadcast_to(q[:, None], wide).reshape(-1, n)
-    base = inverse_dynamics(robot, qs, qd, _steady(robot, qs, qd)).reshape(wide)
+    base = inverse_dynamics(robot, qs, qd, _steady_accelerations(robot, qs, qd)).reshape(wide)
     still = np.zeros_like(q)
     held = inverse_dynamics(robot, q, still, still)
     # Efforts by an acceleration along each axis of the position.
@@ -217,7 +221,7 @@ def _efforts(
     return np.asarray(np.abs(base) + swing[:, None], np.float64)
 
 
-def _directions(size: int, count: int) -> Array:
+def _unit_vectors(size: int, count: int) -> Array:
     """Unit vectors of a position of ``size`` coordinates, shape (count, size)."""
     if size == 1:
         return np.array([[1.0], [-1.0]])

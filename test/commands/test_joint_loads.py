@@ -76,7 +76,7 @@ def test_loads_in_blocks_are_those_of_the_whole(twin, tmp_path, monkeypatch):
     (tmp_path / "bearings.yaml").write_text("bearings: {elbow_right: {C: 5000, Y: 1.5}}")
     results = []
     for block in (512, 7):
-        monkeypatch.setattr("pkm_twin.paths.joint_loads.BLOCK", block)
+        monkeypatch.setattr("pkm_twin.paths.joint_loads.SAMPLES_PER_BLOCK", block)
         out = tmp_path / f"{block}.csv"
         data = twin.told(
             "loads", "five_bar", path(robot, tmp_path), "--bearings", tmp_path / "bearings.yaml",

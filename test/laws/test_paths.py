@@ -10,11 +10,11 @@ from delta_dynamics import inverse_dynamics
 from pkm_twin.errors import ParameterError, UnreachableError
 from pkm_twin.mechanisms.catalogue import robot_of_data
 from pkm_twin.paths import circle, cycle, fastest, lines, through, timed
-from pkm_twin.paths.carrying import Carried
+from pkm_twin.paths.carrying import PayloadChange
 from pkm_twin.paths.fastest import LAWS
 from pkm_twin.paths.jerk import smooth_run
 from pkm_twin.paths.joint_path import joint_paths
-from pkm_twin.paths.motion import BINDS
+from pkm_twin.paths.motion import BINDING_USE
 from pkm_twin.paths.pieces import Arc, Corner, arc_through
 from test.support.robots import load, parameters_of, partly_long
 
@@ -141,7 +141,7 @@ def test_a_limit_that_is_reached_binds_and_a_rest_uses_its_own(law):
     robot, dwell = load("delta"), 0.1
     motion = timed(robot, cycle(robot, 0.025, 0.1, 0.025, dwell=dwell), law)
     free = [bound.used for bound in motion.bounds if not bound.what]
-    assert max(free) < BINDS and any(bound.what for bound in motion.bounds)
+    assert max(free) < BINDING_USE and any(bound.what for bound in motion.bounds)
     begin = motion.begins[1] - dwell
     (rest,) = [b for b in motion.bounds if b.begin < begin + 0.02 and b.end > begin + 0.08]
     assert law != "fastest" or rest.used < 0.1
@@ -271,7 +271,7 @@ def test_rates_with_limits_of_jerk_are_those_of_the_positions():
 def test_a_motion_never_goes_back_along_its_path():
     """Of any profile, with places where the machine nearly stops."""
     rng, robot = np.random.default_rng(2), load("five_bar")
-    [part] = joint_paths(through(robot, points_of(robot)), [Carried(robot)], 120, 1e-6)
+    [part] = joint_paths(through(robot, points_of(robot)), [PayloadChange(robot)], 120, 1e-6)
     s = part.ends / part.ends[-1]
     for dip in 10.0 ** rng.uniform(-9.0, 0.0, 20):
         x = np.sin(np.pi * s) ** (4 / 3) * (1.0 - (1.0 - dip) * (rng.random(len(s)) < 0.05))

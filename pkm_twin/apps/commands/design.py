@@ -139,7 +139,7 @@ def read_path(given: Design, path: Path, *, efforts: bool = True) -> tuple[Robot
     :raises BagError: a bag without a motion.
     """
     from pkm_twin.design import PosePath
-    from pkm_twin.paths.along import compared
+    from pkm_twin.paths.along import compare_efforts
 
     robot = given.machine()
     motion = given.read_motion(path, robot)
@@ -148,7 +148,7 @@ def read_path(given: Design, path: Path, *, efforts: bool = True) -> tuple[Robot
             bound = "one that is held throughout; --payload gives one"
             raise ParameterError(f"{path}: payload", str(motion.load), bound)
         robot = motion.load.on(robot)
-    if efforts and robot.has_masses and (unlike := compared(motion, "file").unlike):
+    if efforts and robot.has_masses and (unlike := compare_efforts(motion, "file").unlike):
         warn(path, unlike)
     q, qd, qdd, load = motion.motion
     load = load + np.asarray(given.wrench or np.zeros(6))

@@ -60,13 +60,13 @@ class Loads(CarriesAtTimes, ReadsMotions, Writes, Draws):
 
 def loads(given: Loads) -> Report:
     """The loads of all joints, the largest first in the answer."""
-    from pkm_twin.paths.joint_loads import spectra, summaries
+    from pkm_twin.paths.joint_loads import format_spectra, summarise_loads
 
     motion = given.read_motion(given.motion, given.machine())
     with progress("loads", len(motion.time)) as update, writing(given.out):
-        found = summaries(motion, given.bearings, given.out, update)
+        found = summarise_loads(motion, given.bearings, given.out, update)
     if given.spectrum is not None:
-        replace_file(given.spectrum, spectra(found).encode())
+        replace_file(given.spectrum, format_spectra(found).encode())
     robot, duration = motion.robot, float(motion.time[-1] - motion.time[0])
     joints = {load.name: of_joint(load, given.exponent, duration) for load in found}
     worst = max(found, key=lambda load: load.peaks[2])

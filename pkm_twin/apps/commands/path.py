@@ -320,13 +320,13 @@ def _tables(motion: TimedPath, soft: bool) -> list[Table]:
 
 def draw_limits(motion: TimedPath, title: str) -> Any:
     """How much of each limit is used when, coloured by the one that binds."""
-    from pkm_twin.paths.constraints import names_of
+    from pkm_twin.paths.constraints import limit_names
     from pkm_twin.paths.joint_path import only_turns
 
     figure, axes = plots.columns(1, 2)
     used, time = motion.used, motion.fine.time
     top, low = axes[0]
-    names = names_of(motion.robot)
+    names = limit_names(motion.robot)
     shown = [i for i in np.argsort(-used.max(0)) if used[:, i].max() > SHOWN][:8]
     colours = {names[i]: plots.COLOURS[k] for k, i in enumerate(shown)}
     for i in shown:
@@ -358,10 +358,10 @@ def draw_limits(motion: TimedPath, title: str) -> Any:
 
 def _cut(cut: SoftCut, motion: TimedPath) -> tuple[list[Fact], Any]:
     """What a cut is beside a motion, and its picture: feed and deflection with their bounds."""
-    from pkm_twin.paths.joint_path import velocity_of
+    from pkm_twin.paths.joint_path import reference_velocity
 
     s, speed, tolerance = motion.fine, cut.feed, cut.tolerance
-    way = velocity_of(motion.robot, s.q, s.qd) / np.maximum(s.speed, 1e-300)[:, None]
+    way = reference_velocity(motion.robot, s.q, s.qd) / np.maximum(s.speed, 1e-300)[:, None]
     bend = cut.bends(s.q, way)
     soft, most = float(bend.max()), float((bend * s.speed).max())
     # The largest constant feed within the tolerance.

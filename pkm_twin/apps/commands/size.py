@@ -24,7 +24,7 @@ from pkm_twin.report import Column, Fact, Report, Table, plots
 from pkm_twin.settings import setting
 
 if TYPE_CHECKING:
-    from pkm_twin.paths.along import Compared
+    from pkm_twin.paths.along import EffortComparison
     from pkm_twin.paths.sizing import DriveDuty, Fit, Gear, Gears
     from pkm_twin.robot.robot import Robot
 
@@ -99,7 +99,7 @@ class Size(CarriesAtTimes, ReadsMotions, AwayFromSingular, Draws):
 
 def size(given: Size) -> Report:
     """What each drive must give, and which motors can."""
-    from pkm_twin.paths.along import SAME, compared
+    from pkm_twin.paths.along import EFFORT_TOLERANCE, compare_efforts
     from pkm_twin.paths.sizing import read_motors, size_drives
 
     if (given.motion is None) == (given.over_workspace is None):
@@ -118,15 +118,15 @@ def size(given: Size) -> Report:
         return over_workspace(given)
     motors = {} if given.drives is None else read_motors(given.drives, given.motor)
     motion = given.read_motion(given.motion, given.machine())
-    taken, notes = compared(motion, given.efforts or "file"), list(motion.notes)
+    taken, notes = compare_efforts(motion, given.efforts or "file"), list(motion.notes)
     doubted = taken.unlike or motion.efforts != "measured"
     if given.payload is not None and given.efforts is None and doubted:
-        if taken.difference.max() > SAME:
+        if taken.difference.max() > EFFORT_TOLERANCE:
             notes.append(
                 f"the file's efforts are not those of {motion.load}: the model's are used; "
                 "--efforts file uses the file's"
             )
-        taken = compared(motion, "model")
+        taken = compare_efforts(motion, "model")
     duties = size_drives(motion, taken.effort, motors, *gears(given, motion.robot))
     duration = float(motion.time[-1] - motion.time[0])
     energy = sum(d.at_joint.energy for d in duties)
@@ -198,14 +198,14 @@ def gears(given: Size, robot: Robot) -> tuple[list[Gear], list[Gears]]:
 
 def smallest_motors(duties: Sequence[DriveDuty]) -> tuple[list[Fact], list[str]]:
     """The smallest motor with a gear for all drives, and those for each, as facts and in words."""
-    from pkm_twin.paths.sizing import smallest
+    from pkm_twin.paths.sizing import find_smallest
 
     none = f"none of {len(duties[0].fits)}"
-    alike = smallest([duty.alike for duty in duties])
+    alike = find_smallest([duty.alike for duty in duties])
     shared = [] if alike is None else [duty.alike[alike] for duty in duties]
     each = {}
     for duty in duties:
-        k = smallest([duty.fits])
+        k = find_smallest([duty.fits])
         each[duty.joint] = None if k is None else duty.fits[k]
     facts = [
         Fact("smallest_motor", shared[0].name if shared else None),
@@ -340,7 +340,7 @@ def near(duty: DriveDuty) -> list[Fit]:
     return fits[max(first - 3, 0) : first + 1]
 
 
-def draw(taken: Compared, duties: Sequence[DriveDuty], answer: str) -> Any:
+def draw(taken: EffortComparison, duties: Sequence[DriveDuty], answer: str) -> Any:
     """Torque against speed, an axes for each drive, with the curves of motors or the limits."""
     from pkm_twin.paths.sizing import RPM
 
