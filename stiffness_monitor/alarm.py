@@ -165,7 +165,7 @@ class _Window:
         return added[..., 0], (columns * amounts[:, None]) @ mine
 
     def estimate_each(self, count: int) -> tuple[Array, Array]:
-        """Return each element's factor alone to first order, and its deviation, (elements,)."""
+        """Return each element's factor alone to first order, and standard error, (elements,)."""
         _, slopes = self.predict_change(range(count), np.ones(count))
         rows, columns = slopes.reshape(-1, count), self.common.reshape(-1, len(self.prior))
         columns = np.concatenate([columns, np.diag(np.sqrt(self.prior))])

@@ -23,21 +23,22 @@ from pkm_twin.robot.limits import beyond_limits
 from pkm_twin.robot.robot import Robot
 
 SAMPLES_PER_BLOCK: Final = 4096
-"""Samples computed at a time, so that memory stays flat."""
+"""Samples computed at a time, so that memory use is bounded."""
 BEYOND_LIMITS: Final = "beyond_limits"
 EFFORT_TOLERANCE: Final = 1e-6
-"""Relative difference of two computations of the same efforts."""
+"""Largest relative difference of two computations of the same efforts."""
 SAME_NUMBERS: Final = 1e-3
 """The same, of one robot, whose files have nine digits or more: beyond rounding, below any term."""
 MAX_EFFORT_DIFFERENCE: Final = 0.05
-"""Difference between a file's efforts and the model's, over the RMS, from which it is reported."""
+"""RMS difference between a file's efforts and the model's, over the model's RMS, above which it is
+reported."""
 
 
 @dataclass(frozen=True)
 class EffortComparison:
-    """A motion with the efforts that are sized, shape (k, n), and where these are from.
+    """Hold a motion, the efforts to size for, shape (k, n), and where these are from.
 
-    ``model``: what the robot's model computes for the motion, shape (k, n).
+    ``model``: efforts of the robot's model along the motion, shape (k, n).
     """
 
     motion: Recording
@@ -52,7 +53,7 @@ class EffortComparison:
 
     @property
     def unlike(self) -> str:
-        """Says of which joint the file's efforts are not the model's; empty where they are."""
+        """Warning that names the joint whose file efforts are not the model's; else empty."""
         worst = int(self.difference.argmax())
         if not self.difference[worst] > MAX_EFFORT_DIFFERENCE:
             return ""
@@ -94,7 +95,7 @@ def check_computed(motion: Recording) -> Recording:
 
 
 def compare_efforts(motion: Recording, efforts: str = "file") -> EffortComparison:
-    """A motion with the file's efforts where it has them and they are asked for, else the model's.
+    """Return a motion with the file's efforts if it has them and they are wanted, or the model's.
 
     :raises ParameterError: a robot without masses.
     """
@@ -105,9 +106,9 @@ def compare_efforts(motion: Recording, efforts: str = "file") -> EffortCompariso
 
 
 def model_efforts(m: Recording) -> Array:
-    """What the model needs along a motion with rates, shape (samples, n).
+    """Return the model's efforts along a motion with velocities, shape (samples, n).
 
-    Where a joint stands still dry friction has no direction, and the model none of it.
+    Dry friction has no direction at standstill, and the model adds none there.
     """
     (q, _, qdd, wrench), rates, made = m.motion, _friction_rates(m), np.empty_like(m.q)
     for robot, part in by_load(m.robot, m.load, m.time, SAMPLES_PER_BLOCK):
@@ -121,12 +122,12 @@ def settle_rests(m: Recording) -> Recording:
 
 
 def _friction_rates(m: Recording) -> Array:
-    """The rates, without those that friction may not count."""
+    """Return the velocities, with zero where friction may not count."""
     qd = m.motion[1]
     if m.still is None:
         return qd
     rates = moving_rates(qd, m.still, friction_reach(m.robot))
-    # Drives that share the effort follow those at rest.
+    # Redundant drives follow those at rest.
     rests = (rates != qd).any(1)
     rates[rests] = m.robot.agreeing(m.q[rests], rates[rests])[1]
     return rates
@@ -134,9 +135,9 @@ def _friction_rates(m: Recording) -> Array:
 
 @dataclass(frozen=True)
 class SoftCut:
-    """A cut whose force is proportional to the feed and against the motion.
+    """Model a cut whose force is proportional to the feed and against the motion.
 
-    ``force``: N per m/s; ``tolerance``: most deflection of the reference point, m; ``feed``:
+    ``force``: N per m/s; ``tolerance``: largest deflection of the reference point, m; ``feed``:
     programmed, m/s.
     """
 
@@ -150,7 +151,7 @@ class SoftCut:
             raise ParameterError("slow-where-soft", self.robot.name, "a pose with x, y or z")
 
     def deflection_per_feed(self, q: Array, way: Array) -> Array:
-        """Deflection of the reference point per feed, m per m/s, shape (p,).
+        """Return the deflection of the reference point per feed, m per m/s, shape (p,).
 
         :param q: joint positions (p, n); ``way``: directions of the motion (p, 3), base axes.
         :raises ParameterError: a robot without elastic members.
@@ -161,17 +162,17 @@ class SoftCut:
         return np.asarray(self.force * np.linalg.norm(matrix @ way[..., None], axis=(-2, -1)))
 
     def slowdown(self, q: Array, way: Array) -> Array:
-        """What divides the feed so that the deflection stays within the tolerance, (p,)."""
+        """Return the divisor of the feed that keeps the deflection within the tolerance, (p,)."""
         return np.maximum(1.0, self.feed / self.tolerance * self.deflection_per_feed(q, way))
 
 
 def torque_table(m: Recording, progress: Callable[[int], None] | None = None) -> dict[str, Array]:
-    """Named columns: time, the motion, efforts, their terms, and every joint's reaction.
+    """Return named columns: time, motion, efforts, their terms, and all joints' reactions.
 
     The terms ``NAME.effort_gravity``, ``NAME.effort_inertia`` ... sum to ``NAME.effort``. A
     reaction that rigid bodies do not determine is left empty (NaN) in the table. Where a sample is
     beyond the limits, there is a column :data:`BEYOND_LIMITS`, 1 for such samples, 0 for others.
-    Of a robot whose file has an ``uncertainty``, ``NAME.effort_deviation`` is what that makes.
+    If the robot's file has an ``uncertainty``, ``NAME.effort_deviation`` is its effect.
 
     :raises UnreachableError: by the sample's index in the motion.
     :raises SingularityError: likewise.
@@ -228,6 +229,6 @@ def torque_table(m: Recording, progress: Callable[[int], None] | None = None) ->
     if m.effort is not None and m.efforts == "effort" and told:
         model = np.stack([whole[f"{joint}.effort"] for joint in m.robot.joint_names], -1)
         if np.abs(m.effort - model).max() <= EFFORT_TOLERANCE * np.abs(model).max():
-            # A plan of this machine: nothing was measured.
+            # The file is a plan of this machine, not a measurement.
             whole = {name: v for name, v in whole.items() if not name.endswith(".measured")}
     return whole | origin_columns(m.robot, m.load, m.wrench, m.time)

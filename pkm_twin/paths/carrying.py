@@ -1,7 +1,7 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""Payloads that change at waypoints of a path: the model's efforts with the payload of each part.
+"""Split paths at payload changes, and compute efforts with the payload of each part.
 
-A path is cut where its payload changes, so that no interval of its points has two.
+A path is split where its payload changes, so that no interval of its points has two payloads.
 """
 
 from __future__ import annotations
@@ -23,10 +23,12 @@ from pkm_twin.robot.robot import Robot
 
 @dataclass(frozen=True)
 class PayloadChange:
-    """A payload from a place of a path on: the begin of a piece of a stretch (the stretch's end
-    where it has no such piece; stretch -1: the rest before the first), after a rest there, s.
+    """Describe a payload from a position of a path on.
 
-    ``mass``: kg, None as in the robot's file, or the same. ``robot``: with it.
+    ``stretch``, ``piece``: it begins with this piece of the stretch, or at the stretch's end if it
+    has no such piece; stretch -1 is the rest before the first. ``rest``: time of standstill there
+    before the change, s. ``mass``: kg, None as in the robot's file, or the same. ``robot``: with
+    the payload.
     """
 
     robot: Robot
@@ -39,7 +41,7 @@ class PayloadChange:
 def split_at_payloads(
     robot: Robot, path: Path, payload: Sequence[float | None] | None
 ) -> tuple[Path, tuple[PayloadChange, ...]]:
-    """A path with pieces that end where its payload changes, and what is carried from where on.
+    """Split a path where its payload changes; return it with the payloads from where on.
 
     :param payload: from each waypoint on, kg, (waypoints,); None is the robot's own.
     :raises ParameterError: not one for each waypoint, or a mass that the robot cannot carry.
@@ -71,7 +73,7 @@ def split_at_payloads(
 
 
 def _split_piece(stretch: Stretch, way: float) -> tuple[Stretch, int]:
-    """A stretch with a piece that begins there, and its number."""
+    """Split a stretch so that a piece begins at ``way``; return it and the piece's number."""
     for k, piece in enumerate(stretch.pieces):
         if way <= MIN_DISTANCE:
             return stretch, k
@@ -84,7 +86,7 @@ def _split_piece(stretch: Stretch, way: float) -> tuple[Stretch, int]:
 
 
 def loaded_robots(carried: Sequence[PayloadChange], stretch: int, pieces: int) -> tuple[Robot, ...]:
-    """The robot with its payload on each piece of a stretch."""
+    """Return the robot with its payload for each piece of a stretch."""
     return tuple(
         next(c.robot for c in reversed(carried) if (c.stretch, c.piece) <= (stretch, k))
         for k in range(pieces)
@@ -95,7 +97,7 @@ def compute_efforts(
     robots: Sequence[Robot], which: NDArray[np.int64], q: Array, qd: Array, qdd: Array,
     wrench: Array | None,
 ) -> Array:  # fmt: skip
-    """Efforts of samples, shape (k, n), each of its own robot, by number ``which`` (k,)."""
+    """Return efforts of samples, (k, n), each with its own robot by number ``which`` (k,)."""
     if all(robot is robots[0] for robot in robots):
         return inverse_dynamics(robots[0], q, qd, qdd, wrench)
     made = np.empty_like(q)

@@ -1,12 +1,13 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""Limits of a motion along a path as rows in the path's acceleration and speed.
+"""Write limits of a motion along a path as rows in the path's acceleration and speed.
 
 With v = ds/dt, x = v^2 and u = d2s/dt2 the efforts are exactly
 
     tau = a u + b x + w v + k + g,
 
-a by the masses, b by the velocity terms, w by viscous and k by dry friction in the direction of the
-path, g by gravity, offsets and the wrench. The five come from five calls of the inverse dynamics.
+with a from the masses, b from the velocity terms, w from viscous and k from dry friction in the
+direction of the path, g from gravity, offsets and the wrench. Five calls of the inverse dynamics
+give the five.
 """
 
 from __future__ import annotations
@@ -23,12 +24,12 @@ from pkm_twin.paths.joint_path import Index, JointPath, describe_place
 from pkm_twin.robot.robot import Robot
 
 MIN_RATE_FRACTION: Final = 1e-12
-"""Part of the greatest rate below which a joint does not move."""
+"""Velocity, relative to the largest, below which a joint does not move: rounding."""
 
 
 @dataclass(frozen=True)
 class Limits:
-    """Limits of a motion; infinite means no limit.
+    """Hold limits of a motion; infinite means no limit.
 
     ``effort``, ``velocity``, ``acceleration``, ``jerk``: of the actuated joints, shape (n,).
     ``speed``: of the platform's reference point, m/s.
@@ -52,7 +53,7 @@ class Limits:
         speed: float | None = None,
         share: float = 1.0,
     ) -> Limits:
-        """The limits of a robot's file, or those given here; one number stands for all joints.
+        """Return the limits of a robot's file, or those given; one number applies to all joints.
 
         :param share: part of the file's efforts and velocities that a motion may use.
         :raises ParameterError: a limit that no machine has, or too many numbers.
@@ -81,16 +82,16 @@ class Limits:
         )  # fmt: skip
 
     def part(self, share: float) -> Limits:
-        """The same, each times ``share``."""
+        """Return the limits times ``share``."""
         return Limits(
             share * self.effort, share * self.velocity, share * self.acceleration,
             share * self.jerk, share * self.speed,
         )  # fmt: skip
 
     def check(self) -> None:
-        """Reject limits that leave the speed open.
+        """Reject limits that do not bound the speed.
 
-        :raises ParameterError: there is none.
+        :raises ParameterError: no limit is finite.
         """
         bounds = (self.effort, self.velocity, self.acceleration, self.jerk)
         if not (np.isfinite(self.speed) or any(np.isfinite(b).any() for b in bounds)):
@@ -102,7 +103,7 @@ class Limits:
 
 @dataclass(frozen=True)
 class Forces:
-    """a, b, w, k and g of the efforts at points of a path, shape (p, n) each."""
+    """Hold a, b, w, k and g of the efforts at points of a path, shape (p, n) each."""
 
     a: Array
     b: Array
@@ -115,7 +116,7 @@ class Forces:
         cls, part: JointPath, points: Index, q: Array, first: Array, second: Array,
         wrench: Array | None = None,
     ) -> Forces:  # fmt: skip
-        """From the inverse dynamics at joint positions with derivatives by s, (p, n) each.
+        """Compute the five from the inverse dynamics at q with derivatives by s, (p, n) each.
 
         :param points: of the stretch, whose payloads are carried, (p,).
         :param wrench: on the platform all the time, (6,); None: no wrench.
@@ -138,27 +139,27 @@ class Forces:
         b = 0.5 * (ahead + back) - g
         odd = 0.5 * (ahead - back)
         w = twice - g - 4.0 * b - odd
-        # What is left of rounding is no friction.
+        # Remainders of the size of rounding errors are not friction.
         size = 1e-12 * np.abs(efforts).max(initial=0.0)
         w = np.where(np.abs(w) > size, w, 0.0)
         k = odd - w
         return cls(a - g, b, w, np.where(np.abs(k) > size, k, 0.0), g)
 
     def efforts(self, v: Array, u: Array) -> Array:
-        """Efforts at speeds v and accelerations u along the path, (p,) each: shape (p, n)."""
+        """Return efforts at speeds v and accelerations u along the path, (p,) each: (p, n)."""
         moving = (v > 0.0)[:, None]
         v, u = v[:, None], u[:, None]
-        # A machine that starts has its dry friction already.
+        # Dry friction acts from the first moment of a start.
         moving |= u != 0.0
         return self.a * u + self.b * v**2 + self.w * v + self.g + np.where(moving, self.k, 0.0)
 
 
 @dataclass(frozen=True)
 class Rows:
-    """Limits at points of a path as parts of them, and the greatest x there.
+    """Hold limits at points of a path, scaled to 1, and the largest x there.
 
     -1 <= alpha u + beta x + drag v + fixed + dry <= 1, shape (p, r), and x <= most, shape (p,).
-    ``dry``: dry friction, which jumps where a joint turns round.
+    ``dry``: dry friction, which changes sign where a joint reverses.
     """
 
     alpha: Array
@@ -170,7 +171,7 @@ class Rows:
 
     @classmethod
     def of(cls, part: JointPath, forces: Forces | None, limits: Limits) -> Rows:
-        """Of the points of a stretch."""
+        """Return the rows of a stretch's points."""
         p = len(part.s)
         alpha, beta, drag, fixed, dry = ([np.zeros((p, 0))] for _ in range(5))
         used = np.isfinite(limits.effort)
@@ -195,7 +196,7 @@ class Rows:
 
 
 def _unreachable_bound(part: JointPath, alpha: Array, most: Array) -> float:
-    """An x that no motion reaches: ten times what the hardest acceleration all the way gives."""
+    """Return an x that no motion reaches: ten times that of constant full acceleration."""
     size = np.abs(alpha).max(1, initial=0.0)
     pushed = size > MIN_RATE_FRACTION * size.max()
     if not pushed.any():
@@ -204,7 +205,7 @@ def _unreachable_bound(part: JointPath, alpha: Array, most: Array) -> float:
 
 
 def _velocity_bound(part: JointPath, limits: Limits) -> Array:
-    """Greatest x by joint velocities and the tool's speed, shape (p,)."""
+    """Return the largest x by joint velocities and the tool's speed, shape (p,)."""
     rates = np.abs(part.first)
     least = MIN_RATE_FRACTION * max(float(rates.max()), 1e-300)
     with np.errstate(divide="ignore"):
@@ -214,7 +215,7 @@ def _velocity_bound(part: JointPath, limits: Limits) -> Array:
 
 
 def limit_names(robot: Robot) -> list[str]:
-    """What may bind, in the order of :func:`limit_usage`."""
+    """Return the names of all limits, in the order of :func:`limit_usage`."""
     joints = robot.joint_names
     words = ("effort", "velocity", "acceleration", "jerk")
     return [f"{word} {joint}" for word in words for joint in joints] + ["speed"]
@@ -223,7 +224,7 @@ def limit_names(robot: Robot) -> list[str]:
 def limit_usage(
     limits: Limits, effort: Array | None, qd: Array, qdd: Array, qddd: Array, speed: Array
 ) -> Array:
-    """Each limit's used part with its sign, (k, 4 n + 1), 1 at the limit; 0 where there is none."""
+    """Return the signed used fraction of each limit, (k, 4 n + 1), 1 at the limit, 0 without."""
     zero = np.zeros_like(qd)
     parts = [
         values / bound
@@ -236,9 +237,9 @@ def limit_usage(
 
 
 def check_rest(part: JointPath, rows: Rows, limits: Limits) -> None:
-    """Reject a path on which the drives cannot hold the machine or creep.
+    """Reject a path on which the drives cannot hold the machine at rest.
 
-    :raises ParameterError: by the place and joint.
+    :raises ParameterError: names the position and the joint.
     """
     size = np.abs(rows.fixed + rows.dry)
     if not size.size or (size < 1.0).all():

@@ -1,6 +1,7 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""The shortest motion along a path within the limits of drives, joints and tool, or one by a law:
-a quintic, or an S-curve of limited jerk.
+"""Plan the fastest motion along a path within limits, or one by a law.
+
+Limits are those of drives, joints and tool. Laws are the quintic and S-curves of limited jerk.
 """
 
 from __future__ import annotations
@@ -26,13 +27,13 @@ from pkm_twin.robot.robot import Robot
 
 @dataclass(frozen=True, eq=False)
 class Law:
-    """A way from 0 to 1 in the time from 0 to 1, as :class:`Run` has it."""
+    """Describe a motion law from 0 to 1 in the time from 0 to 1, as :class:`Run` stores it."""
 
     knots: Array
     way: Array
 
     def on(self, part: JointPath, duration: float) -> Run:
-        """A stretch by this law, its duration in s."""
+        """Return a stretch by this law, its duration in s."""
         return Run(part, self.knots, float(part.ends[-1]) * self.way).slower(duration)
 
 
@@ -40,7 +41,7 @@ QUINTIC: Final = Law(np.array([0.0, 1.0]), np.array([[0.0, 0.0, 0.0, 10.0, -15.0
 
 
 def s_curve(cruise: float, smooth: float) -> Law:
-    """Seven parts of constant jerk.
+    """Return a law of seven parts with constant jerk.
 
     :param cruise: part of the duration at even speed, 0 to below 1.
     :param smooth: part of each ramp in which its acceleration changes, above 0 to 1.
@@ -50,7 +51,7 @@ def s_curve(cruise: float, smooth: float) -> Law:
     top = 1.0 / (ramp + cruise)
     jerk = top / (ramp - change) / change * np.array([1.0, 0.0, -1.0, 0.0, -1.0, 0.0, 1.0])
     steps = np.array([change, even, change, cruise, change, even, change])
-    # A part of no duration is none.
+    # Drop parts without duration.
     jerk, steps = jerk[steps > 0.0], steps[steps > 0.0]
     state, rows = np.zeros(3), []
     for h, j in zip(steps, jerk, strict=True):
@@ -63,7 +64,7 @@ def s_curve(cruise: float, smooth: float) -> Law:
 
 
 MIN_DURATION: Final = 1e-6
-"""Duration of a stretch that nothing limits, s."""
+"""Duration of a stretch that no limit bounds, s."""
 LAWS: Final[Mapping[str, Sequence[Law]]] = {
     "quintic": (QUINTIC,),
     "s-curve": tuple(
@@ -72,11 +73,11 @@ LAWS: Final[Mapping[str, Sequence[Law]]] = {
         for smooth in (0.3, 0.5, 0.75, 1.0)
     ),
 }
-"""Laws by name: of several the one that is fastest within the limits."""
+"""Laws by name; the one that is fastest within the limits is used."""
 
 
 def run_by_law(part: JointPath, law: Law, limits: Limits, wrench: Array | None) -> Run:
-    """A stretch by a law, the shortest within the limits at as many times as it has points."""
+    """Return the shortest run of a stretch by a law; limits hold at one time per point."""
     run = law.on(part, 1.0)
     time = np.linspace(0.0, 1.0, len(part.ends))
     interval, share, v, u = run.at(time)
@@ -110,34 +111,34 @@ def run_by_law(part: JointPath, law: Law, limits: Limits, wrench: Array | None) 
 
 
 DEFAULT_POINTS: Final = 1000
-"""Points of a path."""
+"""Default number of points of a path."""
 MAX_JERK_POINTS: Final = 400
-"""The same where jerks are limited: each is a variable of linear programs."""
+"""Largest number of points with jerk limits, where each is a variable of linear programs."""
 MIN_SINGULARITY_INDEX: Final = 0.01
-"""Least singularity index of a path, by default the nodes' ``singularity_stop``."""
+"""Default smallest singularity index of a path: the nodes' ``singularity_stop``."""
 LIMIT_RESERVE: Final = 1e-4
-"""Part of each limit that the points of a path leave to what is between them."""
+"""Fraction of each limit that the points leave to the motion between them."""
 MAX_EXCESS: Final = 3e-4
-"""Part of a limit passed between the points that slowing the whole down makes good."""
+"""Excess of a limit between points, as a fraction, that slowing the whole motion corrects."""
 REFINEMENT_EXCESS: Final = 1e-3
-"""Part of a limit passed from which on intervals are divided, and of the duration, with limits of
-jerk, that is worth another program."""
+"""Excess of a limit, as a fraction, above which intervals are divided; with jerk limits, also the
+gain of duration that justifies another program."""
 SLOWDOWN_RESERVE: Final = 1e-5
-"""By what part more than is needed a motion is slowed down; each time four times as much."""
+"""Fraction by which a motion is slowed more than needed; four times as much in each attempt."""
 MAX_SLOWDOWNS: Final = 12
-"""How often a motion that passes a limit is slowed down."""
+"""Largest number of attempts to slow a motion that exceeds a limit."""
 MAX_TIGHTENINGS: Final = 4
-"""How often limits are tightened where they are passed between the points."""
+"""Largest number of times that limits are tightened where they are exceeded between points."""
 MAX_REFINEMENTS: Final = 5
-"""How often intervals in which they are passed are divided before that."""
+"""Largest number of times that intervals are divided before that."""
 MAX_PARTS: Final = 8
-"""Most parts of an interval each time."""
+"""Largest number of parts into which an interval is divided at a time."""
 MAX_JERK_REFINEMENTS: Final = 4
-"""How often intervals are divided where jerks are limited."""
+"""Largest number of times that intervals are divided with jerk limits."""
 MAX_SPEED_RATIO: Final = 2.0
-"""Ratio of squared speeds at the ends of an interval from which on it is divided then."""
+"""Ratio of squared speeds at an interval's ends above which it is divided with jerk limits."""
 UNDIVIDED_ENDS: Final = 8
-"""Intervals next to a stop that are not divided: their points are set closer already."""
+"""Intervals next to a stop that are not divided: their points are already closer."""
 
 
 def fastest(
@@ -156,7 +157,7 @@ def fastest(
     slowdown: Slowdown | None = None,
     payload: Sequence[float | None] | None = None,
 ) -> TimedPath:
-    """The shortest motion along a path, at rest at its ends, by the exact inverse dynamics.
+    """Plan the fastest motion along a path, at rest at its ends, by the exact inverse dynamics.
 
     The limits hold at all times: between the points of the path the inverse dynamics checks them
     as closely as needed (:func:`~pkm_twin.paths.motion.peaks`). If one is exceeded, the path gets
@@ -173,7 +174,8 @@ def fastest(
     :param share: fraction of the robot file's efforts and velocities to use.
     :param singularity: least singularity index on the path, 0 to 1.
     :param wrench: constant external wrench on the platform, (6,), base axes.
-    :param points: about how many points of the path; with a jerk limit at most :data:`MAX_JERK_POINTS`.
+    :param points: about how many points of the path; at most :data:`MAX_JERK_POINTS` with a
+        jerk limit.
     :param slowdown: divides ``speed`` at points of the path, by their joint positions (p, n) and
         the direction (p, 3) of the reference point, base axes: returns 1 or more, (p,).
     :param payload: mass from each waypoint on, kg, (waypoints,); None is the robot's own payload,
@@ -206,7 +208,7 @@ def timed(
     payload: Sequence[float | None] | None = None,
     **bounds: Any,
 ) -> TimedPath:
-    """A motion along a path by a law, with a given duration or the shortest within the limits.
+    """Plan a motion along a path by a law, with a duration or the shortest within the limits.
 
     :param law: ``fastest``, ``quintic`` or ``s-curve``, each from stop to stop.
     :param duration: of the whole, rests included, s; all stretches are slowed down alike.
@@ -247,15 +249,15 @@ def timed(
     result = replace(result, runs=tuple(run.slower(factor) for run in result.runs))
     over = max(result.worst.values(), default=0.0)
     if over > 1.0 + LIMIT_RESERVE:
-        # Speed can carry a load that the drives alone do not hold.
+        # At lower speed the drives may lack the inertial forces that helped to hold the load.
         raise ParameterError("duration", duration, f"a motion within limits, not {over:.4g} of one")
     return result
 
 
 def _solve_stretch(part: JointPath, limits: Limits, wrench: Array | None) -> Run:
-    """One stretch, its limits kept between the points too.
+    """Find the fastest run of one stretch that keeps the limits between its points too.
 
-    Intervals within which a limit is passed are divided, and at last use less of the limits.
+    Intervals within which a limit is exceeded are divided, and finally use smaller limits.
     """
     share = np.ones(len(part.left))
     rows = _limit_rows(part, limits, wrench)
@@ -271,7 +273,7 @@ def _solve_stretch(part: JointPath, limits: Limits, wrench: Array | None) -> Run
             break
         parts = np.ones(len(bad), np.int64)
         if count < MAX_REFINEMENTS:
-            # What a limit is passed by between two points goes by the square of their distance.
+            # The excess between two points grows with the square of their distance.
             wanted = np.ceil(np.sqrt(np.maximum(over - 1.0, 0.0) / MAX_EXCESS))
             most = np.minimum(part.steps / part.curve.least_step, MAX_PARTS)
             coarse = over > 1.0 + REFINEMENT_EXCESS
@@ -286,7 +288,7 @@ def _solve_stretch(part: JointPath, limits: Limits, wrench: Array | None) -> Run
 
 
 def _solve_with_jerk(part: JointPath, limits: Limits, wrench: Array | None) -> Run:
-    """The same with limits of jerk: the best of several profiles, or a quintic."""
+    """Find the fastest run within jerk limits: the best of several profiles, or a quintic."""
     rows = _limit_rows(part, limits, wrench)
     slow = run_by_law(part, QUINTIC, limits, wrench)
     best: Run = slow
@@ -315,7 +317,7 @@ def _solve_with_jerk(part: JointPath, limits: Limits, wrench: Array | None) -> R
         interval = run.at(0.5 * (run.times[1:] + run.times[:-1]))[0]
         np.maximum.at(over[0], interval, np.delete(used, np.s_[3 * n : 4 * n], 1).max(1))
         np.maximum.at(over[1], interval, used[:, 3 * n : 4 * n].max(1))
-        # Where the speed changes by much within an interval, the programs say little of it.
+        # The programs are inaccurate in intervals in which the speed changes by much.
         parts = np.ones(len(share), np.int64)
         if count < MAX_JERK_REFINEMENTS:
             steep = np.maximum(x[1:], x[:-1]) > MAX_SPEED_RATIO * np.minimum(x[1:], x[:-1])
@@ -336,7 +338,7 @@ def _solve_with_jerk(part: JointPath, limits: Limits, wrench: Array | None) -> R
 
 
 def _limit_rows(part: JointPath, limits: Limits, wrench: Array | None) -> Rows:
-    """The limits at the points of a stretch, smaller by :data:`LIMIT_RESERVE`."""
+    """Return the limits at the points of a stretch, reduced by :data:`LIMIT_RESERVE`."""
     forces = None
     if needs_forces(part, limits):
         points = np.arange(len(part.s))
@@ -347,7 +349,7 @@ def _limit_rows(part: JointPath, limits: Limits, wrench: Array | None) -> Rows:
 
 
 def _check_no_stop(part: JointPath, x: Array) -> None:
-    """Reject a profile that stands still on its way."""
+    """Reject a profile that stops on the way."""
     slow = (x[:-1] + x[1:]) <= 0.0
     if slow.any():
         way = part.curve.begin + float(part.s[part.left[int(slow.argmax())]])
@@ -357,10 +359,10 @@ def _check_no_stop(part: JointPath, x: Array) -> None:
 
 
 def slowdown_factor(used: Array) -> float:
-    """By what a motion has to be slowed down, about, from its used parts of limits (4 n + 1,).
+    """Estimate the factor of the duration that a motion needs, from used fractions (4 n + 1,).
 
-    Rates go by the speed, accelerations by its square, jerks by its cube. What moves of an effort
-    goes by the square too; what rests of it does not change.
+    Velocities scale with the speed, accelerations with its square, jerks with its cube. The moving
+    part of an effort scales with the square too; its part at rest does not change.
     """
     n = len(used) // 4
     powers = np.append(np.repeat([2.0, 1.0, 2.0, 3.0], n), 1.0)
@@ -370,10 +372,11 @@ def slowdown_factor(used: Array) -> float:
 def slow_within_limits(
     run: Run, limits: Limits, wrench: Array | None, used: Array | None = None
 ) -> Run:
-    """A run, slower by as much as its limits need.
+    """Slow a run down as much as its limits need.
 
-    :param used: greatest used part of each limit, where it is known, shape (4 n + 1,).
-    :raises ParameterError: no speed keeps them.
+    :param used: largest used fraction of each limit if known, shape (4 n + 1,).
+
+    :raises ParameterError: no speed keeps the limits.
     """
     factor = 1.0
     for more in SLOWDOWN_RESERVE * 4.0 ** np.arange(MAX_SLOWDOWNS):

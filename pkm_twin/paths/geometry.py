@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""Paths in pose or joint coordinates: lines, rounded corners, arcs and smooth curves.
+"""Build paths in pose or joint coordinates: lines, rounded corners, arcs, smooth curves.
 
 A path is a chain of stretches, each from rest to rest; a stretch is a chain of pieces that meet
 with the same direction. The coordinate s of a piece is a length: angles count by the platform's
@@ -24,16 +24,17 @@ from pkm_twin.robot.robot import Robot
 Space = Literal["pose", "joint"]
 
 MIN_DISTANCE: Final = 1e-9
-"""Distance below which two waypoints are one, m."""
+"""Distance below which two waypoints coincide, m."""
 REVERSAL_COSINE: Final = -0.985
-"""Cosine of the turn from which on a corner is a reversal (170 degrees) and cannot be rounded."""
+"""Cosine of the angle between two lines below which the corner (170 degrees or more) cannot be
+rounded."""
 TANGENT_TOLERANCE: Final = 1e-6
-"""Difference of two unit directions below which a path passes from one to the other at speed."""
+"""Difference of two unit directions below which a path continues without a stop."""
 
 
 @dataclass(frozen=True)
 class Stretch:
-    """Pieces that are passed without a stop, and how long the machine then rests, s."""
+    """Hold pieces that are passed without a stop, and the rest after them, s."""
 
     pieces: tuple[Piece, ...]
     dwell: float = 0.0
@@ -45,8 +46,10 @@ class Stretch:
 
 
 class Mark(NamedTuple):
-    """A place of a path: on a stretch (-1: the rest before the first) the way to it, m, and how
-    long the machine has then rested there, s.
+    """Describe where a waypoint lies on a path.
+
+    ``stretch``: its index; -1 is the rest before the first. ``way``: length up to the waypoint on
+    the stretch, m. ``rest``: time that the machine has rested there, s.
     """
 
     stretch: int
@@ -56,7 +59,7 @@ class Mark(NamedTuple):
 
 @dataclass(frozen=True)
 class Path:
-    """Stretches in pose or joint coordinates; ``wait`` is the rest before the first, s.
+    """Hold stretches in pose or joint coordinates; ``wait`` is the rest before the first, s.
 
     ``marks``: where each waypoint is; for a rounded corner, the middle of the rounding.
     """
@@ -74,16 +77,16 @@ class Path:
 
 
 def scales_of(robot: Robot, space: Space) -> Array:
-    """What makes lengths of the coordinates: 1 of a length, the platform's radius of an angle."""
+    """Return lengths per coordinate: 1 for a length, the platform's radius for an angle."""
     if space == "pose":
         return robot.pose_scales
     return np.array([1.0 if unit == "m" else robot.size for unit in robot.joint_units])
 
 
 def _check_waypoints(robot: Robot, points: ArrayLike, space: Space) -> tuple[Array, Array]:
-    """Way-points (k, m), and which of them differ from the one before.
+    """Check waypoints (k, m); return them, and which differ from the one before.
 
-    :raises ParameterError: a wrong shape, no number, or no way at all.
+    :raises ParameterError: a wrong shape, a value that is not finite, or all waypoints equal.
     """
     values = np.asarray(points, np.float64)
     names = robot.pose_names if space == "pose" else robot.joint_names
@@ -101,7 +104,7 @@ def _check_waypoints(robot: Robot, points: ArrayLike, space: Space) -> tuple[Arr
 
 
 def through(robot: Robot, points: ArrayLike, *, space: Space = "pose") -> Path:
-    """A smooth curve through waypoints without a stop: a cubic spline over the chords' lengths.
+    """Return a smooth curve through waypoints: a cubic spline over the chords' lengths.
 
     :param points: shape (k, m), coordinates of the pose, or joint positions (k, n).
     :raises ParameterError: fewer than two different waypoints, or values that are not finite.
@@ -127,7 +130,7 @@ def lines(
     arc: ArrayLike = False,
     space: Space = "pose",
 ) -> Path:
-    """Straight lines and arcs between waypoints, corners rounded or passed with a stop.
+    """Return lines and arcs between waypoints, with corners rounded or passed with a stop.
 
     :param points: shape (k, m), coordinates of the pose, or joint positions (k, n).
     :param blend: by waypoint (k,) or one for all: distance from the corner at which the path
@@ -147,7 +150,7 @@ def lines(
         if bad.any():
             row = int(bad.argmax())
             raise ParameterError(f"waypoint {row}: {name}", numbers[row], "0 or more")
-    # A waypoint that is repeated only adds its rest.
+    # A repeated waypoint only adds its rest.
     rested = np.zeros(count)
     for k in np.flatnonzero(np.logical_not(new)):
         rested[k] = dwells[k - 1]
@@ -161,7 +164,7 @@ def lines(
 
 
 class _Lines:
-    """Lines and arcs between waypoints that differ."""
+    """Build the pieces between waypoints that differ."""
 
     def __init__(
         self, robot: Robot, space: Space, points: Array, blends: Array, dwells: Array,
@@ -199,7 +202,7 @@ class _Lines:
         return Path(self.space, tuple(stretches), float(self.dwells[0]), "lines", tuple(marks))
 
     def _make_pieces(self) -> Sequence[tuple[Piece, int]]:
-        """Each line or arc, and the waypoint that it ends in."""
+        """Return each line or arc, and the waypoint at its end."""
         result: list[tuple[Piece, int]] = []
         k, last = 0, len(self.points) - 1
         if self.arcs[0] or self.arcs[last]:
@@ -222,7 +225,7 @@ class _Lines:
         return result
 
     def _blend_radius(self, k: int, piece: Piece, following: Piece) -> float:
-        """Where a corner is left, m; 0 where it is passed with a stop or is none."""
+        """Return the blend radius of a corner, m; 0 if the path stops there or has no corner."""
         wanted = float(self.blends[k])
         if wanted == 0.0 or self.dwells[k] > 0.0:
             return 0.0
@@ -236,7 +239,7 @@ class _Lines:
         return min(wanted, 0.5 * piece.length, 0.5 * following.length)
 
     def _make_arc(self, k: int) -> Arc:
-        """The arc from waypoint k through the next one to the one behind."""
+        """Return the arc from waypoint k through the next one to the one after it."""
         names = self.robot.pose_names if self.space == "pose" else ()
         places = [i for i, name in enumerate(names) if name in ("x", "y", "z")]
         if len(places) < 2:
@@ -255,7 +258,7 @@ def _end_direction(piece: Piece) -> Array:
 
 
 def _shorten(piece: Piece, begin: float, end: float) -> list[Piece]:
-    """A line without its first and last parts; nothing where nothing is left."""
+    """Return a line without its first and last parts; nothing if no length is left."""
     length = piece.length - begin - end
     if not length > MIN_DISTANCE:
         return []
@@ -265,9 +268,9 @@ def _shorten(piece: Piece, begin: float, end: float) -> list[Piece]:
 
 
 def circle(robot: Robot, centre: ArrayLike, radius: float, *, turns: float = 1.0) -> Path:
-    """A circle of the platform's reference point about a pose, in the first two of x, y, z.
+    """Return a circle of the reference point about a pose, in the first two of x, y, z.
 
-    For a pose without two of them, a circle of its first two angles.
+    For a pose without two of them, the circle is in its first two angles.
 
     :param centre: the pose in the middle, shape (m,).
     :param radius: m, of angles rad.
@@ -302,7 +305,7 @@ def cycle(
     dwell: float = 0.0,
     back: bool = True,
 ) -> Path:
-    """A pick-and-place cycle: up, across, down, a stop, and the same way back.
+    """Return a pick-and-place cycle: up, across, down, a stop, and the same way back.
 
     :param height: rise at the first place, m.
     :param width: between the two places, m.

@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""The fastest speed along a path with limits on the joints' jerk, as a sequence of linear programs.
+"""Find the fastest profile with limits on the joints' jerk, by a sequence of linear programs.
 
 A joint's jerk is v (q' du/ds + 3 q'' u + q''' x) with x = v^2, so a limit J on it is a bound
 J / sqrt(x) on what is linear in x. That bound is convex: its tangent at a profile that keeps the
@@ -25,32 +25,35 @@ from pkm_twin.paths.profile import interval_rows
 Index = NDArray[np.int64]
 
 MAX_PROGRAMS: Final = 20
-"""Most linear programs."""
+"""Largest number of linear programs."""
 DURATION_TOLERANCE: Final = 1e-4
-"""Relative change of the duration that ends them."""
+"""Relative change of the duration at which the sequence ends."""
 MIN_PROFILE_FRACTION: Final = 1e-9
-"""Part of the greatest x below which a machine does not slow down on its way."""
+"""Smallest x inside a stretch, relative to the largest, so that the machine does not stop there."""
 MAX_SLOWDOWNS: Final = 6
-"""How often a start is slowed down until a program has a solution."""
+"""Largest number of times that the start is slowed until a program has a solution."""
 MAX_RAISES: Final = 20
-"""How often a profile is raised where it would go back."""
+"""Largest number of times that a profile is raised where the speed would be negative."""
 ROUNDING: Final = 1e-12
-"""Part of the greatest speed below rest that is rounding."""
+"""Negative speed, relative to the largest, that is a rounding error."""
 
 
 def _min_speed(knots: Array, v: Array, u: Array) -> Array:
-    """Least speed between knots, where it turns too, by v and u there, (k,); shape (k - 1,)."""
+    """Return the smallest speed between knots by v and u there, (k,); shape (k - 1,).
+
+    The acceleration may change its sign within an interval, where the speed then has a minimum.
+    """
     span, change = np.diff(knots), np.diff(u)
     rises = (u[:-1] < 0.0) & (u[1:] > 0.0)
-    # From there to the turn the acceleration goes to zero.
+    # Speed change from the left knot to the minimum, where the acceleration is zero.
     dip = np.where(rises, -0.5 * u[:-1] ** 2 * span / np.where(rises, change, 1.0), 0.0)
     return np.minimum(np.minimum(v[:-1], v[1:]), v[:-1] + dip)
 
 
 def _boundary_derivatives(part: JointPath) -> tuple[Array, Array, tuple[Array, Array]]:
-    """The first two derivatives at the points between two intervals, and the third on both sides.
+    """Return q', q'' at points between two intervals, and q''' on both sides.
 
-    Shape (i - 1, n) each; where two pieces meet the third jumps.
+    Shape (i - 1, n) each; q''' jumps where two pieces meet.
     """
     left = part.left
     third = (part.second[left + 1] - part.second[left]) / part.steps[:, None]
@@ -63,15 +66,15 @@ def smooth_profile(
     part: JointPath, rows: Rows, limits: Limits, start: Array, share: Array, jerks: Array,
     programs: int = MAX_PROGRAMS,
 ) -> Array | None:  # fmt: skip
-    """The greatest x at the intervals' ends, (i + 1,), with the joints' jerks within limits.
+    """Find the largest x at the intervals' ends, (i + 1,), within the joints' jerk limits.
 
-    None where no program has a solution.
+    Returns None if no program has a solution.
 
     :param start: a profile that keeps the limits, shape (i + 1,).
-    :param share: part of each interval's limits that is used, shape (i,); ``jerks``: of jerks.
+    :param share: fraction of each interval's limits to use, shape (i,); ``jerks``: of jerk limits.
     :param programs: most linear programs that improve it.
     """
-    # In units of time in which the start has the greatest speed 1.
+    # Scale time so that the start's largest speed is 1.
     unit = float(start.max())
     jerk = limits.jerk / unit**1.5
     rows = Rows(
@@ -97,7 +100,7 @@ def smooth_profile(
             method="highs",
         )  # fmt: skip
         if answer.status != 0 and count == 0 and slower < MAX_SLOWDOWNS:
-            # A slower motion has smaller jerks, so that the bounds' tangents there leave room.
+            # A slower motion has smaller jerks, so that the bounds' tangents there are feasible.
             x, slower = 0.25 * x, slower + 1
             continue
         if answer.status != 0 and count == 0:
@@ -116,7 +119,7 @@ def smooth_profile(
 
 
 def _bound_from_rest(part: JointPath, jerk: Array, most: Array) -> Array:
-    """Greatest x at the intervals' ends, (i + 1,), also by the jerk from rest and to it."""
+    """Return the largest x at the intervals' ends, (i + 1,), also by the jerk at stops."""
     most = most.copy()
     most[0] = most[-1] = 0.0
     for k, step, at in ((1, part.steps[0], 0), (-2, part.steps[-1], -1)):
@@ -131,6 +134,7 @@ def _bound_from_rest(part: JointPath, jerk: Array, most: Array) -> Array:
 def _sparse_matrix(
     rows: list[tuple[Any, Any, Any]], shape: tuple[int, int]
 ) -> scipy.sparse.csr_matrix:
+    """Return the sparse matrix of triplets (values, rows, columns)."""
     values, row, column = (np.concatenate([np.ravel(r[k]) for r in rows]) for k in range(3))
     return scipy.sparse.coo_matrix((values, (row, column)), shape=shape).tocsr()
 
@@ -138,7 +142,7 @@ def _sparse_matrix(
 def _program_rows(
     p: Array, q: Array, least: Array, greatest: Array
 ) -> tuple[scipy.sparse.csr_matrix, Array]:
-    """Rows least <= p x + q x' <= greatest of all intervals, (i, r), as a program has them."""
+    """Write least <= p x + q x' <= greatest of all intervals, (i, r), as A x <= b."""
     count, width = p.shape
     number, column = np.arange(p.size), np.repeat(np.arange(count), width)
     made = _sparse_matrix([(p, number, column), (q, number, column + 1)], (p.size, count + 1))
@@ -148,7 +152,7 @@ def _program_rows(
 def _jerk_rows(
     part: JointPath, jerk: Array, h: Array, x: Array, share: Array
 ) -> tuple[scipy.sparse.csr_matrix, Array]:
-    """Jerks at the points between two intervals, their bound's tangent at a profile."""
+    """Write the jerk limits at points between two intervals, linearised about a profile."""
     used = np.isfinite(jerk)
     first, second, sides = _boundary_derivatives(part)
     # As fractions of the limits.
@@ -182,10 +186,10 @@ def _jerk_rows(
 
 
 def smooth_run(part: JointPath, x: Array) -> Run | None:
-    """A profile in time that never goes back along the path; None where none is found.
+    """Convert a profile to a run that never moves backwards; None if none is found.
 
-    Where a machine nearly stops on its way, lines between the accelerations may go below rest: the
-    profile is raised there.
+    Where the machine nearly stops, linear accelerations may give negative speeds: the profile is
+    raised there.
     """
     x = x.copy()
     for count in range(MAX_RAISES):
@@ -202,10 +206,10 @@ def smooth_run(part: JointPath, x: Array) -> Run | None:
 
 
 def _integrate_profile(part: JointPath, x: Array) -> tuple[Array, Array, Array, Array]:
-    """A profile in time: its mean accelerations, joined by lines in time; times, way, v and u.
+    """Integrate a profile's mean accelerations, linear in time: times, way, v and u.
 
-    Between points y = x^(3/4) is linear in s, as it is from rest with even jerk. What the lines
-    miss of the way's end and of rest there, a smooth change over the whole makes good.
+    Between points y = x^(3/4) is linear in s, as for constant jerk from rest. A smooth bump over
+    the whole corrects the error of the final position and speed.
     """
     h = part.steps
     v, y = np.sqrt(x), x**0.75

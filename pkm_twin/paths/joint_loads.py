@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""Forces and moments in the joints along a motion, cycles and bearing life."""
+"""Compute forces and moments in the joints along a motion, load cycles and bearing life."""
 
 from __future__ import annotations
 
@@ -29,26 +29,27 @@ from pkm_twin.recordings.tables import WRENCH as AXES
 from pkm_twin.robot.robot import Robot
 
 RATED_TURNS: Final = 1e6
+"""Revolutions for which a rotary bearing's C holds (ISO 281)."""
 RATED_TRAVEL: Final = 1e5
-"""Of a linear bearing, m, for which its C holds."""
+"""Travel for which a linear bearing's C holds, m (ISO 14728-1)."""
 MIN_STEP: Final = 1e-12
-"""Mean step of a bearing that does not move, rad or m: rounding."""
+"""Mean step below which a bearing does not move, rad or m: rounding."""
 
 
 @dataclass(frozen=True, eq=False)
 class Cycles:
-    """Cycles in the order of counting: ``ranges``, ``means``, ``counts`` of 1 or 0.5, (k,)."""
+    """Hold load cycles in counting order: ``ranges``, ``means``, ``counts`` of 1 or 0.5, (k,)."""
 
     ranges: Array
     means: Array
     counts: Array
 
     def equivalent_range(self, exponent: float) -> float:
-        """Range of the one cycle that does the damage of all (Miner's sum, Wöhler's exponent)."""
+        """Return the range of one cycle with the damage of all (Miner's sum, Wöhler's exponent)."""
         return float(np.sum(self.counts * self.ranges**exponent) ** (1.0 / exponent))
 
     def spectrum(self, classes: int) -> tuple[Array, Array]:
-        """Upper ends of so many equal classes of range, and the counts in each."""
+        """Return the upper ends of ``classes`` equal classes of range, and their counts."""
         top = float(self.ranges.max(initial=0.0)) or 1.0
         ends = top * np.arange(1, classes + 1) / classes
         place = np.minimum(np.searchsorted(ends, self.ranges * (1.0 - 1e-12)), classes - 1)
@@ -56,7 +57,7 @@ class Cycles:
 
 
 def turning_points(values: ArrayLike) -> Array:
-    """A load's reversals and its two ends, shape (k,)."""
+    """Return a load's reversals and its two ends, shape (k,)."""
     y = np.asarray(values, np.float64)
     y = y[np.concatenate([[True], np.diff(y) != 0.0])] if len(y) else y
     inner = np.flatnonzero(np.diff(np.sign(np.diff(y))) != 0.0) + 1
@@ -64,27 +65,27 @@ def turning_points(values: ArrayLike) -> Array:
 
 
 class Reversals:
-    """A load's reversals and its two ends, of blocks one after the other."""
+    """Collect a load's reversals and its two ends from consecutive blocks."""
 
     def __init__(self) -> None:
         self._parts: list[Array] = []
         self._tail: Array = np.empty(0)
 
     def add(self, values: Array) -> None:
-        """The next block, shape (samples,)."""
+        """Add the next block, shape (samples,)."""
         points = turning_points(np.concatenate([self._tail, values]))
-        # The last point may go on; the one before it is where it comes from.
+        # The last point is a reversal only if the next block turns; it needs the one before.
         self._parts.append(points[:-2])
         self._tail = points[-2:]
 
     @property
     def values(self) -> Array:
-        """All of them, shape (k,)."""
+        """All reversals, shape (k,)."""
         return np.concatenate([*self._parts, self._tail])
 
 
 def rainflow(values: ArrayLike) -> Cycles:
-    """Rainflow counting, ASTM E1049-85 (2017), section 5.4.4.
+    """Count cycles by the rainflow method, ASTM E1049-85 (2017), section 5.4.4.
 
     :param values: a load over time, shape (samples,).
     """
@@ -101,7 +102,7 @@ def rainflow(values: ArrayLike) -> Cycles:
             if newest < before:
                 break
             if len(stack) == 3:
-                # The range holds the start: half a cycle, and the start goes on.
+                # The range contains the start: count half a cycle and drop the start.
                 count(stack[0], stack[1], 0.5)
                 del stack[0]
             else:
@@ -114,9 +115,9 @@ def rainflow(values: ArrayLike) -> Cycles:
 
 @dataclass(frozen=True)
 class Life:
-    """Of a bearing: equivalent load, N; its motion in turns or m; life in these and in hours.
+    """Hold a bearing's equivalent load, N; motion in turns or m; life in these and in hours.
 
-    Infinite where nothing loads it, NaN where it bears a load and does not move.
+    Life is infinite without load, NaN under a load at standstill.
     """
 
     load: float
@@ -129,10 +130,10 @@ def bearing_life(
     load: ArrayLike, moved: ArrayLike, duration: float, rating: float, exponent: float = 3.0,
     slides: bool = False,
 ) -> Life:  # fmt: skip
-    """L10 of a rolling bearing under a load that varies with how it moves.
+    """Compute the L10 life of a rolling bearing under a load that varies with its motion.
 
     P = (sum F^p dphi / sum dphi)^(1/p), L10 = (C / P)^p million turns (ISO 281), or times 100 km of
-    a linear bearing (ISO 14728-1). To and fro is motion.
+    a linear bearing (ISO 14728-1). Motion counts in both directions.
 
     :param load: equivalent load of the bearing in each interval, shape (k,), N.
     :param moved: angle or travel in each, shape (k,), rad or m.
@@ -152,18 +153,20 @@ def bearing_life(
 
 
 SAMPLES_PER_BLOCK: Final = 512
-"""Samples at once: each has matrices of all unknowns."""
+"""Samples computed at a time: each has matrices of all unknowns."""
 SPECTRUM_CLASSES: Final = 32
+"""Classes of range in a written load spectrum."""
 ZERO_COMPONENT: Final = 1e-9
-"""Part of a direction below which it is across another."""
+"""Component of a unit vector below which it is perpendicular to an axis."""
 
 
 @dataclass(frozen=True, eq=False)
 class BearingSpec:
-    """A bearing of a joint: C (N), the life's exponent p, and its load X Fr + Y Fa.
+    """Describe a bearing of a joint: C (N), the life's exponent p, and its load X Fr + Y Fa.
 
-    Without Y the load is the force's amount; of a sliding joint always its part across the axis:
-    what is along it, the drive bears. ``axis`` (base axes, at home): default the joint's.
+    Without Y the load is the force's magnitude; for a sliding joint always its part perpendicular
+    to the axis, because the drive carries the part along it. ``axis`` (base axes, at home): default
+    the joint's.
     """
 
     C: float = schema.number(above=0.0, unit="N")
@@ -175,11 +178,11 @@ class BearingSpec:
 
 @dataclass(frozen=True, eq=False)
 class JointLoad:
-    """Of one joint, what its inner body applies to its outer one at its point, some samples.
+    """Hold the load of a joint's inner body on its outer one at the joint's point, per sample.
 
     ``wrench``: base axes, ``own``: axes that turn with the inner body, (k, 6), N and N m; NaN where
-    undetermined. ``turned``: between samples, the outer body against the inner one, rad, (k - 1,);
-    ``travelled``: likewise of a joint that slides, m, else 0.
+    undetermined. ``turned``: rotation of the outer body relative to the inner one between samples,
+    rad, (k - 1,); ``travelled``: translation of a sliding joint, m, else 0.
     """
 
     name: str
@@ -190,9 +193,9 @@ class JointLoad:
 
 
 def joint_loads(motion: Recording) -> Iterator[list[JointLoad]]:
-    """Loads of all joints along a motion in blocks, each from the last sample of the one before.
+    """Yield the loads of all joints along a motion in blocks that overlap by one sample.
 
-    Errors as ``reactions``.
+    Errors as of ``reactions``.
     """
     last: dict[str, tuple[Array, ...]] = {}
     slides = {name: joint for name, joint in joints_by_label(motion.robot).items() if joint.slides}
@@ -203,7 +206,7 @@ def joint_loads(motion: Recording) -> Iterator[list[JointLoad]]:
         turn = {BASE: np.broadcast_to(np.eye(3), (len(q), 3, 3)), **rotations}
         order = list(found.names)
         for rod in motion.robot.graph.rods.values():
-            # What a rod turns is its direction; its spin is idle.
+            # A rod's rotation is that of its direction; its spin is idle.
             start, end = (found.points[:, order.index(name)] for name in rod.joint_names)
             turn[rod.name] = _minimal_rotation(rod.ends[1] - rod.ends[0], end - start)
         result = []
@@ -216,7 +219,7 @@ def joint_loads(motion: Recording) -> Iterator[list[JointLoad]]:
             place = np.zeros(len(q))
             if name in slides:
                 joint, at = slides[name], motion.robot.engine.tree.at
-                # From the points of both bodies: of what closes a loop no value is kept.
+                # From the points of both bodies, because a loop-closing joint has no coordinate.
                 ends = [
                     origins[body] + turn[body] @ (joint.at - at[body]) if body != BASE else joint.at
                     for body in (inner, outer)
@@ -232,7 +235,7 @@ def joint_loads(motion: Recording) -> Iterator[list[JointLoad]]:
 
 
 def _step_angles(rotations: Array) -> Array:
-    """Angles between neighbouring rotations (k, 3, 3), shape (k - 1,), rad."""
+    """Return angles between consecutive rotations (k, 3, 3), shape (k - 1,), rad."""
     step = rotations[:-1].swapaxes(-1, -2) @ rotations[1:]
     skew = np.stack([step[:, i, j] - step[:, j, i] for i, j in ((2, 1), (0, 2), (1, 0))], -1)
     sine = np.linalg.norm(skew, axis=-1)
@@ -240,11 +243,12 @@ def _step_angles(rotations: Array) -> Array:
 
 
 class Summary:
-    """What is kept of one joint's loads: peaks, sums of squares, reversals, and its bearing's.
+    """Accumulate one joint's loads: peaks, sums of squares, reversals, and its bearing's.
 
-    ``peaks`` and ``squares`` are of force and moment, then of both without what an actuated joint's
-    drive bears: the moment about its axis, or the force along it. They, and ``sizes`` of the
-    latter force, are of determined components. ``known``: whether all are, in all samples.
+    ``peaks`` and ``squares``: of force and moment, then of both without the part that an actuated
+    joint's drive carries (the moment about its axis, or the force along it). They, and ``sizes`` of
+    the latter force, include determined components only. ``known``: whether all components are
+    determined in all samples.
     """
 
     def __init__(self, robot: Robot, name: str, spec: BearingSpec | None) -> None:
@@ -264,7 +268,7 @@ class Summary:
         self.bearing: list[tuple[Array, Array]] = []
 
     def add(self, load: JointLoad) -> None:
-        """The next block."""
+        """Add the next block."""
         fresh = slice(1 if self.samples else 0, None)
         borne = _multiply(self.across, load.own[fresh].reshape(-1, 2, 3))
         parts = np.concatenate([load.wrench[fresh].reshape(-1, 2, 3), borne], 1)
@@ -285,24 +289,24 @@ class Summary:
             self.bearing.append(((amount[1:] + amount[:-1]) / 2.0, moved))
 
     def cycles(self, axis: int) -> Cycles:
-        """Rainflow cycles of one component."""
+        """Return the rainflow cycles of one component."""
         return rainflow(self.reversals[axis].values)
 
     def life(self, duration: float) -> Life:
-        """L10 of its bearing, whose load between samples is their mean."""
+        """Return the L10 of the joint's bearing, with linear load between samples."""
         assert self.spec is not None  # noqa: S101  asked for joints with a bearing
         load, moved = (np.concatenate(column) for column in zip(*self.bearing, strict=True))
         return bearing_life(load, moved, duration, self.spec.C, self.spec.p, self.slides)
 
 
 def _multiply(matrices: Array, vectors: Array) -> Array:
-    # What is undetermined leaves the directions across it alone.
+    """Multiply matrices and vectors; NaN components only affect directions they act along."""
     products = np.where(np.abs(matrices) > ZERO_COMPONENT, matrices * vectors[..., None, :], 0.0)
     return np.asarray(products.sum(-1), np.float64)
 
 
 def _minimal_rotation(home: Array, now: Array) -> Array:
-    """The least rotations that turn a direction to others, shape (k, 3, 3)."""
+    """Return the smallest rotations from one direction to others, shape (k, 3, 3)."""
     a = home / np.linalg.norm(home)
     b = now / np.linalg.norm(now, axis=-1, keepdims=True)
     v, cosine = np.cross(a, b), b @ a
@@ -313,8 +317,9 @@ def _minimal_rotation(home: Array, now: Array) -> Array:
 
 
 def read_bearings(path: Path, names: tuple[str, ...], robot: Robot) -> dict[str, BearingSpec]:
-    """Read bearings by joint from a YAML with a mapping ``bearings`` of names to data.
+    """Read bearings by joint from a YAML mapping ``bearings``; names may contain wildcards.
 
+    :raises ParameterError: names the field, or a name that no joint has.
     A * in a name stands for any text; joints of such a name that the bearing does not fit are left
     out, with a warning that names them.
 
@@ -344,14 +349,14 @@ def read_bearings(path: Path, names: tuple[str, ...], robot: Robot) -> dict[str,
 
 
 def joints_by_label(robot: Robot) -> dict[str, Joint]:
-    """The joints by their names among the reactions."""
+    """Return the joints by their names among the reactions."""
     return {joint.label or joint.name: joint for joint in robot.graph.joints.values()}
 
 
 def bearing_axis(joint: Joint | None, name: str, spec: BearingSpec) -> Array | None:
-    """The axis of a joint's bearing, base axes at home, of length 1; None where none is needed.
+    """Return the axis of a joint's bearing, unit, base axes at home; None if not needed.
 
-    :param joint: None of a rod's end.
+    :param joint: None for a rod's end.
     :raises ParameterError: Y without an axis, or of a sliding joint; a joint that slides and has
         other freedoms.
     """
@@ -376,7 +381,7 @@ def bearing_axis(joint: Joint | None, name: str, spec: BearingSpec) -> Array | N
 
 
 def bearing_load(force: Array, spec: BearingSpec, axis: Array | None) -> Array:
-    """Equivalent load of a bearing under forces (k, 3), in axes of the inner body, (k,), N."""
+    """Return a bearing's equivalent load under forces (k, 3), inner body's axes, (k,), N."""
     amount = np.linalg.norm(force, axis=-1)
     if axis is None:
         return np.asarray(amount)
@@ -386,13 +391,13 @@ def bearing_load(force: Array, spec: BearingSpec, axis: Array | None) -> Array:
 
 
 def write_rows(writer: Any, time: Array, loads: Sequence[JointLoad]) -> None:
-    """Wrenches over time in base axes, as rows of a CSV; empty where undetermined."""
+    """Write wrenches over time in base axes as CSV rows; empty where undetermined."""
     rows = np.concatenate([time[:, None], *(load.wrench[-len(time) :] for load in loads)], -1)
     writer.writerows([["" if v != v else v for v in row] for row in rows.tolist()])
 
 
 def format_spectra(loads: Sequence[Summary]) -> str:
-    """Rainflow counts by joint, component and class of range, as CSV."""
+    """Return rainflow counts by joint, component and class of range, as CSV."""
     text = io.StringIO()
     writer = csv.writer(text)
     writer.writerow(["joint", "component", "range_up_to", "cycles"])
@@ -409,7 +414,7 @@ def summarise_loads(
     motion: Recording, bearings: Path | None, out: Path | None,
     progress: Callable[[int], None] | None = None,
 ) -> list[Summary]:  # fmt: skip
-    """The loads of all joints along a motion, computed and written block by block.
+    """Compute the loads of all joints along a motion, and write them block by block.
 
     :raises ParameterError: fewer than two samples, or by the field of a bearing.
     """

@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""A path as joint positions over its length: points with derivatives, and quintics between."""
+"""Sample a path as joint positions over its length, with quintics between the points."""
 
 from __future__ import annotations
 
@@ -23,19 +23,19 @@ from pkm_twin.robot.workspace import passing_singularity
 Index = NDArray[np.int64]
 
 MIN_POINTS: Final = 16
-"""Intervals of the shortest piece."""
+"""Smallest number of intervals of a piece."""
 MIN_STEP_FRACTION: Final = 1e-5
 """Shortest interval, as a fraction of the robot's size: the second derivatives of a quintic over a
 shorter one are rounding errors."""
 GRADING_EXPONENT: Final = 1.5
-"""Power of the distance from a stop by which points are set: speeds go by its root."""
+"""Exponent of the distance from a stop by which points are spaced: speed grows with its root."""
 Slowdown = Callable[[Array, Array], Array]
-"""Of joint positions (p, n) and the way that the reference point goes (p, 3): factors (p,)."""
+"""Function of joint positions (p, n) and the reference point's direction (p, 3): factors (p,)."""
 
 
 @dataclass(frozen=True)
 class Curve:
-    """A stretch of a path of a robot, of which any points can be computed.
+    """Describe a stretch of a robot's path, at any points of which joints can be computed.
 
     ``robots``: with the payload of each piece. ``begin``: way up to the stretch, m.
     ``singularity``: least singularity index on it, 0 to 1.
@@ -55,7 +55,7 @@ class Curve:
         return MIN_STEP_FRACTION * self.robot.size
 
     def grid(self, points: int) -> list[Array]:
-        """About so many points, of each piece: half by the pieces' lengths, half alike for all."""
+        """Return about so many points: half by the pieces' lengths, half equal for all pieces."""
         pieces, result = self.stretch.pieces, []
         for k, piece in enumerate(pieces):
             share = piece.length / self.stretch.length + 1.0 / len(pieces)
@@ -65,10 +65,10 @@ class Curve:
         return result
 
     def at(self, grid: list[Array]) -> JointPath:
-        """The joint positions at points of each piece.
+        """Compute the joint positions at points of each piece.
 
-        :raises ParameterError: by the place, a pose that the machine does not reach, a joint beyond
-            its limits, or a singularity.
+        :raises ParameterError: with the position: a pose out of reach, a joint beyond its limits,
+            or a singularity.
         :raises UnreachableError: joint positions without an assembly.
         :raises SingularityError: joint positions beyond a singularity.
         """
@@ -98,13 +98,13 @@ class Curve:
 
 @dataclass(frozen=True)
 class JointPath:
-    """A stretch of a path in joint coordinates, from rest to rest.
+    """Hold a stretch of a path in joint coordinates, from rest to rest.
 
     ``grid``: points of each piece of ``curve``. ``s``: all of them, shape (p,), m; where two pieces
     meet there are two points of one s. ``q``, ``first``, ``second``: joint positions and
-    derivatives by s, shape (p, n). ``felt``: the reference point's way by s times ``slower``, what
-    multiplies its speed for the limit, shape (p,). ``left``: first point of each interval, whose
-    other end is the next point.
+    derivatives by s, shape (p, n). ``felt``: the reference point's path length by s times
+    ``slower``, the factor of its speed in the limit, shape (p,). ``left``: first point of each
+    interval, whose other end is the next point.
     """
 
     curve: Curve
@@ -128,23 +128,23 @@ class JointPath:
         return np.append(self.s[self.left], self.s[-1])
 
     def first_of(self, piece: int) -> int:
-        """The first interval of a piece; their count where there is none."""
+        """Return the first interval of a piece; the number of intervals if there is none."""
         return sum(len(own) - 1 for own in self.grid[:piece])
 
     @cached_property
     def piece(self) -> Index:
-        """Which piece each point is of, shape (p,)."""
+        """Piece of each point, shape (p,)."""
         return np.repeat(np.arange(len(self.grid)), [len(own) for own in self.grid])
 
     def efforts(
         self, points: Index, q: Array, qd: Array, qdd: Array, wrench: Array | None
     ) -> Array:
-        """Efforts with the payloads of the pieces that points (k,) are of, shape (k, n)."""
+        """Return efforts with the payloads of the points' pieces, points (k,): shape (k, n)."""
         return compute_efforts(self.curve.robots, self.piece[points], q, qd, qdd, wrench)
 
     @cached_property
     def _quintics(self) -> Array:
-        """Coefficients by the part of an interval, shape (6, intervals, n).
+        """Coefficients by powers of the fraction of an interval, shape (6, intervals, n).
 
         A quintic in each interval has the values and both derivatives of its ends.
         """
@@ -159,7 +159,7 @@ class JointPath:
         return np.stack([self.q[a], u, 0.5 * x, c3, c4, c5])
 
     def between(self, interval: Index, part: Array) -> tuple[Array, Array, Array]:
-        """Positions and derivatives by s at a part (0 to 1) of intervals, shape (k, n) each."""
+        """Return positions and derivatives by s at fractions of intervals, shape (k, n) each."""
         c0, c1, c2, c3, c4, c5 = self._quintics[:, interval]
         h, t = self.steps[interval][:, None], part[:, None]
         q = c0 + t * (c1 + t * (c2 + t * (c3 + t * (c4 + t * c5))))
@@ -168,17 +168,17 @@ class JointPath:
         return q, first / h, second / h**2
 
     def motion(self, interval: Index, part: Array, v: Array, u: Array) -> tuple[Array, ...]:
-        """Positions, rates and accelerations there, (k, n) each, at v and u along the path."""
+        """Return positions, velocities and accelerations there, (k, n) each, for v and u."""
         q, first, second = self.between(interval, part)
         return q, first * v[:, None], first * u[:, None] + second * (v**2)[:, None]
 
     def slowed(self, interval: Index, part: Array) -> Array:
-        """What multiplies the reference point's speed for its limit there, shape (k,)."""
+        """Return the factor of the reference point's speed in its limit, shape (k,)."""
         left = self.left[interval]
         return (1.0 - part) * self.slower[left] + part * self.slower[left + 1]
 
     def refined(self, parts: Index) -> JointPath:
-        """The same with each interval in so many parts.
+        """Return the path with each interval divided into so many parts.
 
         :param parts: shape (intervals,).
         :raises ParameterError: as of :meth:`Curve.at`.
@@ -194,23 +194,23 @@ class JointPath:
 
 
 def reference_velocity(robot: Robot, q: Array, qd: Array) -> Array:
-    """Velocity of the reference point, base axes, shape (k, 3), m/s, of joint rates (k, n).
+    """Return the reference point's velocity, base axes, (k, 3), m/s, for joint rates (k, n).
 
-    Of a machine that only turns, the platform's angular velocity, rad/s.
+    For a machine that only rotates, the platform's angular velocity, rad/s.
     """
     rows = robot.platform_jacobian(q)[:, 3:] if only_turns(robot) else robot.platform_jacobian(q)
     return np.asarray((rows[:, :3] @ qd[..., None])[..., 0], np.float64)
 
 
 def only_turns(robot: Robot) -> bool:
-    """Whether no coordinate of the pose is a position."""
+    """Return whether no coordinate of the pose is a position."""
     return not {"x", "y", "z"} & set(robot.pose_names)
 
 
 def _solve_inverse(robot: Robot, places: Array, way: Array) -> Array:
-    """Joint positions of poses (k, m).
+    """Return joint positions of poses (k, m).
 
-    :raises ParameterError: by the first pose out of reach, its way along the path (k,).
+    :raises ParameterError: names the first pose out of reach, and its path length of (k,).
     """
     q, good = robot.try_inverse(places)
     if good.all():
@@ -225,7 +225,7 @@ def _solve_inverse(robot: Robot, places: Array, way: Array) -> Array:
 
 
 def _insert_knots(s: Array, knots: Array, least: float) -> Array:
-    """Points of a piece, those next to a knot moved there; no two closer than ``least``."""
+    """Move points of a piece to its knots; no two points closer than ``least``."""
     inner: list[float] = []
     for knot in knots.tolist():
         if min(knot, s[-1] - knot) > least and not (inner and knot - inner[-1] < least):
@@ -233,7 +233,7 @@ def _insert_knots(s: Array, knots: Array, least: float) -> Array:
     if not inner:
         return s
     at = np.array(inner)
-    # Of the even points those stay that keep a quarter of their own distance to the knots.
+    # Keep the points that are at least a quarter of their spacing away from the knots.
     away = np.abs(s[:, None] - at).min(1)
     free = away > np.maximum(0.25 * np.gradient(s), least)
     free[[0, -1]] = True
@@ -241,7 +241,7 @@ def _insert_knots(s: Array, knots: Array, least: float) -> Array:
 
 
 def _grade_points(count: int, *, begins: bool, ends: bool) -> Array:
-    """Points from 0 to 1, shape (count + 1,), closer where the machine is slow: at a stop."""
+    """Return points from 0 to 1, shape (count + 1,), closer near a stop."""
     t = np.linspace(0.0, 1.0, count + 1)
     if begins and ends:
         half = 0.5 * (2.0 * np.minimum(t, 1.0 - t)) ** GRADING_EXPONENT
@@ -252,7 +252,7 @@ def _grade_points(count: int, *, begins: bool, ends: bool) -> Array:
 
 
 def describe_place(robot: Robot, q: Array, way: float) -> str:
-    """A place of a path by its joint positions (n,): the way to it, m, and the pose."""
+    """Describe a position of a path by its joint positions (n,): length, m, and pose."""
     return _format_place(robot, robot.forward(q), way)
 
 
@@ -260,16 +260,18 @@ def _format_place(robot: Robot, pose: Array, way: float) -> str:
     values = (np.round(pose, 12) + 0.0).tolist()
     entries = zip(robot.pose_names, values, robot.pose_units, strict=True)
     place = "at " + ", ".join(f"{name} {value:.4g} {unit}" for name, value, unit in entries)
-    # The length of a path in angles alone is no distance.
+    # A path in angles alone has no length in metres.
     return f"{place}, {way:.4g} m after the start" if "m" in robot.pose_units else place
 
 
 def check_positions(robot: Robot, s: Array, q: Array, begin: float) -> None:
-    """Check that a path keeps the limits of joints, passive ones too.
+    """Check that a path keeps the joints' limits, passive joints too.
 
-    :param s: way within the stretch, shape (p,), m; ``q``: joint positions there, (p, n).
-    :param begin: way up to the stretch, m.
-    :raises ParameterError: by the first joint and place.
+    :param s: length within the stretch, shape (p,), m; ``q``: joint positions there, (p, n).
+
+    :param begin: length up to the stretch, m.
+
+    :raises ParameterError: names the first joint and position.
     """
     if (beyond := first_beyond(robot, q)) is not None:
         row = beyond.index or 0

@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""A motion along a path in time, and which limit binds where."""
+"""Describe a motion along a path in time, and find which limit binds where."""
 
 from __future__ import annotations
 
@@ -24,26 +24,27 @@ from pkm_twin.robot.robot import Robot
 Index = NDArray[np.int64]
 
 BINDING_USE: Final = 0.98
-"""Used part of a limit from which on it binds."""
+"""Used fraction of a limit from which on it binds."""
 BISECTIONS: Final = 60
-"""Steps of the search for the time of a place."""
+"""Bisection steps to the time of a position: an interval shrinks to rounding."""
 MIN_SPEED_FRACTION: Final = 1e-9
-"""Least speed along the path of a machine that moves, of its mean speed."""
+"""Smallest speed along the path of a moving machine, relative to its mean speed."""
 MAX_SAMPLES: Final = 10_000_000
-"""Of a motion at a rate."""
+"""Largest number of samples of a motion at a rate."""
 PARTS_PER_INTERVAL: Final = (4, 16, 64, 256)
-"""Parts of an interval at whose ends limits are checked, more where it is needed."""
+"""Parts of an interval at whose ends limits are checked, more where needed."""
 JUMP_CLEARANCE: Final = 1e-6
-"""Part of an interval that its first and last samples stay away from jumps at its ends."""
+"""Fraction of an interval between its outer samples and its ends, where accelerations jump."""
 PEAK_TOLERANCE: Final = 2e-5
-"""Part of a limit between samples that is added to them; above it, they are closer."""
+"""Excess between samples, as a fraction of a limit, that is added to them; above it, more samples
+are taken."""
 MIN_BOUND_FRACTION: Final = 0.01
-"""Part of the duration: a stretch shorter than it joins the one before it."""
+"""Fraction of the duration below which an interval joins the one before it."""
 
 
 @dataclass(frozen=True)
 class Bound:
-    """An interval in which one limit binds: times (s), the limit's name and its used fraction.
+    """Describe an interval in which one limit binds: times (s), limit and its used fraction.
 
     ``what`` is empty where the machine rests or no limit binds.
     """
@@ -54,7 +55,7 @@ class Bound:
     used: float
 
     def as_json(self) -> dict[str, Any]:
-        """Plain data, units in the keys."""
+        """Return plain data, units in the keys."""
         return {
             "from_s": self.begin, "to_s": self.end, "limit": self.what or None, "used": self.used,
         }  # fmt: skip
@@ -62,7 +63,7 @@ class Bound:
 
 @dataclass(frozen=True)
 class Run:
-    """One stretch of a path in time: its way a polynomial of the time since each of some knots.
+    """Describe one stretch in time: its path length as polynomials of the time since knots.
 
     ``knots``: rising from 0, the last one the end, shape (k + 1,), s. ``way``: coefficients by
     rising powers, shape (powers, k), m, m/s, ...
@@ -74,23 +75,23 @@ class Run:
 
     @classmethod
     def of(cls, part: JointPath, x: Array) -> Run:
-        """By x = v^2 at the intervals' ends, linear in the way between them, shape (i + 1,)."""
+        """Return the run by x = v^2 at the intervals' ends, linear in between, shape (i + 1,)."""
         v = np.sqrt(x)
         knots = np.concatenate([[0.0], np.cumsum(2.0 * part.steps / (v[:-1] + v[1:]))])
         return cls(part, knots, np.stack([part.ends[:-1], v[:-1], np.diff(x) / (4.0 * part.steps)]))
 
     @property
     def duration(self) -> float:
-        """From rest to rest, s."""
+        """Time from rest to rest, s."""
         return float(self.knots[-1])
 
     def slower(self, factor: float) -> Run:
-        """The same with ``factor`` times the duration."""
+        """Return the run with ``factor`` times the duration."""
         powers = np.arange(len(self.way))[:, None]
         return Run(self.part, factor * self.knots, self.way / factor**powers)
 
     def evaluate(self, k: Index, time: Array) -> tuple[Array, Array, Array]:
-        """Way, v and u at times after knots k."""
+        """Return path length, v and u at times after knots k."""
         t = np.clip(time - self.knots[k], 0.0, self.knots[k + 1] - self.knots[k])
         way, v, u = np.zeros((3, len(t)))
         for row in self.way[::-1, k]:
@@ -98,7 +99,7 @@ class Run:
         return way, v, u
 
     def _last_knot(self, time: Array) -> Index:
-        """The last knot before times (k,)."""
+        """Return the index of the last knot before times (k,)."""
         last = len(self.knots) - 2
         return np.clip(np.searchsorted(self.knots, time, side="right") - 1, 0, last)
 
@@ -117,17 +118,17 @@ class Run:
 
     @cached_property
     def times(self) -> Array:
-        """Knots and intervals' ends, rising, s: between two of them the motion is smooth."""
+        """Knots and intervals' ends, rising, s; the motion is smooth between two of them."""
         return np.unique(np.concatenate([self.knots, self.ends]))
 
     def profile(self) -> Array:
-        """v^2 at the intervals' ends, shape (i + 1,)."""
+        """Return v^2 at the intervals' ends, shape (i + 1,)."""
         x = self.evaluate(self._last_knot(self.ends), self.ends)[1] ** 2
         x[[0, -1]] = 0.0
         return x
 
     def at(self, time: Array) -> tuple[Index, Array, Array, Array]:
-        """Interval, part of it, v and u at times (k,)."""
+        """Return interval, fraction of it, v and u at times (k,)."""
         way, v, u = self.evaluate(self._last_knot(time), time)
         s = self.part.ends
         j = np.clip(np.searchsorted(s, way, side="right") - 1, 0, len(s) - 2)
@@ -136,7 +137,7 @@ class Run:
 
 @dataclass(frozen=True)
 class TimedPath:
-    """A motion along a path: runs from rest to rest, with the rests before and between (s).
+    """Describe a motion along a path: runs from rest to rest, rests before and between (s).
 
     ``robot``: with the payload that it begins with. ``limits``: those of the plan. ``law``: how its
     speed was chosen. ``carried``: payloads, the first from the beginning on.
@@ -168,7 +169,7 @@ class TimedPath:
 
     @cached_property
     def switches(self) -> Array:
-        """Times from which on the payload is another, shape (changes,), s."""
+        """Times at which the payload changes, shape (changes,), s."""
         result = []
         for change in self.carried[1:]:
             clock = change.rest
@@ -181,7 +182,7 @@ class TimedPath:
 
     @property
     def load(self) -> Load | None:
-        """The payloads of the path's waypoints over time; None: throughout that of the robot."""
+        """Payloads of the path's waypoints over time; None if it is always the robot's own."""
         edges = [0.0, *self.switches.tolist(), np.inf]
         spans = [
             (begin, end, change.mass)
@@ -191,7 +192,7 @@ class TimedPath:
         return Load.of(spans, "path") if spans else None
 
     def _efforts(self, t: Array, q: Array, qd: Array, qdd: Array) -> Array | None:
-        """At times (k,), with the payload then; None for a robot without masses."""
+        """Return efforts at times (k,) with the payload then; None for a robot without masses."""
         if not self.robot.has_masses:
             return None
         which = np.searchsorted(self.switches, t, side="right")
@@ -199,7 +200,7 @@ class TimedPath:
 
     @cached_property
     def _sample_times(self) -> Array:
-        """Times of all intervals' ends, middles of intervals between, s."""
+        """Times of all intervals' ends and middles, s."""
         times = []
         for begin, run in zip(self.begins, self.runs, strict=True):
             ends = begin + run.times
@@ -207,7 +208,7 @@ class TimedPath:
         return np.unique(np.concatenate(times))
 
     def sample(self, times: ArrayLike) -> Samples:
-        """The motion at times (k,), s from its beginning; it rests before and behind it."""
+        """Return the motion at times (k,), s from its beginning, at rest before and after it."""
         t = np.asarray(times, np.float64)
         robot, n = self.robot, self.robot.joints_count
         q, qd, qdd = (np.zeros((len(t), n)) for _ in range(3))
@@ -216,15 +217,16 @@ class TimedPath:
         for k, (begin, run) in enumerate(zip(self.begins, self.runs, strict=True)):
             mine = np.flatnonzero(run_of == k)
             if len(mine):
-                # At its end the machine rests; at its beginning it has its friction already.
+                # The end counts as rest; the beginning as motion, with its friction.
                 moves = (t[mine] >= begin) & (t[mine] - begin < run.duration * (1.0 - 1e-12))
                 own = sample_run(run, t[mine] - begin, moves)
                 q[mine], qd[mine], qdd[mine], travel[mine], felt[mine] = own[:5]
         return Samples(t, q, qd, qdd, self._efforts(t, q, qd, qdd), robot.forward(q), travel, felt)
 
     def uniform(self, rate: float) -> Samples:
-        """The motion at ``rate`` samples a second; the last is its end, half to three halves of a
-        period after the one before.
+        """Return the motion at ``rate`` samples per second.
+
+        The last sample is its end, half to three halves of a period after the one before.
 
         :raises ParameterError: more than :data:`MAX_SAMPLES`.
         """
@@ -237,7 +239,7 @@ class TimedPath:
         return self.sample(np.append(np.arange(count) / rate, self.duration))
 
     def __iter__(self) -> Iterator[Any]:
-        """Times, q, qd, qdd, effort (as in ``fine``) and ``bounds``, to unpack."""
+        """Yield times, q, qd, qdd, effort (as in ``fine``) and ``bounds``, to unpack."""
         s = self.fine
         return iter((s.time, s.q, s.qd, s.qdd, s.effort, self.bounds))
 
@@ -273,12 +275,12 @@ class TimedPath:
 
     @cached_property
     def fine(self) -> Samples:
-        """The motion at all points of the path and in the middle between them."""
+        """Motion at all points of the path and in the middle between them."""
         return self.sample(self._sample_times)
 
     @cached_property
     def peaks(self) -> dict[str, dict[str, dict[str, Any]]]:
-        """Largest amounts of each joint: velocity, acceleration, effort, with their units."""
+        """Largest magnitudes of each joint: velocity, acceleration, effort, with units."""
         robot, fine, peaks = self.robot, self.fine, {}
         for i, joint in enumerate(robot.joint_names):
             unit = robot.joint_units[i]
@@ -292,7 +294,7 @@ class TimedPath:
 
     @cached_property
     def used(self) -> Array:
-        """Used part of every limit at the points of ``fine``, shape (k, 4 n + 1)."""
+        """Used fraction of every limit at the points of ``fine``, shape (k, 4 n + 1)."""
         s = self.fine
         jerk = np.zeros_like(s.q)
         if np.isfinite(self.limits.jerk).any() and len(s.time) > 2:
@@ -301,15 +303,15 @@ class TimedPath:
 
     @cached_property
     def bounds(self) -> list[Bound]:
-        """Which limit binds when, in order."""
+        """Intervals with the limit that binds, in order."""
         return merge_bounds(
             self.fine.time, find_binding(self.used), limit_names(self.robot), self.used
         )
 
     def check_rests(self) -> None:
-        """Reject payloads that the drives cannot hold where the machine rests.
+        """Reject payloads that the drives cannot hold while the machine rests.
 
-        :raises ParameterError: by the joint and time.
+        :raises ParameterError: names the joint and the time.
         """
         times, used = self._rest_usage
         row, column = np.unravel_index(int(used.argmax()), used.shape)
@@ -322,7 +324,7 @@ class TimedPath:
 
     @property
     def _rest_usage(self) -> tuple[Array, Array]:
-        """Times of rests, (k,), and the used part of each limit there, shape (k, 4 n + 1)."""
+        """Times of rests, (k,), and the used fraction of each limit there, (k, 4 n + 1)."""
         times = np.concatenate([np.nextafter(self.begins, -1.0), self.switches, [self.duration]])
         rests = self.sample(times)
         zero = np.zeros_like(rests.q)
@@ -332,13 +334,13 @@ class TimedPath:
 
     @cached_property
     def _peak_usage(self) -> Array:
-        """Greatest used part of each limit at all times, shape (4 n + 1,)."""
+        """Largest used fraction of each limit at all times, shape (4 n + 1,)."""
         moved = [run_peaks(run, self.limits, self.wrench).max(0) for run in self.runs]
         return np.asarray(np.concatenate([self._rest_usage[1], moved]).max(0), np.float64)
 
     @property
     def worst(self) -> dict[str, float]:
-        """Greatest used part of each limit that there is, between points too; 1 is the limit."""
+        """Largest used fraction of each limit, between points too; 1 is the limit."""
         return {
             name: float(value)
             for name, value in zip(limit_names(self.robot), self._peak_usage, strict=True)
@@ -348,10 +350,11 @@ class TimedPath:
 
 @dataclass(frozen=True)
 class Samples:
-    """A motion at times (k,), s: joint positions, rates, accelerations and efforts, shape (k, n),
-    rad or m, per s and s2, N m or N; the pose (k, m); speed of the reference point (k,), m/s.
+    """Hold a motion at times (k,), s.
 
-    ``effort`` is None for a robot without masses. ``felt``: the speed that has a limit, (k,).
+    ``q``, ``qd``, ``qdd``: joint positions, velocities, accelerations, shape (k, n), rad or m.
+    ``effort``: (k, n), N m or N; None for a robot without masses. ``pose``: (k, m). ``speed``: of
+    the reference point, (k,), m/s. ``felt``: the speed that is limited, (k,).
     """
 
     time: Array
@@ -365,8 +368,9 @@ class Samples:
 
 
 class RunSamples(NamedTuple):
-    """A run at times: q, qd, qdd (k, n); the reference point's speed and what its limit is for,
-    (k,); the interval, (k,).
+    """Hold a run at times: q, qd, qdd (k, n), speeds (k,) and intervals (k,).
+
+    ``speed``: of the reference point. ``felt``: the speed that is limited.
     """
 
     q: Array
@@ -378,10 +382,11 @@ class RunSamples(NamedTuple):
 
 
 def sample_run(run: Run, time: Array, moves: Mask | bool = True, tool: bool = True) -> RunSamples:
-    """A run at times (k,).
+    """Sample a run at times (k,).
 
     :param moves: at which times the machine moves; it rests at the others.
-    :param tool: whether the speeds are asked for; otherwise they are zero.
+
+    :param tool: whether to compute the speeds; otherwise they are zero.
     """
     interval, part, v, u = run.at(time)
     creep = MIN_SPEED_FRACTION * run.part.ends[-1] / run.duration
@@ -393,17 +398,17 @@ def sample_run(run: Run, time: Array, moves: Mask | bool = True, tool: bool = Tr
 
 
 Moments = tuple[Array | None, Array, Array, Array]
-"""Efforts, joint rates and accelerations, (k, n), and what the speed's limit is for, (k,)."""
+"""Efforts, joint velocities and accelerations, (k, n), and the limited speed, (k,)."""
 
 
 def peaks(limits: Limits, times: Array, sample: Callable[[Array], Moments]) -> Array:
-    """Greatest used part of each limit between neighbouring times, (i, 4 n + 1).
+    """Return the largest used fraction of each limit between neighbouring times, (i, 4 n + 1).
 
-    Each interval is sampled, and a parabola through three samples says how much more there can be
-    between them. Where that is more than :data:`PEAK_TOLERANCE` and could pass a limit or what is the
-    greatest so far, the interval is sampled more closely.
+    Each interval is sampled, and a parabola through three samples estimates the excess between
+    them. If it is more than :data:`PEAK_TOLERANCE` and could exceed a limit or the largest value so
+    far, the interval is sampled more closely.
 
-    :param times: the motion is smooth between two of them, shape (i + 1,), s.
+    :param times: between two of them the motion is smooth, shape (i + 1,), s.
     """
     jerks = np.isfinite(limits.jerk).any()
     spans = np.diff(times)
@@ -430,7 +435,7 @@ def peaks(limits: Limits, times: Array, sample: Callable[[Array], Moments]) -> A
 
 
 def run_peaks(run: Run, limits: Limits, wrench: Array | None) -> Array:
-    """Greatest used part of each limit between neighbouring times of a run, (i, 4 n + 1)."""
+    """Return the largest used fraction of each limit between times of a run, (i, 4 n + 1)."""
     part = run.part
     needs = needs_forces(part, limits)
 
@@ -443,9 +448,10 @@ def run_peaks(run: Run, limits: Limits, wrench: Array | None) -> Array:
 
 
 def find_binding(used: Array) -> list[int]:
-    """The column of each row of used parts (k, l) that binds, -1 for none.
+    """Return the binding column of each row of used fractions (k, l), -1 for none.
 
-    As few changes as can be: of several that bind, the one that binds longest from there.
+    Changes are as few as possible: of several limits that bind, the one that binds longest is
+    taken.
     """
     active = used >= BINDING_USE
     lasts = np.zeros(used.shape, np.int64)
@@ -463,7 +469,10 @@ def find_binding(used: Array) -> list[int]:
 
 
 def merge_bounds(time: Array, columns: list[int], names: list[str], used: Array) -> list[Bound]:
-    """Parts of one binding limit; one shorter than :data:`MIN_BOUND_FRACTION` of all joins the one before it."""
+    """Join samples to intervals of one binding limit.
+
+    An interval shorter than :data:`MIN_BOUND_FRACTION` of the duration joins the one before it.
+    """
     if len(time) < 2:
         return []
     brief = MIN_BOUND_FRACTION * float(time[-1] - time[0])
@@ -472,7 +481,7 @@ def merge_bounds(time: Array, columns: list[int], names: list[str], used: Array)
     spans = [(b, e, columns[b]) for b, e in pairwise(edges) if e > b]
     result: list[tuple[int, int, int]] = []
     for b, e, column in spans:
-        # What touches a limit is no part of a rest, or of a stretch that touches none.
+        # A brief contact with a limit after an interval without one stays separate.
         short = float(time[e] - time[b]) < brief and result and result[-1][2] >= 0
         if result and (short or result[-1][2] == column):
             result[-1] = (result[-1][0], e, result[-1][2])
@@ -488,9 +497,9 @@ def merge_bounds(time: Array, columns: list[int], names: list[str], used: Array)
 
 
 def needs_forces(part: JointPath, limits: Limits) -> bool:
-    """Whether efforts bound the motion.
+    """Return whether efforts bound the motion.
 
-    :raises ParameterError: they do, and the robot's file gives no masses.
+    :raises ParameterError: they do, and the robot's file has no masses.
     """
     if not np.isfinite(limits.effort).any():
         return False

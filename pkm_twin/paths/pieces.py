@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""Pieces of paths: curves p(s) with their first two derivatives."""
+"""Evaluate pieces of paths: curves p(s) with their first two derivatives."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ class Piece(Protocol):
 
     @property
     def knots(self) -> Array:
-        """Where within it a derivative jumps, rising."""
+        """Values of s where a derivative jumps, rising."""
 
     def at(self, s: Array) -> tuple[Array, Array, Array]:
-        """Coordinates and their first two derivatives by s, shape (k, m) each."""
+        """Return coordinates and their first two derivatives by s, shape (k, m) each."""
 
 
 @dataclass(frozen=True)
@@ -48,11 +48,11 @@ class Line:
 
 @dataclass(frozen=True)
 class Corner:
-    """A rounded corner: it leaves one line ``radius`` before the corner and meets the next one
-    ``radius`` behind it, with continuous second derivatives.
+    """Round a corner with continuous second derivatives.
 
-    With t = s / radius - 1 and f(t) = 3/16 + t/2 + 3/8 t^2 - t^4/16:
-    p = corner + radius (before (t - f) + behind f).
+    The curve leaves one line ``radius`` before the corner and meets the next one ``radius`` after
+    it. With t = s / radius - 1 and f(t) = 3/16 + t/2 + 3/8 t^2 - t^4/16: p = corner + radius
+    (before (t - f) + behind f).
     """
 
     corner: Array
@@ -79,7 +79,7 @@ class Corner:
 
 @dataclass(frozen=True)
 class SubPiece:
-    """A part of another piece, from ``begin`` to ``end`` in its s."""
+    """Restrict another piece to the range from ``begin`` to ``end`` of its s."""
 
     whole: Piece
     begin: float
@@ -92,7 +92,7 @@ class SubPiece:
 
     @property
     def knots(self) -> Array:
-        """Those of the whole that lie within."""
+        """Knots of the whole within the range."""
         inner = (self.whole.knots > self.begin) & (self.whole.knots < self.end)
         return np.asarray(self.whole.knots[inner] - self.begin)
 
@@ -103,7 +103,7 @@ class SubPiece:
 
 @dataclass(frozen=True)
 class Arc:
-    """A circular arc of the position; the other coordinates change evenly along it.
+    """Describe a circular arc of the position; the other coordinates change linearly along it.
 
     ``across``, ``along``: unit vectors (m,) from the centre to the beginning, and of the motion
     there; ``rest``: change of the other coordinates by s.
@@ -123,7 +123,7 @@ class Arc:
         return self.radius * self.angle
 
     def to(self, point: Array) -> float:
-        """S of a point of the arc."""
+        """Return s of a point of the arc."""
         way = point - self.centre
         return self.radius * float(np.arctan2(way @ self.along, way @ self.across) % (2 * np.pi))
 
@@ -161,7 +161,7 @@ class Smooth:
 def arc_through(
     begin: Array, middle: Array, end: Array, *, places: Sequence[int], where: str = "arc"
 ) -> Arc:
-    """The arc through three points, by the coordinates ``places`` that are lengths.
+    """Return the arc through three points; ``places`` are the coordinates that are lengths.
 
     :raises ParameterError: three points on a line.
     """

@@ -1,10 +1,10 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""The fastest speed along a path within limits: reachability over a grid.
+"""Find the fastest profile along a path within limits, by reachability over a grid.
 
 Between two points of the path the acceleration u is constant, so x = v^2 is linear:
 x' = x + 2 h u. Limits hold at both ends of every interval. A pass from the end finds the greatest x
-from which the end is still reached, a pass from the beginning then accelerates as hard as is
-allowed.
+from which the end is still reached; a pass from the beginning then accelerates as much as the
+limits allow.
 
 Source: Pham, Pham: A new approach to time-optimal path parameterization based on reachability
 analysis, IEEE Transactions on Robotics 34 (2018), with the first-order interpolation scheme.
@@ -24,15 +24,15 @@ from pkm_twin.paths.constraints import Rows
 Index = NDArray[np.int64]
 
 MAX_NEWTON_STEPS: Final = 50
-"""Most steps to an interval's greatest x; two or three are usual."""
+"""Largest number of Newton steps to an interval's largest x; two or three are usual."""
 ZERO_COEFFICIENT: Final = 1e-12
-"""Of a row's greatest coefficient, what counts as none."""
+"""Coefficient, relative to the row's largest, that counts as zero."""
 SPEED_TOLERANCE: Final = 3e-4
-"""Relative change of the speeds at which viscous friction is settled."""
+"""Relative change of the speeds at which viscous friction has converged."""
 MAX_ITERATIONS: Final = 8
-"""Most solutions for viscous friction."""
+"""Largest number of solutions for viscous friction."""
 MIN_SPEED_FRACTION: Final = 0.01
-"""Part of the greatest speed below which viscous friction is taken as at this speed."""
+"""Speed, relative to the largest, below which viscous friction is that of this speed."""
 
 
 Numbers = list[float]
@@ -40,7 +40,7 @@ Numbers = list[float]
 
 @dataclass(frozen=True)
 class IntervalPrograms:
-    """The intervals' linear programs in x and x', a list of rows for each interval.
+    """Hold the intervals' linear programs in x and x', a list of rows per interval.
 
     x <= ``most``, and low + slope x <= x' <= high + slope x.
     """
@@ -52,7 +52,7 @@ class IntervalPrograms:
 
     @classmethod
     def of(cls, p: Array, q: Array, least: Array, greatest: Array, most: Array) -> IntervalPrograms:
-        """Of rows least <= p x + q x' <= greatest, (i, r); ``most`` at the ends, (i + 1,)."""
+        """Convert rows least <= p x + q x' <= greatest, (i, r); ``most`` at the ends, (i + 1,)."""
         level = np.abs(q) <= ZERO_COEFFICIENT * np.abs(p)
         with np.errstate(divide="ignore", invalid="ignore"):
             one, other, slope = least / q, greatest / q, -p / q
@@ -65,7 +65,7 @@ class IntervalPrograms:
         return cls(low.tolist(), high.tolist(), slope.tolist(), most.tolist())
 
     def solve(self) -> Array:
-        """The greatest x at the intervals' ends, shape (i + 1,), from rest to rest."""
+        """Return the largest x at the intervals' ends, shape (i + 1,), from rest to rest."""
         count = len(self.low)
         reachable = [0.0] * (count + 1)
         value = 0.0
@@ -86,10 +86,10 @@ class IntervalPrograms:
 
 
 def _largest_start(low: Numbers, high: Numbers, slopes: Numbers, x: float, after: float) -> float:
-    """Greatest x of an interval from which some x' up to ``after`` is reached.
+    """Return an interval's largest x from which some x' up to ``after`` is reached.
 
-    Where the gap between the greatest lower and the least upper line on x' closes: the gap is
-    convex in x and open at 0, so Newton's steps from the right end there, on a line each.
+    The gap between the largest lower and the smallest upper line on x' is convex in x and open at
+    0, so Newton's steps from the right converge to where it closes.
     """
     for _ in range(MAX_NEWTON_STEPS):
         least, rise, most, fall = 0.0, 0.0, after, 0.0
@@ -114,9 +114,9 @@ def _largest_start(low: Numbers, high: Numbers, slopes: Numbers, x: float, after
 def interval_rows(
     rows: Rows, left: Index, steps: Array, x: Array | None, part: Array
 ) -> tuple[Array, Array, Array, Array, Array]:
-    """Limits at both ends of the intervals as :meth:`Programs.of` takes them.
+    """Return limits at both ends of the intervals, as :meth:`IntervalPrograms.of` takes them.
 
-    Viscous friction is linear in x about a profile.
+    Viscous friction is linearised in x about a profile.
 
     :param x: at the intervals' ends, shape (i + 1,); None leaves viscous friction out.
     :param part: of each interval's limits that is used, shape (i,).
@@ -124,7 +124,7 @@ def interval_rows(
     double = (2.0 * steps)[:, None]
     right = left + 1
     bound = part[:, None]
-    # A joint that turns round in an interval has dry friction of both signs there.
+    # A joint that reverses in an interval has dry friction of both signs there.
     dry = rows.dry[left], rows.dry[right]
     least, greatest = np.minimum(*dry), np.maximum(*dry)
     alphas, betas, lows, highs = [], [], [], []
@@ -137,11 +137,11 @@ def interval_rows(
             fixed = fixed + 0.5 * rows.drag[k] * about
         alphas.append(rows.alpha[k] / double)
         betas.append(beta)
-        # At rest, limits that are made smaller hold all the same.
+        # Rest stays feasible when limits are reduced.
         lows.append(np.minimum(-bound - fixed - least, 0.0))
         highs.append(np.maximum(bound - fixed - greatest, 0.0))
     most = np.append(rows.most[left], rows.most[right[-1]])
-    # Where two pieces meet the stricter one counts.
+    # Where two pieces meet, the stricter limit applies.
     most[1:] = np.minimum(most[1:], rows.most[right])
     most[:-1] *= part**2
     most[1:] *= part**2
@@ -155,7 +155,7 @@ def interval_rows(
 def fastest_profile(
     rows: Rows, left: Index, steps: Array, part: Array, about: Array | None = None
 ) -> Array:
-    """The greatest x = v^2 at the intervals' ends, shape (i + 1,), at rest at both ends.
+    """Find the largest x = v^2 at the intervals' ends, (i + 1,), at rest at both ends.
 
     :param part: of each interval's limits that is used, shape (i,).
     :param about: a profile close to the result, about which viscous friction is linear first.

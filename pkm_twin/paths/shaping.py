@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""Input shaping of a motion: the first mode, whose frequency depends on the pose, rests at its end.
+"""Shape a motion so that the first mode, whose frequency changes, rests at its end.
 
 ZV and ZVD (Singer and Seering 1990) split a motion into two or three, half a damped vibration
 apart. As the frequency changes along the path, delays are measured in the vibration's phase: the
@@ -27,23 +27,24 @@ from stiffness_monitor.modes import natural_frequencies
 from stiffness_monitor.vibration import damping_ratios
 
 HALF_PERIODS: Final = {"zv": 1, "zvd": 2}
-"""Half vibrations that each shaper takes."""
+"""Half vibration periods by which each shaper lengthens a stretch."""
 POSES_PER_STRETCH: Final = 16
-"""Poses of a stretch whose frequency is computed."""
+"""Poses of a stretch at which the frequency is computed."""
 MAX_ITERATIONS: Final = 3
-"""How often: on the motion, then on what was shaped before."""
+"""Number of times the frequencies are computed: on the motion, then on the shaped one."""
 MIN_TIME_STEP: Final = 1e-9
-"""Times that are closer are one, s."""
+"""Difference below which two times are the same, s."""
 CHECKED_TIMES: Final = 4001
 """Times at which a shaped motion is compared with its limits."""
 ROUNDING: Final = 1e-9
+"""Excess of a limit, as a fraction, that is a rounding error."""
 MAX_SLOWDOWNS: Final = 8
-"""How often a motion that passes a limit is slowed down."""
+"""Largest number of times that a motion that exceeds a limit is slowed down."""
 
 
 @dataclass(frozen=True)
 class Phase:
-    """The vibration's phase over time: ``rate`` (rad/s) at ``times`` (k,), s, constant outside."""
+    """Describe the vibration's phase: ``rate`` (rad/s) at ``times`` (k,), s, constant outside."""
 
     times: Array
     rate: Array
@@ -57,14 +58,14 @@ class Phase:
         return self._curve.antiderivative()
 
     def at(self, time: Array) -> tuple[Array, Array, Array]:
-        """Phase (rad), its rate and the rate's slope at times (k,)."""
+        """Return phase (rad), its rate and the rate's derivative at times (k,)."""
         inside = np.clip(time, self.times[0], self.times[-1])
         rate = self._curve(inside)
         slope = np.where(inside == time, self._curve(inside, 1), 0.0)
         return self._whole(inside) + rate * (time - inside), rate, slope
 
     def earlier(self, time: Array, phase: float) -> tuple[Array, Array, Array]:
-        """Times at which the phase was so much less, and their first and second derivatives."""
+        """Return times at which the phase was ``phase`` less, and their two derivatives."""
         now, rate, slope = self.at(time)
         found = time - phase / rate
         for _ in range(50):
@@ -79,7 +80,9 @@ class Phase:
 
 @dataclass(frozen=True)
 class ShapedPath(TimedPath):
-    """A motion that leaves its first mode at rest at every stop; ``runs``: of the unshaped motion.
+    """Describe a motion that leaves its first mode at rest at every stop.
+
+    ``runs``: of the unshaped motion.
 
     ``phase``: of the first mode. ``amplitudes``: of the split motion, sum 1, each half a vibration
     after the one before. ``shaper``: ``zv`` or ``zvd``; ``frequencies``: lowest and highest, Hz;
@@ -103,7 +106,7 @@ class ShapedPath(TimedPath):
         plain = np.concatenate(
             [begin + run.times for begin, run in zip(self.begins, self.runs, strict=True)]
         )
-        # Each part of the split motion jumps where the plain one does, later.
+        # Each delayed copy jumps where the unshaped motion does, later.
         late = [self.phase.earlier(plain, -k * np.pi)[0] for k in range(len(self.amplitudes))]
         even = np.linspace(0.0, self.duration, POSES_PER_STRETCH)
         times = np.unique(np.clip(np.concatenate([even, *late]), 0.0, self.duration))
@@ -116,7 +119,7 @@ class ShapedPath(TimedPath):
         return np.asarray(peaks(self.limits, times, sample).max(0), np.float64)
 
     def sample(self, times: ArrayLike) -> Samples:
-        """The shaped motion at times (k,), s from its beginning."""
+        """Return the shaped motion at times (k,), s from its beginning."""
         t = np.asarray(times, np.float64)
         robot = self.robot
         pose, rate, change = (np.zeros((len(t), len(robot.pose_names))) for _ in range(3))
@@ -145,7 +148,7 @@ def shaped(
     *,
     singularity: float = 0.01,
 ) -> ShapedPath:
-    """A motion that leaves the first mode at rest at every stop.
+    """Shape a motion so that it leaves the first mode at rest at every stop.
 
     Each stretch takes half (``zv``) or one (``zvd``) damped vibration more. ``zvd`` tolerates more
     error of the frequency. Corners that are not stops become a little rounder. Where the shaped
@@ -176,7 +179,7 @@ def shaped(
     amplitudes = tuple((weights / weights.sum()).tolist())
 
     def add_settling_rests(plain: TimedPath, phase: Phase) -> TimedPath:
-        """With rests in which all parts of the split motion arrive."""
+        """Add rests so that all delayed copies end before the next stretch begins."""
         rests, end = [plain.rests[0]], 0.0
         for run, rest in zip(plain.runs, plain.rests[1:], strict=True):
             end += rests[-1] + run.duration
@@ -187,7 +190,7 @@ def shaped(
     def shape_path(plain: TimedPath) -> ShapedPath:
         looked, tails = plain, np.zeros(len(plain.runs))
         for _ in range(MAX_ITERATIONS):
-            # The shaped motion is later than the plain one, and so are its frequencies.
+            # The shaped motion passes its poses later, which changes the frequencies over time.
             spans = zip(looked.begins, looked.runs, tails, strict=True)
             times = np.concatenate(
                 [
@@ -226,7 +229,7 @@ def shaped(
 def _damped_frequencies(
     motion: TimedPath, times: Array, frequency: Callable[[Array], Array], root: float
 ) -> Array:
-    """Damped angular frequency of the first mode at times of a motion, rad/s."""
+    """Return the damped angular frequency of the first mode along a motion, rad/s."""
     found = np.asarray(frequency(motion.sample(times).pose), np.float64)
     if not (np.isfinite(found).all() and (found > 0.0).all()):
         raise ParameterError("frequency", found.tolist(), "finite numbers above 0, Hz")

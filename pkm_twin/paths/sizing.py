@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""What drives must give for a motion: efforts, speeds, power and energy, at joint and motor.
+"""Size drives for a motion: efforts, speeds, power and energy, at joint and motor.
 
 At the joint power is effort times rate. With a drive of ``turns`` N (motor angle per joint motion),
 rotor inertia J and efficiency e of the gear, the motor gives
@@ -7,9 +7,9 @@ rotor inertia J and efficiency e of the gear, the motor gives
     torque = J N qdd + load / (N e)     where the load takes power,
     torque = J N qdd + load e / N       where it gives power back,
 
-with load = effort - J N^2 qdd, what goes through the gear. J includes a gear's own inertia at the
+with load = effort - J N^2 qdd, the effort through the gear. J includes a gear's own inertia at the
 motor. Joint and effort are the model's: the ratio of a ``joint_map`` converts a controller's
-numbers before, and is not N.
+numbers before that, and is not N.
 """
 
 from __future__ import annotations
@@ -34,24 +34,26 @@ from pkm_twin.recordings.payload import by_load
 from pkm_twin.recordings.recording import Recording
 
 SAMPLES_PER_BLOCK: Final = 4096
-"""Samples computed at a time, so that memory stays flat."""
+"""Samples computed at a time, so that memory use is bounded."""
 MIN_SAMPLES: Final = 2
-"""Samples of a motion."""
+"""Smallest number of samples of a motion."""
 SHIPPED: Final = "shipped"
+"""Name of the file of drives that is shipped with the package."""
 RPM: Final = 2 * math.pi / 60
+"""One revolution per minute, rad/s."""
 GEARS_PER_ROUND: Final = 33
-"""Gears of a range that are tried at a time,"""
+"""Gears of a range that are tried in a round."""
 REFINEMENTS: Final = 4
-"""and how often: each time between the neighbours of the best."""
+"""Rounds of the search in a range; each is between the neighbours of the best gear."""
 
 
 @dataclass(frozen=True)
 class Duty:
-    """One side of a drive over a motion; torques in N m (or N), speeds in rad/s (or m/s).
+    """Hold one side of a drive over a motion; torques in N m (or N), speeds in rad/s (or m/s).
 
-    ``peak``: greatest amount of the effort; ``rms``: its root mean square, which heats the motor;
-    ``speed``, ``mean_speed``: greatest and mean amount; ``power``: greatest, W; ``braking``:
-    greatest power that comes back, W; ``work``, ``returned``: energy given and come back, J.
+    ``peak``: largest magnitude of the effort; ``rms``: its root mean square, which heats the motor;
+    ``speed``, ``mean_speed``: largest and mean magnitude; ``power``: largest, W; ``braking``:
+    largest regenerated power, W; ``work``, ``returned``: energy delivered and regenerated, J.
     """
 
     peak: float
@@ -65,12 +67,12 @@ class Duty:
 
     @property
     def energy(self) -> float:
-        """Given less come back, J."""
+        """Energy delivered minus energy regenerated, J."""
         return self.work - self.returned
 
     @classmethod
     def of(cls, time: Array, effort: Array, rate: Array, net: Array) -> Duty:
-        """Integrate a motion's samples (k,) by trapezoids.
+        """Integrate a motion's samples (k,) by the trapezoidal rule.
 
         :param net: energy given in each interval less what comes back, shape (k - 1,), J. Where an
             effort steps between two samples, trapezoids alone would not conserve energy.
@@ -91,7 +93,7 @@ class Duty:
         )  # fmt: skip
 
     def as_json(self, slides: bool) -> dict[str, float]:
-        """Plain data, units in the keys."""
+        """Return plain data, units in the keys."""
         force, rate = ("N", "m_s") if slides else ("N_m", "rad_s")
         return {
             f"peak_effort_{force}": self.peak, f"rms_effort_{force}": self.rms,
@@ -102,7 +104,7 @@ class Duty:
 
 
 def integral(time: Array, values: Array) -> float:
-    """Integrate values (k,) at times (k,) by trapezoids."""
+    """Integrate values (k,) over times (k,) by the trapezoidal rule."""
     return float(_areas(time, values).sum())
 
 
@@ -113,9 +115,9 @@ def _areas(time: Array, values: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Motor:
-    """A motor as its data sheet has it: torques in N m, speeds in 1/min, inertia in kg m2.
+    """Describe a motor by its data sheet: torques in N m, speeds in 1/min, inertia in kg m2.
 
-    ``curve``: rows of speed and greatest torque; without it the peak torque up to the rated speed,
+    ``curve``: rows of speed and largest torque; without it the peak torque up to the rated speed,
     then a straight line to the continuous torque at the greatest speed.
     """
 
@@ -131,7 +133,7 @@ class Motor:
     )
 
     def verify(self, path: str) -> None:
-        """What a data sheet says of one motor agrees."""
+        """Check that the data sheet's values are consistent."""
         most, where = self.peak_torque, "peak_torque"
         if self.curve is not None and self.curve[:, 1].max() < most:
             most, where = float(self.curve[:, 1].max()), "the curve's greatest torque"
@@ -144,7 +146,7 @@ class Motor:
 
     @cached_property
     def limits(self) -> tuple[Array, Array]:
-        """Rising speeds (k,), rad/s, and the greatest torque at them, N m."""
+        """Rising speeds (k,), rad/s, and the largest torque at them, N m."""
         rows = self.curve
         if rows is None:
             rows = np.array(
@@ -154,7 +156,7 @@ class Motor:
         return RPM * rows[:, 0], rows[:, 1]
 
     def most(self, speed: Array) -> Array:
-        """Greatest torque at speeds (k,), rad/s; 0 beyond the curve."""
+        """Return the largest torque at speeds (k,), rad/s; 0 beyond the curve."""
         amount, (speeds, torques) = np.abs(speed), self.limits
         return np.where(amount > speeds[-1], 0.0, np.interp(amount, speeds, torques))
 
@@ -176,7 +178,7 @@ def _read_curve(field: str, value: Any) -> Array:
 
 
 def read_entries(path: Path, key: str, of: str, needed: bool = True) -> dict[Any, Any]:
-    """The mapping of a YAML under a key, from ``of`` to data; empty where it is not ``needed``.
+    """Read a YAML mapping under a key, from ``of`` to data; empty if not ``needed``.
 
     :raises ParameterError: the file cannot be read or has no such mapping.
     """
@@ -190,7 +192,7 @@ def read_entries(path: Path, key: str, of: str, needed: bool = True) -> dict[Any
 
 @dataclass(frozen=True)
 class Gear:
-    """A gear for joints that turn, a screw or belt for joints that slide, as its data sheet has it.
+    """Describe a gear for rotary joints, or a screw or belt for sliding joints.
 
     ``ratio``: turns of the motor per turn of the joint; ``lead``: m per turn of the motor.
     ``inertia``: at the motor, kg m2. At the joint, N m and rad, or N and m: ``backlash``,
@@ -209,11 +211,11 @@ class Gear:
     name: str = ""
 
     def verify(self, path: str) -> None:
-        """Either a ratio or a lead."""
+        """Check that exactly one of ratio and lead is given."""
         self.drive().verify(path)
 
     def drive(self, inertia: float = 0.0) -> DriveSpec:
-        """A drive with this gear; its rotor's inertia, kg m2."""
+        """Return a drive with this gear and a rotor inertia, kg m2."""
         return DriveSpec(inertia, self.ratio, self.lead, self.efficiency)
 
     @property
@@ -222,11 +224,11 @@ class Gear:
         return (self.ratio if self.lead is None else self.lead) or 0.0
 
     def sized(self, key: str, size: float) -> Gear:
-        """The same with another ratio or lead."""
+        """Return the gear with another ratio or lead."""
         return replace(self, ratio=size) if key == "ratio" else replace(self, lead=size)
 
     def used(self, time: Array, through: Array) -> float:
-        """The greatest used part of its torques by an effort (k,); 0 without any."""
+        """Return the largest used fraction of the gear's torques by an effort (k,)."""
         peak = float(np.abs(through).max()) / (self.peak_torque or math.inf)
         return max(peak, rms(time, through) / (self.continuous_torque or math.inf))
 
@@ -237,14 +239,14 @@ class Gear:
 
 @dataclass(frozen=True)
 class Gears:
-    """Gears to choose from; ``span``: all between two neighbours too."""
+    """Hold gears to choose from; ``span``: also all between two neighbours."""
 
     gears: tuple[Gear, ...]
     span: bool = False
 
     @classmethod
     def of(cls, key: str, text: str, efficiency: float = 1.0) -> Gears:
-        """Of ``LOW:HIGH`` or of numbers with commas; ``key``: ratio or lead.
+        """Parse ``LOW:HIGH`` or numbers with commas; ``key``: ratio or lead.
 
         :raises ParameterError: another form, or numbers that no gear has.
         """
@@ -263,7 +265,7 @@ class Gears:
         return cls(tuple(own.sized(key, value) for value in steps), span)
 
     def near(self, k: int) -> Gears:
-        """Those about one of a span."""
+        """Return the gears around one of a span."""
         low, high = self.gears[max(0, k - 1)], self.gears[min(k + 1, len(self.gears) - 1)]
         steps = np.geomspace(low.size, high.size, GEARS_PER_ROUND).tolist()
         key = "ratio" if low.lead is None else "lead"
@@ -271,9 +273,9 @@ class Gears:
 
 
 def read_motors(path: Path, names: Sequence[str] = ()) -> dict[str, Motor]:
-    """Motors by name, of a YAML with a mapping ``drives`` of names to data.
+    """Read motors by name from a YAML mapping ``drives``.
 
-    :raises ParameterError: by the field.
+    :raises ParameterError: names the field.
     """
     path = _resolve_file(path)
     entries = read_entries(path, "drives", "names")
@@ -288,7 +290,7 @@ def read_motors(path: Path, names: Sequence[str] = ()) -> dict[str, Motor]:
 
 
 def read_gears(path: Path) -> tuple[Gear, ...]:
-    """Gears of the same file, of a mapping ``gears`` of names to data; none where it has none.
+    """Read gears from the mapping ``gears`` of the same file; none if it has none.
 
     :raises ParameterError: by the field.
     """
@@ -300,6 +302,7 @@ def read_gears(path: Path) -> tuple[Gear, ...]:
 
 
 def _resolve_file(path: Path) -> Path:
+    """Return the path of a file of drives, or of the shipped one."""
     if str(path) == SHIPPED:
         return config_folder() / "drives" / "servos.yaml"
     if not path.suffix and not path.exists():
@@ -309,12 +312,12 @@ def _resolve_file(path: Path) -> Path:
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """How a motor and a gear suit a drive, the motor's rotor in place of the file's.
+    """Describe how a motor and a gear suit a drive, with the motor's rotor instead of the file's.
 
-    Greatest used parts of its torque curve, of its continuous torque, of its greatest speed and of
-    the gear's torques, 1 at the bound. ``inertia_ratio``: the greatest inertia of the load seen by
-    the motor, and the gear's, against the rotor's. ``torques``, ``speeds``: the motor's, shape
-    (k,), N m and rad/s; ``rms``, N m.
+    ``torque``, ``thermal``, ``speed``, ``geared``: largest used fractions of the torque curve, the
+    continuous torque, the largest speed and the gear's torques, 1 at the bound. ``inertia_ratio``:
+    largest load inertia at the motor plus the gear's, over the rotor's. ``torques``, ``speeds``:
+    the motor's, shape (k,), N m and rad/s; ``rms``, N m.
     """
 
     name: str
@@ -331,7 +334,7 @@ class Fit:
 
     @property
     def used(self) -> float:
-        """The greatest used part."""
+        """Largest used fraction."""
         return max(self.torque, self.thermal, self.speed, self.geared)
 
     @property
@@ -341,7 +344,7 @@ class Fit:
 
     @property
     def answer(self) -> str:
-        """In words; beyond its greatest speed a motor has no torque to be compared."""
+        """Verdict in words; beyond its largest speed a motor has no torque to compare with."""
         slow = self.speed > 1.0
         small = max(self.thermal, 0.0 if slow else self.torque) > 1.0
         words = ["too small"] * small + ["too slow"] * slow + ["gear too small"] * (self.geared > 1)
@@ -349,11 +352,11 @@ class Fit:
 
     @property
     def cost(self) -> float | None:
-        """Of the motor, and of the gear where it has one."""
+        """Cost of the motor, and of the gear if it has one."""
         return None if self.motor.cost is None else self.motor.cost + (self.gear.cost or 0.0)
 
     def as_json(self) -> dict[str, Any]:
-        """Plain data; parts are 1 at the bound."""
+        """Return plain data; fractions are 1 at the bound."""
         return {
             "good": self.good, "used_torque": _none_if_infinite(self.torque),
             "used_continuous_torque": self.thermal, "used_speed": self.speed,
@@ -366,7 +369,7 @@ class Fit:
 
     @property
     def choice(self) -> dict[str, Any]:
-        """The motor and the gear as plain data."""
+        """Motor and gear as plain data."""
         gear = self.gear
         return {
             "motor": self.name, "gear": gear.name or None, "ratio": gear.ratio,
@@ -379,12 +382,12 @@ class Fit:
 
 @dataclass(frozen=True)
 class DriveDuty:
-    """What one drive gives: at its joint, and at its motor where the file has a ``drive``.
+    """Describe the load of one drive: at its joint, and at its motor if the file has a ``drive``.
 
-    ``load_inertia``: least and greatest inertia of the machine at the joint without the rotor,
-    kg m2 or kg; ``inertia_ratio``: the greatest, seen by the motor, against the rotor's inertia.
-    ``torques``, ``speeds``: the motor's, shape (k,), N m and rad/s. ``fits``: of each motor with
-    the gear that is best for this drive; ``alike``: with the one best for all that may have it.
+    ``load_inertia``: smallest and largest inertia of the machine at the joint without the rotor,
+    kg m2 or kg; ``inertia_ratio``: the largest at the motor over the rotor's inertia.
+    ``torques``, ``speeds``: the motor's, shape (k,), N m and rad/s. ``fits``: each motor with the
+    gear that is best for this drive; ``alike``: with the gear that is best for all such drives.
     """
 
     joint: str
@@ -400,7 +403,7 @@ class DriveDuty:
     alike: tuple[Fit, ...] = ()
 
     def as_json(self) -> dict[str, Any]:
-        """Plain data, units in the keys."""
+        """Return plain data, units in the keys."""
         unit = "kg" if self.slides else "kg_m2"
         data: dict[str, Any] = {
             "joint": self.at_joint.as_json(self.slides),
@@ -417,7 +420,7 @@ def size_drives(
     motion: Recording, effort: Array, motors: Mapping[str, Motor] | None = None,
     given: Sequence[Gear] = (), choices: Sequence[Gears] = (),
 ) -> list[DriveDuty]:  # fmt: skip
-    """What each drive must supply for a motion.
+    """Compute what each drive must supply for a motion.
 
     :param motion: with rates and accelerations; ``effort``: the joints' efforts, shape (k, n).
     :param motors: candidates by name; each replaces the rotor of the robot's file.
@@ -485,7 +488,7 @@ def size_drives(
 def _drive_with_gear(
     joint: str, slides: bool, rotor: float, own: DriveSpec | None, given: Sequence[Gear]
 ) -> DriveSpec:
-    """The drive of a joint whose rotor has this inertia at the joint, kg m2 or kg."""
+    """Return the drive of a joint with a rotor inertia at the joint, kg m2 or kg."""
     if own is not None:
         raise ParameterError(f"drive of {joint}", "in the file", "no ratio or lead; or --ratios")
     gear = next((gear for gear in given if (gear.lead is not None) == slides), None)
@@ -496,7 +499,7 @@ def _drive_with_gear(
 
 
 def _allowed_gears(robot: str, duty: DriveDuty, choices: Sequence[Gears]) -> Gears:
-    """The gears that a drive may have."""
+    """Return the gears that a drive may have."""
     for choice in choices:
         if (choice.gears[0].lead is not None) == duty.slides:
             return choice
@@ -512,8 +515,9 @@ def _allowed_gears(robot: str, duty: DriveDuty, choices: Sequence[Gears]) -> Gea
 
 @dataclass(frozen=True)
 class _Axis:
-    """A joint over a motion: rates, accelerations and what goes through the gear, shape (k,) each,
-    and the greatest inertia of the load, kg m2 or kg.
+    """Hold a joint over a motion: velocities, accelerations and efforts through the gear, (k,).
+
+    ``load``: largest inertia of the load, kg m2 or kg.
     """
 
     time: Array
@@ -523,7 +527,7 @@ class _Axis:
     load: float
 
     def torques(self, inertia: float, drive: DriveSpec) -> Array:
-        """Of the motor, shape (k,), N m, see the module; ``inertia``: at the motor, kg m2."""
+        """Return the motor's torques (module equation), (k,), N m; ``inertia``: at the motor."""
         turns = drive.turns
         return np.asarray(inertia * turns * self.qdd + self.through * self.losses(drive) / turns)
 
@@ -533,7 +537,7 @@ class _Axis:
         return np.where(back, drive.efficiency, 1.0 / drive.efficiency)
 
     def fit(self, name: str, motor: Motor, gear: Gear) -> Fit:
-        """How a motor with a gear suits the joint."""
+        """Evaluate a motor with a gear for the joint."""
         drive = gear.drive()
         torques = self.torques(motor.inertia + gear.inertia, drive)
         speeds = drive.turns * self.qd
@@ -551,7 +555,7 @@ class _Axis:
 
 
 def _fit_best_gear(axes: Sequence[_Axis], name: str, motor: Motor, choice: Gears) -> list[Fit]:
-    """Fits of joints with one gear: of the least greatest used part of all."""
+    """Fit joints with one gear: that with the smallest largest used fraction of all joints."""
     for _ in range(REFINEMENTS if choice.span else 1):
         rows = [[axis.fit(name, motor, gear) for axis in axes] for gear in choice.gears]
         k = min(range(len(rows)), key=lambda i: _ranking(rows[i]))
@@ -560,18 +564,18 @@ def _fit_best_gear(axes: Sequence[_Axis], name: str, motor: Motor, choice: Gears
 
 
 def _ranking(fits: Sequence[Fit]) -> tuple[float, float]:
-    """What counts of joints together; beyond the curve, where a torque is infinite, the rest."""
+    """Return the ranking key of fits; beyond the curve, where a torque is infinite, the others."""
     return max(f.used for f in fits), max(max(f.thermal, f.speed) for f in fits)
 
 
 def find_smallest(fits: Sequence[Sequence[Fit]]) -> int | None:
-    """Which motor of the least continuous torque suits all drives, of their fits in one order."""
+    """Find the motor of the smallest continuous torque that suits all drives; None without one."""
     good = [k for k, row in enumerate(zip(*fits, strict=True)) if all(fit.good for fit in row)]
     return min(good, key=lambda k: fits[0][k].motor.continuous_torque, default=None)
 
 
 def rms(time: Array, values: Array) -> float:
-    """Root of the mean square over time, of values (k,)."""
+    """Return the root mean square over time of values (k,)."""
     return math.sqrt(integral(time, values**2) / float(time[-1] - time[0]))
 
 

@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""Paths out of tables of waypoints."""
+"""Read paths from tables of waypoints."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from pkm_twin.recordings.tables import (
 from pkm_twin.robot.robot import Robot
 
 PATH_COLUMNS: Final = ("blend", "dwell", "arc")
-"""Columns of waypoints beside their coordinates."""
+"""Columns of waypoints in addition to their coordinates."""
 
 
 def read_waypoints(
@@ -37,7 +37,7 @@ def read_waypoints(
     blend: float | None,
     dialect: Dialect = PLAIN,
 ) -> tuple[Path, list[float] | None]:
-    """The path of a table of waypoints: the pose's coordinates, or JOINT.position of every joint.
+    """Read the path of a table of waypoints: pose coordinates, or JOINT.position of every joint.
 
     A smooth curve; with ``blend`` (m) or one of the columns :data:`PATH_COLUMNS`, lines and arcs.
 
@@ -68,7 +68,7 @@ def read_waypoints(
     arc = given.get("arc", np.zeros(len(points))) == 1.0
     rounded = given.get("blend", np.full(len(points), blend or 0.0))
     if "blend" not in given:
-        # An arc's ends and middle are no corners.
+        # An arc's ends and middle are not corners.
         near = arc | np.roll(arc, 1) | np.roll(arc, -1)
         rounded = np.where(near, 0.0, rounded)
     try:
@@ -81,7 +81,7 @@ def read_waypoints(
 
 
 def _read_payloads(table: Table, robot: Robot) -> list[float] | None:
-    """The payload from each waypoint on, kg, with the centre of mass of the robot's file."""
+    """Read the payload from each waypoint on, kg, with the robot file's centre of mass."""
     if PAYLOAD[0] not in table:
         return None
     masses, centre = table[PAYLOAD[0]], table.fill(PAYLOAD[1:])
@@ -100,9 +100,9 @@ def _read_payloads(table: Table, robot: Robot) -> list[float] | None:
 
 
 def parse_loads(texts: Sequence[str], waypoints: int) -> list[float | None]:
-    """Payload from each waypoint on, kg, None the robot's own, of some ``MASS@FROM:TO``.
+    """Parse texts ``MASS@FROM:TO`` to the payload from each waypoint on, kg, None the robot's own.
 
-    :raises ParameterError: no such text, waypoints that there are not, or two masses on one part.
+    :raises ParameterError: another form, waypoints that do not exist, or two masses on one part.
     """
     result: list[float | None] = [None] * waypoints
     for text in texts:

@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""The greatest efforts and speeds of drives over the whole workspace."""
+"""Find the largest efforts and speeds of drives over the whole workspace."""
 
 from __future__ import annotations
 
@@ -21,27 +21,28 @@ from pkm_twin.robot.workspace import causes, counts, try_inverse
 DEFAULT_RAYS: Final = 1000
 """Rays from home on which poses of the workspace are taken."""
 RAY_FRACTIONS: Final = (1.0, 0.8, 0.5)
-"""Of a ray's length at which poses are taken."""
+"""Fractions of a ray's length at which poses are taken."""
 BISECTIONS: Final = 14
-"""Of the search for a ray's end."""
+"""Bisection steps to a ray's end."""
 COARSE_DIRECTIONS: Final = 32
-"""Of the tool point's speed, at all poses."""
+"""Directions of the tool point's speed at all poses."""
 FINE_DIRECTIONS: Final = 2000
-"""The same at each drive's worst poses."""
+"""Directions at each drive's worst poses."""
 REFINED_POSES: Final = 8
-"""Worst poses of each drive that are looked at closely."""
+"""Worst poses of each drive at which the fine directions are evaluated."""
 MIN_SINGULARITY_INDEX: Final = 0.05
-"""Least singularity index of a pose that counts."""
+"""Default smallest singularity index of a pose that counts."""
 MIN_LEVER: Final = 0.3
-"""Least lever of a drive where a pose counts, against its greatest."""
+"""Default smallest lever of a drive at a pose that counts, over its largest."""
 DIFFERENCE_STEP: Final = 1e-4
-"""Joint motion of a difference, rad or m."""
+"""Joint step of a finite difference, rad or m."""
 
 
 @dataclass(frozen=True)
 class Worst:
-    """By actuated joint the greatest effort, effort at rest and speed, shape (n,), N m or N and
-    rad/s or m/s, and the pose of each, shape (n, m); ``poses``: how many were looked at.
+    """Hold the drives' largest effort, effort at rest and speed, shape (n,), and their poses.
+
+    Efforts in N m or N, speeds in rad/s or m/s, poses (n, m). ``poses``: number of poses evaluated.
     """
 
     effort: Array
@@ -59,9 +60,9 @@ def workspace_poses(
     singularity: float = MIN_SINGULARITY_INDEX,
     lever: float = 0.0,
 ) -> Array:
-    """Poses of the workspace, shape (k, m): in reach, within limits, clear of singularities.
+    """Return poses of the workspace, (k, m): reachable, within limits, without singularities.
 
-    On rays from home through the pose coordinates, up to where the workspace ends on them.
+    They lie on rays from home through the pose coordinates, up to the end of the workspace.
 
     :param lever: least :func:`levers` of each drive, against its greatest in the workspace: near
         zero at a stretched limb, where the singularity index of the machine may still be high.
@@ -90,9 +91,9 @@ def _named(robot: Robot, pose: Array) -> str:
 
 
 def levers(robot: Robot, q: Array) -> Array:
-    """The tool point's speed per joint rate in the direction where it is least, shape (k, n).
+    """Return the tool point's speed per joint rate in its smallest direction, shape (k, n).
 
-    In m per rad or m; of a machine that only turns, the platform's turn, rad per rad or m.
+    In m per rad or m; for a machine that only rotates, the platform's rotation, rad per rad or m.
     """
     size = np.linalg.norm(_joint_rates(robot, q), axis=-1)
     with np.errstate(divide="ignore"):
@@ -100,12 +101,13 @@ def levers(robot: Robot, q: Array) -> Array:
 
 
 def _poses_on_rays(robot: Robot, rays: int, singularity: float, least: Array) -> Array:
+    """Return poses on rays from home within the workspace, whose ends bisection finds."""
     home, box = robot.home(), robot.search_box()
     rng = np.random.default_rng(0)
     ways = rng.normal(size=(rays, len(home)))
     ways /= np.abs(ways).max(1, keepdims=True)
     ways = np.concatenate([np.eye(len(home)), -np.eye(len(home)), ways])
-    # From home to the side of the box that the ray leaves it by.
+    # From home to the side of the box through which the ray leaves.
     span = np.where(ways > 0.0, box[:, 1] - home, home - box[:, 0]) * ways
     if not _are_in_workspace(robot, home[None], singularity, least)[0]:
         q, known = try_inverse(robot, home[None])
@@ -122,7 +124,7 @@ def _poses_on_rays(robot: Robot, rays: int, singularity: float, least: Array) ->
 
 
 def _are_in_workspace(robot: Robot, poses: Array, singularity: float, least: Array) -> Mask:
-    """Which poses (k, m) are of the workspace."""
+    """Return which poses (k, m) are in the workspace."""
     q, known = try_inverse(robot, poses)
     inside = counts(robot, q, poses, known, singularity, -np.inf)
     if least.any():
@@ -131,9 +133,9 @@ def _are_in_workspace(robot: Robot, poses: Array, singularity: float, least: Arr
 
 
 def _joint_rates(robot: Robot, q: Array) -> Array:
-    """Joint rates by the velocity of the tool point, the orientation constant, (k, n, size).
+    """Return joint rates per velocity of the tool point at constant orientation, (k, n, size).
 
-    Of a machine that only turns, by the platform's angular velocity in axes of its own.
+    For a machine that only rotates, per angular velocity of the platform in axes of its own.
     """
     if only_turns(robot):
         robot.check_independent("worst directions of a rotation")
@@ -147,7 +149,7 @@ def _rotation_jacobian(robot: Robot, q: Array) -> Array:
 
 
 def _steady_accelerations(robot: Robot, q: Array, qd: Array) -> Array:
-    """Joint accelerations at which the tool point, or the platform's turn, keeps its velocity."""
+    """Return joint accelerations at which the tool point (or rotation) keeps its velocity."""
     if not only_turns(robot):
         return joint_changes(robot, q, qd, robot.inverse_jacobian(q))
     step = DIFFERENCE_STEP / np.maximum(np.abs(qd).max(-1, keepdims=True), DIFFERENCE_STEP)
@@ -165,11 +167,11 @@ def worst_over_workspace(
     lever: float = MIN_LEVER,
     rays: int = DEFAULT_RAYS,
 ) -> Worst:
-    """The largest efforts and speeds of the drives, for the worst directions of the tool point.
+    """Find the drives' largest efforts and speeds, for the worst directions of the tool point.
 
-    Speed and acceleration are those of the position; the orientation stays constant. The
-    worst acceleration is exact; for the speed :data:`COARSE_DIRECTIONS` directions are tried at all poses,
-    and :data:`FINE_DIRECTIONS` at the worst.
+    Speed and acceleration are those of the position; the orientation stays constant. The worst
+    acceleration is exact; for the speed :data:`COARSE_DIRECTIONS` directions are tried at all
+    poses, and :data:`FINE_DIRECTIONS` at the worst.
 
     :param speed: of the tool point, m/s; ``acceleration``: m/s2. Of a machine that only turns, of
         the platform's rotation, rad/s and rad/s2.
@@ -202,9 +204,9 @@ def worst_over_workspace(
 def _efforts_by_direction(
     robot: Robot, q: Array, back: Array, speed: float, acceleration: float, count: int
 ) -> Array:
-    """Greatest efforts by direction of the speed, shape (k, count + 1, n); the last is rest.
+    """Return the largest efforts by direction of the speed, (k, count + 1, n); the last is rest.
 
-    :param back: joint rates by the position's, shape (k, n, size).
+    :param back: joint rates per velocity of the position, shape (k, n, size).
     """
     k, n, size = back.shape
     ways = _unit_vectors(size, count)
@@ -222,7 +224,7 @@ def _efforts_by_direction(
 
 
 def _unit_vectors(size: int, count: int) -> Array:
-    """Unit vectors of a position of ``size`` coordinates, shape (count, size)."""
+    """Return unit vectors of a position of ``size`` coordinates, shape (count, size)."""
     if size == 1:
         return np.array([[1.0], [-1.0]])
     if size == 2:

@@ -139,7 +139,7 @@ def test_messages():
     assert found == []
 
 
-ROOMS = ("bags", "demo", "messages", "ros", "state", "streams")
+ROOMS = ("bags", "demo", "messages", "paths", "ros", "state", "streams")
 """Folders of ``pkm_twin`` whose docstrings are in the field's terms; and the twins' packages."""
 
 
