@@ -319,11 +319,10 @@ def _minimal_rotation(home: Array, now: Array) -> Array:
 def read_bearings(path: Path, names: tuple[str, ...], robot: Robot) -> dict[str, BearingSpec]:
     """Read bearings by joint from a YAML mapping ``bearings``; names may contain wildcards.
 
-    :raises ParameterError: names the field, or a name that no joint has.
     A * in a name stands for any text; joints of such a name that the bearing does not fit are left
     out, with a warning that names them.
 
-    :raises ParameterError: by the field; a name that no joint has, or a bearing that fits none.
+    :raises ParameterError: names the field; a name that no joint has, or a bearing that fits none.
     """
     found: dict[str, BearingSpec] = {}
     joints = joints_by_label(robot)

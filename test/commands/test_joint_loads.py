@@ -15,8 +15,8 @@ from pkm_twin.paths.joint_loads import (
     Reversals,
     Summary,
     bearing_life,
-    by_label,
     joint_loads,
+    joints_by_label,
     rainflow,
     read_bearings,
     turning_points,
@@ -236,10 +236,10 @@ def test_a_slide_that_closes_a_loop_travels_by_the_screw_s_lead():
 def test_a_star_skips_joints_that_the_bearing_does_not_fit(tmp_path):
     """A cylindrical joint takes no bearing; the warning names it."""
     robot = robot_of_data(plain("rccc"), "rccc")
-    names = tuple(by_label(robot))
+    names = tuple(joints_by_label(robot))
     lines = "bearings: {'*': {C: 1000.0, p: 3}}"
     (tmp_path / "b.yaml").write_text(lines)
-    left = [n for n, j in by_label(robot).items() if j.kind == "cylindrical"]
+    left = [n for n, j in joints_by_label(robot).items() if j.kind == "cylindrical"]
     with pytest.warns(RobotWarning, match=", ".join(left)):
         found = read_bearings(tmp_path / "b.yaml", names, robot)
     assert set(found) == set(names) - set(left) and found
