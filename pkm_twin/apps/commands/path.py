@@ -362,7 +362,7 @@ def _cut(cut: SoftCut, motion: TimedPath) -> tuple[list[Fact], Any]:
 
     s, speed, tolerance = motion.fine, cut.feed, cut.tolerance
     way = reference_velocity(motion.robot, s.q, s.qd) / np.maximum(s.speed, 1e-300)[:, None]
-    bend = cut.bends(s.q, way)
+    bend = cut.deflection_per_feed(s.q, way)
     soft, most = float(bend.max()), float((bend * s.speed).max())
     # The largest constant feed within the tolerance.
     even = min(speed, tolerance / soft) if soft > 0.0 else speed
