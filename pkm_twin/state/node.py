@@ -54,13 +54,13 @@ KINDS: Final = {
 def transform(
     stamp: int, frame: str, child: str, position: NDArray[Any], turn: NDArray[Any]
 ) -> TransformStamped:
-    """From a frame to its child, by a place (3,) and a quaternion x y z w."""
+    """Make the message of a frame's transform to its child: position (3,), quaternion x y z w."""
     moved = Transform(translation=xyz(Vector3, position), rotation=xyz(Quaternion, turn))
     return TransformStamped(header=header(stamp, frame), child_frame_id=child, transform=moved)
 
 
 def markers(own: Header, shapes: Iterable[Shape], lifetime: DurationMessage) -> MarkerArray:
-    """Shapes as markers; those that do not last are drawn for ``lifetime``."""
+    """Convert shapes to markers; those that are not lasting disappear after ``lifetime``."""
     array_of = MarkerArray()
     for shape in shapes:
         marker = Marker(header=own, ns=shape.group, id=shape.number, type=KINDS[shape.kind])
@@ -79,8 +79,9 @@ def markers(own: Header, shapes: Iterable[Shape], lifetime: DurationMessage) -> 
 class Transforms:
     """Publishers of ``/tf`` (base to platform) and ``/tf_static`` (platform to tool).
 
-    :param frames: names of the frames ``platform`` and ``tool``; ``tool``: where it stands.
-    :param platform: whether base to platform is published here.
+    :param frames: names of the frames ``platform`` and ``tool``.
+    :param tool: pose of the tool on the platform.
+    :param platform: whether to publish the transform from base to platform.
     :raises ImportError: tf2_msgs is not installed.
     """
 
@@ -96,25 +97,25 @@ class Transforms:
         self._moving = node.create_guarded_publisher("/tf") if platform else None
 
     def send_tool(self, now: int) -> None:
-        """Platform to tool, once and for all; ``now`` in ns."""
+        """Publish the static transform from platform to tool; ``now`` in ns."""
         turn = rotations.to_quaternion(self._tool.rotation)
         names = self._frames["platform"], self._frames["tool"]
         found = transform(now, *names, self._tool.position, turn)
         self._static.publish(self._message(transforms=[found]))
 
     def send_platform(self, stamp: int, position: NDArray[Any], turn: NDArray[Any]) -> None:
-        """Base to platform."""
+        """Publish the transform from base to platform, if it is published here."""
         if self._moving is not None:
             found = transform(stamp, self._base, self._frames["platform"], position, turn)
             self._moving.publish(self._message(transforms=[found]))
 
 
 LIFETIME = 1.0
-"""How long what a load does is drawn after the last marker, s."""
+"""Time for which a load's effects are drawn after the last marker, s."""
 
 
 class MachineStateNode(TwinNode):
-    """What others need to see the machine: rviz2, Foxglove, robot_state_publisher, plots."""
+    """The node ``machine_state``, for rviz2, Foxglove, robot_state_publisher and plots."""
 
     topics = STATE
 
@@ -155,7 +156,7 @@ class MachineStateNode(TwinNode):
         self._pose = self.create_guarded_publisher("~/pose")
         self._twist = self.create_guarded_publisher("~/twist")
         self._description = self.create_guarded_publisher("robot_description")
-        # Hardware only where it is asked for: a controller_manager beside would load and move it.
+        # Only on request: a controller_manager that reads the description loads this hardware.
         hardware = self.declare(
             "hardware_plugin", "", "hardware plugin in the ros2_control element of "
             "robot_description; "
@@ -165,7 +166,7 @@ class MachineStateNode(TwinNode):
         self._names = joint_names(robot, hardware)
         self._transforms = self._create_transforms()
         self._drawn = 0
-        """Stamp of the state that was drawn last."""
+        """Stamp of the state that was drawn last, ns."""
         self._create_markers()
         self.create_guarded_subscription(
             "joint_states",
@@ -182,26 +183,26 @@ class MachineStateNode(TwinNode):
         self.start()
 
     def details(self) -> str:
-        """Passive joints, members and transforms."""
+        """Describe passive joints, members and transforms."""
         members = "elastic" if self._elastic else "rigid"
         transforms = "" if self._transforms else "; no transforms"
         return f" and {len(self.core.robot.passive_joints)} passive, {members} members{transforms}"
 
     def time_jumped_backward(self) -> None:
-        """No state across the seam."""
+        """Forget all states after the clock jumped backward."""
         self.core.reset()
         self._transforms_pace.reset()
         self._drawn = 0
 
     def activated(self) -> None:
-        """What does not change is published once; nothing from before is."""
+        """Publish the URDF and the tool's transform once; forget earlier states."""
         self.time_jumped_backward()
         self._description.publish(String(data=self._urdf))
         if self._transforms is not None:
             self._transforms.send_tool(self.now())
 
     def values(self) -> dict[str, object]:
-        """Values of the node's diagnostic status."""
+        """Return the values of the node's diagnostic status."""
         core = self.core
         return {
             "older stamps dropped": core.dropped,
@@ -217,7 +218,7 @@ class MachineStateNode(TwinNode):
         return frame
 
     def _create_transforms(self) -> Transforms | None:
-        """Publishers of ``/tf`` and ``/tf_static``, where they are asked for and tf2 is there."""
+        """Create the publishers of ``/tf`` and ``/tf_static``; None without tf2_msgs."""
         wanted = self.declare(
             "publish_tf",
             "all",
@@ -272,7 +273,7 @@ class MachineStateNode(TwinNode):
             self._transforms.send_platform(state.stamp, state.position, quaternion)
 
     def _publish_markers(self) -> None:
-        """Of the latest state: shapes are for the eye, and elasticity takes its milliseconds."""
+        """Publish markers of the latest state; a timer limits their rate, as they take time."""
         state = self.core.latest
         if not self.active or state is None or state.stamp == self._drawn:
             return
@@ -284,7 +285,7 @@ class MachineStateNode(TwinNode):
         self._markers.publish(markers(own, shapes, Duration(seconds=LIFETIME).to_msg()))
 
     def _load(self, state: State) -> Load | None:
-        """What the wrench does to the machine, None where it is not known."""
+        """Compute the effects of the wrench on the machine; None if the wrench is unknown."""
         wrench = self.core.load(state) if self._elastic else None
         if wrench is None:
             return None
@@ -314,7 +315,7 @@ def _is_elastic(robot: Robot) -> bool:
 
 
 def _warm_up(robot: Robot, elastic: bool) -> None:
-    """Compile, or load, what samples and markers call, before there is a topic to be found by."""
+    """Compile, or load, all programs before the node's topics exist."""
     for kernel in (state_kernel(robot), moving_state_kernel(robot)):
         kernel.warm_up()
     home = robot.inverse(robot.home())
@@ -324,7 +325,7 @@ def _warm_up(robot: Robot, elastic: bool) -> None:
 
 
 NODE = MachineStateNode
-"""What a process of one or several nodes makes."""
+"""The class of this module's node, for processes of one or several nodes."""
 
 if __name__ == "__main__":
     sys.exit(run(NODE))

@@ -1,8 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""Shapes of a machine and of what a load does to it, to be drawn elsewhere. Pure.
-
-Shapes are in base axes, m. Results of elasticity come as numbers.
-"""
+"""Describe the shapes to draw for a machine and for the effects of a load, in base axes, m."""
 
 from __future__ import annotations
 
@@ -33,21 +30,21 @@ TEXT: Final[Colour] = (1.0, 1.0, 1.0, 1.0)
 COLD: Final = (0.0, 0.45, 0.70)
 WARM: Final = (0.94, 0.89, 0.26)
 HOT: Final = (0.84, 0.37, 0.0)
-"""Colours that are told apart with every kind of colour vision (Okabe and Ito 2008)."""
+"""Colours that can be distinguished with every kind of colour vision (Okabe and Ito 2008)."""
 LINE: Final = 0.004
 ARROW: Final = 0.012
 JOINT: Final = 0.02
 LETTER: Final = 0.06
-"""Widths and heights, per size of the machine."""
+"""Widths and heights as fractions of the machine's size."""
 
 
 @dataclass(frozen=True, eq=False)
 class Load:
-    """What a wrench does to the machine; base axes at the platform's reference point.
+    """The effects of a wrench on the machine, in base axes at the platform's reference point.
 
     ``wrench`` (6,), N and N m; ``compliance`` (6, 6); ``deflection`` (6,), m and rad. ``factors``:
-    part of the strain energy by element. ``members``: by name points (k, 3) along a member, m, and
-    their displacements (k, 3), m.
+    fraction of the strain energy of each element; ``dominant``: the element with the largest one.
+    ``members``: points (k, 3) along each member and their displacements (k, 3), m.
     """
 
     wrench: Array
@@ -60,9 +57,10 @@ class Load:
 
 @dataclass(frozen=True)
 class Scales:
-    """How what is small is drawn: ``deflection`` times as large, arrows in m per N and per N m.
+    """Scales of drawing: deflections times ``deflection``, arrows in m per N and m per N m.
 
-    ``ellipsoid_force``: the force whose deflections, in all directions, the ellipsoid shows, N.
+    ``ellipsoid_force``: size of the force, in all directions, whose deflections form the ellipsoid,
+    N.
     """
 
     deflection: float = setting(
@@ -79,12 +77,13 @@ class Scales:
 
 @dataclass(frozen=True, eq=False)
 class Shape:
-    """One thing to draw, as a visualization_msgs/Marker has it.
+    """A shape to draw, with the fields of a visualization_msgs/Marker.
 
-    ``group`` and ``number`` identify it. ``position`` (3,), ``quaternion`` x y z w. ``size``: of
-    a cylinder (along z) or sphere its diameters and length, of an arrow the diameters of shaft and
-    head and the head's length, of a line its width, of a text its height last. ``points``: of a
-    line or an arrow, (k, 3). ``lasting``: drawn until it is drawn again.
+    ``group`` and ``number`` identify the shape. ``position`` (3,), ``quaternion`` x y z w.
+    ``size``: for a cylinder (along z) or sphere the diameters and length, for an arrow the
+    diameters of shaft and head and the head's length, for a line its width, for a text its height
+    as the last entry. ``points``: points of a line or an arrow, (k, 3). ``lasting``: keep the shape
+    until it is drawn again.
     """
 
     kind: Kind
@@ -100,7 +99,7 @@ class Shape:
 
 
 def heat(share: float) -> Colour:
-    """Colour of a part from 0 to 1 of the greatest: blue, yellow, vermilion."""
+    """Return the colour of a fraction from 0 to 1: blue, yellow, vermilion."""
     part = min(1.0, max(0.0, share))
     low, high, at = (COLD, WARM, 2.0 * part) if part < 0.5 else (WARM, HOT, 2.0 * part - 1.0)
     r, g, b = (a + at * (z - a) for a, z in zip(low, high, strict=True))
@@ -108,7 +107,7 @@ def heat(share: float) -> Colour:
 
 
 class Scene:
-    """Shapes of one robot."""
+    """The shapes of one robot."""
 
     def __init__(self, robot: Robot, scales: Scales | None = None) -> None:
         self.robot, self.scales = robot, scales or Scales()
@@ -120,7 +119,7 @@ class Scene:
         }
 
     def shapes(self, state: State, load: Load | None = None) -> list[Shape]:
-        """The machine, and what the load does to it."""
+        """Return the shapes of the machine in a state, and of the load's effects."""
         places = self.placed(state.q)
         shares = _shares(load)
         shapes = self._bars(places, shares)
@@ -135,7 +134,7 @@ class Scene:
         return shapes
 
     def placed(self, q: Array) -> Array:
-        """Ends of all bars at joint positions (n,), shape (bars, 2, 3), m."""
+        """Compute the ends of all bars at joint positions (n,), shape (bars, 2, 3), m."""
         ends = [end for bar in self.bars for end in (bar.start, bar.end)]
         return self._points(q, ends).reshape(len(self.bars), 2, 3)
 
@@ -160,7 +159,7 @@ class Scene:
         return shapes
 
     def _joints(self, q: Array, shares: Mapping[str, float]) -> list[Shape]:
-        """Elastic joints as balls."""
+        """Draw the elastic joints as spheres."""
         names = [name for name in self.joints if name in shares]
         width = JOINT * self._size
         points = self._points(q, [self.joints[name] for name in names])
@@ -170,7 +169,7 @@ class Scene:
         ]
 
     def _deflected(self, places: Array, state: State, load: Load) -> list[Shape]:
-        """Members bent as the load bends them, and the platform moved, enlarged alike."""
+        """Draw deflected members and the displaced platform, both enlarged by the same factor."""
         scale, width = self.scales.deflection, (LINE * self._size, 0.0, 0.0)
         lines = [(name, x + scale * u) for name, (x, u) in load.members.items()]
         shift, turn = load.deflection[:3], load.deflection[3:]
@@ -184,7 +183,7 @@ class Scene:
         ]
 
     def _ellipsoid(self, state: State, load: Load) -> Shape:
-        """Deflections under a force of one size in all directions: semi-axes are those of C."""
+        """Draw the deflections under forces of one size: an ellipsoid with the axes of C."""
         values, axes = np.linalg.eigh(load.compliance[:3, :3])
         if np.linalg.det(axes) < 0.0:
             axes = -axes
@@ -194,7 +193,7 @@ class Scene:
         return Shape("sphere", "compliance", 0, ELLIPSOID, (x, y, z), state.position, turned)
 
     def _arrows(self, state: State, load: Load) -> list[Shape]:
-        """Force and moment, from the reference point."""
+        """Draw force and moment as arrows from the reference point."""
         shaft = ARROW * self._size
         size = (shaft, 2.0 * shaft, 3.0 * shaft)
         parts = (
@@ -217,14 +216,14 @@ class Scene:
 
 
 def _shares(load: Load | None) -> dict[str, float]:
-    """Each element's energy as part of the greatest one's; nothing without energy."""
+    """Return each element's energy relative to the largest one; nothing without energy."""
     factors = {} if load is None else load.factors
     greatest = max(factors.values(), default=0.0)
     return {name: value / greatest for name, value in factors.items()} if greatest > 0.0 else {}
 
 
 def _joint_places(robot: Robot) -> dict[str, Place]:
-    """Where each joint stands, by its name among the elements."""
+    """Return the position of each joint, by the joint's name among the elastic elements."""
     places: dict[str, Place] = {}
     for joint in robot.graph.joints.values():
         if joint.kind != "translation":
@@ -236,7 +235,7 @@ def _joint_places(robot: Robot) -> dict[str, Place]:
 
 
 def _along_z(span: Array) -> tuple[float, float, float, float]:
-    """A turn that takes z along a vector."""
+    """Return the quaternion of a rotation that turns the z axis along a vector."""
     length = float(np.linalg.norm(span))
     if not length > 0.0:
         return 0.0, 0.0, 0.0, 1.0

@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""The core of ``machine_state``: joint states in, the whole machine's state out. Pure."""
+"""Compute the state of the whole machine from joint states, for the node ``machine_state``."""
 
 from __future__ import annotations
 
@@ -45,17 +45,18 @@ STATE: Final = table(
 
 
 NONE: Final = np.zeros(0)
-"""The programs' parameters: a geometry is all that they take."""
+"""Parameters of the programs: none besides the geometry."""
 
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """The machine at one stamp, ns; base axes.
+    """The state of the machine at one stamp, ns, in base axes.
 
-    ``q``: shape (n,). ``joints``: all joints of the exported URDF, actuated ones first, rad or m.
-    ``position`` (3,), ``rotation`` (3, 3): of the platform's reference point. ``rates``: of all
-    joints, rad/s or m/s; ``twist``: velocity of the reference point and angular velocity, shape
-    (6,), m/s and rad/s; both None without joint velocities.
+    ``q``: actuated joints, shape (n,). ``joints``: positions of all joints of the exported URDF,
+    actuated ones first, rad or m. ``position`` (3,), ``rotation`` (3, 3): pose of the platform's
+    reference point. ``rates``: velocities of all joints, rad/s or m/s; ``twist``: velocity of the
+    reference point and angular velocity, shape (6,), m/s and rad/s; both None without joint
+    velocities.
     """
 
     stamp: int
@@ -68,18 +69,18 @@ class State:
 
 
 def state_kernel(robot: Robot) -> Kernel:
-    """Program of a state without velocities."""
+    """Return the program of a state without velocities."""
     return robot.engine.kernel("state", state_program)
 
 
 def moving_state_kernel(robot: Robot) -> Kernel:
-    """Program of a state with velocities."""
+    """Return the program of a state with velocities."""
     return robot.engine.kernel("moving state", moving_state_program)
 
 
 @dataclass
 class MachineState(TimeSynchronizer):
-    """Answers joint states with the machine's state, and keeps wrenches to pair with it."""
+    """Computes the machine's state from joint states, and keeps wrenches to assign to it."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -90,13 +91,13 @@ class MachineState(TimeSynchronizer):
         self._recent: TimeCache[tuple[WrenchSample, Mount]] = TimeCache()
 
     def reset(self) -> None:
-        """Forget the past, as when the clock jumps."""
+        """Forget states and wrenches, for instance after a jump of the clock."""
         self.latest = None
         self.pace.reset()
         self._recent.clear()
 
     def joint_state(self, message: Any, now: int) -> State | None:
-        """The machine's state at a sensor_msgs/JointState; None where ``pace`` leaves it out.
+        """Compute the machine's state from a sensor_msgs/JointState; None if ``pace`` skips it.
 
         :raises MessageError: the message is rejected, and counted.
         """
@@ -113,7 +114,7 @@ class MachineState(TimeSynchronizer):
         return state
 
     def wrench(self, message: Any, now: int) -> None:
-        """Keep a geometry_msgs/WrenchStamped.
+        """Store a geometry_msgs/WrenchStamped.
 
         :raises MessageError: the message is rejected, and counted.
         """
@@ -122,9 +123,9 @@ class MachineState(TimeSynchronizer):
             self._recent.push(sample.stamp, (sample, mount))
 
     def load(self, state: State) -> Array | None:
-        """The wrench nearest to a state, base axes at the reference point, shape (6,).
+        """Return the wrench nearest in time to a state, base axes at the reference point, (6,).
 
-        None where none is within ``max_state_age``.
+        None if no wrench is within ``max_state_age``.
         """
         found = self._recent.nearest(state.stamp)
         if found is None or abs(state.stamp - found[0]) > self.settings.max_state_age * SECOND:

@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""What a controller must notice in a stream of stamped torques. Pure: times are arguments."""
+"""Count delays, silences, losses and faults in a stream of stamped torques; times are arguments."""
 
 from __future__ import annotations
 
@@ -14,21 +14,22 @@ from pkm_twin.streams.monitor import TopicStatistics
 
 @dataclass
 class Arrivals:
-    """Ages, silences, losses and faults of a stream, in memory that does not grow.
+    """Counts of the ages, silences, losses and faults of a stream.
 
-    ``deadline``, s: a longer silence is an overrun of it, an older message a late one. All other
-    times are in ns: ``longest_silence``, ``oldest``, and the sum of the ages, ``ages``.
+    ``deadline``, s: longer silences and older messages are counted. All other times are in ns:
+    ``longest_silence``, ``oldest`` (the largest age), ``ages`` (the sum of all ages), and ``first``
+    and ``last`` arrival by the steady clock.
     """
 
     deadline: float
     count: int = 0
     longest_silence: int = 0
     silences: int = 0
-    """Silences beyond the deadline."""
+    """Number of silences longer than the deadline."""
     ages: int = 0
     oldest: int = 0
     late: int = 0
-    """Messages that were older than the deadline when they came."""
+    """Number of messages that were older than the deadline when they arrived."""
     faults: Counter[str] = field(default_factory=Counter)
     topic: TopicStatistics = field(default_factory=TopicStatistics)
     first: int = 0
@@ -46,11 +47,11 @@ class Arrivals:
         number: int | None = None,
         sent: int = 0,
     ) -> None:
-        """Take one message.
+        """Count one message.
 
-        :param stamp: its own stamp, ns; ``now``: the clock that stamps are by, ns.
-        :param steady: the steady clock at its arrival, ns.
-        :param number: the publisher's sequence number and ``sent``, its time, by the middleware.
+        :param stamp: the message's stamp, ns; ``now``: the clock of the stamps, ns.
+        :param steady: the steady clock at the arrival, ns.
+        :param number: sequence number, and ``sent``: time of sending, ns, by the middleware.
         """
         if self.count:
             self._silence(steady - self.last)
@@ -69,7 +70,7 @@ class Arrivals:
         self._last_stamp = max(self._last_stamp, stamp)
 
     def ended(self, steady: int) -> None:
-        """The watch is over: what is silent now may have been so for too long."""
+        """End the count; the silence until ``steady``, ns, counts, too."""
         if self.count:
             self._silence(steady - self.last)
             self.last = steady

@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""Whether a stream of joint states is clear of singularities and moves without jumps."""
+"""Check that a stream of joint states keeps clear of singularities and moves without jumps."""
 
 from __future__ import annotations
 
@@ -18,12 +18,13 @@ from pkm_twin.robot.robot import Robot
 from pkm_twin.streams.steps import farthest
 
 MAX_MOVE: Final = 0.25
-"""Largest move between two samples, in platform radii: beyond it, another assembly is likely."""
+"""Largest unpredicted move of the pose between two samples, relative to the robot's size: a larger
+one means that the assembly probably changed."""
 
 
 @dataclass(slots=True)
 class _State:
-    """A sample, and its row of :func:`stream_kernel`."""
+    """A sample's stamp and its result of :func:`stream_kernel`."""
 
     stamp: int
     numbers: Array
@@ -32,12 +33,14 @@ class _State:
 class Continuity:
     """Checks samples one after the other.
 
-    The edge of reach is a singularity too, so one measure (see :meth:`Robot.singularity`) warns
-    of both. Joint positions alone do not determine the assembly mode: modes meet in singularities,
-    where the stream is stopped, and what skips over one shows as a jump of a joint or of the pose.
+    The edge of the workspace is a singularity, too, so one index (see :meth:`Robot.singularity`)
+    covers both. Joint positions alone do not determine the assembly mode. Modes meet at
+    singularities, where the stream is stopped; a stream that skips over a singularity shows a jump
+    of a joint or of the pose.
 
-    :param warn: measure below which a sample is near a singularity; ``stop``: too near.
-    :param velocity: bounds of the joints' rates, one per joint, rad/s or m/s.
+    :param warn: singularity index below which a sample is near a singularity.
+    :param stop: singularity index below which a sample is rejected.
+    :param velocity: largest joint velocities, one per joint, rad/s or m/s.
     """
 
     def __init__(self, robot: Robot, warn: float, stop: float, velocity: Sequence[float]) -> None:
@@ -58,15 +61,16 @@ class Continuity:
         self._before: _State | None = None
 
     def retract(self) -> None:
-        """Take the newest sample back, as if it had not been there; once after a step."""
+        """Undo the newest step; possible once after a step."""
         self._last = self._before
 
     def step(self, stamp: int, q: Array) -> bool:
-        """Take a sample, shape (n,): whether it is within the warning band of a singularity.
+        """Check a sample, shape (n,); return whether it is near a singularity.
 
-        :raises MessageError: it is too close to a singularity ("singular"), or it jumped ("jump").
-            The next sample is then compared with the one before.
-        :raises UnreachableError: the robot has no assembly there.
+        :param stamp: ns.
+        :raises MessageError: the sample is too close to a singularity ("singular"), or a joint or
+            the pose jumped ("jump"). The next sample is then compared with the one before.
+        :raises UnreachableError: the robot cannot be assembled at these joint positions.
         """
         last = self._last
         before = self._nothing if last is None else last.numbers
@@ -85,7 +89,7 @@ class Continuity:
         return bool(measure < self.warn)
 
     def _check_jump(self, last: _State, state: _State, beyond: list[float]) -> None:
-        """No joint moves farther than its velocity limit allows, no pose than its rates tell."""
+        """Reject joints that moved farther than their velocity limits allow, and pose jumps."""
         period = (state.stamp - last.stamp) / SECOND
         joints = zip(state.numbers.tolist(), last.numbers.tolist(), self._velocity, strict=False)
         for joint, (now, before, velocity) in enumerate(joints):

@@ -1,11 +1,11 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""Acceleration of a joint-state stream: Savitzky and Golay's fit, causal, for uneven stamps.
+"""Estimate the acceleration of a joint-state stream by a causal Savitzky-Golay fit.
 
 A polynomial of degree ``order`` is fitted to the last ``window`` velocities (or one of degree
-``order + 1`` to the positions where the stream carries no velocity) by their own stamps, and
-its derivative is taken at the newest sample. A motion whose velocity is a polynomial of that
-degree comes out exactly, so the delay is zero for ``order`` 2 and above; ``order`` 1 gives the mean
-slope of the window, which is the acceleration half a window ago.
+``order + 1`` to the positions if the stream carries no velocities) at their stamps, which may be
+uneven, and differentiated at the newest sample. The result is exact for a motion whose velocity is
+such a polynomial, so the delay is zero for ``order`` 2 and above; ``order`` 1 gives the mean slope
+of the window, which is the acceleration half a window ago.
 
 A. Savitzky, M. J. E. Golay, Smoothing and differentiation of data by simplified least squares
 procedures, Analytical Chemistry 36 (1964), doi:10.1021/ac60214a047.
@@ -31,23 +31,24 @@ from pkm_twin.errors import MessageError
 from pkm_twin.messages.stamps import SECOND
 
 LEAST_PIVOT: Final = 1e-4
-"""Least diagonal entry of the normal equations' Cholesky factor; even stamps stay above 1e-2."""
+"""Smallest diagonal entry of the Cholesky factor; even stamps give 1e-2 or more."""
 BLOCK: Final = 32
-"""Samples that one call of a program sums up: those of the default window, and some."""
+"""Samples that one call of the program sums up; the default window, 25, fits in one block."""
 LEAST: Final = 5
-"""Samples that a window has in any case."""
+"""Fewest samples of a window."""
 JITTER: Final = 1.1
-"""Length of a window over what it should be that is no slow stream."""
+"""A filling window may exceed its time by this factor before the stream counts as slow."""
 _NONE: Final = np.zeros(0)
 
 
 @dataclass
 class Differentiator:
-    """``order``: degree of the velocity's polynomial; ``window``: samples fitted, at most.
+    """Differentiates a stream of joint states, sample by sample.
 
-    ``time``: length of the window, s, at most; a slow stream has fewer samples in it, but at least
-    :data:`LEAST`. ``middle``: read the polynomial off at the window's middle sample instead of its
-    newest. That is less noisy and half a window late: for recordings, not for control.
+    ``order``: degree of the velocity's polynomial. ``window``: most samples that are fitted.
+    ``time``: longest window, s; a slow stream has fewer samples in it, but at least
+    :data:`MIN_SAMPLES`. ``middle``: evaluate the polynomial at the window's middle sample instead
+    of the newest, which is less noisy and half a window late: for recordings, not for control.
     """
 
     order: int = 2
@@ -57,12 +58,12 @@ class Differentiator:
     _carries_velocity: bool | None = None
 
     def __post_init__(self) -> None:
-        # One place more than whole blocks have, so that the newest sample can be taken back; every
-        # sample stands twice, so that each window is one piece, oldest first.
+        # A ring of whole blocks plus one sample, so that the newest can be removed. Every sample is
+        # stored twice, so that each window is contiguous, oldest first.
         self._most = self.window
         self._held = -(-self.window // BLOCK) * BLOCK
         self._places = self._held + 1
-        # Since the first sample, ns: whole numbers, exact for a hundred days.
+        # Time since the first sample, ns: integers as doubles are exact for a hundred days.
         self._stamps = np.zeros(2 * self._places)
         self._begin = 0
         self._values = np.zeros(0)
@@ -72,13 +73,13 @@ class Differentiator:
 
     @property
     def delay(self) -> float:
-        """Delay of the acceleration in samples."""
+        """Delay of the acceleration, samples."""
         if self.order == 1:
             return (self.window - 1) / 2
         return float(self.window - 1 - self.window // 2) if self.middle else 0.0
 
     def prepare(self, joints: int) -> None:
-        """Compile, or load, what samples of so many joints call, with rates and without."""
+        """Compile, or load, the programs for this number of joints, with velocities and without."""
         for degree in (self.order, self.order + 1):
             _Fit(degree, self.window, joints)
 
@@ -88,12 +89,12 @@ class Differentiator:
         self._fit_samples(self._most)
 
     def retract(self) -> None:
-        """Take the newest sample back, as if it had not been pushed; once after a push."""
+        """Remove the newest sample; possible once after a push."""
         self._count = max(0, self._count - 1)
 
     @property
     def degree(self) -> int:
-        """Of the polynomial that is fitted."""
+        """Degree of the polynomial that is fitted."""
         return self.order + (not self._carries_velocity)
 
     @property
@@ -104,42 +105,42 @@ class Differentiator:
         return self._span / (self.window - 1) / SECOND
 
     def sine_error(self, frequency: float) -> float:
-        """Greatest error of the acceleration of a sine, part of its peak, at the stream's period.
+        """Return the largest error of the acceleration of a sine, as a fraction of its peak.
 
-        :param frequency: Hz.
+        :param frequency: of the sine, Hz.
         """
         turns = 2.0 * np.pi * frequency * self.period
         derivative, back, weights = self._weights()
         return float(abs(weights @ np.exp(1j * turns * back) / (1j * turns) ** derivative - 1.0))
 
     def noise_gain(self) -> float:
-        """Noise of the acceleration over that of the samples at the stream's period.
+        """Return the ratio of the acceleration's noise to that of the samples.
 
-        1/s^2 of positions, 1/s of velocities.
+        In 1/s^2 for positions, in 1/s for velocities, at the stream's period.
         """
         derivative, _, weights = self._weights()
         return float(np.linalg.norm(weights)) / self.period**derivative
 
     def _weights(self) -> tuple[int, Array, Array]:
-        """Which derivative the acceleration is; places of the window's samples; their weights."""
+        """Return the order of derivative, the samples' times in periods, and their weights."""
         back: Array = np.arange(1.0 - self.window, 1.0)
         powers = np.vander(back, self.degree + 1, increasing=True)
         derivative = 1 if self._carries_velocity else 2
         return derivative, back, np.asarray(derivative * np.linalg.pinv(powers)[derivative])
 
     def _apart(self, stamp: int) -> bool:
-        """Whether a live stream was silent for longer than its window: no polynomial spans that."""
+        """Return whether the stream was silent for too long to fit a polynomial across."""
         if self._count < LEAST:
             return False
         newest = self._stamps.item((self._count - 1) % self._places)
         return stamp - self._begin - newest > max(self._span, self.time * SECOND)
 
     def _keep_time(self, end: int) -> None:
-        """Fit fewer samples where the window, while it fills or later, is too long in time."""
+        """Fit fewer samples if the window spans too long a time."""
         held = min(self._count, self.window)
         self._span = self._stamps.item(end - 1) - self._stamps.item(end - held)
         least, time = max(LEAST, self.degree + 2), self.time * SECOND
-        # Later it may be too long for once, of lost samples.
+        # A full window may be too long for a moment because samples were lost.
         filling = self._count <= self.window == self._most
         if held > least and self._span > (JITTER if filling else 2.0) * time:
             self._fit_samples(max(1 + round(time * (held - 1) / self._span), least))
@@ -152,12 +153,14 @@ class Differentiator:
             self._fit = _Fit(self.degree, window, self._fit.joints)
 
     def push(self, stamp: int, q: Array, qd: Array | None) -> tuple[Array, Array] | None:
-        """Add a sample with a later stamp (ns); rates and accelerations once the window is full.
+        """Add a sample; return velocities and accelerations once the window is full.
 
-        :param q: joint positions, ``qd`` their rates or None, shape (n,).
-        :returns: qd and qdd at this stamp (the middle one's, if so set), shape (n,) each, or
-            None while samples are missing.
-        :raises MessageError: stamps so uneven that they do not determine a polynomial.
+        :param stamp: ns, later than that of the last sample.
+        :param q: joint positions, shape (n,).
+        :param qd: joint velocities, shape (n,), or None.
+        :returns: velocities and accelerations at this stamp (with ``middle`` at that of the middle
+            sample), shape (n,) each; None while the window fills.
+        :raises MessageError: the stamps are too uneven to determine a polynomial.
         """
         carries = qd is not None
         values = q if qd is None else qd
@@ -176,7 +179,7 @@ class Differentiator:
         self._stamps[slot] = self._stamps[twin] = stamp - self._begin
         self._values[slot * n : slot * n + n] = self._values[twin * n : twin * n + n] = values
         self._count += 1
-        # The blocks end at the newest sample's second place, or at its first.
+        # The window ends at the newest sample's first copy if all blocks fit before it.
         end = (slot if slot + 1 >= self._held else twin) + 1
         self._keep_time(end)
         if self._count < self.window:
@@ -189,10 +192,10 @@ class Differentiator:
 
 
 class _Fit:
-    """A least-squares polynomial of one degree through the samples of one window.
+    """The least-squares polynomial of one degree for the samples of one window.
 
-    With t from -1 at the oldest sample to 1 at the newest, so that the normal equations
-    V V' c = V y of a degree up to 5 stay far from rounding.
+    Time is scaled to t from -1 (oldest sample) to 1 (newest), so that the normal equations
+    V V' c = V y are well conditioned up to degree 5.
     """
 
     def __init__(self, degree: int, window: int, joints: int) -> None:
@@ -205,14 +208,14 @@ class _Fit:
         if self._blocks > 1:
             self._sums.warm_up()
         self._all = np.ones(BLOCK)
-        # Of the oldest block, those of the window alone.
+        # The oldest block contains samples from before the window, which have weight 0.
         self._oldest = np.zeros(BLOCK)
         self._oldest[self._blocks * BLOCK - window :] = 1.0
 
     def derivatives(self, stamps: Array, values: Array, end: int, at: int) -> tuple[Array, Array]:
-        """First and second derivative by time at the sample ``at``, shape (n,) each.
+        """Return first and second time derivative at sample ``at``, shape (n,) each.
 
-        :param stamps: ns, and ``values``, n each: the window is what stands before ``end``.
+        :param stamps: ns, and ``values``, n per sample; the window ends before index ``end``.
         :raises MessageError: the stamps are too uneven.
         """
         n = self.joints
@@ -237,11 +240,11 @@ class _Fit:
 
 @cache
 def _kernel(degree: int, joints: int, *, solved: bool) -> Kernel:
-    """Sums over a block of samples, added to those before: of powers of t, and of them and values.
+    """Return the program that adds a block of samples to the sums of the normal equations.
 
-    In: the sums before; stamps, values and weights (0 or 1) of the block; the middle of the window
-    and half of it, and where to look, ns. Out: the sums; or, ``solved``, the first and the second
-    derivative by s there, and the pivots of V V'.
+    Inputs: the sums before, of t^k and of t^k y; stamps, values and weights (0 or 1) of the block;
+    middle and half length of the window, and the stamp to evaluate at, ns. Output: the new sums;
+    with ``solved`` first and second derivative by seconds at that stamp, and the pivots of V V'.
     """
     key = EMPTY.also(f"polynomial fit {degree} {joints} {solved}", _program)
     return Kernel(Code(lambda: _program(degree, joints, solved), key))
@@ -274,9 +277,10 @@ def _program(degree: int, joints: int, solved: bool) -> Program:
 
 
 def _solution(powers: list[Any], mixed: Objects, t: Any, rate: Any) -> list[Any]:
-    """First and second derivative at t, n each, ``rate`` the change of t in a second; the pivots.
+    """Solve the normal equations; return first and second derivative at t, and the pivots.
 
-    :param powers: sums of t^k; ``mixed``: of t^k y, shape (degree + 1, n).
+    :param powers: sums of t^k; ``mixed``: sums of t^k y, shape (degree + 1, n).
+    :param rate: change of t per second.
     """
     size, joints = mixed.shape
     factor = np.zeros((size, size), dtype=object)
@@ -293,7 +297,7 @@ def _solution(powers: list[Any], mixed: Objects, t: Any, rate: Any) -> list[Any]
         ([k * (k - 1) for k in range(size)], rate * rate),
     ):
         first = 1 if scale is rate else 2
-        # V V' w = d, by both triangles; then w' V y.
+        # Solve V V' w = d with the Cholesky factor; the derivative is w' V y.
         w = np.zeros(size, dtype=object)
         for k in range(size):
             d = float(slopes[k]) * here[k - first] if slopes[k] else 0.0

@@ -1,10 +1,9 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""Drives that are off or braked: efforts that are zero, or do not change, while nothing moves.
+"""Detect drives that are off or braked: efforts that are zero or constant while nothing moves.
 
-The effort of a drive that is off, or behind a closed brake, does not bear the machine. The effort
-of a drive that holds it agrees with the model, or at least changes with the noise of its current.
-
-Pure.
+The effort of a drive that is off, or behind a closed brake, does not carry the machine. The effort
+of a drive that holds the machine agrees with the model, or at least changes with the noise of its
+current.
 """
 
 from __future__ import annotations
@@ -18,24 +17,25 @@ import numpy as np
 from pkm_twin.codegen.arrays import Array, Mask
 
 FROZEN: Final = 0.1
-"""Time without any change of the efforts after which they are no measurement, s."""
+"""Efforts that do not change for this time, s, and for CONSTANT_SAMPLES are not measured."""
 COUNT: Final = 10
-"""Samples of it at least."""
+"""Fewest samples without a change."""
 SAME: Final = 1e-9
-"""Change of an effort that is none, as a share of the greatest effort."""
+"""Largest change that counts as none, as a fraction of the largest effort."""
 AGREES: Final = 0.05
-"""Share of the expected efforts by which efforts that do not change may be off."""
+"""Largest error of constant efforts that agree with the model, relative to the expected efforts."""
 RELEASE: Final = 0.5
-"""How long a brake may take to open or close, s."""
+"""Longest time for which a brake opens or closes, s."""
 STANDING: Final = 0.02
-"""Time over which it is averaged whether a joint moves, s: noise moves one now and then."""
+"""Time constant of the average of "a joint moves", s: noise appears as a motion now and then."""
 
 
 class DriveWatch:
-    """Whether the efforts of a stream say nothing of what the drives bear.
+    """Decides for each sample of a stream whether its efforts carry the machine.
 
-    ``idle``: of the last sample. ``changes``: how often that began. ``repeated``: samples since the
-    efforts changed: what the first of them have said is to be forgotten where ``idle`` begins.
+    ``idle``: whether those of the last sample do not. ``changes``: how often ``idle`` began.
+    ``repeated``: number of samples since the efforts last changed; when ``idle`` begins, estimates
+    from these samples are invalid.
     """
 
     def __init__(self) -> None:
@@ -51,13 +51,14 @@ class DriveWatch:
         self._released = -math.inf
 
     def push(self, time: float, still: Mask, effort: Array, expected: Array) -> bool:
-        """Take a sample; whether its efforts are to be left out.
+        """Take a sample; return whether to leave its efforts out.
 
-        :param time: s, later than the last one's.
+        :param time: s, later than that of the last sample.
         :param still: which joints stand still, shape (n,).
-        :param effort: measured, and ``expected`` by the model at rest, shape (n,), N m or N.
+        :param effort: measured efforts, and ``expected``: efforts of the model at rest, shape (n,),
+            N m or N.
         """
-        # In plain numbers: of arrays so small the calls would take most of the time.
+        # Python floats: for arrays this small numpy's calls would take most of the time.
         efforts: list[float] = effort.tolist()
         greatest = max(map(abs, efforts))
         moves = 0.0 if still.all() else 1.0
@@ -87,16 +88,17 @@ class DriveWatch:
             if off:
                 self._released = time
             return True
-        # Where a brake opens, or has just closed, it bears a part of what the drive does.
+        # While a brake opens or has just closed, it carries a part of the drive's effort.
         return off and time - self._released < RELEASE
 
 
 def idle_samples(time: Array, still: Mask, effort: Array, expected: Array) -> Mask:
-    """The samples of a recording whose efforts are to be left out, shape (k,).
+    """Find the samples of a recording whose efforts do not carry the machine.
 
-    As :class:`DriveWatch` finds them forwards and backwards in time.
+    :class:`DriveWatch` runs over the recording forwards and backwards in time.
 
-    :param time: rising, shape (k,), s; the others (k, n) as of :meth:`DriveWatch.push`.
+    :param time: rising, shape (k,), s; the other arguments as for :meth:`DriveWatch.push`, (k, n).
+    :returns: shape (k,).
     """
     found = np.zeros(len(time), np.bool_)
     for order, sign in ((slice(None), 1.0), (slice(None, None, -1), -1.0)):

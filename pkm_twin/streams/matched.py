@@ -1,13 +1,11 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""Wrenches and efforts seen through the window that gives a stream its acceleration.
+"""Average wrenches and efforts over the window that gives a stream its acceleration.
 
 A differentiated acceleration is a weighted mean of the accelerations in its window: fast parts of
-the motion are damped and late in it. A cutter's force makes such parts, and so does the effort that
-bears it; next to a damped acceleration neither fits. Through the same weights both do: the
-equations of motion are linear in acceleration, wrench and effort, and the pose hardly changes in a
-window.
-
-Pure.
+the motion, such as those from a cutter's force, appear damped and delayed. The force itself, and
+the effort that carries it, do not match such an acceleration. Averaged with the same weights they
+do: the equations of motion are linear in acceleration, wrench and effort, and the pose hardly
+changes within a window.
 """
 
 from __future__ import annotations
@@ -30,13 +28,16 @@ MissingWrench = Literal["ignore", "stop"]
 
 
 def window_weights(stamps: Array, order: int, carries_velocity: bool) -> Array:
-    """Weights of the accelerations between the samples in a fit's, at its newest sample.
+    """Return the weights that the accelerations between samples have in the fitted acceleration.
 
-    The fit's derivative is sum c_k v_k (or sum c_k q_k of positions, second derivative). With the
-    acceleration a_j constant between samples j and j + 1 that is sum h_j a_j,
-    h_j = dt_j sum_{k > j} c_k (of positions each c_k times t_k - (t_j + t_{j+1}) / 2).
+    The derivative of the fit at its newest sample is sum c_k v_k (for positions sum c_k q_k, the
+    second derivative). With a constant acceleration a_j between samples j and j + 1 this equals
+    sum h_j a_j with h_j = dt_j sum_{k > j} c_k (for positions each c_k is multiplied by
+    t_k - (t_j + t_{j+1}) / 2).
 
-    :param stamps: shape (w,), ns, rising; ``order``: degree of the velocity's polynomial.
+    :param stamps: shape (w,), ns, rising.
+    :param order: degree of the velocity's polynomial.
+    :param carries_velocity: whether velocities are fitted, otherwise positions.
     :returns: shape (w - 1,), sum 1.
     """
     t = (stamps - stamps[-1]) / SECOND
@@ -59,7 +60,7 @@ def window_weights(stamps: Array, order: int, carries_velocity: bool) -> Array:
 
 @dataclass(slots=True)
 class _Row:
-    """One joint state of the window; ``since``: stamp of the wrench that it has, ns."""
+    """One joint state of the window; ``since``: stamp of its wrench, ns, -1 without one."""
 
     stamp: int
     rotation: Array
@@ -70,11 +71,11 @@ class _Row:
 
 @dataclass
 class WrenchWindow(Core):
-    """Wrenches for a stream of joint states.
+    """Assigns wrenches to a stream of joint states, and averages them like its acceleration.
 
-    ``max_age``: between a joint state and its wrench, ns. ``missing_wrench_policy``: without
-    one the joint state counts as one without load (``ignore``), or is rejected (``stop``).
-    ``order``, ``window``: the differentiator's.
+    ``max_age``: largest time between a joint state and its wrench, ns. ``missing_wrench_policy``: a
+    joint state without wrench counts as unloaded (``ignore``) or is rejected (``stop``).
+    ``order``, ``window``: those of the differentiator.
     """
 
     reader: WrenchReader
@@ -83,24 +84,24 @@ class WrenchWindow(Core):
     order: int = 2
     window: int = 25
     without: int = 0
-    """Joint states without a fresh wrench, counted."""
+    """Number of joint states without a recent wrench."""
     stream: StreamMonitor = field(default_factory=counting)
 
     def __post_init__(self) -> None:
         self._recent: TimeCache[tuple[WrenchSample, Mount]] = TimeCache()
-        # One more, so that the newest can be taken back.
+        # One more than the window, so that the newest sample can be removed.
         self._rows: deque[_Row] = deque(maxlen=self.window + 1)
         self._carries: bool | None = None
         self._weights: tuple[bytes, Array] = (b"", np.zeros(0))
 
     def change_fit(self, order: int, window: int) -> None:
-        """Another differentiator: the window begins again."""
+        """Use another order and window; the window fills again from its start."""
         self.order, self.window = order, window
         self._weights = (b"", np.zeros(0))
         self._rows = deque(maxlen=window + 1)
 
     def change_stamps(self, accept_zero_stamp: bool, future_tolerance: float) -> None:
-        """Other rules for stamps from the next wrench on."""
+        """Use other rules for stamps from the next wrench on."""
         settings = dataclasses.replace(
             self.reader.settings,
             accept_zero_stamp=accept_zero_stamp,
@@ -109,33 +110,33 @@ class WrenchWindow(Core):
         self.reader = WrenchReader(settings, self.reader.mounts)
 
     def clear(self) -> None:
-        """Forget joint states and wrenches, as when the clock jumps."""
+        """Forget joint states and wrenches, for instance after a jump of the clock."""
         self._recent.clear()
         self._rows.clear()
 
     def restart(self) -> None:
-        """Forget the joint states: the differentiator begins again."""
+        """Forget the joint states, as the differentiator was reset."""
         self._rows.clear()
 
     def take(self, message: object, now: int) -> None:
-        """Take a geometry_msgs/WrenchStamped; joint states that it is nearer to get it too.
+        """Take a geometry_msgs/WrenchStamped; assign it also to joint states measured after it.
 
-        :raises MessageError: it is rejected, and counted.
+        :raises MessageError: the message is rejected, and counted.
         """
         with self.taking(self.stream):
             sample, mount = self.reader.read(message, now)
             self._recent.push(sample.stamp, (sample, mount))
         for row in reversed(self._rows):
-            # It came after the joint state that it was measured with.
+            # The wrench belongs to joint states at least as new whose own wrench is older.
             if row.stamp < sample.stamp or row.since >= sample.stamp:
                 break
             row.wrench = self.reader.at_reference(sample, mount, row.rotation)
             row.since = sample.stamp
 
     def require(self, stamp: int) -> tuple[WrenchSample, Mount] | None:
-        """The wrench at a joint state, or None where there is none and none is needed.
+        """Return the wrench for a joint state's stamp, ns; None if it may be missing.
 
-        :raises MessageError: there is none, and the policy is to stop.
+        :raises MessageError: there is no recent wrench, and the policy is to stop.
         """
         found = self._recent.held(stamp)
         age = None if found is None else abs(stamp - found[0])
@@ -157,7 +158,8 @@ class WrenchWindow(Core):
     ) -> None:
         """Add a joint state that the differentiator has taken.
 
-        :param given: what :meth:`require` said; ``rotation``: the platform's, shape (3, 3).
+        :param rotation: rotation of the platform, shape (3, 3).
+        :param given: the result of :meth:`require`.
         """
         carries = sample.qd is not None
         if carries is not self._carries:
@@ -170,14 +172,15 @@ class WrenchWindow(Core):
         self._rows.append(_Row(sample.stamp, rotation, sample.effort, wrench, since))
 
     def retract(self) -> None:
-        """Take the newest joint state back."""
+        """Remove the newest joint state."""
         if self._rows:
             self._rows.pop()
 
     def through(self) -> tuple[Array, Array | None]:
-        """Wrench (6,) and effort (n,) through the window; no effort where one has none.
+        """Return wrench (6,) and effort (n,) averaged with the weights of the acceleration.
 
-        Base axes at the platform's reference point; the window has to be full.
+        The wrench is in base axes at the platform's reference point. The effort is None if a sample
+        has none. The window must be full.
         """
         rows = list(self._rows)[-self.window :]
         weights = self._window_weights(np.array([row.stamp for row in rows]))
@@ -190,7 +193,7 @@ class WrenchWindow(Core):
         return wrench, weights @ (0.5 * (measured[1:] + measured[:-1]))
 
     def _window_weights(self, stamps: Array) -> Array:
-        """Remembered while the stamps are equally far apart."""
+        """Return the window's weights; compute them only if the intervals of the stamps changed."""
         key = np.diff(stamps).tobytes()
         if key != self._weights[0]:
             carries = bool(self._carries)

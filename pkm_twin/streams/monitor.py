@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""Counts what is rejected, lost or late and latches the stop of a stream. Pure: no clock here."""
+"""Count rejected, lost and late messages, and stop a stream after too many of them."""
 
 from __future__ import annotations
 
@@ -15,17 +15,18 @@ from pkm_twin.messages.stamps import SECOND
 V = TypeVar("V")
 
 MANY: Final = 5
-"""Rejects since a stop from which the status has their reason."""
+"""Number of rejects after a stop from which the status shows their reason."""
 SMOOTHING: Final = 0.1
-"""Weight of the newest period in the mean."""
+"""Weight of the newest period in the exponential mean."""
 
 
 @dataclass
 class StreamMonitor:
-    """Whether a stream may be answered.
+    """Decides whether a stream may be answered.
 
-    ``trip_count`` rejects in a row stop it; a stop holds until ``recovery_count`` good samples in
-    a row. Both stop reasons and rejects are counted by reason.
+    ``trip_count`` rejects in a row stop the stream; it resumes after ``recovery_count`` good
+    samples in a row. ``rejected`` and ``stops`` are counted by reason. ``reason`` and ``text``
+    describe the present stop, otherwise the last reject.
     """
 
     trip_count: int
@@ -36,14 +37,13 @@ class StreamMonitor:
     stopped: bool = False
     reason: str = ""
     text: str = ""
-    """Of the stop that holds; without one, of the last reject."""
     _since: tuple[int, str, str] = (0, "", "")
-    """Rejects since the stop: how many, and reason and text of the last."""
+    """Number of rejects since the stop, and reason and text of the last of them."""
     _bad: int = 0
     _good: int = 0
 
     def reject(self, reason: str, text: str) -> bool:
-        """Count a rejected sample; True where it stops the stream now."""
+        """Count a rejected sample; return whether it stops the stream now."""
         self.rejected[reason] += 1
         if self.stopped:
             self._since = self._since[0] + 1, reason, text
@@ -54,7 +54,7 @@ class StreamMonitor:
         return self._bad >= self.trip_count and self.stop(reason, text)
 
     def stop(self, reason: str, text: str) -> bool:
-        """Stop the stream; True where it ran until now. What stopped it stays its reason."""
+        """Stop the stream; return whether it was running. The first reason of a stop stays."""
         self._good = 0
         if self.stopped:
             return False
@@ -66,7 +66,7 @@ class StreamMonitor:
 
     @property
     def status(self) -> str:
-        """Why the stream is stopped, and why messages are rejected since then, where many are."""
+        """Reason of the stop, and of rejects since then if there are many."""
         status, (count, reason, text) = label_reason(self.reason, self.text), self._since
         if count >= MANY:
             status += f"; rejected since then: {count}"
@@ -74,7 +74,7 @@ class StreamMonitor:
         return status
 
     def accept(self) -> bool:
-        """Count a good sample; True where it may be answered."""
+        """Count a good sample; return whether it may be answered."""
         self._bad = 0
         if self.stopped:
             self._good += 1
@@ -85,19 +85,19 @@ class StreamMonitor:
         return True
 
     def counts(self, what: str, taken: str = "accepted") -> dict[str, object]:
-        """Values of a node's diagnostics: how many were taken, and rejected by reason."""
+        """Return values of a node's diagnostics: accepted messages, and rejected ones by reason."""
         rejected = {f"{what} rejected: {k}": v for k, v in self.rejected.items()}
         return {f"{what} {taken}": self.accepted, **rejected}
 
     def resume(self) -> bool:
-        """End a stop by hand, however few good samples came; True where there was one."""
+        """Resume a stopped stream at once; return whether it was stopped."""
         stopped, self.stopped = self.stopped, False
         self._bad = self._good = 0
         return stopped
 
 
 def finished(steps: Generator[None, None, V]) -> V:
-    """What a generator returns, its steps taken at once."""
+    """Run a generator to its end and return its result."""
     while True:
         try:
             next(steps)
@@ -106,26 +106,26 @@ def finished(steps: Generator[None, None, V]) -> V:
 
 
 def counting() -> StreamMonitor:
-    """Counts messages that each stand for themselves: nothing stops them."""
+    """Return a monitor of independent messages, which only counts and never stops."""
     return StreamMonitor(trip_count=2**62, recovery_count=1)
 
 
 class Core:
-    """What takes messages for a robot, and counts those that it rejects.
+    """The base class of computations that take messages and count rejected ones.
 
-    ``last_reject``: why the last one was rejected, of any stream; empty before the first.
+    ``last_reject``: why the last message of any stream was rejected; empty before the first.
     """
 
     last_reject = ""
 
     def refuse(self, counts: StreamMonitor, error: MessageError) -> None:
-        """Count a message that is rejected."""
+        """Count a rejected message."""
         counts.reject(error.reason, str(error))
         self.last_reject = str(error)
 
     @contextmanager
     def refusing(self, counts: StreamMonitor) -> Iterator[None]:
-        """Count the message that is rejected in here."""
+        """Count a message that is rejected in this block."""
         try:
             yield
         except MessageError as error:
@@ -134,7 +134,7 @@ class Core:
 
     @contextmanager
     def taking(self, counts: StreamMonitor) -> Iterator[None]:
-        """Count the message that is read in here, as taken or as rejected."""
+        """Count the message that is read in this block, as accepted or as rejected."""
         with self.refusing(counts):
             yield
         counts.accept()
@@ -142,10 +142,10 @@ class Core:
 
 @dataclass
 class TopicStatistics:
-    """Whether a topic's messages come whole, and whether they are answered at their pace.
+    """Counts of a topic's lost messages and of answers that took too long.
 
-    ``missed``: messages between two that came, by the middleware's own numbers. ``overruns``:
-    answers that took longer than the mean time between messages.
+    ``missed``: lost messages by the middleware's sequence numbers. ``overruns``: answers that took
+    longer than the mean time between messages. ``longest``: time of the longest answer, s.
     """
 
     messages: int = 0
@@ -159,15 +159,15 @@ class TopicStatistics:
     _missing: int = 0
 
     def received(self, number: int | None, sent: int) -> bool:
-        """Take the number that the publisher gave (None: it gives none) and its time, ns.
+        """Take a message's sequence number (None without one) and its time of sending, ns.
 
-        :returns: True where messages are missing before this one. They are counted by
-            :meth:`count_missed`: two publishers on one topic look the same.
+        :returns: whether messages are missing before this one. The caller counts them with
+            :meth:`count_missed`, as two publishers on one topic look the same.
         """
         period = (sent - self._sent) / 1e9
         if self._sent and period > 0.0:
             self._periods += 1
-            # A silence is no period, but a slower stream has to be learned.
+            # The bound keeps a silence out of the mean, but lets it follow a slower stream.
             longest = 2.0 * self._period if self._periods > 1 else period
             weight = max(SMOOTHING, 1.0 / self._periods)
             self._period += (min(period, longest) - self._period) * weight
@@ -178,29 +178,29 @@ class TopicStatistics:
         return self._missing > 0
 
     def count_missed(self) -> None:
-        """Count what is missing before the newest message."""
+        """Count the messages that are missing before the newest one."""
         self.missed += self._missing
 
     def handled(self, took: float) -> None:
-        """The newest message took so long to handle, s."""
+        """Record the time that the newest message took, s."""
         self.longest = max(self.longest, took)
         self.overruns += 0.0 < self._period < took
 
 
 CAUGHT_UP: Final = 0.5
-"""Fraction of the longest wait below which a node has caught up: a busy computer lets every message
-wait for some milliseconds, and a bound near these would drop all."""
+"""A node has caught up below this fraction of the longest wait: on a busy computer every message
+waits for some milliseconds, and a smaller bound would drop all."""
 RELIEF: Final = 1.0
-"""Time without a dropped message after which an overload is over, s."""
+"""Time without a dropped message that ends an overload, s."""
 
 
 @dataclass
 class Backlog:
     """Decides which of the messages that wait for a node are dropped, so that it answers new ones.
 
-    ``every``: the messages are differentiated, so that gaps cost a window: once caught up, all are
-    taken again until one waits too long. Otherwise only new ones are taken while the overload
-    lasts. Pure: times are arguments.
+    ``every``: once the node has caught up, answer all messages again until one waits too long, as
+    for messages that are differentiated, where each gap empties the window. Otherwise answer only
+    new messages while the overload lasts. Times are arguments.
     """
 
     every: bool = False
@@ -232,9 +232,9 @@ class Backlog:
 
 
 class Pace:
-    """At most so many samples a second, by their stamps; 0 is every one.
+    """Thins a stream to a largest rate, Hz, by its stamps; rate 0 passes every sample.
 
-    A stream that has just this rate is answered whole, however its stamps tremble.
+    A stream of exactly this rate passes completely in spite of jitter in its stamps.
     """
 
     def __init__(self, rate: float) -> None:
@@ -242,15 +242,15 @@ class Pace:
         self._due = 0
 
     def reset(self) -> None:
-        """The next sample is answered."""
+        """Let the next sample pass."""
         self._due = 0
 
     def due(self, stamp: int) -> bool:
-        """Whether the sample of a stamp, ns, is to be answered."""
+        """Return whether the sample with this stamp, ns, passes."""
         return stamp >= self._due
 
     def answered(self, stamp: int) -> None:
-        """The sample of this stamp was; later ones are judged by it."""
+        """Record that the sample with this stamp, ns, was answered."""
         if self._period:
-            # Behind by less than a period: a silence earns no burst.
+            # Making up for less than a period avoids a burst after a silence.
             self._due = max(self._due + self._period, stamp + self._period // 4)

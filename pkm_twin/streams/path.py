@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""A joint trajectory between its points, as joint_trajectory_controller goes it."""
+"""Interpolate a joint trajectory as joint_trajectory_controller does."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from pkm_twin.messages.reading import Trajectory
 
 @dataclass(frozen=True)
 class Wanted:
-    """What a path asks for at one time, shape (n,) each; effort zero where it has none."""
+    """The setpoint at one time, shape (n,) each; effort zero if the trajectory has none."""
 
     q: Array
     qd: Array
@@ -23,10 +23,11 @@ class Wanted:
 
 @dataclass(frozen=True)
 class JointPath:
-    """Points of a joint trajectory with polynomials between: as many derivatives as points have.
+    """A joint trajectory with polynomials between its points.
 
-    Of degree five with velocities and accelerations, three with velocities, else one. Efforts go
-    straight from point to point. Before the first point and behind the last they stand.
+    Their degree is five if the points have velocities and accelerations, three with velocities
+    alone, else one. Efforts are interpolated linearly. Before the first and after the last point
+    the joints stand still.
     """
 
     points: Trajectory
@@ -37,7 +38,7 @@ class JointPath:
         return float(self.points.times[-1])
 
     def from_here(self, q: Array) -> JointPath:
-        """The path with where the machine stands as its beginning, unless it has one."""
+        """Add a point at rest at q, shape (n,), at time 0 unless the path has a point there."""
         p = self.points
         if p.times[0] == 0.0:
             return self
@@ -58,7 +59,7 @@ class JointPath:
         )
 
     def at(self, time: float) -> Wanted:
-        """What the path asks for ``time`` after its start, s."""
+        """Return the setpoint at ``time`` after the start, s."""
         p = self.points
         end = len(p.times) - 1
         after = int(np.searchsorted(p.times, time, side="right"))
@@ -76,7 +77,7 @@ class JointPath:
 
 
 def _between(p: Trajectory, a: int, b: int, span: float, t: float) -> tuple[Array, Array]:
-    """Position and velocity at the part t of the way from point a to b (Hermite's polynomials)."""
+    """Interpolate by Hermite polynomials at fraction t of the time from point a to b."""
     d = p.q[b] - p.q[a]
     if p.qd is None:
         return p.q[a] + t * d, d / span

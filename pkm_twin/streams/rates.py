@@ -1,9 +1,9 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""Whether joints move as far as their measured velocities say.
+"""Compare the moves of joints with the integral of their measured velocities.
 
-Positions of a wrong scale, unit or sign pass every limit, and so do velocities: their sum over time
-does not agree. Both are compared over short blocks, so that noise, late velocities and lost samples
-make no difference. Pure.
+Positions and velocities of a wrong scale, unit or sign pass every limit, but they do not agree.
+Moves are compared over short blocks, so that noise, delayed velocities and lost samples make no
+difference.
 """
 
 from __future__ import annotations
@@ -20,32 +20,32 @@ from pkm_twin.streams.rest import SIGMAS, noise
 from pkm_twin.streams.steps import GAP
 
 BLOCK: Final = 0.05
-"""Shortest time over which both are compared, s."""
+"""Shortest time over which moves are compared, s."""
 STEPS: Final = 5
-"""Fewest steps of a block."""
+"""Fewest steps between samples in a block."""
 BLOCKS: Final = 20
-"""Blocks of a live stream that are judged together."""
+"""Number of blocks of a live stream that are judged together."""
 LEAST: Final = 0.01
-"""Root of the sum of squares of the moves in all blocks below which nothing is judged, rad; of a
-sliding joint this part of the machine's size."""
+"""Joints are judged if the root of the sum of their squared moves is at least this, rad; for a
+prismatic joint this fraction of the machine's size."""
 MAX_ERROR: Final = 0.4
-"""Difference of both over the larger one, root of the sum of squares, that velocities which are
-late may have."""
+"""Largest RMS difference of the moves of a live stream, relative to the larger RMS move: what
+delayed velocities may cause."""
 STANDS: Final = 0.03
-"""Part of the other's motion below which positions, or velocities, stand still."""
+"""Moves below this fraction of the other quantity's moves count as standing still."""
 MAX_RATE: Final = 0.15
-"""The same of a whole recording, RMS."""
+"""Largest relative RMS difference of the moves of a whole recording."""
 LIKE: Final = 0.1
-"""Relative difference below which a scale is named as a cause."""
+"""Largest relative difference that a factor between both may leave to be named as the cause."""
 
 
 def rms(values: Array) -> Array:
-    """Root mean square along the first axis, shape (n,)."""
+    """Return the root mean square along the first axis."""
     return np.asarray(np.sqrt(np.mean(values**2, 0)), np.float64)
 
 
 def likely_cause(moved: Array, told: Array) -> str:
-    """Why the moves of a joint, shape (blocks,), are not those by its velocities; may be empty."""
+    """Name the likely cause of a difference of both moves, (blocks,); may be empty."""
     by_q, by_qd = float(rms(moved)), float(rms(told))
     scale = float(np.sum(told * moved) / max(np.sum(moved**2), 1e-300))
     if by_q < STANDS * by_qd:
@@ -62,9 +62,9 @@ def likely_cause(moved: Array, told: Array) -> str:
 class RateAgreement:
     """Compares the positions of a stream with its velocities.
 
-    ``fault``: the joint that disagrees most in the last blocks that moved, in words; else empty.
+    ``fault``: description of the joint that disagrees most in the last blocks; empty without one.
 
-    :param blocks: how many blocks are kept; None keeps all, and judges nothing by itself.
+    :param blocks: number of blocks that are kept and judged; None keeps all and judges none.
     """
 
     def __init__(self, robot: Robot, blocks: int | None = BLOCKS) -> None:
@@ -83,7 +83,7 @@ class RateAgreement:
         self.skip()
 
     def skip(self) -> None:
-        """Begin another block: nothing is known of what is between two samples."""
+        """Begin a new block at the next sample, as the motion until then is unknown."""
         self._begin: tuple[int, list[float]] | None = None
 
     @property
@@ -93,7 +93,7 @@ class RateAgreement:
         return both[:, 0], both[:, 1]
 
     def push(self, stamp: int, q: Array, qd: Array) -> None:
-        """Take a sample, shape (n,) each; the stamp, ns, is later than the last one's."""
+        """Take a sample, shape (n,) each; its stamp, ns, is later than that of the last sample."""
         rates = qd.tolist()
         if self._begin is None:
             self._start(stamp, q)
@@ -139,12 +139,12 @@ def rate_faults(
     qd: Array,
     jumps: Mask | None = None,
 ) -> tuple[Array, list[str]]:
-    """How far the velocities of a recording are from the positions' rates, over short times.
+    """Compare the velocities of a recording with its positions.
 
-    :param stamps: rising, ns, shape (k,); q and qd, shape (k, n). ``jumps``: steps that are no
-        motion, (k - 1, n).
-    :returns: the difference, part of the motion, RMS, (n,), empty of a recording that is too short;
-        and the joints that disagree, in words.
+    :param stamps: rising, ns, shape (k,); q and qd, shape (k, n).
+    :param jumps: steps that are not motions of the machine, (k - 1, n).
+    :returns: relative RMS difference of the moves, (n,), empty if the recording is too short; and
+        descriptions of the joints that disagree.
     """
     names, time = robot.joint_names, 1e-9 * (stamps - stamps[0])
     span = np.diff(time)
@@ -159,7 +159,7 @@ def rate_faults(
     moved, told = agreement.moves
     if len(moved) < 2:
         return np.zeros(0), []
-    # A joint that hardly moves shows noise alone.
+    # The moves of a joint that hardly moves are noise.
     units, most = np.array(robot.joint_units), np.maximum(rms(moved), rms(told))
     floor = np.array([STANDS * most[units == unit].max() for unit in units])
     size, width = rms(told - moved), max(STEPS, BLOCK / period)

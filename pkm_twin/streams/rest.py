@@ -1,12 +1,10 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""How far the rates of joints may be off, so that a joint at rest is known as one.
+"""Bound the errors of joint velocities, so that joints at rest are recognised.
 
-The sign of a rate is the direction of dry friction, and of a joint at rest it is that of the noise.
-So a rate counts as zero where it is below its doubt: what the noise of the positions or velocities
-makes of it, and what the differentiation itself is wrong by. The noise is what a divided difference
-of order six leaves; of a smooth motion it leaves nothing.
-
-Pure.
+The sign of a velocity is the direction of dry friction; for a joint at rest it would be the sign of
+the noise. So a velocity counts as zero if it is below its error bound: the noise of positions or
+velocities, propagated, plus the truncation error of the differentiation. The noise is estimated
+from divided differences of order six, in which a smooth motion vanishes.
 """
 
 from __future__ import annotations
@@ -22,23 +20,23 @@ from pkm_twin.codegen.arrays import ROUNDING_NOISE, Array
 from pkm_twin.messages.stamps import SECOND
 
 SIGMAS: Final = 4.0
-"""Standard deviations of its noise below which a rate counts as zero."""
+"""A velocity below this many standard deviations of its noise counts as zero."""
 POINTS: Final = 7
-"""Samples of a divided difference of order six."""
+"""Number of samples in a divided difference of order six."""
 KEPT: Final = 15
-"""Differences of a stream whose median is its noise."""
+"""Number of divided differences whose median gives a stream's noise."""
 ROBUST: Final = 1.4826
-"""Standard deviation of a normal distribution over its median absolute deviation."""
+"""Ratio of standard deviation to median absolute deviation for a normal distribution."""
 BLOCK: Final = 4096
 
 
 def difference_weights(times: Array) -> Array:
-    """Weights (..., 7) of a divided difference over times (..., 7), of unit length.
+    """Return the weights (..., 7) of a divided difference over times (..., 7), scaled to length 1.
 
-    Applied to numbers with independent noise they give numbers with the same noise.
+    The weighted sum of numbers with independent noise has the same noise as each of them.
     """
     apart = times[..., :, None] - times[..., None, :] + np.eye(POINTS)
-    # In units of the step, so that no product leaves the range of numbers.
+    # Times in units of the mean step keep the products within the range of doubles.
     step = (times[..., -1] - times[..., 0])[..., None, None] / (POINTS - 1)
     apart = np.where(np.eye(POINTS, dtype=bool), 1.0, apart / step)
     weights = 1.0 / np.prod(apart, -1)
@@ -46,7 +44,9 @@ def difference_weights(times: Array) -> Array:
 
 
 def noise(time: Array, values: Array) -> Array:
-    """Standard deviation of the noise of samples, shape (n,); zero for fewer than seven.
+    """Estimate the standard deviation of samples' noise, shape (n,); zero for fewer than seven.
+
+    It is the median of the absolute divided differences of order six, scaled.
 
     :param time: rising, shape (k,), s.
     :param values: shape (k, n).
@@ -59,7 +59,7 @@ def noise(time: Array, values: Array) -> Array:
         rows = np.arange(first, min(first + BLOCK, count))[:, None] + np.arange(POINTS)
         left.append(np.abs(np.einsum("kp,kpn->kn", difference_weights(time[rows]), values[rows])))
     sizes = np.concatenate(left)
-    # A joint that stands exactly still says nothing of its noise.
+    # Samples of a joint that repeat exactly do not show its noise.
     sizes[sizes <= ROUNDING_NOISE * np.abs(values).max(initial=0.0)] = np.nan
     known = np.isfinite(sizes).any(0)
     found = np.zeros(values.shape[1])
@@ -68,15 +68,16 @@ def noise(time: Array, values: Array) -> Array:
 
 
 def rate_doubt(time: Array, q: Array, gain: Array | float, stride: int = 2) -> Array:
-    """How far differentiated rates may be from the true ones, shape (k, n).
+    """Bound the errors of velocities that were differentiated from positions, shape (k, n).
 
-    What the noise of the positions makes of them, and by how much the mean rates over one step and
-    over ``stride`` steps differ: of a smooth motion at least twice the error of either.
+    The bound is the propagated noise of the positions plus the truncation error: the difference of
+    central differences over one step and over ``stride`` steps, for a smooth motion at least twice
+    the error of either.
 
     :param time: rising, shape (k,), s.
     :param q: positions, shape (k, n).
-    :param gain: noise of the rates over that of the positions, 1/s, a number or shape (k, 1).
-    :param stride: steps that the differentiation looks to either side.
+    :param gain: ratio of velocity noise to position noise, 1/s, a number or shape (k, 1).
+    :param stride: half-width of the differentiation in steps.
     """
     if len(time) < 3:
         return np.zeros_like(q)
@@ -93,7 +94,7 @@ def rate_doubt(time: Array, q: Array, gain: Array | float, stride: int = 2) -> A
 
 
 def gradient_gain(time: Array) -> Array:
-    """Noise of second-order differences over that of the values, shape (k, 1), 1/s."""
+    """Return the noise of second-order differences relative to that of the values, (k, 1), 1/s."""
     steps = np.diff(time)
     inner = math.sqrt(2.0) / (steps[1:] + steps[:-1])
     # One-sided at the ends: weights -3, 4, -1 over two steps.
@@ -102,18 +103,18 @@ def gradient_gain(time: Array) -> Array:
 
 
 def fit_gain(degree: int, window: int, at: int) -> float:
-    """Noise of the slope of a polynomial fit over that of the values, times the period.
+    """Return the noise of a fitted slope relative to that of the values, times the period.
 
-    :param at: the sample of the window where the slope is taken, 0 the oldest.
+    :param at: sample of the window where the slope is taken, 0 for the oldest.
     """
     powers = np.vander(np.arange(window) - float(at), degree + 1, increasing=True)
     return float(np.linalg.norm(np.linalg.pinv(powers)[1]))
 
 
 class RestWatch:
-    """The same of a stream, sample by sample.
+    """Bounds the errors of a stream's velocities, sample by sample.
 
-    :param gain: of :func:`fit_gain`, for rates that are differentiated from positions.
+    :param gain: :func:`fit_gain` of the differentiation, for velocities from positions.
     """
 
     def __init__(self, gain: float) -> None:
@@ -122,30 +123,30 @@ class RestWatch:
 
     def reset(self) -> None:
         """Forget the stream."""
-        # One more, so that the newest can be taken back.
+        # One more than needed, so that the newest sample can be removed.
         self._samples: deque[tuple[int, list[float]]] = deque(maxlen=POINTS + 1)
         self._left: deque[list[float]] = deque(maxlen=KEPT + 1)
         self._differentiated: bool | None = None
 
     def retract(self) -> None:
-        """Take the newest sample back, as if it had not been pushed; once after a push."""
+        """Remove the newest sample; possible once after a push."""
         if self._samples:
             self._samples.pop()
         if self._left:
             self._left.pop()
 
     def push(self, stamp: int, q: Array, measured: Array | None, rate: Array | None) -> Array:
-        """Take a sample; how far its rates may be from the true ones, shape (n,).
+        """Take a sample; return the error bounds of its velocities, shape (n,).
 
-        :param stamp: of the sample, ns, later than the last one's.
-        :param q: positions (n,); ``measured``: their rates where the stream has them.
-        :param rate: the rates that are used, (n,); None where there are none yet.
+        :param stamp: ns, later than that of the last sample.
+        :param q: positions (n,); ``measured``: velocities (n,) if the stream has them.
+        :param rate: velocities (n,) that are used; None while there are none.
         """
         differentiated = measured is None
         if differentiated is not self._differentiated:
             self.reset()
             self._differentiated = differentiated
-        # In plain numbers: of arrays so small the calls would take most of the time.
+        # Python floats: for arrays this small numpy's calls would take most of the time.
         values: list[float] = (q if measured is None else measured).tolist()
         self._samples.append((stamp, values))
         recent = list(self._samples)[-POINTS:]
@@ -169,7 +170,7 @@ class RestWatch:
         doubt = []
         for size, column, given in zip(sizes, columns, rate.tolist(), strict=True):
             size += ROUNDING_NOISE * abs(column[-1])
-            # The fit lags where a motion begins or ends, the last three positions do not.
+            # When a motion begins or ends the fit lags behind the slope of three positions.
             apart = abs(given - sum(map(mul, slope, column[-3:])))
             late = apart if apart > slack * size else 0.0
             doubt.append(SIGMAS * size * self.gain / period + late)
@@ -177,7 +178,7 @@ class RestWatch:
 
 
 def _weights(times: list[float]) -> list[float]:
-    """As :func:`difference_weights`, of seven times."""
+    """Return :func:`difference_weights` of seven times, in Python floats."""
     step = times[-1] / (POINTS - 1)
     weights = []
     for t in times:
@@ -191,6 +192,6 @@ def _weights(times: list[float]) -> list[float]:
 
 
 def _backward(first: float, second: float, third: float) -> tuple[float, float, float]:
-    """Weights of the slope at the third time of the parabola through values at three times."""
+    """Return the weights of a parabola's slope at the third of three times."""
     a, b = third - second, third - first
     return a / (b * (b - a)), -b / (a * (b - a)), (a + b) / (a * b)

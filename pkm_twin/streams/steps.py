@@ -1,11 +1,9 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""Whether joints can have moved as their positions say: jumps, repeats, two publishers, gaps.
+"""Find jumps, repeated samples, interleaved publishers and gaps in recorded joint positions.
 
-From one sample to the next a joint moves by its rate times the period. What it moves farther than
-its rates on both sides allow is a jump: a wrong sample of an encoder, or another publisher's. Where
-no rates are measured they are those of the steps around.
-
-Pure.
+From one sample to the next a joint moves by its velocity times the period. A move that exceeds what
+the velocities on both sides allow is a jump: a wrong sample of an encoder, or a sample of another
+publisher. Without measured velocities those of the steps around are used.
 """
 
 from __future__ import annotations
@@ -22,67 +20,69 @@ from pkm_twin.codegen.arrays import Array, Mask
 from pkm_twin.streams.rest import ROBUST, SIGMAS, noise
 
 SLACK: Final = 5e-3
-"""By how much stamps may be off, s: at the highest rate a joint may be so far from where it should
-be."""
+"""Largest error of stamps, s; a joint may be off by this time at its largest velocity."""
 FACTOR: Final = 2.0
-"""How many times a joint's velocity limit its mean rate between two samples may be."""
+"""Largest mean velocity between two samples relative to the joint's velocity limit."""
 LATE: Final = 0.01
-"""By how much measured rates may be late, s."""
+"""Largest delay of measured velocities, s."""
 AROUND: Final = 5
-"""Steps whose median is a rate, where none is measured."""
+"""Number of steps whose median replaces a measured velocity."""
 GAP: Final = 3.5
-"""Periods between two samples whose move only the limits bound."""
+"""Over a gap of more periods than this only the velocity limits bound a move."""
 OFTEN: Final = 0.02
-"""Part of the steps that jump from which there may be two publishers."""
+"""Two publishers are looked for if more than this fraction of the steps jump."""
 PUBLISHER: Final = 0.05
-"""Part of the samples that is one publisher's at least."""
+"""Smallest fraction of the samples that a publisher sends."""
 BEFORE: Final = 10
-"""Samples before, of which one is of the same publisher."""
+"""One of this number of samples before is from the same publisher."""
 FEW: Final = 0.85
-"""Part of the samples of which the largest rate is the motion's, not that of jumps."""
+"""The velocity of the motion is this quantile over the samples; higher ones may be jumps."""
 NEARLY: Final = 0.95
-"""Part of the steps whose moves beyond the rates of steps around are the motion's."""
+"""Without measured velocities this quantile of the unexplained moves belongs to the motion."""
 LEAST: Final = 0.1
-"""Part of the second differences that are of one publisher's samples and no jump of its own,"""
+"""Quantile of the second differences, small enough to lie within one publisher without jumps,"""
 OF_NOISE: Final = 0.1257 * 6.0**0.5
-"""and their quantile of it, over the noise's standard deviation."""
+"""and its value for noise of unit standard deviation: 0.1257 is this quantile of |N(0, 1)|; second
+differences have the weights 1, -2, 1."""
 ALTERNATING: Final = 16
-"""Samples in a row that alternate between two publishers,"""
+"""Alternating publishers are looked for in blocks of this number of samples,"""
 ALTERNATING_PART: Final = 0.75
-"""and part of them that must."""
+"""of which at least this fraction must alternate."""
 AGAIN: Final = 3
-"""Samples in a row that may repeat the one before: more are an encoder that stands still."""
+"""Longest run of repeated samples; a longer run is an encoder that stands still."""
 MIN_CROSSINGS: Final = 4
-"""Crossings of a joint's play that show it: so many equal steps in turn are no chance,"""
+"""Fewest equal steps up and down in turn that identify play in a joint,"""
 CROSSING_SIGMAS: Final = 8.0
-"""from so many standard deviations of the other samples on, beyond all of 1e9 normal numbers,"""
+"""each at least this many standard deviations of the noise, beyond all of 1e9 normal numbers,"""
 CROSSING_TICKS: Final = 10.0
-"""and so many steps of the encoder, whose rounding also goes up and down in turn."""
+"""and this many steps of the encoder, whose rounding goes up and down in turn, too."""
 CROSSING_SPREAD: Final = 0.15
-"""Median deviation of the crossings' sizes, as a share of their median,"""
+"""Largest median absolute deviation of the steps' sizes, relative to their median,"""
 CROSSING_TURNS: Final = 0.75
-"""and share of them that are against the one before: two within three samples are not seen."""
+"""and smallest fraction of steps opposite to the one before: a pair in three samples is missed."""
 APART: Final = 0.25
-"""By how much of a period a gap may miss a whole number of periods, where samples are missing."""
+"""Largest difference of a gap due to missing samples from a whole number of periods, in periods."""
 
 
 Numbers = TypeVar("Numbers", float, Array)
 
 
 def farthest(velocity: Numbers, period: Numbers) -> Numbers:
-    """How far a joint may move between two samples by its velocity limit, rad or m.
+    """Return the farthest that a joint may move between two samples, rad or m.
 
-    :param velocity: the limit; ``period``: between their stamps, s.
+    :param velocity: the joint's velocity limit.
+    :param period: time between the samples' stamps, s.
     """
     return velocity * (FACTOR * period + SLACK)
 
 
 @dataclass(frozen=True)
 class Steps:
-    """Steps between the samples of a recording that are no motion of the machine.
+    """Steps between the samples of a recording that are not motions of the machine.
 
-    ``jumps``: shape (k - 1, n). ``sizes``: how much farther each moved than its rates allow.
-    ``publishers``: how many samples each of two interleaved publishers sent; empty for one.
+    ``jumps``: which steps jump, shape (k - 1, n). ``sizes``: move of each step beyond what its
+    velocities allow. ``publishers``: number of samples of each of two interleaved publishers; empty
+    for a single publisher.
     """
 
     jumps: Mask
@@ -91,7 +91,7 @@ class Steps:
 
     @property
     def first(self) -> list[tuple[int, int]]:
-        """Step and joint of each jump, the first of every run of steps."""
+        """Step and joint of each jump; the joint is the one that jumped farthest."""
         rows = np.flatnonzero(self.jumps.any(1))
         return [(int(k), int(np.argmax(self.jumps[k] * self.sizes[k]))) for k in rows]
 
@@ -99,10 +99,10 @@ class Steps:
 def steps_of(
     time: Array, q: Array, qd: Array | None, limit: Sequence[float] | Array | None
 ) -> Steps:
-    """Judge the steps of a recording.
+    """Find the steps of a recording that are not motions of the machine.
 
-    :param time: rising, shape (k,), s; q and qd, where it is measured, shape (k, n).
-    :param limit: largest rates, (n,), where they are known.
+    :param time: rising, shape (k,), s; q and qd (None if not measured), shape (k, n).
+    :param limit: velocity limits, (n,), if known.
     """
     k, n = q.shape
     if k < 2:
@@ -122,7 +122,7 @@ def steps_of(
     near = span[:, 0] <= (GAP if qd is not None else 1.5) * period
     sizes = np.maximum(np.maximum(move - high * span, low * span - move), 0.0)
     if qd is None and near.any():
-        # Rates of steps miss what happens within a few steps.
+        # Medians over several steps do not follow fast changes of the velocity.
         slack = slack + SIGMAS * np.quantile(sizes[near], NEARLY, axis=0)
     sizes = np.where(near[:, None] & (sizes > slack), sizes, 0.0)
     if limit is not None:
@@ -142,10 +142,10 @@ def steps_of(
 
 
 def repeats_of(time: Array, q: Array) -> Mask:
-    """Samples that repeat the one before although a joint moves on, shape (k,).
+    """Find samples that repeat the sample before although a joint is moving, shape (k,).
 
-    Nothing was read at their time: they are off the cubic through two samples on each side. Slow
-    joints repeat the numbers of a coarse encoder.
+    Such samples differ from the cubic through two samples on each side, as the encoder was not read
+    at their time. The bound on this difference excludes slow joints of a coarse encoder.
 
     :param time: rising, shape (k,), s; q, shape (k, n).
     """
@@ -161,7 +161,7 @@ def repeats_of(time: Array, q: Array) -> Mask:
         apart_from = np.prod(count + 1 - around) / (count + 1 - around)
         weights = apart_from / [np.prod([x - y for y in around if y != x]) for x in around]
         same = ~sliding_window_view(apart[2:-2], count, axis=0).any(-1) & apart[1 : -count - 2]
-        # The cubic is through samples at even times: none across a gap.
+        # The cubic assumes even times: skip samples next to a gap.
         span = time[count + 3 :] - time[: -count - 3]
         rows = np.flatnonzero(same.any(1) & (span < (count + GAP) * period))
         away = np.abs(np.einsum("p,kpn->kn", weights, q[rows[:, None] + around]) - q[rows + 1])
@@ -200,15 +200,15 @@ def find_play(q: Array) -> tuple[Array, NDArray[np.int64]]:
 
 
 def _tick(steps: Array) -> Array:
-    """The least step of each column that is one, (n,); zero where there is none."""
+    """Return the smallest step of each column (the encoder's resolution), (n,); zero without."""
     least = np.where(steps > 0.0, steps, np.inf).min(0)
     return np.where(np.isfinite(least), least, 0.0)
 
 
 def _nearest(q: Array) -> Array:
-    """By how much each sample is apart from the nearest of those before, shape (k - 1, n).
+    """Return the distance of each sample to the nearest of the BEFORE samples before, (k - 1, n).
 
-    Of two publishers one of them is the same one's.
+    With two publishers at least one of these samples is from the same publisher.
     """
     lags = [np.abs(q[lag:] - q[:-lag]) for lag in range(1, min(BEFORE, len(q) - 1) + 1)]
     least = lags[0].copy()
@@ -218,7 +218,7 @@ def _nearest(q: Array) -> Array:
 
 
 def _noise(q: Array) -> Array:
-    """Standard deviation of the positions' noise, (n,), of one publisher or of each of two."""
+    """Estimate the standard deviation of the positions' noise, (n,), also with two publishers."""
     found = np.full(q.shape[1], np.inf)
     for lag in (1, 2, 3):
         if len(q) > 2 * lag:
@@ -228,9 +228,9 @@ def _noise(q: Array) -> Array:
 
 
 def _bracket(qd: Array | None, rates: Array, period: float) -> tuple[Array, Array]:
-    """Least and greatest rates around each step, shape (k - 1, n) each."""
+    """Return the smallest and the largest velocity around each step, shape (k - 1, n) each."""
     if qd is None:
-        # Of the steps before and of those after, so that one that jumps is in neither.
+        # Medians before and after the step exclude the step itself, which may be a jump.
         wide = np.pad(rates, ((AROUND, AROUND), (0, 0)), mode="edge")
         around = np.median(sliding_window_view(wide, AROUND, axis=0), -1)
         before, after = around[: len(rates)], around[AROUND + 1 :]
@@ -242,11 +242,11 @@ def _bracket(qd: Array | None, rates: Array, period: float) -> tuple[Array, Arra
 
 
 def _alternating(time: Array, q: Array) -> Array:
-    """How far apart two tracks are between which the samples alternate, shape (k, n); else zero.
+    """Return the distance of two tracks between which samples alternate, (k, n); zero elsewhere.
 
-    Of the difference of each sample from its neighbours' line, with its sign turned at every other
-    sample, a motion and its noise leave nothing that lasts. A track that is sampled half as often
-    leaves half of its move over two samples.
+    The difference of each sample from the line through its neighbours, with the sign reversed at
+    every other sample, averages to zero for a motion with noise, and to the distance for two
+    tracks. Each track contributes up to half of its own move over two samples.
     """
     found = np.zeros_like(q)
     blocks = (len(q) - 2) // ALTERNATING
@@ -268,7 +268,7 @@ def _alternating(time: Array, q: Array) -> Array:
 
 
 def _publishers(q: Array, slack: Array) -> tuple[int, ...]:
-    """Samples of two tracks that are each smooth, where the samples are from two; else nothing."""
+    """Count the samples of two smooth tracks; return nothing if there is only one."""
     scale = 1.0 / np.maximum(slack, 1e-300)
     rows = (q * scale).tolist()
     last, counts, seen, jumps, turns, current = [rows[0]], [1], [0], 0, 0, 0
@@ -288,7 +288,7 @@ def _publishers(q: Array, slack: Array) -> tuple[int, ...]:
         counts[nearest] += 1
     if len(counts) < 2 or min(counts) < PUBLISHER * len(rows) or jumps > OFTEN * len(rows):
         return ()
-    # A stretch that is off is one publisher's.
+    # Few changes between the tracks mean a single publisher with an offset for some time.
     if turns < min(counts) / BEFORE:
         return ()
     return tuple(counts)
@@ -296,9 +296,9 @@ def _publishers(q: Array, slack: Array) -> tuple[int, ...]:
 
 @dataclass(frozen=True)
 class Sampling:
-    """Period of a recording, s, and how many samples are missing of how many that there should be.
+    """Period of a recording, s, its expected and its missing number of samples.
 
-    ``missing`` is None where the samples have no common period.
+    ``missing`` is None if the samples have no common period.
     """
 
     period: float
@@ -307,7 +307,7 @@ class Sampling:
 
 
 def sampling_of(time: Array) -> Sampling:
-    """The period of the samples and how many are missing.
+    """Find the period of the samples and count missing samples.
 
     :param time: rising, shape (k,), s.
     """

@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""Topics and services of a node as rows: what makes, documents and permits them. Needs no ROS."""
+"""Declare a node's topics and services as rows, from which they are created and documented."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from typing import Any, Final, Literal
 
 @dataclass(frozen=True)
 class Topic:
-    """A row of a node's table.
+    """A topic or service of a node.
 
-    ``name``: ``<joint>`` in it stands for a joint's. ``kind``: package and type. ``when``: what has
-    to be asked for. ``latched``: late joiners get the last message. ``whole``: no message may be
-    lost for a newer one.
+    ``way``: direction. ``name``: ``<joint>`` stands for a joint's name. ``kind``: package and type.
+    ``when``: the setting that creates the topic. ``latched``: late subscribers get the last
+    message. ``whole``: a newer message must not replace an older one in the queue.
     """
 
     way: Literal["in", "out", "service"]
@@ -30,7 +30,7 @@ class Topic:
 
     @property
     def message(self) -> Any:
-        """The class of its messages."""
+        """The class of the messages."""
         package, kind = self.kind.split("/")
         return getattr(import_module(f"{package}.msg"), kind)
 
@@ -38,8 +38,8 @@ class Topic:
 def topic_tokens(names: Sequence[str]) -> dict[str, str]:
     """Return for each name a different token of a ROS topic name.
 
-    ROS allows ASCII letters, digits and single underscores, and no digit in front. Accents go, any
-    other character becomes an underscore, and a token that is taken already gets a number.
+    ROS allows ASCII letters, digits and single underscores, and no leading digit. Accents are
+    dropped, any other character becomes an underscore, and a repeated token gets a number.
     """
     tokens: dict[str, str] = {}
     for name in names:
@@ -56,7 +56,7 @@ def topic_tokens(names: Sequence[str]) -> dict[str, str]:
 
 
 def table(*rows: Topic) -> dict[str, Topic]:
-    """Rows by name."""
+    """Return rows by name."""
     return {row.name: row for row in rows}
 
 

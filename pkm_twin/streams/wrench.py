@@ -1,8 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""Measured wrenches: where they are measured, and what they are at the platform's reference point.
-
-Pure: times are arguments.
-"""
+"""Read measured wrenches and transform them to the platform's reference point."""
 
 from __future__ import annotations
 
@@ -27,17 +24,17 @@ Triple = tuple[float, float, float]
 V = TypeVar("V")
 
 PLATFORM: Final = "platform"
-"""The platform's link in an exported URDF."""
+"""Name of the platform's link in an exported URDF."""
 ZERO: Final = (0.0, 0.0, 0.0)
 STAMP_ORDER: Final = "stamp order"
-"""Why a message is refused that is older than the one before."""
+"""Reason for rejecting a message that is older than the one before."""
 MAX_OFFSET: Final = 100.0
-"""Farthest that a sensor may stand from the reference point, m."""
+"""Largest distance of a sensor from the reference point along an axis, m."""
 
 
 @dataclass(frozen=True, eq=False)
 class Mount:
-    """Where a wrench is measured, from the platform's reference point, in platform axes.
+    """The pose of a force sensor relative to the platform's reference point, in platform axes.
 
     ``position``: shape (3,), m. ``rotation``: the sensor's axes as columns, shape (3, 3).
     """
@@ -47,17 +44,17 @@ class Mount:
 
     @classmethod
     def of(cls, xyz: Triple, rpy: Triple) -> Mount:
-        """From numbers as a URDF's origin has them, m and rad."""
+        """Make a mount from the numbers of a URDF origin, m and rad."""
         return cls(np.array(xyz), rotations.from_rpy(np.array(rpy)))
 
 
 Mounts = Callable[[str, int], Mount]
-"""The mount of a frame at a stamp, ns; raises MessageError where it is not known."""
+"""Function from a frame and a stamp, ns, to the mount; raises MessageError if it is unknown."""
 
 
 @dataclass(frozen=True)
 class WrenchSettings:
-    """Which wrenches are taken, and where they are measured.
+    """Settings: which wrenches are accepted, and where they are measured.
 
     ``sensor_xyz``, ``sensor_rpy``: the fixed :class:`Mount`, m and rad.
     """
@@ -103,21 +100,21 @@ class WrenchSettings:
 
     @property
     def platform_frame(self) -> str:
-        """The frame that turns with the platform, as far as the wrench identifies it."""
+        """Name of the frame fixed to the platform, derived from the wrench's frame."""
         moved = any(self.sensor_xyz) or any(self.sensor_rpy)
         return PLATFORM if moved or self.wrench_frame == self.base_frame else self.wrench_frame
 
     @property
     def stamp_rules(self) -> StampRules:
-        """What stamps have to keep to."""
+        """The rules for stamps of wrenches."""
         return StampRules(self.accept_zero_stamp, round(self.future_tolerance * SECOND))
 
 
 @dataclass
 class WrenchReader:
-    """Reads wrenches and moves them to the platform's reference point.
+    """Reads wrenches and transforms them to the platform's reference point.
 
-    ``mounts``: gives where a frame stands; None is the settings' fixed mount.
+    ``mounts``: looks up a frame's mount; None: use the fixed mount of the settings.
     """
 
     settings: WrenchSettings
@@ -129,9 +126,9 @@ class WrenchReader:
         self._fixed = Mount.of(s.sensor_xyz, s.sensor_rpy)
 
     def read(self, message: Any, now: int) -> tuple[WrenchSample, Mount]:
-        """A geometry_msgs/WrenchStamped as it came, and where it was measured.
+        """Read a geometry_msgs/WrenchStamped; return it unchanged, with its mount.
 
-        :raises MessageError: it is rejected.
+        :raises MessageError: the message is rejected.
         """
         s = self.settings
         sample = read_wrench(message, now, self._rules, s.wrench_frame, s.accept_empty_frame)
@@ -140,11 +137,11 @@ class WrenchReader:
         return sample, self.mounts(sample.frame, sample.stamp)
 
     def at_reference(self, sample: WrenchSample, mount: Mount, rotation: Array) -> Array:
-        """The wrench at the platform's reference point, base axes, shape (6,), N and N m.
+        """Transform a wrench to the platform's reference point, base axes, shape (6,), N and N m.
 
-        With the sensor's axes S and place p in the platform's axes, and the platform's rotation R:
-        f = R S f_s, m = R S m_s + (R p) x f (Murray, Li and Sastry 1994, equation 2.66). One in the
-        base frame has base axes already.
+        With the sensor's rotation S and position p in platform axes, and the platform's rotation R:
+        f = R S f_s, m = R S m_s + (R p) x f (Murray, Li and Sastry 1994, equation 2.66). A wrench
+        in the base frame is in base axes already.
 
         :param rotation: platform axes as columns, shape (3, 3).
         """
@@ -158,9 +155,9 @@ class WrenchReader:
 
 
 def check_order(stamp: int, last: int) -> None:
-    """Reject a stamp that is older than the one before, ns.
+    """Reject a stamp, ns, that is older than the last one, ns.
 
-    :raises MessageError: it is.
+    :raises MessageError: the stamp is older.
     """
     if stamp < last:
         late = (last - stamp) / SECOND
@@ -169,7 +166,7 @@ def check_order(stamp: int, last: int) -> None:
 
 @dataclass
 class TimeCache(Generic[V]):
-    """The newest values of a stream whose stamps do not fall, by stamp, ns."""
+    """The newest values of a stream with their stamps, ns, which do not decrease."""
 
     length: int = 256
     items: deque[tuple[int, V]] = field(init=False)
@@ -179,20 +176,20 @@ class TimeCache(Generic[V]):
 
     @property
     def latest(self) -> tuple[int, V] | None:
-        """The newest one, None before the first."""
+        """The newest stamp and value; None before the first."""
         return self.items[-1] if self.items else None
 
     def push(self, stamp: int, value: V) -> None:
-        """Add one that is not older than the last.
+        """Add a value that is not older than the last.
 
-        :raises MessageError: it is older.
+        :raises MessageError: the stamp is older.
         """
         if self.items:
             check_order(stamp, self.items[-1][0])
         self.items.append((stamp, value))
 
     def nearest(self, stamp: int) -> tuple[int, V] | None:
-        """The one nearest in time, the older of two; None before the first."""
+        """Return the value nearest in time, the older of two; None if there is none."""
         best: tuple[int, V] | None = None
         for item in reversed(self.items):
             if best is not None and abs(stamp - item[0]) > abs(stamp - best[0]):
@@ -201,14 +198,14 @@ class TimeCache(Generic[V]):
         return best
 
     def held(self, stamp: int) -> tuple[int, V] | None:
-        """The newest one that is not later, else the oldest; None before the first."""
+        """Return the newest value that is not later, else the oldest; None if there is none."""
         for item in reversed(self.items):
             if item[0] <= stamp:
                 return item
         return self.items[0] if self.items else None
 
     def around(self, stamp: int) -> tuple[tuple[int, V], tuple[int, V]] | None:
-        """The newest one that is not later and the oldest that is not earlier; None outside."""
+        """Return the two values around a stamp; None if the stamp is outside the stored ones."""
         after: tuple[int, V] | None = None
         for item in reversed(self.items):
             if item[0] <= stamp:
@@ -219,15 +216,16 @@ class TimeCache(Generic[V]):
         return None
 
     def clear(self) -> None:
-        """Forget all."""
+        """Forget all values."""
         self.items.clear()
 
 
 @dataclass
 class TimeSynchronizer(Core):
-    """Settings that may change between two messages, and counts of what is taken and rejected.
+    """Reads joint states and wrenches of one robot and counts accepted and rejected ones.
 
-    ``mounts``: gives where a wrench's frame stands; None is the settings' fixed mount.
+    ``settings`` may change between messages. ``mounts``: looks up the mount of a wrench's frame;
+    None: use the fixed mount of the settings.
     """
 
     robot: Robot
@@ -242,11 +240,11 @@ class TimeSynchronizer(Core):
 
     @property
     def dropped(self) -> int:
-        """Joint states that were older than the one before."""
+        """Number of joint states that were older than the one before."""
         return self.states.rejected[STAMP_ORDER]
 
     def change_settings(self, settings: WrenchSettings) -> None:
-        """Answer by other settings from the next message on."""
+        """Use other settings from the next message on."""
         self.settings = settings
         self._rules = settings.stamp_rules
         self._wrench_reader = WrenchReader(settings, self.mounts)
