@@ -1,6 +1,6 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""Judges of the twin: other engines that compute a machine from its plain description.
+"""Check the package by independent engines that compute a machine from its plain description.
 
-A machine is the mapping that its YAML file holds. Of the twin nothing is imported but what joint
-types are called, let move and hold, see ``pkm_twin.machine.joints``.
+The description is the mapping of a machine's YAML file. The engines import nothing of the package
+but the names, freedoms and constraints of joint types, see ``pkm_twin.machine.joints``.
 """

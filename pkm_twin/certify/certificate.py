@@ -1,8 +1,8 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""A robot's certificate: its torques and places beside other engines', over random states.
+"""Compare a robot's torques, poses and matrices with other engines over random states.
 
-The judges compute from the machine's description alone, see ``pkm_twin.certify``. One of
-them needs numpy only; Pinocchio and MuJoCo are asked where they are installed.
+The engines compute from the machine's description alone, see ``pkm_twin.certify``. One of them
+needs only numpy; Pinocchio and MuJoCo are used if they are installed.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ ENGINES: Final = {
     "pinocchio": ("pkm_twin.certify.pinocchio_tree:PinocchioTree", "pin"),
     "mujoco": ("pkm_twin.certify.mujoco_tree:MujocoTree", "mujoco"),
 }
-"""A judge's name to its class and to the distribution that it needs."""
+"""Each engine's class and the distribution that it needs."""
 BOUNDS: Final = {
     "torques": 1e-9,
     "platform": 1e-9,
@@ -45,33 +45,33 @@ BOUNDS: Final = {
     "round_trip": 1e-9,
     "batch": 0.0,
 }
-"""Greatest difference that passes; places in m and as entries of a rotation, joints in rad or m,
-all else relative."""
+"""Largest differences that pass: platform in m and entries of the rotation, round trip in rad or m,
+all others relative."""
 SPREAD: Final = 0.02
-"""Relative standard deviation of the numbers of drawn machines."""
+"""Relative standard deviation of the parameters of random machines."""
 SMALL: Final = 1e-3
-"""A state's efforts are not measured against less than this part of the greatest of all states."""
+"""Smallest scale of a state's relative error, as a fraction of the largest effort of all states."""
 
 
 class Judge(Protocol):
-    """What a judge answers, for one state."""
+    """The quantities that an engine computes for one state."""
 
     def inverse_dynamics(self, q: Array, qd: Array, qdd: Array, wrench: Array) -> Array:
-        """Efforts, shape (n,)."""
+        """Compute the efforts, shape (n,)."""
 
     def platform(self, q: Array) -> tuple[Array, Array]:
-        """Position, shape (3,), and rotation, shape (3, 3)."""
+        """Compute the platform's position, shape (3,), and rotation, shape (3, 3)."""
 
     def jacobian(self, q: Array) -> Array:
-        """Twist per joint rate, shape (6, n)."""
+        """Compute the platform's twist per joint velocity, shape (6, n)."""
 
     def mass_matrix(self, q: Array) -> Array:
-        """Shape (n, n)."""
+        """Compute the mass matrix, shape (n, n)."""
 
 
 @dataclass(frozen=True)
 class Item:
-    """One comparison: the worst and the median difference over all states, and its bound."""
+    """One comparison: the largest and the median difference over all states, and its bound."""
 
     engine: str
     what: str
@@ -81,13 +81,17 @@ class Item:
 
     @property
     def good(self) -> bool:
-        """Whether the bound is kept."""
+        """Whether the largest difference keeps the bound."""
         return self.worst <= self.bound
 
 
 @dataclass(frozen=True)
 class Certificate:
-    """What was compared, and what could not be."""
+    """The result of all comparisons, and the engines that could not be used.
+
+    ``drawn``, ``skipped``: see :class:`States`. ``mobility``, ``rank``, ``rows``: degrees of
+    freedom, rank and number of the constraint equations at home.
+    """
 
     robot: str
     seed: int
@@ -98,21 +102,21 @@ class Certificate:
     rank: int
     rows: int
     versions: Mapping[str, str]
-    """Engine to its version."""
+    """Versions of the engines."""
     missing: Mapping[str, str]
-    """Engine to why it was not asked."""
+    """Reasons why engines were not used."""
     items: Sequence[Item]
     variants: int = 0
-    """Machines that were drawn and compared too."""
+    """Number of random machines that were compared, too."""
 
     @property
     def good(self) -> bool:
-        """Whether every bound is kept."""
+        """Whether every comparison keeps its bound."""
         return all(item.good for item in self.items)
 
     @property
     def data(self) -> dict[str, Any]:
-        """Numbers and names only; differences relative, or in m and rad where ``what`` is so."""
+        """The certificate as numbers and names, for JSON; units of differences as in BOUNDS."""
         found = asdict(self)
         found["constraints"] = found.pop("rows")
         found["items"] = [
@@ -130,17 +134,17 @@ def certify(
     engines: Sequence[str] = tuple(ENGINES),
     progress: Callable[[int], None] = lambda _: None,
 ) -> Certificate:
-    """Compare a robot with engines that know its plain description only.
+    """Compare a robot with engines that know only its plain description.
 
-    :param robot: what is judged.
-    :param description: the same machine as a ``mechanism: machine`` mapping; of a robot that is
-        loaded it is ``robot_description(robot)``. Of more actuated joints than degrees of freedom,
-        those that lead count: what the efforts of all do together is compared.
-    :param states: how many random states inside the limits.
-    :param seed: where the random numbers begin.
-    :param engines: names out of ``ENGINES``; what is not installed is told, not raised.
-    :param progress: is told how many of ``states`` are done.
-    :raises PkmTwinError: a machine that no judge can compute, or no state that all can reach.
+    :param robot: the robot to check.
+    :param description: the same machine as a ``mechanism: machine`` mapping; for a loaded robot
+        ``robot_description(robot)``. With more actuated joints than degrees of freedom the efforts
+        are compared as projected on the independent joints.
+    :param states: number of random states inside the limits.
+    :param seed: seed of the random numbers.
+    :param engines: names out of ``ENGINES``; engines that are not installed are reported.
+    :param progress: called with the number of states that are done.
+    :raises PkmTwinError: no engine can compute the machine, or too few states can be reached.
     """
 
     def reaches(q: Array) -> bool:
@@ -191,18 +195,18 @@ def certify(
 
 
 def certificate_of(robot: Any, **options: Any) -> Certificate:
-    """As :func:`certify`, with the description that the robot brings."""
+    """Run :func:`certify` with the robot's own description."""
     return certify(robot, robot_description(robot), **options)
 
 
 def certify_variants(
     robot: Robot, count: int, *, seed: int = 1, progress: Callable[[int], None], **options: Any
 ) -> Certificate:
-    """As :func:`certificate_of`, of the robot and of machines with other numbers, together.
+    """Compare the robot and random variants of it; return one certificate of all.
 
-    :param count: machines whose masses, inertias, friction and lengths differ by ``SPREAD``; the
-        lengths stay where the loops close with them alone.
-    :param seed: of the states, and of the machines' numbers.
+    :param count: number of variants, whose masses, inertias, friction and lengths are perturbed by
+        ``SPREAD``; lengths stay unchanged if the loops do not close otherwise.
+    :param seed: seed of the states and of the variants.
     """
     found: list[Certificate] = []
     for k in range(count + 1):
@@ -232,7 +236,7 @@ def certify_variants(
 
 
 def drawn(robot: Robot, seed: int) -> Robot:
-    """A machine of other numbers, with other lengths only if its loops close."""
+    """Make a variant with perturbed parameters; perturb lengths only if the loops still close."""
     kinds = [kind for kind in KINDS if kind != "lengths"]
     try:
         return varied(robot, dict.fromkeys(KINDS, SPREAD), seed).robot
@@ -241,7 +245,7 @@ def drawn(robot: Robot, seed: int) -> Robot:
 
 
 def _led(robot: Any, description: Mapping[str, Any]) -> Mapping[str, Any]:
-    """The description whose joints that follow others are not actuated."""
+    """Return the description with only the independent joints of a redundant machine actuated."""
     if not _shares(robot):
         return description
     idle = set(robot.joint_names) - set(robot.graph.leads)
@@ -253,12 +257,12 @@ def _led(robot: Any, description: Mapping[str, Any]) -> Mapping[str, Any]:
 
 
 def _shares(robot: Any) -> bool:
-    """Whether there are more actuated joints than freedoms."""
+    """Return whether the robot has more actuated joints than degrees of freedom."""
     return bool(getattr(robot, "redundant", False))
 
 
 def _agreeing(robot: Any, *motion: Array) -> tuple[Array, ...]:
-    """Positions, rates and accelerations of all joints, by those that lead."""
+    """Compute positions, velocities and accelerations of all joints from the independent ones."""
     if not _shares(robot):
         return motion
     whole = [np.zeros((*one.shape[:-1], robot.joints_count)) for one in motion]
@@ -269,7 +273,7 @@ def _agreeing(robot: Any, *motion: Array) -> tuple[Array, ...]:
 
 
 def _own(robot: Any, states: States) -> list[Item]:
-    """What needs no other engine: the round trip, and one sample against the batch."""
+    """Compare the inverse with the forward kinematics, and single samples with a batch."""
     motion = *_agreeing(robot, states.q, states.qd, states.qdd), states.wrench
     back = robot.inverse(robot.forward(motion[0]))
     trip = np.abs(back - motion[0]).max(-1)
@@ -289,7 +293,7 @@ def _compared(
     position, rotation = robot.platform(place)
     twist, inertia = robot.platform_jacobian(place), mass_matrix(robot, place)
     if _shares(robot):
-        # Rates of all joints by those that lead.
+        # Velocities of all joints per velocity of the independent joints.
         back = robot.inverse_jacobian(place)
         by = back @ np.linalg.inv(back[:, robot.graph.leading])
         tau = np.einsum("knm,kn->km", by, tau)
@@ -319,9 +323,10 @@ def _compared(
 
 
 def effort_differences(got: Array, expected: Array) -> Array:
-    """Each state's greatest difference over its greatest effort, shape (states,).
+    """Return each state's largest difference relative to its largest effort, shape (states,).
 
-    States in which the efforts nearly vanish are measured against the others' size.
+    For states in which the efforts nearly vanish, it is relative to SMALL times the largest effort
+    of all states.
     """
     size = np.abs(expected).max(-1)
     scale = np.maximum(size, SMALL * size.max())
@@ -331,13 +336,13 @@ def effort_differences(got: Array, expected: Array) -> Array:
 
 
 def relative(got: Array, expected: Array) -> float:
-    """Greatest difference over the greatest expected amount."""
+    """Return the largest difference relative to the largest expected absolute value."""
     apart, size = float(np.abs(got - expected).max()), float(np.abs(expected).max())
     return apart / size if size else (math.inf if apart else 0.0)
 
 
 def _item(engine: str, what: str, values: Any) -> Item:
     amounts = np.asarray(values, dtype=float)
-    # A number that is not finite passes no bound.
+    # Infinity for NaN: np.max would depend on its position, and no bound must pass.
     worst = float(np.where(np.isfinite(amounts), amounts, np.inf).max())
     return Item(engine, what, worst, float(np.median(amounts)), BOUNDS[what])

@@ -1,8 +1,8 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""A machine's plain description, limbs written out, every vector in base axes at home.
+"""Read a machine's plain description for the independent engines, independently of the package.
 
-Of the twin it takes what a joint type is called, lets move and holds; what that means in equations
-each judge says for itself.
+Limbs are expanded to bodies, joints and rods; every vector is in base axes at home. Only the names,
+freedoms and constraints of joint types come from the package; each engine writes their equations.
 """
 
 from __future__ import annotations
@@ -22,17 +22,17 @@ Description = Mapping[str, Any]
 
 BASE: Final = "base"
 STANDARD_GRAVITY: Final = (0.0, 0.0, -9.81)
-"""Gravity where the description names none, m/s2."""
+"""Gravity of a description without gravity, m/s2."""
 POSE_NAMES: Final = ("x", "y", "z", "roll", "pitch", "yaw")
 
 
 class UnfitError(ValueError):
-    """A description or a state that a judge cannot compute; the text says why."""
+    """A description or a state that an engine cannot compute; the text says why."""
 
 
 @dataclass(frozen=True)
 class Body:
-    """A rigid body at home."""
+    """A rigid body in its position at home."""
 
     mass: float
     """kg"""
@@ -44,14 +44,14 @@ class Body:
 
 @dataclass(frozen=True)
 class Joint:
-    """A joint at home; its value is ``home`` there."""
+    """A joint in its position at home, where its value is ``home``."""
 
     name: str
     type: type[JointType]
     inner: str
     outer: str
     at: Array
-    """Shape (3,), m; free for a joint of orientations only."""
+    """Position, shape (3,), m; arbitrary for a joint that constrains orientations only."""
     axes: Array
     """Unit vectors, shape (axes, 3)."""
     actuated: bool
@@ -63,20 +63,20 @@ class Joint:
     offset: float
     rotor_inertia: float
     friction: Mapping[str, Any]
-    """As the file has it."""
+    """The friction section of the file."""
     pitch: float
-    """Of a screw, m a rad."""
+    """Pitch of a screw, m/rad."""
 
     @property
     def slides(self) -> bool:
-        """Whether its value is a length."""
+        """Whether the joint's value is a length."""
         return self.type.steps == ("slide",)
 
     @property
     def steps(self) -> list[tuple[bool, Array]]:
-        """Single freedoms from the inner body to the outer: whether it turns, and the axis.
+        """Single freedoms from the inner to the outer body: whether it is a rotation, and its axis.
 
-        A screw is a slide and a turn that a further equation ties together.
+        A screw is a translation and a rotation that an additional equation couples.
         """
         found = []
         for freedom in self.type.freedoms(self.axes, self.pitch):
@@ -87,7 +87,7 @@ class Joint:
 
 @dataclass(frozen=True)
 class Rod:
-    """A thin even bar with a ball joint at each end."""
+    """A thin homogeneous bar with a ball joint at each end."""
 
     name: str
     inner: str
@@ -98,13 +98,13 @@ class Rod:
 
     @property
     def length(self) -> float:
-        """Distance of the ends, m."""
+        """Length between the ends, m."""
         return float(np.linalg.norm(self.ends[1] - self.ends[0]))
 
 
 @dataclass(frozen=True)
 class Machine:
-    """All that a judge reads."""
+    """The machine as the engines read it."""
 
     gravity: Array
     platform: str
@@ -115,7 +115,7 @@ class Machine:
     joints: tuple[Joint, ...]
     rods: tuple[Rod, ...]
     actuated: tuple[Joint, ...] = field(init=False)
-    """In the order of appearance."""
+    """The actuated joints in the order of the description."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "actuated", tuple(j for j in self.joints if j.actuated))
@@ -126,13 +126,13 @@ class Machine:
         return np.array([joint.home for joint in self.actuated])
 
     def of(self, rotation: Array, position: Array) -> Array:
-        """Pose coordinates of the platform's place, shape (m,), m and rad."""
+        """Return the pose coordinates of a rotation and a position, shape (m,), m and rad."""
         full = dict(zip(POSE_NAMES, (*position, *angles(rotation)), strict=True))
         return np.array([full[name] for name in self.pose])
 
 
 def angles(rotation: Array) -> tuple[float, float, float]:
-    """Roll, pitch and yaw of R = Rz(yaw) Ry(pitch) Rx(roll), rad."""
+    """Return roll, pitch and yaw of R = Rz(yaw) Ry(pitch) Rx(roll), rad."""
     return (
         math.atan2(rotation[2, 1], rotation[2, 2]),
         math.atan2(-rotation[2, 0], math.hypot(rotation[2, 1], rotation[2, 2])),
@@ -141,7 +141,7 @@ def angles(rotation: Array) -> tuple[float, float, float]:
 
 
 def vector(value: Any) -> Array:
-    """Three numbers as an array, shape (3,)."""
+    """Convert three numbers to an array, shape (3,)."""
     result = np.asarray(value, dtype=float)
     if result.shape != (3,):
         raise UnfitError(f"expected three numbers, found {value!r}")
@@ -149,21 +149,21 @@ def vector(value: Any) -> Array:
 
 
 def tensor(value: Any) -> Array:
-    """A matrix of inertia from three principal or nine numbers, shape (3, 3), kg m2."""
+    """Make an inertia matrix from three principal moments or nine numbers, shape (3, 3), kg m2."""
     result = np.asarray(value, dtype=float)
     return np.diag(result) if result.shape == (3,) else result.reshape(3, 3)
 
 
 def turn_about_z(angle: float) -> Array:
-    """Rotation about base z, shape (3, 3)."""
+    """Return the rotation about base z by an angle, rad, shape (3, 3)."""
     c, s = math.cos(angle), math.sin(angle)
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
 def expand(description: Description) -> dict[str, Any]:
-    """The description with its ``limbs`` written out as bodies, joints and rods.
+    """Expand the ``limbs`` of a description to bodies, joints and rods.
 
-    :returns: a new mapping without ``limbs``; the input stays as it is.
+    :returns: a new mapping without ``limbs``; the input is not changed.
     """
     result = {key: value for key, value in description.items() if key != "limbs"}
     for kind in ("bodies", "joints", "rods"):
@@ -200,7 +200,7 @@ def _turned(entry: dict[str, Any], turn: Array, own: set[str], number: int) -> d
         entry["member"] = entry["member"] | ends
     if "inertia" in entry:
         entry["inertia"] = (turn @ tensor(entry["inertia"]) @ turn.T).tolist()
-    # Drives of copies may differ: one number a copy.
+    # Drives of the copies may differ: a list has one number per copy.
     if isinstance(entry.get("rotor_inertia"), list):
         entry["rotor_inertia"] = entry["rotor_inertia"][number - 1]
     if entry.get("friction"):
@@ -216,9 +216,9 @@ def _turned(entry: dict[str, Any], turn: Array, own: set[str], number: int) -> d
 
 
 def read(description: Description) -> Machine:
-    """The machine of a ``mechanism: machine`` mapping.
+    """Read a ``mechanism: machine`` mapping.
 
-    :raises UnfitError: what a judge cannot read; the twin's own loader is the one that explains.
+    :raises UnfitError: the mapping cannot be read; the package's own loader has better messages.
     """
     data = expand(description)
     bodies = {name: _body(entry) for name, entry in data["bodies"].items()}
@@ -231,7 +231,7 @@ def read(description: Description) -> Machine:
     origin = vector(data.get("origin", bodies[platform].com))
     load = data.get("payload") or {}
     if load.get("mass"):
-        # The payload's centre is told from the reference point.
+        # The payload's centre is relative to the platform's reference point.
         at = origin + vector(load.get("com", (0, 0, 0)))
         payload = Body(float(load["mass"]), at, tensor(load.get("inertia", (0, 0, 0))))
         bodies[platform] = joined(bodies[platform], payload)
@@ -239,7 +239,7 @@ def read(description: Description) -> Machine:
         vector(data.get("gravity", STANDARD_GRAVITY)),
         platform,
         origin,
-        # A mechanism may have pose coordinates of its own: then places are compared alone.
+        # Without pose coordinates of its own only positions and rotations are compared.
         tuple(data.get("pose", ())),
         bodies,
         joints,
@@ -248,7 +248,7 @@ def read(description: Description) -> Machine:
 
 
 def joined(one: Body, other: Body) -> Body:
-    """Two rigid bodies as one; the other has mass."""
+    """Combine two rigid bodies; ``other`` must have mass."""
     mass = one.mass + other.mass
     com = (one.mass * one.com + other.mass * other.com) / mass
     inertia = np.zeros((3, 3))
@@ -306,7 +306,7 @@ def _joint(name: str, entry: Mapping[str, Any], known: set[str]) -> Joint:
 
 
 def _rotor(entry: Mapping[str, Any]) -> float:
-    """The inertia of a drive at its joint: given, or the rotor's times the square of its turns."""
+    """Return a drive's inertia at its joint: given, or the rotor's times the squared gear ratio."""
     drive = entry.get("drive")
     if not drive:
         return float(entry.get("rotor_inertia", 0.0))
@@ -321,9 +321,9 @@ def _rod(name: str, entry: Mapping[str, Any], known: set[str]) -> Rod:
 
 
 def with_laws(drives: Sequence[Joint], q: Array, qd: Array, tau: Array) -> Array:
-    """Efforts with the friction laws of the drives beside viscous, Coulomb and offset, shape (n,).
+    """Add load-dependent friction, Stribeck friction and cogging to the efforts, shape (n,).
 
-    :param tau: efforts with these three only, N m or N.
+    :param tau: efforts that include viscous friction, Coulomb friction and offset, N m or N.
     """
     result: Array = np.array(tau, dtype=float)
     for k, joint in enumerate(drives):
@@ -341,13 +341,13 @@ def with_laws(drives: Sequence[Joint], q: Array, qd: Array, tau: Array) -> Array
 
 
 def cross(a: Array, b: Array) -> Array:
-    """The product a x b, shape (3,); of one pair numpy's own is ten times slower."""
+    """Return a x b, shape (3,); for a single pair np.cross is ten times slower."""
     (ax, ay, az), (bx, by, bz) = a.tolist(), b.tolist()
     return np.array([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])
 
 
 def across(axis: Array) -> tuple[Array, Array]:
-    """Two unit vectors that make a right-handed triple with ``axis``, each of shape (3,)."""
+    """Return two unit vectors that form a right-handed triple with ``axis``, shape (3,) each."""
     first = cross(axis, np.eye(3)[int(np.argmin(np.abs(axis)))])
     first = first / np.linalg.norm(first)
     return first, cross(axis, first)

@@ -1,10 +1,10 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""Inverse dynamics in maximal coordinates: six for each body, every joint its rows.
+"""Compute inverse dynamics in maximal coordinates, and draw random states for comparisons.
 
-All bodies are free; every joint is equations between two of them, see ``rows``. Positions come
-from home by continuation along the straight line in joint space: a step of second order, then
-Newton's method on all rows, with the step's length held so that Newton has little to do. No tree,
-no spanning, no symbolic algebra. And random states that a machine can be judged in.
+Each body has six coordinates; every joint is a set of equations between two bodies, see ``rows``.
+Positions follow by continuation from home along the straight line in joint space: a predictor of
+second order, then Newton's method on all equations, with a step length for which Newton's
+correction is small. There is no spanning tree and no symbolic algebra.
 """
 
 from __future__ import annotations
@@ -28,54 +28,55 @@ from pkm_twin.certify.description import (
 from pkm_twin.certify.rows import SINGULAR, Frame, Moving, skewed
 
 FIRST_STEP: Final = 1.0 / 16.0
-"""Part of the way home to goal that the first step goes."""
+"""Length of the first step as a fraction of the line from home to the goal."""
 LEAST_STEP: Final = 1e-5
+"""Shortest step as a fraction of the line; a shorter one means a singularity."""
 MAX_STEP: Final = 0.02
-"""Longest first correction of a good step, relative to the motion's own size."""
+"""Largest first correction of an accepted step, relative to the step's motion."""
 KEPT: Final = 64
-"""Assemblies that are kept: the way from home takes far longer than what is asked for there."""
+"""Number of cached assemblies: the continuation takes far longer than the computations there."""
 WITHIN: Final = 0.8
-"""Part of the joints' limits that positions are drawn from."""
+"""Fraction of the range between the joints' limits from which positions are drawn."""
 NARROW: Final = 0.3
-"""Half the range of a joint without limits, rad; of a sliding one this part of the size."""
+"""Half the range of a joint without limits, rad; for a prismatic joint half this times the size."""
 CLEAR: Final = 0.1
-"""Least condition and least determinant of the pose on the way from home, relative to home's:
-nearer to a singularity every engine loses digits, and behind a fold the pose has two answers."""
+"""Smallest reciprocal condition number and determinant on the line from home, relative to home:
+closer to a singularity every engine loses digits, and beyond a fold a pose has two assemblies."""
 
 
 @dataclass(frozen=True)
 class State:
-    """All bodies' places and, where asked for, their rates."""
+    """Positions and velocities of all bodies."""
 
     rotation: Array
-    """Shape (bodies, 3, 3); the identity at home."""
+    """Rotations, shape (bodies, 3, 3); the identity at home."""
     com: Array
-    """Shape (bodies, 3), m."""
+    """Centres of mass, shape (bodies, 3), m."""
     velocity: Array
-    """Velocity of the centre, angular velocity, shape (bodies, 6), m/s and rad/s."""
+    """Velocities of the centres and angular velocities, shape (bodies, 6), m/s and rad/s."""
     least: float = 1.0
-    """Least singular value over the greatest on the way from home, relative to home's."""
+    """Smallest reciprocal condition number on the line from home, relative to home."""
     pose: float = 1.0
-    """Least determinant of the pose's rates by the joints', relative to home's: at zero the pose
-    folds over and no longer tells the joint state."""
+    """Smallest determinant of d(pose)/dq on the line from home, relative to home: at zero the pose
+    has a fold and no longer determines the joint positions."""
 
 
 class Home(NamedTuple):
-    """What the rows say at home."""
+    """Mobility, rank, number and conditioning of the constraint equations at home."""
 
     mobility: int
     rank: int
     rows: int
     condition: float
-    """Least over greatest singular value of all rows, actuated ones included."""
+    """Reciprocal condition number of all equations, including those of the actuated joints."""
 
 
 def rotation_of(turn: Array) -> Array:
-    """Rotation by a vector's length about it (Rodrigues), shape (3, 3)."""
+    """Return the rotation of a rotation vector (Rodrigues' formula), shape (3, 3)."""
     angle = float(np.linalg.norm(turn))
     skew = skewed(turn)
     if angle < 1e-4:
-        # Taylor; the next terms are below 1e-19.
+        # Taylor series; the next terms are below 1e-19.
         return np.eye(3) + (1 - angle**2 / 6) * skew + (0.5 - angle**2 / 24) * skew @ skew
     result: Array = (
         np.eye(3)
@@ -88,7 +89,7 @@ def rotation_of(turn: Array) -> Array:
 class Maximal(Moving):
     """A machine in maximal coordinates.
 
-    :raises UnfitError: a description that cannot be read.
+    :raises UnfitError: the description cannot be read.
     """
 
     name = "maximal"
@@ -109,7 +110,7 @@ class Maximal(Moving):
         self.home: Final = self._analyse()
 
     def frame(self, body: str) -> Frame:
-        """A body's frame in its centre of mass."""
+        """Return a body's frame at its centre of mass."""
         k, state = self.names.index(body), self._state
         columns = self._columns[k]
         return Frame(
@@ -128,9 +129,9 @@ class Maximal(Moving):
     # Positions
 
     def assemble(self, q: Array) -> State:
-        """The assembly at ``q``, shape (n,), connected to home along the straight line.
+        """Find the assembly at ``q``, shape (n,), by continuation from home on a straight line.
 
-        :raises UnfitError: a singularity on the way, with where it is.
+        :raises UnfitError: a singularity lies on the line; the text says where.
         """
         q = np.asarray(q, dtype=float)
         if q.tobytes() not in self._assembled:
@@ -170,7 +171,7 @@ class Maximal(Moving):
         return replace(state, velocity=np.zeros_like(state.velocity), least=least, pose=pose)
 
     def _fold(self, tangent: Array) -> float:
-        """Determinant of the pose's rates by the joints' rates; one where they are not as many."""
+        """Return the determinant of d(pose)/dq; 1 if this matrix is not square."""
         machine = self.machine
         if len(machine.pose) != len(machine.actuated):
             return 1.0
@@ -178,7 +179,7 @@ class Maximal(Moving):
         _, rotation = self._placed()
         _, pitch, yaw = angles(rotation)
         c, s = math.cos(yaw), math.sin(yaw)
-        # Angular velocity by the rates of roll, pitch and yaw.
+        # Angular velocity per rate of roll, pitch and yaw.
         spin = np.array(
             [
                 [c * math.cos(pitch), -s, 0.0],
@@ -192,7 +193,7 @@ class Maximal(Moving):
     def _moved(self, state: State, change: Array) -> State:
         each = change.reshape(-1, 6)
         turned = np.array([rotation_of(step[3:]) for step in each]) @ state.rotation
-        # Products of rotations lose their right angles digit by digit; this gives them back.
+        # One Newton step of the polar decomposition restores orthogonality after rounding.
         turned = turned @ (1.5 * np.eye(3) - 0.5 * turned.transpose(0, 2, 1) @ turned)
         return replace(state, rotation=turned, com=state.com + each[:, :3])
 
@@ -218,16 +219,16 @@ class Maximal(Moving):
     # Rates and forces
 
     def move(self, rates: Array) -> None:
-        """Let the bodies have velocities, shape (6 bodies,)."""
+        """Set the velocities of the bodies, shape (6 bodies,)."""
         self._state = replace(self._state, velocity=rates.reshape(-1, 6))
 
     def pose(self, q: Array) -> Array:
-        """Pose coordinates, shape (m,), m and rad."""
+        """Compute the pose coordinates, shape (m,), m and rad."""
         position, rotation = self.platform(q)
         return self.machine.of(rotation, position)
 
     def energy(self, q: Array, qd: Array) -> tuple[float, float]:
-        """Kinetic and potential energy, J; the potential one is zero at base height."""
+        """Compute kinetic and potential energy, J; the latter is zero at the base's origin."""
         qd = np.asarray(qd, dtype=float)
         kinetic = float(qd @ self.mass_matrix(q) @ qd / 2)
         weights = [
@@ -242,7 +243,7 @@ class Maximal(Moving):
         return kinetic, -float(sum(weights))
 
     def forces(self, change: Array) -> Array:
-        """Of inertia, gyroscopic ones and the weight's, shape (6 bodies,)."""
+        """Compute the generalised forces of inertia and weight, shape (6 bodies,)."""
         gravity = self.machine.gravity
         total = np.zeros(self.size)
         for name, body in self.machine.bodies.items():
@@ -269,13 +270,13 @@ class States:
     qdd: Array
     wrench: Array
     drawn: int
-    """How many positions were drawn; the others are out of reach, near a singularity or folded."""
+    """Number of positions drawn, also out of reach, near a singularity or beyond a fold."""
     skipped: int
-    """How many of these only the twin does not reach: on its way from home is a singularity."""
+    """Number of positions that only the package does not reach, for a singularity on its way."""
 
 
 def ranges(judge: Maximal) -> Array:
-    """The range that positions are drawn from, shape (n, 2), rad or m."""
+    """Return the ranges from which joint positions are drawn, shape (n, 2), rad or m."""
     machine, size = judge.machine, extent(judge)
     result = []
     for joint in machine.actuated:
@@ -289,7 +290,7 @@ def ranges(judge: Maximal) -> Array:
 
 
 def extent(judge: Maximal) -> float:
-    """The machine's size: half the diagonal of all its points at home, m."""
+    """Return the machine's size: half the diagonal of the box around all its points at home, m."""
     machine = judge.machine
     points = [machine.origin, *(joint.at for joint in machine.joints)]
     points += [body.com for body in machine.bodies.values() if body.mass]
@@ -303,12 +304,13 @@ def random_states(
     count: int,
     reaches: Callable[[Array], bool] = lambda _: True,
 ) -> States:
-    """States inside the limits, connected to home, clear of singularities.
+    """Draw states inside the limits, connected to home and clear of singularities.
 
-    Rates of the order of the range in a second, wrenches of the order of the machine's weight.
+    Velocities are of the order of the range per second, wrenches of the order of the machine's
+    weight.
 
-    :param reaches: whether the twin reaches joint positions, shape (n,).
-    :raises UnfitError: fewer than ``count`` in twenty times as many draws.
+    :param reaches: returns whether the package reaches joint positions, shape (n,).
+    :raises UnfitError: twenty times ``count`` draws give too few states.
     """
     low, high = ranges(judge).T
     found: list[Array] = []

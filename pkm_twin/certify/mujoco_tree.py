@@ -1,11 +1,11 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""The same machine as a MuJoCo tree, its loops closed without MuJoCo's soft constraints.
+"""Compute a machine as a MuJoCo tree with loops closed without MuJoCo's soft constraints.
 
-The tree is made of the joints that come last and leave most freedom, so it is another one than the
-Pinocchio judge's. Body frames stand in the base's at home.
+The tree consists of the joints with the most freedoms, the last ones first, so that it differs from
+the Pinocchio engine's. Body frames coincide with the base frame at home.
 
-MuJoCo's compiler wants some inertia in whatever moves: TINY is added to every body, and taken away
-again from the model that it makes.
+MuJoCo's compiler requires some inertia of every moving body: TINY is added to every body, and
+removed again from the compiled model.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ from pkm_twin.certify.rows import Frame
 from pkm_twin.certify.trees import Steps, Tree
 
 TINY: Final = 1e-14
-"""Mass (kg) and moments of inertia (kg m2) that every body is compiled with in addition."""
+"""Mass (kg) and moments of inertia (kg m2) added to every body for the compiler."""
 
 
 class MujocoTree(Tree):
-    """A machine as a tree of MuJoCo's with loop constraints.
+    """A machine as a MuJoCo tree with loop constraints.
 
-    :raises UnfitError: a description that cannot be read.
+    :raises UnfitError: the description cannot be read.
     """
 
     name = "MuJoCo"
@@ -41,7 +41,7 @@ class MujocoTree(Tree):
         super().__init__(description)
 
     def hang(self, name: str, parent: str, at: Array, steps: Steps | None, body: Body) -> None:
-        """Add a body; three turns are a ball."""
+        """Add a body to the tree; three rotations are a ball joint."""
         element = Xml.SubElement(self._elements[parent], "body", name=f"body {name}")
         self._elements[name] = element
         self._weigh(element, body)
@@ -66,11 +66,11 @@ class MujocoTree(Tree):
         return int(self._model.nv)
 
     def neutral(self) -> Array:
-        """The configuration at home."""
+        """Return the configuration at home."""
         return np.asarray(self._start)
 
     def place(self, full: Array, rates: Array) -> None:
-        """Put the tree's configuration and rates, shape (size,)."""
+        """Set the tree's configuration and velocities, shape (size,)."""
         self._frames: dict[str, Frame] = {}
         self._data.qpos[:], self._data.qvel[:] = full, rates
         mujoco.mj_kinematics(self._model, self._data)
@@ -78,13 +78,13 @@ class MujocoTree(Tree):
         mujoco.mj_comVel(self._model, self._data)
 
     def stepped(self, full: Array, step: Array) -> Array:
-        """The configuration that a small motion leads to, shape (size,)."""
+        """Return the configuration after a small motion, shape (size,)."""
         result = full.copy()
         mujoco.mj_integratePos(self._model, result, step, 1.0)
         return result
 
     def frame(self, body: str) -> Frame:
-        """A body's frame, which is the base's at home."""
+        """Return a body's frame, which coincides with the base frame at home."""
         if body not in self._frames:
             model, data = self._model, self._data
             number = int(model.body(f"body {body}").id)
@@ -99,16 +99,16 @@ class MujocoTree(Tree):
         return self._frames[body]
 
     def forces(self, change: Array) -> Array:
-        """MuJoCo's inverse dynamics of the tree, shape (size,)."""
+        """Compute MuJoCo's inverse dynamics of the tree, shape (size,)."""
         self._data.qacc[:] = change
         result = np.zeros(self.size)
-        # Not mj_inverse: it factorises the mass matrix of the tree, which may be singular.
+        # mj_inverse would factorise the mass matrix of the tree, which may be singular.
         mujoco.mj_rne(self._model, self._data, 1, result)
         return result
 
     def _weigh(self, element: Xml.Element, body: Body) -> None:
         moments, axes = np.linalg.eigh(body.inertia)
-        # eigh may leave a mirror image.
+        # The eigenvectors may form a reflection instead of a rotation.
         axes[:, 0] *= np.sign(np.linalg.det(axes))
         turn = np.zeros(4)
         mujoco.mju_mat2Quat(turn, axes.ravel())

@@ -1,7 +1,7 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""The same machine as a Pinocchio tree, its loops closed without Pinocchio's constraints.
+"""Compute a machine as a Pinocchio tree with loops closed without Pinocchio's constraints.
 
-The tree is made of the actuated joints and of those that leave least freedom.
+The tree consists of the actuated joints and those with the fewest freedoms.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from pkm_twin.certify.trees import Steps, Tree
 
 
 class PinocchioTree(Tree):
-    """A machine as a tree of Pinocchio's with loop constraints.
+    """A machine as a Pinocchio tree with loop constraints.
 
-    :raises UnfitError: a description that cannot be read.
+    :raises UnfitError: the description cannot be read.
     """
 
     name = "Pinocchio"
@@ -28,11 +28,11 @@ class PinocchioTree(Tree):
     def __init__(self, description: Description) -> None:
         self.model = pin.Model()
         self._carriers: dict[str, tuple[int, Array]] = {BASE: (0, np.zeros(3))}
-        """The joint that each body moves with, and where its frame is at home."""
+        """Joint that moves each body, and the position of its frame at home, m."""
         super().__init__(description)
 
     def hang(self, name: str, parent: str, at: Array, steps: Steps | None, body: Body) -> None:
-        """Add a body; three turns are a ball."""
+        """Add a body to the tree; three rotations are a ball joint."""
         carrier, origin = self._carriers[parent]
         if steps is None:
             models = [pin.JointModelFreeFlyer()]
@@ -52,28 +52,28 @@ class PinocchioTree(Tree):
             self.model.appendBodyToJoint(carrier, inertia, pin.SE3.Identity())
 
     def finish(self) -> int:
-        """Make the data."""
+        """Complete the model; return its number of velocities."""
         self.model.gravity.linear = self.machine.gravity
         self.data = self.model.createData()
         return int(self.model.nv)
 
     def neutral(self) -> Array:
-        """The configuration at home."""
+        """Return the configuration at home."""
         return np.asarray(pin.neutral(self.model))
 
     def place(self, full: Array, rates: Array) -> None:
-        """Put the tree's configuration and rates, shape (size,)."""
+        """Set the tree's configuration and velocities, shape (size,)."""
         self._frames: dict[str, Frame] = {}
         self._state = full, rates
         pin.forwardKinematics(self.model, self.data, full, rates, np.zeros(self.size))
         pin.computeJointJacobians(self.model, self.data, full)
 
     def stepped(self, full: Array, step: Array) -> Array:
-        """The configuration that a small motion leads to, shape (size,)."""
+        """Return the configuration after a small motion, shape (size,)."""
         return np.asarray(pin.integrate(self.model, full, step))
 
     def frame(self, body: str) -> Frame:
-        """The frame of the joint that carries a body."""
+        """Return the frame of the joint that moves a body."""
         if body not in self._frames:
             carrier, origin = self._carriers[body]
             given = self.model, self.data, carrier
@@ -88,7 +88,7 @@ class PinocchioTree(Tree):
         return self._frames[body]
 
     def forces(self, change: Array) -> Array:
-        """Recursive Newton-Euler of the tree, shape (size,)."""
+        """Compute the tree's inverse dynamics by recursive Newton-Euler, shape (size,)."""
         return np.array(pin.rnea(self.model, self.data, *self._state, change))
 
 

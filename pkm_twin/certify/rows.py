@@ -1,13 +1,14 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""What every judge computes from how its engine moves bodies, and from the engine's forces.
+"""Compute a machine's kinematics and dynamics from an engine's frames, Jacobians and forces.
 
-A joint is equations between points and directions of two bodies; each is a row with its change per
-coordinate rate, and the part of its second derivative that needs no acceleration:
+A joint is a set of equations between points and directions of two bodies. Each equation is a row:
+its value, its change per coordinate velocity, and its second derivative at zero acceleration. With
+coordinate velocities u, rows A of the closures (bias a) and B of the actuated joints (bias b):
 
     A u = 0,  B u = q',   A u' = -a,  B u' = q'' - b,   T = [A; B]^+ [0; 1]
     tau = T' (forces of inertia and weight - wrench) + friction + rotors
 
-by least squares over all rows, redundant ones too.
+by least squares over all rows, including redundant ones.
 """
 
 from __future__ import annotations
@@ -32,47 +33,47 @@ from pkm_twin.certify.description import (
 )
 
 SINGULAR: Final = 1e-9
-"""Least singular value over the greatest: below it the rows do not determine the motion."""
+"""Smallest ratio of singular values: below it the rows do not determine the motion."""
 
 
 class Frame(NamedTuple):
-    """A frame that moves with a body, parallel to the base's at home."""
+    """A frame that moves with a body and is parallel to the base frame at home."""
 
     home: Array
-    """Its origin at home, shape (3,), m."""
+    """Origin at home, shape (3,), m."""
     place: Array
     rotation: Array
     columns: Array
     """Velocity of the origin and angular velocity per coordinate rate, shape (6, size)."""
     rate: Array
-    """Both velocities, shape (6,)."""
+    """Velocity of the origin and angular velocity, shape (6,)."""
     bias: Array
-    """Both accelerations where the coordinates' accelerations are zero, shape (6,)."""
+    """Accelerations of both at zero coordinate accelerations, shape (6,)."""
 
 
 class Jet(NamedTuple):
-    """A vector that moves with the bodies."""
+    """A vector that moves with the bodies, with its derivatives."""
 
     value: Array
     """Shape (3,)."""
     columns: Array
-    """Its velocity per coordinate rate, shape (3, size)."""
+    """Derivative by time per coordinate velocity, shape (3, size)."""
     rate: Array
-    """Its velocity."""
+    """Derivative by time, shape (3,)."""
     bias: Array
-    """Its acceleration where the coordinates' accelerations are zero."""
+    """Second derivative at zero coordinate accelerations, shape (3,)."""
 
     def minus(self, other: Jet) -> Jet:
-        """Difference of two."""
+        """Subtract another vector."""
         return Jet(*(a - b for a, b in zip(self, other, strict=True)))
 
     def plus(self, other: Jet) -> Jet:
-        """Sum of two."""
+        """Add another vector."""
         return Jet(*(a + b for a, b in zip(self, other, strict=True)))
 
 
 class Rows(NamedTuple):
-    """Equations: value = 0, columns u = 0, columns u' + bias = 0."""
+    """Equations and their derivatives: value = 0, columns u = 0, columns u' + bias = 0."""
 
     value: Array
     columns: Array
@@ -80,35 +81,35 @@ class Rows(NamedTuple):
 
 
 class Moving(ABC):
-    """A machine whose bodies some engine moves."""
+    """The base class of engines, which computes everything from their frames and forces."""
 
     machine: Machine
     size: int
-    """How many rates the engine's coordinates have."""
+    """Number of the engine's coordinate velocities."""
 
     @abstractmethod
     def frame(self, body: str) -> Frame:
-        """A body's frame at the present state."""
+        """Return a body's frame in the present state."""
 
     @abstractmethod
     def assemble(self, q: Array) -> Any:
-        """Put the assembly at ``q``, shape (n,), rad or m, at rest; connected to home.
+        """Set the assembly at ``q``, shape (n,), rad or m, at rest, connected to home.
 
-        :raises UnfitError: none is found, with where the way from home ends.
+        :raises UnfitError: no assembly is found; the text says where the line from home ends.
         """
 
     @abstractmethod
     def move(self, rates: Array) -> None:
-        """Let the present assembly have coordinate rates, shape (size,)."""
+        """Set the coordinate velocities of the present assembly, shape (size,)."""
 
     @abstractmethod
     def forces(self, change: Array) -> Array:
-        """What the coordinates' accelerations and rates and the weight ask for, shape (size,)."""
+        """Compute generalised forces of inertia and weight for coordinate accelerations, (size,)."""
 
     # Motion of points and directions
 
     def point(self, body: str, at: Array) -> Jet:
-        """A point fixed in a body, by its place at home (m)."""
+        """Return a point fixed in a body, given by its position at home, m."""
         if body == BASE:
             return self._still(at)
         frame = self.frame(body)
@@ -116,11 +117,11 @@ class Moving(ABC):
         return origin.plus(self._swung(frame, at - frame.home))
 
     def direction(self, body: str, axis: Array) -> Jet:
-        """A direction fixed in a body, by its components at home."""
+        """Return a direction fixed in a body, given by its components at home."""
         return self._still(axis) if body == BASE else self._swung(self.frame(body), axis)
 
     def spin(self, body: str) -> Jet:
-        """A body's angular velocity; as a vector it is nothing, its value is zero."""
+        """Return a body's angular velocity as a derivative; the value itself is zero."""
         if body == BASE:
             return self._still(np.zeros(3))
         frame = self.frame(body)
@@ -138,7 +139,7 @@ class Moving(ABC):
     # Joints
 
     def joint_rows(self, joint: Joint, holds: Iterable[str] | None = None) -> list[Rows]:
-        """What a joint holds, or only some of it."""
+        """Return the equations of a joint, or of some of its constraints."""
         inner, outer, axes = joint.inner, joint.outer, joint.axes
         gap = self.point(outer, joint.at).minus(self.point(inner, joint.at))
 
@@ -163,7 +164,7 @@ class Moving(ABC):
             elif held == "thread":
                 slide, turn, turned = self._slide(joint), self._turn(joint), joint.pitch
                 gone = slide.value - turned * turn.value
-                # The turn is known but for whole ones.
+                # The angle is known up to full revolutions.
                 gone = np.array([math.remainder(gone[0], 2.0 * math.pi * turned)])
                 rows.append(
                     Rows(gone, *(a - turned * b for a, b in zip(slide[1:], turn[1:], strict=True)))
@@ -173,7 +174,7 @@ class Moving(ABC):
         return rows
 
     def rates(self, joint: Joint) -> Rows:
-        """Rate of a joint of one freedom: columns u are it, columns u' + bias change it."""
+        """Return the value of a joint with one freedom, as a row with its derivatives."""
         if len(joint.type.steps) != 1:
             raise UnfitError(f"joints.{joint.name}: a {joint.type.name} joint has no rate")
         return self._slide(joint) if joint.slides else self._turn(joint)
@@ -196,27 +197,27 @@ class Moving(ABC):
         )
 
     def held(self) -> Iterable[tuple[Joint, Sequence[str]]]:
-        """The joints that are equations, and what of them; a tree's own are left out."""
+        """List the joints that are equations, with their constraints."""
         return [(joint, joint.type.holds) for joint in self.machine.joints]
 
     def closures(self) -> Rows:
-        """All joints' and rods' rows at the present state."""
+        """Return the equations of all joints and rods in the present state."""
         rows = [row for joint, holds in self.held() for row in self.joint_rows(joint, holds)]
         rows += [self.rod_rows(rod) for rod in self.machine.rods]
         return stacked(rows, self.size)
 
     def rod_rows(self, rod: Rod) -> Rows:
-        """A rod keeps its length."""
+        """Return the equation of a rod's constant length."""
         gap = self.point(rod.outer, rod.ends[1]).minus(self.point(rod.inner, rod.ends[0]))
         half = dot(gap, gap)
         return Rows(half.value / 2 - rod.length**2 / 2, half.columns / 2, half.bias / 2)
 
     def drives(self) -> Rows:
-        """The actuated joints' rows; the value is the way from home, rad or m."""
+        """Return the rows of the actuated joints; values are relative to home, rad or m."""
         return stacked([self.rates(joint) for joint in self.machine.actuated], self.size)
 
     def missing(self, way: Array) -> Array:
-        """How far the actuated joints are from their way from home, shape (n,), rad or m."""
+        """Return ``way`` minus the actuated joints' motion from home, (n,), rad or m."""
         result: Array = way - self.drives().value
         for k, joint in enumerate(self.machine.actuated):
             if not joint.slides:
@@ -224,18 +225,18 @@ class Moving(ABC):
         return result
 
     def solve(self, closed: Array, driven: Array) -> Array:
-        """Coordinate rates that give the closures' and the drives' rows these rates."""
+        """Find coordinate velocities for given rates of the closures and of the actuated joints."""
         columns = np.vstack([self.closures().columns, self.drives().columns])
         right = np.concatenate([closed, driven])
         return np.asarray(np.linalg.lstsq(columns, right, rcond=SINGULAR)[0], dtype=np.float64)
 
     def tangent(self) -> Array:
-        """Coordinate rates per joint rate, shape (size, n)."""
+        """Return coordinate velocities per velocity of the actuated joints, shape (size, n)."""
         n = len(self.machine.actuated)
         return self.solve(np.zeros((len(self.closures().value), n)), np.eye(n))
 
     def twist_columns(self) -> Array:
-        """The platform's twist at its reference point per coordinate rate, shape (6, size)."""
+        """Return the platform's twist at its reference point per coordinate velocity, (6, size)."""
         machine = self.machine
         point = self.point(machine.platform, machine.origin)
         return np.vstack([point.columns, self.spin(machine.platform).columns])
@@ -243,7 +244,7 @@ class Moving(ABC):
     # What is asked for
 
     def platform(self, q: Array) -> tuple[Array, Array]:
-        """Position of the reference point, shape (3,), m, and rotation from home, (3, 3)."""
+        """Compute the reference point's position, (3,), m, and the rotation from home, (3, 3)."""
         self.assemble(q)
         return self._placed()
 
@@ -253,17 +254,17 @@ class Moving(ABC):
         return self.point(platform, self.machine.origin).value, rotation
 
     def jacobian(self, q: Array) -> Array:
-        """The platform's twist at its reference point per joint rate, shape (6, n)."""
+        """Compute the platform's twist at its reference point per joint velocity, shape (6, n)."""
         self.assemble(q)
         return self.twist_columns() @ self.tangent()
 
     def inverse_dynamics(
         self, q: Array, qd: Array, qdd: Array, wrench: Array | None = None
     ) -> Array:
-        """Efforts of the actuated joints, shape (n,), N m or N.
+        """Compute the efforts of the actuated joints, shape (n,), N m or N.
 
-        :param q: positions, shape (n,), rad or m; ``qd``, ``qdd`` their derivatives.
-        :param wrench: force (N) and moment (N m) of the surroundings on the platform, shape (6,).
+        :param q: positions, shape (n,), rad or m; ``qd``, ``qdd``: their derivatives.
+        :param wrench: force (N) and moment (N m) of the environment on the platform, shape (6,).
         """
         qd, qdd = np.asarray(qd, dtype=float), np.asarray(qdd, dtype=float)
         self.assemble(q)
@@ -286,10 +287,10 @@ class Moving(ABC):
         return with_laws(self.machine.actuated, q, qd, tau)
 
     def mass_matrix(self, q: Array) -> Array:
-        """Inertia felt at the actuated joints, shape (n, n), kg m2, kg or kg m."""
+        """Compute the mass matrix at the actuated joints, shape (n, n), kg m2, kg or kg m."""
         self.assemble(q)
         tangent = self.tangent()
-        # The weight is the force where nothing moves.
+        # Without motion only the weight is left.
         weight = self.forces(np.zeros(self.size))
         result: Array = np.array([self.forces(column) - weight for column in tangent.T]) @ tangent
         for joint in self.machine.joints:
@@ -300,7 +301,7 @@ class Moving(ABC):
 
 
 def dot(a: Jet, b: Jet) -> Rows:
-    """The row a . b."""
+    """Return the scalar product a . b as a row."""
     return Rows(
         np.array([a.value @ b.value]),
         (a.value @ b.columns + b.value @ a.columns)[None],
@@ -309,7 +310,7 @@ def dot(a: Jet, b: Jet) -> Rows:
 
 
 def stacked(rows: list[Rows], size: int | None = None) -> Rows:
-    """Rows one under another; ``size`` columns where there are none."""
+    """Stack rows; without rows return an empty one with ``size`` columns."""
     if not rows:
         return Rows(np.zeros(0), np.zeros((0, size or 0)), np.zeros(0))
     return Rows(
@@ -320,12 +321,12 @@ def stacked(rows: list[Rows], size: int | None = None) -> Rows:
 
 
 def drag(joint: Joint, rates: Array) -> Array:
-    """Friction's share of the effort at these rates, one a rate, N m or N."""
+    """Return viscous friction, Coulomb friction and offset at each velocity, N m or N."""
     result: Array = joint.viscous * rates + joint.coulomb * np.sign(rates) + joint.offset
     return result
 
 
 def skewed(v: Array) -> Array:
-    """The matrix of v x, shape (3, 3)."""
+    """Return the matrix of the cross product v x, shape (3, 3)."""
     x, y, z = v.tolist()
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])

@@ -1,9 +1,9 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""A machine as an engine's tree of joints with loops cut open: no closure is the engine's.
+"""Compute a machine as an engine's tree of joints, with the loops cut and closed here.
 
-A spanning tree, a rod as a body of its own on two hinges across it, positions by Newton's method in
-many equal steps from home. Points and directions move by the engine's kinematics and Jacobians; its
-inverse dynamics of the tree is projected on the actuated joints.
+Each rod is a body on two hinges perpendicular to it. Positions follow by Newton's method in equal
+steps from home. Kinematics and Jacobians of points and directions are the engine's; its inverse
+dynamics of the tree is projected on the actuated joints.
 """
 
 from __future__ import annotations
@@ -29,19 +29,19 @@ from pkm_twin.certify.description import (
 from pkm_twin.certify.rows import Moving, Rows
 
 STEPS: Final = 64
-"""Steps from home to a state."""
+"""Number of steps from home to a state."""
 Steps = Sequence[tuple[bool, Array]]
-"""Freedoms of a joint from the parent outwards: whether each turns, and its axis at home."""
+"""Freedoms of a joint from parent to child: whether each is a rotation, and its axis at home."""
 
 
 class Tree(Moving):
-    """A machine as a tree with loop constraints.
+    """The base class of machines as trees with loop constraints.
 
-    :raises UnfitError: a description that cannot be read.
+    :raises UnfitError: the description cannot be read.
     """
 
     widest: bool
-    """Whether the joints of most freedoms make the tree, else the actuated and the narrowest."""
+    """Whether the tree prefers joints with many freedoms; else actuated ones and few freedoms."""
 
     def __init__(self, description: Description) -> None:
         self.machine = read(description)
@@ -57,13 +57,13 @@ class Tree(Moving):
         self._assembled: dict[bytes, Array] = {}
 
     def _grow(self) -> None:
-        """A spanning tree from the base outwards; the other joints are equations."""
+        """Build a spanning tree from the base; the remaining joints become equations."""
         joints, bodies = list(self.machine.joints), self.machine.bodies
         hung = {BASE}
         while len(hung) <= len(bodies):
             edges = [j for j in joints if (j.inner in hung) != (j.outer in hung)]
             if not edges:
-                # Held by rods alone: it hangs free, with what joints carry on from it.
+                # A body held by rods alone gets six freedoms; joints continue the tree from it.
                 name = next(n for n in (self.machine.platform, *bodies) if n not in hung)
                 self.hang(name, BASE, bodies[name].com, None, bodies[name])
                 hung.add(name)
@@ -84,49 +84,49 @@ class Tree(Moving):
 
     @abstractmethod
     def hang(self, name: str, parent: str, at: Array, steps: Steps | None, body: Body) -> None:
-        """Add a body on its parent, by joints through a point at home; None: it is free."""
+        """Add a body to its parent by joints through a point at home; None: six freedoms."""
 
     @abstractmethod
     def finish(self) -> int:
-        """Make the model, place it at home, and say how many rates it has."""
+        """Complete the model at home; return its number of velocities."""
 
     @abstractmethod
     def place(self, full: Array, rates: Array) -> None:
-        """Put the tree's configuration and rates, shape (size,)."""
+        """Set the tree's configuration and velocities, shape (size,)."""
 
     @abstractmethod
     def stepped(self, full: Array, step: Array) -> Array:
-        """The configuration that a small motion leads to, shape (size,)."""
+        """Return the configuration after a small motion, shape (size,)."""
 
     @abstractmethod
     def neutral(self) -> Array:
-        """The configuration at home."""
+        """Return the configuration at home."""
 
     def held(self) -> Iterable[tuple[Joint, Sequence[str]]]:
-        """The joints that the tree leaves out, and threads."""
+        """List the joints that the tree leaves out, and the thread constraints of its screws."""
         return self._held
 
     def rod_rows(self, rod: Rod) -> Rows:
-        """A rod's far end stays on its ball."""
+        """Return the equations that hold a rod's far end at its ball joint."""
         end = rod.ends[1]
         gap = self.point(_name(rod), end).minus(self.point(rod.outer, end))
         return Rows(gap.value, gap.columns, gap.bias)
 
     def assemble(self, q: Array) -> Array:
-        """The configuration at ``q``, shape (n,), reached from home in equal steps.
+        """Set the configuration at ``q``, shape (n,), reached from home in equal steps; return it.
 
         :raises UnfitError: Newton's method does not close the loops on the way.
         """
         q = np.asarray(q, dtype=float)
         if q.tobytes() not in self._assembled:
-            # One is enough: torques, place and masses are asked for one state after another.
+            # Caching one state is enough: all quantities are computed state by state.
             self._assembled = {q.tobytes(): self._follow(q - self.machine.home)}
         full = self._assembled[q.tobytes()]
         self._at(full)
         return full
 
     def move(self, rates: Array) -> None:
-        """Let the present assembly have rates, shape (size,)."""
+        """Set the velocities of the present assembly, shape (size,)."""
         self.place(self._full, rates)
 
     def _at(self, full: Array) -> None:
@@ -158,5 +158,5 @@ class Tree(Moving):
 
 
 def _name(rod: Rod) -> str:
-    """Of the body that stands for a rod."""
+    """Return the name of the body that represents a rod."""
     return f"rod {rod.name}"

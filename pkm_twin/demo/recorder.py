@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""What every stage of the demonstration needs: child processes, and a recorder of their topics."""
+"""Start the nodes of the demonstration, play bags to them and record their topics."""
 
 from __future__ import annotations
 
@@ -23,22 +23,22 @@ from pkm_twin.bags.reader import BagMessage, BagWriter
 from pkm_twin.errors import PkmTwinError
 
 PATIENCE = 120.0
-"""How long an answer may take, s: where nothing else runs it is less than a thousandth of it; a
-node that starts for the first time compiles its programs."""
+"""Longest wait for an answer, s. On an idle computer answers take less than a thousandth of this,
+but a node that starts for the first time compiles its programs."""
 TICK = 5_000_000
-"""Period of the clock of a bag, ns."""
+"""Period of the published clock, ns."""
 AHEAD = 50_000_000
-"""How far a bag goes ahead of its answers, ns. Joint states and wrenches that belong together come
-by ways of their own: this is half of what a node allows between them."""
+"""Longest time by which a bag runs ahead of its answers, ns: half of what a node allows between a
+joint state and its wrench, which arrive independently."""
 DEPTH = 20_000
-"""Of the recorder's queues: more than a stage publishes while nobody takes it."""
+"""Depth of the recorder's queues: more messages than a stage publishes before they are taken."""
 
 STATE = "sensor_msgs/msg/JointState"
 TRAJECTORY = "trajectory_msgs/msg/JointTrajectory"
 
 
 class Recorder:
-    """Writes the raw messages of some topics into a bag, under a prefix for each stage."""
+    """Writes the raw messages of topics into a bag, with a prefix for each stage."""
 
     def __init__(self, node: Node, writer: BagWriter) -> None:
         self._node = node
@@ -46,12 +46,13 @@ class Recorder:
         self._subscriptions: list[Any] = []
         self.counts: dict[str, int] = {}
         self.newest = 0
-        """Stamp of the last message of the topic that is paced, ns."""
+        """Stamp of the last message of the paced topic, ns."""
 
     def listen(self, prefix: str, topics: dict[str, str], paced: str = "") -> None:
-        """Record these topics from now on, as ``prefix`` followed by the topic.
+        """Record topics from now on, each under ``prefix`` followed by its name.
 
-        :param paced: of these one with headers, whose stamps ``newest`` follows.
+        :param topics: types by topic.
+        :param paced: the topic (with headers) whose stamps ``newest`` follows.
         """
         self.newest = 0
         qos = QoSProfile(depth=DEPTH, reliability=ReliabilityPolicy.RELIABLE)
@@ -67,11 +68,11 @@ class Recorder:
 
     @property
     def total(self) -> int:
-        """How many messages have come."""
+        """Number of messages received."""
         return sum(self.counts.values())
 
     def stop(self) -> None:
-        """Forget the current topics."""
+        """Stop recording the current topics."""
         for subscription in self._subscriptions:
             self._node.destroy_subscription(subscription)
         self._subscriptions.clear()
@@ -87,11 +88,12 @@ class Recorder:
 
 
 class Lockstep:
-    """Plays a bag as fast as it is answered: load makes it slower and changes nothing else.
+    """Paces a bag by the answers to it, and publishes the nodes' clock.
 
-    It is the nodes' clock, too.
+    A busy computer makes the demonstration slower, but does not change its results.
 
-    :param topic: whose messages are answered by stamp on the recorder's paced topic.
+    :param topic: the topic whose messages are answered, by stamp, on the recorder's paced topic.
+    :param child: the node's process; ``what``: description of the wait, for errors.
     """
 
     def __init__(
@@ -112,7 +114,7 @@ class Lockstep:
         )
 
     def close(self) -> None:
-        """End the clock."""
+        """Stop the clock."""
         self._node.destroy_publisher(self._clock)
         self._node.destroy_subscription(self._answers)
 
@@ -120,12 +122,12 @@ class Lockstep:
         self._heard = array.header.stamp.sec
 
     def begin(self, time: int) -> None:
-        """Wait until the node's clock is the bag's, ns: its diagnostics have the stamp."""
+        """Wait until the stamps of the node's diagnostics reach ``time``, ns."""
         self._now = time
         self._wait(lambda: self._heard >= time // 10**9)
 
     def pace(self, message: BagMessage) -> None:
-        """Wait before a message goes out."""
+        """Wait until a message may be published."""
         if message.log_time >= self._now + TICK:
             self._now = message.log_time
             self._tick()
@@ -141,7 +143,7 @@ class Lockstep:
 
     @property
     def answered(self) -> bool:
-        """Whether the last message has its answer."""
+        """Whether the last message is answered."""
         return self._recorder.newest >= self._last
 
     def _wait(self, condition: Callable[[], bool]) -> None:
@@ -150,7 +152,7 @@ class Lockstep:
         def holds() -> bool:
             nonlocal total
             if self._recorder.total == total:
-                # Nothing came: the clock, which is not delivered reliably, goes out again.
+                # The clock is not delivered reliably: publish it again as long as no answer comes.
                 self._tick()
             total = self._recorder.total
             return condition()
@@ -164,14 +166,14 @@ class Lockstep:
 
 
 def stamp(data: bytes) -> int:
-    """Stamp of an encoded message that begins with a header, ns."""
+    """Read the stamp, ns, of an encoded message that begins with a header."""
     seconds, nanoseconds = struct.unpack_from("<iI" if data[1] & 1 else ">iI", data, 4)
     return int(seconds) * 10**9 + int(nanoseconds)
 
 
 @contextmanager
 def process(command: Sequence[str]) -> Iterator[subprocess.Popen[bytes]]:
-    """A child process in a session of its own, ended with SIGINT and waited for."""
+    """Run a child process in a session of its own; end it with SIGINT and wait for it."""
     child = subprocess.Popen(command, start_new_session=True, env=child_environment())  # noqa: S603
     try:
         yield child
@@ -186,7 +188,7 @@ def process(command: Sequence[str]) -> Iterator[subprocess.Popen[bytes]]:
 
 
 def child_environment() -> dict[str, str]:
-    """The environment, changed so that a child's ROS wheels find their libraries again."""
+    """Return the environment for a child, changed so that ROS wheels find their libraries."""
     environment = dict(os.environ)
     environment.pop("_ROS_WHEELS_BOOTSTRAP_COMPLETE", None)
     return environment
@@ -200,7 +202,7 @@ def wait_for(
 ) -> None:
     """Spin until the condition holds.
 
-    :raises PkmTwinError: it does not for :data:`PATIENCE`, or the child ends before.
+    :raises PkmTwinError: the condition fails for :data:`PATIENCE`, or the child ends before.
     """
     deadline = time.monotonic() + PATIENCE
     while not condition():
@@ -219,10 +221,10 @@ def drain(
     recorder: Recorder,
     answered: Callable[[], bool] = lambda: True,
 ) -> None:
-    """Take what is still on its way: until nothing has come for half a second.
+    """Receive messages until none has come for half a second.
 
-    :param answered: whether all is there that is known to come; else it is waited for ten times
-        as long.
+    :param answered: returns whether all expected messages have come; otherwise the wait is ten
+        times as long.
     """
     last, quiet = recorder.total, time.monotonic()
     while time.monotonic() - quiet < (0.5 if answered() else 5.0):

@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""What the demonstration found: figures, verdicts and a picture, read from its recording."""
+"""Evaluate the recording of the demonstration: figures, verdicts and a picture."""
 
 from __future__ import annotations
 
@@ -23,22 +23,22 @@ from pkm_twin.report import judged as judge
 from pkm_twin.robot.robot import Robot
 
 MAX_RESIDUAL = 0.05
-"""Largest residual RMS without payload, part of the joint's peak effort."""
+"""Largest residual RMS without payload, relative to the joint's peak effort."""
 
 MAX_CUTTING_RESIDUAL = 0.01
-"""Largest residual RMS while cutting, likewise: without the wrench it is 0.15."""
+"""Largest residual RMS while cutting, relative to the peak effort: without the wrench 0.15."""
 
 MIN_ANSWERED = 0.95
-"""Least part of the samples that has to be answered."""
+"""Smallest fraction of the samples that must be answered."""
 
 MAX_DEFLECTION_ERROR = 0.02
-"""Largest RMS difference to the frame's deflection, part of its RMS: noise of wrench and encoders
-makes 0.4 %; a wrench left unturned, 8 %."""
+"""Largest RMS difference to the finite-element deflection, relative to its RMS. Noise of wrench and
+encoders gives 0.4 %, a wrench in wrong axes 8 %."""
 
 
 @dataclass(frozen=True)
 class Panel:
-    """A panel of the picture over time, s; ``lines``: times, values and the line's style each."""
+    """A panel of the picture over time, s; ``lines``: times, values and style of each line."""
 
     title: str
     upright: str
@@ -46,13 +46,13 @@ class Panel:
 
 
 def _window(time: Array, seconds: float, whole: Array) -> Mask:
-    """What is drawn: some seconds from an eighth of all rising times on."""
+    """Select the times to draw: some seconds from the first eighth of all times on."""
     begin = float(whole[len(whole) // 8]) if len(whole) else 0.0
     return (time >= begin) & (time <= begin + seconds)
 
 
 def report_dynamics(bag: Path, recording: Path, prefix: str) -> tuple[list[Fact], Panel]:
-    """Compare recorded efforts with the answered ones."""
+    """Compare recorded efforts with those that the node published."""
     r = read(bag, how=ReadOptions(limited=True))
     robot, unit = r.robot, " or ".join(dict.fromkeys(r.robot.effort_units))
     torques = _by_stamp(recording, f"/{prefix}/delta_dynamics/joint_torques")
@@ -93,7 +93,7 @@ def report_dynamics(bag: Path, recording: Path, prefix: str) -> tuple[list[Fact]
         left("without load", free, MAX_RESIDUAL),
     ]
     if r.wrench is not None:
-        # Where a force acts, which the node was given.
+        # Samples with a cutting force, which the node received.
         findings.append(left("while cutting", ~free, MAX_CUTTING_RESIDUAL))
     if r.load is not None and r.load.times:
         begin, end = r.load.times[0]
@@ -103,12 +103,12 @@ def report_dynamics(bag: Path, recording: Path, prefix: str) -> tuple[list[Fact]
 
 
 def _rms(values: Array) -> Array:
-    """Root mean square over the samples, by joint."""
+    """Return each joint's root mean square over the samples."""
     return np.asarray(np.sqrt(np.mean(values**2, 0)), np.float64)
 
 
 def _free(r: Recording) -> Mask:
-    """Where nothing is held and nothing cut; half a second around either counts for neither."""
+    """Find samples without payload or cutting force, at least half a second away from either."""
     if r.load is not None:
         loaded = r.load.held(r.time)
     elif r.wrench is not None:
@@ -128,12 +128,12 @@ def _free(r: Recording) -> Mask:
 def _payload(
     prefix: str, r: Recording, residual: Array, free: Mask, answered: Indices, held: Mask
 ) -> list[Fact]:
-    """The step that the payload makes in the residual, and the mass that it means."""
+    """Judge the payload's step in the residual and the mass estimated from it."""
     assert r.load is not None  # noqa: S101
     change = residual[held] - residual[free].mean(0)
     step = np.linalg.norm(change.mean(0))
     scatter = np.linalg.norm(np.std(residual[free], 0))
-    # What one kilogram would need, along the recorded motion.
+    # Efforts of one kilogram along the recorded motion.
     qd, qdd, _ = differentiated(r)
     state = [values[answered[held]] for values in (r.q, qd, qdd)]
     kilogram = inverse_dynamics(r.robot.changed(payload={"mass": 1.0}), *state)
@@ -157,7 +157,7 @@ def _payload(
 
 
 def report_stiffness(bag: Path, recording: Path, prefix: str) -> tuple[list[Fact], Panel]:
-    """Compare answered deflections with the frame's, and say what dominated."""
+    """Compare published deflections with the finite-element frame, and list dominant elements."""
     wrenches = _by_stamp(bag, "/wrench")
     energies = _by_stamp(recording, f"/{prefix}/stiffness_monitor/strain_energy")
     moved = _by_stamp(recording, f"/{prefix}/stiffness_monitor/deflection")
@@ -225,13 +225,13 @@ def _by_stamp(bag: Path, topic: str) -> dict[int, Any]:
 
 
 def _efforts(messages: Mapping[int, Any], stamps: list[int], robot: Robot) -> Array:
-    """Efforts in the order that the node publishes, the robot's, shape (samples, n)."""
+    """Return the messages' efforts in the robot's joint order, shape (samples, n)."""
     efforts = [messages[stamp].effort for stamp in stamps]
     return np.array(efforts).reshape(-1, len(robot.joint_names))
 
 
 def share(bag: str, what: str, count: int, total: int) -> Fact:
-    """How many of so many there are, judged by :data:`MIN_ANSWERED`."""
+    """Judge a count as a fraction of a total by :data:`MIN_ANSWERED`."""
     return judge(
         f"{bag}: {what}",
         f"{count} of {total}",
@@ -241,7 +241,7 @@ def share(bag: str, what: str, count: int, total: int) -> Fact:
 
 
 def told(bag: str, what: str, words: str) -> Fact:
-    """A figure that is not judged."""
+    """Make a fact that is reported without a verdict."""
     return Fact("", words, text=f"{bag}: {what}")
 
 
@@ -254,7 +254,7 @@ def _xyz(vector: Any) -> list[float]:
 
 
 def draw(panels: Sequence[Panel], path: Path) -> Path:
-    """One picture of all stages: a panel each."""
+    """Draw one picture with a panel for each stage."""
     figure, columns = plots.columns(2, 2, 8)
     axes = [columns[k % 2][k // 2] for k in range(4)]
     for ax, panel in zip(axes, panels, strict=False):

@@ -1,10 +1,10 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""The demonstration: every recorded bag through the real nodes over the real middleware.
+"""Run the demonstration: recorded bags through the real nodes over the real middleware.
 
-For each bag a node runs as a process of its own, then the twin with a simulated machine. This
-process plays the bags in lockstep with the answers, records what the nodes publish into one MCAP,
-reads that back, and ends with a table, a picture and a verdict. Time is simulated everywhere, so a
-loaded machine takes longer and finds the same.
+For each bag a node runs as a separate process, and at last a simulated machine with feedforward.
+This process plays the bags in lockstep with the answers, records the nodes' topics into one MCAP
+file, evaluates it, and ends with a table, a picture and a verdict. Time is simulated everywhere, so
+a busy computer takes longer with the same results.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ from pkm_twin.ros.signals import INTERRUPTED, first_signal
 class Stage:
     """One bag, the node that answers it, and the node's output topics with their types.
 
-    ``asked``: the input whose every message is answered, with its stamp, on ``answer``.
+    ``asked``: the input whose messages are all answered, with their stamps, on ``answer``.
     """
 
     bag: str
@@ -62,7 +62,7 @@ class Stage:
 
     @property
     def arguments(self) -> list[str]:
-        """Of the node: no queue on the way overflows, whatever waits for a turn on this machine."""
+        """Arguments of the node, with queues that do not overflow on a busy computer."""
         queues = [f"qos_overrides.{t}.subscription.reliability:=reliable" for t in self.inputs]
         queues += [f"qos_overrides.{t}.publisher.depth:={DEPTH}" for t in self.outputs]
         given = (
@@ -75,7 +75,7 @@ class Stage:
         return ["--ros-args", *(word for parameter in given for word in ("-p", parameter))]
 
 
-# Nobody is pushed by a late torque here.
+# Late torques do no harm here, as they only are recorded.
 PATIENT = f"stale_after:={PATIENCE}"
 PATIENT_QUEUE = f"max_wait:={PATIENCE}"
 JOINTS = "/joint_states"
@@ -175,7 +175,7 @@ def run_stage(
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the demonstration; 0 where every node answered and every figure is in bounds."""
+    """Run the demonstration; return 0 if every node answered and every figure keeps its bound."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--bags", type=Path, default=Path("bags"), help="folder of the bags")
     parser.add_argument("--out", type=Path, default=Path("out"), help="folder for the results")
@@ -192,7 +192,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         console.print(f"[red]demo failed:[/red] {options.out}: {error.strerror}")
         return 1
     try:
-        # The children too have to end with this process.
+        # A signal must end the child processes, too.
         with first_signal(KeyboardInterrupt):
             report = run(options.bags, options.out, console)
     except KeyboardInterrupt:
@@ -205,7 +205,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def run(bags: Path, out: Path, console: Console) -> Report:
-    """Bags through their nodes, a machine by the twin; draw what came back."""
+    """Play the bags to their nodes, control a simulated machine, and evaluate the recording."""
     recording = out / "demo.mcap"
     context = Context()
     rclpy.init(args=middleware_arguments([]), context=context)

@@ -1,8 +1,8 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""The demonstration's closed loop: PD alone, then PD with feedforward, on the same path.
+"""Compare PD control with and without feedforward on the demonstration's simulated machine.
 
-machine_sim, whose parameters are drawn about the model's, keeps simulated time and follows a
-trajectory by itself, with the brakes on before. So the result does not depend on the computer.
+The parameters of machine_sim are perturbed from the model's. It keeps simulated time and follows
+a trajectory by itself, starting with brakes on, so that the result does not depend on the computer.
 """
 
 from __future__ import annotations
@@ -41,22 +41,25 @@ from pkm_twin.report import Fact, judged, plots
 from pkm_twin.streams.path import JointPath
 
 TIMES_BETTER: Final = 5.0
-"""How much smaller feedforward has to make the tracking error at the smallest spread."""
+"""Smallest ratio of tracking errors without and with feedforward, at the smallest perturbation."""
 ROBOT: Final = "delta_cu"
 PERIOD: Final = 2e-3
-"""Of the machine's joint states, s: what a loaded computer can still record."""
+"""Period of the machine's joint states, s, which a busy computer can still record."""
 SPREADS: Final = (0.01, 0.2)
+"""Relative standard deviations of the machine's parameters."""
 AMPLITUDES: Final = (0.5, -0.4, 0.6)
-"""How far the joints go and come back, rad."""
+"""Amplitudes of the joints' motion from home and back, rad."""
 DURATION: Final = 0.8
+"""Duration of the motion, s."""
 POINTS: Final = 81
+"""Number of points of its trajectory."""
 INPUT: Final = "/machine_sim/joint_trajectory"
 QUEUE: Final = "qos_overrides./joint_states.publisher.depth"
 TWIN: Final = "/delta_dynamics/joint_trajectory"
 
 
 class _Watch:
-    """How far the machine's clock is, ns, whether it stands, and whether its path is over."""
+    """Follows the machine's clock, ns, and whether it stands still or has finished its path."""
 
     def __init__(self) -> None:
         self.newest = 0
@@ -64,7 +67,7 @@ class _Watch:
         self._since: int | None = None
 
     def take(self, state: JointState) -> None:
-        """A joint state: a machine with its brakes on has no rate at all."""
+        """Take a joint state; with its brakes on the machine's velocities are exactly zero."""
         self.newest = stamp_of(state.header)
         self.stands = not any(state.velocity)
         if self._since is None and not self.stands:
@@ -73,7 +76,7 @@ class _Watch:
             self.done |= self.newest > self._since + 1.1 * DURATION * SECOND
 
     def begin(self) -> None:
-        """Watch another path, from the start."""
+        """Begin to watch another path."""
         self.stands = self.done = False
         self._since = None
 
@@ -81,7 +84,7 @@ class _Watch:
 def run(
     spread: float, recorder: Recorder, executor: SingleThreadedExecutor, console: Console
 ) -> None:
-    """Both runs on a machine of this spread, recorded."""
+    """Record a run without and a run with feedforward on a machine with this perturbation."""
     node = executor.get_nodes()[0]
     recorder.listen(prefix(spread), {"/joint_states": STATE, INPUT: TRAJECTORY})
     watch = _Watch()
@@ -92,12 +95,12 @@ def run(
     twin, machine = (node.create_publisher(JointTrajectory, t, depth) for t in (TWIN, INPUT))
     reset = node.create_client(Trigger, "/machine_sim/reset")
     module = [sys.executable, "-m"]
-    # Trajectories alone are asked of the twin.
+    # The twin only answers trajectories: its joint states come from an empty topic.
     asked = [*module, "delta_dynamics.nodes.twin", "--ros-args", "-p", f"mechanism:={ROBOT}"]
     asked += ["-r", "joint_states:=/delta_dynamics/joint_states"]
     moved = [*module, "delta_dynamics.nodes.simulation", "--ros-args", "-p", f"mechanism:={ROBOT}"]
     moved += ["-p", "clock:=simulated", "-p", f"period:={PERIOD}"]
-    # A loaded computer catches up in bursts.
+    # Deep queues, as a busy computer catches up in bursts.
     moved += ["-p", f"spread:={spread}", "-p", f"{QUEUE}:={DEPTH}"]
     console.print(f"machine_sim at {100 * spread:g} % spread: PD, then with feedforward")
     plain = _trajectory()
@@ -107,7 +110,7 @@ def run(
             wait_for(executor, condition, what, first)
 
         def answered() -> bool:
-            # Asked again and again: who hears a node is not at once heard by it.
+            # Publish repeatedly: discovery is not complete in both directions at once.
             if not answers:
                 twin.publish(plain)
             return bool(answers)
@@ -125,7 +128,7 @@ def run(
             watch.begin()
             machine.publish(trajectory)
             await_that(lambda: watch.done, "the path's end")
-    # What the recorder has not taken yet.
+    # Receive the messages that are still in the queues.
     drain(executor, recorder)
     recorder.stop()
     for subscription in (states, heard):
@@ -136,11 +139,11 @@ def run(
 
 
 def _trajectory() -> JointTrajectory:
-    """There and back from home, at rest at both ends, from when it comes; the joints apart."""
+    """Make a trajectory from home and back, at rest at both ends, that starts on receipt."""
     robot = load(ROBOT)
     home = robot.inverse(robot.home())
     x = np.linspace(0.0, 1.0, POINTS)
-    # 64 (x - x^2)^3, which is 1 in the middle.
+    # 64 (x - x^2)^3 is 1 at x = 1/2, and its first two derivatives vanish at both ends.
     blend = 64.0 * np.array([-1.0, 3.0, -3.0, 1.0, 0.0, 0.0, 0.0])
     rows = [
         np.outer(np.polyval(np.polyder(blend, k), x) / DURATION**k, AMPLITUDES) for k in range(3)
@@ -160,7 +163,7 @@ def _trajectory() -> JointTrajectory:
 
 @dataclass(frozen=True)
 class Run:
-    """One way along the path: its duration and times, s; errors (rad) and efforts (N m), (p, n)."""
+    """One run along the path: duration and times, s; errors (rad) and efforts (N m), (p, n)."""
 
     duration: float
     time: Array
@@ -174,12 +177,12 @@ class Run:
 
 
 def prefix(spread: float) -> str:
-    """Under what a spread's topics stand in the recording."""
+    """Return the prefix of a perturbation's topics in the recording."""
     return f"machine_sim_{100 * spread:g}_percent"
 
 
 def report(recording: Path) -> tuple[list[Fact], Panel]:
-    """Tracking error and torque of both runs of every model error."""
+    """Report tracking errors and efforts of both runs for each perturbation."""
     findings: list[Fact] = []
     panel = Panel("machine_sim: tracking error by model error", "error, all joints (mrad)", [])
     robot = load(ROBOT)
@@ -206,13 +209,13 @@ def report(recording: Path) -> tuple[list[Fact], Panel]:
 
 
 def _runs(recording: Path, name: str) -> tuple[Run, Run]:
-    """The two trajectories that the machine got, and the joint states while it went them."""
+    """Read the runs without and with feedforward from the recording."""
     reader = JointReader(load(ROBOT), with_effort=True)
     messages = read_messages(recording, [f"/{name}/joint_states"])
     states = {stamp_of(m.message.header): m.message for m in messages}
     stamps = np.array(sorted(states))
     moving = np.array([any(states[stamp].velocity) for stamp in stamps.tolist()])
-    # A trajectory begins with the last joint state that stands still.
+    # A trajectory begins at the last joint state at rest.
     starts = stamps[:-1][~moving[:-1] & moving[1:]]
     topic = f"/{name}/machine_sim/joint_trajectory"
     trajectories = [reader.trajectory(m.message, 0) for m in read_messages(recording, [topic])]
@@ -221,7 +224,7 @@ def _runs(recording: Path, name: str) -> tuple[Run, Run]:
         path = JointPath(trajectory)
         end = start + round(path.duration * SECOND)
         during = stamps[(stamps > start) & (stamps <= end)].tolist()
-        # In the machine's order of joints, the robot's.
+        # The machine publishes its joints in the robot's order.
         q = np.array([states[s].position for s in during])
         times = (np.array(during) - start) / SECOND
         wanted = np.array([path.at(t).q for t in times.tolist()])
