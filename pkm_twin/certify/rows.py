@@ -104,7 +104,7 @@ class Moving(ABC):
 
     @abstractmethod
     def forces(self, change: Array) -> Array:
-        """Compute generalised forces of inertia and weight for coordinate accelerations, (size,)."""
+        """Compute forces of inertia and weight at coordinate accelerations, shape (size,)."""
 
     # Motion of points and directions
 

@@ -1,8 +1,8 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""Parameters of a machine file, and the expressions that stand for its numbers.
+"""Read the parameters of a machine file and the expressions in place of its numbers.
 
-An expression is a text of arithmetic: + - * / ** ( ), sqrt, sin, cos, tan, atan2, pi and the names
-of parameters. It is read as a syntax tree, of which only these parts are known; nothing is run.
+An expression is arithmetic text: + - * / ** ( ), sqrt, sin, cos, tan, atan2, pi and names of
+parameters. It is parsed to a syntax tree that may contain only these elements; no code is executed.
 """
 
 from __future__ import annotations
@@ -25,25 +25,25 @@ from pkm_twin.codegen.expressions import reference
 from pkm_twin.errors import ParameterError, unknown_number
 
 PARAMETERS: Final = "parameters"
-"""The section of parameters, and the first key of their paths."""
+"""Name of the parameters' section, the first key of their paths."""
 MAX_LENGTH: Final = 500
 """Longest expression, characters."""
 MAX_DEPTH: Final = 40
 """Deepest nesting of an expression."""
 MAX_SIZE: Final = 1e18
-"""Beyond every quantity of a machine in SI units; products of such numbers stay finite."""
+"""Largest number: beyond every quantity of a machine in SI units; products stay finite."""
 _NAME: Final = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 _STRANGE: Final = re.compile(r"[^A-Za-z0-9_ \t.+\-*/(),]")
 _NUMBER: Final = re.compile(r"(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
 _WITH_UNIT: Final = re.compile(r"\s*[-+]?[\d.]+([eE][-+]?\d+)?\s*[A-Za-z]\S*\s*")
 _ANGLES: Final = ("sin", "cos", "tan")
-"""Functions of an angle, whose values have no unit."""
+"""Functions of an angle; their values have no unit."""
 _SQUARE: Final = "^2"
-"""Behind the unit of what a root is taken of."""
+"""Suffix that marks the squared unit of a root's argument."""
 
 
 def _either(numbers: Callable[..., float], expressions: Callable[..., Any]) -> Callable[..., Any]:
-    """A function of numbers, or of expressions where one of its arguments is one."""
+    """Return a function that calls ``expressions`` if an argument is one, else ``numbers``."""
 
     def call(*values: Any) -> Any:
         if any(hasattr(value, "tape") for value in values):
@@ -54,13 +54,13 @@ def _either(numbers: Callable[..., float], expressions: Callable[..., Any]) -> C
 
 
 def _power(base: Any, exponent: Any) -> Any:
-    """Of expressions: a whole exponent by products, any other by exp and log, base above zero."""
+    """Raise an expression to a power: by products for an integer exponent, else by exp and log."""
     fixed = None if hasattr(exponent, "tape") else float(exponent)
     if fixed is not None and fixed.is_integer() and abs(fixed) <= MAX_DEPTH:
         product = base ** int(abs(fixed)) if fixed else 1.0
         return product if fixed >= 0.0 else 1.0 / product
     own = reference(base)
-    # A step of Halley's method moves a logarithm by at most 2: the 256th root's is found first.
+    # A step of Halley's method changes a logarithm by at most 2: begin with the 256th root.
     ratio = base / own
     root = ratio
     for _ in range(8):
@@ -70,7 +70,7 @@ def _power(base: Any, exponent: Any) -> Any:
 
 
 def _halley(value: Any, log: Any, steps: int) -> Any:
-    """Logarithm of a value by Halley's method for exp(log) = value, of third order."""
+    """Compute a logarithm by Halley's third-order method for exp(log) = value."""
     for _ in range(steps):
         power = operations.exp(log)
         log = log + 2.0 * (value - power) / (value + power)
@@ -84,7 +84,7 @@ FUNCTIONS: Final[Mapping[str, tuple[int, Callable[..., Any]]]] = {
     "tan": (1, _either(math.tan, lambda x: operations.sin(x) / operations.cos(x))),
     "atan2": (2, _either(math.atan2, operations.atan2)),
 }
-"""How many arguments a function has, and what it gives."""
+"""Functions of expressions: number of arguments, and implementation."""
 _OPERATORS: Final[Mapping[type, Callable[..., Any]]] = {
     ast.Add: operator.add, ast.Sub: operator.sub, ast.Mult: operator.mul, ast.Div: operator.truediv,
     ast.Pow: _either(operator.pow, _power), ast.USub: operator.neg, ast.UAdd: lambda x: x,
@@ -93,7 +93,7 @@ _OPERATORS: Final[Mapping[type, Callable[..., Any]]] = {
 
 @dataclass(frozen=True, eq=False)
 class Formula:
-    """An expression, checked; ``path``: where it stands; ``names``: the parameters in it."""
+    """A checked expression; ``path``: its path in the file; ``names``: its parameters."""
 
     path: str
     text: str
@@ -102,9 +102,9 @@ class Formula:
 
     @classmethod
     def of(cls, path: str, text: str) -> Formula:
-        """Read an expression.
+        """Parse and check an expression.
 
-        :raises ParameterError: it is no arithmetic, or too long or too deep.
+        :raises ParameterError: the text is not arithmetic, too long or nested too deep.
         """
         if len(text) > MAX_LENGTH:
             raise ParameterError(path, text, f"at most {MAX_LENGTH} characters")
@@ -130,9 +130,9 @@ class Formula:
         return cls(path, text, tree, frozenset(names))
 
     def value(self, given: Mapping[str, Any]) -> Any:
-        """Its value for values of the parameters: numbers, or expressions of programs.
+        """Evaluate the expression for parameters that are numbers or expressions of programs.
 
-        :raises ParameterError: an unknown parameter, or no finite number.
+        :raises ParameterError: a parameter is unknown, or the result is not a finite number.
         """
         for name in sorted(self.names - given.keys()):
             if name.lower() in ("nan", "inf"):
@@ -158,12 +158,12 @@ class Formula:
         return ParameterError(self.path, self.text, reason)
 
     def units(self, unit: str) -> Iterator[tuple[str, str]]:
-        """Units of the parameters in it where they can be told, for the unit of its value."""
+        """Derive units of parameters, where possible, from the unit of the expression's value."""
         return _units(self.tree, unit)
 
 
 def _walk(node: ast.expr, depth: int) -> Iterator[tuple[ast.expr, int]]:
-    """All parts, and how deep they stand; none below one that is too deep."""
+    """Iterate over all nodes of a syntax tree with their depths."""
     rows = [(node, depth)]
     while rows:
         node, depth = rows.pop()
@@ -172,7 +172,7 @@ def _walk(node: ast.expr, depth: int) -> Iterator[tuple[ast.expr, int]]:
 
 
 def _parts(node: ast.expr) -> list[ast.expr]:
-    """What a part is made of."""
+    """Return the operands or arguments of a node."""
     if isinstance(node, ast.BinOp):
         return [node.left, node.right]
     if isinstance(node, ast.UnaryOp):
@@ -181,7 +181,7 @@ def _parts(node: ast.expr) -> list[ast.expr]:
 
 
 def _refused(node: ast.expr, text: str) -> str:
-    """Why a part is none of an expression; empty where it is one."""
+    """Return why a node is not allowed in an expression; empty if it is allowed."""
     own = text[node.col_offset : node.end_col_offset]
     if isinstance(node, ast.Name):
         return f"{own}( )" if own in FUNCTIONS else ""
@@ -231,7 +231,7 @@ def _units(node: ast.expr, unit: str) -> Iterator[tuple[str, str]]:
         squared = isinstance(parts[1], ast.Constant) and parts[1].value == 2
         yield from _units(parts[0], unit.removesuffix(_SQUARE) if squared else "")
     elif isinstance(node, ast.BinOp) and isinstance(node.op, (ast.Mult, ast.Div)):
-        # A factor has the unit of the product where the other one has none.
+        # A factor has the unit of the product if the other factor has none.
         bare = [_has_no_unit(part) for part in parts]
         yield from _units(parts[0], unit if bare[1] else "")
         yield from _units(parts[1], unit if isinstance(node.op, ast.Mult) and bare[0] else "")
@@ -241,7 +241,7 @@ def _units(node: ast.expr, unit: str) -> Iterator[tuple[str, str]]:
 
 
 def _has_no_unit(node: ast.expr) -> bool:
-    """Whether it is of numbers and sines alone."""
+    """Return whether an expression contains only numbers, pi and angle functions (no unit)."""
     if isinstance(node, ast.Name):
         return node.id == "pi"
     if isinstance(node, ast.Call) and node.func.id in _ANGLES:  # type: ignore[attr-defined]
@@ -250,22 +250,22 @@ def _has_no_unit(node: ast.expr) -> bool:
 
 
 class Written(str):
-    """A text of a machine file, which may stand for a number."""
+    """A text of a machine file that may be an expression for a number."""
 
     book: Book
     place: str
 
     @classmethod
     def of(cls, text: str, book: Book, place: str = "") -> Written:
-        """A text in a file with these parameters; ``place``: behind the path of its number."""
+        """Make the text of a file with these parameters; ``place``: suffix of the number's path."""
         made = cls(text)
         made.book, made.place = book, place
         return made
 
     def number(self, path: str) -> float:
-        """Its number, that stands at a path from now on.
+        """Evaluate the expression and record it at the path of its number.
 
-        :raises ParameterError: it is no arithmetic, or has no finite result.
+        :raises ParameterError: the text is not arithmetic, or its result is not finite.
         """
         formula = Formula.of(path + self.place, str(self))
         self.book.formulas[formula.path] = formula
@@ -274,10 +274,11 @@ class Written(str):
 
 @dataclass(frozen=True, eq=False)
 class Book:
-    """Parameters by name, in the order in which they follow from each other, and expressions.
+    """The parameters of a file in the order of their dependence, and all expressions.
 
-    ``own``: the expressions of parameters, by name. ``formulas``: of the other numbers, by path.
-    ``data``: the file as it stands; empty where numbers are not the file's any more.
+    ``values``: of the parameters, by name. ``own``: expressions of parameters, by name.
+    ``formulas``: expressions of other numbers, by path. ``data``: the file's content; empty if
+    numbers were changed since it was read.
     """
 
     values: Mapping[str, Any] = field(default_factory=dict)
@@ -287,9 +288,10 @@ class Book:
 
     @classmethod
     def of(cls, data: Mapping[str, Any]) -> Book:
-        """The parameters of a file.
+        """Read the parameters of a file.
 
-        :raises ParameterError: a name or value that is refused, or parameters in a circle.
+        :raises ParameterError: a name or value is invalid, or parameters depend on each other in a
+            circle.
         """
         given = data.get(PARAMETERS)
         if given is None:
@@ -320,7 +322,7 @@ class Book:
         return cls(dict.fromkeys(order, 0.0), own, {}, data)._with(numbers)
 
     def marked(self, data: Any) -> Any:
-        """Data whose texts may stand for numbers."""
+        """Convert all texts of data to :class:`Written`, so that they may be expressions."""
         if isinstance(data, Mapping):
             return {name: self.marked(value) for name, value in data.items()}
         if isinstance(data, list):
@@ -328,7 +330,7 @@ class Book:
         return Written.of(data, self) if isinstance(data, str) else data
 
     def _with(self, numbers: Mapping[str, Any]) -> Book:
-        """The same with other values of some parameters; those are no expressions any more."""
+        """Return the book with numbers in place of some parameters."""
         own = {name: formula for name, formula in self.own.items() if name not in numbers}
         values: dict[str, Any] = {}
         for name, old in self.values.items():
@@ -339,9 +341,9 @@ class Book:
         return replace(self, values=values, own=own)
 
     def moved(self, values: Mapping[str, Any]) -> tuple[Book, dict[str, Any]]:
-        """The book, and all numbers that change, for new values by path, of parameters too.
+        """Change numbers and parameters by path; return the book and all numbers that change.
 
-        :raises ParameterError: a parameter that there is not, or no finite result.
+        :raises ParameterError: a parameter does not exist, or a result is not finite.
         """
         start = f"{PARAMETERS}."
         new = {path[len(start) :]: v for path, v in values.items() if path.startswith(start)}
@@ -355,28 +357,28 @@ class Book:
         return book, {**{one.path: one.value(book.values) for one in book.moving(new)}, **rest}
 
     def told_anew(self, sections: Mapping[str, Any]) -> Book:
-        """The book of a file with other sections; of none, where the file does not tell them."""
+        """Return the book of the file with other sections, without their expressions."""
         kept = {path: f for path, f in self.formulas.items() if path.split(".")[0] not in sections}
         data = {**self.data, **sections} if sections and self.data else {}
         return replace(self, formulas=kept, data=data)
 
     def moving(self, names: Iterable[str]) -> list[Formula]:
-        """The numbers that move with some parameters, or with those that follow from them."""
+        """List the numbers that depend, directly or not, on some parameters."""
         moving = set(names)
         for name in self.values:
             if name in self.own and self.own[name].names & moving:
                 moving.add(name)
-        # How sure a number is stays as the file has it.
+        # Uncertainties and tolerances keep the values of the file.
         moved = (one for one in self.formulas.values() if one.names & moving)
         return [one for one in moved if not one.path.startswith(("uncertainty.", "tolerances."))]
 
     def text(self, path: str) -> str:
-        """The expression that a number of the file is; empty for a plain number."""
+        """Return the expression at a path; empty for a plain number."""
         found = self.own.get(path.partition(f"{PARAMETERS}.")[2]) or self.formulas.get(path)
         return found.text if found else ""
 
     def lost(self, other: Book) -> list[str]:
-        """What another book of the file has no more, in at most two lines."""
+        """Describe the expressions and dependences that another book lacks, in up to two lines."""
         texts = [
             f"{path} was {formula.text}"
             for path, formula in self.formulas.items()
@@ -389,12 +391,12 @@ class Book:
 
     @property
     def unused(self) -> list[str]:
-        """Parameters that no expression has."""
+        """Parameters that no expression uses."""
         used = {n for one in (*self.own.values(), *self.formulas.values()) for n in one.names}
         return [name for name in self.values if name not in used]
 
     def told(self, units: Mapping[str, str] | None = None) -> list[str]:
-        """Each parameter with its value, unit and expression, in words."""
+        """Describe each parameter: value, unit and expression."""
         return [
             f"{name} = {value:.12g} {(units or {}).get(name, '')}".strip()
             + (f" = {self.own[name].text}" if name in self.own else "")
@@ -403,9 +405,9 @@ class Book:
         ]
 
     def units(self, given: Mapping[str, str]) -> dict[str, str]:
-        """Units of the parameters, empty where they cannot be told or differ.
+        """Derive the units of the parameters; empty if unknown or contradictory.
 
-        :param given: of numbers by path.
+        :param given: units of the file's numbers by path.
         """
         found: dict[str, set[str]] = {name: set() for name in self.values}
         for path, formula in self.formulas.items():

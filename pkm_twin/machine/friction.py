@@ -1,8 +1,8 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""Friction laws of drives: one class a law, with its parameters and the effort that it takes.
+"""Define the friction laws of drives: one class per law, with its parameters and its effort.
 
-Schema, compiled dynamics, plant, regressor and fit read the classes; another law is one class in
-this file. Laws add up.
+Schema, compiled dynamics, simulation, regressor and fit read the classes; a new law is one class in
+this file. The efforts of several laws are added.
 """
 
 from __future__ import annotations
@@ -21,20 +21,21 @@ from pkm_twin.codegen.operations import absolute, cos, exp, maximum, sign, sin
 from pkm_twin.errors import ParameterError
 
 Values = Mapping[str, Any]
-"""A law's parameters by key: a number, an expression or an array."""
+"""Parameters of a law by key, each a number, an expression or an array."""
 
 LEAST: Final = 1e-9
-"""Divisor in place of a parameter that is not given: its law's effort is zero."""
+"""Smallest divisor, in place of a parameter that is not given, whose law has zero effort then."""
 KNOWN: Final = 0.01
-"""Part of an unknown beginning below which a state is known: after five presliding distances."""
+"""A state counts as known when this fraction of the unknown initial state is left: after five
+presliding distances."""
 
 
 @dataclass(frozen=True)
 class Parameter:
-    """A number of a law, one a drive.
+    """A parameter of a law, one number per drive.
 
-    ``unit``: with ``{effort}`` and ``{joint}`` (rad or m). ``linear``: the effort is linear in it;
-    any other is above zero where one of its law's linear parameters is not zero.
+    ``unit``: with ``{effort}`` and ``{joint}`` (rad or m). ``linear``: whether the effort is linear
+    in it; a nonlinear one must be positive if a linear parameter of its law is not zero.
     """
 
     unit: str
@@ -43,63 +44,63 @@ class Parameter:
     linear: bool = True
 
     def in_units(self, *, slides: bool) -> str:
-        """The unit of a drive that slides or turns."""
+        """Return the unit for a prismatic or a rotary drive."""
         effort, joint = ("N", "m") if slides else ("N m", "rad")
         text = self.unit.replace("{effort} per {joint}/s", "N s/m" if slides else "N m s/rad")
         return text.format(effort=effort, joint=joint)
 
 
 class FrictionLaw:
-    """A friction law of a drive.
+    """The base class of a drive's friction laws.
 
-    Its effort is by_position(q) + (dry(q, speed) + share(q, speed) |load|) sign(rate). The load is
-    the drive's effort without friction, its rotor's inertia included.
+    The effort is by_position(q) + (dry(q, speed) + share(q, speed) |load|) sign(rate). The load is
+    the drive's effort without friction, including its rotor's inertia.
     """
 
     name: ClassVar[str]
     parameters: ClassVar[Mapping[str, Parameter]]
     turns: ClassVar[bool] = True
-    """Whether it turns round with the rate."""
+    """Whether the effort changes sign with the velocity."""
     memory: ClassVar[bool] = False
-    """Whether it depends on the way that the joint has come: it is in no compiled program."""
+    """Whether the effort depends on the past motion; such laws are not in compiled programs."""
 
     @staticmethod
     def by_position(values: Values, q: Any) -> Any:
-        """Effort that depends on the position alone."""
+        """Return the effort that depends on the position alone."""
         del values, q
         return 0.0
 
     @staticmethod
     def potential(values: Values, q: Any) -> Any:
-        """Energy of the same, J: its derivative by q is :meth:`by_position`."""
+        """Return the energy, J, whose derivative by q is :meth:`by_position`."""
         del values, q
         return 0.0
 
     @staticmethod
     def dry(values: Values, q: Any, speed: Any) -> Any:
-        """Effort against the motion, zero or more.
+        """Return the effort against the motion, zero or more.
 
-        :param speed: without sign.
+        :param speed: absolute value of the velocity.
         """
         del values, q, speed
         return 0.0
 
     @staticmethod
     def share(values: Values, q: Any, speed: Any) -> Any:
-        """Effort against the motion, as part of the load's magnitude, less than one."""
+        """Return the effort against the motion as a fraction of the load's magnitude, below one."""
         del values, q, speed
         return 0.0
 
     @classmethod
     def along(cls, values: Values, q: Array, rates: Array) -> Array:
-        """Effort along a motion in the order of time without load, shape (k, n) as q and rates."""
+        """Return the effort without load along a motion in time, shape (k, n) as q and rates."""
         return np.asarray(taken([cls.name], values, q, rates, 0.0 * q), np.float64)
 
 
 class ViscousCoulomb(FrictionLaw):
-    """Viscous friction, Coulomb friction and a constant effort: of every drive, zero by default.
+    """The friction that every drive has: viscous, Coulomb and a constant effort, zero by default.
 
-    The plant integrates the viscous part exactly, so the dynamics take this law by its parameters.
+    The simulation integrates viscous friction exactly, so the dynamics read its parameters.
     """
 
     name = "coulomb"
@@ -111,7 +112,7 @@ class ViscousCoulomb(FrictionLaw):
 
 
 class Stribeck(FrictionLaw):
-    """Breakaway friction above Coulomb's, which falls with speed: F exp(-(v / vs)^2).
+    """Breakaway friction above Coulomb friction, which decreases with speed: F exp(-(v / vs)^2).
 
     Bo and Pavelescu, 1982; Armstrong-Helouvry, Dupont, Canudas de Wit, 1994, eq. 5.
     """
@@ -124,30 +125,27 @@ class Stribeck(FrictionLaw):
 
     @staticmethod
     def dry(values: Values, q: Any, speed: Any) -> Any:
-        """Zero or more."""
+        """Return F exp(-(v / vs)^2)."""
         del q
         ratio = speed / maximum(values["stribeck_speed"], LEAST)
         return values["stribeck"] * exp(-(ratio * ratio))
 
 
 class LoadDependent(FrictionLaw):
-    """Coulomb friction that grows with the load, of gears and screws."""
+    """Coulomb friction of gears and screws, proportional to the load."""
 
     name = "load-dependent"
     parameters: ClassVar = {"load_dependent": Parameter("1", high=0.9)}
 
     @staticmethod
     def share(values: Values, q: Any, speed: Any) -> Any:
-        """Less than one: a drive that its load cannot move back is none."""
+        """Return the friction coefficient, below one: self-locking drives are not modelled."""
         del q, speed
         return values["load_dependent"]
 
 
 class Periodic(FrictionLaw):
-    """An effort of one harmonic of the position: cogging of a motor, ripple of a gear.
-
-    It stores energy and takes none.
-    """
+    """An effort periodic in the position: cogging of a motor, ripple of a gear; conservative."""
 
     name = "periodic"
     turns = False
@@ -159,13 +157,13 @@ class Periodic(FrictionLaw):
 
     @staticmethod
     def by_position(values: Values, q: Any) -> Any:
-        """C cos(2 pi q / p) + S sin(2 pi q / p)."""
+        """Return C cos(2 pi q / p) + S sin(2 pi q / p)."""
         angle = q * (math.tau / maximum(values["cogging_period"], LEAST))
         return values["cogging_cos"] * cos(angle) + values["cogging_sin"] * sin(angle)
 
     @staticmethod
     def potential(values: Values, q: Any) -> Any:
-        """Zero on average."""
+        """Return the energy of the periodic effort, J, zero on average."""
         wave = math.tau / maximum(values["cogging_period"], LEAST)
         angle = q * wave
         return (values["cogging_cos"] * sin(angle) - values["cogging_sin"] * cos(angle)) / wave
@@ -176,12 +174,12 @@ BASIC: Final = ViscousCoulomb
 
 
 class Memory(NamedTuple):
-    """State of friction with memory; shape (n,) each, or (k, n) along a motion.
+    """The state of friction with memory; shape (n,) each, or (k, n) along a motion.
 
-    ``z``: part of the Coulomb friction that is built up, -1 to 1. ``q``: the farthest place of the
-    motion one way. ``way``: its direction, 0 before a motion. ``unknown``: the part of the unknown
-    beginning that is left; z begins at zero. ``slope``: of z by the presliding distance, 1/rad or
-    1/m.
+    ``z``: friction relative to Coulomb friction, -1 to 1. ``q``: the farthest position since the
+    last reversal. ``way``: direction of motion, 0 before the first. ``unknown``: fraction of the
+    unknown initial state that is left; z begins at zero. ``slope``: derivative of z by the
+    presliding distance, 1/rad or 1/m.
     """
 
     z: Array
@@ -192,15 +190,16 @@ class Memory(NamedTuple):
 
     @classmethod
     def begun(cls, q: Array) -> Memory:
-        """Nothing is known."""
+        """Return the initial state at positions q, of which nothing is known."""
         return cls(np.zeros_like(q), q, np.zeros_like(q), np.ones_like(q), np.zeros_like(q))
 
     def after(self, q: Array, way: Array, distance: Array) -> Memory:
-        """After places (k, n) of a motion one way, +1, -1 or 0 for that before, shape (n,).
+        """Return the states after positions (k, n) of a motion in one direction.
 
-        Exact, whatever the steps. What noise goes the other way does not count.
+        The solution is exact for any step. Moves against the direction count as noise.
 
-        :param distance: of presliding, shape (n,), rad or m.
+        :param way: direction of motion, +1, -1 or 0 to keep the last one, shape (n,).
+        :param distance: presliding distance, shape (n,), rad or m.
         """
         way = np.where(way == 0.0, self.way, way)
         travel = np.maximum.accumulate(np.maximum(way * (q - self.q), 0.0))
@@ -213,16 +212,16 @@ class Memory(NamedTuple):
 
     @property
     def last(self) -> Memory:
-        """At a motion's end."""
+        """The state at the end of the motion."""
         return Memory(*(one[-1] for one in self))
 
 
 class Dahl(FrictionLaw):
-    """Coulomb friction that builds up over a presliding distance, and does so again at reversals.
+    """Coulomb friction that builds up over a presliding distance after each reversal.
 
     The effort is coulomb z instead of coulomb sign(rate), dz = (sign(dq) - z) |dq| / presliding.
-    P. Dahl, A solid friction model, 1968, with the stiffness sigma0 = coulomb / presliding.
-    Only what follows a motion in time has z; all else takes coulomb sign(rate).
+    P. Dahl, A solid friction model, 1968, with the stiffness sigma0 = coulomb / presliding. Only
+    computations along a motion in time use z; all others use coulomb sign(rate).
     """
 
     name = "dahl"
@@ -234,9 +233,9 @@ class Dahl(FrictionLaw):
 
     @staticmethod
     def states(q: Array, rates: Array, distance: Array) -> Memory:
-        """States along a motion, shape (k, n).
+        """Compute the states along a motion, shape (k, n).
 
-        :param rates: zero where their sign is not known: a joint turns at its farthest place there.
+        :param rates: zero if their sign is unknown; a reversal is at the farthest position there.
         """
         way, parts, here = np.sign(rates), [], Memory.begun(q[0])
         for own, place in zip(way.T, q.T, strict=True):
@@ -254,19 +253,19 @@ class Dahl(FrictionLaw):
 
     @classmethod
     def along(cls, values: Values, q: Array, rates: Array) -> Array:
-        """From an unknown state."""
+        """Return the effort along a motion that begins with an unknown state."""
         z = cls.states(q, rates, values["presliding"]).z
         return np.asarray(values["coulomb"] * z, np.float64)
 
     @staticmethod
     def beyond(friction: Any, z: Array, rates: Array) -> Array:
-        """What memory changes in efforts with coulomb sign(rate), shape of z, N m or N."""
+        """Return coulomb (z - sign(rate)), the effect of memory on efforts, shape of z, N m or N."""
         change = friction.coulomb * (z - np.sign(rates))
         return np.where(friction.presliding > 0.0, change, 0.0)
 
     @classmethod
     def remembered(cls, friction: Any, q: Array, rates: Array) -> tuple[Array, Array]:
-        """The same along a motion from an unknown state, and its doubt, (k, n) as q and rates."""
+        """Return :meth:`beyond` from an unknown state, and its error bound, shape (k, n) each."""
         if not friction.presliding.any():
             return np.zeros_like(q), np.zeros_like(q)
         memory = cls.states(q, rates, friction.presliding)
@@ -277,11 +276,11 @@ class Dahl(FrictionLaw):
 LAWS: Final[Mapping[str, type[FrictionLaw]]] = {
     law.name: law for law in FrictionLaw.__subclasses__() if law is not BASIC
 }
-"""The other laws by name."""
+"""All laws but the basic one, by name."""
 
 
 def law_names(friction: Any, opened: Sequence[str] = ()) -> tuple[str, ...]:
-    """Laws beside the basic one that a friction section states, or that are open to a fit."""
+    """Name the laws besides the basic one that ``friction`` or ``opened`` has."""
 
     def given(law: type[FrictionLaw], *, linear: bool) -> list[bool]:
         keys = [key for key, one in law.parameters.items() if one.linear == linear]
@@ -295,42 +294,42 @@ def law_names(friction: Any, opened: Sequence[str] = ()) -> tuple[str, ...]:
 
 
 def compiled(names: Sequence[str]) -> tuple[str, ...]:
-    """Those of some laws that programs have."""
+    """Select the laws that are part of compiled programs: those without memory."""
     return tuple(name for name in names if not LAWS[name].memory)
 
 
 def not_shared(names: Sequence[str]) -> list[str]:
-    """Those of some laws that follow the load or the way: no drives that share the effort."""
+    """Select the laws that depend on load or past motion, which redundant drives cannot have."""
     laws = {name: LAWS[name] for name in names}
     return [n for n, law in laws.items() if law.memory or law.share is not FrictionLaw.share]
 
 
 def keys_of(names: Sequence[str]) -> dict[str, Parameter]:
-    """Parameters of laws by key, in order."""
+    """Return the parameters of laws by key, in order."""
     return {key: one for name in names for key, one in LAWS[name].parameters.items()}
 
 
 def linear_keys(names: Sequence[str]) -> tuple[str, ...]:
-    """Parameters that efforts are linear in, of the basic law and of others."""
+    """Return the keys of the linear parameters of the basic law and of the named laws."""
     every = {**BASIC.parameters, **keys_of(names)}
     return tuple(key for key, one in every.items() if one.linear)
 
 
 def turning_keys() -> frozenset[str]:
-    """Parameters whose efforts jump where a joint turns round."""
+    """Return the keys of the parameters whose efforts jump at a reversal of the joint."""
     own = (key for law in LAWS.values() if law.turns for key in law.parameters)
     return frozenset({"coulomb", *own})
 
 
 def all_keys() -> dict[str, Parameter]:
-    """Every parameter of a drive's friction, the basic law's first."""
+    """Return all parameters of a drive's friction, those of the basic law first."""
     return {**BASIC.parameters, **keys_of(tuple(LAWS))}
 
 
 def check_laws(friction: Any, path: str) -> None:
-    """Reject a law without one of its other parameters.
+    """Check that a law whose linear parameters are given has its nonlinear ones, too.
 
-    :raises ParameterError: by the field.
+    :raises ParameterError: a parameter is missing; the error names its field.
     """
     for law in (LAWS[name] for name in compiled(tuple(LAWS))):
         linear = [key for key, one in law.parameters.items() if one.linear]
@@ -344,9 +343,9 @@ def check_laws(friction: Any, path: str) -> None:
 
 
 def taken(names: Sequence[str], values: Values, q: Any, rate: Any, load: Any) -> Any:
-    """Effort that laws take of a drive beside the basic one.
+    """Return the friction of a drive by the named laws, without the basic law.
 
-    :param names: of the laws; others as of :class:`FrictionLaw`, numbers, expressions or arrays.
+    :param names: names of the laws; other arguments as for :class:`FrictionLaw`.
     """
     speed, way = absolute(rate), sign(rate)
     at_place, dry, share = parts(names, values, q, speed)
@@ -354,7 +353,7 @@ def taken(names: Sequence[str], values: Values, q: Any, rate: Any, load: Any) ->
 
 
 def parts(names: Sequence[str], values: Values, q: Any, speed: Any) -> tuple[Any, Any, Any]:
-    """Sums over laws: by position, dry, and the share of the load's magnitude."""
+    """Sum the laws' efforts by position, dry efforts, and fractions of the load's magnitude."""
     laws = [LAWS[name] for name in names]
     at_place: Any = sum((law.by_position(values, q) for law in laws), 0.0)
     dry: Any = sum((law.dry(values, q, speed) for law in laws), 0.0)
@@ -363,24 +362,24 @@ def parts(names: Sequence[str], values: Values, q: Any, speed: Any) -> tuple[Any
 
 
 def potential(names: Sequence[str], values: Values, q: Any) -> Any:
-    """Energy of the effort by position, a drive."""
+    """Return the energy of a drive's effort by position, J."""
     return sum((LAWS[name].potential(values, q) for name in names), 0.0)
 
 
 def friction_values(names: Sequence[str], friction: Any) -> dict[str, Array]:
-    """Parameters of laws by key, of a friction section."""
+    """Return the parameters of laws, by key, from a friction section."""
     return {key: np.asarray(getattr(friction, key), np.float64) for key in keys_of(names)}
 
 
 def load_of(driving: Any, share: Any, way: Any) -> Any:
-    """The load L of L + share |L| way = driving, where the share is less than one."""
+    """Solve L + share |L| way = driving for the load L, with a share below one."""
     return driving / (1.0 + share * way * sign(driving))
 
 
 def bounds(held: Any, dry: Any, share: Any) -> tuple[Any, Any]:
-    """Least and greatest friction f that a joint can have: |f| <= dry + share |held - f|.
+    """Return the smallest and largest friction f of a joint at rest: |f| <= dry + share |held - f|.
 
-    :param held: effort of the drive less what depends on its position and its rate.
+    :param held: effort of the drive minus the efforts that depend on position and velocity.
     """
     low, high = (held - load_of(held - way * dry, share, way) for way in (-1.0, 1.0))
     return low, high

@@ -1,7 +1,7 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""The numbers of a graph's geometry in a row, and the same graph on other numbers or expressions.
+"""Convert a graph's geometry to a vector, and build the graph from other numbers or expressions.
 
-Masses and friction are apart, see ``machine.inertia``.
+Masses and friction are in ``machine.inertia``.
 """
 
 from __future__ import annotations
@@ -20,42 +20,42 @@ from pkm_twin.machine.tree import Tree
 
 @dataclass(frozen=True, eq=False)
 class SizedGraph(Graph):
-    """A graph whose lengths that only scale equations are given, and not computed."""
+    """A graph whose scale lengths (size, rim and frames) are given instead of computed."""
 
     given: Sequence[Any] = field(default=())
 
     @property
     def size(self) -> Any:
-        """As given."""
+        """The given size, m."""
         return self.given[0]
 
     @property
     def rim(self) -> Any:
-        """As given."""
+        """The given rim, m."""
         return self.given[1]
 
     def frame(self, body: str) -> tuple[Array, Any]:
-        """As given."""
+        """Return the given frame of a body: its middle, shape (3,), and its reach, m."""
         k = 2 + 4 * list(self.bodies).index(body)
         return plain(self.given[k : k + 3]), self.given[k + 3]
 
 
 def scales_of(graph: Graph) -> list[float]:
-    """Lengths that only scale equations: size, rim, and every body's frame."""
+    """List the lengths that only scale equations: size, rim, and every body's frame."""
     frames = [graph.frame(body) for body in graph.bodies]
     return [graph.size, graph.rim, *(v for middle, reach in frames for v in (*middle, reach))]
 
 
 def geometry_of(graph: Graph) -> Array:
-    """All numbers of a graph's geometry, shape (k,), lengths that only scale equations last."""
+    """Return all numbers of a graph's geometry, shape (k,), the scale lengths last."""
     return array([*graph.numbers, *scales_of(graph)])
 
 
 def graph_on(graph: Graph, numbers: Numbers) -> SizedGraph:
-    """The graph with other numbers, in the order of :func:`geometry_of`.
+    """Build the graph with other numbers or expressions, in the order of :func:`geometry_of`.
 
-    What is 0, 1 or -1 in the known case of expressions is taken for that, see
-    :func:`pkm_twin.codegen.expressions.snapped`; lengths that only scale are not.
+    Expressions that are 0, 1 or -1 at the reference geometry become constants, see
+    :func:`pkm_twin.codegen.expressions.snapped`, except for scale lengths.
     """
     left = iter(numbers)
 
@@ -84,14 +84,14 @@ def graph_on(graph: Graph, numbers: Numbers) -> SizedGraph:
 
 
 def pattern_of(tree: Tree) -> str:
-    """Text of what programs take for constant, and of how a tree's frames were chosen.
+    """Describe the constants that programs assume, and the choice of the tree's frames.
 
-    Two graphs of one topology and one pattern have the same programs, on their own numbers.
+    Two graphs with equal topology and pattern have the same programs, with their own numbers.
     """
     graph = tree.graph
     parts: list[Any] = [marks(graph.numbers)]
     for body, link in tree.links.items():
-        # The signs and zeros of a frame in base axes tell which way its axes were chosen.
+        # The signs and zeros of a frame in base axes show how its axes were chosen.
         parts += [link.parent, marks(link.arm), marks(link.axes)]
         parts += [(marks(s.before), marks(s.local), marks([s.offset])) for s in link.steps]
         for vector in _vectors(graph, body):
@@ -121,6 +121,6 @@ def _vectors(graph: Graph, body: str) -> Iterator[Array]:
 
 
 def marks(values: Any) -> str:
-    """A character a number: what it is taken for."""
+    """Return one character per number: the constant that programs assume for it, or a dot."""
     known = {0.0: "0", 1.0: "1", -1.0: "-"}
     return "".join(known.get(float(snapped(v)), ".") for v in np.ravel(values))

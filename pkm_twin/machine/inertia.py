@@ -1,7 +1,7 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""Run-time inputs of the dynamics: ten numbers a body, rods, gravity, friction, rotors.
+"""Lay out the parameters of the dynamics: inertial parameters, rods, gravity, friction, rotors.
 
-Efforts are linear in every one of them, so a payload or a mass changes no program.
+They are inputs of the compiled programs, so that a payload or a changed mass needs no compilation.
 """
 
 from __future__ import annotations
@@ -21,35 +21,36 @@ from pkm_twin.machine.tree import Tree
 Objects = NDArray[Any]
 
 TEN: Final = ("mass", "mx", "my", "mz", "ixx", "iyy", "izz", "ixy", "ixz", "iyz")
-"""Names of a body's ten numbers: mass, kg; first moments, kg m; inertia, kg m2."""
+"""A body's ten standard inertial parameters: mass, kg; first moments, kg m; inertia, kg m2."""
 TEN_UNITS: Final = ("kg", *["kg m"] * 3, *["kg m2"] * 6)
 PARTS: Final = (
     "bodies", "rods", "gravity", "viscous", "coulomb", "offset", "laws", "rotors", "passive",
 )  # fmt: skip
-"""Parts of the inputs, in order."""
+"""Parts of the parameter vector, in order."""
 GRAVITY: Final = 2
 LAW_VALUES: Final = 6
 ROTORS: Final = 7
-"""Parts of the inputs, see :meth:`Layout.part`."""
+"""Indices of parts, see :meth:`Layout.part`."""
 
 
 def standard_parameters(mass: float, com: Array, inertia: Array) -> Array:
-    """Mass, first moments and inertia (xx yy zz xy xz yz) about the point that com starts at.
+    """Return the ten standard inertial parameters about the origin of ``com``.
 
-    :param com: centre of mass, shape (3,), m; ``inertia`` about it, shape (3, 3), kg m2.
+    :param com: centre of mass, shape (3,), m.
+    :param inertia: inertia matrix about the centre of mass, shape (3, 3), kg m2.
     """
-    # Expressions of one entry alone are half of the effect of both.
+    # Symmetrise, so that a derivative by one off-diagonal entry is half of that by both.
     about = 0.5 * (inertia + inertia.T) + mass * (com @ com * np.eye(3) - np.outer(com, com))
     return _numbers(mass, mass * com, about)
 
 
 def change_of_frame(axes: Array, lever: Array) -> Array:
-    """Takes ten numbers about one point to those about another and in other axes, shape (10, 10).
+    """Return the matrix (10, 10) that transforms standard inertial parameters to another frame.
 
     :param axes: the new axes as columns in the old ones, shape (3, 3).
     :param lever: from the new point to the old one, in the old axes, shape (3,), m.
     """
-    # A row a number: its mass, first moments and inertia.
+    # One row per parameter: its mass, first moments and inertia.
     mass, first = np.eye(10)[:, :1], np.eye(10)[:, 1:4]
     crossed = lever[:, None] * first[:, None, :]
     about = _UNITS + 2.0 * (first @ lever)[:, None, None] * np.eye(3)
@@ -61,13 +62,13 @@ def change_of_frame(axes: Array, lever: Array) -> Array:
 
 
 def matrix_of(ten: Array) -> Array:
-    """The inertia matrix in ten numbers, shape (3, 3)."""
+    """Return the inertia matrix of ten standard inertial parameters, shape (3, 3)."""
     xx, yy, zz, xy, xz, yz = ten[4:]
     return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
 
 
 _UNITS: Final = np.array([matrix_of(ten) for ten in np.eye(10)])
-"""Inertia matrices of a unit of each of the ten numbers."""
+"""Inertia matrices for a unit of each of the ten standard inertial parameters."""
 
 
 def _numbers(mass: float, first: Array, about: Array) -> Array:
@@ -76,56 +77,57 @@ def _numbers(mass: float, first: Array, about: Array) -> Array:
 
 
 def _turned(ten: Objects, axes: Objects) -> Objects:
-    """Ten numbers in other axes, given as columns in the old ones."""
+    """Rotate standard inertial parameters to other axes, given as columns in the old ones."""
     about = axes.T @ matrix_of(ten) @ axes
     upper = [about[i][k] for i, k in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))]
     return np.array([ten[0], *(axes.T @ ten[1:4]), *upper])
 
 
 def loaded_joints(graph: Graph) -> tuple[Joint, ...]:
-    """Passive joints with friction or a rotor."""
+    """Return the passive joints with friction or a rotor."""
     return tuple(joint for joint in graph.joints.values() if joint.loaded)
 
 
 def drive_units(graph: Graph, joint: str) -> dict[str, str]:
-    """Units of a joint's friction and rotor."""
+    """Return the units of a joint's friction parameters and rotor inertia."""
     slides = graph.joints[joint].slides
     units = {key: one.in_units(slides=slides) for key, one in all_keys().items()}
     return units | {"rotor_inertia": "kg" if slides else "kg m2"}
 
 
 class Coefficients(Protocol):
-    """Friction of the actuated joints, shape (n,) each."""
+    """The friction coefficients of the actuated joints, shape (n,) each."""
 
     @property
     def viscous(self) -> Array:
-        """Per rate, N m s/rad or N s/m."""
+        """Viscous friction, N m s/rad or N s/m."""
 
     @property
     def coulomb(self) -> Array:
-        """By the rate's sign, N m or N."""
+        """Coulomb friction, N m or N."""
 
     @property
     def offset(self) -> Array:
-        """What the drive needs beside, whatever the motion, N m or N."""
+        """Constant effort of the drive, independent of the motion, N m or N."""
 
     @property
     def presliding(self) -> Array:
-        """Distance over which Coulomb friction builds up, rad or m; 0: at once."""
+        """Distance over which Coulomb friction builds up, rad or m; 0 for an immediate change."""
 
 
 @dataclass(frozen=True)
 class Layout:
-    """Where each run-time input stands; the sizes of its parts.
+    """The positions of all parameters in the parameter vector of the dynamics.
 
-    A body's ten numbers are about its link's origin (``tree.at``), in base axes at home.
+    A body's ten standard inertial parameters are about its link's origin (``tree.at``), in base
+    axes at home.
     """
 
     tree: Tree
 
     @property
     def starts(self) -> Array:
-        """Starts of the parts that :meth:`part` names, and the end."""
+        """Start index of each part, and the end."""
         graph = self.tree.graph
         n = len(graph.actuated)
         sizes = [
@@ -143,17 +145,17 @@ class Layout:
 
     @property
     def size(self) -> int:
-        """Number of inputs."""
+        """Number of parameters."""
         return int(self.starts[-1])
 
     def part(self, k: int) -> slice:
-        """Part k, of :data:`PARTS`."""
+        """Return the slice of part k of :data:`PARTS`."""
         a, b = self.starts[k : k + 2]
         return slice(int(a), int(b))
 
     @property
     def friction(self) -> Indices:
-        """Indices of all friction that efforts are linear in, that of passive joints too."""
+        """Indices of all friction parameters that efforts are linear in, also of passive joints."""
         starts, keys = self.starts, keys_of(self.tree.graph.laws).values()
         passive = np.arange(starts[8], starts[9])
         rubs = passive[np.arange(len(passive)) % 3 < 2]
@@ -162,27 +164,27 @@ class Layout:
         return np.concatenate([np.arange(starts[3], starts[6]), laws, rubs]).astype(np.intp)
 
     def laws(self, part: Objects) -> dict[str, Objects]:
-        """Parameters of the drives' friction laws by key, shape (n,) each, of part ``laws``."""
+        """Split part ``laws`` into the friction laws' parameters by key, shape (n,) each."""
         keys = keys_of(self.tree.graph.laws)
         return dict(zip(keys, part.reshape(len(keys), -1) if keys else [], strict=True))
 
     def body(self, name: str) -> slice:
-        """The ten numbers of a body."""
+        """Return the slice of a body's ten standard inertial parameters."""
         k = 10 * list(self.tree.links).index(name)
         return slice(k, k + 10)
 
     def split(self, p: Objects) -> list[Objects]:
-        """The parts of an input vector; bodies in their links' axes, shape (bodies, 10)."""
+        """Split a parameter vector into its parts; bodies (bodies, 10) in their links' axes."""
         parts = [p[self.part(k)] for k in range(len(PARTS))]
         bodies = zip(parts[0].reshape(-1, 10), self.tree.links.values(), strict=True)
         parts[0] = np.array([_turned(ten, link.axes) for ten, link in bodies])
         return parts
 
     def pack(self, graph: Graph, gravity: Array, friction: Coefficients) -> Array:
-        """Inputs of a graph's own masses, without a payload.
+        """Return the parameter vector of a graph, without a payload.
 
-        :param graph: of this tree's geometry; the tree's own may be of a machine with other masses.
-        :param friction: of the actuated joints; that of passive ones stands in the graph.
+        :param graph: of this tree's geometry, but possibly with other masses.
+        :param friction: of the actuated joints; the graph has that of the passive joints.
         """
         bodies = []
         for link in self.tree.links.values():
@@ -210,7 +212,7 @@ class Layout:
         )
 
     def payload(self, mass: float, com: Array, inertia: Array) -> Array:
-        """What a body fixed to the platform adds; com from its reference point, home axes."""
+        """Return what a payload adds to the parameters; com from the reference point, home axes."""
         graph = self.tree.graph
         link = self.tree.links[graph.platform]
         result = np.zeros(self.size, dtype=object)

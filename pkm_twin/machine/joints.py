@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""Joint types: what each lets move and what it holds. A new type is a class and a line in TYPES.
+"""Declare joint types by their freedoms and constraints; a new type is a class listed in TYPES.
 
 Everything else follows: the steps of the tree, the closures of a cut joint, the loads that a joint
 transmits, what it releases in an elastic frame, units and passive coordinates.
@@ -22,15 +22,15 @@ UNITS: Final = np.eye(3)
 
 
 def unit(vector: ArrayLike) -> Array:
-    """The vector at length one."""
+    """Scale a vector to length 1."""
     values = plain(vector)
     return np.asarray(values / norm(values))
 
 
 def across(axis: Array) -> tuple[Array, Array]:
-    """Two unit vectors across an axis and each other, right-handed with it."""
+    """Return two unit vectors that form a right-handed orthogonal triple with an axis."""
     first = np.zeros(3)
-    # Rounded: where two components are equal, the last bit must not choose.
+    # Rounding keeps the choice the same where two components differ by the last bit only.
     first[int(np.argmin(np.round([abs(reference(value)) for value in axis], 9)))] = 1.0
     first = unit(np.cross(axis, first))
     return first, np.cross(axis, first)
@@ -38,10 +38,10 @@ def across(axis: Array) -> tuple[Array, Array]:
 
 @dataclass(frozen=True, eq=False)
 class Freedom:
-    """One elementary freedom, of the outer body against the inner one.
+    """One degree of freedom of the outer body relative to the inner body.
 
-    ``axis``: at home, base axes. ``turns``: whether it turns about the axis. ``slide``: how far it
-    goes along the axis per unit of its number: 1 for a slide, m a rad for a screw, else 0.
+    ``axis``: at home, base axes. ``turns``: whether it rotates about the axis. ``slide``:
+    translation along the axis per unit of the coordinate: 1 for a slide, m/rad for a screw, else 0.
     ``outer``: whether the axis is fixed in the outer body.
     """
 
@@ -52,22 +52,23 @@ class Freedom:
 
     @property
     def unit(self) -> str:
-        """Of its number, ``rad`` or ``m``."""
+        """Unit of the coordinate, ``rad`` or ``m``."""
         return "rad" if self.turns else "m"
 
     def nearest(self, directions: Array) -> int:
-        """The direction, of several (k, 3) in base axes, to which its axis is nearest."""
+        """Return the index of the direction, of (k, 3) in base axes, nearest to the axis."""
         return int(np.abs(references(directions @ self.axis)).argmax())
 
 
 @dataclass(frozen=True, eq=False)
 class Constraint:
-    """What a joint holds, in one of four ways, at home and in base axes.
+    """A constraint of a joint, at home and in base axes; ``kind`` is one of four.
 
-    ``point``: the bodies' points are at one place (three equations). ``plane``: the outer body's
-    point stays in the plane across ``inner``. ``angle``: ``inner`` and ``outer``, each fixed in its
-    body, keep their angle. ``screw``: the outer body's point goes ``slide`` along ``inner`` per rad
-    that ``outer``, across it, turns. ``axes``: which of the joint's axes carries each vector.
+    ``point``: the bodies' points coincide (three equations). ``plane``: the outer body's point
+    stays in the plane normal to ``inner``. ``angle``: ``inner`` and ``outer``, each fixed in its
+    body, keep their angle. ``screw``: the outer body's point moves by ``slide`` along ``inner`` per
+    rad by which ``outer``, normal to it, rotates. ``axes``: index of the joint's axis to which each
+    vector belongs.
     """
 
     kind: str
@@ -78,13 +79,13 @@ class Constraint:
 
 
 class JointType:
-    """A joint type, declared by what it lets move and holds.
+    """The base class of joint types, each declared by its freedoms and constraints.
 
-    ``steps``: its freedoms from the inner body to the outer one, of "turn", "slide" and "screw".
-    ``holds``: keys of HELD. ``count``: how many axes it has: with one, all is about that; with two,
-    the second is fixed in the outer body; with none, freedoms are along base axes. ``placed``:
-    whether its point matters. ``ball``: whether it is a quaternion in the tree. ``cost``: its
-    unknowns in the tree, where joints of the least come first.
+    ``steps``: freedoms from the inner to the outer body: "turn", "slide" or "screw". ``holds``:
+    constraints, keys of HELD. ``count``: number of axes: one for all freedoms; two, of which the
+    second is fixed in the outer body; or none, with freedoms along base axes. ``placed``: whether
+    the joint's point matters. ``ball``: whether the tree describes it by a quaternion. ``cost``:
+    unknowns that it adds to the tree, which takes joints of lower cost first.
     """
 
     name: ClassVar[str]
@@ -97,14 +98,15 @@ class JointType:
 
     @classmethod
     def threaded(cls) -> bool:
-        """Whether it has a pitch."""
+        """Return whether the joint has a pitch."""
         return "screw" in cls.steps
 
     @classmethod
     def freedoms(cls, axes: Array, pitch: float) -> tuple[Freedom, ...]:
-        """From the inner body to the outer one.
+        """Return the joint's freedoms from the inner to the outer body.
 
-        :param axes: unit vectors, shape (count, 3). ``pitch``: of a screw, m a rad.
+        :param axes: unit vectors, shape (count, 3).
+        :param pitch: of a screw, m/rad.
         """
         along = {0: UNITS, 1: np.repeat(axes, len(cls.steps), axis=0)}.get(cls.count, axes)
         slides = {"turn": 0.0, "slide": 1.0, "screw": pitch}
@@ -115,7 +117,7 @@ class JointType:
 
     @classmethod
     def directions(cls, axes: Array) -> Array:
-        """Unit vectors along which loads and compliances are given, shape (3, 3)."""
+        """Return the unit vectors along which loads and compliances are given, shape (3, 3)."""
         if not cls.count:
             return UNITS
         first, other = axes[0], axes[-1]
@@ -126,7 +128,7 @@ class JointType:
 
     @classmethod
     def constraints(cls, axes: Array, pitch: float) -> tuple[Constraint, ...]:
-        """What is left of six freedoms; arguments as of :meth:`freedoms`."""
+        """Return the joint's constraints; arguments as for :meth:`freedoms`."""
         return tuple(held for key in cls.holds for held in HELD[key](axes, pitch))
 
 
@@ -143,89 +145,86 @@ HELD: Final[dict[str, Callable[[Array, float], Sequence[Constraint]]]] = {
         Constraint("screw", axes[0], across(axes[0])[0], slide=pitch)
     ],
 }  # fmt: skip
-"""Constraints of a joint's axes and pitch, by what is kept."""
+"""Constraints as functions of a joint's axes and pitch, by name."""
 
 
 class Fixed(JointType):
-    """Holds everything."""
+    """A fixed connection."""
 
     name, steps, holds = "fixed", (), ("point", "turns")
     count, placed, cost = 0, False, 0
 
 
 class Revolute(JointType):
-    """Turns about its axis."""
+    """A joint that rotates about its axis."""
 
     name, steps, holds = "revolute", ("turn",), ("point", "direction")
 
 
 class Prismatic(JointType):
-    """Slides along its axis."""
+    """A joint that slides along its axis."""
 
     name, steps, holds = "prismatic", ("slide",), ("line", "turns")
     placed = False
 
 
 class Cylindrical(JointType):
-    """Slides along its axis and turns about it."""
+    """A joint that slides along its axis and rotates about it."""
 
     name, steps, holds = "cylindrical", ("slide", "turn"), ("line", "direction")
     cost = 2
 
 
 class Universal(JointType):
-    """Turns about two axes that cross: one fixed in the inner body, one in the outer."""
+    """A joint that rotates about two crossing axes, one fixed in each body."""
 
     name, steps, holds = "universal", ("turn", "turn"), ("point", "crossing")
     count, cost = 2, 2
 
 
 class Spherical(JointType):
-    """Turns about every axis."""
+    """A joint that rotates about every axis."""
 
     name, steps, holds = "spherical", ("turn", "turn", "turn"), ("point",)
     count, ball, cost = 0, True, 3
 
 
 class Translation(JointType):
-    """Slides along every axis: what parallelograms keep from turning."""
+    """A joint that slides along every axis, as a body whose rotation parallelograms prevent."""
 
     name, steps, holds = "translation", ("slide", "slide", "slide"), ("turns",)
     count, placed = 0, False
 
 
 class Helical(JointType):
-    """Turns about its axis and slides along it in proportion, as a screw."""
+    """A screw: rotates about its axis and slides along it in proportion."""
 
     name, steps, holds = "helical", ("screw",), ("line", "direction", "thread")
     cost = 0
 
 
 class Planar(JointType):
-    """Slides along two axes across its axis and turns about it."""
+    """A joint that slides along two axes normal to its axis and rotates about it."""
 
     name, steps, holds = "planar", ("slide", "slide", "turn"), ("flat", "direction")
     cost = 3
 
     @classmethod
     def freedoms(cls, axes: Array, pitch: float) -> tuple[Freedom, ...]:
-        """Slides first."""
+        """Return two slides, then the rotation."""
         slides = (Freedom(axis, turns=False, slide=1.0) for axis in across(axes[0]))
         return (*slides, Freedom(axes[0]))
 
 
 class Free(JointType):
-    """Of a body that nothing but the joints after it holds: slides, then turns; no entry of a file.
-
-    A file's joints are those in TYPES.
-    """
+    """The six freedoms of a body without a joint to its parent; not available in files."""
 
     name, steps, holds = "free", ("slide",) * 3 + ("turn",) * 3, ()
     count, cost = 0, 6
 
     @classmethod
     def freedoms(cls, axes: Array, pitch: float) -> tuple[Freedom, ...]:
-        """Slides first."""
+        """Return three slides, then three rotations."""
         slides = (Freedom(axis, turns=False, slide=1.0) for axis in UNITS)
         return (*slides, *(Freedom(axis) for axis in UNITS))
 
@@ -239,11 +238,11 @@ TYPES: Final = {
 """Joint types by name."""
 
 TURN: Final = 2.0 * math.pi
-"""A full turn, rad: a screw's lead is its pitch times this."""
+"""One revolution, rad: a screw's lead is its pitch times this."""
 
 
 def single_names(name: str, freedoms: Sequence[Freedom]) -> list[str]:
-    """Names of a joint's freedoms as single turns and slides; a screw is one of each."""
+    """Name a joint's freedoms as single rotations and slides; a screw has one of each."""
     if len(freedoms) == 1:
         return [name, f"{name}_slide"] if freedoms[0].turns and freedoms[0].slide else [name]
     marks = {3: ("x", "y", "z"), 6: ("px", "py", "pz", "x", "y", "z")}

@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""The numbers of a file by dotted path."""
+"""Find and replace the numbers of a file by dotted paths."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ T = TypeVar("T")
 _PART: Final = re.compile(r"([^.\[\]]+)|\[(\d+)\]")
 Key = str | int
 Keys = tuple[Key, ...]
-"""Where a number stands in a file: keys, and places in lists."""
+"""Location of a number in a file: keys of mappings and indices of lists."""
 
 
 def keys_of(path: str) -> list[Key]:
-    """The keys and places of a dotted path: ``joints.arm.at[2]`` has four.
+    """Split a dotted path into keys and indices: ``joints.arm.at[2]`` has four.
 
-    :raises ParameterError: no text, or one without a key.
+    :raises ParameterError: the path is not a text or has no key.
     """
     text = path if isinstance(path, str) else ""
     keys = [name or int(place) for name, place in _PART.findall(text)]
@@ -36,13 +36,13 @@ def keys_of(path: str) -> list[Key]:
 
 
 def path_of(keys: Iterable[Key]) -> str:
-    """The dotted path of keys and places."""
+    """Join keys and indices to a dotted path."""
     parts = (f"[{key}]" if isinstance(key, int) else f".{key}" for key in keys)
     return "".join(parts).removeprefix(".")
 
 
 def full_keys(path: str) -> list[Key]:
-    """The same, of an inertia's principal moment ``inertia[0]`` as of its matrix."""
+    """Split a path; a principal moment ``inertia[0]`` becomes ``inertia[0][0]``."""
     keys = keys_of(path)
     moment = keys[-2:-1] == ["inertia"] and isinstance(keys[-1], int)
     return [*keys, keys[-1]] if moment else keys
@@ -51,7 +51,7 @@ def full_keys(path: str) -> list[Key]:
 def numbers_of(
     sections: Mapping[str, Any], units: Mapping[str, Any]
 ) -> dict[str, tuple[float, str]]:
-    """Every number that sections of a file give, by dotted path, with its unit."""
+    """Return every number in sections of a file, by dotted path, with its unit."""
     data = {k: v for k, v in given(sections).items() if k not in ("uncertainty", "tolerances")}
     return dict(_walk(data, units, ""))
 
@@ -69,19 +69,19 @@ def _walk(data: Any, units: Any, path: str) -> Iterator[tuple[str, tuple[float, 
 
 
 def given(data: Any) -> Any:
-    """Without what a file would leave out: that is derived."""
+    """Drop entries without a value, which a file leaves out and which are derived."""
     if not isinstance(data, Mapping):
         return data
     return {key: given(value) for key, value in data.items() if value is not None}
 
 
 def placed(section: T, changes: Mapping[tuple[Key, ...], Any], path: str = "") -> T:
-    """A section with other numbers or expressions at some places; nothing is checked.
+    """Return a section with other numbers or expressions at some locations, without any check.
 
     :param section: a dataclass, mapping, sequence or array.
-    :param changes: by keys and places, as a file has them.
-    :param path: of the section, for the error.
-    :raises ParameterError: a place where there is no number.
+    :param changes: new values by keys and indices, as in a file.
+    :param path: of the section, for errors.
+    :raises ParameterError: there is no number at a location.
     """
     below: dict[Key, dict[tuple[Key, ...], Any]] = {}
     for (key, *rest), value in changes.items():
@@ -117,9 +117,9 @@ def placed(section: T, changes: Mapping[tuple[Key, ...], Any], path: str = "") -
 
 
 def check_number(section: Any, keys: Sequence[Key], path: str) -> None:
-    """Judge a number of a section as a file's is, with what its section says of it.
+    """Check a number of a section like one of a file, including its section's own checks.
 
-    :raises ParameterError: by the path.
+    :raises ParameterError: the number is invalid; the error names its path.
     """
     inner, left = section, list(keys)
     while left:
@@ -139,7 +139,7 @@ def check_number(section: Any, keys: Sequence[Key], path: str) -> None:
 
 
 def merged(data: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    """Plain data with other values at some keys, of mappings within likewise."""
+    """Merge changes into plain data, recursively for mappings."""
     result = dict(data)
     for key, value in changes.items():
         old = result.get(key)
@@ -149,9 +149,9 @@ def merged(data: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any
 
 
 def number_in(data: Any, keys: Iterable[Key], path: str) -> float:
-    """A number of plain data.
+    """Return a number of plain data.
 
-    :raises ParameterError: there is none.
+    :raises ParameterError: there is no number at this location.
     """
     keys, there = list(keys), data
     for i, key in enumerate(keys):
@@ -173,7 +173,7 @@ def _places(values: Any) -> list[int]:
 
 
 def has_entry(data: Any, path: str) -> bool:
-    """Whether plain data has a value of that path."""
+    """Return whether plain data has a value at a path."""
     for key in keys_of(path):
         if isinstance(data, Mapping):
             data = data.get(key)

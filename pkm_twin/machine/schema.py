@@ -1,9 +1,8 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""Parameter files: plain data to frozen dataclasses, each refusal naming field and bound.
+"""Check parameter files against schemas; every error names the field and its bound.
 
-A mechanism declares its schema as frozen dataclasses whose fields are made by the functions below:
-settings with a check. In units ``{joint}``, ``{effort}`` and ``{rotor}`` stand for those of the
-actuated joints.
+A schema is a frozen dataclass whose fields are made by the functions below, each with its check.
+In units ``{joint}``, ``{effort}`` and ``{rotor}`` stand for those of the actuated joints.
 """
 
 from __future__ import annotations
@@ -26,7 +25,7 @@ from pkm_twin.settings import Setting, settings_of
 MAX_INERTIA: Final = 1e12
 """Largest entry of an inertia matrix, kg m2."""
 _SLACK: Final = 1e-9
-"""Error that an inertia matrix may have, relative to its largest entry."""
+"""Rounding error allowed in an inertia matrix, relative to its largest entry."""
 
 Check = Callable[[str, Any], Any]
 T = TypeVar("T")
@@ -36,9 +35,9 @@ T = TypeVar("T")
 class Key(Setting):
     """A key of a file.
 
-    ``check``: gives the field's value for the file's, by its path. ``bound``: the valid values in
-    words. ``section``: schema of a nested section. ``entries``: of each entry of a mapping.
-    ``rare``: left out of descriptions where it is zero.
+    ``check``: converts the file's value, at a path, to the field's. ``bound``: description of valid
+    values. ``section``: schema of a nested section. ``entries``: schema of each entry of a mapping.
+    ``rare``: leave the key out of descriptions if it is zero.
     """
 
     text: str = ""
@@ -50,7 +49,7 @@ class Key(Setting):
 
 
 def key(check: Check, bound: str, default: Any = MISSING, **more: Any) -> Any:
-    """Field: a key with a check of its own; ``more``: further attributes of :class:`Key`."""
+    """Make a field with its own check; ``more``: further attributes of :class:`Key`."""
     metadata = {"setting": Key(check=check, bound=bound, **more)}
     if isinstance(default, (list, dict)):
         return dataclasses.field(metadata=metadata, default_factory=lambda: check("", default))
@@ -58,21 +57,21 @@ def key(check: Check, bound: str, default: Any = MISSING, **more: Any) -> Any:
 
 
 def number(*, default: Any = MISSING, **more: Any) -> Any:
-    """Field: one finite number within bounds; ``more``: attributes of :class:`Key`."""
+    """Make a field of one finite number within bounds; ``more``: attributes of :class:`Key`."""
     return _numbers((), "number", default, more)
 
 
 def vector(size: int, *, spread: bool = False, default: Any = MISSING, **more: Any) -> Any:
-    """Field: ``size`` numbers, read-only array; with ``spread`` one number stands for all.
+    """Make a field of ``size`` numbers, a read-only array; with ``spread`` one number sets all.
 
-    Of no size, any number of them, but none only where there is a default.
+    Size 0 means any number of entries, but none only if there is a default.
     """
     words = f"{size} numbers" if size else "one number or more"
     return _numbers((size,), words, default, more, spread)
 
 
 def matrix(rows: int, columns: int, *, default: Any = MISSING, **more: Any) -> Any:
-    """Field: ``rows`` lists of ``columns`` numbers, read-only array."""
+    """Make a field of ``rows`` lists of ``columns`` numbers, a read-only array."""
     return _numbers((rows, columns), f"{rows} lists of {columns} numbers", default, more)
 
 
@@ -93,7 +92,7 @@ def _numbers(
 
 
 def text(*, default: Any = MISSING, **more: Any) -> Any:
-    """Field: a non-empty text."""
+    """Make a field of a non-empty text."""
 
     def check(field: str, value: Any) -> str:
         if not isinstance(value, str) or not value:
@@ -105,18 +104,18 @@ def text(*, default: Any = MISSING, **more: Any) -> Any:
 
 
 def _check_printable(field: str, name: str) -> None:
-    """Reject a name that XML, topics and tables have no place for.
+    """Reject a name that XML, topics and tables cannot contain.
 
-    :raises ParameterError: control characters, or others that cannot be printed.
+    :raises ParameterError: the name has control or other characters that cannot be printed.
     """
     if not name.isprintable():
         raise ParameterError(field, name, "a name of printable characters")
 
 
 def mapping(entry: Any, *, default: Any = MISSING, **more: Any) -> Any:
-    """Field: names to sections with the schema of a dataclass, or to values of another field.
+    """Make a field that maps names to sections of a schema, or to values of another field.
 
-    Where there is a default, a key without a value is an empty mapping.
+    With a default, a key without a value is an empty mapping.
     """
     section = isinstance(entry, type)
     what = "entries" if section else "numbers"
@@ -140,7 +139,7 @@ def mapping(entry: Any, *, default: Any = MISSING, **more: Any) -> Any:
 
 
 def flag(*, default: Any = MISSING, **more: Any) -> Any:
-    """Field: true or false."""
+    """Make a field that is true or false."""
 
     def check(field: str, value: Any) -> bool:
         if not isinstance(value, bool):
@@ -153,7 +152,7 @@ def flag(*, default: Any = MISSING, **more: Any) -> Any:
 def words(
     *allowed: str, size: int = 0, distinct: bool = True, default: Any = MISSING, **more: Any
 ) -> Any:
-    """Field: ``size`` words, by default one or more, each of the allowed where there are any."""
+    """Make a field of ``size`` words (0: one or more), each one of ``allowed`` if there are any."""
 
     def check(field: str, value: Any) -> tuple[str, ...]:
         items = _sequence(field, value, size, ", ".join(allowed))
@@ -177,12 +176,12 @@ def words(
 
 
 def checked(field: Any, path: str, value: Any) -> Any:
-    """A value checked as the field of a schema is, by its path."""
+    """Check a value like a field of a schema; return the field's value."""
     return field.metadata["setting"].check(path, value)
 
 
 def interval(*, count: int = 0, default: Any = MISSING, **more: Any) -> Any:
-    """Field: ``[min, max]``; with ``count`` one for all or one each, shape (count, 2)."""
+    """Make a field ``[min, max]``; with ``count`` one for all or one each, shape (count, 2)."""
     bounds = Key(**more)
 
     def pair(field: str, value: Any) -> list[float]:
@@ -204,9 +203,10 @@ def interval(*, count: int = 0, default: Any = MISSING, **more: Any) -> Any:
 
 
 def inertia(*, positive: bool, default: Any = MISSING, **more: Any) -> Any:
-    """Field: an inertia matrix about a centre of mass, 3x3 or its diagonal, kg m2.
+    """Make a field of an inertia matrix about the centre of mass, 3x3 or its diagonal, kg m2.
 
-    Symmetric, principal moments not negative (``positive``: above zero), triangle rule kept.
+    The matrix must be symmetric, its principal moments not negative (``positive``: above zero), and
+    none larger than the sum of the others.
     """
 
     def check(field: str, value: Any) -> Array:
@@ -234,10 +234,10 @@ def inertia(*, positive: bool, default: Any = MISSING, **more: Any) -> Any:
 
 
 def inertia_margins(matrix: Sequence[Sequence[Any]]) -> tuple[Any, Any, Any, Any]:
-    """What a body's inertia matrix, kg m2, keeps to its bounds; each at least zero if it is valid.
+    """Return the margins of an inertia matrix, kg m2, to its bounds; all are >= 0 if it is valid.
 
-    Of its size, its symmetry, its principal moments (at least zero) and the triangle rule (each at
-    most the sum of the others). Of expressions, expressions: exported code has the same rule.
+    The margins are those of size, symmetry, principal moments (at least zero) and triangle rule
+    (each at most the sum of the others). Expressions give expressions, for exported code.
     """
     (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = matrix
     entries = [absolute(value) for row in matrix for value in row]
@@ -256,7 +256,7 @@ def inertia_margins(matrix: Sequence[Sequence[Any]]) -> tuple[Any, Any, Any, Any
 
 
 def _least_pivot(diagonal: Sequence[Any], products: Sequence[Any]) -> Any:
-    """Of a symmetric matrix; negative or NaN where it is not positive semidefinite."""
+    """Return the least pivot of a symmetric matrix: not >= 0 if it is indefinite or NaN."""
     (xx, yy, zz), (xy, xz, yz) = diagonal, products
     tiny = 1e-300
     first = 1.0 / maximum(xx, tiny)
@@ -267,7 +267,7 @@ def _least_pivot(diagonal: Sequence[Any], products: Sequence[Any]) -> Any:
 
 
 def choice(*allowed: str, default: Any = MISSING, **more: Any) -> Any:
-    """Field: one of the allowed words."""
+    """Make a field of one of the allowed words."""
 
     def check(field: str, value: Any) -> str:
         if value not in allowed:
@@ -278,7 +278,7 @@ def choice(*allowed: str, default: Any = MISSING, **more: Any) -> Any:
 
 
 def section(kind: type, *, default: Any = MISSING, **more: Any) -> Any:
-    """Field: a nested mapping with the schema of the dataclass ``kind``."""
+    """Make a field of a nested mapping with the schema of the dataclass ``kind``."""
 
     def check(field: str, value: Any) -> Any:
         return build(kind, value, field)
@@ -287,10 +287,10 @@ def section(kind: type, *, default: Any = MISSING, **more: Any) -> Any:
 
 
 def build(kind: type[T], data: object, path: str = "") -> T:
-    """A mapping checked against the schema dataclass ``kind``.
+    """Check a mapping against the schema ``kind`` and build its dataclass.
 
-    :raises ParameterError: a key missing, a wrong type, a value out of range.
-    :raises UnknownNameError: a key that does not exist, with the closest valid one.
+    :raises ParameterError: a key is missing, or a value has a wrong type or is out of range.
+    :raises UnknownNameError: a key does not exist; the error names the closest valid one.
     """
     if not isinstance(data, Mapping):
         raise ParameterError(path or "parameters", data, "a mapping of keys to values")
@@ -313,7 +313,7 @@ def build(kind: type[T], data: object, path: str = "") -> T:
 
 
 def plain(value: Any) -> Any:
-    """Dataclasses, arrays and tuples as mappings and lists, in mappings too; keys as in a file."""
+    """Convert dataclasses, arrays and tuples to mappings and lists with the keys of a file."""
     if isinstance(value, Mapping):
         return {name: plain(entry) for name, entry in value.items()}
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
@@ -328,10 +328,10 @@ def plain(value: Any) -> Any:
 
 
 def units(kind: type, data: Mapping[str, Any], words: Mapping[str, str]) -> dict[str, Any]:
-    """Units of a section's plain data by key, of nested sections as mappings; no unit is empty.
+    """Return the units of a section's plain data by key; nested sections are mappings.
 
     :param kind: the section's schema.
-    :param words: what stands for ``{joint}`` and ``{effort}`` in them.
+    :param words: units that replace ``{joint}`` and ``{effort}``.
     """
     keys = settings_of(kind)
     result: dict[str, Any] = {}
@@ -347,7 +347,7 @@ def units(kind: type, data: Mapping[str, Any], words: Mapping[str, str]) -> dict
 
 
 def frozen(values: object) -> Array:
-    """A read-only float array."""
+    """Make a read-only float array."""
     array = np.array(values, dtype=np.float64)
     array.setflags(write=False)
     return array
@@ -359,7 +359,7 @@ def _is_number(value: Any) -> bool:
 
 
 def _nested(field: str, value: Any, shape: Sequence[int], bounds: Key, least: int = 1) -> Any:
-    """A number, or lists of them of a shape."""
+    """Check a number, or nested lists of numbers of a shape."""
     if not shape:
         return _number(field, value, bounds)
     items = _sequence(field, value, shape[0], "numbers", least)
@@ -386,7 +386,7 @@ def _number(field: str, value: Any, bounds: Key) -> float:
 
 
 def _sequence(field: str, value: Any, size: int, what: str = "", least: int = 1) -> Sequence[Any]:
-    """A list of that size, or of any from the least on."""
+    """Check a list's length: ``size``, or any from ``least`` on if ``size`` is 0."""
     if isinstance(value, np.ndarray):
         value = value.tolist()
     if not isinstance(value, (list, tuple)) or len(value) < least:

@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""Sections that parameter files of every mechanism have, and fields that many have."""
+"""Define the sections that all parameter files share, and fields that many of them have."""
 
 from __future__ import annotations
 
@@ -18,30 +18,32 @@ from pkm_twin.machine.friction import BASIC, all_keys, check_laws
 from pkm_twin.machine.graph import MIN_LENGTH
 
 MAX_LENGTH: Final = 100.0
+"""Largest length of a machine, m."""
 MAX_MASS: Final = 1e5
+"""Largest mass, kg."""
 MAX_PLACE: Final = 1e6
-"""How far a point of a machine may be from the origin of its axes, along each, m."""
+"""Largest coordinate of a point of a machine, m."""
 MAX_LEAD: Final = 1.0
-"""Of screws and belts to choose from, m per turn: more are mm."""
+"""Largest lead of screws and belts, m per turn: larger numbers were meant in mm."""
 
 
 def length(**options: Any) -> Any:
-    """Field: a length that may be divided by, m."""
+    """Make a field of a length, m, that may be a divisor."""
     return schema.number(low=MIN_LENGTH, high=MAX_LENGTH, unit="m", **options)
 
 
 def place(**options: Any) -> Any:
-    """Field: a point of the machine, m."""
+    """Make a field of a point of the machine, m."""
     return schema.vector(3, low=-MAX_PLACE, high=MAX_PLACE, unit="m", **options)
 
 
 def mass(**options: Any) -> Any:
-    """Field: a mass of zero or more, kg."""
+    """Make a field of a mass of zero or more, kg."""
     return schema.number(low=0.0, high=MAX_MASS, unit="kg", **options)
 
 
 def check_azimuths(azimuths: Array, path: str) -> None:
-    """Refuse limbs that stand in one place."""
+    """Reject limbs at equal azimuths, rad."""
     for i in range(len(azimuths)):
         check_angles(float(azimuths[i]), f"{path}[{i}]")
         apart = math.remainder(float(azimuths[i] - azimuths[i - 1]), 2 * math.pi)
@@ -50,9 +52,9 @@ def check_azimuths(azimuths: Array, path: str) -> None:
 
 
 def shared_middle(limits: Array | None) -> float | None:
-    """Middle of the range that the limits of all joints share, shape (n, 2); None: there is none.
+    """Return the middle of the range common to the limits of all joints, shape (n, 2).
 
-    Infinite ends have no middle.
+    None if there are no limits, no common range or infinite ends.
     """
     if limits is None:
         return None
@@ -62,7 +64,7 @@ def shared_middle(limits: Array | None) -> float | None:
 
 @dataclass(frozen=True, eq=False)
 class Payload:
-    """A body fixed to the platform: com from its reference point, inertia about the com."""
+    """A payload fixed to the platform: com from the reference point, inertia about the com."""
 
     mass: float = mass(default=0.0)
     com: Array = schema.vector(3, low=-MAX_LENGTH, high=MAX_LENGTH, unit="m", default=[0, 0, 0])
@@ -70,7 +72,7 @@ class Payload:
 
 
 def payload_margins(mass: Any, com: Any, inertia: Any) -> list[Any]:
-    """What a payload's numbers keep to the bounds of :class:`Payload`; valid: each at least zero.
+    """Return the margins of a payload's numbers to the bounds of :class:`Payload`; >= 0 if valid.
 
     :param com: shape (3,), m; ``inertia``: shape (3, 3), kg m2. Numbers or expressions.
     """
@@ -83,7 +85,7 @@ def payload_margins(mass: Any, com: Any, inertia: Any) -> list[Any]:
 
 
 def check_angles(angle: float, path: str) -> None:
-    """Refuse an angle that was meant in degrees."""
+    """Reject an angle that was probably meant in degrees."""
     if abs(angle) > 4 * math.pi:
         raise ParameterError(
             path,
@@ -94,12 +96,12 @@ def check_angles(angle: float, path: str) -> None:
 
 @dataclass(frozen=True, eq=False)
 class DriveSpec:
-    """A drive: the inertia of the rotor (kg m2), and a gear with ``ratio`` (motor turns per turn of
-    the joint), or a screw or belt with ``lead`` (m per turn of the motor). The inertia reflected to
-    the joint is ``rotor_inertia``.
+    """A drive: a rotor with a gear, a screw or a belt; reflected inertia becomes ``rotor_inertia``.
 
-    ``efficiency``: of the gear or screw, for sizing motors; the dynamics do not use it.
-    ``rated_torque``: the motor's (N m), for tables whose efforts are in per cent of it.
+    ``inertia``: of the rotor, kg m2. ``ratio``: motor revolutions per revolution of the joint, of a
+    gear; or ``lead``: m per revolution of the motor, of a screw or belt. ``efficiency``: of the
+    gear or screw, for sizing motors; the dynamics do not use it. ``rated_torque``: of the motor,
+    N m, for tables whose efforts are in per cent of it.
     """
 
     inertia: float = schema.number(low=0.0, unit="kg m2")
@@ -109,7 +111,7 @@ class DriveSpec:
     rated_torque: float | None = schema.number(above=0.0, unit="N m", default=None)
 
     def verify(self, path: str) -> None:
-        """One of the two."""
+        """Check that exactly one of ``ratio`` and ``lead`` is given."""
         if (self.ratio is None) == (self.lead is None):
             raise ParameterError(
                 path, None, "either `ratio` (turns per turn) or `lead` (m per turn)"
@@ -122,7 +124,7 @@ class DriveSpec:
         return turns  # type: ignore[no-any-return]
 
     def reflected(self, slides: bool, path: str) -> float:
-        """Kg m2 of a joint that turns, kg of one that slides."""
+        """Return the inertia reflected to the joint: kg m2 if rotary, kg if prismatic."""
         if slides != (self.lead is not None):
             what = "lead, m per turn" if slides else "ratio, turns per turn"
             raise ParameterError(path, None, f"{what}, for this type of joint")
@@ -131,7 +133,7 @@ class DriveSpec:
 
 @dataclass(frozen=True, eq=False)
 class Redundancy:
-    """More actuated joints than degrees of freedom: some lead, the others follow."""
+    """Settings of a machine with more actuated joints than degrees of freedom."""
 
     leads: tuple[str, ...] | None = schema.words(
         text="joints that determine the pose; default: the most independent", default=None
@@ -149,17 +151,16 @@ class Redundancy:
 
 @remembered
 def friction_of(joints: int) -> Any:
-    """Schema of friction at so many actuated joints: viscous per rate, Coulomb by its sign.
+    """Make the schema of friction at this number of actuated joints.
 
-    ``offset``: a constant effort of the drive; then the parameters of the other
-    laws of :mod:`~pkm_twin.machine.friction`.
+    Its fields are the parameters of all laws of :mod:`~pkm_twin.machine.friction`.
     """
     fields = friction_fields(schema.vector, joints, spread=True, default=[0.0] * joints)
     return _section("Friction", fields, joints, {"verify": check_laws})
 
 
 def friction_fields(kind: Any, *size: int, **options: Any) -> list[tuple[str, Any, Any]]:
-    """Keys of friction, types and fields; a description leaves zeros out but for the basic law."""
+    """Return names, types and fields of friction; only the basic law's zeros are written out."""
     return [
         (key, Any, kind(*size, unit=one.unit, low=one.low, high=one.high,
                         rare=key not in BASIC.parameters, **options))
@@ -169,7 +170,7 @@ def friction_fields(kind: Any, *size: int, **options: Any) -> list[tuple[str, An
 
 @remembered
 def limits_of(joints: int) -> Any:
-    """Schema of limits of so many actuated joints; absent is None, one value stands for all."""
+    """Make the schema of limits of this number of joints: absent is None, one value sets all."""
     above: dict[str, Any] = {"above": 0.0, "high": math.inf, "spread": True, "default": None}
     entries = [
         ("position", Any, schema.interval(count=joints, unit="{joint}", default=None)),
@@ -182,7 +183,7 @@ def limits_of(joints: int) -> Any:
 def _section(
     name: str, entries: list[tuple[str, Any, Any]], joints: int, more: Mapping[str, Any] = {}
 ) -> Any:
-    """A section's class for so many joints; what it makes passes between processes."""
+    """Make a section's class for this number of joints; its instances can be pickled."""
 
     def reduce(self: Any) -> tuple[Any, ...]:
         return _rebuilt, (name, joints, [getattr(self, entry[0]) for entry in entries])
@@ -198,16 +199,16 @@ def _rebuilt(name: str, joints: int, values: list[Any]) -> Any:
 
 
 class JointLimits(Protocol):
-    """Limits of the actuated joints, as every mechanism's section has them."""
+    """The limits of the actuated joints, common to all mechanisms."""
 
     @property
     def position(self) -> Array | None:
-        """Least and greatest, shape (n, 2), rad or m."""
+        """Smallest and largest positions, shape (n, 2), rad or m."""
 
     @property
     def velocity(self) -> Array | None:
-        """Greatest rates, shape (n,), rad/s or m/s."""
+        """Largest velocities, shape (n,), rad/s or m/s."""
 
     @property
     def effort(self) -> Array | None:
-        """Greatest efforts, shape (n,), N m or N."""
+        """Largest efforts, shape (n,), N m or N."""

@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""How sure a robot's numbers are."""
+"""Read the uncertainties and tolerances of a robot's numbers."""
 
 from __future__ import annotations
 
@@ -13,60 +13,61 @@ from pkm_twin.machine import schema
 
 @dataclass(frozen=True, eq=False)
 class UncertaintyEntry:
-    """Standard deviation of the number at a path of this file, or of all numbers below it together.
+    """The standard deviation of the number at a path, or of all numbers below it together.
 
-    Each entry is an independent cause. ``deviation``: in the number's unit; or ``relative``: that
-    of a common factor.
+    Entries are statistically independent. ``deviation``: in the number's unit; or ``relative``: of
+    a common factor of all these numbers.
     """
 
     deviation: float | None = schema.number(low=0.0, unit="the number's", default=None)
     relative: float | None = schema.number(low=0.0, high=1.0, default=None)
 
     def verify(self, path: str) -> None:
-        """One of both."""
+        """Check that exactly one of ``deviation`` and ``relative`` is given."""
         if (self.deviation is None) == (self.relative is None):
             raise ParameterError(path, None, "either `deviation` or `relative`")
 
 
 @dataclass(frozen=True)
 class Tolerance:
-    """How far a part's error may go, by its path as of `design --tolerance`; * stands for any text.
+    """The error allowed at a path as of `design --tolerance`; * stands for any text.
 
-    ``deviation``: standard deviation of a normal distribution; or ``bound``: anywhere within
-    it on both sides of zero. Of a ``backlash`` or a ``clearance`` the bound is the whole play.
+    ``deviation``: standard deviation of a normal distribution; or ``bound``: limits of a uniform
+    distribution on both sides of zero. For ``backlash`` or ``clearance`` the bound is the total
+    play.
     """
 
     deviation: float | None = schema.number(low=0.0, unit="m or rad", default=None)
     bound: float | None = schema.number(low=0.0, unit="m or rad", default=None)
 
     def verify(self, path: str) -> None:
-        """One of both."""
+        """Check that exactly one of ``deviation`` and ``bound`` is given."""
         if (self.deviation is None) == (self.bound is None):
             raise ParameterError(path, None, "either `deviation` or `bound`")
 
     @property
     def size(self) -> float:
-        """The one that is given."""
+        """The standard deviation or bound, whichever is given."""
         return (self.deviation if self.bound is None else self.bound) or 0.0
 
     @property
     def sigma(self) -> float:
-        """The standard deviation."""
+        """The standard deviation; a uniform distribution has bound / sqrt(3)."""
         return self.size if self.bound is None else self.size / math.sqrt(3.0)
 
     @property
     def most(self) -> float:
-        """The bound; of a normal distribution three standard deviations."""
+        """The bound; for a normal distribution three standard deviations."""
         return 3.0 * self.size if self.bound is None else self.size
 
 
 def causes_of(
     entries: Mapping[str, UncertaintyEntry], numbers: Mapping[str, tuple[float, str]]
 ) -> dict[str, dict[str, float]]:
-    """Of each cause that the file names: by path of a number, what one standard deviation adds.
+    """Return for each entry the changes of numbers, by path, for one standard deviation.
 
-    :param numbers: the file's, by dotted path, with units.
-    :raises ParameterError: by the field, of a name that is no number of the file.
+    :param numbers: the file's numbers by dotted path, with units.
+    :raises ParameterError: an entry matches no number of the file; the error names its field.
     """
     found = {}
     for name, entry in entries.items():
@@ -82,7 +83,7 @@ def causes_of(
 def numbers_below(
     name: str, entry: UncertaintyEntry, numbers: Mapping[str, tuple[float, str]]
 ) -> dict[str, float]:
-    """The numbers that an entry is about; arguments and errors as of :func:`causes_of`."""
+    """Return the numbers that an entry's path covers; errors as of :func:`causes_of`."""
     parts = (f"{name}.", f"{name}[")
     below = {path: v for path, (v, _) in numbers.items() if path == name or path.startswith(parts)}
     field = f"uncertainty.{name}"
