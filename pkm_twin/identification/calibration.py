@@ -48,15 +48,15 @@ from pkm_twin.identification.calibration_state import (
     start_of,
     written,
 )
+from pkm_twin.identification.lines import LINE_ENDS, line_slopes
 from pkm_twin.identification.measurements import (
     PLACE,
     Measured,
     left_over,
-    scale_slopes,
     whole_of,
 )
 from pkm_twin.identification.parameters import OBSERVED, weights_of
-from pkm_twin.identification.undetermined import undetermined
+from pkm_twin.identification.undetermined import Pair, find_determined_pairs, undetermined
 from pkm_twin.machine.formulas import PARAMETERS
 from pkm_twin.machine.joint_map import JointMap
 from pkm_twin.mechanisms.entries import Fitted as FittedNumber
@@ -171,20 +171,33 @@ class Agreement:
 
 
 class Scale(NamedTuple):
-    """Relative standard deviation of distances across the poses, before and after."""
+    """How well distances and angles between new poses are known, among the measured ones.
+
+    ``before``, ``after``: relative standard deviation of the uniform scale. ``distance`` and
+    ``angle``: standard deviations of a distance, over its length, and of an angle between two
+    lines, rad; shear and distortion are in both.
+    """
 
     before: float
     after: float
     determined: bool
+    distance: float
+    angle: float
 
     def __str__(self) -> str:
-        ends = f"{100.0 * self.after:.2g} mm in 100 mm"
+        ends = f"{100.0 * self.distance:.2g} mm in 100 mm"
+        if np.isfinite(self.angle):
+            ends = f"{ends}, angles to {1e3 * self.angle:.2g} mrad"
         if self.determined:
-            return f"scale: determined; distances are known to {ends} (standard deviation)"
+            return (
+                f"scale: determined; distances between new poses are known to {ends} (standard "
+                "deviations)"
+            )
         return (
-            f"the scale is not determined: distances may be wrong by {ends} (standard deviation, "
-            f"{100.0 * self.before:.2g} mm before). Numbers that depend on it are marked no, and "
-            "stay near the file's values. Measure distances as well (--measure height,distance)"
+            f"the scale is not determined (standard deviation {100.0 * self.after:.2g} mm in 100 "
+            f"mm, {100.0 * self.before:.2g} mm before): distances between new poses are known to "
+            f"{ends}. Numbers that depend on it are marked no, and stay near the file's values. "
+            "Measure distances as well (--measure height,distance)"
         )
 
 
@@ -198,6 +211,8 @@ class Calibration(Estimate):
     """Lines of the table that do not fit the others, the worst first."""
     scale: Scale | None
     """None where the platform does not move from its place."""
+    pairs: tuple[Pair, ...]
+    """Sums and differences of parameters that are determined though the parameters are not."""
     condition: float | None
     """Of the measurements' equations in units of the prior deviations, over what was observed."""
     steps: int
@@ -402,7 +417,7 @@ def _calibrated(
     covariance, steps = found.covariance, found.steps
     deviations = np.sqrt(np.diag(covariance)).tolist()
     told = [replace(p, deviation=d) for p, d in zip(parameters, deviations, strict=True)]
-    scale, told = _scaled(robot, found.state, learnt, told, covariance)
+    scale, told, row = _scaled(robot, found.state, learnt, told, covariance)
     if scale is not None and not scale.determined:
         near = [
             replace(p, prior=KEPT * p.prior)
@@ -424,10 +439,15 @@ def _calibrated(
         raise ParameterError(
             "poses", count, "poses farther apart: these determine none of the numbers"
         )
+    pairs = find_determined_pairs(
+        [k for k in np.flatnonzero(~good).tolist() if told[k].name not in learnt.own],
+        [p.unit for p in told], covariance, row,
+    )  # fmt: skip
     singular = np.linalg.svd(found.table[:, good], compute_uv=False)
     return Calibration(
         robot=built, parameters=tuple(told), covariance=covariance, agreements=agreements,
         condition=float(singular[0] / singular[-1]) if good.any() else None, scale=scale,
+        pairs=tuple(pairs),
         outliers=outliers, steps=steps, faults=tuple(faults), cost=cost_of(changes),
         placed=apart is not None and not free.frame and _looks_placed(robot, learnt, found, told),
         instrument=found.state.instrument,
@@ -498,17 +518,22 @@ def _looks_placed(
 
 def _scaled(
     robot: Robot, state: State, measured: Measured, told: list[Parameter], covariance: Array
-) -> tuple[Scale | None, list[Parameter]]:
-    """How well the scale is known, and the numbers with those marked that depend on it alone."""
-    row = scale_slopes(robot, state, [p.name for p in told])
-    if row is None:
-        return None, told
+) -> tuple[Scale | None, list[Parameter], Array | None]:
+    """How well the scale is known, and the numbers with those marked that depend on it alone.
+
+    And the scale's derivatives, where it is not determined.
+    """
+    lines = line_slopes(robot, state.between(measured.joints, LINE_ENDS), [p.name for p in told])
+    if lines is None:
+        return None, told, None
+    row = lines.scale
     prior = np.array([p.prior for p in told])
     before, after = (float(np.sqrt(row @ c @ row)) for c in (np.diag(prior**2), covariance))
     length = any(one.kind.length for one in measured.readings)
     known = after < SCALED * before and (length or after < CURVED)
-    scale = Scale(before, after, known)
+    scale = Scale(before, after, known, *lines.deviations(covariance))
     if known or not before > 0.0:
-        return scale, told
+        return scale, told, None
     share = (covariance @ row) ** 2 / (after**2 * np.diag(covariance))
-    return scale, [replace(p, scaled=bool(s > SCALED)) for p, s in zip(told, share, strict=True)]
+    marked = [replace(p, scaled=bool(s > SCALED)) for p, s in zip(told, share, strict=True)]
+    return scale, marked, row

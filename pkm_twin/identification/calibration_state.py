@@ -86,6 +86,16 @@ class State:
         q = self.instrument.map.positions(joints)
         return replace(self, q=q, platform=robot.platform(q))
 
+    def between(self, joints: Array, count: int) -> State:
+        """Return the same at up to ``count`` new joint states on lines between measured ones."""
+        rng = np.random.default_rng(0)
+        first, second = rng.integers(len(joints), size=(2, count))
+        part = rng.uniform(size=(count, 1))
+        q = self.instrument.map.positions(joints[first] + part * (joints[second] - joints[first]))
+        position, rotation = self.machine.platform(q[None])
+        good = np.isfinite(position[0]).all(1)
+        return replace(self, q=q[good], platform=(position[0][good], rotation[0][good]))
+
     @property
     def numbers(self) -> dict[str, float]:
         """Of the file, by path."""

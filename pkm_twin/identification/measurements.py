@@ -6,7 +6,6 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import combinations
 from pathlib import Path
 from typing import Final
 
@@ -24,10 +23,6 @@ BELIEVED: Final = 4.0
 MEDIANS: Final = {1: 0.6745, 3: 0.888}
 """Median, by the number of axes, of the root mean square of normal variables of deviation one."""
 MAX_ITERATIONS: Final = 5
-SPANS: Final = 24
-"""Poses between which distances stand for the scale."""
-SHORT: Final = 0.3
-"""Part of the longest of them from which on a distance counts."""
 COORDINATES: Final = ("x", "y", "z", "roll", "pitch", "yaw")
 UNKNOWN_DEVIATION: Final = 10.0
 """Standard deviation of a place, m, and a slope that nothing is known of."""
@@ -393,22 +388,6 @@ def left_over(slopes: Sequence[Array], noise: Sequence[float], prior: Array) -> 
     left = np.maximum(1.0 - np.sum(base**2, 1), 1e-9)
     each = np.split(left, np.cumsum([len(row) for row in rows])[:-1])
     return [part.reshape(len(table), -1).mean(1) for part, table in zip(each, slopes, strict=True)]
-
-
-def scale_slopes(robot: Robot, state: State, names: Sequence[str]) -> Array | None:
-    """Relative derivatives (p,) of the mean distance of poses; None: the platform stays there."""
-    some = np.unique(np.linspace(0, len(state.q) - 1, SPANS).astype(int))
-    first, second = np.array(list(combinations(some.tolist(), 2)), np.intp).reshape(-1, 2).T
-    position = state.instrument.seen(*state.platform)[0]
-    ways = position[first] - position[second]
-    lengths = np.linalg.norm(ways, axis=1)
-    far = lengths > max(SHORT * float(lengths.max(initial=0.0)), 1e-6)
-    if not far.any():
-        return None
-    columns = derivatives(robot, state, names)[:, :3]
-    moved = (columns[first] - columns[second])[far]
-    relative = ways[far] / lengths[far, None] ** 2
-    return np.asarray(np.einsum("ma,map->mp", relative, moved).mean(0), np.float64)
 
 
 def whole_of(poses: Poses, rows: Indices) -> Measured:

@@ -13,13 +13,13 @@ from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError
 from pkm_twin.identification.calibration import Estimate, Free, geometric, placed, unknowns
 from pkm_twin.identification.calibration_state import derivatives
+from pkm_twin.identification.lines import line_slopes
 from pkm_twin.identification.measurements import (
     KINDS,
     Kind,
     Measured,
     Readings,
     named_numbers,
-    scale_slopes,
 )
 from pkm_twin.machine.rotations import skew
 from pkm_twin.robot.robot import Robot
@@ -53,8 +53,8 @@ class Plan:
     ``joints``: (count, n) in the controller's numbers; ``second``: of a pair's other pose;
     ``poses``: (count, m). ``position``: standard deviation of the platform's position on the worst
     axis, m, root mean square over the workspace, apart from a rigid motion of it; ``quantity``: of
-    what is measured, by kind; ``scale``: of distances, relative. ``known``: what will be known of
-    the numbers.
+    what is measured, by kind; ``distance``, ``angle``: of distances of poses, over their length,
+    and of angles between these lines, rad. ``known``: what will be known of the numbers.
     """
 
     joints: Array
@@ -62,7 +62,8 @@ class Plan:
     poses: Array
     position: Array
     quantity: Mapping[str, Array]
-    scale: Array
+    distance: Array
+    angle: Array
     known: Estimate
 
     def table(self, robot: Robot) -> str:
@@ -140,15 +141,17 @@ def plan(
     ).reshape(-1, 6)
     flat = places.reshape(len(rigid), -1)
     places = (flat - rigid @ np.linalg.lstsq(rigid, flat, rcond=1e-9)[0]).reshape(places.shape)
-    scaled = scale_slopes(robot, state, names)
-    span = np.zeros(len(names)) if scaled is None else scaled * prior
+    lines = line_slopes(robot, state, names)
     order: list[int] = []
-    told: list[tuple[float, float, Array]] = []
+    told: list[tuple[float, float, float, Array]] = []
     most = min(count or (MAX_MEASUREMENTS if accuracy else USUAL), MAX_MEASUREMENTS, len(q))
     while True:
         axes = np.sqrt(np.mean(_variances(places, covariance), 0))
         seen = np.sqrt(np.mean(_variances(rows, covariance), 0))
-        told.append((float(axes.max()), float(np.sqrt(span @ covariance @ span)), seen))
+        apart = (0.0, 0.0) if lines is None else lines.deviations(
+            covariance * np.outer(prior, prior)
+        )  # fmt: skip
+        told.append((float(axes.max()), *apart, seen))
         if len(order) == most or (accuracy and not count and told[-1][0] <= accuracy):
             break
         moved = rows @ covariance
@@ -159,7 +162,7 @@ def plan(
         order.append(best)
         taken = moved[best]
         covariance = covariance - taken.T @ np.linalg.solve(inner[best], taken)
-    axis, scale, seen_all = zip(*told, strict=True)
+    axis, distance, angle, seen_all = zip(*told, strict=True)
     seen_by = zip(kinds, usual, np.array(seen_all).T, strict=True)
     quantity = {kind.name: size * seen for kind, size, seen in seen_by}
     deviations = prior * np.sqrt(np.maximum(np.diag(covariance), 0.0))
@@ -170,7 +173,7 @@ def plan(
     return Plan(
         joints=joints[order], second=None if second is None else joints[second[order]],
         poses=robot.forward(q[order]), position=np.array(axis), quantity=quantity,
-        scale=np.array(scale),
+        distance=np.array(distance), angle=np.array(angle),
         known=Estimate(
             robot=robot, parameters=numbers, covariance=covariance * np.outer(prior, prior)
         ),

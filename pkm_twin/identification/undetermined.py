@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pkm_twin.codegen.arrays import Array
+from pkm_twin.identification.parameters import OBSERVED
 from pkm_twin.machine.graph import Graph, limbs
 from pkm_twin.machine.places import keys_of
 
@@ -31,6 +32,52 @@ SHOWN: Final = 0.1
 NAMED: Final = 6
 """Names in a list before the others are counted."""
 AXES: Final = "xyz"
+
+
+class Pair(NamedTuple):
+    """Places of two numbers of which a fit determines the sum (``sign`` 1) or the difference (-1).
+
+    ``deviation``: standard deviation of this sum or difference.
+    """
+
+    first: int
+    second: int
+    sign: int
+    deviation: float
+
+
+def find_determined_pairs(
+    unobserved: Sequence[int], units: Sequence[str], covariance: Array, scale: Array | None
+) -> list[Pair]:
+    """Find sums and differences of numbers that are determined though the numbers are not.
+
+    The best known first; of numbers that hang together in pairs each new pair brings in another.
+
+    :param unobserved: places of the numbers. ``covariance``: of all numbers, (p, p).
+    :param scale: derivatives of a scale that is not determined, (p,): no pair may depend on it.
+    """
+    possible = []
+    for number, first in enumerate(unobserved):
+        for second in unobserved[number + 1 :]:
+            for sign in (-1, 1) if units[first] == units[second] else ():
+                row = np.zeros(len(units))
+                row[[first, second]] = 1.0, sign
+                variance = float(row @ covariance @ row)
+                share = variance / float(covariance[first, first] + covariance[second, second])
+                if scale is not None:
+                    by_scale = float(row @ covariance @ scale) ** 2
+                    if by_scale > OBSERVED * variance * float(scale @ covariance @ scale):
+                        continue
+                if share < OBSERVED**2:
+                    possible.append((share, Pair(first, second, sign, max(variance, 0.0) ** 0.5)))
+    group = {place: {place} for place in unobserved}
+    found = []
+    for _, pair in sorted(possible):
+        if group[pair.first] is not group[pair.second]:
+            found.append(pair)
+            group[pair.first] |= group[pair.second]
+            group |= dict.fromkeys(group[pair.second], group[pair.first])
+    return found
 
 
 class Change(NamedTuple):

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -94,6 +96,54 @@ def test_numbers_that_are_reported_are_right_and_the_rest_is_named(
         assert found.undetermined or len(told) == len(one.truth)
     assert good >= 0.95 * count
     assert numbers > 3 * count and off <= 0.01 * numbers + 1
+
+
+@pytest.mark.parametrize(
+    ("name", "kinds", "rows"),
+    [("printer", "height,distance", 20), ("delta", "distance", 40), ("delta_cu", "position", 30)],
+)
+def test_distances_and_angles_of_new_poses_err_by_what_is_stated(
+    name: str, kinds: str, rows: int, printer: Robot
+) -> None:
+    """And so do sums and differences of numbers that are not determined alone."""
+    robot = printer if name == "printer" else load(name)
+    over: list[tuple[float, float, float]] = []
+    for seed in range(1000, 1012):
+        one = case(robot, [k.name for k in kinds_of([kinds])], rows, seed, flat=name == "printer")
+        found = calibrate(robot, one.measured, one.paths)
+        own = robot.controller
+        offsets = [one.truth[f"joint_map.{joint}.offset"] for joint in robot.joint_names]
+        real = robot.filed({path: one.truth[path] for path in one.paths})
+        rng, joints = np.random.default_rng([seed, 9]), one.measured.joints
+        part, ends = rng.uniform(size=(40, 1)), joints[rng.integers(rows, size=(2, 40))]
+        new = ends[0] + part * (ends[1] - ends[0])
+        true = real.platform(replace(own, offsets=np.array(offsets)).positions(new))[0]
+        told = found.robot.platform(found.joint_map.positions(new))[0]
+        # Lines from ten points to the next two.
+        lines = [(p[:30:3] - p[1:31:3], p[:30:3] - p[2:32:3]) for p in (true, told)]
+        sizes = [np.linalg.norm(line, axis=-1) for line in lines]
+        far = (sizes[0] > 0.3 * sizes[0].max()).all(0)
+        turns = [
+            np.arccos(np.sum(a * b, -1) / np.prod(size, 0))
+            for (a, b), size in zip(lines, sizes, strict=True)
+        ]
+        wide = far & (np.abs(np.cos(turns[0])) < np.sqrt(0.75))
+        scale, values = found.scale, [p.value for p in found.parameters]
+        assert scale is not None and scale.determined and found.pairs and wide.any()
+        names = [p.name for p in found.parameters]
+        sums = [
+            (values[p.first] - one.truth[names[p.first]]
+             + p.sign * (values[p.second] - one.truth[names[p.second]])) / p.deviation
+            for p in found.pairs
+        ]  # fmt: skip
+        errors = (
+            (sizes[1] / sizes[0] - 1.0)[:, far] / scale.distance,
+            (turns[1] - turns[0])[wide] / scale.angle, np.array(sums),
+        )  # fmt: skip
+        over.append(tuple(float(np.mean(one**2)) for one in errors))
+    # The median over the machines: a few directions make most of each machine's errors.
+    ratio = np.sqrt(np.median(over, 0))
+    assert (ratio > 0.5).all() and (ratio < 1.5).all()
 
 
 def probed(seed: int, distances: int, lean: float = 1e-3) -> tuple[Towers, dict[str, np.ndarray]]:
@@ -215,7 +265,7 @@ def test_a_plan_keeps_its_promise(printer: Robot) -> None:
     chosen = plan(printer, kinds, within=box, accuracy=1e-4, noise=noise)
     count = len(chosen.joints)
     assert chosen.needed(1e-4) == count
-    assert (np.diff(chosen.position) < 1e-9).all() and (np.diff(chosen.scale) < 1e-9).all()
+    assert (np.diff(chosen.position) < 1e-9).all() and (np.diff(chosen.distance) < 1e-9).all()
     assert chosen.second is not None
 
     def deviations(first: np.ndarray, second: np.ndarray) -> float:

@@ -211,6 +211,7 @@ def report_of(
         Fact("scale", None if scale is None else {
             "relative_deviation_before": scale.before, "relative_deviation": scale.after,
             "determined": scale.determined,
+            "distance_deviation": scale.distance, "angle_deviation_rad": scale.angle,
         }),
     ]  # fmt: skip
     for unit in ("m", "rad") if whole else ():
@@ -241,6 +242,12 @@ def report_of(
         last = f"{1e3 * a.noise:.4f}", f"m{a.unit}"
         agreements[a.name] = [a.unit, a.count, *stored, *told, *last]
     found = sum(p.observed for p in result.parameters)
+    pairs = {}
+    for one in result.pairs:
+        p, other = result.parameters[one.first], result.parameters[one.second]
+        name = f"{p.name} {'+' if one.sign > 0 else '-'} {other.name}"
+        sums = p.before + one.sign * other.before, p.value + one.sign * other.value
+        pairs[name] = [*sums, one.deviation, p.unit]
     lines = [] if scale is None else [fill(str(scale), WIDTH)]
     lines += [f"outlier, with a small weight: {one}" for one in result.outliers[:MOST_SHOWN]]
     if len(result.outliers) > MOST_SHOWN:
@@ -250,6 +257,8 @@ def report_of(
         f"({before} before); {found} of {len(rows)} numbers determined",
         facts,
         [Table("parameters", columns, rows, "calibrated parameters"),
+         *([Table("determined_pairs", columns[:4], pairs, "sums and differences that are "
+                  "determined, of numbers that are not")] if pairs else []),
          Table("measurements", kinds, agreements, "measured minus computed, RMS (worst); held out: "
                "every fourth whole pose, else each measurement against a fit to all others")],
         notes=[*lines, *_open(result), *marks],
@@ -281,11 +290,13 @@ def planned(robot: Robot, plan: Plan, accuracy: float | None, out: Path) -> Repo
     columns = [
         Column("", text="position*, worst axis", scale=1e3, shown="mm"),
         Column("", text="distances", scale=100.0, shown="mm per 100 mm"),
+        Column("", text="angles between", scale=1e3, shown="mrad"),
         *(Column("", text=n, scale=1e3, shown=f"m{KINDS[n].unit}") for n in plan.quantity),
     ]
     each = [
         plan.position.tolist(),
-        plan.scale.tolist(),
+        plan.distance.tolist(),
+        plan.angle.tolist(),
         *(v.tolist() for v in plan.quantity.values()),
     ]
     rows = {
@@ -301,7 +312,8 @@ def planned(robot: Robot, plan: Plan, accuracy: float | None, out: Path) -> Repo
             Fact("count", len(plan.joints)),
             Fact("needed", needed),
             Fact("position_deviation_m", plan.position, "m"),
-            Fact("scale_relative_deviation", plan.scale),
+            Fact("distance_deviation", plan.distance),
+            Fact("angle_deviation_rad", plan.angle, "rad"),
             Fact("quantity_deviation", plan.quantity),
             Fact("parameters", Table("", names, {
                 p.name: [p.unit, p.prior, p.deviation, p.observed] for p in plan.known.parameters
