@@ -23,7 +23,7 @@ OK: Final = DiagnosticStatus.OK
 WARN: Final = DiagnosticStatus.WARN
 ERROR: Final = DiagnosticStatus.ERROR
 
-OVERRUN_SHARE: Final = 100
+CALLBACKS_PER_OVERRUN: Final = 100
 """One callback in so many may take longer than its period before the diagnostics warn."""
 MAX_TEXT: Final = 500
 """Characters of a line in the log or of a value in the diagnostics."""
@@ -94,7 +94,7 @@ class Health:
         self._last_exception = ""
         self._last_kind = ""
         self._reported = (0, 0, 0, 0, 0)
-        self._watched: dict[str, list[Callable[[Incompatibility], None]]] = {}
+        self._watched_topics: dict[str, list[Callable[[Incompatibility], None]]] = {}
         self._incompatible_ends: dict[str, dict[bytes, Incompatibility]] = {}
         self._incompatible = 0
         self._last_clock = 0
@@ -102,7 +102,7 @@ class Health:
     def caught(self, where: str, error: Exception) -> None:
         """An exception in a callback: the node lives; one traceback a kind."""
         self.seen["exceptions"] += 1
-        self._last_kind = cut(f"{where}: {type(error).__name__}: {error}")
+        self._last_kind = shorten(f"{where}: {type(error).__name__}: {error}")
         text = traceback.format_exc()
         if text != self._last_exception:
             self._last_exception = text
@@ -115,18 +115,18 @@ class Health:
         held = self._logged.setdefault(reason, _Repetition()).begin_line(time.monotonic())
         if held is not None:
             more = f" ({held} more since the last line)" if held else ""
-            self._node.get_logger().warning(cut(text) + more)
+            self._node.get_logger().warning(shorten(text) + more)
 
     def watch(self, topic: str, tell: Callable[[Incompatibility], None] | None = None) -> None:
         """Report other nodes with which this one cannot exchange messages on a topic.
 
         :param tell: called with what does not fit, once a publisher or subscriber.
         """
-        self._watched.setdefault(topic, []).extend([tell] if tell else [])
+        self._watched_topics.setdefault(topic, []).extend([tell] if tell else [])
 
-    def _look(self) -> None:
+    def _find_incompatible_ends(self) -> None:
         """Find those nodes in the graph, which costs less than the middleware's events."""
-        for topic, listeners in self._watched.items():
+        for topic, listeners in self._watched_topics.items():
             before, now = self._incompatible_ends.get(topic, {}), self._incompatibilities(topic)
             self._incompatible_ends[topic] = now
             for end in now.keys() - before.keys():
@@ -147,20 +147,20 @@ class Health:
         # Every node's own are few: the others are looked at once, however many there are.
         pairs = [(s, r, r) for s, r in product(speaking, listeners)]
         pairs += [(s, r, s) for s, r in product(strangers, listening)]
-        found = {bytes(end.endpoint_gid): incompatibility(s, r) for s, r, end in pairs}
+        found = {bytes(end.endpoint_gid): find_incompatibility(s, r) for s, r, end in pairs}
         return {end: what for end, what in found.items() if what}
 
     def _is_own(self, end: TopicEndpointInfo) -> bool:
         node = self._node
         return (end.node_name, end.node_namespace) == (node.get_name(), node.get_namespace())
 
-    def _troubles(self) -> list[tuple[bytes, str]]:
+    def _find_problems(self) -> list[tuple[bytes, str]]:
         """What is wrong with the node's surroundings, worst first."""
         found: list[tuple[bytes, str]] = []
         if self.seen["exceptions"]:
             found.append((ERROR, f"a callback raised an exception: {self._last_kind}"))
         found += [(WARN, text) for text in self.limitations]
-        self._look()
+        self._find_incompatible_ends()
         found += [
             (WARN, f"another node on {topic} has an incompatible {text}")
             for topic, unfit in self._incompatible_ends.items()
@@ -198,7 +198,7 @@ class Health:
         if lost:
             found.append((WARN, f"{lost} messages lost in the last second"))
         # A single late one on a machine that also does other things is no trouble.
-        if overruns > taken / OVERRUN_SHARE:
+        if overruns > taken / CALLBACKS_PER_OVERRUN:
             found.append((WARN, f"{overruns} of {taken} callbacks took longer than their period"))
         return found
 
@@ -214,7 +214,7 @@ class Health:
             level, message = OK, "inactive"
         elif level == OK and waiting:
             level, message = WARN, f"waiting for {', '.join(waiting)}"
-        troubles = self._troubles()
+        troubles = self._find_problems()
         if level == ERROR:
             troubles.insert(0, (level, message))
         elif level != OK or not troubles or not active:
@@ -238,16 +238,16 @@ class Health:
         status = DiagnosticStatus(
             level=level,
             name=self._node.get_fully_qualified_name(),
-            message=cut(message),
+            message=shorten(message),
             hardware_id=str(robot),
-            values=[KeyValue(key=key, value=cut(str(value))) for key, value in values.items()],
+            values=[KeyValue(key=key, value=shorten(str(value))) for key, value in values.items()],
         )
         array = DiagnosticArray(status=[status])
         array.header.stamp = self._node.get_clock().now().to_msg()
         return array
 
 
-def incompatibility(
+def find_incompatibility(
     speaker: TopicEndpointInfo, listener: TopicEndpointInfo
 ) -> Incompatibility | None:
     """Why a publisher's messages do not reach a subscriber; None if they do."""
@@ -271,6 +271,6 @@ def node_of(end: TopicEndpointInfo) -> str:
     return f"{end.node_namespace.rstrip('/')}/{end.node_name}"
 
 
-def cut(text: str) -> str:
+def shorten(text: str) -> str:
     """A text that strangers may have made long."""
     return text if len(text) <= MAX_TEXT else f"{text[:MAX_TEXT]}... ({len(text)} characters)"

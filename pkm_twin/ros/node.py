@@ -35,7 +35,7 @@ from pkm_twin.codegen.code import slowness
 from pkm_twin.errors import MessageError, ParameterError
 from pkm_twin.messages.fast_decoder import JointStateDecoder
 from pkm_twin.messages.stamps import SECOND
-from pkm_twin.ros.health import OK, QOS, RELIABILITY, WARN, Health, Incompatibility, cut
+from pkm_twin.ros.health import OK, QOS, RELIABILITY, WARN, Health, Incompatibility, shorten
 from pkm_twin.ros.parameters import ParameterNode
 from pkm_twin.ros.turns import LOW_RATE_PERIOD, LowRateGroup, Task, Tasks
 from pkm_twin.streams.monitor import Backlog, TopicStatistics
@@ -74,8 +74,8 @@ def input_qos(depth: int, *, best_effort: bool, expiry: float | None = None) -> 
 
 # The middleware's threads hold its locks while they report an event, and wait there for the lock
 # that the executor holds while it takes one or ends: a node could stand still for ever.
-NO_HEARD: Final = SubscriptionEventCallbacks(use_default_callbacks=False)
-NO_TOLD: Final = PublisherEventCallbacks(use_default_callbacks=False)
+NO_SUBSCRIPTION_EVENTS: Final = SubscriptionEventCallbacks(use_default_callbacks=False)
+NO_PUBLISHER_EVENTS: Final = PublisherEventCallbacks(use_default_callbacks=False)
 
 
 class GuardedNode(ParameterNode):
@@ -156,13 +156,13 @@ class GuardedNode(ParameterNode):
     ) -> Any:
         """As rclpy's, which makes its own one of ``/clock`` by it: that is checked here."""
         if msg_type is ClockMessage:
-            callback = self._checked_clock(callback)
-        options.setdefault("event_callbacks", NO_HEARD)
+            callback = self._guard_clock(callback)
+        options.setdefault("event_callbacks", NO_SUBSCRIPTION_EVENTS)
         return super().create_subscription(msg_type, topic, callback, *arguments, **options)
 
     def create_publisher(self, *arguments: Any, **options: Any) -> Any:
         """As rclpy's, without events of the middleware."""
-        options.setdefault("event_callbacks", NO_TOLD)
+        options.setdefault("event_callbacks", NO_PUBLISHER_EVENTS)
         return super().create_publisher(*arguments, **options)
 
     def create_guarded_subscription(
@@ -212,7 +212,7 @@ class GuardedNode(ParameterNode):
 
         return self.create_timer(period, guarded, clock=self.steady)
 
-    def _checked_clock(self, callback: Callable[[Any], None]) -> Callable[[Any], None]:
+    def _guard_clock(self, callback: Callable[[Any], None]) -> Callable[[Any], None]:
         """The callback of rclpy for ``/clock`` raises where the message is no time."""
 
         def checked(message: Any) -> None:
@@ -272,7 +272,7 @@ class GuardedSubscription:
         self._given = f"qos_overrides.{self._name}.subscription.reliability" in node.given
         self._relaxed = False
         self._subscription = self._subscribe()
-        node.health.watch(topic, self._incompatible_with)
+        node.health.watch(topic, self._relax_reliability)
 
     def _subscribe(self) -> Any:
         relaxed, best_effort = self._relaxed, self._best_effort or self._relaxed
@@ -282,7 +282,7 @@ class GuardedSubscription:
             message, info = arguments if len(arguments) == 2 else arguments[0]
             # What the one before has left, which may live on, came twice.
             if relaxed == self._relaxed:
-                self._take(message, info)
+                self._handle(message, info)
 
         # By its signature rclpy knows that the information is wanted.
         heard.__signature__ = inspect.signature(  # type: ignore[attr-defined]
@@ -298,7 +298,7 @@ class GuardedSubscription:
             qos_overriding_options=QoSOverridingOptions(OVERRIDES[:-1] if relaxed else OVERRIDES),
         )
 
-    def _take(self, message: Any, info: Any) -> None:
+    def _handle(self, message: Any, info: Any) -> None:
         node, statistics = self._node, self._statistics
         began = time.perf_counter()
         try:
@@ -315,12 +315,12 @@ class GuardedSubscription:
                 if self._backlog.drop(waited, min(node.max_wait, self._expires()), began):
                     return
             node.health.seen["messages"] += 1
-            self._callback(message if self._decode is None else self._decoded(message))
+            self._callback(message if self._decode is None else self._decode_message(message))
         except Exception as error:
             node.failed(self._topic, error)
         statistics.handled(time.perf_counter() - began)
 
-    def _decoded(self, data: bytes) -> Any:
+    def _decode_message(self, data: bytes) -> Any:
         assert self._decode is not None  # noqa: S101  asked for with it
         try:
             return self._decode(data)
@@ -329,7 +329,7 @@ class GuardedSubscription:
                 self._refuse(error)
             raise
 
-    def _incompatible_with(self, what: Incompatibility) -> None:
+    def _relax_reliability(self, what: Incompatibility) -> None:
         """From there on publishers of both kinds are taken."""
         if what != (QOS, RELIABILITY) or self._best_effort or self._given or self._relaxed:
             return
@@ -342,9 +342,9 @@ class GuardedSubscription:
 
 
 COMPILING: Final = "loading or compiling the robot's programs: the node does not answer yet"
-PATIENCE: Final = 0.5
+START_REPORT_PERIOD: Final = 0.5
 """Time between two statements of a node that starts, s: of stored programs it needs less."""
-MAX_ASKED: Final = 1000
+MAX_QUERIED: Final = 1000
 """Entries of a request that only asks; one that sets has at most as many as the node has
 parameters. More take the stream's time."""
 
@@ -366,14 +366,14 @@ class TwinNode(GuardedNode):
         self._tasks = Tasks(self.failed)
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", output_qos())
         self._made = threading.Event()
-        threading.Thread(target=self._tell_start, daemon=True).start()
+        threading.Thread(target=self._report_start, daemon=True).start()
 
-    def _tell_start(self) -> None:
+    def _report_start(self) -> None:
         """Until the node is made, and where that takes long."""
         logger = self.get_logger()
         # Where a constructor fails, the context ends meanwhile.
         with suppress(Exception):
-            while not self._made.wait(PATIENCE) and self.context.ok():
+            while not self._made.wait(START_REPORT_PERIOD) and self.context.ok():
                 logger.info(COMPILING, once=True)
                 self._diagnostics.publish(self.health.array(WARN, COMPILING))
 
@@ -401,7 +401,7 @@ class TwinNode(GuardedNode):
                 min_backward=Duration(nanoseconds=-1),
                 on_clock_change=True,
             ),
-            post_callback=self._jumped,
+            post_callback=self._on_clock_jump,
         )
         domain = os.environ.get("ROS_DOMAIN_ID", "0")
         reach = os.environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "SUBNET")
@@ -445,7 +445,7 @@ class TwinNode(GuardedNode):
 
     def shutdown(self) -> None:
         """The end: nothing is answered from here on, while the topics are still there."""
-        self._quit()
+        self._stop_answering()
 
     @property
     def shutting_down(self) -> bool:
@@ -472,15 +472,15 @@ class TwinNode(GuardedNode):
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Answer nothing more; what waits is forgotten."""
-        self._quit()
+        self._stop_answering()
         return super().on_deactivate(state)
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
         """As deactivated, for good."""
-        self._quit()
+        self._stop_answering()
         return super().on_shutdown(state)
 
-    def _quit(self) -> None:
+    def _stop_answering(self) -> None:
         if self.active:
             self.active = False
             self._tasks.clear()
@@ -498,9 +498,9 @@ class TwinNode(GuardedNode):
         """
         self._tasks.add(where, task)
 
-    def turned(self) -> None:
+    def end_turn(self) -> None:
         """A turn of the executor is over: one step of what waits."""
-        self.low_rate.turned()
+        self.low_rate.end_turn()
         self._tasks.step()
 
     def _on_reset(self, request: Any, response: Any) -> Any:
@@ -509,7 +509,7 @@ class TwinNode(GuardedNode):
         response.message = f"reset: {ended}" if ended else "no stop was latched"
         return response
 
-    def _jumped(self, jump: Any) -> None:
+    def _on_clock_jump(self, jump: Any) -> None:
         try:
             # One is an enumeration of Python, the other may be the binding's.
             same_clock = int(jump.clock_change) == int(ClockChange.ROS_TIME_NO_CHANGE)
@@ -549,7 +549,7 @@ def guarded_service(
                     response.results.extend(one.results)
                 return response
             if kind in (SetParameters, SetParametersAtomically):
-                request.parameters = _changes(request.parameters, declared())
+                request.parameters = _select_changes(request.parameters, declared())
                 if not request.parameters:
                     good = SetParametersResult(successful=True)
                     one = kind is SetParametersAtomically
@@ -557,7 +557,7 @@ def guarded_service(
             return callback(request, response)
         except Exception as error:
             health.seen["requests rejected"] += 1
-            text = cut(f"{type(error).__name__}: {error}")
+            text = shorten(f"{type(error).__name__}: {error}")
             health.log_throttled("request", f"{kind.__name__}: rejected, {text}")
         response = kind.Response()
         refusal = SetParametersResult(successful=False, reason=text)
@@ -570,7 +570,7 @@ def guarded_service(
     return guarded
 
 
-def _changes(asked: Sequence[Any], declared: Mapping[str, Parameter]) -> list[Any]:
+def _select_changes(asked: Sequence[Any], declared: Mapping[str, Parameter]) -> list[Any]:
     """Return the parameters of a request that differ from the node's."""
     return [
         one
@@ -586,7 +586,7 @@ def _check_size(request: Any, parameters: int) -> None:
     """
     for field in ("parameters", "names", "prefixes"):
         entries = len(getattr(request, field, ()))
-        most = parameters if field == "parameters" else MAX_ASKED
+        most = parameters if field == "parameters" else MAX_QUERIED
         if entries > most:
             raise ParameterError(field, entries, f"at most {most} in a request")
     named = Counter(parameter.name for parameter in getattr(request, "parameters", ()))

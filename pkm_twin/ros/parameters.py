@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 S = TypeVar("S", bound="DataclassInstance")
 V = TypeVar("V")
 
-KNOWN = "7.1"
+SUPPORTED_RCLPY = "7.1"
 """The rclpy that keeps parameter overrides as below, that of Jazzy."""
 
 
@@ -193,10 +193,10 @@ class ParameterNode(LifecycleNode):
         if deaf:
             # A set of it would be answered as taken.
             raise NotImplementedError(f"nothing follows a change of {', '.join(deaf)}")
-        self.add_pre_set_parameters_callback(self._with_floats)
-        self.add_on_set_parameters_callback(_refuse_nameless)
+        self.add_pre_set_parameters_callback(self._convert_to_floats)
+        self.add_on_set_parameters_callback(_reject_nameless)
 
-    def _with_floats(self, changes: list[Parameter]) -> list[Parameter]:
+    def _convert_to_floats(self, changes: list[Parameter]) -> list[Parameter]:
         """Whole numbers for floats where the declaration has floats."""
         return [
             _as_float(change, self.get_parameter(change.name).value)
@@ -206,7 +206,7 @@ class ParameterNode(LifecycleNode):
         ]
 
 
-def _refuse_nameless(changes: list[Parameter]) -> SetParametersResult:
+def _reject_nameless(changes: list[Parameter]) -> SetParametersResult:
     """Refuse what rclpy would declare by the way."""
     good = all(change.name for change in changes)
     return SetParametersResult(successful=good, reason="" if good else "a parameter without a name")
@@ -241,5 +241,5 @@ def parameter_overrides(node: Any) -> dict[str, Any]:
             found = version("rclpy")
         except PackageNotFoundError:
             found = "of an unknown version"
-        raise RuntimeError(f"rclpy {found} is not supported; use {KNOWN}") from None
+        raise RuntimeError(f"rclpy {found} is not supported; use {SUPPORTED_RCLPY}") from None
     return overrides

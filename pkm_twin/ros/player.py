@@ -33,10 +33,10 @@ _DELIVERY_TIME = 1.0
 # How long lockstep waits for a subscriber to know its publisher, s.
 _MATCH_TIME = 60.0
 # A wait of the operating system overshoots by less than this, s; the rest is short sleeps.
-_COARSE = 0.002
-_FINE = 0.0001
+_SLEEP_OVERSHOOT = 0.002
+_SHORT_SLEEP = 0.0001
 # How often a long wait looks for a signal, s.
-_LOOK = 0.02
+_SIGNAL_PERIOD = 0.02
 
 
 @dataclass
@@ -47,7 +47,7 @@ class _Stop:
 
     def wait(self, seconds: float) -> None:
         """Sleep, but no longer than until the next look."""
-        time.sleep(min(seconds, _LOOK))
+        time.sleep(min(seconds, _SIGNAL_PERIOD))
 
 
 @dataclass(frozen=True)
@@ -95,39 +95,39 @@ def play(
         differs from the installed one.
     :raises ParameterError: a number is out of range.
     """
-    _require("rate", rate, rate > 0, "a finite number above 0")
-    _require("clock", clock or 0.0, (clock or 0.0) >= 0, "0 or more, Hz")
-    _require(
+    _check_number("rate", rate, rate > 0, "a finite number above 0")
+    _check_number("clock", clock or 0.0, (clock or 0.0) >= 0, "0 or more, Hz")
+    _check_number(
         "wait_for_subscribers", wait_for_subscribers, wait_for_subscribers >= 0, "0 or more, s"
     )
     bag = open_bag(path)
     if clock:
-        _require_times(bag)
-    names = _selected(bag, topics, bool(clock))
-    targets = _targets(bag, names, remap or {})
+        _check_log_times(bag)
+    names = _select_topics(bag, topics, bool(clock))
+    targets = _find_targets(bag, names, remap or {})
     stop = _Stop()
     with (
-        _signals(stop) if pace is None else nullcontext(),
-        _publishers(bag, targets, bool(clock)) as (publishers, clock_publisher),
+        _stop_on_signals(stop) if pace is None else nullcontext(),
+        _create_publishers(bag, targets, bool(clock)) as (publishers, clock_publisher),
     ):
         awaited = {**publishers, CLOCK_TOPIC: clock_publisher} if clock else publishers
         _await_subscribers(awaited, wait_for_subscribers, stop)
         replay = _Replay(bag, publishers, rate, stop, pace)
         if clock and clock_publisher:
             replay.add_clock(clock_publisher, clock)
-        with _bar(bag, progress) as update:
+        with _progress_bar(bag, progress) as update:
             result = replay.run(loop=loop, update=update)
         if not result.interrupted:
             _await_delivery(publishers)
     return result
 
 
-def _require(name: str, value: float, holds: bool, bound: str) -> None:
+def _check_number(name: str, value: float, holds: bool, bound: str) -> None:
     if not (math.isfinite(value) and holds):
         raise ParameterError(name, value, bound)
 
 
-def _require_times(bag: Bag) -> None:
+def _check_log_times(bag: Bag) -> None:
     """Refuse log times that a clock message cannot carry: they would come out as others."""
     end = bag.report.start_time * 1e-9 + bag.report.duration
     if not end < MAX_CLOCK:
@@ -139,7 +139,7 @@ def _require_times(bag: Bag) -> None:
         )
 
 
-def _selected(bag: Bag, topics: Iterable[str] | None, own_clock: bool) -> list[str]:
+def _select_topics(bag: Bag, topics: Iterable[str] | None, own_clock: bool) -> list[str]:
     """Return the topics to play, checked to be playable here."""
     known = bag.report.topics
     names = list(known) if topics is None else list(dict.fromkeys(topics))
@@ -179,7 +179,7 @@ def _check_type(bag: Bag, name: str, info: TopicInfo) -> None:
             )
 
 
-def _targets(bag: Bag, names: list[str], remap: Mapping[str, str]) -> dict[str, str]:
+def _find_targets(bag: Bag, names: list[str], remap: Mapping[str, str]) -> dict[str, str]:
     unknown = sorted(remap.keys() - bag.report.topics.keys())
     if unknown:
         raise BagError(
@@ -194,7 +194,7 @@ def _targets(bag: Bag, names: list[str], remap: Mapping[str, str]) -> dict[str, 
 
 
 @contextmanager
-def _signals(stop: _Stop) -> Iterator[None]:
+def _stop_on_signals(stop: _Stop) -> Iterator[None]:
     """Let SIGINT and SIGTERM ask to stop; only the main thread can have it so."""
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -213,7 +213,7 @@ def _signals(stop: _Stop) -> Iterator[None]:
 
 
 @contextmanager
-def _publishers(
+def _create_publishers(
     bag: Bag, targets: Mapping[str, str], with_clock: bool
 ) -> Iterator[tuple[dict[str, Any], Any]]:
     """Yield a publisher for each recorded topic, and one for the clock or None."""
@@ -224,7 +224,7 @@ def _publishers(
             name: node.create_publisher(
                 message_class(bag.report.topics[name].type),
                 target,
-                _qos(parse_qos(name, bag.report.topics[name].offered_qos)),
+                _publisher_qos(parse_qos(name, bag.report.topics[name].offered_qos)),
             )
             for name, target in targets.items()
         }
@@ -235,7 +235,7 @@ def _publishers(
         yield publishers, clock
 
 
-def _qos(offer: OfferedQos) -> Any:
+def _publisher_qos(offer: OfferedQos) -> Any:
     """Return the publisher's QoS of a recorded offer.
 
     Deadline, lifespan and liveliness are not taken over: a replay does not keep such promises.
@@ -276,7 +276,7 @@ def _await_acknowledged(publisher: Any, seconds: float) -> None:
 
 
 @contextmanager
-def _bar(bag: Bag, shown: bool) -> Iterator[Callable[[float, int], None]]:
+def _progress_bar(bag: Bag, shown: bool) -> Iterator[Callable[[float, int], None]]:
     """Yield a function that takes bag time since the start (s) and messages so far."""
     if not shown:
         yield lambda _seconds, _messages: None
@@ -343,7 +343,7 @@ class _Replay:
         begin = time.monotonic()
         loops = 0
         while not self._stop.asked:
-            self._pass(update)
+            self._play_once(update)
             loops += not self._stop.asked
             if not loop or not self._publishers:
                 break
@@ -355,7 +355,7 @@ class _Replay:
             interrupted=self._stop.asked,
         )
 
-    def _pass(self, update: Callable[[float, int], None]) -> None:
+    def _play_once(self, update: Callable[[float, int], None]) -> None:
         """Play the bag once; ``begin`` is the monotonic time of its first message."""
         first = self._bag.report.start_time
         begin = time.monotonic()
@@ -390,8 +390,8 @@ class _Replay:
         while (left := due - time.monotonic()) > 0:
             if self._stop.asked:
                 return False
-            if left > _COARSE:
-                self._stop.wait(left - _COARSE / 2)
+            if left > _SLEEP_OVERSHOOT:
+                self._stop.wait(left - _SLEEP_OVERSHOOT / 2)
             else:
-                time.sleep(min(left, _FINE))
+                time.sleep(min(left, _SHORT_SLEEP))
         return not self._stop.asked

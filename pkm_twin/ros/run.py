@@ -52,11 +52,11 @@ def set_priority(priority: int) -> None:
         raise OSError(f"locking memory: {os.strerror(ctypes.get_errno())}")
 
 
-LOOK: Final = 0.5
+MAX_SPIN_TIME: Final = 0.5
 """How often the events executor looks whether it has to end, s."""
-SHUTDOWN_TIME: Final = 1.0
+MAX_SHUTDOWN_TIME: Final = 1.0
 """How long a node may take to end what others wait for, s: a launcher gives five."""
-TEARDOWN: Final = 3.0
+MAX_TEARDOWN_TIME: Final = 3.0
 """How long rclpy and the middleware may take to end, s: their threads can wait for each other."""
 
 
@@ -70,7 +70,7 @@ class _Executor:
         for node in nodes:
             self._executor.add_node(node)
         # Without a bound the one waits for ever; with one the other makes a timer a message.
-        self._patience = LOOK if events else None
+        self._patience = MAX_SPIN_TIME if events else None
 
     def spin(self, ended: Callable[[], bool]) -> None:
         """Run callbacks, and between them a step of what waits, until the end is asked for."""
@@ -80,7 +80,7 @@ class _Executor:
             try:
                 turn(0.0 if any(node.busy for node in nodes) else patience)
                 for node in nodes:
-                    node.turned()
+                    node.end_turn()
             except (KeyboardInterrupt, ExternalShutdownException):
                 raise
             except Exception as error:
@@ -93,7 +93,7 @@ class _Executor:
         self._executor.shutdown()
 
 
-def _prioritise(nodes: Sequence[TwinNode]) -> None:
+def _set_process_priority(nodes: Sequence[TwinNode]) -> None:
     """The highest priority that a node asks for is the process's; without permission it runs on."""
     node = max(nodes, key=lambda n: n.thread_priority)
     if node.thread_priority:
@@ -130,7 +130,7 @@ def run(*factories: Callable[[], TwinNode], arguments: Sequence[str] | None = No
                 for factory in factories:
                     nodes.append(factory())
             one_blas_thread()
-            _prioritise(nodes)
+            _set_process_priority(nodes)
             # What is loaded by now stays: the collector need not look at it again.
             gc.collect()
             gc.freeze()
@@ -154,13 +154,13 @@ def run(*factories: Callable[[], TwinNode], arguments: Sequence[str] | None = No
         ignore_signals()
         for node in nodes:
             node.shutdown()
-        end = time.monotonic() + SHUTDOWN_TIME
+        end = time.monotonic() + MAX_SHUTDOWN_TIME
         if executor is not None:
             executor.spin(
                 lambda: not any([n.shutting_down for n in nodes]) or time.monotonic() > end
             )
         # A thread without Python's lock ends what hangs from here on, and says where.
-        faulthandler.dump_traceback_later(TEARDOWN, exit=True)
+        faulthandler.dump_traceback_later(MAX_TEARDOWN_TIME, exit=True)
         if executor is not None:
             executor.close()
         for node in nodes:

@@ -18,7 +18,7 @@ from typing import Final
 SIGNALS: Final = (signal.SIGINT, signal.SIGTERM)
 INTERRUPTED: Final = 130
 """Exit code of a command that was interrupted, as a shell gives it."""
-PATIENCE: Final = 2.0
+IGNORE_TIME: Final = 2.0
 """How long after a signal others are ignored while the process cleans up, s. Not for ever: an
 exception that is raised in a callback of a C library is lost."""
 
@@ -58,8 +58,8 @@ def first_signal(
         nonlocal came
         came = True
         now = time.monotonic()
-        if now - _Process.asked > PATIENCE:
-            _Process.asked = now
+        if now - _Process.requested > IGNORE_TIME:
+            _Process.requested = now
             raise raising()
 
     before = [signal.signal(number, end) for number in numbers]
@@ -78,7 +78,7 @@ def leave_at_once() -> None:
 
     An exception in the middle of an import may be lost, or come out as another one.
     """
-    for number in _of_nodes():
+    for number in _node_signals():
         signal.signal(number, lambda *_: os._exit(0))
 
 
@@ -106,18 +106,18 @@ class NodeSignals:
         self.raises = False
         """Whether the first signal raises KeyboardInterrupt; and a later one, if that was lost."""
         self.came = False
-        for number in _of_nodes():
+        for number in _node_signals():
             signal.signal(number, self._take)
 
     def _take(self, *_: object) -> None:
         self.came = True
         now = time.monotonic()
-        if self.raises and now - _Process.asked > PATIENCE:
-            _Process.asked = now
+        if self.raises and now - _Process.requested > IGNORE_TIME:
+            _Process.requested = now
             raise KeyboardInterrupt
 
 
-def _of_nodes() -> list[signal.Signals]:
+def _node_signals() -> list[signal.Signals]:
     """A closed terminal ends a node too, but not one that was started to outlive it."""
     deaf = signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
     return [*SIGNALS] if deaf else [*SIGNALS, signal.SIGHUP]

@@ -35,7 +35,7 @@ class LowRateGroup(MutuallyExclusiveCallbackGroup):
         """Let the next turns of the executor look at them."""
         self._turns = LOW_RATE_TURNS
 
-    def turned(self) -> None:
+    def end_turn(self) -> None:
         """A turn of the executor is over."""
         if self._turns:
             self._turns -= 1
