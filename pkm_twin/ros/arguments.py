@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""What the command lines of nodes and launch files may hold."""
+"""Check the command lines of nodes and launch files."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ Runs until SIGINT or SIGTERM. For its parameters see docs/nodes.md, section {nod
 
 
 def answer(name: str, summary: str, arguments: Sequence[str], others: str = "") -> None:
-    """Print help or the version and end, where the command line asks for one.
+    """Print help or the version and exit, if the command line asks for one.
 
-    :param arguments: what stands behind the command's name.
-    :param others: what the help calls the names of nodes that stand before the options.
-    :raises SystemExit: 0 when something was printed, 2 where an argument is no node's.
+    :param arguments: the words after the command's name.
+    :param others: name in the help of the words before the options that name nodes.
+    :raises SystemExit: 0 if something was printed, 2 for an argument that no node has.
     """
     end = arguments.index("--ros-args") if "--ros-args" in arguments else len(arguments)
     own = arguments[:end]

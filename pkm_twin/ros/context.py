@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""A node for a command, where there is ROS."""
+"""Create a ROS node for a command."""
 
 from __future__ import annotations
 
@@ -16,9 +16,10 @@ from pkm_twin.errors import PkmTwinError, install
 
 
 def middleware_arguments(arguments: Sequence[str]) -> list[str]:
-    """Arguments for rclpy: without log files, said once, where there can be no folder for them.
+    """Return arguments for rclpy; turn log files off if no folder for them can be written.
 
-    The middleware would not start. What it logs goes to the terminal and /rosout as ever.
+    The middleware would not start without the folder. Log lines still go to the terminal and
+    /rosout, and standard error states the reason once.
     """
     given = list(arguments)
     try:
@@ -37,13 +38,13 @@ def middleware_arguments(arguments: Sequence[str]) -> list[str]:
 def own_node(
     name: str, needs: str, *, sim_time: bool = False, namespace: str = ""
 ) -> Iterator[Any]:
-    """A node in a context of its own, which leaves signals alone; both end with the block.
+    """Yield a node in its own context, which handles no signals; both end with the block.
 
     It has no parameter services.
 
-    :param needs: what needs it, for the error.
-    :param sim_time: its clock is that of ``/clock``.
-    :raises PkmTwinError: there is no ROS here, or the namespace is none.
+    :param needs: what needs the node, for the error.
+    :param sim_time: use the clock of ``/clock``.
+    :raises PkmTwinError: ROS is not installed, or the namespace is invalid.
     """
     try:
         import rclpy
@@ -83,11 +84,11 @@ def own_node(
 def listening_node(
     name: str, sim_time: bool = False, namespace: str = ""
 ) -> Iterator[tuple[Any, Callable[[float], None]]]:
-    """A node in a context of its own, and a function that lets it take messages for some time, s.
+    """Yield a node in its own context, and a function that takes its messages for a time, s.
 
-    Signals are the caller's.
+    The caller handles signals.
 
-    :raises PkmTwinError: there is no ROS, or the namespace is none.
+    :raises PkmTwinError: ROS is not installed, or the namespace is invalid.
     """
     needs = name.replace("_", "-")
     with own_node(name, needs, sim_time=sim_time, namespace=namespace) as node:
@@ -106,9 +107,9 @@ def listening_node(
 
 
 def subscribe_best_effort(node: Any, kind: str, topic: str, take: Callable[[Any], None]) -> None:
-    """Hear a topic of a type (``sensor_msgs/msg/JointState``), however it is published.
+    """Subscribe to a topic of a type (``sensor_msgs/msg/JointState``), with any publisher QoS.
 
-    A few messages wait at most: who only looks wants the newest.
+    Only the newest few messages wait.
     """
     from rclpy.qos import QoSProfile, ReliabilityPolicy
 

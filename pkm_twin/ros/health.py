@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""How a node is: counts, log lines at a bounded rate, and its diagnostic status."""
+"""Report a node's health: counts, log lines at a bounded rate, and its diagnostic status."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ WARN: Final = DiagnosticStatus.WARN
 ERROR: Final = DiagnosticStatus.ERROR
 
 CALLBACKS_PER_OVERRUN: Final = 100
-"""One callback in so many may take longer than its period before the diagnostics warn."""
+"""Callbacks per late one (longer than its period) below which the diagnostics warn."""
 MAX_TEXT: Final = 500
-"""Characters of a line in the log or of a value in the diagnostics."""
+"""Largest number of characters of a log line or of a value in the diagnostics."""
 MIN_PAUSE: Final = 1.0
 MAX_PAUSE: Final = 30.0
-"""Pauses between two lines of the same reason, s; after a longer silence they begin anew."""
+"""Smallest and largest pause between lines of one reason, s; a longer silence resets it."""
 UNKNOWN_NODE: Final = "_NODE_NAME_UNKNOWN_"
-"""What rmw calls a node of which only an endpoint has been discovered."""
+"""Name that rmw gives a node of which only an endpoint has been discovered."""
 
 
 QOS: Final = "QoS"
@@ -39,7 +39,7 @@ RELIABILITY: Final = "reliability"
 
 
 class Incompatibility(NamedTuple):
-    """Why a publisher and a subscriber exchange nothing: the policy of a QoS, or the types."""
+    """State why a publisher and a subscriber exchange nothing: a QoS policy, or the types."""
 
     kind: str
     detail: str
@@ -50,13 +50,13 @@ class Incompatibility(NamedTuple):
 
 @dataclass
 class _Repetition:
-    """When lines of one reason are logged."""
+    """Decide when lines of one reason are logged."""
 
     pause: float = 0.0
     due: float = -math.inf
     last: float = -math.inf
     held: int = 0
-    """Lines that were not logged since the last one."""
+    """Lines that were suppressed since the last logged one."""
 
     def begin_line(self, now: float) -> int | None:
         """Return how many lines were held back before this one, or None to hold it back too."""
@@ -73,13 +73,13 @@ class _Repetition:
 
 
 class Health:
-    """What a node's callbacks met, and what is wrong around it.
+    """Count a node's events, and find problems of its surroundings.
 
     :param now: the ROS clock, ns.
     """
 
     def __init__(self, node: LifecycleNode, now: Callable[[], int]) -> None:
-        """Nothing of the node is used before it is made."""
+        """Store the node; nothing of it is used before it is constructed."""
         self._node, self._now = node, now
         self.seen = dict.fromkeys(
             ("messages", "exceptions", "requests rejected", "clock messages rejected"), 0
@@ -87,9 +87,9 @@ class Health:
         self.statistics: dict[str, TopicStatistics] = {}
         self.backlogs: dict[str, Backlog] = {}
         self.expected: list[str] = []
-        """Topics of which the diagnostics warn until the first message."""
+        """Topics for which the diagnostics warn until the first message."""
         self.limitations: list[str] = []
-        """What the node was asked for at start and could not have."""
+        """Settings that the node was started with and that are not possible here."""
         self._logged: dict[str, _Repetition] = {}
         self._last_exception = ""
         self._last_kind = ""
@@ -100,7 +100,7 @@ class Health:
         self._last_clock = 0
 
     def caught(self, where: str, error: Exception) -> None:
-        """An exception in a callback: the node lives; one traceback a kind."""
+        """Count an exception in a callback; log one traceback per kind."""
         self.seen["exceptions"] += 1
         self._last_kind = shorten(f"{where}: {type(error).__name__}: {error}")
         text = traceback.format_exc()
@@ -111,7 +111,7 @@ class Health:
             )
 
     def log_throttled(self, reason: str, text: str) -> None:
-        """Log a line of a reason; while the reason goes on, the pauses between its lines double."""
+        """Log a line of a reason; the pauses between lines of a reason double."""
         held = self._logged.setdefault(reason, _Repetition()).begin_line(time.monotonic())
         if held is not None:
             more = f" ({held} more since the last line)" if held else ""
@@ -120,12 +120,12 @@ class Health:
     def watch(self, topic: str, tell: Callable[[Incompatibility], None] | None = None) -> None:
         """Report other nodes with which this one cannot exchange messages on a topic.
 
-        :param tell: called with what does not fit, once a publisher or subscriber.
+        :param tell: called with the incompatibility, once per publisher or subscriber.
         """
         self._watched_topics.setdefault(topic, []).extend([tell] if tell else [])
 
     def _find_incompatible_ends(self) -> None:
-        """Find those nodes in the graph, which costs less than the middleware's events."""
+        """Find incompatible nodes in the graph; this costs less than the middleware's events."""
         for topic, listeners in self._watched_topics.items():
             before, now = self._incompatible_ends.get(topic, {}), self._incompatibilities(topic)
             self._incompatible_ends[topic] = now
@@ -138,13 +138,13 @@ class Health:
                     tell(now[end])
 
     def _incompatibilities(self, topic: str) -> dict[bytes, Incompatibility]:
-        """What does not fit at other nodes' publishers and subscribers, by their identity."""
+        """Return the incompatibilities of other nodes' endpoints, by endpoint identity."""
         # The name as it was given: both calls remap it.
         speakers = self._node.get_publishers_info_by_topic(topic)
         listeners = self._node.get_subscriptions_info_by_topic(topic)
         speaking, listening = ([*filter(self._is_own, ends)] for ends in (speakers, listeners))
         strangers = [end for end in speakers if not self._is_own(end)]
-        # Every node's own are few: the others are looked at once, however many there are.
+        # A node has few endpoints of its own, so that each foreign endpoint is checked about once.
         pairs = [(s, r, r) for s, r in product(speaking, listeners)]
         pairs += [(s, r, s) for s, r in product(strangers, listening)]
         found = {bytes(end.endpoint_gid): find_incompatibility(s, r) for s, r, end in pairs}
@@ -155,7 +155,7 @@ class Health:
         return (end.node_name, end.node_namespace) == (node.get_name(), node.get_namespace())
 
     def _find_problems(self) -> list[tuple[bytes, str]]:
-        """What is wrong with the node's surroundings, worst first."""
+        """Return the problems of the node and its surroundings, worst first."""
         found: list[tuple[bytes, str]] = []
         if self.seen["exceptions"]:
             found.append((ERROR, f"a callback raised an exception: {self._last_kind}"))
@@ -173,7 +173,7 @@ class Health:
             elif now == self._last_clock:
                 found.append((WARN, "use_sim_time is set and /clock stands still"))
             self._last_clock = now
-        # Every node has one; of the list of names, an ended node's last words may bring it back.
+        # Every node publishes it; the list of node names may still contain ended nodes.
         publishers = self._node.get_publishers_info_by_topic("/parameter_events")
         namesakes = sum(map(self._is_own, publishers))
         if namesakes > 1:
@@ -197,7 +197,7 @@ class Health:
             )
         if lost:
             found.append((WARN, f"{lost} messages lost in the last second"))
-        # A single late one on a machine that also does other things is no trouble.
+        # Single late callbacks are normal on a machine that runs other programs too.
         if overruns > taken / CALLBACKS_PER_OVERRUN:
             found.append((WARN, f"{overruns} of {taken} callbacks took longer than their period"))
         return found
@@ -205,9 +205,9 @@ class Health:
     def report(
         self, level: bytes, message: str, values: dict[str, object], *, active: bool
     ) -> DiagnosticArray:
-        """The diagnostics of the last second.
+        """Return the diagnostics of the last second.
 
-        :param values: the node's own, which are added to.
+        :param values: the node's values, which are extended.
         """
         waiting = [topic for topic in self.expected if not self.statistics[topic].messages]
         if not active:
@@ -220,7 +220,7 @@ class Health:
         elif level != OK or not troubles or not active:
             troubles.append((level, message))
         values |= self.seen
-        # The message is the worst; what else there is stands here.
+        # The message names the worst problem; this value lists the others.
         values["other problems"] = "; ".join(text for _, text in troubles[1:])
         values["incompatible QoS"] = self._incompatible
         for topic, statistics in self.statistics.items():
@@ -234,7 +234,7 @@ class Health:
     def array(
         self, level: bytes, message: str, *, robot: object = "", **values: object
     ) -> DiagnosticArray:
-        """The node's status as a message, stamped now; ``robot`` is its hardware."""
+        """Return the node's status as a message, stamped now; ``robot`` is its hardware."""
         status = DiagnosticStatus(
             level=level,
             name=self._node.get_fully_qualified_name(),
@@ -250,7 +250,7 @@ class Health:
 def find_incompatibility(
     speaker: TopicEndpointInfo, listener: TopicEndpointInfo
 ) -> Incompatibility | None:
-    """Why a publisher's messages do not reach a subscriber; None if they do."""
+    """Return why a publisher's messages do not reach a subscriber; None if they do."""
     if speaker.topic_type != listener.topic_type:
         return Incompatibility("message type", f"{speaker.topic_type} for {listener.topic_type}")
     offered, requested = speaker.qos_profile, listener.qos_profile
@@ -265,12 +265,12 @@ def find_incompatibility(
 
 
 def node_of(end: TopicEndpointInfo) -> str:
-    """The full name of an endpoint's node; the graph can know an endpoint before its node."""
+    """Return the full name of an endpoint's node, which the graph may not know yet."""
     if end.node_name == UNKNOWN_NODE:
         return "a node whose name is not known yet"
     return f"{end.node_namespace.rstrip('/')}/{end.node_name}"
 
 
 def shorten(text: str) -> str:
-    """A text that strangers may have made long."""
+    """Shorten a text from outside to :data:`MAX_TEXT`."""
     return text if len(text) <= MAX_TEXT else f"{text[:MAX_TEXT]}... ({len(text)} characters)"

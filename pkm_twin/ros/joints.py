@@ -1,9 +1,9 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""What nodes publish: messages with a header, and joint numbers as the controller has them.
+"""Make messages with a header, and publish joint values as the controller has them.
 
-A node publishes numbers of the actuated joints through these alone. They take
-:data:`~pkm_twin.machine.joint_map.ControllerNumbers`, which only a robot's joint map makes: the
-type checker finds a conversion that was forgotten.
+Nodes publish values of the actuated joints only through these classes. They take
+:data:`~pkm_twin.machine.joint_map.ControllerNumbers`, which only a robot's joint map makes, so
+that the type checker finds a missing conversion.
 """
 
 from __future__ import annotations
@@ -36,17 +36,17 @@ FIELDS: Final = ("position", "velocity", "effort")
 
 
 def header(stamp: int, frame: str = "") -> Header:
-    """A header with a stamp, ns."""
+    """Return a header with a stamp, ns."""
     return Header(stamp=Time(nanoseconds=stamp).to_msg(), frame_id=frame)
 
 
 def xyz(kind: Any, values: Iterable[float]) -> Any:
-    """A message of numbers x, y, z and, where there are four, w."""
+    """Return a message of numbers x, y, z and, if there are four, w."""
     return kind(**dict(zip("xyzw", map(float, values), strict=False)))
 
 
 def wrench_stamped(stamp: int, frame: str, wrench: Array) -> WrenchStamped:
-    """A wrench, shape (6,), N and N m, along the axes of a frame."""
+    """Return a wrench message, values (6,), N and N m, along the axes of a frame."""
     force, torque = xyz(Vector3, wrench[:3]), xyz(Vector3, wrench[3:])
     return WrenchStamped(header=header(stamp, frame), wrench=Wrench(force=force, torque=torque))
 
@@ -58,7 +58,7 @@ def named(
     rates: Sequence[float] = (),
     efforts: Sequence[float] = (),
 ) -> JointState:
-    """Numbers by name: the message of names and numbers that plots know."""
+    """Return values by name as a joint state, which plotting tools can show."""
     position, velocity, effort = (array("d", row) for row in (values, rates, efforts))
     return JointState(
         header=header, name=list(names), position=position, velocity=velocity, effort=effort
@@ -66,7 +66,7 @@ def named(
 
 
 class JointPublisher:
-    """Publishes sensor_msgs/JointState, the same fields in each message."""
+    """Publish sensor_msgs/JointState with the same fields in each message."""
 
     def __init__(
         self,
@@ -90,13 +90,13 @@ class JointPublisher:
         )
 
     def publish(self, stamp: int, *values: ControllerNumbers) -> None:
-        """Send the numbers of the fields, shape (n,) each; the stamp in ns."""
+        """Publish the values of the fields, shape (n,) each; the stamp in ns."""
         row: Any = values[0] if len(values) == 1 else np.concatenate(values)
         self._publisher.publish(self._template.fill(row, divmod(stamp, SECOND)))
 
 
 class EffortPublisher:
-    """Publishes efforts with names and a stamp, and as plain numbers for effort controllers.
+    """Publish efforts with names and a stamp, and as plain numbers for effort controllers.
 
     Efforts leave a node through this class alone. It takes
     :data:`~pkm_twin.robot.effort_limits.LimitedEfforts`, which only the limits make.
@@ -115,7 +115,7 @@ class EffortPublisher:
         """Create the topics.
 
         :param stamped: topic of sensor_msgs/JointState; ``plain``: topic of
-            std_msgs/Float64MultiArray, a number a joint, created where ``with_plain`` is true.
+            std_msgs/Float64MultiArray, a number per joint, created if ``with_plain`` is true.
         :param expiry: as of ``create_guarded_publisher``, s.
         """
         self._stamped = JointPublisher(node, robot, stamped, expiry=expiry)
@@ -127,11 +127,11 @@ class EffortPublisher:
 
     @property
     def controllers(self) -> int:
-        """The number of subscribers of the plain numbers."""
+        """Number of subscribers of the plain numbers."""
         return 0 if self._plain is None else self._plain.get_subscription_count()
 
     def publish(self, stamp: int, efforts: LimitedEfforts) -> None:
-        """Send efforts, shape (n,); the stamp in ns."""
+        """Publish efforts, shape (n,); the stamp in ns."""
         if self._plain is not None:
             self._plain.publish(self._template.fill(efforts))
         self._stamped.publish(stamp, efforts)

@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""What launch files check before their first action: a launch that fails must start no node."""
+"""Check launch arguments before the first action, so that a failing launch starts no node."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""What every node of the suite shares: life cycle, parameters, guards, diagnostics.
+"""Share between all nodes: life cycle, parameters, guards, diagnostics.
 
-Nothing that runs while a node spins can end it: what a message, a request or a clock breaks is
+Nothing that happens while a node spins can end it: errors of messages, requests and clocks are
 caught, counted and reported.
 """
 
@@ -43,16 +43,16 @@ from pkm_twin.streams.topics import JOINTS, Topic
 
 OVERRIDES: Final = (QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH, QoSPolicyKind.RELIABILITY)
 EXPIRY: Final = (QoSPolicyKind.LIFESPAN, QoSPolicyKind.DEADLINE)
-"""QoS policies that parameters may override; the second ones of topics that expire."""
+"""QoS policies that parameters may override; :data:`EXPIRY` only for topics that expire."""
 
 
 def output_qos() -> QoSProfile:
-    """Reliable and volatile: a torque or a compliance is for now, never for a late joiner."""
+    """Return reliable, volatile QoS: a late subscriber must not receive an old torque."""
     return QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
 
 
 def latched_qos() -> QoSProfile:
-    """What does not change while a node runs, such as a description: late joiners get it too."""
+    """Return transient local QoS for what is constant while a node runs, such as a description."""
     return QoSProfile(
         depth=1,
         reliability=ReliabilityPolicy.RELIABLE,
@@ -61,9 +61,9 @@ def latched_qos() -> QoSProfile:
 
 
 def input_qos(depth: int, *, best_effort: bool, expiry: float | None = None) -> QoSProfile:
-    """Best effort takes what publishers of both kinds send; reliable only what reliable ones do.
+    """Return QoS for inputs: best effort matches all publishers, reliable only reliable ones.
 
-    :param expiry: lifespan and deadline that they have to offer, s; None is any.
+    :param expiry: lifespan and deadline that publishers must offer, s; None for any.
     """
     kind = ReliabilityPolicy.BEST_EFFORT if best_effort else ReliabilityPolicy.RELIABLE
     qos = QoSProfile(depth=depth, reliability=kind)
@@ -72,20 +72,20 @@ def input_qos(depth: int, *, best_effort: bool, expiry: float | None = None) -> 
     return qos
 
 
-# The middleware's threads hold its locks while they report an event, and wait there for the lock
-# that the executor holds while it takes one or ends: a node could stand still for ever.
+# The middleware's threads hold its locks while they report an event, and wait for the lock that the
+# executor holds while it takes an event or ends: a node could deadlock.
 NO_SUBSCRIPTION_EVENTS: Final = SubscriptionEventCallbacks(use_default_callbacks=False)
 NO_PUBLISHER_EVENTS: Final = PublisherEventCallbacks(use_default_callbacks=False)
 
 
 class GuardedNode(ParameterNode):
-    """A node with guarded subscriptions, publishers and timers.
+    """Provide guarded subscriptions, publishers and timers.
 
-    A node that is not active takes no message.
+    An inactive node takes no message.
     """
 
     topics: ClassVar[Mapping[str, Topic]]
-    """The topics that it can have, and its own services."""
+    """Topics and services that the node can have."""
 
     def __init__(self, name: str) -> None:
         # rclpy subscribes to the clock while it makes the node.
@@ -118,31 +118,31 @@ class GuardedNode(ParameterNode):
             "real-time priority (SCHED_FIFO) of the process, with its memory locked; 0: none",
             low=0, high=99
         )  # fmt: skip
-        # The diagnostics run on the steady clock: they have to tell that the ROS clock stands.
+        # The diagnostics run on the steady clock: they report a ROS clock that stands still.
         self.steady = Clock(clock_type=ClockType.STEADY_TIME)
 
     def stream_broken(self, where: str) -> None:
-        """A callback failed: whatever it feeds cannot be trusted now."""
+        """React to an exception in a callback: its stream cannot be trusted any more."""
 
     def caught(self, where: str, error: Exception) -> None:
-        """An exception in a callback: the node lives."""
+        """Report an exception in a callback; the node keeps running."""
         self.health.caught(where, error)
         self.stream_broken(where)
 
     def failed(self, where: str, error: Exception) -> None:
-        """What a callback raised: a rejected message is no fault of the node."""
+        """Report what a callback raised; a rejected message is not a fault of the node."""
         if isinstance(error, MessageError):
             self.log_throttled(error.reason, f"{where}: rejected, {error.labelled}")
         else:
             self.caught(where, error)
 
     def log_throttled(self, reason: str, text: str) -> None:
-        """Log a reason, with pauses that grow while it goes on; the diagnostics count."""
+        """Log a reason with growing pauses; the diagnostics count every occurrence."""
         self.health.log_throttled(reason, text)
 
     def now(self) -> int:
-        """The ROS clock, ns."""
-        # As Clock.now, without its objects: it is asked twice a sample.
+        """Return the ROS clock, ns."""
+        # Like Clock.now, without its objects: it is called twice per sample.
         nanoseconds: int = self.get_clock().handle.get_now().nanoseconds
         return nanoseconds
 
@@ -154,31 +154,31 @@ class GuardedNode(ParameterNode):
         *arguments: Any,
         **options: Any,
     ) -> Any:
-        """As rclpy's, which makes its own one of ``/clock`` by it: that is checked here."""
+        """Subscribe as rclpy does; guard its own subscription of ``/clock``."""
         if msg_type is ClockMessage:
             callback = self._guard_clock(callback)
         options.setdefault("event_callbacks", NO_SUBSCRIPTION_EVENTS)
         return super().create_subscription(msg_type, topic, callback, *arguments, **options)
 
     def create_publisher(self, *arguments: Any, **options: Any) -> Any:
-        """As rclpy's, without events of the middleware."""
+        """Create a publisher as rclpy does, without events of the middleware."""
         options.setdefault("event_callbacks", NO_PUBLISHER_EVENTS)
         return super().create_publisher(*arguments, **options)
 
     def create_guarded_subscription(
         self, topic: str, callback: Callable[[Any], None], **options: Any
     ) -> None:
-        """Subscribe to a topic of the node's table; arguments as :class:`GuardedSubscription`."""
+        """Subscribe to a topic of the node's table; see :class:`GuardedSubscription`."""
         GuardedSubscription(self, topic, callback, **options)
 
     def create_guarded_publisher(
         self, topic: str, expiry: float | None = None, *, joint: str = ""
     ) -> Any:
-        """A publisher of a topic of the node's table, with QoS overrides by parameter.
+        """Create a publisher of the node's table, with QoS overrides by parameter.
 
-        :param expiry: lifespan and deadline that the topic offers, s; None is none. ``joint``:
-            stands for ``<joint>`` in the name.
-        :raises ParameterError: an override that would make it never expire.
+        :param expiry: lifespan and deadline that the topic offers, s; None for none. ``joint``:
+            replaces ``<joint>`` in the name.
+        :raises ParameterError: an override without expiry.
         """
         row = self.topics[topic]
         topic = topic.replace("<joint>", joint)
@@ -193,7 +193,7 @@ class GuardedNode(ParameterNode):
                     f"{policy.name.lower()}"
                 )
                 given = self.given.get(override)
-                # The middleware takes zero for no limit.
+                # The middleware treats zero as no limit.
                 if given is not None and not (isinstance(given.value, int) and given.value > 0):
                     raise ParameterError(override, given.value, "1 ns or more")
         self.health.watch(topic)
@@ -202,7 +202,7 @@ class GuardedNode(ParameterNode):
         )
 
     def create_guarded_timer(self, period: float, callback: Callable[[], None]) -> Any:
-        """A timer on the steady clock, with a callback that cannot end the node; period in s."""
+        """Create a timer on the steady clock, with a guarded callback; period in s."""
 
         def guarded() -> None:
             try:
@@ -213,7 +213,7 @@ class GuardedNode(ParameterNode):
         return self.create_timer(period, guarded, clock=self.steady)
 
     def _guard_clock(self, callback: Callable[[Any], None]) -> Callable[[Any], None]:
-        """The callback of rclpy for ``/clock`` raises where the message is no time."""
+        """Return rclpy's callback for ``/clock``, which raises on invalid times, with a check."""
 
         def checked(message: Any) -> None:
             sec, nanosec = message.clock.sec, message.clock.nanosec
@@ -227,19 +227,19 @@ class GuardedNode(ParameterNode):
 
 
 class GuardedSubscription:
-    """A subscription with a callback that cannot end its node, which holds it.
+    """Subscribe with a callback that cannot end the node.
 
-    QoS overrides are parameters. By default messages may be lost for the newest, and publishers
-    of both kinds match. Of a topic that is ``whole`` none is lost, as long messages need it, until
-    a best-effort publisher comes: from there on as others. Joint states are read from their bytes.
+    QoS overrides are parameters. By default messages may be lost in favour of newer ones, and
+    publishers of both reliabilities match. A ``whole`` topic, for long messages, is reliable until
+    a best-effort publisher appears. Joint states are decoded from their bytes.
 
-    :param refuse: takes what is wrong with bytes that are no joint state.
+    :param refuse: called with the error of bytes that are not a joint state.
     :param raw: the callback takes the message's bytes.
     :param expected: the diagnostics warn until the first message.
     :param expires: how long a message may wait for the node, s, if less than ``max_wait``.
     :param every: the messages are differentiated: see :class:`Backlog`. ``droppable``: messages
-        are dropped where the node cannot keep pace; never of a topic that is ``whole``.
-    :param expiry: lifespan and deadline that publishers have to offer, s; None is any.
+        are dropped if the node cannot keep up; never those of a ``whole`` topic.
+    :param expiry: lifespan and deadline that publishers must offer, s; None for any.
     """
 
     def __init__(
@@ -278,13 +278,13 @@ class GuardedSubscription:
         relaxed, best_effort = self._relaxed, self._best_effort or self._relaxed
 
         def heard(*arguments: Any) -> None:
-            # The events executor gives both in one.
+            # The events executor passes both as one tuple.
             message, info = arguments if len(arguments) == 2 else arguments[0]
-            # What the one before has left, which may live on, came twice.
+            # A replaced subscription may still deliver; its messages arrive twice.
             if relaxed == self._relaxed:
                 self._handle(message, info)
 
-        # By its signature rclpy knows that the information is wanted.
+        # rclpy passes the message information if the signature has two parameters.
         heard.__signature__ = inspect.signature(  # type: ignore[attr-defined]
             lambda message, info: None
         )
@@ -303,10 +303,10 @@ class GuardedSubscription:
         began = time.perf_counter()
         try:
             number, sent = info["publication_sequence_number"], info["source_timestamp"]
-            # Two publishers number their messages each: then nothing can be said.
+            # Several publishers have independent sequence numbers.
             if statistics.received(number, sent) and node.count_publishers(self._name) == 1:
                 statistics.count_missed()
-            # Not every middleware tells when it came; 0 then.
+            # 0 if the middleware does not report the time of reception.
             came = info["received_timestamp"]
             if not node.active or 0 < came < node.active_since:
                 return
@@ -330,7 +330,7 @@ class GuardedSubscription:
             raise
 
     def _relax_reliability(self, what: Incompatibility) -> None:
-        """From there on publishers of both kinds are taken."""
+        """Accept best-effort publishers from now on, unless a parameter says otherwise."""
         if what != (QOS, RELIABILITY) or self._best_effort or self._given or self._relaxed:
             return
         self._relaxed, node = True, self._node
@@ -343,25 +343,24 @@ class GuardedSubscription:
 
 COMPILING: Final = "loading or compiling the robot's programs: the node does not answer yet"
 START_REPORT_PERIOD: Final = 0.5
-"""Time between two statements of a node that starts, s: of stored programs it needs less."""
+"""Time between two reports of a starting node, s; stored programs load faster."""
 MAX_QUERIED: Final = 1000
-"""Entries of a request that only asks; one that sets has at most as many as the node has
-parameters. More take the stream's time."""
+"""Largest number of entries of a request that only reads; one that sets has at most one per
+parameter. Longer requests would delay the stream."""
 
 
 class TwinNode(GuardedNode):
-    """A life-cycle node with guarded callbacks, diagnostics at 1 Hz and checked parameters.
+    """Provide life cycle, guarded callbacks, diagnostics at 1 Hz and checked parameters.
 
-    Everything is made and every parameter checked before the first state; a node that is not
-    active takes no message. While a node is made, which compiles programs that are not stored, its
-    diagnostics say so.
+    Everything is created and every parameter checked before the first state. While a node is
+    created, which may compile programs, its diagnostics say so.
     """
 
     core: Any
-    """What answers messages, a :class:`~pkm_twin.streams.monitor.Core` with its robot."""
+    """Core that answers messages: a :class:`~pkm_twin.streams.monitor.Core` with its robot."""
 
     def __init__(self, name: str) -> None:
-        """Declare what all nodes have."""
+        """Declare the parameters that all nodes have."""
         super().__init__(name)
         self._tasks = Tasks(self.failed)
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", output_qos())
@@ -369,18 +368,18 @@ class TwinNode(GuardedNode):
         threading.Thread(target=self._report_start, daemon=True).start()
 
     def _report_start(self) -> None:
-        """Until the node is made, and where that takes long."""
+        """Report that the node starts, repeatedly until it is created."""
         logger = self.get_logger()
-        # Where a constructor fails, the context ends meanwhile.
+        # If a constructor fails, the context ends meanwhile.
         with suppress(Exception):
             while not self._made.wait(START_REPORT_PERIOD) and self.context.ok():
                 logger.info(COMPILING, once=True)
                 self._diagnostics.publish(self.health.array(WARN, COMPILING))
 
     def start(self, leap: float | None = None) -> None:
-        """The node is made: reject unknown parameters, begin the diagnostics, and log its summary.
+        """Finish the start: reject unknown parameters, begin diagnostics, log a summary.
 
-        :param leap: how far the ROS clock goes forward at once for :meth:`time_jumped_forward`, s.
+        :param leap: forward step of the ROS clock that calls :meth:`time_jumped_forward`, s.
         """
         self.close_declarations()
         self._made.set()
@@ -394,7 +393,7 @@ class TwinNode(GuardedNode):
             self.low_rate.add_entity(service)
         if self.executor_kind == "single":
             self.create_guarded_timer(LOW_RATE_PERIOD, self.low_rate.open)
-        # Kept: the middleware calls the handle without holding it.
+        # Keep the handle alive: the middleware holds no reference.
         self._jump_handle = self.get_clock().create_jump_callback(
             JumpThreshold(
                 min_forward=None if leap is None else Duration(seconds=leap),
@@ -414,69 +413,69 @@ class TwinNode(GuardedNode):
             self.trigger_activate()
 
     def details(self) -> str:
-        """What the summary says of more than the robot."""
+        """Return what the summary adds about the node."""
         return ""
 
     def summary(self) -> str:
-        """One line that says what the node runs."""
+        """Return one line that describes what the node runs."""
         robot = self.core.robot
         joints = ", ".join(robot.joint_names)
         return f"robot {robot.name} ({robot.mechanism}), joints {joints}{self.details()}"
 
     def judge(self) -> tuple[bytes, str]:
-        """Level and message of the node's diagnostic status."""
+        """Return level and message of the node's diagnostic status."""
         rejected = self.core.last_reject
         return (WARN, f"last reject: {rejected}") if rejected else (OK, "running")
 
     def values(self) -> dict[str, object]:
-        """Values of the node's diagnostic status."""
+        """Return the values of the node's diagnostic status."""
         raise NotImplementedError
 
     def diagnose(self) -> tuple[bytes, str, dict[str, object]]:
-        """Level, message and values of the node's diagnostic status."""
+        """Return level, message and values of the node's diagnostic status."""
         return (*self.judge(), {"robot": self.core.robot.name, **self.values()})
 
     def time_jumped_backward(self) -> None:
-        """The ROS clock went back or changed: forget everything that depends on time."""
+        """Discard everything that depends on time: the ROS clock went back or changed."""
 
     def time_jumped_forward(self) -> None:
-        """The ROS clock went forward by more than a stream's messages may be apart."""
+        """React to a forward step of the ROS clock beyond the allowed gap of a stream."""
         self.time_jumped_backward()
 
     def shutdown(self) -> None:
-        """The end: nothing is answered from here on, while the topics are still there."""
+        """Stop answering, while the topics still exist."""
         self._stop_answering()
 
     @property
     def shutting_down(self) -> bool:
-        """Whether something of the end still waits for turns of the executor."""
+        """Whether the shutdown still needs turns of the executor."""
         return False
 
     def activated(self) -> None:
-        """Messages are answered from here on."""
+        """React to the activation: messages are answered from now on."""
 
     def deactivated(self) -> None:
-        """Messages are not answered from here on."""
+        """React to the deactivation: messages are not answered from now on."""
 
     def reset_stop(self) -> str:
-        """End a stop that is latched; says what was ended, empty where nothing was."""
+        """End a latched stop; return its description, or an empty text."""
         return ""
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Begin to answer."""
+        """Begin to answer messages."""
         self.activated()
-        # What came before and waits is not for a node that is active.
+        # Messages received before the activation are not answered.
         self.active_since = time.time_ns()
         self.active = True
         return super().on_activate(state)
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Answer nothing more; what waits is forgotten."""
+        """Stop answering, and discard waiting tasks."""
         self._stop_answering()
         return super().on_deactivate(state)
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """As deactivated, for good."""
+        """Stop answering for good."""
         self._stop_answering()
         return super().on_shutdown(state)
 
@@ -488,18 +487,18 @@ class TwinNode(GuardedNode):
 
     @property
     def busy(self) -> bool:
-        """Whether work waits between the callbacks."""
+        """Whether tasks wait between the callbacks."""
         return bool(self._tasks)
 
     def defer(self, where: str, task: Task) -> None:
-        """Work in steps between the callbacks, one after the other; the stream goes on meanwhile.
+        """Run a task in steps between the callbacks, so that the stream continues.
 
-        :raises MessageError: too much waits already.
+        :raises MessageError: too many tasks are waiting.
         """
         self._tasks.add(where, task)
 
     def end_turn(self) -> None:
-        """A turn of the executor is over: one step of what waits."""
+        """Run one step of the waiting tasks after a turn of the executor."""
         self.low_rate.end_turn()
         self._tasks.step()
 
@@ -511,7 +510,7 @@ class TwinNode(GuardedNode):
 
     def _on_clock_jump(self, jump: Any) -> None:
         try:
-            # One is an enumeration of Python, the other may be the binding's.
+            # One is a Python enumeration, the other may be the binding's.
             same_clock = int(jump.clock_change) == int(ClockChange.ROS_TIME_NO_CHANGE)
             if same_clock and jump.delta.nanoseconds > 0:
                 self.time_jumped_forward()
@@ -531,10 +530,9 @@ def guarded_service(
     health: Health,
     declared: Callable[[], Mapping[str, Parameter]],
 ) -> Any:
-    """A service callback, rclpy's own ones too, that rejects what it cannot take.
+    """Wrap a service callback, also rclpy's own, so that it rejects invalid requests.
 
-    A parameter that has its value already may be set to it, though it is read-only: a node takes
-    back its own dump.
+    A read-only parameter may be set to its current value, so that a node accepts its own dump.
 
     :param declared: the node's parameters by name.
     """
@@ -543,7 +541,7 @@ def guarded_service(
         try:
             _check_size(request, len(declared()))
             if kind is SetParameters and len(request.parameters) > 1:
-                # Each for itself, as rclpy does: what is refused does not hide what was set.
+                # One by one, as rclpy does: a rejected one does not affect the others.
                 for parameter in request.parameters:
                     one = guarded(kind.Request(parameters=[parameter]), kind.Response())
                     response.results.extend(one.results)
@@ -580,9 +578,9 @@ def _select_changes(asked: Sequence[Any], declared: Mapping[str, Parameter]) -> 
 
 
 def _check_size(request: Any, parameters: int) -> None:
-    """Refuse a request that would hold up the stream by its length.
+    """Reject a request that is so long that it would delay the stream.
 
-    :raises ParameterError: it has too many entries.
+    :raises ParameterError: the request has too many entries.
     """
     for field in ("parameters", "names", "prefixes"):
         entries = len(getattr(request, field, ()))

@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""A node's parameters: declared with bounds, whole numbers taken for floats, no others."""
+"""Declare a node's parameters with bounds, convert integers to floats, reject others."""
 
 from __future__ import annotations
 
@@ -31,11 +31,11 @@ S = TypeVar("S", bound="DataclassInstance")
 V = TypeVar("V")
 
 SUPPORTED_RCLPY = "7.1"
-"""The rclpy that keeps parameter overrides as below, that of Jazzy."""
+"""Version of rclpy that stores parameter overrides as below, that of Jazzy."""
 
 
 class UnknownParametersError(PkmTwinError):
-    """Parameters that no declaration knows: one line each, what is closest first."""
+    """Report undeclared parameters, one line each, with the closest names first."""
 
     def __init__(self, unknown: Iterable[str], valid: Iterable[str]) -> None:
         names = sorted(valid)
@@ -49,13 +49,13 @@ class UnknownParametersError(PkmTwinError):
 
 
 class ParameterNode(LifecycleNode):
-    """A life-cycle node that rejects parameters and values that no declaration allows."""
+    """Provide parameters that reject undeclared names and invalid values."""
 
     def __init__(self, name: str) -> None:
         self.followed: set[str] = set()
-        """Parameters whose changes are taken while the node runs."""
+        """Parameters whose changes are applied while the node runs."""
         self.rows: dict[str, tuple[Any, Setting]] = {}
-        """Declared parameters: the default, and what it means."""
+        """Declared parameters: default and description."""
         super().__init__(name)
 
     @property
@@ -72,7 +72,7 @@ class ParameterNode(LifecycleNode):
     def declare(
         self, name: str, default: Any, text: str, *, changeable: bool = False, **row: Any
     ) -> Any:
-        """Declare a parameter and return its value; a whole number is taken for a float.
+        """Declare a parameter and return its value; integers are converted to floats.
 
         :param row: of a :class:`~pkm_twin.settings.Setting`: ``unit``, ``low``, ``high``,
             ``choices``, and words for a ``usual`` default that depends on the robot.
@@ -132,12 +132,12 @@ class ParameterNode(LifecycleNode):
         return kind(**given)
 
     def check_parameter(self, name: str, value: Any) -> None:
-        """Reject what a parameter's declaration does not allow.
+        """Reject a value that the parameter's declaration does not allow.
 
         :raises ParameterError: out of range, not a number, or not one of the words.
         """
         _, row = self.rows.get(name, (None, Setting("")))
-        # rclpy lets a value that is not a number pass.
+        # rclpy accepts NaN.
         if row.low is not None and not row.allows(value):
             raise ParameterError(name, value, row.span.removeprefix(", "))
         if row.choices and value not in row.choices:
@@ -149,17 +149,19 @@ class ParameterNode(LifecycleNode):
         prepare: Callable[[dict[str, Any]], V],
         take: Callable[[V], object],
     ) -> None:
-        """A set of parameters is taken or rejected whole, between two messages.
+        """Apply or reject a set of parameters as a whole, between two messages.
 
         :param names: of all parameters that ``prepare`` knows.
-        :param prepare: makes what the new values, by name, come to; nothing else depends on it yet.
-            A PkmTwinError rejects the set.
-        :param take: goes on with that, once the parameters have their values.
+
+        :param prepare: computes the effect of the new values, by name, without side effects. A
+        PkmTwinError rejects the set.
+
+        :param take: applies the effect once the parameters have their values.
         """
         prepared: list[V] = []
 
         def judge(changes: Sequence[Parameter]) -> SetParametersResult:
-            # What another callback has refused after this one is never taken.
+            # Drop what a later callback rejected.
             prepared.clear()
             values = {change.name: change.value for change in changes}
             try:
@@ -180,9 +182,9 @@ class ParameterNode(LifecycleNode):
         self.add_post_set_parameters_callback(follow)
 
     def close_declarations(self) -> None:
-        """All parameters are declared: from here on others are rejected, now and when set.
+        """Reject undeclared parameters from now on, and those given at start.
 
-        :raises UnknownParametersError: some were given already; a misspelling, it names each.
+        :raises UnknownParametersError: some were given at start; names each.
         """
         declared = self.declared
         unknown = [name for name in self.given if name not in declared]
@@ -191,13 +193,13 @@ class ParameterNode(LifecycleNode):
         changeable = {name for name, (_, row) in self.rows.items() if not row.fixed}
         deaf = sorted(changeable - self.followed)
         if deaf:
-            # A set of it would be answered as taken.
+            # Setting it would be reported as successful.
             raise NotImplementedError(f"nothing follows a change of {', '.join(deaf)}")
         self.add_pre_set_parameters_callback(self._convert_to_floats)
         self.add_on_set_parameters_callback(_reject_nameless)
 
     def _convert_to_floats(self, changes: list[Parameter]) -> list[Parameter]:
-        """Whole numbers for floats where the declaration has floats."""
+        """Convert integers to floats where the declaration has floats."""
         return [
             _as_float(change, self.get_parameter(change.name).value)
             if self.has_parameter(change.name)
@@ -207,13 +209,13 @@ class ParameterNode(LifecycleNode):
 
 
 def _reject_nameless(changes: list[Parameter]) -> SetParametersResult:
-    """Refuse what rclpy would declare by the way."""
+    """Reject a parameter without a name, which rclpy would declare."""
     good = all(change.name for change in changes)
     return SetParametersResult(successful=good, reason="" if good else "a parameter without a name")
 
 
 def _as_float(given: Parameter, like: Any) -> Parameter:
-    """A parameter of whole numbers as one of floats, where what it is for is one of floats."""
+    """Convert a parameter of integers to floats if ``like`` has floats."""
     if isinstance(like, float) and given.type_ == Parameter.Type.INTEGER:
         return Parameter(given.name, value=float(given.value))
     many = not isinstance(like, str) and hasattr(like, "__len__")
@@ -228,11 +230,11 @@ def _as_float(given: Parameter, like: Any) -> Parameter:
 
 
 def parameter_overrides(node: Any) -> dict[str, Any]:
-    """Parameters that the node was started with, by name; a change of it changes the node's.
+    """Return the parameters that the node was started with, by name; a live view.
 
     rclpy has no public name for them while they are not declared.
 
-    :raises RuntimeError: an rclpy that keeps them elsewhere.
+    :raises RuntimeError: an rclpy version that stores them elsewhere.
     """
     try:
         overrides: dict[str, Any] = node._parameter_overrides

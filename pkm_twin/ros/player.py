@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""Replays a bag onto ROS topics, for machines without rosbag2.
+"""Replay a bag onto ROS topics, without rosbag2.
 
 ROS is imported inside the functions, so that a command line can show its help without it.
 """
@@ -25,38 +25,41 @@ from pkm_twin.ros.context import own_node
 
 CLOCK_TOPIC = "/clock"
 MAX_CLOCK = 2**31 - 1
-"""Seconds that a /clock can tell."""
-# A second at 1 kHz: a subscriber that the machine leaves waiting so long still gets everything.
+"""Largest time that a /clock message can hold, s."""
 _MIN_DEPTH = 1000
-# How long the last messages may take to reach reliable subscribers, s.
+"""Smallest queue depth: a second at 1 kHz, so that a subscriber delayed so long loses nothing."""
 _DELIVERY_TIME = 1.0
-# How long lockstep waits for a subscriber to know its publisher, s.
+"""Largest time for the last messages to reach reliable subscribers, s."""
 _MATCH_TIME = 60.0
-# A wait of the operating system overshoots by less than this, s; the rest is short sleeps.
+"""Largest time that lockstep waits for a subscriber to discover its publisher, s."""
 _SLEEP_OVERSHOOT = 0.002
 _SHORT_SLEEP = 0.0001
-# How often a long wait looks for a signal, s.
+"""Bound of the overshoot of a sleep, s, and the short sleeps for the remaining time."""
 _SIGNAL_PERIOD = 0.02
+"""Period at which a long wait checks for a signal, s."""
 
 
 @dataclass
 class _Stop:
-    """Set by signals. Not an event: its lock would stop a handler that interrupts a handler."""
+    """Hold a flag that signals set.
+
+    An event's lock would deadlock a handler that interrupts a handler.
+    """
 
     asked: bool = False
 
     def wait(self, seconds: float) -> None:
-        """Sleep, but no longer than until the next look."""
+        """Sleep, but no longer than until the next check for a signal."""
         time.sleep(min(seconds, _SIGNAL_PERIOD))
 
 
 @dataclass(frozen=True)
 class PlayResult:
-    """What was played. ``duration`` and ``late_max`` (the worst delay of a message) are in s."""
+    """Report what was played; ``duration`` and ``late_max`` (largest delay of a message) in s."""
 
     messages: int
     loops: int
-    """Passes through the bag that were completed."""
+    """Completed passes through the bag."""
     duration: float
     late_max: float
     interrupted: bool
@@ -128,7 +131,7 @@ def _check_number(name: str, value: float, holds: bool, bound: str) -> None:
 
 
 def _check_log_times(bag: Bag) -> None:
-    """Refuse log times that a clock message cannot carry: they would come out as others."""
+    """Reject log times that a clock message cannot hold: they would wrap around."""
     end = bag.report.start_time * 1e-9 + bag.report.duration
     if not end < MAX_CLOCK:
         raise BagError(
@@ -157,7 +160,7 @@ def _select_topics(bag: Bag, topics: Iterable[str] | None, own_clock: bool) -> l
 
 
 def _check_type(bag: Bag, name: str, info: TopicInfo) -> None:
-    """Refuse a type whose recorded definition is not the installed one.
+    """Reject a type whose recorded definition is not the installed one.
 
     The recorded bytes are published as they are: subscribers would misread them without notice.
     """
@@ -187,7 +190,7 @@ def _find_targets(bag: Bag, names: list[str], remap: Mapping[str, str]) -> dict[
             path=bag.report.path,
             reason="no_topic",
         )
-    # Looked at before anything is published.
+    # Check all offers before anything is published.
     for name in names:
         parse_qos(name, bag.report.topics[name].offered_qos)
     return {name: require_topic(remap.get(name, name)) for name in names}
@@ -195,7 +198,7 @@ def _find_targets(bag: Bag, names: list[str], remap: Mapping[str, str]) -> dict[
 
 @contextmanager
 def _stop_on_signals(stop: _Stop) -> Iterator[None]:
-    """Let SIGINT and SIGTERM ask to stop; only the main thread can have it so."""
+    """Let SIGINT and SIGTERM request a stop; works in the main thread only."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -236,9 +239,9 @@ def _create_publishers(
 
 
 def _publisher_qos(offer: OfferedQos) -> Any:
-    """Return the publisher's QoS of a recorded offer.
+    """Return the publisher's QoS for a recorded offer.
 
-    Deadline, lifespan and liveliness are not taken over: a replay does not keep such promises.
+    Deadline, lifespan and liveliness are left out: a replay cannot guarantee them.
     """
     from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
@@ -304,7 +307,7 @@ def _progress_bar(bag: Bag, shown: bool) -> Iterator[Callable[[float, int], None
 
 
 class _Replay:
-    """Passes through a bag on an absolute schedule, or in lockstep."""
+    """Publish passes of a bag on an absolute schedule, or in lockstep."""
 
     def __init__(
         self,
@@ -323,12 +326,12 @@ class _Replay:
         self._clock_period = math.inf
         self._messages = 0
         self._late = 0.0
-        # A subscriber that does not know its publisher yet gets the first messages later than
-        # those of other topics that were sent after them.
+        # A subscriber that has not discovered its publisher receives the first messages after
+        # later ones of other topics.
         self._unmatched = set(publishers if pace is not None else ())
 
     def add_clock(self, publisher: Any, frequency: float) -> None:
-        """Publish bag time ``frequency`` times a second of wall time."""
+        """Publish bag time ``frequency`` times per second of wall time."""
         kind = publisher.msg_type
 
         def publish(now: int) -> None:
@@ -386,7 +389,7 @@ class _Replay:
         update(self._bag.report.duration, self._messages)
 
     def _sleep_until(self, due: float) -> bool:
-        """Wait; return whether to go on."""
+        """Sleep until a time; return whether to continue."""
         while (left := due - time.monotonic()) > 0:
             if self._stop.asked:
                 return False

@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""A node's process: start, executor, signals, end."""
+"""Run a node's process: start, executor, signals, end."""
 
 from __future__ import annotations
 
@@ -53,15 +53,15 @@ def set_priority(priority: int) -> None:
 
 
 MAX_SPIN_TIME: Final = 0.5
-"""How often the events executor looks whether it has to end, s."""
+"""Period at which the events executor checks whether to end, s."""
 MAX_SHUTDOWN_TIME: Final = 1.0
-"""How long a node may take to end what others wait for, s: a launcher gives five."""
+"""Largest time in which a node may finish what others wait for, s: a launcher gives five."""
 MAX_TEARDOWN_TIME: Final = 3.0
-"""How long rclpy and the middleware may take to end, s: their threads can wait for each other."""
+"""Largest time in which rclpy and the middleware may end, s: their threads can deadlock."""
 
 
 class _Executor:
-    """One of rclpy's for all nodes of a process, by their choice, a turn at a time."""
+    """Run rclpy's executor, of the kind that all nodes choose, one turn at a time."""
 
     def __init__(self, nodes: Sequence[TwinNode]) -> None:
         events = all(node.executor_kind == "events" for node in nodes)
@@ -69,11 +69,11 @@ class _Executor:
         self._executor = EventsExecutor() if events else SingleThreadedExecutor()
         for node in nodes:
             self._executor.add_node(node)
-        # Without a bound the one waits for ever; with one the other makes a timer a message.
+        # The events executor needs a timeout to end; the single one creates a timer per timeout.
         self._patience = MAX_SPIN_TIME if events else None
 
     def spin(self, ended: Callable[[], bool]) -> None:
-        """Run callbacks, and between them a step of what waits, until the end is asked for."""
+        """Run callbacks, and between them a step of the waiting tasks, until ``ended``."""
         nodes, turn, patience = self._nodes, self._executor.spin_once, self._patience
         going = nodes[0].context.ok
         while going() and not ended():
@@ -84,17 +84,17 @@ class _Executor:
             except (KeyboardInterrupt, ExternalShutdownException):
                 raise
             except Exception as error:
-                # The last line of defence: rclpy's own code, on the way to a callback or back.
+                # An error in rclpy's own code around a callback.
                 for node in nodes:
                     node.caught("rclpy", error)
 
     def close(self) -> None:
-        """No message calls into it any more: for the nodes to end one after the other."""
+        """Stop message delivery, so that the nodes can be destroyed one by one."""
         self._executor.shutdown()
 
 
 def _set_process_priority(nodes: Sequence[TwinNode]) -> None:
-    """The highest priority that a node asks for is the process's; without permission it runs on."""
+    """Set the largest priority that a node asks for; without permission, only warn."""
     node = max(nodes, key=lambda n: n.thread_priority)
     if node.thread_priority:
         try:
@@ -108,9 +108,9 @@ def _set_process_priority(nodes: Sequence[TwinNode]) -> None:
 def run(*factories: Callable[[], TwinNode], arguments: Sequence[str] | None = None) -> int:
     """Run a node, or several in one executor, until SIGINT, SIGTERM or SIGHUP.
 
-    Signals are not the middleware's, which would close the topics at once: a signal ends the
-    spinning at its next event, and :meth:`TwinNode.shutdown` is called while the topics are there.
-    The process has to end after it, within ``TEARDOWN``.
+    The middleware does not handle signals, because it would close the topics at once: a signal ends
+    the spinning at its next event, then :meth:`TwinNode.shutdown` is called while the topics exist.
+    After that, the process must end within :data:`MAX_TEARDOWN_TIME`.
 
     :returns: 0 after a signal, 1 if a node rejects its configuration.
     """
@@ -131,7 +131,7 @@ def run(*factories: Callable[[], TwinNode], arguments: Sequence[str] | None = No
                     nodes.append(factory())
             one_blas_thread()
             _set_process_priority(nodes)
-            # What is loaded by now stays: the collector need not look at it again.
+            # Everything loaded by now stays: exclude it from garbage collection.
             gc.collect()
             gc.freeze()
         finally:
@@ -145,7 +145,7 @@ def run(*factories: Callable[[], TwinNode], arguments: Sequence[str] | None = No
             raise
         if signals.came:
             return 0  # Where the interrupt was in an import, say, it may come out as another error.
-        # The middleware's own refusals (arguments, types, QoS overrides) have many lines.
+        # Errors of the middleware (arguments, types, QoS overrides) have many lines.
         lines = error.lines if isinstance(error, UnknownParametersError) else [str(error)]
         for line in lines:
             print(f"cannot start: {' '.join(line.split())}", file=sys.stderr)
@@ -159,7 +159,7 @@ def run(*factories: Callable[[], TwinNode], arguments: Sequence[str] | None = No
             executor.spin(
                 lambda: not any([n.shutting_down for n in nodes]) or time.monotonic() > end
             )
-        # A thread without Python's lock ends what hangs from here on, and says where.
+        # A thread without Python's lock ends the process if it hangs, and prints where.
         faulthandler.dump_traceback_later(MAX_TEARDOWN_TIME, exit=True)
         if executor is not None:
             executor.close()

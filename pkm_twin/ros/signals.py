@@ -1,8 +1,8 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""Ending a process on the first signal: the next ones cannot tear its clean-up.
+"""End a process on the first signal, so that later ones do not interrupt its clean-up.
 
-A terminal sends Ctrl-C to every process in it and a launcher sends another, so signals come in
-twos and threes.
+A terminal sends Ctrl-C to every process in it and a launcher sends another, so that several signals
+arrive.
 """
 
 from __future__ import annotations
@@ -17,23 +17,23 @@ from typing import Final
 
 SIGNALS: Final = (signal.SIGINT, signal.SIGTERM)
 INTERRUPTED: Final = 130
-"""Exit code of a command that was interrupted, as a shell gives it."""
+"""Exit code of an interrupted command, as a shell reports it."""
 IGNORE_TIME: Final = 2.0
-"""How long after a signal others are ignored while the process cleans up, s. Not for ever: an
-exception that is raised in a callback of a C library is lost."""
+"""Time after a signal in which others are ignored while the process cleans up, s. It is limited
+because an exception that is raised in a callback of a C library is lost."""
 
 
 class _Process:
-    """Plain values: a lock would stop a handler that interrupts a handler."""
+    """Hold the process's state without a lock: a handler may interrupt a handler."""
 
     asked = -float("inf")
     ending = False
 
 
 def ignore_signals() -> None:
-    """From here on the process is ending, and no signal can change that."""
+    """Ignore signals from now on: the process is ending."""
     _Process.ending = True
-    # Python ends itself by SIGINT if the last text that it ran was interrupted, caught or not.
+    # Python exits by SIGINT if the last code string that it ran was interrupted, even if caught.
     exec("")  # noqa: S102
     if threading.current_thread() is threading.main_thread():
         for number in (*SIGNALS, signal.SIGHUP):
@@ -44,10 +44,10 @@ def ignore_signals() -> None:
 def first_signal(
     raising: Callable[[], BaseException], numbers: Sequence[signal.Signals] = SIGNALS
 ) -> Iterator[None]:
-    """The first signal raises, the next ones are ignored; handlers come back where none came.
+    """Raise on the first signal and ignore the next ones; restore handlers if none came.
 
-    Where one came, the process is ending when the block is left: signals are ignored from there.
-    Only the main thread can have it so.
+    After a signal the process is ending when the block is left, and signals stay ignored. Only the
+    main thread can handle signals.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -74,7 +74,7 @@ def first_signal(
 
 
 def leave_at_once() -> None:
-    """From here on a signal ends the process with 0: for imports, after which nothing is left.
+    """Exit with 0 on a signal from now on: for imports, which need no clean-up.
 
     An exception in the middle of an import may be lost, or come out as another one.
     """
@@ -83,28 +83,27 @@ def leave_at_once() -> None:
 
 
 def leave_interrupts_to_launch() -> None:
-    """For a launch file's function, which a running launch service calls: no KeyboardInterrupt.
+    """Raise no KeyboardInterrupt in a launch file's function, which a launch service calls.
 
-    A launch service takes SIGINT from a socket that Python writes to in any case. The exception
-    that Python raises as well, and that the service ignores, can end the taking between reading
-    the socket and beginning the shutdown: of two signals in a row both were lost, and nodes that
-    had ended by them were started again.
+    A launch service reads SIGINT from a socket that Python always writes to. The exception that
+    Python raises as well can interrupt the service between reading the socket and starting the
+    shutdown: two signals in a row were lost, and nodes that they had ended were restarted.
     """
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, lambda *_: None)
 
 
 class NodeSignals:
-    """The signals of a node's process: noted from here to its end, and raised while it is made.
+    """Record the signals of a node's process, and raise the first while the node is created.
 
-    The handlers stay the same and are never the default ones again: there is no moment at which a
-    signal could end the process without its last words. Once one has come, a change of phase is
-    the assignment to :attr:`raises`, before which Python delivers none.
+    The handlers stay the same until the end, so that a signal can never end the process before its
+    shutdown. Setting :attr:`raises` changes the phase atomically, because Python delivers signals
+    between bytecodes only.
     """
 
     def __init__(self) -> None:
         self.raises = False
-        """Whether the first signal raises KeyboardInterrupt; and a later one, if that was lost."""
+        """Whether the first signal raises KeyboardInterrupt, and a later one if that was lost."""
         self.came = False
         for number in _node_signals():
             signal.signal(number, self._take)
@@ -118,6 +117,6 @@ class NodeSignals:
 
 
 def _node_signals() -> list[signal.Signals]:
-    """A closed terminal ends a node too, but not one that was started to outlive it."""
+    """Return the signals that end a node: SIGHUP only if it was not ignored at start."""
     deaf = signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
     return [*SIGNALS] if deaf else [*SIGNALS, signal.SIGHUP]

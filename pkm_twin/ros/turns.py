@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""What waits for turns of the executor: requests, and work in steps."""
+"""Run requests and stepwise tasks between the callbacks of the executor."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from pkm_twin.errors import MessageError
 
 MAX_TASKS: Final = 10
-"""How much work may wait beside the callbacks."""
+"""Largest number of waiting tasks."""
 LOW_RATE_PERIOD: Final = 0.1
 LOW_RATE_TURNS: Final = 3
-"""How often requests are looked for, s, and how many at a time at least."""
+"""Period at which requests are checked, s, and the smallest number of turns for it."""
 
 Task = Generator[None, None, None]
 
 
 class LowRateGroup(MutuallyExclusiveCallbackGroup):
-    """What is not asked for a thousand times a second: requests.
+    """Group the entities of requests, which are rare.
 
-    rclpy makes a new wait set for every message, and each entity in it costs time; these are
-    in it now and then only. The events executor has no wait set and does not ask.
+    rclpy builds a wait set for every message, and each entity in it costs time; these are added
+    only now and then. The events executor has no wait set and ignores the group.
     """
 
     def __init__(self) -> None:
@@ -32,23 +32,23 @@ class LowRateGroup(MutuallyExclusiveCallbackGroup):
         self._turns = 0
 
     def open(self) -> None:
-        """Let the next turns of the executor look at them."""
+        """Let the next turns of the executor check the group."""
         self._turns = LOW_RATE_TURNS
 
     def end_turn(self) -> None:
-        """A turn of the executor is over."""
+        """Count a turn of the executor."""
         if self._turns:
             self._turns -= 1
 
     def can_execute(self, entity: Any) -> bool:
-        """Whether the executor looks at it."""
+        """Return whether the executor checks an entity."""
         return self._turns > 0 and bool(super().can_execute(entity))
 
 
 class Tasks:
-    """Work in steps between the callbacks, one task after the other.
+    """Run tasks in steps between the callbacks, one after the other.
 
-    :param failed: takes what a task raised, and where.
+    :param failed: called with the place and the exception of a task.
     """
 
     def __init__(self, failed: Callable[[str, Exception], None]) -> None:
@@ -59,20 +59,20 @@ class Tasks:
         return bool(self._waiting)
 
     def add(self, where: str, task: Task) -> None:
-        """Let a task wait for its turn.
+        """Add a task to the queue.
 
-        :raises MessageError: too much waits already.
+        :raises MessageError: too many tasks are waiting.
         """
         if len(self._waiting) >= MAX_TASKS:
             raise MessageError("busy", f"{MAX_TASKS} requests are waiting already")
         self._waiting.append((where, task))
 
     def clear(self) -> None:
-        """Forget what waits."""
+        """Discard all waiting tasks."""
         self._waiting.clear()
 
     def step(self) -> None:
-        """One step of the first task."""
+        """Run one step of the first task."""
         if not self._waiting:
             return
         entry = where, task = self._waiting[0]

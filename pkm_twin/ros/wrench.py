@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""Where a measured wrench is measured: parameters, or transforms where tf2 is installed."""
+"""Locate a wrench sensor by parameters, or by transforms if tf2 is installed."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ if TYPE_CHECKING:
 
 
 def declare_mounts(node: TwinNode, platform_frame: str = PLATFORM) -> Mounts | None:
-    """The transforms that give a sensor's place; None where the parameters give it.
+    """Return the transforms that give a sensor's pose; None if parameters give it.
 
-    :raises ParameterError: transforms are asked for and tf2_ros is not installed.
+    :raises ParameterError: transforms are wanted and tf2_ros is not installed.
     """
     wanted = node.declare(
         "use_tf", False, "take the sensor's pose from /tf in place of sensor.xyz and sensor.rpy, "
@@ -33,7 +33,7 @@ def declare_mounts(node: TwinNode, platform_frame: str = PLATFORM) -> Mounts | N
 def triple(node: TwinNode, name: str, text: str, unit: str) -> tuple[float, float, float]:
     """Declare a parameter of three numbers, zeros by default.
 
-    :raises ParameterError: not three.
+    :raises ParameterError: another number of values.
     """
     values = node.declare(name, [0.0, 0.0, 0.0], text, unit=unit)
     if len(values) != 3:
@@ -43,7 +43,7 @@ def triple(node: TwinNode, name: str, text: str, unit: str) -> tuple[float, floa
 
 
 class TransformMounts:
-    """Where a frame stands on the platform, from ``/tf`` and ``/tf_static``.
+    """Find a frame's pose on the platform, from ``/tf`` and ``/tf_static``.
 
     :raises ParameterError: tf2_ros is not installed.
     """
@@ -59,7 +59,7 @@ class TransformMounts:
         self._listener = tf2.TransformListener(self._buffer, node)
 
     def __call__(self, frame: str, stamp: int) -> Mount:
-        """The frame on the platform at a stamp, ns.
+        """Return the frame's pose on the platform at a stamp, ns.
 
         :raises MessageError: no transform between the two is known for that time.
         """

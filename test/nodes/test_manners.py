@@ -188,7 +188,7 @@ def test_the_graph_is_asked_once_however_many_are_there():
     # A publisher on the same topic takes nothing from the subscription.
     own.watch("~/x")
     for _ in range(2):
-        own._look()
+        own._find_incompatible_ends()
     # The graph's calls expand and remap a name: one that has been would be twice.
     assert asked == ["~/x"] * 4
     assert sorted(told) == [("QoS", "reliability"), ("message type", "a/msg/B for a/msg/A")]
