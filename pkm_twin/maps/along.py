@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.maps import figures
-from pkm_twin.maps.kind import Case, Found, Kind, found_of
+from pkm_twin.maps.kind import Case, Found, Kind, evaluate_kind
 from pkm_twin.maps.sweep import check
 from pkm_twin.report import plots
 from pkm_twin.robot.robot import Robot
@@ -127,4 +127,6 @@ def along(
     known = np.ones(len(pose), bool)
     least = kind.least if least is None else least
     counted = counts(robot, q, pose, known, least, least_clearance)
-    return Along(robot, kind, chosen, time, pose, least, counted, found_of(kind, robot, q, chosen))
+    return Along(
+        robot, kind, chosen, time, pose, least, counted, evaluate_kind(kind, robot, q, chosen)
+    )

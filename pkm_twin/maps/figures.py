@@ -23,18 +23,18 @@ if TYPE_CHECKING:
     from xarray import Dataset
 
 
-MAP: Final = "viridis"
+COLOUR_MAP: Final = "viridis"
 PREFIXES: Final = {-12: "p", -9: "n", -6: "µ", -3: "m", 0: "", 3: "k", 6: "M"}
-NOISE: Final = 5e-6
+SEARCH_NOISE: Final = 5e-6
 """Coordinate, m or rad, that a search leaves of zero."""
 PANELS: Final = 3
 """Most planes in a picture."""
-LEAST_SHOWN: Final = 5e-5
+MIN_SHOWN: Final = 5e-5
 """Coordinate, m or rad, and part of a direction."""
-BULK: Final = 0.95
+SCALE_QUANTILE: Final = 0.95
 """Part of the values that has the whole scale where the largest is ``FAR`` times as large."""
-FAR: Final = 2.0
-SHARES: Final = ((0.35, 0.85), (0.25, 0.6, 0.9))
+OUTLIER_RATIO: Final = 2.0
+CONTOUR_QUANTILES: Final = ((0.35, 0.85), (0.25, 0.6, 0.9))
 """Of a plane's values below its contours: where it has neighbours on both sides, and else."""
 
 
@@ -106,13 +106,13 @@ def sentence(answer: dict[str, Any]) -> str:
 
     The pose is as commands read it, with digits that keep its singularity index.
     """
-    pose = ", ".join(f"{_plain(v, NOISE):.6g}" for v in answer["pose"].values())
+    pose = ", ".join(f"{_drop_noise(v, SEARCH_NOISE):.6g}" for v in answer["pose"].values())
     text = f"{answer['answer']}: {shown(answer['value'], answer['unit'])}"
     way = np.array(answer.get("direction", []))
     if len(way) and np.isfinite(way).all() and way.any():
         axis = int(np.abs(way).argmax())
         alone = abs(way[axis]) > 0.9995
-        words = ", ".join(f"{_plain(v):.3g}" for v in way)
+        words = ", ".join(f"{_drop_noise(v):.3g}" for v in way)
         text += f" along {answer['axes'][axis] if alone else f'({words})'}"
     units = list(answer["pose_units"].values())
     text += f" at ({pose}) " + (units[0] if len(set(units)) == 1 else f"[{', '.join(units)}]")
@@ -123,7 +123,7 @@ def sentence(answer: dict[str, Any]) -> str:
     return text
 
 
-def _plain(value: float, least: float = LEAST_SHOWN) -> float:
+def _drop_noise(value: float, least: float = MIN_SHOWN) -> float:
     """Without what is zero but for rounding and a search's steps."""
     return value if abs(value) >= least else 0.0
 
@@ -169,7 +169,10 @@ def limits(values: Array, worst: float) -> tuple[float, float]:
     known = values[np.isfinite(values)]
     every = np.append(known, worst) if math.isfinite(worst) else known
     low, high = (float(every.min()), float(every.max())) if len(every) else (0.0, 1.0)
-    if len(known) and high > FAR * (most := float(np.quantile(known, BULK))) > 0.0:
+    if (
+        len(known)
+        and high > OUTLIER_RATIO * (most := float(np.quantile(known, SCALE_QUANTILE))) > 0.0
+    ):
         high = most
     if 0.0 <= low <= 0.5 * high:
         low = 0.0
@@ -187,7 +190,7 @@ def plane_of(data: Dataset, case: int, plane: int) -> dict[str, Any]:
     pose, through = part.worst_pose.values, part.through.values
     every = [str(name) for name in data.coordinate.values]
     at = {n: through[every.index(n)] for n in every}
-    held = [f"{n} = {_plain(at[n]):.4g} {units[n]}" for n in every if n not in names]
+    held = [f"{n} = {_drop_noise(at[n]):.4g} {units[n]}" for n in every if n not in names]
     star = None
     if np.isfinite(pose).all() and np.allclose(pose, through, rtol=0.0, atol=1e-12):
         star = [at[n] for n in names]
@@ -230,9 +233,11 @@ def planes(data: Dataset, case: int) -> Figure:
         axes, over = [column[0] for column in columns], ""
         for one, ax in zip(drawn, axes, strict=True):
             if len(one["names"]) == 1:
-                _line(one, ax, scale, label)
+                _draw_line(one, ax, scale, label)
                 continue
-            mesh = draw_panel(one, ax, scale, scale * low, scale * high, SHARES[count < PANELS])
+            mesh = draw_panel(
+                one, ax, scale, scale * low, scale * high, CONTOUR_QUANTILES[count < PANELS]
+            )
             over = kind.overlay(data, one["names"], one["through"], ax)
         if len(drawn[0]["names"]) > 1:
             bar = figure.colorbar(
@@ -267,7 +272,7 @@ def _caption(drawn: list[dict[str, Any]], beyond: bool) -> str:
     return f"{star}outline: joint limits; white: does not count{more}"
 
 
-def _line(one: dict[str, Any], ax: Axes, scale: float, label: str) -> None:
+def _draw_line(one: dict[str, Any], ax: Axes, scale: float, label: str) -> None:
     ax.plot(one["ticks"][0], scale * one["values"][:, 0], color=plots.COLOURS[0])
     plots.label(ax, f"{one['names'][0]} ({one['units'][0]})", label)
     if one["star"]:
@@ -282,7 +287,7 @@ def draw_panel(
     x, y = one["ticks"]
     values = scale * one["values"].T
     mesh = ax.pcolormesh(
-        x, y, np.ma.masked_invalid(values), shading="nearest", cmap=MAP, vmin=low, vmax=high,
+        x, y, np.ma.masked_invalid(values), shading="nearest", cmap=COLOUR_MAP, vmin=low, vmax=high,
         rasterized=True,
     )  # fmt: skip
     if one["reach"].any() and not one["reach"].all():

@@ -26,17 +26,17 @@ if TYPE_CHECKING:
     from xarray import Dataset
 
 Mask = NDArray[np.bool_]
-FORMAT: Final = "2"
+FORMAT_VERSION: Final = "2"
 """Of stored maps: files of another one are rejected."""
-POSITIVE: Final = {"valid_min": 0.0}
-SHARE: Final = {"units": "1", "valid_min": 0.0, "valid_max": 1.0}
+NON_NEGATIVE: Final = {"valid_min": 0.0}
+UNIT_INTERVAL: Final = {"units": "1", "valid_min": 0.0, "valid_max": 1.0}
 FLAG: Final = {"valid_min": 0, "valid_max": 1}
-NONE: Final[Mapping[str, Any]] = MappingProxyType({})
+NO_BOUNDS: Final[Mapping[str, Any]] = MappingProxyType({})
 """Attributes by what a variable can be (CF conventions, 2.5.1): checked when a file is opened."""
 Values = dict[str, NDArray[Any]]
 
 
-def about(what: str, units: str = "", bounds: Mapping[str, Any] = NONE) -> dict[str, Any]:
+def describe(what: str, units: str = "", bounds: Mapping[str, Any] = NO_BOUNDS) -> dict[str, Any]:
     """Attributes of a variable: what it can be, its unit where it has one, and what it is."""
     return {**bounds, **({"units": units} if units else {}), "long_name": what}
 
@@ -59,12 +59,14 @@ class Field:
     dtype: str = "f8"
 
 
-def number(value: Any, what: str, units: str = "", bounds: Mapping[str, Any] = NONE) -> Variable:
+def scalar(
+    value: Any, what: str, units: str = "", bounds: Mapping[str, Any] = NO_BOUNDS
+) -> Variable:
     """A single number."""
-    return Variable((), np.array(value), about(what, units, bounds))
+    return Variable((), np.array(value), describe(what, units, bounds))
 
 
-def texts(dim: str, words: Iterable[str]) -> Variable:
+def name_labels(dim: str, words: Iterable[str]) -> Variable:
     """Names along a dimension."""
     return Variable((dim,), np.array(list(words), "U"), {})
 
@@ -289,7 +291,7 @@ class Space:
         return self.worst[case].pose if self.at is None else self.at
 
 
-def found_of(kind: Kind, robot: Robot, q: Array, cases: Sequence[Case]) -> list[Found]:
+def evaluate_kind(kind: Kind, robot: Robot, q: Array, cases: Sequence[Case]) -> list[Found]:
     """A kind's cases at joint positions (k, n); NaN in single poses that have no value."""
     ways = len(kind.axes(robot))
 
@@ -306,18 +308,18 @@ def found_of(kind: Kind, robot: Robot, q: Array, cases: Sequence[Case]) -> list[
     except PkmTwinError:
         if len(q) == 1:
             return [without(1) for _ in cases]
-        halves = [found_of(kind, robot, part, cases) for part in np.array_split(q, 2)]
-        return [_joined(*pair) for pair in zip(*halves, strict=True)]
+        halves = [evaluate_kind(kind, robot, part, cases) for part in np.array_split(q, 2)]
+        return [_concatenate(*pair) for pair in zip(*halves, strict=True)]
 
 
-def _joined(one: Found, other: Found) -> Found:
+def _concatenate(one: Found, other: Found) -> Found:
     def both(a: NDArray[Any] | None, b: NDArray[Any] | None) -> Any:
         return None if a is None or b is None else np.concatenate([a, b])
 
     return Found(*map(both, one, other))
 
 
-def limits_of(robot: Robot, name: str) -> Array:
+def drive_limits(robot: Robot, name: str) -> Array:
     """Limits of the drives by name, ``effort`` or ``velocity``, shape (n,); SI units.
 
     :raises ParameterError: the robot's file has none.
@@ -346,7 +348,7 @@ def unit_of_motion(robot: Robot) -> str:
     return "m" if set("xyz") & set(robot.pose_names) else "rad"
 
 
-def least_room(room: Array, rows: Array) -> tuple[Array, Array, NDArray[np.int64]]:
+def tightest_limit(room: Array, rows: Array) -> tuple[Array, Array, NDArray[np.int64]]:
     """The least of each pose, the unit vector of its row, and its index: what limits a motion.
 
     :param room: shape (k, n); ``rows``: shape (k, n, 3).

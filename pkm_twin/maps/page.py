@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 CAMERA: Final = {"eye": {"x": 1.3, "y": -1.5, "z": 0.95}, "center": {"x": 0, "y": 0, "z": -0.1}}
-LIT: Final = {"ambient": 1.0, "diffuse": 0.0, "specular": 0.0, "fresnel": 0.0}
+FLAT_LIGHT: Final = {"ambient": 1.0, "diffuse": 0.0, "specular": 0.0, "fresnel": 0.0}
 """Light that leaves colours as the bar has them."""
 CONFIG: Final = {"displaylogo": False, "responsive": True, "showSendToCloud": False}
 """No buttons that lead into the network."""
@@ -70,7 +70,7 @@ def page(data: Dataset) -> Any:
     return _layers(data) if len(data.coordinate) == 3 else _planes(data)
 
 
-def _case(data: Dataset, case: int, values: Array) -> tuple[float, str, dict[str, Any]]:
+def _case_layout(data: Dataset, case: int, values: Array) -> tuple[float, str, dict[str, Any]]:
     """Scale, unit, and layout of a case: one scale of colours with the worst."""
     part = data.isel(case=case)
     low, high = figures.limits(values, float(part.worst_value))
@@ -78,8 +78,8 @@ def _case(data: Dataset, case: int, values: Array) -> tuple[float, str, dict[str
     label = f"{part.case_what.values} ({unit})" if unit else str(part.case_what.values)
     label += ", brightest: or more" if (values > high).any() else ""
     layout = {
-        "coloraxis.cmin": float(few(np.array(scale * low))),
-        "coloraxis.cmax": float(few(np.array(scale * high))),
+        "coloraxis.cmin": float(round_digits(np.array(scale * low))),
+        "coloraxis.cmax": float(round_digits(np.array(scale * high))),
         "coloraxis.colorbar.title.text": label,
     }
     return scale, unit, layout
@@ -105,21 +105,23 @@ def _layers(data: Dataset) -> Any:
     for z, seen in zip(heights.tolist(), kept, strict=True):
         figure.add_mesh3d(
             x=np.float32(x[seen]), y=np.float32(y[seen]), z=np.float32(np.full(seen.sum(), z)),
-            **triangles(seen), coloraxis="coloraxis", flatshading=True, lighting=LIT,
+            **grid_triangles(seen), coloraxis="coloraxis", flatshading=True, lighting=FLAT_LIGHT,
         )  # fmt: skip
     figure.add_scatter3d(mode="markers", marker=STAR | {"size": 7, "symbol": "diamond"})
     where = "".join(f"{n} %{{{axis}:.4~f}}<br>" for n, axis in zip(names, "xyz", strict=True))
     buttons = []
     for k, case in enumerate(data.case.values):
-        scale, unit, layout = _case(data, k, values[k])
+        scale, unit, layout = _case_layout(data, k, values[k])
         name = str(data.case_what.values[k])
         said = f"{where}{name} %{{intensity:.4~g}} {unit}<extra></extra>"
         pose = dict(zip(units, data.worst_pose.values[k].tolist(), strict=True))
         known = math.isfinite(float(data.worst_value[k]))
-        star = [few(np.array([pose[n]] * known)).tolist() for n in (*flat, upwards)]
+        star = [round_digits(np.array([pose[n]] * known)).tolist() for n in (*flat, upwards)]
         worst = figures.shown(float(data.worst_value[k]), str(data.case_unit.values[k]))
         change = {
-            "intensity": [*(few(scale * v[s]) for v, s in zip(values[k], kept, strict=True)), None],
+            "intensity": [
+                *(round_digits(scale * v[s]) for v, s in zip(values[k], kept, strict=True)), None,
+            ],
             "hovertemplate": [*[said] * len(kept), f"{where}worst {worst}<extra></extra>"],
             **{axis: [*(t[axis] for t in figure.data[:-1]), place]
                for axis, place in zip("xyz", star, strict=True)},
@@ -134,7 +136,7 @@ def _layers(data: Dataset) -> Any:
     ]  # fmt: skip
     figure.update_layout(
         scene={
-            **{f"{axis}axis": {"title": name, "range": span(ends)}
+            **{f"{axis}axis": {"title": name, "range": axis_range(ends)}
                for axis, name, ends in zip("xyz", names, (x, y, heights), strict=True)},
             "aspectmode": "cube", "camera": CAMERA,
         },
@@ -142,7 +144,7 @@ def _layers(data: Dataset) -> Any:
         sliders=[{"steps": [every, *slices], "currentvalue": {"prefix": f"{names[2]}: "},
                   "len": 0.9, "x": 0.05, "pad": {"t": 10, "b": 10}}],
     )  # fmt: skip
-    return _chosen(figure, buttons)
+    return _show_first(figure, buttons)
 
 
 def _planes(data: Dataset) -> Any:
@@ -150,20 +152,20 @@ def _planes(data: Dataset) -> Any:
     figure, buttons = graph.Figure(), []
     every = [(k, p) for k in range(len(data.case)) for p in figures.full_planes(data, k)]
     for k, p in every:
-        scale, unit, layout = _case(data, k, data.plane_value.isel(case=k).values)
+        scale, unit, layout = _case_layout(data, k, data.plane_value.isel(case=k).values)
         one = figures.plane_of(data, k, p)
         what, (x, *y) = str(data.case_what.values[k]), one["names"]
-        values, axes = scale * one["values"], [few(ticks) for ticks in one["ticks"]]
+        values, axes = scale * one["values"], [round_digits(ticks) for ticks in one["ticks"]]
         named = [f"{n} ({u})" for n, u in zip(one["names"], one["units"], strict=True)]
         where = "".join(f"{n} %{{{a}:.4~f}}<br>" for n, a in zip(named, "xy", strict=False))
         said = f"{where}{what} %{{{'z' if y else 'y'}:.4~g}} {unit}<extra></extra>"
         if y:
             figure.add_heatmap(
-                x=axes[0], y=axes[1], z=few(values.T), coloraxis="coloraxis", hoverongaps=False,
-                hovertemplate=said,
+                x=axes[0], y=axes[1], z=round_digits(values.T), coloraxis="coloraxis",
+                hoverongaps=False, hovertemplate=said,
             )  # fmt: skip
         else:
-            figure.add_scatter(x=axes[0], y=few(values[:, 0]), hovertemplate=said)
+            figure.add_scatter(x=axes[0], y=round_digits(values[:, 0]), hovertemplate=said)
         star = one["star"] if one["star"] and y else [None, None]
         worst = figures.shown(float(data.worst_value[k]), str(data.case_unit.values[k]))
         figure.add_scatter(
@@ -178,13 +180,13 @@ def _planes(data: Dataset) -> Any:
     for trace, seen in zip(figure.data, visible[0], strict=True):
         trace.visible = seen
     figure.update_layout(margin={**MARGIN, "l": 70, "b": 60})
-    return _chosen(figure, [
+    return _show_first(figure, [
         button(text, {"visible": seen}, layout)
         for (text, layout), seen in zip(buttons, visible, strict=True)
     ])  # fmt: skip
 
 
-def _chosen(figure: Any, buttons: list[dict[str, Any]]) -> Any:
+def _show_first(figure: Any, buttons: list[dict[str, Any]]) -> Any:
     """A figure as its menu's first entry shows it."""
     figure.update_layout(
         coloraxis={"colorscale": "Viridis", "colorbar": BAR},
@@ -207,7 +209,7 @@ def button(
     return {"label": label, "method": "update", "args": args if traces is None else [*args, traces]}
 
 
-def few(values: NDArray[Any]) -> Array:
+def round_digits(values: NDArray[Any]) -> Array:
     """Five digits: what a button changes stands in the page as text."""
     with np.errstate(divide="ignore", invalid="ignore"):
         power = np.floor(np.log10(np.abs(values)))
@@ -215,7 +217,7 @@ def few(values: NDArray[Any]) -> Array:
     return np.asarray(np.round(np.asarray(values, np.float64) * unit) / unit, np.float64)
 
 
-def triangles(shown: NDArray[np.bool_]) -> dict[str, NDArray[np.int64]]:
+def grid_triangles(shown: NDArray[np.bool_]) -> dict[str, NDArray[np.int64]]:
     """Corners i, j, k of the triangles between those points of a grid that are shown.
 
     Points that are not shown are not counted. A mesh of triangles says of a place under the cursor
@@ -238,7 +240,7 @@ def triangles(shown: NDArray[np.bool_]) -> dict[str, NDArray[np.int64]]:
     return dict(zip("ijk", np.unique(corners, axis=0).T, strict=True))
 
 
-def span(values: Array) -> list[float]:
+def axis_range(values: Array) -> list[float]:
     """Ends of an axis a little beyond the values: it stays when some are hidden."""
     low, high = float(np.nanmin(values)), float(np.nanmax(values))
     return [low - 0.05 * (high - low), high + 0.05 * (high - low)]

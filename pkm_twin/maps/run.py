@@ -35,13 +35,13 @@ Progress = Callable[[int], None]
 Work = Sequence[tuple[int, Any]]
 """Numbered parts of a task."""
 
-ATTEMPTS: Final = 3
+MAX_POOL_FAILURES: Final = 3
 """How often workers may die at one chunk before the sweep is given up."""
-FEW: Final = 3
+MAX_SERIAL_CHUNKS: Final = 3
 """Chunks that are not worth starting processes for."""
-CONNECT: Final = "10s"
+CONNECT_TIMEOUT: Final = "10s"
 """How long a scheduler may take to answer."""
-IN_FLIGHT: Final = 2
+CHUNKS_PER_WORKER: Final = 2
 """Chunks a worker that are handed out at a time."""
 
 
@@ -93,15 +93,15 @@ def run(
         parts.open(overwrite)
         try:
             tell = progress or (lambda _: None)
-            _fill(sweep, parts, False, workers, scheduler, tell)
+            _compute_pending(sweep, parts, False, workers, scheduler, tell)
             # Deterministic, so that a run that is resumed has the same planes.
             try:
-                sweep = sweep.searched(parts.grid())
+                sweep = sweep.with_worst(parts.grid())
             except ParameterError:
                 # Nothing to continue from: no pose counts.
                 parts.drop()
                 raise
-            _fill(sweep, parts, True, workers, scheduler, tell)
+            _compute_pending(sweep, parts, True, workers, scheduler, tell)
             join(sweep, parts, out)
             parts.drop()
         finally:
@@ -109,7 +109,7 @@ def run(
     return out
 
 
-def _fill(
+def _compute_pending(
     sweep: Map,
     parts: Parts,
     planes: bool,
@@ -125,11 +125,15 @@ def _fill(
     work = [(i, chunks[i]) for i in pending if (chunks[i].plane is not None) == planes]
     results: Iterator[tuple[int, Values | None]]
     if scheduler is not None and work:
-        results = on_cluster(sweep, work, scheduler)
+        results = compute_on_cluster(sweep, work, scheduler)
     else:
         count = workers or os.cpu_count() or 1
-        alone = count == 1 or len(work) <= FEW
-        results = here(sweep, work) if alone else on_cores(sweep, work, count, parts.folder)
+        alone = count == 1 or len(work) <= MAX_SERIAL_CHUNKS
+        results = (
+            compute_serially(sweep, work)
+            if alone
+            else compute_on_cores(sweep, work, count, parts.folder)
+        )
     for index, values in results:
         if values is not None:
             parts.save(index, values)
@@ -137,13 +141,13 @@ def _fill(
         tell(done)
 
 
-def here(sweep: Map, work: Work) -> Iterator[tuple[int, Values]]:
+def compute_serially(sweep: Map, work: Work) -> Iterator[tuple[int, Values]]:
     """Chunks one after the other in this process."""
     for index, chunk in work:
         yield index, sweep.evaluate(chunk)
 
 
-def on_cores(
+def compute_on_cores(
     sweep: Map, work: Work, workers: int, folder: Path
 ) -> Iterator[tuple[int, Values | None]]:
     """Chunks on processes of this machine, in the order in which they are done.
@@ -154,21 +158,23 @@ def on_cores(
     """
     # The first chunk compiles what the others load; processes that all compile would waste it.
     first = next((k for k, (_, chunk) in enumerate(work) if sweep.count(chunk)), 0)
-    yield from here(sweep, [work[first]])
+    yield from compute_serially(sweep, [work[first]])
     rest = dict([*work[:first], *work[first + 1 :]])
     broken = 0
     while rest:
         try:
-            for index in _pool(sweep, list(rest.items()), min(workers, len(rest)), folder):
+            for index in _run_pool(sweep, list(rest.items()), min(workers, len(rest)), folder):
                 del rest[index]
                 yield index, None
         except BrokenProcessPool:
             broken += 1
-            if broken == ATTEMPTS:
-                raise ClusterError(f"processes died {ATTEMPTS} times in this sweep") from None
+            if broken == MAX_POOL_FAILURES:
+                raise ClusterError(
+                    f"processes died {MAX_POOL_FAILURES} times in this sweep"
+                ) from None
 
 
-def _pool(sweep: Map, work: Work, workers: int, folder: Path) -> Iterator[int]:
+def _run_pool(sweep: Map, work: Work, workers: int, folder: Path) -> Iterator[int]:
     # Not forked: the parent has threads (the progress bar's).
     context = multiprocessing.get_context("spawn")
     # Once, and here: a pool that cannot pass its work on waits for ever.
@@ -180,8 +186,8 @@ def _pool(sweep: Map, work: Work, workers: int, folder: Path) -> Iterator[int]:
         while True:
             for index, chunk in queue:
                 with _without_interrupts(), one_blas_thread_for_children():
-                    flying.add(pool.submit(_keep, packed, chunk, folder, index))
-                if len(flying) >= IN_FLIGHT * workers:
+                    flying.add(pool.submit(_evaluate_and_save, packed, chunk, folder, index))
+                if len(flying) >= CHUNKS_PER_WORKER * workers:
                     break
             if not flying:
                 break
@@ -192,7 +198,7 @@ def _pool(sweep: Map, work: Work, workers: int, folder: Path) -> Iterator[int]:
         pool.shutdown(cancel_futures=True)
 
 
-def on_cluster(sweep: Task, work: Work, scheduler: str) -> Iterator[tuple[int, Values]]:
+def compute_on_cluster(sweep: Task, work: Work, scheduler: str) -> Iterator[tuple[int, Values]]:
     """Chunks on a Dask cluster, in the order in which they are done.
 
     The scheduler gives the chunks of a lost worker to another one.
@@ -207,7 +213,7 @@ def on_cluster(sweep: Task, work: Work, scheduler: str) -> Iterator[tuple[int, V
         # A client that is made without one fails at once, and again at its end.
         raise ClusterError(f"{scheduler} asks for TLS, and Dask is configured with no certificate")
     try:
-        client = distributed.Client(scheduler, timeout=CONNECT, set_as_default=False)
+        client = distributed.Client(scheduler, timeout=CONNECT_TIMEOUT, set_as_default=False)
     except (OSError, TimeoutError, ValueError, RuntimeError) as error:
         raise ClusterError(f"no Dask scheduler answers at {scheduler}: {error}") from None
     with client:
@@ -215,7 +221,7 @@ def on_cluster(sweep: Task, work: Work, scheduler: str) -> Iterator[tuple[int, V
         if not threads:
             raise ClusterError(f"the Dask scheduler at {scheduler} has no workers")
         try:
-            yield from _from_workers(sweep, work, distributed, client, threads)
+            yield from _collect_results(sweep, work, distributed, client, threads)
         except distributed.KilledWorker as error:
             raise ClusterError(f"workers kept dying: {error}") from None
         except (CancelledError, FutureCancelled, distributed.comm.CommClosedError):
@@ -226,15 +232,17 @@ def on_cluster(sweep: Task, work: Work, scheduler: str) -> Iterator[tuple[int, V
             raise ClusterError(f"the Dask scheduler at {scheduler}: {error}") from None
 
 
-def _from_workers(
+def _collect_results(
     sweep: Task, work: Work, distributed: Any, client: Any, threads: int
 ) -> Iterator[tuple[int, Values]]:
     def submit(index: int, chunk: Any) -> Any:
         key = f"map-{sweep.fingerprint[:16]}-{index}"
-        return client.submit(compute, sweep, chunk, pkm_twin.__version__, key=key, pure=False)
+        return client.submit(
+            evaluate_chunk, sweep, chunk, pkm_twin.__version__, key=key, pure=False
+        )
 
     queue = itertools.starmap(submit, work)
-    flying = list(itertools.islice(queue, IN_FLIGHT * threads))
+    flying = list(itertools.islice(queue, CHUNKS_PER_WORKER * threads))
     finished = distributed.as_completed(flying, loop=client.loop)
     del flying
     for future in finished:
@@ -246,7 +254,7 @@ def _from_workers(
             finished.add(following)
 
 
-def compute(sweep: Task, chunk: Any, version: str) -> Values:
+def evaluate_chunk(sweep: Task, chunk: Any, version: str) -> Values:
     """One chunk, in a worker.
 
     :raises PkmTwinError: what the chunk raises, in a form that passes between processes; or a
@@ -260,13 +268,13 @@ def compute(sweep: Task, chunk: Any, version: str) -> Values:
         raise PkmTwinError(str(error)) from None
 
 
-def _keep(packed: bytes, chunk: Chunk, folder: Path, index: int) -> int:
-    save_part(folder, index, compute(_unpacked(packed), chunk, pkm_twin.__version__))
+def _evaluate_and_save(packed: bytes, chunk: Chunk, folder: Path, index: int) -> int:
+    save_part(folder, index, evaluate_chunk(_unpickle(packed), chunk, pkm_twin.__version__))
     return index
 
 
 @functools.lru_cache(1)
-def _unpacked(packed: bytes) -> Map:
+def _unpickle(packed: bytes) -> Map:
     # Once a process: what the robot derives for its first chunk serves all.
     sweep: Map = pickle.loads(packed)  # noqa: S301  from the parent
     return sweep

@@ -13,19 +13,19 @@ from numpy.typing import NDArray
 
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError
-from pkm_twin.maps.kind import Case, Kind, Space, Worst, found_of
+from pkm_twin.maps.kind import Case, Kind, Space, Worst, evaluate_kind
 from pkm_twin.robot.robot import Robot
 from pkm_twin.robot.workspace import causes, passing_singularity, reachable, try_forward
 
 JOINT_STATES: Final = 2**14
 """Joint states, evenly spread between the limits, whose poses bound a workspace."""
-CLIMBERS: Final = 32
+CLIMB_STARTS: Final = 32
 """States from which the ends of a workspace of many coordinates are looked for."""
-COARSE: Final = 33
+GRID_SIDE: Final = 33
 """Poses along each coordinate of a grid that bounds a workspace, or what a plane shows of it."""
-FULL: Final = 3
+MAX_GRID_DIMENSIONS: Final = 3
 """Most pose coordinates of which a whole grid is made."""
-NEAR: Final = 64
+NEIGHBOURS: Final = 64
 """Places next to the worst that show whether the singularity index excludes worse ones."""
 EDGE_WALKERS: Final = 1024
 """Places nearest to the least singularity index that walk to it."""
@@ -33,13 +33,13 @@ EDGE_STEPS: Final = 24
 """Steps of their walk."""
 EDGE_STARTS: Final = 128
 """Places on that border from which the worst pose is searched."""
-HALVINGS: Final = 12
+BISECTIONS: Final = 12
 """Of the way to a place that does not count, to find where it still does."""
-INSIDE: Final = 1e-9
+LIMIT_MARGIN: Final = 1e-9
 """Part of a joint's range that the search stays away from its ends."""
 
 
-def worst_of(
+def find_worst(
     space: Space, case: Case, starts: Array, tell: Callable[[float], object] = abs
 ) -> Worst:
     """The worst pose of the workspace.
@@ -55,7 +55,7 @@ def worst_of(
     rng = np.random.default_rng(0)
     first = robot.inverse(starts) if by_joints and len(starts) else starts
     if by_joints:
-        low, high = low + INSIDE * (high - low), high - INSIDE * (high - low)
+        low, high = low + LIMIT_MARGIN * (high - low), high - LIMIT_MARGIN * (high - low)
 
     def inside(x: Array) -> NDArray[np.bool_]:
         return space.counts(*space.state(x), case)
@@ -65,7 +65,7 @@ def worst_of(
         counted = inside(x)
         one = case if what is kind else what.cases(robot)[0]
         result = np.full(len(x), -np.inf)
-        (found,) = found_of(what, robot, q[counted], [one])
+        (found,) = evaluate_kind(what, robot, q[counted], [one])
         result[counted] = badness(found.value, one.largest)
         return result
 
@@ -81,9 +81,9 @@ def worst_of(
         order = np.argsort(-score(more, kind.screen), kind="stable")
         tried = np.concatenate([tried, more[order[: kind.samples]]])
     kept = inside if kind.screen is not None else None
-    x, best = evolved(score, np.clip(tried, low, high), low, high, kind, rng, kept, tell)
+    x, best = evolve(score, np.clip(tried, low, high), low, high, kind, rng, kept, tell)
     if len(edge := _edge_states(space, tried, inside, low, high, rng)):
-        more, other = evolved(score, edge, low, high, kind, rng, inside)
+        more, other = evolve(score, edge, low, high, kind, rng, inside)
         x, best = (more, other) if other > best else (x, best)
     if not np.isfinite(best):
         without = replace(space, least=0.0).counts(*space.state(tried), case)
@@ -99,11 +99,11 @@ def worst_of(
         bound = "a workspace in which some pose counts"
         raise ParameterError("robot", robot.name, f"{bound}: {why}" if why else bound)
     q, pose, _ = space.state(x[None])
-    found = found_of(kind, robot, q, [case])[0]
-    near = rng.normal(size=(NEAR, len(x))) * 10.0 ** rng.uniform(-4.0, -2.0, (NEAR, 1))
+    found = evaluate_kind(kind, robot, q, [case])[0]
+    near = rng.normal(size=(NEIGHBOURS, len(x))) * 10.0 ** rng.uniform(-4.0, -2.0, (NEIGHBOURS, 1))
     state = space.state(np.clip(x + near * (high - low), low, high))
     below = replace(space, least=0.0).counts(*state, case) & ~space.counts(*state, case)
-    (beyond,) = found_of(kind, robot, state[0][below], [case])
+    (beyond,) = evaluate_kind(kind, robot, state[0][below], [case])
     worse = badness(beyond.value, case.largest) > badness(found.value, case.largest)
     index = float(robot.try_singularity(q)[0][0])
     return Worst(pose[0], q[0], found, index, bool(worse.any()))
@@ -137,7 +137,7 @@ def _edge_states(
     x, index = x[order], index[order]
     for size in np.geomspace(0.1, 1e-4, EDGE_STEPS):
         moved = np.clip(x + size * (high - low) * rng.normal(size=x.shape), low, high)
-        moved = _bordered(x, moved, inside)
+        moved = _pull_inside(x, moved, inside)
         nearer = index_at(moved) < index
         x = np.where(nearer[:, None], moved, x)
         index = np.where(nearer, index_at(moved), index)
@@ -155,7 +155,7 @@ def badness(value: Array, largest: bool) -> Array:
     return np.where(np.isfinite(value), value if largest else -value, -np.inf)
 
 
-def evolved(
+def evolve(
     score: Callable[[Array], Array],
     tried: Array,
     low: Array,
@@ -190,7 +190,7 @@ def evolved(
         local = np.asarray(rng.random(count) < 0.7)
         moved = np.clip(x + np.where(local[:, None], near, far), low, high)
         if inside is not None:
-            moved = _bordered(x, moved, inside)
+            moved = _pull_inside(x, moved, inside)
         reached = score(moved)
         better = reached > f
         step = np.clip(np.where(local, step * np.where(better, 1.5, 0.9), step), 1e-6, 0.3)
@@ -198,14 +198,14 @@ def evolved(
     return x[f.argmax()], float(f.max())
 
 
-def _bordered(x: Array, moved: Array, inside: Callable[[Array], NDArray[np.bool_]]) -> Array:
+def _pull_inside(x: Array, moved: Array, inside: Callable[[Array], NDArray[np.bool_]]) -> Array:
     """Places moved (k, n), those outside drawn back towards x as far as they have to, by halving.
 
     Extremes are often where a pose just counts: at a limit or the least singularity index.
     """
     share = inside(moved).astype(float)
     step = np.where(share < 1.0, 0.5, 0.0)
-    for _ in range(HALVINGS):
+    for _ in range(BISECTIONS):
         good = inside(x + (share + step)[:, None] * (moved - x))
         share, step = share + np.where(good, step, 0.0), 0.5 * step
     return np.asarray(x + share[:, None] * (moved - x))
@@ -221,22 +221,22 @@ def workspace_box(robot: Robot) -> Array:
     """
     bounds = np.asarray(robot.search_box(), np.float64)
     # With what interference takes away, which maps show.
-    found = _from_joints(robot)
+    found = _poses_from_joints(robot)
     grid = robot.grid()
     lateral = [robot.pose_names.index(name) for name in grid.lateral]
     box = bounds
-    if len(bounds) > FULL:
+    if len(bounds) > MAX_GRID_DIMENSIONS:
         if len(found):
-            box = _around(found, 0.1 * np.ptp(found, axis=0), bounds)
+            box = _bounding_box(found, 0.1 * np.ptp(found, axis=0), bounds)
         return box
     # Twice: a machine may reach a small part of what its lengths allow.
     for _ in range(2):
-        ticks = [np.linspace(low, high, COARSE) for low, high in box]
+        ticks = [np.linspace(low, high, GRID_SIDE) for low, high in box]
         poses = np.stack(np.meshgrid(*ticks, indexing="ij"), -1).reshape(-1, len(ticks))
         seen = np.concatenate([found, poses[reachable(robot, poses, -math.inf)]])
         if not len(seen):
             raise ParameterError("limits", robot.name, "limits that leave a workspace")
-        box = _around(seen, np.ptp(box, axis=1) / (COARSE - 1), bounds)
+        box = _bounding_box(seen, np.ptp(box, axis=1) / (GRID_SIDE - 1), bounds)
         if lateral:
             # The axis stays in the middle, and on the grid: workspaces end in tips there.
             half = np.abs(box[lateral]).max(1)
@@ -244,12 +244,12 @@ def workspace_box(robot: Robot) -> Array:
     return box
 
 
-def _around(poses: Array, margin: Array, bounds: Array) -> Array:
+def _bounding_box(poses: Array, margin: Array, bounds: Array) -> Array:
     low, high = poses.min(0) - margin, poses.max(0) + margin
     return np.stack([np.maximum(low, bounds[:, 0]), np.minimum(high, bounds[:, 1])], -1)
 
 
-def _from_joints(robot: Robot) -> Array:
+def _poses_from_joints(robot: Robot) -> Array:
     """Reachable poses of joint states between the limits, shape (k, m); none without limits."""
     limits = robot.limits.position
     count = len(robot.joint_names)
@@ -266,10 +266,10 @@ def _from_joints(robot: Robot) -> Array:
     poses, good = try_forward(robot, q)
     good[good] = reachable(robot, poses[good], -math.inf)
     poses, q = poses[good], q[good]
-    if len(robot.pose_names) > FULL and len(q):
+    if len(robot.pose_names) > MAX_GRID_DIMENSIONS and len(q):
         # States so few are far apart where joints are many.
         ends = [
-            _farthest(robot, limits, q[np.argsort(-sign * poses[:, k])[:CLIMBERS]], k, sign)
+            _climb(robot, limits, q[np.argsort(-sign * poses[:, k])[:CLIMB_STARTS]], k, sign)
             for k in range(poses.shape[1])
             for sign in (-1.0, 1.0)
         ]
@@ -277,7 +277,7 @@ def _from_joints(robot: Robot) -> Array:
     return poses
 
 
-def _farthest(robot: Robot, limits: Array, q: Array, k: int, sign: float) -> Array:
+def _climb(robot: Robot, limits: Array, q: Array, k: int, sign: float) -> Array:
     """Poses uphill of joint states (c, n) in pose coordinate k times a sign.
 
     :param limits: of the joints, shape (n, 2).

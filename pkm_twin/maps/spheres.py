@@ -24,7 +24,7 @@ from delta_dynamics.torques.isotropy import (
 )
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError, require
-from pkm_twin.maps.kind import FLAG, POSITIVE, SHARE, Space, Variable, about, number
+from pkm_twin.maps.kind import FLAG, NON_NEGATIVE, UNIT_INTERVAL, Space, Variable, describe, scalar
 from pkm_twin.report import plots
 from pkm_twin.robot.robot import Robot
 from pkm_twin.robot.workspace import reachable
@@ -37,24 +37,24 @@ TILTS: Final = np.radians([0.0, 15.0, 30.0, 45.0])
 """Tilts of the spheres, rad; the paper's images end at 45 degrees."""
 AZIMUTHS: Final = np.radians(np.arange(0.0, 360.0, 30.0))
 """Azimuths of the spheres, rad; those of the paper's statement, 60, 180 and 300 degrees, too."""
-DIRECTIONS: Final = 1000
+DIRECTIONS_PER_SPHERE: Final = 1000
 """Directions on a sphere, about 6 degrees apart."""
-LEAST_INDEX: Final = 1e-3
+MIN_SINGULARITY_INDEX: Final = 1e-3
 """Singularity index below which a pose has no sphere: efforts grow without bound there."""
 RADIUS: Final = math.radians(7.0)
 """Radius of a drawn sphere, rad of tilt: neighbours on a ring and of the next ring stay apart."""
-VIEW: Final = np.array([0.5, math.sqrt(0.75), 0.0])
+VIEW_DIRECTION: Final = np.array([0.5, math.sqrt(0.75), 0.0])
 """Unit vector towards the viewer, in pose rates: the rate of the position points up, and that of a
 tilt to the right does so too."""
-BULK: Final = 0.995
+SCALE_QUANTILE: Final = 0.995
 """Part of the values below the end of a scale: a few near singularities share its last colour."""
-FLAT: Final = {
+TOP_CAMERA: Final = {
     "eye": {"x": 0.0, "y": 0.0, "z": 1.25},
     "up": {"x": 0.0, "y": 1.0, "z": 0.0},
     "projection": {"type": "orthographic"},
 }
 """Camera of the page: the picture, from above."""
-BEYOND: Final = "#D55E00"
+OUTSIDE_COLOUR: Final = "#D55E00"
 """Colour of the rim of spheres whose pose is beyond the machine's limits."""
 
 
@@ -84,8 +84,8 @@ def find_spheres(space: Space, energy: float) -> dict[str, Variable]:
     lean = robot.platform(q[known])[1][:, 2, 2]
     if not np.allclose(lean, np.cos(tilt[known]), rtol=0.0, atol=1e-9):
         raise ParameterError("spheres", ",".join(robot.pose_names), "tilts about x and y (as prru)")
-    known[known] = robot.try_singularity(q[known])[0] >= LEAST_INDEX
-    directions = sphere_directions(DIRECTIONS)
+    known[known] = robot.try_singularity(q[known])[0] >= MIN_SINGULARITY_INDEX
+    directions = sphere_directions(DIRECTIONS_PER_SPHERE)
     share, force = np.full((2, *tilt.shape, len(directions)), np.nan)
     at = poses[known][:, None]
     share[known] = energy_transfer(robot, at, directions)
@@ -95,18 +95,20 @@ def find_spheres(space: Space, energy: float) -> dict[str, Variable]:
     sphere = ("azimuth", "tilt", "way")
     unit = robot.effort_unit
     return {
-        "sphere_height": number(height, "position coordinate of the spheres", "m"),
-        "azimuth": Variable(("azimuth",), AZIMUTHS, about("towards which it tilts", "rad")),
-        "tilt": Variable(("tilt",), TILTS, about("tilt of the platform", "rad")),
-        "way": Variable(("way", "axis"), directions, about("unit vector of pose rates")),
+        "sphere_height": scalar(height, "position coordinate of the spheres", "m"),
+        "azimuth": Variable(("azimuth",), AZIMUTHS, describe("towards which it tilts", "rad")),
+        "tilt": Variable(("tilt",), TILTS, describe("tilt of the platform", "rad")),
+        "way": Variable(("way", "axis"), directions, describe("unit vector of pose rates")),
         "sphere_energy": Variable(
-            sphere, share, about("eta_KE, share of the kinetic energy in the platform", "", SHARE)
+            sphere,
+            share,
+            describe("eta_KE, share of the kinetic energy in the platform", "", UNIT_INTERVAL),
         ),
         "sphere_force": Variable(
-            sphere, force, about("F_max, largest effort of the drives", unit, POSITIVE)
+            sphere, force, describe("F_max, largest effort of the drives", unit, NON_NEGATIVE)
         ),
         "sphere_inside": Variable(
-            sphere[:2], inside.astype(np.int8), about("1 where all limits are kept", "", FLAG)
+            sphere[:2], inside.astype(np.int8), describe("1 where all limits are kept", "", FLAG)
         ),
     }
 
@@ -145,14 +147,14 @@ def state_ranges(data: Dataset) -> list[str]:
 
 def _limits(values: Array) -> tuple[float, float]:
     """Return the ends of a scale: the least value, and one that few values exceed."""
-    return float(np.nanmin(values)), float(np.nanquantile(values, BULK))
+    return float(np.nanmin(values)), float(np.nanquantile(values, SCALE_QUANTILE))
 
 
 def _height(data: Dataset) -> str:
     return f"{data.coordinate.values[0]} = {float(data.sphere_height):.4g} m"
 
 
-def _places(data: Dataset) -> list[tuple[int, int, Array]]:
+def _sphere_centres(data: Dataset) -> list[tuple[int, int, Array]]:
     """Return azimuth and tilt by index, and the centre (2,), of each sphere that is drawn.
 
     The level pose has one sphere, and the first ring every other azimuth, for want of room.
@@ -179,9 +181,9 @@ def _triangles(ways: Array) -> NDArray[np.int64]:
 
 def _axes() -> tuple[Array, Array]:
     """Return the picture's right and up in pose rates."""
-    right = np.cross([1.0, 0.0, 0.0], VIEW)
+    right = np.cross([1.0, 0.0, 0.0], VIEW_DIRECTION)
     right /= np.linalg.norm(right)
-    return right, np.cross(VIEW, right)
+    return right, np.cross(VIEW_DIRECTION, right)
 
 
 def draw_spheres(data: Dataset) -> dict[str, Figure]:
@@ -192,7 +194,7 @@ def draw_spheres(data: Dataset) -> dict[str, Figure]:
 def _draw(data: Dataset, index: str) -> Figure:
     from matplotlib.patches import Circle
 
-    from pkm_twin.maps.figures import MAP
+    from pkm_twin.maps.figures import COLOUR_MAP
 
     question, label = questions(data)[index]
     values, inside = data[f"sphere_{index}"].values, data.sphere_inside.values
@@ -201,19 +203,19 @@ def _draw(data: Dataset, index: str) -> Figure:
     right, up = _axes()
     flat = np.stack([ways @ right, ways @ up], -1)
     corners = _triangles(ways)
-    front = corners[(ways @ VIEW)[corners].max(-1) > 0.0]
+    front = corners[(ways @ VIEW_DIRECTION)[corners].max(-1) > 0.0]
     figure: Figure
     figure, ((ax,),) = plots.columns(1, 1, 8.6)
     mesh: Any = None
-    for a, t, centre in _places(data):
+    for a, t, centre in _sphere_centres(data):
         x, y = (centre + RADIUS * flat).T
         mesh = ax.tripcolor(
-            x, y, front, values[a, t], shading="gouraud", cmap=MAP, vmin=low, vmax=high,
+            x, y, front, values[a, t], shading="gouraud", cmap=COLOUR_MAP, vmin=low, vmax=high,
             rasterized=True,
         )  # fmt: skip
         rim: dict[str, Any] = {"ec": "0.3", "lw": 0.6}
         if not inside[a, t]:
-            rim = {"ec": BEYOND, "lw": 1.6, "ls": "--"}
+            rim = {"ec": OUTSIDE_COLOUR, "lw": 1.6, "ls": "--"}
         circle = Circle((float(centre[0]), float(centre[1])), RADIUS, fill=False, zorder=3, **rim)
         ax.add_patch(circle)
         mesh.set_clip_path(circle)
@@ -271,11 +273,11 @@ def _draw_rates(data: Dataset, ax: Any) -> None:
 def make_page(data: Dataset) -> Any:
     """Return the spheres as a plotly figure to turn; a menu chooses the index."""
     graph = require("plotly.graph_objects", "atlas")
-    from pkm_twin.maps.page import BAR, LIT, MARGIN, MENU, button, few
+    from pkm_twin.maps.page import BAR, FLAT_LIGHT, MARGIN, MENU, button, round_digits
 
-    ways, places = data.way.values, _places(data)
+    ways, places = data.way.values, _sphere_centres(data)
     corners = _triangles(ways)
-    vertices = np.concatenate([np.append(c, 0.0) + RADIUS * _scene(ways) for _, _, c in places])
+    vertices = np.concatenate([np.append(c, 0.0) + RADIUS * _to_scene(ways) for _, _, c in places])
     every = np.concatenate([corners + k * len(ways) for k in range(len(places))])
     poses = np.degrees([(data.azimuth.values[a], data.tilt.values[t]) for a, t, _ in places])
     named = np.hstack((np.repeat(poses, len(ways), 0), np.tile(ways, (len(places), 1))))
@@ -286,13 +288,13 @@ def make_page(data: Dataset) -> Any:
     figure.add_mesh3d(
         **{axis: np.float32(vertices[:, k]) for k, axis in enumerate("xyz")},
         **{corner: np.int32(every[:, k]) for k, corner in enumerate("ijk")},
-        customdata=np.float32(named), coloraxis="coloraxis", lighting=LIT,
+        customdata=np.float32(named), coloraxis="coloraxis", lighting=FLAT_LIGHT,
     )  # fmt: skip
     buttons = []
     for index, (_, label) in questions(data).items():
         values = data[f"sphere_{index}"].values
         low, high = _limits(values)
-        shown = np.concatenate([few(values[a, t]) for a, t, _ in places])
+        shown = np.concatenate([round_digits(values[a, t]) for a, t, _ in places])
         said = f"{where}{label.partition(':')[0]} %{{intensity:.4~g}}<extra></extra>"
         layout = {"coloraxis.cmin": low, "coloraxis.cmax": high,
                   "coloraxis.colorbar.title.text": label}  # fmt: skip
@@ -312,13 +314,13 @@ def make_page(data: Dataset) -> Any:
         coloraxis={"colorscale": "Viridis", "colorbar": BAR}, margin=MARGIN,
         updatemenus=[{"buttons": buttons, **MENU}],
         scene={"xaxis": hidden, "yaxis": hidden, "zaxis": hidden, "aspectmode": "data",
-               "camera": FLAT},
+               "camera": TOP_CAMERA},
     )  # fmt: skip
     figure.update_layout(layout)
     return figure
 
 
-def _scene(ways: Array) -> Array:
+def _to_scene(ways: Array) -> Array:
     """Return directions in the scene's axes, in which the viewer of the picture looks down."""
     right, up = _axes()
-    return np.asarray(ways @ np.stack([right, up, VIEW], -1), np.float64)
+    return np.asarray(ways @ np.stack([right, up, VIEW_DIRECTION], -1), np.float64)

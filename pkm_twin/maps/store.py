@@ -32,28 +32,33 @@ from numpy.typing import NDArray
 
 from pkm_twin.errors import PkmTwinError, require
 from pkm_twin.files import replace_file
-from pkm_twin.maps.kind import FORMAT, Values
+from pkm_twin.maps.kind import FORMAT_VERSION, Values
 
 if TYPE_CHECKING:
     from xarray import Dataset
 
     from pkm_twin.maps.sweep import Chunk, Map
 
-_MARK: Final = "sweep.json"
-_LOCK: Final = "lock"
-_JOINED: Final = "joined.tmp"
-_STORED: Final = {"compression": "gzip", "compression_opts": 1, "shuffle": True, "fletcher32": True}
+_INFO_FILE: Final = "sweep.json"
+_LOCK_FILE: Final = "lock"
+_JOINED_FILE: Final = "joined.tmp"
+_FIELD_FILTERS: Final = {
+    "compression": "gzip",
+    "compression_opts": 1,
+    "shuffle": True,
+    "fletcher32": True,
+}
 """How fields are stored; level 1, as numbers with all their digits gain little by more."""
-_OWN: Final = re.compile(r"sweep\.json|lock|\d{8}\.npz|[\w.]+\.tmp")
+_OWN_NAMES: Final = re.compile(r"sweep\.json|lock|\d{8}\.npz|[\w.]+\.tmp")
 """Names of what a run writes into its folder."""
-SEALED: Final = {"checksum": "SHA-256 of all before, in the last 32 bytes"}
+CHECKSUM_ATTRIBUTE: Final = {"checksum": "SHA-256 of all before, in the last 32 bytes"}
 """The attribute of a file that has its checksum at the end."""
 ROUNDING: Final = 1e-9
 """By how much a number may be beyond its bounds: they are of order 1."""
 _SEAL_MARK: Final = b"\npkm_twin atlas SHA-256\n"
 _SEAL: Final = len(_SEAL_MARK) + hashlib.sha256().digest_size
-_BLOCK: Final = 1 << 20
-_SLAB: Final = 1 << 22
+_BLOCK_SIZE: Final = 1 << 20
+_SLAB_SIZE: Final = 1 << 22
 """Numbers of a variable that are judged at once, about."""
 
 
@@ -61,11 +66,11 @@ class MapError(PkmTwinError):
     """A map, or the chunks of one, that cannot be read or written as asked."""
 
     def __init__(self, path: Path, what: str) -> None:
-        super().__init__(f"{_short(path)}: {what}")
+        super().__init__(f"{_shorten(path)}: {what}")
         self.path = path
 
 
-def _short(path: Path) -> str:
+def _shorten(path: Path) -> str:
     text = str(path)
     return text if len(text) <= 200 else f"{text[:120]}...{text[-60:]}"
 
@@ -100,7 +105,7 @@ def reading(path: Path) -> Iterator[None]:
     except PkmTwinError:
         raise
     except Exception as error:
-        raise MapError(path, _damage(error)) from None
+        raise MapError(path, _describe_damage(error)) from None
 
 
 class Parts:
@@ -123,15 +128,15 @@ class Parts:
             raise MapError(self.folder, "is not a folder; the chunks need a folder of this name")
         while self._lock < 0:
             self.folder.mkdir(parents=True, exist_ok=True)
-            self._refuse_foreign()
-            self._lock = self._locked()
-        mark = self.folder / _MARK
+            self._reject_foreign()
+            self._lock = self._acquire_lock()
+        mark = self.folder / _INFO_FILE
         try:
             found = json.loads(mark.read_text())["fingerprint"]
         except (OSError, ValueError, KeyError, TypeError):
             found = None
         if found != self._sweep.fingerprint:
-            chunks = [name for name in self._names() if name != _LOCK]
+            chunks = [name for name in self._names() if name != _LOCK_FILE]
             if chunks and not overwrite:
                 self.close()
                 raise MapError(self.folder, "holds chunks of another sweep; --overwrite drops them")
@@ -146,19 +151,19 @@ class Parts:
     def _names(self) -> list[str]:
         return [path.name for path in self.folder.iterdir()]
 
-    def _refuse_foreign(self) -> None:
-        foreign = [name for name in self._names() if not _OWN.fullmatch(name)]
+    def _reject_foreign(self) -> None:
+        foreign = [name for name in self._names() if not _OWN_NAMES.fullmatch(name)]
         if foreign:
             raise MapError(
                 self.folder, f"holds {foreign[0]!r}, which no map wrote; move it elsewhere"
             )
 
-    def _locked(self) -> int:
+    def _acquire_lock(self) -> int:
         """The lock's file descriptor; below 0 if the folder went away meanwhile.
 
         :raises MapError: another process has it.
         """
-        path = self.folder / _LOCK
+        path = self.folder / _LOCK_FILE
         try:
             lock = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
         except FileNotFoundError:
@@ -212,19 +217,19 @@ class Parts:
     def drop(self) -> None:
         """Remove what runs wrote, and the folder if it is empty then."""
         for name in self._names():
-            if _OWN.fullmatch(name):
+            if _OWN_NAMES.fullmatch(name):
                 (self.folder / name).unlink(missing_ok=True)
         self.close()
         with suppress(OSError):
             self.folder.rmdir()
 
     def _path(self, index: int) -> Path:
-        return _part(self.folder, index)
+        return _part_path(self.folder, index)
 
 
 def save_part(folder: Path, index: int, values: Values) -> None:
     """Keep a finished chunk in a folder."""
-    path = _part(folder, index)
+    path = _part_path(folder, index)
     # Of a run that was killed a worker may still be at it.
     hidden = path.with_suffix(f".{os.getpid()}.tmp")
     with writing(path):
@@ -239,7 +244,7 @@ def save_part(folder: Path, index: int, values: Values) -> None:
             raise
 
 
-def _part(folder: Path, index: int) -> Path:
+def _part_path(folder: Path, index: int) -> Path:
     return folder / f"{index:08}.npz"
 
 
@@ -291,12 +296,12 @@ def join(sweep: Map, parts: Parts, out: Path) -> None:
     :raises MapError: a damaged chunk.
     :raises OSError: the disk is full, or the target cannot be written.
     """
-    hidden = parts.folder / _JOINED
+    hidden = parts.folder / _JOINED_FILE
     try:
         with hidden.open("w+b", buffering=0) as file:
             sink = _Sink(file)
             try:
-                _join(sweep, parts, sink)
+                _write_file(sweep, parts, sink)
             except Exception:
                 # What the library makes of a disk that is full.
                 if sink.error is None:
@@ -310,7 +315,7 @@ def join(sweep: Map, parts: Parts, out: Path) -> None:
         hidden.unlink(missing_ok=True)
 
 
-def _join(sweep: Map, parts: Parts, sink: _Sink) -> None:
+def _write_file(sweep: Map, parts: Parts, sink: _Sink) -> None:
     h5netcdf = require("h5netcdf", "atlas")
     summaries = sweep.summaries(parts.grid())
     with h5netcdf.File(sink, "w") as file:
@@ -319,10 +324,10 @@ def _join(sweep: Map, parts: Parts, sink: _Sink) -> None:
             for variable in summaries.values()
             for dim, size in zip(variable.dims, variable.values.shape, strict=True)
         }
-        for key, value in (sweep.attributes | SEALED).items():
+        for key, value in (sweep.attributes | CHECKSUM_ATTRIBUTE).items():
             file.attrs[key] = value
         for name, coordinate in (sweep.coordinates | summaries).items():
-            _write(file, name, coordinate.dims, coordinate.values, coordinate.attrs)
+            _write_variable(file, name, coordinate.dims, coordinate.values, coordinate.attrs)
         sizes = sweep.sizes
         fields = sweep.fields
         for name, field in fields.items():
@@ -333,9 +338,9 @@ def _join(sweep: Map, parts: Parts, sink: _Sink) -> None:
             rows = (1, *shape[1:3], 1, *shape[4:]) if planes else (sweep.rows, *shape[1:])
             chunks = tuple(min(sides) for sides in zip(rows, shape, strict=True))
             target = file.create_variable(
-                name, field.dims, field.dtype, fillvalue=fill, chunks=chunks, **_STORED
+                name, field.dims, field.dtype, fillvalue=fill, chunks=chunks, **_FIELD_FILTERS
             )
-            target.attrs.update(_typed(field.attrs, field.dtype))
+            target.attrs.update(_convert_bounds(field.attrs, field.dtype))
         for chunk, values in parts:
             if sink.error is not None:
                 raise sink.error
@@ -343,7 +348,7 @@ def _join(sweep: Map, parts: Parts, sink: _Sink) -> None:
                 file[name][chunk.place(fields[name].dims)] = values[name]
 
 
-def _write(file: Any, name: str, dims: tuple[str, ...], values: Any, attrs: Any) -> None:
+def _write_variable(file: Any, name: str, dims: tuple[str, ...], values: Any, attrs: Any) -> None:
     array = np.asarray(values)
     if array.dtype.kind == "U":
         h5py = require("h5py", "atlas")
@@ -354,10 +359,10 @@ def _write(file: Any, name: str, dims: tuple[str, ...], values: Any, attrs: Any)
         filters = {"fletcher32": True} if array.size and array.ndim else {}
         variable = file.create_variable(name, dims, array.dtype, **filters)
         variable[...] = array
-    variable.attrs.update(_typed(attrs, array.dtype))
+    variable.attrs.update(_convert_bounds(attrs, array.dtype))
 
 
-def _typed(attrs: Mapping[str, Any], dtype: Any) -> dict[str, Any]:
+def _convert_bounds(attrs: Mapping[str, Any], dtype: Any) -> dict[str, Any]:
     """Attributes, bounds in the type of their variable, as the CF conventions want them."""
     return {
         key: np.asarray(value, dtype)[()] if key.startswith("valid_") else value
@@ -365,7 +370,7 @@ def _typed(attrs: Mapping[str, Any], dtype: Any) -> dict[str, Any]:
     }
 
 
-def _opened(xarray: Any, path: Path) -> Dataset:
+def _open_dataset(xarray: Any, path: Path) -> Dataset:
     """The data set of a file.
 
     What the library leaves half made of a damaged file complains when it goes: here, unheard.
@@ -375,7 +380,7 @@ def _opened(xarray: Any, path: Path) -> Dataset:
         try:
             data: Dataset = xarray.open_dataset(path, engine="h5netcdf")
         except Exception as error:
-            what = _damage(error)
+            what = _describe_damage(error)
         else:
             return data
         gc.collect()
@@ -384,7 +389,7 @@ def _opened(xarray: Any, path: Path) -> Dataset:
         sys.unraisablehook = hook
 
 
-def _damage(error: Exception) -> str:
+def _describe_damage(error: Exception) -> str:
     what = " ".join(str(error).split())[:200]
     return f"no map of `pkm-twin map`, or damaged: {what}"
 
@@ -404,20 +409,20 @@ def open_map(path: Path) -> Dataset:
         if not path.is_file():
             raise MapError(path, "no regular file")
         # Before HDF5 sees the file: damage may end the process there.
-        whole = seal_holds(path)
+        whole = verify_checksum(path)
     if whole is False:
         raise MapError(path, "damaged, or changed by another program: its checksum differs")
-    data = _opened(xarray, path)
+    data = _open_dataset(xarray, path)
     try:
-        if data.attrs.get("format") != FORMAT:
+        if data.attrs.get("format") != FORMAT_VERSION:
             older = "kind" in data.attrs and "robot" in data.attrs
             what = "made by an earlier version: build it again" if older else "no map"
             raise MapError(path, what)
-        if whole is None and SEALED.keys() <= data.attrs.keys():
+        if whole is None and CHECKSUM_ATTRIBUTE.keys() <= data.attrs.keys():
             what = "damaged, or written by another program: its checksum is missing"
             raise MapError(path, what)
         with reading(path):
-            wrong = nonsense(data)
+            wrong = find_invalid_number(data)
         if wrong:
             raise MapError(path, f"no map of `pkm-twin map`, or damaged: {wrong}")
     except MapError:
@@ -437,7 +442,7 @@ def seal(file: BinaryIO) -> None:
         rest = rest[file.write(rest) :]
 
 
-def seal_holds(path: Path) -> bool | None:
+def verify_checksum(path: Path) -> bool | None:
     """Whether the checksum at a file's end is that of the file; None where there is none."""
     with path.open("rb") as file:
         size = file.seek(0, 2) - _SEAL
@@ -451,13 +456,13 @@ def seal_holds(path: Path) -> bool | None:
 def _digest(file: BinaryIO, size: int) -> bytes:
     file.seek(0)
     found = hashlib.sha256()
-    while size > 0 and (block := file.read(min(size, _BLOCK))):
+    while size > 0 and (block := file.read(min(size, _BLOCK_SIZE))):
         found.update(block)
         size -= len(block)
     return found.digest()
 
 
-def nonsense(data: Dataset) -> str:
+def find_invalid_number(data: Dataset) -> str:
     """What is wrong with the numbers of a map, for an error; empty where nothing is.
 
     Axes and other coordinates are finite, axes never decrease, nothing is infinite. All numbers
@@ -484,11 +489,11 @@ def nonsense(data: Dataset) -> str:
 
 def _slabs(variable: Any) -> Iterator[NDArray[Any]]:
     """All numbers of a variable: at once where they are few, else along its first two axes."""
-    if variable.size <= _SLAB or variable.ndim < 2:
+    if variable.size <= _SLAB_SIZE or variable.ndim < 2:
         yield np.asarray(variable.values)
         return
     first, second, *rest = variable.shape
-    rows = max(1, _SLAB // math.prod(rest))
+    rows = max(1, _SLAB_SIZE // math.prod(rest))
     for k in range(first):
         for start in range(0, second, rows):
             yield np.asarray(variable[k, start : start + rows].values)

@@ -25,9 +25,9 @@ from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError
 from pkm_twin.maps.kind import (
     FLAG,
-    FORMAT,
-    POSITIVE,
-    SHARE,
+    FORMAT_VERSION,
+    NON_NEGATIVE,
+    UNIT_INTERVAL,
     Case,
     Field,
     Found,
@@ -37,26 +37,26 @@ from pkm_twin.maps.kind import (
     Values,
     Variable,
     Worst,
-    about,
-    found_of,
-    number,
-    texts,
+    describe,
+    evaluate_kind,
+    name_labels,
+    scalar,
 )
 from pkm_twin.maps.kinds.workspace import LAYERS, circle_variables, circles
-from pkm_twin.maps.search import COARSE, FULL, badness, workspace_box, worst_of
+from pkm_twin.maps.search import GRID_SIDE, MAX_GRID_DIMENSIONS, badness, find_worst, workspace_box
 from pkm_twin.robot.clearance import has_clearance, joint_clearance
 from pkm_twin.robot.robot import Robot
 from pkm_twin.robot.workspace import LEAST_TILT, distance_unit, keeps_limits
 
-LONGEST: Final = 2001
+MAX_TICKS: Final = 2001
 """Most poses along one coordinate."""
-KEPT: Final = 16
+STARTS_PER_CHUNK: Final = 16
 """Worst poses of a chunk that the search may begin at."""
 ZOOMS: Final = 3
 """How often the part of a plane that is reachable is looked for, each time finer."""
-LEAST_VIEW: Final = 0.1
+MIN_VIEW_FRACTION: Final = 0.1
 """Part of a coordinate's range that a plane shows at least on each side of its pose."""
-SIDES: Final = (11, 151)
+PLANE_SIDE_RANGE: Final = (11, 151)
 """Fewest and most poses along a side of a plane."""
 
 
@@ -120,25 +120,27 @@ class Map(Space):
         axes, elements = self.kind.axes(self.robot), self.elements
         turn = {"units": "1", "valid_min": -1.0, "valid_max": 1.0}
         names = {"valid_min": -1, "valid_max": len(elements) - 1}
-        value = about(self.kind.name, "", {} if self.kind.signed else POSITIVE)
-        blame = about(f"index of the {self.kind.element}", "", names)
+        value = describe(self.kind.name, "", {} if self.kind.signed else NON_NEGATIVE)
+        blame = describe(f"index of the {self.kind.element}", "", names)
         grid, plane = (*self.dims, "case"), ("plane", "row", "column", "case")
         fields = {"value": Field(grid, value)}
         if axes:
-            fields["direction"] = Field((*grid, "axis"), about("of the value", "", turn))
+            fields["direction"] = Field((*grid, "axis"), describe("of the value", "", turn))
         if elements:
             fields["dominant"] = Field(grid, blame, "i2")
-        share = about("share of an element", "", SHARE)
+        share = describe("share of an element", "", UNIT_INTERVAL)
         if self.kind.has_shares:
             fields["factor"] = Field((*grid, "element"), share)
         if not self.ticks:
-            fields["pose"] = Field(("sample", "coordinate"), about("pose of a sample, m and rad"))
+            fields["pose"] = Field(
+                ("sample", "coordinate"), describe("pose of a sample, m and rad")
+            )
         fields["plane_value"] = Field(plane, value)
         if elements:
             fields["plane_dominant"] = Field(plane, blame, "i2")
         if self.kind.has_shares:
             fields["plane_factor"] = Field((*plane, "element"), share)
-        reach = about("1 where all limits are kept", "", FLAG)
+        reach = describe("1 where all limits are kept", "", FLAG)
         return fields | {"plane_reach": Field(plane, reach, "i1")}
 
     @property
@@ -147,21 +149,21 @@ class Map(Space):
         robot, cases = self.robot, self.cases
         named = list(zip(robot.pose_names, robot.pose_units, strict=True))
         result = {
-            name: Variable((name,), ticks, about(f"pose coordinate {name}", unit))
+            name: Variable((name,), ticks, describe(f"pose coordinate {name}", unit))
             for (name, unit), ticks in zip(named, self.ticks, strict=False)
         }
-        result |= {"coordinate": texts("coordinate", robot.pose_names),
-                   "unit": texts("coordinate", robot.pose_units),
-                   "case": texts("case", [case.name for case in cases])}  # fmt: skip
+        result |= {"coordinate": name_labels("coordinate", robot.pose_names),
+                   "unit": name_labels("coordinate", robot.pose_units),
+                   "case": name_labels("case", [case.name for case in cases])}  # fmt: skip
         for word in ("what", "unit", "answer"):
-            result[f"case_{word}"] = texts("case", [getattr(case, word) for case in cases])
+            result[f"case_{word}"] = name_labels("case", [getattr(case, word) for case in cases])
         for k, dim in enumerate(("row", "column")):
             shown = [robot.pose_names[p[k]] if k < len(p) else "" for p in self.planes]
-            result[f"{dim}_name"] = texts("plane", shown)
+            result[f"{dim}_name"] = name_labels("plane", shown)
         if axes := self.kind.axes(robot):
-            result["axis"] = texts("axis", axes)
+            result["axis"] = name_labels("axis", axes)
         if self.elements:
-            result["element"] = texts("element", self.elements)
+            result["element"] = name_labels("element", self.elements)
         return result
 
     @property
@@ -184,7 +186,7 @@ class Map(Space):
         return {
             "title": f"{self.kind.name} of {self.robot.name}",
             "Conventions": "CF-1.10",
-            "format": FORMAT,
+            "format": FORMAT_VERSION,
             "kind": self.kind.name,
             "question": self.kind.question,
             "element": self.kind.element,
@@ -223,11 +225,11 @@ class Map(Space):
 
     def chunks(self) -> list[Chunk]:
         """All chunks: those of the grid, then those of the planes."""
-        chunks = _parted(self.shape[0], self.rows)
+        chunks = _split_rows(self.shape[0], self.rows)
         rows = max(1, self.kind.chunk // self.sizes["column"])
         cases = (None,) if self.kind.together else range(len(self.cases))
         for plane, case in itertools.product(range(len(self.planes)), cases):
-            chunks += [replace(c, plane=plane, case=case) for c in _parted(self.side, rows)]
+            chunks += [replace(c, plane=plane, case=case) for c in _split_rows(self.side, rows)]
         return chunks
 
     def count(self, chunk: Chunk) -> int:
@@ -243,22 +245,24 @@ class Map(Space):
     def plane_ticks(self, plane: int, case: int) -> list[Array]:
         """Coordinates along a plane's sides; its pose is among them."""
         sides = zip(self.planes[plane], self.extents[case][plane], strict=False)
-        return [_ticks(ends, self.through(case)[k], self.side) for k, ends in sides]
+        return [_make_ticks(ends, self.through(case)[k], self.side) for k, ends in sides]
 
-    def _extent(self, plane: int, case: int) -> Array:
+    def _find_extent(self, plane: int, case: int) -> Array:
         """Ends of a plane's sides (2, 2), around what is reachable in it and its pose."""
         shown, pose = list(self.planes[plane]), self.through(case)
         box = bounds = self.bounds[shown]
         least, most = np.minimum(bounds[:, 0], pose[shown]), np.maximum(bounds[:, 1], pose[shown])
         for _ in range(ZOOMS):
-            ticks = [_ticks(ends, pose[k], COARSE) for k, ends in zip(shown, box, strict=True)]
+            ticks = [
+                _make_ticks(ends, pose[k], GRID_SIDE) for k, ends in zip(shown, box, strict=True)
+            ]
             poses = self._plane_poses(plane, case, ticks)
             q, _, known = self.of_poses(poses)
             reach = keeps_limits(self.robot, q, poses, -math.inf, known)
             seen = np.concatenate([poses[reach], pose[None]])[:, shown]
             # More than a step: a tip between the poses of this grid is seen on the next.
             margin = 1.5 * np.array([np.diff(side).max() for side in ticks])
-            around = np.maximum(margin, LEAST_VIEW * np.ptp(bounds, axis=1))
+            around = np.maximum(margin, MIN_VIEW_FRACTION * np.ptp(bounds, axis=1))
             low = np.minimum(seen.min(0) - margin, pose[shown] - around)
             high = np.maximum(seen.max(0) + margin, pose[shown] + around)
             box = np.stack([np.maximum(low, least), np.minimum(high, most)], -1)
@@ -292,7 +296,7 @@ class Map(Space):
         parts = 1 + len(states[0]) // self.kind.chunk
         cases = self.cases if chunk.case is None else (self.cases[chunk.case],)
         batches = zip(*(np.array_split(array, parts) for array in states), strict=True)
-        done = [self._values(q, pose, known, cases) for q, pose, known in batches]
+        done = [self._evaluate_batch(q, pose, known, cases) for q, pose, known in batches]
         joined = {name: np.concatenate([one[name] for one in done]) for name in done[0]}
         total, starts = joined.pop("counts").sum(0), joined.pop("starts")
         if chunk.plane is None:
@@ -300,7 +304,7 @@ class Map(Space):
             values = {"counts": total, "starts": starts} | joined
         else:
             shape = (chunk.stop - chunk.start, self.sizes["column"])
-            self._put_worst(joined, states[1], chunk.case)
+            self._store_worst(joined, states[1], chunk.case)
             values = {chunk.before + name: array for name, array in joined.items()}
         fields = self.fields
         return {
@@ -309,16 +313,16 @@ class Map(Space):
             if name in fields or name in ("counts", "starts")
         }
 
-    def _put_worst(self, values: Values, poses: Array, case: int | None) -> None:
+    def _store_worst(self, values: Values, poses: Array, case: int | None) -> None:
         """Write the worst where its pose is: by inverse kinematics it may be out by rounding."""
         cases = range(len(self.cases)) if case is None else [case]
         for column, k in enumerate(cases):
             worst = self.worst[k]
             kept = (poses == worst.pose).all(-1)
-            _put(values, column, kept, worst.found)
+            _store(values, column, kept, worst.found)
             values["reach"][kept, column] = 1
 
-    def _values(self, q: Array, pose: Array, known: Mask, cases: Sequence[Case]) -> Values:
+    def _evaluate_batch(self, q: Array, pose: Array, known: Mask, cases: Sequence[Case]) -> Values:
         robot, count = self.robot, len(q)
         reach = keeps_limits(robot, q, pose, -math.inf, known)
         inside = reach & self.encircled(pose)
@@ -336,20 +340,20 @@ class Map(Space):
             "reach": np.repeat(reach[:, None], len(cases), 1).astype(np.int8),
             "pose": np.where(known[:, None], pose, np.nan),
             "counts": np.array([[inside.sum(), apart.sum(), count]]),
-            "starts": np.full((1, len(cases), KEPT, pose.shape[-1]), np.nan),
+            "starts": np.full((1, len(cases), STARTS_PER_CHUNK, pose.shape[-1]), np.nan),
         }
         for interfering, kept in ((False, apart), (True, inside)):
             own = [k for k, case in enumerate(cases) if case.interfering == interfering]
             if not own:
                 continue
-            each = found_of(self.kind, robot, q[kept], [cases[k] for k in own])
+            each = evaluate_kind(self.kind, robot, q[kept], [cases[k] for k in own])
             for k, found in zip(own, each, strict=True):
-                _put(values, k, kept, found)
-                best = np.argsort(-badness(found.value, cases[k].largest))[:KEPT]
+                _store(values, k, kept, found)
+                best = np.argsort(-badness(found.value, cases[k].largest))[:STARTS_PER_CHUNK]
                 values["starts"][0, k, : len(best)] = pose[kept][best]
         return values
 
-    def searched(self, grid: Iterable[Values]) -> Map:
+    def with_worst(self, grid: Iterable[Values]) -> Map:
         """With the worst pose of each case.
 
         :param grid: results of all chunks of the grid.
@@ -360,38 +364,38 @@ class Map(Space):
         def worst(k: int) -> Worst:
             first = starts[:, k].reshape(-1, starts.shape[-1])
             first = first[np.isfinite(first[:, 0])]
-            return worst_of(self, self.cases[k], first)
+            return find_worst(self, self.cases[k], first)
 
         count = range(len(self.cases))
         if self.kind.together:
             one = worst(0)
-            every = found_of(self.kind, self.robot, one.q[None], self.cases)
+            every = evaluate_kind(self.kind, self.robot, one.q[None], self.cases)
             found = replace(self, worst=tuple(replace(one, found=value) for value in every))
         else:
             found = replace(self, worst=tuple(map(worst, count)))
         planes = range(len(self.planes))
-        extents = tuple(np.array([found._extent(p, k) for p in planes]) for k in count)
+        extents = tuple(np.array([found._find_extent(p, k) for p in planes]) for k in count)
         return replace(found, extents=extents)
 
     def summaries(self, grid: Iterable[Values]) -> dict[str, Variable]:
         """The worst of each case, the planes' axes, and what the kind says of the workspace."""
         counted, apart, every = np.sum([values["counts"] for values in grid], axis=0).tolist()
-        result = {"valid": number(apart / every, "part of the grid that counts", "", SHARE)}
+        result = {"valid": scalar(apart / every, "part of the grid that counts", "", UNIT_INTERVAL)}
         for k, dim in enumerate(("row", "column")):
             sides = [
                 [[*self.plane_ticks(p, c), np.zeros(1)][k] for p in range(len(self.planes))]
                 for c in range(len(self.cases))
             ]
-            what = about(f"pose coordinate along the {dim}s")
+            what = describe(f"pose coordinate along the {dim}s")
             result[f"{dim}_value"] = Variable(("case", "plane", dim), np.array(sides), what)
         poses = np.array([self.through(k) for k in range(len(self.cases))])
-        what = about("pose that the planes go through, m and rad")
+        what = describe("pose that the planes go through, m and rad")
         result["through"] = Variable(("case", "coordinate"), poses, what)
         if self.circles is not None:
             result |= circle_variables(self.robot, *self.circles)
-        return result | self._worst() | self.kind.summaries(self, counted, apart)
+        return result | self._worst_variables() | self.kind.summaries(self, counted, apart)
 
-    def _worst(self) -> dict[str, Variable]:
+    def _worst_variables(self) -> dict[str, Variable]:
         """Value, pose, singularity index, direction and element of the worst poses."""
         worst, what = self.worst, "the worst value"
         value = [one.found.value[0] for one in worst]
@@ -399,29 +403,33 @@ class Map(Space):
         bound = [self.least if one.bounded else np.nan for one in worst]
         least = f"singularity index below which poses are worse than {what}, if it is there"
         result = {
-            "worst_value": Variable(("case",), np.array(value), about(what)),
+            "worst_value": Variable(("case",), np.array(value), describe(what)),
             "worst_singularity": Variable(
-                ("case",), np.array(index), about(f"singularity index of {what}", "", SHARE)
+                ("case",),
+                np.array(index),
+                describe(f"singularity index of {what}", "", UNIT_INTERVAL),
             ),
-            "worst_bound": Variable(("case",), np.array(bound), about(least, "", SHARE)),
+            "worst_bound": Variable(("case",), np.array(bound), describe(least, "", UNIT_INTERVAL)),
             "worst_pose": Variable(
-                ("case", "coordinate"), np.array([one.pose for one in worst]), about(f"of {what}")
+                ("case", "coordinate"),
+                np.array([one.pose for one in worst]),
+                describe(f"of {what}"),
             ),
         }
         if self.kind.axes(self.robot):
             none_of = np.full((1, len(self.kind.axes(self.robot))), np.nan)
             ways = [none_of if (d := one.found.direction) is None else d for one in worst]
             result["worst_direction"] = Variable(
-                ("case", "axis"), np.concatenate(ways), about(f"of {what}")
+                ("case", "axis"), np.concatenate(ways), describe(f"of {what}")
             )
         if self.elements:
-            names = about(f"index of the {self.kind.element}", "", {"valid_min": -1})
+            names = describe(f"index of the {self.kind.element}", "", {"valid_min": -1})
             blame = np.array([-1 if (e := one.found.element) is None else e[0] for one in worst])
             result["worst_element"] = Variable(("case",), blame, names)
         return result
 
 
-def _put(values: Values, case: int, kept: Mask, found: Found) -> None:
+def _store(values: Values, case: int, kept: Mask, found: Found) -> None:
     """Write what was found in the poses kept."""
     finite = np.isfinite(found.value)
     values["value"][kept, case] = np.where(finite, found.value, np.nan)
@@ -433,14 +441,14 @@ def _put(values: Values, case: int, kept: Mask, found: Found) -> None:
         values["factor"][kept, case] = found.shares
 
 
-def _ticks(ends: Array, value: float, count: int) -> Array:
+def _make_ticks(ends: Array, value: float, count: int) -> Array:
     """Numbers between ends (2,), evenly but for one that is a value; wider where it is outside."""
     ticks = np.linspace(min(ends[0], value), max(ends[1], value), count)
     ticks[np.abs(ticks - value).argmin()] = value
     return np.asarray(ticks, np.float64)
 
 
-def _parted(count: int, rows: int) -> list[Chunk]:
+def _split_rows(count: int, rows: int) -> list[Chunk]:
     return [Chunk(start, min(start + rows, count)) for start in range(0, count, rows)]
 
 
@@ -490,8 +498,8 @@ def map_of(
         stack = find_circles(robot, bounds, least, least_clearance)
         bounds = _bound_circles(robot, stack)
     ticks: tuple[Array, ...] = ()
-    if count <= FULL:
-        length = max(5, min(round(total ** (1 / count)), LONGEST))
+    if count <= MAX_GRID_DIMENSIONS:
+        length = max(5, min(round(total ** (1 / count)), MAX_TICKS))
         # Odd across an axis, so that the axis is on the grid.
         odd = length + 1 - length % 2
         lateral = robot.grid().lateral
@@ -500,8 +508,9 @@ def map_of(
             for (low, high), name in zip(bounds, robot.pose_names, strict=True)
         )
     side = round(math.sqrt(total / (3 if count > 2 else 1))) if count > 1 else total
+    fewest, most = PLANE_SIDE_RANGE
     return Map(
-        robot, kind, cases, bounds, ticks, total, min(max(side, SIDES[0]), SIDES[1]), least,
+        robot, kind, cases, bounds, ticks, total, min(max(side, fewest), most), least,
         least_clearance, None if at is None else np.array(at, np.float64), circles=stack,
     )  # fmt: skip
 
@@ -544,4 +553,4 @@ def check(robot: Robot, kind: Kind, cases: Sequence[Case]) -> None:
     :raises ParameterError: by the section.
     """
     kind.elements(robot)
-    found_of(kind, robot, robot.graph.home[None], cases)
+    evaluate_kind(kind, robot, robot.graph.home[None], cases)

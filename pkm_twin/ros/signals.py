@@ -26,7 +26,7 @@ because an exception that is raised in a callback of a C library is lost."""
 class _Process:
     """Hold the process's state without a lock: a handler may interrupt a handler."""
 
-    asked = -float("inf")
+    requested = -float("inf")
     ending = False
 
 

@@ -293,13 +293,13 @@ class Model:
         :raises PkmTwinError: no elasticity in the robot's file, or no pose that counts.
         """
         from pkm_twin.maps.kinds.compliance import Compliance
-        from pkm_twin.maps.search import worst_of
+        from pkm_twin.maps.search import find_worst
         from pkm_twin.maps.sweep import map_of
 
         robot, kind = self.robot, Compliance()
         cases = [kind.loaded(robot, "load", wrench.tolist())] if wrench.any() else ()
         space = map_of(robot, kind, cases=cases)
-        worst = worst_of(space, space.cases[0], self.start.pose[None], tell)
+        worst = find_worst(space, space.cases[0], self.start.pose[None], tell)
         what = "largest deflection {:.4g} µm" if cases else "softest: {:.4g} µm/N"
         direction = np.zeros(3) if worst.found.direction is None else worst.found.direction
         along = ", ".join(f"{part:.2f}" for part in np.round(direction.reshape(-1), 2) + 0.0)

@@ -46,7 +46,7 @@ def shorten(patch, chunk=Kind.chunk):
         patch.setattr(Frequency, name, most // 4)
     patch.setattr(Kind, "chunk", chunk)
     patch.setattr("pkm_twin.maps.kinds.workspace.LAYERS", 31)
-    patch.setattr("pkm_twin.maps.sweep.COARSE", 21)
+    patch.setattr("pkm_twin.maps.sweep.GRID_SIDE", 21)
 
 
 @pytest.fixture

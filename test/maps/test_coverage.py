@@ -89,7 +89,7 @@ def test_planes_of_every_number_of_coordinates(name, tmp_path, monkeypatch):
     """Through the least singularity index: values are those of the poses that planes have."""
     from matplotlib import pyplot
 
-    monkeypatch.setattr("pkm_twin.maps.sweep.COARSE", 21)
+    monkeypatch.setattr("pkm_twin.maps.sweep.GRID_SIDE", 21)
     robot = load(name)
     size = len(robot.pose_names)
     with open_map(run(map_of(robot, Workspace(), 3000), tmp_path / "a.nc", workers=1)) as data:

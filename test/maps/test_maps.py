@@ -14,12 +14,12 @@ from pkm_twin.errors import ParameterError
 from pkm_twin.machine.strict_yaml import read_yaml
 from pkm_twin.maps import figures
 from pkm_twin.maps.figures import shown
-from pkm_twin.maps.kind import counts, found_of
+from pkm_twin.maps.kind import counts, evaluate_kind
 from pkm_twin.maps.kinds import KINDS
 from pkm_twin.maps.kinds.cutting_depth import CuttingDepth
 from pkm_twin.maps.kinds.frequency import Frequency
 from pkm_twin.maps.run import run
-from pkm_twin.maps.search import badness, evolved, worst_of
+from pkm_twin.maps.search import badness, evolve, find_worst
 from pkm_twin.maps.store import open_map
 from pkm_twin.maps.sweep import map_of
 from pkm_twin.mechanisms.catalogue import robot_of_data
@@ -51,7 +51,7 @@ def states(robot, rng, count, least=LEAST):
 
 def found(robot, name, q, wrench=None):
     kind = KINDS[name]()
-    return found_of(kind, robot, q, [case_of(kind, robot, wrench)])[0]
+    return evaluate_kind(kind, robot, q, [case_of(kind, robot, wrench)])[0]
 
 
 def case_of(kind, robot, wrench=None, name="case"):
@@ -218,7 +218,7 @@ def test_documented_worst_values():
     page, robot, kind = "docs/maps.md", load("delta"), KINDS["compliance"]()
     (softest,) = numbers(page, r"softest: (\S+) µm/N along")
     sweep = map_of(robot, kind)
-    worst = worst_of(sweep, sweep.cases[0], np.empty((0, 3)))
+    worst = find_worst(sweep, sweep.cases[0], np.empty((0, 3)))
     assert 1e6 * worst.found.value[0] == pytest.approx(softest, rel=0.01)
     assert worst.bounded and worst.index == pytest.approx(LEAST, rel=1e-3)
     # Also as it is printed.
@@ -228,7 +228,7 @@ def test_documented_worst_values():
     push, x, y, z, lift = numbers(page, pattern + r"most: (\S+) µm")
     q = robot.inverse([[x, y, z]])
     for value, wrench in ((push, (30.0, 0, 0, 0, 0, 0)), (lift, (0, 0, 30.0, 0, 0, 0))):
-        moved = found_of(kind, robot, q, [kind.loaded(robot, "load", wrench)])[0]
+        moved = evaluate_kind(kind, robot, q, [kind.loaded(robot, "load", wrench)])[0]
         assert 1e6 * moved.value[0] == pytest.approx(value, rel=1e-3)
 
 
@@ -317,7 +317,7 @@ def test_a_search_finds_what_is_best_at_the_border(rng):
         population, rounds = 8, 30
 
     best = [
-        evolved(
+        evolve(
             lambda x: np.where((x**2).sum(1) <= 1.0, x[:, 0] + 0.2 * x[:, 1], -np.inf),
             rng.uniform(-0.7, 0.7, (8, 2)), np.full(2, -1.0), np.ones(2), Few(), rng, inside,
         )[1]
@@ -342,11 +342,11 @@ def test_kinds_of_one_machine_agree(rng):
     found = {}
     for kind in (KINDS[name]() for name in ("payload", "acceleration", "speeds")):
         sweep = map_of(robot, kind)
-        found[kind] = sweep.cases[0], worst_of(sweep, sweep.cases[0], np.empty((0, 3)))
+        found[kind] = sweep.cases[0], find_worst(sweep, sweep.cases[0], np.empty((0, 3)))
     tried = np.vstack([q, *(worst.q for _, worst in found.values())])
     assert len(q) > 20
     for kind, (case, worst) in found.items():
-        (other,) = found_of(kind, robot, tried, [case])
+        (other,) = evaluate_kind(kind, robot, tried, [case])
         least = badness(worst.found.value, case.largest)[0]
         assert (badness(other.value, case.largest) <= least + 0.01 * abs(least)).all(), kind.name
     payload, acceleration = (found[kind][1].found.value[0] for kind in list(found)[:2])
@@ -358,7 +358,7 @@ def test_the_lowest_frequency_is_found():
     """The Delta rings lowest where the singularity index is as low as it may be."""
     robot = load("delta")
     sweep = map_of(robot, Frequency())
-    worst = worst_of(sweep, sweep.cases[0], np.empty((0, 3)))
+    worst = find_worst(sweep, sweep.cases[0], np.empty((0, 3)))
     assert robot.singularity(worst.q) == pytest.approx(LEAST, abs=2e-3)
     # 44.03 Hz by five times the rounds.
     assert worst.found.value[0] < 44.03 * 1.002
@@ -478,7 +478,7 @@ def test_isotropy_is_that_of_directions(name, rng):
     robot = load(name)
     q = states(robot, rng, 60)[:3]
     kind = KINDS["isotropy"]()
-    energy, force = found_of(kind, robot, q, kind.cases(robot))
+    energy, force = evaluate_kind(kind, robot, q, kind.cases(robot))
     ways = rng.normal(size=(300, len(robot.pose_names)))
     for k, pose in enumerate(robot.forward(q)):
         assert energy_transfer(robot, pose, energy.direction[k]) == pytest.approx(energy.value[k])
@@ -492,7 +492,7 @@ def test_a_workspace_in_which_nothing_counts_names_the_cause(name):
     robot = load(name)
     sweep = map_of(robot, KINDS["compliance"](), 60, least_singularity=0.999)
     with pytest.raises(ParameterError, match=r"no pose has a singularity index of 0\.999 or more"):
-        worst_of(sweep, sweep.cases[0], np.empty((0, len(robot.pose_names))))
+        find_worst(sweep, sweep.cases[0], np.empty((0, len(robot.pose_names))))
 
 
 @pytest.mark.parametrize(

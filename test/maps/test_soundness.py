@@ -9,7 +9,7 @@ pytest.importorskip("h5py")
 
 import h5py
 
-from pkm_twin.maps.store import SEALED, MapError, open_map, seal
+from pkm_twin.maps.store import CHECKSUM_ATTRIBUTE, MapError, open_map, seal
 from test.support.robots import partly_long
 
 NAMES = partly_long(["modes prru", "workspace delta_cu", "isotropy delta_cu"], "workspace delta_cu")
@@ -33,7 +33,7 @@ def copy(tmp_path, small_maps):
         path.write_bytes(small_maps[name].read_bytes()[:-SEAL])
         with h5py.File(path, "r+") as file:
             if not sealed:
-                for key in SEALED:
+                for key in CHECKSUM_ATTRIBUTE:
                     del file.attrs[key]
             change(file)
         if sealed:
@@ -128,7 +128,7 @@ def test_numbers_that_cannot_be_are_found_in_a_whole_file(copy, name, change, na
 
 def test_large_fields_are_judged_part_by_part(copy, monkeypatch):
     """As the whole is: in each part a number that cannot be is found."""
-    monkeypatch.setattr("pkm_twin.maps.store._SLAB", 500)
+    monkeypatch.setattr("pkm_twin.maps.store._SLAB_SIZE", 500)
     open_map(copy("workspace delta_cu", lambda _: None, sealed=True)).close()
     for corner in [(0, 0, 0), (16, 16, 15), (8, 16, 0), (3, 9, 15)]:
         change = put("value", (*corner, 1), math.inf)

@@ -339,7 +339,7 @@ def swept(given: Design, path: Path, kind: str) -> Report:
     from pkm_twin.design.sweep import here
     from pkm_twin.design.variables import parse_vary
     from pkm_twin.errors import require
-    from pkm_twin.maps.run import on_cluster
+    from pkm_twin.maps.run import compute_on_cluster
 
     out = given.out
     if kind not in SWEEPS:
@@ -355,7 +355,9 @@ def swept(given: Design, path: Path, kind: str) -> Report:
     robot, way = read_path(given, path)
     box = parse_vary(given.vary)
     grid = kind == "grid"
-    compute = here if given.scheduler is None else partial(on_cluster, scheduler=given.scheduler)
+    compute = (
+        here if given.scheduler is None else partial(compute_on_cluster, scheduler=given.scheduler)
+    )
     with progress("machines", given.samples ** len(box) if grid else given.samples) as update:
         table = sweep_box(
             robot, box, way, None, given.samples,

@@ -13,8 +13,8 @@ from pkm_twin.maps.kind import (
     Case,
     Found,
     Kind,
-    least_room,
-    limits_of,
+    drive_limits,
+    tightest_limit,
     unit_motions,
     unit_of_motion,
 )
@@ -45,7 +45,7 @@ class Acceleration(Kind):
 
         0 where the drives do not hold the machine.
         """
-        limits, still = limits_of(robot, "effort"), np.zeros_like(q)
+        limits, still = drive_limits(robot, "effort"), np.zeros_like(q)
         back, axes = unit_motions(robot, q)
         held = inverse_dynamics(robot, q, still, still, case.wrench)
         columns = [inverse_dynamics(robot, q, still, c, case.wrench) - held
@@ -55,5 +55,5 @@ class Acceleration(Kind):
         with np.errstate(divide="ignore", invalid="ignore"):
             room = np.where(size > 0.0, (limits - np.abs(held)) / size, np.inf)
         sign = np.where(held < 0.0, -1.0, 1.0)[..., None]
-        value, direction, drive = least_room(room, sign * (each @ axes))
+        value, direction, drive = tightest_limit(room, sign * (each @ axes))
         return Found(np.maximum(value, 0.0), direction, drive)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import require
 from pkm_twin.machine.graph import BASE
-from pkm_twin.maps.kind import POSITIVE, SHARE, Case, Space, Variable, about
+from pkm_twin.maps.kind import NON_NEGATIVE, UNIT_INTERVAL, Case, Space, Variable, describe
 from pkm_twin.maps.kinds.frequency import Frequency
 from pkm_twin.report import plots
 from pkm_twin.robot.robot import Robot
@@ -25,12 +25,12 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from xarray import Dataset
 
-COUNT: Final = 6
-DRAWN: Final = 3
+MODE_COUNT: Final = 6
+DRAWN_MODES: Final = 3
 """Modes in the picture of shapes."""
-ENLARGED: Final = 0.13
+MAX_DRAWN_DISPLACEMENT: Final = 0.13
 """Largest displacement of a drawn mode shape over the size of the machine."""
-PHASES: Final = 16
+FRAMES_PER_SWING: Final = 16
 """Pictures in one swing of a mode."""
 
 
@@ -47,7 +47,7 @@ class Modes(Frequency):
     def cases(self, robot: Robot) -> tuple[Case, ...]:
         """The modes, lowest first."""
         (first,) = super().cases(robot)
-        numbers = range(1, COUNT + 1)
+        numbers = range(1, MODE_COUNT + 1)
         return tuple(replace(first, name=f"mode {k}", what=f"frequency of mode {k}",
                              answer="lowest frequency" if k == 1 else "frequency there")
                      for k in numbers)  # fmt: skip
@@ -61,15 +61,15 @@ class Modes(Frequency):
         )
         ends = {"valid_min": 0, "valid_max": len(found.nodes) - 1}
         what = "displacement of the nodes in a mode of unit generalised mass"
-        share = {kind: about(f"part of the mode's {kind} energy", "", SHARE)
+        share = {kind: describe(f"part of the mode's {kind} energy", "", UNIT_INTERVAL)
                  for kind in ("strain", "kinetic")}  # fmt: skip
         return {
             "node": Variable(("node",), np.array(found.nodes, "U"), {}),
-            "line": Variable(("edge", "end"), edges, about("nodes that it joins", "", ends)),
-            "position": Variable(("node", "space"), found.positions, about("node at rest", "m")),
-            "displacement": Variable(node, found.shapes[..., :3], about(what, "1/sqrt(kg)")),
+            "line": Variable(("edge", "end"), edges, describe("nodes that it joins", "", ends)),
+            "position": Variable(("node", "space"), found.positions, describe("node at rest", "m")),
+            "displacement": Variable(node, found.shapes[..., :3], describe(what, "1/sqrt(kg)")),
             "shape_frequency": Variable(
-                ("mode",), found.frequencies, about("of the shape", "Hz", POSITIVE)
+                ("mode",), found.frequencies, describe("of the shape", "Hz", NON_NEGATIVE)
             ),
             "strain_share": Variable(part, found.energies.strain, share["strain"]),
             "kinetic_share": Variable(part, found.energies.kinetic, share["kinetic"]),
@@ -80,10 +80,10 @@ class Modes(Frequency):
         """The shapes of the lowest modes, in colours of how far each point moves."""
         from mpl_toolkits.mplot3d.art3d import Line3DCollection  # type: ignore[import-untyped]
 
-        figure, columns = plots.columns(DRAWN, 1, 4.6, subplot_kw={"projection": "3d"})
+        figure, columns = plots.columns(DRAWN_MODES, 1, 4.6, subplot_kw={"projection": "3d"})
         axes = [column[0] for column in columns]
         rest, edges = data.position.values, data.line.values
-        low, high = _ends(rest)
+        low, high = _scene_bounds(rest)
         for mode, ax in enumerate(axes):
             moved, far = deformed(data, mode)
             ax.add_collection3d(Line3DCollection(rest[edges], colors="0.7", linewidths=1.0))
@@ -96,7 +96,7 @@ class Modes(Frequency):
             ax.set_box_aspect(high - low, zoom=0.95)
             ax.view_init(elev=18, azim=-58)
             ax.set_axis_off()
-            ax.set_title("\n".join(_head(data, mode)), fontsize=9)
+            ax.set_title("\n".join(_mode_title(data, mode)), fontsize=9)
         figure.colorbar(drawn, ax=axes, aspect=25, pad=0.01).set_label(
             "displacement over the mode's largest (dimensionless)", fontsize=9
         )
@@ -114,13 +114,13 @@ class Modes(Frequency):
         graph = require("plotly.graph_objects", "atlas")
         from pkm_twin.maps.page import BAR, CAMERA, MARGIN, MENU, button
 
-        rest, path = data.position.values, _path(data.line.values)
-        low, high = _ends(rest)
+        rest, path = data.position.values, _join_edges(data.line.values)
+        low, high = _scene_bounds(rest)
         still: dict[str, Any] = {"hoverinfo": "skip", "showlegend": False}
         figure = graph.Figure()
         grey, square = {"color": "#b0b0b0"}, {"symbol": "square", "size": 4, "color": "#444"}
-        ground = _points(rest, grounded(data))
-        figure.add_scatter3d(**_points(rest, path), mode="lines", line=grey, **still)
+        ground = _path_coordinates(rest, grounded(data))
+        figure.add_scatter3d(**_path_coordinates(rest, path), mode="lines", line=grey, **still)
         figure.add_scatter3d(**ground, mode="markers", marker=square, **still)
         names = ["" if k < 0 else str(data.node.values[k]) for k in path.tolist()]
         figure.add_scatter3d(mode="lines", text=names, hovertemplate="%{text}<extra></extra>",
@@ -128,16 +128,25 @@ class Modes(Frequency):
         buttons, frames = [], []
         for mode in range(data.sizes["mode"]):
             moved, far = deformed(data, mode)
-            line = {"color": _picked(far, path, 0.0), "coloraxis": "coloraxis", "width": 7}
-            for n in range(PHASES):
-                place = rest + math.cos(2 * math.pi * n / PHASES) * (moved - rest)
-                shape = graph.Scatter3d(**_points(place, path), line=line)
+            line = {
+                "color": _values_along_path(far, path, 0.0),
+                "coloraxis": "coloraxis",
+                "width": 7,
+            }
+            for n in range(FRAMES_PER_SWING):
+                place = rest + math.cos(2 * math.pi * n / FRAMES_PER_SWING) * (moved - rest)
+                shape = graph.Scatter3d(**_path_coordinates(place, path), line=line)
                 frames.append(graph.Frame(name=f"{mode}/{n}", data=[shape], traces=[2]))
-            head = _head(data, mode)
-            change = {axis: [values] for axis, values in _points(moved, path).items()}
+            head = _mode_title(data, mode)
+            change = {axis: [values] for axis, values in _path_coordinates(moved, path).items()}
             change["line"] = [line]
             buttons.append(
-                button("; ".join(head), change, {"updatemenus[1].buttons": _players(mode)}, [2])
+                button(
+                    "; ".join(head),
+                    change,
+                    {"updatemenus[1].buttons": _animation_buttons(mode)},
+                    [2],
+                )
             )
         figure.frames = frames
         first = buttons[0]["args"][0]
@@ -158,7 +167,7 @@ class Modes(Frequency):
             updatemenus=[
                 {"buttons": buttons, **MENU},
                 {"type": "buttons", "direction": "left", "showactive": False,
-                 "buttons": _players(0), **MENU, "x": 1.0, "xanchor": "right"},
+                 "buttons": _animation_buttons(0), **MENU, "x": 1.0, "xanchor": "right"},
             ],
         )  # fmt: skip
         return figure
@@ -173,7 +182,7 @@ def deformed(data: Dataset, mode: int) -> tuple[Array, Array]:
     """
     rest, moved = data.position.values, data.displacement.values[mode]
     far = np.linalg.norm(moved, axis=1)
-    scale = ENLARGED * float(np.linalg.norm(np.ptp(rest, axis=0))) / far.max()
+    scale = MAX_DRAWN_DISPLACEMENT * float(np.linalg.norm(np.ptp(rest, axis=0))) / far.max()
     return rest + scale * moved, far / far.max()
 
 
@@ -183,7 +192,7 @@ def grounded(data: Dataset) -> NDArray[np.int64]:
     return np.asarray(nodes[count == 1], np.int64)
 
 
-def _head(data: Dataset, mode: int) -> list[str]:
+def _mode_title(data: Dataset, mode: int) -> list[str]:
     """A mode's number, its frequency, and the parts that hold most of its energy."""
     lines = [f"mode {mode + 1}: {float(data.shape_frequency[mode]):.4g} Hz"]
     for kind in ("strain", "kinetic"):
@@ -195,13 +204,13 @@ def _head(data: Dataset, mode: int) -> list[str]:
     return lines
 
 
-def _ends(rest: Array) -> tuple[Array, Array]:
+def _scene_bounds(rest: Array) -> tuple[Array, Array]:
     """Bounds of a scene that are the same for all modes, with room for the shapes."""
-    margin = 0.6 * ENLARGED * float(np.linalg.norm(np.ptp(rest, axis=0)))
+    margin = 0.6 * MAX_DRAWN_DISPLACEMENT * float(np.linalg.norm(np.ptp(rest, axis=0)))
     return rest.min(0) - margin, rest.max(0) + margin
 
 
-def _path(edges: NDArray[np.int64]) -> NDArray[np.int64]:
+def _join_edges(edges: NDArray[np.int64]) -> NDArray[np.int64]:
     """Nodes of all lines in one go; -1 between lines that do not meet."""
     path: list[int] = []
     for start, end in edges.tolist():
@@ -211,19 +220,21 @@ def _path(edges: NDArray[np.int64]) -> NDArray[np.int64]:
     return np.array(path)
 
 
-def _picked(values: Array, path: NDArray[np.int64], gap: float | None = None) -> list[Any]:
+def _values_along_path(
+    values: Array, path: NDArray[np.int64], gap: float | None = None
+) -> list[Any]:
     """Values (nodes,) along a path; a plain list, as only that can have None in its gaps."""
     return [gap if k < 0 else round(float(values[k]), 5) for k in path.tolist()]
 
 
-def _points(nodes: Array, path: NDArray[np.int64]) -> dict[str, Any]:
+def _path_coordinates(nodes: Array, path: NDArray[np.int64]) -> dict[str, Any]:
     """Coordinates of nodes (n, 3) along a path."""
-    return {axis: _picked(nodes[:, k], path) for k, axis in enumerate("xyz")}
+    return {axis: _values_along_path(nodes[:, k], path) for k, axis in enumerate("xyz")}
 
 
-def _players(mode: int) -> list[dict[str, Any]]:
+def _animation_buttons(mode: int) -> list[dict[str, Any]]:
     """Buttons that swing a mode ten times and hold it; plotly cannot repeat without end."""
-    names = [f"{mode}/{n % PHASES}" for n in range(10 * PHASES + 1)]
+    names = [f"{mode}/{n % FRAMES_PER_SWING}" for n in range(10 * FRAMES_PER_SWING + 1)]
     timing = {"mode": "immediate", "transition": {"duration": 0}}
     swing = {**timing, "frame": {"duration": 60, "redraw": True}}
     hold = {**timing, "frame": {"duration": 0, "redraw": False}}

@@ -10,10 +10,10 @@ import numpy as np
 from delta_dynamics import inverse_dynamics
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError
-from pkm_twin.maps.kind import Case, Found, Kind, limits_of
+from pkm_twin.maps.kind import Case, Found, Kind, drive_limits
 from pkm_twin.robot.robot import Robot
 
-STAYS: Final = 1e-12
+ROUNDING: Final = 1e-12
 """Motion, part of the machine's size, or effort, part of the limit, that is rounding."""
 
 
@@ -46,17 +46,17 @@ class Payload(Kind):
         :raises ParameterError: the mass stays where the platform turns about it.
         """
         moved, com = robot.platform_jacobian(robot.graph.home)[:3], robot.payload.com
-        if not com.any() and np.abs(moved).max() < STAYS * robot.size:
+        if not com.any() and np.abs(moved).max() < ROUNDING * robot.size:
             bound = "--payload MASS,x,y,z, away from the point that the platform turns about"
             raise ParameterError("payload.com", com.tolist(), bound)
-        limits, still = limits_of(robot, "effort"), np.zeros_like(q)
+        limits, still = drive_limits(robot, "effort"), np.zeros_like(q)
         none = {"mass": 0.0, "inertia": np.zeros((3, 3)).tolist()}
         bare, loaded = (robot.changed(payload=none | {"mass": mass}) for mass in (0.0, 1.0))
         held = inverse_dynamics(bare, q, still, still, case.wrench)
         each = inverse_dynamics(loaded, q, still, still, case.wrench) - held
         with np.errstate(divide="ignore", invalid="ignore"):
             room = np.where(
-                np.abs(each) < STAYS * limits, np.inf, (np.copysign(limits, each) - held) / each
+                np.abs(each) < ROUNDING * limits, np.inf, (np.copysign(limits, each) - held) / each
             )
         over = np.abs(held) / limits
         fails = over.max(-1) > 1.0

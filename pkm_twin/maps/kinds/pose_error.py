@@ -15,7 +15,7 @@ from pkm_twin.maps.kind import Case, Found, Kind, largest_axis
 from pkm_twin.robot.derivatives import position_effects
 from pkm_twin.robot.robot import Robot
 
-SHARED: Final = {"at", "axis", "axes", "ends"}
+SHARED_KEYS: Final = {"at", "axis", "axes", "ends"}
 """Keys of a machine's points and axes at home."""
 
 
@@ -36,27 +36,29 @@ class PoseError(Kind):
 
     def elements(self, robot: Robot) -> tuple[str, ...]:
         """The numbers of the geometry whose errors move the platform."""
-        return tuple(list(robot.causes)[k] for k in _moving(robot))
+        return tuple(list(robot.causes)[k] for k in _moving_causes(robot))
 
     def found(self, robot: Robot, q: Array, case: Case) -> Found:
         """In the worst direction, joints at their set points; to first order, independent causes.
 
         The element is the cause with the greatest part in that direction.
         """
-        effects = position_effects(robot, q)[..., _moving(robot)].swapaxes(-1, -2)
+        effects = position_effects(robot, q)[..., _moving_causes(robot)].swapaxes(-1, -2)
         value, direction = largest_axis(effects.swapaxes(-1, -2) @ effects)
         along = np.abs((effects * direction[..., None, :]).sum(-1))
         return Found(np.sqrt(np.maximum(value, 0.0)), direction, along.argmax(-1))
 
 
-def _moving(robot: Robot) -> NDArray[np.intp]:
+def _moving_causes(robot: Robot) -> NDArray[np.intp]:
     """Places of the causes that move the platform at home.
 
     :raises ParameterError: a file without standard deviations of the geometry, or with those of
         points or axes at home: all parts that meet there move along, and home closes as before.
     """
     for name, steps in robot.causes.items() if robot.mechanism == "machine" else ():
-        shared = [path for path, step in steps.items() if step and SHARED & {*keys_of(path)[2:3]}]
+        shared = [
+            path for path, step in steps.items() if step and SHARED_KEYS & {*keys_of(path)[2:3]}
+        ]
         if shared:
             raise ParameterError(
                 f"uncertainty.{name}", shared[0],

@@ -10,8 +10,8 @@ from pkm_twin.maps.kind import (
     Case,
     Found,
     Kind,
-    least_room,
-    limits_of,
+    drive_limits,
+    tightest_limit,
     unit_motions,
     unit_of_motion,
 )
@@ -36,5 +36,5 @@ class Speeds(Kind):
         """Velocity limits over the joint rates of unit motions; the element is at its limit."""
         back, axes = unit_motions(robot, q)
         with np.errstate(divide="ignore"):
-            room = limits_of(robot, "velocity") / np.linalg.norm(back, axis=-1)
-        return Found(*least_room(room, back @ axes))
+            room = drive_limits(robot, "velocity") / np.linalg.norm(back, axis=-1)
+        return Found(*tightest_limit(room, back @ axes))

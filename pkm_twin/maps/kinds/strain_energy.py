@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from xarray import Dataset
 
-LEAST_DRAWN: Final = 0.005
+MIN_DRAWN_SHARE: Final = 0.005
 """Mean share of the smallest element that has a picture."""
 PANELS: Final = 3
 """Elements in a picture."""
@@ -84,7 +84,7 @@ class StrainEnergy(Compliance):
         for case in data.case.values if _draws_elements(data) else ():
             before = f"{case}_" if len(data.case) > 1 else ""
             mean, order = _rank(data, case)
-            ranked = [int(n) for n in order if mean[n] >= LEAST_DRAWN]
+            ranked = [int(n) for n in order if mean[n] >= MIN_DRAWN_SHARE]
             named = {f"{before}energy": _draw_slices(data, case, [])}
             for k in range(0, len(ranked), PANELS):
                 part = ranked[k : k + PANELS]
@@ -123,7 +123,7 @@ def _draw_slices(data: Dataset, case: str, elements: list[int]) -> dict[str, Fig
 
     :returns: the picture by the end of its name; none where poses have no height.
     """
-    from pkm_twin.maps.figures import MAP, limits, scale_of, units_of
+    from pkm_twin.maps.figures import COLOUR_MAP, limits, scale_of, units_of
 
     units = units_of(data)
     upwards = data.attrs["height"]
@@ -149,7 +149,7 @@ def _draw_slices(data: Dataset, case: str, elements: list[int]) -> dict[str, Fig
     for table, (ax,), n in zip(tables, columns, elements or [-1], strict=True):
         for layer, height in zip(table[chosen], heights.tolist(), strict=True):
             drawn = ax.contourf(
-                x, y, np.ma.masked_invalid(scale * layer), levels, cmap=MAP, zdir="z",
+                x, y, np.ma.masked_invalid(scale * layer), levels, cmap=COLOUR_MAP, zdir="z",
                 offset=height, extend=extend,
             )  # fmt: skip
         ax.set(

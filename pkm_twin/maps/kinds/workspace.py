@@ -12,7 +12,17 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pkm_twin.codegen.arrays import Array
-from pkm_twin.maps.kind import POSITIVE, SHARE, Case, Found, Kind, Space, Variable, about, number
+from pkm_twin.maps.kind import (
+    NON_NEGATIVE,
+    UNIT_INTERVAL,
+    Case,
+    Found,
+    Kind,
+    Space,
+    Variable,
+    describe,
+    scalar,
+)
 from pkm_twin.robot.clearance import has_clearance, member_gaps, member_pairs
 from pkm_twin.robot.robot import Robot
 from pkm_twin.robot.workspace import (
@@ -36,7 +46,7 @@ CLEARANCE: Final = Case(
 ANGLE: Final = Case("joint-angle", "largest passive joint angle", "rad", "bends most")
 LAYERS: Final = 101
 """Heights of the circles."""
-OVER: Final = "; white lines: largest circles; dashed: largest cylinder"
+OVERLAY_CAPTION: Final = "; white lines: largest circles; dashed: largest cylinder"
 
 
 class Workspace(Kind):
@@ -79,11 +89,13 @@ class Workspace(Kind):
         if 1 < len(space.ticks) == len(robot.pose_names):
             cell = math.prod(float(ticks[1] - ticks[0]) for ticks in space.ticks)
             what = "volume of the reachable poses"
-            result["volume"] = number(apart * cell, what, _product(robot.pose_units), POSITIVE)
+            result["volume"] = scalar(
+                apart * cell, what, _volume_unit(robot.pose_units), NON_NEGATIVE
+            )
         if has_clearance(robot):
             share = (counted - apart) / counted if counted else math.nan
             what = "share of otherwise reachable poses in which limbs interfere"
-            result["interference"] = number(share, what, "", SHARE)
+            result["interference"] = scalar(share, what, "", UNIT_INTERVAL)
         if space.ticks and robot.grid().kind == "cylinder":
             low, high = space.ticks[robot.pose_names.index(robot.grid().height)][[0, -1]]
             heights = np.linspace(low, high, LAYERS)
@@ -125,14 +137,14 @@ class Workspace(Kind):
             if low <= through[height] <= high:
                 turn = np.linspace(0.0, 2 * np.pi, 181)
                 ax.plot(radius * np.cos(turn), radius * np.sin(turn), "--", color="white", lw=1.2)
-            return OVER
+            return OVERLAY_CAPTION
         outline = [radius, radius, -radius, -radius, radius], [low, high, high, low, low]
         circle = np.where(cut[1:] > 0.0, cut[1:], np.nan)
         sides = np.concatenate([circle, [np.nan], -circle])
         heights = np.concatenate([data.height.values, [np.nan], data.height.values])
         for style, (x, y) in (("-", (sides, heights)), ("--", outline)):
             ax.plot(*((x, y) if names[1] == height else (y, x)), style, color="white", lw=1.2)
-        return OVER
+        return OVERLAY_CAPTION
 
 
 def regular(
@@ -142,17 +154,17 @@ def regular(
     radius = circles(robot, heights, least=least, least_clearance=least_clearance)
     best, unit = largest_cylinder(heights, radius), distance_unit(robot)
     return circle_variables(robot, heights, radius) | {
-        "cylinder_low": number(best.low, "largest cylinder, low", "m"),
-        "cylinder_high": number(best.high, "largest cylinder, high", "m"),
-        "cylinder_radius": number(best.radius, "largest cylinder, radius", unit),
+        "cylinder_low": scalar(best.low, "largest cylinder, low", "m"),
+        "cylinder_high": scalar(best.high, "largest cylinder, high", "m"),
+        "cylinder_radius": scalar(best.radius, "largest cylinder, radius", unit),
     }
 
 
 def circle_variables(robot: Robot, heights: Array, radius: Array) -> dict[str, Variable]:
     """Return circles about the axis at heights (n,), m, of radii (n,), for a file."""
-    what = about("largest circle, radius", distance_unit(robot), POSITIVE)
+    what = describe("largest circle, radius", distance_unit(robot), NON_NEGATIVE)
     return {
-        "height": Variable(("height",), heights, about("height of the circles", "m")),
+        "height": Variable(("height",), heights, describe("height of the circles", "m")),
         "circle": Variable(("height",), radius, what),
     }
 
@@ -203,7 +215,7 @@ def largest_cylinder(heights: Array, radius: Array) -> Cylinder:
     return best
 
 
-def _product(units: Iterable[str]) -> str:
+def _volume_unit(units: Iterable[str]) -> str:
     """Unit of a volume: "m3", "m rad2"."""
     counts = {unit: list(units).count(unit) for unit in sorted(set(units))}
     return " ".join(f"{unit}{power if power > 1 else ''}" for unit, power in counts.items())
