@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""A kind of map along a path instead of over the workspace: values over time, and the worst."""
+"""Evaluate a kind of map along a path: values over time, and the worst sample."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ from pkm_twin.robot.workspace import counts
 
 @dataclass(frozen=True, eq=False)
 class Along:
-    """What a kind finds on a path: ``time`` (k,), s; ``pose`` (k, m); ``found`` of each case.
+    """Hold a kind's values along a path: ``time`` (k,), s; ``pose`` (k, m); ``found`` per case.
 
-    ``counted``: which samples keep all limits, of the singularity index ``least``, shape (k,).
+    ``counted``: which samples keep all limits and a singularity index of ``least``, shape (k,).
     """
 
     robot: Robot
@@ -39,7 +39,7 @@ class Along:
 
     @property
     def worst(self) -> list[dict[str, Any]]:
-        """The worst sample of each case as plain data, as of a stored map, with its time."""
+        """Worst sample of each case as plain data, as for a stored map, with its time."""
         answers, axes = [], self.kind.axes(self.robot)
         elements = self.kind.elements(self.robot)
         for case, one in zip(self.cases, self.found, strict=True):
@@ -59,7 +59,7 @@ class Along:
 
     @property
     def sentences(self) -> list[str]:
-        """The worst of each case in words."""
+        """Worst sample of each case in words."""
         return [
             ("" if len(self.cases) == 1 else f"{one['case']}: ")
             + f"{figures.sentence(one)}; at {one['time_s']:.4g} s"
@@ -67,7 +67,7 @@ class Along:
         ]
 
     def table(self) -> str:
-        """A CSV of each case's value, direction and element over time."""
+        """Return a CSV of each case's value, direction and element over time."""
         header = ["time", *self.robot.pose_names, "counts"]
         columns: list[list[Any]] = [
             self.time.tolist(), *self.pose.T.tolist(), self.counted.astype(int).tolist()
@@ -88,7 +88,7 @@ class Along:
         return text.getvalue()
 
     def draw(self) -> Any:
-        """The values of each case over time, in the colours of the elements to blame."""
+        """Draw the values of each case over time, coloured by the critical element."""
         elements = self.kind.elements(self.robot)
         indices = [one.element for one in self.found if one.element is not None and elements]
         # An element has one colour in all panels.
@@ -115,7 +115,7 @@ def along(
     kind: Kind, robot: Robot, time: Array, q: Array, *, cases: Sequence[Case] = (),
     least: float | None = None, least_clearance: float = 0.0,
 ) -> Along:  # fmt: skip
-    """A kind's quantity at joint positions q (k, n) at times (k,), s.
+    """Evaluate a kind at joint positions q (k, n) at times (k,), s.
 
     :param cases: load cases; by default the kind's own.
     :param least: singularity index below which a sample does not count; by default the kind's.

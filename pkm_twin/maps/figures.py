@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""Pictures of stored maps: planes through the worst pose, the answer in the title."""
+"""Draw stored maps: planes through the worst pose, with the answer in the title."""
 
 from __future__ import annotations
 
@@ -26,23 +26,25 @@ if TYPE_CHECKING:
 COLOUR_MAP: Final = "viridis"
 PREFIXES: Final = {-12: "p", -9: "n", -6: "µ", -3: "m", 0: "", 3: "k", 6: "M"}
 SEARCH_NOISE: Final = 5e-6
-"""Coordinate, m or rad, that a search leaves of zero."""
+"""Coordinate, m or rad, below which the search's result counts as zero."""
 PANELS: Final = 3
-"""Most planes in a picture."""
+"""Largest number of planes in a picture."""
 MIN_SHOWN: Final = 5e-5
-"""Coordinate, m or rad, and part of a direction."""
+"""Coordinate, m or rad, or component of a direction, below which zero is shown."""
 SCALE_QUANTILE: Final = 0.95
 """Part of the values that has the whole scale where the largest is ``FAR`` times as large."""
 OUTLIER_RATIO: Final = 2.0
+"""Quantile of the values that ends the colour scale if the largest value is ``OUTLIER_RATIO`` times
+it or more."""
 CONTOUR_QUANTILES: Final = ((0.35, 0.85), (0.25, 0.6, 0.9))
-"""Of a plane's values below its contours: where it has neighbours on both sides, and else."""
+"""Quantiles of a plane's contours: for panels in a full row, and for fewer panels."""
 
 
 def scale_of(greatest: float, unit: str) -> tuple[float, str]:
-    """Factor and unit with a prefix that leave values up to a greatest below 1000.
+    """Return factor and prefixed unit that leave values up to ``greatest`` below 1000.
 
-    Prefixes stand where they exist: kg has g and t, and what starts with another power or an angle
-    has none.
+    Prefixes are used where they exist: kg has g and t; units that start with a power or an angle
+    have none.
     """
     power = 3 * math.floor(math.log10(abs(greatest) or 1.0) / 3) if math.isfinite(greatest) else 0
     if unit == "kg":
@@ -55,13 +57,13 @@ def scale_of(greatest: float, unit: str) -> tuple[float, str]:
 
 
 def shown(value: float, unit: str, digits: int = 4) -> str:
-    """A value with its unit, as text."""
+    """Format a value with its unit."""
     scale, prefixed = scale_of(value, unit)
     return f"{scale * value + 0.0:.{digits}g} {prefixed}".strip()
 
 
 def kind_of(data: Dataset) -> type[Kind]:
-    """The kind of a stored map.
+    """Return the kind of a stored map.
 
     :raises UnknownNameError: a kind that this version does not know.
     """
@@ -72,7 +74,7 @@ def kind_of(data: Dataset) -> type[Kind]:
 
 
 def answers(data: Dataset) -> list[dict[str, Any]]:
-    """The worst of each case as plain data: case, value, unit, pose, direction, element."""
+    """Return the worst of each case as plain data: case, value, unit, pose, direction, element."""
     names = [str(name) for name in data.coordinate.values]
     found = []
     for k, case in enumerate(data.case.values):
@@ -102,9 +104,9 @@ def answers(data: Dataset) -> list[dict[str, Any]]:
 
 
 def sentence(answer: dict[str, Any]) -> str:
-    """The worst of a case in words: "softest: 32.8 µm/N along y at (0, -0.16, -0.35) m, arm III".
+    """State the worst of a case: "softest: 32.8 µm/N along y at (0, -0.16, -0.35) m, arm III".
 
-    The pose is as commands read it, with digits that keep its singularity index.
+    The pose can be given to commands; it has enough digits to keep its singularity index.
     """
     pose = ", ".join(f"{_drop_noise(v, SEARCH_NOISE):.6g}" for v in answer["pose"].values())
     text = f"{answer['answer']}: {shown(answer['value'], answer['unit'])}"
@@ -124,17 +126,17 @@ def sentence(answer: dict[str, Any]) -> str:
 
 
 def _drop_noise(value: float, least: float = MIN_SHOWN) -> float:
-    """Without what is zero but for rounding and a search's steps."""
+    """Return zero for a value that is only rounding or search noise."""
     return value if abs(value) >= least else 0.0
 
 
 def units_of(data: Dataset) -> dict[str, str]:
-    """Units of the pose coordinates."""
+    """Return the units of the pose coordinates, by name."""
     return {str(k): str(u) for k, u in zip(data.coordinate.values, data.unit.values, strict=True)}
 
 
 def lines(data: Dataset) -> list[str]:
-    """What a map answers: a line for each case, then what its kind says of the workspace."""
+    """Return the answers of a map: a line per case, and the kind's facts on the workspace."""
     found = answers(data)
     alone = len(found) == 1
     texts = [("" if alone else f"{a['case']}: ") + sentence(a) for a in found]
@@ -144,7 +146,7 @@ def lines(data: Dataset) -> list[str]:
 
 
 def title(data: Dataset, case: int) -> list[str]:
-    """Question and answer of a case."""
+    """Return the lines of a case's title: question and answer."""
     name = str(data.case.values[case])
     own = [sentence(a) for a in answers(data) if a["case"] == name]
     label = "" if len(data.case) == 1 else f", {name.replace('-', ' ')}"
@@ -155,16 +157,16 @@ def title(data: Dataset, case: int) -> list[str]:
 
 
 def draw(data: Dataset) -> dict[str, Figure]:
-    """All pictures of a stored map: one for each case, and those of its kind; by name."""
+    """Draw all pictures of a stored map, by name: one per case, and those of its kind."""
     names = [str(name) for name in data.case.values]
     pictures = {n if len(names) > 1 else "": planes(data, k) for k, n in enumerate(names)}
     return pictures | kind_of(data).figures(data)
 
 
 def limits(values: Array, worst: float) -> tuple[float, float]:
-    """First and last value of a scale: from 0, or from least to most where these are near.
+    """Return the ends of a colour scale: from 0, or from least to most if these are close.
 
-    A few values far above the others share its last colour.
+    A few outliers above the others share the last colour.
     """
     known = values[np.isfinite(values)]
     every = np.append(known, worst) if math.isfinite(worst) else known
@@ -180,9 +182,10 @@ def limits(values: Array, worst: float) -> tuple[float, float]:
 
 
 def plane_of(data: Dataset, case: int, plane: int) -> dict[str, Any]:
-    """A plane for drawing: names, units and ticks of its sides, values.
+    """Return a plane for drawing: names, units and ticks of its sides, and values.
 
-    ``star``: where the worst pose is in it; None where it is not. ``held``: the other coordinates.
+    ``star``: position of the worst pose; None if it is not in the plane. ``held``: the other
+    coordinates.
     """
     part, units = data.isel(case=case, plane=plane), units_of(data)
     names = tuple(n for n in (str(part.row_name.values), str(part.column_name.values)) if n)
@@ -207,14 +210,14 @@ def plane_of(data: Dataset, case: int, plane: int) -> dict[str, Any]:
 
 
 def full_planes(data: Dataset, case: int) -> list[int]:
-    """Planes of a case, by index, in which more than their pose counts, the fullest first."""
+    """Return the planes of a case that have more than one counted pose, fullest first."""
     known = np.isfinite(data.plane_value.isel(case=case).values).sum((1, 2))
     order = np.argsort(-known, kind="stable")
     return [int(k) for k in order if known[k] > 1] or [int(order[0])]
 
 
 def planes(data: Dataset, case: int) -> Figure:
-    """Up to three planes of a case through its worst pose, on one scale of colours."""
+    """Draw up to three planes of a case through its worst pose, with one colour scale."""
     kind, part = kind_of(data), data.isel(case=case)
     drawn = [plane_of(data, case, k) for k in sorted(full_planes(data, case)[:PANELS])]
     count = len(drawn)
@@ -251,7 +254,7 @@ def planes(data: Dataset, case: int) -> Figure:
 
 
 def _height(one: dict[str, Any], count: int) -> float:
-    """Of one or two panels, inches: one of equal scales fills the width."""
+    """Return the height of one or two panels, inches; equal scales fill the width."""
     if count > 1 or len(set(one["units"])) != 1 or len(one["names"]) == 1:
         return 0.5 * plots.WIDTH
     across, up = map(np.ptp, one["ticks"])
@@ -259,7 +262,7 @@ def _height(one: dict[str, Any], count: int) -> float:
 
 
 def _widths(drawn: list[dict[str, Any]]) -> list[float]:
-    """Widths of panels: of equal scale where all coordinates have one unit."""
+    """Return the widths of panels: with equal scales if all coordinates have one unit."""
     if len({unit for one in drawn for unit in one["units"]}) > 1 or len(drawn) == 1:
         return [1.0] * len(drawn)
     widths = np.array([np.ptp(one["ticks"][0]) for one in drawn])
@@ -283,7 +286,7 @@ def _draw_line(one: dict[str, Any], ax: Axes, scale: float, label: str) -> None:
 def draw_panel(
     one: dict[str, Any], ax: Axes, scale: float, low: float, high: float, shares: Sequence[float]
 ) -> Any:
-    """Draw a plane of :func:`plane_of` with contours below these shares of its values."""
+    """Draw a plane of :func:`plane_of`, with contours at quantiles of its values."""
     x, y = one["ticks"]
     values = scale * one["values"].T
     mesh = ax.pcolormesh(
@@ -299,7 +302,7 @@ def draw_panel(
         for text in ax.clabel(contours, fmt="%.3g", fontsize=8.5):
             text.set_bbox({"facecolor": "0.25", "edgecolor": "none", "alpha": 0.55, "pad": 0.6})
     if one["star"]:
-        # In the colour of its cell, which it covers.
+        # The star has the colour of the cell that it covers.
         at = [
             int(np.abs(side - place).argmin())
             for side, place in zip((x, y), one["star"], strict=True)

@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""What a kind of map states: a quantity of a pose, its unit, and which value is worst.
+"""Define a kind of map: a quantity of a pose, its unit, and which value is worst.
 
 Grid, search of the worst pose, storage, pictures, pages and commands are the same for all kinds.
 """
@@ -27,23 +27,23 @@ if TYPE_CHECKING:
 
 Mask = NDArray[np.bool_]
 FORMAT_VERSION: Final = "2"
-"""Of stored maps: files of another one are rejected."""
+"""Version of the file format; files of another version are rejected."""
 NON_NEGATIVE: Final = {"valid_min": 0.0}
 UNIT_INTERVAL: Final = {"units": "1", "valid_min": 0.0, "valid_max": 1.0}
 FLAG: Final = {"valid_min": 0, "valid_max": 1}
 NO_BOUNDS: Final[Mapping[str, Any]] = MappingProxyType({})
-"""Attributes by what a variable can be (CF conventions, 2.5.1): checked when a file is opened."""
+"""Attributes that bound a variable (CF conventions, 2.5.1), checked when a file is opened."""
 Values = dict[str, NDArray[Any]]
 
 
 def describe(what: str, units: str = "", bounds: Mapping[str, Any] = NO_BOUNDS) -> dict[str, Any]:
-    """Attributes of a variable: what it can be, its unit where it has one, and what it is."""
+    """Return the attributes of a variable: its bounds, its unit if any, and its description."""
     return {**bounds, **({"units": units} if units else {}), "long_name": what}
 
 
 @dataclass(frozen=True, eq=False)
 class Variable:
-    """A small array with named dimensions, held whole: coordinates and summaries."""
+    """Hold a small array with named dimensions: a coordinate or a summary."""
 
     dims: tuple[str, ...]
     values: NDArray[Any]
@@ -52,7 +52,7 @@ class Variable:
 
 @dataclass(frozen=True)
 class Field:
-    """A large array that is computed chunk by chunk."""
+    """Describe a large array that is computed chunk by chunk."""
 
     dims: tuple[str, ...]
     attrs: Mapping[str, Any]
@@ -62,20 +62,20 @@ class Field:
 def scalar(
     value: Any, what: str, units: str = "", bounds: Mapping[str, Any] = NO_BOUNDS
 ) -> Variable:
-    """A single number."""
+    """Return a single number as a variable."""
     return Variable((), np.array(value), describe(what, units, bounds))
 
 
 def name_labels(dim: str, words: Iterable[str]) -> Variable:
-    """Names along a dimension."""
+    """Return names along a dimension as a variable."""
     return Variable((dim,), np.array(list(words), "U"), {})
 
 
 class Found(NamedTuple):
-    """A quantity in k poses: ``value`` (k,), its ``direction`` (k, axes), its ``element`` (k,).
+    """Hold a quantity in k poses: ``value`` (k,), ``direction`` (k, axes), ``element`` (k,).
 
-    ``element``: index of the name that is to blame. ``shares``: parts of the elements, shape
-    (k, elements). A kind without directions, elements or shares leaves them out.
+    ``element``: index of the critical element. ``shares``: fractions of the elements, shape (k,
+    elements). A kind without directions, elements or shares leaves them out.
     """
 
     value: Array
@@ -86,12 +86,12 @@ class Found(NamedTuple):
 
 @dataclass(frozen=True)
 class Case:
-    """One quantity of a map; several load cases or several modes are several cases.
+    """Describe one quantity of a map, for example one load case or one mode.
 
-    ``what`` and ``unit``: of the value. ``answer``: what the worst pose is, as "softest".
-    ``largest``: is the largest value the worst? ``wrench``: force (N) and moment (N m) that the
-    surroundings apply to the platform at its reference point, base axes. ``interfering``: whether
-    poses count in which limbs interfere.
+    ``what`` and ``unit``: of the value. ``answer``: name of the worst pose, as "softest".
+    ``largest``: whether the largest value is the worst. ``wrench``: external force (N) and moment
+    (N m) on the platform at its reference point, base axes. ``interfering``: whether poses in which
+    limbs interfere count.
     """
 
     name: str
@@ -105,11 +105,11 @@ class Case:
 
 @dataclass(frozen=True)
 class Kind:
-    """A kind of map; its fields are the options of its command.
+    """Define a kind of map; its fields are the options of its command.
 
     ``question``: what its picture answers. ``points``: of the grid; ``chunk``: poses that are
     computed at once; ``samples``, ``population`` and ``rounds``: size of the search for the worst
-    pose. ``screen``: of a quantity that takes long, a fast one that is bad in the same poses.
+    pose. ``screen``: for a slow quantity, a fast one that is bad in the same poses.
     ``least``: default singularity index below which a pose does not count. ``together``: all cases
     share the worst pose of the first. ``signed``: values may be negative. ``facts_first``: whether
     the facts answer the question. ``page_help``: explains the further figure of the page.
@@ -137,22 +137,22 @@ class Kind:
     page_help: ClassVar[str] = ""
 
     def found(self, robot: Robot, q: Array, case: Case) -> Found:
-        """The quantity at joint positions (k, n), k above zero.
+        """Evaluate the quantity at joint positions (k, n), k above zero.
 
         :raises ParameterError: the robot's file lacks what the quantity needs.
         """
         raise NotImplementedError
 
     def each(self, robot: Robot, q: Array, cases: Sequence[Case]) -> list[Found]:
-        """The same for several cases."""
+        """Evaluate several cases at joint positions (k, n)."""
         return [self.found(robot, q, case) for case in cases]
 
     def cases(self, robot: Robot) -> tuple[Case, ...]:
-        """The cases of a map without given loads."""
+        """Return the cases of a map without given loads."""
         return (Case(self.name, self.what, self.unit, self.answer, self.largest),)
 
     def loaded(self, robot: Robot, name: str, wrench: Sequence[float]) -> Case:
-        """A load case of a name.
+        """Return a load case with a name.
 
         :raises ParameterError: other than six finite numbers, or a kind without loads.
         """
@@ -163,11 +163,11 @@ class Kind:
         return replace(self.cases(robot)[0], name=name, wrench=tuple(map(float, wrench)))
 
     def elements(self, robot: Robot) -> tuple[str, ...]:
-        """Names that ``element`` counts."""
+        """Return the names that ``element`` indexes."""
         return ()
 
     def axes(self, robot: Robot) -> tuple[str, ...]:
-        """Names of the components of a direction."""
+        """Return the names of a direction's components."""
         return ("x", "y", "z")
 
     @property
@@ -176,42 +176,42 @@ class Kind:
         return asdict(self)
 
     def summaries(self, space: Space, counted: int, apart: int) -> dict[str, Variable]:
-        """Results over the whole workspace.
+        """Return results over the whole workspace.
 
-        :param counted: poses of the grid that keep all bounds but the one on the clearance;
-            ``apart``: of these, poses in which no limbs interfere.
+        :param counted: number of grid poses that keep all bounds except that on the clearance;
+            ``apart``: number of these in which no limbs interfere.
         """
         return {}
 
     @classmethod
     def facts(cls, data: Dataset) -> list[str]:
-        """Sentences about a stored map, besides those on worst poses."""
+        """Return sentences about a stored map, in addition to those on worst poses."""
         return []
 
     @classmethod
     def overlay(
         cls, data: Dataset, names: tuple[str, ...], through: Mapping[str, float], ax: Axes
     ) -> str:
-        """Draw over a plane of two pose coordinates through a pose; what it is, for the caption."""
+        """Draw over a plane of two pose coordinates; return an explanation for the caption."""
         return ""
 
     @classmethod
     def figures(cls, data: Dataset) -> dict[str, Figure]:
-        """Further pictures of a stored map, by name."""
+        """Draw further pictures of a stored map, by name."""
         return {}
 
     @classmethod
     def page(cls, data: Dataset) -> Any:
-        """A further plotly figure of a stored map for its page; None for none."""
+        """Return a further plotly figure of a stored map for its page; None without one."""
         return None
 
 
 @dataclass(frozen=True, eq=False)
 class Worst:
-    """A worst pose (m,), its joint positions (n,), and what was found there.
+    """Hold a worst pose (m,), its joint positions (n,), and the kind's values there.
 
-    ``index``: singularity index. ``bounded``: whether only its bound keeps next poses from being
-    worse.
+    ``index``: singularity index. ``bounded``: whether only the bound on it excludes worse poses
+    nearby.
     """
 
     pose: Array
@@ -223,14 +223,14 @@ class Worst:
 
 @dataclass(frozen=True, eq=False)
 class Space:
-    """The poses of a map, and which of them count.
+    """Describe the poses of a map, and decide which of them count.
 
     ``bounds``: of the pose coordinates, shape (m, 2). ``ticks``: of a grid of up to three of them;
-    otherwise empty, and ``samples`` joint positions are drawn. ``side``: poses along a side of a
-    plane. ``least``: singularity index, and ``least_clearance``: distance of the limbs, m, below
-    which a pose does not count. ``at``: the pose (m,) that planes go through, instead of the worst.
-    ``worst``: of each case, once they are known. ``circles``: heights and radii, shape (2, k), of
-    the circles about the axis that a pose has to be in; None for all poses.
+    otherwise empty, and ``samples`` joint positions are drawn at random. ``side``: poses along a
+    side of a plane. ``least``: singularity index, and ``least_clearance``: distance of the limbs,
+    m, below which a pose does not count. ``at``: the pose (m,) that planes go through, instead of
+    the worst. ``worst``: of each case, once they are known. ``circles``: heights and radii, shape
+    (2, k), of the circles about the axis that a pose has to be in; None for all poses.
     """
 
     robot: Robot
@@ -254,24 +254,24 @@ class Space:
 
     @property
     def box(self) -> Array:
-        """Where worst poses are searched: limits of joints (n, 2), or bounds of poses."""
+        """Box of the search for worst poses: limits of joints (n, 2), or bounds of poses."""
         limits = self.robot.limits.position
         return limits if self.by_joints and limits is not None else self.bounds
 
     def state(self, x: Array) -> tuple[Array, Array, Mask]:
-        """Joint positions, poses, and which are known, of places (k, n) in the box."""
+        """Return joint positions, poses, and which are known, for points (k, n) of the box."""
         if not self.by_joints:
             return self.of_poses(x)
         pose, known = self.robot.try_forward(x)
         return x, np.where(known[:, None], pose, self.robot.home()), known
 
     def of_poses(self, poses: Array) -> tuple[Array, Array, Mask]:
-        """Joint positions, the poses (k, m), and which of them are known."""
+        """Return joint positions, the poses (k, m), and which of them are known."""
         q, known = self.robot.try_inverse(poses)
         return np.where(known[:, None], q, self.robot.graph.home), poses, known
 
     def counts(self, q: Array, pose: Array, known: Mask, case: Case) -> Mask:
-        """Which joint positions (k, n) and poses (k, m) count, of those that are known."""
+        """Return which joint positions (k, n) and poses (k, m) count, of those known."""
         bound = -math.inf if case.interfering else self.least_clearance
         return counts(self.robot, q, pose, known & self.encircled(pose), self.least, bound)
 
@@ -283,16 +283,16 @@ class Space:
         height = pose[:, self.robot.pose_names.index(grid.height)]
         layers, radii = self.circles
         radius = np.interp(height, layers, radii, left=np.nan, right=np.nan)
-        # NaN, where a circle is too small, is not above.
+        # Comparisons with NaN, for a circle that is too small, are false.
         return np.asarray(radius >= grid.distance(pose))
 
     def through(self, case: int) -> Array:
-        """The pose that the planes of a case go through, shape (m,)."""
+        """Return the pose (m,) that the planes of a case go through."""
         return self.worst[case].pose if self.at is None else self.at
 
 
 def evaluate_kind(kind: Kind, robot: Robot, q: Array, cases: Sequence[Case]) -> list[Found]:
-    """A kind's cases at joint positions (k, n); NaN in single poses that have no value."""
+    """Evaluate a kind's cases at joint positions (k, n); NaN in poses without a value."""
     ways = len(kind.axes(robot))
 
     def without(k: int) -> Found:
@@ -320,9 +320,9 @@ def _concatenate(one: Found, other: Found) -> Found:
 
 
 def drive_limits(robot: Robot, name: str) -> Array:
-    """Limits of the drives by name, ``effort`` or ``velocity``, shape (n,); SI units.
+    """Return the drives' limits ``effort`` or ``velocity``, shape (n,); SI units.
 
-    :raises ParameterError: the robot's file has none.
+    :raises ParameterError: the robot's file has no such limits.
     """
     limits = getattr(robot.limits, name)
     if limits is None or not np.isfinite(limits).any():
@@ -331,9 +331,10 @@ def drive_limits(robot: Robot, name: str) -> Array:
 
 
 def unit_motions(robot: Robot, q: Array) -> tuple[Array, Array]:
-    """Joint rates of unit rates of the platform, shape (k, n, d), and their directions, (d, 3).
+    """Return joint rates of unit platform velocities, (k, n, d), and their directions, (d, 3).
 
-    Of the position in the pose, its angles at rest; of a pose of angles alone about the base axes.
+    Velocities are those of the pose's position at constant angles, or, without a position, the
+    angular velocity about the base axes.
     """
     back = robot.inverse_jacobian(q)
     places = [k for k, name in enumerate(robot.pose_names) if name in "xyz"]
@@ -344,14 +345,14 @@ def unit_motions(robot: Robot, q: Array) -> tuple[Array, Array]:
 
 
 def unit_of_motion(robot: Robot) -> str:
-    """Unit of what :func:`unit_motions` moves: ``m`` or ``rad``."""
+    """Return the unit of :func:`unit_motions`: ``m`` or ``rad``."""
     return "m" if set("xyz") & set(robot.pose_names) else "rad"
 
 
 def tightest_limit(room: Array, rows: Array) -> tuple[Array, Array, NDArray[np.int64]]:
-    """The least of each pose, the unit vector of its row, and its index: what limits a motion.
+    """Return the smallest margin of each pose, the direction of its row, and the joint's index.
 
-    :param room: shape (k, n); ``rows``: shape (k, n, 3).
+    :param room: margins, shape (k, n); ``rows``: shape (k, n, 3).
     """
     joint = room.argmin(-1)
     value = np.take_along_axis(room, joint[..., None], -1)[..., 0]
@@ -360,7 +361,7 @@ def tightest_limit(room: Array, rows: Array) -> tuple[Array, Array, NDArray[np.i
 
 
 def largest_axis(matrices: Array) -> tuple[Array, Array]:
-    """Largest eigenvalue (k,) and its direction (k, 3) of symmetric matrices (k, 3, 3).
+    """Return the largest eigenvalue (k,) and its vector (k, 3) of symmetric (k, 3, 3) matrices.
 
     The direction's largest entry is positive.
     """
@@ -372,6 +373,6 @@ def largest_axis(matrices: Array) -> tuple[Array, Array]:
 
 
 def size_and_direction(vectors: Array) -> tuple[Array, Array]:
-    """Lengths (k,) and unit vectors (k, 3); zero where a vector is."""
+    """Return lengths (k,) and unit vectors (k, 3); zero vectors stay zero."""
     size = np.linalg.norm(vectors, axis=-1)
     return size, vectors / np.where(size > 0.0, size, 1.0)[..., None]

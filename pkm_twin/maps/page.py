@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""Pages of stored maps: one HTML file that needs no network, with the picture's star and value."""
+"""Write pages of stored maps: one HTML file that works offline."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ if TYPE_CHECKING:
 
 CAMERA: Final = {"eye": {"x": 1.3, "y": -1.5, "z": 0.95}, "center": {"x": 0, "y": 0, "z": -0.1}}
 FLAT_LIGHT: Final = {"ambient": 1.0, "diffuse": 0.0, "specular": 0.0, "fresnel": 0.0}
-"""Light that leaves colours as the bar has them."""
+"""Light that shows colours as in the colour bar."""
 CONFIG: Final = {"displaylogo": False, "responsive": True, "showSendToCloud": False}
-"""No buttons that lead into the network."""
+"""Plotly settings without buttons that need the network."""
 MENU: Final = {"x": 0.0, "y": 1.0, "xanchor": "left", "yanchor": "bottom", "pad": {"b": 8}}
 BAR: Final = {"len": 0.8, "thickness": 12, "title": {"side": "right"}}
-"""A bar of colours with its title along it, which narrow windows have room for."""
+"""Colour bar with its title along it, to fit narrow windows."""
 MARGIN: Final = {"l": 20, "r": 20, "t": 60, "b": 20}
 MAX_SAMPLES: Final = (15, 61)
-"""Layers, and samples along the sides of a layer."""
+"""Largest number of layers, and of samples along the sides of a layer."""
 STAR: Final = {"color": "red", "line": {"color": "white", "width": 1}}
 HELP: Final = (
     "Coloured poses count: joints within limits, limbs apart, clear of singularities. The \
@@ -41,7 +41,7 @@ menu chooses the case and plane, a slider one layer alone."
 
 
 def write_page(data: Dataset, path: Path) -> Path:
-    """Write a stored map as one HTML file: plotly's script is inside.
+    """Write a stored map as one HTML file with plotly's script inside.
 
     :raises MissingExtraError: plotly is not installed.
     """
@@ -66,12 +66,12 @@ def write_page(data: Dataset, path: Path) -> Path:
 
 
 def page(data: Dataset) -> Any:
-    """Three coordinates as layers, others as planes through the worst pose, of every case."""
+    """Return a figure of all cases: layers for three coordinates, else planes."""
     return _layers(data) if len(data.coordinate) == 3 else _planes(data)
 
 
 def _case_layout(data: Dataset, case: int, values: Array) -> tuple[float, str, dict[str, Any]]:
-    """Scale, unit, and layout of a case: one scale of colours with the worst."""
+    """Return scale, unit, and layout of a case, with one colour scale that includes the worst."""
     part = data.isel(case=case)
     low, high = figures.limits(values, float(part.worst_value))
     scale, unit = figures.scale_of(max(abs(low), abs(high)), str(part.case_unit.values))
@@ -187,7 +187,7 @@ def _planes(data: Dataset) -> Any:
 
 
 def _show_first(figure: Any, buttons: list[dict[str, Any]]) -> Any:
-    """A figure as its menu's first entry shows it."""
+    """Set up a figure's menu, and show its first entry."""
     figure.update_layout(
         coloraxis={"colorscale": "Viridis", "colorbar": BAR},
         updatemenus=[{"buttons": buttons, **MENU}],
@@ -204,13 +204,13 @@ def _show_first(figure: Any, buttons: list[dict[str, Any]]) -> Any:
 def button(
     label: str, data: dict[str, Any], layout: dict[str, Any], traces: list[int] | None = None
 ) -> dict[str, Any]:
-    """An entry of a menu that changes data and layout."""
+    """Return a menu entry that changes data and layout."""
     args: list[Any] = [data, layout]
     return {"label": label, "method": "update", "args": args if traces is None else [*args, traces]}
 
 
 def round_digits(values: NDArray[Any]) -> Array:
-    """Five digits: what a button changes stands in the page as text."""
+    """Round to five digits, because a button's data are text in the page."""
     with np.errstate(divide="ignore", invalid="ignore"):
         power = np.floor(np.log10(np.abs(values)))
     unit = 10.0 ** (4.0 - np.where(np.isfinite(power), power, 0.0))
@@ -218,10 +218,10 @@ def round_digits(values: NDArray[Any]) -> Array:
 
 
 def grid_triangles(shown: NDArray[np.bool_]) -> dict[str, NDArray[np.int64]]:
-    """Corners i, j, k of the triangles between those points of a grid that are shown.
+    """Return corners i, j, k of the triangles between the shown points of a grid.
 
-    Points that are not shown are not counted. A mesh of triangles says of a place under the cursor
-    which point it is; plotly's surfaces mix up rows and columns there.
+    Hidden points are not counted. Meshes report the point under the cursor correctly; plotly's
+    surfaces swap rows and columns there.
 
     :param shown: shape (rows, columns).
     """
@@ -232,7 +232,7 @@ def grid_triangles(shown: NDArray[np.bool_]) -> dict[str, NDArray[np.int64]]:
         [np.stack(three, -1).reshape(-1, 3) for three in ((a, b, c), (a, c, d))]
     )
     whole = (corners >= 0).all(1)
-    # Where one corner of a cell is missing, the other three make a triangle.
+    # A cell with one missing corner gives one triangle.
     three = np.concatenate([np.stack(t, -1).reshape(-1, 3) for t in ((a, b, d), (b, c, d))])
     missing = (np.stack([a, b, c, d], -1).reshape(-1, 4) < 0).sum(1) == 1
     three = three[np.tile(missing, 2) & (three >= 0).all(1)]
@@ -241,6 +241,6 @@ def grid_triangles(shown: NDArray[np.bool_]) -> dict[str, NDArray[np.int64]]:
 
 
 def axis_range(values: Array) -> list[float]:
-    """Ends of an axis a little beyond the values: it stays when some are hidden."""
+    """Return the ends of an axis with a margin, constant when traces are hidden."""
     low, high = float(np.nanmin(values)), float(np.nanmax(values))
     return [low - 0.05 * (high - low), high + 0.05 * (high - low)]

@@ -1,9 +1,9 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""Computing a sweep: here in one process or on all cores, or on a Dask cluster.
+"""Compute a sweep in one process, on all cores, or on a Dask cluster.
 
-Chunks are independent, so the results are the same bit for bit wherever and in whatever order they
-are computed. Few chunks are in flight at a time, and each goes to disk when it is done: memory
-does not grow with the sweep.
+Chunks are independent, so that the results are bit-identical wherever and in whatever order they
+are computed. Few chunks are in flight at a time, and each is saved when it is done: memory use does
+not grow with the sweep.
 """
 
 from __future__ import annotations
@@ -36,28 +36,28 @@ Work = Sequence[tuple[int, Any]]
 """Numbered parts of a task."""
 
 MAX_POOL_FAILURES: Final = 3
-"""How often workers may die at one chunk before the sweep is given up."""
+"""Number of times that worker processes may die before the sweep is given up."""
 MAX_SERIAL_CHUNKS: Final = 3
-"""Chunks that are not worth starting processes for."""
+"""Number of chunks up to which no processes are started."""
 CONNECT_TIMEOUT: Final = "10s"
-"""How long a scheduler may take to answer."""
+"""Time in which a scheduler must answer."""
 CHUNKS_PER_WORKER: Final = 2
-"""Chunks a worker that are handed out at a time."""
+"""Chunks per worker in flight."""
 
 
 class Task(Protocol):
-    """Work that workers get whole with each of its parts, as :class:`Map` with its chunks."""
+    """Define work that workers receive with each of its parts, as :class:`Map` with its chunks."""
 
     @property
     def fingerprint(self) -> str:
-        """Of this task alone."""
+        """Identifier of this task."""
 
     def evaluate(self, chunk: Any, /) -> Values:
-        """Results of one part."""
+        """Compute one part."""
 
 
 class ClusterError(PkmTwinError):
-    """A Dask scheduler that does not answer, or a cluster that keeps losing its workers."""
+    """Report a Dask scheduler that does not answer, or a cluster that keeps losing workers."""
 
 
 def run(
@@ -69,7 +69,7 @@ def run(
     overwrite: bool = False,
     progress: Progress | None = None,
 ) -> Path:
-    """Compute a sweep into a NetCDF file; chunks that an earlier, stopped run finished are kept.
+    """Compute a sweep into a NetCDF file; reuse finished chunks of a stopped run.
 
     :param workers: processes on this machine; default one per core, 1 is this process alone.
     :param scheduler: address of a Dask scheduler, which then does the work.
@@ -80,7 +80,7 @@ def run(
     :raises ClusterError: no scheduler, or workers that keep dying.
     :raises MissingExtraError: a package that is not installed.
     """
-    # Before hours of work.
+    # Check before hours of work.
     require("h5netcdf", "atlas")
     if workers is not None and workers < 1:
         raise PkmTwinError(f"workers is {workers}; it has to be 1 or more")
@@ -98,7 +98,7 @@ def run(
             try:
                 sweep = sweep.with_worst(parts.grid())
             except ParameterError:
-                # Nothing to continue from: no pose counts.
+                # No pose counts, so the chunks are useless.
                 parts.drop()
                 raise
             _compute_pending(sweep, parts, True, workers, scheduler, tell)
@@ -117,7 +117,7 @@ def _compute_pending(
     scheduler: str | None,
     tell: Progress,
 ) -> None:
-    """Compute the chunks of the grid or of the planes that are not there yet."""
+    """Compute the missing chunks of the grid or of the planes."""
     chunks = sweep.chunks()
     pending = parts.pending()
     done = sum(map(sweep.count, chunks)) - sum(sweep.count(chunks[i]) for i in pending)
@@ -142,7 +142,7 @@ def _compute_pending(
 
 
 def compute_serially(sweep: Map, work: Work) -> Iterator[tuple[int, Values]]:
-    """Chunks one after the other in this process."""
+    """Compute chunks one after the other in this process."""
     for index, chunk in work:
         yield index, sweep.evaluate(chunk)
 
@@ -150,11 +150,11 @@ def compute_serially(sweep: Map, work: Work) -> Iterator[tuple[int, Values]]:
 def compute_on_cores(
     sweep: Map, work: Work, workers: int, folder: Path
 ) -> Iterator[tuple[int, Values | None]]:
-    """Chunks on processes of this machine, in the order in which they are done.
+    """Compute chunks on processes of this machine, in the order of completion.
 
-    The processes keep their chunks in the folder themselves (None here): only a number goes
-    through the pipe, which a process that is killed in the middle of a long message would block.
-    A killed process costs its chunk's time.
+    The processes save their chunks themselves (None here): only a number goes through the pipe,
+    which a process killed during a long message would block. A killed process costs its chunk's
+    time.
     """
     # The first chunk compiles what the others load; processes that all compile would waste it.
     first = next((k for k, (_, chunk) in enumerate(work) if sweep.count(chunk)), 0)
@@ -177,7 +177,7 @@ def compute_on_cores(
 def _run_pool(sweep: Map, work: Work, workers: int, folder: Path) -> Iterator[int]:
     # Not forked: the parent has threads (the progress bar's).
     context = multiprocessing.get_context("spawn")
-    # Once, and here: a pool that cannot pass its work on waits for ever.
+    # Pickled here once: a pool that fails to pickle its work would wait forever.
     packed = pickle.dumps(sweep)
     pool = ProcessPoolExecutor(workers, mp_context=context)
     queue = iter(work)
@@ -199,18 +199,18 @@ def _run_pool(sweep: Map, work: Work, workers: int, folder: Path) -> Iterator[in
 
 
 def compute_on_cluster(sweep: Task, work: Work, scheduler: str) -> Iterator[tuple[int, Values]]:
-    """Chunks on a Dask cluster, in the order in which they are done.
+    """Compute chunks on a Dask cluster, in the order of completion.
 
     The scheduler gives the chunks of a lost worker to another one.
 
     :raises ClusterError: no scheduler answers, it has no workers, or chunks keep losing theirs.
     """
     distributed = require("distributed", "cluster")
-    # Its own log tells at length what one line of ours says.
+    # Its log is long; one line of ours reports the error.
     logging.getLogger("distributed").setLevel(logging.CRITICAL)
     arguments = distributed.Security().get_connection_args("client")
     if scheduler.startswith("tls:") and arguments.get("ssl_context") is None:
-        # A client that is made without one fails at once, and again at its end.
+        # A client without a certificate fails at once, and again when it is closed.
         raise ClusterError(f"{scheduler} asks for TLS, and Dask is configured with no certificate")
     try:
         client = distributed.Client(scheduler, timeout=CONNECT_TIMEOUT, set_as_default=False)
@@ -255,7 +255,7 @@ def _collect_results(
 
 
 def evaluate_chunk(sweep: Task, chunk: Any, version: str) -> Values:
-    """One chunk, in a worker.
+    """Compute one chunk in a worker.
 
     :raises PkmTwinError: what the chunk raises, in a form that passes between processes; or a
         worker with another version of this package.
@@ -275,16 +275,16 @@ def _evaluate_and_save(packed: bytes, chunk: Chunk, folder: Path, index: int) ->
 
 @functools.lru_cache(1)
 def _unpickle(packed: bytes) -> Map:
-    # Once a process: what the robot derives for its first chunk serves all.
+    # Once per process, so that the robot's caches serve all chunks.
     sweep: Map = pickle.loads(packed)  # noqa: S301  from the parent
     return sweep
 
 
 @contextmanager
 def _without_interrupts() -> Iterator[None]:
-    """A process started here never sees Ctrl-C: the parent decides what it means.
+    """Block SIGINT while a process is started, which then never receives it.
 
-    A terminal sends it to all its processes; one that had to be told would be hit at its imports.
+    A terminal sends Ctrl-C to all its processes; the parent alone handles it.
     """
     signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:

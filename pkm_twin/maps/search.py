@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""The box of all poses that a machine reaches, and the worst pose of a quantity in it."""
+"""Find the box of all reachable poses, and the worst pose of a quantity in it."""
 
 from __future__ import annotations
 
@@ -20,33 +20,33 @@ from pkm_twin.robot.workspace import causes, passing_singularity, reachable, try
 JOINT_STATES: Final = 2**14
 """Joint states, evenly spread between the limits, whose poses bound a workspace."""
 CLIMB_STARTS: Final = 32
-"""States from which the ends of a workspace of many coordinates are looked for."""
+"""States from which the ends of a workspace of many coordinates are searched."""
 GRID_SIDE: Final = 33
-"""Poses along each coordinate of a grid that bounds a workspace, or what a plane shows of it."""
+"""Poses along each coordinate of the grid that bounds a workspace, or a plane's visible part."""
 MAX_GRID_DIMENSIONS: Final = 3
-"""Most pose coordinates of which a whole grid is made."""
+"""Largest number of pose coordinates of a full grid."""
 NEIGHBOURS: Final = 64
-"""Places next to the worst that show whether the singularity index excludes worse ones."""
+"""Poses near the worst that show whether the bound on the singularity index excludes worse ones."""
 EDGE_WALKERS: Final = 1024
-"""Places nearest to the least singularity index that walk to it."""
+"""Points with the smallest counted singularity index that walk to its bound."""
 EDGE_STEPS: Final = 24
 """Steps of their walk."""
 EDGE_STARTS: Final = 128
-"""Places on that border from which the worst pose is searched."""
+"""Points on that border from which the worst pose is searched."""
 BISECTIONS: Final = 12
-"""Of the way to a place that does not count, to find where it still does."""
+"""Bisection steps towards a point that does not count."""
 LIMIT_MARGIN: Final = 1e-9
-"""Part of a joint's range that the search stays away from its ends."""
+"""Fraction of a joint's range that the search keeps away from its ends."""
 
 
 def find_worst(
     space: Space, case: Case, starts: Array, tell: Callable[[float], object] = abs
 ) -> Worst:
-    """The worst pose of the workspace.
+    """Find the worst pose of the workspace.
 
-    Over joint positions between finite limits, otherwise over poses in the map's box.
+    Search joint positions between finite limits, otherwise poses in the map's box.
 
-    :param starts: poses that count, shape (k, m). ``tell``: gets the part that is done, 0 to 1.
+    :param starts: poses that count, shape (k, m). ``tell``: called with the completed fraction.
     :raises ParameterError: no pose counts; the error names what removes most of them.
     """
     robot, kind = space.robot, space.kind
@@ -70,7 +70,7 @@ def find_worst(
         return result
 
     def drawn(count: int) -> Array:
-        # Extremes are often where joints are at their limits.
+        # Extremes are often at joint limits.
         ends = rng.integers(0, 3, (count // 2, len(low))) / 2.0
         inner = rng.random((count - len(ends), len(low)))
         return np.asarray(low + np.concatenate([ends, inner]) * (high - low))
@@ -117,7 +117,7 @@ def _edge_states(
     high: Array,
     rng: np.random.Generator,
 ) -> Array:
-    """Return places (k, n) all along the border on which the least singularity index ends a map.
+    """Return points (k, n) all along the border given by the least singularity index.
 
     Quantities that grow towards a singularity are worst there, and a workspace may end in several
     separate narrow parts there. Places near the border walk to it; of those that arrive the ones
@@ -151,7 +151,7 @@ def _edge_states(
 
 
 def badness(value: Array, largest: bool) -> Array:
-    """How bad values are; minus infinity where there is none."""
+    """Return values whose largest is the worst; minus infinity where there is no value."""
     return np.where(np.isfinite(value), value if largest else -value, -np.inf)
 
 
@@ -165,13 +165,13 @@ def evolve(
     inside: Callable[[Array], NDArray[np.bool_]] | None = None,
     tell: Callable[[float], object] = abs,
 ) -> tuple[Array, float]:
-    """The place (n,) of the highest score in a box, and it, from the best of the places tried.
+    """Maximise a score in a box, from the best of the points tried; return point (n,) and score.
 
-    Each place of a population climbs for itself, so that many hills are climbed: by steps along one
-    coordinate or all, whose size follows their success, and by differences of two others
-    (differential evolution, Storn and Price 1997); some go towards the best.
+    Each point of a population climbs on its own, so that several maxima are followed: by steps
+    along one or all coordinates, whose size adapts to their success, and by differences of two
+    other points (differential evolution, Storn and Price 1997), some of them towards the best.
 
-    :param inside: which places (k, n) count; a step to where none does ends at the border between.
+    :param inside: which points (k, n) count; a step to one that does not count ends at the border.
     """
     scores = np.concatenate([score(part) for part in np.array_split(tried, 1 + len(tried) // 4096)])
     order = np.argsort(-scores, kind="stable")[: kind.population]
@@ -199,7 +199,7 @@ def evolve(
 
 
 def _pull_inside(x: Array, moved: Array, inside: Callable[[Array], NDArray[np.bool_]]) -> Array:
-    """Places moved (k, n), those outside drawn back towards x as far as they have to, by halving.
+    """Pull points that do not count back towards x, by bisection, until they count; (k, n).
 
     Extremes are often where a pose just counts: at a limit or the least singularity index.
     """
@@ -212,15 +212,15 @@ def _pull_inside(x: Array, moved: Array, inside: Callable[[Array], NDArray[np.bo
 
 
 def workspace_box(robot: Robot) -> Array:
-    """Bounds of all reachable poses, limb interference aside, a little wider; shape (m, 2).
+    """Return bounds of all reachable poses, interference ignored, slightly wider; (m, 2).
 
     From poses of joint states all over the limits and, for few coordinates, from a grid of poses.
-    Lateral coordinates of a cylinder are bounded alike on both sides of the axis.
+    Lateral coordinates of a cylinder have symmetric bounds about the axis.
 
     :raises ParameterError: nothing bounds the workspace, or it is empty.
     """
     bounds = np.asarray(robot.search_box(), np.float64)
-    # With what interference takes away, which maps show.
+    # Poses with interference are included: maps show them.
     found = _poses_from_joints(robot)
     grid = robot.grid()
     lateral = [robot.pose_names.index(name) for name in grid.lateral]
@@ -229,7 +229,7 @@ def workspace_box(robot: Robot) -> Array:
         if len(found):
             box = _bounding_box(found, 0.1 * np.ptp(found, axis=0), bounds)
         return box
-    # Twice: a machine may reach a small part of what its lengths allow.
+    # Twice, because a machine may reach a small part of what its lengths allow.
     for _ in range(2):
         ticks = [np.linspace(low, high, GRID_SIDE) for low, high in box]
         poses = np.stack(np.meshgrid(*ticks, indexing="ij"), -1).reshape(-1, len(ticks))
@@ -238,7 +238,7 @@ def workspace_box(robot: Robot) -> Array:
             raise ParameterError("limits", robot.name, "limits that leave a workspace")
         box = _bounding_box(seen, np.ptp(box, axis=1) / (GRID_SIDE - 1), bounds)
         if lateral:
-            # The axis stays in the middle, and on the grid: workspaces end in tips there.
+            # Keep the axis in the middle and on the grid: workspaces have tips there.
             half = np.abs(box[lateral]).max(1)
             box[lateral] = np.stack([-half, half], -1)
     return box
@@ -250,15 +250,15 @@ def _bounding_box(poses: Array, margin: Array, bounds: Array) -> Array:
 
 
 def _poses_from_joints(robot: Robot) -> Array:
-    """Reachable poses of joint states between the limits, shape (k, m); none without limits."""
+    """Return reachable poses of joint states between the limits, (k, m); none without limits."""
     limits = robot.limits.position
     count = len(robot.joint_names)
     if limits is None or not np.isfinite(limits).all():
         return np.empty((0, len(robot.pose_names)))
-    # Not above: every process of a sweep would load it, which takes longer than many sweeps.
+    # Imported here, because loading it in every process takes longer than many sweeps.
     from scipy.stats import qmc  # type: ignore[import-untyped]
 
-    # Extremes are mostly where joints are at a limit or in the middle.
+    # Extremes are mostly where joints are at a limit or in the middle of their range.
     corners = np.stack(np.meshgrid(*[[0.0, 0.5, 1.0]] * count, indexing="ij"), -1)
     inner = qmc.Halton(count, scramble=False).random(JOINT_STATES)
     share = np.concatenate([corners.reshape(-1, count), inner])
@@ -267,7 +267,7 @@ def _poses_from_joints(robot: Robot) -> Array:
     good[good] = reachable(robot, poses[good], -math.inf)
     poses, q = poses[good], q[good]
     if len(robot.pose_names) > MAX_GRID_DIMENSIONS and len(q):
-        # States so few are far apart where joints are many.
+        # With many joints, so few states are sparse: climb to the ends.
         ends = [
             _climb(robot, limits, q[np.argsort(-sign * poses[:, k])[:CLIMB_STARTS]], k, sign)
             for k in range(poses.shape[1])
@@ -278,7 +278,7 @@ def _poses_from_joints(robot: Robot) -> Array:
 
 
 def _climb(robot: Robot, limits: Array, q: Array, k: int, sign: float) -> Array:
-    """Poses uphill of joint states (c, n) in pose coordinate k times a sign.
+    """Climb from joint states (c, n) along ``sign`` times pose coordinate k; return poses.
 
     :param limits: of the joints, shape (n, 2).
     """

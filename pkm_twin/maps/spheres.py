@@ -1,10 +1,10 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""Spheres of directions on a polar plane of tilts: the 5-D image of the 3-PRRU paper, section 2.3.
+"""Draw spheres of directions on a polar plane of tilts: 3-PRRU paper, section 2.3.
 
-A sphere stands for a pose: around the plane the azimuth of the platform's tilt, outwards the tilt,
-without torsion. A point of a sphere is a unit vector of pose rates, and its colour is an index of
-isotropy in this direction of motion. An index is the same in opposite directions, so the visible
-half of a sphere shows all of them.
+The picture is the paper's 5-D image. A sphere stands for a pose: around the plane the azimuth of
+the platform's tilt, outwards the tilt, without torsion. A point of a sphere is a unit vector of
+pose rates, and its colour is an index of isotropy in this direction of motion. An index is the same
+in opposite directions, so the visible half of a sphere shows all of them.
 """
 
 from __future__ import annotations
@@ -47,15 +47,15 @@ VIEW_DIRECTION: Final = np.array([0.5, math.sqrt(0.75), 0.0])
 """Unit vector towards the viewer, in pose rates: the rate of the position points up, and that of a
 tilt to the right does so too."""
 SCALE_QUANTILE: Final = 0.995
-"""Part of the values below the end of a scale: a few near singularities share its last colour."""
+"""Quantile of the values at the end of a colour scale; higher values share its last colour."""
 TOP_CAMERA: Final = {
     "eye": {"x": 0.0, "y": 0.0, "z": 1.25},
     "up": {"x": 0.0, "y": 1.0, "z": 0.0},
     "projection": {"type": "orthographic"},
 }
-"""Camera of the page: the picture, from above."""
+"""Camera of the page that looks from above, as in the picture."""
 OUTSIDE_COLOUR: Final = "#D55E00"
-"""Colour of the rim of spheres whose pose is beyond the machine's limits."""
+"""Colour of the rim of spheres whose pose is outside the machine's limits."""
 
 
 def check_tilts(robot: Robot) -> None:
@@ -74,7 +74,7 @@ def find_spheres(space: Space, energy: float) -> dict[str, Variable]:
     The height is that of the pose that the map's planes are asked to go through, or of home.
 
     :param energy: the platform's kinetic energy, J.
-    :raises ParameterError: two angles that are no tilts about x and y.
+    :raises ParameterError: the two angles are not tilts about x and y.
     """
     robot = space.robot
     height = float((robot.home() if space.at is None else space.at)[0])
@@ -114,7 +114,7 @@ def find_spheres(space: Space, energy: float) -> dict[str, Variable]:
 
 
 def questions(data: Dataset) -> dict[str, tuple[str, str]]:
-    """Return of each index its question and the label of its scale."""
+    """Return the question and the scale's label of each index."""
     energy = json.loads(data.attrs["settings"])["options"]["energy"]
     unit = str(data.sphere_force.attrs["units"])
     what = "force" if unit == "N" else "torque"
@@ -131,7 +131,7 @@ def questions(data: Dataset) -> dict[str, tuple[str, str]]:
 
 
 def state_ranges(data: Dataset) -> list[str]:
-    """Return for each index its least and greatest value at the least and the largest tilt."""
+    """Return each index's smallest and largest value at the smallest and largest tilt."""
     lines = []
     for index, (_, label) in questions(data).items():
         values = data[f"sphere_{index}"].values
@@ -155,7 +155,7 @@ def _height(data: Dataset) -> str:
 
 
 def _sphere_centres(data: Dataset) -> list[tuple[int, int, Array]]:
-    """Return azimuth and tilt by index, and the centre (2,), of each sphere that is drawn.
+    """Return azimuth and tilt by index, and the centre (2,), of each drawn sphere.
 
     The level pose has one sphere, and the first ring every other azimuth, for want of room.
     """

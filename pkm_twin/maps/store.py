@@ -1,12 +1,12 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""Finished chunks in a folder beside the target, joined into one NetCDF file at the end.
+"""Store finished chunks next to the target, and join them into one NetCDF file at the end.
 
-Everything is written under another name and renamed, so a stop at any time leaves whole files
-only. One run at a time works in a folder: it holds a lock there that names its owner, and that the
-system takes away with the process. Nothing is removed but what a run wrote.
+Files are written under a temporary name and renamed, so that a stop at any time leaves complete
+files only. One run at a time works in a folder: it holds a lock file that names its owner; the
+system releases the lock when the process ends. Only files of a run are removed.
 
-HDF5 protects data alone: a flipped bit in its own structures may pass for another number. So the
-SHA-256 of the file stands at its end, where HDF5 does not look.
+HDF5 protects data only: a flipped bit in its own structures may change a number unnoticed.
+Therefore the SHA-256 of the file is appended at its end, which HDF5 ignores.
 """
 
 from __future__ import annotations
@@ -48,22 +48,22 @@ _FIELD_FILTERS: Final = {
     "shuffle": True,
     "fletcher32": True,
 }
-"""How fields are stored; level 1, as numbers with all their digits gain little by more."""
+"""Storage filters of fields; gzip level 1, because full-precision numbers gain little by more."""
 _OWN_NAMES: Final = re.compile(r"sweep\.json|lock|\d{8}\.npz|[\w.]+\.tmp")
-"""Names of what a run writes into its folder."""
+"""Names of the files that a run writes into its folder."""
 CHECKSUM_ATTRIBUTE: Final = {"checksum": "SHA-256 of all before, in the last 32 bytes"}
-"""The attribute of a file that has its checksum at the end."""
+"""Attribute of a file that has its checksum at the end."""
 ROUNDING: Final = 1e-9
-"""By how much a number may be beyond its bounds: they are of order 1."""
+"""Largest excess of a number over its bounds, which are of order 1."""
 _SEAL_MARK: Final = b"\npkm_twin atlas SHA-256\n"
 _SEAL: Final = len(_SEAL_MARK) + hashlib.sha256().digest_size
 _BLOCK_SIZE: Final = 1 << 20
 _SLAB_SIZE: Final = 1 << 22
-"""Numbers of a variable that are judged at once, about."""
+"""Approximate number of values of a variable that are checked at once."""
 
 
 class MapError(PkmTwinError):
-    """A map, or the chunks of one, that cannot be read or written as asked."""
+    """Report a map, or its chunks, that cannot be read or written."""
 
     def __init__(self, path: Path, what: str) -> None:
         super().__init__(f"{_shorten(path)}: {what}")
@@ -76,15 +76,15 @@ def _shorten(path: Path) -> str:
 
 
 def source(data: Dataset) -> Path:
-    """The file that a map came from, for errors."""
+    """Return the file that a map came from, for errors."""
     return Path(str(data.encoding.get("source", "map")))
 
 
 @contextmanager
 def writing(path: Path) -> Iterator[None]:
-    """What the system refuses (a full disk, a folder that is none) as an error with its path.
+    """Convert errors of the system (a full disk, a missing folder) to errors with the path.
 
-    :param path: named where the system names none.
+    :param path: named if the system names none.
     :raises MapError: instead of any ``OSError``.
     """
     try:
@@ -96,9 +96,9 @@ def writing(path: Path) -> Iterator[None]:
 
 @contextmanager
 def reading(path: Path) -> Iterator[None]:
-    """Whatever a damaged file makes of its readers as one error.
+    """Convert any error that a damaged file causes to one error.
 
-    :raises MapError: the file is not what a map is.
+    :raises MapError: the file is not a valid map.
     """
     try:
         yield
@@ -109,7 +109,7 @@ def reading(path: Path) -> Iterator[None]:
 
 
 class Parts:
-    """The finished chunks of one sweep, in ``<target>.parts``."""
+    """Manage the finished chunks of one sweep, in ``<target>.parts``."""
 
     def __init__(self, out: Path, sweep: Map) -> None:
         self.folder = out.with_name(out.name + ".parts")
@@ -118,11 +118,11 @@ class Parts:
         self._lock = -1
 
     def open(self, overwrite: bool = False) -> None:
-        """Make the folder, or take up the one that is there, and lock it.
+        """Create the folder, or continue with the existing one, and lock it.
 
-        :param overwrite: drop what is there if it belongs to another sweep.
-        :raises MapError: another process works there, or the folder holds what is not this
-            sweep's; what no run wrote is never dropped.
+        :param overwrite: remove the chunks of another sweep.
+        :raises MapError: another process works there, or the folder contains other files; files
+            that no run wrote are never removed.
         """
         if self.folder.exists() and not self.folder.is_dir():
             raise MapError(self.folder, "is not a folder; the chunks need a folder of this name")
@@ -144,7 +144,7 @@ class Parts:
                 (self.folder / name).unlink()
             about = {"fingerprint": self._sweep.fingerprint, **self._sweep.attributes}
             replace_file(mark, json.dumps(about, indent=2).encode())
-        # Of runs that were killed.
+        # Temporary files of killed runs.
         for path in self.folder.glob("*.tmp"):
             path.unlink(missing_ok=True)
 
@@ -159,9 +159,9 @@ class Parts:
             )
 
     def _acquire_lock(self) -> int:
-        """The lock's file descriptor; below 0 if the folder went away meanwhile.
+        """Return the lock's file descriptor; below 0 if the folder was removed meanwhile.
 
-        :raises MapError: another process has it.
+        :raises MapError: another process holds the lock.
         """
         path = self.folder / _LOCK_FILE
         try:
@@ -183,27 +183,27 @@ class Parts:
         return -1
 
     def close(self) -> None:
-        """Let go of the folder; the chunks stay."""
+        """Release the folder's lock; the chunks stay."""
         if self._lock >= 0:
             os.close(self._lock)
             self._lock = -1
 
     def pending(self) -> list[int]:
-        """Indices of chunks that are not there yet."""
+        """Return the indices of missing chunks."""
         here = set(self._names())
         return [i for i in range(len(self._chunks)) if self._path(i).name not in here]
 
     def save(self, index: int, values: Values) -> None:
-        """Keep a finished chunk."""
+        """Save a finished chunk."""
         save_part(self.folder, index, values)
 
     def grid(self) -> list[Values]:
-        """What the chunks of the grid say besides their fields, in the order of the grid."""
+        """Return the search starts and counts of the grid's chunks, in the order of the grid."""
         chunks = [k for k, chunk in enumerate(self._chunks) if chunk.plane is None]
         return [self._read(index, ("starts", "counts")) for index in chunks]
 
     def __iter__(self) -> Iterator[tuple[Chunk, Values]]:
-        """All chunks with their values, in order."""
+        """Yield all chunks with their values, in order."""
         for index, chunk in enumerate(self._chunks):
             yield chunk, self._read(index)
 
@@ -215,7 +215,7 @@ class Parts:
             raise MapError(self._path(index), f"damaged ({error}); remove it") from None
 
     def drop(self) -> None:
-        """Remove what runs wrote, and the folder if it is empty then."""
+        """Remove the files of runs, and the folder if it is empty then."""
         for name in self._names():
             if _OWN_NAMES.fullmatch(name):
                 (self.folder / name).unlink(missing_ok=True)
@@ -228,9 +228,9 @@ class Parts:
 
 
 def save_part(folder: Path, index: int, values: Values) -> None:
-    """Keep a finished chunk in a folder."""
+    """Save a finished chunk in a folder."""
     path = _part_path(folder, index)
-    # Of a run that was killed a worker may still be at it.
+    # A worker of a killed run may still write the same chunk.
     hidden = path.with_suffix(f".{os.getpid()}.tmp")
     with writing(path):
         try:
@@ -249,9 +249,9 @@ def _part_path(folder: Path, index: int) -> Path:
 
 
 class _Sink(io.RawIOBase):
-    """A file for the HDF5 library that remembers the first refusal of the system.
+    """Provide a file to the HDF5 library that records the system's first error.
 
-    After it writes go nowhere: the library does not survive errors while it closes a file.
+    Later writes are discarded: the library does not survive errors while it closes a file.
     """
 
     def __init__(self, file: BinaryIO) -> None:
@@ -303,7 +303,7 @@ def join(sweep: Map, parts: Parts, out: Path) -> None:
             try:
                 _write_file(sweep, parts, sink)
             except Exception:
-                # What the library makes of a disk that is full.
+                # Errors that the library raises after an error of the system.
                 if sink.error is None:
                     raise
             if sink.error is not None:
@@ -333,7 +333,7 @@ def _write_file(sweep: Map, parts: Parts, sink: _Sink) -> None:
         for name, field in fields.items():
             fill = np.nan if np.dtype(field.dtype).kind == "f" else None
             shape = [sizes[dim] for dim in field.dims]
-            # As large as what is written at once.
+            # Storage chunks are as large as the parts that are written.
             planes = field.dims[0] == "plane"
             rows = (1, *shape[1:3], 1, *shape[4:]) if planes else (sweep.rows, *shape[1:])
             chunks = tuple(min(sides) for sides in zip(rows, shape, strict=True))
@@ -363,7 +363,7 @@ def _write_variable(file: Any, name: str, dims: tuple[str, ...], values: Any, at
 
 
 def _convert_bounds(attrs: Mapping[str, Any], dtype: Any) -> dict[str, Any]:
-    """Attributes, bounds in the type of their variable, as the CF conventions want them."""
+    """Convert bounds among the attributes to their variable's type, as CF requires."""
     return {
         key: np.asarray(value, dtype)[()] if key.startswith("valid_") else value
         for key, value in attrs.items()
@@ -371,9 +371,9 @@ def _convert_bounds(attrs: Mapping[str, Any], dtype: Any) -> dict[str, Any]:
 
 
 def _open_dataset(xarray: Any, path: Path) -> Dataset:
-    """The data set of a file.
+    """Open the data set of a file.
 
-    What the library leaves half made of a damaged file complains when it goes: here, unheard.
+    Objects that the library leaves after an error complain when they are deleted: here, silently.
     """
     hook, sys.unraisablehook = sys.unraisablehook, lambda _: None
     try:
@@ -395,7 +395,7 @@ def _describe_damage(error: Exception) -> str:
 
 
 def open_map(path: Path) -> Dataset:
-    """A stored map, its checksum and the ranges of its numbers checked.
+    """Open a stored map; check its checksum and the ranges of its numbers.
 
     Large fields are read in parts for the check, and again when they are used.
 
@@ -408,7 +408,7 @@ def open_map(path: Path) -> Dataset:
             raise MapError(path, "no such file")
         if not path.is_file():
             raise MapError(path, "no regular file")
-        # Before HDF5 sees the file: damage may end the process there.
+        # Checked before HDF5 opens the file, because damage may crash the process there.
         whole = verify_checksum(path)
     if whole is False:
         raise MapError(path, "damaged, or changed by another program: its checksum differs")
@@ -432,7 +432,7 @@ def open_map(path: Path) -> Dataset:
 
 
 def seal(file: BinaryIO) -> None:
-    """Write the checksum of a whole file at its end."""
+    """Append the checksum of a whole file at its end."""
     size = file.seek(0, 2)
     digest = _digest(file, size)
     file.seek(size)
@@ -443,7 +443,7 @@ def seal(file: BinaryIO) -> None:
 
 
 def verify_checksum(path: Path) -> bool | None:
-    """Whether the checksum at a file's end is that of the file; None where there is none."""
+    """Return whether the checksum at a file's end is correct; None without a checksum."""
     with path.open("rb") as file:
         size = file.seek(0, 2) - _SEAL
         if size < 0:
@@ -463,7 +463,7 @@ def _digest(file: BinaryIO, size: int) -> bytes:
 
 
 def find_invalid_number(data: Dataset) -> str:
-    """What is wrong with the numbers of a map, for an error; empty where nothing is.
+    """Describe the first invalid number of a map; return an empty text if there is none.
 
     Axes and other coordinates are finite, axes never decrease, nothing is infinite. All numbers
     are within ``valid_min`` and ``valid_max`` (CF conventions, 2.5.1), or NaN in fields.
@@ -478,7 +478,7 @@ def find_invalid_number(data: Dataset) -> str:
         for values in _slabs(variable):
             if name in data.coords and np.isnan(values).any():
                 return f"{name} has the value nan"
-            # The least and the greatest number; NaN where there is none.
+            # The smallest and the largest number; NaN if there is none.
             for value in (np.fmin.reduce(values, None), np.fmax.reduce(values, None)):
                 if math.isinf(value) or value < low - ROUNDING or value > high + ROUNDING:
                     return f"{name} has the value {value:g}, allowed: {low:g} to {high:g}"
@@ -488,7 +488,7 @@ def find_invalid_number(data: Dataset) -> str:
 
 
 def _slabs(variable: Any) -> Iterator[NDArray[Any]]:
-    """All numbers of a variable: at once where they are few, else along its first two axes."""
+    """Yield all numbers of a variable, large ones in parts along the first two axes."""
     if variable.size <= _SLAB_SIZE or variable.ndim < 2:
         yield np.asarray(variable.values)
         return

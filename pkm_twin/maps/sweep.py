@@ -1,10 +1,10 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""A map: a kind's cases over all poses, the worst pose of each, and planes through it.
+"""Compute a map: a kind's cases over all poses, the worst pose of each, and planes through it.
 
-Poses count where actuators and passive joints keep their limits, limbs stay apart, and the
-singularity index is not below a bound. Of up to three pose coordinates there is a grid of poses, of
-more a sample of joint positions. The worst pose is searched in the whole workspace, from the worst
-of these poses. Then come planes of every two coordinates that go exactly through it.
+A pose counts if actuators and passive joints keep their limits, limbs do not interfere, and the
+singularity index is not below a bound. Up to three pose coordinates have a grid of poses, more have
+a sample of joint positions. The worst pose is searched in the whole workspace, from the worst of
+these poses. Planes of every two coordinates then go exactly through it.
 """
 
 from __future__ import annotations
@@ -49,20 +49,20 @@ from pkm_twin.robot.robot import Robot
 from pkm_twin.robot.workspace import LEAST_TILT, distance_unit, keeps_limits
 
 MAX_TICKS: Final = 2001
-"""Most poses along one coordinate."""
+"""Largest number of poses along one coordinate."""
 STARTS_PER_CHUNK: Final = 16
-"""Worst poses of a chunk that the search may begin at."""
+"""Worst poses of a chunk that the search may start from."""
 ZOOMS: Final = 3
-"""How often the part of a plane that is reachable is looked for, each time finer."""
+"""Number of times that the reachable part of a plane is searched, each time on a finer grid."""
 MIN_VIEW_FRACTION: Final = 0.1
-"""Part of a coordinate's range that a plane shows at least on each side of its pose."""
+"""Smallest fraction of a coordinate's range that a plane shows on each side of its pose."""
 PLANE_SIDE_RANGE: Final = (11, 151)
-"""Fewest and most poses along a side of a plane."""
+"""Smallest and largest number of poses along a side of a plane."""
 
 
 @dataclass(frozen=True)
 class Chunk:
-    """Rows ``start`` to ``stop`` of the grid, or of a plane; ``case``: of which, None all."""
+    """Describe rows ``start`` to ``stop`` of the grid, or of a plane; ``case`` None: all cases."""
 
     start: int
     stop: int
@@ -71,11 +71,11 @@ class Chunk:
 
     @property
     def before(self) -> str:
-        """What names of its fields begin with."""
+        """Prefix of the names of its fields."""
         return "" if self.plane is None else "plane_"
 
     def place(self, dims: Sequence[str]) -> tuple[Any, ...]:
-        """Where its values stand in a field."""
+        """Return the index of its values in a field."""
         rows = slice(self.start, self.stop)
         if self.plane is None:
             return (rows,)
@@ -85,9 +85,10 @@ class Chunk:
 
 @dataclass(frozen=True, eq=False)
 class Map(Space):
-    """One map to be computed. Frozen and small: workers get it whole with every chunk.
+    """Describe one map to be computed; small, because workers receive it with every chunk.
 
-    ``extents``: of the planes of each case, shape (planes, 2, 2), once the worst poses are known.
+    ``extents``: ends of the planes of each case, shape (planes, 2, 2), once the worst poses are
+    known.
     """
 
     extents: tuple[Array, ...] = ()
@@ -99,19 +100,19 @@ class Map(Space):
 
     @property
     def planes(self) -> list[tuple[int, ...]]:
-        """Pose coordinates of the planes, by index, those of places first; or the only one."""
+        """Pose coordinates of the planes, by index, positions first; or the only coordinate."""
         angles = [unit == "rad" for unit in self.robot.pose_units]
         pairs = itertools.combinations(range(len(angles)), 2)
         return sorted(pairs, key=lambda pair: sum(angles[k] for k in pair)) or [(0,)]
 
     @cached_property
     def elements(self) -> tuple[str, ...]:
-        """Names that ``dominant`` counts."""
+        """Names that ``dominant`` indexes."""
         return self.kind.elements(self.robot)
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Of the grid."""
+        """Shape of the grid."""
         return tuple(map(len, self.ticks)) or (self.samples,)
 
     @cached_property
@@ -168,7 +169,7 @@ class Map(Space):
 
     @property
     def settings(self) -> dict[str, Any]:
-        """What made this map besides the robot, as plain values."""
+        """Settings of this map except the robot, as plain values."""
         return {
             "points": math.prod(self.shape),
             "least_singularity": self.least,
@@ -181,7 +182,7 @@ class Map(Space):
 
     @property
     def attributes(self) -> dict[str, str]:
-        """Global attributes of the file: everything that made it."""
+        """Global attributes of the file: all inputs of the map."""
         grid = self.robot.grid()
         return {
             "title": f"{self.kind.name} of {self.robot.name}",
@@ -200,7 +201,7 @@ class Map(Space):
 
     @property
     def fingerprint(self) -> str:
-        """Equal for two maps exactly if their results are."""
+        """Hash that is equal for two maps exactly if their results are."""
         digest = hashlib.sha256(json.dumps(self.attributes, sort_keys=True).encode())
         digest.update(self.robot.graph.key.encode() + self.robot.own_inertial.tobytes())
         digest.update(f"{self.rows} {self.side} {self.bounds.tolist()}".encode())
@@ -224,7 +225,7 @@ class Map(Space):
         return max(1, self.kind.chunk // math.prod(self.shape[1:]))
 
     def chunks(self) -> list[Chunk]:
-        """All chunks: those of the grid, then those of the planes."""
+        """Return all chunks: those of the grid, then those of the planes."""
         chunks = _split_rows(self.shape[0], self.rows)
         rows = max(1, self.kind.chunk // self.sizes["column"])
         cases = (None,) if self.kind.together else range(len(self.cases))
@@ -233,22 +234,22 @@ class Map(Space):
         return chunks
 
     def count(self, chunk: Chunk) -> int:
-        """Poses of one chunk."""
+        """Return the number of poses of one chunk."""
         across = math.prod(self.shape[1:]) if chunk.plane is None else self.sizes["column"]
         return (chunk.stop - chunk.start) * across
 
     @property
     def points(self) -> int:
-        """Poses to compute; the unit of progress."""
+        """Number of poses to compute; the unit of progress."""
         return sum(self.count(chunk) for chunk in self.chunks())
 
     def plane_ticks(self, plane: int, case: int) -> list[Array]:
-        """Coordinates along a plane's sides; its pose is among them."""
+        """Return the coordinates along a plane's sides, which include its pose."""
         sides = zip(self.planes[plane], self.extents[case][plane], strict=False)
         return [_make_ticks(ends, self.through(case)[k], self.side) for k, ends in sides]
 
     def _find_extent(self, plane: int, case: int) -> Array:
-        """Ends of a plane's sides (2, 2), around what is reachable in it and its pose."""
+        """Return the ends of a plane's sides (2, 2), around its reachable part and its pose."""
         shown, pose = list(self.planes[plane]), self.through(case)
         box = bounds = self.bounds[shown]
         least, most = np.minimum(bounds[:, 0], pose[shown]), np.maximum(bounds[:, 1], pose[shown])
@@ -260,7 +261,7 @@ class Map(Space):
             q, _, known = self.of_poses(poses)
             reach = keeps_limits(self.robot, q, poses, -math.inf, known)
             seen = np.concatenate([poses[reach], pose[None]])[:, shown]
-            # More than a step: a tip between the poses of this grid is seen on the next.
+            # More than a step, so that a tip between the poses appears on the next grid.
             margin = 1.5 * np.array([np.diff(side).max() for side in ticks])
             around = np.maximum(margin, MIN_VIEW_FRACTION * np.ptp(bounds, axis=1))
             low = np.minimum(seen.min(0) - margin, pose[shown] - around)
@@ -269,7 +270,7 @@ class Map(Space):
         return np.concatenate([box, np.zeros((2 - len(box), 2))])
 
     def _plane_poses(self, plane: int, case: int, ticks: Sequence[Array]) -> Array:
-        """Poses of a plane, shape (k, m)."""
+        """Return the poses of a plane, shape (k, m)."""
         grid = np.meshgrid(*ticks, indexing="ij")
         poses = np.broadcast_to(self.through(case), (*grid[0].shape, len(self.bounds))).copy()
         for k, values in zip(self.planes[plane], grid, strict=True):
@@ -277,7 +278,7 @@ class Map(Space):
         return poses.reshape(-1, len(self.bounds))
 
     def _states(self, chunk: Chunk) -> tuple[Array, Array, Mask]:
-        """Joint positions, poses, and which are known, of a chunk."""
+        """Return joint positions, poses, and which are known, of a chunk."""
         rows = slice(chunk.start, chunk.stop)
         if chunk.plane is not None:
             case = chunk.case or 0
@@ -291,7 +292,7 @@ class Map(Space):
         return self.state(rng.uniform(low, high, (chunk.stop - chunk.start, len(low))))
 
     def evaluate(self, chunk: Chunk) -> Values:
-        """The cases on a chunk, and of the grid its worst poses and how many count."""
+        """Evaluate the cases on a chunk; for the grid also worst poses and counts."""
         states = self._states(chunk)
         parts = 1 + len(states[0]) // self.kind.chunk
         cases = self.cases if chunk.case is None else (self.cases[chunk.case],)
@@ -314,7 +315,7 @@ class Map(Space):
         }
 
     def _store_worst(self, values: Values, poses: Array, case: int | None) -> None:
-        """Write the worst where its pose is: by inverse kinematics it may be out by rounding."""
+        """Store the worst at its pose, which inverse kinematics may put outside by rounding."""
         cases = range(len(self.cases)) if case is None else [case]
         for column, k in enumerate(cases):
             worst = self.worst[k]
@@ -354,7 +355,7 @@ class Map(Space):
         return values
 
     def with_worst(self, grid: Iterable[Values]) -> Map:
-        """With the worst pose of each case.
+        """Return the map with the worst pose of each case.
 
         :param grid: results of all chunks of the grid.
         :raises ParameterError: no pose counts.
@@ -378,7 +379,7 @@ class Map(Space):
         return replace(found, extents=extents)
 
     def summaries(self, grid: Iterable[Values]) -> dict[str, Variable]:
-        """The worst of each case, the planes' axes, and what the kind says of the workspace."""
+        """Return the worst of each case, the planes' axes, and the kind's summaries."""
         counted, apart, every = np.sum([values["counts"] for values in grid], axis=0).tolist()
         result = {"valid": scalar(apart / every, "part of the grid that counts", "", UNIT_INTERVAL)}
         for k, dim in enumerate(("row", "column")):
@@ -396,7 +397,7 @@ class Map(Space):
         return result | self._worst_variables() | self.kind.summaries(self, counted, apart)
 
     def _worst_variables(self) -> dict[str, Variable]:
-        """Value, pose, singularity index, direction and element of the worst poses."""
+        """Return value, pose, singularity index, direction and element of the worst poses."""
         worst, what = self.worst, "the worst value"
         value = [one.found.value[0] for one in worst]
         index = [one.index for one in worst]
@@ -430,7 +431,7 @@ class Map(Space):
 
 
 def _store(values: Values, case: int, kept: Mask, found: Found) -> None:
-    """Write what was found in the poses kept."""
+    """Store the values of the kept poses."""
     finite = np.isfinite(found.value)
     values["value"][kept, case] = np.where(finite, found.value, np.nan)
     if found.direction is not None:
@@ -442,7 +443,7 @@ def _store(values: Values, case: int, kept: Mask, found: Found) -> None:
 
 
 def _make_ticks(ends: Array, value: float, count: int) -> Array:
-    """Numbers between ends (2,), evenly but for one that is a value; wider where it is outside."""
+    """Return even numbers between ends (2,), one of them moved to ``value``; wider if outside."""
     ticks = np.linspace(min(ends[0], value), max(ends[1], value), count)
     ticks[np.abs(ticks - value).argmin()] = value
     return np.asarray(ticks, np.float64)
@@ -463,7 +464,7 @@ def map_of(
     least_clearance: float = 0.0,
     regular: bool = False,
 ) -> Map:
-    """The map of a kind over a robot's workspace.
+    """Plan the map of a kind over a robot's workspace.
 
     :param points: about how many poses; default by the kind.
     :param cases: load cases (:meth:`Kind.loaded`); default the kind's own.
@@ -472,9 +473,9 @@ def map_of(
     :param least_clearance: distance between limbs, m, below which a pose does not count.
     :param regular: count only poses inside the largest circles about the axis, of
         ``LEAST_TILT`` or more where they are tilts (2UPR-RPU paper, figure 5).
-    :raises ParameterError: the robot's file lacks what the kind needs, or limits without which
-        the workspace has no end; a bound on a clearance that is not known; no circle.
-    :raises UnreachableError: ``at`` is none of the robot's poses.
+    :raises ParameterError: the robot's file lacks what the kind needs, or limits that bound the
+        workspace; a bound on an unknown clearance; no circle.
+    :raises UnreachableError: ``at`` is out of reach.
     """
     cases = tuple(cases) or kind.cases(robot)
     check(robot, kind, cases)
@@ -500,7 +501,7 @@ def map_of(
     ticks: tuple[Array, ...] = ()
     if count <= MAX_GRID_DIMENSIONS:
         length = max(5, min(round(total ** (1 / count)), MAX_TICKS))
-        # Odd across an axis, so that the axis is on the grid.
+        # An odd number across an axis, so that the axis is on the grid.
         odd = length + 1 - length % 2
         lateral = robot.grid().lateral
         ticks = tuple(
@@ -516,12 +517,12 @@ def map_of(
 
 
 def find_circles(robot: Robot, bounds: Array, least: float, least_clearance: float) -> Array:
-    """Return heights and radii, shape (2, k), of the largest circles about the axis that count.
+    """Return heights and radii, (2, k), of the largest circles about the axis that count.
 
     Circles of tilts below ``LEAST_TILT`` are NaN.
 
     :param bounds: of the pose coordinates, shape (m, 2).
-    :raises ParameterError: a machine whose poses lie about no axis, or that has no circle.
+    :raises ParameterError: a machine whose workspace has no axis, or without a circle.
     """
     grid = robot.grid()
     if grid.kind != "cylinder":
@@ -548,9 +549,9 @@ def _bound_circles(robot: Robot, stack: Array) -> Array:
 
 
 def check(robot: Robot, kind: Kind, cases: Sequence[Case]) -> None:
-    """Compute a kind once, at home, for what it says the robot's file lacks.
+    """Evaluate a kind once, at home, so that missing data of the robot's file raise early.
 
-    :raises ParameterError: by the section.
+    :raises ParameterError: names the missing section.
     """
     kind.elements(robot)
     evaluate_kind(kind, robot, robot.graph.home[None], cases)

@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""The kinds of maps, one a file: the folder is their table."""
+"""Collect the kinds of maps, one per file of this folder."""
 
 from __future__ import annotations
 

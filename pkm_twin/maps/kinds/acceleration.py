@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""The acceleration from rest that the drives reach in every direction."""
+"""Map the acceleration from rest that the drives reach in every direction."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from pkm_twin.robot.robot import Robot
 
 
 class Acceleration(Kind):
-    """The acceleration from rest that the drives reach in every direction."""
+    """Map the acceleration from rest that the drives reach in every direction."""
 
     name = "acceleration"
     question = "how hard can it accelerate?"
@@ -33,17 +33,17 @@ class Acceleration(Kind):
     takes_wrench = True
 
     def cases(self, robot: Robot) -> tuple[Case, ...]:
-        """Of a pose of angles alone the angular acceleration."""
+        """Return the case, with angular acceleration for a pose of angles alone."""
         return (replace(super().cases(robot)[0], unit=f"{unit_of_motion(robot)}/s2"),)
 
     def elements(self, robot: Robot) -> tuple[str, ...]:
-        """The drives."""
+        """Return the names of the drives."""
         return robot.joint_names
 
     def found(self, robot: Robot, q: Array, case: Case) -> Found:
-        """Least over directions of what the first drive at its limit leaves; its angles at rest.
+        """Return the smallest acceleration over directions at which a drive reaches its limit.
 
-        0 where the drives do not hold the machine.
+        The pose's angles stay at rest. The value is 0 if the drives cannot hold the machine.
         """
         limits, still = drive_limits(robot, "effort"), np.zeros_like(q)
         back, axes = unit_motions(robot, q)

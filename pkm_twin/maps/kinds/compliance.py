@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""Compliance of the platform, or its deflection under loads."""
+"""Map the compliance of the platform, or its deflection under loads."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from stiffness_monitor import platform_response
 
 
 class Compliance(Kind):
-    """The softest pose: compliance and its direction, or deflections under loads."""
+    """Map the compliance and its softest direction, or deflections under loads."""
 
     name = "compliance"
     question = "where is it softest?"
@@ -25,16 +25,16 @@ class Compliance(Kind):
     takes_wrench = True
 
     def loaded(self, robot: Robot, name: str, wrench: Sequence[float]) -> Case:
-        """Under a load the value is the deflection."""
+        """Return a load case, whose value is the deflection."""
         case = super().loaded(robot, name, wrench)
         return replace(case, what="deflection", unit="m", answer="moves most")
 
     def elements(self, robot: Robot) -> tuple[str, ...]:
-        """Members and joints with elasticity."""
+        """Return the names of members and elastic joints."""
         return platform_response(robot, robot.graph.home, np.zeros(6)).elements
 
     def found(self, robot: Robot, q: Array, case: Case) -> Found:
-        """Largest eigenvalue of the compliance's translational block; or a load's deflection.
+        """Return the largest eigenvalue of the translational compliance, or a load's deflection.
 
         Without a load the element is the one with most strain energy under a force in the softest
         direction.

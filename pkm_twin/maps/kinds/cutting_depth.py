@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""The least axial depth of cut of the stability lobes, in the zero-order approximation."""
+"""Map the smallest axial depth of cut of the stability lobes, in zero order."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from stiffness_monitor.vibration import DYNAMIC_MODES, tool_modes
 
 @dataclass(frozen=True)
 class CuttingDepth(Frequency):
-    """The least axial depth of cut of the stability lobes, in the zero-order approximation.
+    """Map the smallest axial depth of cut of the stability lobes, in zero order.
 
     At small immersion some speeds chatter at a smaller depth: `lobes` is exact at one pose.
     """
 
     milling: Milling
-    # As of stiffness_monitor.vibration.tool_modes.
+    # Parameters of stiffness_monitor.vibration.tool_modes.
     damping: tuple[float, ...] | None = None
     tool: tuple[float, ...] = (0.0, 0.0, 0.0)
 
@@ -36,11 +36,11 @@ class CuttingDepth(Frequency):
     together = False
 
     def elements(self, robot: Robot) -> tuple[str, ...]:
-        """Modes of the tool point, lowest first."""
+        """Return the names of the tool point's modes, lowest first."""
         return tuple(f"mode {k}" for k in range(1, DYNAMIC_MODES + 1))
 
     def each(self, robot: Robot, q: Array, cases: object) -> list[Found]:
-        """The zero-order depth, how the tool point swings in the mode that chatters, and which."""
+        """Return the zero-order depth, and direction and index of the chattering mode."""
         poses = robot.forward(q)
         found = [tool_modes(robot, p, damping=self.damping, tool=self.tool) for p in poses]
         depths = [stable_depth_of(modes, self.milling) for modes in found]

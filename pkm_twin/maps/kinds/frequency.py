@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""The first natural frequency, actuators locked."""
+"""Map the first natural frequency, actuators locked."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from stiffness_monitor.modes import modes
 
 
 class Frequency(Kind):
-    """The first natural frequency, actuators locked."""
+    """Map the first natural frequency, actuators locked."""
 
     name = "frequency"
     question = "where does it ring lowest?"
@@ -30,11 +30,11 @@ class Frequency(Kind):
     screen = Compliance()
 
     def elements(self, robot: Robot) -> tuple[str, ...]:
-        """Bodies, and joints with elasticity."""
+        """Return the names of bodies and elastic joints."""
         return modes(robot, robot.home(), 1).energies.elements
 
     def each(self, robot: Robot, q: Array, cases: Sequence[Case]) -> list[Found]:
-        """Frequencies, the way that the platform swings, and the parts with most strain energy."""
+        """Return frequencies, the platform's direction, and the element with most strain energy."""
         found = modes(robot, robot.forward(q), len(cases))
         _, direction = size_and_direction(found.shapes[..., 0, :3])
         strain = found.energies.strain.argmax(-1)

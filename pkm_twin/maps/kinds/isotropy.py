@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""Dynamic isotropy: kinetic energy and drive force in the worst direction of the motion."""
+"""Map dynamic isotropy: kinetic energy and drive force in the worst direction of motion."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ TRANSFER = Case(
 
 @dataclass(frozen=True)
 class Isotropy(Kind):
-    """Kinetic energy and driving force in the worst direction of motion."""
+    """Map kinetic energy and driving force in the worst direction of motion."""
 
     energy: float = setting(ENERGY, "the platform's kinetic energy for the driving force (J)")
     spheres: bool = setting(
@@ -44,7 +44,7 @@ class Isotropy(Kind):
     )
 
     def cases(self, robot: Robot) -> tuple[Case, ...]:
-        """The platform's share of the kinetic energy, and the driving force at its energy."""
+        """Return the platform's share of kinetic energy, and the driving force at its energy."""
         robot.massive()
         if self.spheres:
             spheres.check_tilts(robot)
@@ -54,11 +54,11 @@ class Isotropy(Kind):
         return TRANSFER, Case("force", what, robot.effort_unit, "needs most drive")
 
     def elements(self, robot: Robot) -> tuple[str, ...]:
-        """The drives."""
+        """Return the names of the drives."""
         return robot.joint_names
 
     def axes(self, robot: Robot) -> tuple[str, ...]:
-        """Directions are unit vectors of the pose's rates."""
+        """Return the components of directions, which are unit vectors of pose rates."""
         return tuple(f"d{name}/dt" for name in robot.pose_names)
 
     def found(self, robot: Robot, q: Array, case: Case) -> Found:
@@ -70,20 +70,20 @@ class Isotropy(Kind):
         return Found(*driving_force_peak(robot, pose, self.energy))
 
     def summaries(self, space: Space, counted: int, apart: int) -> dict[str, Variable]:
-        """With ``spheres`` both indices in every direction of motion."""
+        """Return both indices in every direction of motion if ``spheres`` is set."""
         return spheres.find_spheres(space, self.energy) if self.spheres else {}
 
     @classmethod
     def facts(cls, data: Dataset) -> list[str]:
-        """Ranges of the indices on the spheres."""
+        """Return ranges of the indices on the spheres."""
         return spheres.state_ranges(data) if "sphere_energy" in data else []
 
     @classmethod
     def figures(cls, data: Dataset) -> dict[str, Figure]:
-        """The spheres."""
+        """Draw the spheres."""
         return spheres.draw_spheres(data) if "sphere_energy" in data else {}
 
     @classmethod
     def page(cls, data: Dataset) -> Any:
-        """The spheres, to turn."""
+        """Return a figure with the spheres to rotate."""
         return spheres.make_page(data) if "sphere_energy" in data else None

@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""The six lowest natural frequencies, actuators locked, and the shapes of their modes."""
+"""Map the six lowest natural frequencies, actuators locked, and store their mode shapes."""
 
 from __future__ import annotations
 
@@ -26,16 +26,17 @@ if TYPE_CHECKING:
     from xarray import Dataset
 
 MODE_COUNT: Final = 6
+"""Number of modes of the map."""
 DRAWN_MODES: Final = 3
-"""Modes in the picture of shapes."""
+"""Number of modes in the picture of shapes."""
 MAX_DRAWN_DISPLACEMENT: Final = 0.13
 """Largest displacement of a drawn mode shape over the size of the machine."""
 FRAMES_PER_SWING: Final = 16
-"""Pictures in one swing of a mode."""
+"""Frames in one period of a mode's animation."""
 
 
 class Modes(Frequency):
-    """The six lowest natural frequencies and their mode shapes."""
+    """Map the six lowest natural frequencies, and store their mode shapes."""
 
     name = "modes"
     question = "how does it vibrate?"
@@ -45,7 +46,7 @@ class Modes(Frequency):
     )
 
     def cases(self, robot: Robot) -> tuple[Case, ...]:
-        """The modes, lowest first."""
+        """Return one case per mode, lowest first."""
         (first,) = super().cases(robot)
         numbers = range(1, MODE_COUNT + 1)
         return tuple(replace(first, name=f"mode {k}", what=f"frequency of mode {k}",
@@ -53,7 +54,7 @@ class Modes(Frequency):
                      for k in numbers)  # fmt: skip
 
     def summaries(self, space: Space, counted: int, apart: int) -> dict[str, Variable]:
-        """The shapes of the modes at the planes' pose, where their energy is, and lines to draw."""
+        """Return the mode shapes at the planes' pose, their energy shares, and lines to draw."""
         pose, node, part = space.through(0), ("mode", "node", "space"), ("mode", "element")
         found = modes(space.robot, pose, len(space.cases))
         edges = structure_edges(
@@ -77,7 +78,7 @@ class Modes(Frequency):
 
     @classmethod
     def figures(cls, data: Dataset) -> dict[str, Figure]:
-        """The shapes of the lowest modes, in colours of how far each point moves."""
+        """Draw the shapes of the lowest modes, coloured by displacement."""
         from mpl_toolkits.mplot3d.art3d import Line3DCollection  # type: ignore[import-untyped]
 
         figure, columns = plots.columns(DRAWN_MODES, 1, 4.6, subplot_kw={"projection": "3d"})
@@ -110,7 +111,7 @@ class Modes(Frequency):
 
     @classmethod
     def page(cls, data: Dataset) -> Any:
-        """The frame at rest and in a mode that a menu chooses and buttons swing and hold."""
+        """Return a figure of the frame at rest and in a mode, with menu and animation."""
         graph = require("plotly.graph_objects", "atlas")
         from pkm_twin.maps.page import BAR, CAMERA, MARGIN, MENU, button
 
@@ -174,9 +175,9 @@ class Modes(Frequency):
 
 
 def deformed(data: Dataset, mode: int) -> tuple[Array, Array]:
-    """Nodes of a mode shape, enlarged, and how far each moves; (nodes, 3), m, and (nodes,).
+    """Return a mode's magnified nodes, (nodes, 3), m, and relative displacements, (nodes,).
 
-    The second is over the largest of all nodes.
+    Displacements are relative to the largest of all nodes.
 
     :param mode: by index, 0 is the lowest.
     """
@@ -187,13 +188,13 @@ def deformed(data: Dataset, mode: int) -> tuple[Array, Array]:
 
 
 def grounded(data: Dataset) -> NDArray[np.int64]:
-    """Nodes on the ground, by index: the ends that one line alone meets."""
+    """Return the nodes on the ground, by index: the ends that only one line meets."""
     nodes, count = np.unique(data.line.values, return_counts=True)
     return np.asarray(nodes[count == 1], np.int64)
 
 
 def _mode_title(data: Dataset, mode: int) -> list[str]:
-    """A mode's number, its frequency, and the parts that hold most of its energy."""
+    """Return a mode's number, its frequency, and the parts with most of its energy."""
     lines = [f"mode {mode + 1}: {float(data.shape_frequency[mode]):.4g} Hz"]
     for kind in ("strain", "kinetic"):
         shares = data[f"{kind}_share"].values[mode]
@@ -205,13 +206,13 @@ def _mode_title(data: Dataset, mode: int) -> list[str]:
 
 
 def _scene_bounds(rest: Array) -> tuple[Array, Array]:
-    """Bounds of a scene that are the same for all modes, with room for the shapes."""
+    """Return bounds of the scene for all modes, with a margin for the shapes."""
     margin = 0.6 * MAX_DRAWN_DISPLACEMENT * float(np.linalg.norm(np.ptp(rest, axis=0)))
     return rest.min(0) - margin, rest.max(0) + margin
 
 
 def _join_edges(edges: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Nodes of all lines in one go; -1 between lines that do not meet."""
+    """Return the nodes of all lines as one path, with -1 between lines that do not meet."""
     path: list[int] = []
     for start, end in edges.tolist():
         if not path or path[-1] != start:
@@ -223,17 +224,17 @@ def _join_edges(edges: NDArray[np.int64]) -> NDArray[np.int64]:
 def _values_along_path(
     values: Array, path: NDArray[np.int64], gap: float | None = None
 ) -> list[Any]:
-    """Values (nodes,) along a path; a plain list, as only that can have None in its gaps."""
+    """Return values (nodes,) along a path as a list, which can hold None in gaps."""
     return [gap if k < 0 else round(float(values[k]), 5) for k in path.tolist()]
 
 
 def _path_coordinates(nodes: Array, path: NDArray[np.int64]) -> dict[str, Any]:
-    """Coordinates of nodes (n, 3) along a path."""
+    """Return the coordinates of nodes (n, 3) along a path."""
     return {axis: _values_along_path(nodes[:, k], path) for k, axis in enumerate("xyz")}
 
 
 def _animation_buttons(mode: int) -> list[dict[str, Any]]:
-    """Buttons that swing a mode ten times and hold it; plotly cannot repeat without end."""
+    """Return buttons that animate a mode for ten periods and stop it: plotly cannot loop."""
     names = [f"{mode}/{n % FRAMES_PER_SWING}" for n in range(10 * FRAMES_PER_SWING + 1)]
     timing = {"mode": "immediate", "transition": {"duration": 0}}
     swing = {**timing, "frame": {"duration": 60, "redraw": True}}
@@ -245,10 +246,10 @@ def _animation_buttons(mode: int) -> list[dict[str, Any]]:
 
 
 def structure_edges(model: StructuralModel, nodes: tuple[str, ...]) -> NDArray[np.int64]:
-    """Pairs of nodes to draw lines between, shape (edges, 2).
+    """Return pairs of nodes to draw lines between, shape (edges, 2).
 
-    Along the members; from a member's end to those that stand on it; the platform as spokes from
-    its origin and the outline of the points where members meet it.
+    Lines go along the members, from a member's end to members attached to it, from the platform's
+    origin to its points, and around these points.
 
     :param nodes: names as :func:`stiffness_monitor.modes.modes` gives them: the platform's origin,
         then ``<member> <k>/<elements>``.
@@ -272,7 +273,7 @@ def structure_edges(model: StructuralModel, nodes: tuple[str, ...]) -> NDArray[n
                 corners.append((node, point))
             elif support.body in of:
                 lines.append((of[support.body][-1], node))
-    # Around the platform by angle, in the plane of its points.
+    # Order the platform's points by angle in their plane.
     arms = np.array([point - model.origin for _, point in corners])
     across = np.linalg.svd(arms - arms.mean(0))[2][:2]
     turn = np.arctan2(*((arms - arms.mean(0)) @ across.T).T)

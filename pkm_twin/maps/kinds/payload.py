@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""The largest mass that the drives hold at rest."""
+"""Map the largest mass that the drives hold at rest."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from pkm_twin.maps.kind import Case, Found, Kind, drive_limits
 from pkm_twin.robot.robot import Robot
 
 ROUNDING: Final = 1e-12
-"""Motion, part of the machine's size, or effort, part of the limit, that is rounding."""
+"""Motion over the machine's size, or effort over its limit, that is a rounding error."""
 
 
 class Payload(Kind):
-    """The largest mass that the drives hold at rest, with the machine's own weight."""
+    """Map the largest mass that the drives hold at rest, with the machine's own weight."""
 
     name = "payload"
     question = "how much can it carry?"
@@ -30,20 +30,20 @@ class Payload(Kind):
     takes_wrench = True
 
     def elements(self, robot: Robot) -> tuple[str, ...]:
-        """The drives."""
+        """Return the names of the drives."""
         return robot.joint_names
 
     def axes(self, robot: Robot) -> tuple[str, ...]:
-        """None: weight acts along gravity."""
+        """Return no axes: weight acts along gravity."""
         return ()
 
     def found(self, robot: Robot, q: Array, case: Case) -> Found:
-        """The mass with the centre of the file's payload, which is taken away.
+        """Return the largest mass at the centre of the file's payload, which is removed.
 
-        0 where the drives do not hold the machine without it; infinite where no drive feels the
-        mass. The element is the drive at its limit.
+        The value is 0 if the drives cannot hold the machine without it, infinite if no drive feels
+        the mass. The element is the drive at its limit.
 
-        :raises ParameterError: the mass stays where the platform turns about it.
+        :raises ParameterError: the mass does not move, as the platform rotates about it.
         """
         moved, com = robot.platform_jacobian(robot.graph.home)[:3], robot.payload.com
         if not com.any() and np.abs(moved).max() < ROUNDING * robot.size:

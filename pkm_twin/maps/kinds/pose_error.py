@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""The standard deviation of the platform's position, from the file's `uncertainty`."""
+"""Map the standard deviation of the platform's position, from the file's `uncertainty`."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ SHARED_KEYS: Final = {"at", "axis", "axes", "ends"}
 
 
 class PoseError(Kind):
-    """The standard deviation of the position, from the file's `uncertainty`."""
+    """Map the standard deviation of the position, from the file's `uncertainty`."""
 
     name = "pose-error"
     question = "where is it least accurate?"
@@ -35,13 +35,13 @@ class PoseError(Kind):
     rounds = 100
 
     def elements(self, robot: Robot) -> tuple[str, ...]:
-        """The numbers of the geometry whose errors move the platform."""
+        """Return the numbers of the geometry whose errors move the platform."""
         return tuple(list(robot.causes)[k] for k in _moving_causes(robot))
 
     def found(self, robot: Robot, q: Array, case: Case) -> Found:
-        """In the worst direction, joints at their set points; to first order, independent causes.
+        """Return the standard deviation in the worst direction, joints at their set points.
 
-        The element is the cause with the greatest part in that direction.
+        To first order, independent causes. The element is the cause with the largest contribution.
         """
         effects = position_effects(robot, q)[..., _moving_causes(robot)].swapaxes(-1, -2)
         value, direction = largest_axis(effects.swapaxes(-1, -2) @ effects)
@@ -50,10 +50,10 @@ class PoseError(Kind):
 
 
 def _moving_causes(robot: Robot) -> NDArray[np.intp]:
-    """Places of the causes that move the platform at home.
+    """Return the indices of the causes that move the platform at home.
 
     :raises ParameterError: a file without standard deviations of the geometry, or with those of
-        points or axes at home: all parts that meet there move along, and home closes as before.
+    points or axes at home: all parts that meet there move along, and home still closes.
     """
     for name, steps in robot.causes.items() if robot.mechanism == "machine" else ():
         shared = [

@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""The speed that the drives reach in every direction."""
+"""Map the speed that the drives reach in every direction."""
 
 from dataclasses import replace
 
@@ -19,21 +19,21 @@ from pkm_twin.robot.robot import Robot
 
 
 class Speeds(Kind):
-    """The speed that the drives reach in every direction."""
+    """Map the speed that the drives reach in every direction."""
 
     name, what, answer = "speeds", "speed in the slowest direction", "slowest"
     question, element, largest = "how fast can it move?", "drive", False
 
     def cases(self, robot: Robot) -> tuple[Case, ...]:
-        """Of a pose of angles alone the angular velocity."""
+        """Return the case, with angular velocity for a pose of angles alone."""
         return (replace(super().cases(robot)[0], unit=f"{unit_of_motion(robot)}/s"),)
 
     def elements(self, robot: Robot) -> tuple[str, ...]:
-        """The drives."""
+        """Return the names of the drives."""
         return robot.joint_names
 
     def found(self, robot: Robot, q: Array, case: Case) -> Found:
-        """Velocity limits over the joint rates of unit motions; the element is at its limit."""
+        """Return velocity limits over joint rates of unit motions; the element is at its limit."""
         back, axes = unit_motions(robot, q)
         with np.errstate(divide="ignore"):
             room = drive_limits(robot, "velocity") / np.linalg.norm(back, axis=-1)

@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""Strain energy of loads, and each element's share."""
+"""Map the strain energy of loads, and each element's share."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ if TYPE_CHECKING:
     from xarray import Dataset
 
 MIN_DRAWN_SHARE: Final = 0.005
-"""Mean share of the smallest element that has a picture."""
+"""Mean share of an element below which it has no picture."""
 PANELS: Final = 3
-"""Elements in a picture."""
+"""Number of elements in a picture."""
 SLICES: Final = 5
-"""Heights in a picture."""
+"""Number of heights in a picture."""
 
 
 @dataclass(frozen=True)
 class StrainEnergy(Compliance):
-    """The strain energy of loads, and each element's share; without a load 1 N along z."""
+    """Map the strain energy of loads, and each element's share; default load 1 N along z."""
 
     slices: bool = setting(
         False,
@@ -47,12 +47,12 @@ class StrainEnergy(Compliance):
     has_shares = True
 
     def cases(self, robot: Robot) -> tuple[Case, ...]:
-        """A force of 1 N upwards."""
+        """Return the case of a force of 1 N upwards."""
         (case,) = super().cases(robot)
         return (replace(case, name="1 N along z", wrench=(0.0, 0.0, 1.0, 0.0, 0.0, 0.0)),)
 
     def loaded(self, robot: Robot, name: str, wrench: object) -> Case:
-        """The same quantity under another load."""
+        """Return the case of another load."""
         load = super().loaded(robot, name, wrench)  # type: ignore[arg-type]
         return replace(self.cases(robot)[0], name=name, wrench=load.wrench)
 
@@ -68,7 +68,7 @@ class StrainEnergy(Compliance):
 
     @classmethod
     def facts(cls, data: Dataset) -> list[str]:
-        """Mean share of the elements, largest first (global factor, equation 39)."""
+        """Return mean shares of the elements, largest first (global factor, equation 39)."""
         lines = []
         for case in data.case.values:
             mean, order = _rank(data, case)
@@ -79,7 +79,7 @@ class StrainEnergy(Compliance):
 
     @classmethod
     def figures(cls, data: Dataset) -> dict[str, Figure]:
-        """With ``slices`` the energy, and the shares by rank, in slices and in a plane."""
+        """Draw the energy and the ranked shares in slices and in a plane if ``slices`` is set."""
         pictures: dict[str, Figure] = {}
         for case in data.case.values if _draws_elements(data) else ():
             before = f"{case}_" if len(data.case) > 1 else ""

@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""Reach, singularities, limb interference, and the largest cylinder in the workspace."""
+"""Map reach, singularities, limb interference, and the largest cylinder in the workspace."""
 
 from __future__ import annotations
 
@@ -45,12 +45,12 @@ CLEARANCE: Final = Case(
 )
 ANGLE: Final = Case("joint-angle", "largest passive joint angle", "rad", "bends most")
 LAYERS: Final = 101
-"""Heights of the circles."""
+"""Number of heights of the circles."""
 OVERLAY_CAPTION: Final = "; white lines: largest circles; dashed: largest cylinder"
 
 
 class Workspace(Kind):
-    """Reach, singularities, limb interference, largest inscribed cylinder."""
+    """Map reach, singularities, limb interference, and the largest inscribed cylinder."""
 
     name = "workspace"
     question = "where can it move?"
@@ -61,21 +61,21 @@ class Workspace(Kind):
     element = "members that are nearest"
 
     def elements(self, robot: Robot) -> tuple[str, ...]:
-        """Members of different limbs, two by two."""
+        """Return the names of pairs of members of different limbs."""
         return tuple(f"{a.name} and {b.name}" for a, b in member_pairs(robot))
 
     def cases(self, robot: Robot) -> tuple[Case, ...]:
-        """The singularity index; clearance and passive angle where the file gives them."""
+        """Return singularity index, and clearance and passive angle if the file gives them."""
         known = (True, has_clearance(robot), has_joint_angles(robot))
         cases = (SINGULARITY, CLEARANCE, ANGLE)
         return tuple(case for case, there in zip(cases, known, strict=True) if there)
 
     def axes(self, robot: Robot) -> tuple[str, ...]:
-        """None: distances and angles have no direction."""
+        """Return no axes: distances and angles have no direction."""
         return ()
 
     def found(self, robot: Robot, q: Array, case: Case) -> Found:
-        """One number a pose, without direction; of the clearance the members that are nearest."""
+        """Return one number per pose; for the clearance also the nearest pair of members."""
         if case == SINGULARITY:
             return Found(robot.try_singularity(q)[0])
         if case == CLEARANCE:
@@ -84,7 +84,7 @@ class Workspace(Kind):
         return Found(joint_angle_at(robot, robot.forward(q)))
 
     def summaries(self, space: Space, counted: int, apart: int) -> dict[str, Variable]:
-        """Volume, what interference takes away, and of poses about an axis circles and cylinder."""
+        """Return volume, interference, and circles and cylinder of a workspace with an axis."""
         robot, result = space.robot, {}
         if 1 < len(space.ticks) == len(robot.pose_names):
             cell = math.prod(float(ticks[1] - ticks[0]) for ticks in space.ticks)
@@ -104,7 +104,7 @@ class Workspace(Kind):
 
     @classmethod
     def facts(cls, data: Dataset) -> list[str]:
-        """How much is reachable, and the cylinder."""
+        """Return sentences on the reachable volume and the cylinder."""
         facts = []
         if "volume" in data:
             facts.append(f"reaches {float(data.volume):.4g} {data.volume.attrs['units']}")
@@ -124,7 +124,7 @@ class Workspace(Kind):
     def overlay(
         cls, data: Dataset, names: tuple[str, ...], through: Mapping[str, float], ax: Axes
     ) -> str:
-        """The circles about the axis and the cylinder, where a plane cuts them."""
+        """Draw the circles about the axis and the cylinder, as a plane cuts them."""
         if "circle" not in data or len(names) != 2:
             return ""
         height = data.attrs["height"]
@@ -150,7 +150,7 @@ class Workspace(Kind):
 def regular(
     robot: Robot, heights: Array, least: float, least_clearance: float
 ) -> dict[str, Variable]:
-    """The largest circles about the axis at heights (n,), m, and the cylinder, for a file."""
+    """Return the largest circles about the axis at heights (n,), and the cylinder, for a file."""
     radius = circles(robot, heights, least=least, least_clearance=least_clearance)
     best, unit = largest_cylinder(heights, radius), distance_unit(robot)
     return circle_variables(robot, heights, radius) | {
@@ -176,14 +176,14 @@ def circles(
     least: float = 0.0,
     least_clearance: float = 0.0,
 ) -> Array:
-    """Radii of the largest reachable circles about the axis with all their inside, (n,), m or rad.
+    """Return radii of the largest reachable circles about the axis, insides included, (n,).
 
-    0 where the axis itself is out of reach.
+    Radii are in m or rad, 0 where the axis itself is out of reach.
 
     :param heights: shape (n,), m.
     :param steps: first search along each of 360 rays; a bisection refines it.
     :param least: singularity index below which a pose counts as out of reach; ``CLEAR`` at least.
-    :param least_clearance: what the limbs' clearance has to be above, m.
+    :param least_clearance: smallest clearance of the limbs, m.
     """
     z = np.atleast_1d(np.asarray(heights, np.float64))
     lateral = [robot.pose_names.index(name) for name in robot.grid().lateral]
@@ -195,7 +195,10 @@ def circles(
 
 @dataclass(frozen=True)
 class Cylinder:
-    """The largest upright cylinder about the axis in a stack of circles, m (radius m or rad)."""
+    """Describe the largest upright cylinder about the axis in a stack of circles.
+
+    Heights in m, radius in m or rad.
+    """
 
     low: float
     high: float
@@ -203,7 +206,7 @@ class Cylinder:
 
 
 def largest_cylinder(heights: Array, radius: Array) -> Cylinder:
-    """The cylinder of greatest radius squared times height between two of the heights (n,)."""
+    """Return the cylinder of largest radius squared times height between two heights (n,)."""
     best, volume = Cylinder(math.nan, math.nan, 0.0), 0.0
     for i in range(len(heights)):
         thin = np.minimum.accumulate(radius[i:])
@@ -216,6 +219,6 @@ def largest_cylinder(heights: Array, radius: Array) -> Cylinder:
 
 
 def _volume_unit(units: Iterable[str]) -> str:
-    """Unit of a volume: "m3", "m rad2"."""
+    """Return the unit of a volume: "m3", "m rad2"."""
     counts = {unit: list(units).count(unit) for unit in sorted(set(units))}
     return " ".join(f"{unit}{power if power > 1 else ''}" for unit, power in counts.items())
