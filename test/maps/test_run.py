@@ -20,7 +20,7 @@ from pkm_twin.design.pose_path import PosePath
 from pkm_twin.design.sweep import sweep as design_sweep
 from pkm_twin.errors import MissingExtraError, PkmTwinError
 from pkm_twin.maps import run as running
-from pkm_twin.maps.run import ClusterError, on_cluster, run
+from pkm_twin.maps.run import ClusterError, compute_on_cluster, run
 from pkm_twin.maps.store import MapError, Parts, open_map
 from test.maps.conftest import CHUNK, few, same
 from test.maps.scale import command
@@ -123,7 +123,10 @@ def test_a_sweep_of_a_design_is_computed_on_a_cluster(cluster):
     done: list[int] = []
     table, expected = (
         design_sweep(robot, box, path, ["peak-effort"], 600, progress=done.append, **how)
-        for how in ({"compute": partial(on_cluster, scheduler=cluster.scheduler_address)}, {})
+        for how in (
+            {"compute": partial(compute_on_cluster, scheduler=cluster.scheduler_address)},
+            {},
+        )
     )
     assert done[2] == done[-1] == 600 and len(done) == 6
     for name, values in expected.quantities.items():
@@ -157,7 +160,7 @@ def test_a_stopped_run_on_a_cluster_is_resumed_here(strain, tmp_path, cluster):
 
 def test_no_scheduler(strain, tmp_path, monkeypatch):
     pytest.importorskip("distributed")
-    monkeypatch.setattr(running, "CONNECT", "1s")
+    monkeypatch.setattr(running, "CONNECT_TIMEOUT", "1s")
     with pytest.raises(ClusterError, match="no Dask scheduler answers"):
         run(strain[0], tmp_path / "a.nc", scheduler="tcp://127.0.0.1:9")
     # Without a certificate.
@@ -200,7 +203,7 @@ def test_typed_errors(tmp_path, strain, monkeypatch):
     with pytest.raises(MapError):
         open_map(tmp_path / "text.nc")
     with pytest.raises(PkmTwinError, match="not 0"):
-        running.compute(sweep, sweep.chunks()[0], "0")
+        running.evaluate_chunk(sweep, sweep.chunks()[0], "0")
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(MissingExtraError, match=r"\[cluster\]"):
         run(sweep, tmp_path / "b.nc", scheduler="tcp://127.0.0.1:9")
