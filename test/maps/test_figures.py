@@ -129,26 +129,26 @@ def test_a_scale_begins_at_zero_or_at_the_least_with_the_worst_inside(values, wo
 def test_shapes_are_those_of_the_pose_that_rings_lowest(small_maps):
     robot = load("upr_rpu")
     with open_map(small_maps[MODES]) as data:
-        found = modes_of(robot, data.through.values[0], modes.COUNT)
+        found = modes_of(robot, data.through.values[0], modes.MODE_COUNT)
         assert data.shape_frequency.values == pytest.approx(found.frequencies, rel=1e-9)
         assert data.worst_value.values == pytest.approx(found.frequencies, rel=1e-9)
         assert data.displacement.values == pytest.approx(found.shapes[..., :3], rel=1e-9, abs=1e-9)
         assert data.strain_share.values == pytest.approx(found.energies.strain, abs=1e-9)
         rest = data.position.values
         size = np.linalg.norm(np.ptp(rest, axis=0))
-        for mode in range(modes.COUNT):
+        for mode in range(modes.MODE_COUNT):
             moved, far = deformed(data, mode)
             steps = np.linalg.norm(moved - rest, axis=1)
-            assert steps.max() == pytest.approx(modes.ENLARGED * size)
+            assert steps.max() == pytest.approx(modes.MAX_DRAWN_DISPLACEMENT * size)
             assert far == pytest.approx(steps / steps.max())
         pytest.importorskip("plotly")
         page = KINDS["modes"].page(data)
         frames = {frame.name: frame.data[0] for frame in page.frames}
-        assert len(frames) == modes.COUNT * modes.PHASES
+        assert len(frames) == modes.MODE_COUNT * modes.FRAMES_PER_SWING
         # Half a swing later the shape is on the other side of rest.
         one, other = (
             np.array([v for v in frames[f"3/{n}"].x if v is not None])
-            for n in (0, modes.PHASES // 2)
+            for n in (0, modes.FRAMES_PER_SWING // 2)
         )
         still = np.array([v for v in page.data[0].x if v is not None])
         assert one + other == pytest.approx(2 * still, abs=2e-5)
