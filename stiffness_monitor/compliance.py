@@ -63,7 +63,8 @@ def platform_response(robot: Robot, q: ArrayLike, wrench: ArrayLike) -> Platform
     """Return compliance, deflection and strain energies at joint positions, from one factorisation.
 
     2UPR-RPU paper: C (equation 35), the total strain energy U = P' C P / 2 (equation 37), and the
-    local strain-energy factors mu_ij = U_ij / U (equation 38).
+    local strain-energy factors mu_ij = U_ij / U (equation 38), whose mean over even poses of a
+    workspace is the global factor (equation 39).
 
     :param q: joint positions, shape (..., n), rad or m; locked.
     :param wrench: external force and moment on the platform at its reference point, base axes,

@@ -26,6 +26,7 @@ from pkm_twin.kinematics.pose import Coordinate
 from pkm_twin.kinematics.programs import (
     POSE_WEIGHT,
     acceleration_program,
+    body_jacobian_program,
     forward_program,
     inverse_program,
     jacobian_program,
@@ -196,6 +197,11 @@ class Engine(Scheme):
     def placement(self) -> Kernel:
         """Q to rotation (9) from home and place of the origin (3) of every body, by body."""
         return self.kernel("placement", placement_program)
+
+    @property
+    def body_jacobian(self) -> Kernel:
+        """Q to the twist (6 n) of every body's frame per joint rate, by body."""
+        return self.kernel("body jacobian", body_jacobian_program)
 
     @property
     def acceleration(self) -> Kernel:

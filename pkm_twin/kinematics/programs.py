@@ -70,8 +70,8 @@ def forward_program(t: Traced) -> Program:
 def jacobian_program(t: Traced) -> Program:
     """The program of :attr:`.engine.Engine.jacobian`."""
     t.solve()
-    _, rotation = t.motion.platform()
-    twists = t.twists()
+    position, rotation = t.motion.platform()
+    twists = t.twists(t.graph.platform, position, t.rate_columns())
     rates = [poses.rates(t.scheme.coordinates, rotation, v, w) for v, w in twists]
     by_pose, by_twist = (zip(*r, strict=True) for r in (rates, [[*v, *w] for v, w in twists]))
     outputs = {
@@ -88,6 +88,16 @@ def placement_program(t: Traced) -> Program:
     for body in t.graph.bodies:
         rows += [*np.ravel(t.motion.turned(body)), *t.motion.origin[body]]
     return Program(t.inputs("q"), 0, {"bodies": t.lift(rows)}, t.equations())
+
+
+def body_jacobian_program(t: Traced) -> Program:
+    """The program of :attr:`.engine.Engine.body_jacobian`."""
+    t.solve()
+    columns, values = t.rate_columns(), []
+    for body in t.graph.bodies:
+        twists = [[*v, *w] for v, w in t.twists(body, t.motion.origin[body], columns)]
+        values += [value for row in zip(*twists, strict=True) for value in t.drives.shared(row)]
+    return Program(t.inputs("q"), 0, {"twists": t.lift(values)}, t.equations())
 
 
 def acceleration_program(t: Traced) -> Program:

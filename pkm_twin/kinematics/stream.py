@@ -45,7 +45,8 @@ def _stream(t: Traced) -> Program:
     t.solve()
     position, rotation = t.motion.platform()
     pose = scales * np.array(poses.values(t.scheme.coordinates, position, rotation), dtype=object)
-    columns = [poses.rates(t.scheme.coordinates, rotation, v, w) for v, w in t.twists()]
+    twists = t.twists(t.graph.platform, position, t.rate_columns())
+    columns = [poses.rates(t.scheme.coordinates, rotation, v, w) for v, w in twists]
     rates = scales[:, None] * np.array(columns, dtype=object).T
     last = before[n + m : n + m + m * m].reshape(m, m)
     move = t.q - before[t.drives.leading]

@@ -272,17 +272,18 @@ class Traced:
         kept = self.scheme.independent
         return [self.lu.solve(-self.jq[kept][:, j]) for j in range(self.joints)]
 
-    def twists(self) -> list[tuple[Any, Any]]:
-        """Velocity of the reference point and angular velocity of the platform per joint rate."""
-        motion, body = self.motion, self.graph.platform
-        position, _ = motion.platform()
-        linear, angular = motion.linear_jacobian(body, position), motion.angular_jacobian(body)
+    def twists(self, body: str, at: Any, columns: Sequence[Objects]) -> list[tuple[Any, Any]]:
+        """Return velocity at a place and angular velocity of a body per joint rate.
+
+        :param columns: :meth:`rate_columns`.
+        """
+        linear, angular = self.motion.linear_jacobian(body, at), self.motion.angular_jacobian(body)
         result = []
-        for j, u in enumerate(self.rate_columns()):
+        for j, u in enumerate(columns):
             pair = []
-            for columns in (linear, angular):
+            for part in (linear, angular):
                 total: Any = np.zeros(3, dtype=object)
-                for (kind, k), column in columns.items():
+                for (kind, k), column in part.items():
                     if kind == "u":
                         total = total + np.asarray(column, dtype=object) * u[k]
                     elif k == j:

@@ -311,6 +311,18 @@ class Robot(Mechanism):
         """
         return self._jacobians(q)[1]
 
+    def body_jacobians(self, q: ArrayLike) -> dict[str, Array]:
+        """Return the twist of each body's frame per joint rate, shape (..., 6, n), by body.
+
+        Velocity of the origin that :meth:`placements` returns, and angular velocity; base axes. On
+        pose rates, by :meth:`inverse_jacobian`: the link matrices J_Hij of the 3-PRRU paper
+        (equation 30), whose frames are at the slider joints. Rods have no frame.
+        """
+        (flat,) = self.evaluate(self.engine.body_jacobian, _NONE, q)
+        n = self.joints_count
+        table = flat.reshape(*flat.shape[:-1], len(self.graph.bodies), 6, n)
+        return {name: table[..., k, :, :] for k, name in enumerate(self.graph.bodies)}
+
     def _jacobians(self, q: ArrayLike) -> list[Array]:
         n = self.joints_count
         tables = self.evaluate(self.engine.jacobian, _NONE, q)

@@ -44,8 +44,8 @@ def functions(robot):
     table = {
         name: (getattr(robot, name), [q])
         for name in (
-            "forward", "platform", "placements", "jacobian", "platform_jacobian", "singularity",
-            "passive", "try_forward", "try_jacobian", "try_singularity",
+            "forward", "platform", "placements", "jacobian", "platform_jacobian", "body_jacobians",
+            "singularity", "passive", "try_forward", "try_jacobian", "try_singularity",
         )
     }  # fmt: skip
     table |= {name: (getattr(robot, name), [pose]) for name in ("inverse", "try_inverse")}

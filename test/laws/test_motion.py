@@ -114,15 +114,29 @@ def test_jacobians_are_the_derivatives_of_forward(name, rng):
     np.testing.assert_allclose(
         robot.jacobian(q), finite_difference(robot.forward, q), rtol=1e-6, atol=1e-7
     )
-    twist = robot.platform_jacobian(q)
-    position = finite_difference(lambda at: robot.platform(at)[0], q)
+    check_twists(robot.platform_jacobian(q), robot.platform, q)
+
+
+def check_twists(twist, place, q):
+    """Twists (..., 6, n) are the change of a frame; ``place``: q to its origin and rotation."""
+    position = finite_difference(lambda at: place(at)[0], q)
     np.testing.assert_allclose(twist[:, :3], position, rtol=1e-6, atol=1e-7)
-    rotation = robot.platform(q)[1]
-    flat = finite_difference(lambda at: robot.platform(at)[1].reshape(*at.shape[:-1], 9), q)
+    rotation = place(q)[1]
+    flat = finite_difference(lambda at: place(at)[1].reshape(*at.shape[:-1], 9), q)
     for j in range(q.shape[-1]):
         w = flat[..., j].reshape(-1, 3, 3) @ rotation.swapaxes(-1, -2)
         spin = np.stack([w[:, 2, 1], w[:, 0, 2], w[:, 1, 0]], -1)
         np.testing.assert_allclose(twist[:, 3:, j], spin, rtol=1e-6, atol=1e-7)
+
+
+@every_robot
+def test_body_jacobians_are_the_derivatives_of_placements(name, rng):
+    robot = load(name)
+    q = random_joints(robot, rng, 20)
+    found = robot.body_jacobians(q)
+    assert list(found) == list(robot.graph.bodies)
+    for body, twist in found.items():
+        check_twists(twist, lambda at, body=body: [p[body] for p in robot.placements(at)[::-1]], q)
 
 
 @every_robot

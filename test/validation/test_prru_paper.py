@@ -24,7 +24,7 @@ from delta_dynamics import (
     sphere_directions,
     tilted_pose,
 )
-from pkm_twin.mechanisms.prru import Prru
+from pkm_twin.mechanisms.prru import LIMBS, Prru
 from test.support.bodies import bodies
 from test.support.robots import load, partly_long
 
@@ -206,7 +206,7 @@ def test_upper_link_follows_the_platform() -> None:
 
 @pytest.mark.parametrize("branch", ["below", "above"])
 def test_velocity_maps(branch: str) -> None:
-    """Equations 22, 24 and 30 against the twin's maps on joint rates."""
+    """Equations 22, 24, 26 and 30 against the twin's maps on joint rates."""
     robot = machine(branch, 0.5)
     for pose, _, _ in states(20, 2):
         j = maps(robot, pose)
@@ -215,10 +215,12 @@ def test_velocity_maps(branch: str) -> None:
         np.testing.assert_allclose(robot.jacobian(q), back, atol=1e-12)
         twist = np.concatenate([j.centre, j.platform]) @ back
         np.testing.assert_allclose(robot.platform_jacobian(q), twist, atol=1e-11)
-        angular = bodies(robot, q, np.zeros(3), np.zeros(3)).angular
-        for k in range(6):
-            body = 3 * (k // 2) + 1 + k % 2
-            np.testing.assert_allclose(angular[body], j.links[k] @ back, atol=1e-11)
+        found = robot.body_jacobians(q)
+        names = [f"{level} link {limb}" for limb in LIMBS for level in ("lower", "upper")]
+        for k, body in enumerate(names):
+            lift = np.outer([0.0, 0.0, 1.0], j.slider[k // 2])
+            expected = np.concatenate([lift, j.links[k]]) @ back
+            np.testing.assert_allclose(found[body], expected, atol=1e-11)
 
 
 def driving_forces(

@@ -84,7 +84,10 @@ EQUATIONS: Final = (
         "the paper has both links' mass at the slider joint: `link_com: 0`; the shipped file 0.5",
     ),
     _equation("27-29", "links' angular maps", (MOTION + "angular_jacobian",), VELOCITIES),
-    _equation("30", "J_Hij, links' velocity maps", (MOTION + "set_rates",), VELOCITIES),
+    _equation(
+        "30", "J_Hij, links' velocity maps",
+        ("pkm_twin.robot.robot.Robot.body_jacobians", MOTION + "set_rates"), VELOCITIES,
+    ),
     _equation("31", "links' accelerations", (MOTION + "set_accelerations",), FORCES),
     _equation("32-33", "Q_M of the platform", (TORQUES + "Forces.inertia",), FORCES),
     _equation("34-35", "Q_S of the sliders", (TORQUES + "Forces.inertia",), FORCES),
