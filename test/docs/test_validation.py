@@ -101,9 +101,11 @@ class TestErrataOfTheDeltaCu:
         rms = [delta_cu.measure_difference(found, source)[0]]
         used, source[3, 2] = source[3, 2], -10.80
         rms.append(delta_cu.measure_difference(found, source)[0])
+        source[3, 2] = -108.0
+        rms.append(delta_cu.measure_difference(found, source)[0])
         pattern = (
             r"(-10\.80) mm/s; here (\S+) mm/s, a digit is lost: the model gives (\S+); "
-            r"velocities differ by (\S+) instead of (\S+) mm/s rms"
+            r"velocities differ by (\S+) instead of (\S+) mm/s rms.*? and -108.0 is meant: (\S+) "
         )
         assert_printed(PAGE, pattern, -10.80, used, found[3, 2], *rms)
 

@@ -63,7 +63,7 @@ TABLE_2: Final = (
 )
 """Platform velocity at ``TIME``, mm/s, without the zeros that fill every number to two decimals.
 
-The paper has -10.80 for -110.8.
+The paper has -10.80 for -110.8; -108.0 may be meant too (docs/validation.md).
 """
 TABLE_3: Final = (
     "-62.7 29.2 109",
@@ -73,7 +73,7 @@ TABLE_3: Final = (
     "83.6 -50.2 71.2",
     "67.6 -23.5 95.6",
 )
-"""Platform acceleration, mm/s2; the paper has 17.20 for 71.2."""
+"""Platform acceleration, mm/s2; the scan has 17.20 for 71.2."""
 TABLES_4_TO_6: Final = (
     (
         "3004.216 5209.801 6.485",
@@ -191,17 +191,18 @@ def draw_motion(file: Path) -> None:
     q, qd, qdd = find_motion(time)
     figure, columns = plots.columns(2, 1)
     curves = (
-        (find_velocity(robot, q, qd), TABLE_2, "velocity (mm/s)", "Figure 3: velocity"),
         (
-            find_acceleration(robot, q, qd, qdd),
-            TABLE_3,
-            "acceleration (mm/s²)",
-            "Figure 4: acceleration",
+            find_velocity(robot, q, qd), TABLE_2, "velocity (mm/s)",
+            "Figure 3: how fast is the platform?",
         ),
-    )
+        (
+            find_acceleration(robot, q, qd, qdd), TABLE_3, "acceleration (mm/s²)",
+            "Figure 4: how does it accelerate?",
+        ),
+    )  # fmt: skip
     for (ax,), (values, table, unit, title) in zip(columns, curves, strict=True):
         _draw_curves(ax, time, values, read_numbers(table), "xyz")
-        plots.label(ax, "time (s)", unit, f"{title} (lines), table (dots)")
+        plots.label(ax, "time (s)", unit, f"{title} Dots: table")
     plots.save(figure, file)
 
 
@@ -211,7 +212,8 @@ def draw_torques(file: Path) -> None:
     torques = inverse_dynamics(load("delta_cu"), *find_motion(time), LOAD)
     figure, ((ax,),) = plots.columns(1, 1)
     _draw_curves(ax, time, torques, find_printed_torques(), ("arm I", "arm II", "arm III"))
-    plots.label(ax, "time (s)", "torque (N m)", "Figures 5 to 7: torques (lines), tables (dots)")
+    question = "Figures 5 to 7: which torque does each arm need? Dots: tables 4 to 6"
+    plots.label(ax, "time (s)", "torque (N m)", question)
     plots.save(figure, file)
 
 
@@ -247,6 +249,8 @@ def draw_modes(file: Path, first: int) -> None:
         ax.set_box_aspect(np.ptp(found.positions, axis=0), zoom=1.35)
         ax.view_init(elev=12, azim=-60)
         ax.set_axis_off()
+    question = "delta_cu: which parts move in each mode? Orange: R-C-U forearm; grey: at rest"
+    plots.head(figure, question, 10)
     plots.save(figure, file)
 
 
