@@ -263,8 +263,8 @@ def find_rows() -> Paper:
         {"equation": 40, "table": 2, "figure": 10},
         (
             f"2UPR-RPU, agrees: table 1 within {theory.largest:.0f} units of the last digit; table "
-            f"2, P2 and P3, within {loads:.3f} over the volume; figures 5 to 10, but for the symmetry "
-            "of one limb's factors.",
+            f"2, P2 and P3, within {loads:.3f} over the volume; figures 5 to 10, but for the "
+            "symmetry of one limb's factors.",
             "2UPR-RPU, does not agree: table 2, P1: the mean share of 1U is printed as 0.146; over "
             f"the volume it is {volume:.3f}, over points on rays, dense at the axis, {rays:.3f}. "
             f"The paper's finite elements are {min(softer):.0f} to {max(softer):.0f} % softer.",
