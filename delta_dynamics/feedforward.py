@@ -15,7 +15,7 @@ from delta_dynamics.torques.stiction import friction_reach, moving_rates
 from delta_dynamics.torques.virtual_work import inverse_dynamics
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import MessageError, ParameterError
-from pkm_twin.machine.friction import KNOWN, Dahl, Memory
+from pkm_twin.machine.friction import KNOWN_FRACTION, Dahl, Memory
 from pkm_twin.machine.joint_map import ControllerNumbers
 from pkm_twin.messages.reading import (
     ExtraJoints,
@@ -35,7 +35,12 @@ from pkm_twin.streams.differentiator import Differentiator
 from pkm_twin.streams.matched import WrenchWindow
 from pkm_twin.streams.monitor import Core, StreamMonitor, counting, finished
 from pkm_twin.streams.rates import RateAgreement
-from pkm_twin.streams.rest import RestWatch, fit_gain, gradient_gain, rate_doubt
+from pkm_twin.streams.rest import (
+    VelocityErrorEstimator,
+    fit_gain,
+    gradient_gain,
+    velocity_error_bound,
+)
 
 OnStop = Literal["nothing", "zeros", "gravity"]
 
@@ -181,7 +186,7 @@ class Feedforward(Core):
         """Of the drives' friction; None before the stream's first answer."""
         self.differentiator = _differentiator(s, self.robot)
         self._window = s.window
-        self._rest = RestWatch(_slope_gain(self.differentiator))
+        self._rest = VelocityErrorEstimator(_slope_gain(self.differentiator))
         self.rates = RateAgreement(self.robot)
         self._reach = friction_reach(self.robot)
         self._rules = s.stamp_rules
@@ -213,7 +218,7 @@ class Feedforward(Core):
         if (before.order, before.window) != (settings.order, settings.window):
             self.differentiator = _differentiator(settings, self.robot)
             self._window = settings.window
-            self._rest = RestWatch(_slope_gain(self.differentiator))
+            self._rest = VelocityErrorEstimator(_slope_gain(self.differentiator))
             if self.wrenches is not None:
                 self.wrenches.change_fit(settings.order, settings.window)
 
@@ -242,7 +247,7 @@ class Feedforward(Core):
         distance, memory = self.robot.friction.presliding, self._memory
         unknown = distance > 0.0
         if memory is not None:
-            unknown &= memory.unknown > KNOWN
+            unknown &= memory.unknown > KNOWN_FRACTION
         return [n for n, one in zip(self.robot.joint_names, unknown, strict=True) if one]
 
     def trajectory(self, message: Any, now: int) -> LimitedEfforts:
@@ -331,7 +336,7 @@ class Feedforward(Core):
         qd, qdd = _derivatives(t, settings.differentiate)
         reader.check_derived(qd, qdd)
         if t.qd is None and self._reach.any():
-            doubt = rate_doubt(t.times, t.q, gradient_gain(t.times))
+            doubt = velocity_error_bound(t.times, t.q, gradient_gain(t.times))
             qd = moving_rates(qd, np.abs(qd) <= doubt, self._reach)
         efforts = np.empty_like(t.q)
         saturated = False

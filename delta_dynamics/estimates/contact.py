@@ -27,8 +27,8 @@ from pkm_twin.codegen.arrays import Array, finite, later, one_vector, vectors
 from pkm_twin.messages.stamps import SECOND
 from pkm_twin.robot.mechanism import SHARED
 from pkm_twin.robot.robot import Robot
-from pkm_twin.streams.drives import RELEASE, DriveWatch
-from pkm_twin.streams.rest import RestWatch
+from pkm_twin.streams.drives import BRAKE_TIME, DriveWatch
+from pkm_twin.streams.rest import VelocityErrorEstimator
 
 RANK: Final = 1e-9
 """Singular values below this share of the greatest are directions that the joints do not feel."""
@@ -238,7 +238,7 @@ class ContactMonitor:
         n = self.robot.joints_count
         self.observer.reset()
         self.drives = DriveWatch()
-        self._rest = RestWatch(0.0)
+        self._rest = VelocityErrorEstimator(0.0)
         self._noise = self._kept = Noise(np.zeros(n), LEARNING, CLIPPED)
         self._unsure, self._slack, self._impulse, self._friction = np.zeros((4, n))
         self._greatest = usual_effort(self.robot)
@@ -297,7 +297,7 @@ class ContactMonitor:
             return None
         step = time - last
         if idle:
-            if not was_idle and time - self._since < RELEASE:
+            if not was_idle and time - self._since < BRAKE_TIME:
                 # It was the brake that took the weight.
                 self._touching = False
             return self._verdict(q, external, idle)

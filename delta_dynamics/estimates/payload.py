@@ -19,7 +19,7 @@ from pkm_twin.messages.stamps import SECOND
 from pkm_twin.robot.mechanism import SHARED
 from pkm_twin.robot.robot import Robot
 from pkm_twin.streams.drives import DriveWatch
-from pkm_twin.streams.rest import RestWatch
+from pkm_twin.streams.rest import VelocityErrorEstimator
 
 FOUND: Final = ("mass", "mx", "my", "mz")
 """What is estimated: mass and first moments about the platform's reference point."""
@@ -88,7 +88,7 @@ class PayloadEstimator:
         self._least = SHARE * max(float(np.abs(rest).max()), 1e-3 * self._scale())
         self._reach = friction_reach(robot)
         self.drives = DriveWatch()
-        self._rest = RestWatch(0.0)
+        self._rest = VelocityErrorEstimator(0.0)
         self.resets = 0
         self._noise = Noise(np.full(robot.joints_count, 4.0 * self._least**2), STEADY, CLIPPED)
         self.reset()

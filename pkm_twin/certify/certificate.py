@@ -47,9 +47,9 @@ BOUNDS: Final = {
 }
 """Largest differences that pass: platform in m and entries of the rotation, round trip in rad or m,
 all others relative."""
-SPREAD: Final = 0.02
+VARIANT_DEVIATION: Final = 0.02
 """Relative standard deviation of the parameters of random machines."""
-SMALL: Final = 1e-3
+MIN_SCALE_FRACTION: Final = 1e-3
 """Smallest scale of a state's relative error, as a fraction of the largest effort of all states."""
 
 
@@ -149,12 +149,12 @@ def certify(
 
     def reaches(q: Array) -> bool:
         try:
-            robot.forward(_agreeing(robot, q)[0])
+            robot.forward(_expand_to_all_joints(robot, q)[0])
         except (SingularityError, UnreachableError):
             return False
         return True
 
-    description = _led(robot, description)
+    description = _actuate_independent_joints(robot, description)
     try:
         first = Maximal(description)
         drawn = random_states(first, np.random.default_rng(seed), states, reaches)
@@ -178,7 +178,7 @@ def certify(
             missing[name] = f"{ENGINES[name][1]} is not installed; {install('certificate')}"
         except UnfitError as error:
             missing[name] = str(error)
-    items = [*_own(robot, drawn), *_compared(robot, judges, drawn, progress)]
+    items = [*_compare_with_itself(robot, drawn), *_compare_engines(robot, judges, drawn, progress)]
     return Certificate(
         robot.name,
         seed,
@@ -205,7 +205,7 @@ def certify_variants(
     """Compare the robot and random variants of it; return one certificate of all.
 
     :param count: number of variants, whose masses, inertias, friction and lengths are perturbed by
-        ``SPREAD``; lengths stay unchanged if the loops do not close otherwise.
+        ``VARIANT_DEVIATION``; lengths stay unchanged if the loops do not close otherwise.
     :param seed: seed of the states and of the variants.
     """
     found: list[Certificate] = []
@@ -239,14 +239,14 @@ def drawn(robot: Robot, seed: int) -> Robot:
     """Make a variant with perturbed parameters; perturb lengths only if the loops still close."""
     kinds = [kind for kind in KINDS if kind != "lengths"]
     try:
-        return varied(robot, dict.fromkeys(KINDS, SPREAD), seed).robot
+        return varied(robot, dict.fromkeys(KINDS, VARIANT_DEVIATION), seed).robot
     except ParameterError:
-        return varied(robot, dict.fromkeys(kinds, SPREAD), seed).robot
+        return varied(robot, dict.fromkeys(kinds, VARIANT_DEVIATION), seed).robot
 
 
-def _led(robot: Any, description: Mapping[str, Any]) -> Mapping[str, Any]:
+def _actuate_independent_joints(robot: Any, description: Mapping[str, Any]) -> Mapping[str, Any]:
     """Return the description with only the independent joints of a redundant machine actuated."""
-    if not _shares(robot):
+    if not _is_redundant(robot):
         return description
     idle = set(robot.joint_names) - set(robot.graph.leads)
     joints = {
@@ -256,14 +256,14 @@ def _led(robot: Any, description: Mapping[str, Any]) -> Mapping[str, Any]:
     return {**description, "joints": joints}
 
 
-def _shares(robot: Any) -> bool:
+def _is_redundant(robot: Any) -> bool:
     """Return whether the robot has more actuated joints than degrees of freedom."""
     return bool(getattr(robot, "redundant", False))
 
 
-def _agreeing(robot: Any, *motion: Array) -> tuple[Array, ...]:
+def _expand_to_all_joints(robot: Any, *motion: Array) -> tuple[Array, ...]:
     """Compute positions, velocities and accelerations of all joints from the independent ones."""
-    if not _shares(robot):
+    if not _is_redundant(robot):
         return motion
     whole = [np.zeros((*one.shape[:-1], robot.joints_count)) for one in motion]
     for one, leads in zip(whole, motion, strict=True):
@@ -272,27 +272,30 @@ def _agreeing(robot: Any, *motion: Array) -> tuple[Array, ...]:
     return made
 
 
-def _own(robot: Any, states: States) -> list[Item]:
+def _compare_with_itself(robot: Any, states: States) -> list[Item]:
     """Compare the inverse with the forward kinematics, and single samples with a batch."""
-    motion = *_agreeing(robot, states.q, states.qd, states.qdd), states.wrench
+    motion = *_expand_to_all_joints(robot, states.q, states.qd, states.qdd), states.wrench
     back = robot.inverse(robot.forward(motion[0]))
     trip = np.abs(back - motion[0]).max(-1)
     batch = inverse_dynamics(robot, *motion)
     single = np.array([inverse_dynamics(robot, *state) for state in zip(*motion, strict=True)])
-    return [_item("twin", "round_trip", trip), _item("twin", "batch", np.abs(batch - single))]
+    return [
+        _make_item("twin", "round_trip", trip),
+        _make_item("twin", "batch", np.abs(batch - single)),
+    ]
 
 
-def _compared(
+def _compare_engines(
     robot: Any,
     judges: Mapping[str, Judge],
     states: States,
     progress: Callable[[int], None],
 ) -> list[Item]:
-    place, rates, changes = _agreeing(robot, states.q, states.qd, states.qdd)
+    place, rates, changes = _expand_to_all_joints(robot, states.q, states.qd, states.qdd)
     tau = inverse_dynamics(robot, place, rates, changes, states.wrench)
     position, rotation = robot.platform(place)
     twist, inertia = robot.platform_jacobian(place), mass_matrix(robot, place)
-    if _shares(robot):
+    if _is_redundant(robot):
         # Velocities of all joints per velocity of the independent joints.
         back = robot.inverse_jacobian(place)
         by = back @ np.linalg.inv(back[:, robot.graph.leading])
@@ -312,36 +315,38 @@ def _compared(
                 ("jacobian", twist[k], judge.jacobian(q)),
                 ("mass_matrix", inertia[k], judge.mass_matrix(q)),
             ):
-                found.setdefault((name, what), []).append(relative(got, expected))
+                found.setdefault((name, what), []).append(relative_difference(got, expected))
         progress(k + 1)
     items = []
     for name in judges:
         expected = np.array(efforts[name])
-        items.append(_item(name, "torques", effort_differences(tau, expected)))
-        items += [_item(name, what, found[name, what]) for owner, what in found if owner == name]
+        items.append(_make_item(name, "torques", effort_differences(tau, expected)))
+        items += [
+            _make_item(name, what, found[name, what]) for owner, what in found if owner == name
+        ]
     return items
 
 
 def effort_differences(got: Array, expected: Array) -> Array:
     """Return each state's largest difference relative to its largest effort, shape (states,).
 
-    For states in which the efforts nearly vanish, it is relative to SMALL times the largest effort
-    of all states.
+    If a state's efforts nearly vanish, the difference is relative to MIN_SCALE_FRACTION times the
+    largest effort of all states.
     """
     size = np.abs(expected).max(-1)
-    scale = np.maximum(size, SMALL * size.max())
+    scale = np.maximum(size, MIN_SCALE_FRACTION * size.max())
     apart = np.abs(got - expected).max(-1)
     result: Array = np.divide(apart, scale, out=np.where(apart > 0, np.inf, 0.0), where=scale > 0)
     return result
 
 
-def relative(got: Array, expected: Array) -> float:
+def relative_difference(got: Array, expected: Array) -> float:
     """Return the largest difference relative to the largest expected absolute value."""
     apart, size = float(np.abs(got - expected).max()), float(np.abs(expected).max())
     return apart / size if size else (math.inf if apart else 0.0)
 
 
-def _item(engine: str, what: str, values: Any) -> Item:
+def _make_item(engine: str, what: str, values: Any) -> Item:
     amounts = np.asarray(values, dtype=float)
     # Infinity for NaN: np.max would depend on its position, and no bound must pass.
     worst = float(np.where(np.isfinite(amounts), amounts, np.inf).max())

@@ -167,28 +167,30 @@ def expand(description: Description) -> dict[str, Any]:
     """
     result = {key: value for key, value in description.items() if key != "limbs"}
     for kind in ("bodies", "joints", "rods"):
-        result[kind] = {name: dict(entry or {}) for name, entry in _section(description, kind)}
+        result[kind] = {
+            name: dict(entry or {}) for name, entry in _section_items(description, kind)
+        }
     sections = description.get("limbs") or []
     if isinstance(sections, Mapping):
         sections = [sections]
     for section in sections:
-        own = {name for name, _ in _section(section, "bodies")}
+        own = {name for name, _ in _section_items(section, "bodies")}
         for number, azimuth in enumerate(section["azimuths"], 1):
             turn = turn_about_z(float(azimuth))
             for kind in ("bodies", "joints", "rods"):
-                for name, entry in _section(section, kind):
+                for name, entry in _section_items(section, kind):
                     full = f"{name}_{number}"
                     if full in result[kind]:
                         raise UnfitError(f"{kind}.{full} occurs twice")
-                    result[kind][full] = _turned(dict(entry or {}), turn, own, number)
+                    result[kind][full] = _rotate_entry(dict(entry or {}), turn, own, number)
     return result
 
 
-def _section(of: Description, kind: str) -> list[tuple[str, Any]]:
+def _section_items(of: Description, kind: str) -> list[tuple[str, Any]]:
     return list((of.get(kind) or {}).items())
 
 
-def _turned(entry: dict[str, Any], turn: Array, own: set[str], number: int) -> dict[str, Any]:
+def _rotate_entry(entry: dict[str, Any], turn: Array, own: set[str], number: int) -> dict[str, Any]:
     for key in ("at", "axis", "com"):
         if key in entry:
             entry[key] = (turn @ vector(entry[key])).tolist()
@@ -221,10 +223,10 @@ def read(description: Description) -> Machine:
     :raises UnfitError: the mapping cannot be read; the package's own loader has better messages.
     """
     data = expand(description)
-    bodies = {name: _body(entry) for name, entry in data["bodies"].items()}
+    bodies = {name: _read_body(entry) for name, entry in data["bodies"].items()}
     known = {BASE, *bodies}
-    joints = tuple(_joint(name, entry, known) for name, entry in data["joints"].items())
-    rods = tuple(_rod(name, entry, known) for name, entry in data["rods"].items())
+    joints = tuple(_read_joint(name, entry, known) for name, entry in data["joints"].items())
+    rods = tuple(_read_rod(name, entry, known) for name, entry in data["rods"].items())
     platform = str(data.get("platform", "platform"))
     if platform not in bodies:
         raise UnfitError(f"no body is named {platform!r}, the platform")
@@ -234,7 +236,7 @@ def read(description: Description) -> Machine:
         # The payload's centre is relative to the platform's reference point.
         at = origin + vector(load.get("com", (0, 0, 0)))
         payload = Body(float(load["mass"]), at, tensor(load.get("inertia", (0, 0, 0))))
-        bodies[platform] = joined(bodies[platform], payload)
+        bodies[platform] = combine_bodies(bodies[platform], payload)
     return Machine(
         vector(data.get("gravity", STANDARD_GRAVITY)),
         platform,
@@ -247,7 +249,7 @@ def read(description: Description) -> Machine:
     )
 
 
-def joined(one: Body, other: Body) -> Body:
+def combine_bodies(one: Body, other: Body) -> Body:
     """Combine two rigid bodies; ``other`` must have mass."""
     mass = one.mass + other.mass
     com = (one.mass * one.com + other.mass * other.com) / mass
@@ -258,7 +260,7 @@ def joined(one: Body, other: Body) -> Body:
     return Body(mass, com, inertia)
 
 
-def _body(entry: Mapping[str, Any]) -> Body:
+def _read_body(entry: Mapping[str, Any]) -> Body:
     return Body(
         float(entry.get("mass", 0.0)),
         vector(entry.get("com", (0, 0, 0))),
@@ -266,7 +268,7 @@ def _body(entry: Mapping[str, Any]) -> Body:
     )
 
 
-def _ends(name: str, entry: Mapping[str, Any], known: set[str]) -> tuple[str, str]:
+def _read_ends(name: str, entry: Mapping[str, Any], known: set[str]) -> tuple[str, str]:
     inner, outer = entry["between"]
     for body in (inner, outer):
         if body not in known:
@@ -274,12 +276,12 @@ def _ends(name: str, entry: Mapping[str, Any], known: set[str]) -> tuple[str, st
     return inner, outer
 
 
-def _joint(name: str, entry: Mapping[str, Any], known: set[str]) -> Joint:
+def _read_joint(name: str, entry: Mapping[str, Any], known: set[str]) -> Joint:
     kind = entry["type"]
     if kind not in TYPES:
         raise UnfitError(f"joints.{name}: no joint type {kind!r}")
     count = TYPES[kind].count
-    inner, outer = _ends(f"joints.{name}", entry, known)
+    inner, outer = _read_ends(f"joints.{name}", entry, known)
     axes: Sequence[Any] = entry.get("axes") or ([entry["axis"]] if "axis" in entry else [])
     if len(axes) != count:
         raise UnfitError(f"joints.{name}: {len(axes)} axes, a {kind} joint has {count}")
@@ -299,13 +301,13 @@ def _joint(name: str, entry: Mapping[str, Any], known: set[str]) -> Joint:
         float(friction.get("viscous", 0.0)),
         float(friction.get("coulomb", 0.0)),
         float(friction.get("offset", 0.0)),
-        _rotor(entry),
+        _reflected_inertia(entry),
         friction,
         float(entry.get("lead", 0.0)) / (2.0 * math.pi),
     )
 
 
-def _rotor(entry: Mapping[str, Any]) -> float:
+def _reflected_inertia(entry: Mapping[str, Any]) -> float:
     """Return a drive's inertia at its joint: given, or the rotor's times the squared gear ratio."""
     drive = entry.get("drive")
     if not drive:
@@ -314,8 +316,8 @@ def _rotor(entry: Mapping[str, Any]) -> float:
     return float(drive["inertia"] * turns**2)
 
 
-def _rod(name: str, entry: Mapping[str, Any], known: set[str]) -> Rod:
-    inner, outer = _ends(f"rods.{name}", entry, known)
+def _read_rod(name: str, entry: Mapping[str, Any], known: set[str]) -> Rod:
+    inner, outer = _read_ends(f"rods.{name}", entry, known)
     ends = np.array([vector(end) for end in entry["ends"]])
     return Rod(name, inner, outer, ends, float(entry.get("mass", 0.0)))
 

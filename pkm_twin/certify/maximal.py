@@ -29,17 +29,17 @@ from pkm_twin.certify.rows import SINGULAR, Frame, Moving, skewed
 
 FIRST_STEP: Final = 1.0 / 16.0
 """Length of the first step as a fraction of the line from home to the goal."""
-LEAST_STEP: Final = 1e-5
+MIN_STEP: Final = 1e-5
 """Shortest step as a fraction of the line; a shorter one means a singularity."""
 MAX_STEP: Final = 0.02
 """Largest first correction of an accepted step, relative to the step's motion."""
-KEPT: Final = 64
+CACHED_ASSEMBLIES: Final = 64
 """Number of cached assemblies: the continuation takes far longer than the computations there."""
-WITHIN: Final = 0.8
+RANGE_FRACTION: Final = 0.8
 """Fraction of the range between the joints' limits from which positions are drawn."""
-NARROW: Final = 0.3
+DEFAULT_HALF_RANGE: Final = 0.3
 """Half the range of a joint without limits, rad; for a prismatic joint half this times the size."""
-CLEAR: Final = 0.1
+MIN_RELATIVE_CONDITION: Final = 0.1
 """Smallest reciprocal condition number and determinant on the line from home, relative to home:
 closer to a singularity every engine loses digits, and beyond a fold a pose has two assemblies."""
 
@@ -135,7 +135,7 @@ class Maximal(Moving):
         """
         q = np.asarray(q, dtype=float)
         if q.tobytes() not in self._assembled:
-            if len(self._assembled) == KEPT:
+            if len(self._assembled) == CACHED_ASSEMBLIES:
                 self._assembled.clear()
             self._assembled[q.tobytes()] = self._follow(q - self.machine.home)
         self._state = self._assembled[q.tobytes()]
@@ -160,7 +160,7 @@ class Maximal(Moving):
             trial, condition = self._close(guess, goal * way, MAX_STEP * max(size * step, 1e-9))
             if trial is None:
                 step /= 2
-                if step < LEAST_STEP:
+                if step < MIN_STEP:
                     raise UnfitError(f"a singularity on the way from home, at {gone:.4g} of it")
                 continue
             state, gone, step = trial, goal, 1.5 * step
@@ -280,11 +280,11 @@ def ranges(judge: Maximal) -> Array:
     machine, size = judge.machine, extent(judge)
     result = []
     for joint in machine.actuated:
-        reach = NARROW * size / 2 if joint.slides else NARROW
+        reach = DEFAULT_HALF_RANGE * size / 2 if joint.slides else DEFAULT_HALF_RANGE
         low, high = joint.position
         low = low if np.isfinite(low) else joint.home - reach
         high = high if np.isfinite(high) else joint.home + reach
-        middle, half = (low + high) / 2, WITHIN * (high - low) / 2
+        middle, half = (low + high) / 2, RANGE_FRACTION * (high - low) / 2
         result.append((middle - half, middle + half))
     return np.array(result)
 
@@ -324,7 +324,7 @@ def random_states(
             state = judge.assemble(q)
         except UnfitError:
             continue
-        if min(state.least, state.pose) >= CLEAR:
+        if min(state.least, state.pose) >= MIN_RELATIVE_CONDITION:
             good = reaches(q)
             skipped += not good
             found += [q] if good else []

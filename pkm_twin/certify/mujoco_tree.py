@@ -4,8 +4,8 @@
 The tree consists of the joints with the most freedoms, the last ones first, so that it differs from
 the Pinocchio engine's. Body frames coincide with the base frame at home.
 
-MuJoCo's compiler requires some inertia of every moving body: TINY is added to every body, and
-removed again from the compiled model.
+MuJoCo's compiler requires some inertia of every moving body: COMPILER_INERTIA is added to every
+body, and removed again from the compiled model.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from pkm_twin.certify.description import BASE, Array, Body, Description
 from pkm_twin.certify.rows import Frame
 from pkm_twin.certify.trees import Steps, Tree
 
-TINY: Final = 1e-14
+COMPILER_INERTIA: Final = 1e-14
 """Mass (kg) and moments of inertia (kg m2) added to every body for the compiler."""
 
 
@@ -51,11 +51,13 @@ class MujocoTree(Tree):
         elif [kind for kind, _ in kinds] == ["hinge"] * 3:
             kinds = [("ball", np.zeros(3))]
         for kind, axis in kinds:
-            Xml.SubElement(element, "joint", type=kind, pos=_text(at), axis=_text(axis))
+            Xml.SubElement(
+                element, "joint", type=kind, pos=_format_numbers(at), axis=_format_numbers(axis)
+            )
 
     def finish(self) -> int:
         """Compile the model."""
-        option = Xml.SubElement(self._root, "option", gravity=_text(self.machine.gravity))
+        option = Xml.SubElement(self._root, "option", gravity=_format_numbers(self.machine.gravity))
         Xml.SubElement(option, "flag", contact="disable", constraint="disable")
         self._model = mujoco.MjModel.from_xml_string(Xml.tostring(self._root, encoding="unicode"))
         for name, mass, moments in self._weights:
@@ -117,12 +119,12 @@ class MujocoTree(Tree):
         Xml.SubElement(
             element,
             "inertial",
-            pos=_text(body.com),
-            quat=_text(turn),
-            mass=repr(float(body.mass + TINY)),
-            diaginertia=_text(moments + TINY),
+            pos=_format_numbers(body.com),
+            quat=_format_numbers(turn),
+            mass=repr(float(body.mass + COMPILER_INERTIA)),
+            diaginertia=_format_numbers(moments + COMPILER_INERTIA),
         )
 
 
-def _text(values: Any) -> str:
+def _format_numbers(values: Any) -> str:
     return " ".join(repr(float(value)) for value in values)

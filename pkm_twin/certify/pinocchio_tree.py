@@ -44,7 +44,9 @@ class PinocchioTree(Tree):
                 for turns, a in steps
             ]
         for number, model in enumerate(models):
-            carrier = self.model.addJoint(carrier, model, _shift(at - origin), f"{name}.{number}")
+            carrier = self.model.addJoint(
+                carrier, model, _translation(at - origin), f"{name}.{number}"
+            )
             origin = at
         self._carriers[name] = carrier, origin
         if carrier:
@@ -92,5 +94,5 @@ class PinocchioTree(Tree):
         return np.array(pin.rnea(self.model, self.data, *self._state, change))
 
 
-def _shift(offset: Array) -> Any:
+def _translation(offset: Array) -> Any:
     return pin.SE3(np.eye(3), np.asarray(offset, dtype=float))

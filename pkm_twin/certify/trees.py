@@ -52,7 +52,7 @@ class Tree(Moving):
             turning = rod.mass * rod.length**2 / 12 * (np.eye(3) - np.outer(unit, unit))
             body = Body(rod.mass, rod.ends.mean(0), turning)
             hinges = [(True, axis) for axis in across(unit)]
-            self.hang(_name(rod), rod.inner, rod.ends[0], hinges, body)
+            self.hang(_rod_body_name(rod), rod.inner, rod.ends[0], hinges, body)
         self.size = self.finish()
         self._assembled: dict[bytes, Array] = {}
 
@@ -109,7 +109,7 @@ class Tree(Moving):
     def rod_rows(self, rod: Rod) -> Rows:
         """Return the equations that hold a rod's far end at its ball joint."""
         end = rod.ends[1]
-        gap = self.point(_name(rod), end).minus(self.point(rod.outer, end))
+        gap = self.point(_rod_body_name(rod), end).minus(self.point(rod.outer, end))
         return Rows(gap.value, gap.columns, gap.bias)
 
     def assemble(self, q: Array) -> Array:
@@ -157,6 +157,6 @@ class Tree(Moving):
         return full
 
 
-def _name(rod: Rod) -> str:
+def _rod_body_name(rod: Rod) -> str:
     """Return the name of the body that represents a rod."""
     return f"rod {rod.name}"

@@ -10,7 +10,7 @@ from pkm_twin.codegen.expressions import Objects
 from pkm_twin.codegen.lu import is_zero
 from pkm_twin.codegen.operations import maximum
 
-FLOOR: Final = 1e-20
+MIN_PIVOT_RATIO: Final = 1e-20
 """Smallest pivot relative to its scale: far below rounding errors, it only avoids division by 0."""
 
 Entries = dict[tuple[int, int], Any]
@@ -31,7 +31,7 @@ class SparseCholesky:
 
     def __init__(self, matrix: Mapping[tuple[int, int], Any], scale: Sequence[Any], last: int = 0):
         n = len(scale)
-        self.order = _order(matrix, n, last)
+        self.order = _minimum_degree_order(matrix, n, last)
         self.place = {index: k for k, index in enumerate(self.order)}
         left: Entries = {}
         for (a, b), value in matrix.items():
@@ -42,7 +42,7 @@ class SparseCholesky:
         self.inverses: list[Any] = []
         self.below: list[list[int]] = []
         for j, index in enumerate(self.order):
-            self.pivots.append(maximum(left[j, j], FLOOR * scale[index]))
+            self.pivots.append(maximum(left[j, j], MIN_PIVOT_RATIO * scale[index]))
             column = [i for i in range(j + 1, n) if (i, j) in left]
             inverse = 1.0 / self.pivots[j]
             self.inverses.append(inverse)
@@ -72,7 +72,7 @@ class SparseCholesky:
         return [b[self.place[index]] for index in range(len(b))]
 
 
-def _order(matrix: Mapping[tuple[int, int], Any], n: int, last: int) -> list[int]:
+def _minimum_degree_order(matrix: Mapping[tuple[int, int], Any], n: int, last: int) -> list[int]:
     """Return the elimination order: least degree first; the first ``last`` rows at the end."""
     near: dict[int, set[int]] = {a: set() for a in range(n)}
     for a, b in matrix:

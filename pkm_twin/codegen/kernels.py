@@ -14,7 +14,7 @@ from pkm_twin.codegen.arrays import Array
 from pkm_twin.codegen.code import NOT_FINITE, Code, Space
 from pkm_twin.codegen.program import Program
 
-MISSED: Final = 1e-24
+MAX_GEOMETRY_MISMATCH: Final = 1e-24
 """Largest sum of squared differences between a geometry and the constants that a program assumes:
 rounding errors of 1e-12."""
 _NO_GEOMETRY: Final = np.zeros(0)
@@ -41,7 +41,9 @@ class Kernel:
     def holds(self) -> bool:
         """Whether the geometry agrees with the constants that the program assumes."""
         p = np.zeros(self.code.parameters - len(self.geometry))
-        return bool(self.code.prepare(np.concatenate([p, self.geometry]))[-1] <= MISSED)
+        return bool(
+            self.code.prepare(np.concatenate([p, self.geometry]))[-1] <= MAX_GEOMETRY_MISMATCH
+        )
 
     def prepared(self, p: Array) -> Array:
         """Compute the expressions of parameters and geometry alone, for all samples to use."""

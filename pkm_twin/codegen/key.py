@@ -36,18 +36,22 @@ class ProgramKey:
 
     def also(self, text: str, *writers: Callable[..., Any]) -> ProgramKey:
         """Return the key of a program made from this one with further content and writers."""
-        modules = (module for writer in writers for module in _modules(writer))
+        modules = (module for writer in writers for module in _writer_modules(writer))
         return ProgramKey(f"{self.text} {text}", self.writers.union(modules))
 
     @property
     def sources(self) -> frozenset[str]:
         """Source files of the writers and of codegen, and of all modules that these import."""
-        return _sources(self.writers)
+        return _find_sources(self.writers)
 
     def digest(self, *more: str) -> str:
         """Return the cache name of the program; it changes with the content and any source file."""
-        writers = [name if _file(name) else f"{name} {_UNSAVED}" for name in sorted(self.writers)]
-        return digest(self.text, *writers, *sorted(_read(file)[0] for file in self.sources), *more)
+        writers = [
+            name if _source_file(name) else f"{name} {_UNSAVED}" for name in sorted(self.writers)
+        ]
+        return digest(
+            self.text, *writers, *sorted(_read_source(file)[0] for file in self.sources), *more
+        )
 
 
 EMPTY: Final = ProgramKey()
@@ -55,67 +59,71 @@ _UNSAVED: Final = uuid4().hex
 """A text that differs in every process: stands for the source of writers without a file."""
 
 
-def _modules(writer: Callable[..., Any]) -> Iterator[str]:
+def _writer_modules(writer: Callable[..., Any]) -> Iterator[str]:
     if isinstance(writer, partial):
         for part in (writer.func, *writer.args):
             if callable(part):
-                yield from _modules(part)
+                yield from _writer_modules(part)
     else:
         yield writer.__module__
 
 
-def _file(module: str) -> str:
+def _source_file(module: str) -> str:
     """Return the source file of a loaded module; empty if it has none."""
     name = getattr(sys.modules.get(module), "__file__", None) or ""
     return name if name.endswith(".py") else ""
 
 
 @cache
-def _sources(writers: frozenset[str]) -> frozenset[str]:
-    todo: list[Module] = [(name, _file(name)) for name in {*writers, _COMPILER} if _file(name)]
+def _find_sources(writers: frozenset[str]) -> frozenset[str]:
+    todo: list[Module] = [
+        (name, _source_file(name)) for name in {*writers, _COMPILER} if _source_file(name)
+    ]
     found = set(todo)
     while todo:
-        new = _imports(*todo.pop()) - found
+        new = _find_imports(*todo.pop()) - found
         found |= new
         todo += new
     return frozenset(file for _, file in found)
 
 
 @cache
-def _imports(module: str, file: str) -> frozenset[Module]:
+def _find_imports(module: str, file: str) -> frozenset[Module]:
     """Find the modules of its own package and of pkm_twin that a file imports.
 
     The text is searched, so imports inside functions and imports for type checking count, too.
     """
-    homes = dict((_home(_COMPILER, _file(_COMPILER)), _home(module, file)))
+    homes = dict((_package_root(_COMPILER, _source_file(_COMPILER)), _package_root(module, file)))
     found = set()
-    for package, names in _read(file)[1]:
+    for package, names in _read_source(file)[1]:
         for name in [package] if package else names:
             home = homes.get(name.partition(".")[0])
             if home is None:
                 continue
-            place = _place(home, name)
+            place = _module_file(home, name)
             found.add((name, place))
             if place.endswith(_PACKAGE):
-                found |= {(f"{name}.{part}", _place(home, f"{name}.{part}")) for part in names}
+                found |= {
+                    (f"{name}.{part}", _module_file(home, f"{name}.{part}")) for part in names
+                }
     return frozenset(one for one in found if one[1])
 
 
-def _home(module: str, file: str) -> tuple[str, str]:
+def _package_root(module: str, file: str) -> tuple[str, str]:
     """Return the top-level package of a module and the folder that contains the package."""
     depth = module.count(".") + 1 + file.endswith(_PACKAGE)
     return module.partition(".")[0], file.rsplit(os.sep, depth)[0]
 
 
 @cache
-def _place(folder: str, module: str) -> str:
+def _module_file(folder: str, module: str) -> str:
     """Find the file of a module below a folder; empty if there is none."""
     base = os.path.join(folder, *module.split("."))
     return next((file for file in (f"{base}.py", base + _PACKAGE) if os.path.isfile(file)), "")
 
 
 @cache
-def _read(file: str) -> tuple[str, list[tuple[str, list[str]]]]:
+def _read_source(file: str) -> tuple[str, list[tuple[str, list[str]]]]:
     """Read a file's digest and its imports: each module with the names imported from it."""
     with open(file, "rb") as opened:
         data = opened.read()

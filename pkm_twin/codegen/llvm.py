@@ -47,7 +47,7 @@ from pkm_twin.codegen.program import (
 )
 
 STATUS: Final = " status"
-LONG: Final = 100
+MAX_UNROLLED_STORES: Final = 100
 """Most entries of an output that are stored by straight-line code; more are stored in a loop."""
 
 ZERO: Final = whole(0)
@@ -134,23 +134,23 @@ class _Counter:
         b.go_to(self.after)
 
 
-def _function(name: str) -> Function:
+def _make_function(name: str) -> Function:
     return Function(name, typed_pointers=binding.llvm_version_info < (17,))
 
 
-def _word(b: Function, k: int) -> Value:
+def _load_word(b: Function, k: int) -> Value:
     return b.load(b.gep(b.words, whole(k)))
 
 
-def _preparation(program: Program) -> Function:
+def _write_preparation(program: Program) -> Function:
     """Write the function that computes all expressions of parameters alone, for each machine.
 
     Its words: number of machines; address of the parameters and their stride, doubles; address of
     the results, each repeated in all lanes.
     """
-    b = _function(PREPARE)
-    count, stride = _word(b, 0), _word(b, 2)
-    source, target = b.inttoptr(_word(b, 1), DOUBLE), b.inttoptr(_word(b, 3), DOUBLE)
+    b = _make_function(PREPARE)
+    count, stride = _load_word(b, 0), _load_word(b, 2)
+    source, target = b.inttoptr(_load_word(b, 1), DOUBLE), b.inttoptr(_load_word(b, 3), DOUBLE)
     results = [*program.prepared, program.missed]
     machines = _Counter(b, "machine", count)
     index = machines.begin()
@@ -177,24 +177,24 @@ class _Writer:
 
     def __init__(self, program: Program) -> None:
         self.program = program
-        b = self.b = _function(SYMBOL)
+        b = self.b = _make_function(SYMBOL)
         self.used = uses(program.results)
         names = list(program.inputs)
-        self.count, self.steps = _word(b, 1), _word(b, 2)
+        self.count, self.steps = _load_word(b, 1), _load_word(b, 2)
         self.flags = b.alloca(INT64)
         b.store(ZERO, self.flags)
-        self.strides = {name: _word(b, 6 + 3 * k) for k, name in enumerate(names)}
+        self.strides = {name: _load_word(b, 6 + 3 * k) for k, name in enumerate(names)}
         # Addresses and their strides from one machine to the next, doubles.
         at = 5 + 3 * len(names)
-        leaps = {"": (3, _word(b, 4))}
-        leaps |= {name: (5 + 3 * k, _word(b, 7 + 3 * k)) for k, name in enumerate(names)}
+        leaps = {"": (3, _load_word(b, 4))}
+        leaps |= {name: (5 + 3 * k, _load_word(b, 7 + 3 * k)) for k, name in enumerate(names)}
         sizes = {**{name: len(row) for name, row in program.outputs.items()}, STATUS: 2}
         for k, (name, size) in enumerate(sizes.items()):
             leaps[f"to {name}"] = at + k, b.mul(self.count, whole(size))
         places = {name: b.alloca(INT64) for name in leaps}
         for name, (k, _) in leaps.items():
-            b.store(_word(b, k), places[name])
-        machines = _Counter(b, "machine", _word(b, 0))
+            b.store(_load_word(b, k), places[name])
+        machines = _Counter(b, "machine", _load_word(b, 0))
         machines.begin()
         self.pointers = {name: b.inttoptr(b.load(at), DOUBLE) for name, at in places.items()}
         self.base = b.inttoptr(b.load(places[""]), VECTOR)
@@ -231,7 +231,7 @@ class _Writer:
 
     def _save(self, base: Value, values: Sequence[Value]) -> None:
         b = self.b
-        if len(values) > LONG:
+        if len(values) > MAX_UNROLLED_STORES:
             self._save_long(base, values)
             return
         size = whole(len(values))
@@ -376,7 +376,7 @@ class _Writer:
 def emit(program: Program) -> str:
     """Write a program as LLVM assembly: two functions that take the address of 64-bit words.
 
-    ``prepare``: see :func:`_preparation`. ``kernel`` returns 0 if all samples are good. Its words:
+    ``prepare``: see :func:`_write_preparation`. ``kernel``: 0 if all samples are good; its words:
 
     - number of machines, samples per machine, steps;
     - address of the prepared parameters and their stride from one machine to the next, doubles;
@@ -386,4 +386,4 @@ def emit(program: Program) -> str:
     - the address of the status, two numbers per sample: 0 good, 1 refused, 2 not finite; and the
       fraction of the motion from home that was reached.
     """
-    return module(binding.get_default_triple(), [_preparation(program), _Writer(program).b])
+    return module(binding.get_default_triple(), [_write_preparation(program), _Writer(program).b])

@@ -11,7 +11,7 @@ from pkm_twin.codegen.arrays import Array
 from pkm_twin.codegen.expressions import Objects
 from pkm_twin.errors import SingularityError
 
-ZERO: Final = 1e-13
+RELATIVE_ZERO: Final = 1e-13
 """Entries below this fraction of the largest one, in all samples, are rounding errors of zero."""
 
 
@@ -42,7 +42,7 @@ def independent_rows(matrices: Array, bound: float = 1e-9) -> list[int]:
     return sorted(chosen)
 
 
-STRONG: Final = 0.3
+STRONG_PIVOT_RATIO: Final = 0.3
 """Pivots above this fraction of their row's and column's largest entry count as equally good."""
 
 Order = tuple[tuple[int, int], ...]
@@ -66,7 +66,7 @@ def pivot_order(samples: Array, share: float = 0.1) -> Order:
     order: list[tuple[int, int]] = []
     while rows:
         block = np.abs(numbers[:, rows][:, :, columns])
-        there = (block > ZERO * scale).any(0)
+        there = (block > RELATIVE_ZERO * scale).any(0)
         large = np.maximum(block.max(2)[:, :, None], block.max(1)[:, None, :])
         good = there & (block > np.maximum(share * large, 1e-12)).all(0)
         if not good.any():
@@ -75,7 +75,7 @@ def pivot_order(samples: Array, share: float = 0.1) -> Order:
             raise SingularityError("the sample states", (), float(scale), share)
         fill = np.multiply.outer(there.sum(1) - 1, there.sum(0) - 1)
         # Ties take the first entry: a finer criterion would depend on the processor's rounding.
-        strong = ((block / np.maximum(large, 1e-300)).min(0) > STRONG)[good]
+        strong = ((block / np.maximum(large, 1e-300)).min(0) > STRONG_PIVOT_RATIO)[good]
         # The reciprocal of a constant entry is computed once, not per sample.
         steady = (np.ptp(numbers[:, rows][:, :, columns], axis=0) < 1e-12 * scale)[good]
         best = int((fill[good] + 0.5 * ~strong + 0.6 * ~steady).argmin())
@@ -140,7 +140,7 @@ class SparseLU:
             for c, factor in upper.items():
                 value = value - factor * x[c]
             x[column] = value * inverse
-        return _objects(x)
+        return _object_array(x)
 
     def solve_transposed(self, right: Any) -> Objects:
         """Solve A' y = right, shape (n,)."""
@@ -153,7 +153,7 @@ class SparseLU:
         for (row, _, _), lower in zip(reversed(self._pivots), reversed(self._lower), strict=True):
             for r, factor in lower.items():
                 y[row] = y[row] - factor * y[r]
-        return _objects(y)
+        return _object_array(y)
 
 
 def is_zero(value: Any) -> bool:
@@ -162,7 +162,7 @@ def is_zero(value: Any) -> bool:
     return bool(constant(0.0)) if constant is not None else value == 0.0
 
 
-def _objects(values: list[Any]) -> Objects:
+def _object_array(values: list[Any]) -> Objects:
     array = np.empty(len(values), dtype=object)
     array[:] = values
     return array

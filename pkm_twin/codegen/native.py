@@ -36,7 +36,7 @@ _initialise()
 CPU: Final[str] = binding.get_host_cpu_name()
 
 
-def _features() -> str:
+def _host_features() -> str:
     try:
         text: str = binding.get_host_cpu_features().flatten()
     except RuntimeError:  # LLVM cannot read the features of every processor
@@ -44,7 +44,7 @@ def _features() -> str:
     return text
 
 
-FEATURES: Final = _features()
+FEATURES: Final = _host_features()
 FUSED: Final = "+fma" in FEATURES.split(",") or "aarch64" in binding.get_process_triple()
 
 
@@ -53,7 +53,7 @@ def compile_object(text: str, level: int = OPTIMISATION) -> bytes:
     module = binding.parse_assembly(text)
     module.verify()
     # No optimisation passes before: straight-line code gains nothing, and they double the time.
-    code: bytes = _machine(level).emit_object(module)
+    code: bytes = _make_target_machine(level).emit_object(module)
     return code
 
 
@@ -62,14 +62,14 @@ _ENGINES: Final[list[Any]] = []
 
 def load_object(code: bytes) -> tuple[Any, Any]:
     """Load an object file; return the addresses of ``prepare`` and ``kernel``."""
-    engine = binding.create_mcjit_compiler(binding.parse_assembly(""), _machine())
+    engine = binding.create_mcjit_compiler(binding.parse_assembly(""), _make_target_machine())
     engine.add_object_file(binding.ObjectFileRef.from_data(code))
     engine.finalize_object()
     _ENGINES.append(engine)
     return tuple(engine.get_function_address(name) for name in (PREPARE, SYMBOL))
 
 
-def _machine(level: int = OPTIMISATION) -> Any:
+def _make_target_machine(level: int = OPTIMISATION) -> Any:
     target = binding.Target.from_default_triple()
     return target.create_target_machine(
         cpu=CPU, features=FEATURES, opt=level, jit=True, reloc="pic"

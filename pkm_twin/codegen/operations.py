@@ -26,7 +26,7 @@ SAMPLE: Final = 2
 
 MAX_ANGLE: Final = 1e6
 """Largest angle of sine and cosine, rad; beyond it the reduction by quarter turns loses digits."""
-QUARTERS: Final = 1048576
+MAX_QUARTER: Final = 1048576
 """More quarter turns than MAX_ANGLE has (2^20): added before truncation, it makes it a floor."""
 # Minimax polynomials of sine and cosine up to a quarter turn, and pi / 2 in three parts
 # (Cody and Waite 1980; coefficients of this file as in Cephes, public domain).
@@ -38,7 +38,7 @@ COSINE: Final = (
     -1.13585365213876817300e-11, 2.08757008419747316778e-9, -2.75573141792967388112e-7,
     2.48015872888517045348e-5, -1.38888888888730564116e-3, 4.16666666666665929218e-2,
 )  # fmt: skip
-QUARTER: Final = (1.5707963267341256e00, 6.0771005065061922e-11, 2.0222662487959506e-21)
+HALF_PI: Final = (1.5707963267341256e00, 6.0771005065061922e-11, 2.0222662487959506e-21)
 # Arctangent up to 0.66 as x + x z P(z) / Q(z), z = x^2.
 ATAN_P: Final = (
     -8.750608600031904122785e-1, -1.615753718733365076637e1, -7.500855792314704667340e1,
@@ -48,7 +48,7 @@ ATAN_Q: Final = (
     1.0, 2.485846490142306297962e1, 1.650270098316988542046e2, 4.328810604912902668951e2,
     4.853903996359136964868e2, 1.945506571482613964425e2,
 )  # fmt: skip
-MORE: Final = 6.123233995736765886130e-17
+HALF_PI_REMAINDER: Final = 6.123233995736765886130e-17
 """Difference between pi / 2 and its nearest double."""
 # The exponential function up to ln(2) / 2 as 1 + 2 x P(z) / (Q(z) - x P(z)), ln(2) in two parts.
 EXP_P: Final = (1.26177193074810590878e-4, 3.02994407707441961300e-2, 9.99999999999999999910e-1)
@@ -56,7 +56,7 @@ EXP_Q: Final = (
     3.00198505138664455042e-6, 2.52448340349684104192e-3, 2.27265548208155028766e-1, 2.0,
 )  # fmt: skip
 LN2: Final = (6.93145751953125e-1, 1.42860682030941723212e-6)
-LARGEST_POWER: Final = 745.2
+MAX_EXPONENT: Final = 745.2
 """Beyond this exponent (ln of the smallest double) the result is infinite, or zero if negative."""
 # Hyperbolic tangent up to 0.625 as x + x z P(z) / Q(z).
 TANH_P: Final = (-9.64399179425052238628e-1, -9.92877231001918586564e1, -1.61468768441708447952e3)
@@ -71,14 +71,14 @@ def c_number(value: float) -> str:
     return f"({text})" if text.startswith("-") else text
 
 
-def _series(coefficients: Sequence[float]) -> str:
+def _write_horner_c(coefficients: Sequence[float]) -> str:
     text = c_number(coefficients[0])
     for c in coefficients[1:]:
         text = f"PKM_FMA({text}, z,\n        {c_number(c)})"
     return text
 
 
-TURN: Final = f"""\
+SINE_COSINE_C: Final = f"""\
 /* Sines and cosines: polynomials after Cody and Waite's reduction by quarter turns. NaN where
    the angle is so large that the reduction loses digits. */
 static void @_turn(const double *x, double *s, double *c, int count)
@@ -86,13 +86,13 @@ static void @_turn(const double *x, double *s, double *c, int count)
     int i;
     for (i = 0; i < count; i++) {{
         const double angle = (fabs(x[i]) < {MAX_ANGLE!r}) ? x[i] : 0.0;
-        const int k = (int)((angle * {c_number(2.0 / math.pi)}) + {QUARTERS}.5) - {QUARTERS};
+        const int k = (int)((angle * {c_number(2.0 / math.pi)}) + {MAX_QUARTER}.5) - {MAX_QUARTER};
         const double n = -(double)k;
-        const double y = PKM_FMA(n, {c_number(QUARTER[2])},
-            PKM_FMA(n, {c_number(QUARTER[1])}, PKM_FMA(n, {c_number(QUARTER[0])}, angle)));
+        const double y = PKM_FMA(n, {c_number(HALF_PI[2])},
+            PKM_FMA(n, {c_number(HALF_PI[1])}, PKM_FMA(n, {c_number(HALF_PI[0])}, angle)));
         const double z = y * y;
-        const double sine = PKM_FMA(z * y, {_series(SINE)}, y);
-        const double cosine = PKM_FMA(z, -0.5, 1.0) + (z * z) * {_series(COSINE)};
+        const double sine = PKM_FMA(z * y, {_write_horner_c(SINE)}, y);
+        const double cosine = PKM_FMA(z, -0.5, 1.0) + (z * z) * {_write_horner_c(COSINE)};
         const int even = 1 - (k & 1);
         const int side = 1 - (k & 2);
         const double u = (double)(even * side);
@@ -169,65 +169,67 @@ class Operation:
         return self.name
 
 
-def _sum(a: Any, b: Any) -> Any:
+def _fold_sum(a: Any, b: Any) -> Any:
     if a.level == CONSTANT and a.value == 0.0:
         return b
     if b.level == CONSTANT and b.value == 0.0:
         return a
     if b.op is neg:
-        return _difference(a, *b.args)
-    return _difference(b, *a.args) if a.op is neg else a.tape.make(add, a, b)
+        return _fold_difference(a, *b.args)
+    return _fold_difference(b, *a.args) if a.op is neg else a.tape.make(add, a, b)
 
 
-def _difference(a: Any, b: Any) -> Any:
+def _fold_difference(a: Any, b: Any) -> Any:
     if a is b:
         return a.tape.constant(0.0)
     if b.level == CONSTANT and b.value == 0.0:
         return a
     if a.level == CONSTANT and a.value == 0.0:
-        return _negative(b)
+        return _fold_negation(b)
     if b.op is neg:
-        return _sum(a, *b.args)
-    return _negative(_sum(a.args[0], b)) if a.op is neg else a.tape.make(sub, a, b)
+        return _fold_sum(a, *b.args)
+    return _fold_negation(_fold_sum(a.args[0], b)) if a.op is neg else a.tape.make(sub, a, b)
 
 
-def _product(a: Any, b: Any) -> Any:
+def _fold_product(a: Any, b: Any) -> Any:
     for u, v in ((a, b), (b, a)):
         if u.level == CONSTANT and u.value in (0.0, 1.0, -1.0):
-            return u if u.value == 0.0 else v if u.value > 0.0 else _negative(v)
+            return u if u.value == 0.0 else v if u.value > 0.0 else _fold_negation(v)
     if a.op is neg:
         both = b.op is neg
-        return _product(*a.args, *b.args) if both else _negative(_product(a.args[0], b))
-    return _negative(_product(a, *b.args)) if b.op is neg else a.tape.make(mul, a, b)
+        return (
+            _fold_product(*a.args, *b.args) if both else _fold_negation(_fold_product(a.args[0], b))
+        )
+    return _fold_negation(_fold_product(a, *b.args)) if b.op is neg else a.tape.make(mul, a, b)
 
 
-def _negative(a: Any) -> Any:
+def _fold_negation(a: Any) -> Any:
     if a.op is neg:
         return a.args[0]
-    return _difference(*a.args[::-1]) if a.op is sub else a.tape.make(neg, a)
+    return _fold_difference(*a.args[::-1]) if a.op is sub else a.tape.make(neg, a)
 
 
-def _quotient(a: Any, b: Any) -> Any:
+def _fold_quotient(a: Any, b: Any) -> Any:
     """Record a quotient as a product with the reciprocal, which other quotients share."""
     if a.is_constant(0.0):
         return a
     if a.op is neg:
-        return _negative(_quotient(a.args[0], b))
-    return _negative(_quotient(a, *b.args)) if b.op is neg else _product(a, inv(b))
+        return _fold_negation(_fold_quotient(a.args[0], b))
+    return _fold_negation(_fold_quotient(a, *b.args)) if b.op is neg else _fold_product(a, inv(b))
 
 
-def _circle(e: Any) -> tuple[Any, Any] | None:
+def _closed_form_cosine_sine(e: Any) -> tuple[Any, Any] | None:
     """Return cosine and sine of a sum of arctangents in closed form; None for other expressions."""
     if e.op is atan2:
         y, x = e.args
         over = 1.0 / sqrt(x * x + y * y)
         return x * over, y * over
     if e.op is neg:
-        inner = _circle(*e.args)
+        inner = _closed_form_cosine_sine(*e.args)
         return inner and (inner[0], -inner[1])
     if e.op is not add and e.op is not sub:
         return None
-    first, second = map(_circle, e.args)
+    first, second = map(_closed_form_cosine_sine, e.args)
     if first is None or second is None:
         return None
     (c, s), (d, t) = first, second
@@ -235,35 +237,35 @@ def _circle(e: Any) -> tuple[Any, Any] | None:
     return c * d - s * t, s * d + c * t
 
 
-def _turn(name: str, index: int, slope: Callable[[Any], Any]) -> Operation:
+def _define_angle_function(name: str, index: int, slope: Callable[[Any], Any]) -> Operation:
     """Define sine or cosine; compiled code computes both together."""
     numbers, within = getattr(np, name), getattr(math, name)
 
     def folds(x: Any) -> Any:
-        circle = _circle(x)
+        circle = _closed_form_cosine_sine(x)
         return x.tape.make(turn, x) if circle is None else circle[index]
 
     def lanes(to: Lanes, e: Any, x: Value) -> Value:
         number = e.args[0].number
         if number not in to.turned:
-            to.turned[number] = _turned(to, x)
+            to.turned[number] = _write_cosine_sine(to, x)
         return to.turned[number][index]
 
     turn = Operation(
         name, numbers, lanes, lambda e, x: (slope(x),),
         lambda x: within(x) if abs(x) < MAX_ANGLE else math.nan,
         lambda x: numbers(np.where(np.abs(x) < MAX_ANGLE, x, np.nan)),
-        folds=folds, helper=TURN,
+        folds=folds, helper=SINE_COSINE_C,
     )  # fmt: skip
     return turn
 
 
-def _turned(to: Lanes, x: Value) -> tuple[Value, Value]:
+def _write_cosine_sine(to: Lanes, x: Value) -> tuple[Value, Value]:
     """Write cosine and sine in lanes."""
     b, n = to.b, to.number
     quarters = to.call("rint", b.fmul(x, n(2 / math.pi)))
     y = b.select(b.fcmp("olt", to.call("fabs", x), n(MAX_ANGLE)), x, n(math.nan))
-    for part in QUARTER:
+    for part in HALF_PI:
         y = to.fused(quarters, n(-part), y)
     z = b.fmul(y, y)
     sine = to.fused(b.fmul(z, y), to.polynomial(z, SINE), y)
@@ -279,9 +281,9 @@ def _turned(to: Lanes, x: Value) -> tuple[Value, Value]:
     return signed(b.select(odd, sine, cosine), b.add(k, to.whole(1))), turned
 
 
-def _exponential(to: Lanes, x: Value) -> Value:
+def _write_exponential(to: Lanes, x: Value) -> Value:
     b, n = to.b, to.number
-    for bound, condition in ((n(LARGEST_POWER), "ogt"), (n(-LARGEST_POWER), "olt")):
+    for bound, condition in ((n(MAX_EXPONENT), "ogt"), (n(-MAX_EXPONENT), "olt")):
         x = b.select(b.fcmp(condition, x, bound), bound, x)
     twos = to.call("rint", b.fmul(x, n(1.0 / math.log(2.0))))
     for part in LN2:
@@ -298,24 +300,24 @@ def _exponential(to: Lanes, x: Value) -> Value:
     return result
 
 
-def _power(x: float) -> float:
+def _saturating_exponential(x: float) -> float:
     try:
         return math.exp(x)
     except OverflowError:
         return math.inf
 
 
-def _hyperbolic(to: Lanes, e: Any, x: Value) -> Value:
+def _write_tanh(to: Lanes, e: Any, x: Value) -> Value:
     b, n = to.b, to.number
     size, z = to.call("fabs", x), b.fmul(x, x)
     ratio = b.fdiv(to.polynomial(z, TANH_P), to.polynomial(z, TANH_Q))
-    power = _exponential(to, b.fmul(size, n(2.0)))
+    power = _write_exponential(to, b.fmul(size, n(2.0)))
     large = b.fsub(n(1.0), b.fdiv(n(2.0), b.fadd(power, n(1.0))))
     small = b.fcmp("olt", size, n(0.625))
     return b.select(small, to.fused(b.fmul(x, z), ratio, x), to.call("copysign", large, x))
 
 
-def _arctangent(to: Lanes, e: Any, y: Value, x: Value) -> Value:
+def _write_atan2(to: Lanes, e: Any, y: Value, x: Value) -> Value:
     b, n = to.b, to.number
     ay, ax = to.call("fabs", y), to.call("fabs", x)
     steep = b.fcmp("ogt", ay, ax)
@@ -327,51 +329,51 @@ def _arctangent(to: Lanes, e: Any, y: Value, x: Value) -> Value:
     z = b.fmul(u, u)
     ratio = b.fdiv(to.polynomial(z, ATAN_P), to.polynomial(z, ATAN_Q))
     angle = to.fused(b.fmul(u, z), ratio, u)
-    angle = b.select(high, b.fadd(b.fadd(angle, n(MORE / 2)), n(math.pi / 4)), angle)
-    angle = b.select(steep, b.fadd(b.fsub(n(math.pi / 2), angle), n(MORE)), angle)
+    angle = b.select(high, b.fadd(b.fadd(angle, n(HALF_PI_REMAINDER / 2)), n(math.pi / 4)), angle)
+    angle = b.select(steep, b.fadd(b.fsub(n(math.pi / 2), angle), n(HALF_PI_REMAINDER)), angle)
     back = b.icmp("slt", b.bitcast(x, to.integer), to.whole(0))
-    angle = b.select(back, b.fadd(b.fsub(n(math.pi), angle), n(2 * MORE)), angle)
+    angle = b.select(back, b.fadd(b.fsub(n(math.pi), angle), n(2 * HALF_PI_REMAINDER)), angle)
     signs = b.and_(b.bitcast(y, to.integer), to.whole(-(2**63)))
     return b.bitcast(b.or_(b.bitcast(angle, to.integer), signs), to.type)
 
 
-def _signed(to: Lanes, e: Any, x: Value) -> Value:
+def _write_sign(to: Lanes, e: Any, x: Value) -> Value:
     b, n = to.b, to.number
     down = b.select(b.fcmp("olt", x, n(0.0)), n(-1.0), b.fmul(x, n(0.0)))
     return b.select(b.fcmp("ogt", x, n(0.0)), n(1.0), down)
 
 
-def _flag(to: Lanes, e: Any, mask: Value) -> Value:
+def _write_flag(to: Lanes, e: Any, mask: Value) -> Value:
     """Return 1.0 or 0.0; a following ``select`` uses the mask itself."""
     to.masks[e.number] = mask
     to.flags.add(e.number)
     return to.b.select(mask, to.number(1.0), to.number(0.0))
 
 
-def _below(to: Lanes, e: Any, x: Value, y: Value) -> Value:
-    return _flag(to, e, to.masks.get(e.number) or to.b.fcmp("olt", x, y))
+def _write_less(to: Lanes, e: Any, x: Value, y: Value) -> Value:
+    return _write_flag(to, e, to.masks.get(e.number) or to.b.fcmp("olt", x, y))
 
 
-def _selected(to: Lanes, e: Any, x: Value, y: Value, z: Value) -> Value:
+def _write_select(to: Lanes, e: Any, x: Value, y: Value, z: Value) -> Value:
     where, value, other = e.args
     if where.number not in to.masks:
         to.masks[where.number] = to.b.fcmp("ogt", x, to.number(0.0))
     mask = to.masks[where.number]
     if value.number in to.flags and other.is_constant(0.0):
-        return _flag(to, e, to.b.and_(mask, to.masks[value.number]))
+        return _write_flag(to, e, to.b.and_(mask, to.masks[value.number]))
     return to.b.select(mask, y, z)
 
 
-def _choice(x: Any, y: Any, z: Any) -> Any:
+def _fold_select(x: Any, y: Any, z: Any) -> Any:
     return (y if x.value > 0.0 else z) if x.level == CONSTANT else x.tape.make(select, x, y, z)
 
 
-def _greater(a: Any, b: Any) -> Any:
+def _step_weight(a: Any, b: Any) -> Any:
     """Return 1 where a > b, 0 where a < b, 1/2 where a = b."""
     return 0.5 + 0.5 * sign(a - b)
 
 
-def _steepness(e: Any, x: Any) -> tuple[Any, ...]:
+def _sqrt_derivative(e: Any, x: Any) -> tuple[Any, ...]:
     # d sqrt(x) / dx = 1 / (2 sqrt(x)) is infinite at 0. Where the root is zero at the reference
     # geometry, x is a sum of squares with derivative 0 there: a bounded factor gives 0.
     return (0.5 / (maximum(e, 1e-150) if e.value == 0.0 else e),)
@@ -379,62 +381,72 @@ def _steepness(e: Any, x: Any) -> tuple[Any, ...]:
 
 add: Final = Operation(
     "add", operator.add, "fadd", lambda e, a, b: (1.0, 1.0),
-    infix="({} + {})", folds=_sum, commutes=True,
+    infix="({} + {})", folds=_fold_sum, commutes=True,
 )  # fmt: skip
 sub: Final = Operation(
-    "sub", operator.sub, "fsub", lambda e, a, b: (1.0, -1.0), infix="({} - {})", folds=_difference
+    "sub",
+    operator.sub,
+    "fsub",
+    lambda e, a, b: (1.0, -1.0),
+    infix="({} - {})",
+    folds=_fold_difference,
 )
 mul: Final = Operation(
     "mul", operator.mul, "fmul", lambda e, a, b: (b, a),
-    infix="({} * {})", folds=_product, commutes=True,
+    infix="({} * {})", folds=_fold_product, commutes=True,
 )  # fmt: skip
 neg: Final = Operation(
-    "neg", operator.neg, "fneg", lambda e, x: (-1.0,), infix="(-{})", folds=_negative
+    "neg", operator.neg, "fneg", lambda e, x: (-1.0,), infix="(-{})", folds=_fold_negation
 )
 inv: Final[Operation] = Operation(
     "inv", lambda x: 1.0 / x, lambda to, e, x: to.b.fdiv(to.number(1.0), x),
     lambda e, x: (-(e * e),), lambda x: 1.0 / x if x else math.copysign(math.inf, x),
-    c="(1.0 / {})", folds=lambda x: _negative(inv(*x.args)) if x.op is neg else x.tape.make(inv, x),
+    c="(1.0 / {})",
+    folds=lambda x: _fold_negation(inv(*x.args)) if x.op is neg else x.tape.make(inv, x),
 )  # fmt: skip
-divide: Final = Operation("divide", lambda a, b: a * (1.0 / b), "", folds=_quotient)
+divide: Final = Operation("divide", lambda a, b: a * (1.0 / b), "", folds=_fold_quotient)
 sqrt: Final = Operation(
-    "sqrt", np.sqrt, "sqrt", _steepness, lambda x: math.sqrt(x) if x >= 0.0 else math.nan
+    "sqrt", np.sqrt, "sqrt", _sqrt_derivative, lambda x: math.sqrt(x) if x >= 0.0 else math.nan
 )
-sin: Final = _turn("sin", 1, lambda x: cos(x))
-cos: Final[Operation] = _turn("cos", 0, lambda x: -sin(x))
+sin: Final = _define_angle_function("sin", 1, lambda x: cos(x))
+cos: Final[Operation] = _define_angle_function("cos", 0, lambda x: -sin(x))
 exp: Final = Operation(
-    "exp", np.exp, lambda to, e, x: _exponential(to, x), lambda e, x: (e,), _power
+    "exp",
+    np.exp,
+    lambda to, e, x: _write_exponential(to, x),
+    lambda e, x: (e,),
+    _saturating_exponential,
 )
-tanh: Final = Operation("tanh", np.tanh, _hyperbolic, lambda e, x: (1.0 - e * e,), math.tanh)
+tanh: Final = Operation("tanh", np.tanh, _write_tanh, lambda e, x: (1.0 - e * e,), math.tanh)
 absolute: Final = Operation("abs", np.abs, "fabs", lambda e, x: (sign(x),), abs, c="fabs")
 sign: Final[Operation] = Operation(
-    "sign", np.sign, _signed, one=lambda x: 1.0 if x > 0.0 else -1.0 if x < 0.0 else x * 0.0,
+    "sign", np.sign, _write_sign, one=lambda x: 1.0 if x > 0.0 else -1.0 if x < 0.0 else x * 0.0,
     body="(x > 0.0) ? 1.0 : ((x < 0.0) ? -1.0 : x * 0.0)",
 )  # fmt: skip
 """-1, 0 or 1."""
 atan2: Final = Operation(
-    "atan2", np.arctan2, _arctangent,
+    "atan2", np.arctan2, _write_atan2,
     lambda e, y, x: (x / (y * y + x * x), -y / (y * y + x * x)), math.atan2,
 )  # fmt: skip
 minimum: Final = Operation(
     "min", np.minimum, lambda to, e, x, y: to.b.select(to.b.fcmp("olt", x, y), x, y),
-    lambda e, x, y: (_greater(y, x), _greater(x, y)), lambda x, y: x if x < y else y,
+    lambda e, x, y: (_step_weight(y, x), _step_weight(x, y)), lambda x, y: x if x < y else y,
     body="(x < y) ? x : y", commutes=True,
 )  # fmt: skip
 maximum: Final = Operation(
     "max", np.maximum, lambda to, e, x, y: to.b.select(to.b.fcmp("ogt", x, y), x, y),
-    lambda e, x, y: (_greater(x, y), _greater(y, x)), lambda x, y: x if x > y else y,
+    lambda e, x, y: (_step_weight(x, y), _step_weight(y, x)), lambda x, y: x if x > y else y,
     body="(x > y) ? x : y", commutes=True,
 )  # fmt: skip
 less: Final = Operation(
-    "less", lambda x, y: np.where(x < y, 1.0, 0.0), _below,
+    "less", lambda x, y: np.where(x < y, 1.0, 0.0), _write_less,
     one=lambda x, y: 1.0 if x < y else 0.0, body="(x < y) ? 1.0 : 0.0",
 )  # fmt: skip
 """1 where x < y, else 0, also if one of them is NaN."""
 select: Final[Operation] = Operation(
-    "select", lambda x, y, z: np.where(x > 0.0, y, z), _selected,
+    "select", lambda x, y, z: np.where(x > 0.0, y, z), _write_select,
     lambda e, x, y, z: (0.0, select(x, 1.0, 0.0), select(x, 0.0, 1.0)),
-    lambda x, y, z: y if x > 0.0 else z, body="(x > 0.0) ? y : z", folds=_choice,
+    lambda x, y, z: y if x > 0.0 else z, body="(x > 0.0) ? y : z", folds=_fold_select,
 )  # fmt: skip
 """y where x > 0, else z."""
 OPERATIONS: Final = (

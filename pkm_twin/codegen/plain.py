@@ -30,13 +30,17 @@ from pkm_twin.codegen.program import (
     progress,
 )
 
-_LONGEST: Final = 200
+_MAX_INLINE: Final = 200
 """Most characters of an expression that is written inline instead of as a variable."""
 
 
 _NUMBERS: Final = {"inf": math.inf, "nan": math.nan}
-_ONE: Final[dict[str, Any]] = {op.name: op.one or op.numbers for op in OPERATIONS} | _NUMBERS
-_MANY: Final[dict[str, Any]] = {op.name: op.many or op.numbers for op in OPERATIONS} | _NUMBERS
+_SCALAR_FUNCTIONS: Final[dict[str, Any]] = {
+    op.name: op.one or op.numbers for op in OPERATIONS
+} | _NUMBERS
+_ARRAY_FUNCTIONS: Final[dict[str, Any]] = {
+    op.name: op.many or op.numbers for op in OPERATIONS
+} | _NUMBERS
 
 
 def source(
@@ -66,7 +70,7 @@ def source(
             text[e.number] = f"({e.value!r})"
         else:
             written = e.op.text([text[x.number] for x in e.args])
-            if counts[e.number] == 1 and len(written) < _LONGEST:
+            if counts[e.number] == 1 and len(written) < _MAX_INLINE:
                 text[e.number] = written
             else:
                 text[e.number] = f"v{e.number}"
@@ -83,7 +87,7 @@ def functions(
     """Compile the function of :func:`source` twice: for floats and for arrays."""
     code = compile(source(results, inputs, known), "<program>", "exec")
     made = []
-    for library in (_ONE, _MANY):
+    for library in (_SCALAR_FUNCTIONS, _ARRAY_FUNCTIONS):
         space: dict[str, Any] = dict(library)
         exec(code, space)  # noqa: S102
         made.append(space["program"])
@@ -134,7 +138,7 @@ class PlainCode:
             values = self._call("results", named, many=many)
             good: Any = n[AT.alive] * (values.pop() if self.program.equations else 1.0)
             total = sum(map(abs, [*values, *(x for column in columns for x in column)]))
-            own = _MANY if many else _ONE
+            own = _ARRAY_FUNCTIONS if many else _SCALAR_FUNCTIONS
             finite = own["select"](own["less"](total, LARGE), 0.0, 2.0)
             code = own["select"](good, finite, 1.0)
         table = np.empty((count, len(values)))

@@ -25,9 +25,9 @@ from pkm_twin.errors import PkmTwinError
 PATIENCE = 120.0
 """Longest wait for an answer, s. On an idle computer answers take less than a thousandth of this,
 but a node that starts for the first time compiles its programs."""
-TICK = 5_000_000
+CLOCK_PERIOD = 5_000_000
 """Period of the published clock, ns."""
-AHEAD = 50_000_000
+MAX_LEAD_TIME = 50_000_000
 """Longest time by which a bag runs ahead of its answers, ns: half of what a node allows between a
 joint state and its wrench, which arrive independently."""
 DEPTH = 20_000
@@ -128,15 +128,15 @@ class Lockstep:
 
     def pace(self, message: BagMessage) -> None:
         """Wait until a message may be published."""
-        if message.log_time >= self._now + TICK:
+        if message.log_time >= self._now + CLOCK_PERIOD:
             self._now = message.log_time
             self._tick()
         if message.topic != self._topic:
             return
         self._last = stamp(message.data)
         self._first = self._first or self._last
-        if self._ahead() > AHEAD:
-            self._wait(lambda: self._ahead() <= AHEAD // 2)
+        if self._ahead() > MAX_LEAD_TIME:
+            self._wait(lambda: self._ahead() <= MAX_LEAD_TIME // 2)
 
     def _ahead(self) -> int:
         return self._last - max(self._recorder.newest, self._first)

@@ -45,7 +45,7 @@ class Panel:
     lines: list[tuple[Array, Array, dict[str, Any]]]
 
 
-def _window(time: Array, seconds: float, whole: Array) -> Mask:
+def _select_window(time: Array, seconds: float, whole: Array) -> Mask:
     """Select the times to draw: some seconds from the first eighth of all times on."""
     begin = float(whole[len(whole) // 8]) if len(whole) else 0.0
     return (time >= begin) & (time <= begin + seconds)
@@ -55,13 +55,13 @@ def report_dynamics(bag: Path, recording: Path, prefix: str) -> tuple[list[Fact]
     """Compare recorded efforts with those that the node published."""
     r = read(bag, how=ReadOptions(limited=True))
     robot, unit = r.robot, " or ".join(dict.fromkeys(r.robot.effort_units))
-    torques = _by_stamp(recording, f"/{prefix}/delta_dynamics/joint_torques")
-    residuals = _by_stamp(recording, f"/{prefix}/delta_dynamics/torque_residual")
+    torques = _read_by_stamp(recording, f"/{prefix}/delta_dynamics/joint_torques")
+    residuals = _read_by_stamp(recording, f"/{prefix}/delta_dynamics/torque_residual")
     answered = [i for i, s in enumerate(r.stamps.tolist()) if s in torques and s in residuals]
     stamps, time = r.stamps[answered].tolist(), r.time[answered]
-    predicted, residual = (_efforts(found, stamps, robot) for found in (torques, residuals))
+    predicted, residual = (_stack_efforts(found, stamps, robot) for found in (torques, residuals))
     measured = np.zeros_like(predicted) if r.effort is None else r.effort[answered]
-    near = _window(time, 2.0, time)
+    near = _select_window(time, 2.0, time)
     rms = f", residual RMS {_rms(residual[near])[0]:.2g} {unit}" if near.any() else ""
     panel = Panel(
         f"{prefix}:\neffort of {robot.joint_names[0]}{rms}", f"effort ({unit})",
@@ -82,14 +82,14 @@ def report_dynamics(bag: Path, recording: Path, prefix: str) -> tuple[list[Fact]
     def left(what: str, rows: Mask, bound: float) -> Fact:
         part = _rms(residual[rows]) / np.abs(measured).max(0)
         return judge(
-            f"{prefix}: residual RMS {what}", _listed(100 * part, "% of peak"),
+            f"{prefix}: residual RMS {what}", _format_list(100 * part, "% of peak"),
             f"below {100 * bound:g} %", bool((part < bound).all()),
         )  # fmt: skip
 
-    free = _free(r)[answered]
+    free = _find_unloaded(r)[answered]
     findings += [
-        told(prefix, "peak effort", _listed(np.abs(predicted).max(0), unit)),
-        told(prefix, "RMS effort", _listed(_rms(predicted), unit)),
+        told(prefix, "peak effort", _format_list(np.abs(predicted).max(0), unit)),
+        told(prefix, "RMS effort", _format_list(_rms(predicted), unit)),
         left("without load", free, MAX_RESIDUAL),
     ]
     if r.wrench is not None:
@@ -98,7 +98,7 @@ def report_dynamics(bag: Path, recording: Path, prefix: str) -> tuple[list[Fact]
     if r.load is not None and r.load.times:
         begin, end = r.load.times[0]
         held = (time > begin + 0.5) & (time < end - 0.5)
-        findings += _payload(prefix, r, residual, free, np.array(answered), held)
+        findings += _judge_payload(prefix, r, residual, free, np.array(answered), held)
     return findings, panel
 
 
@@ -107,7 +107,7 @@ def _rms(values: Array) -> Array:
     return np.asarray(np.sqrt(np.mean(values**2, 0)), np.float64)
 
 
-def _free(r: Recording) -> Mask:
+def _find_unloaded(r: Recording) -> Mask:
     """Find samples without payload or cutting force, at least half a second away from either."""
     if r.load is not None:
         loaded = r.load.held(r.time)
@@ -125,7 +125,7 @@ def _free(r: Recording) -> Mask:
     return np.asarray(nearest > 0.5, np.bool_)
 
 
-def _payload(
+def _judge_payload(
     prefix: str, r: Recording, residual: Array, free: Mask, answered: Indices, held: Mask
 ) -> list[Fact]:
     """Judge the payload's step in the residual and the mass estimated from it."""
@@ -158,10 +158,10 @@ def _payload(
 
 def report_stiffness(bag: Path, recording: Path, prefix: str) -> tuple[list[Fact], Panel]:
     """Compare published deflections with the finite-element frame, and list dominant elements."""
-    wrenches = _by_stamp(bag, "/wrench")
-    energies = _by_stamp(recording, f"/{prefix}/stiffness_monitor/strain_energy")
-    moved = _by_stamp(recording, f"/{prefix}/stiffness_monitor/deflection")
-    truth = _by_stamp(bag, "/ground_truth/deflection")
+    wrenches = _read_by_stamp(bag, "/wrench")
+    energies = _read_by_stamp(recording, f"/{prefix}/stiffness_monitor/strain_energy")
+    moved = _read_by_stamp(recording, f"/{prefix}/stiffness_monitor/deflection")
+    truth = _read_by_stamp(bag, "/ground_truth/deflection")
     robot = load(inspect(bag).metadata["pkm_twin"]["robot"])
     start = min(wrenches)
     common = sorted(set(wrenches) & set(energies) & set(moved))
@@ -176,7 +176,7 @@ def report_stiffness(bag: Path, recording: Path, prefix: str) -> tuple[list[Fact
     curves: dict[str, Any] = {"lw": 0.8}
     dots = {"marker": "o", "ls": "", "ms": 4, "mec": "black", "mew": 0.4}
     for time, moves, style in zip(times, (fixed, true), (curves, dots), strict=True):
-        part = _window(time, 0.6, times[0])
+        part = _select_window(time, 0.6, times[0])
         for i, axis in enumerate("xyz"):
             name = {} if style is dots else {"label": axis}
             line = (time[part], 1e6 * moves[part, i], {"color": plots.COLOURS[i], **style, **name})
@@ -220,11 +220,11 @@ REPORTS: dict[str, Reports] = {
 }
 
 
-def _by_stamp(bag: Path, topic: str) -> dict[int, Any]:
+def _read_by_stamp(bag: Path, topic: str) -> dict[int, Any]:
     return {stamp_of(m.message.header): m.message for m in read_messages(bag, [topic])}
 
 
-def _efforts(messages: Mapping[int, Any], stamps: list[int], robot: Robot) -> Array:
+def _stack_efforts(messages: Mapping[int, Any], stamps: list[int], robot: Robot) -> Array:
     """Return the messages' efforts in the robot's joint order, shape (samples, n)."""
     efforts = [messages[stamp].effort for stamp in stamps]
     return np.array(efforts).reshape(-1, len(robot.joint_names))
@@ -245,7 +245,7 @@ def told(bag: str, what: str, words: str) -> Fact:
     return Fact("", words, text=f"{bag}: {what}")
 
 
-def _listed(values: Array, unit: str) -> str:
+def _format_list(values: Array, unit: str) -> str:
     return ", ".join(f"{v:.3g}" for v in values) + f" {unit}"
 
 

@@ -40,7 +40,7 @@ from pkm_twin.messages.stamps import SECOND, stamp_of
 from pkm_twin.report import Fact, judged, plots
 from pkm_twin.streams.path import JointPath
 
-TIMES_BETTER: Final = 5.0
+MIN_IMPROVEMENT: Final = 5.0
 """Smallest ratio of tracking errors without and with feedforward, at the smallest perturbation."""
 ROBOT: Final = "delta_cu"
 PERIOD: Final = 2e-3
@@ -53,9 +53,9 @@ DURATION: Final = 0.8
 """Duration of the motion, s."""
 POINTS: Final = 81
 """Number of points of its trajectory."""
-INPUT: Final = "/machine_sim/joint_trajectory"
-QUEUE: Final = "qos_overrides./joint_states.publisher.depth"
-TWIN: Final = "/delta_dynamics/joint_trajectory"
+INPUT_TOPIC: Final = "/machine_sim/joint_trajectory"
+QUEUE_PARAMETER: Final = "qos_overrides./joint_states.publisher.depth"
+TWIN_TOPIC: Final = "/delta_dynamics/joint_trajectory"
 
 
 class _Watch:
@@ -86,13 +86,15 @@ def run(
 ) -> None:
     """Record a run without and a run with feedforward on a machine with this perturbation."""
     node = executor.get_nodes()[0]
-    recorder.listen(prefix(spread), {"/joint_states": STATE, INPUT: TRAJECTORY})
+    recorder.listen(prefix(spread), {"/joint_states": STATE, INPUT_TOPIC: TRAJECTORY})
     watch = _Watch()
     states = node.create_subscription(JointState, "/joint_states", watch.take, DEPTH)
     answers: list[JointTrajectory] = []
-    heard = node.create_subscription(JointTrajectory, f"{TWIN}_ff", answers.append, 10)
+    heard = node.create_subscription(JointTrajectory, f"{TWIN_TOPIC}_ff", answers.append, 10)
     depth = QoSProfile(depth=1)
-    twin, machine = (node.create_publisher(JointTrajectory, t, depth) for t in (TWIN, INPUT))
+    twin, machine = (
+        node.create_publisher(JointTrajectory, t, depth) for t in (TWIN_TOPIC, INPUT_TOPIC)
+    )
     reset = node.create_client(Trigger, "/machine_sim/reset")
     module = [sys.executable, "-m"]
     # The twin only answers trajectories: its joint states come from an empty topic.
@@ -101,9 +103,9 @@ def run(
     moved = [*module, "delta_dynamics.nodes.simulation", "--ros-args", "-p", f"mechanism:={ROBOT}"]
     moved += ["-p", "clock:=simulated", "-p", f"period:={PERIOD}"]
     # Deep queues, as a busy computer catches up in bursts.
-    moved += ["-p", f"spread:={spread}", "-p", f"{QUEUE}:={DEPTH}"]
+    moved += ["-p", f"spread:={spread}", "-p", f"{QUEUE_PARAMETER}:={DEPTH}"]
     console.print(f"machine_sim at {100 * spread:g} % spread: PD, then with feedforward")
-    plain = _trajectory()
+    plain = _make_trajectory()
     with process(moved) as first, process(asked) as second:
 
         def await_that(condition: Callable[[], bool], what: str) -> None:
@@ -138,7 +140,7 @@ def run(
         node.destroy_publisher(publisher)
 
 
-def _trajectory() -> JointTrajectory:
+def _make_trajectory() -> JointTrajectory:
     """Make a trajectory from home and back, at rest at both ends, that starts on receipt."""
     robot = load(ROBOT)
     home = robot.inverse(robot.home())
@@ -188,7 +190,7 @@ def report(recording: Path) -> tuple[list[Fact], Panel]:
     robot = load(ROBOT)
     for i, spread in enumerate(SPREADS):
         name = prefix(spread)
-        plain, ahead = _runs(recording, name)
+        plain, ahead = _read_runs(recording, name)
         there = sum(len(run.time) for run in (plain, ahead))
         all_in_all = sum(round(run.duration / PERIOD) for run in (plain, ahead))
         findings.append(share(name, "joint states recorded", there, all_in_all))
@@ -202,13 +204,13 @@ def report(recording: Path) -> tuple[list[Fact], Panel]:
             findings.append(told(name, f"peak effort, {what}", f"{peaks} {robot.effort_unit}"))
         ratio = plain.rms / ahead.rms
         what = f"feedforward at {100 * spread:g} % parameter error"
-        bound = f"{TIMES_BETTER:g} or more" if spread == min(SPREADS) else ""
+        bound = f"{MIN_IMPROVEMENT:g} or more" if spread == min(SPREADS) else ""
         value = f"{ratio:.1f} times better"
-        findings.append(judged(f"{name}: {what}", value, bound, bool(ratio >= TIMES_BETTER)))
+        findings.append(judged(f"{name}: {what}", value, bound, bool(ratio >= MIN_IMPROVEMENT)))
     return findings, panel
 
 
-def _runs(recording: Path, name: str) -> tuple[Run, Run]:
+def _read_runs(recording: Path, name: str) -> tuple[Run, Run]:
     """Read the runs without and with feedforward from the recording."""
     reader = JointReader(load(ROBOT), with_effort=True)
     messages = read_messages(recording, [f"/{name}/joint_states"])

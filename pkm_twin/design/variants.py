@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 from delta_dynamics.torques.reactions import BALANCE_BOUND, Reactions, balanced, known_alone
 from pkm_twin.codegen.arrays import Array, doubles
 from pkm_twin.codegen.code import Code
-from pkm_twin.codegen.kernels import MISSED
+from pkm_twin.codegen.kernels import MAX_GEOMETRY_MISMATCH
 from pkm_twin.design import programs
 from pkm_twin.errors import ParameterError, PkmTwinError
 from pkm_twin.machine.formulas import PARAMETERS
@@ -335,7 +335,7 @@ class Variants:
         code, prepared = self._prepare(ask, self.robot)
         rows, batch = self._laid_out(code, inputs)
         k, count = len(self), math.prod(batch)
-        fits = prepared[:, -1] <= MISSED
+        fits = prepared[:, -1] <= MAX_GEOMETRY_MISMATCH
         if fits.all():
             outputs, status = code.run_each(prepared, *rows)
             good = np.ones((k, count), bool) if status is None else status[..., 0] == 0.0
@@ -385,7 +385,7 @@ class Variants:
                 if robot is self.robot:
                     raise
                 continue
-            fits = left & (prepared[:, -1] <= MISSED)
+            fits = left & (prepared[:, -1] <= MAX_GEOMETRY_MISMATCH)
             if fits.any() and robot is not self.robot and robot not in others:
                 others.append(robot)
             yield code, prepared, np.flatnonzero(fits)

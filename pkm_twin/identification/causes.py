@@ -32,7 +32,7 @@ from pkm_twin.identification.judge import SIGMAS
 from pkm_twin.identification.plausible import MASSES, listed, scale_text, wrenches
 from pkm_twin.identification.samples import held_payload, passed_band
 from pkm_twin.identification.suspects import OFF
-from pkm_twin.machine.friction import KNOWN, Dahl
+from pkm_twin.machine.friction import KNOWN_FRACTION, Dahl
 from pkm_twin.recordings import Load, Recording
 from pkm_twin.robot.plausibility import why_no_torques
 from pkm_twin.robot.robot import Robot
@@ -206,7 +206,7 @@ class _Numbers:
         doubt = [Dahl.remembered(robot.friction, t.q, t.sure(c.how))[1] for t in c.tracks]
         doubt = [one[rows] for one, rows in zip(doubt, c.inner, strict=True)]
         reach = friction_reach(robot)
-        self.used = (~c.rests & (np.concatenate(doubt) <= KNOWN * reach)) | (reach == 0.0)
+        self.used = (~c.rests & (np.concatenate(doubt) <= KNOWN_FRACTION * reach)) | (reach == 0.0)
         self.count = max(int(self.used.sum()), 1) * passed_band(c.how, 1.0 / c.period)
 
     def clear(self, least: float, other: float, times: float) -> bool:

@@ -39,8 +39,8 @@ from pkm_twin.recordings import Recording
 from pkm_twin.report import Fact, Verdict, judged
 from pkm_twin.robot.limits import ranges
 from pkm_twin.robot.plausibility import why_no_torques
-from pkm_twin.streams.drives import COUNT, SAME
-from pkm_twin.streams.rates import MAX_RATE, STANDS, rate_faults, rms
+from pkm_twin.streams.drives import CONSTANT_SAMPLES, MAX_RELATIVE_CHANGE
+from pkm_twin.streams.rates import MAX_RATE, STANDSTILL_FRACTION, rate_faults, rms
 from pkm_twin.streams.steps import find_play
 
 REJECTED: Final = "messages that a node rejects"
@@ -243,7 +243,7 @@ def stuck_from(time: Array, values: Array, told: Array, count: int = 1) -> tuple
         return None
     steps = np.abs(np.diff(values))
     tick = steps[steps > 0.0].min(initial=np.inf)
-    size = max(TICKS * tick, STANDS * float(np.ptp(told[np.isfinite(told)])))
+    size = max(TICKS * tick, STANDSTILL_FRACTION * float(np.ptp(told[np.isfinite(told)])))
     for begin, end in np.flatnonzero(np.diff(steps == 0.0, prepend=0, append=0)).reshape(-1, 2):
         known = told[begin : end + 1]
         known = known[np.isfinite(known)]
@@ -354,14 +354,14 @@ def _stuck_efforts(r: Recording, c: Compared) -> str:
     for j, (joint, unit) in enumerate(zip(r.robot.joint_names, r.robot.effort_units, strict=True)):
         values = r.effort[:, j].copy()
         most, told = np.abs(values).max(), np.full(len(values), np.nan)
-        if np.ptp(values) <= SAME * most:
+        if np.ptp(values) <= MAX_RELATIVE_CHANGE * most:
             if not good[j]:
                 text = f"{values[0] + 0.0:.4g} {unit} throughout: nothing was measured"
                 texts.append(f"the effort of {joint} is {text}")
             continue
-        values[np.abs(values) >= most * (1.0 - SAME)] = np.nan
+        values[np.abs(values) >= most * (1.0 - MAX_RELATIVE_CHANGE)] = np.nan
         told[rows] = moved[:, j]
-        found = stuck_from(r.time, values, told, COUNT)
+        found = stuck_from(r.time, values, told, CONSTANT_SAMPLES)
         if found is not None:
             begin, end = found
             change = np.nanmax(told[begin : end + 1]) - np.nanmin(told[begin : end + 1])

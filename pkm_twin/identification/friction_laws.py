@@ -28,7 +28,7 @@ from pkm_twin.identification.parameters import Number, file_parameters
 from pkm_twin.identification.rows import Problem
 from pkm_twin.identification.samples import EXACT, filtered
 from pkm_twin.identification.suspects import RESONANCE
-from pkm_twin.machine.friction import BASIC, KNOWN, LAWS, Dahl, compiled
+from pkm_twin.machine.friction import BASIC, KNOWN_FRACTION, LAWS, Dahl, compiled
 from pkm_twin.recordings import Recording
 from pkm_twin.robot.robot import Robot
 from pkm_twin.streams.steps import sampling_of
@@ -377,7 +377,7 @@ class _Search:
             # It shows where joints turn round, at any rate, once the state is known.
             most = PARTS[-1] * self._travel
             unknown = self._filtered(lambda q, rates: Dahl.states(q, rates, most).unknown)
-            counts = (unknown < KNOWN).astype(np.float64)
+            counts = (unknown < KNOWN_FRACTION).astype(np.float64)
         noise = [np.broadcast_to(some.signals.noise, some.target.shape) for some in parts]
         self._weight = counts / np.maximum(np.concatenate(noise), 1e-300)
         self._left = np.concatenate([some.target for some in parts]) * self._weight

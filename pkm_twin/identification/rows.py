@@ -39,7 +39,7 @@ from pkm_twin.identification.samples import (
     tracks,
     usual_size,
 )
-from pkm_twin.machine.friction import KNOWN, Dahl, Memory, all_keys, compiled, not_shared
+from pkm_twin.machine.friction import KNOWN_FRACTION, Dahl, Memory, all_keys, compiled, not_shared
 from pkm_twin.recordings.recording import Recording
 from pkm_twin.robot.robot import Robot
 
@@ -321,7 +321,9 @@ class _Piece:
         memory, moves = model.memory(track, how), track.moves(how)
         table, rest = model.columns(track, memory)
         if memory is not None:
-            moves = np.where(model.robot.friction.presliding > 0.0, memory.unknown < KNOWN, moves)
+            moves = np.where(
+                model.robot.friction.presliding > 0.0, memory.unknown < KNOWN_FRACTION, moves
+            )
         return cls(track, table, track.effort - rest, rest, moves.astype(np.float64))
 
     def columns(self, told: _Told) -> dict[str, Array]:

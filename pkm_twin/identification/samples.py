@@ -22,7 +22,7 @@ import scipy  # type: ignore[import-untyped]  # its parts come when they are ask
 
 from pkm_twin.codegen.arrays import Array, Mask
 from pkm_twin.recordings import Recording
-from pkm_twin.streams.rest import ROBUST, SIGMAS
+from pkm_twin.streams.rest import MAD_TO_SIGMA, SIGMAS
 from pkm_twin.streams.rest import noise as noise_of_samples
 
 DEGREE: Final = 4
@@ -335,7 +335,7 @@ def passed_band(how: Filtering, rate: float) -> float:
 
 def usual_size(residual: Array) -> Array:
     """Standard deviation of normal residuals (k, n) by the median of their sizes, (n,)."""
-    return np.asarray(ROBUST * np.median(np.abs(residual), axis=0), np.float64)
+    return np.asarray(MAD_TO_SIGMA * np.median(np.abs(residual), axis=0), np.float64)
 
 
 def in_motion(values: Sequence[Array], moves: Sequence[Array | Mask]) -> list[Array]:

@@ -33,16 +33,16 @@ MAX_DEPTH: Final = 40
 MAX_SIZE: Final = 1e18
 """Largest number: beyond every quantity of a machine in SI units; products stay finite."""
 _NAME: Final = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
-_STRANGE: Final = re.compile(r"[^A-Za-z0-9_ \t.+\-*/(),]")
+_INVALID_CHARACTER: Final = re.compile(r"[^A-Za-z0-9_ \t.+\-*/(),]")
 _NUMBER: Final = re.compile(r"(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
 _WITH_UNIT: Final = re.compile(r"\s*[-+]?[\d.]+([eE][-+]?\d+)?\s*[A-Za-z]\S*\s*")
-_ANGLES: Final = ("sin", "cos", "tan")
+_ANGLE_FUNCTIONS: Final = ("sin", "cos", "tan")
 """Functions of an angle; their values have no unit."""
-_SQUARE: Final = "^2"
+_SQUARED_SUFFIX: Final = "^2"
 """Suffix that marks the squared unit of a root's argument."""
 
 
-def _either(numbers: Callable[..., float], expressions: Callable[..., Any]) -> Callable[..., Any]:
+def _dispatch(numbers: Callable[..., float], expressions: Callable[..., Any]) -> Callable[..., Any]:
     """Return a function that calls ``expressions`` if an argument is one, else ``numbers``."""
 
     def call(*values: Any) -> Any:
@@ -53,7 +53,7 @@ def _either(numbers: Callable[..., float], expressions: Callable[..., Any]) -> C
     return call
 
 
-def _power(base: Any, exponent: Any) -> Any:
+def _raise_expression(base: Any, exponent: Any) -> Any:
     """Raise an expression to a power: by products for an integer exponent, else by exp and log."""
     fixed = None if hasattr(exponent, "tape") else float(exponent)
     if fixed is not None and fixed.is_integer() and abs(fixed) <= MAX_DEPTH:
@@ -65,11 +65,11 @@ def _power(base: Any, exponent: Any) -> Any:
     root = ratio
     for _ in range(8):
         root = operations.sqrt(root)
-    log = _halley(ratio, 256.0 * _halley(root, 0.0, 4), 2)
+    log = _halley_logarithm(ratio, 256.0 * _halley_logarithm(root, 0.0, 4), 2)
     return operations.exp(exponent * (math.log(own) + log))
 
 
-def _halley(value: Any, log: Any, steps: int) -> Any:
+def _halley_logarithm(value: Any, log: Any, steps: int) -> Any:
     """Compute a logarithm by Halley's third-order method for exp(log) = value."""
     for _ in range(steps):
         power = operations.exp(log)
@@ -78,16 +78,17 @@ def _halley(value: Any, log: Any, steps: int) -> Any:
 
 
 FUNCTIONS: Final[Mapping[str, tuple[int, Callable[..., Any]]]] = {
-    "sqrt": (1, _either(math.sqrt, operations.sqrt)),
-    "sin": (1, _either(math.sin, operations.sin)),
-    "cos": (1, _either(math.cos, operations.cos)),
-    "tan": (1, _either(math.tan, lambda x: operations.sin(x) / operations.cos(x))),
-    "atan2": (2, _either(math.atan2, operations.atan2)),
+    "sqrt": (1, _dispatch(math.sqrt, operations.sqrt)),
+    "sin": (1, _dispatch(math.sin, operations.sin)),
+    "cos": (1, _dispatch(math.cos, operations.cos)),
+    "tan": (1, _dispatch(math.tan, lambda x: operations.sin(x) / operations.cos(x))),
+    "atan2": (2, _dispatch(math.atan2, operations.atan2)),
 }
 """Functions of expressions: number of arguments, and implementation."""
 _OPERATORS: Final[Mapping[type, Callable[..., Any]]] = {
     ast.Add: operator.add, ast.Sub: operator.sub, ast.Mult: operator.mul, ast.Div: operator.truediv,
-    ast.Pow: _either(operator.pow, _power), ast.USub: operator.neg, ast.UAdd: lambda x: x,
+    ast.Pow: _dispatch(operator.pow, _raise_expression), ast.USub: operator.neg,
+    ast.UAdd: lambda x: x,
 }  # fmt: skip
 
 
@@ -108,7 +109,7 @@ class Formula:
         """
         if len(text) > MAX_LENGTH:
             raise ParameterError(path, text, f"at most {MAX_LENGTH} characters")
-        if strange := _STRANGE.search(text):
+        if strange := _INVALID_CHARACTER.search(text):
             raise ParameterError(path, text, f"arithmetic; {strange[0]!r} is no part of it")
         try:
             with warnings.catch_warnings():
@@ -120,10 +121,10 @@ class Formula:
                 raise ParameterError(path, text, "a number without unit, rad and m") from None
             raise ParameterError(path, text, f"arithmetic; {told}") from None
         names = set[str]()
-        for node, depth in _walk(tree, 1):
+        for node, depth in _iterate_nodes(tree, 1):
             if depth > MAX_DEPTH:
                 raise ParameterError(path, text, f"a nesting of at most {MAX_DEPTH}")
-            if reason := _refused(node, text.strip()):
+            if reason := _find_invalid_reason(node, text.strip()):
                 raise ParameterError(path, text, reason)
             if isinstance(node, ast.Name) and node.id != "pi":
                 names.add(node.id)
@@ -141,7 +142,7 @@ class Formula:
             hint = f"; did you mean {close[0]!r}?" if close else ""
             raise self._error(f"names under `{PARAMETERS}`; {name!r} is none{hint}")
         try:
-            found = _value(self.tree, given)
+            found = _evaluate(self.tree, given)
         except ZeroDivisionError:
             raise self._error("a finite number, not a division by zero") from None
         except FloatingPointError:
@@ -159,19 +160,19 @@ class Formula:
 
     def units(self, unit: str) -> Iterator[tuple[str, str]]:
         """Derive units of parameters, where possible, from the unit of the expression's value."""
-        return _units(self.tree, unit)
+        return _derive_units(self.tree, unit)
 
 
-def _walk(node: ast.expr, depth: int) -> Iterator[tuple[ast.expr, int]]:
+def _iterate_nodes(node: ast.expr, depth: int) -> Iterator[tuple[ast.expr, int]]:
     """Iterate over all nodes of a syntax tree with their depths."""
     rows = [(node, depth)]
     while rows:
         node, depth = rows.pop()
         yield node, depth
-        rows += [(part, depth + 1) for part in _parts(node)]
+        rows += [(part, depth + 1) for part in _child_nodes(node)]
 
 
-def _parts(node: ast.expr) -> list[ast.expr]:
+def _child_nodes(node: ast.expr) -> list[ast.expr]:
     """Return the operands or arguments of a node."""
     if isinstance(node, ast.BinOp):
         return [node.left, node.right]
@@ -180,7 +181,7 @@ def _parts(node: ast.expr) -> list[ast.expr]:
     return node.args if isinstance(node, ast.Call) else []
 
 
-def _refused(node: ast.expr, text: str) -> str:
+def _find_invalid_reason(node: ast.expr, text: str) -> str:
     """Return why a node is not allowed in an expression; empty if it is allowed."""
     own = text[node.col_offset : node.end_col_offset]
     if isinstance(node, ast.Name):
@@ -203,12 +204,12 @@ def _refused(node: ast.expr, text: str) -> str:
     return f"+ - * / ** ( ) and {', '.join(FUNCTIONS)}, not {own!r}"
 
 
-def _value(node: ast.expr, given: Mapping[str, Any]) -> Any:
+def _evaluate(node: ast.expr, given: Mapping[str, Any]) -> Any:
     if isinstance(node, ast.Constant):
         return float(node.value)  # type: ignore[arg-type]
     if isinstance(node, ast.Name):
         return math.pi if node.id == "pi" else given[node.id]
-    values = [_value(part, given) for part in _parts(node)]
+    values = [_evaluate(part, given) for part in _child_nodes(node)]
     if isinstance(node, ast.Call):
         return FUNCTIONS[node.func.id][1](*values)  # type: ignore[attr-defined]
     found = _OPERATORS[type(node.op)](*values)  # type: ignore[attr-defined]
@@ -218,35 +219,48 @@ def _value(node: ast.expr, given: Mapping[str, Any]) -> Any:
     return found
 
 
-def _units(node: ast.expr, unit: str) -> Iterator[tuple[str, str]]:
-    if isinstance(node, ast.Name) and node.id != "pi" and unit and not unit.endswith(_SQUARE):
+def _derive_units(node: ast.expr, unit: str) -> Iterator[tuple[str, str]]:
+    if (
+        isinstance(node, ast.Name)
+        and node.id != "pi"
+        and unit
+        and not unit.endswith(_SQUARED_SUFFIX)
+    ):
         yield node.id, unit
-    parts = _parts(node)
+    parts = _child_nodes(node)
     if isinstance(node, ast.Call):
         called = node.func.id  # type: ignore[attr-defined]
-        inner = "rad" if called in _ANGLES else unit + _SQUARE if called == "sqrt" and unit else ""
+        inner = (
+            "rad"
+            if called in _ANGLE_FUNCTIONS
+            else unit + _SQUARED_SUFFIX
+            if called == "sqrt" and unit
+            else ""
+        )
         for part in parts:
-            yield from _units(part, inner)
+            yield from _derive_units(part, inner)
     elif isinstance(node, ast.BinOp) and isinstance(node.op, ast.Pow):
         squared = isinstance(parts[1], ast.Constant) and parts[1].value == 2
-        yield from _units(parts[0], unit.removesuffix(_SQUARE) if squared else "")
+        yield from _derive_units(parts[0], unit.removesuffix(_SQUARED_SUFFIX) if squared else "")
     elif isinstance(node, ast.BinOp) and isinstance(node.op, (ast.Mult, ast.Div)):
         # A factor has the unit of the product if the other factor has none.
         bare = [_has_no_unit(part) for part in parts]
-        yield from _units(parts[0], unit if bare[1] else "")
-        yield from _units(parts[1], unit if isinstance(node.op, ast.Mult) and bare[0] else "")
+        yield from _derive_units(parts[0], unit if bare[1] else "")
+        yield from _derive_units(
+            parts[1], unit if isinstance(node.op, ast.Mult) and bare[0] else ""
+        )
     else:
         for part in parts:
-            yield from _units(part, unit)
+            yield from _derive_units(part, unit)
 
 
 def _has_no_unit(node: ast.expr) -> bool:
     """Return whether an expression contains only numbers, pi and angle functions (no unit)."""
     if isinstance(node, ast.Name):
         return node.id == "pi"
-    if isinstance(node, ast.Call) and node.func.id in _ANGLES:  # type: ignore[attr-defined]
+    if isinstance(node, ast.Call) and node.func.id in _ANGLE_FUNCTIONS:  # type: ignore[attr-defined]
         return True
-    return all(map(_has_no_unit, _parts(node)))
+    return all(map(_has_no_unit, _child_nodes(node)))
 
 
 class Written(str):

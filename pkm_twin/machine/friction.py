@@ -23,9 +23,9 @@ from pkm_twin.errors import ParameterError
 Values = Mapping[str, Any]
 """Parameters of a law by key, each a number, an expression or an array."""
 
-LEAST: Final = 1e-9
+MIN_DIVISOR: Final = 1e-9
 """Smallest divisor, in place of a parameter that is not given, whose law has zero effort then."""
-KNOWN: Final = 0.01
+KNOWN_FRACTION: Final = 0.01
 """A state counts as known when this fraction of the unknown initial state is left: after five
 presliding distances."""
 
@@ -127,7 +127,7 @@ class Stribeck(FrictionLaw):
     def dry(values: Values, q: Any, speed: Any) -> Any:
         """Return F exp(-(v / vs)^2)."""
         del q
-        ratio = speed / maximum(values["stribeck_speed"], LEAST)
+        ratio = speed / maximum(values["stribeck_speed"], MIN_DIVISOR)
         return values["stribeck"] * exp(-(ratio * ratio))
 
 
@@ -158,13 +158,13 @@ class Periodic(FrictionLaw):
     @staticmethod
     def by_position(values: Values, q: Any) -> Any:
         """Return C cos(2 pi q / p) + S sin(2 pi q / p)."""
-        angle = q * (math.tau / maximum(values["cogging_period"], LEAST))
+        angle = q * (math.tau / maximum(values["cogging_period"], MIN_DIVISOR))
         return values["cogging_cos"] * cos(angle) + values["cogging_sin"] * sin(angle)
 
     @staticmethod
     def potential(values: Values, q: Any) -> Any:
         """Return the energy of the periodic effort, J, zero on average."""
-        wave = math.tau / maximum(values["cogging_period"], LEAST)
+        wave = math.tau / maximum(values["cogging_period"], MIN_DIVISOR)
         angle = q * wave
         return (values["cogging_cos"] * sin(angle) - values["cogging_sin"] * cos(angle)) / wave
 
@@ -203,10 +203,10 @@ class Memory(NamedTuple):
         """
         way = np.where(way == 0.0, self.way, way)
         travel = np.maximum.accumulate(np.maximum(way * (q - self.q), 0.0))
-        widths = travel / np.maximum(distance, LEAST)
+        widths = travel / np.maximum(distance, MIN_DIVISOR)
         left = np.exp(-widths)
         away = (self.z - way) * left
-        slope = self.slope * left + away * widths / np.maximum(distance, LEAST)
+        slope = self.slope * left + away * widths / np.maximum(distance, MIN_DIVISOR)
         place, ways = self.q + way * travel, np.broadcast_to(way, q.shape)
         return Memory(way + away, place, ways, self.unknown * left, slope)
 
@@ -259,7 +259,7 @@ class Dahl(FrictionLaw):
 
     @staticmethod
     def beyond(friction: Any, z: Array, rates: Array) -> Array:
-        """Return coulomb (z - sign(rate)), the effect of memory on efforts, shape of z, N m or N."""
+        """Return coulomb (z - sign(rate)), the effect of memory on efforts, as z, N m or N."""
         change = friction.coulomb * (z - np.sign(rates))
         return np.where(friction.presliding > 0.0, change, 0.0)
 

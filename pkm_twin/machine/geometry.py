@@ -94,21 +94,21 @@ def pattern_of(tree: Tree) -> str:
         # The signs and zeros of a frame in base axes show how its axes were chosen.
         parts += [link.parent, marks(link.arm), marks(link.axes)]
         parts += [(marks(s.before), marks(s.local), marks([s.offset])) for s in link.steps]
-        for vector in _vectors(graph, body):
+        for vector in _body_vectors(graph, body):
             parts.append(marks(link.axes.T @ vector))
-        parts += [marks(link.axes.T @ (point - link.at)) for point in _points(graph, body)]
+        parts += [marks(link.axes.T @ (point - link.at)) for point in _body_points(graph, body)]
     for joint in graph.joints.values():
         for held in joint.constraints:
             parts.append(marks([held.inner @ held.outer]))
     return repr(parts)
 
 
-def _points(graph: Graph, body: str) -> list[Array]:
+def _body_points(graph: Graph, body: str) -> list[Array]:
     own = [graph.origin] if body == graph.platform else []
     return [*graph.joint_points(body), *own]
 
 
-def _vectors(graph: Graph, body: str) -> Iterator[Array]:
+def _body_vectors(graph: Graph, body: str) -> Iterator[Array]:
     for joint in graph.joints.values():
         if body in (joint.inner, joint.outer):
             for held in joint.constraints:

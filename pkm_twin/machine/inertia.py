@@ -41,7 +41,7 @@ def standard_parameters(mass: float, com: Array, inertia: Array) -> Array:
     """
     # Symmetrise, so that a derivative by one off-diagonal entry is half of that by both.
     about = 0.5 * (inertia + inertia.T) + mass * (com @ com * np.eye(3) - np.outer(com, com))
-    return _numbers(mass, mass * com, about)
+    return _pack_parameters(mass, mass * com, about)
 
 
 def change_of_frame(axes: Array, lever: Array) -> Array:
@@ -53,7 +53,7 @@ def change_of_frame(axes: Array, lever: Array) -> Array:
     # One row per parameter: its mass, first moments and inertia.
     mass, first = np.eye(10)[:, :1], np.eye(10)[:, 1:4]
     crossed = lever[:, None] * first[:, None, :]
-    about = _UNITS + 2.0 * (first @ lever)[:, None, None] * np.eye(3)
+    about = _UNIT_INERTIAS + 2.0 * (first @ lever)[:, None, None] * np.eye(3)
     about = about - crossed - crossed.swapaxes(-1, -2)
     about = about + mass[..., None] * (lever @ lever * np.eye(3) - np.outer(lever, lever))
     turned = axes.T @ about @ axes
@@ -67,16 +67,16 @@ def matrix_of(ten: Array) -> Array:
     return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
 
 
-_UNITS: Final = np.array([matrix_of(ten) for ten in np.eye(10)])
+_UNIT_INERTIAS: Final = np.array([matrix_of(ten) for ten in np.eye(10)])
 """Inertia matrices for a unit of each of the ten standard inertial parameters."""
 
 
-def _numbers(mass: float, first: Array, about: Array) -> Array:
+def _pack_parameters(mass: float, first: Array, about: Array) -> Array:
     i = about
     return plain([mass, *first, i[0, 0], i[1, 1], i[2, 2], i[0, 1], i[0, 2], i[1, 2]])
 
 
-def _turned(ten: Objects, axes: Objects) -> Objects:
+def _rotate_parameters(ten: Objects, axes: Objects) -> Objects:
     """Rotate standard inertial parameters to other axes, given as columns in the old ones."""
     about = axes.T @ matrix_of(ten) @ axes
     upper = [about[i][k] for i, k in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))]
@@ -177,7 +177,7 @@ class Layout:
         """Split a parameter vector into its parts; bodies (bodies, 10) in their links' axes."""
         parts = [p[self.part(k)] for k in range(len(PARTS))]
         bodies = zip(parts[0].reshape(-1, 10), self.tree.links.values(), strict=True)
-        parts[0] = np.array([_turned(ten, link.axes) for ten, link in bodies])
+        parts[0] = np.array([_rotate_parameters(ten, link.axes) for ten, link in bodies])
         return parts
 
     def pack(self, graph: Graph, gravity: Array, friction: Coefficients) -> Array:

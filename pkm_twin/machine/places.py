@@ -17,7 +17,7 @@ from pkm_twin.machine import schema
 from pkm_twin.settings import settings_of
 
 T = TypeVar("T")
-_PART: Final = re.compile(r"([^.\[\]]+)|\[(\d+)\]")
+_PATH_PART: Final = re.compile(r"([^.\[\]]+)|\[(\d+)\]")
 Key = str | int
 Keys = tuple[Key, ...]
 """Location of a number in a file: keys of mappings and indices of lists."""
@@ -29,7 +29,7 @@ def keys_of(path: str) -> list[Key]:
     :raises ParameterError: the path is not a text or has no key.
     """
     text = path if isinstance(path, str) else ""
-    keys = [name or int(place) for name, place in _PART.findall(text)]
+    keys = [name or int(place) for name, place in _PATH_PART.findall(text)]
     if not keys:
         raise ParameterError("path", path, "a dotted path of a number of the robot's file")
     return keys
@@ -53,17 +53,17 @@ def numbers_of(
 ) -> dict[str, tuple[float, str]]:
     """Return every number in sections of a file, by dotted path, with its unit."""
     data = {k: v for k, v in given(sections).items() if k not in ("uncertainty", "tolerances")}
-    return dict(_walk(data, units, ""))
+    return dict(_iterate_numbers(data, units, ""))
 
 
-def _walk(data: Any, units: Any, path: str) -> Iterator[tuple[str, tuple[float, str]]]:
+def _iterate_numbers(data: Any, units: Any, path: str) -> Iterator[tuple[str, tuple[float, str]]]:
     if isinstance(data, Mapping):
         for key, value in data.items():
             unit = units.get(key, "") if isinstance(units, Mapping) else ""
-            yield from _walk(value, unit, f"{path}.{key}" if path else str(key))
+            yield from _iterate_numbers(value, unit, f"{path}.{key}" if path else str(key))
     elif isinstance(data, list | tuple):
         for place, value in enumerate(data):
-            yield from _walk(value, units, f"{path}[{place}]")
+            yield from _iterate_numbers(value, units, f"{path}[{place}]")
     elif isinstance(data, int | float) and not isinstance(data, bool):
         yield path, (float(data), units if isinstance(units, str) else "")
 
@@ -160,7 +160,7 @@ def number_in(data: Any, keys: Iterable[Key], path: str) -> float:
         except (KeyError, IndexError, TypeError):
             whole = keys_of(path)
             before = whole[: len(whole) - len(keys) + i]
-            names = list(there) if isinstance(there, Mapping) else _places(there)
+            names = list(there) if isinstance(there, Mapping) else _list_indices(there)
             near = [path_of([*before, name, *keys[i + 1 :]]) for name in names]
             raise unknown_number(path, near) from None
     if isinstance(there, bool) or not isinstance(there, int | float):
@@ -168,7 +168,7 @@ def number_in(data: Any, keys: Iterable[Key], path: str) -> float:
     return float(there)
 
 
-def _places(values: Any) -> list[int]:
+def _list_indices(values: Any) -> list[int]:
     return list(range(len(values))) if isinstance(values, list | tuple) else []
 
 

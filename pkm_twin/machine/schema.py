@@ -24,7 +24,7 @@ from pkm_twin.settings import Setting, settings_of
 
 MAX_INERTIA: Final = 1e12
 """Largest entry of an inertia matrix, kg m2."""
-_SLACK: Final = 1e-9
+_INERTIA_TOLERANCE: Final = 1e-9
 """Rounding error allowed in an inertia matrix, relative to its largest entry."""
 
 Check = Callable[[str, Any], Any]
@@ -58,7 +58,7 @@ def key(check: Check, bound: str, default: Any = MISSING, **more: Any) -> Any:
 
 def number(*, default: Any = MISSING, **more: Any) -> Any:
     """Make a field of one finite number within bounds; ``more``: attributes of :class:`Key`."""
-    return _numbers((), "number", default, more)
+    return _numbers_field((), "number", default, more)
 
 
 def vector(size: int, *, spread: bool = False, default: Any = MISSING, **more: Any) -> Any:
@@ -67,15 +67,15 @@ def vector(size: int, *, spread: bool = False, default: Any = MISSING, **more: A
     Size 0 means any number of entries, but none only if there is a default.
     """
     words = f"{size} numbers" if size else "one number or more"
-    return _numbers((size,), words, default, more, spread)
+    return _numbers_field((size,), words, default, more, spread)
 
 
 def matrix(rows: int, columns: int, *, default: Any = MISSING, **more: Any) -> Any:
     """Make a field of ``rows`` lists of ``columns`` numbers, a read-only array."""
-    return _numbers((rows, columns), f"{rows} lists of {columns} numbers", default, more)
+    return _numbers_field((rows, columns), f"{rows} lists of {columns} numbers", default, more)
 
 
-def _numbers(
+def _numbers_field(
     shape: tuple[int, ...], words: str, default: Any, more: Mapping[str, Any], spread: bool = False
 ) -> Any:
     bounds = Key(**more)
@@ -84,7 +84,7 @@ def _numbers(
     def check(field: str, value: Any) -> Any:
         if spread and _is_number(value):
             value = [value] * shape[0]
-        found = _nested(field, value, shape, bounds, least)
+        found = _check_nested(field, value, shape, bounds, least)
         return frozen(found) if shape else found
 
     bound = words + bounds.span + ("; one stands for all" if spread else "")
@@ -127,7 +127,7 @@ def mapping(entry: Any, *, default: Any = MISSING, **more: Any) -> Any:
             raise ParameterError(field, value, f"a mapping of names to {what}")
         for name in value:
             _check_printable(field, name)
-        paths = {name: _join(field, name) for name in value}
+        paths = {name: _join_path(field, name) for name in value}
         if section:
             return {name: build(entry, item, paths[name]) for name, item in value.items()}
         return {name: checked(entry, paths[name], item) for name, item in value.items()}
@@ -155,7 +155,7 @@ def words(
     """Make a field of ``size`` words (0: one or more), each one of ``allowed`` if there are any."""
 
     def check(field: str, value: Any) -> tuple[str, ...]:
-        items = _sequence(field, value, size, ", ".join(allowed))
+        items = _check_list(field, value, size, ", ".join(allowed))
         for i, item in enumerate(items):
             if allowed and item not in allowed:
                 raise UnknownNameError(f"{field}[{i}]", item, allowed)
@@ -187,14 +187,14 @@ def interval(*, count: int = 0, default: Any = MISSING, **more: Any) -> Any:
     def pair(field: str, value: Any) -> list[float]:
         if not isinstance(value, (list, tuple, np.ndarray)):
             raise ParameterError(field, value, "[min, max]")
-        low, high = _nested(field, value, (2,), bounds)
+        low, high = _check_nested(field, value, (2,), bounds)
         if not low < high:
             raise ParameterError(field, value, "[min, max] with min below max")
         return [low, high]
 
     def check(field: str, value: Any) -> Array:
         if count and isinstance(value, list) and any(isinstance(v, list) for v in value):
-            items = _sequence(field, value, count)
+            items = _check_list(field, value, count)
             return frozen([pair(f"{field}[{i}]", v) for i, v in enumerate(items)])
         return frozen([pair(field, value)] * count if count else pair(field, value))
 
@@ -210,8 +210,8 @@ def inertia(*, positive: bool, default: Any = MISSING, **more: Any) -> Any:
     """
 
     def check(field: str, value: Any) -> Array:
-        flat = all(map(_is_number, _sequence(field, value, 3)))
-        found = np.array(_nested(field, value, (3,) if flat else (3, 3), Key()))
+        flat = all(map(_is_number, _check_list(field, value, 3)))
+        found = np.array(_check_nested(field, value, (3,) if flat else (3, 3), Key()))
         matrix = np.diag(found) if flat else found
         with np.errstate(all="ignore"):
             size, symmetry, moments, triangle = inertia_margins(matrix.tolist())
@@ -243,10 +243,10 @@ def inertia_margins(matrix: Sequence[Sequence[Any]]) -> tuple[Any, Any, Any, Any
     entries = [absolute(value) for row in matrix for value in row]
     differences = [absolute(xy - yx), absolute(xz - zx), absolute(yz - zy)]
     scale = reduce(maximum, entries)
-    slack = _SLACK * scale
+    slack = _INERTIA_TOLERANCE * scale
     products = (0.5 * (xy + yx), 0.5 * (xz + zx), 0.5 * (yz + zy))
     # The largest principal moment is at most (1 + slack) / (2 + slack) of the trace.
-    most = (1.0 + _SLACK) / (2.0 + _SLACK) * (xx + yy + zz)
+    most = (1.0 + _INERTIA_TOLERANCE) / (2.0 + _INERTIA_TOLERANCE) * (xx + yy + zz)
     return (
         MAX_INERTIA - scale,
         slack - reduce(maximum, differences),
@@ -297,14 +297,14 @@ def build(kind: type[T], data: object, path: str = "") -> T:
     keys = settings_of(kind)
     for name in data:
         if name not in keys:
-            raise UnknownNameError(_join(path, str(name)), name, keys)
+            raise UnknownNameError(_join_path(path, str(name)), name, keys)
     fields = {field.name: field for field in dataclasses.fields(kind)}  # type: ignore[arg-type]
     values: dict[str, Any] = {}
     for name, (field, row) in keys.items():
         if name in data:
-            values[field] = row.check(_join(path, name), data[name])
+            values[field] = row.check(_join_path(path, name), data[name])
         elif fields[field].default is MISSING and fields[field].default_factory is MISSING:
-            raise ParameterError(_join(path, name), None, "a value")
+            raise ParameterError(_join_path(path, name), None, "a value")
     result = kind(**values)
     verify = getattr(result, "verify", None)
     if verify is not None:
@@ -358,15 +358,15 @@ def _is_number(value: Any) -> bool:
     return isinstance(value, kinds) and not isinstance(value, bool)
 
 
-def _nested(field: str, value: Any, shape: Sequence[int], bounds: Key, least: int = 1) -> Any:
+def _check_nested(field: str, value: Any, shape: Sequence[int], bounds: Key, least: int = 1) -> Any:
     """Check a number, or nested lists of numbers of a shape."""
     if not shape:
-        return _number(field, value, bounds)
-    items = _sequence(field, value, shape[0], "numbers", least)
-    return [_nested(f"{field}[{i}]", item, shape[1:], bounds) for i, item in enumerate(items)]
+        return _check_single(field, value, bounds)
+    items = _check_list(field, value, shape[0], "numbers", least)
+    return [_check_nested(f"{field}[{i}]", item, shape[1:], bounds) for i, item in enumerate(items)]
 
 
-def _number(field: str, value: Any, bounds: Key) -> float:
+def _check_single(field: str, value: Any, bounds: Key) -> float:
     bound = f"a finite number{bounds.span}"
     if bounds.high is not None and "{" not in bounds.unit:
         bound += f" {bounds.unit}".rstrip()
@@ -385,7 +385,7 @@ def _number(field: str, value: Any, bounds: Key) -> float:
     return result
 
 
-def _sequence(field: str, value: Any, size: int, what: str = "", least: int = 1) -> Sequence[Any]:
+def _check_list(field: str, value: Any, size: int, what: str = "", least: int = 1) -> Sequence[Any]:
     """Check a list's length: ``size``, or any from ``least`` on if ``size`` is 0."""
     if isinstance(value, np.ndarray):
         value = value.tolist()
@@ -399,5 +399,5 @@ def _sequence(field: str, value: Any, size: int, what: str = "", least: int = 1)
     return value
 
 
-def _join(path: str, name: str) -> str:
+def _join_path(path: str, name: str) -> str:
     return f"{path}.{name}" if path else name

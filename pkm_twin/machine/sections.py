@@ -156,7 +156,7 @@ def friction_of(joints: int) -> Any:
     Its fields are the parameters of all laws of :mod:`~pkm_twin.machine.friction`.
     """
     fields = friction_fields(schema.vector, joints, spread=True, default=[0.0] * joints)
-    return _section("Friction", fields, joints, {"verify": check_laws})
+    return _make_section("Friction", fields, joints, {"verify": check_laws})
 
 
 def friction_fields(kind: Any, *size: int, **options: Any) -> list[tuple[str, Any, Any]]:
@@ -177,23 +177,23 @@ def limits_of(joints: int) -> Any:
         ("velocity", Any, schema.vector(joints, unit="{joint}/s", **above)),
         ("effort", Any, schema.vector(joints, unit="{effort}", **above)),
     ]
-    return _section("Limits", entries, joints)
+    return _make_section("Limits", entries, joints)
 
 
-def _section(
+def _make_section(
     name: str, entries: list[tuple[str, Any, Any]], joints: int, more: Mapping[str, Any] = {}
 ) -> Any:
     """Make a section's class for this number of joints; its instances can be pickled."""
 
     def reduce(self: Any) -> tuple[Any, ...]:
-        return _rebuilt, (name, joints, [getattr(self, entry[0]) for entry in entries])
+        return _rebuild_section, (name, joints, [getattr(self, entry[0]) for entry in entries])
 
     return dataclasses.make_dataclass(
         name, entries, frozen=True, eq=False, namespace={"__reduce__": reduce, **more}
     )
 
 
-def _rebuilt(name: str, joints: int, values: list[Any]) -> Any:
+def _rebuild_section(name: str, joints: int, values: list[Any]) -> Any:
     schema_of = friction_of if name == "Friction" else limits_of
     return schema_of(joints)(*values)
 

@@ -22,19 +22,19 @@ from pkm_twin.errors import BagError, MessageError
 from pkm_twin.machine.joint_map import ControllerNumbers
 from pkm_twin.messages.reading import COLUMNS, Ragged, TrajectoryFields
 
-HEAD: Final = 4
+ENCAPSULATION_BYTES: Final = 4
 """Length of the encapsulation header, bytes; alignment counts from its end."""
-STAMP: Final = slice(4, 12)
+STAMP_BYTES: Final = slice(4, 12)
 """Byte range of the stamp in a message that begins with a header."""
-LITTLE: Final = b"\x00\x01"
-ENDIANNESS: Final = {b"\x00\x00": ">", LITTLE: "<"}
+LITTLE_ENDIAN: Final = b"\x00\x01"
+ENDIANNESS: Final = {b"\x00\x00": ">", LITTLE_ENDIAN: "<"}
 MAX_JOINT_STATE: Final = 2**18
 """Most bytes of a joint state: far beyond all robots, and few enough to decode in no time that the
 stream would notice."""
 MAX_NAMES: Final = 1000
 """Most joint names of a trajectory, for the same reason."""
 POINT_ARRAYS: Final = tuple(COLUMNS)
-TIME: Final = len(POINT_ARRAYS)
+TIME_INDEX: Final = len(POINT_ARRAYS)
 """Index of a point's time, which follows its arrays."""
 
 
@@ -93,10 +93,10 @@ class JointStateDecoder:
         if (
             layout is not None
             and len(data) == layout.size
-            and data[:2] == LITTLE
-            and data[STAMP.stop : layout.names_end] == layout.names
+            and data[:2] == LITTLE_ENDIAN
+            and data[STAMP_BYTES.stop : layout.names_end] == layout.names
         ):
-            sec, nanosec, *numbers = layout.numbers.unpack_from(data, HEAD)
+            sec, nanosec, *numbers = layout.numbers.unpack_from(data, ENCAPSULATION_BYTES)
             p, v, e = layout.counts
             if numbers[0] == p and numbers[p + 1] == v and numbers[p + v + 2] == e:
                 return JointStateView(
@@ -116,34 +116,34 @@ class JointStateDecoder:
         except BagError as error:
             raise MessageError("cdr", str(error)) from error
         arrays = (message.position, message.velocity, message.effort)
-        if data[:2] == LITTLE:
-            self._layout = _layout(data, message, arrays)
+        if data[:2] == LITTLE_ENDIAN:
+            self._layout = _find_layout(data, message, arrays)
         stamp = message.header.stamp
         header = _Header(_Time(stamp.sec, stamp.nanosec), message.header.frame_id)
         return JointStateView(header, tuple(message.name), *arrays)
 
 
-def _layout(data: bytes, message: Any, arrays: Sequence[Sequence[float]]) -> _Layout:
-    end = STAMP.stop
+def _find_layout(data: bytes, message: Any, arrays: Sequence[Sequence[float]]) -> _Layout:
+    end = STAMP_BYTES.stop
     for text in (message.header.frame_id, None, *message.name):
-        end += -(end - HEAD) % 4 + 4
+        end += -(end - ENCAPSULATION_BYTES) % 4 + 4
         if text is not None:
             # An empty string may be sent without its terminating zero.
             end += struct.unpack_from("<I", data, end - 4)[0]
-    code = ["<iI", f"{end - STAMP.stop}x"]
+    code = ["<iI", f"{end - STAMP_BYTES.stop}x"]
     at = end
     for values in arrays:
-        pad = -(at - HEAD) % 4
+        pad = -(at - ENCAPSULATION_BYTES) % 4
         at += pad + 4
         code.append(f"{pad}xI")
         if len(values):
-            pad = -(at - HEAD) % 8
+            pad = -(at - ENCAPSULATION_BYTES) % 8
             at += pad + 8 * len(values)
             code.append(f"{pad}x{len(values)}d")
     return _Layout(
         len(data),
         end,
-        data[STAMP.stop : end],
+        data[STAMP_BYTES.stop : end],
         struct.Struct("".join(code)),
         (len(arrays[0]), len(arrays[1]), len(arrays[2])),
         message.header.frame_id,
@@ -151,20 +151,20 @@ def _layout(data: bytes, message: Any, arrays: Sequence[Sequence[float]]) -> _La
     )
 
 
-def _doubles(value: Any) -> int:
+def _count_doubles(value: Any) -> int:
     """Count the numbers in a field; 0 if it contains anything else."""
     if isinstance(value, float):
         return 1
     inner = value.values() if isinstance(value, dict) else value
-    counts = [_doubles(v) for v in inner] if isinstance(value, dict | list) else []
+    counts = [_count_doubles(v) for v in inner] if isinstance(value, dict | list) else []
     return sum(counts) if all(counts) else 0
 
 
-def _with(value: Any, number: float) -> Any:
+def _fill_numbers(value: Any, number: float) -> Any:
     """Return a copy of a field with every number replaced by ``number``."""
     if isinstance(value, dict):
-        return {name: _with(v, number) for name, v in value.items()}
-    return [_with(v, number) for v in value] if isinstance(value, list) else number
+        return {name: _fill_numbers(v, number) for name, v in value.items()}
+    return [_fill_numbers(v, number) for v in value] if isinstance(value, list) else number
 
 
 class DoublesTemplate:
@@ -179,16 +179,19 @@ class DoublesTemplate:
         self, type_name: str, definition: str, message: dict[str, Any], *, stamped: bool
     ) -> None:
         codec = MessageCodec(type_name, definition)
-        arrays = {name: count for name, v in message.items() if (count := _doubles(v))}
+        arrays = {name: count for name, v in message.items() if (count := _count_doubles(v))}
         # Each field is filled with eight equal bytes that never occur in UTF-8 text, to find it.
         marks = [bytes([0x80 + k] * 8) for k in range(len(arrays))]
         filled = {
-            name: _with(message[name], struct.unpack("<d", mark)[0])
+            name: _fill_numbers(message[name], struct.unpack("<d", mark)[0])
             for name, mark in zip(arrays, marks, strict=True)
         }
         data = codec.encode({**message, **filled})
-        self._head = data[:HEAD]
-        rest, self._pieces = data[STAMP.stop if stamped else HEAD :], list[bytes]()
+        self._head = data[:ENCAPSULATION_BYTES]
+        rest, self._pieces = (
+            data[STAMP_BYTES.stop if stamped else ENCAPSULATION_BYTES :],
+            list[bytes](),
+        )
         self._sizes = [8 * count for count in arrays.values()]
         for mark, size in zip(marks, self._sizes, strict=True):
             piece, rest = rest.split(mark * (size // 8))
@@ -229,18 +232,18 @@ class RawTrajectory:
         :raises MessageError: the bytes are not such a message.
         """
         order = ENDIANNESS.get(data[:2])
-        if order is None or len(data) < STAMP.stop:
+        if order is None or len(data) < STAMP_BYTES.stop:
             raise MessageError("cdr", f"{len(data)} bytes that are not plain CDR")
-        sec, nanosec = struct.unpack_from(f"{order}iI", data, HEAD)
-        frame, at = _text(data, STAMP.stop, order)
-        count, at = _number(data, at, order)
+        sec, nanosec = struct.unpack_from(f"{order}iI", data, ENCAPSULATION_BYTES)
+        frame, at = _read_text(data, STAMP_BYTES.stop, order)
+        count, at = _read_number(data, at, order)
         if count > MAX_NAMES:
             raise MessageError("bounds", f"{count} joint names, at most {MAX_NAMES}")
         names = []
         for _ in range(count):
-            name, at = _text(data, at, order)
+            name, at = _read_text(data, at, order)
             names.append(name)
-        points, begin = _number(data, at, order)
+        points, begin = _read_number(data, at, order)
         header = _Header(_Time(sec, nanosec), frame)
         if points == 0:
             nothing = np.zeros((2, 0), np.int64)
@@ -249,14 +252,14 @@ class RawTrajectory:
         lengths = []
         at = begin
         for _ in POINT_ARRAYS:
-            length, at = _number(data, at, order)
-            at += (-(at - HEAD) % 8 + 8 * length) if length else 0
+            length, at = _read_number(data, at, order)
+            at += (-(at - ENCAPSULATION_BYTES) % 8 + 8 * length) if length else 0
             lengths.append(length)
         table = _Points(begin, points, tuple(lengths))
         if points * 8 > len(data) or at > len(data):
             raise MessageError("cdr", f"{points} points in {len(data)} bytes")
         table.check_lengths(data, order)
-        times = table.read(data, TIME, f"{order}u4", 2)
+        times = table.read(data, TIME_INDEX, f"{order}u4", 2)
         columns: dict[str, Array | Ragged | None] = {
             what: table.read(data, i, f"{order}f8", lengths[i]) if lengths[i] else None
             for i, what in enumerate(POINT_ARRAYS)
@@ -281,7 +284,7 @@ class RawTrajectory:
                 # Copied as integers, so that no bit changes.
                 kept = before.read(self.data, i, "u8", length)
                 after.write(data, i, kept, "u8")
-        after.write(data, TIME, before.read(self.data, TIME, "u4", 2), "u4")
+        after.write(data, TIME_INDEX, before.read(self.data, TIME_INDEX, "u4", 2), "u4")
         return bytes(data)
 
 
@@ -295,8 +298,8 @@ class _Points:
 
     def __init__(self, begin: int, points: int, lengths: tuple[int, ...]) -> None:
         self.points, self.lengths = points, lengths
-        first = _end(begin, lengths)
-        second = _end(first, lengths)
+        first = _find_end(begin, lengths)
+        second = _find_end(first, lengths)
         if (second - first) % 8 == 0:
             groups = [
                 (slice(0, 1), begin, first - begin),
@@ -310,12 +313,12 @@ class _Points:
         self._groups = [g for g in groups if len(range(*g[0].indices(points)))]
         which, start, stride = max(self._groups, key=lambda g: range(*g[0].indices(points))[-1])
         last = start + stride * (len(range(*which.indices(points))) - 1)
-        self.end = _end(last, lengths)
+        self.end = _find_end(last, lengths)
 
     def read(
         self, data: Any, array: int, kind: str, columns: int, *, of_length: bool = False
     ) -> NDArray[Any]:
-        """Read an array (or :data:`TIME`) of all points, shape (points, columns)."""
+        """Read an array (or :data:`TIME_INDEX`) of all points, shape (points, columns)."""
         values = np.empty((self.points, columns), np.dtype(kind).newbyteorder("="))
         for which, view in self._views(data, array, kind, columns, of_length):
             values[which] = view
@@ -361,39 +364,39 @@ class _Points:
         self, data: Any, array: int, kind: str, columns: int, of_length: bool
     ) -> Iterator[tuple[slice, NDArray[Any]]]:
         for which, start, stride in self._groups:
-            at = _places(start, self.lengths)[array][0 if of_length else 1]
+            at = _find_offsets(start, self.lengths)[array][0 if of_length else 1]
             count = len(range(*which.indices(self.points)))
             size = np.dtype(kind).itemsize
             yield which, np.ndarray((count, columns), kind, data, at, (stride, size))
 
 
-def _places(begin: int, lengths: Sequence[int]) -> list[tuple[int, int]]:
+def _find_offsets(begin: int, lengths: Sequence[int]) -> list[tuple[int, int]]:
     """List the offsets of the length and first number of a point's arrays, then of its time."""
     places = []
     at = begin
     for length in lengths:
         first = at + 4
         if length:
-            first += -(first - HEAD) % 8
+            first += -(first - ENCAPSULATION_BYTES) % 8
         places.append((at, first))
         at = first + 8 * length
     return [*places, (at, at)]
 
 
-def _end(begin: int, lengths: Sequence[int]) -> int:
-    return _places(begin, lengths)[-1][0] + 8
+def _find_end(begin: int, lengths: Sequence[int]) -> int:
+    return _find_offsets(begin, lengths)[-1][0] + 8
 
 
-def _number(data: bytes, at: int, order: str) -> tuple[int, int]:
+def _read_number(data: bytes, at: int, order: str) -> tuple[int, int]:
     """Read the unsigned 32-bit number at the next multiple of four; return it and its end."""
-    at += -(at - HEAD) % 4
+    at += -(at - ENCAPSULATION_BYTES) % 4
     if at + 4 > len(data):
         raise MessageError("cdr", f"cut at byte {len(data)}")
     return struct.unpack_from(f"{order}I", data, at)[0], at + 4
 
 
-def _text(data: bytes, at: int, order: str) -> tuple[str, int]:
-    length, at = _number(data, at, order)
+def _read_text(data: bytes, at: int, order: str) -> tuple[str, int]:
+    length, at = _read_number(data, at, order)
     if at + length > len(data):
         raise MessageError("cdr", f"a text of {length} bytes at byte {at} of {len(data)}")
     return data[at : at + length].rstrip(b"\0").decode(errors="replace"), at + length

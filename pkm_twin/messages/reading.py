@@ -37,7 +37,7 @@ MAX_EFFORT: Final = 1e7
 """Largest effort, N m or N: beyond all machines."""
 MAX_POINTS: Final = 100_000
 """Most points of a trajectory."""
-ROUNDING: Final = 4.0 * sys.float_info.epsilon
+CONVERSION_ROUNDING: Final = 4.0 * sys.float_info.epsilon
 """Relative rounding error of a number that is converted to other units and back."""
 MAX_SHOWN: Final = 80
 """Most characters of a name from a message that an error shows."""
@@ -53,7 +53,7 @@ COLUMNS: Final = {
 ExtraJoints = Literal["refuse", "zero"]
 
 
-_MODEL: Final[Mapping[str, Callable[[JointMap, Array], Array]]] = {
+_TO_MODEL: Final[Mapping[str, Callable[[JointMap, Array], Array]]] = {
     "position": JointMap.positions,
     "velocity": JointMap.rates,
     "acceleration": JointMap.rates,
@@ -115,13 +115,13 @@ class TrajectoryFields:
             names,
             np.array([[d.sec for d in durations], [d.nanosec for d in durations]], np.int64),
             {
-                what: _rows([getattr(point, what) for point in points], len(names))
+                what: _stack_rows([getattr(point, what) for point in points], len(names))
                 for what in COLUMNS
             },
         )
 
 
-def _rows(rows: list[Sequence[float]], count: int) -> Array | Ragged | None:
+def _stack_rows(rows: list[Sequence[float]], count: int) -> Array | Ragged | None:
     if not any(map(len, rows)):
         return None
     for i, row in enumerate(rows):
@@ -183,10 +183,13 @@ class JointReader:
             # A value at its limit must still be accepted after the rounding of the conversion.
             shift = np.abs(self._map.offsets / self._map.factors).tolist()
             self._position = [
-                (low - ROUNDING * (abs(low) + o), high + ROUNDING * (abs(high) + o))
+                (
+                    low - CONVERSION_ROUNDING * (abs(low) + o),
+                    high + CONVERSION_ROUNDING * (abs(high) + o),
+                )
                 for (low, high), o in zip(self._position, shift, strict=True)
             ]
-            rates = [rate * (1.0 + ROUNDING) for rate in rates]
+            rates = [rate * (1.0 + CONVERSION_ROUNDING) for rate in rates]
         self._velocity = [(-rate, rate) for rate in rates]
         self.highest_velocity: tuple[float, ...] = tuple(rates)
         self._highest_velocity = np.array(rates)
@@ -364,7 +367,7 @@ class JointReader:
             raise MessageError("length", f"{what}: {len(values)} values for {count} names")
         picked = [values[i] for i in index]
         if self._map is not None:
-            picked = _MODEL[what](self._map, np.array(picked)).tolist()
+            picked = _TO_MODEL[what](self._map, np.array(picked)).tolist()
         for i, (value, (low, high)) in enumerate(zip(picked, bounds, strict=True)):
             if not low <= value <= high or (-TINY < value < TINY and value != 0.0):
                 if all(map(math.isnan, picked)):
@@ -391,7 +394,7 @@ class JointReader:
             )
         values = given[:, index]
         if self._map is not None:
-            values = _MODEL[COLUMNS[what]](self._map, values)
+            values = _TO_MODEL[COLUMNS[what]](self._map, values)
         box = np.array(bounds)
         size = np.abs(values)
         good = (values >= box[:, 0]) & (values <= box[:, 1]) & ((size >= TINY) | (size == 0.0))
@@ -508,7 +511,7 @@ def read_wrench(
 MAX_SHIFT: Final = 0.1
 MAX_TURN: Final = 0.1
 """Largest deflection, m and rad: larger ones are not small, or belong to another pose."""
-UNIT: Final = 1e-3
+MAX_NORM_ERROR: Final = 1e-3
 """Largest difference of a quaternion's length from one."""
 
 
@@ -538,7 +541,7 @@ def read_deflection(message: Any, now: int, rules: StampRules) -> DeflectionSamp
     if far > MAX_SHIFT:
         raise MessageError("bounds", f"translation is {far:g} m, allowed up to {MAX_SHIFT:g}")
     length = math.hypot(*values[3:])
-    if abs(length - 1.0) > UNIT:
+    if abs(length - 1.0) > MAX_NORM_ERROR:
         raise MessageError("bounds", f"the rotation's length is {length:g}, not 1")
     # A quaternion and its negative describe the same rotation.
     sign = math.copysign(1.0, turn.w)

@@ -11,7 +11,7 @@ from pkm_twin.errors import MessageError
 SECOND: Final = 1_000_000_000
 """Nanoseconds per second."""
 
-REPLAYED: Final = 60 * SECOND
+MIN_REPLAY_AGE: Final = 60 * SECOND
 """Age of a stamp beyond which it is one of a recording, ns: no queue holds a message so long."""
 MAX_DURATION: Final = 1_000_000 * SECOND
 """Longest duration of a trajectory, ns: up to here seconds as floats resolve nanoseconds."""
@@ -45,7 +45,7 @@ class StampRules:
             age = now - stamp
             cause = (
                 "a replayed bag needs use_sim_time and a /clock"
-                if age > REPLAYED
+                if age > MIN_REPLAY_AGE
                 else "its sender, the network or this computer is overloaded, or clocks differ"
             )
             raise MessageError(
@@ -58,10 +58,10 @@ class StampRules:
 
 def stamp_of(header: Any) -> int:
     """Return a header's stamp, ns, after checking that it is a valid time."""
-    return _nanoseconds("stamp", header.stamp)
+    return _to_nanoseconds("stamp", header.stamp)
 
 
-def _nanoseconds(what: str, time: Any) -> int:
+def _to_nanoseconds(what: str, time: Any) -> int:
     sec, nanosec = time.sec, time.nanosec
     if sec < 0 or not 0 <= nanosec < SECOND:
         raise MessageError("time", f"{what} is {sec} s and {nanosec} ns")

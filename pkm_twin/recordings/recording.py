@@ -22,8 +22,8 @@ from pkm_twin.robot.derivatives import nearest_motion
 from pkm_twin.robot.robot import Robot
 from pkm_twin.streams.differentiator import Differentiator
 from pkm_twin.streams.rates import MAX_RATE, rate_faults
-from pkm_twin.streams.rest import SIGMAS, fit_gain, gradient_gain, noise, rate_doubt
-from pkm_twin.streams.steps import GAP, Steps, repeats_of, steps_of
+from pkm_twin.streams.rest import SIGMAS, fit_gain, gradient_gain, noise, velocity_error_bound
+from pkm_twin.streams.steps import MAX_GAP_PERIODS, Steps, repeats_of, steps_of
 from pkm_twin.streams.wrench import WrenchSettings
 
 BY_SAMPLE: Final = (
@@ -244,7 +244,7 @@ class Recording:
         ends = self.time[0] - 0.5 * period, self.time[-1] + 0.5 * period
         after = np.searchsorted(self.time, there).clip(1, len(self.time) - 1)
         known = (there > ends[0]) & (there < ends[1])
-        known &= np.diff(self.time)[after - 1] < GAP * period
+        known &= np.diff(self.time)[after - 1] < MAX_GAP_PERIODS * period
         effort = np.stack([np.interp(there, self.time, one) for one in self.measured.T], -1)
         return replace(self, effort=effort, late=self.late + late).part(known)
 
@@ -284,7 +284,7 @@ class Recording:
         qd = _differences(self.q, self.time) if self.qd is None else self.qd
         rest = None
         if self.qd is None:
-            rest = np.abs(qd) <= rate_doubt(self.time, self.q, gradient_gain(self.time))
+            rest = np.abs(qd) <= velocity_error_bound(self.time, self.q, gradient_gain(self.time))
         qdd = _differences(qd, self.time) if self.qdd is None else self.qdd
         return self._moving(qd, qdd, rest, slice(None))
 
@@ -312,7 +312,7 @@ def at_rest(r: Recording, qd: Array) -> Mask:
     if len(r.time) < 3:
         return np.zeros(r.q.shape, np.bool_)
     gain = fit_gain(_ORDER + 1, _WINDOW, _WINDOW // 2) / float(np.median(np.diff(r.time)))
-    return np.asarray(np.abs(qd) <= rate_doubt(r.time, r.q, gain, _WINDOW // 2))
+    return np.asarray(np.abs(qd) <= velocity_error_bound(r.time, r.q, gain, _WINDOW // 2))
 
 
 def differentiated(r: Recording) -> tuple[Array, Array, Mask]:

@@ -49,18 +49,18 @@ def page(
         if fact.text is not None:
             parts.append(f"<p>{html.escape(f'{fact.text}: {fact.words}')}</p>")
     parts += [f'<div class="plot">{figure}</div>' for figure in figures]
-    parts += [_table(table) for table in (*report.tables, *more) if table.rows]
+    parts += [_write_table(table) for table in (*report.tables, *more) if table.rows]
     for draw in report.figures.values():
         data = base64.b64encode(plots.rendered(draw(), DPI)).decode()
         parts.append(f'<img alt="" src="data:image/png;base64,{data}">')
     return SHELL.format(title=html.escape(title), body="\n".join(parts))
 
 
-def _table(table: Table) -> str:
+def _write_table(table: Table) -> str:
     head, *rows = table.cells
-    lines = [_row("th", head), *(_row("td", row) for row in rows)]
+    lines = [_write_row("th", head), *(_write_row("td", row) for row in rows)]
     return f"<h2>{html.escape(table.title)}</h2>\n<table>{''.join(lines)}</table>"
 
 
-def _row(tag: str, cells: Sequence[str]) -> str:
+def _write_row(tag: str, cells: Sequence[str]) -> str:
     return f"<tr>{''.join(f'<{tag}>{html.escape(cell)}</{tag}>' for cell in cells)}</tr>"

@@ -20,7 +20,7 @@ COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#F
 WINE: Final = "#882255"
 TERMS: Final = ("gravity", "inertia", "velocity", "payload", "friction", "external")
 """Of an effort."""
-LONG: Final = 5.0
+MAX_SINGLE_COLUMN_TIME: Final = 5.0
 """A motion that lasts longer, s, has a picture of its largest effort beside the whole."""
 DASHES: Final = ("-", "--", ":", "-.")
 """Styles of lines that can lie on one another."""
@@ -112,17 +112,17 @@ def save(figure: Any, path: Path, dpi: int = DPI) -> Path:
 def torques(motion: Any, table: Mapping[str, Any], title: str) -> Any:
     """Draw efforts and their terms, one row per actuated joint; grey where beyond the limits.
 
-    For a motion longer than LONG the terms are drawn in a second column, one second before and
-    after the largest effort.
+    For a motion longer than MAX_SINGLE_COLUMN_TIME the terms are drawn in a second column, one
+    second before and after the largest effort.
     """
     robot, time = motion.robot, np.asarray(table["time"])
-    whole = time[-1] - time[0] <= LONG
+    whole = time[-1] - time[0] <= MAX_SINGLE_COLUMN_TIME
     figure, columns_ = columns(1 if whole else 2, len(robot.joint_names), sharey="row")
     efforts = np.array([table[f"{joint}.effort"] for joint in robot.joint_names])
     for k, (joint, unit) in enumerate(zip(robot.joint_names, robot.effort_units, strict=True)):
         peak = int(np.abs(efforts[k]).argmax())
         for axes in columns_:
-            _efforts(axes[k], joint, table, terms=axes is columns_[-1])
+            _draw_efforts(axes[k], joint, table, terms=axes is columns_[-1])
             label(axes[k], "time (s)", f"effort ({unit})")
         axes[k].set_title(f"{joint}: {efforts[k, peak]:.4g} {unit} at {time[peak]:.4g} s")
         if not whole:
@@ -132,7 +132,7 @@ def torques(motion: Any, table: Mapping[str, Any], title: str) -> Any:
     return figure
 
 
-def _efforts(ax: Any, joint: str, table: Mapping[str, Any], terms: bool) -> None:
+def _draw_efforts(ax: Any, joint: str, table: Mapping[str, Any], terms: bool) -> None:
     """Draw a joint's efforts over time, their terms and their standard deviation."""
     time, effort = table["time"], table[f"{joint}.effort"]
     measured = table.get(f"{joint}.measured")

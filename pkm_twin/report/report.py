@@ -113,7 +113,7 @@ class Table:
         rows = self.rows.items()
         # Only numbers of the same unit can be compared with the largest.
         least = [
-            ROUNDING * _largest(values[k] for _, values in rows) * bool(column.unit)
+            ROUNDING * _largest_size(values[k] for _, values in rows) * bool(column.unit)
             for k, column in shown
         ]
         return [
@@ -184,7 +184,7 @@ class Report:
         return dict(plain(found))
 
 
-def _largest(values: Iterable[Any]) -> float:
+def _largest_size(values: Iterable[Any]) -> float:
     """Return the largest absolute value of the finite numbers; 0 if there is none."""
     sizes = [abs(v) for v in values if isinstance(v, int | float) and math.isfinite(v)]
     return float(max(sizes, default=0.0))

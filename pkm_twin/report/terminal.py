@@ -46,7 +46,7 @@ def text_of(report: Report) -> str:
         if fact.text is not None and fact.verdict is None:
             found.append(f"{fact.text}: {fact.words}" if fact.text else fact.words)
     if judged := [fact for fact in report.facts if fact.verdict is not None]:
-        found += ["", *_judged(judged)] if found else _judged(judged)
+        found += ["", *_layout_judged(judged)] if found else _layout_judged(judged)
     for table in report.tables:
         found += ["", *table_lines(table)] if found else table_lines(table)
     written = [str(path) for path in report.files.values() if path is not None]
@@ -57,12 +57,12 @@ def text_of(report: Report) -> str:
     return "\n".join(found)
 
 
-def _judged(facts: Sequence[Fact]) -> Iterator[str]:
+def _layout_judged(facts: Sequence[Fact]) -> Iterator[str]:
     """Lay out judged properties as a table with coloured verdicts."""
     # A verdict stays on its row's first line, where it is coloured.
     words = [fact.verdict.words.replace(" ", BLANK) if fact.verdict else "" for fact in facts]
     rows = [
-        (f.text or f.name, f.words, _words(f.bound), word)
+        (f.text or f.name, f.words, _format_bound(f.bound), word)
         for f, word in zip(facts, words, strict=True)
     ]
     lines = aligned([("", "value", "limit", "verdict"), *rows], "<<<<")
@@ -73,7 +73,7 @@ def _judged(facts: Sequence[Fact]) -> Iterator[str]:
         yield "\n".join([first[: -len(word)] + shown, *rest])
 
 
-def _words(bound: object) -> str:
+def _format_bound(bound: object) -> str:
     return "" if bound is None else str(bound)
 
 
@@ -97,7 +97,10 @@ def aligned(rows: Sequence[Sequence[str]], sides: str) -> Iterator[str]:
     if not any(row[0] for row in rows):
         rows, sides = [row[1:] for row in rows], sides[1:]
     # Text in brackets (a unit) is not broken. A blank cell has no width to wrap to.
-    rows = [[re.sub(r"\([^)]*\)", _glued, c) if c.strip() else "" for c in row] for row in rows]
+    rows = [
+        [re.sub(r"\([^)]*\)", _join_with_no_break_spaces, c) if c.strip() else "" for c in row]
+        for row in rows
+    ]
     columns = list(zip(*rows, strict=True))
     widths = [max(map(len, column)) for column in columns]
     words = [[max(map(len, cell.split(" "))) for cell in column] for column in columns]
@@ -118,5 +121,5 @@ def aligned(rows: Sequence[Sequence[str]], sides: str) -> Iterator[str]:
         ).replace(BLANK, " ")
 
 
-def _glued(match: re.Match[str]) -> str:
+def _join_with_no_break_spaces(match: re.Match[str]) -> str:
     return match[0].replace(" ", BLANK)

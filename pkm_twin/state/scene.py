@@ -21,20 +21,20 @@ from pkm_twin.state.state import State
 Kind = Literal["cylinder", "sphere", "arrow", "line", "text"]
 Colour = tuple[float, float, float, float]
 
-PLAIN: Final[Colour] = (0.55, 0.57, 0.60, 1.0)
-DEFLECTED: Final[Colour] = (0.84, 0.37, 0.0, 0.9)
-ELLIPSOID: Final[Colour] = (0.0, 0.45, 0.70, 0.25)
-FORCE: Final[Colour] = (0.80, 0.47, 0.65, 1.0)
-MOMENT: Final[Colour] = (0.94, 0.89, 0.26, 1.0)
-TEXT: Final[Colour] = (1.0, 1.0, 1.0, 1.0)
+NEUTRAL_COLOUR: Final[Colour] = (0.55, 0.57, 0.60, 1.0)
+DEFLECTED_COLOUR: Final[Colour] = (0.84, 0.37, 0.0, 0.9)
+ELLIPSOID_COLOUR: Final[Colour] = (0.0, 0.45, 0.70, 0.25)
+FORCE_COLOUR: Final[Colour] = (0.80, 0.47, 0.65, 1.0)
+MOMENT_COLOUR: Final[Colour] = (0.94, 0.89, 0.26, 1.0)
+TEXT_COLOUR: Final[Colour] = (1.0, 1.0, 1.0, 1.0)
 COLD: Final = (0.0, 0.45, 0.70)
 WARM: Final = (0.94, 0.89, 0.26)
 HOT: Final = (0.84, 0.37, 0.0)
 """Colours that can be distinguished with every kind of colour vision (Okabe and Ito 2008)."""
-LINE: Final = 0.004
-ARROW: Final = 0.012
-JOINT: Final = 0.02
-LETTER: Final = 0.06
+LINE_WIDTH: Final = 0.004
+ARROW_WIDTH: Final = 0.012
+JOINT_WIDTH: Final = 0.02
+LETTER_HEIGHT: Final = 0.06
 """Widths and heights as fractions of the machine's size."""
 
 
@@ -121,7 +121,7 @@ class Scene:
     def shapes(self, state: State, load: Load | None = None) -> list[Shape]:
         """Return the shapes of the machine in a state, and of the load's effects."""
         places = self.placed(state.q)
-        shares = _shares(load)
+        shares = _relative_energies(load)
         shapes = self._bars(places, shares)
         if load is None:
             return shapes
@@ -146,14 +146,14 @@ class Scene:
         shapes = []
         for k, (bar, (start, end)) in enumerate(zip(self.bars, places, strict=True)):
             share = shares.get(bar.element)
-            colour = PLAIN if share is None else heat(share)
+            colour = NEUTRAL_COLOUR if share is None else heat(share)
             span = end - start
             length = float(np.linalg.norm(span))
             width = 2.0 * bar.radius
             shapes.append(
                 Shape(
                     "cylinder", "bars", k, colour, (width, width, length), (start + end) / 2.0,
-                    _along_z(span), text=bar.part, lasting=True,
+                    _rotate_z_to(span), text=bar.part, lasting=True,
                 )
             )  # fmt: skip
         return shapes
@@ -161,7 +161,7 @@ class Scene:
     def _joints(self, q: Array, shares: Mapping[str, float]) -> list[Shape]:
         """Draw the elastic joints as spheres."""
         names = [name for name in self.joints if name in shares]
-        width = JOINT * self._size
+        width = JOINT_WIDTH * self._size
         points = self._points(q, [self.joints[name] for name in names])
         return [
             Shape("sphere", "joints", k, heat(shares[name]), (1.5 * width,) * 3, point, text=name)
@@ -170,7 +170,7 @@ class Scene:
 
     def _deflected(self, places: Array, state: State, load: Load) -> list[Shape]:
         """Draw deflected members and the displaced platform, both enlarged by the same factor."""
-        scale, width = self.scales.deflection, (LINE * self._size, 0.0, 0.0)
+        scale, width = self.scales.deflection, (LINE_WIDTH * self._size, 0.0, 0.0)
         lines = [(name, x + scale * u) for name, (x, u) in load.members.items()]
         shift, turn = load.deflection[:3], load.deflection[3:]
         for bar, ends in zip(self.bars, places, strict=True):
@@ -178,7 +178,7 @@ class Scene:
                 moved = shift + np.cross(turn, ends - state.position)
                 lines.append((bar.part, ends + scale * moved))
         return [
-            Shape("line", "deflected", k, DEFLECTED, width, points=points, text=name)
+            Shape("line", "deflected", k, DEFLECTED_COLOUR, width, points=points, text=name)
             for k, (name, points) in enumerate(lines)
         ]
 
@@ -189,16 +189,16 @@ class Scene:
             axes = -axes
         reach = 2.0 * values * self.scales.ellipsoid_force * self.scales.deflection
         x, y, z = reach.tolist()
-        turned = _quaternion(axes)
-        return Shape("sphere", "compliance", 0, ELLIPSOID, (x, y, z), state.position, turned)
+        turned = _to_quaternion(axes)
+        return Shape("sphere", "compliance", 0, ELLIPSOID_COLOUR, (x, y, z), state.position, turned)
 
     def _arrows(self, state: State, load: Load) -> list[Shape]:
         """Draw force and moment as arrows from the reference point."""
-        shaft = ARROW * self._size
+        shaft = ARROW_WIDTH * self._size
         size = (shaft, 2.0 * shaft, 3.0 * shaft)
         parts = (
-            (load.wrench[:3], self.scales.force, FORCE),
-            (load.wrench[3:], self.scales.moment, MOMENT),
+            (load.wrench[:3], self.scales.force, FORCE_COLOUR),
+            (load.wrench[3:], self.scales.moment, MOMENT_COLOUR),
         )
         return [
             Shape(
@@ -210,12 +210,12 @@ class Scene:
         ]  # fmt: skip
 
     def _text(self, state: State, name: str) -> Shape:
-        height = LETTER * self._size
+        height = LETTER_HEIGHT * self._size
         at = state.position + np.array([0.0, 0.0, 2.0 * height])
-        return Shape("text", "dominant", 0, TEXT, (0.0, 0.0, height), at, text=name)
+        return Shape("text", "dominant", 0, TEXT_COLOUR, (0.0, 0.0, height), at, text=name)
 
 
-def _shares(load: Load | None) -> dict[str, float]:
+def _relative_energies(load: Load | None) -> dict[str, float]:
     """Return each element's energy relative to the largest one; nothing without energy."""
     factors = {} if load is None else load.factors
     greatest = max(factors.values(), default=0.0)
@@ -234,16 +234,16 @@ def _joint_places(robot: Robot) -> dict[str, Place]:
     return places
 
 
-def _along_z(span: Array) -> tuple[float, float, float, float]:
+def _rotate_z_to(span: Array) -> tuple[float, float, float, float]:
     """Return the quaternion of a rotation that turns the z axis along a vector."""
     length = float(np.linalg.norm(span))
     if not length > 0.0:
         return 0.0, 0.0, 0.0, 1.0
     z = span / length
     x = across(z)[0]
-    return _quaternion(np.column_stack((x, np.cross(z, x), z)))
+    return _to_quaternion(np.column_stack((x, np.cross(z, x), z)))
 
 
-def _quaternion(rotation: Array) -> tuple[float, float, float, float]:
+def _to_quaternion(rotation: Array) -> tuple[float, float, float, float]:
     x, y, z, w = rotations.to_quaternion(rotation).tolist()
     return x, y, z, w

@@ -44,7 +44,7 @@ STATE: Final = table(
 )  # fmt: skip
 
 
-NONE: Final = np.zeros(0)
+NO_PARAMETERS: Final = np.zeros(0)
 """Parameters of the programs: none besides the geometry."""
 
 
@@ -137,9 +137,9 @@ class MachineState(TimeSynchronizer):
         robot, q, qd = self.robot, sample.q, sample.qd
         rates = twist = None
         if qd is None:
-            position, flat, passive = robot.evaluate(state_kernel(robot), NONE, q)
+            position, flat, passive = robot.evaluate(state_kernel(robot), NO_PARAMETERS, q)
         else:
-            found = robot.evaluate(moving_state_kernel(robot), NONE, q, qd)
+            found = robot.evaluate(moving_state_kernel(robot), NO_PARAMETERS, q, qd)
             position, flat, passive, passive_rates, twist = found
             rates = np.concatenate((qd, passive_rates))
         rotation, joints = flat.reshape(3, 3), np.concatenate((q, passive))

@@ -30,15 +30,15 @@ from pkm_twin.codegen.program import Program
 from pkm_twin.errors import MessageError
 from pkm_twin.messages.stamps import SECOND
 
-LEAST_PIVOT: Final = 1e-4
+MIN_PIVOT: Final = 1e-4
 """Smallest diagonal entry of the Cholesky factor; even stamps give 1e-2 or more."""
-BLOCK: Final = 32
+BLOCK_SAMPLES: Final = 32
 """Samples that one call of the program sums up; the default window, 25, fits in one block."""
-LEAST: Final = 5
+MIN_SAMPLES: Final = 5
 """Fewest samples of a window."""
-JITTER: Final = 1.1
+FILLING_TOLERANCE: Final = 1.1
 """A filling window may exceed its time by this factor before the stream counts as slow."""
-_NONE: Final = np.zeros(0)
+_NO_PARAMETERS: Final = np.zeros(0)
 
 
 @dataclass
@@ -61,7 +61,7 @@ class Differentiator:
         # A ring of whole blocks plus one sample, so that the newest can be removed. Every sample is
         # stored twice, so that each window is contiguous, oldest first.
         self._most = self.window
-        self._held = -(-self.window // BLOCK) * BLOCK
+        self._held = -(-self.window // BLOCK_SAMPLES) * BLOCK_SAMPLES
         self._places = self._held + 1
         # Time since the first sample, ns: integers as doubles are exact for a hundred days.
         self._stamps = np.zeros(2 * self._places)
@@ -130,7 +130,7 @@ class Differentiator:
 
     def _apart(self, stamp: int) -> bool:
         """Return whether the stream was silent for too long to fit a polynomial across."""
-        if self._count < LEAST:
+        if self._count < MIN_SAMPLES:
             return False
         newest = self._stamps.item((self._count - 1) % self._places)
         return stamp - self._begin - newest > max(self._span, self.time * SECOND)
@@ -139,10 +139,10 @@ class Differentiator:
         """Fit fewer samples if the window spans too long a time."""
         held = min(self._count, self.window)
         self._span = self._stamps.item(end - 1) - self._stamps.item(end - held)
-        least, time = max(LEAST, self.degree + 2), self.time * SECOND
+        least, time = max(MIN_SAMPLES, self.degree + 2), self.time * SECOND
         # A full window may be too long for a moment because samples were lost.
         filling = self._count <= self.window == self._most
-        if held > least and self._span > (JITTER if filling else 2.0) * time:
+        if held > least and self._span > (FILLING_TOLERANCE if filling else 2.0) * time:
             self._fit_samples(max(1 + round(time * (held - 1) / self._span), least))
 
     def _fit_samples(self, window: int) -> None:
@@ -200,17 +200,17 @@ class _Fit:
 
     def __init__(self, degree: int, window: int, joints: int) -> None:
         self.joints, self._window = joints, window
-        self._call = _kernel(degree, joints, solved=True).bound(_NONE)
-        self._sums = _kernel(degree, joints, solved=False)
+        self._call = _make_fit_kernel(degree, joints, solved=True).bound(_NO_PARAMETERS)
+        self._sums = _make_fit_kernel(degree, joints, solved=False)
         size = degree + 1
         self._nothing = np.zeros(2 * degree + 1 + size * joints)
-        self._blocks = -(-window // BLOCK)
+        self._blocks = -(-window // BLOCK_SAMPLES)
         if self._blocks > 1:
             self._sums.warm_up()
-        self._all = np.ones(BLOCK)
+        self._all = np.ones(BLOCK_SAMPLES)
         # The oldest block contains samples from before the window, which have weight 0.
-        self._oldest = np.zeros(BLOCK)
-        self._oldest[self._blocks * BLOCK - window :] = 1.0
+        self._oldest = np.zeros(BLOCK_SAMPLES)
+        self._oldest[self._blocks * BLOCK_SAMPLES - window :] = 1.0
 
     def derivatives(self, stamps: Array, values: Array, end: int, at: int) -> tuple[Array, Array]:
         """Return first and second time derivative at sample ``at``, shape (n,) each.
@@ -224,14 +224,16 @@ class _Fit:
         place = np.array((oldest + half, half, stamps.item(at)))
         sums, weights = self._nothing, self._oldest
         for block in range(self._blocks - 1, 0, -1):
-            last = end - block * BLOCK
-            part = slice(last - BLOCK, last), slice((last - BLOCK) * n, last * n)
-            (sums,), _ = self._sums(_NONE, sums, stamps[part[0]], values[part[1]], weights, place)
+            last = end - block * BLOCK_SAMPLES
+            part = slice(last - BLOCK_SAMPLES, last), slice((last - BLOCK_SAMPLES) * n, last * n)
+            (sums,), _ = self._sums(
+                _NO_PARAMETERS, sums, stamps[part[0]], values[part[1]], weights, place
+            )
             weights = self._all
-        first = end - BLOCK
+        first = end - BLOCK_SAMPLES
         inputs = sums, stamps[first:end], values[first * n : end * n], weights, place
         result: Array = self._call(*inputs)
-        if not min(result[2 * n :].tolist()) > LEAST_PIVOT:
+        if not min(result[2 * n :].tolist()) > MIN_PIVOT:
             raise MessageError(
                 "uneven stamps", "the stamps of the window are too uneven to differentiate"
             )
@@ -239,22 +241,23 @@ class _Fit:
 
 
 @cache
-def _kernel(degree: int, joints: int, *, solved: bool) -> Kernel:
+def _make_fit_kernel(degree: int, joints: int, *, solved: bool) -> Kernel:
     """Return the program that adds a block of samples to the sums of the normal equations.
 
     Inputs: the sums before, of t^k and of t^k y; stamps, values and weights (0 or 1) of the block;
     middle and half length of the window, and the stamp to evaluate at, ns. Output: the new sums;
     with ``solved`` first and second derivative by seconds at that stamp, and the pivots of V V'.
     """
-    key = EMPTY.also(f"polynomial fit {degree} {joints} {solved}", _program)
-    return Kernel(Code(lambda: _program(degree, joints, solved), key))
+    key = EMPTY.also(f"polynomial fit {degree} {joints} {solved}", _write_fit_program)
+    return Kernel(Code(lambda: _write_fit_program(degree, joints, solved), key))
 
 
-def _program(degree: int, joints: int, solved: bool) -> Program:
+def _write_fit_program(degree: int, joints: int, solved: bool) -> Program:
     tape, size = Tape(), degree + 1
     sizes = {
-        "before": 2 * degree + 1 + size * joints, "stamps": BLOCK, "values": BLOCK * joints,
-        "weights": BLOCK, "place": 3,
+        "before": 2 * degree + 1 + size * joints, "stamps": BLOCK_SAMPLES,
+        "values": BLOCK_SAMPLES * joints,
+        "weights": BLOCK_SAMPLES, "place": 3,
     }  # fmt: skip
     before, stamps, values, weights, (middle, half, look) = (
         tape.inputs(name, count) for name, count in sizes.items()
@@ -262,7 +265,7 @@ def _program(degree: int, joints: int, solved: bool) -> Program:
     inverse = 1.0 / half
     powers = list(before[: 2 * degree + 1])
     mixed = before[2 * degree + 1 :].reshape(size, joints)
-    for k in range(BLOCK):
+    for k in range(BLOCK_SAMPLES):
         t, power = (stamps[k] - middle) * inverse, weights[k]
         for i in range(2 * degree + 1):
             powers[i] = powers[i] + power
@@ -272,11 +275,11 @@ def _program(degree: int, joints: int, solved: bool) -> Program:
     results = [*powers, *mixed.ravel()]
     if solved:
         t = (look - middle) * inverse
-        results = _solution(powers, mixed, t, float(SECOND) * inverse)
+        results = _solve_normal_equations(powers, mixed, t, float(SECOND) * inverse)
     return Program(sizes, 0, {"result": [tape.lift(value) for value in results]})
 
 
-def _solution(powers: list[Any], mixed: Objects, t: Any, rate: Any) -> list[Any]:
+def _solve_normal_equations(powers: list[Any], mixed: Objects, t: Any, rate: Any) -> list[Any]:
     """Solve the normal equations; return first and second derivative at t, and the pivots.
 
     :param powers: sums of t^k; ``mixed``: sums of t^k y, shape (degree + 1, n).

@@ -16,17 +16,17 @@ import numpy as np
 
 from pkm_twin.codegen.arrays import Array, Mask
 
-FROZEN: Final = 0.1
+FROZEN_TIME: Final = 0.1
 """Efforts that do not change for this time, s, and for CONSTANT_SAMPLES are not measured."""
-COUNT: Final = 10
+CONSTANT_SAMPLES: Final = 10
 """Fewest samples without a change."""
-SAME: Final = 1e-9
+MAX_RELATIVE_CHANGE: Final = 1e-9
 """Largest change that counts as none, as a fraction of the largest effort."""
-AGREES: Final = 0.05
+MAX_RELATIVE_ERROR: Final = 0.05
 """Largest error of constant efforts that agree with the model, relative to the expected efforts."""
-RELEASE: Final = 0.5
+BRAKE_TIME: Final = 0.5
 """Longest time for which a brake opens or closes, s."""
-STANDING: Final = 0.02
+AVERAGING_TIME: Final = 0.02
 """Time constant of the average of "a joint moves", s: noise appears as a motion now and then."""
 
 
@@ -66,9 +66,9 @@ class DriveWatch:
             self._moving = moves
         else:
             step = time - self._last[0]
-            self._moving += min(1.0, step / STANDING) * (moves - self._moving)
+            self._moving += min(1.0, step / AVERAGING_TIME) * (moves - self._moving)
             change = max(map(abs, map(sub, efforts, self._last[1])))
-            same = change <= SAME * greatest
+            same = change <= MAX_RELATIVE_CHANGE * greatest
             self._frozen = self._frozen + step if same else 0.0
             self.repeated = self.repeated + 1 if same else 0
         self._last = time, efforts
@@ -82,14 +82,14 @@ class DriveWatch:
             return False
         wanted = expected.tolist()
         missed = max(map(abs, map(sub, efforts, wanted)))
-        off = missed > AGREES * max(map(abs, wanted))
-        frozen = self._frozen >= FROZEN and self.repeated >= COUNT
+        off = missed > MAX_RELATIVE_ERROR * max(map(abs, wanted))
+        frozen = self._frozen >= FROZEN_TIME and self.repeated >= CONSTANT_SAMPLES
         if greatest == 0.0 or (frozen and off):
             if off:
                 self._released = time
             return True
         # While a brake opens or has just closed, it carries a part of the drive's effort.
-        return off and time - self._released < RELEASE
+        return off and time - self._released < BRAKE_TIME
 
 
 def idle_samples(time: Array, still: Mask, effort: Array, expected: Array) -> Mask:

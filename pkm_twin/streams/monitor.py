@@ -14,9 +14,9 @@ from pkm_twin.messages.stamps import SECOND
 
 V = TypeVar("V")
 
-MANY: Final = 5
+MIN_REJECTS_SHOWN: Final = 5
 """Number of rejects after a stop from which the status shows their reason."""
-SMOOTHING: Final = 0.1
+PERIOD_SMOOTHING: Final = 0.1
 """Weight of the newest period in the exponential mean."""
 
 
@@ -68,7 +68,7 @@ class StreamMonitor:
     def status(self) -> str:
         """Reason of the stop, and of rejects since then if there are many."""
         status, (count, reason, text) = label_reason(self.reason, self.text), self._since
-        if count >= MANY:
+        if count >= MIN_REJECTS_SHOWN:
             status += f"; rejected since then: {count}"
             status += "" if reason == self.reason else f", the last: {label_reason(reason, text)}"
         return status
@@ -169,7 +169,7 @@ class TopicStatistics:
             self._periods += 1
             # The bound keeps a silence out of the mean, but lets it follow a slower stream.
             longest = 2.0 * self._period if self._periods > 1 else period
-            weight = max(SMOOTHING, 1.0 / self._periods)
+            weight = max(PERIOD_SMOOTHING, 1.0 / self._periods)
             self._period += (min(period, longest) - self._period) * weight
         self.messages += 1
         self._sent = sent

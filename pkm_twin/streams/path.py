@@ -70,13 +70,13 @@ class JointPath:
         before = after - 1
         span = float(p.times[after] - p.times[before])
         t = (time - float(p.times[before])) / span
-        q, qd = _between(p, before, after, span, t)
+        q, qd = _interpolate(p, before, after, span, t)
         if p.effort is None:
             return Wanted(q, qd, np.zeros_like(q))
         return Wanted(q, qd, (1.0 - t) * p.effort[before] + t * p.effort[after])
 
 
-def _between(p: Trajectory, a: int, b: int, span: float, t: float) -> tuple[Array, Array]:
+def _interpolate(p: Trajectory, a: int, b: int, span: float, t: float) -> tuple[Array, Array]:
     """Interpolate by Hermite polynomials at fraction t of the time from point a to b."""
     d = p.q[b] - p.q[a]
     if p.qd is None:

@@ -17,25 +17,25 @@ from pkm_twin.codegen.arrays import Array, Mask
 from pkm_twin.messages.stamps import SECOND
 from pkm_twin.robot.robot import Robot
 from pkm_twin.streams.rest import SIGMAS, noise
-from pkm_twin.streams.steps import GAP
+from pkm_twin.streams.steps import MAX_GAP_PERIODS
 
-BLOCK: Final = 0.05
+MIN_BLOCK_TIME: Final = 0.05
 """Shortest time over which moves are compared, s."""
-STEPS: Final = 5
+MIN_STEPS: Final = 5
 """Fewest steps between samples in a block."""
-BLOCKS: Final = 20
+JUDGED_BLOCKS: Final = 20
 """Number of blocks of a live stream that are judged together."""
-LEAST: Final = 0.01
+MIN_MOVE: Final = 0.01
 """Joints are judged if the root of the sum of their squared moves is at least this, rad; for a
 prismatic joint this fraction of the machine's size."""
-MAX_ERROR: Final = 0.4
+MAX_LIVE_ERROR: Final = 0.4
 """Largest RMS difference of the moves of a live stream, relative to the larger RMS move: what
 delayed velocities may cause."""
-STANDS: Final = 0.03
+STANDSTILL_FRACTION: Final = 0.03
 """Moves below this fraction of the other quantity's moves count as standing still."""
 MAX_RATE: Final = 0.15
 """Largest relative RMS difference of the moves of a whole recording."""
-LIKE: Final = 0.1
+SCALE_TOLERANCE: Final = 0.1
 """Largest relative difference that a factor between both may leave to be named as the cause."""
 
 
@@ -44,17 +44,17 @@ def rms(values: Array) -> Array:
     return np.asarray(np.sqrt(np.mean(values**2, 0)), np.float64)
 
 
-def likely_cause(moved: Array, told: Array) -> str:
+def find_likely_cause(moved: Array, told: Array) -> str:
     """Name the likely cause of a difference of both moves, (blocks,); may be empty."""
     by_q, by_qd = float(rms(moved)), float(rms(told))
     scale = float(np.sum(told * moved) / max(np.sum(moved**2), 1e-300))
-    if by_q < STANDS * by_qd:
+    if by_q < STANDSTILL_FRACTION * by_qd:
         return " (the position stands still: encoder?)"
-    if by_qd < STANDS * by_q:
+    if by_qd < STANDSTILL_FRACTION * by_q:
         return " (the velocity is zero)"
-    if abs(scale + 1.0) < LIKE:
+    if abs(scale + 1.0) < SCALE_TOLERANCE:
         return " (wrong sign?)"
-    if rms(told - scale * moved) < LIKE * by_qd:
+    if rms(told - scale * moved) < SCALE_TOLERANCE * by_qd:
         return f" ({scale:.3g} times the positions' rate: time stamps, ratio or unit?)"
     return ""
 
@@ -67,10 +67,10 @@ class RateAgreement:
     :param blocks: number of blocks that are kept and judged; None keeps all and judges none.
     """
 
-    def __init__(self, robot: Robot, blocks: int | None = BLOCKS) -> None:
+    def __init__(self, robot: Robot, blocks: int | None = JUDGED_BLOCKS) -> None:
         self._names, self._count = robot.joint_names, blocks
         sizes = [robot.size if unit == "m" else 1.0 for unit in robot.joint_units]
-        self._least = LEAST * np.array(sizes)
+        self._least = MIN_MOVE * np.array(sizes)
         self.reset()
 
     def reset(self) -> None:
@@ -103,7 +103,7 @@ class RateAgreement:
             self._sums = [total + half * (a + b) for total, a, b in pairs]
             self._steps += 1
             first, before = self._begin
-            if self._steps >= STEPS and (stamp - first) / SECOND >= BLOCK:
+            if self._steps >= MIN_STEPS and (stamp - first) / SECOND >= MIN_BLOCK_TIME:
                 moves = [now - then for now, then in zip(q.tolist(), before, strict=True)]
                 self._blocks.append((moves, self._sums))
                 if len(self._blocks) == self._count:
@@ -124,8 +124,8 @@ class RateAgreement:
         error = np.where(moves, rms(told - moved) / np.maximum(size, 1e-300), 0.0)
         j = int(np.argmax(error))
         self.fault = ""
-        if error[j] > MAX_ERROR:
-            cause = likely_cause(moved[:, j], told[:, j])
+        if error[j] > MAX_LIVE_ERROR:
+            cause = find_likely_cause(moved[:, j], told[:, j])
             self.fault = (
                 f"{self._names[j]}: velocities differ from the rate of the positions by "
                 f"{100 * error[j]:.2g} %{cause}"
@@ -149,7 +149,7 @@ def rate_faults(
     names, time = robot.joint_names, 1e-9 * (stamps - stamps[0])
     span = np.diff(time)
     period = float(np.median(span))
-    apart = span > GAP * period
+    apart = span > MAX_GAP_PERIODS * period
     agreement = RateAgreement(robot, blocks=None)
     skipped = [False, *(apart if jumps is None else apart | jumps.any(1)).tolist()]
     for stamp, place, rate, other in zip(stamps.tolist(), q, qd, skipped, strict=True):
@@ -161,12 +161,12 @@ def rate_faults(
         return np.zeros(0), []
     # The moves of a joint that hardly moves are noise.
     units, most = np.array(robot.joint_units), np.maximum(rms(moved), rms(told))
-    floor = np.array([STANDS * most[units == unit].max() for unit in units])
-    size, width = rms(told - moved), max(STEPS, BLOCK / period)
+    floor = np.array([STANDSTILL_FRACTION * most[units == unit].max() for unit in units])
+    size, width = rms(told - moved), max(MIN_STEPS, MIN_BLOCK_TIME / period)
     noisy = 2.0 * noise(time, q) + np.sqrt(width) * period * noise(time, qd)
     part = size / np.maximum(np.maximum(most, floor), 1e-300)
     bad = (part > MAX_RATE) & (size > SIGMAS * noisy)
     return part, [
-        f"{names[j]} {100 * part[j]:.3g} %{likely_cause(moved[:, j], told[:, j])}"
+        f"{names[j]} {100 * part[j]:.3g} %{find_likely_cause(moved[:, j], told[:, j])}"
         for j in np.flatnonzero(bad)
     ]

@@ -21,13 +21,13 @@ from pkm_twin.messages.stamps import SECOND
 
 SIGMAS: Final = 4.0
 """A velocity below this many standard deviations of its noise counts as zero."""
-POINTS: Final = 7
+STENCIL: Final = 7
 """Number of samples in a divided difference of order six."""
-KEPT: Final = 15
+MEDIAN_WINDOW: Final = 15
 """Number of divided differences whose median gives a stream's noise."""
-ROBUST: Final = 1.4826
+MAD_TO_SIGMA: Final = 1.4826
 """Ratio of standard deviation to median absolute deviation for a normal distribution."""
-BLOCK: Final = 4096
+BLOCK_SAMPLES: Final = 4096
 
 
 def difference_weights(times: Array) -> Array:
@@ -35,10 +35,10 @@ def difference_weights(times: Array) -> Array:
 
     The weighted sum of numbers with independent noise has the same noise as each of them.
     """
-    apart = times[..., :, None] - times[..., None, :] + np.eye(POINTS)
+    apart = times[..., :, None] - times[..., None, :] + np.eye(STENCIL)
     # Times in units of the mean step keep the products within the range of doubles.
-    step = (times[..., -1] - times[..., 0])[..., None, None] / (POINTS - 1)
-    apart = np.where(np.eye(POINTS, dtype=bool), 1.0, apart / step)
+    step = (times[..., -1] - times[..., 0])[..., None, None] / (STENCIL - 1)
+    apart = np.where(np.eye(STENCIL, dtype=bool), 1.0, apart / step)
     weights = 1.0 / np.prod(apart, -1)
     return np.asarray(weights / np.linalg.norm(weights, axis=-1, keepdims=True), np.float64)
 
@@ -51,23 +51,23 @@ def noise(time: Array, values: Array) -> Array:
     :param time: rising, shape (k,), s.
     :param values: shape (k, n).
     """
-    count = len(time) - POINTS + 1
+    count = len(time) - STENCIL + 1
     if count < 1:
         return np.zeros(values.shape[1])
     left = []
-    for first in range(0, count, BLOCK):
-        rows = np.arange(first, min(first + BLOCK, count))[:, None] + np.arange(POINTS)
+    for first in range(0, count, BLOCK_SAMPLES):
+        rows = np.arange(first, min(first + BLOCK_SAMPLES, count))[:, None] + np.arange(STENCIL)
         left.append(np.abs(np.einsum("kp,kpn->kn", difference_weights(time[rows]), values[rows])))
     sizes = np.concatenate(left)
     # Samples of a joint that repeat exactly do not show its noise.
     sizes[sizes <= ROUNDING_NOISE * np.abs(values).max(initial=0.0)] = np.nan
     known = np.isfinite(sizes).any(0)
     found = np.zeros(values.shape[1])
-    found[known] = ROBUST * np.nanmedian(sizes[:, known], 0)
+    found[known] = MAD_TO_SIGMA * np.nanmedian(sizes[:, known], 0)
     return found
 
 
-def rate_doubt(time: Array, q: Array, gain: Array | float, stride: int = 2) -> Array:
+def velocity_error_bound(time: Array, q: Array, gain: Array | float, stride: int = 2) -> Array:
     """Bound the errors of velocities that were differentiated from positions, shape (k, n).
 
     The bound is the propagated noise of the positions plus the truncation error: the difference of
@@ -111,7 +111,7 @@ def fit_gain(degree: int, window: int, at: int) -> float:
     return float(np.linalg.norm(np.linalg.pinv(powers)[1]))
 
 
-class RestWatch:
+class VelocityErrorEstimator:
     """Bounds the errors of a stream's velocities, sample by sample.
 
     :param gain: :func:`fit_gain` of the differentiation, for velocities from positions.
@@ -124,8 +124,8 @@ class RestWatch:
     def reset(self) -> None:
         """Forget the stream."""
         # One more than needed, so that the newest sample can be removed.
-        self._samples: deque[tuple[int, list[float]]] = deque(maxlen=POINTS + 1)
-        self._left: deque[list[float]] = deque(maxlen=KEPT + 1)
+        self._samples: deque[tuple[int, list[float]]] = deque(maxlen=STENCIL + 1)
+        self._left: deque[list[float]] = deque(maxlen=MEDIAN_WINDOW + 1)
         self._differentiated: bool | None = None
 
     def retract(self) -> None:
@@ -149,23 +149,23 @@ class RestWatch:
         # Python floats: for arrays this small numpy's calls would take most of the time.
         values: list[float] = (q if measured is None else measured).tolist()
         self._samples.append((stamp, values))
-        recent = list(self._samples)[-POINTS:]
-        if len(recent) < POINTS:
+        recent = list(self._samples)[-STENCIL:]
+        if len(recent) < STENCIL:
             self._left.append([])
             return np.zeros(len(values))
         first = recent[0][0]
         times = [(sample[0] - first) / SECOND for sample in recent]
         rows = [sample[1] for sample in recent]
-        weights = _weights(times)
+        weights = _difference_weights(times)
         columns = list(zip(*rows, strict=True))
         self._left.append([abs(sum(map(mul, weights, column))) for column in columns])
-        kept = [left for left in list(self._left)[-KEPT:] if left]
+        kept = [left for left in list(self._left)[-MEDIAN_WINDOW:] if left]
         middle = len(kept) // 2
-        sizes = [ROBUST * sorted(left)[middle] for left in zip(*kept, strict=True)]
+        sizes = [MAD_TO_SIGMA * sorted(left)[middle] for left in zip(*kept, strict=True)]
         if not differentiated or rate is None:
             return SIGMAS * np.array(sizes)
-        period = times[-1] / (POINTS - 1)
-        slope = _backward(*times[-3:])
+        period = times[-1] / (STENCIL - 1)
+        slope = _backward_slope_weights(*times[-3:])
         slack = SIGMAS * math.sqrt(sum(map(mul, slope, slope)))
         doubt = []
         for size, column, given in zip(sizes, columns, rate.tolist(), strict=True):
@@ -177,9 +177,9 @@ class RestWatch:
         return np.array(doubt)
 
 
-def _weights(times: list[float]) -> list[float]:
+def _difference_weights(times: list[float]) -> list[float]:
     """Return :func:`difference_weights` of seven times, in Python floats."""
-    step = times[-1] / (POINTS - 1)
+    step = times[-1] / (STENCIL - 1)
     weights = []
     for t in times:
         product = 1.0
@@ -191,7 +191,9 @@ def _weights(times: list[float]) -> list[float]:
     return [weight / length for weight in weights]
 
 
-def _backward(first: float, second: float, third: float) -> tuple[float, float, float]:
+def _backward_slope_weights(
+    first: float, second: float, third: float
+) -> tuple[float, float, float]:
     """Return the weights of a parabola's slope at the third of three times."""
     a, b = third - second, third - first
     return a / (b * (b - a)), -b / (a * (b - a)), (a + b) / (a * b)

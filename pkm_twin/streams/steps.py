@@ -17,38 +17,38 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from pkm_twin.codegen.arrays import Array, Mask
-from pkm_twin.streams.rest import ROBUST, SIGMAS, noise
+from pkm_twin.streams.rest import MAD_TO_SIGMA, SIGMAS, noise
 
-SLACK: Final = 5e-3
+STAMP_ERROR: Final = 5e-3
 """Largest error of stamps, s; a joint may be off by this time at its largest velocity."""
-FACTOR: Final = 2.0
+MAX_SPEED_RATIO: Final = 2.0
 """Largest mean velocity between two samples relative to the joint's velocity limit."""
-LATE: Final = 0.01
+VELOCITY_DELAY: Final = 0.01
 """Largest delay of measured velocities, s."""
-AROUND: Final = 5
+MEDIAN_STEPS: Final = 5
 """Number of steps whose median replaces a measured velocity."""
-GAP: Final = 3.5
+MAX_GAP_PERIODS: Final = 3.5
 """Over a gap of more periods than this only the velocity limits bound a move."""
-OFTEN: Final = 0.02
+MIN_JUMPING_FRACTION: Final = 0.02
 """Two publishers are looked for if more than this fraction of the steps jump."""
-PUBLISHER: Final = 0.05
+MIN_PUBLISHER_FRACTION: Final = 0.05
 """Smallest fraction of the samples that a publisher sends."""
-BEFORE: Final = 10
+LOOKBACK_SAMPLES: Final = 10
 """One of this number of samples before is from the same publisher."""
-FEW: Final = 0.85
+MOTION_QUANTILE: Final = 0.85
 """The velocity of the motion is this quantile over the samples; higher ones may be jumps."""
-NEARLY: Final = 0.95
+UNEXPLAINED_QUANTILE: Final = 0.95
 """Without measured velocities this quantile of the unexplained moves belongs to the motion."""
-LEAST: Final = 0.1
+NOISE_QUANTILE: Final = 0.1
 """Quantile of the second differences, small enough to lie within one publisher without jumps,"""
-OF_NOISE: Final = 0.1257 * 6.0**0.5
+NOISE_QUANTILE_VALUE: Final = 0.1257 * 6.0**0.5
 """and its value for noise of unit standard deviation: 0.1257 is this quantile of |N(0, 1)|; second
 differences have the weights 1, -2, 1."""
-ALTERNATING: Final = 16
+ALTERNATING_BLOCK: Final = 16
 """Alternating publishers are looked for in blocks of this number of samples,"""
 ALTERNATING_PART: Final = 0.75
 """of which at least this fraction must alternate."""
-AGAIN: Final = 3
+MAX_REPEATS: Final = 3
 """Longest run of repeated samples; a longer run is an encoder that stands still."""
 MIN_CROSSINGS: Final = 4
 """Fewest equal steps up and down in turn that identify play in a joint,"""
@@ -60,7 +60,7 @@ CROSSING_SPREAD: Final = 0.15
 """Largest median absolute deviation of the steps' sizes, relative to their median,"""
 CROSSING_TURNS: Final = 0.75
 """and smallest fraction of steps opposite to the one before: a pair in three samples is missed."""
-APART: Final = 0.25
+GAP_TOLERANCE: Final = 0.25
 """Largest difference of a gap due to missing samples from a whole number of periods, in periods."""
 
 
@@ -73,7 +73,7 @@ def farthest(velocity: Numbers, period: Numbers) -> Numbers:
     :param velocity: the joint's velocity limit.
     :param period: time between the samples' stamps, s.
     """
-    return velocity * (FACTOR * period + SLACK)
+    return velocity * (MAX_SPEED_RATIO * period + STAMP_ERROR)
 
 
 @dataclass(frozen=True)
@@ -110,32 +110,32 @@ def steps_of(
     span, move = np.diff(time)[:, None], np.diff(q, axis=0)
     period = float(np.median(span))
     rates = move / span
-    low, high = _bracket(qd, rates, period)
+    low, high = _bound_velocities(qd, rates, period)
     steps = np.abs(move)
-    tick = _tick(steps)
-    speed = np.quantile(_nearest(q), FEW, axis=0) / period
+    tick = _find_resolution(steps)
+    speed = np.quantile(_nearest_distances(q), MOTION_QUANTILE, axis=0) / period
     if qd is not None:
-        speed = np.maximum(speed, np.quantile(np.abs(qd), FEW, axis=0))
-    floor = 2.0 * SIGMAS * _noise(q) + 2.0 * tick
-    off = SIGMAS * ROBUST * float(np.median(np.abs(span - period)))
-    slack = max(min(SLACK, period), off) * speed + floor
-    near = span[:, 0] <= (GAP if qd is not None else 1.5) * period
+        speed = np.maximum(speed, np.quantile(np.abs(qd), MOTION_QUANTILE, axis=0))
+    floor = 2.0 * SIGMAS * _estimate_noise(q) + 2.0 * tick
+    off = SIGMAS * MAD_TO_SIGMA * float(np.median(np.abs(span - period)))
+    slack = max(min(STAMP_ERROR, period), off) * speed + floor
+    near = span[:, 0] <= (MAX_GAP_PERIODS if qd is not None else 1.5) * period
     sizes = np.maximum(np.maximum(move - high * span, low * span - move), 0.0)
     if qd is None and near.any():
         # Medians over several steps do not follow fast changes of the velocity.
-        slack = slack + SIGMAS * np.quantile(sizes[near], NEARLY, axis=0)
+        slack = slack + SIGMAS * np.quantile(sizes[near], UNEXPLAINED_QUANTILE, axis=0)
     sizes = np.where(near[:, None] & (sizes > slack), sizes, 0.0)
     if limit is not None:
         bound = farthest(np.asarray(limit, np.float64), span)
         sizes = np.where(steps > bound, np.maximum(sizes, steps), sizes)
     jumps = sizes > 0.0
     publishers: tuple[int, ...] = ()
-    if np.mean(jumps.any(1)) > OFTEN:
-        publishers = _publishers(q, floor + BEFORE * period * speed)
+    if np.mean(jumps.any(1)) > MIN_JUMPING_FRACTION:
+        publishers = _count_publisher_samples(q, floor + LOOKBACK_SAMPLES * period * speed)
     if not publishers:
-        apart = _alternating(time, q)
+        apart = _find_alternating_tracks(time, q)
         rows = apart.any(1)
-        if np.mean(rows) > 2.0 * PUBLISHER:
+        if np.mean(rows) > 2.0 * MIN_PUBLISHER_FRACTION:
             sizes = np.maximum(sizes, apart[1:])
             jumps, publishers = sizes > 0.0, (k - k // 2, k // 2)
     return Steps(jumps, sizes, publishers)
@@ -154,16 +154,16 @@ def repeats_of(time: Array, q: Array) -> Mask:
     if apart.all():
         return found
     own = [noise(time[new], one[new, None])[0] for one, new in zip(q.T, apart.T, strict=True)]
-    floor = 2.0 * SIGMAS * np.array(own) + 2.0 * _tick(np.abs(move))
+    floor = 2.0 * SIGMAS * np.array(own) + 2.0 * _find_resolution(np.abs(move))
     period = np.median(np.diff(time))
-    for count in range(1, min(AGAIN, len(move) - 3) + 1):
+    for count in range(1, min(MAX_REPEATS, len(move) - 3) + 1):
         around = np.array([0, 1, count + 2, count + 3])
         apart_from = np.prod(count + 1 - around) / (count + 1 - around)
         weights = apart_from / [np.prod([x - y for y in around if y != x]) for x in around]
         same = ~sliding_window_view(apart[2:-2], count, axis=0).any(-1) & apart[1 : -count - 2]
         # The cubic assumes even times: skip samples next to a gap.
         span = time[count + 3 :] - time[: -count - 3]
-        rows = np.flatnonzero(same.any(1) & (span < (count + GAP) * period))
+        rows = np.flatnonzero(same.any(1) & (span < (count + MAX_GAP_PERIODS) * period))
         away = np.abs(np.einsum("p,kpn->kn", weights, q[rows[:, None] + around]) - q[rows + 1])
         for k in rows[(same[rows] & (away > floor)).any(1)]:
             found[k + 2 : k + count + 2] = True
@@ -183,8 +183,8 @@ def find_play(q: Array) -> tuple[Array, NDArray[np.int64]]:
     if len(q) < 6:
         return size, count
     bent = np.diff(q, 3, axis=0) / -2.0
-    floor = CROSSING_SIGMAS * ROBUST * np.median(np.abs(bent), axis=0)
-    floor = np.maximum(floor, CROSSING_TICKS * _tick(np.abs(np.diff(q, axis=0))))
+    floor = CROSSING_SIGMAS * MAD_TO_SIGMA * np.median(np.abs(bent), axis=0)
+    floor = np.maximum(floor, CROSSING_TICKS * _find_resolution(np.abs(np.diff(q, axis=0))))
     middle, before, after = bent[1:-1], bent[:-2], bent[2:]
     against = np.maximum(np.sign(middle) * before, np.sign(middle) * after)
     sharp = (np.abs(middle) > floor) & (against < -0.25 * np.abs(middle))
@@ -199,49 +199,51 @@ def find_play(q: Array) -> tuple[Array, NDArray[np.int64]]:
     return size, count
 
 
-def _tick(steps: Array) -> Array:
+def _find_resolution(steps: Array) -> Array:
     """Return the smallest step of each column (the encoder's resolution), (n,); zero without."""
     least = np.where(steps > 0.0, steps, np.inf).min(0)
     return np.where(np.isfinite(least), least, 0.0)
 
 
-def _nearest(q: Array) -> Array:
-    """Return the distance of each sample to the nearest of the BEFORE samples before, (k - 1, n).
+def _nearest_distances(q: Array) -> Array:
+    """Return each sample's distance to the nearest of the LOOKBACK_SAMPLES before, (k - 1, n).
 
     With two publishers at least one of these samples is from the same publisher.
     """
-    lags = [np.abs(q[lag:] - q[:-lag]) for lag in range(1, min(BEFORE, len(q) - 1) + 1)]
+    lags = [np.abs(q[lag:] - q[:-lag]) for lag in range(1, min(LOOKBACK_SAMPLES, len(q) - 1) + 1)]
     least = lags[0].copy()
     for lag, apart in enumerate(lags[1:], 1):
         least[lag:] = np.minimum(least[lag:], apart)
     return least
 
 
-def _noise(q: Array) -> Array:
+def _estimate_noise(q: Array) -> Array:
     """Estimate the standard deviation of the positions' noise, (n,), also with two publishers."""
     found = np.full(q.shape[1], np.inf)
     for lag in (1, 2, 3):
         if len(q) > 2 * lag:
             bent = np.abs(q[2 * lag :] - 2.0 * q[lag:-lag] + q[: -2 * lag])
-            found = np.minimum(found, np.quantile(bent, LEAST, axis=0) / OF_NOISE)
+            found = np.minimum(
+                found, np.quantile(bent, NOISE_QUANTILE, axis=0) / NOISE_QUANTILE_VALUE
+            )
     return np.where(np.isfinite(found), found, 0.0)
 
 
-def _bracket(qd: Array | None, rates: Array, period: float) -> tuple[Array, Array]:
+def _bound_velocities(qd: Array | None, rates: Array, period: float) -> tuple[Array, Array]:
     """Return the smallest and the largest velocity around each step, shape (k - 1, n) each."""
     if qd is None:
         # Medians before and after the step exclude the step itself, which may be a jump.
-        wide = np.pad(rates, ((AROUND, AROUND), (0, 0)), mode="edge")
-        around = np.median(sliding_window_view(wide, AROUND, axis=0), -1)
-        before, after = around[: len(rates)], around[AROUND + 1 :]
+        wide = np.pad(rates, ((MEDIAN_STEPS, MEDIAN_STEPS), (0, 0)), mode="edge")
+        around = np.median(sliding_window_view(wide, MEDIAN_STEPS, axis=0), -1)
+        before, after = around[: len(rates)], around[MEDIAN_STEPS + 1 :]
         return np.minimum(before, after), np.maximum(before, after)
-    reach = min(max(1, round(LATE / period)), len(qd) - 1)
+    reach = min(max(1, round(VELOCITY_DELAY / period)), len(qd) - 1)
     wide = np.pad(qd, ((reach - 1, reach - 1), (0, 0)), mode="edge")
     windows = sliding_window_view(wide, 2 * reach, axis=0)
     return windows.min(-1), windows.max(-1)
 
 
-def _alternating(time: Array, q: Array) -> Array:
+def _find_alternating_tracks(time: Array, q: Array) -> Array:
     """Return the distance of two tracks between which samples alternate, (k, n); zero elsewhere.
 
     The difference of each sample from the line through its neighbours, with the sign reversed at
@@ -249,25 +251,25 @@ def _alternating(time: Array, q: Array) -> Array:
     tracks. Each track contributes up to half of its own move over two samples.
     """
     found = np.zeros_like(q)
-    blocks = (len(q) - 2) // ALTERNATING
+    blocks = (len(q) - 2) // ALTERNATING_BLOCK
     if blocks < 1:
         return found
     size = np.maximum(noise(time[::2], q[::2]), noise(time[1::2], q[1::2]))
     span = np.diff(time)[:, None]
     line = (q[:-2] * span[1:] + q[2:] * span[:-1]) / (span[1:] + span[:-1])
     signs = np.where(np.arange(len(line)) % 2, -1.0, 1.0)[:, None]
-    shape = (blocks, ALTERNATING, q.shape[1])
-    bent = (signs * (q[1:-1] - line))[: blocks * ALTERNATING].reshape(shape)
+    shape = (blocks, ALTERNATING_BLOCK, q.shape[1])
+    bent = (signs * (q[1:-1] - line))[: blocks * ALTERNATING_BLOCK].reshape(shape)
     twice = np.abs(q[2:] - q[:-2])
-    moved = twice[: blocks * ALTERNATING].reshape(shape).mean(1)
+    moved = twice[: blocks * ALTERNATING_BLOCK].reshape(shape).mean(1)
     bent *= np.sign(bent.sum(1, keepdims=True))
-    clear = bent > np.maximum(moved + SIGMAS * size, 2.0 * _tick(twice))[:, None]
+    clear = bent > np.maximum(moved + SIGMAS * size, 2.0 * _find_resolution(twice))[:, None]
     apart = np.where(clear.mean(1) > ALTERNATING_PART, bent.mean(1), 0.0)
-    found[1 : blocks * ALTERNATING + 1] = np.repeat(apart, ALTERNATING, 0)
+    found[1 : blocks * ALTERNATING_BLOCK + 1] = np.repeat(apart, ALTERNATING_BLOCK, 0)
     return found
 
 
-def _publishers(q: Array, slack: Array) -> tuple[int, ...]:
+def _count_publisher_samples(q: Array, slack: Array) -> tuple[int, ...]:
     """Count the samples of two smooth tracks; return nothing if there is only one."""
     scale = 1.0 / np.maximum(slack, 1e-300)
     rows = (q * scale).tolist()
@@ -275,7 +277,7 @@ def _publishers(q: Array, slack: Array) -> tuple[int, ...]:
     for k, row in enumerate(rows[1:], 1):
         far = [max(abs(a - b) for a, b in zip(row, other, strict=True)) for other in last]
         nearest = far.index(min(far))
-        if far[nearest] > max(1.0, (k - seen[nearest]) / BEFORE):
+        if far[nearest] > max(1.0, (k - seen[nearest]) / LOOKBACK_SAMPLES):
             if len(last) == 1:
                 last.append(row)
                 counts.append(1)
@@ -286,10 +288,14 @@ def _publishers(q: Array, slack: Array) -> tuple[int, ...]:
         current = nearest
         last[nearest], seen[nearest] = row, k
         counts[nearest] += 1
-    if len(counts) < 2 or min(counts) < PUBLISHER * len(rows) or jumps > OFTEN * len(rows):
+    if (
+        len(counts) < 2
+        or min(counts) < MIN_PUBLISHER_FRACTION * len(rows)
+        or jumps > MIN_JUMPING_FRACTION * len(rows)
+    ):
         return ()
     # Few changes between the tracks mean a single publisher with an offset for some time.
-    if turns < min(counts) / BEFORE:
+    if turns < min(counts) / LOOKBACK_SAMPLES:
         return ()
     return tuple(counts)
 
@@ -321,8 +327,8 @@ def sampling_of(time: Array) -> Sampling:
         period = float(spans.sum() / whole.sum())
     long = spans / period
     long = long[long > 1.5]
-    odd = np.abs(long - np.round(long)) > APART
-    if len(long) > 0.1 * len(spans) and odd.mean() > APART:
+    odd = np.abs(long - np.round(long)) > GAP_TOLERANCE
+    if len(long) > 0.1 * len(spans) and odd.mean() > GAP_TOLERANCE:
         return Sampling(float(np.median(spans)), len(time), None)
     expected = int(whole.sum()) + 1
     return Sampling(period, expected, expected - len(time))

@@ -17,7 +17,7 @@ from pkm_twin.codegen import cache
 from pkm_twin.codegen import code as codes
 from pkm_twin.codegen import expressions as ex
 from pkm_twin.codegen import operations as op
-from pkm_twin.codegen.cholesky import FLOOR, trace_over
+from pkm_twin.codegen.cholesky import MIN_PIVOT_RATIO, trace_over
 from pkm_twin.codegen.code import Code
 from pkm_twin.codegen.expressions import tangents
 from pkm_twin.codegen.kernels import Kernel
@@ -489,4 +489,4 @@ def test_trace_over_sparse_matrices(rng):
 
 def test_trace_over_a_matrix_without_inverse_is_large_and_finite():
     found = trace_over(np.eye(2), np.ones((2, 2)))
-    assert 1e12 < found <= 2.0 / FLOOR
+    assert 1e12 < found <= 2.0 / MIN_PIVOT_RATIO

@@ -18,7 +18,13 @@ from pkm_twin.errors import PkmTwinError
 from pkm_twin.paths.along import torque_table
 from pkm_twin.recordings import ReadOptions, Recording, read
 from pkm_twin.streams.differentiator import Differentiator
-from pkm_twin.streams.rest import RestWatch, fit_gain, gradient_gain, noise, rate_doubt
+from pkm_twin.streams.rest import (
+    VelocityErrorEstimator,
+    fit_gain,
+    gradient_gain,
+    noise,
+    velocity_error_bound,
+)
 from test.laws.recordings import smooth_motion
 from test.nodes.harness import SECOND, Maker, Plain
 from test.support.robots import SHIPPED, joint_range, load, loaded_like, partly_long
@@ -73,7 +79,7 @@ def test_a_rate_beyond_its_doubt_has_the_true_sign(jitter: float, size: float) -
     q, true = stops_and_goes(rng, time, 6)
     seen = q + size * rng.normal(size=q.shape)
     rate = np.gradient(seen, time, axis=0, edge_order=2)
-    doubt = rate_doubt(time, seen, gradient_gain(time))
+    doubt = velocity_error_bound(time, seen, gradient_gain(time))
     beyond = np.abs(rate) > doubt
     wrong = beyond & (np.sign(rate) != np.sign(true))
     # At rest a few in ten thousand are beyond four standard deviations.
@@ -95,7 +101,7 @@ def test_a_streams_rate_beyond_its_doubt_has_the_true_sign(measured: bool, size:
     seen = q + size * rng.normal(size=q.shape)
     speeds = true + 100.0 * size * rng.normal(size=q.shape)
     differentiator = Differentiator(order, window)
-    watch = RestWatch(fit_gain(order + 1, window, window - 1))
+    watch = VelocityErrorEstimator(fit_gain(order + 1, window, window - 1))
     wrong, known = [], []
     for k, t in enumerate((SECOND * time).round().astype(int).tolist()):
         qd = speeds[k] if measured else None
@@ -111,7 +117,7 @@ def test_a_streams_rate_beyond_its_doubt_has_the_true_sign(measured: bool, size:
 
 def test_a_sample_that_is_taken_back_leaves_nothing_behind() -> None:
     rng = np.random.default_rng(4)
-    one, other = RestWatch(100.0), RestWatch(100.0)
+    one, other = VelocityErrorEstimator(100.0), VelocityErrorEstimator(100.0)
     for k in range(40):
         q = rng.normal(size=2)
         other.push(1000 * (k * 1000) + 500, 1e3 * q, None, q)
