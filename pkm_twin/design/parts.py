@@ -35,18 +35,18 @@ from pkm_twin.machine.joints import across, unit
 from pkm_twin.machine.places import full_keys, keys_of, path_of
 from pkm_twin.robot.robot import SINGULARITY_BOUND, Robot
 
-CONSISTENT: Final = 1e-6
+MAX_OPEN_FRACTION: Final = 1e-6
 """Largest part of an error's rows that may stay open where the parts can be assembled."""
-CLOSED: Final = 1e-12
+STEP_TOLERANCE: Final = 1e-12
 """Last correction of an assembly, of unit one."""
-CORRECTIONS: Final = 30
-POINTS: Final = 1e-3 * np.array([-2.0, -1.0, 1.0, 2.0])
-WEIGHTS: Final = np.array([1.0, -8.0, 8.0, -1.0]) / 12e-3
+MAX_ITERATIONS: Final = 30
+STENCIL: Final = 1e-3 * np.array([-2.0, -1.0, 1.0, 2.0])
+STENCIL_WEIGHTS: Final = np.array([1.0, -8.0, 8.0, -1.0]) / 12e-3
 """Differences of fourth order: errors of a rigid part change its rows smoothly."""
 
 CLEARANCE: Final = ("clearance[0]", "clearance[1]", "clearance[2]")
 """A joint's clearance, along each of the base axes at home."""
-ENDS: Final = {
+ERROR_KEYS: Final = {
     "bodies": ["length"], "rods": ["length"],
     "joints": ["at[0]", "at[1]", "at[2]", "axis[0]", "axis[1]", "offset", "backlash",
                *CLEARANCE],
@@ -80,28 +80,28 @@ def part_of(robot: Robot, path: str) -> Part | None:
     """
     keys = full_keys(path)
     if "," in path:
-        return _alike(robot, path)
-    if keys[0] not in (*ENDS, "limbs"):
+        return _join_parts(robot, path)
+    if keys[0] not in (*ERROR_KEYS, "limbs"):
         numbers = robot.file_numbers()
         if keys[0] in {keys_of(number)[0] for number in numbers}:
             return None
-        raise unknown_number(path, [*map(path_of, _known(robot)), *numbers])
+        raise unknown_number(path, [*map(path_of, _error_keys(robot)), *numbers])
     effects: dict[Effect, Array] = {}
     texts, unit_ = [], ""
     for kind, name, where, azimuth in robot.named(keys):
-        found = _effects(robot, kind, name, where, rotation_about_z(azimuth), path)
+        found = _part_effects(robot, kind, name, where, rotation_about_z(azimuth), path)
         if found is None:
             break
         effects |= found[0]
         texts.append(found[1])
         unit_ = found[2]
     if not effects:
-        raise _unknown(robot, keys, path)
+        raise _explain_unknown(robot, keys, path)
     alike = ", and its copies alike" if len(texts) > 1 else ""
     return Part(effects, texts[0] + alike, unit_)
 
 
-def _alike(robot: Robot, path: str) -> Part:
+def _join_parts(robot: Robot, path: str) -> Part:
     """The part that several paths name together."""
     effects: dict[Effect, Array] = {}
     found: list[Part] = []
@@ -116,14 +116,14 @@ def _alike(robot: Robot, path: str) -> Part:
     return Part(effects, f"{found[0].text}, and {len(found) - 1} more alike", found[0].unit)
 
 
-def _known(robot: Robot) -> Iterator[list[str | int]]:
+def _error_keys(robot: Robot) -> Iterator[list[str | int]]:
     """The keys of every error that is a path's form."""
     places: dict[tuple[str | int, ...], str] = {}
-    for kind in ENDS:
+    for kind in ERROR_KEYS:
         places |= {(kind, name): kind for name in getattr(robot.graph, kind)}
     for (kind, _), source in getattr(robot, "sources", {}).items():
         places[source.path] = kind
-    return ([*place, *keys_of(end)] for place, kind in places.items() for end in ENDS[kind])
+    return ([*place, *keys_of(end)] for place, kind in places.items() for end in ERROR_KEYS[kind])
 
 
 def error_of(path: str) -> str:
@@ -138,7 +138,7 @@ def matching(robot: Robot, pattern: str) -> list[str]:
     """
     fits = re.compile(".*".join(map(re.escape, pattern.split("*")))).fullmatch
     found = []
-    for path in map(path_of, _known(robot)):
+    for path in map(path_of, _error_keys(robot)):
         if fits(error_of(path)):
             with contextlib.suppress(ParameterError):
                 part_of(robot, path)
@@ -148,9 +148,9 @@ def matching(robot: Robot, pattern: str) -> list[str]:
     return list(dict.fromkeys(found))
 
 
-def _unknown(robot: Robot, keys: Sequence[str | int], path: str) -> ParameterError:
+def _explain_unknown(robot: Robot, keys: Sequence[str | int], path: str) -> ParameterError:
     """The error of a path without a part: by its first word that there is not."""
-    known = list(_known(robot))
+    known = list(_error_keys(robot))
     for k in range(len(keys) + 1):
         words = {str(one[k]) for one in known if one[:k] == keys[:k] and len(one) > k}
         if k < len(keys) and words and str(keys[k]) not in words:
@@ -161,7 +161,7 @@ def _unknown(robot: Robot, keys: Sequence[str | int], path: str) -> ParameterErr
     raise AssertionError(path)
 
 
-def _effects(
+def _part_effects(
     robot: Robot, kind: str, name: str, where: Sequence[str | int], turn: Array, path: str
 ) -> tuple[dict[Effect, Array], str, str] | None:
     """What one entry's error moves, in words, and its unit; None where it has none of that name."""
@@ -170,7 +170,7 @@ def _effects(
         case "rods", "length":
             return {("length", name): np.ones(1)}, f"{name} longer", "m"
         case "bodies", "length":
-            return _longer(robot, name, path), f"{name} longer", "m"
+            return _lengthen_body(robot, name, path), f"{name} longer", "m"
         case "joints", ("offset" | "backlash") as what:
             joint = graph.joints[name]
             if name not in graph.leads:
@@ -194,7 +194,7 @@ def _effects(
     return None
 
 
-def _longer(robot: Robot, body: str, path: str) -> dict[Effect, Array]:
+def _lengthen_body(robot: Robot, body: str, path: str) -> dict[Effect, Array]:
     """All points of a body but its joint towards the base, along the line to their mean.
 
     Where all its joints turn about parallel axes, the line is across these: a part along them would
@@ -233,10 +233,10 @@ def _longer(robot: Robot, body: str, path: str) -> dict[Effect, Array]:
     if len(moved) == len(own) - 1 and all(joint.kind == "revolute" for joint in own):
         axis = start.axes[0]
         flat = line - axis * (axis @ line)
-        parallel = all(np.linalg.norm(np.cross(j.axes[0], axis)) < CONSISTENT for j in own)
-        if parallel and float(np.linalg.norm(flat)) > CONSISTENT * graph.size:
+        parallel = all(np.linalg.norm(np.cross(j.axes[0], axis)) < MAX_OPEN_FRACTION for j in own)
+        if parallel and float(np.linalg.norm(flat)) > MAX_OPEN_FRACTION * graph.size:
             line = flat
-    if not float(np.linalg.norm(line)) > CONSISTENT * graph.size:
+    if not float(np.linalg.norm(line)) > MAX_OPEN_FRACTION * graph.size:
         raise ParameterError(path, start.name, "a body with points apart from that joint")
     return dict.fromkeys(moved, unit(line))
 
@@ -266,11 +266,11 @@ class Placed:
 
     def moved(self, twists: Mapping[str, Array]) -> Placed:
         """After displacements of the origin and small turns, shape (..., 6) each."""
-        rotation = {n: turned(v[..., 3:]) @ self.rotation[n] for n, v in twists.items()}
+        rotation = {n: rotation_about(v[..., 3:]) @ self.rotation[n] for n, v in twists.items()}
         return Placed(rotation, {n: self.origin[n] + v[..., :3] for n, v in twists.items()})
 
 
-def turned(vector: Array) -> Array:
+def rotation_about(vector: Array) -> Array:
     """Rotation by a vector's length about it, shape (..., 3, 3)."""
     angle = np.linalg.norm(vector, axis=-1)[..., None, None]
     x, y, z = np.moveaxis(vector, -1, 0)
@@ -281,7 +281,7 @@ def turned(vector: Array) -> Array:
 
 
 def rotation_vector(rotation: Array) -> Array:
-    """The vector of :func:`turned`, of less than half a turn, shape (..., 3)."""
+    """The vector of :func:`rotation_about`, of less than half a turn, shape (..., 3)."""
     r = rotation
     twice = np.stack(
         [r[..., 2, 1] - r[..., 1, 2], r[..., 0, 2] - r[..., 2, 0], r[..., 1, 0] - r[..., 0, 1]], -1
@@ -320,7 +320,7 @@ class Assembly:
             if joint.virtual or (only is not None and joint.name not in only):
                 continue
             value = q[..., names.index(joint.name)] if joint.name in self.graph.leads else None
-            found += self._joint(joint, placed, value, errors)
+            found += self._joint_rows(joint, placed, value, errors)
         for rod in self.graph.rods.values():
             if only is not None and rod.name not in only:
                 continue
@@ -364,7 +364,7 @@ class Assembly:
         arm = (placed.rotation[body] @ (local - self.at[body])[..., None])[..., 0]
         return np.asarray(placed.origin[body] + arm)
 
-    def _joint(
+    def _joint_rows(
         self, joint: Joint, placed: Placed, value: Array | None, errors: Mapping[Effect, Array]
     ) -> list[Row]:
         a, b = joint.inner, joint.outer
@@ -373,7 +373,7 @@ class Assembly:
         apart, none = point - first, np.zeros(3)
         inner, outer = (np.eye(3) if n == BASE else placed.rotation[n] for n in (a, b))
         if ("tilt", joint.name) in errors:
-            inner = inner @ turned(errors["tilt", joint.name])
+            inner = inner @ rotation_about(errors["tilt", joint.name])
         rows: list[Row] = []
 
         def add(value: Array, force: Array, moment: Array, scale: float) -> None:
@@ -450,17 +450,17 @@ class Assembly:
             raise SingularityError(f"the joint state {state}", (), float(np.min(measure)), bound)
         return q, r
 
-    def _solved(self, values: Array) -> Array:
+    def _solve_twists(self, values: Array) -> Array:
         """Twists, of unit one, that take rows (..., rows, k) to zero in the least squares."""
         q, r = self._factors
         return np.asarray(-np.linalg.solve(r, q.swapaxes(-1, -2) @ values), np.float64)
 
-    def _slope(self, part: Part) -> Array:
+    def _differentiate(self, part: Part) -> Array:
         """Derivatives of the rows by an error, shape (..., rows, 1), by differences."""
         scale = self.size if part.unit == "m" else 1.0
         moving, shape = {name for _, name in part.effects}, self.q.shape[:-1]
         total: Any = 0.0
-        for point, weight in zip(POINTS, WEIGHTS, strict=True):
+        for point, weight in zip(STENCIL, STENCIL_WEIGHTS, strict=True):
             errors = {what: scale * point * vector for what, vector in part.effects.items()}
             moved = iter(self.rows(self.placed, self.q, errors, moving))
             values = [
@@ -476,8 +476,8 @@ class Assembly:
         :returns: displacement of the reference point and small turn per unit of each error, base
             axes, shape (..., 6, parts); greatest part of its rows that stays open, shape (parts,).
         """
-        columns = np.concatenate([self._slope(part) for part in parts], -1)
-        found = self._solved(columns)
+        columns = np.concatenate([self._differentiate(part) for part in parts], -1)
+        found = self._solve_twists(columns)
         left = columns - self._factors[0] @ (self._factors[0].swapaxes(-1, -2) @ columns)
         whole = np.maximum(np.linalg.norm(columns, axis=-2), np.finfo(float).tiny)
         missed = (np.linalg.norm(left, axis=-2) / whole).reshape(-1, len(parts)).max(0, initial=0.0)
@@ -517,19 +517,19 @@ class Assembly:
             {n: np.broadcast_to(o, (*shape, 3)) for n, o in self.placed.origin.items()},
         )
         worst = 0
-        for _ in range(CORRECTIONS):
+        for _ in range(MAX_ITERATIONS):
             rows = self.rows(placed, self.q, errors)
             values = np.stack([np.broadcast_to(row.value, shape) for row in rows], -1)
-            step = np.moveaxis(self._solved(np.moveaxis(values, 0, -1)), -1, 0)
+            step = np.moveaxis(self._solve_twists(np.moveaxis(values, 0, -1)), -1, 0)
             twists = step.reshape(*shape, -1, 6) * ([self.size] * 3 + [1.0] * 3)
             placed = placed.moved({n: twists[..., k, :] for k, n in enumerate(self.bodies)})
             last = float(np.abs(step).max())
             worst = int(np.abs(values).max(-1).max(0).argmax())
             if not last < 1.0:
                 break
-            if last < CLOSED:
+            if last < STEP_TOLERANCE:
                 left = float(np.abs(values).max())
-                if left > CONSISTENT:
+                if left > MAX_OPEN_FRACTION:
                     break
                 name, origin = self.graph.platform, self.graph.origin
                 there = self._point(placed, name, origin, errors.get(("origin", name)))

@@ -86,7 +86,7 @@ class PosePath:
         return float(self.time[-1] - self.time[0])
 
 
-class Followed:
+class PathMotion:
     """Machines (k) on a path: joints, efforts and what else is asked; NaN where one cannot.
 
     Derivatives are of one machine, by its numbers (d).
@@ -95,14 +95,14 @@ class Followed:
     def __init__(self, many: Variants, path: PosePath) -> None:
         self.many, self.path = many, path
 
-    def _each(self, values: Array) -> Array:
+    def _for_machines(self, values: Array) -> Array:
         """Samples given to every machine by itself: no count of samples is taken for machines."""
         return np.broadcast_to(values, (len(self.many), *values.shape))
 
     @cached_property
     def q(self) -> Array:
         """Shape (k, t, n)."""
-        return self.many.inverse(self._each(self.path.pose))
+        return self.many.inverse(self._for_machines(self.path.pose))
 
     @cached_property
     def jacobian(self) -> Array:
@@ -111,7 +111,7 @@ class Followed:
         good = np.isfinite(found).all((-1, -2), keepdims=True)
         return np.where(good, found, np.eye(*found.shape[-2:]))
 
-    def _solved(self, right: Array) -> Array:
+    def _solve_jacobian(self, right: Array) -> Array:
         """J^-1 times vectors (k, t, m); of drives that share efforts as ``inverse_jacobian``."""
         robot = self.many.robot
         if not robot.redundant:
@@ -122,7 +122,9 @@ class Followed:
     @cached_property
     def qd(self) -> Array:
         """Shape (k, t, n)."""
-        return np.where(np.isfinite(self.q), self._solved(self._each(self.path.rate)), np.nan)
+        return np.where(
+            np.isfinite(self.q), self._solve_jacobian(self._for_machines(self.path.rate)), np.nan
+        )
 
     @cached_property
     def qdd(self) -> Array:
@@ -131,12 +133,12 @@ class Followed:
         if self.many.robot.redundant:
             own = self.many.agreeing(self.q, self.qd, own)[2]
         bent = self.many.pose_acceleration(self.q, self.qd, own)
-        return own + self._solved(self._each(self.path.acceleration) - bent)
+        return own + self._solve_jacobian(self._for_machines(self.path.acceleration) - bent)
 
     @cached_property
     def efforts(self) -> Array:
         """Shape (k, t, n), N m or N."""
-        load = self._each(self.path.wrench)
+        load = self._for_machines(self.path.wrench)
         return self.many.inverse_dynamics(self.q, self.qd, self.qdd, load)
 
     @cached_property
@@ -147,7 +149,7 @@ class Followed:
     @cached_property
     def compliance(self) -> Array:
         """Shape (k, t, 6, 6)."""
-        return self.many.compliance(self._each(self.path.pose))
+        return self.many.compliance(self._for_machines(self.path.pose))
 
     @cached_property
     def deflection(self) -> Array:
@@ -163,7 +165,7 @@ class Followed:
 
         :param weights: w, shape (t, n); ``rates``: r, ``changes``: c, shape (t, n), None is none.
         """
-        state = (self.q, self.qd, self.qdd, self._each(self.path.wrench), weights[None])
+        state = (self.q, self.qd, self.qdd, self._for_machines(self.path.wrench), weights[None])
         (by_q, by_qd, by_qdd), _ = self.many.run(programs.torque_gradient, *state)
         (of_geometry, of_masses), _ = self.many.run(programs.torque_numbers, *state)
         if rates is not None:

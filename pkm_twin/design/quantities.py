@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pkm_twin.codegen.arrays import Array
-from pkm_twin.design.pose_path import Followed
+from pkm_twin.design.pose_path import PathMotion
 from pkm_twin.errors import ParameterError, UnknownNameError
 from pkm_twin.robot.numbers import FileNumbers
 from pkm_twin.robot.robot import Robot
@@ -38,12 +38,12 @@ class Quantity:
 
     name: str
     meaning: str
-    of: Callable[[Followed], Array]
-    slopes: Callable[[Followed, Index], Array]
+    of: Callable[[PathMotion], Array]
+    slopes: Callable[[PathMotion, Index], Array]
     sampled: bool = False
     least: bool = False
 
-    def pieces(self, followed: Followed) -> Array:
+    def pieces(self, followed: PathMotion) -> Array:
         """Of k machines, shape (k, pieces)."""
         found = self.of(followed)
         return found.reshape(len(found), -1)
@@ -85,7 +85,7 @@ class Constraint:
             bound = math.nan
         if match is None or not math.isfinite(bound):
             raise ParameterError("subject-to", text, "NAME<=NUMBER or singularity>=NUMBER")
-        quantity = quantity_of(match[1], "subject-to")
+        quantity = find_quantity(match[1], "subject-to")
         if (match[2] == ">=") != quantity.least:
             side = ">=" if quantity.least else "<="
             raise ParameterError("subject-to", text, f"{quantity.name}{side}{match[3]}")
@@ -118,11 +118,11 @@ def effort_scales(robot: Robot) -> Array:
     return 1.0 / np.asarray(limit, np.float64)
 
 
-def _peak(f: Followed) -> Array:
+def _peak_efforts(f: PathMotion) -> Array:
     return np.abs(f.efforts) * effort_scales(f.many.robot)
 
 
-def _peak_slopes(f: Followed, places: Index) -> Array:
+def _peak_slopes(f: PathMotion, places: Index) -> Array:
     rows = np.arange(len(places))
     weights = np.zeros(f.efforts.shape[1:])
     scale = effort_scales(f.many.robot)[places]
@@ -130,32 +130,32 @@ def _peak_slopes(f: Followed, places: Index) -> Array:
     return f.effort_slopes(weights)
 
 
-def _root(f: Followed, values: Array) -> Array:
+def _rms_over_time(f: PathMotion, values: Array) -> Array:
     """Root mean square over time of values (k, t, n), shape (k, n)."""
     squares = (f.path.weights[:, None] * values**2).sum(1) / f.path.duration
     return np.asarray(np.sqrt(squares), np.float64)
 
 
-def _root_weights(f: Followed, values: Array, place: int) -> Array:
+def _rms_gradient(f: PathMotion, values: Array, place: int) -> Array:
     """Derivatives of one of them by the values of one machine, shape (t,)."""
-    root = _root(f, values)[0, place] * f.path.duration
+    root = _rms_over_time(f, values)[0, place] * f.path.duration
     return np.asarray(f.path.weights * values[0, :, place] / max(root, 1e-300), np.float64)
 
 
-def _rms(f: Followed) -> Array:
-    return _root(f, f.efforts) * effort_scales(f.many.robot)
+def _rms_efforts(f: PathMotion) -> Array:
+    return _rms_over_time(f, f.efforts) * effort_scales(f.many.robot)
 
 
-def _rms_slopes(f: Followed, places: Index) -> Array:
+def _rms_slopes(f: PathMotion, places: Index) -> Array:
     scales, rows = effort_scales(f.many.robot), []
     for place in places:
         weights = np.zeros(f.efforts.shape[1:])
-        weights[:, place] = scales[place] * _root_weights(f, f.efforts, place)
+        weights[:, place] = scales[place] * _rms_gradient(f, f.efforts, place)
         rows.append(f.effort_slopes(weights).sum(0))
     return np.array(rows)
 
 
-def _gears(robot: Robot) -> list[Any]:
+def _list_gear_numbers(robot: Robot) -> list[Any]:
     """Turns, inertias of the rotors and efficiencies of the drives."""
     drives = [drive for drive in robot.drives if drive is not None]
     if len(drives) < robot.joints_count:
@@ -164,18 +164,20 @@ def _gears(robot: Robot) -> list[Any]:
     return [*found, *(drive.inertia for drive in drives), *(drive.efficiency for drive in drives)]
 
 
-def _motor(f: Followed) -> tuple[Array, Array, Array, Array, Array]:
+def _motor_torques(f: PathMotion) -> tuple[Array, Array, Array, Array, Array]:
     """Torques of the motors, as :mod:`pkm_twin.paths.sizing` has them, shape (k, t, n), and the
     losses; turns, inertias and efficiencies, shape (k, 1, n).
     """
-    turns, inertia, share = np.split(_file_numbers(f, _gears)(f.many.values)[:, None], 3, -1)
+    turns, inertia, share = np.split(
+        _cached_numbers(f, _list_gear_numbers)(f.many.values)[:, None], 3, -1
+    )
     through = f.efforts - inertia * turns**2 * f.qdd
     losses = np.where(through * f.qd < 0.0, share, 1.0 / share)
     return inertia * turns * f.qdd + through * losses / turns, losses, turns, inertia, share
 
 
-def _motor_slopes(f: Followed, places: Index) -> Array:
-    torques, losses, *numbers = _motor(f)
+def _motor_slopes(f: PathMotion, places: Index) -> Array:
+    torques, losses, *numbers = _motor_torques(f)
     loss, tau, qdd = losses[0], f.efforts[0], f.qdd[0]
     turns, inertia, share = (values[0] for values in numbers)
     through = tau - inertia * turns**2 * qdd
@@ -185,11 +187,15 @@ def _motor_slopes(f: Followed, places: Index) -> Array:
         turns * qdd * (1.0 - loss),
         through / turns * np.where(through * f.qd[0] < 0.0, 1.0, -1.0 / share**2),
     )
-    slopes = _file_numbers(f, _gears).slopes_at(f.many.values)[0].reshape(3, len(turns[0]), -1)
+    slopes = (
+        _cached_numbers(f, _list_gear_numbers)
+        .slopes_at(f.many.values)[0]
+        .reshape(3, len(turns[0]), -1)
+    )
     rows = []
     for place in places:
         weights = np.zeros(tau.shape)
-        weights[:, place] = _root_weights(f, torques, place)
+        weights[:, place] = _rms_gradient(f, torques, place)
         along = f.effort_slopes(
             weights * loss / turns, None, weights * inertia * turns * (1.0 - loss)
         )
@@ -200,22 +206,22 @@ def _motor_slopes(f: Followed, places: Index) -> Array:
     return np.array(rows)
 
 
-def _energy(f: Followed) -> Array:
+def _energy(f: PathMotion) -> Array:
     power = np.maximum(f.efforts * f.qd, 0.0)
     return np.asarray((f.path.weights[:, None] * power).sum((1, 2))[:, None], np.float64)
 
 
-def _energy_slopes(f: Followed, places: Index) -> Array:
+def _energy_slopes(f: PathMotion, places: Index) -> Array:
     given = (f.efforts * f.qd > 0.0)[0] * f.path.weights[:, None]
     rows = f.effort_slopes(given * f.qd[0], given * f.efforts[0])
     return np.repeat(rows.sum(0)[None], len(places), 0)
 
 
-def _deflection(f: Followed) -> Array:
+def _deflection(f: PathMotion) -> Array:
     return np.asarray(np.linalg.norm(f.deflection[..., :3], axis=-1)[..., None], np.float64)
 
 
-def _deflection_slopes(f: Followed, places: Index) -> Array:
+def _deflection_slopes(f: PathMotion, places: Index) -> Array:
     del places
     moved = f.deflection[0, :, :3]
     size = np.linalg.norm(moved, axis=-1, keepdims=True)
@@ -230,7 +236,7 @@ def _moving_masses(robot: Robot) -> list[Any]:
     return [sum((rod.mass for rod in graph.rods.values()), sum(parts, 0.0))]
 
 
-def _file_numbers(f: Followed, of: Callable[[Robot], list[Any]]) -> FileNumbers:
+def _cached_numbers(f: PathMotion, of: Callable[[Robot], list[Any]]) -> FileNumbers:
     """Of the machines' numbers, made once."""
     functions = f.many.functions
     found = vars(functions).get(of.__name__)
@@ -240,22 +246,22 @@ def _file_numbers(f: Followed, of: Callable[[Robot], list[Any]]) -> FileNumbers:
     return found
 
 
-def _mass(f: Followed) -> Array:
-    return _file_numbers(f, _moving_masses)(f.many.values)
+def _mass(f: PathMotion) -> Array:
+    return _cached_numbers(f, _moving_masses)(f.many.values)
 
 
-def _mass_slopes(f: Followed, places: Index) -> Array:
-    slopes = _file_numbers(f, _moving_masses).slopes_at(f.many.values)
+def _mass_slopes(f: PathMotion, places: Index) -> Array:
+    slopes = _cached_numbers(f, _moving_masses).slopes_at(f.many.values)
     return np.repeat(slopes[0], len(places), 0)
 
 
 QUANTITIES: Final = {
     quantity.name: quantity
     for quantity in (
-        Quantity("peak-effort", "greatest effort of any joint", _peak, _peak_slopes, True),
-        Quantity("rms-effort", "greatest RMS effort of a joint", _rms, _rms_slopes),
+        Quantity("peak-effort", "greatest effort of any joint", _peak_efforts, _peak_slopes, True),
+        Quantity("rms-effort", "greatest RMS effort of a joint", _rms_efforts, _rms_slopes),
         Quantity("motor-torque", "greatest RMS torque of a motor, of files with drives",
-                 lambda f: _root(f, _motor(f)[0]), _motor_slopes),
+                 lambda f: _rms_over_time(f, _motor_torques(f)[0]), _motor_slopes),
         Quantity("energy", "energy that the drives give, nothing regenerated", _energy,
                  _energy_slopes),
         Quantity("deflection", "greatest translation of the reference point under the wrench",
@@ -268,7 +274,7 @@ QUANTITIES: Final = {
 }  # fmt: skip
 
 
-def quantity_of(name: str, field: str) -> Quantity:
+def find_quantity(name: str, field: str) -> Quantity:
     """The quantity of a name.
 
     :raises UnknownNameError: there is none.

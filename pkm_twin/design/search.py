@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pkm_twin.codegen.arrays import Array
-from pkm_twin.design.pose_path import Followed, PosePath
-from pkm_twin.design.quantities import QUANTITIES, Constraint, Quantity, quantity_of
+from pkm_twin.design.pose_path import PathMotion, PosePath
+from pkm_twin.design.quantities import QUANTITIES, Constraint, Quantity, find_quantity
 from pkm_twin.design.variables import Variables
 from pkm_twin.design.variants import Variants
 from pkm_twin.errors import ParameterError, PkmTwinError
@@ -28,19 +28,19 @@ from pkm_twin.robot.robot import Robot
 
 Index = NDArray[np.intp]
 
-ROUNDS: Final = 20
-SHRINKS: Final = 12
-NEAR: Final = 0.7
+MAX_RUNS: Final = 20
+MAX_SHRINKS: Final = 12
+NEAR_WORST_FRACTION: Final = 0.7
 """Part of the greatest piece above which pieces are looked at."""
 MAX_PIECES: Final = 40
 """Pieces of a quantity that are looked at at a time."""
-KEPT: Final = 1e-6
+MISS_TOLERANCE: Final = 1e-6
 """Miss of a bound, over it, that counts as none."""
-SAME: Final = 1e-7
+GAIN_TOLERANCE: Final = 1e-7
 """Relative gain below which the search ends."""
-DIFFERENCE: Final = 1e-4
+DIFFERENCE_STEP: Final = 1e-4
 """Steps on both sides for slopes by differences, part of a variable's range."""
-BATCH: Final = 200_000
+SAMPLES_PER_BATCH: Final = 200_000
 """Samples of all machines that are computed at a time."""
 
 
@@ -57,7 +57,7 @@ class DesignPoint:
     @property
     def feasible(self) -> bool:
         """Whether it follows the path and keeps all bounds."""
-        return self.miss <= KEPT
+        return self.miss <= MISS_TOLERANCE
 
 
 class _OutsideError(Exception):
@@ -79,16 +79,16 @@ class Problem:
         self.count += len(y)
         return self._many.with_values(self.variables.values(y), checked=self._checked)
 
-    def followed(self, y: Array) -> Followed:
+    def followed(self, y: Array) -> PathMotion:
         """Machines of points (k, d) on the path."""
-        return Followed(self.machines(y), self.path)
+        return PathMotion(self.machines(y), self.path)
 
     def pieces(self, y: Array, quantities: Sequence[Quantity]) -> list[Array]:
         """Of machines (k, d), in batches: of each quantity shape (k, pieces).
 
         NaN of machines that cannot follow the path.
         """
-        size = max(1, BATCH // len(self.path.time))
+        size = max(1, SAMPLES_PER_BATCH // len(self.path.time))
         parts = []
         for k in range(0, len(y), size):
             followed = self.followed(y[k : k + size])
@@ -127,7 +127,7 @@ class Search:
         self.problem, self.aim, self.constraints = problem, aim, tuple(constraints)
         self._all = [aim, *(c.quantity for c in constraints)]
 
-    def judged(self, y: Array) -> tuple[Array, Array, list[Array]]:
+    def evaluate(self, y: Array) -> tuple[Array, Array, list[Array]]:
         """Of machines (k, d): the aim, the greatest miss (infinite where one cannot follow)."""
         pieces = self.problem.pieces(y, self._all)
         misses = np.zeros(len(y))
@@ -139,31 +139,31 @@ class Search:
 
     def descend(self, y: Array) -> tuple[Array, float, float]:
         """From a machine that follows the path: the best one near it, its aim and its miss."""
-        aims, misses, pieces = self.judged(y[None])
+        aims, misses, pieces = self.evaluate(y[None])
         best, aim, miss = y, float(aims[0]), float(misses[0])
         scale = max(abs(aim), 1e-300)
         chosen = [np.zeros(0, np.intp) for _ in self._all]
         radius, shrinks = 1.0, 0
-        for _ in range(ROUNDS):
+        for _ in range(MAX_RUNS):
             chosen = [
-                np.union1d(old, self._near(k, found[0]))
+                np.union1d(old, self._pieces_near_worst(k, found[0]))
                 for k, (old, found) in enumerate(zip(chosen, pieces, strict=True))
             ]
             run = _Run(self, chosen, scale, best, aim, radius)
-            found, outside = run.solved()
-            aims, misses, new = self.judged(found[None])
-            if better(float(aims[0]), float(misses[0]), aim, miss):
+            found, outside = run.solve()
+            aims, misses, new = self.evaluate(found[None])
+            if is_better(float(aims[0]), float(misses[0]), aim, miss):
                 gain = abs(aim - float(aims[0])) / scale + max(0.0, miss - float(misses[0]))
                 bound = radius < 1.0 and np.abs(found - best).max() > 0.9 * radius
                 best, aim, miss, pieces = found, float(aims[0]), float(misses[0]), new
                 if bound:
                     radius = min(1.0, 2.0 * radius)
-                elif gain < SAME and not outside:
+                elif gain < GAIN_TOLERANCE and not outside:
                     break
                 continue
             passed = np.isfinite(aims[0]) and np.isfinite(misses[0])
             fresh = passed and any(
-                len(np.setdiff1d(self._near(k, p[0]), old))
+                len(np.setdiff1d(self._pieces_near_worst(k, p[0]), old))
                 for k, (p, old) in enumerate(zip(new, chosen, strict=True))
             )
             step = float(np.abs(found - best).max())
@@ -172,18 +172,18 @@ class Search:
             if fresh:
                 # Pieces that were not looked at grew: with them, the same again.
                 chosen = [
-                    np.union1d(old, self._near(k, p[0]))
+                    np.union1d(old, self._pieces_near_worst(k, p[0]))
                     for k, (old, p) in enumerate(zip(chosen, new, strict=True))
                 ]
             radius, shrinks = (
                 0.5 * max(min(radius, step if step > 0.0 else radius), 1e-9),
                 shrinks + 1,
             )
-            if shrinks > SHRINKS:
+            if shrinks > MAX_SHRINKS:
                 break
         return best, aim, miss
 
-    def _near(self, k: int, pieces: Array) -> Index:
+    def _pieces_near_worst(self, k: int, pieces: Array) -> Index:
         """Pieces of a quantity that may be the greatest next: peaks in time near the worst."""
         quantity = self._all[k]
         if not quantity.sampled:
@@ -193,16 +193,18 @@ class Search:
         padded = np.pad(table, ((1, 1), (0, 0)), constant_values=-np.inf)
         peaks = (table >= padded[:-2]) & (table >= padded[2:])
         worst = float(table.max())
-        reach = worst - (1.0 - NEAR) * max(abs(worst), 0.3 if quantity.least else 0.0)
+        reach = worst - (1.0 - NEAR_WORST_FRACTION) * max(
+            abs(worst), 0.3 if quantity.least else 0.0
+        )
         flat = table.ravel()
         order = np.flatnonzero(peaks.ravel() & (flat >= reach))
         return order[np.argsort(-flat[order], kind="stable")][:MAX_PIECES]
 
 
-def better(aim: float, miss: float, old_aim: float, old_miss: float) -> bool:
+def is_better(aim: float, miss: float, old_aim: float, old_miss: float) -> bool:
     """Whether a machine is better: a smaller miss, and a smaller aim where both miss nothing."""
-    if miss > KEPT or old_miss > KEPT:
-        return miss < old_miss or (miss <= KEPT and old_miss > KEPT)
+    if miss > MISS_TOLERANCE or old_miss > MISS_TOLERANCE:
+        return miss < old_miss or (miss <= MISS_TOLERANCE and old_miss > MISS_TOLERANCE)
     return aim < old_aim
 
 
@@ -218,7 +220,7 @@ class _Run:
         self._known: dict[bytes, tuple[Array, Array]] = {}
         self._best: tuple[float, float, Array] = (np.inf, np.inf, centre)
 
-    def solved(self) -> tuple[Array, bool]:
+    def solve(self) -> tuple[Array, bool]:
         """The best machine, and whether the run ended at one that cannot follow the path."""
         from scipy.optimize import minimize  # type: ignore[import-untyped]
 
@@ -234,7 +236,7 @@ class _Run:
                     "type": "ineq", "fun": lambda z: self._margins(z)[0],
                     "jac": lambda z: self._margins(z)[1],
                 },
-                options={"maxiter": 60, "ftol": 0.1 * SAME},
+                options={"maxiter": 60, "ftol": 0.1 * GAIN_TOLERANCE},
             )  # fmt: skip
         except _OutsideError:
             return self._best[2], True
@@ -247,7 +249,7 @@ class _Run:
         y, s = np.clip(z[:-1], 0.0, 1.0), z[-1]
         key = y.tobytes()
         if key not in self._known:
-            self._known[key] = self._computed(y)
+            self._known[key] = self._evaluate(y)
         values, slopes = self._known[key]
         first = len(self.chosen[0])
         margins, table = -values, np.hstack([-slopes, np.zeros((len(values), 1))])
@@ -255,12 +257,12 @@ class _Run:
         table[:first, -1] = 1.0
         return margins, table
 
-    def _computed(self, y: Array) -> tuple[Array, Array]:
+    def _evaluate(self, y: Array) -> tuple[Array, Array]:
         search, problem = self.search, self.search.problem
         values, slopes = [], []
         many = problem.machines(y[None])
         for k, (quantity, chosen) in enumerate(zip(search._all, self.chosen, strict=True)):
-            found, by = _pieces_at(problem, quantity, chosen, many, y)
+            found, by = _evaluate_pieces(problem, quantity, chosen, many, y)
             if not (np.isfinite(found).all() and np.isfinite(by).all()):
                 raise _OutsideError
             if k == 0:
@@ -273,12 +275,12 @@ class _Run:
                 slopes.append(side * by)
         aim = float(values[0].max())
         miss = max([0.0, *(float(row.max()) for row in values[1:])])
-        if better(aim, miss, self._best[0], self._best[1]):
+        if is_better(aim, miss, self._best[0], self._best[1]):
             self._best = aim, miss, y
         return np.concatenate(values), np.concatenate(slopes)
 
 
-def _pieces_at(
+def _evaluate_pieces(
     problem: Problem, quantity: Quantity, chosen: Index, one: Variants, y: Array
 ) -> tuple[Array, Array]:
     """Chosen pieces of one machine, at y, and their slopes by the variables, shape (pieces, d)."""
@@ -286,8 +288,8 @@ def _pieces_at(
     path = problem.path.at(chosen // width) if width else problem.path
     places = chosen % width if width else chosen
 
-    def of(many: Variants) -> tuple[Followed, Array]:
-        followed = Followed(many, path)
+    def of(many: Variants) -> tuple[PathMotion, Array]:
+        followed = PathMotion(many, path)
         if width:
             return followed, quantity.of(followed)[:, np.arange(len(chosen)), places]
         return followed, quantity.pieces(followed)[:, chosen]
@@ -298,15 +300,15 @@ def _pieces_at(
     if not problem.robot.redundant:
         return found, quantity.slopes(followed, places) @ problem.variables.slopes
     # What drives that share efforts need has no exact slopes.
-    steps = DIFFERENCE * np.eye(len(y))
+    steps = DIFFERENCE_STEP * np.eye(len(y))
     ahead, behind = (of(problem.machines(y + side * steps))[1] for side in (1.0, -1.0))
-    return found, (ahead - behind).T / (2.0 * DIFFERENCE)
+    return found, (ahead - behind).T / (2.0 * DIFFERENCE_STEP)
 
 
-STARTS: Final = 64
-LOCAL: Final = 3
+DEFAULT_STARTS: Final = 64
+LOCAL_SEARCHES: Final = 3
 """Starts from which the search goes on, the file's own beside."""
-POINTS: Final = 9
+DEFAULT_FRONT_POINTS: Final = 9
 """Of a Pareto front, its two ends too."""
 
 
@@ -330,8 +332,9 @@ class Design:
 
 def design(
     robot: Robot, vary: Mapping[str, tuple[float, float]], path: PosePath,
-    minimise: str | Sequence[str], subject_to: Sequence[str] = (), *, starts: int = STARTS,
-    points: int = POINTS, seed: int = 0, progress: Callable[[int], None] = lambda _: None,
+    minimise: str | Sequence[str], subject_to: Sequence[str] = (), *, starts: int = DEFAULT_STARTS,
+    points: int = DEFAULT_FRONT_POINTS, seed: int = 0,
+    progress: Callable[[int], None] = lambda _: None,
 ) -> Design:  # fmt: skip
     """Optimise numbers of a robot's file, for the least value of a quantity on a path.
 
@@ -355,7 +358,7 @@ def design(
     names = [minimise] if isinstance(minimise, str) else list(minimise)
     if len(names) not in (1, 2) or len(set(names)) < len(names):
         raise ParameterError("minimise", names, "one quantity, or two different ones")
-    aims = [quantity_of(name, "minimise") for name in names]
+    aims = [find_quantity(name, "minimise") for name in names]
     if any(aim.least for aim in aims):
         raise ParameterError("minimise", names, "a quantity that is better when it is less")
     constraints = tuple(Constraint.of(text) for text in subject_to)
@@ -363,39 +366,39 @@ def design(
     if deflects and not path.wrench.any():
         raise ParameterError("wrench", None, "a wrench that deflects the platform")
     problem = Problem(robot, Variables.of(robot, vary), path)
-    first = _starts(problem, starts, seed)
+    first = _start_points(problem, starts, seed)
     done, rejected = 0, 0
 
-    def searched(aim: Quantity, bounds: Sequence[Constraint], tries: Array) -> Array | None:
+    def search_from(aim: Quantity, bounds: Sequence[Constraint], tries: Array) -> Array | None:
         """The best machine; None where no try keeps the bounds in the end."""
         nonlocal done, rejected
         search = Search(problem, aim, bounds)
-        values, misses, _ = search.judged(tries)
+        values, misses, _ = search.evaluate(tries)
         rejected = max(rejected, int(np.isinf(misses).sum()))
         order = sorted(
-            np.flatnonzero(np.isfinite(misses)).tolist(), key=lambda k: _rank(values, misses, k)
+            np.flatnonzero(np.isfinite(misses)).tolist(), key=lambda k: _ranking(values, misses, k)
         )
         found: tuple[Array, float, float] | None = None
-        for k in order[: LOCAL + 1]:
+        for k in order[: LOCAL_SEARCHES + 1]:
             result = search.descend(tries[k])
             done += 1
             progress(done)
-            if found is None or better(*result[1:], *found[1:]):
+            if found is None or is_better(*result[1:], *found[1:]):
                 found = result
-        return None if found is None or found[2] > KEPT else found[0]
+        return None if found is None or found[2] > MISS_TOLERANCE else found[0]
 
-    least = searched(aims[0], constraints, first)
+    least = search_from(aims[0], constraints, first)
     if least is None:
-        raise _none_found(problem, constraints, first, rejected)
+        raise _explain_failure(problem, constraints, first, rejected)
     front: list[Array] = [least]
     if len(aims) > 1:
-        other = searched(aims[1], constraints, np.vstack([first, least]))
+        other = search_from(aims[1], constraints, np.vstack([first, least]))
         assert other is not None  # noqa: S101  the first end of the front keeps the bounds
-        front = _front(problem, aims, constraints, (least, other), points, searched)
+        front = _trace_front(problem, aims, constraints, (least, other), points, search_from)
     told = [problem.point(y, constraints) for y in front]
     best = told[len(told) // 2 if len(told) > 1 else 0]
     if len(told) > 1:
-        best = _middle(told, names)
+        best = _choose_middle(told, names)
     before = problem.point(problem.variables.start, constraints)
     return Design(
         robot.filed(best.numbers), best, before, tuple(told) if len(aims) > 1 else (),
@@ -403,17 +406,17 @@ def design(
     )  # fmt: skip
 
 
-def searches(aims: int, points: int = POINTS) -> int:
+def searches(aims: int, points: int = DEFAULT_FRONT_POINTS) -> int:
     """How many searches :func:`design` makes at most."""
-    return (LOCAL + 1) * (1 if aims == 1 else points)
+    return (LOCAL_SEARCHES + 1) * (1 if aims == 1 else points)
 
 
-def _rank(aims: Array, misses: Array, k: int) -> tuple[float, float]:
-    kept = misses[k] <= KEPT
+def _ranking(aims: Array, misses: Array, k: int) -> tuple[float, float]:
+    kept = misses[k] <= MISS_TOLERANCE
     return (0.0, float(aims[k])) if kept else (float(misses[k]), 0.0)
 
 
-def _starts(problem: Problem, count: int, seed: int) -> Array:
+def _start_points(problem: Problem, count: int, seed: int) -> Array:
     """Sobol's points in the box, and the file's own numbers where they are in it, (k, d)."""
     points = sobol(len(problem.variables), count, seed)
     own = problem.variables.start
@@ -430,10 +433,10 @@ def sobol(dimensions: int, count: int, seed: int) -> Array:
     return np.asarray(points[:count], np.float64)
 
 
-def _front(
+def _trace_front(
     problem: Problem, aims: Sequence[Quantity], constraints: Sequence[Constraint],
     ends: tuple[Array, Array], points: int,
-    searched: Callable[[Quantity, Sequence[Constraint], Array], Array | None],
+    search_from: Callable[[Quantity, Sequence[Constraint], Array], Array | None],
 ) -> list[Array]:  # fmt: skip
     """Machines between the ends: the least first aim for bounds of the second."""
     first, second = aims
@@ -443,13 +446,13 @@ def _front(
     for share in np.linspace(0.0, 1.0, max(3, points))[1:-1]:
         bound = Constraint(second, float(high + share * (low - high)))
         tries = np.array([front[-1], ends[1]])
-        found = searched(first, [*constraints, bound], tries)
+        found = search_from(first, [*constraints, bound], tries)
         if found is not None:
             front.append(found)
     return [*front, ends[1]]
 
 
-def _middle(front: Sequence[DesignPoint], names: Sequence[str]) -> DesignPoint:
+def _choose_middle(front: Sequence[DesignPoint], names: Sequence[str]) -> DesignPoint:
     """The machine of the front nearest to the least of both aims, over their ranges."""
     table = np.array([[point.quantities[name] for name in names] for point in front])
     span = np.ptp(table, 0)
@@ -457,7 +460,7 @@ def _middle(front: Sequence[DesignPoint], names: Sequence[str]) -> DesignPoint:
     return front[int(np.argmin((near**2).sum(1)))]
 
 
-def _none_found(
+def _explain_failure(
     problem: Problem, constraints: Sequence[Constraint], starts: Array, rejected: int
 ) -> PkmTwinError:
     name = problem.robot.name

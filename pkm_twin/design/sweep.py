@@ -13,7 +13,7 @@ import numpy as np
 
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.design.pose_path import PosePath
-from pkm_twin.design.quantities import QUANTITIES, quantity_of
+from pkm_twin.design.quantities import QUANTITIES, find_quantity
 from pkm_twin.design.search import Problem, sobol
 from pkm_twin.design.variables import Variables
 from pkm_twin.errors import ParameterError
@@ -21,7 +21,7 @@ from pkm_twin.robot.robot import Robot
 
 MAX_MACHINES: Final = 10_000_000
 """Machines of a sweep."""
-STEP: Final = 256
+MACHINES_PER_PART: Final = 256
 """Machines that are computed together, between two reports of progress."""
 
 
@@ -77,7 +77,7 @@ class Box:
 
     def evaluate(self, points: Array) -> dict[str, Array]:
         """Quantities of points (k, d) of the box, each 0 to 1, by name: shape (k,)."""
-        wanted = [quantity_of(name, "quantities") for name in self.quantities]
+        wanted = [find_quantity(name, "quantities") for name in self.quantities]
         found = self.problem.pieces(points, wanted)
         return {q.name: q.worst(pieces) for q, pieces in zip(wanted, found, strict=True)}
 
@@ -100,7 +100,7 @@ Work = Sequence[tuple[int, Array]]
 """Numbered points."""
 
 
-def here(box: Box, work: Work) -> Iterator[tuple[int, dict[str, Array]]]:
+def compute_serially(box: Box, work: Work) -> Iterator[tuple[int, dict[str, Array]]]:
     """Points part by part in this process."""
     for index, points in work:
         yield index, box.evaluate(points)
@@ -110,7 +110,7 @@ def sweep(
     robot: Robot, vary: Mapping[str, tuple[float, float]], path: PosePath,
     quantities: Sequence[str] | None, samples: int, kind: Literal["grid", "sobol"] = "grid", *,
     seed: int = 0, progress: Callable[[int], None] = lambda _: None,
-    compute: Callable[[Box, Work], Iterable[tuple[int, Mapping[str, Array]]]] = here,
+    compute: Callable[[Box, Work], Iterable[tuple[int, Mapping[str, Array]]]] = compute_serially,
 ) -> Sweep:  # fmt: skip
     """Quantities of many machines whose numbers are within bounds.
 
@@ -122,7 +122,7 @@ def sweep(
     :raises ParameterError: a path, a quantity or a count that there is not.
     """
     wanted = known_quantities(robot, path) if quantities is None else quantities
-    names = tuple(quantity_of(name, "quantities").name for name in wanted)
+    names = tuple(find_quantity(name, "quantities").name for name in wanted)
     box = Box(robot, vary, path, names)
     variables = box.problem.variables
     d = len(variables)
@@ -139,9 +139,9 @@ def sweep(
         points, shape = sobol(d, samples, seed), (samples,)
     table = {name: np.empty(count) for name in names}
     done = 0
-    work = [(k, points[k : k + STEP]) for k in range(0, count, STEP)]
+    work = [(k, points[k : k + MACHINES_PER_PART]) for k in range(0, count, MACHINES_PER_PART)]
     for first, found in compute(box, work):
-        size = len(points[first : first + STEP])
+        size = len(points[first : first + MACHINES_PER_PART])
         for name, values in found.items():
             table[name][first : first + size] = values
         done += size

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from pkm_twin.codegen.arrays import Array, vectors
 from pkm_twin.design.parts import (
-    CONSISTENT,
+    MAX_OPEN_FRACTION,
     Assembly,
     Effect,
     error_of,
@@ -30,15 +30,15 @@ from pkm_twin.robot.derivatives import platform_derivatives
 from pkm_twin.robot.robot import Robot
 from stiffness_monitor.compliance import platform_response
 
-REGULAR: Final = 0.05
+MIN_SINGULARITY_INDEX: Final = 0.05
 """Least singularity index of joint states that stand for the workspace."""
-LARGEST: Final = 0.02
+MAX_DEVIATION: Final = 0.02
 """Standard deviation at most, rad, or part of the machine's extent: more is a wrong unit."""
-STAYS: Final = 1e-9
+MOTION_ROUNDING: Final = 1e-9
 """Motion of the reference point that is rounding, m per rad of the platform's turn."""
 MAX_COMBINED_ERRORS: Final = 12
 """Errors of which all combinations of signs are tried: 2,048 that differ."""
-STATES: Final = 256
+STATES_PER_BLOCK: Final = 256
 """States whose bodies are solved for at a time: large tables for each."""
 
 
@@ -71,13 +71,13 @@ class Tolerances:
 
     def effect(self, error: str) -> Array:
         """Standard deviation by one error of :attr:`together`, shape (..., 6)."""
-        return _root([self.part(path) for path in self.together[error]])
+        return _root_of_squares([self.part(path) for path in self.together[error]])
 
     @cached_property
     def worst(self) -> Array:
         """Largest effect of all errors together on each component, shape (..., 6)."""
         each = [
-            _root([self.bounds[path] * self.sensitivity[path] for path in paths])
+            _root_of_squares([self.bounds[path] * self.sensitivity[path] for path in paths])
             for paths in self.together.values()
         ]
         return np.asarray(sum(each), np.float64)
@@ -125,13 +125,13 @@ class Tolerances:
     @cached_property
     def deviation(self) -> Array:
         """Standard deviation by all errors together, shape (..., 6)."""
-        return _root([self.part(path) for path in self.sigma])
+        return _root_of_squares([self.part(path) for path in self.sigma])
 
     @cached_property
     def only_turns(self) -> bool:
         """Whether the errors turn the platform about its reference point, which stays."""
         moves, turns = np.split(self.deviation, 2, -1)
-        return bool(np.linalg.norm(moves) < STAYS * np.linalg.norm(turns))
+        return bool(np.linalg.norm(moves) < MOTION_ROUNDING * np.linalg.norm(turns))
 
     @cached_property
     def variance(self) -> dict[str, float]:
@@ -151,7 +151,7 @@ class Tolerances:
         return {path: self.part(path) ** 2 / whole for path in self.sigma}
 
 
-def _root(parts: Sequence[Array]) -> Array:
+def _root_of_squares(parts: Sequence[Array]) -> Array:
     """Root of the sum of squares."""
     return np.asarray(np.sqrt(sum(part**2 for part in parts)), np.float64)
 
@@ -161,7 +161,9 @@ def is_play(path: str) -> bool:
     return error_of(path).endswith((".backlash", ".clearance"))
 
 
-def spread(robot: Robot, given: Mapping[str, float | Tolerance]) -> dict[str, float | Tolerance]:
+def expand_patterns(
+    robot: Robot, given: Mapping[str, float | Tolerance]
+) -> dict[str, float | Tolerance]:
     """Errors by single path: a pattern for all parts that fit, a clearance for its three axes.
 
     :raises ParameterError: a pattern that fits nothing, or a play that is not a bound.
@@ -209,8 +211,8 @@ def tolerances(
 
     A * in a path stands for any text: each part that fits has an error of its own.
 
-    :param sigma: standard deviation by path, m or rad, at most :data:`LARGEST`; or how the error
-        is distributed.
+    :param sigma: standard deviation by path, m or rad, at most :data:`MAX_DEVIATION`; or how the
+        error is distributed.
     :param q: joint positions, shape (..., n), rad or m.
     :param wrench: on the platform, shape (6,) or (..., 6), N and N m, for ``deflection``.
     :raises ParameterError: an unknown path, an invalid standard deviation, a number
@@ -222,7 +224,7 @@ def tolerances(
     states = vectors(q, robot.joints_count, "q")
     if not sigma:
         raise ParameterError("tolerance", None, "at least one PATH with its standard deviation")
-    given_sizes = spread(robot, sigma)
+    given_sizes = expand_patterns(robot, sigma)
     parts = {path: part_of(robot, path) for path in given_sizes}
     known = {path: part for path, part in parts.items() if part is not None}
     numbers = [path for path in given_sizes if path not in known]
@@ -234,7 +236,7 @@ def tolerances(
     }
     sizes: dict[str, Tolerance] = {}
     for path, value in given_sizes.items():
-        most = {"m": LARGEST * robot.graph.size, "rad": LARGEST}.get(units[path])
+        most = {"m": MAX_DEVIATION * robot.graph.size, "rad": MAX_DEVIATION}.get(units[path])
         number = schema.number(low=0.0, high=most, unit=units[path])
         told = value.size if isinstance(value, Tolerance) else value
         size = schema.checked(number, f"tolerance {path}", told)
@@ -247,15 +249,15 @@ def tolerances(
     if known:
         rows = states.reshape(-1, robot.joints_count)
         found = [
-            Assembly(robot, rows[start : start + STATES]).platform(list(known.values()))
-            for start in range(0, max(1, len(rows)), STATES)
+            Assembly(robot, rows[start : start + STATES_PER_BLOCK]).platform(list(known.values()))
+            for start in range(0, max(1, len(rows)), STATES_PER_BLOCK)
         ]
         table = np.concatenate([twist for twist, _ in found])
         table = table.reshape(*states.shape[:-1], 6, len(known))
         for k, (path, part) in enumerate(known.items()):
             slopes[path] = np.ascontiguousarray(table[..., k])
             missed = max(float(part_missed[k]) for _, part_missed in found)
-            if missed > CONSISTENT:
+            if missed > MAX_OPEN_FRACTION:
                 raise ParameterError(
                     f"tolerance {path}", part.text,
                     f"an error after which rigid parts still fit: {robot.name} is overconstrained, "
@@ -292,7 +294,7 @@ def drawn(
     :raises PkmTwinError: errors so large that a machine cannot be assembled.
     """
     states = np.atleast_2d(vectors(q, robot.joints_count, "q"))
-    known, sizes = tolerances(robot, sigma, states), spread(robot, sigma)
+    known, sizes = tolerances(robot, sigma, states), expand_patterns(robot, sigma)
     rng = np.random.default_rng(seed)
     errors: dict[str, Array] = {}
     for paths in known.together.values():
@@ -307,14 +309,14 @@ def drawn(
     parts = [path for path in errors if part_of(robot, path) is not None]
     assembly = Assembly(robot, states)
     if len(parts) == len(errors):
-        return assembly.displaced(_effects(robot, errors))
+        return assembly.displaced(_add_effects(robot, errors))
     own = {path: robot.number(path) + errors[path] for path in errors if path not in parts}
     machines = variants(robot, own)
     if parts:
         # The errors of parts are those of each machine, whose numbers differ.
         found = np.concatenate([
             assembly.like(machine.graph).displaced(
-                _effects(robot, {path: errors[path][k : k + 1] for path in parts})
+                _add_effects(robot, {path: errors[path][k : k + 1] for path in parts})
             )
             for k, machine in enumerate(machines)
         ])  # fmt: skip
@@ -331,7 +333,7 @@ def drawn(
     return found
 
 
-def _effects(robot: Robot, errors: Mapping[str, Array]) -> dict[Effect, Array]:
+def _add_effects(robot: Robot, errors: Mapping[str, Array]) -> dict[Effect, Array]:
     """What moves by errors of parts, (count,) each."""
     effects: dict[Effect, Array] = {}
     for path, values in errors.items():
@@ -352,7 +354,7 @@ def workspace_states(robot: Robot, count: int, seed: int = 0) -> Array:
     rng = np.random.default_rng(seed)
     q = limits[:, 0] + np.ptp(limits, 1) * rng.random((count, robot.joints_count))
     measure, good = robot.try_singularity(q)
-    kept = q[good & (measure >= REGULAR)]
+    kept = q[good & (measure >= MIN_SINGULARITY_INDEX)]
     if not len(kept):
         raise ParameterError("limits.position", None, "limits inside which states are regular")
     return np.asarray(kept, np.float64)

@@ -103,7 +103,7 @@ def parse_vary(texts: Sequence[str]) -> dict[str, tuple[float, float]]:
 
     :raises ParameterError: another form.
     """
-    found = _parsed("vary", texts, "PATH=LOW:HIGH, each path once", 2)
+    found = _parse_numbers("vary", texts, "PATH=LOW:HIGH, each path once", 2)
     return {name: (low, high) for name, (low, high) in found.items()}
 
 
@@ -113,7 +113,7 @@ def parse_tolerances(texts: Sequence[str]) -> dict[str, Tolerance]:
     :raises ParameterError: another form, or a path that is given twice.
     """
     form = "PATH=SIGMA or PATH=+-BOUND, each path once, 0 or more"
-    plain = _parsed("tolerance", [text.replace("=+-", "=") for text in texts], form, 1)
+    plain = _parse_numbers("tolerance", [text.replace("=+-", "=") for text in texts], form, 1)
     found = {}
     for text, (name, (value,)) in zip(texts, plain.items(), strict=True):
         if not 0.0 <= value < math.inf:
@@ -122,7 +122,9 @@ def parse_tolerances(texts: Sequence[str]) -> dict[str, Tolerance]:
     return found
 
 
-def _parsed(field: str, texts: Sequence[str], form: str, count: int) -> dict[str, list[float]]:
+def _parse_numbers(
+    field: str, texts: Sequence[str], form: str, count: int
+) -> dict[str, list[float]]:
     """Numbers with colons between by the path before them."""
     found: dict[str, list[float]] = {}
     for text in texts:

@@ -36,15 +36,15 @@ from stiffness_monitor.programs import Elastic
 
 Mask = NDArray[np.bool_]
 
-CORNERS: Final = 5
+MAX_CORNER_NUMBERS: Final = 5
 """Most numbers of a section of which every combination of least and greatest is looked at."""
-BALANCES: Final = 2048
+SAMPLES_PER_BALANCE: Final = 2048
 """Samples whose joint loads are solved at a time: large tables for each."""
-BY_SAMPLE: Final = (
+REACTION_ARRAYS: Final = (
     "points", "wrenches", "determinate", "values", "determinate_components", "residual",
 )  # fmt: skip
 """Arrays of reactions."""
-NEAR: Final = 1e-3
+HOME_NEIGHBOURHOOD: Final = 1e-3
 """How far beside home a machine has to be assembled too, rad, or part of the machine's size."""
 
 
@@ -110,7 +110,7 @@ class Variants:
         home, graph = self.robot.graph.home, self.robot.graph
         reach = [graph.size if graph.joints[name].slides else 1.0 for name in graph.actuated]
         steps = np.linspace(-1.0, 1.0, len(home)) + 0.3
-        away = NEAR * np.array([0.0 * steps, steps, -steps]) * reach
+        away = HOME_NEIGHBOURHOOD * np.array([0.0 * steps, steps, -steps]) * reach
         rest = [np.zeros_like(home)] * 2 * self.robot.redundant
         ask = programs.agreeing if self.robot.redundant else programs.forward
         (poses, *_), good = self.run(ask, (home + away)[None], *rest)
@@ -150,8 +150,8 @@ class Variants:
         loads, good = self.run(programs.loads, q, qd, qdd, load)
         rows, at = [part.reshape(good.size, part.shape[-1]) for part in loads], np.flatnonzero(good)
         parts = []
-        for start in range(0, max(1, len(at)), BALANCES):
-            taken = [row[at[start : start + BALANCES]] for row in rows]
+        for start in range(0, max(1, len(at)), SAMPLES_PER_BALANCE):
+            taken = [row[at[start : start + SAMPLES_PER_BALANCE]] for row in rows]
             found = balanced(self.robot, taken, strict=False)
             parts.append(known_alone(found.reactions(found.value, found.null)))
         kept = np.concatenate([part.residual <= BALANCE_BOUND for part in parts])
@@ -164,7 +164,7 @@ class Variants:
             table.setflags(write=False)
             return table.reshape(*good.shape[:-1], *values.shape[1:])
 
-        made: dict[str, Any] = {name: everywhere(name) for name in BY_SAMPLE}
+        made: dict[str, Any] = {name: everywhere(name) for name in REACTION_ARRAYS}
         return replace(parts[0], **made)
 
     def mass_matrix(self, q: ArrayLike) -> Array:
@@ -279,17 +279,19 @@ class Variants:
         out = np.asarray(np.isnan(self.values).any(1))
         for columns in self._sections:
             known = self.values[~out][:, columns]
-            if len(known) and not self._box_fits(columns, known):
+            if len(known) and not self._is_box_valid(columns, known):
                 paths = [self.paths[column] for column in columns]
                 rows, which = np.unique(known, axis=0, return_inverse=True)
-                fits = np.array([self._fits(paths, row) for row in rows.tolist()])
+                fits = np.array([self._is_valid(paths, row) for row in rows.tolist()])
                 out[~out] = ~fits[which.ravel()]
         return out
 
     @property
     def whole_box_fits(self) -> bool:
         """Whether a file may have all numbers between the least and the greatest of each path."""
-        return all(self._box_fits(columns, self.values[:, columns]) for columns in self._sections)
+        return all(
+            self._is_box_valid(columns, self.values[:, columns]) for columns in self._sections
+        )
 
     @property
     def _sections(self) -> list[list[int]]:
@@ -298,18 +300,20 @@ class Variants:
             sections.setdefault(path.rpartition(".")[0], []).append(column)
         return list(sections.values())
 
-    def _box_fits(self, columns: Sequence[int], rows: Array) -> bool:
+    def _is_box_valid(self, columns: Sequence[int], rows: Array) -> bool:
         """What bounds numbers of a section together is convex: corners that hold do.
 
         Numbers that hang on a parameter may be any function of it.
         """
         paths = [self.paths[column] for column in columns]
-        if len(columns) > CORNERS or any(keys_of(path)[0] == PARAMETERS for path in paths):
+        if len(columns) > MAX_CORNER_NUMBERS or any(
+            keys_of(path)[0] == PARAMETERS for path in paths
+        ):
             return False
         ends = zip(rows.min(0).tolist(), rows.max(0).tolist(), strict=True)
-        return all(self._fits(paths, row) for row in set(itertools.product(*ends)))
+        return all(self._is_valid(paths, row) for row in set(itertools.product(*ends)))
 
-    def _fits(self, paths: Sequence[str], values: Sequence[float]) -> bool:
+    def _is_valid(self, paths: Sequence[str], values: Sequence[float]) -> bool:
         """Whether a file may have these numbers."""
         try:
             made = self.robot.numbered(dict(zip(paths, values, strict=True)))
@@ -333,7 +337,7 @@ class Variants:
     def run(self, ask: programs.Ask, *inputs: ArrayLike) -> tuple[list[Array], Mask]:
         """Outputs (k, ..., size) each, and which are good, shape (k, ..., 1)."""
         code, prepared = self._prepare(ask, self.robot)
-        rows, batch = self._laid_out(code, inputs)
+        rows, batch = self._arrange_inputs(code, inputs)
         k, count = len(self), math.prod(batch)
         fits = prepared[:, -1] <= MAX_GEOMETRY_MISMATCH
         if fits.all():
@@ -342,7 +346,7 @@ class Variants:
         else:
             outputs = [np.full((k, count, size), np.nan) for size in code.sizes[1]]
             good = np.zeros((k, count), bool)
-            for one, rest, own in self._by_structure(ask):
+            for one, rest, own in self._programs_by_structure(ask):
                 picked = [row[own] if len(row) > 1 else row for row in rows]
                 found, status = one.run_each(rest[own], *picked)
                 for table, values in zip(outputs, found, strict=True):
@@ -351,7 +355,7 @@ class Variants:
         shaped = [values.reshape(k, *batch, values.shape[-1]) for values in outputs]
         return shaped, np.asarray(good).reshape(k, *batch, 1)
 
-    def _laid_out(
+    def _arrange_inputs(
         self, code: Code, inputs: Sequence[ArrayLike]
     ) -> tuple[list[Array], tuple[int, ...]]:
         """Inputs as :meth:`Code.run_each` takes them, and the batch axes."""
@@ -372,12 +376,14 @@ class Variants:
             rows.append(np.ascontiguousarray(values))
         return rows, batch
 
-    def _by_structure(self, ask: programs.Ask) -> Iterator[tuple[Code, Array, NDArray[np.intp]]]:
+    def _programs_by_structure(
+        self, ask: programs.Ask
+    ) -> Iterator[tuple[Code, Array, NDArray[np.intp]]]:
         """Programs with the machines that each is right for: one program a structure."""
         # Where there is no assembly at home, there are no numbers for any program.
         left = np.asarray(~np.isnan(ask(self.robot)[1](self)).any(1))
         others = self.functions.others
-        robots = itertools.chain([self.robot, *others], self._built(left))
+        robots = itertools.chain([self.robot, *others], self._build_robots(left))
         for robot in robots:
             try:
                 code, prepared = self._prepare(ask, robot)
@@ -391,13 +397,13 @@ class Variants:
             yield code, prepared, np.flatnonzero(fits)
             left &= ~fits
 
-    def _built(self, left: Mask) -> Iterator[Robot]:
+    def _build_robots(self, left: Mask) -> Iterator[Robot]:
         """The first of the machines that are left, as robots; it looks again after each."""
         while left.any():
             first, *others = np.flatnonzero(left).tolist()
             try:
                 robot = self[first]
-                if _layout(robot) == _layout(self.robot):
+                if _inertia_order(robot) == _inertia_order(self.robot):
                     yield robot
             except PkmTwinError:
                 # Machines with the same zeros and parallels can be built as little.
@@ -417,7 +423,7 @@ class Variants:
         return self._patterns[k]
 
 
-def _layout(robot: Robot) -> list[tuple[str, str]]:
+def _inertia_order(robot: Robot) -> list[tuple[str, str]]:
     """Bodies with the joints that carry them: the order of the inertial inputs."""
     return [(link.body, str(link.joint)) for link in robot.engine.tree.links.values()]
 

@@ -11,7 +11,7 @@ import pytest
 from delta_dynamics import inverse_dynamics
 from pkm_twin import variants
 from pkm_twin.design import PosePath, design, sweep
-from pkm_twin.design.pose_path import Followed
+from pkm_twin.design.pose_path import PathMotion
 from pkm_twin.design.quantities import QUANTITIES
 from pkm_twin.errors import ParameterError, PkmTwinError, UnknownNameError
 from pkm_twin.paths import cycle, timed
@@ -58,7 +58,7 @@ def test_joints_follow_and_gradients_are_those_of_differences(name):
     robot, (_, q, qd, qdd), path = wave(name)
     own = {number: robot.number(number) for number in NUMBERS[name]}
     many = variants(robot, own)
-    f = Followed(many, path)
+    f = PathMotion(many, path)
     for found, given in ((f.q, q), (f.qd, qd), (f.qdd, qdd)):
         np.testing.assert_allclose(found[0], given, rtol=0, atol=1e-11)
     rng = np.random.default_rng(0)
@@ -72,7 +72,7 @@ def test_joints_follow_and_gradients_are_those_of_differences(name):
         step = 1e-3 * abs(own[number])
         values = np.tile(list(own.values()), (len(POINTS), 1))
         values[:, k] += step * POINTS
-        near = Followed(many.with_values(values), path)
+        near = PathMotion(many.with_values(values), path)
         sums = [(near.efforts * weights + near.qd * rates).sum(-1), near.singularity]
         if elastic:
             sums.append((near.compliance * table).sum((-1, -2)))
@@ -87,7 +87,7 @@ def test_joints_follow_and_gradients_are_those_of_differences(name):
 def test_quantities_are_those_of_each_machine_by_itself(picking):
     robot, path = picking
     many = variants(robot, {"geometry.arm_length": [0.19, 0.24], "inertia.platform_mass": 0.3})
-    f = Followed(many, path)
+    f = PathMotion(many, path)
     peak, rms, energy, mass = (
         q.worst(q.pieces(f))
         for q in map(QUANTITIES.get, ("peak-effort", "rms-effort", "energy", "mass"))
@@ -143,7 +143,7 @@ def test_the_ratio_of_least_motor_torque_is_that_of_brute_force(picking):
     assert result.best.quantities["motor-torque"] == pytest.approx(best[0], rel=3e-4)
     assert result.best.numbers["drive.ratio"] == pytest.approx(best[1], abs=0.5)
     # Its derivatives, by the ratio and by a length that moves the joints otherwise.
-    quantity, f = QUANTITIES["motor-torque"], Followed(variants(robot, {
+    quantity, f = QUANTITIES["motor-torque"], PathMotion(variants(robot, {
         "drive.ratio": 20.0, "geometry.arm_length": length, "drive.efficiency": 0.8,
         "drive.inertia": 9e-6}), path)  # fmt: skip
     slopes = quantity.slopes(f, np.arange(3))
@@ -153,7 +153,7 @@ def test_the_ratio_of_least_motor_torque_is_that_of_brute_force(picking):
     for k, step in ((2, 1e-5), (3, 1e-10)):
         values = np.tile([20.0, length, 0.8, 9e-6], (2, 1))
         values[:, k] += [step, -step]
-        ahead, behind = quantity.pieces(Followed(f.many.with_values(values), path))
+        ahead, behind = quantity.pieces(PathMotion(f.many.with_values(values), path))
         np.testing.assert_allclose(slopes[:, k], (ahead - behind) / (2 * step), rtol=1e-5)
     with pytest.raises(ParameterError, match="drive"):
         design(load("delta"), BOX, path, "motor-torque", starts=4)

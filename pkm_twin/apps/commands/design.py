@@ -241,12 +241,12 @@ def optimised(given: Design, path: Path) -> Report:
 
 def against_limits(found: Found, path: PosePath) -> Iterator[Fact]:
     """The effort and the singularity index of the best machine on the path, judged."""
-    from pkm_twin.design.pose_path import Followed
-    from pkm_twin.design.tolerance import REGULAR
+    from pkm_twin.design.pose_path import PathMotion
+    from pkm_twin.design.tolerance import MIN_SINGULARITY_INDEX
     from pkm_twin.design.variants import Variants
 
     robot, limit = found.robot, found.robot.limits.effort
-    followed = Followed(Variants(robot, {}), path)
+    followed = PathMotion(Variants(robot, {}), path)
     if limit is not None and "peak-effort" in found.best.quantities:
         peaks = np.abs(followed.efforts[0]).max(0)
         k = int((peaks / limit).argmax())
@@ -256,8 +256,14 @@ def against_limits(found: Found, path: PosePath) -> Iterator[Fact]:
         yield judged(what, f"{peaks[k]:.4g} {unit}", f"{limit[k]:g} {unit}", good, **numbers)
     index = float(followed.singularity.min())
     what = "singularity index on the path"
-    numbers = {"number": index, "limit": REGULAR, "unit": ""}
-    yield judged(what, f"{index:.4g}", f"{REGULAR:g} or more", index >= REGULAR, **numbers)
+    numbers = {"number": index, "limit": MIN_SINGULARITY_INDEX, "unit": ""}
+    yield judged(
+        what,
+        f"{index:.4g}",
+        f"{MIN_SINGULARITY_INDEX:g} or more",
+        index >= MIN_SINGULARITY_INDEX,
+        **numbers,
+    )
 
 
 def at_bound(value: float, bound: tuple[float, float]) -> str:
@@ -295,7 +301,7 @@ def write_robot(robot: Robot, source: str, found: Found, path: Path, out: Path) 
 def draw(robot: Robot, found: Found, path: PosePath, answer: str) -> Any:
     """The Pareto front, or the efforts before and after."""
     from pkm_twin.design import QUANTITIES
-    from pkm_twin.design.pose_path import Followed
+    from pkm_twin.design.pose_path import PathMotion
     from pkm_twin.design.variants import Variants
 
     if found.front:
@@ -314,7 +320,7 @@ def draw(robot: Robot, found: Found, path: PosePath, answer: str) -> Any:
         return figure
     numbers = found.best.numbers
     both = [{n: [robot.number(n)] for n in numbers}, {n: [v] for n, v in numbers.items()}]
-    efforts = [Followed(Variants(robot, one), path).efforts[0] for one in both]
+    efforts = [PathMotion(Variants(robot, one), path).efforts[0] for one in both]
     figure, (axes,) = plots.columns(1, 2)
     most = np.nanmax(np.abs(efforts)) * 1.05
     for ax, table, title in zip(axes, efforts, ("before", "after"), strict=True):
@@ -336,7 +342,7 @@ def swept(given: Design, path: Path, kind: str) -> Report:
     :raises MissingExtraError: h5netcdf or xarray is not installed.
     """
     from pkm_twin.design import sweep as sweep_box
-    from pkm_twin.design.sweep import here
+    from pkm_twin.design.sweep import compute_serially
     from pkm_twin.design.variables import parse_vary
     from pkm_twin.errors import require
     from pkm_twin.maps.run import compute_on_cluster
@@ -356,7 +362,9 @@ def swept(given: Design, path: Path, kind: str) -> Report:
     box = parse_vary(given.vary)
     grid = kind == "grid"
     compute = (
-        here if given.scheduler is None else partial(compute_on_cluster, scheduler=given.scheduler)
+        compute_serially
+        if given.scheduler is None
+        else partial(compute_on_cluster, scheduler=given.scheduler)
     )
     with progress("machines", given.samples ** len(box) if grid else given.samples) as update:
         table = sweep_box(
