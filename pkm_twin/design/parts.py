@@ -1,13 +1,13 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""Errors of a machine's parts, and where they take the bodies while the actuated joints are held.
+"""Model errors of a machine's parts, and where they move the bodies, actuated joints held.
 
 A part's error moves a joint's frame on one of its two bodies, or changes a length. Every body has
 six coordinates of its own; joints, rods and held drives are rows between two bodies:
 
     A V + C e = 0
 
-with V the bodies' twists and e the errors, to first order; and Newton's method on the rows
-themselves for errors of any size. Where no V fulfils all rows, rigid parts cannot be assembled.
+with V the bodies' twists and e the errors, to first order; for errors of any size Newton's method
+solves the rows themselves. If no V fulfils all rows, rigid parts cannot be assembled.
 """
 
 from __future__ import annotations
@@ -36,34 +36,35 @@ from pkm_twin.machine.places import full_keys, keys_of, path_of
 from pkm_twin.robot.robot import SINGULARITY_BOUND, Robot
 
 MAX_OPEN_FRACTION: Final = 1e-6
-"""Largest part of an error's rows that may stay open where the parts can be assembled."""
+"""Largest fraction of an error's rows that may stay open if the parts can be assembled."""
 STEP_TOLERANCE: Final = 1e-12
-"""Last correction of an assembly, of unit one."""
+"""Size of the last Newton step of an assembly, in units of one."""
 MAX_ITERATIONS: Final = 30
 STENCIL: Final = 1e-3 * np.array([-2.0, -1.0, 1.0, 2.0])
 STENCIL_WEIGHTS: Final = np.array([1.0, -8.0, 8.0, -1.0]) / 12e-3
-"""Differences of fourth order: errors of a rigid part change its rows smoothly."""
+"""Fourth-order finite difference; errors of a rigid part change its rows smoothly."""
 
 CLEARANCE: Final = ("clearance[0]", "clearance[1]", "clearance[2]")
-"""A joint's clearance, along each of the base axes at home."""
+"""Keys of a joint's clearance along the base axes at home."""
 ERROR_KEYS: Final = {
     "bodies": ["length"], "rods": ["length"],
     "joints": ["at[0]", "at[1]", "at[2]", "axis[0]", "axis[1]", "offset", "backlash",
                *CLEARANCE],
 }  # fmt: skip
-"""How paths of errors end, by the kind of the part."""
+"""Keys at the end of an error's path, by the kind of the part."""
 
 Effect = tuple[str, str]
-"""What moves, and of what: ``inner`` or ``outer`` (a joint's centre on that body), ``tilt`` (its
-frame on the inner body), ``start`` or ``end`` (of a rod), ``length``, ``offset``, ``origin``."""
+"""Kind of a change, and its joint, rod or body: ``inner`` or ``outer`` (a joint's centre on that
+body), ``tilt`` (its frame on the inner body), ``start`` or ``end`` (of a rod), ``length``,
+``offset``, ``origin``."""
 
 
 @dataclass(frozen=True)
 class Part:
-    """An error of a part, or of several parts alike.
+    """Describe an error of a part, or a common error of several parts.
 
-    ``effects``: by what moves, per unit of the error, base axes at home, shape (3,); of a length or
-    an offset (1,). ``text``: what the error is, in words. ``unit``: rad or m.
+    ``effects``: change per unit of the error, by kind, base axes at home, shape (3,); (1,) for a
+    length or an offset. ``text``: description of the error. ``unit``: rad or m.
     """
 
     effects: Mapping[Effect, Array]
@@ -72,11 +73,11 @@ class Part:
 
 
 def part_of(robot: Robot, path: str) -> Part | None:
-    """The part that a path names; None where it names a number of the file.
+    """Return the part that a path names; None if it names a number of the file.
 
-    Paths with commas between are of parts that are off alike, with a ``-`` before it the other way.
+    Paths separated by commas share one error, with the opposite sign after a ``-``.
 
-    :raises ParameterError: an entry of the machine without such an error.
+    :raises ParameterError: the machine's entry has no such error.
     """
     keys = full_keys(path)
     if "," in path:
@@ -102,7 +103,7 @@ def part_of(robot: Robot, path: str) -> Part | None:
 
 
 def _join_parts(robot: Robot, path: str) -> Part:
-    """The part that several paths name together."""
+    """Return the common error of the parts of several paths."""
     effects: dict[Effect, Array] = {}
     found: list[Part] = []
     for word in path.split(","):
@@ -117,7 +118,7 @@ def _join_parts(robot: Robot, path: str) -> Part:
 
 
 def _error_keys(robot: Robot) -> Iterator[list[str | int]]:
-    """The keys of every error that is a path's form."""
+    """Yield the keys of every possible error's path."""
     places: dict[tuple[str | int, ...], str] = {}
     for kind in ERROR_KEYS:
         places |= {(kind, name): kind for name in getattr(robot.graph, kind)}
@@ -127,14 +128,14 @@ def _error_keys(robot: Robot) -> Iterator[list[str | int]]:
 
 
 def error_of(path: str) -> str:
-    """The error that a path is of: a clearance is one error along three axes."""
+    """Return the error of a path: a clearance is one error along three axes."""
     return re.sub(r"(\.clearance)\[\d\]$", r"\1", path)
 
 
 def matching(robot: Robot, pattern: str) -> list[str]:
-    """Errors of the machine's parts that a pattern with * for any text names.
+    """Return the errors of the machine's parts that match a pattern, with * for any text.
 
-    :raises ParameterError: there is none.
+    :raises ParameterError: nothing matches.
     """
     fits = re.compile(".*".join(map(re.escape, pattern.split("*")))).fullmatch
     found = []
@@ -149,7 +150,7 @@ def matching(robot: Robot, pattern: str) -> list[str]:
 
 
 def _explain_unknown(robot: Robot, keys: Sequence[str | int], path: str) -> ParameterError:
-    """The error of a path without a part: by its first word that there is not."""
+    """Return the error for a path without a part: it names the first unknown word."""
     known = list(_error_keys(robot))
     for k in range(len(keys) + 1):
         words = {str(one[k]) for one in known if one[:k] == keys[:k] and len(one) > k}
@@ -164,7 +165,7 @@ def _explain_unknown(robot: Robot, keys: Sequence[str | int], path: str) -> Para
 def _part_effects(
     robot: Robot, kind: str, name: str, where: Sequence[str | int], turn: Array, path: str
 ) -> tuple[dict[Effect, Array], str, str] | None:
-    """What one entry's error moves, in words, and its unit; None where it has none of that name."""
+    """Return the effects of an entry's error, its description and unit; None if it has none."""
     graph = robot.graph
     match kind, *where:
         case "rods", "length":
@@ -195,10 +196,11 @@ def _part_effects(
 
 
 def _lengthen_body(robot: Robot, body: str, path: str) -> dict[Effect, Array]:
-    """All points of a body but its joint towards the base, along the line to their mean.
+    """Return effects on all points of a body except its joint towards the base.
 
-    Where all its joints turn about parallel axes, the line is across these: a part along them would
-    tilt the body out of its plane.
+    They move along the line from that joint to their mean. If all joints of the body rotate about
+    parallel axes, the line is perpendicular to these: a component along them would tilt the body
+    out of its plane.
     """
     graph = robot.graph
     joints = [j for j in graph.joints.values() if not j.virtual]
@@ -242,7 +244,7 @@ def _lengthen_body(robot: Robot, body: str, path: str) -> dict[Effect, Array]:
 
 
 class Row(NamedTuple):
-    """A scalar equation between two bodies, of unit one; arrays lead with the batch axes.
+    """Describe a scalar equation between two bodies, of unit one; leading axes are the batch.
 
     A unit of its multiplier is a force and a moment at ``point`` on ``outer``, the opposite on
     ``inner``. ``part``: the joint or rod.
@@ -259,19 +261,19 @@ class Row(NamedTuple):
 
 @dataclass(frozen=True)
 class Placed:
-    """Where bodies are: rotation from home (..., 3, 3) and place of the origin (..., 3) by name."""
+    """Hold where bodies are: rotation from home (..., 3, 3) and origin (..., 3) by name."""
 
     rotation: dict[str, Array]
     origin: dict[str, Array]
 
     def moved(self, twists: Mapping[str, Array]) -> Placed:
-        """After displacements of the origin and small turns, shape (..., 6) each."""
+        """Return the bodies after displacements of origins and small rotations, (..., 6) each."""
         rotation = {n: rotation_about(v[..., 3:]) @ self.rotation[n] for n, v in twists.items()}
         return Placed(rotation, {n: self.origin[n] + v[..., :3] for n, v in twists.items()})
 
 
 def rotation_about(vector: Array) -> Array:
-    """Rotation by a vector's length about it, shape (..., 3, 3)."""
+    """Return the rotation about a vector by its length, shape (..., 3, 3)."""
     angle = np.linalg.norm(vector, axis=-1)[..., None, None]
     x, y, z = np.moveaxis(vector, -1, 0)
     o = np.zeros_like(x)
@@ -281,7 +283,7 @@ def rotation_about(vector: Array) -> Array:
 
 
 def rotation_vector(rotation: Array) -> Array:
-    """The vector of :func:`rotation_about`, of less than half a turn, shape (..., 3)."""
+    """Return the vector of :func:`rotation_about` for less than half a turn, (..., 3)."""
     r = rotation
     twice = np.stack(
         [r[..., 2, 1] - r[..., 1, 2], r[..., 0, 2] - r[..., 2, 0], r[..., 1, 0] - r[..., 0, 1]], -1
@@ -292,7 +294,7 @@ def rotation_vector(rotation: Array) -> Array:
 
 
 class Assembly:
-    """A machine's bodies and rows at joint positions, with errors of its parts.
+    """Hold a machine's bodies and rows at joint positions, with errors of its parts.
 
     :param q: joint positions, shape (..., n). Errors as of :meth:`Robot.forward`.
     """
@@ -309,10 +311,10 @@ class Assembly:
         self, placed: Placed, q: Array, errors: Mapping[Effect, Array],
         only: Container[str] | None = None,
     ) -> list[Row]:  # fmt: skip
-        """What joints, rods and drives hold.
+        """Return the equations of joints, rods and held drives.
 
-        :param errors: by what moves, shape (..., 3) or (..., 1); what is not there has none.
-        :param only: names of joints and rods; None is all.
+        :param errors: by effect, shape (..., 3) or (..., 1); missing effects have no error.
+        :param only: names of joints and rods; None for all.
         """
         found: list[Row] = []
         names = list(self.graph.actuated)
@@ -342,8 +344,8 @@ class Assembly:
                 )
             )  # fmt: skip
             if rod.pair is not None:
-                # Two rods as long as each other: their middle stands across the difference of the
-                # directions in which they are side by side on both bodies.
+                # Two rods of equal length: their middle line is perpendicular to the difference of
+                # the directions from rod to rod on both bodies.
                 first, second = (
                     np.asarray((np.eye(3) if body == BASE else placed.rotation[body]) @ rod.pair)
                     for body in (rod.inner, rod.outer)
@@ -380,7 +382,7 @@ class Assembly:
             rows.append(Row(joint.name, value * scale, a, b, point, force * scale, moment * scale))
 
         def angle(one: Array, other: Array, known: float = 0.0) -> None:
-            """A vector of the inner frame and one of the outer frame keep their cosine."""
+            """Add the equation of a constant angle between vectors of both frames."""
             e, u = (inner @ one[..., None])[..., 0], outer @ other
             add((e * u).sum(-1) - known, none, np.cross(u, e), 1.0)
 
@@ -418,7 +420,7 @@ class Assembly:
     # To first order.
 
     def _matrix(self, rows: Sequence[Row]) -> Array:
-        """Derivatives of the rows by the bodies' twists of unit one, (..., rows, 6 bodies)."""
+        """Return the rows' derivatives by the bodies' twists of unit one, (..., rows, 6 bodies)."""
         table = np.zeros((*self.q.shape[:-1], len(rows), 6 * len(self.bodies)))
         for i, row in enumerate(rows):
             for body, side in ((row.outer, 1.0), (row.inner, -1.0)):
@@ -431,12 +433,12 @@ class Assembly:
 
     @cached_property
     def _rows(self) -> list[Row]:
-        """Without errors."""
+        """Rows without errors."""
         return self.rows(self.placed, self.q, {})
 
     @cached_property
     def _factors(self) -> tuple[Array, Array]:
-        """Of the matrix: orthonormal columns and a triangle.
+        """QR factors of the matrix: orthonormal columns and a triangle.
 
         :raises SingularityError: the rows do not determine the bodies.
         """
@@ -451,12 +453,12 @@ class Assembly:
         return q, r
 
     def _solve_twists(self, values: Array) -> Array:
-        """Twists, of unit one, that take rows (..., rows, k) to zero in the least squares."""
+        """Return the least-squares twists, of unit one, that make rows (..., rows, k) zero."""
         q, r = self._factors
         return np.asarray(-np.linalg.solve(r, q.swapaxes(-1, -2) @ values), np.float64)
 
     def _differentiate(self, part: Part) -> Array:
-        """Derivatives of the rows by an error, shape (..., rows, 1), by differences."""
+        """Return the rows' derivatives by an error, shape (..., rows, 1), by differences."""
         scale = self.size if part.unit == "m" else 1.0
         moving, shape = {name for _, name in part.effects}, self.q.shape[:-1]
         total: Any = 0.0
@@ -471,10 +473,11 @@ class Assembly:
         return np.asarray(total[..., None], np.float64)
 
     def platform(self, parts: Sequence[Part]) -> tuple[Array, Array]:
-        """How errors move the platform, and how much of each the bodies cannot follow, 0 to 1.
+        """Return how errors move the platform, and the fraction of each that stays open, 0 to 1.
 
-        :returns: displacement of the reference point and small turn per unit of each error, base
-            axes, shape (..., 6, parts); greatest part of its rows that stays open, shape (parts,).
+        :returns: displacement of the reference point and small rotation per unit of each error,
+        base axes, shape (..., 6, parts); largest open fraction of each error's rows, shape
+        (parts,).
         """
         columns = np.concatenate([self._differentiate(part) for part in parts], -1)
         found = self._solve_twists(columns)
@@ -494,17 +497,17 @@ class Assembly:
     # Of any size.
 
     def like(self, graph: Graph) -> Assembly:
-        """A machine of other numbers, whose bodies are sought, and displaced, from these on."""
-        # Factors are made once, before they are shared.
+        """Return the assembly of a machine with other numbers, to be solved from these bodies."""
+        # Compute the factors once, before they are shared.
         _ = self._factors
         other = copy.copy(self)
         other.graph = graph
         return other
 
     def displaced(self, errors: Mapping[Effect, Array]) -> Array:
-        """How far errors take the platform, by Newton's method on all rows.
+        """Compute how far errors move the platform, by Newton's method on all rows.
 
-        :param errors: by what moves, shape (count, 3) or (count, 1).
+        :param errors: by effect, shape (count, 3) or (count, 1).
         :returns: displacement of the reference point and rotation vector, base axes, shape
             (count, ..., 6).
         :raises PkmTwinError: parts with these errors cannot be assembled.

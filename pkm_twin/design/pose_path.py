@@ -1,13 +1,13 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""A path of the platform, and how machines of other numbers follow it.
+"""Describe a path of the platform, and compute how machines with other numbers follow it.
 
 The pose p and its first and second derivatives in time stay the same. Joints follow:
 
     q by the inverse,   J qd = p',   J qdd = p'' - J' qd      (J the pose's Jacobian)
 
-A sum w . tau of efforts changes with a number g of the file by what the program itself says, less
-what keeps the pose: with P, V and A the pose, its rate and its acceleration as functions of q, qd,
-qdd and g,
+A sum w . tau of efforts has a direct derivative by a number g of the file, less the part that
+keeps the pose: with P, V and A the pose, its rate and its acceleration as functions of q, qd, qdd
+and g,
 
     d(w . tau)/dg = tau_g - a . A_g - v . V_g - p . P_g,
     J^T a = tau_qdd,   J^T v = tau_qd - A_qd^T a,   J^T p = tau_q - A_q^T a - V_q^T v
@@ -34,7 +34,7 @@ Index = NDArray[np.intp]
 
 @dataclass(frozen=True, eq=False)
 class PosePath:
-    """A path of the platform over t samples.
+    """Describe a path of the platform over t samples.
 
     ``time``, shape (t,), s, rising. ``pose``, ``rate`` and ``acceleration``: the pose and its
     derivatives in time, shape (t, m). ``wrench``: on the platform, shape (t, 6), N and N m, base
@@ -52,10 +52,10 @@ class PosePath:
         cls, robot: Robot, time: ArrayLike, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike,
         wrench: ArrayLike | None = None,
     ) -> PosePath:  # fmt: skip
-        """The path of a robot's platform during a joint motion.
+        """Return the path of a robot's platform during a joint motion.
 
         :param time: shape (t,), s; ``q``, ``qd``, ``qdd``: shape (t, n).
-        :param wrench: shape (t, 6) or (6,); None is none.
+        :param wrench: shape (t, 6) or (6,); None for no wrench.
         :raises ParameterError: fewer than two samples, or times that do not rise.
         :raises UnreachableError: a joint state without an assembly. Others as of ``forward``.
         """
@@ -70,49 +70,49 @@ class PosePath:
         )  # fmt: skip
 
     def at(self, rows: Index) -> PosePath:
-        """Some of its samples, in any order."""
+        """Return some samples of the path, in any order."""
         parts = (self.time, self.pose, self.rate, self.acceleration, self.wrench)
         return PosePath(*(part[rows] for part in parts))
 
     @cached_property
     def weights(self) -> Array:
-        """Of each sample in the integral over time by trapezoids, shape (t,), s."""
+        """Weight of each sample in a trapezoidal integral over time, shape (t,), s."""
         steps = np.diff(self.time)
         return np.asarray(0.5 * (np.append(steps, 0.0) + np.append(0.0, steps)), np.float64)
 
     @property
     def duration(self) -> float:
-        """From the first sample to the last, s."""
+        """Time from the first sample to the last, s."""
         return float(self.time[-1] - self.time[0])
 
 
 class PathMotion:
-    """Machines (k) on a path: joints, efforts and what else is asked; NaN where one cannot.
+    """Compute motion and efforts of machines (k) on a path; NaN if a machine cannot follow it.
 
-    Derivatives are of one machine, by its numbers (d).
+    Derivatives are those of one machine, by its numbers (d).
     """
 
     def __init__(self, many: Variants, path: PosePath) -> None:
         self.many, self.path = many, path
 
     def _for_machines(self, values: Array) -> Array:
-        """Samples given to every machine by itself: no count of samples is taken for machines."""
+        """Repeat samples for every machine, so that their count is not taken for machines."""
         return np.broadcast_to(values, (len(self.many), *values.shape))
 
     @cached_property
     def q(self) -> Array:
-        """Shape (k, t, n)."""
+        """Joint positions, shape (k, t, n)."""
         return self.many.inverse(self._for_machines(self.path.pose))
 
     @cached_property
     def jacobian(self) -> Array:
-        """Pose rates per joint rate, shape (k, t, m, n); one where there is none."""
+        """Pose rates per joint rate, shape (k, t, m, n); the unit matrix if undefined."""
         found = self.many.jacobian(self.q)
         good = np.isfinite(found).all((-1, -2), keepdims=True)
         return np.where(good, found, np.eye(*found.shape[-2:]))
 
     def _solve_jacobian(self, right: Array) -> Array:
-        """J^-1 times vectors (k, t, m); of drives that share efforts as ``inverse_jacobian``."""
+        """Return J^-1 times vectors (k, t, m); for redundant drives as ``inverse_jacobian``."""
         robot = self.many.robot
         if not robot.redundant:
             return _solve(self.jacobian, right)
@@ -121,14 +121,14 @@ class PathMotion:
 
     @cached_property
     def qd(self) -> Array:
-        """Shape (k, t, n)."""
+        """Joint velocities, shape (k, t, n)."""
         return np.where(
             np.isfinite(self.q), self._solve_jacobian(self._for_machines(self.path.rate)), np.nan
         )
 
     @cached_property
     def qdd(self) -> Array:
-        """Shape (k, t, n)."""
+        """Joint accelerations, shape (k, t, n)."""
         own = np.zeros_like(self.qd)
         if self.many.robot.redundant:
             own = self.many.agreeing(self.q, self.qd, own)[2]
@@ -137,23 +137,23 @@ class PathMotion:
 
     @cached_property
     def efforts(self) -> Array:
-        """Shape (k, t, n), N m or N."""
+        """Efforts, shape (k, t, n), N m or N."""
         load = self._for_machines(self.path.wrench)
         return self.many.inverse_dynamics(self.q, self.qd, self.qdd, load)
 
     @cached_property
     def singularity(self) -> Array:
-        """Index of every sample, shape (k, t)."""
+        """Singularity index of every sample, shape (k, t)."""
         return self.many.singularity(self.q)
 
     @cached_property
     def compliance(self) -> Array:
-        """Shape (k, t, 6, 6)."""
+        """Compliance of every sample, shape (k, t, 6, 6)."""
         return self.many.compliance(self._for_machines(self.path.pose))
 
     @cached_property
     def deflection(self) -> Array:
-        """Of the platform under the path's wrench, shape (k, t, 6), m and rad."""
+        """Deflection of the platform under the path's wrench, shape (k, t, 6), m and rad."""
         return np.asarray((self.compliance @ self.path.wrench[..., None])[..., 0])
 
     # Derivatives by the numbers, of one machine.
@@ -161,9 +161,9 @@ class PathMotion:
     def effort_slopes(
         self, weights: Array, rates: Array | None = None, changes: Array | None = None
     ) -> Array:
-        """Derivatives of each sample's w . tau + r . qd + c . qdd, shape (t, d).
+        """Return the derivatives of each sample's w . tau + r . qd + c . qdd, shape (t, d).
 
-        :param weights: w, shape (t, n); ``rates``: r, ``changes``: c, shape (t, n), None is none.
+        :param weights: w, shape (t, n); ``rates``: r, ``changes``: c, shape (t, n), None for zero.
         """
         state = (self.q, self.qd, self.qdd, self._for_machines(self.path.wrench), weights[None])
         (by_q, by_qd, by_qdd), _ = self.many.run(programs.torque_gradient, *state)
@@ -177,13 +177,13 @@ class PathMotion:
         return np.asarray(rows[0] @ self.many.rigid_slopes)
 
     def singularity_slopes(self) -> Array:
-        """Derivatives of each sample's index, shape (t, d)."""
+        """Return the derivatives of each sample's index, shape (t, d)."""
         ones = np.ones((1, len(self.path.time), 1))
         (by_q, by_geometry), _ = self.many.run(programs.singularity_slopes, self.q, ones)
         return self._by_geometry(by_geometry + self._held(by_q))
 
     def compliance_slopes(self, weights: Array) -> Array:
-        """Derivatives of each sample's sum of weights times the compliance's entries, (t, d).
+        """Return the derivatives of each sample's weighted sum of C's entries, (t, d).
 
         :param weights: shape (t, 6, 6).
         """
@@ -198,9 +198,9 @@ class PathMotion:
         return np.asarray(rows[0] @ self.many.geometry_slopes)
 
     def _held(self, by_q: Array, by_rates: tuple[Array, Array] | None = None) -> Array:
-        """What the joints' following adds to derivatives by the geometry, shape (1, t, g).
+        """Return what constant poses add to derivatives by the geometry, shape (1, t, g).
 
-        :param by_rates: derivatives by qd and qdd; None where there are none.
+        :param by_rates: derivatives by qd and qdd; None for zero.
         """
         back = np.swapaxes(self.jacobian, -1, -2)
         weights = np.zeros((*by_q.shape[:-1], 3, by_q.shape[-1]))
@@ -220,11 +220,11 @@ class PathMotion:
 
 
 def _solve(matrix: Array, right: Array) -> Array:
-    """Solutions for vectors; NaN of a singular matrix."""
+    """Solve for vectors; NaN for a singular matrix."""
     try:
         return np.asarray(np.linalg.solve(matrix, right[..., None])[..., 0], np.float64)
     except np.linalg.LinAlgError:
-        # One of them is: its machine is in a singularity.
+        # Some matrix is singular: its machine is in a singularity.
         good = np.abs(np.linalg.det(matrix)) > 0.0
         sound = np.where(good[..., None, None], matrix, np.eye(matrix.shape[-1]))
         found = np.linalg.solve(sound, right[..., None])[..., 0]

@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""Programs that are asked of many machines, and what each takes of a machine's numbers."""
+"""List the programs that are run for many machines, and the numbers that each needs."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ from stiffness_monitor.programs import Elastic
 
 
 class NumberFunctions:
-    """What programs take of a robot, as functions of numbers of its file."""
+    """Compute the programs' inputs of a robot as functions of numbers of its file."""
 
     def __init__(self, robot: Robot, paths: Sequence[str]) -> None:
         self.robot, self.paths = robot, paths
         self.others: list[Robot] = []
-        """Robots with these numbers changed, one for each other structure that was needed."""
+        """Robots with these numbers changed, one per further structure that occurred."""
         self.geometry = FileNumbers(robot, paths, geometry_numbers)
 
     @cached_property
@@ -46,11 +46,11 @@ class NumberFunctions:
 
 
 class Rows(Protocol):
-    """What programs take of machines, a row each, shape (k, size)."""
+    """Define the programs' inputs of machines, a row each, shape (k, size)."""
 
     @property
     def geometry(self) -> Array:
-        """Of the joints, rods and bodies."""
+        """Numbers of joints, rods and bodies."""
 
     @property
     def masses(self) -> Array:
@@ -62,63 +62,63 @@ class Rows(Protocol):
 
 
 Asked = tuple[Kernel, Callable[[Rows], Array]]
-"""A program, and what it takes of the machines, shape (k, size)."""
+"""A program, and the function that returns its inputs of machines, shape (k, size)."""
 Ask = Callable[[Robot], Asked]
 
 
 def of_geometry(many: Rows) -> Array:
-    """Geometry of the machines."""
+    """Return the geometry of the machines."""
     return many.geometry
 
 
 def of_masses(many: Rows) -> Array:
-    """Masses, then geometry."""
+    """Return masses, then geometry."""
     return np.concatenate([many.masses, many.geometry], 1)
 
 
 def of_elasticity(many: Rows) -> Array:
-    """Geometry, then elasticity."""
+    """Return geometry, then elasticity."""
     return np.concatenate([many.geometry, many.elasticity], 1)
 
 
 def asks(kernel: Callable[[Robot], Kernel], numbers: Callable[[Rows], Array] = of_geometry) -> Ask:
-    """A program of a robot, by default one that takes the geometry alone."""
+    """Return a program of a robot with its inputs, by default the geometry alone."""
     return lambda robot: (kernel(robot), numbers)
 
 
 forward: Final = asks(lambda robot: robot.engine.forward)
-"""Of q to pose, position and rotation."""
+"""From q to pose, position and rotation."""
 anywhere: Final = asks(lambda robot: free_forward(robot.engine))
-"""As :func:`forward`, one program for machines of every structure."""
+"""The same as :func:`forward`, one program for machines of every structure."""
 agreeing: Final = asks(lambda robot: robot.agreeing_kernel)
-"""Of q, qd, qdd to those of all drives by the drives that lead."""
+"""From q, qd, qdd of the leading drives to those of all drives."""
 inverse: Final = asks(lambda robot: robot.inverse_kernel)
-"""Of the pose to q of some assembly."""
+"""From the pose to q of some assembly."""
 jacobian: Final = asks(lambda robot: robot.engine.jacobian)
-"""Of q to pose rates per joint rate."""
+"""From q to pose rates per joint rate."""
 acceleration: Final = asks(lambda robot: robot.engine.acceleration)
-"""Of q, qd, qdd to the pose's second derivative."""
+"""From q, qd, qdd to the pose's second derivative."""
 singularity: Final = asks(lambda robot: robot.singularity_kernel())
-"""Of q to the index."""
+"""From q to the singularity index."""
 torques: Final = asks(torques_kernel, of_masses)
-"""Of q, qd, qdd and wrench to efforts."""
+"""From q, qd, qdd and wrench to efforts."""
 loads: Final = asks(loads_kernel, of_masses)
-"""Of q, qd, qdd and wrench to what joints have to bear, and where they are."""
+"""From q, qd, qdd and wrench to the joints' loads and positions."""
 masses: Final = asks(masses_kernel, of_masses)
-"""Of q to the mass matrix."""
+"""From q to the mass matrix."""
 compliance: Final = asks(lambda robot: robot.made(Elastic).compliance, of_elasticity)
-"""Of q to the compliance and the measure of its frame."""
+"""From q to the compliance and its frame's pivot ratio."""
 torque_gradient: Final = asks(motion_gradient, of_masses)
-"""Of the torques, by q, qd and qdd."""
+"""Derivatives of the torques by q, qd and qdd."""
 torque_numbers: Final = asks(numbers_gradient, of_masses)
-"""Of the torques, by geometry and masses."""
+"""Derivatives of the torques by geometry and masses."""
 platform_slopes: Final = asks(lambda robot: platform_gradient(robot.engine))
-"""Of pose, position and rotation, by geometry."""
+"""Derivatives of pose, position and rotation by geometry."""
 pose_motion: Final = asks(lambda robot: pose_motion_gradient(robot.engine))
-"""Of pose, rate and acceleration, by q, qd and geometry."""
+"""Derivatives of pose, rate and acceleration by q, qd and geometry."""
 singularity_slopes: Final = asks(lambda robot: singularity_gradient(robot.engine))
-"""Of the index, by q and geometry."""
+"""Derivatives of the index by q and geometry."""
 compliance_slopes: Final = asks(
     lambda robot: compliance_gradient(robot.made(Elastic)), of_elasticity
 )
-"""Of the compliance, by q and all numbers."""
+"""Derivatives of the compliance by q and all numbers."""

@@ -1,8 +1,8 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""What a design is judged by: quantities of machines on a path, and their derivatives.
+"""Compute the quantities that a design is optimised for, and their derivatives.
 
-A quantity is the greatest (of the singularity index the least) of several smooth pieces: of the
-efforts of all joints in all samples, say, or of one number.
+A quantity is the largest (for the singularity index the smallest) of several smooth pieces, for
+example of the efforts of all joints in all samples.
 """
 
 from __future__ import annotations
@@ -29,11 +29,12 @@ CONSTRAINT: Final = re.compile(r"\s*([\w-]+)\s*(<=|>=)\s*(\S+)\s*")
 
 @dataclass(frozen=True)
 class Quantity:
-    """One of :data:`QUANTITIES`.
+    """Define one of :data:`QUANTITIES`.
 
-    ``of``: of k machines, pieces of shape (k, t, c) where ``sampled``, else (k, c). ``slopes``: of
-    one machine and places of c, derivatives by its numbers, shape (pieces, d); where sampled, the
-    machine's path has one sample a piece. ``least``: the least piece counts.
+    ``of``: returns the pieces of k machines, shape (k, t, c) if ``sampled``, else (k, c).
+    ``slopes``: returns the derivatives of one machine's pieces, given their indices along c, by its
+    numbers, shape (pieces, d); if sampled, the machine's path has one sample per piece. ``least``:
+    the smallest piece counts.
     """
 
     name: str
@@ -44,20 +45,20 @@ class Quantity:
     least: bool = False
 
     def pieces(self, followed: PathMotion) -> Array:
-        """Of k machines, shape (k, pieces)."""
+        """Return the pieces of k machines, shape (k, pieces)."""
         found = self.of(followed)
         return found.reshape(len(found), -1)
 
     def width(self, robot: Robot) -> int:
-        """Pieces a sample."""
+        """Return the number of pieces per sample."""
         return robot.joints_count if self.name == "peak-effort" else 1
 
     def worst(self, pieces: Array) -> Array:
-        """The quantity of pieces (k, p), shape (k,)."""
+        """Return the quantity from pieces (k, p), shape (k,)."""
         return np.asarray(pieces.min(-1) if self.least else pieces.max(-1), np.float64)
 
     def unit(self, robot: Robot) -> str:
-        """Of its values; empty for plain numbers."""
+        """Return the unit of the values; empty for plain numbers."""
         if self.name in ("peak-effort", "rms-effort"):
             units = set(robot.effort_units)
             return units.pop() if len(units) == 1 else "of the limit"
@@ -67,14 +68,14 @@ class Quantity:
 
 @dataclass(frozen=True)
 class Constraint:
-    """A quantity at most (of the singularity index at least) a bound."""
+    """Bound a quantity from above (the singularity index from below)."""
 
     quantity: Quantity
     bound: float
 
     @classmethod
     def of(cls, text: str) -> Constraint:
-        """``singularity>=0.1`` or ``peak-effort<=20``.
+        """Parse ``singularity>=0.1`` or ``peak-effort<=20``.
 
         :raises ParameterError: another form, quantity, or side.
         """
@@ -93,11 +94,11 @@ class Constraint:
 
     @property
     def scale(self) -> float:
-        """What makes misses of unit one."""
+        """Scale that makes misses of unit one."""
         return max(abs(self.bound), 1e-12)
 
     def misses(self, pieces: Array) -> Array:
-        """By how much pieces miss the bound, over it: above zero where they do."""
+        """Return the pieces' excess over the bound, relative to it: positive if violated."""
         side = -1.0 if self.quantity.least else 1.0
         return side * (pieces - self.bound) / self.scale
 
@@ -106,9 +107,9 @@ class Constraint:
 
 
 def effort_scales(robot: Robot) -> Array:
-    """What efforts are multiplied by, shape (n,): one, or one over the limits of mixed joints.
+    """Return the factors of efforts, (n,): one, or one over the limits of mixed joints.
 
-    :raises ParameterError: joints of two kinds without limits of their efforts.
+    :raises ParameterError: rotary and sliding joints without effort limits.
     """
     if len(set(robot.effort_units)) == 1:
         return np.ones(robot.joints_count)
@@ -131,13 +132,13 @@ def _peak_slopes(f: PathMotion, places: Index) -> Array:
 
 
 def _rms_over_time(f: PathMotion, values: Array) -> Array:
-    """Root mean square over time of values (k, t, n), shape (k, n)."""
+    """Return the root mean square over time of values (k, t, n), shape (k, n)."""
     squares = (f.path.weights[:, None] * values**2).sum(1) / f.path.duration
     return np.asarray(np.sqrt(squares), np.float64)
 
 
 def _rms_gradient(f: PathMotion, values: Array, place: int) -> Array:
-    """Derivatives of one of them by the values of one machine, shape (t,)."""
+    """Return the derivatives of one RMS by one machine's values, shape (t,)."""
     root = _rms_over_time(f, values)[0, place] * f.path.duration
     return np.asarray(f.path.weights * values[0, :, place] / max(root, 1e-300), np.float64)
 
@@ -156,7 +157,7 @@ def _rms_slopes(f: PathMotion, places: Index) -> Array:
 
 
 def _list_gear_numbers(robot: Robot) -> list[Any]:
-    """Turns, inertias of the rotors and efficiencies of the drives."""
+    """Return transmission ratios, rotor inertias and efficiencies of the drives."""
     drives = [drive for drive in robot.drives if drive is not None]
     if len(drives) < robot.joints_count:
         raise ParameterError("drive", None, "a section drive for each joint, for motor-torque")
@@ -165,8 +166,9 @@ def _list_gear_numbers(robot: Robot) -> list[Any]:
 
 
 def _motor_torques(f: PathMotion) -> tuple[Array, Array, Array, Array, Array]:
-    """Torques of the motors, as :mod:`pkm_twin.paths.sizing` has them, shape (k, t, n), and the
-    losses; turns, inertias and efficiencies, shape (k, 1, n).
+    """Return the motors' torques, losses, turns, inertias and efficiencies.
+
+    Torques as in :mod:`pkm_twin.paths.sizing`, shape (k, t, n); numbers, shape (k, 1, n).
     """
     turns, inertia, share = np.split(
         _cached_numbers(f, _list_gear_numbers)(f.many.values)[:, None], 3, -1
@@ -181,7 +183,7 @@ def _motor_slopes(f: PathMotion, places: Index) -> Array:
     loss, tau, qdd = losses[0], f.efforts[0], f.qdd[0]
     turns, inertia, share = (values[0] for values in numbers)
     through = tau - inertia * turns**2 * qdd
-    # By turns, inertia and efficiency, the effort and the motion as they are.
+    # Derivatives by turns, inertia and efficiency at constant effort and motion.
     own = (
         inertia * qdd * (1.0 - loss) - tau * loss / turns**2,
         turns * qdd * (1.0 - loss),
@@ -237,7 +239,7 @@ def _moving_masses(robot: Robot) -> list[Any]:
 
 
 def _cached_numbers(f: PathMotion, of: Callable[[Robot], list[Any]]) -> FileNumbers:
-    """Of the machines' numbers, made once."""
+    """Return a function of the machines' numbers, created once."""
     functions = f.many.functions
     found = vars(functions).get(of.__name__)
     if found is None:
@@ -275,9 +277,9 @@ QUANTITIES: Final = {
 
 
 def find_quantity(name: str, field: str) -> Quantity:
-    """The quantity of a name.
+    """Return the quantity of a name.
 
-    :raises UnknownNameError: there is none.
+    :raises UnknownNameError: there is no such quantity.
     """
     if name not in QUANTITIES:
         raise UnknownNameError(field, name, QUANTITIES)

@@ -1,9 +1,9 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""Numbers of a robot's file that are best for a path: a search from several starts.
+"""Optimise numbers of a robot's file for a path: a local search from several starts.
 
-The starts of a Sobol sequence are computed as one batch; the search goes on from the best ones. The
-greatest piece of a quantity is made least by scipy's SLSQP (Kraft 1988) with exact derivatives, on
-the pieces that are near the greatest; pieces that pass it join, and it goes on (an exchange method,
+The starts of a Sobol sequence are computed as one batch; the search continues from the best ones.
+Scipy's SLSQP (Kraft 1988) minimises the largest piece of a quantity with exact derivatives, on the
+pieces near the largest; pieces that exceed it are added, and SLSQP runs again (an exchange method,
 Hettich and Kortanek 1993). A machine that cannot follow the path ends a run; the next run starts in
 a smaller box around the best machine so far, so that the search stays where machines can follow the
 path.
@@ -29,43 +29,45 @@ from pkm_twin.robot.robot import Robot
 Index = NDArray[np.intp]
 
 MAX_RUNS: Final = 20
+"""Largest number of SLSQP runs from a start."""
 MAX_SHRINKS: Final = 12
+"""Largest number of times that the box is made smaller."""
 NEAR_WORST_FRACTION: Final = 0.7
-"""Part of the greatest piece above which pieces are looked at."""
+"""Fraction of the largest piece above which pieces are included."""
 MAX_PIECES: Final = 40
-"""Pieces of a quantity that are looked at at a time."""
+"""Largest number of pieces of a quantity that are included at a time."""
 MISS_TOLERANCE: Final = 1e-6
-"""Miss of a bound, over it, that counts as none."""
+"""Excess of a bound, relative to it, that counts as none."""
 GAIN_TOLERANCE: Final = 1e-7
 """Relative gain below which the search ends."""
 DIFFERENCE_STEP: Final = 1e-4
-"""Steps on both sides for slopes by differences, part of a variable's range."""
+"""Step of central differences, as a fraction of a variable's range."""
 SAMPLES_PER_BATCH: Final = 200_000
 """Samples of all machines that are computed at a time."""
 
 
 @dataclass(frozen=True)
 class DesignPoint:
-    """One machine: values of the variables, of the quantities, and by how much it misses bounds."""
+    """Describe one machine: variables, quantities, and its largest excess of a bound."""
 
     variables: Mapping[str, float]
     numbers: Mapping[str, float]
-    """By path of the file."""
+    """Values by path of the file."""
     quantities: Mapping[str, float]
     miss: float
 
     @property
     def feasible(self) -> bool:
-        """Whether it follows the path and keeps all bounds."""
+        """Whether the machine follows the path and keeps all bounds."""
         return self.miss <= MISS_TOLERANCE
 
 
 class _OutsideError(Exception):
-    """A machine that cannot follow the path."""
+    """Report a machine that cannot follow the path."""
 
 
 class Problem:
-    """Machines of a box of variables (each 0 to 1) on a path."""
+    """Evaluate machines of a box of variables (each 0 to 1) on a path."""
 
     def __init__(self, robot: Robot, variables: Variables, path: PosePath) -> None:
         self.robot, self.variables, self.path = robot, variables, path
@@ -75,18 +77,18 @@ class Problem:
         self.count = 0
 
     def machines(self, y: Array) -> Variants:
-        """Of points (k, d)."""
+        """Return the machines of points (k, d)."""
         self.count += len(y)
         return self._many.with_values(self.variables.values(y), checked=self._checked)
 
     def followed(self, y: Array) -> PathMotion:
-        """Machines of points (k, d) on the path."""
+        """Return the motion of the machines of points (k, d) on the path."""
         return PathMotion(self.machines(y), self.path)
 
     def pieces(self, y: Array, quantities: Sequence[Quantity]) -> list[Array]:
-        """Of machines (k, d), in batches: of each quantity shape (k, pieces).
+        """Return the pieces of each quantity, (k, pieces), for points (k, d), in batches.
 
-        NaN of machines that cannot follow the path.
+        Machines that cannot follow the path have NaN.
         """
         size = max(1, SAMPLES_PER_BATCH // len(self.path.time))
         parts = []
@@ -98,7 +100,7 @@ class Problem:
         return [np.concatenate(rows) for rows in zip(*parts, strict=True)]
 
     def point(self, y: Array, constraints: Sequence[Constraint]) -> DesignPoint:
-        """A machine with all quantities that its file has data for."""
+        """Return a machine with all quantities that its file has data for."""
         followed = self.followed(y[None])
         found: dict[str, float] = {}
         for name, quantity in QUANTITIES.items():
@@ -121,14 +123,14 @@ class Problem:
 
 
 class Search:
-    """The least of one quantity under constraints."""
+    """Minimise one quantity under constraints."""
 
     def __init__(self, problem: Problem, aim: Quantity, constraints: Sequence[Constraint]) -> None:
         self.problem, self.aim, self.constraints = problem, aim, tuple(constraints)
         self._all = [aim, *(c.quantity for c in constraints)]
 
     def evaluate(self, y: Array) -> tuple[Array, Array, list[Array]]:
-        """Of machines (k, d): the aim, the greatest miss (infinite where one cannot follow)."""
+        """Return aims, largest misses (infinite if a machine fails) and pieces of points (k, d)."""
         pieces = self.problem.pieces(y, self._all)
         misses = np.zeros(len(y))
         for constraint, found in zip(self.constraints, pieces[1:], strict=True):
@@ -138,7 +140,7 @@ class Search:
         return np.where(lost, np.inf, aims), np.where(lost, np.inf, misses), pieces
 
     def descend(self, y: Array) -> tuple[Array, float, float]:
-        """From a machine that follows the path: the best one near it, its aim and its miss."""
+        """Return the best machine near one that follows the path, its aim and its miss."""
         aims, misses, pieces = self.evaluate(y[None])
         best, aim, miss = y, float(aims[0]), float(misses[0])
         scale = max(abs(aim), 1e-300)
@@ -170,7 +172,7 @@ class Search:
             if step < 1e-9 and not outside:
                 break
             if fresh:
-                # Pieces that were not looked at grew: with them, the same again.
+                # Pieces that were not included grew: include them.
                 chosen = [
                     np.union1d(old, self._pieces_near_worst(k, p[0]))
                     for k, (old, p) in enumerate(zip(chosen, new, strict=True))
@@ -184,7 +186,7 @@ class Search:
         return best, aim, miss
 
     def _pieces_near_worst(self, k: int, pieces: Array) -> Index:
-        """Pieces of a quantity that may be the greatest next: peaks in time near the worst."""
+        """Return pieces that may become the largest: peaks in time near the worst."""
         quantity = self._all[k]
         if not quantity.sampled:
             return np.arange(len(pieces))
@@ -202,14 +204,14 @@ class Search:
 
 
 def is_better(aim: float, miss: float, old_aim: float, old_miss: float) -> bool:
-    """Whether a machine is better: a smaller miss, and a smaller aim where both miss nothing."""
+    """Return whether a machine is better: smaller miss, or smaller aim if both keep bounds."""
     if miss > MISS_TOLERANCE or old_miss > MISS_TOLERANCE:
         return miss < old_miss or (miss <= MISS_TOLERANCE and old_miss > MISS_TOLERANCE)
     return aim < old_aim
 
 
 class _Run:
-    """SLSQP on chosen pieces, in a box around a machine: variables y and the aim's bound s."""
+    """Run SLSQP on chosen pieces, in a box around a machine: variables y, aim's bound s."""
 
     def __init__(
         self, search: Search, chosen: Sequence[Index], scale: float, centre: Array, aim: float,
@@ -221,7 +223,7 @@ class _Run:
         self._best: tuple[float, float, Array] = (np.inf, np.inf, centre)
 
     def solve(self) -> tuple[Array, bool]:
-        """The best machine, and whether the run ended at one that cannot follow the path."""
+        """Return the best machine, and whether the run ended at one that cannot follow the path."""
         from scipy.optimize import minimize  # type: ignore[import-untyped]
 
         low = np.maximum(0.0, self.centre - self.radius)
@@ -245,7 +247,7 @@ class _Run:
         return self._best[2], False
 
     def _margins(self, z: Array) -> tuple[Array, Array]:
-        """Above zero where s bounds the aim's pieces and constraints hold; and their slopes."""
+        """Return margins, positive if s bounds the aim and constraints hold, and their slopes."""
         y, s = np.clip(z[:-1], 0.0, 1.0), z[-1]
         key = y.tobytes()
         if key not in self._known:
@@ -283,7 +285,7 @@ class _Run:
 def _evaluate_pieces(
     problem: Problem, quantity: Quantity, chosen: Index, one: Variants, y: Array
 ) -> tuple[Array, Array]:
-    """Chosen pieces of one machine, at y, and their slopes by the variables, shape (pieces, d)."""
+    """Return chosen pieces of one machine at y, and their derivatives, shape (pieces, d)."""
     width = quantity.width(problem.robot) if quantity.sampled else 0
     path = problem.path.at(chosen // width) if width else problem.path
     places = chosen % width if width else chosen
@@ -299,35 +301,36 @@ def _evaluate_pieces(
         raise _OutsideError
     if not problem.robot.redundant:
         return found, quantity.slopes(followed, places) @ problem.variables.slopes
-    # What drives that share efforts need has no exact slopes.
+    # Redundant drives have no exact derivatives.
     steps = DIFFERENCE_STEP * np.eye(len(y))
     ahead, behind = (of(problem.machines(y + side * steps))[1] for side in (1.0, -1.0))
     return found, (ahead - behind).T / (2.0 * DIFFERENCE_STEP)
 
 
 DEFAULT_STARTS: Final = 64
+"""Default number of starts of a Sobol sequence."""
 LOCAL_SEARCHES: Final = 3
-"""Starts from which the search goes on, the file's own beside."""
+"""Number of starts from which the search continues, in addition to the file's own."""
 DEFAULT_FRONT_POINTS: Final = 9
-"""Of a Pareto front, its two ends too."""
+"""Default number of points of a Pareto front, including its ends."""
 
 
 @dataclass(frozen=True)
 class Design:
-    """The best machine of a search, the machine before it, and the Pareto front, if any."""
+    """Hold the best machine of a search, the machine before it, and the Pareto front, if any."""
 
     robot: Robot
     best: DesignPoint
     before: DesignPoint
-    """The file's own numbers; quantities are NaN where that machine cannot follow the path."""
+    """Machine of the file; its quantities are NaN if it cannot follow the path."""
     front: tuple[DesignPoint, ...]
-    """Of two aims: from the least of the first to the least of the second."""
+    """For two aims: from the smallest first aim to the smallest second aim."""
     minimise: tuple[str, ...]
     constraints: tuple[Constraint, ...]
     machines: int
-    """How many were computed."""
+    """Number of machines computed."""
     rejected: int
-    """Of the starts, those that cannot follow the path."""
+    """Number of starts that cannot follow the path."""
 
 
 def design(
@@ -352,7 +355,7 @@ def design(
     :param starts: of the Sobol sequence, in addition to the file's own numbers.
     :param points: of the front, 3 or more.
     :param progress: called with the number of searches done, of at most :func:`searches`.
-    :raises ParameterError: a path, a quantity or a bound that there is not.
+    :raises ParameterError: an unknown path or quantity, or an invalid bound.
     :raises PkmTwinError: no machine that was tried can follow the path, or none keeps the bounds.
     """
     names = [minimise] if isinstance(minimise, str) else list(minimise)
@@ -370,7 +373,7 @@ def design(
     done, rejected = 0, 0
 
     def search_from(aim: Quantity, bounds: Sequence[Constraint], tries: Array) -> Array | None:
-        """The best machine; None where no try keeps the bounds in the end."""
+        """Return the best machine; None if none keeps the bounds."""
         nonlocal done, rejected
         search = Search(problem, aim, bounds)
         values, misses, _ = search.evaluate(tries)
@@ -407,7 +410,7 @@ def design(
 
 
 def searches(aims: int, points: int = DEFAULT_FRONT_POINTS) -> int:
-    """How many searches :func:`design` makes at most."""
+    """Return the largest number of searches that :func:`design` runs."""
     return (LOCAL_SEARCHES + 1) * (1 if aims == 1 else points)
 
 
@@ -417,7 +420,7 @@ def _ranking(aims: Array, misses: Array, k: int) -> tuple[float, float]:
 
 
 def _start_points(problem: Problem, count: int, seed: int) -> Array:
-    """Sobol's points in the box, and the file's own numbers where they are in it, (k, d)."""
+    """Return Sobol points in the box, and the file's numbers if inside, (k, d)."""
     points = sobol(len(problem.variables), count, seed)
     own = problem.variables.start
     inside = bool(((own >= 0.0) & (own <= 1.0)).all())
@@ -425,7 +428,7 @@ def _start_points(problem: Problem, count: int, seed: int) -> Array:
 
 
 def sobol(dimensions: int, count: int, seed: int) -> Array:
-    """The first points of a scrambled Sobol sequence, shape (count, dimensions)."""
+    """Return the first points of a scrambled Sobol sequence, shape (count, dimensions)."""
     from scipy.stats import qmc  # type: ignore[import-untyped]
 
     power = max(0, int(np.ceil(np.log2(max(count, 1)))))
@@ -438,7 +441,7 @@ def _trace_front(
     ends: tuple[Array, Array], points: int,
     search_from: Callable[[Quantity, Sequence[Constraint], Array], Array | None],
 ) -> list[Array]:  # fmt: skip
-    """Machines between the ends: the least first aim for bounds of the second."""
+    """Return machines between the front's ends: smallest first aim for bounds of the second."""
     first, second = aims
     rows = problem.pieces(np.array(ends), [second])[0]
     high, low = second.worst(rows)
@@ -453,7 +456,7 @@ def _trace_front(
 
 
 def _choose_middle(front: Sequence[DesignPoint], names: Sequence[str]) -> DesignPoint:
-    """The machine of the front nearest to the least of both aims, over their ranges."""
+    """Return the front's machine nearest to both smallest aims, relative to their ranges."""
     table = np.array([[point.quantities[name] for name in names] for point in front])
     span = np.ptp(table, 0)
     near = (table - table.min(0)) / np.where(span > 0.0, span, 1.0)

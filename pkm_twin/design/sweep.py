@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""All quantities of many machines in a box of numbers: on a grid, or on evenly spread points."""
+"""Compute all quantities of many machines in a box of numbers: grid or Sobol points."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ from pkm_twin.errors import ParameterError
 from pkm_twin.robot.robot import Robot
 
 MAX_MACHINES: Final = 10_000_000
-"""Machines of a sweep."""
+"""Largest number of machines of a sweep."""
 MACHINES_PER_PART: Final = 256
 """Machines that are computed together, between two reports of progress."""
 
 
 @dataclass(frozen=True)
 class Sweep:
-    """Machines of a sweep: ``shape`` of the grid, or (k,).
+    """Hold the machines of a sweep: ``shape`` of the grid, or (k,).
 
-    ``variables``: by name, shape ``shape``; ``quantities`` likewise, NaN of machines that cannot
+    ``variables``: by name, shape ``shape``; ``quantities`` likewise, NaN for machines that cannot
     follow the path.
     """
 
@@ -38,9 +38,9 @@ class Sweep:
     quantities: Mapping[str, Array]
 
     def dataset(self, robot: Robot, path: str, kind: str) -> Any:
-        """As xarray has it: a grid with the variables as axes, other machines in a row.
+        """Return an xarray data set: a grid with the variables as axes, or a list of machines.
 
-        :param path: what the machines follow, in words. ``kind``: grid or sobol.
+        :param path: description of the path. ``kind``: grid or sobol.
         """
         from xarray import Dataset
 
@@ -61,33 +61,33 @@ class Sweep:
 
 @dataclass(frozen=True, eq=False)
 class Box:
-    """A box of machines and what is asked of them; workers get it whole with their points."""
+    """Hold a box of machines and the wanted quantities; workers receive it with their points."""
 
     robot: Robot
     vary: Mapping[str, tuple[float, float]]
     path: PosePath
     quantities: tuple[str, ...]
     fingerprint: str = field(default_factory=lambda: uuid4().hex)
-    """Of this object and its copies alone."""
+    """Identifier of this object and its copies."""
 
     @cached_property
     def problem(self) -> Problem:
-        """The machines on the path."""
+        """Machines on the path."""
         return Problem(self.robot, Variables.of(self.robot, self.vary), self.path)
 
     def evaluate(self, points: Array) -> dict[str, Array]:
-        """Quantities of points (k, d) of the box, each 0 to 1, by name: shape (k,)."""
+        """Return quantities of points (k, d) of the box, each 0 to 1, by name: shape (k,)."""
         wanted = [find_quantity(name, "quantities") for name in self.quantities]
         found = self.problem.pieces(points, wanted)
         return {q.name: q.worst(pieces) for q, pieces in zip(wanted, found, strict=True)}
 
     def __getstate__(self) -> dict[str, Any]:
-        """Without what is made once a process."""
+        """Return the state without data that each process computes once."""
         return {key: value for key, value in vars(self).items() if key != "problem"}
 
 
 def known_quantities(robot: Robot, path: PosePath) -> list[str]:
-    """Quantities that the robot's file and the path have data for."""
+    """Return the quantities that the robot's file and the path have data for."""
     try:
         elastic = bool(robot.element_names)
     except ParameterError:
@@ -101,7 +101,7 @@ Work = Sequence[tuple[int, Array]]
 
 
 def compute_serially(box: Box, work: Work) -> Iterator[tuple[int, dict[str, Array]]]:
-    """Points part by part in this process."""
+    """Evaluate points part by part in this process."""
     for index, points in work:
         yield index, box.evaluate(points)
 
@@ -112,14 +112,14 @@ def sweep(
     seed: int = 0, progress: Callable[[int], None] = lambda _: None,
     compute: Callable[[Box, Work], Iterable[tuple[int, Mapping[str, Array]]]] = compute_serially,
 ) -> Sweep:  # fmt: skip
-    """Quantities of many machines whose numbers are within bounds.
+    """Compute quantities of many machines whose numbers are within bounds.
 
-    :param vary: as of :func:`pkm_twin.design.design`; also of the path.
+    :param vary, path: as of :func:`pkm_twin.design.design`.
     :param quantities: names; None: all that the robot's file and the path have data for.
     :param samples: machines along each variable of a grid, or in all.
-    :param progress: called with how many machines are done.
+    :param progress: called with the number of machines done.
     :param compute: evaluates the parts, in any order.
-    :raises ParameterError: a path, a quantity or a count that there is not.
+    :raises ParameterError: an unknown path or quantity, or an invalid count.
     """
     wanted = known_quantities(robot, path) if quantities is None else quantities
     names = tuple(find_quantity(name, "quantities").name for name in wanted)

@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""How far errors of parts take the platform, the actuated joints that lead held."""
+"""Compute how far errors of parts move the platform, leading actuated joints held."""
 
 from __future__ import annotations
 
@@ -31,27 +31,27 @@ from pkm_twin.robot.robot import Robot
 from stiffness_monitor.compliance import platform_response
 
 MIN_SINGULARITY_INDEX: Final = 0.05
-"""Least singularity index of joint states that stand for the workspace."""
+"""Smallest singularity index of joint states that represent the workspace."""
 MAX_DEVIATION: Final = 0.02
-"""Standard deviation at most, rad, or part of the machine's extent: more is a wrong unit."""
+"""Largest standard deviation, rad, or relative to the machine's size: more is a wrong unit."""
 MOTION_ROUNDING: Final = 1e-9
-"""Motion of the reference point that is rounding, m per rad of the platform's turn."""
+"""Motion of the reference point per rotation of the platform that is rounding, m per rad."""
 MAX_COMBINED_ERRORS: Final = 12
-"""Errors of which all combinations of signs are tried: 2,048 that differ."""
+"""Errors up to which all combinations of signs are tried: 2,048 different ones."""
 STATES_PER_BLOCK: Final = 256
-"""States whose bodies are solved for at a time: large tables for each."""
+"""States whose bodies are solved at a time: each has large tables."""
 
 
 @dataclass(frozen=True, eq=False)
 class Tolerances:
-    """Effect of independent errors of parts on the platform, to first order, actuated joints held.
+    """Hold the first-order effect of independent part errors on the platform, actuated joints held.
 
-    All arrays (..., 6): displacement of the reference point and small turns, base axes, m and rad,
-    against the machine without errors at the same joint positions. ``sigma``: standard deviation
-    by path, m or rad, and ``bounds``: how far the error may go, of a play half of it.
-    ``sensitivity``: by path, per m or rad of the error. ``texts``: what each error is, in words.
-    ``deflection``: of the machine without errors under the wrench, None without one: to first order
-    an error does not change it.
+    All arrays (..., 6): displacement of the reference point and small rotations, base axes, m and
+    rad, relative to the machine without errors at the same joint positions. ``sigma``: standard
+    deviation by path, m or rad, and ``bounds``: largest error, half of a play. ``sensitivity``: by
+    path, per m or rad of the error. ``texts``: description of each error. ``deflection``: of the
+    machine without errors under the wrench, None without one: to first order an error does not
+    change it.
     """
 
     sigma: Mapping[str, float]
@@ -63,14 +63,14 @@ class Tolerances:
 
     @cached_property
     def together(self) -> dict[str, list[str]]:
-        """Paths of each error: of a clearance the three of its axes."""
+        """Paths of each error: the three axes of a clearance."""
         found: dict[str, list[str]] = {}
         for path in self.sigma:
             found.setdefault(error_of(path), []).append(path)
         return found
 
     def effect(self, error: str) -> Array:
-        """Standard deviation by one error of :attr:`together`, shape (..., 6)."""
+        """Return the standard deviation by one error of :attr:`together`, shape (..., 6)."""
         return _root_of_squares([self.part(path) for path in self.together[error]])
 
     @cached_property
@@ -84,13 +84,13 @@ class Tolerances:
 
     @cached_property
     def is_exact(self) -> bool:
-        """Whether :attr:`farthest` is reached: few errors, and none of a free direction."""
+        """Whether :attr:`farthest` is attained: few errors, none of a free direction."""
         single = all(len(paths) == 1 for paths in self.together.values())
         return single and len(self.bounds) <= MAX_COMBINED_ERRORS
 
     @cached_property
     def farthest(self) -> Array:
-        """Greatest displacement (m) and rotation (rad) by all errors together, shape (..., 2).
+        """Largest displacement (m) and rotation (rad) by all errors together, (..., 2).
 
         A length is greatest with every error at one of its bounds: all combinations of signs are
         tried if :attr:`is_exact`. Otherwise this is an upper bound: the lesser of the errors'
@@ -109,7 +109,7 @@ class Tolerances:
             apart = np.linalg.norm(self.worst.reshape(*shape, 2, 3), axis=-1)
             return np.asarray(np.minimum(sum(lengths), apart), np.float64)
         each = np.array([self.bounds[path] * self.sensitivity[path] for path in self.sigma])
-        # Opposite signs throughout give the same length.
+        # Reversing all signs gives the same length.
         signs = np.array([(1.0, *row) for row in product((1.0, -1.0), repeat=len(each) - 1)])
         rows = each.reshape(len(each), -1, 6)
         found = [
@@ -119,7 +119,7 @@ class Tolerances:
         return np.reshape(found, (*shape, 2))
 
     def part(self, path: str) -> Array:
-        """Effect of one standard deviation of an error, shape (..., 6)."""
+        """Return the effect of one standard deviation of an error, shape (..., 6)."""
         return self.sigma[path] * self.sensitivity[path]
 
     @cached_property
@@ -129,15 +129,15 @@ class Tolerances:
 
     @cached_property
     def only_turns(self) -> bool:
-        """Whether the errors turn the platform about its reference point, which stays."""
+        """Whether the errors rotate the platform about its reference point without moving it."""
         moves, turns = np.split(self.deviation, 2, -1)
         return bool(np.linalg.norm(moves) < MOTION_ROUNDING * np.linalg.norm(turns))
 
     @cached_property
     def variance(self) -> dict[str, float]:
-        """Part of the variance of the position over all states that is each error's, 0 to 1.
+        """Fraction of the position's variance over all states by each error, 0 to 1.
 
-        Of the rotation where the platform's reference point stays.
+        If the reference point does not move, fraction of the rotation's variance.
         """
         counts = slice(3, 6) if self.only_turns else slice(0, 3)
         own = {path: float((self.part(path)[..., counts] ** 2).sum()) for path in self.sigma}
@@ -146,30 +146,30 @@ class Tolerances:
 
     @cached_property
     def share(self) -> dict[str, Array]:
-        """Part of the variance that is each error's, 0 to 1, shape (..., 6); 0 where none is."""
+        """Fraction of the variance by each error, 0 to 1, shape (..., 6); 0 without variance."""
         whole = np.where(self.deviation > 0.0, self.deviation, 1.0) ** 2
         return {path: self.part(path) ** 2 / whole for path in self.sigma}
 
 
 def _root_of_squares(parts: Sequence[Array]) -> Array:
-    """Root of the sum of squares."""
+    """Return the root of the sum of squares."""
     return np.asarray(np.sqrt(sum(part**2 for part in parts)), np.float64)
 
 
 def is_play(path: str) -> bool:
-    """Whether an error is a play, which no calibration knows."""
+    """Return whether an error is a play, which calibration cannot identify."""
     return error_of(path).endswith((".backlash", ".clearance"))
 
 
 def expand_patterns(
     robot: Robot, given: Mapping[str, float | Tolerance]
 ) -> dict[str, float | Tolerance]:
-    """Errors by single path: a pattern for all parts that fit, a clearance for its three axes.
+    """Return errors by single path: expand patterns to parts, a clearance to its three axes.
 
-    :raises ParameterError: a pattern that fits nothing, or a play that is not a bound.
+    :raises ParameterError: a pattern that matches nothing, or a play without a bound.
     """
     found: dict[str, float | Tolerance] = {}
-    # What is said of one part counts before a pattern.
+    # An entry for a single part takes precedence over a pattern.
     for path in sorted(given, key=lambda path: "*" not in str(path)):
         value = given[path]
         for name in matching(robot, path) if "*" in str(path) else [path]:
@@ -187,29 +187,29 @@ def tolerances(
     q: ArrayLike,
     wrench: ArrayLike | None = None,
 ) -> Tolerances:
-    """Errors of the platform by independent errors of single parts, to first order.
+    """Compute the platform's errors by independent errors of single parts, to first order.
 
     A part's error changes one part: the passive joints close the loops again while the actuated
     joints keep their positions. Paths, in base axes at home:
 
     - ``rods.NAME.length``;
     - ``bodies.NAME.length``: all joints and rods of the body, and the reference point on the
-      platform, but for its joint towards the base, move along the line from that joint to their
-      mean, across the axes where all joints of the body turn about parallel ones;
+      platform, except its joint towards the base, move along the line from that joint to their
+      mean, perpendicular to the axes if all joints of the body rotate about parallel ones;
     - ``joints.NAME.at[0]`` to ``[2]``: the joint's centre on its inner body alone;
     - ``joints.NAME.axis[0]``, ``[1]``: the joint's frame on its inner body turns about its centre
       and two axes across the joint's (first) axis;
-    - ``joints.NAME.offset``: an actuated joint stands by this beyond its position;
+    - ``joints.NAME.offset``: an actuated joint is off its position by this;
     - ``joints.NAME.backlash``: the play of an actuated joint, uniform within half of it either way;
-    - ``joints.NAME.clearance``: the play of a joint, whose centre on the inner body is half of it
-      away at most, in any direction;
-    - ``limbs.`` in front, or ``limbs[0].`` where ``limbs`` is a list: all copies of a limb alike,
-      in the axes of azimuth 0; paths with commas between: these parts alike.
+    - ``joints.NAME.clearance``: the play of a joint, whose centre on the inner body is up to half
+      of it away, in any direction;
+    - ``limbs.`` in front, or ``limbs[0].`` if ``limbs`` is a list: one error of all copies of a
+      limb, in the axes of azimuth 0; paths separated by commas: one error of these parts.
 
     Any other number of the file that moves the platform may be given too, such as
     ``geometry.arm_length``: then the file's number changes, with all that follows from it.
 
-    A * in a path stands for any text: each part that fits has an error of its own.
+    A * in a path stands for any text: each matching part has its own error.
 
     :param sigma: standard deviation by path, m or rad, at most :data:`MAX_DEVIATION`; or how the
         error is distributed.
@@ -241,7 +241,7 @@ def tolerances(
         told = value.size if isinstance(value, Tolerance) else value
         size = schema.checked(number, f"tolerance {path}", told)
         one = value if isinstance(value, Tolerance) else Tolerance(deviation=size)
-        # Parts stand half of a play away from its middle at most.
+        # Parts are at most half of a play away from its middle.
         sizes[path] = Tolerance(bound=size / 2.0) if is_play(path) else one
     for path in numbers:
         if states.size and not slopes[path].any():
@@ -273,7 +273,7 @@ def tolerances(
 
 
 def _deflection(robot: Robot, q: Array, wrench: ArrayLike) -> Array | None:
-    """Of the machine without errors, shape (..., 6); None where its file has no elasticity."""
+    """Return the deflection without errors, shape (..., 6); None without elasticity data."""
     try:
         _ = robot.element_names
     except ParameterError:
@@ -284,7 +284,7 @@ def _deflection(robot: Robot, q: Array, wrench: ArrayLike) -> Array | None:
 def drawn(
     robot: Robot, sigma: Mapping[str, float | Tolerance], q: ArrayLike, count: int, seed: int = 0
 ) -> Array:
-    """Errors of the platform of machines with random errors, by exact assembly in every state.
+    """Draw machines with random errors; return the platform's errors by exact assembly.
 
     :func:`tolerances` gives them to first order.
 
@@ -301,7 +301,7 @@ def drawn(
         if getattr(sizes[paths[0]], "bound", None) is None:
             errors |= {path: known.sigma[path] * rng.normal(size=count) for path in paths}
         else:
-            # The parts of a clearance touch somewhere: any direction, the bound's length.
+            # The parts of a clearance touch: any direction, with the bound's length.
             way = rng.normal(size=(len(paths), count)) if len(paths) > 1 else None
             unit = rng.uniform(-1.0, 1.0, (1, count)) if way is None else (
                 way / np.linalg.norm(way, axis=0))  # fmt: skip
@@ -313,7 +313,7 @@ def drawn(
     own = {path: robot.number(path) + errors[path] for path in errors if path not in parts}
     machines = variants(robot, own)
     if parts:
-        # The errors of parts are those of each machine, whose numbers differ.
+        # Each machine has its own numbers and its own part errors.
         found = np.concatenate([
             assembly.like(machine.graph).displaced(
                 _add_effects(robot, {path: errors[path][k : k + 1] for path in parts})
@@ -334,7 +334,7 @@ def drawn(
 
 
 def _add_effects(robot: Robot, errors: Mapping[str, Array]) -> dict[Effect, Array]:
-    """What moves by errors of parts, (count,) each."""
+    """Sum the effects of errors of parts, (count,) each."""
     effects: dict[Effect, Array] = {}
     for path, values in errors.items():
         part = part_of(robot, path)
@@ -344,9 +344,9 @@ def _add_effects(robot: Robot, errors: Mapping[str, Array]) -> dict[Effect, Arra
 
 
 def workspace_states(robot: Robot, count: int, seed: int = 0) -> Array:
-    """Joint states between the limits, away from singularities, shape (k, n), k at most ``count``.
+    """Draw joint states between the limits, away from singularities: (k, n), k up to ``count``.
 
-    :raises ParameterError: no limits of positions, or no such state.
+    :raises ParameterError: no position limits, or no such state.
     """
     limits = robot.limits.position
     if limits is None or not np.isfinite(limits).all():
@@ -361,10 +361,10 @@ def workspace_states(robot: Robot, count: int, seed: int = 0) -> Array:
 
 
 def rms(vectors: Array) -> float:
-    """Root mean square length of vectors (..., 3)."""
+    """Return the root mean square length of vectors (..., 3)."""
     return float(np.sqrt((vectors**2).sum(-1).mean()))
 
 
 def greatest(vectors: Array) -> float:
-    """The greatest length of vectors (..., 3)."""
+    """Return the largest length of vectors (..., 3)."""
     return float(np.linalg.norm(vectors, axis=-1).max())

@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""What a design may change: numbers of the file, alone or several together, between bounds."""
+"""Parse what a design may change: numbers of the file, alone or coupled, between bounds."""
 
 from __future__ import annotations
 
@@ -17,16 +17,17 @@ from pkm_twin.machine.uncertainty import Tolerance
 from pkm_twin.robot.robot import Robot
 
 MAX_RANGE: Final = 1e4
-"""Widest range of a variable over its value in the file, or the machine's size: in a wider one the
-search, which compares to a millionth of the range, loses the value."""
+"""Largest range of a variable over its value in the file, or the machine's size: the search
+resolves a millionth of the range, so a wider one loses the value."""
 
 
 @dataclass(frozen=True, eq=False)
 class Variables:
-    """Variables (d) as parts of their ranges, 0 to 1, and the numbers (p) of the file by them.
+    """Map variables (d), scaled to 0 to 1, to the numbers (p) of the file.
 
-    ``own``: the file's values, shape (p,). ``slopes``: of numbers by variables, shape (p, d).
-    ``low``, ``high``: shape (d,), of the first number of each. ``start``: the file's own, (d,).
+    ``own``: the file's values, shape (p,). ``slopes``: derivatives of numbers by variables, shape
+    (p, d). ``low``, ``high``: of the first number of each, shape (d,). ``start``: variables of the
+    file, (d,).
     """
 
     names: tuple[str, ...]
@@ -42,7 +43,7 @@ class Variables:
 
     @classmethod
     def of(cls, robot: Robot, vary: Mapping[str, tuple[float, float]]) -> Variables:
-        """Of names (see :func:`pkm_twin.design.search.design`) and their bounds.
+        """Return the variables of names (see :func:`pkm_twin.design.search.design`) and bounds.
 
         :raises ParameterError: an unknown path, one that is given twice, or bounds that
             are none.
@@ -90,16 +91,16 @@ class Variables:
         )  # fmt: skip
 
     def values(self, y: Array) -> Array:
-        """Numbers of the file of points (k, d), shape (k, p)."""
+        """Return the numbers of the file for points (k, d), shape (k, p)."""
         return np.asarray(self.own + (y - self.start) @ self.slopes.T)
 
     def named(self, y: Array) -> list[float]:
-        """Values of the variables at a point (d,)."""
+        """Return the values of the variables at a point (d,)."""
         return [float(v) for v in self.low + y * (self.high - self.low)]
 
 
 def parse_vary(texts: Sequence[str]) -> dict[str, tuple[float, float]]:
-    """Bounds by name of ``PATH=LOW:HIGH`` texts.
+    """Parse ``PATH=LOW:HIGH`` texts to bounds by name.
 
     :raises ParameterError: another form.
     """
@@ -108,7 +109,7 @@ def parse_vary(texts: Sequence[str]) -> dict[str, tuple[float, float]]:
 
 
 def parse_tolerances(texts: Sequence[str]) -> dict[str, Tolerance]:
-    """By path of ``PATH=SIGMA`` texts, standard deviations, and ``PATH=+-BOUND``.
+    """Parse ``PATH=SIGMA`` (standard deviation) and ``PATH=+-BOUND`` texts, by path.
 
     :raises ParameterError: another form, or a path that is given twice.
     """
@@ -125,7 +126,7 @@ def parse_tolerances(texts: Sequence[str]) -> dict[str, Tolerance]:
 def _parse_numbers(
     field: str, texts: Sequence[str], form: str, count: int
 ) -> dict[str, list[float]]:
-    """Numbers with colons between by the path before them."""
+    """Parse texts ``NAME=NUMBERS``, numbers separated by colons, by name."""
     found: dict[str, list[float]] = {}
     for text in texts:
         name, _, words = text.rpartition("=")

@@ -1,9 +1,9 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""Many machines that differ in numbers of their file, asked at once.
+"""Evaluate many machines that differ in numbers of their file, in one call.
 
-They share the programs of one robot; only what hangs on their numbers is computed for each. Where a
-machine does not have what a program takes for constant, a zero or a parallel axis, it is asked
-through a program of its own structure.
+They share the programs of one robot; only inputs that depend on their numbers are computed for
+each. If a machine lacks a property that a program takes as constant, a zero or a parallel axis, a
+program of its own structure is used.
 """
 
 from __future__ import annotations
@@ -37,24 +37,24 @@ from stiffness_monitor.programs import Elastic
 Mask = NDArray[np.bool_]
 
 MAX_CORNER_NUMBERS: Final = 5
-"""Most numbers of a section of which every combination of least and greatest is looked at."""
+"""Numbers of a section up to which all combinations of smallest and largest value are checked."""
 SAMPLES_PER_BALANCE: Final = 2048
-"""Samples whose joint loads are solved at a time: large tables for each."""
+"""Samples whose joint loads are solved at a time: each has large tables."""
 REACTION_ARRAYS: Final = (
     "points", "wrenches", "determinate", "values", "determinate_components", "residual",
 )  # fmt: skip
-"""Arrays of reactions."""
+"""Names of the arrays of reactions."""
 HOME_NEIGHBOURHOOD: Final = 1e-3
-"""How far beside home a machine has to be assembled too, rad, or part of the machine's size."""
+"""Distance from home at which a machine must be assembled too, rad, or over the machine's size."""
 
 
 class Variants:
-    """Machines of one robot with other numbers, see :func:`variants`.
+    """Evaluate machines of one robot with other numbers, see :func:`variants`.
 
-    Methods are like those of one robot, with an axis over the k machines in front of the result.
-    An input whose first axis has length k, and which has one axis more than a sample, is by
-    machine; every other input is that of all machines. (To give all machines the same k samples,
-    shape them (1, k, ...).) What a machine cannot do is NaN.
+    Methods are those of one robot, with a leading axis over the k machines in the result. An input
+    whose first axis has length k, and which has one axis more than a sample, is per machine; every
+    other input applies to all machines. (To give all machines the same k samples, shape them (1,
+    k, ...).) Results that a machine does not have are NaN.
     """
 
     def __init__(self, robot: Robot, numbers: Mapping[str, ArrayLike]) -> None:
@@ -75,7 +75,7 @@ class Variants:
             sizes = {path: len(a) for path, a in zip(self.paths, arrays, strict=True) if a.ndim}
             raise ParameterError("numbers", sizes, "as many of each, one per machine") from None
         self.values: Array = np.stack([np.atleast_1d(row) for row in rows], -1)
-        """Of the paths, shape (k, paths)."""
+        """Values of the paths, shape (k, paths)."""
         self.functions = robot.made(programs.NumberFunctions, self.paths)
         self._own: dict[int, Robot | PkmTwinError] = {}
         self._patterns: dict[int, str] = {}
@@ -85,9 +85,9 @@ class Variants:
         return len(self.values)
 
     def __getitem__(self, index: int) -> Robot:
-        """One of the machines, as a robot.
+        """Return one of the machines as a robot.
 
-        :raises PkmTwinError: there is no such machine, as of a file with its numbers.
+        :raises PkmTwinError: a file with its numbers is rejected.
         """
         k = range(len(self))[index]
         if k not in self._own:
@@ -119,7 +119,7 @@ class Variants:
         return np.asarray(sound.reshape(len(self), 3).all(1) & known)
 
     def reason(self, index: int) -> str:
-        """Why a machine is not valid; empty for one that is."""
+        """Return why a machine is not valid; empty for a valid one."""
         if self.valid[index]:
             return ""
         try:
@@ -133,17 +133,17 @@ class Variants:
     def inverse_dynamics(
         self, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, wrench: ArrayLike | None = None
     ) -> Array:
-        """Efforts, shape (k, ..., n), see :func:`delta_dynamics.inverse_dynamics`."""
+        """Return efforts, shape (k, ..., n), see :func:`delta_dynamics.inverse_dynamics`."""
         load = np.zeros(6) if wrench is None else wrench
         return self.run(programs.torques, q, qd, qdd, load)[0][0]
 
     def reactions(
         self, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, wrench: ArrayLike | None = None
     ) -> Reactions:
-        """Of arrays (k, ..., joints, 6) and so on, see :func:`delta_dynamics.reactions`.
+        """Return reactions with arrays (k, ..., joints, 6), see :func:`delta_dynamics.reactions`.
 
-        Where a machine has no assembly or no equilibrium nothing is determinate. Components along
-        "across 1" and "across 2" are in the directions that the first robot has.
+        Nothing is determinate for a machine without assembly or equilibrium. Components along
+        "across 1" and "across 2" are in the directions of the first robot.
         """
         self.robot.check_independent("joint loads of variants")
         load = np.zeros(6) if wrench is None else wrench
@@ -168,36 +168,36 @@ class Variants:
         return replace(parts[0], **made)
 
     def mass_matrix(self, q: ArrayLike) -> Array:
-        """Shape (k, ..., n, n), see :func:`delta_dynamics.mass_matrix`."""
+        """Return mass matrices, shape (k, ..., n, n), see :func:`delta_dynamics.mass_matrix`."""
         flat = self.run(programs.masses, q)[0][0]
         n = self.robot.joints_count
         return flat.reshape(*flat.shape[:-1], n, n)
 
     def agreeing(self, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike) -> tuple[Array, Array, Array]:
-        """Shape (k, ..., n) each, see :meth:`Robot.agreeing`."""
+        """Return states of all drives, shape (k, ..., n) each, see :meth:`Robot.agreeing`."""
         first, second, third = self.run(programs.agreeing, q, qd, qdd)[0]
         return first, second, third
 
     def forward(self, q: ArrayLike) -> Array:
-        """Poses, shape (k, ..., m), see :meth:`Robot.forward`."""
+        """Return poses, shape (k, ..., m), see :meth:`Robot.forward`."""
         return self.run(programs.forward, q)[0][0]
 
     def inverse(self, pose: ArrayLike) -> Array:
-        """Joint positions, shape (k, ..., n), see :meth:`Robot.inverse`."""
+        """Return joint positions, shape (k, ..., n), see :meth:`Robot.inverse`."""
         return self.run(programs.inverse, pose)[0][0]
 
     def jacobian(self, q: ArrayLike) -> Array:
-        """Pose rates per joint rate, shape (k, ..., m, n), see :meth:`Robot.jacobian`."""
+        """Return pose rates per joint rate, shape (k, ..., m, n), see :meth:`Robot.jacobian`."""
         flat, n = self.run(programs.jacobian, q)[0][0], self.robot.joints_count
         return flat.reshape(*flat.shape[:-1], len(self.robot.pose_names), n)
 
     def platform_jacobian(self, q: ArrayLike) -> Array:
-        """Platform twist per joint rate, shape (k, ..., 6, n)."""
+        """Return platform twists per joint rate, shape (k, ..., 6, n)."""
         flat, n = self.run(programs.jacobian, q)[0][1], self.robot.joints_count
         return flat.reshape(*flat.shape[:-1], 6, n)
 
     def platform_slopes(self, q: ArrayLike) -> Array:
-        """Platform twist by each number of one machine, joints held, shape (..., 6, paths).
+        """Return one machine's platform twist by each number, joints held, (..., 6, paths).
 
         :param q: joint positions, shape (samples, n).
         """
@@ -207,20 +207,20 @@ class Variants:
         return np.asarray(found[0] @ self.geometry_slopes, np.float64)
 
     def pose_acceleration(self, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike) -> Array:
-        """Second derivative of the pose, shape (k, ..., m)."""
+        """Return the second derivative of the pose, shape (k, ..., m)."""
         return self.run(programs.acceleration, q, qd, qdd)[0][0]
 
     def platform(self, q: ArrayLike) -> tuple[Array, Array]:
-        """Positions (k, ..., 3) and rotations (k, ..., 3, 3), see :meth:`Robot.platform`."""
+        """Return positions (k, ..., 3) and rotations (k, ..., 3, 3), see :meth:`Robot.platform`."""
         _, position, rotation = self.run(programs.forward, q)[0]
         return position, rotation.reshape(*rotation.shape[:-1], 3, 3)
 
     def singularity(self, q: ArrayLike) -> Array:
-        """Shape (k, ...), see :meth:`Robot.singularity`."""
+        """Return singularity indices, shape (k, ...), see :meth:`Robot.singularity`."""
         return np.asarray(self.run(programs.singularity, q)[0][0][..., 0], np.float64)
 
     def compliance(self, pose: ArrayLike) -> Array:
-        """Shape (k, ..., 6, 6), see :func:`stiffness_monitor.compliance`.
+        """Return compliances, (k, ..., 6, 6), see :func:`stiffness_monitor.compliance`.
 
         :raises ParameterError: the robot's file lacks a section that elasticity needs.
         """
@@ -230,9 +230,9 @@ class Variants:
         return np.asarray(found.reshape(*flat.shape[:-1], 6, 6), np.float64)
 
     def with_values(self, values: Array, *, checked: bool = False) -> Variants:
-        """Machines with other values of the same paths, shape (k, paths).
+        """Return machines with other values of the same paths, shape (k, paths).
 
-        :param checked: a file may have each of these values.
+        :param checked: the values are known to be valid.
         """
         made = copy.copy(self)
         for name, value in vars(type(self)).items():
@@ -260,12 +260,12 @@ class Variants:
 
     @cached_property
     def geometry_slopes(self) -> Array:
-        """Of the first machine's geometry by the numbers, shape (row, paths)."""
+        """Derivatives of the first machine's geometry by the numbers, shape (row, paths)."""
         return np.asarray(self.functions.geometry.slopes_at(self.values[:1])[0])
 
     @cached_property
     def rigid_slopes(self) -> Array:
-        """Of the first machine's geometry and masses by the numbers, shape (row, paths)."""
+        """Derivatives of the first machine's geometry and masses, shape (row, paths)."""
         return np.asarray(self.functions.rigid.slopes_at(self.values[:1])[0])
 
     @cached_property
@@ -275,7 +275,7 @@ class Variants:
 
     @cached_property
     def _out_of_range(self) -> Mask:
-        """Machines with numbers that no file may have."""
+        """Machines with numbers that a file may not have."""
         out = np.asarray(np.isnan(self.values).any(1))
         for columns in self._sections:
             known = self.values[~out][:, columns]
@@ -288,7 +288,7 @@ class Variants:
 
     @property
     def whole_box_fits(self) -> bool:
-        """Whether a file may have all numbers between the least and the greatest of each path."""
+        """Whether a file may have all numbers between each path's smallest and largest value."""
         return all(
             self._is_box_valid(columns, self.values[:, columns]) for columns in self._sections
         )
@@ -301,9 +301,9 @@ class Variants:
         return list(sections.values())
 
     def _is_box_valid(self, columns: Sequence[int], rows: Array) -> bool:
-        """What bounds numbers of a section together is convex: corners that hold do.
+        """Return whether all rows are valid, by their corners: bounds in a section are convex.
 
-        Numbers that hang on a parameter may be any function of it.
+        Numbers that depend on a parameter may be any function of it.
         """
         paths = [self.paths[column] for column in columns]
         if len(columns) > MAX_CORNER_NUMBERS or any(
@@ -314,7 +314,7 @@ class Variants:
         return all(self._is_valid(paths, row) for row in set(itertools.product(*ends)))
 
     def _is_valid(self, paths: Sequence[str], values: Sequence[float]) -> bool:
-        """Whether a file may have these numbers."""
+        """Return whether a file may have these numbers."""
         try:
             made = self.robot.numbered(dict(zip(paths, values, strict=True)))
             for path in paths:
@@ -324,7 +324,7 @@ class Variants:
         return True
 
     def _prepare(self, ask: programs.Ask, robot: Robot) -> tuple[Code, Array]:
-        """A robot's program, and what hangs on each machine's numbers, shape (k, prepared + 1)."""
+        """Return a robot's program, and its inputs of each machine, shape (k, prepared + 1)."""
         kernel, numbers = ask(robot)
         code = kernel.code
         found = self._prepared.get(id(code))
@@ -335,7 +335,7 @@ class Variants:
         return found
 
     def run(self, ask: programs.Ask, *inputs: ArrayLike) -> tuple[list[Array], Mask]:
-        """Outputs (k, ..., size) each, and which are good, shape (k, ..., 1)."""
+        """Return outputs (k, ..., size) each, and which are valid, shape (k, ..., 1)."""
         code, prepared = self._prepare(ask, self.robot)
         rows, batch = self._arrange_inputs(code, inputs)
         k, count = len(self), math.prod(batch)
@@ -358,12 +358,12 @@ class Variants:
     def _arrange_inputs(
         self, code: Code, inputs: Sequence[ArrayLike]
     ) -> tuple[list[Array], tuple[int, ...]]:
-        """Inputs as :meth:`Code.run_each` takes them, and the batch axes."""
+        """Return inputs as :meth:`Code.run_each` takes them, and the batch axes."""
         k = len(self)
         arrays, shapes = code.checked(inputs), []
         for array in arrays:
             each = array.ndim > 1 and array.shape[0] == k
-            # All machines are given the same k samples by a shape that begins with 1.
+            # A shape that begins with 1 gives all machines the same k samples.
             shapes.append((each, array.shape[1 if each or array.shape[:2] == (1, k) else 0 : -1]))
         batch = np.broadcast_shapes(*(shape for _, shape in shapes))
         rows = []
@@ -379,8 +379,8 @@ class Variants:
     def _programs_by_structure(
         self, ask: programs.Ask
     ) -> Iterator[tuple[Code, Array, NDArray[np.intp]]]:
-        """Programs with the machines that each is right for: one program a structure."""
-        # Where there is no assembly at home, there are no numbers for any program.
+        """Yield each structure's program with the machines that it is valid for."""
+        # Without an assembly at home there are no inputs for any program.
         left = np.asarray(~np.isnan(ask(self.robot)[1](self)).any(1))
         others = self.functions.others
         robots = itertools.chain([self.robot, *others], self._build_robots(left))
@@ -398,7 +398,7 @@ class Variants:
             left &= ~fits
 
     def _build_robots(self, left: Mask) -> Iterator[Robot]:
-        """The first of the machines that are left, as robots; it looks again after each."""
+        """Yield the first of the remaining machines as robots, checking again after each."""
         while left.any():
             first, *others = np.flatnonzero(left).tolist()
             try:
@@ -406,14 +406,14 @@ class Variants:
                 if _inertia_order(robot) == _inertia_order(self.robot):
                     yield robot
             except PkmTwinError:
-                # Machines with the same zeros and parallels can be built as little.
+                # Machines with the same zeros and parallels cannot be built either.
                 pattern = self._pattern(first)
                 for other in others:
                     left[other] = self._pattern(other) != pattern
             left[first] = False
 
     def _pattern(self, k: int) -> str:
-        """Text of a machine's zeros and parallels."""
+        """Return a text of a machine's zeros and parallels."""
         if k not in self._patterns:
             given = dict(zip(self.paths, self.values[k].tolist(), strict=True))
             try:
@@ -424,12 +424,12 @@ class Variants:
 
 
 def _inertia_order(robot: Robot) -> list[tuple[str, str]]:
-    """Bodies with the joints that carry them: the order of the inertial inputs."""
+    """Return bodies with the joints that carry them: the order of the inertial inputs."""
     return [(link.body, str(link.joint)) for link in robot.engine.tree.links.values()]
 
 
 def variants(robot: Robot, numbers: Mapping[str, ArrayLike]) -> Variants:
-    """Machines that differ from a robot in numbers of its file.
+    """Return machines that differ from a robot in numbers of its file.
 
     :param numbers: by dotted path as docs/parameters.md has it (``geometry.arm_length``,
         ``joints.ball_1.at[0]``; ``limbs.joints.ball.at[0]`` for all copies of a limb), each an
