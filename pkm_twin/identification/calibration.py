@@ -18,6 +18,7 @@ import numpy as np
 
 from pkm_twin.codegen.arrays import Array, Indices
 from pkm_twin.design import programs
+from pkm_twin.design.tolerance import Tolerances, is_play, tolerances, workspace_states
 from pkm_twin.design.variants import Variants
 from pkm_twin.errors import ParameterError, PkmTwinError, UnreachableError
 from pkm_twin.identification.calibration_fit import (
@@ -299,6 +300,36 @@ def left_by_calibration(
     table, wanted = ((scale * of(states)).reshape(6 * len(states), -1) for of in (slopes, errors))
     found = np.linalg.lstsq(table, wanted, rcond=UNSEEN)[0]
     return np.asarray(errors(q) - slopes(q) @ found, np.float64)
+
+
+MEASURED_STATES: Final = 100
+"""Joint states of the workspace in which a calibration measures poses."""
+
+
+def calibrated_errors(robot: Robot, found: Tolerances, q: Array) -> dict[str, Array]:
+    """Return the position errors that a calibration leaves of each error, shape (k, 3), m.
+
+    They are standard deviations.
+
+    A play changes from pose to pose, so that no calibration identifies it.
+
+    :param q: joint states of ``found``, shape (k, n).
+    """
+    known = {path: sigma for path, sigma in found.sigma.items() if not is_play(path)}
+    left = {n: found.effect(n)[:, :3] for n in found.together if is_play(n)}
+    if not known:
+        return left
+    try:
+        states = workspace_states(robot, MEASURED_STATES)
+    except ParameterError:
+        states = q[np.unique(np.linspace(0, len(q) - 1, MEASURED_STATES).round().astype(int))]
+
+    def errors(rows: Array) -> Array:
+        own = tolerances(robot, known, rows)
+        return np.stack([own.part(path) for path in known], -1)
+
+    stays = left_by_calibration(robot, errors, states, q)
+    return left | {path: stays[:, :3, k] for k, path in enumerate(known)}
 
 
 def unknowns(robot: Robot, measured: Measured, paths: Sequence[str], free: Free) -> list[Parameter]:

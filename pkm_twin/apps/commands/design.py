@@ -21,7 +21,7 @@ from pkm_twin.settings import setting
 
 if TYPE_CHECKING:
     from pkm_twin.design import Design as Found
-    from pkm_twin.design import DesignPoint, PosePath, Tolerances
+    from pkm_twin.design import DesignPoint, PosePath
     from pkm_twin.robot.robot import Robot
 
 SWEEPS: Final = ("grid", "sobol")
@@ -29,12 +29,8 @@ FILE_DIGITS: Final = 12
 """Significant digits of a number that is written."""
 STATES: Final = 2000
 """Joint states that stand for the workspace."""
-MEASURED: Final = 100
-"""Joint states of the workspace in which a calibration measures poses."""
 OF_FILE: Final = "file"
 """In place of a tolerance: those of the robot's file."""
-DRAWN_STATES: Final = 25
-"""Joint states, spread over all, in which drawn machines are assembled."""
 Box = Mapping[str, tuple[float, float]]
 
 
@@ -382,13 +378,15 @@ def swept(given: Design, path: Path, kind: str) -> Report:
 
 
 def budget(given: Design) -> Report:
-    """The pose error budget over a path, or over the workspace without one.
+    """Report the pose error budget over a path, or over the workspace without one.
 
     :raises ParameterError: as :func:`~pkm_twin.design.tolerances`, or a file without limits.
     """
-    from pkm_twin.design import drawn, tolerances
+    from pkm_twin.design import tolerances
+    from pkm_twin.design.budget import ErrorBudget, draw_machines
     from pkm_twin.design.tolerance import greatest, rms, workspace_states
     from pkm_twin.design.variables import parse_tolerances
+    from pkm_twin.identification.calibration import calibrated_errors
 
     robot, where = given.machine(), "the workspace"
     sigma = parse_tolerances([text for text in given.tolerance if text != OF_FILE])
@@ -404,19 +402,14 @@ def budget(given: Design) -> Report:
             given.path.name,
         )
     found = tolerances(robot, sigma, q, given.wrench)
-    left = {n: v.round(FILE_DIGITS) for n, v in after_calibration(robot, found, q).items()}
-    shares = {
-        name: sum(found.variance[path] for path in paths) for name, paths in found.together.items()
-    }
-    rows: dict[str, list[Any]] = {}
-    for name, paths in sorted(found.together.items(), key=lambda item: -shares[item[0]]):
-        moves, turns = np.split(found.effect(name).round(FILE_DIGITS), 2, -1)
-        still = not any(np.any(np.abs(found.sensitivity[path]) > 1e-9) for path in paths)
-        rows[name] = [
-            found.sigma[paths[0]], found.bounds[paths[0]], found.units[paths[0]], rms(moves),
-            greatest(moves), rms(turns), greatest(turns), rms(left[name]), shares[name],
-            found.texts[paths[0]], "moves nothing" if still else "",
-        ]  # fmt: skip
+    summary = ErrorBudget(robot, found, q, calibrated_errors(robot, found, q))
+    rows: dict[str, list[Any]] = {
+        name: [
+            one.sigma, one.bound, one.unit, *one.position, *one.angle, one.calibrated, one.share,
+            one.text, "" if one.moves else "moves nothing",
+        ]
+        for name, one in summary.contributions.items()
+    }  # fmt: skip
     columns = [
         Column("sigma"),
         Column("bound", "", None),
@@ -430,17 +423,11 @@ def budget(given: Design) -> Report:
         Column("varied", text="what varies"),
         Column("", text=" "),
     ]
-    moves, turns = np.split(found.deviation.round(FILE_DIGITS), 2, -1)
-    turning, bounds = found.only_turns, found.farthest.round(FILE_DIGITS)
-    farthest, worst = (
-        robot.forward(q[int(sizes.argmax())]).round(12) + 0.0
-        for sizes in (
-            bounds[..., int(turning)],
-            np.linalg.norm((moves, turns)[turning], axis=-1),
-        )
-    )
-    at, bound_at = (f" at {_place(robot, pose)}" for pose in (worst, farthest))
-    most, (shift, bound) = greatest(turns), bounds.max(0).tolist()
+    moves, turns = summary.deviations
+    turning, (shift, bound) = found.only_turns, summary.bounds
+    at, bound_at = (f" at {_place(robot, pose)}" for pose in
+                    (summary.worst_pose, summary.bound_pose))  # fmt: skip
+    most = greatest(turns)
     case = "worst case of all bounds" if found.is_exact else "upper bound of the worst case"
     facts = [
         Fact("robot", robot.name),
@@ -453,18 +440,17 @@ def budget(given: Design) -> Report:
              f"{1e3 * rms(turns):.4g} mrad"),
         Fact("greatest_angle_rad", most, "rad", "largest standard deviation" if turning else None,
              f"{1e3 * most:.4g} mrad{at}"),
-        Fact("worst_pose", worst),
+        Fact("worst_pose", summary.worst_pose),
         _length("bound_position_m", shift, None if turning else case, bound_at),
         Fact("bound_angle_rad", bound, "rad", case if turning else None,
              f"{1e3 * bound:.4g} mrad{bound_at}"),
-        Fact("bound_pose", farthest),
+        Fact("bound_pose", summary.bound_pose),
         Fact("bound_is_reached", found.is_exact),
-        _length("rms_calibrated_position_m", rms(np.sqrt(sum(v**2 for v in left.values()))),
+        _length("rms_calibrated_position_m", summary.calibrated_position,
                 "RMS after a calibration without noise"),
     ]  # fmt: skip
     if given.monte_carlo:
-        chosen = np.unique(np.linspace(0, len(q) - 1, DRAWN_STATES).round().astype(int))
-        errors = drawn(robot, sigma, q[chosen], given.monte_carlo, given.seed)
+        chosen, errors = draw_machines(summary, sigma, given.monte_carlo, given.seed)
         exact = {
             "machines": given.monte_carlo, "states": len(chosen),
             "rms_position_m": rms(errors[..., :3]),
@@ -483,7 +469,7 @@ def budget(given: Design) -> Report:
         label = "deflection under the wrench, not in the table: RMS"
         facts.append(_length("rms_deflection_m", bent, label))
     what = f"position {1e3 * rms(moves):.4g} mm"
-    if found.only_turns:
+    if turning:
         what = f"rotation {1e3 * rms(turns):.4g} mrad"
     held = f"{', '.join(robot.graph.leads)}" if robot.redundant else "actuated joints"
     return Report(
@@ -492,32 +478,6 @@ def budget(given: Design) -> Report:
         facts,
         [Table("contributions", columns, rows, head="error")],
     )
-
-
-def after_calibration(robot: Robot, found: Tolerances, q: Any) -> dict[str, Any]:
-    """What a calibration leaves of each error's standard deviation of the position, (k, 3).
-
-    Plays change from pose to pose: no calibration knows them.
-    """
-    from pkm_twin.design import tolerances
-    from pkm_twin.design.tolerance import is_play, workspace_states
-    from pkm_twin.identification.calibration import left_by_calibration
-
-    known = {path: sigma for path, sigma in found.sigma.items() if not is_play(path)}
-    left = {n: found.effect(n)[:, :3] for n in found.together if is_play(n)}
-    if not known:
-        return left
-    try:
-        states = workspace_states(robot, MEASURED)
-    except ParameterError:
-        states = q[np.unique(np.linspace(0, len(q) - 1, MEASURED).round().astype(int))]
-
-    def errors(rows: Any) -> Any:
-        own = tolerances(robot, known, rows)
-        return np.stack([own.part(path) for path in known], -1)
-
-    stays = left_by_calibration(robot, errors, states, q)
-    return left | {path: stays[:, :3, k] for k, path in enumerate(known)}
 
 
 def _place(robot: Robot, pose: Any) -> str:
