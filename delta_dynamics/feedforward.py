@@ -29,6 +29,7 @@ from pkm_twin.robot.derivatives import nearest_motion
 from pkm_twin.robot.effort_limits import NON_FINITE, EffortLimits, LimitedEfforts, LimitPolicy
 from pkm_twin.robot.limits import first_beyond
 from pkm_twin.robot.robot import Robot
+from pkm_twin.robot.workspace import passing_singularity
 from pkm_twin.settings import COUNT, FUTURE, LATE, SECONDS, SHARE, ZERO_STAMP, setting
 from pkm_twin.streams.continuity import Continuity
 from pkm_twin.streams.differentiator import Differentiator
@@ -372,8 +373,8 @@ class Feedforward(Core):
             raise MessageError(
                 "singular",
                 f"point {first + worst}: close to a singularity or the edge of the workspace: "
-                "index "
-                f"{measures[worst]:.3g}, allowed {stop:g} or more (singularity_stop)",
+                f"index {measures[worst]:.3g}, allowed {stop:g} or more; "
+                f"{passing_singularity(float(measures[worst]), 'singularity_stop ')} passes",
             )
         self.near_singularities += int((measures < self.settings.singularity_warn).sum())
 

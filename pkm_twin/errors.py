@@ -163,8 +163,8 @@ class UnreachableError(PkmTwinError, ValueError):
     ``limb`` is the name of the limb or joint, ``index`` the sample's index in the batch (``()`` for
     one sample), ``miss`` the gap that remains (m), ``reached`` the fraction of the straight line
     from home up to which there is an assembly, None if no line was followed.
-    ``question``: whether the pose has another unit, in place of that fraction. ``how``: why the
-    limb has no place, in place of the gap.
+    ``question``: which coordinate is far beyond the machine and which unit it may have, in place of
+    limb and gap. ``how``: why the limb has no place, in place of the gap.
     """
 
     def __init__(
@@ -179,10 +179,10 @@ class UnreachableError(PkmTwinError, ValueError):
     ) -> None:
         where = f" at sample {index if len(index) != 1 else index[0]}" if index else ""
         way = "" if reached is None else f", beyond {100 * reached:.3g} % of the way from home"
-        way = question or way
         # A limb of no length at all misses nothing, and points nowhere.
         gap = f"misses by {miss:.6g} m" if miss else "has no direction there"
-        super().__init__(f"{what}{where} is unreachable: {limb} {how or gap}{way}")
+        text = f" is unreachable: {limb} {how or gap}{way}"
+        super().__init__(f"{what}{where}{question or text}")
         self.reached = reached
         self.limb = limb
         self.index = index
@@ -196,7 +196,8 @@ class SingularityError(PkmTwinError, ValueError):
     ``measure`` is the dimensionless reciprocal condition number, ``bound`` the least valid one;
     ``reached`` the fraction of the straight line from home at which the singularity occurs, None at
     the pose itself; ``beyond`` whether the pose is on the other side of one;
-    ``question`` ends the text.
+    ``question``: which coordinate is far beyond the machine and which unit it may have; all that is
+    said then.
     """
 
     def __init__(
@@ -210,16 +211,18 @@ class SingularityError(PkmTwinError, ValueError):
         question: str = "",
     ) -> None:
         where = f" at sample {index if len(index) != 1 else index[0]}" if index else ""
-        if beyond:
-            text = "lies beyond a singularity: its joint positions assemble the machine elsewhere"
+        if question:
+            text = question
+        elif beyond:
+            text = " lies beyond a singularity: its joint positions assemble the machine elsewhere"
         elif reached is None:
-            text = f"is singular: reciprocal condition {measure:.3g} is below {bound:.3g}"
+            text = f" is singular: reciprocal condition {measure:.3g} is below {bound:.3g}"
         else:
             text = (
-                "lies beyond a singularity, which the straight path from home meets at "
+                " lies beyond a singularity, which the straight path from home meets at "
                 f"{100 * reached:.3g} %"
             )
-        super().__init__(f"{what}{where} {text}{question}")
+        super().__init__(f"{what}{where}{text}")
         self.reached, self.beyond = reached, beyond
         self.index = index
         self.measure = measure

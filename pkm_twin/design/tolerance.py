@@ -260,8 +260,9 @@ def tolerances(
             if missed > MAX_OPEN_FRACTION:
                 raise ParameterError(
                     f"tolerance {path}", part.text,
-                    f"an error after which rigid parts still fit: {robot.name} is overconstrained, "
-                    f"and {100 * missed:.2g} % of this error are left to clearance or deformation",
+                    f"errors after which the closed loops of {robot.name} still assemble (this one "
+                    f"alone leaves {100 * missed:.2g} % of it open); parts with commas between "
+                    f"share an error: {path},OTHER_PART=SIZE",
                 )  # fmt: skip
     return Tolerances(
         {path: size.sigma for path, size in sizes.items()}, {path: slopes[path] for path in sizes},

@@ -25,7 +25,7 @@ from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import PkmTwinError, check_limit
 from pkm_twin.identification.parameters import FileParameters
 from pkm_twin.robot.robot import Robot
-from pkm_twin.robot.workspace import position_range, reachable
+from pkm_twin.robot.workspace import passing_singularity, position_range, reachable
 
 SAMPLES: Final = 120
 """States of a trial at which the information is taken."""
@@ -203,10 +203,7 @@ def excite(
         if progress is not None:
             progress(trial + 1)
     if best is None:
-        raise PkmTwinError(
-            "no trajectory found inside the limits and away from singularities; try a smaller "
-            "--singularity or wider limits.position"
-        )
+        raise PkmTwinError(f"no trajectory found inside the limits; {_remedy(robot, keep, centre)}")
     final = _clear_of(robot, keep, duration, harmonics, centre, best[2], whole.time, whole.margin)
     if final is None:
         raise PkmTwinError(
@@ -321,6 +318,21 @@ def clear(robot: Robot, keep: Bounds, q: Array, qd: Array, qdd: Array, margin: f
     return bool((np.abs(efforts) <= margin * keep.share * robot.limits.effort).all())
 
 
+def _remedy(robot: Robot, keep: Bounds, centre: Array) -> str:
+    """Return what would let joints move about their centre (n,): the bound of the index, or limits.
+
+    Motions shrink towards the centre, so that its index decides.
+    """
+    index = float(robot.try_singularity(centre[None])[0][0])
+    if index >= keep.singularity:
+        return "try wider limits.position"
+    return (
+        f"the singularity index is {index:.3g} in the middle of the travel, allowed "
+        f"{keep.singularity:g} or more; {passing_singularity(index)} passes there, half of it "
+        "leaves room to move"
+    )
+
+
 @dataclass(frozen=True, eq=False)
 class Sweeps:
     """Sweeps of one joint at a time, the other joints at their centres.
@@ -418,8 +430,8 @@ def sweeps(judge: Judge, duration: float, bounds: Bounds | None = None) -> Sweep
             reach[j] *= SHRINK
         else:
             raise PkmTwinError(
-                f"{robot.joint_names[j]} cannot move alone inside the limits; try a smaller "
-                "--singularity or wider limits.position"
+                f"{robot.joint_names[j]} cannot move alone inside the limits; "
+                f"{_remedy(robot, keep, centre)}"
             )
     found = Sweeps(centre, reach, np.array([speeds(j) for j in range(n)]))
     motion = found.at(np.linspace(0.0, found.duration, 3 * n * STATES))

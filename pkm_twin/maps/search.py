@@ -90,7 +90,7 @@ def find_worst(
         if without.any() and not inside(tried).any():
             best = float(robot.try_singularity(space.state(tried)[0][without])[0].max())
             raise ParameterError(
-                "singularity", space.least, f"{passing_singularity(best).split()[1]} or less: "
+                "singularity", space.least, f"{passing_singularity(best, '')} or less: "
                 f"no pose has a singularity index of {space.least:g} or more (best: {best:.3g})",
             )  # fmt: skip
         why = "" if inside(tried).any() else causes(

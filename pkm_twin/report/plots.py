@@ -91,7 +91,9 @@ def head(figure: Any, text: str, size: float = STYLE["figure.titlesize"]) -> int
 
 
 def legend(ax: Any, below: bool = False) -> None:
-    """Place the legend to the right of the data, or below."""
+    """Place the legend to the right of the data, or below; none where no curve has a label."""
+    if not ax.get_legend_handles_labels()[0]:
+        return
     if below:
         ax.legend(ncol=2, loc="upper center", bbox_to_anchor=(0.5, -0.16))
     else:

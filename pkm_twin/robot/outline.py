@@ -167,6 +167,18 @@ def base_face(graph: Graph) -> Array:
     return face(list(_fixed(graph, BASE)))
 
 
+def base_line(graph: Graph) -> Array:
+    """Return the farthest two of the points that the base's joints stand on, (2, 3) or (0, 3).
+
+    The ground of a planar linkage, whose base has no face.
+    """
+    points = np.array(list(_fixed(graph, BASE))).reshape(-1, 3)
+    far = np.linalg.norm(points[:, None] - points, axis=-1)
+    if not far.any():
+        return np.zeros((0, 3))
+    return points[list(np.unravel_index(int(far.argmax()), far.shape))]
+
+
 def platform_face(graph: Graph) -> Array:
     """Corners of the platform: its joints and rods' ends, without what it slides along."""
     return face(list(_fixed(graph, graph.platform)))

@@ -241,12 +241,18 @@ class Robot(Mechanism):
         raise SingularityError("pose", index, measure, SINGULARITY_BOUND, None, True, slip)
 
     def _slip(self, pose: Array) -> str:
-        """The unit that a pose (m,) far beyond the machine may be in, as a question."""
+        """Return which coordinate of a pose (m,) is far beyond, with a question about its unit."""
         far = np.abs(pose - self.home())
-        angle = np.array([unit == "rad" for unit in self.pose_units])
-        if (far[~angle] > FAR * self.graph.size).any():
-            return "; is it in mm?"
-        return "; in degrees?" if (far[angle] > 2 * np.pi).any() else ""
+        for unit, most, other in (("m", FAR * self.graph.size, "mm"), ("rad", 2.0 * np.pi, "deg")):
+            own = np.where([one == unit for one in self.pose_units], far, 0.0)
+            k = int(own.argmax())
+            if own[k] > most:
+                name, word = self.pose_names[k], {"mm": "mm", "deg": "degrees"}[other]
+                return (
+                    f": {name} {pose[k]:.6g} {unit} cannot be reached. Did you give {word}? A "
+                    f"table's header is then `{name} [{other}]`"
+                )
+        return ""
 
     def forward(self, q: ArrayLike) -> Array:
         """Pose of joint positions q, shape (..., m), in the mechanism's documented assembly.

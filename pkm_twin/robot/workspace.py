@@ -297,10 +297,12 @@ def _first_rungs(
     return rung, left
 
 
-def passing_singularity(index: float) -> str:
-    """Return the option whose bound a singularity index passes: the index, rounded down."""
-    digits = 1 - math.floor(math.log10(index)) if index > 0.0 else 0
-    return f"--singularity {math.floor(index * 10**digits) / 10**digits:g}"
+def passing_singularity(index: float, bound: str = "--singularity ") -> str:
+    """Return a bound that a singularity index passes, the index rounded down, after its name."""
+    if not index > 0.0:
+        return f"{bound}0"
+    digits = 1 - math.floor(math.log10(index))
+    return f"{bound}{math.floor(index * 10**digits) / 10**digits:g}"
 
 
 def causes(

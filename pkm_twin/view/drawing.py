@@ -10,6 +10,7 @@ from matplotlib.path import Path as Outline
 
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.report.plots import pyplot
+from pkm_twin.robot.outline import base_line
 from pkm_twin.robot.robot import Robot
 from pkm_twin.view.scene import ANCHORS, GROUND, PLATFORM, Scene, anchors
 from pkm_twin.view.stage import LETTER, LOOK
@@ -129,6 +130,10 @@ class Camera:
         return np.asarray(fine.mean((1, 3)), np.float64)
 
 
+GROUND_BAR: Final = 0.015
+"""Radius of the ground between a planar linkage's joints, of the machine's size."""
+
+
 def draw(robot: Robot) -> Any:
     """A matplotlib figure of the robot at home.
 
@@ -151,6 +156,8 @@ def draw(robot: Robot) -> Any:
         camera.plate(scene.platform + shapes.platform_at, PLATFORM)
     if len(scene.base):
         camera.plate(scene.base, GROUND, opacity=0.35)
+    elif len(ground := base_line(robot.graph)):
+        camera.cylinder(ground, GROUND_BAR * scene.size, GROUND)
     figure = pyplot().figure(figsize=(WIDTH / DPI, HEIGHT / DPI), dpi=DPI)
     ax = figure.add_axes((0.0, 0.0, 1.0, 1.0))
     extent = (camera.low[0], camera.high[0], camera.low[1], camera.high[1])

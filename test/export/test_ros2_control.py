@@ -514,7 +514,7 @@ def test_settings_name_the_joints_and_have_the_gains_of_the_masses(files):
     ("name", "package"),
     [
         ("delta_cu", "delta_cu"), ("My Delta-2", "my_delta_2"), ("3rps", "robot_3rps"),
-        ("größe", "gr_e"), ("__", "robot"), ("a//b", "a_b"),
+        ("größe", "gru00f6u00dfe"), ("__", "robot"), ("a//b", "a_b"),
     ],
 )  # fmt: skip
 def test_names_of_packages(name, package):

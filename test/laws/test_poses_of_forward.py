@@ -132,7 +132,8 @@ def test_all_joints_of_a_spherical_machine_in_one_point(shift, rng):
 
 @pytest.mark.parametrize(
     ("name", "far", "question"),
-    [("delta", [0.0, 0.0, -350.0], "is it in mm"), ("prru", [0.84, 30.0, 0.0], "in degrees"),
+    [("delta", [0.0, 0.0, -350.0], "z -350 m cannot be reached. Did you give mm?"),
+     ("prru", [0.84, 30.0, 0.0], "30 rad cannot be reached. Did you give degrees?"),
      ("delta", [0.0, 0.0, -2.0], "")],
 )  # fmt: skip
 def test_a_pose_in_another_unit_is_asked_for(name, far, question):

@@ -22,6 +22,8 @@ from pkm_twin.robot.mechanism import RigidError
 from pkm_twin.robot.plausibility import findings, why_no_torques
 from pkm_twin.robot.robot import Robot
 
+DRAWN_APART: Final = 0.02
+"""Distance of drives, of the machine's size, up to which a picture shows them at one point."""
 MOST_NAMES: Final = 6
 """Most names that a line has."""
 
@@ -111,8 +113,20 @@ def info(given: Info) -> Report:
         if section not in ("mechanism", "name", PARAMETERS) and not listed:
             facts += _parameters(section, value, units.get(section, ""))
     return Report(
-        f"{robot.name}: {robot.description}", facts, figures={"": lambda: _picture(robot)}
-    )
+        f"{robot.name}: {robot.description}", facts, figures={"": lambda: _picture(robot)},
+        notes=_joints_at_one_point(robot) if given.picture else [],
+    )  # fmt: skip
+
+
+def _joints_at_one_point(robot: Robot) -> list[str]:
+    """Return a note on how to draw a machine apart whose drives' joints stand at one point."""
+    places = np.array([robot.graph.joints[name].at for name in robot.joint_names])
+    if len(places) < 2 or np.ptp(places, axis=0).max() > DRAWN_APART * robot.graph.size:
+        return []
+    return [
+        f"{', '.join(robot.joint_names)} stand at one point in the picture: give each joint's `at` "
+        "a point of its own along its axis, which changes nothing else"
+    ]
 
 
 def members_fault(robot: Robot) -> str:

@@ -107,7 +107,18 @@ class Workspace(Kind):
         """Return sentences on the reachable volume and the cylinder."""
         facts = []
         if "volume" in data:
-            facts.append(f"reaches {float(data.volume):.4g} {data.volume.attrs['units']}")
+            names = [str(name) for name in data.coordinate.values]
+            counted = np.isfinite(data.value.values).any(-1)
+            extents = []
+            for k, name in enumerate(names):
+                others = tuple(axis for axis in range(len(names)) if axis != k)
+                ends = data[name].values[counted.any(others)]
+                extents.append(f"{name} {ends.min():.3g} to {ends.max():.3g}")
+            what = {2: "area", 3: "volume"}.get(len(names), "measure")
+            facts.append(
+                f"{what} of the reachable {', '.join(names)}: {float(data.volume):.4g} "
+                f"{data.volume.attrs['units']}; {', '.join(extents)}"
+            )
         else:
             of = "joint states within limits" if "sample" in data.sizes else "the poses tried"
             facts.append(f"reaches {100 * float(data.valid):.3g} % of {of}")

@@ -92,7 +92,6 @@ private:
   Load load_;
   Counters counters_;
   Motion target_;
-  State state_{};
   Vector feedforward_{}, effort_{};
   Rejection verdict_ = REJECTIONS;
   std::size_t joint_ = JOINTS;

@@ -54,16 +54,15 @@ inline Vector model_velocities(const Vector & qd)
   return result;
 }
 
-/// Efforts, and the singularity index: 0 in a singularity, 1 at best; of the stream's next sample.
+/// Efforts, and the singularity index: 0 in a singularity, 1 at best.
 inline int efforts(
-  const Parameters & parameters, State & state, const Vector & q, const Vector & qd,
-  const Vector & qdd, Vector & tau, double & index)
+  const Parameters & parameters, const Vector & q, const Vector & qd, const Vector & qdd,
+  Vector & tau, double & index)
 {
   constexpr std::array<double, 6> no_wrench{};
   const Vector x = model_positions(q), v = model_velocities(qd), a = model_rates(qdd);
-  const int status = @PREFIX@_torques_and_singularity_next_with(
-    parameters.data(), state.data(), x.data(), v.data(), a.data(), no_wrench.data(), tau.data(),
-    &index);
+  const int status = @PREFIX@_torques_and_singularity_with(
+    parameters.data(), x.data(), v.data(), a.data(), no_wrench.data(), tau.data(), &index);
   for (std::size_t i = 0; i < JOINTS; ++i) {
     tau[i] /= DRIVES[i].factor;
   }
@@ -74,9 +73,8 @@ inline int efforts(
   const Parameters & parameters, const Vector & q, const Vector & qd, const Vector & qdd,
   Vector & tau)
 {
-  State none{};
   double index;
-  return efforts(parameters, none, q, qd, qdd, tau, index);
+  return efforts(parameters, q, qd, qdd, tau, index);
 }
 
 /// Friction of the drives. Dry friction is zero at rest.

@@ -14,8 +14,6 @@ namespace @PACKAGE@
 constexpr std::size_t JOINTS = @MACRO@_JOINTS, FREEDOMS = @MACRO@_POSE;
 using Vector = std::array<double, JOINTS>;
 using Parameters = std::array<double, @MACRO@_PARAMETERS>;
-/// What one sample of a stream leaves to the next; zeros before the first one.
-using State = std::array<double, @MACRO@_STATE>;
 
 constexpr double UNLIMITED = std::numeric_limits<double>::infinity();
 

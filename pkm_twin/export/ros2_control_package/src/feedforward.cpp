@@ -54,8 +54,7 @@ Rejection Feedforward::compute(const Motion & motion, Vector & effort)
     }
   }
   const int status = efforts(
-    load_.parameters, state_, motion.position, motion.velocity, motion.acceleration, effort,
-    found_);
+    load_.parameters, motion.position, motion.velocity, motion.acceleration, effort, found_);
   if (status != 0) {
     return status == 1 ? NO_ASSEMBLY : NOT_FINITE;
   }
