@@ -56,7 +56,7 @@ def test_a_map_to_pictures_and_shown_again(call, tmp_path):
     """The answer is the first line; the file says what made it; `atlas` is the older name."""
     pytest.importorskip("plotly")
     out = call(*SMALL, "--out", "a.nc", "--jobs", "1").out
-    assert "reaches" in out.splitlines()[0]
+    assert "reachable" in out.splitlines()[0]
     with open_map(tmp_path / "a.nc") as data:
         assert data.attrs["robot"] == "five_bar"
         assert "arm" in data.attrs["robot_parameters"]
