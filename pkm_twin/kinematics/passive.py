@@ -9,6 +9,7 @@ two revolutes, that turn them from their direction at home.
 
 from __future__ import annotations
 
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -21,7 +22,8 @@ from pkm_twin.kinematics.engine import Engine
 from pkm_twin.kinematics.motion import cross
 from pkm_twin.kinematics.traced import Traced
 from pkm_twin.machine.graph import Rod
-from pkm_twin.machine.joints import Free, across, single_names, unit
+from pkm_twin.machine.joints import across, single_names, unit
+from pkm_twin.machine.names import FREE, ROD, joint_labels
 from pkm_twin.machine.tree import Link
 
 
@@ -33,13 +35,15 @@ def rod_axes(rod: Rod) -> tuple[Array, Array]:
 def passive_names(engine: Engine) -> tuple[str, ...]:
     """Names of all passive numbers: of the tree from the ground outwards, then of the rods."""
     names: list[str] = []
+    labels = joint_labels(engine.tree)
     for link in engine.tree.links.values():
-        joint = None if link.joint is None else engine.graph.joints[link.joint]
-        if joint is None:
-            names += single_names(f"{link.body}_free", Free.freedoms(np.zeros((0, 3)), 0.0))
+        if link.joint is None:
+            names += single_names(labels["bodies", link.body], FREE)
         else:
-            names += single_names(joint.name, joint.freedoms)[joint.actuated :]
-    return (*names, *(f"{rod}_{k}" for rod in engine.graph.rods for k in (1, 2)))
+            joint = engine.graph.joints[link.joint]
+            names += single_names(labels["joints", joint.name], joint.freedoms)[joint.actuated :]
+    rods = (single_names(labels["rods", rod], ROD) for rod in engine.graph.rods)
+    return (*names, *chain.from_iterable(rods))
 
 
 def passive_program(t: Traced) -> Program:

@@ -19,8 +19,9 @@ import numpy as np
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError
 from pkm_twin.machine.joints import TYPES, Free, Freedom, JointType, single_names
+from pkm_twin.machine.names import plain_name
 from pkm_twin.machine.rotations import Pose
-from pkm_twin.machine.urdf_xml import free_name, plain_name
+from pkm_twin.machine.urdf_xml import free_name
 
 KINDS: Final[Mapping[str, type[JointType]]] = {**TYPES, Free.name: Free}
 """Types of joints, that of a body that closures alone hold among them."""

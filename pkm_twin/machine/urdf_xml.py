@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import math
-import re
 import xml.etree.ElementTree as ET
 from collections.abc import Collection, Container, Mapping
 from pathlib import Path
@@ -17,13 +16,13 @@ from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError, UnknownNameError
 from pkm_twin.files import decimal, read_bounded
 from pkm_twin.machine.formulas import MAX_SIZE
+from pkm_twin.machine.names import plain_name
 from pkm_twin.machine.rotations import Pose, from_quaternion, from_rpy
 
 MAX_FILE_SIZE: Final = 4 * 1024 * 1024
 """Largest URDF that is read, bytes."""
 MAX_DEPTH: Final = 64
 """Deepest nesting of elements that is read."""
-ROMAN: Final = {"I": "1", "II": "2", "III": "3", "IV": "4", "V": "5", "VI": "6"}
 UNLIMITED: Final = {
     "revolute": 2.0 * math.pi - 1e-6,
     "prismatic": 10.0,
@@ -111,12 +110,6 @@ def single(element: ET.Element, tag: str, where: str) -> ET.Element | None:
     if len(found) > 1:
         raise ParameterError(f"{where}.{tag}", f"{len(found)} <{tag}> elements", "at most one")
     return found[0] if found else None
-
-
-def plain_name(name: str) -> str:
-    """A link's name that takes no quoting anywhere: ``arm I`` is ``arm_1``."""
-    words = re.sub(r" (I{1,3}|IV|VI?)(?![A-Za-z0-9])", lambda found: "_" + ROMAN[found[1]], name)
-    return re.sub(r"\s", "_", words)
 
 
 def known_link(where: str, name: str, links: Collection[str]) -> str:

@@ -430,7 +430,10 @@ class Robot(Mechanism):
 
     @cached_property
     def passive_joints(self) -> tuple[str, ...]:
-        """Names of the passive joints' values, one per revolute or prismatic axis."""
+        """Names of the passive joints' values, one per revolute or prismatic axis, without spaces.
+
+        ``elbow III`` of the robot file is ``elbow_3``, as in the exported URDF.
+        """
         return passive_names(self.engine)
 
     def passive(self, q: ArrayLike) -> Array:

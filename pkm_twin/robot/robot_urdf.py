@@ -17,12 +17,12 @@ from pkm_twin.machine.graph_description import graph_description
 from pkm_twin.machine.graph_file import drive_numbers
 from pkm_twin.machine.loop_tree import Capsule, Joint, Link, LoopTree
 from pkm_twin.machine.mjcf_write import write_mjcf
+from pkm_twin.machine.names import joint_labels, plain_name
 from pkm_twin.machine.places import has_entry, path_of
 from pkm_twin.machine.rotations import Pose
 from pkm_twin.machine.sdf_write import write_sdf
 from pkm_twin.machine.urdf_control import Control, tree_names
 from pkm_twin.machine.urdf_write import GROUND, MOCK, PLATFORM, write_urdf
-from pkm_twin.machine.urdf_xml import plain_name
 from pkm_twin.robot.mechanism import FREE_FALL
 from pkm_twin.robot.outline import bars
 from pkm_twin.robot.robot import Robot
@@ -105,6 +105,7 @@ def robot_tree(robot: Robot) -> LoopTree:
     """The robot as description formats have it, drawn at home, with bars to look at."""
     graph, tree, load = robot.graph, robot.engine.tree, robot.payload
     names = _link_names([BASE, *graph.bodies, *graph.rods])
+    labels = joint_labels(tree)
     links, joints = {GROUND: Link(GROUND)}, dict[str, Joint]()
 
     def joint_of(source: str) -> Joint:
@@ -115,8 +116,9 @@ def robot_tree(robot: Robot) -> LoopTree:
             k = graph.actuated.index(source)
             rub, limits = drive_numbers(robot.friction, robot.limits, k)
         return Joint(
-            one.name, one.kind, names[one.inner], names[one.outer], (at, at), one.axes, one.home,
-            limits, rub["viscous"], rub["coulomb"], one.rotor_inertia, rub["offset"], one.pitch,
+            labels["joints", source], one.kind, names[one.inner], names[one.outer], (at, at),
+            one.axes, one.home, limits, rub["viscous"], rub["coulomb"], one.rotor_inertia,
+            rub["offset"], one.pitch,
         )  # fmt: skip
 
     for link in tree.links.values():
@@ -124,10 +126,11 @@ def robot_tree(robot: Robot) -> LoopTree:
         own = names[link.body]
         links[own] = Link(own, at, body.mass, body.com, body.inertia)
         if link.joint is None:
-            label = f"{link.body}_free"
+            label = labels["bodies", link.body]
             joints[label] = Joint(label, "free", names[link.parent], own, (at, at))
         else:
-            joints[link.joint] = joint_of(link.joint)
+            joint = joint_of(link.joint)
+            joints[joint.name] = joint
     closures = [joint_of(source) for source in tree.cut]
     for rod in graph.rods.values():
         start, end = (Pose(position=place) for place in rod.ends)
@@ -136,9 +139,9 @@ def robot_tree(robot: Robot) -> LoopTree:
         own, middle = names[rod.name], (start.position + end.position) / 2.0
         links[own] = Link(own, start, rod.mass, middle, inertia)
         axes = np.array(rod_axes(rod))
-        inner, outer = names[rod.inner], names[rod.outer]
-        joints[rod.name] = Joint(rod.name, "universal", inner, own, (start, start), axes)
-        closures.append(Joint(f"{rod.name}_end", "spherical", own, outer, (end, end)))
+        inner, outer, label = names[rod.inner], names[rod.outer], labels["rods", rod.name]
+        joints[label] = Joint(label, "universal", inner, own, (start, start), axes)
+        closures.append(Joint(f"{label}_end", "spherical", own, outer, (end, end)))
     platform = names[graph.platform]
     if load.mass > 0.0 or load.inertia.any():
         at = Pose(position=graph.origin + load.com)
@@ -155,7 +158,7 @@ def robot_tree(robot: Robot) -> LoopTree:
 
 
 def _link_names(names: Sequence[str]) -> dict[str, str]:
-    """A link for each name, apart from those that the file has of its own."""
+    """Return a link's name for each part, none of them one that the file has of its own."""
     links = {BASE: GROUND}
     # What needs no change keeps its name, whatever else would come to have it.
     for name in sorted(names, key=lambda name: plain_name(name) != name):

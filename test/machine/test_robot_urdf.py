@@ -12,15 +12,23 @@ from xml.etree import ElementTree as ET
 
 import numpy as np
 import pytest
+import yaml
 
 from delta_dynamics import inverse_dynamics
 from pkm_twin import robot_names
 from pkm_twin.errors import ParameterError
 from pkm_twin.machine import urdf_file, urdf_xml
+from pkm_twin.machine.names import plain_name
 from pkm_twin.mechanisms.catalogue import robot_of_data
 from pkm_twin.mechanisms.machine import Machine
 from pkm_twin.robot import robot_urdf as writing
-from pkm_twin.robot.robot_urdf import joint_names, robot_description, robot_urdf
+from pkm_twin.robot.robot_urdf import (
+    joint_names,
+    robot_description,
+    robot_mjcf,
+    robot_sdf,
+    robot_urdf,
+)
 from pkm_twin.robot.urdf_read import read_urdf
 from test.machine.random_machines import plain
 from test.support.mapped import sides
@@ -102,6 +110,37 @@ def test_the_platform_stands_where_the_robot_says_and_all_loops_are_closed(robot
         platform = data.oMf[model.getFrameId("platform", pin.BODY)]
         np.testing.assert_allclose(platform.translation, at, atol=1e-9)
         np.testing.assert_allclose(platform.rotation, turned, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", robot_names())
+def test_no_passive_joint_has_a_space_and_the_files_have_the_same_names(name):
+    robot = load(name)
+    names = {*robot.joint_names, *robot.passive_joints}
+    for text in (robot_urdf(robot, hardware=""), robot_mjcf(robot), robot_sdf(robot)):
+        root = ET.fromstring(text)
+        found = [element.get("name") for element in root.iter("joint") if element.get("name")]
+        found += [element.get("name") for element in root.iter("constraint")]
+        assert len(set(found)) == len(found)
+        assert not any(re.search(r"\s", name) for name in found)
+    moving = [
+        j for j in ET.fromstring(robot_urdf(robot)).findall("joint") if j.get("type") != "fixed"
+    ]
+    assert {joint.get("name") for joint in moving} == names
+
+
+def test_names_that_differ_only_by_spaces_or_parts_stay_apart():
+    original = load("stewart")
+    text = yaml.safe_dump(robot_description(original), sort_keys=False)
+    names = {"a_1": "foot", "b_1": "foot_1", "a_2": "foot 1", "b_2": "foot I", "a_3": "foot_1_1"}
+    for old, new in names.items():
+        assert f"foot_{old}" in text
+        text = text.replace(f"foot_{old}", new)
+    robot = robot_of_data(yaml.safe_load(text), "names")
+    names = [*robot.joint_names, *robot.passive_joints]
+    assert len(set(names)) == len(names) and not any(" " in name for name in names)
+    assert set(pin.buildModelFromXML(robot_urdf(robot)).names[1:]) == set(names)
+    q = original.inverse(original.home()) + 0.01 * np.arange(6)
+    np.testing.assert_allclose(robot.passive(q), original.passive(q), atol=1e-12)
 
 
 def test_masses_sum_to_the_robot_s(robot):
@@ -215,7 +254,7 @@ def test_links_need_no_quoting_and_their_old_names_are_found(robot, tmp_path):
     path = tmp_path / "robot.urdf"
     path.write_text(robot_urdf(robot))
     body = next(body for body in robot.graph.bodies if body != "platform")
-    assert read_urdf(path, platform=body)["platform"] == urdf_xml.plain_name(body)
+    assert read_urdf(path, platform=body)["platform"] == plain_name(body)
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,54 @@
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
+"""Names of joints in ROS messages and description files: each once, passive ones without spaces."""
+
+from __future__ import annotations
+
+import re
+from typing import Final
+
+from pkm_twin.machine.joints import UNITS, Free, Freedom, single_names
+from pkm_twin.machine.tree import Tree
+
+ROMAN: Final = {"I": "1", "II": "2", "III": "3", "IV": "4", "V": "5", "VI": "6"}
+FREE: Final = Free.freedoms(UNITS, 0.0)
+"""Freedoms of a body that only closures hold."""
+ROD: Final = (Freedom(UNITS[0]), Freedom(UNITS[1]))
+"""Freedoms of a rod about its inner end, if it lies along z."""
+
+
+def plain_name(name: str) -> str:
+    """Return a name without spaces, Roman numerals as digits: ``arm I`` becomes ``arm_1``."""
+    words = re.sub(r" (I{1,3}|IV|VI?)(?![A-Za-z0-9])", lambda found: "_" + ROMAN[found[1]], name)
+    return re.sub(r"\s", "_", words)
+
+
+def joint_labels(tree: Tree) -> dict[tuple[str, str], str]:
+    """Return the names of all joints, rods and free bodies in messages and description files.
+
+    Actuated joints keep the names of the robot file, because commands have them. Other names are
+    plain; an underscore is added where a name, or that of a single turn or slide, is taken.
+
+    :return: by section of a robot file and entry: ``("joints", "elbow III")`` has ``elbow_3``.
+    """
+    graph = tree.graph
+    wanted = {("joints", name): (name, joint.freedoms) for name, joint in graph.joints.items()}
+    wanted |= {("rods", name): (name, ROD) for name in graph.rods}
+    for link in tree.links.values():
+        if link.joint is None:
+            wanted["bodies", link.body] = f"{link.body}_free", FREE
+    labels = {("joints", name): name for name in graph.actuated}
+    taken = {
+        single
+        for name in graph.actuated
+        for single in single_names(name, graph.joints[name].freedoms)
+    }
+    # Names that need no change come first and stay.
+    for key, (name, freedoms) in sorted(wanted.items(), key=lambda one: " " in one[1][0]):
+        if key in labels:
+            continue
+        label = plain_name(name)
+        while taken.intersection([label, f"{label}_end", *single_names(label, freedoms)]):
+            label += "_"
+        taken.update([label, f"{label}_end", *single_names(label, freedoms)])
+        labels[key] = label
+    return labels
