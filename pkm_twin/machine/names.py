@@ -43,9 +43,9 @@ def joint_labels(tree: Tree) -> dict[tuple[str, str], str]:
         for single in single_names(name, graph.joints[name].freedoms)
     }
     # Names that need no change come first and stay.
-    for key, (name, freedoms) in sorted(wanted.items(), key=lambda one: " " in one[1][0]):
-        if key in labels:
-            continue
+    changes = {key: plain_name(name) != name for key, (name, _) in wanted.items()}
+    for key in sorted(wanted.keys() - labels.keys(), key=lambda key: (changes[key], key)):
+        name, freedoms = wanted[key]
         label = plain_name(name)
         while taken.intersection([label, f"{label}_end", *single_names(label, freedoms)]):
             label += "_"
