@@ -133,8 +133,9 @@ def test_a_rounded_file_needs_the_efforts_of_the_exact_one(case, digits, how, tm
     try:
         other = read(tmp_path, rounded(text, digits, how), ending)
     except ParameterError as error:
-        # What is named is the file's own: never a lack of freedoms that the machine has.
-        assert case not in SAMPLE, error
+        # What is named is the file's own: never a lack of freedoms that the machine has. Five
+        # decimals leave two digits of an inertia of 4e-4 kg m2, which may be none of a body.
+        assert case not in SAMPLE or "inertia" in str(error), error
         return
     assert len(other.coordinates) == len(exact.coordinates)
     found = efforts(other, exact.joint_names, states)
