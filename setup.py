@@ -54,6 +54,7 @@ setup(
         (f"share/{NAME}/view", sorted(glob("launch/view/*"))),
     ],
     install_requires=[
+        "click>=8.1",
         "matplotlib>=3.6",
         "lz4",
         "llvmlite>=0.41",
@@ -63,7 +64,6 @@ setup(
         "rich>=13",
         "scipy>=1.11",
         "setuptools",
-        "typer>=0.9",
         "zstandard",
     ],
     extras_require={

@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import typer
+import click
 
 from pkm_twin.errors import PkmTwinError, one_line
 from pkm_twin.files import STANDARD, parse_numbers, require_replaceable
@@ -67,13 +67,13 @@ def numbers(text: str, count: int, expected: str = "") -> list[float]:
     values = parse_numbers(text)
     if len(values) != (count or max(len(values), 1)):
         expected = expected or f"{count or ''} numbers separated by commas".strip()
-        raise typer.BadParameter(f"{text.strip()!r} is not {expected}")
+        raise click.UsageError(f"{text.strip()!r} is not {expected}")
     return values
 
 
 def print_json(data: Any, *, err: bool = False) -> None:
     """JSON proper: a number that is not finite is a mistake here."""
-    typer.echo(json.dumps(data, indent=2, allow_nan=False), err=err)
+    click.echo(json.dumps(data, indent=2, allow_nan=False), err=err)
 
 
 def refuse_existing(path: Path, overwrite: bool, source: Path | None = None) -> None:

@@ -26,7 +26,8 @@ class Setting:
     ``usual``, words for a default that depends on the robot. Of commands alone: ``argument``, given
     by its place; ``count``, this many numbers with commas between, 0 for any count; ``writes``, a
     file that the command writes, whose name ends in one of ``endings`` where there are any;
-    ``older``, spellings that help does not list; ``metavar``, the value's name in help.
+    ``older``, spellings that help does not list; ``alone``, the value of an option without one;
+    ``metavar``, the value's name in help.
     """
 
     text: str
@@ -42,6 +43,7 @@ class Setting:
     writes: bool = False
     endings: tuple[str, ...] = ()
     older: tuple[str, ...] = ()
+    alone: str | None = None
     metavar: str | None = None
     above: float | None = None
 

@@ -15,7 +15,10 @@ from pkm_twin.apps.groups import commands, module_of
 from test.support.sources import ROOT, arrows, imports, nodes, room, sources, within
 from tools.pages import architecture
 
-OWN = {"pkm_twin.errors", "pkm_twin.files", "pkm_twin.threads", "pkm_twin.settings"}
+OWN = {
+    "pkm_twin.errors", "pkm_twin.extensions", "pkm_twin.files", "pkm_twin.threads",
+    "pkm_twin.settings",
+}  # fmt: skip
 """Modules without a folder that all may import."""
 GRAPH = {"pkm_twin.codegen", "pkm_twin.machine", "pkm_twin.kinematics"}
 CORE = GRAPH | {"pkm_twin.robot"}
@@ -26,6 +29,7 @@ TWINS = {"delta_dynamics", "stiffness_monitor"}
 MAY = {
     "pkm_twin": {"pkm_twin.robot", "pkm_twin.mechanisms", "pkm_twin.design"},
     "pkm_twin.errors": set(),
+    "pkm_twin.extensions": set(),
     "pkm_twin.files": set(),
     "pkm_twin.threads": set(),
     "pkm_twin.settings": set(),

@@ -313,7 +313,7 @@ class TestManifest:
 
 DECLARED = {
     "hypothesis", "matplotlib", "numpy", "pkm_twin", "delta_dynamics", "stiffness_monitor",
-    "pytest", "rich", "scipy", "setuptools", "support", "test", "tools", "bags", "typer", "yaml",
+    "pytest", "rich", "scipy", "setuptools", "support", "test", "tools", "bags", "click", "yaml",
 }  # fmt: skip
 """What package.xml's dependencies bring, and this package."""
 

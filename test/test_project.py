@@ -77,14 +77,12 @@ def test_make_targets_exist():
 
 def test_the_page_of_commands_has_all():
     """Else `make pages` writes it anew."""
-    from typer.main import get_command
-
     from pkm_twin.apps.cli import app
     from tools.pages.commands import USUAL
 
     text = (REPOSITORY / "docs" / "commands.md").read_text(encoding="utf-8")
     written = dict(re.findall(r"^## `pkm-twin ([\w-]+)`\n(.*?)(?=^## |\Z)", text, re.M | re.S))
-    commands = get_command(app).commands
+    commands = app.commands
     assert set(written) == set(commands)
     groups = re.findall(r"^\*\*(\w+ options)\*\*\n\n((?:\* .*\n)+)", text, re.M)
     for name, command in commands.items():
@@ -94,7 +92,10 @@ def test_the_page_of_commands_has_all():
         told = written[name]
         told += "".join(those for group, those in groups if re.search(group, told, re.I))
         assert options <= {*re.findall(r"--[\w-]+", told), "--json", *USUAL}, name
-        robot = {"ROBOT", "SOURCE", "--robot"} & {*options, *(p.metavar for p in params)}
+        robot = {"ROBOT", "SOURCE", "--robot"} & {
+            *options,
+            *(p.human_readable_name for p in params),
+        }
         assert ("--platform" in options) == bool(robot), name
 
 

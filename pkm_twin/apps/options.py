@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import typer
+import click
 
 from pkm_twin.console import numbers
 from pkm_twin.errors import ParameterError
@@ -75,12 +75,12 @@ class Carries(OfRobot):
         times = getattr(self, "load_times", None)
         if self.payload is None:
             if times is not None:
-                raise typer.BadParameter("--load-times needs --payload")
+                raise click.UsageError("--load-times needs --payload")
             return None
         try:
             return Load(*parse_payload(self.payload), () if times is None else parse_times(times))
         except ParameterError as error:
-            raise typer.BadParameter(str(error)) from None
+            raise click.UsageError(str(error)) from None
 
     def machine(self) -> Robot:
         """The robot with its payload."""
@@ -164,7 +164,7 @@ class ReadsRecordings(ReadsTables):
         from pkm_twin.recordings import read
 
         if self.topic and not is_bag(path):
-            raise typer.BadParameter(f"--topic is for bags; {path} is read as a table")
+            raise click.UsageError(f"--topic is for bags; {path} is read as a table")
         return read(path, robot, self.reading(**more), progress)
 
     def reading(self, **more: Any) -> ReadOptions:
@@ -239,7 +239,7 @@ class AtPose(Carries, BeyondLimitsToo):
         if self.at is not None:
             pose = numbers(self.at, len(names), f"a pose {','.join(names)}")
         for joint in self.admitted(machine, machine.inverse(pose)):
-            typer.echo(f"outside the limits: {joint}", err=True)
+            click.echo(f"outside the limits: {joint}", err=True)
         return pose
 
 
@@ -318,8 +318,8 @@ class Draws(Overwrites):
     picture: str | None = setting(
         None,
         "draw the result: .png, .svg or .pdf, or - for a PNG to stdout; default: next to --out",
-        metavar="[FILE]",
-    )
+        metavar="[FILE]", alone=BESIDE,
+    )  # fmt: skip
     no_picture: bool = setting(False, "draw nothing next to --out")
 
     def drawing(self, command: str) -> Path | None:
@@ -330,7 +330,7 @@ class Draws(Overwrites):
         out = getattr(self, "out", None)
         if self.picture == STANDARD:
             if str(out) == STANDARD:
-                raise typer.BadParameter("--out - and --picture -: only one of them to stdout")
+                raise click.UsageError("--out - and --picture -: only one of them to stdout")
             return Path(STANDARD)
         beside = None if out is None or str(out) == STANDARD else out.with_suffix(".png")
         if self.no_picture or (self.picture is None and beside is None):

@@ -9,7 +9,7 @@ import textwrap
 from collections.abc import Iterator, Sequence
 from typing import Final
 
-import typer
+import click
 
 from pkm_twin.console import print_json, tell
 from pkm_twin.files import STANDARD
@@ -30,11 +30,11 @@ def present(report: Report, as_json: bool, *, piped: bool = False) -> None:
     if as_json:
         print_json(report.data, err=piped)
     elif report.raw:
-        typer.echo(report.raw, nl=False)
+        click.echo(report.raw, nl=False)
     else:
         text = text_of(report)
         if text:
-            typer.echo(text, err=piped)
+            click.echo(text, err=piped)
     if report.error:
         tell(report.error)
 
@@ -69,7 +69,7 @@ def _layout_judged(facts: Sequence[Fact]) -> Iterator[str]:
     yield next(lines)
     for fact, word, line in zip(facts, words, lines, strict=True):
         first, *rest = line.split("\n")
-        shown = typer.style(word.replace(BLANK, " "), fg=COLOURS[fact.verdict or Verdict.UNKNOWN])
+        shown = click.style(word.replace(BLANK, " "), fg=COLOURS[fact.verdict or Verdict.UNKNOWN])
         yield "\n".join([first[: -len(word)] + shown, *rest])
 
 

@@ -8,7 +8,6 @@ import subprocess
 from functools import cache
 
 import pytest
-from typer.main import get_command
 
 from pkm_twin.apps.cli import app
 from test.commands.conftest import REPOSITORY
@@ -103,7 +102,7 @@ def reason(line):
 @pytest.fixture(scope="module")
 def tree():
     """All commands with their options."""
-    return get_command(app)
+    return app
 
 
 @pytest.mark.parametrize(

@@ -1,27 +1,27 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """``pkm-twin`` alone and ``--help``: every command once, by task, its purpose whole."""
 
+import os
 import re
-
-from typer.main import get_command
+import subprocess
+import sys
 
 from pkm_twin.apps.cli import app
-from pkm_twin.apps.groups import WIDE, commands
-from test.support.command import typed_line
+from pkm_twin.apps.groups import WIDE, commands, group_by_task
+from test.support.command import REPOSITORY, typed_line
 
 ALL = commands()
 
 
 def test_every_command_has_one_task():
-    named = [name for names in ALL.tasks().values() for name in names]
+    named = [name for names in group_by_task().values() for name in names]
     assert sorted(named) == sorted(ALL)
 
 
 def test_help_lists_every_purpose_whole(twin):
     words = " ".join(twin("--help").out.split())
-    for name, command in get_command(app).commands.items():
-        if not command.hidden:
-            assert f" {name} {command.get_short_help_str(WIDE)}" in words
+    for name, command in app.commands.items():
+        assert f" {name} {command.get_short_help_str(WIDE)}" in words
     assert "..." not in words.split("Robots:")[1]
 
 
@@ -49,3 +49,39 @@ def test_an_older_name_runs_the_same_command(twin):
     names = ("monitor-torques", "guard-check")
     new, old = (twin(name, "--help").out.partition("Arguments:")[2] for name in names)
     assert new == old != ""
+
+
+LINES = {
+    "pkm-twin inf": "info", "pkm-twin --vers": "--version", "pkm-twin map delta comp": "compliance",
+    "pkm-twin atlas x comp": "compliance", "pkm-twin info delta --plat": "--platform",
+    "pkm-twin export fmu delta --kind to": "torques",
+}  # fmt: skip
+
+
+def test_completion_is_installed_once_and_completes_in_bash(tmp_path):
+    program = tmp_path / "bin" / "pkm-twin"
+    program.parent.mkdir()
+    program.write_text(f'#!/bin/sh\nexec "{sys.executable}" -m pkm_twin.apps.cli "$@"\n')
+    program.chmod(0o755)
+    path = os.pathsep.join([str(program.parent), os.environ["PATH"]])
+    root = {"PYTHONPATH": str(REPOSITORY), "HOME": str(tmp_path), "PATH": path}
+    (tmp_path / ".bashrc").write_text("set -u\n")
+
+    def run(*words, shell="/bin/bash"):
+        return subprocess.run(
+            words, env=os.environ | root | {"SHELL": shell}, capture_output=True, text=True
+        )
+
+    for _ in range(2):
+        assert run(program, "--install-completion").returncode == 0
+    source = (tmp_path / ".bashrc").read_text().splitlines()
+    assert (source[0], source.count(source[-1])) == ("set -u", 1)
+    script = (tmp_path / ".pkm-twin-complete.bash").read_text()
+    assert run(program, "--show-completion").stdout == f"{script}\n"
+    for line, word in LINES.items():
+        count = len(line.split()) - 1
+        typed = f"COMP_WORDS=({line}); COMP_CWORD={count}; _pkm_twin_completion pkm-twin"
+        done = run("bash", "-c", f'{source[-1]}; {typed}; echo "${{COMPREPLY[@]}}"')
+        assert done.stdout.split() == [word], done.stderr
+    wrong = run(program, "--show-completion", shell="/bin/none")
+    assert wrong.returncode == 2 and "'none'; expected bash or zsh or fish" in wrong.stderr

@@ -9,7 +9,6 @@ import re
 from pathlib import Path
 
 import pytest
-from typer.main import get_command
 
 import delta_dynamics
 import stiffness_monitor
@@ -85,13 +84,13 @@ def helps(command):
     """Help of a command, of its options and of the commands in it."""
     yield command.help or ""
     for parameter in command.params:
-        yield getattr(parameter, "help", None) or ""
+        yield parameter.row.text if hasattr(parameter, "row") else parameter.help or ""
     for inner in getattr(command, "commands", {}).values():
         yield from helps(inner)
 
 
 def test_help_of_the_commands():
-    top = get_command(app)
+    top = app
     texts = [top.help or ""]
     for command in top.commands.values():
         texts += helps(command)

@@ -17,8 +17,6 @@ from pathlib import Path
 from typing import Any
 from unittest import mock
 
-import typer.main
-
 from pkm_twin.apps import cli
 from pkm_twin.machine.strict_yaml import read_yaml
 from pkm_twin.mechanisms import catalogue
@@ -33,10 +31,9 @@ EACH = 1000
 
 
 class Once:
-    """What every command line would make anew, made once: the tree of commands, shipped robots."""
+    """What every command line would make anew, made once: shipped robots."""
 
     def __init__(self) -> None:
-        self.tree = functools.cache(typer.main.get_command)
         self.robots: dict[str, Robot] = {}
         self.shipped = functools.cache(read_yaml)
         self.read, self.build = read_yaml, catalogue.robot_of_data
@@ -53,7 +50,6 @@ class Once:
     @contextlib.contextmanager
     def used(self) -> Iterator[None]:
         with (
-            mock.patch.object(typer.main, "get_command", self.tree),
             mock.patch.object(catalogue, "read_yaml", self.read_yaml),
             mock.patch.object(catalogue, "robot_of_data", self.robot_of_data),
         ):

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
+from click.testing import CliRunner
 
 from pkm_twin.apps.cli import app
 from pkm_twin.errors import ParameterError

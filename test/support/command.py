@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import functools
 import json
 import multiprocessing
 import os
@@ -17,7 +16,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import typer
 
 from pkm_twin.apps import cli
 
@@ -25,9 +23,6 @@ REPOSITORY = Path(__file__).parents[2]
 SHELL = (">", ">>", "<", "|", "&&", ";", "2>")
 """Words of a line that are the shell's."""
 _FORK = multiprocessing.get_context("fork")
-
-# The tree of all commands takes longer to build than most commands to run.
-typer.main.get_command = functools.cache(typer.main.get_command)
 
 
 @dataclass(frozen=True)

@@ -10,10 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from typer.main import get_command
-
 from pkm_twin.apps.cli import app
-from pkm_twin.apps.groups import commands
+from pkm_twin.apps.groups import group_by_task
 
 SEVERAL = 2
 """Commands that an option has to have with one meaning to be explained once for all."""
@@ -47,10 +45,17 @@ def words_of(command: Any) -> list[Word]:
     found = []
     for one in command.params:
         argument = one.param_type_name == "argument"
-        shown = one.show_default and one.default not in (None, False)
-        default = str(one.default) if shown else ""
-        name = one.metavar if argument else one.opts[0]
-        found.append(Word(name, one.metavar or "", one.help or "", default, argument))
+        name = one.human_readable_name if argument else one.opts[0]
+        shown = getattr(one, "shown", "")
+        found.append(
+            Word(
+                name,
+                one.metavar or "",
+                (one.row.text if argument else one.help) or "",
+                shown,
+                argument,
+            )
+        )
     return [word for word in found if word.name != "--json"]
 
 
@@ -62,7 +67,7 @@ def leaves(name: str, command: Any) -> dict[str, Any]:
 
 def page() -> str:
     """The page, with the commands ordered by task."""
-    every, tasks = get_command(app), commands().tasks()
+    every, tasks = app, group_by_task()
     found = {name: leaves(name, command) for name, command in every.commands.items()}
     users: dict[Word, list[str]] = defaultdict(list)
     for inner in found.values():
@@ -145,8 +150,7 @@ def section(
         lines += groups.named(often)
     for words, one in inner.items():
         every = words_of(one)
-        group = commands().declared(name)
-        typed = words if alone else f"{name} {group.shown(words.split()[-1])}"
+        typed = words if alone else f"{name} {command.show(words.split()[-1])}"
         usage = " ".join(w.name for w in every if w.argument and w.name not in typed.split())
         lines += [f"`{f'pkm-twin {typed} {usage}'.rstrip()}`: {first(one.help)}", ""]
         told = [word for word in every if word not in own and word not in groups.shared]

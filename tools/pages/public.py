@@ -13,8 +13,6 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-from typer.main import get_command
-
 import delta_dynamics
 import pkm_twin
 import stiffness_monitor
@@ -47,7 +45,7 @@ def groups() -> Iterator[tuple[str, list[str]]]:
     yield "python Robot", re.split(r",\s+", members[1])
     kinds = [name for name, value in vars(errors).items() if isinstance(value, type)]
     yield "python pkm_twin.errors", [name for name in kinds if name.endswith("Error")]
-    for name, command in get_command(app).commands.items():
+    for name, command in app.commands.items():
         for words, leaf in leaves(name, command).items():
             options = [one for p in leaf.params for one in [*p.opts, *p.secondary_opts]]
             yield f"command {words}", [one for one in options if one.startswith("-")]

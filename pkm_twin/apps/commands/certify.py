@@ -7,7 +7,7 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-import typer
+import click
 
 from pkm_twin.apps.frame import command
 from pkm_twin.apps.options import OfRobot, Seeded
@@ -53,7 +53,7 @@ def certify(given: Certify) -> Report:
 
     unknown = [name for name in given.engine if name not in ENGINES]
     if unknown:
-        raise typer.BadParameter(f"no engine {unknown[0]!r}; there are {', '.join(ENGINES)}")
+        raise click.UsageError(f"no engine {unknown[0]!r}; there are {', '.join(ENGINES)}")
     with progress("states", given.states * (given.variants + 1)) as update:
         found = certify_variants(
             given.machine(), given.variants, seed=given.seed, progress=update,

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import typer
+import click
 
 from pkm_twin.apps.frame import command
 from pkm_twin.apps.options import BeyondLimitsToo, OfRobot
@@ -52,7 +52,7 @@ def compliance(given: Compliance) -> Report:
     if len(given.pose) != len(names):
         units = (f"{n} ({u})" for n, u in zip(names, machine.pose_units, strict=True))
         shown = " ".join(f"{number:g}" for number in given.pose)
-        raise typer.BadParameter(f"a pose of {machine.name} is {', '.join(units)}, not {shown}")
+        raise click.UsageError(f"a pose of {machine.name} is {', '.join(units)}, not {shown}")
     try:
         beyond = given.admitted(machine, machine.inverse(given.pose))
         energy = strain_energy(machine, given.pose, given.wrench)

@@ -9,8 +9,8 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
+import click
 import numpy as np
-import typer
 
 from pkm_twin.apps.frame import command
 from pkm_twin.apps.options import Carries, Draws, ReadsMotions, Seeded, Writes
@@ -107,21 +107,21 @@ def design(given: Design) -> Report:
     if given.tolerance:
         others = (given.vary, given.minimise, given.sweep, given.subject_to, given.out)
         if any(others) or given.picture:
-            raise typer.BadParameter(
+            raise click.UsageError(
                 "--tolerance can only be combined with --path, --wrench, --monte-carlo, --seed and "
                 "--json"
             )
         return budget(given)
     if given.monte_carlo:
-        raise typer.BadParameter("--monte-carlo needs --tolerance")
+        raise click.UsageError("--monte-carlo needs --tolerance")
     if given.path is None:
-        raise typer.BadParameter("give the motion with --path, see `pkm-twin path`")
+        raise click.UsageError("give the motion with --path, see `pkm-twin path`")
     if given.sweep is not None:
         return swept(given, given.path, given.sweep)
     if given.scheduler is not None:
-        raise typer.BadParameter("--scheduler needs --sweep")
+        raise click.UsageError("--scheduler needs --sweep")
     if not given.minimise:
-        raise typer.BadParameter("give --minimise, --sweep or --tolerance")
+        raise click.UsageError("give --minimise, --sweep or --tolerance")
     if given.out is not None and given.out.suffix not in (".yaml", ".yml"):
         raise ParameterError("out", str(given.out), "a name that ends in .yaml or .yml")
     return optimised(given, given.path)
@@ -347,7 +347,7 @@ def swept(given: Design, path: Path, kind: str) -> Report:
     if kind not in SWEEPS:
         raise UnknownNameError("sweep", kind, SWEEPS)
     if given.minimise or given.subject_to or given.picture:
-        raise typer.BadParameter(
+        raise click.UsageError(
             "--sweep computes all quantities; leave out --minimise and --subject-to"
         )
     if out is None or out.suffix != ".nc":

@@ -7,11 +7,15 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Final
+
+import click
 
 from pkm_twin.apps.frame import Group, command
 from pkm_twin.apps.options import OfRobot, Overwrites
 from pkm_twin.console import refuse_existing, tell
 from pkm_twin.errors import ParameterError
+from pkm_twin.extensions import Extensible
 from pkm_twin.files import replace_file, replace_files
 from pkm_twin.report import Fact, Report
 from pkm_twin.robot.printers import Firmware, printer_of, written
@@ -225,17 +229,18 @@ def printer(given: ToPrinter) -> Report:
     return given.write(written(printer_of(given.machine()), given.firmware))
 
 
+OWN: Final = {
+    "c": command(c),
+    "ros2-control": command(ros2_control),
+    "fmu": command(fmu),
+    "urdf": command(urdf),
+    "mjcf": command(mjcf),
+    "sdf": command(sdf),
+    "moveit": command(moveit),
+    "printer": command(printer),
+}
 COMMAND = Group(
     "Export a robot to other software.",
-    {
-        "c": command(c),
-        "ros2-control": command(ros2_control),
-        "fmu": command(fmu),
-        "urdf": command(urdf),
-        "mjcf": command(mjcf),
-        "sdf": command(sdf),
-        "moveit": command(moveit),
-        "printer": command(printer),
-    },
+    Extensible("pkm_twin.exports", click.Command, OWN, OWN.__getitem__),
     "Design and export",
 )

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import typer
+import click
 
 from pkm_twin.apps.frame import command
 from pkm_twin.apps.options import (
@@ -150,7 +150,7 @@ def fit(given: Fit) -> Report:
     if given.drive is not None:
         return _of_drive(given, given.drive)
     if not given.robot or not given.recordings:
-        raise typer.BadParameter("a robot and recordings are missing; give both, or --drive TABLE")
+        raise click.UsageError("a robot and recordings are missing; give both, or --drive TABLE")
     (kinds, laws), options = given.words(), {"accept": given.accept}
     text, machine = robot_text(given.robot, platform=given.platform, per_copy=given.per_copy)
     elastic, currents = kinds is None, given.torque_constant is not None

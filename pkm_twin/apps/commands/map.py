@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, get_type_hints
@@ -14,8 +13,10 @@ from pkm_twin.apps.frame import Command, Group, command
 from pkm_twin.apps.options import Carries, Draws, OfMilling, OfTool, Overwrites, Parallel, Writes
 from pkm_twin.console import numbers, progress, refuse_existing
 from pkm_twin.errors import ParameterError
+from pkm_twin.extensions import Extensible
 from pkm_twin.files import replace_file
-from pkm_twin.maps.kinds import KINDS
+from pkm_twin.maps.kind import Kind
+from pkm_twin.maps.kinds import KINDS, OWN
 from pkm_twin.maps.kinds.cutting_depth import CuttingDepth
 from pkm_twin.report import Fact, Report
 from pkm_twin.ros.signals import INTERRUPTED, first_signal
@@ -24,7 +25,7 @@ from pkm_twin.settings import setting
 if TYPE_CHECKING:
     from xarray import Dataset
 
-    from pkm_twin.maps.kind import Case, Kind
+    from pkm_twin.maps.kind import Case
     from pkm_twin.robot.robot import Robot
 
 MAX_POSES: Final = 10**11
@@ -270,20 +271,20 @@ def offered(kind: type[Kind]) -> Command:
 class AfterRobot(Group):
     """Kinds as commands after the robot; ``show`` stands in its place."""
 
-    def ordered(self, words: list[str]) -> list[str]:
+    def order(self, words: list[str]) -> list[str]:
         """The robot and the kind change places."""
-        if not words or words[0] in ("show", *KINDS):
+        if not words or words[0] in self.commands:
             return words
         if len(words) == 1 or words[1].startswith("-"):
             return [word for word in words if word.startswith("-")]
         return [words[1], words[0], *words[2:]]
 
-    def shown(self, name: str) -> str:
+    def show(self, name: str) -> str:
         """The robot comes first."""
         return name if name == "show" else f"ROBOT {name}"
 
 
-COMMANDS: Final[Mapping[str, Command]] = {name: offered(kind) for name, kind in KINDS.items()}
+SHOW: Final = command(show)
 COMMAND = AfterRobot(
     """Map a quantity over the workspace, find its worst pose, and draw planes through it.
 
@@ -294,7 +295,13 @@ COMMAND = AfterRobot(
 
     For the options of a kind use `pkm-twin map ROBOT KIND --help`.
     """,
-    {"show": command(show), **COMMANDS},
+    Extensible(
+        "pkm_twin.maps",
+        Kind,
+        ["show", *OWN],
+        lambda name: SHOW if name == "show" else offered(OWN[name]),
+        offered,
+    ),
     "Stiffness, workspace and vibration",
     "ROBOT KIND [OPTIONS]",
 )

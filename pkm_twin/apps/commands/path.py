@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
+import click
 import numpy as np
-import typer
 
 from pkm_twin.apps.frame import command
 from pkm_twin.apps.options import (
@@ -159,11 +159,11 @@ def path(given: Motion) -> Report:
     if given.slow_where_soft:
         missing = [n for n in ("force", "deflection", "speed") if getattr(given, n) is None]
         if missing:
-            raise typer.BadParameter(f"--slow-where-soft needs --{' and --'.join(missing)}")
+            raise click.UsageError(f"--slow-where-soft needs --{' and --'.join(missing)}")
         for name, unit in (("deflection", "m"), ("speed", "m/s")):
             check_limit(name, getattr(given, name), unit)
     elif given.force is not None or given.deflection is not None:
-        raise typer.BadParameter("--force and --deflection are for --slow-where-soft")
+        raise click.UsageError("--force and --deflection are for --slow-where-soft")
     cut = None
     if given.slow_where_soft:
         cut = SoftCut(machine, given.force or 0.0, given.deflection or 0.0, given.speed or 0.0)
@@ -181,7 +181,7 @@ def path(given: Motion) -> Report:
     if given.shaper is not None:
         motion = shaped(motion, given.shaper, None, given.damping, singularity=given.singularity)
     elif given.damping is not None:
-        raise typer.BadParameter("--damping is for --shaper")
+        raise click.UsageError("--damping is for --shaper")
     carried = motion.load or given.load
     if given.out is not None:
         s = motion.uniform(given.rate)
@@ -240,12 +240,12 @@ def _way(given: Motion, machine: Robot) -> tuple[Way, Sequence[float | None] | N
     from pkm_twin.paths.waypoints import parse_loads
 
     if given.carries and given.payload is not None:
-        raise typer.BadParameter("--payload is for the whole path; leave it out with --load")
+        raise click.UsageError("--payload is for the whole path; leave it out with --load")
     way, masses = _unloaded(given, machine)
     option = "--load" if given.carries else "--payload" if given.payload is not None else ""
     same = not given.carries and set(masses or ()) <= {machine.payload.mass}
     if masses is not None and option and not same:
-        raise typer.BadParameter(f"the waypoints have a column payload; leave out {option}")
+        raise click.UsageError(f"the waypoints have a column payload; leave out {option}")
     return way, parse_loads(given.carries, len(way.marks)) if given.carries else masses
 
 
@@ -255,23 +255,23 @@ def _unloaded(given: Motion, machine: Robot) -> tuple[Way, list[float] | None]:
     from pkm_twin.paths.waypoints import read_waypoints
 
     if sum(one is not None for one in (given.waypoints, given.cycle, given.circle)) != 1:
-        raise typer.BadParameter("give one of WAYPOINTS, --cycle and --circle")
+        raise click.UsageError("give one of WAYPOINTS, --cycle and --circle")
     if given.waypoints is not None:
         if given.at is not None or given.dwell or given.direction is not None:
-            raise typer.BadParameter("--at, --direction and --dwell are not for waypoints")
+            raise click.UsageError("--at, --direction and --dwell are not for waypoints")
         return read_waypoints(given.waypoints, machine, given.blend, given.dialect)
     if given.at is not None and len(given.at) != len(machine.pose_names):
         names = ", ".join(machine.pose_names)
-        raise typer.BadParameter(f"--at has {len(given.at)} numbers; expected a pose: {names}")
+        raise click.UsageError(f"--at has {len(given.at)} numbers; expected a pose: {names}")
     if given.circle is not None:
         if given.direction is not None or given.dwell:
-            raise typer.BadParameter("--direction and --dwell are for --cycle")
+            raise click.UsageError("--direction and --dwell are for --cycle")
         home = machine.home() if given.at is None else np.array(given.at)
         return paths.circle(machine, home, given.circle), None
     lengths = given.cycle or ()
     if len(lengths) not in (2, 3) or min(lengths) < LEAST_CYCLE:
         found = ",".join(f"{length:g}" for length in lengths)
-        raise typer.BadParameter(
+        raise click.UsageError(
             f"--cycle {found}: HEIGHT,WIDTH[,DROP] in millimetres, for example 25,305,25"
         )
     metres = [1e-3 * value for value in lengths]
@@ -286,9 +286,7 @@ def _limit(name: str, values: tuple[float, ...] | None, machine: Robot) -> list[
     n = machine.joints_count
     if values is not None and (len(values) not in (1, n) or min(values) <= 0.0):
         found = ",".join(f"{value:g}" for value in values)
-        raise typer.BadParameter(
-            f"--{name} {found}: one number above 0, or {n} with commas between"
-        )
+        raise click.UsageError(f"--{name} {found}: one number above 0, or {n} with commas between")
     return None if values is None else list(values)
 
 

@@ -6,7 +6,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-import typer
+import click
 
 from pkm_twin.apps.frame import command
 from pkm_twin.report import Fact, Report
@@ -48,7 +48,7 @@ def play(given: Play) -> Report:
     for text in given.remap:
         source, sign, target = text.partition(":=")
         if not (sign and source and target):
-            raise typer.BadParameter(f"{text!r} is not of the form FROM:=TO")
+            raise click.UsageError(f"{text!r} is not of the form FROM:=TO")
         pairs[source] = target
     result = play_bag(
         given.bag, rate=given.speed, loop=given.loop, clock=given.clock,

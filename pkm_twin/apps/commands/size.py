@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
+import click
 import numpy as np
-import typer
 
 from pkm_twin.apps.frame import command
 from pkm_twin.apps.options import (
@@ -103,15 +103,15 @@ def size(given: Size) -> Report:
     from pkm_twin.paths.sizing import read_motors, size_drives
 
     if (given.motion is None) == (given.over_workspace is None):
-        raise typer.BadParameter("give a recording or path, or --over-workspace")
+        raise click.UsageError("give a recording or path, or --over-workspace")
     searched = given.ratios is not None or given.leads is not None
     geared = searched or given.ratio is not None or given.lead is not None
     if given.drives is None and (given.motor or searched):
-        raise typer.BadParameter("--motor, --ratios and --leads need a drives file; give --drives")
+        raise click.UsageError("--motor, --ratios and --leads need a drives file; give --drives")
     if searched and (given.ratio is not None or given.lead is not None):
-        raise typer.BadParameter("--ratio and --lead give one gear; leave out --ratios and --leads")
+        raise click.UsageError("--ratio and --lead give one gear; leave out --ratios and --leads")
     if given.over_workspace is not None and (geared or given.drives is not None):
-        raise typer.BadParameter(
+        raise click.UsageError(
             "--over-workspace reports joints; leave out --drives, --ratio and --lead"
         )
     if given.motion is None:
@@ -178,7 +178,7 @@ def gears(given: Size, robot: Robot) -> tuple[list[Gear], list[Gears]]:
         raise ParameterError("--lead", given.lead, f"at most {MAX_LEAD:g} m per turn")
     shares = {drive.efficiency for drive in robot.drives if drive is not None}
     if given.efficiency is None and len(shares) > 1 and (given.ratios or given.leads):
-        raise typer.BadParameter("drives of the file have several efficiencies; give --efficiency")
+        raise click.UsageError("drives of the file have several efficiencies; give --efficiency")
     share = given.efficiency or next(iter(shares), 1.0)
     one, choices = [], []
     for key, value, values in (

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
+import click
 import numpy as np
-import typer
 
 from pkm_twin.apps.frame import command
 from pkm_twin.apps.options import (
@@ -95,14 +95,14 @@ def torques(given: Torques) -> Report:
     if given.out is not None:
         check_target(given.out)
     if (given.motion is None) == (given.at is None):
-        raise typer.BadParameter("give a recording or path, or --at")
+        raise click.UsageError("give a recording or path, or --at")
     if given.motion is None:
         if given.picture is not None or given.load_times is not None:
-            raise typer.BadParameter("--picture and --load-times need a recording or path")
+            raise click.UsageError("--picture and --load-times need a recording or path")
         motion = given.resting(given.machine())
     else:
         if given.wrench is not None:
-            raise typer.BadParameter("--wrench needs --at; a motion has it in columns fx ... mz")
+            raise click.UsageError("--wrench needs --at; a motion has it in columns fx ... mz")
         motion = given.read_motion(given.motion, given.machine())
     beyond = given.admitted(motion.robot, motion.q, motion.qd)
     with progress("torques", len(motion.time)) as update:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import typer
+import click
 
 from pkm_twin.apps.frame import command
 from pkm_twin.apps.options import CarriesAtTimes, ReadsRecordings
@@ -48,11 +48,11 @@ def view(given: View) -> Report:
 
     bag = given.bag
     if bag is None and (given.topic or given.load is not None):
-        raise typer.BadParameter("--topic, --payload and --load-times need --bag")
+        raise click.UsageError("--topic, --payload and --load-times need --bag")
     if bag is not None and given.live:
-        raise typer.BadParameter("give --bag or --live, not both")
+        raise click.UsageError("give --bag or --live, not both")
     if given.namespace and not given.live:
-        raise typer.BadParameter("--namespace needs --live")
+        raise click.UsageError("--namespace needs --live")
     require("viser", "view")
     from pkm_twin import load
     from pkm_twin.view.live import Live
@@ -75,7 +75,7 @@ def view(given: View) -> Report:
             heard = Live(machine)
             stack.enter_context(listening(heard, given.namespace))
             LivePanel(page, heard)
-        typer.echo(f"{machine.name}: http://{ADDRESS}:{server.get_port()}/  (Ctrl-C ends)")
+        click.echo(f"{machine.name}: http://{ADDRESS}:{server.get_port()}/  (Ctrl-C ends)")
         page.run()
     return Report()
 

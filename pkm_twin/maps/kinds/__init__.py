@@ -1,14 +1,14 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""Collect the kinds of maps, one per file of this folder."""
+"""Collect the kinds of maps: one per file of this folder, and entry points of other packages."""
 
 from __future__ import annotations
 
 import pkgutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from importlib import import_module
-from types import MappingProxyType
 from typing import Final
 
+from pkm_twin.extensions import Extensible
 from pkm_twin.maps.kind import Kind
 
 
@@ -19,4 +19,5 @@ def _all() -> Iterator[type[Kind]]:
                 yield one
 
 
-KINDS: Final[Mapping[str, type[Kind]]] = MappingProxyType({kind.name: kind for kind in _all()})
+OWN: Final = {kind.name: kind for kind in _all()}
+KINDS: Final[Extensible[type[Kind]]] = Extensible("pkm_twin.maps", Kind, OWN, OWN.__getitem__)
