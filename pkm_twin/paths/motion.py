@@ -219,9 +219,19 @@ class TimedPath:
             if len(mine):
                 # The end counts as rest; the beginning as motion, with its friction.
                 moves = (t[mine] >= begin) & (t[mine] - begin < run.duration * (1.0 - 1e-12))
-                own = sample_run(run, t[mine] - begin, moves)
+                own = sample_run(run, self._local_times(k, t[mine]), moves)
                 q[mine], qd[mine], qdd[mine], travel[mine], felt[mine] = own[:5]
         return Samples(t, q, qd, qdd, self._efforts(t, q, qd, qdd), robot.forward(q), travel, felt)
+
+    def _local_times(self, k: int, t: Array) -> Array:
+        """Return times since the begin of run k, on the same side of each change of payload."""
+        run, local = self.runs[k], t - self.begins[k]
+        for change, switch in zip(self.carried[1:], self.switches, strict=True):
+            if change.stretch == k and not change.rest:
+                end = float(run.ends[run.part.first_of(change.piece)])
+                before = np.minimum(local, np.nextafter(end, 0.0))
+                local = np.where(t >= switch, np.maximum(local, end), before)
+        return local
 
     def uniform(self, rate: float) -> Samples:
         """Return the motion at ``rate`` samples per second.
