@@ -461,7 +461,7 @@ def _header(program: Program, lanes: int) -> dict[str, Any]:
         "outputs": [len(row) for row in program.outputs.values()],
         "parameters": program.parameters + program.geometry,
         "prepared": lanes * (len(program.prepared) + 1),
-        "stepped": bool(program.equations),
+        "stepped": bool(program.equations) and not program.single,
     }
 
 

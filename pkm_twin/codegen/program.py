@@ -252,6 +252,8 @@ class Program:
     outputs: Mapping[str, Sequence[Expression]]
     equations: Sequence[Equations] = ()
     quick: bool = False
+    single: bool = False
+    """Whether a sample that one step does not reach is rejected, and not tried in more steps."""
 
     def __post_init__(self) -> None:
         known = {**self.inputs, PARAMETERS: self.parameters, GEOMETRY: self.geometry}

@@ -86,13 +86,13 @@ def asks(kernel: Callable[[Robot], Kernel], numbers: Callable[[Rows], Array] = o
     return lambda robot: (kernel(robot), numbers)
 
 
-forward: Final = asks(lambda robot: robot.engine.forward)
+forward: Final = asks(lambda robot: robot.engine.own_forward)
 """From q to pose, position and rotation."""
 anywhere: Final = asks(lambda robot: free_forward(robot.engine))
 """The same as :func:`forward`, one program for machines of every structure."""
 agreeing: Final = asks(lambda robot: robot.agreeing_kernel)
 """From q, qd, qdd of the leading drives to those of all drives."""
-inverse: Final = asks(lambda robot: robot.inverse_kernel)
+inverse: Final = asks(lambda robot: robot.engine.followed_inverse)
 """From the pose to q of some assembly."""
 jacobian: Final = asks(lambda robot: robot.engine.jacobian)
 """From q to pose rates per joint rate."""

@@ -85,18 +85,22 @@ class Drives:
     @cached_property
     def null_rows(self) -> list[list[Any]]:
         """N: by drive that does not lead, its own effort of one, and what the leading ones add."""
-        if not self.others:
-            return []
-        t, rows = self.t, []
-        kept = t.jq[t.scheme.independent]
-        for k in self.others:
-            unit = np.eye(t.tree.unknown_rates)[t.tree.drives[k].rate]
+        t = self.t
+        steps = [t.tree.drives[k] for k in self.others]
+        kept = t.jq[t.scheme.independent] if steps else np.zeros((0, 0))
+        units = np.eye(t.tree.unknown_rates)
+        self.set_null_rows([-(kept.T @ t.lu.solve_transposed(units[s.rate])) for s in steps])
+        return self.null_rows
+
+    def set_null_rows(self, rates: Sequence[Objects]) -> None:
+        """Take N by the rates of each drive that does not lead, by those of the leading ones."""
+        self.null_rows = []
+        for k, own in zip(self.others, rates, strict=True):
             row: list[Any] = [0.0] * self.count
             row[k] = 1.0
-            for j, value in zip(self.leading, kept.T @ t.lu.solve_transposed(unit), strict=True):
-                row[j] = value
-            rows.append(row)
-        return rows
+            for j, value in zip(self.leading, own, strict=True):
+                row[j] = -value
+            self.null_rows.append(row)
 
     @cached_property
     def _weights(self) -> list[Any]:

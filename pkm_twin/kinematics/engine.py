@@ -20,17 +20,21 @@ from pkm_twin.codegen.code import Code
 from pkm_twin.codegen.kernels import Kernel
 from pkm_twin.codegen.key import EMPTY, ProgramKey
 from pkm_twin.codegen.program import Program
+from pkm_twin.errors import ParameterError, SingularityError
 from pkm_twin.kinematics.iterations import least_squares, newton
 from pkm_twin.kinematics.linkage import hold
 from pkm_twin.kinematics.pose import Coordinate
+from pkm_twin.kinematics.posed import CarriedScheme
 from pkm_twin.kinematics.programs import (
     POSE_WEIGHT,
     acceleration_program,
+    ahead_forward_program,
     body_jacobian_program,
     forward_program,
     inverse_program,
     jacobian_program,
     placement_program,
+    quick_inverse_program,
     walk_program,
 )
 from pkm_twin.kinematics.scheme import Branch, Closed, Scheme
@@ -181,17 +185,87 @@ class Engine(Scheme):
     @property
     def forward(self) -> Kernel:
         """Q to pose (m), position (3) and rotation (9) of the platform."""
-        return self.kernel("forward", forward_program)
+        return self.kernel("forward", ahead_forward_program, self._ahead_key)
 
     @property
     def jacobian(self) -> Kernel:
         """Q to pose rates per joint rate (m n) and platform twist per joint rate (6 n), by row."""
         return self.kernel("jacobian", jacobian_program)
 
+    @cached_property
+    def posed(self) -> CarriedScheme | None:
+        """The machine that is driven by its pose, None where its joints do not follow so.
+
+        A screw turns more than once, and a joint that alone carries the platform would be cut.
+        """
+        if any(joint.type.threaded() for joint in self.graph.joints.values()):
+            return None
+        try:
+            scheme = CarriedScheme(self, by_pose=True)
+        except ParameterError:
+            return None
+        return scheme if all(n in scheme.tree.steps for n in self.graph.actuated) else None
+
+    @cached_property
+    def ahead(self) -> CarriedScheme | None:
+        """The machine with the platform before its limbs, if all limbs have closed forms so.
+
+        Then Newton's method has the platform's coordinates alone, fewer than all coordinates, and a
+        scalar equation or two a limb. Machines with a closed form, branch rules or a virtual joint
+        keep their tree.
+        """
+        own = self.closed.start is not None or self.branch is not None
+        if own or not self.solved[1] or any(j.virtual for j in self.graph.joints.values()):
+            return None
+        try:
+            scheme = CarriedScheme(self, by_pose=False)
+            fewer = len(scheme.solved[1]) < self.tree.unknown_rates
+            return scheme if fewer and scheme.has_closed_limbs else None
+        except (ParameterError, SingularityError):
+            # A drive that reaches the platform alone cannot come after it.
+            return None
+
+    def posed_kernel(self, name: str, write: Callable[..., Program]) -> Kernel:
+        """The compiled program of that name, which solves the machine that its pose drives.
+
+        :param write: writes it, of a :class:`Traced` and ``scheme``, :attr:`posed` or None.
+        """
+        scheme = self.posed
+        key = f"{self.inverse_pivots}"
+        if scheme is not None:
+            key = f"{scheme.structure.text} {scheme.drive_pivots} {scheme.chain}"
+        key += self._ahead_key
+        return self.kernel(name, partial(write, scheme=scheme), key)
+
+    @property
+    def _ahead_key(self) -> str:
+        return self.ahead.structure.text if self.ahead is not None else ""
+
     @property
     def inverse(self) -> Kernel:
-        """Pose to q, by Newton's method from home."""
-        return self.kernel("inverse", inverse_program, repr(self.inverse_pivots))
+        """Pose to q, as ``forward`` confirms."""
+        return self.posed_kernel("inverse", inverse_program)
+
+    @property
+    def own_forward(self) -> Kernel:
+        """The program of :attr:`forward` with the machine's own tree.
+
+        It holds for machines of other dimensions too, whose limbs may have no closed form.
+        """
+        return self.kernel("forward on own tree", forward_program)
+
+    @property
+    def followed_inverse(self) -> Kernel:
+        """The program of :attr:`inverse` with the machine's own tree, as above."""
+        write = partial(inverse_program, scheme=None)
+        return self.kernel("followed inverse", write, repr(self.inverse_pivots))
+
+    @property
+    def quick_inverse(self) -> Kernel:
+        """The same of poses that are certainly right; others are rejected."""
+        if self.posed is None:
+            return self.inverse
+        return self.posed_kernel("quick inverse", quick_inverse_program)
 
     @property
     def placement(self) -> Kernel:

@@ -44,8 +44,8 @@ class Mobility:
 class Linkage:
     """A graph's tree and closures, on numbers."""
 
-    def __init__(self, graph: Graph) -> None:
-        self.graph, self.tree = graph, Tree(graph)
+    def __init__(self, graph: Graph, first: tuple[str, ...] = ()) -> None:
+        self.graph, self.tree = graph, Tree(graph, first=first)
 
     @property
     def joints(self) -> int:
@@ -57,14 +57,15 @@ class Linkage:
         motion = Motion(self.tree, x, q)
         return motion, motion.closures()
 
-    def _scaled(self, rows: Sequence[Row]) -> tuple[Array, Array]:
+    def scaled(self, rows: Sequence[Row]) -> tuple[Array, Array]:
         """Derivatives by u and by qd, every row and column of unit one."""
         ju, jq = (numbers(m) for m in matrices(self.tree, rows))
         left = np.array([row.scale for row in rows]).reshape(-1, 1)
-        drives = np.array([self._drive_scale(name) for name in self.graph.leads])
+        drives = np.array([self.drive_scale(name) for name in self.graph.leads])
         return left * ju / np.array(self.tree.scales), left * jq / drives
 
-    def _drive_scale(self, name: str) -> float:
+    def drive_scale(self, name: str) -> float:
+        """Return what makes a joint's rate of unit one."""
         return 1.0 / self.tree.size if self.graph.joints[name].slides else 1.0
 
     def close(self, q: Numbers, start: Numbers | None = None) -> Array | None:
@@ -74,7 +75,7 @@ class Linkage:
         def look(x: Numbers) -> tuple[Array, Array]:
             _, rows = self.at(x, q)
             values = np.array([row.scale * float(row.value) for row in rows])
-            return values, self._scaled(rows)[0]
+            return values, self.scaled(rows)[0]
 
         def move(x: Numbers, step: Array) -> Array:
             return np.array(Motion(self.tree, x, q).retracted(x, step / scales), float)
@@ -115,7 +116,7 @@ class Linkage:
     @cached_property
     def _sampled(self) -> tuple[Array, Array]:
         """Scaled derivatives by u and qd in the samples, shape (k, rows, ...)."""
-        pairs = [self._scaled(self.at(x, q)[1]) for x, q in self.samples]
+        pairs = [self.scaled(self.at(x, q)[1]) for x, q in self.samples]
         return np.array([a for a, _ in pairs]), np.array([b for _, b in pairs])
 
     @cached_property
@@ -125,7 +126,7 @@ class Linkage:
 
     def scaled_at_home(self) -> tuple[Array, Array]:
         """Derivatives of the closures at home by u and by qd, every row and column of unit one."""
-        return self._scaled(self.at(self.tree.home, self.graph.lead_home)[1])
+        return self.scaled(self.at(self.tree.home, self.graph.lead_home)[1])
 
     def regular_state(self) -> tuple[Motion, Array]:
         """The motion in a state of the highest rank at or beside home, and derivatives by u."""
@@ -136,7 +137,7 @@ class Linkage:
     def mobility(self) -> Mobility:
         """Freedoms, rank and redundancy at home."""
         _, rows = self.at(self.tree.home, self.graph.lead_home)
-        both = np.hstack(self._scaled(rows))
+        both = np.hstack(self.scaled(rows))
         rank = rank_of(both)
         parts: tuple[str, ...] = ()
         if rank < len(rows):

@@ -48,14 +48,25 @@ COORDINATES: Final = {
 """The pose coordinates that every machine may have."""
 
 
+TURNS: Final = {
+    "zyx": tuple(COORDINATES[name] for name in ("yaw", "pitch", "roll")),
+    "xyz": (
+        Coordinate("", entries=((1, 2, -1.0), (2, 2, 1.0))),
+        Coordinate("", entries=((0, 2, 1.0),)),
+        Coordinate("", entries=((0, 1, -1.0), (0, 0, 1.0))),
+    ),
+}
+"""Angles of R = Rz Ry Rx and of R = Rx Ry Rz, from the base to the platform."""
+
+
 def about_x(name: str) -> Coordinate:
     """The first angle of R = Rx Ry Rz."""
-    return Coordinate(name, entries=((1, 2, -1.0), (2, 2, 1.0)))
+    return Coordinate(name, entries=TURNS["xyz"][0].entries)
 
 
 def about_y(name: str) -> Coordinate:
     """The second angle of R = Rx Ry Rz."""
-    return Coordinate(name, entries=((0, 2, 1.0),))
+    return Coordinate(name, entries=TURNS["xyz"][1].entries)
 
 
 def _entry(matrix: Any, entry: Entry) -> Any:

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Sequence
 from typing import Any, Final
 
 import numpy as np
@@ -11,15 +11,26 @@ import numpy as np
 from pkm_twin.codegen.expressions import Expression, Numbers, Objects
 from pkm_twin.codegen.lu import SparseLU
 from pkm_twin.codegen.operations import absolute, cos, sin
-from pkm_twin.codegen.program import AT, STATE, UNKNOWNS, Equations, Program, previous
+from pkm_twin.codegen.program import (
+    AT,
+    LEAST,
+    MARGIN,
+    STATE,
+    UNKNOWNS,
+    Equations,
+    Program,
+    previous,
+)  # fmt: skip
 from pkm_twin.kinematics import pose as poses
 from pkm_twin.kinematics.motion import Motion, Row, matrices
-from pkm_twin.kinematics.traced import Traced
+from pkm_twin.kinematics.posed import CarriedScheme
+from pkm_twin.kinematics.traced import POSED, Traced
 
 POSE_WEIGHT: Final = 100.0
 """What the pose weighs against closures where not all can be met: so a closure falls short."""
-POSED: Final = "y"
-"""Unknowns and joints of a pose."""
+CERTAIN: Final = 0.2
+"""Largest distance of the start of ``forward`` from a pose, of unit one, that is certainly the
+start of the way to it."""
 SAME_POSE: Final = 1e-7
 """Largest difference of two poses that are one: rounding of the two solutions, of unit one. Another
 assembly is farther away unless a singularity is nearer than that."""
@@ -131,41 +142,90 @@ def agreeing_program(t: Traced) -> Program:
     return Program(t.inputs("q", "qd", "qdd"), 0, outputs, t.equations(goal=t.lift(q)))
 
 
-def inverse_program(
-    t: Traced, closed: Callable[[Objects], tuple[Numbers, Numbers]] | None = None
-) -> Program:
-    """Pose to joints, in closed form or by Newton's method: those of which ``forward`` is the pose.
+def ahead_forward_program(t: Traced) -> Program:
+    """Write the same program with the fewest unknowns."""
+    return forward_program(t.ahead)
+
+
+def inverse_program(t: Traced, scheme: CarriedScheme | None) -> Program:
+    """Write the program from a pose to the joints of which ``forward`` is the pose.
 
     The joints of a pose may belong to another assembly too, so the closures are solved of them.
 
-    :param closed: of the pose to q, and to numbers that are above zero where q is right.
+    :param scheme: None: the joints are found with the machine's own tree.
     """
-    coordinates = t.scheme.coordinates
-    pose = t.tape.inputs("pose", len(coordinates))
-    first = () if closed else (_posed(t, pose),)
-    q: Numbers = t.tape.inputs(POSED, len(t.tree.home) + t.joints)[-t.joints :]
-    gates: Numbers = ()
-    if closed is not None:
-        q, gates = closed(pose)
+    pose = t.tape.inputs("pose", len(t.scheme.coordinates))
+    if scheme is None:
+        first, found = follow_pose(t)
+        q = list(found)
+    else:
+        posed, q = solve_pose(t, scheme)
+        first = posed.equations()
+        t = t.ahead
     t.solve()
-    there = poses.values(coordinates, *t.motion.platform())
-    same = list(gates)
-    for c, scale, a, b in zip(coordinates, t.pose_scales, there, pose, strict=True):
+    there = poses.values(t.scheme.coordinates, *t.motion.platform())
+    same: list[Any] = []
+    for c, scale, a, b in zip(t.scheme.coordinates, t.pose_scales, there, pose, strict=True):
         apart = a - b
         if len(c.entries) == 2:
             # A full turn makes no difference.
             same.append(cos(apart))
             apart = sin(apart)
         same.append(SAME_POSE - absolute(apart) * scale)
-    solved = t.equations(branch=t.lift(same), goal=t.lift(q), stage=len(first))
-    return Program(
-        {"pose": len(pose)}, 0, {"q": t.lift(t.tree.values_of_drives(q, t.x))}, first + solved
+    leads = q if scheme is None else [q[k] for k in t.drives.leading]
+    solved = t.equations(branch=t.lift(same), goal=t.lift(leads), stage=len(first))
+    values = t.tree.values_of_drives(q, t.x) if scheme is None else q
+    return Program({"pose": len(pose)}, 0, {"q": t.lift(values)}, first + solved)
+
+
+def quick_inverse_program(t: Traced, scheme: CarriedScheme) -> Program:
+    """Write the program from a pose to joints that are certainly those of :func:`inverse_program`.
+
+    A pose is accepted if the determinant of the drives has its sign at home, and if the start of
+    ``forward``, to second order about home, is near the pose; others are left to that program.
+    """
+    posed, q = solve_pose(t, scheme)
+    equations = posed.equations(branch=t.lift(certify_assembly(t, scheme, posed, q)))
+    return Program({"pose": len(posed.q)}, 0, {"q": t.lift(q)}, equations, single=True)
+
+
+def solve_pose(t: Traced, scheme: CarriedScheme) -> tuple[Traced, list[Any]]:
+    """Return the machine that is driven by its pose, solved, and all its drives' positions."""
+    posed = t.carried(scheme)
+    posed.solve()
+    return posed, posed.tree.values_of_joints(t.graph.actuated, posed.x)
+
+
+def certify_assembly(
+    t: Traced, scheme: CarriedScheme, posed: Traced, q: Sequence[Any]
+) -> list[Any]:
+    """Return numbers that are above zero if ``forward`` of q is certainly the pose."""
+    names, order = t.graph.leads, scheme.drive_pivots
+    here, at_home = (
+        SparseLU(posed.rates_of_reaches(names, home=home), order) for home in (False, True)
     )
+    t = t.ahead
+    t.q = np.array([q[k] for k in t.drives.leading], dtype=object)
+    position, rotation = t.place_start().platform()
+    goal, turned = posed.motion.platform()
+    apart = (position - goal) / t.tree.size
+    turns = np.ravel(rotation - turned)
+    # Of two rotations by an angle apart, these squares sum to 4 - 4 cos(angle).
+    distance = apart @ apart + 0.5 * (turns @ turns)
+    drives = at_home.inverse_determinant / here.inverse_determinant
+    # Newton's method from that start needs a determinant above so many times its correction.
+    closures = drives * posed.determinant
+    return [
+        drives - LEAST,
+        CERTAIN * CERTAIN - distance,
+        closures * closures - MARGIN * MARGIN * distance,
+    ]
 
 
-def _posed(t: Traced, goal: Objects) -> Equations:
-    """Newton's method for the unknowns and the joints of a pose, from home."""
+def follow_pose(t: Traced) -> tuple[tuple[Equations, ...], Objects]:
+    """Return Newton's method for all unknowns and leading joints of a pose, and these joints."""
     scheme, tree, tape = t.scheme, t.tree, t.tape
+    goal = tape.inputs("pose", len(scheme.coordinates))
     size, split = len(tree.home), tree.unknown_rates
     home = [*tree.home, *t.graph.lead_home]
     everything = tape.inputs(POSED, len(home))
@@ -189,7 +249,7 @@ def _posed(t: Traced, goal: Objects) -> Equations:
 
     onward = tape.inputs(STATE, len(AT))[AT.onward]
     way = onward * (everything - tape.inputs(previous(POSED), len(home)))
-    return Equations(
+    solved = Equations(
         "pose", t.lift(home), t.lift(origin), None,
         moved(everything + way, np.zeros(len(step))), moved(everything, step),
         t.square(step, [*tree.scales, *t.drive_scales]),
@@ -197,3 +257,4 @@ def _posed(t: Traced, goal: Objects) -> Equations:
         t.square([r.value for r in rows] + equations, [r.scale for r in rows] + t.pose_scales),
         unknowns=POSED,
     )  # fmt: skip
+    return (solved,), everything[size:]

@@ -20,13 +20,14 @@ from pkm_twin.errors import ParameterError
 from pkm_twin.kinematics import pose as poses
 from pkm_twin.kinematics.diagnosis import mobility_error, near_conditions, singular_home
 from pkm_twin.kinematics.iterations import RANK
-from pkm_twin.kinematics.limbs import Limb, LimbPose, find_limbs
+from pkm_twin.kinematics.limbs import Limb, LimbPose, find_hanging_limbs, place_in_order
 from pkm_twin.kinematics.linkage import Linkage, rank_of
 from pkm_twin.kinematics.motion import Motion, Row, matrices, numbers
 from pkm_twin.kinematics.pose import Coordinate
 from pkm_twin.kinematics.spins import null
 from pkm_twin.machine.geometry import geometry_of, pattern_of
 from pkm_twin.machine.graph import BASE, Graph
+from pkm_twin.machine.tree import Step, Tree
 
 MOVES: Final = 1e-6
 """Motion of a drive at home, of unit one, and part of the best choice of drives, that is none."""
@@ -62,8 +63,9 @@ class Scheme(Linkage):
         closed: Closed | None = None,
         branch: Branch | None = None,
         mark: ProgramKey = EMPTY,
+        first: tuple[str, ...] = (),
     ) -> None:
-        super().__init__(graph)
+        super().__init__(graph, first)
         self.coordinates = tuple(coordinates)
         self.closed, self.branch, self._mark = closed or Closed(np.zeros(0)), branch, mark
 
@@ -78,7 +80,7 @@ class Scheme(Linkage):
         return self._mark.also(repr((
             self.graph.topology, pattern_of(self.tree), self.coordinates,
             self.closed.start is not None, self.branch is not None, self.independent, self.pivots,
-            self.limbs, self.solved_pivots,
+            self.order, self.solved_pivots,
         )))  # fmt: skip
 
     @cached_property
@@ -88,36 +90,91 @@ class Scheme(Linkage):
         :raises ParameterError: something can move while the actuated joints are held.
         """
         ju, _ = self._sampled
-        rows = independent_rows(ju)
-        if len(rows) < self.tree.unknown_rates:
+        rows = independent_rows(ju[:, :, self.varying])
+        if len(rows) < len(self.varying):
             raise mobility_error(self)
         return rows
+
+    @property
+    def varying(self) -> list[int]:
+        """Unknown rates of coordinates that the closures do not hold at their value at home."""
+        return list(range(self.tree.unknown_rates))
+
+    @property
+    def held(self) -> list[int]:
+        """The other unknown rates."""
+        return []
+
+    def varies(self, step: Step) -> bool:
+        """Return whether a step is passive, and its value not held."""
+        return not step.actuated and step.rate not in self.held
+
+    def holds(self, step: Step) -> bool:
+        """Return whether closures hold a passive step at its value at home."""
+        return not step.actuated and step.rate in self.held
+
+    @property
+    def holding(self) -> list[int]:
+        """Closures that hold these coordinates."""
+        return []
+
+    @property
+    def holding_pivots(self) -> Order:
+        """Pivots of these closures by the coordinates."""
+        return ()
 
     @cached_property
     def pivots(self) -> Order:
         """Of the independent closures by the unknowns, good in states near home."""
-        return pivot_order(self._sampled[0][:, self.independent])
+        return pivot_order(self._sampled[0][:, self.independent][:, :, self.varying])
 
     @cached_property
-    def limbs(self) -> tuple[Limb, ...]:
-        """Limbs whose turns follow in closed form."""
-        return find_limbs(self.tree, self.parts, self.independent)
+    def order(self) -> tuple[str | Limb, ...]:
+        """Bodies in the order in which they are placed, limbs in closed form among them."""
+        limbs = find_hanging_limbs(self)
+        inner = {body for limb in limbs for body in limb.bodies}
+        return (*(body for body in self.tree.links if body not in inner), *limbs)
+
+    @property
+    def limbs(self) -> list[Limb]:
+        """Limbs in closed form."""
+        return [entry for entry in self.order if isinstance(entry, Limb)]
+
+    @property
+    def ahead(self) -> Any:
+        """The same machine with the platform before its limbs; None: it has no fewer unknowns."""
+        return None
+
+    @property
+    def judged(self) -> list[int]:
+        """Closures of which the residual decides."""
+        return list(range(len(self.parts)))
 
     @cached_property
     def solved(self) -> tuple[list[int], list[int]]:
         """What Newton's method has: indices of the unknowns, and of their rates."""
-        roots = {limb.root for limb in self.limbs}
+        inner = {body for limb in self.limbs for body in limb.bodies}
         places, rates = list(range(len(self.tree.home))), list(range(self.tree.unknown_rates))
-        for step in (step for root in roots for step in self.tree.links[root].steps):
-            places = [k for k in places if k not in (step.position, step.position + 1)]
-            rates.remove(step.rate)
+        for link in self.tree.links.values():
+            for step in link.steps:
+                if self.holds(step) or (self.varies(step) and link.body in inner):
+                    size = 2 if step.circle else 1
+                    places = [k for k in places if not 0 <= k - step.position < size]
+                    rates.remove(step.rate)
         return places, rates
 
+    def place(self, tree: Tree, x: Objects, q: Numbers) -> tuple[Motion, list[LimbPose]]:
+        """Place all bodies; limbs in closed form write their unknowns into ``x``.
+
+        :param tree: this linkage's, or the same on expressions of its geometry.
+        """
+        return place_in_order(tree, self.order, x, q)
+
     def solved_rows(self, rows: Sequence[Row], poses: Sequence[LimbPose]) -> list[Row]:
-        """Of the independent closures those of no limb; and what the limbs' turns cannot meet."""
+        """Of the independent closures those of no limb; and what limbs leave to other joints."""
         limbs = {k for limb in self.limbs for k in limb.rows}
         return [rows[k] for k in self.independent if k not in limbs] + [
-            pose.row() for pose in poses
+            row for pose in poses for row in pose.rows
         ]
 
     @cached_property
@@ -127,9 +184,8 @@ class Scheme(Linkage):
             return self.pivots
         samples = []
         for x, q in self.samples:
-            motion, rows = self.at(x, q)
-            poses = [LimbPose(motion, limb, q) for limb in self.limbs]
-            table, _ = self._scaled(self.solved_rows(rows, poses))
+            motion, poses = self.place(self.tree, np.array(x, dtype=object), q)
+            table, _ = self.scaled(self.solved_rows(motion.closures(), poses))
             samples.append(table[:, self.solved[1]])
         return pivot_order(np.array(samples))
 
@@ -143,6 +199,22 @@ class Scheme(Linkage):
             here = [float(v) for v in poses.values(self.coordinates, position, rotation)]
             samples.append(self._inverse_matrix(there, closed, here))
         return pivot_order(np.array(samples))
+
+    @cached_property
+    def jacobian_pivots(self) -> Order:
+        """Pivots of the pose's rates by those of the leading joints, good in states near home."""
+        n, tables = len(self.varying), []
+        for x, q in self.samples:
+            motion, rows = self.at(x, q)
+            ju, jq = self.scaled(rows)
+            follow = -np.linalg.solve(ju[self.independent], jq[self.independent])
+            position, rotation = (numbers(part) for part in motion.platform())
+            here = [float(v) for v in poses.values(self.coordinates, position, rotation)]
+            table = numbers(self.pose_rows(motion, here))
+            drives = np.array([self.drive_scale(name) for name in self.graph.leads])
+            own = table[:, n:] / drives + (table[:, :n] / np.array(self.tree.scales)) @ follow
+            tables.append(np.array(self._pose_scales)[:, None] * own)
+        return pivot_order(np.array(tables))
 
     def check(self) -> None:
         """Refuse a graph that its actuated joints and pose coordinates do not determine.
@@ -178,11 +250,11 @@ class Scheme(Linkage):
 
     def _inverse_matrix(self, motion: Motion, rows: Sequence[Row], pose: Numbers) -> Array:
         """Scaled derivatives of independent closures and pose equations by u and qd."""
-        ju, jq = self._scaled(rows)
+        ju, jq = self.scaled(rows)
         extra = self.pose_rows(motion, pose)
         table = np.array(self._pose_scales)[:, None] * numbers(extra)
         n = self.tree.unknown_rates
-        drives = np.array([self._drive_scale(name) for name in self.graph.leads])
+        drives = np.array([self.drive_scale(name) for name in self.graph.leads])
         lower = np.hstack([table[:, :n] / np.array(self.tree.scales), table[:, n:] / drives])
         return np.vstack([np.hstack([ju, jq])[self.independent], lower])
 

@@ -4,8 +4,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from copy import copy
 from functools import cached_property
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 
@@ -21,19 +22,41 @@ from pkm_twin.codegen.expressions import (
 )
 from pkm_twin.codegen.lu import SparseLU
 from pkm_twin.codegen.operations import cos, sin
-from pkm_twin.codegen.program import AT, STATE, UNKNOWNS, Equations, previous
+from pkm_twin.codegen.program import AT, LEAST, STATE, UNKNOWNS, Equations, previous
 from pkm_twin.kinematics.drives import LEADS, TIME, Drives
 from pkm_twin.kinematics.limbs import LimbPose
-from pkm_twin.kinematics.motion import Motion, Row, cross, matrices
+from pkm_twin.kinematics.motion import Columns, Motion, Row, cross, matrices
 from pkm_twin.kinematics.scheme import Scheme
 from pkm_twin.machine.geometry import graph_on
+from pkm_twin.machine.graph import Graph
 from pkm_twin.machine.tree import Tree
 
+if TYPE_CHECKING:
+    from pkm_twin.kinematics.posed import CarriedScheme
+
 NO_NUMBERS: Final = np.zeros(0)
+POSED: Final = "y"
+"""Name of the unknowns of a pose."""
+
+
+class Factors(NamedTuple):
+    """Closures in one state, see :class:`Traced`.
+
+    ``limbs``: in closed form. ``jq``: derivatives of the independent closures by the drives;
+    ``lu``: by the unknowns. ``solved``: equations of Newton's method, and its factors ``newton``.
+    """
+
+    limbs: Sequence[LimbPose]
+    jq: Objects
+    lu: SparseLU
+    solved: Sequence[Row]
+    newton: SparseLU
 
 
 class Traced:
     """A machine's motion on expressions of its geometry: what programs are written with."""
+
+    unknowns_name, drives_name = UNKNOWNS, "q"
 
     def __init__(self, scheme: Scheme, more: Array = NO_NUMBERS, *, free: bool = False) -> None:
         self.scheme = scheme
@@ -42,39 +65,56 @@ class Traced:
         end = len(scheme.geometry)
         own = end - len(scheme.closed.numbers)
         self.geometry = given[:end]
-        self.graph = graph_on(scheme.graph, given[:own])
+        self.graph: Graph = graph_on(scheme.graph, given[:own])
         self.closed = given[own:end]
         """Numbers of the mechanism's closed forms."""
         self.more = given[end:]
         """Numbers beside the geometry's, see :meth:`.engine.Engine.kernel_with`."""
-        self.tree, self.joints = Tree(self.graph), scheme.joints
+        self._span()
+
+    def _span(self) -> None:
+        """Take the tree and the inputs of the actuated joints."""
+        self.tree, self.joints = Tree(self.graph, first=self.scheme.tree.first), self.scheme.joints
         self.drives = Drives(self)
-        self.target = LEADS if self.drives.others else "q"
+        self.target = LEADS if self.drives.others else self.drives_name
         self.q = self.tape.inputs(self.target, self.joints)
         """Of the drives that lead, all where there are no others."""
 
+    def carried(self, scheme: CarriedScheme) -> Traced:
+        """Return the machine with the platform before its limbs."""
+        other = copy(self)
+        # No cached property of this tree is the other's.
+        vars(other).clear()
+        vars(other).update(
+            tape=self.tape, geometry=self.geometry, closed=self.closed, more=self.more
+        )
+        other.scheme, other.graph = scheme, scheme.carry(self.graph)
+        if scheme.by_pose:
+            other.unknowns_name, other.drives_name = POSED, "pose"
+        other._span()
+        return other
+
+    @property
+    def ahead(self) -> Traced:
+        """The machine as its forward kinematics are solved, with the fewest unknowns."""
+        return self if self.scheme.ahead is None else self.carried(self.scheme.ahead)
+
     def _placed(self, unknowns: Numbers) -> tuple[Motion, list[LimbPose], Objects]:
-        """The motion and the limbs' turns by the unknowns of Newton's method, and all unknowns."""
-        scheme, tree = self.scheme, self.tree
-        x = np.zeros(len(tree.home), dtype=object)
-        x[scheme.solved[0]] = unknowns
-        inner = [body for limb in scheme.limbs for body in limb.bodies]
-        motion = Motion(tree, x, self.q, [body for body in tree.links if body not in inner])
-        limbs = [LimbPose(motion, limb, self.q) for limb in scheme.limbs]
-        for limb in limbs:
-            for k, value in limb.unknowns().items():
-                x[k] = value
-        motion.place(inner, x, self.q)
+        """The motion and the limbs by the unknowns of Newton's method, and all unknowns."""
+        # Coordinates that are held have their values at home.
+        x = np.array(self.tree.home, dtype=object)
+        x[self.scheme.solved[0]] = unknowns
+        motion, limbs = self.scheme.place(self.tree, x, self.q)
         return motion, limbs, x
 
     def solve(self) -> None:
         """Take unknowns and closures."""
         scheme, tree = self.scheme, self.tree
-        self.unknowns = self.tape.inputs(UNKNOWNS, len(scheme.solved[0]))
+        self.unknowns = self.tape.inputs(self.unknowns_name, len(scheme.solved[0]))
         self.motion, self.limbs, self.x = self._placed(self.unknowns)
         self.rows = self.motion.closures()
         self.ju, self.jq = matrices(tree, self.rows)
-        self.lu = SparseLU(self.ju[scheme.independent], scheme.pivots)
+        self.lu = SparseLU(self.ju[scheme.independent][:, scheme.varying], scheme.pivots)
         self.solved = scheme.solved_rows(self.rows, self.limbs)
         self.newton = self.lu
         if self.limbs:
@@ -114,20 +154,24 @@ class Traced:
         rows: list[Any] = [0.0] * tree.unknown_rates
         for k, value in zip(rates, step, strict=True):
             rows[k] = value
-        closed = scheme.closed.start
-        start = self._guess() if closed is None else self._ordered(closed(self.closed, self.q))
         moved = self.motion.retracted(self.x, rows)
-        before = self.tape.inputs(previous(UNKNOWNS), len(places))
+        before = self.tape.inputs(previous(self.unknowns_name), len(places))
         state = self.tape.inputs(STATE, len(AT))
         onward = self.unknowns + state[AT.onward] * (self.unknowns - before)
         branch = [] if scheme.branch is None else self.lift(scheme.branch(self.motion))
+        determinant = self.determinant
+        if not places:
+            # Nothing is corrected: the result alone is judged.
+            branch, determinant = [*branch, *self.lift([determinant - LEAST])], 1.0
+        judged = [self.rows[k] for k in scheme.judged]
         solved = Equations(
             self.target, self.lift([tree.home[k] for k in places]), self.lift(self.graph.lead_home),
-            self.lift(start), self.retracted(onward),
+            self.lift(self._start()), self.retracted(onward),
             self.lift([moved[k] for k in places]),
-            self.square(step, [tree.scales[k] for k in rates]), self.tape.lift(self._determinant()),
-            self.square([r.value for r in self.rows], [r.scale for r in self.rows]),
-            closed is None, [*branch, *more.pop("branch", ())], **more,
+            self.square(step, [tree.scales[k] for k in rates]), self.tape.lift(determinant),
+            self.square([r.value for r in judged], [r.scale for r in judged]),
+            scheme.closed.start is None, [*branch, *more.pop("branch", ())], self.unknowns_name,
+            **more,
         )  # fmt: skip
         return (solved,)
 
@@ -138,16 +182,30 @@ class Traced:
         x[places] = values
         if len(rates):
             du[kept] = rates
-        moved = self.motion.retracted(x, du)
+        moved = self.home.retracted(x, du)
         return self.lift([moved[k] for k in places])
 
-    def _determinant(self) -> Any:
-        """Of all closures, over that at home: of Newton's equations and of the limbs' turns."""
-        limbs, _, _, newton = self._at_home
-        result = newton.inverse_determinant / self.newton.inverse_determinant
-        for here, there in zip(self.limbs, limbs, strict=True):
-            result = result * (here.steepness / there.steepness)
+    @property
+    def determinant(self) -> Any:
+        """Of all closures, over that at home: of Newton's equations and of the limbs."""
+        home = self._at_home
+        result = home.newton.inverse_determinant / self.newton.inverse_determinant
+        for here, there in zip(self.limbs, home.limbs, strict=True):
+            for (slope, _), (at_home, _) in zip(here.slopes, there.slopes, strict=True):
+                result = result * (slope / at_home)
+        if self.scheme.held:
+            holding = self._holding(self.ju, self.lu)
+            at_home = self._holding_at_home.inverse_determinant
+            result = result * (at_home / holding.inverse_determinant)
         return result
+
+    def _holding(self, ju: Objects, lu: SparseLU) -> SparseLU:
+        """Return factors of the closures that hold coordinates of the platform, by these."""
+        scheme, table = self.scheme, ju[self.scheme.holding]
+        held = ju[scheme.independent][:, scheme.held]
+        follow = np.array([lu.solve(column) for column in held.T], dtype=object).T
+        matrix = table[:, scheme.held] - table[:, scheme.varying] @ follow
+        return SparseLU(matrix, scheme.holding_pivots)
 
     @cached_property
     def home(self) -> Motion:
@@ -155,17 +213,72 @@ class Traced:
         return Motion(self.tree, self.tree.home, self.graph.lead_home)
 
     @cached_property
-    def _at_home(self) -> tuple[list[LimbPose], Objects, SparseLU, SparseLU]:
-        """At home: limbs, the kept closures by qd, their factors by u, those of Newton's method."""
-        scheme, motion = self.scheme, self.home
-        limbs = [LimbPose(motion, limb, self.graph.lead_home) for limb in scheme.limbs]
-        closures = motion.closures()
+    def _at_home(self) -> Factors:
+        """The same at home."""
+        scheme = self.scheme
+        x = np.array(self.tree.home, dtype=object)
+        _, limbs = scheme.place(self.tree, x, self.graph.lead_home)
+        closures = self.home.closures()
         ju, jq = (snapped_all(m[scheme.independent]) for m in matrices(self.tree, closures))
-        lu = newton = SparseLU(ju, scheme.pivots)
+        lu = newton = SparseLU(ju[:, scheme.varying], scheme.pivots)
+        solved = scheme.solved_rows(closures, limbs)
         if limbs:
-            table = self._table(scheme.solved_rows(closures, limbs))
-            newton = SparseLU(snapped_all(table), scheme.solved_pivots)
-        return limbs, jq, lu, newton
+            newton = SparseLU(snapped_all(self._table(solved)), scheme.solved_pivots)
+        return Factors(limbs, jq, lu, solved, newton)
+
+    @cached_property
+    def _holding_at_home(self) -> SparseLU:
+        ju, _ = matrices(self.tree, self.home.closures())
+        return self._holding(snapped_all(ju), self._at_home.lu)
+
+    @property
+    def _here(self) -> Factors:
+        """Limbs and factors in the state that is solved."""
+        jq = self.jq[self.scheme.independent]
+        return Factors(self.limbs, jq, self.lu, self.solved, self.newton)
+
+    def _start(self) -> Sequence[Any]:
+        """Return the unknowns that Newton's method starts with: in closed form, or a guess."""
+        closed = self.scheme.closed.start
+        if not self.scheme.solved[0]:
+            return []
+        return self._guess() if closed is None else self._ordered(closed(self.closed, self.q))
+
+    def place_start(self) -> Motion:
+        """Place all bodies by the unknowns that Newton's method starts with."""
+        return self._placed(np.array(self._start(), dtype=object))[0]
+
+    def rates_of_joints(self, names: Sequence[str]) -> Objects:
+        """Return rates of passive joints per rate of each drive, shape (names, n)."""
+        return np.array([self._rates_by_closures(name, self._here) for name in names], object)
+
+    def _rates_by_closures(self, name: str, at: Factors) -> Objects:
+        unit = np.eye(at.lu.size)[self.scheme.varying.index(self.tree.steps[name].rate)]
+        return -(at.jq.T @ at.lu.solve_transposed(unit))
+
+    def rates_of_reaches(self, names: Sequence[str], *, home: bool = False) -> Objects:
+        """Return the same in fewer operations for joints that set a limb's distance.
+
+        :param home: at home.
+        """
+        at, kept = self._at_home if home else self._here, self.scheme.solved[1]
+        reaches = {limb.reach: pose for limb, pose in zip(self.scheme.limbs, at.limbs, strict=True)}
+        bodies = {step.joint: link.body for link in self.tree.links.values() for step in link.steps}
+        rows = []
+        for name in names:
+            columns: Columns = {("u", self.tree.steps[name].rate): 1.0}
+            if bodies[name] in reaches:
+                columns = reaches[bodies[name]].reach_rates()
+            if not all(kind == "q" or k in kept for kind, k in columns):
+                rows.append(self._rates_by_closures(name, at))
+                continue
+            by_q: Any = np.array([columns.get(("q", k), 0.0) for k in range(self.joints)], object)
+            if kept:
+                by_u = [columns.get(("u", k), 0.0) for k in kept]
+                table = matrices(self.tree, at.solved)[1]
+                by_q = by_q - table.T @ at.newton.solve_transposed(by_u)
+            rows.append(by_q)
+        return np.array(rows, dtype=object)
 
     def _guess(self) -> list[Expression]:
         """Unknowns along the tangent at home, corrected once by its derivatives: to second order.
@@ -173,10 +286,10 @@ class Traced:
         This costs less than a correction by derivatives there, and the guess is nearer.
         """
         scheme, home = self.scheme, self.tree.home
-        _, jq, lu, newton = self._at_home
+        _, jq, lu, _, newton = self._at_home
         away = self.q - self.graph.lead_home
         # Solved per joint: a sample then only multiplies by what is prepared.
-        columns = snapped_all([-lu.solve(jq[:, j]) for j in range(self.joints)])
+        columns = snapped_all([self._unknown(-lu.solve(jq[:, j])) for j in range(self.joints)])
         moved = self.home.retracted(home, columns.T @ away)
         tangent = [moved[k] for k in scheme.solved[0]]
         motion, limbs, _ = self._placed(tangent)
@@ -253,7 +366,7 @@ class Traced:
     def set_rates(self, qd: Numbers) -> Objects:
         """Rates of everything by qd; returns those of the unknowns."""
         kept = self.scheme.independent
-        self.u = self.lu.solve(-(self.jq[kept] @ np.asarray(qd, dtype=object)))
+        self.u = self._unknown(self.lu.solve(-(self.jq[kept] @ np.asarray(qd, dtype=object))))
         self.motion.set_rates(self.u, qd)
         self.drives.judge("qd", qd, self.u, TIME)
         return self.u
@@ -263,14 +376,20 @@ class Traced:
         kept = self.scheme.independent
         self.motion.set_accelerations(np.zeros(self.tree.unknown_rates), qdd)
         bias = [self.rows[k].bias() for k in kept]
-        self.du = -self.lu.solve(bias)
+        self.du = self._unknown(-self.lu.solve(bias))
         self.drives.judge("qdd", qdd, self.du, TIME * TIME)
         self.motion.set_accelerations(self.du, qdd, gravity)
 
     def rate_columns(self) -> list[Objects]:
         """Rates of the unknowns per joint rate."""
         kept = self.scheme.independent
-        return [self.lu.solve(-self.jq[kept][:, j]) for j in range(self.joints)]
+        return [self._unknown(self.lu.solve(-self.jq[kept][:, j])) for j in range(self.joints)]
+
+    def _unknown(self, varying: Numbers) -> Objects:
+        """Return all unknown rates by those that are not held."""
+        rates = np.zeros(self.tree.unknown_rates, dtype=object)
+        rates[self.scheme.varying] = varying
+        return rates
 
     def twists(self, body: str, at: Any, columns: Sequence[Objects]) -> list[tuple[Any, Any]]:
         """Return velocity at a place and angular velocity of a body per joint rate.

@@ -96,10 +96,15 @@ class Link:
 
 @dataclass(eq=False)
 class Tree:
-    """Links in an order in which parents come first, cut joints, and unknowns."""
+    """Links in an order in which parents come first, cut joints, and unknowns.
+
+    ``carriers``: joints that the tree may have, by default all. ``first``: joints that come before
+    all but the leading ones, if they make no loop; or the platform, which is free then.
+    """
 
     graph: Graph
     carriers: frozenset[str] | None = None
+    first: tuple[str, ...] = ()
     links: dict[str, Link] = field(default_factory=dict)
     cut: tuple[str, ...] = ()
     home: list[float] = field(default_factory=list)
@@ -134,8 +139,7 @@ class Tree:
     @cached_property
     def drives(self) -> list[Step]:
         """The step of every actuated joint, those that follow too."""
-        steps = {step.joint: step for link in self.links.values() for step in link.steps}
-        return [steps[name] for name in self.graph.actuated]
+        return [self.steps[name] for name in self.graph.actuated]
 
     def of_drives(self, leads: Any, rest: Any) -> list[Any]:
         """Rates or accelerations of all drives, of those that lead, shape (m,), and the unknown."""
@@ -143,24 +147,34 @@ class Tree:
 
     def values_of_drives(self, leads: Any, x: Any) -> list[Any]:
         """Positions of all drives of those that lead; turns within half a turn of home."""
-        found = []
-        for step in self.drives:
-            k, home = step.position, self.graph.joints[step.joint].home
-            if step.actuated:
-                found.append(leads[k])
-            else:
-                found.append((atan2(x[k + 1], x[k]) if step.circle else x[k]) + home)
-        return found
+        return [
+            leads[step.position] if step.actuated else self._value(step, x) for step in self.drives
+        ]
+
+    def values_of_joints(self, names: Sequence[str], x: Any) -> list[Any]:
+        """Positions of passive joints of one freedom; turns within half a turn of home."""
+        return [self._value(self.steps[name], x) for name in names]
+
+    def _value(self, step: Step, x: Any) -> Any:
+        k = step.position
+        value = atan2(x[k + 1], x[k]) if step.circle else x[k]
+        return value + self.graph.joints[step.joint].home
+
+    @cached_property
+    def steps(self) -> dict[str, Step]:
+        """The step of every joint of the tree, of several freedoms the last one."""
+        return {step.joint: step for link in self.links.values() for step in link.steps}
 
     def _span(self) -> dict[str, list[tuple[str, str | None]]]:
         graph = self.graph
         able = self.carriers
         order = sorted(
             (j for j in graph.joints.values() if able is None or j.name in able),
-            key=lambda j: (not j.leads, not j.actuated, j.type.cost),
+            key=lambda j: (not j.leads, j.name not in self.first, not j.actuated, j.type.cost),
         )
         pairs: dict[str | tuple[str], tuple[str, str]]
-        pairs = {joint.name: (joint.inner, joint.outer) for joint in order}
+        pairs = {(body,): (BASE, body) for body in graph.bodies if body in self.first}
+        pairs |= {joint.name: (joint.inner, joint.outer) for joint in order}
         pairs |= {(body,): (BASE, body) for body in graph.bodies}
         neighbours: dict[str, list[tuple[str, str | None]]] = {n: [] for n in (BASE, *graph.bodies)}
         spanned = spanning(neighbours, pairs)

@@ -12,12 +12,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from pkm_twin.codegen.arrays import Array, Mask
-from pkm_twin.codegen.code import NOT_FINITE
-from pkm_twin.codegen.expressions import Numbers, Objects
+from pkm_twin.codegen.code import GOOD, NOT_FINITE, REFUSED
 from pkm_twin.codegen.kernels import Kernel
 from pkm_twin.codegen.key import EMPTY
-from pkm_twin.codegen.operations import less
-from pkm_twin.codegen.program import Program
 from pkm_twin.errors import ParameterError, SingularityError, UnreachableError
 from pkm_twin.kinematics.drives import TIME
 from pkm_twin.kinematics.engine import Engine, engine_of
@@ -26,10 +23,9 @@ from pkm_twin.kinematics.passive import (
     passive_program,
     passive_rates_program,
 )
-from pkm_twin.kinematics.programs import agreeing_program, inverse_program
+from pkm_twin.kinematics.programs import agreeing_program
 from pkm_twin.kinematics.scheme import Closed
 from pkm_twin.kinematics.singularity import singularity_kernel
-from pkm_twin.kinematics.traced import Traced
 from pkm_twin.machine import schema
 from pkm_twin.machine.graph import Graph
 from pkm_twin.machine.inertia import Layout
@@ -62,8 +58,8 @@ def _forward(robot: Robot) -> Kernel:
     return robot.engine.forward
 
 
-def _inverse(robot: Robot) -> Kernel:
-    return robot.inverse_kernel
+def _quick_inverse(robot: Robot) -> Kernel:
+    return robot.engine.quick_inverse
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -180,35 +176,30 @@ class Robot(Mechanism):
         :raises UnreachableError: naming limb, sample and miss.
         :raises SingularityError: a pose beyond a singularity, or in one.
         """
-        return self.bound(_inverse, otherwise=self._checked_inverse)(pose)
+        return self.bound(_quick_inverse, otherwise=self._checked_inverse)(pose)
 
     def _checked_inverse(self, pose: ArrayLike) -> Array:
-        (q,), status = self.inverse_kernel(_NONE, pose)
+        q, status = self._invert(pose)
         if status is not None:
             self._refuse_pose(status, pose)
         return q
 
+    def _invert(self, pose: ArrayLike) -> tuple[Array, Array | None]:
+        """Return joint positions and the status, None if all poses are good."""
+        (q,), status = self.engine.quick_inverse(_NONE, pose)
+        if status is None:
+            return q, None
+        left = status[..., 0] == REFUSED
+        places = np.broadcast_to(np.asarray(pose, np.float64), (*left.shape, len(self.pose_names)))
+        (q[left],), again = self.engine.inverse(_NONE, places[left])
+        status[left] = [GOOD, 1.0] if again is None else again
+        return q, status if status[..., 0].any() else None
+
     def try_inverse(self, pose: ArrayLike) -> tuple[Array, Mask]:
         """Joint positions (..., n), NaN for an invalid pose; and which poses are valid, (...)."""
-        return _tried(self.inverse_kernel, pose)
-
-    @cached_property
-    def inverse_kernel(self) -> Kernel:
-        """Pose to joints, in closed form where there is one, as ``forward`` confirms."""
-        if not self.has_inverse:
-            return self.engine.inverse
-
-        def write(t: Traced) -> Program:
-            def closed(pose: Objects) -> tuple[Numbers, Numbers]:
-                found = self.on(t.closed).solved(pose)
-                gates = [1.0 - less(0.0, miss) for miss in found.misses]
-                if found.measure is not None:
-                    gates.append(found.measure - SINGULARITY_BOUND)
-                return found.q, gates
-
-            return inverse_program(t, closed)
-
-        return self.engine.kernel("closed inverse", write)
+        q, status = self._invert(pose)
+        good = np.ones(q.shape[:-1], bool) if status is None else status[..., 0] == GOOD
+        return q, np.asarray(good)
 
     def _refuse_pose(self, status: Array, pose: ArrayLike) -> None:
         index = _first(status[..., 0])
@@ -231,14 +222,28 @@ class Robot(Mechanism):
                 )
             if found.measure is not None and not found.measure > SINGULARITY_BOUND:
                 measure = max(float(found.measure), 0.0)
-        elif reached < 1.0:
+        else:
             part, miss, met = self.engine.shortest_pose(one)
-            if not met:
-                raise UnreachableError("pose", part, index, miss, reached, self._slip(one))
             slip = self._slip(one)
-            raise SingularityError("pose", index, 0.0, SINGULARITY_BOUND, reached, question=slip)
+            if not met:
+                reached = self._reached_fraction(one)
+                raise UnreachableError("pose", part, index, miss, reached, slip)
+            if reached < 1.0:
+                raise SingularityError(
+                    "pose", index, 0.0, SINGULARITY_BOUND, reached, question=slip
+                )
         slip = self._slip(one)
         raise SingularityError("pose", index, measure, SINGULARITY_BOUND, None, True, slip)
+
+    def _reached_fraction(self, pose: Array) -> float:
+        """Return how much of the straight line from home to a rejected pose is reached."""
+        home, low, high = self.home(), 0.0, 1.0
+        for _ in range(3):
+            way = np.linspace(low, high, 65)
+            good = self.try_inverse(home + way[:, None] * (pose - home))[1]
+            first = int(np.argmin(good)) or 1
+            low, high = way[first - 1], way[first]
+        return float(low)
 
     def _slip(self, pose: Array) -> str:
         """Return which coordinate of a pose (m,) is far beyond, with a question about its unit."""

@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""Limbs in closed form: of random hexapods, all closures hold and nothing else is accepted."""
+"""Limbs in closed form: their joints are those of all closures, and nothing else is accepted."""
 
 from __future__ import annotations
 
@@ -8,11 +8,18 @@ from functools import partial
 import numpy as np
 import pytest
 
+from delta_dynamics import inverse_dynamics, inverse_dynamics_at_pose
+from pkm_twin.errors import PkmTwinError
 from pkm_twin.kinematics.iterations import newton
-from pkm_twin.kinematics.limbs import LimbPose
 from pkm_twin.kinematics.motion import Motion, matrices, numbers
 from pkm_twin.mechanisms.catalogue import robot_of_data
 from test.machine.random_machines import variant
+from test.support.robots import load, partly_long
+
+NAMES = ("delta", "delta_cu", "five_bar", "linear_delta", "prru", "rps3", "stewart", "upr_rpu")
+TEMPLATES = ("agile_eye", "par4", "rrs3", "rss6", "tricept", "rrr3_planar")
+ROBOTS = [*NAMES, *(f"examples/machines/{name}.yaml" for name in TEMPLATES)]
+EVERY = partly_long(ROBOTS, "delta_cu", "five_bar", "rps3", "stewart", ROBOTS[-1])
 
 
 def hexapod(seed):
@@ -36,11 +43,19 @@ def followed(engine, q, steps=128):
     return x
 
 
+def reached(robot, rng, count, reach=0.3):
+    """Poses of joint positions at random about home."""
+    scales = robot.joint_scales
+    q = robot.graph.home + rng.uniform(-reach, reach, (count, robot.joints_count)) * scales
+    return robot.try_forward(robot.try_agreeing(q))[0]
+
+
 @pytest.mark.parametrize("seed", [1, 2])
-def test_the_platform_and_the_turns_are_those_of_all_closures(seed):
+def test_the_platform_is_that_of_all_closures(seed):
     robot = hexapod(seed)
     engine = robot.engine
     assert len(engine.limbs) == 5
+    assert len(engine.ahead.limbs) == 6
     rng = np.random.default_rng(seed)
     q = engine.graph.home + rng.uniform(-0.15, 0.15, (400, 6)) * engine.tree.size
     pose, known = robot.try_forward(q)
@@ -49,24 +64,70 @@ def test_the_platform_and_the_turns_are_those_of_all_closures(seed):
         x = followed(engine, q[k])
         position, _ = Motion(engine.tree, x, q[k]).platform()
         np.testing.assert_allclose(pose[k, :3], numbers(position), atol=1e-10)
-        motion = Motion(engine.tree, x, q[k])
-        for limb in engine.limbs:
-            for place, value in LimbPose(motion, limb, q[k]).unknowns().items():
-                assert value == pytest.approx(x[place], abs=1e-10)
 
 
 @pytest.mark.parametrize("seed", [1, 2])
-def test_the_determinant_is_that_of_all_closures(seed):
+def test_limbs_and_their_determinant_are_those_of_all_closures(seed):
     engine = hexapod(seed).engine
     ratios = []
     for x, q in engine.samples:
-        motion, rows = engine.at(x, q)
-        limbs = [LimbPose(motion, limb, q) for limb in engine.limbs]
+        found = np.array(x, dtype=object)
+        motion, limbs = engine.place(engine.tree, found, q)
+        np.testing.assert_allclose(found.astype(float), x, atol=1e-10)
+        rows = motion.closures()
         solved = numbers(matrices(engine.tree, engine.solved_rows(rows, limbs))[0])
         whole = numbers(matrices(engine.tree, rows)[0])[engine.independent]
-        turns = np.prod([float(limb.steepness) for limb in limbs])
+        turns = np.prod([float(slope) for limb in limbs for slope, _ in limb.slopes])
         part = np.linalg.det(solved[:, engine.solved[1]]) * turns
         ratios.append(np.linalg.det(whole) / part)
     assert len(ratios) > 3
     np.testing.assert_allclose(ratios, ratios[0], rtol=1e-9)
     assert abs(ratios[0]) == pytest.approx(1.0, rel=1e-9)
+
+
+@pytest.mark.parametrize("name", EVERY)
+def test_forward_of_the_inverse_is_the_pose_or_it_is_rejected(name, rng):
+    """Far poses have other assemblies of the same joints: none of these is accepted."""
+    robot = load(name)
+    near = reached(robot, rng, 400)
+    near = near[np.isfinite(near).all(1)]
+    middle, span = near.mean(0), np.ptp(near, axis=0)
+    far = [middle + k * span * rng.uniform(-0.5, 0.5, (1500, len(span))) for k in (1, 2, 4)]
+    poses = np.concatenate([near, *far])
+    q, good = robot.try_inverse(poses)
+    assert good[: len(near)].mean() > 0.9
+    back, known = robot.try_forward(q[good])
+    assert known.all()
+    apart = back - poses[good]
+    turns = [unit == "rad" for unit in robot.pose_units]
+    apart[:, turns] = 2.0 * np.sin(apart[:, turns] / 2.0)
+    assert np.abs(apart).max() < 1e-6
+
+
+@pytest.mark.parametrize("name", EVERY)
+def test_torques_of_a_motion_of_the_pose_are_those_of_its_joints(name, rng):
+    robot = load(name)
+    pose = reached(robot, rng, 60, 0.15)
+    pose = pose[np.isfinite(pose).all(1)]
+    rate, change = rng.normal(size=(2, *pose.shape))
+    wrench = 10.0 * rng.normal(size=(len(pose), 6))
+    found = inverse_dynamics_at_pose(robot, pose, rate, 10.0 * change, wrench)
+    tau = inverse_dynamics(robot, found.q, found.qd, found.qdd, wrench)
+    np.testing.assert_allclose(found.tau, tau, atol=1e-11 * np.abs(tau).max())
+    np.testing.assert_allclose(robot.forward(found.q), pose, atol=1e-9)
+    rates = np.einsum("kij,kj->ki", robot.jacobian(found.q), found.qd)
+    np.testing.assert_allclose(rates, rate, atol=1e-9)
+    second = robot.pose_acceleration(found.q, found.qd, found.qdd)
+    np.testing.assert_allclose(second, 10.0 * change, atol=1e-7)
+    one = inverse_dynamics_at_pose(robot, pose[0], rate[0], 10.0 * change[0], wrench[0])
+    np.testing.assert_array_equal(one.tau, found.tau[0])
+
+
+def test_a_pose_that_is_not_reached_has_no_torques():
+    robot = load("delta")
+    pose, still = robot.home(), np.zeros(3)
+    deep = pose + np.array([0.0, 0.0, -2.0])
+    with pytest.raises(PkmTwinError):
+        inverse_dynamics_at_pose(robot, [pose, deep], still, still)
+    with pytest.raises(ValueError, match="finite"):
+        inverse_dynamics_at_pose(robot, pose, still, np.full(3, np.nan))

@@ -23,7 +23,7 @@ CODEGEN = "pkm_twin.codegen.code"
 def kernels(robot):
     found = {
         "forward": robot.engine.forward,
-        "inverse": robot.inverse_kernel,
+        "inverse": robot.engine.inverse,
         "torques": torques(robot),
         "loads": loads_kernel(robot),
     }
@@ -63,7 +63,7 @@ def forgetful():
     """Sources are read anew when the result is called."""
 
     def forget():
-        for known in (keys._sources, keys._imports, keys._place, keys._read):
+        for known in (keys._find_sources, keys._find_imports, keys._module_file, keys._read_source):
             known.cache_clear()
 
     yield forget

@@ -1,0 +1,385 @@
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
+"""A machine whose platform is carried by a chain of its pose coordinates.
+
+The chain has a slide or a turn for each coordinate of the platform that its joints leave free. If
+those of the pose are actuated, the machine's own joints follow: solving the closures of this graph
+is the inverse kinematics, limb by limb, and generalised forces on the pose coordinates give the
+machine's efforts. If the machine's own joints are actuated, it is the forward kinematics.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Final
+
+import numpy as np
+
+from pkm_twin.codegen.arrays import Array
+from pkm_twin.codegen.expressions import SNAP
+from pkm_twin.codegen.lu import Order, independent_rows, pivot_order
+from pkm_twin.kinematics import pose as poses
+from pkm_twin.kinematics.diagnosis import mobility_error
+from pkm_twin.kinematics.limbs import Limb, chain_to_base, order_closed
+from pkm_twin.kinematics.linkage import REACH
+from pkm_twin.kinematics.motion import Motion, numbers
+from pkm_twin.kinematics.pose import Coordinate
+from pkm_twin.kinematics.scheme import Scheme
+from pkm_twin.machine.graph import BASE, Body, Graph, Joint, array
+from pkm_twin.machine.joints import UNITS, Freedom
+from pkm_twin.machine.tree import Link, Tree
+
+OPEN_STATES: Final = 4
+"""States of an open tree, of which one alone could keep a coordinate by chance."""
+STILL: Final = 1e-8
+"""Largest change of a coordinate, of unit one, that counts as none: rounding of sampled states."""
+
+
+@dataclass(frozen=True)
+class Carrier:
+    """One slide or turn of the chain, along or about a base axis at home.
+
+    ``place``: index of its pose coordinate, None of another coordinate of the platform. ``held``:
+    whether closures hold that at its value at home. ``joint``: the joint of the machine that it
+    replaces, through whose point it turns; empty: none, and the reference point. ``end``: the body
+    that it carries, empty: a massless one.
+    """
+
+    name: str
+    coordinate: Coordinate
+    axis: int
+    place: int | None
+    held: bool = False
+    joint: str = ""
+    end: str = ""
+
+    @property
+    def turns(self) -> bool:
+        """Whether it turns about its axis; else it slides along it."""
+        return self.coordinate.axis is None
+
+
+@dataclass(frozen=True)
+class PoseChain:
+    """Slides and turns from the base to the platform."""
+
+    carriers: tuple[Carrier, ...]
+
+    @property
+    def joints(self) -> tuple[str, ...]:
+        """Names of the joints of the chain."""
+        return tuple(f"pose {carrier.name}" for carrier in self.carriers)
+
+    def attach(self, graph: Graph, *, by_pose: bool) -> Graph:
+        """Return the graph with the chain.
+
+        :param by_pose: whether the pose coordinates are actuated in place of the machine's joints.
+        """
+        chain: list[tuple[int, Joint]] = []
+        massless: dict[str, Body] = {}
+        end, replaced = BASE, {carrier.joint for carrier in self.carriers}
+        for carrier, name in zip(self.carriers, self.joints, strict=True):
+            start, end = end, carrier.end or f"carrier of {carrier.name}"
+            if not carrier.end:
+                massless[end] = Body(end)
+            given = by_pose and carrier.place is not None
+            home = graph.origin[carrier.axis] if given and not carrier.turns else 0.0
+            at = graph.joints[carrier.joint].at if carrier.joint else graph.origin
+            joint = Joint(
+                name, "revolute" if carrier.turns else "prismatic", start, end, at,
+                array(UNITS[carrier.axis : carrier.axis + 1]), actuated=given, home=home,
+            )  # fmt: skip
+            chain.append((len(self.carriers) if carrier.place is None else carrier.place, joint))
+        # Actuated joints have the order of the pose.
+        joints = {joint.name: joint for _, joint in sorted(chain, key=lambda pair: pair[0])}
+        for name, joint in graph.joints.items():
+            if name not in replaced and not by_pose:
+                joints[name] = joint
+            elif name not in replaced:
+                passive = replace(
+                    joint, actuated=False, follows=False, viscous=0.0, coulomb=0.0,
+                    rotor_inertia=0.0,
+                )  # fmt: skip
+                joints[name] = passive if joint.actuated else joint
+        graph = replace(graph, bodies={**graph.bodies, **massless}, joints=joints)
+        return replace(graph, laws=(), sharing=array([])) if by_pose else graph
+
+
+def find_pose_chain(scheme: Scheme) -> PoseChain:
+    """Find the chain of a machine's pose.
+
+    It replaces joints that are the pose coordinates already, as a platform's universal joint on the
+    base, or carries the platform beside the machine's joints.
+    """
+    graph, given = scheme.graph, scheme.coordinates
+    entries = {c.entries for c in given if c.entries}
+    sequence = next(t for t in poses.TURNS.values() if entries <= {c.entries for c in t})
+    every = [*(poses.COORDINATES[name] for name in "xyz"), *sequence]
+    closed = _vary(scheme, every, scheme.samples)
+    # Coordinates that the joints to the platform keep by themselves, as in a plane, need no joint.
+    opened = _vary(scheme, every, _open_states(scheme))
+    carriers = []
+    for c, varies, moves in zip(every, closed, opened, strict=True):
+        place = next(
+            (i for i, own in enumerate(given) if (own.axis, own.entries) == (c.axis, c.entries)),
+            None,
+        )
+        if place is not None:
+            carriers.append(Carrier(given[place].name, c, _axis_of(c), place))
+        elif moves:
+            kind = "slide" if c.axis is not None else "turn"
+            name = f"{'xyz'[_axis_of(c)]} {kind}"
+            carriers.append(Carrier(name, c, _axis_of(c), None, held=not varies))
+    own = [carrier for carrier in carriers if carrier.place is not None]
+    joints = _replace_joints(scheme, own)
+    if joints:
+        return PoseChain(joints)
+    return PoseChain((*carriers[:-1], replace(carriers[-1], end=graph.platform)))
+
+
+def _vary(
+    scheme: Scheme, coordinates: Sequence[Coordinate], states: Sequence[tuple[Array, Array]]
+) -> list[bool]:
+    """Return which coordinates of the platform vary over states (x, q) of a machine."""
+    placed = [tuple(numbers(part) for part in scheme.at(x, q)[0].platform()) for x, q in states]
+    table = np.array([poses.values(coordinates, *state) for state in placed], float)
+    scales = [scheme.tree.size if c.axis is not None else 1.0 for c in coordinates]
+    return [len(states) == 1 or bool(change > STILL) for change in np.ptp(table, axis=0) / scales]
+
+
+def _open_states(scheme: Scheme) -> list[tuple[Array, Array]]:
+    """Return states of a machine's tree at random, whose loops are open."""
+    random, tree, home = np.random.default_rng(0), scheme.tree, scheme.graph.lead_home
+    motion = Motion(tree, tree.home, home)
+    states = []
+    for _ in range(OPEN_STATES):
+        move = random.uniform(-REACH, REACH, tree.unknown_rates) / np.array(tree.scales)
+        drives = [scheme.drive_scale(name) for name in scheme.graph.leads]
+        q = home + random.uniform(-REACH, REACH, len(home)) / np.array(drives)
+        states.append((np.array(motion.retracted(tree.home, move), float), q))
+    return states
+
+
+def _axis_of(coordinate: Coordinate) -> int:
+    """Return the base axis that a coordinate slides along or turns about."""
+    if coordinate.axis is not None:
+        return coordinate.axis
+    return next(
+        abs(first - k)
+        for first, turns in ((2, poses.TURNS["zyx"]), (0, poses.TURNS["xyz"]))
+        for k, turn in enumerate(turns)
+        if turn.entries == coordinate.entries
+    )
+
+
+def _replace_joints(
+    scheme: Scheme,
+    carriers: Sequence[Carrier],
+    body: str = BASE,
+    passed: frozenset[str] = frozenset(),
+) -> tuple[Carrier, ...]:
+    """Return the carriers of a chain of joints from a body to the platform, which are the pose.
+
+    Empty where there is no such chain. Turns need not go through one point, but where slides are
+    given too, they go through the reference point.
+    """
+    graph = scheme.graph
+    if not carriers:
+        return ()
+    for joint in graph.joints.values():
+        if joint.name in passed or body not in (joint.inner, joint.outer):
+            continue
+        end = joint.outer if body == joint.inner else joint.inner
+        freedoms = joint.freedoms if body == joint.inner else joint.freedoms[::-1]
+        mine, rest = carriers[: len(freedoms)], carriers[len(freedoms) :]
+        if (
+            not freedoms
+            or len(mine) < len(freedoms)
+            or joint.actuated
+            or bool(rest) == (end == graph.platform)
+        ):
+            continue
+        if not all(_is_along(f, c) for f, c in zip(freedoms, mine, strict=True)):
+            continue
+        slides = any(not c.turns for c in carriers)
+        if slides and any(c.turns for c in mine) and np.abs(joint.at - graph.origin).max() > 0.0:
+            continue
+        own = [replace(c, joint=joint.name) for c in mine]
+        own[-1] = replace(own[-1], end=end)
+        more = _replace_joints(scheme, rest, end, passed | {joint.name}) if rest else ()
+        if more or not rest:
+            return (*own, *more)
+    return ()
+
+
+def _is_along(freedom: Freedom, carrier: Carrier) -> bool:
+    """Return whether a joint's freedom is a slide or turn along the carrier's base axis."""
+    if carrier.turns != freedom.turns or (freedom.turns and freedom.slide):
+        return False
+    return bool(abs(abs(freedom.axis[carrier.axis]) - 1.0) < SNAP)
+
+
+class CarriedScheme(Scheme):
+    """How the closures of a machine are solved whose platform is placed before its limbs.
+
+    It is driven by its pose, or by its own joints: then the coordinates of the platform are the
+    unknowns, with those of limbs without closed form.
+    """
+
+    def __init__(self, machine: Scheme, *, by_pose: bool) -> None:
+        self.machine, self.by_pose = machine, by_pose
+        self.chain = find_pose_chain(machine)
+        varying = [c for c in self.chain.carriers if not c.held]
+        self._free = not by_pose and sum(c.turns for c in varying) == 3
+        first = (machine.graph.platform,) if self._free else self.chain.joints
+        super().__init__(self.carry(machine.graph), machine.coordinates, first=first)
+
+    def carry(self, graph: Graph) -> Graph:
+        """Return the graph with the chain, where the platform is not free."""
+        return graph if self._free else self.chain.attach(graph, by_pose=self.by_pose)
+
+    @cached_property
+    def held(self) -> list[int]:
+        """Unknown rates of coordinates of the platform that closures hold."""
+        carriers = zip(self.chain.joints, self.chain.carriers, strict=True)
+        names = () if self._free else [name for name, carrier in carriers if carrier.held]
+        return [self.tree.steps[name].rate for name in names]
+
+    @cached_property
+    def varying(self) -> list[int]:
+        """The other unknown rates."""
+        return [k for k in range(self.tree.unknown_rates) if k not in self.held]
+
+    @cached_property
+    def _holding(self) -> tuple[list[int], Order]:
+        """Closures that hold coordinates of the platform, and pivots of them by these."""
+        ju, _ = self._sampled
+        first = ju[:, self.independent]
+        follow = np.linalg.solve(first[:, :, self.varying], first[:, :, self.held])
+        table = ju[:, :, self.held] - ju[:, :, self.varying] @ follow
+        rows = independent_rows(table)
+        if len(rows) < len(self.held):
+            raise mobility_error(self)
+        return rows, pivot_order(table[:, rows])
+
+    @property
+    def holding(self) -> list[int]:
+        """Closures that hold coordinates of the platform; no other closure does."""
+        return self._holding[0]
+
+    @property
+    def holding_pivots(self) -> Order:
+        """Pivots of these closures by the coordinates that they hold."""
+        return self._holding[1]
+
+    @cached_property
+    def samples(self) -> list[tuple[Array, Array]]:
+        """States of the machine at home and near it, as states of this tree."""
+        return [self._carry_over(x, q) for x, q in self.machine.samples]
+
+    def _carry_over(self, x: Array, q: Array) -> tuple[Array, Array]:
+        """Return the unknowns and the drives of a state of the machine."""
+        motion, _ = self.machine.at(x, q)
+        position, rotation = (numbers(part) for part in motion.platform())
+        x = np.array(self.tree.home, float)
+        carriers = zip(self.chain.joints, self.chain.carriers, strict=True)
+        free = {n: c.coordinate for n, c in carriers if not (self.by_pose and c.place is not None)}
+        if self.by_pose:
+            q = np.array(poses.values(self.coordinates, position, rotation), float)
+        for link in self.tree.links.values():
+            if link.joint in free:
+                c = free[link.joint]
+                (value,) = poses.values([c], position, rotation)
+                (step,) = link.steps
+                if step.turns:
+                    x[step.position : step.position + 2] = math.cos(value), math.sin(value)
+                else:
+                    x[step.position] = value - float(self.graph.origin[_axis_of(c)])
+            elif link.joint not in self.chain.joints:
+                _set_joint(self.tree, link, motion, x)
+        return x, q
+
+    @cached_property
+    def order(self) -> tuple[str | Limb, ...]:
+        """Bodies in the order in which they are placed, limbs in closed form among them."""
+        return order_closed(self)
+
+    @property
+    def has_closed_limbs(self) -> bool:
+        """Whether Newton's method has the coordinates of the platform alone."""
+        stem = chain_to_base(self.tree, self.graph.platform)
+        opened = [entry for entry in self.order if not isinstance(entry, Limb)]
+        passive = (b for b in opened if not all(s.actuated for s in self.tree.links[b].steps))
+        return set(passive) <= set(stem)
+
+    @property
+    def judged(self) -> list[int]:
+        """Closures that no closed form meets by itself."""
+        solved = {k for limb in self.limbs for k in limb.rows}
+        return [k for k in range(len(self.parts)) if k not in solved]
+
+    @cached_property
+    def drive_pivots(self) -> Order:
+        """Pivots of the leading drives' rates by those of the pose, good in states near home."""
+        graph, tree = self.machine.graph, self.tree
+        ju, jq = self._sampled
+        steps = {step.joint: step.rate for link in tree.links.values() for step in link.steps}
+        rates = [self.varying.index(steps[name]) for name in graph.leads]
+        tables = []
+        for u, q in zip(ju[:, self.independent], jq[:, self.independent], strict=True):
+            tables.append(-np.linalg.solve(u[:, self.varying], q)[rates])
+        return pivot_order(np.array(tables))
+
+
+def _set_joint(tree: Tree, link: Link, motion: Motion, x: Array) -> None:
+    """Write the unknowns of a link's joint, of bodies that another motion has placed."""
+
+    def rotation(body: str) -> Array:
+        return np.eye(3) if body == BASE else numbers(motion.turned(body))
+
+    inner, outer = rotation(link.parent), rotation(link.body)
+    relative = inner.T @ outer
+    steps = [step for step in link.steps if not step.actuated]
+    for step in steps:
+        k = step.position
+        if step.ball or step.free:
+            w = 0.5 * math.sqrt(max(1.0 + float(np.trace(outer)), 1e-12))
+            x[k] = w
+            x[k + 1 : k + 4] = [
+                (outer[2, 1] - outer[1, 2]) / (4 * w), (outer[0, 2] - outer[2, 0]) / (4 * w),
+                (outer[1, 0] - outer[0, 1]) / (4 * w),
+            ]  # fmt: skip
+            if step.free:
+                x[k + 4 : k + 7] = numbers(motion.point(link.body, link.at)) - link.at
+    turns = [step for step in steps if step.turns]
+    for step in steps:
+        if step.slide and not step.turns:
+            apart = numbers(motion.point(link.body, link.at))
+            apart = apart - (
+                numbers(motion.point(link.parent, link.at)) if link.parent != BASE else link.at
+            )
+            x[step.position] = step.sign * ((inner.T @ apart) @ step.axis) / step.slide
+    if len(turns) == 1:
+        (step,) = turns
+        across = np.linalg.svd(step.axis[None])[2][1]
+        turned = relative @ across
+        angle = math.atan2(np.cross(across, turned) @ step.axis, across @ turned)
+        if step.circle:
+            x[step.position : step.position + 2] = math.cos(angle), step.sign * math.sin(angle)
+        elif step.slide:
+            x[step.position] = step.sign * angle
+    elif len(turns) == 2:
+        # Two turns, about a, then about b: the first takes b, the second a, to where they are.
+        first, second = turns
+        a, b = first.axis, second.axis
+        angles = _angle(a, b, relative @ b), -_angle(b, a, relative.T @ a)
+        for step, angle in zip(turns, angles, strict=True):
+            x[step.position : step.position + 2] = math.cos(angle), step.sign * math.sin(angle)
+
+
+def _angle(axis: Array, start: Array, end: Array) -> float:
+    """Return the angle about an axis from one vector to another, both across it."""
+    start, end = (v - (v @ axis) * axis for v in (start, end))
+    return math.atan2(np.cross(start, end) @ axis, start @ end)
