@@ -9,6 +9,7 @@ from delta_dynamics.estimates.contact import (
 )
 from delta_dynamics.estimates.isolation import ContactPlace
 from delta_dynamics.estimates.payload import PayloadEstimate, PayloadEstimator
+from delta_dynamics.torques.at_pose import PoseMotion, inverse_dynamics_at_pose
 from delta_dynamics.torques.derivatives import (
     TorqueDerivatives,
     torque_derivatives,
@@ -59,6 +60,7 @@ __all__ = [
     "MomentumObserver",
     "PayloadEstimate",
     "PayloadEstimator",
+    "PoseMotion",
     "Reactions",
     "Terms",
     "TorqueDerivatives",
@@ -71,6 +73,7 @@ __all__ = [
     "energy_transfer_range",
     "forward_dynamics",
     "inverse_dynamics",
+    "inverse_dynamics_at_pose",
     "joint_motion",
     "least_norm_reactions",
     "mass_matrix",

@@ -328,7 +328,7 @@ def begun(t: Traced) -> tuple[Layout, list[Objects]]:
     return layout, layout.split(t.tape.inputs(PARAMETERS, layout.size))
 
 
-def _efforts(
+def efforts_of_motion(
     t: Traced, parts: list[Objects], qd: Objects, qdd: Objects
 ) -> tuple[list[Any], list[Any]]:
     """Efforts for a motion under the input ``wrench``, of the drives that lead alone.
@@ -336,8 +336,19 @@ def _efforts(
     :returns: them, and what friction and rotor of each drive take, shape (n,).
     """
     loads = _loads(t, parts, qd, qdd)
-    q, rates = t.drives.variables("q"), t.tree.of_drives(qd, t.u)
-    changes = t.tree.of_drives(qdd, t.du)
+    tree, q = t.tree, t.drives.variables("q")
+    rates, changes = tree.of_drives(qd, t.u), tree.of_drives(qdd, t.du)
+    return add_friction_and_rotors(t, parts, loads, q, rates, changes)
+
+
+def add_friction_and_rotors(
+    t: Traced, parts: list[Objects], loads: Numbers, q: Numbers, rates: Numbers, changes: Numbers
+) -> tuple[list[Any], list[Any]]:
+    """Add what the drives themselves need to the loads of the leading drives.
+
+    :param q: positions of all drives, shape (n,), with ``rates`` and ``changes`` (accelerations).
+    :returns: efforts of the drives that lead, and what friction and rotor of each drive take, (n,).
+    """
     rotors = [rotor * change for rotor, change in zip(parts[ROTORS], changes, strict=True)]
     basic = _basic_friction(parts, rates)
     for k, values in enumerate(_laws_of(t, parts)):
@@ -392,7 +403,7 @@ def body_efforts(robot: Robot) -> Kernel:
 
 def _torques(t: Traced, *, on_bodies: bool) -> Program:
     layout, parts = begun(t)
-    leads, own = _efforts(t, parts, t.drives.given("qd"), t.drives.given("qdd"))
+    leads, own = efforts_of_motion(t, parts, t.drives.given("qd"), t.drives.given("qdd"))
     efforts = t.drives.shared(leads, preload=True)
     if on_bodies:
         efforts = [effort - part for effort, part in zip(efforts, own, strict=True)]
@@ -408,7 +419,7 @@ def _accelerations(t: Traced) -> Program:
     layout, parts = begun(t)
     n = t.joints
     qd, tau = t.drives.given("qd"), t.tape.inputs("tau", t.drives.count)
-    rest = np.array(t.drives.on_leads([*tau])) - _efforts(t, parts, qd, np.zeros(n))[0]
+    rest = np.array(t.drives.on_leads([*tau])) - efforts_of_motion(t, parts, qd, np.zeros(n))[0]
     laws = _laws_of(t, parts)
     if laws and not t.drives.others:
         loads, basic = _loads(t, parts, qd, np.zeros(n)), _basic_friction(parts, qd)

@@ -1,0 +1,181 @@
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
+"""Inverse dynamics of a motion that is given by the platform's pose, without forward kinematics."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from delta_dynamics.torques.virtual_work import (
+    Forces,
+    add_friction_and_rotors,
+    begun,
+    efforts_of_motion,
+)
+from pkm_twin.codegen.arrays import Array
+from pkm_twin.codegen.code import GOOD
+from pkm_twin.codegen.expressions import PARAMETERS, Objects, snapped_all
+from pkm_twin.codegen.kernels import Kernel
+from pkm_twin.codegen.lu import SparseLU
+from pkm_twin.codegen.program import Program
+from pkm_twin.kinematics import pose as poses
+from pkm_twin.kinematics.posed import CarriedScheme
+from pkm_twin.kinematics.programs import certify_assembly, follow_pose, solve_pose
+from pkm_twin.kinematics.traced import Traced
+from pkm_twin.machine.inertia import Layout, change_of_frame, loaded_joints
+from pkm_twin.robot.robot import Robot
+
+_NO_WRENCH: Final = np.zeros(6)
+
+
+@dataclass(frozen=True)
+class PoseMotion:
+    """Joint positions, rates, accelerations and efforts of a motion of the pose, (..., n) each."""
+
+    q: Array
+    qd: Array
+    qdd: Array
+    tau: Array
+
+
+def inverse_dynamics_at_pose(
+    robot: Robot,
+    pose: ArrayLike,
+    rate: ArrayLike,
+    acceleration: ArrayLike,
+    wrench: ArrayLike | None = None,
+) -> PoseMotion:
+    """Compute joint motion and actuator efforts for a motion of the platform.
+
+    The efforts are those of :func:`inverse_dynamics`; nothing is iterated where all limbs have
+    closed forms. The order is that of the 3-PRRU paper: generalised forces of all bodies on the
+    pose coordinates, then F_d.
+
+    :param pose: pose, shape (..., m), m and rad, by ``robot.pose_names``.
+    :param rate: first derivatives of the pose coordinates in time, shape (..., m).
+    :param acceleration: second derivatives of the pose coordinates in time, shape (..., m).
+    :param wrench: external force and moment on the platform at its reference point, base axes,
+        shape (..., 6), N and N m; None: no wrench.
+    :raises UnreachableError: a pose that is not reached, by limb, sample and miss.
+    :raises SingularityError: a pose beyond a singularity, or in one.
+    :raises ValueError: a wrong last axis, or a value that is not finite.
+    """
+    load = _NO_WRENCH if wrench is None else wrench
+    given = pose, rate, acceleration, load
+    found, status = pose_torques(robot)(robot.inertial, *given)
+    if status is not None:
+        # Poses that are not certainly right are judged as by the inverse kinematics.
+        rows = [np.broadcast_to(a, (*status.shape[:-1], np.shape(a)[-1])) for a in given]
+        robot.inverse(rows[0])
+        left = status[..., 0] != GOOD
+        again, status = unjudged_pose_torques(robot)(robot.inertial, *(row[left] for row in rows))
+        if status is not None:
+            raise ValueError("a rate, an acceleration or a wrench is not finite, or too large")
+        for values, new in zip(found, again, strict=True):
+            values[left] = new
+    return PoseMotion(*found)
+
+
+def pose_torques(robot: Robot) -> Kernel:
+    """Return the program from pose, rate, acceleration and wrench to q, qd, qdd and efforts.
+
+    Poses are accepted as by the quick inverse kinematics.
+
+    :raises ParameterError: a robot whose file gives no masses.
+    """
+    engine = robot.massive()
+    write = partial(_pose_torques, certified=True) if engine.posed else _followed_pose_torques
+    return engine.posed_kernel("torques at pose", write)
+
+
+def unjudged_pose_torques(robot: Robot) -> Kernel:
+    """Return the same program for poses that the inverse kinematics has accepted."""
+    if robot.massive().posed is None:
+        return pose_torques(robot)
+    write = partial(_pose_torques, certified=False)
+    return robot.massive().posed_kernel("torques at accepted pose", write)
+
+
+def _pose_torques(t: Traced, scheme: CarriedScheme, *, certified: bool) -> Program:
+    posed, q = solve_pose(t, scheme)
+    m = len(posed.q)
+    layout = Layout(t.tree)
+    parts = layout.split(t.tape.inputs(PARAMETERS, layout.size))
+    rods, gravity, passive = parts[1], parts[2], parts[-1]
+    rate, acceleration = (t.tape.inputs(name, m) for name in ("rate", "acceleration"))
+    posed.set_rates(rate)
+    posed.set_accelerations(acceleration, gravity)
+
+    # J_M' Q_M + sum of J_H' Q_H, on the pose coordinates (3-PRRU paper).
+    forces = Forces(posed.motion)
+    forces.inertia(_bodies_in_frames(t, posed), rods)
+    for k, joint in enumerate(loaded_joints(t.graph)):
+        forces.joint(joint, passive[3 * k : 3 * k + 3])
+    forces.wrench(t.tape.inputs("wrench", 6))
+    unknown, on_pose = forces.generalised()
+    jq = posed.jq[scheme.independent]
+    on_pose = on_pose - jq.T @ posed.lu.solve_transposed(unknown[scheme.varying])
+
+    # F_d = -J^-T (J_M' Q_M + sum of J_H' Q_H) - Q_S, with the bodies' own signs.
+    steps = [posed.tree.steps[name] for name in t.graph.actuated]
+    rates, changes = ([values[step.rate] for step in steps] for values in (posed.u, posed.du))
+    drives = posed.rates_of_joints(t.graph.actuated)
+    lead = SparseLU(drives[t.drives.leading], scheme.drive_pivots)
+    t.drives.set_null_rows([lead.solve_transposed(drives[k]) for k in t.drives.others])
+    leads = add_friction_and_rotors(t, parts, lead.solve_transposed(on_pose), q, rates, changes)
+    efforts = t.drives.shared(leads[0], preload=True)
+    branch = certify_assembly(t, scheme, posed, q) if certified else []
+    outputs = {"q": t.lift(q), "qd": t.lift(rates), "qdd": t.lift(changes), "tau": t.lift(efforts)}
+    return Program(
+        {"pose": m, "rate": m, "acceleration": m, "wrench": 6}, layout.size, outputs,
+        posed.equations(branch=t.lift(branch)), single=certified,
+    )  # fmt: skip
+
+
+def _followed_pose_torques(t: Traced, scheme: None) -> Program:
+    """Write the program of a machine whose pose is followed with its own tree, as of a screw."""
+    del scheme
+    m, coordinates = t.joints, t.scheme.coordinates
+    first, q = follow_pose(t)
+    layout, parts = begun(t)
+    equations = t.equations(goal=t.lift(q), stage=len(first))
+    rate, acceleration = (t.tape.inputs(name, m) for name in ("rate", "acceleration"))
+    position, rotation = t.motion.platform()
+    twists = t.twists(t.graph.platform, position, t.rate_columns())
+    columns = [poses.rates(coordinates, rotation, v, w) for v, w in twists]
+    lu = SparseLU(np.array(columns, dtype=object).T, t.scheme.jacobian_pivots)
+    qd = lu.solve(rate)
+    t.set_rates(qd)
+    t.set_accelerations(np.zeros(m))
+    motion, body = t.motion, t.graph.platform
+    bias = poses.accelerations(
+        coordinates, motion.turned(body), motion.omega[body],
+        motion.acceleration(body, t.graph.origin), motion.alpha[body],
+    )  # fmt: skip
+    qdd = lu.solve(acceleration - np.array(bias, dtype=object))
+    efforts, _ = efforts_of_motion(t, parts, qd, qdd)
+    outputs = {
+        "q": t.lift(t.tree.values_of_drives(q, t.x)), "qd": t.lift(t.tree.of_drives(qd, t.u)),
+        "qdd": t.lift(t.tree.of_drives(qdd, t.du)),
+        "tau": t.lift(t.drives.shared(efforts, preload=True)),
+    }  # fmt: skip
+    inputs = {"pose": m, "rate": m, "acceleration": m, "wrench": 6}
+    return Program(inputs, layout.size, outputs, first + equations)
+
+
+def _bodies_in_frames(t: Traced, posed: Traced) -> Objects:
+    """Return the inertial parameters of all bodies in frames of the tree that the pose drives."""
+    layout, tree = Layout(t.tree), posed.tree
+    p = t.tape.inputs(PARAMETERS, layout.size)
+    rows: list[Any] = []
+    for name, link in tree.links.items():
+        if name not in t.tree.links:
+            rows.append(np.zeros(10))
+            continue
+        lever = snapped_all(t.tree.at[name] - link.at)
+        rows.append(change_of_frame(link.axes, lever) @ p[layout.body(name)])
+    return np.array(rows, dtype=object)
