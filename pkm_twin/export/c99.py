@@ -202,7 +202,8 @@ class Routine:
 
     ``outputs``: expressions by argument. ``equations``: are solved one after the other.
     ``state``: what it leaves to its next call, by the input ``last``. ``upon``: a function whose
-    body it calls and goes on from.
+    body it calls and goes on from. ``single``: whether it makes one attempt. ``otherwise``: where
+    that fails, these are called in turn, on arguments of the same names, as long as they succeed.
     """
 
     name: str
@@ -212,6 +213,8 @@ class Routine:
     summary: str
     state: Sequence[Expression] = ()
     upon: Routine | None = None
+    single: bool = False
+    otherwise: tuple[Routine, ...] = ()
 
     @property
     def given(self) -> dict[str, Sequence[Expression]]:
@@ -240,8 +243,11 @@ class Routine:
         )
         rest = count([*self.results, *(e for q in self.equations for e in (*q.goal, q.held))])
         more = len(self.state) > 1
-        steps, attempts = (sum(LADDER), len(LADDER)) if solved else (1, 1)
-        return (steps + more) * step + (attempts + more) * rest, (1 + more) * (step + rest)
+        tried = solved and not self.single
+        steps, attempts = (sum(LADDER), len(LADDER)) if tried else (1, 1)
+        further = sum(routine.worst[0] for routine in self.otherwise)
+        first = (1 + more) * (step + rest)
+        return (steps + more) * step + (attempts + more) * rest + further, first
 
 
 HOT: Final = "PKM_HOT "
@@ -315,7 +321,8 @@ class Unit:
         self._known = {e.number: f"p[{k}]" for k, e in enumerate(parameters)}
         self._needed: set[Operation] = set()
         self._parts: list[str] = []
-        self._ahead: dict[str, dict[int, int]] = {}
+        self._solvers: dict[tuple[int, ...], tuple[str, dict[int, int]]] = {}
+        """By numbers of the expressions: a solver's name, and places in its table."""
         self._functions: dict[str, str] = {}
         self._routines = routines
         self._bodies: dict[str, tuple[str, list[Expression]]] = {}
@@ -381,13 +388,17 @@ static const int @_steps[{len(LADDER)}] = {{{steps}}};
 
         :returns: its name, and places in its table ``h`` by the expression's number.
         """
-        name = "reach" if q.unknowns != UNKNOWNS else "assembly" if q.near is None else "beside"
-        if name not in self._ahead:
+        work = [*q.begin, *q.onward, *q.correct, *q.aim]
+        key = tuple(e.number for e in work)
+        if key not in self._solvers:
+            name = "reach" if q.unknowns != UNKNOWNS else "assembly" if q.near is None else "beside"
+            others = sum(known.startswith(name) for known, _ in self._solvers.values())
+            name += str(others + 1) if others else ""
             # What does not change in a step is computed once, and the last serves the results.
             ahead = _without((q.unknowns, STATE), q.correct)
-            self._ahead[name] = {e.number: k for k, e in enumerate(ahead)}
+            self._solvers[key] = name, {e.number: k for k, e in enumerate(ahead)}
             self._write_solver(name, q, ahead)
-        return name, self._ahead[name]
+        return self._solvers[key]
 
     def _write_solver(self, name: str, q: Equations, ahead: Sequence[Expression]) -> None:
         n, m = len(q.home), len(q.origin)
@@ -500,13 +511,21 @@ static int @_{name}({more}const double *{q.target}, int steps, double *h, double
         if any(q.home for q in routine.equations):
             lines.append("    int rung;")
             first = "(state[0] > 0.0) ? -1 : 0" if "none" in rooms else "0"
-            loop = f"for (rung = {first}; (rung < PKM_ATTEMPTS) && (status == 1); rung++) {{"
+            last = "1" if routine.single else "PKM_ATTEMPTS"
+            loop = f"for (rung = {first}; (rung < {last}) && (status == 1); rung++) {{"
             work = f"status = 1;\n{loop}\n{indent(work, '    ')}\n}}"
         finite = [f"(@_finite({name}, {size}) != 0)" for name, size in routine.inputs.items()]
         lines.append("    int status = 2;")
         if "parameters" not in call:
             lines.append("    (void)parameters;")
         lines += [f"    if ({' && '.join(finite)}) {{", indent(work, "        "), "    }"]
+        if routine.otherwise:
+            lines.append("    if (status == 1) {")
+            for k, other in enumerate(routine.otherwise):
+                names = ", ".join(["parameters", *other.inputs, *other.outputs])
+                call = f"status = @_{other.name}_with({names});"
+                lines.append(f"        if (status == 0) {{ {call} }}" if k else f"        {call}")
+            lines += ["        if (status == 0) { return 0; }", "    }"]
         at = 0
         for name, row in routine.given.items():
             source = f"&r[{at}]" if at else "r"

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from delta_dynamics.torques.at_pose import pose_torques, unjudged_pose_torques
 from delta_dynamics.torques.equations import motion_kernel
 from delta_dynamics.torques.virtual_work import (
     accelerations,
@@ -97,8 +98,11 @@ class Package:
                 warn(robot.name, f"no functions of elasticity: {error}")
         self.fold = Folding()
         self.payload = self.fold.tape.inputs(PARAMETERS, 13)
+        self.hidden: list[Routine] = []
         self.routines = self._routines()
-        rows = [[e for row in r.outputs.values() for e in row] for r in self.routines]
+        rows = [
+            [e for row in r.outputs.values() for e in row] for r in (*self.hidden, *self.routines)
+        ]
         # A table of no numbers is none in C.
         edges = {e.number: e for row in rows for e in edge(row)}
         self.parameters = [*edges.values()] or [self.payload[0]]
@@ -128,6 +132,7 @@ class Package:
             kernels: Callable[[], Kernel] | Sequence[Callable[[], Kernel]],
             own: Sequence[Any] | Array = (),
             upon: str = "",
+            otherwise: tuple[Routine, ...] = (),
             **outputs: str,
         ) -> None:
             if self._wants(name):
@@ -138,7 +143,12 @@ class Package:
                 made = {key: rows[row] for key, row in outputs.items()}
                 last = rows.get(LAST, ())
                 base = next((r for r in result if r.name == upon), None)
-                result.append(Routine(name, inputs, made, equations, summary, last, base))
+                result.append(
+                    Routine(
+                        name, inputs, made, equations, summary, last, base, bool(otherwise),
+                        otherwise,
+                    )
+                )  # fmt: skip
 
         engine, p = robot.engine, self._inertial() if self.massive else ()
         if self.massive:
@@ -165,10 +175,28 @@ class Package:
                 "torques_and_singularity", tau="efforts", index="measure",
             )  # fmt: skip
         add("forward", "Pose of joint positions.", q, lambda: engine.forward, pose="pose")
-        add(
-            "inverse", "Joint positions of a pose, accepted only if _forward of them is the pose.",
-            {"pose": self.m}, lambda: robot.inverse_kernel, q="q",
-        )  # fmt: skip
+        if self._wants("inverse"):
+            quick: tuple[Routine, ...] = ()
+            if engine.posed is not None:
+                whole = self._hidden("inverse_confirmed", {"pose": self.m}, engine.inverse, q="q")
+                quick = (whole,)
+            add(
+                "inverse", "Joint positions of a pose, accepted only if _forward of them is the "
+                "pose.", {"pose": self.m}, lambda: engine.quick_inverse, otherwise=quick, q="q",
+            )  # fmt: skip
+            if self.massive and self._wants("torques_at_pose"):
+                motion = {"pose": self.m, "rate": self.m, "acceleration": self.m} | wrench
+                names = {name: name for name in ("q", "qd", "qdd", "tau")}
+                if quick:
+                    again = self._hidden(
+                        "torques_at_accepted_pose", motion, unjudged_pose_torques(robot), p, **names
+                    )
+                    quick = (result[-1], again)
+                add(
+                    "torques_at_pose", "Joint motion q, qd, qdd and efforts tau for a motion of "
+                    "the pose: its rate and acceleration are those of the pose's coordinates.",
+                    motion, lambda: pose_torques(robot), p, otherwise=quick, **names,
+                )  # fmt: skip
         add(
             "platform",
             "Position (m) of the platform's reference point in base axes, and the platform's "
@@ -222,6 +250,21 @@ class Package:
             self._add_elastic(self.elastic, result)
         return result
 
+    def _hidden(
+        self,
+        name: str,
+        inputs: Mapping[str, int],
+        kernel: Kernel,
+        own: Sequence[Any] | Array = (),
+        **outputs: str,
+    ) -> Routine:
+        """Return a function that others call, which is not declared."""
+        rows, equations = self._read(kernel, own)
+        made = {key: rows[row] for key, row in outputs.items()}
+        routine = Routine(name, inputs, made, equations, "")
+        self.hidden.append(routine)
+        return routine
+
     def _wants(self, name: str) -> bool:
         return not self._names or name in self._names
 
@@ -262,6 +305,8 @@ class Package:
         unit.add(table("@_own", [e.value for e in own]))
         if self.massive:
             self._write_parameters()
+        for routine in self.hidden:
+            unit.routine(routine, "static ")
         for routine in self.routines:
             unit.routine(routine, HOT if routine.name.startswith("torques_and_s") else "")
             unit.own(routine)

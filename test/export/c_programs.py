@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 import platform
 import re
@@ -15,7 +16,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from delta_dynamics import forward_dynamics, inverse_dynamics, mass_matrix
+from delta_dynamics import (
+    forward_dynamics,
+    inverse_dynamics,
+    inverse_dynamics_at_pose,
+    mass_matrix,
+)
 from pkm_twin import Robot
 from pkm_twin.codegen.arrays import Array
 from stiffness_monitor import platform_response
@@ -66,6 +72,9 @@ def functions(robot: Robot) -> dict[str, Callable[..., Any]]:
         result["torques_and_singularity"] = lambda q, *rest: np.column_stack(
             [result["torques"](q, *rest), robot.singularity(q)]
         )
+        result["torques_at_pose"] = lambda pose, *rest: np.column_stack(
+            dataclasses.astuple(inverse_dynamics_at_pose(robot, pose, *rest))
+        )
         result["mass_matrix"] = lambda q: flat(mass_matrix(robot, q))
         result["accelerations"] = lambda q, qd, tau, w: forward_dynamics(robot, q, qd, tau, w)
     if has(robot, "structure"):
@@ -84,6 +93,8 @@ def inputs_of(robot: Robot, motion: tuple[Array, ...]) -> dict[str, tuple[Array,
     if "torques" in result:
         result["torques"] = result["torques_and_singularity"] = motion
         result["accelerations"] = (q, qd, 0.1 * qdd, wrench)
+        m = len(robot.pose_names)
+        result["torques_at_pose"] = (robot.try_forward(q)[0], qd[:, :m], qdd[:, :m], wrench)
     if "strain_energy" in result:
         result["strain_energy"] = (q, wrench)
     return result
