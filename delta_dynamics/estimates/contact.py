@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""Whether there is a contact: external efforts beyond what model and noise leave open."""
+"""Detect contacts: external efforts beyond the uncertainty of model and noise."""
 
 from __future__ import annotations
 
@@ -31,11 +31,11 @@ from pkm_twin.streams.drives import BRAKE_TIME, DriveWatch
 from pkm_twin.streams.rest import VelocityErrorEstimator
 
 RANK: Final = 1e-9
-"""Singular values below this share of the greatest are directions that the joints do not feel."""
+"""Singular value, relative to the largest, below which the joints do not measure a direction."""
 
 
 class MomentumObserver:
-    """External efforts at the joints by their generalised momentum, a first-order estimate.
+    """Estimate external joint efforts by the generalised momentum, with first-order dynamics.
 
     With the mass matrix M, the momentum M qd, the inverse dynamics b at qdd = 0 and the measured
     efforts tau, external efforts e obey
@@ -52,7 +52,7 @@ class MomentumObserver:
     """
 
     def __init__(self, robot: Robot, bandwidth: float = 60.0) -> None:
-        """Begin without a past.
+        """Start without samples.
 
         :param bandwidth: of the estimate, 1/s: its time constant is the inverse.
         :raises ValueError: a bandwidth that is not positive and finite.
@@ -75,7 +75,7 @@ class MomentumObserver:
         self, time: float, q: Array, qd: Array, effort: Array, wrench: Array | None = None,
         known: tuple[Array, Array] | None = None,
     ) -> Array | None:  # fmt: skip
-        """Take a sample; the external efforts (n,), N m or N, None for the first sample.
+        """Add a sample; return external efforts (n,), N m or N, or None for the first sample.
 
         :param time: of the sample, s, later than the last one's.
         :param q: joint positions (n,), rad or m, with their rates ``qd`` and measured ``effort``.
@@ -113,7 +113,7 @@ class MomentumObserver:
 
 
 def platform_wrench(robot: Robot, q: ArrayLike, external: ArrayLike) -> Array:
-    """The wrench on the platform that explains external joint efforts, base axes, shape (..., 6).
+    """Return the platform wrench that explains external joint efforts, base axes, (..., 6).
 
     A machine with n < 6 actuated joints measures only n directions of the wrench. Of all wrenches
     that explain the efforts this is the smallest one, with moments divided by the platform's size.
@@ -134,27 +134,28 @@ def platform_wrench(robot: Robot, q: ArrayLike, external: ArrayLike) -> Array:
 
 
 SIGMAS: Final = 6.0
-"""Standard deviations of model and noise together that are a contact."""
+"""Standard deviations of model and noise together that indicate a contact."""
 LEARNING: Final = 0.2
-"""Time after a beginning in which only the noise is learnt, s."""
+"""Time after the start in which only the noise is estimated, s."""
 CLIPPED: Final = 9.0
-"""A square counts as noise up to so many times the average: a push is none."""
+"""Ratio of a square to the average above which it is clipped, so that a contact is not learnt as
+noise."""
 SHARE: Final = 1e-3
-"""Least standard deviation of an effort, as a share of the greatest that the stream has shown."""
+"""Smallest standard deviation of an effort, relative to the largest effort of the stream."""
 PLACED: Final = 0.004
-"""Time between two estimates of a contact's place, s, up to ``EARLY`` after its beginning."""
+"""Period of estimates of a contact's position, s, up to ``EARLY`` after its beginning."""
 EARLY: Final = 0.04
 LATER: Final = 0.01
-"""The same from then on: the errors of the efforts last longer, and so does the force."""
+"""Period after that: effort errors last longer, and so does the force."""
 MOST_DRAG: Final = 0.2
-"""Friction that may be learnt, as a share of the greatest effort of the motion."""
+"""Largest friction that may be learnt, relative to the largest effort of the motion."""
 ONSET: Final = 0.1
-"""Time of motion in a direction before its friction is known at all, s."""
+"""Time of motion in a direction before its friction is known, s."""
 
 
 @dataclass(frozen=True)
 class Contact:
-    """External efforts and their bound, shape (n,), N m or N; the wrench (6,) that explains them.
+    """Hold external efforts and their bound, (n,), N m or N, and the wrench (6,) of them.
 
     ``touching``: whether an effort exceeds its bound. ``idle``: the drives are off or braked, so
     the efforts contain no information; ``touching`` then keeps its last value. ``place``: the body
@@ -170,10 +171,10 @@ class Contact:
 
 
 class Drag:
-    """Friction that the model does not have: what opposes a joint in both directions alike.
+    """Estimate friction that the model lacks: effort that opposes a joint in both directions.
 
-    A push does so in one direction at most. So it is learnt at all times, also while the estimate
-    looks like a contact.
+    A contact opposes motion in one direction only, so that friction is learnt all the time, also
+    while the estimate looks like a contact.
 
     Before a joint has moved in both directions, friction is what one of them shows, learnt while
     nothing touches; where a joint has just begun to move for the first time, friction is unknown.
@@ -186,7 +187,7 @@ class Drag:
         self._alone = [[0.0, 0.0] for _ in range(joints)]
 
     def learn(self, step: float, external: Array, qd: Array, *, touching: bool = False) -> Array:
-        """Take external efforts and rates, zero at rest, shape (n,).
+        """Add external efforts and velocities, zero at rest, shape (n,).
 
         :returns: the friction known by now, (n,); infinite where it is unknown.
         """
@@ -211,7 +212,7 @@ class Drag:
 
 
 class ContactMonitor:
-    """The momentum observer with a contact bound from the uncertainty of the model and its input.
+    """Detect contacts by a momentum observer with a bound from model and input uncertainty.
 
     The bound is ``sigmas`` standard deviations: those of the model's efforts, from the robot's file
     or :meth:`.EffortParts.default_deviation`, and the noise of the estimate without contact.
@@ -221,7 +222,7 @@ class ContactMonitor:
     """
 
     def __init__(self, robot: Robot, bandwidth: float = 60.0, sigmas: float = SIGMAS) -> None:
-        """Begin without a past.
+        """Start without samples.
 
         :raises ValueError: a bandwidth or a number of standard deviations that is not positive.
         """
@@ -260,7 +261,7 @@ class ContactMonitor:
         self, time: float, motion: tuple[Array, Array, Array], effort: Array,
         wrench: Array | None = None, doubt: Array | None = None,
     ) -> Contact | None:  # fmt: skip
-        """Take a sample; None until the noise is known.
+        """Add a sample; return the contact state, or None until the noise is known.
 
         :param time: of the sample, s, later than the last one's.
         :param motion: q, qd and qdd, shape (n,) each; qdd is used for the standard deviation of the
@@ -298,7 +299,7 @@ class ContactMonitor:
         step = time - last
         if idle:
             if not was_idle and time - self._since < BRAKE_TIME:
-                # It was the brake that took the weight.
+                # The brake has taken the weight; there was no contact.
                 self._touching = False
             return self._verdict(q, external, idle)
         drag = self._drag.learn(step, external, np.where(still, 0.0, qd), touching=self._touching)
@@ -323,7 +324,7 @@ class ContactMonitor:
     def _locate(
         self, time: float, step: float, q: Array, qd: Array, external: Array, *, begins: bool
     ) -> None:
-        """Follow a contact: the body that it strikes."""
+        """Locate the contact of the present sample."""
         locator = self.prepare()
         if begins:
             self._since = time
@@ -339,7 +340,7 @@ class ContactMonitor:
         self._place, self._placed = locator.place(), time
 
     def prepare(self) -> ContactLocator:
-        """Compile what a contact needs, before there is one."""
+        """Compile the programs of a contact before there is one."""
         if self._locator is None:
             self._locator = ContactLocator(self.robot)
             n = self.robot.joints_count
@@ -350,13 +351,13 @@ class ContactMonitor:
         return self._locator
 
     def _deviation(self, parts: EffortParts, *motion: Any) -> Array:
-        """Standard deviation of the model's efforts, shape (n,)."""
+        """Return the standard deviation of the model's efforts, shape (n,)."""
         if self.stated:
             return torque_deviation(self.robot, *motion)
         return parts.default_deviation(self._greatest)
 
     def _follow(self, step: float, deviation: Array, friction: Array, doubt: Array) -> None:
-        """What is unsure of the efforts, and of the momentum, as it is in the estimate."""
+        """Filter the uncertainty of efforts and momentum as the observer filters the estimate."""
         part, self._friction = self.observer.bandwidth * step, friction
         self._impulse = self.observer.bandwidth * np.abs(self.observer.mass) @ doubt
         slack = friction + self.observer.jump + self._impulse

@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""Which body a contact strikes, and where along it, by the direction of the external efforts.
+"""Locate a contact: which body, and where along it, from the direction of external efforts.
 
 A force F at a point p of a body causes the joint efforts J(p)' F, with the Jacobian J of that
 point. Places on all bodies are compared by their marginal likelihood: F is unknown, its prior
@@ -27,36 +27,36 @@ from pkm_twin.robot.robot import Robot
 PLATFORM: Final = "platform"
 CLAMPING: Final = "clamping"
 UNKNOWN: Final = "unknown"
-"""Efforts that no single force and no clamping explains better, or that several explain."""
+"""Class of efforts that no single force or clamping explains best, or that several explain."""
 PRIOR: Final = {PLATFORM: 0.4, "limbs": 0.4, CLAMPING: 0.15, UNKNOWN: 0.05}
-"""Probabilities before a contact; the limbs share theirs."""
+"""Prior probabilities of a contact's class; the limbs share theirs."""
 NAMED: Final = 0.5
-"""Least posterior probability of a class that is named."""
+"""Smallest posterior probability of a class that is named."""
 PLACES: Final = 5
-"""Places along a bar that are compared."""
+"""Positions along a bar that are compared."""
 GRIP: Final = 0.3
-"""Coefficient of friction of a contact: a thin body feels little force along itself."""
+"""Coefficient of friction of a contact: a thin body transmits little force along itself."""
 MODEL: Final = 0.05
-"""Standard deviation of an external effort as a share of it: gains of the drives, geometry."""
+"""Standard deviation of an external effort relative to it: gains of the drives, geometry."""
 CORRELATION: Final = 0.02
-"""Time over which the errors of the efforts are one and the same, s."""
+"""Correlation time of the efforts' errors, s."""
 MEMORY: Final = 0.1
-"""Time after which a sample weighs 1/e, s."""
+"""Time after which a sample's weight has decayed to 1/e, s."""
 REACH: Final = 0.4
-"""Greatest distance of two bodies that clamp something, as a share of the machine's size."""
+"""Largest distance of two bodies that clamp something, relative to the machine's size."""
 CLOSING: Final = 0.02
-"""Least rate at which they approach, as a share of the greatest approach in the machine."""
+"""Smallest approach speed of two clamping bodies, relative to the largest in the machine."""
 COARSE: Final = 0.15
-"""Standard deviation of a clamping's efforts as a share of them: its places are as far apart."""
+"""Standard deviation of clamping efforts relative to them, by the spacing of the positions."""
 SIZES: Final = np.array([0.1, 0.3, 1.0, 3.0, 10.0])
-"""Forces that are compared, relative to the one that a usual place needs."""
+"""Forces that are compared, relative to that of a typical position."""
 BASE_PLACED: Final = np.append(np.eye(3), np.zeros(3))
-"""Rotation and origin of the ground."""
+"""Rotation and origin of the base."""
 
 
 @dataclass(frozen=True)
 class ContactPlace:
-    """The class of a contact, with its posterior probability, and the place.
+    """Hold the class of a contact, with its posterior probability, and its position.
 
     ``where``: ``platform``, a limb's name, ``clamping A and B`` (opposite forces on two bodies), or
     ``unknown`` where no class has the probability ``NAMED``. ``confidence``: of the most likely
@@ -75,7 +75,7 @@ class ContactPlace:
 
 
 def limbs_of(robot: Robot) -> dict[str, str]:
-    """The limb of each moving body and rod: what is connected without base and platform.
+    """Return the limb of each moving body and rod: connected without base and platform.
 
     A limb has the name of its actuated joint's limb, or of its first body where it has none.
     """
@@ -93,12 +93,12 @@ def limbs_of(robot: Robot) -> dict[str, str]:
 
 
 def joined_bodies(graph: Graph) -> list[tuple[str, str]]:
-    """Bodies and rods that a joint joins, both ways."""
+    """Return pairs of bodies and rods that a joint connects, both ways."""
     return [*graph.links, *((b, a) for a, b in graph.links)]
 
 
 def _twists(t: Traced) -> Program:
-    """Rotation (9), origin (3), and by joint rate velocity and angular velocity (6), by body."""
+    """Write rotation (9), origin (3), and velocity and angular velocity per joint rate, by body."""
     t.solve()
     columns, rows = t.rate_columns(), []
     for body in t.graph.bodies:
@@ -111,11 +111,12 @@ def _twists(t: Traced) -> Program:
 
 
 def _kernel(robot: Robot) -> Kernel:
+    """Return the compiled program of body twists."""
     return robot.engine.kernel("twists of bodies", _twists)
 
 
 class Places:
-    """Places on all moving bodies: P of them, on bars between points of bodies.
+    """Hold candidate positions on all moving bodies: P of them, on bars between points of bodies.
 
     ``parts``: body or rod of each; ``limbs``: its limb, or ``platform``. ``thin``: whether it is
     on a thin bar. ``prior``: its probability, even along a limb's bars and over the platform's.
@@ -188,7 +189,7 @@ class Places:
             self.prior[own] = whole * size[own] / max(size[own].sum(), 1e-300)
 
     def at(self, q: Array) -> tuple[Array, Array, Array]:
-        """Positions (P, 3), Jacobians (P, n, 3) and directions of the bars (P, 3), base axes."""
+        """Return positions (P, 3), Jacobians (P, n, 3) and bar directions (P, 3), base axes."""
         n, count = self.robot.joints_count, len(self.robot.graph.bodies)
         flat = self.robot.bound(_kernel)(q)
         placed = np.concatenate([flat[: 12 * count], BASE_PLACED]).reshape(count + 1, 12)
@@ -212,7 +213,7 @@ class Places:
 
 
 def _blocks(graph: Graph) -> set[str]:
-    """Bodies that are no thin bars: the platform, and what slides on the base."""
+    """Return bodies that are not thin bars: the platform, and what slides on the base."""
     return {graph.platform} | {
         joint.outer
         for joint in graph.joints.values()
@@ -221,7 +222,7 @@ def _blocks(graph: Graph) -> set[str]:
 
 
 class ContactLocator:
-    """The evidence of each place for one contact, from the samples since it began.
+    """Accumulate the evidence of each position for one contact, from its samples.
 
     Over a contact the place on the body and the direction of the force in base axes are one and
     the same; so while the machine moves each sample narrows both. The force grows as the external
@@ -239,12 +240,12 @@ class ContactLocator:
         self.reset()
 
     def reset(self) -> None:
-        """Begin a contact."""
+        """Start a new contact."""
         self._sums: Array | None = None
 
     @np.errstate(all="ignore")
     def push(self, step: float, q: Array, qd: Array, external: Array, deviation: Array) -> None:
-        """Take a sample.
+        """Add a sample.
 
         :param step: time since the last one, s.
         :param q: joint positions (n,), with rates ``qd`` and external efforts (n,), N m or N.
@@ -276,7 +277,7 @@ class ContactLocator:
         self._sums = new if self._sums is None else fade * self._sums + new
 
     def _begin(self, jacobian: Array, sure: Array, qd: Array) -> None:
-        """The usual force, and which bodies can clamp something: those that approach."""
+        """Set the typical force, and the pairs of approaching bodies that can clamp something."""
         self._unit = sure
         whole = np.sqrt(((jacobian * sure[:, None, None]) ** 2).sum((0, 1)))
         felt = whole[whole > 0.0]
@@ -293,7 +294,7 @@ class ContactLocator:
         self._pairs, self._couple = (a[closing], b[closing]), self.places.couple_of[closing]
 
     def _approach(self, jacobian: Array) -> Array:
-        """Rates of the distances of the pairs' places by the joints' rates, (n, pairs)."""
+        """Return the derivatives of the pairs' distances by joint positions, (n, pairs)."""
         a, b = self._pairs
         way = (self._at[a] - self._at[b]).T
         way = way / np.sqrt((way * way).sum(0))
@@ -302,11 +303,11 @@ class ContactLocator:
 
     @np.errstate(all="ignore")
     def place(self) -> ContactPlace | None:
-        """What is known by now; None before the first sample, or where nothing finite is known."""
+        """Return the estimate; None before the first sample, or if it is not finite."""
         if self._sums is None:
             return None
         if not np.isfinite(np.concatenate([self._sums, self._usual, self._at.ravel()])).all():
-            # Nothing that is added to it makes it finite.
+            # Sums that are not finite stay so.
             self.reset()
             return None
         found = self._found(self._sums)
@@ -314,7 +315,7 @@ class ContactLocator:
         return found if finite else None
 
     def _found(self, sums: Array) -> ContactPlace:
-        """The same from finite sums; finite but where they are beyond the range of doubles."""
+        """Return the estimate from finite sums; not finite only beyond the range of doubles."""
         n, count, pairs = len(self._usual), len(self._at), len(self._couple)
         # Errors of the model last: more samples show more directions, none of them more exactly.
         sums = sums / max(sums[0] / n, 1.0)
@@ -359,13 +360,13 @@ class ContactLocator:
         )
 
     def _one(self, likely: Array) -> tuple[str, Array, float]:
-        """The most likely body, the mean of its places, and their standard deviation."""
+        """Return the most likely body, mean position on it, and standard deviation."""
         best = int(np.argmax(self.places.of_body @ likely))
         point, deviation = _middle(likely * self.places.of_body[best], self._at)
         return self.places.bodies[best], point, deviation
 
     def _pair(self, clamped: Array) -> tuple[str, Array, float]:
-        """The same of two bodies: the middle between them."""
+        """Return the most likely pair of bodies, the mean midpoint, and standard deviation."""
         a, b = self._pairs
         best = int(np.argmax(np.bincount(self._couple, clamped)))
         between = 0.5 * (self._at[a] + self._at[b])
@@ -374,14 +375,14 @@ class ContactLocator:
 
 
 def _middle(weights: Array, points: Array) -> tuple[Array, float]:
-    """Mean of points, (3,), and their standard deviation."""
+    """Return the weighted mean of points, (3,), and their standard deviation."""
     share = weights / weights.sum()
     point = share @ points
     return point, math.sqrt(float(share @ ((points - point) ** 2).sum(1)))
 
 
 def _of_force(matrix: Array, vector: Array, precision: Array) -> Array:
-    """Logarithms of marginal likelihoods, (sizes, hypotheses), less what all of them share.
+    """Return log marginal likelihoods, (sizes, hypotheses), up to a common constant.
 
     Of y = B f + noise with f normal of mean zero, by the factors of B' B + precision.
 
@@ -407,7 +408,7 @@ def _of_force(matrix: Array, vector: Array, precision: Array) -> Array:
 def _of_numbers(
     squares: Array, parts: Array, precision: Array, *, one_sided: bool = False
 ) -> Array:
-    """The same of forces with one number, (sizes, hypotheses).
+    """Return log marginal likelihoods of forces with one component, (sizes, hypotheses).
 
     :param squares: B' B, (hypotheses,); ``parts``: B' y.
     :param one_sided: f is positive.
@@ -424,6 +425,6 @@ def _of_numbers(
 
 
 def _mean(logs: Array) -> Array:
-    """Logarithm of the mean over the sizes of the force, (hypotheses,)."""
+    """Return the logarithm of the mean over the force's sizes, (hypotheses,)."""
     top = logs.max(0)
     return np.asarray(top + np.log(np.exp(logs - top).mean(0)), np.float64)

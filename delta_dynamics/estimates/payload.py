@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""What the platform carries, from the efforts that the model does not explain, sample by sample."""
+"""Estimate the payload from the efforts that the model does not explain, sample by sample."""
 
 from __future__ import annotations
 
@@ -22,26 +22,27 @@ from pkm_twin.streams.drives import DriveWatch
 from pkm_twin.streams.rest import VelocityErrorEstimator
 
 FOUND: Final = ("mass", "mx", "my", "mz")
-"""What is estimated: mass and first moments about the platform's reference point."""
+"""Estimated parameters: mass and first moments about the platform's reference point."""
 CORRELATION: Final = 0.02
-"""Time over which what is left is one and the same error, s: samples closer together share it."""
+"""Correlation time of the residual's errors, s."""
 MEMORY: Final = 20.0
-"""Time after which what was learnt weighs 1/e, s."""
+"""Time after which a sample's weight has decayed to 1/e, s."""
 STEADY: Final = 0.4
-"""Time after a beginning in which no jump is looked for, s."""
+"""Time after the start in which no jump is detected, s."""
 CLIPPED: Final = 4.0
-"""A square counts as noise up to so many times the average: a jump is none."""
+"""Ratio of a square to the average above which it is clipped, so that a jump is not learnt as
+noise."""
 JUMP: Final = 0.06
-"""Time over which what is left is averaged to see a jump of it, s."""
+"""Averaging time of the residual for detecting a jump, s."""
 THRESHOLD: Final = 6.0
-"""Deviations of that average that are a jump."""
+"""Standard deviations of that average that indicate a jump."""
 SHARE: Final = 0.01
-"""Least deviation of an effort, as a share of the robot's greatest effort at rest."""
+"""Smallest standard deviation of an effort, relative to the robot's largest effort at rest."""
 
 
 @dataclass(frozen=True)
 class PayloadEstimate:
-    """Mass, kg, and centre of mass (3,), m from the platform's reference point, platform axes.
+    """Hold mass, kg, and centre of mass (3,), m from the reference point, platform axes.
 
     Both have standard deviations. If the motion does not determine the centre of mass, its standard
     deviation is infinite and its value is that of the robot's own payload. ``asked``: the estimate
@@ -58,7 +59,7 @@ class PayloadEstimate:
 
 
 class PayloadEstimator:
-    """Recursive least squares on measured minus computed efforts, without inertia of the payload.
+    """Estimate a payload by recursive least squares on measured minus computed efforts.
 
     Efforts are linear in mass and first moments (:func:`.regressor`). A sample is weighted
     by its time span, at most the correlation time of the errors, and its weight decays slowly. A
@@ -69,10 +70,10 @@ class PayloadEstimator:
     """
 
     def __init__(self, robot: Robot, *, mass_range: float = 5.0, reach: float = 0.2) -> None:
-        """Begin with the robot's own payload.
+        """Start with the robot's own payload.
 
         :param mass_range: standard deviation of a load's mass before anything is known, kg.
-        :param reach: the same of its centre, m.
+        :param reach: standard deviation of its centre of mass, m.
         """
         robot.check_independent("payloads of measured efforts", SHARED)
         self._share = LoadShare(robot)
@@ -109,7 +110,7 @@ class PayloadEstimator:
         self.begin_anew()
 
     def _keep(self) -> None:
-        """Remember what is known: the efforts from here on may turn out to be a brake's."""
+        """Store the estimate: the efforts from here on may turn out to be a brake's."""
         noise = copy.copy(self._noise)
         self._kept = self._information, self._weighted, self._average, self._since, noise
 
@@ -123,7 +124,7 @@ class PayloadEstimator:
         self, time: float, q: Array, qd: Array, qdd: Array, effort: Array,
         wrench: Array | None = None, doubt: Array | None = None,
     ) -> PayloadEstimate | None:  # fmt: skip
-        """Add a sample; None for the first one, and while efforts contain no information.
+        """Add a sample; return None for the first one, and while efforts are uninformative.
 
         :param time: of the sample, s, later than the last one's.
         :param q: joint positions (n,), with rates, accelerations and measured efforts (n,).
@@ -166,7 +167,7 @@ class PayloadEstimator:
         variance = self._noise.variance + np.where(rubs, reach**2, 0.0)
         rows = columns * (share / variance)[:, None]
         prior = np.diag(self._prior**-2.0)
-        # What fades away gives place to what is known of any load.
+        # Faded information is replaced by the prior.
         self._information = fade * self._information + (1 - fade) * prior + rows.T @ columns
         self._weighted = fade * self._weighted + (1 - fade) * prior @ self._own + rows.T @ target
         self._noise.advance(step)
@@ -178,7 +179,7 @@ class PayloadEstimator:
         return np.asarray(np.linalg.solve(self._information, self._weighted), np.float64)
 
     def _jumped(self, left: Array, step: float) -> bool:
-        """Whether the average of what is left has gone from zero, once there was time to learn."""
+        """Return whether the averaged residual has left zero, once noise is known."""
         self._since += step
         self._average = self._average + min(1.0, step / JUMP) * (left - self._average)
         if self._since < STEADY:
@@ -188,7 +189,7 @@ class PayloadEstimator:
         return bool((np.abs(self._average) > THRESHOLD * spread).any())
 
     def estimate(self) -> PayloadEstimate:
-        """The present estimate."""
+        """Return the present estimate."""
         values = self._solution()
         covariance = np.linalg.inv(self._information)
         mass = float(values[0])
@@ -202,7 +203,7 @@ class PayloadEstimator:
         known = told & np.isfinite(com)
         own = self.robot.payload.com
         if mass < 0.0:
-            # No load is lighter than none, and none has a centre.
+            # A negative mass means that no payload was found; its centre is undefined.
             nowhere = np.full(3, np.inf)
             return PayloadEstimate(
                 0.0, own.copy(), math.hypot(deviation, mass), nowhere, self.resets, mass

@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""Runge-Kutta steps that are exact in a linear damping, however stiff.
+"""Integrate second-order equations by Runge-Kutta steps that are exact in a linear damping.
 
 The exponential method of order four of Cox and Matthews (2002, Exponential time differencing for
 stiff systems) for q' = v, v' = n(q, v) - d v with d >= 0; without damping it is the classical
@@ -18,7 +18,7 @@ from pkm_twin.codegen.arrays import Array
 
 
 class Stepper:
-    """The method for a span of time.
+    """Apply the method for one span of time.
 
     :param weights: see :func:`_damped`; matrices, shape (11, n, n), where something is damped.
     :param damping: shape (n, n), 1/s; None: none.
@@ -31,9 +31,9 @@ class Stepper:
     def run(
         self, q: Array, v: Array, accelerations: Callable[[Array, Array], Array]
     ) -> tuple[Array, Array]:
-        """Positions and rates at the end, shape (n,) each.
+        """Return positions and velocities at the end, shape (n,) each.
 
-        :param accelerations: called four times, at positions and rates, damping included.
+        :param accelerations: called four times with positions and velocities; includes damping.
         """
         on, damping = self._on, self._damping
         half, drift, lift, whole, far, v0, v1, v2, q0, q1, q2 = self._weights
@@ -59,14 +59,14 @@ class Stepper:
 
 @lru_cache(64)
 def undamped(span: float) -> Stepper:
-    """The classical method."""
+    """Return the classical method of order four."""
     return Stepper(_undamped(span))
 
 
 def damped(span: float, modes: Array, back: Array, decays: Array) -> Stepper:
-    """The method that is exact in a damping.
+    """Return the method that is exact in a damping.
 
-    :param modes: of the damping, columns, shape (n, r); across them nothing is damped.
+    :param modes: of the damping, columns, shape (n, r); other directions are undamped.
     :param back: takes rates to the modes, shape (r, n).
     :param decays: of the modes, 1/s, shape (r,).
     """
@@ -77,17 +77,17 @@ def damped(span: float, modes: Array, back: Array, decays: Array) -> Stepper:
 
 
 def _undamped(h: float) -> list[float]:
-    """Weights, see :func:`_damped`, of no damping."""
+    """Return the weights of :func:`_damped` without damping."""
     sixth = h / 6.0
     return [1.0, 0.5 * h, h * h / 8.0, 1.0, h, sixth, 2.0 * sixth, sixth, h * sixth, h * sixth, 0.0]
 
 
 def _damped(h: float, decays: Array) -> Array:
-    """Weights by mode, shape (11, r).
+    """Return the weights by mode, shape (11, r).
 
-    Of half a span: rates by rates, positions by rates (and rates by accelerations), positions by
-    accelerations. Of a whole one: rates by rates, positions by rates; then the weights of the
-    stages for rates and for positions.
+    For half a span: velocity by velocity, position by velocity (also velocity by acceleration),
+    position by acceleration. For the whole span: velocity by velocity, position by velocity. Then
+    the stages' weights for velocity and for position.
     """
     z = -h * decays
     near, far = _phi(0.5 * z), _phi(z)
@@ -103,7 +103,7 @@ def _damped(h: float, decays: Array) -> Array:
 
 
 def _phi(z: Array) -> Array:
-    """Functions phi_0 = exp to phi_4 of numbers that are not positive, shape (5, r).
+    """Return the functions phi_0 = exp to phi_4 of non-positive numbers, shape (5, r).
 
     phi_k(z) = z phi_(k+1)(z) + 1 / k!.
     """
@@ -113,7 +113,7 @@ def _phi(z: Array) -> Array:
     with np.errstate(divide="ignore", invalid="ignore"):
         for k in range(4):
             up[k + 1] = (up[k] - 1.0 / factorials[k]) / z
-    # Near zero that loses digits: a series, and down.
+    # Near zero this recursion loses digits: use a series for phi_4, and recur downwards.
     down = np.empty_like(up)
     term = total = np.full_like(z, 1.0 / 24.0)
     for k in range(5, 25):

@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""Which joints of a machine stick, slide or stand at their stops, and what follows for its motion.
+"""Decide which joints stick, slide or rest at their stops, and compute the accelerations.
 
 Rows are the actuated joints, then the passive ones that have friction or a rotor.
 """
@@ -26,20 +26,21 @@ States = NDArray[np.int8]
 """By row: 0 a force that holds the row, 1 the greatest force, -1 the least one."""
 
 TOLERANCE: Final = 1e-7
-"""Of forces and motions, part of the greatest; above how exactly a change's time is found."""
+"""Tolerance of forces and motions, relative to the largest; larger than the accuracy of change
+times."""
 BLOCKS: Final = 10
-"""How often all that is wrong changes at once; then one row after the other, which ends."""
+"""Block pivoting sweeps; then one row changes at a time, which always terminates."""
 REGULAR: Final = 1e-11
-"""Added to the diagonal so that dependent rows have a solution, part of its greatest element."""
+"""Regularisation of dependent rows, relative to the largest diagonal element."""
 
 DEPENDENT: Final = 1e-7
-"""Length of a row without what earlier ones have of it, part of its own."""
+"""Length of a row's independent part, relative to the row, below which it is dependent."""
 
 
 def resisting(
     matrix: Array, motion: Array, low: Array, high: Array, states: States
 ) -> tuple[Array, States]:
-    """Forces that resist motions: a linear complementarity problem with bounds.
+    """Solve for forces that resist motions: a bounded linear complementarity problem.
 
     What is left of the motion, w = motion - matrix force, is zero where the force is between its
     bounds, positive or zero at the upper bound and negative or zero at the lower one: Coulomb's law
@@ -83,7 +84,7 @@ def resisting(
 
 
 def independent(rows: Array, inverse: Array) -> list[int]:
-    """Indices of the rows that depend on no earlier ones.
+    """Return the indices of the rows that do not depend on earlier ones.
 
     :param rows: shape (m, n).
     :param inverse: of the mass matrix, in which they are compared, shape (n, n).
@@ -101,7 +102,7 @@ def independent(rows: Array, inverse: Array) -> list[int]:
 
 
 def first_fall(before: float, fall: float, after: float, last: float, size: float) -> float:
-    """Where in [0, 1] the cubic of these ends falls through zero; infinity where it does not.
+    """Return where in [0, 1] a cubic falls through zero; infinity if it does not.
 
     :param fall: its slope at 0; ``last``: at 1.
     :param size: how far below zero it has to come.
@@ -129,7 +130,7 @@ def first_fall(before: float, fall: float, after: float, last: float, size: floa
 
 
 def _turns(fall: float, square: float, cube: float) -> list[float]:
-    """Where the slope fall + 2 square x + 3 cube x^2 is zero in (0, 1)."""
+    """Return the zeros of the slope fall + 2 square x + 3 cube x^2 in (0, 1)."""
     inner = square * square - 3.0 * cube * fall
     if inner < 0.0:
         return []
@@ -139,18 +140,18 @@ def _turns(fall: float, square: float, cube: float) -> list[float]:
 
 
 STILL: Final = 1e-12
-"""Rate that is none, part of what the joints add to it."""
+"""Velocity that counts as zero, relative to the joints' contributions to it."""
 STIFF: Final = 0.1
-"""Decay in a part of a step by viscous friction from which on that is integrated exactly."""
+"""Decay by viscous friction in a part of a step above which it is integrated exactly."""
 RANK_TOLERANCE: Final = 1e-12
-"""Singular value of rows that depend on each other, part of the greatest."""
+"""Singular value below which rows are dependent, relative to the largest."""
 _NONE: Final = np.zeros(0)
 _NOBODY: Final = np.zeros(0, np.intp)
 
 
 @dataclass(slots=True)
 class Law:
-    """What slides which way and what is held, until one of them changes; m rows slide, h hold."""
+    """Describe which rows slide (m) in which direction and which are held (h), until a change."""
 
     pull: Array
     """Constant dry friction of all rows, shape (n + k,)."""
@@ -186,7 +187,7 @@ class Law:
 
 
 class Resistance:
-    """Friction and stops of a robot, and which of its rows move.
+    """Model friction and stops of a robot, and track which of its rows move.
 
     ``pushed``: passive joints that efforts act on, by their places among those with friction. These
     efforts come after the wrench's six numbers, and their rates after the platform's twist.
@@ -226,7 +227,7 @@ class Resistance:
         self._law: Law | None = None
 
     def at(self, q: Array, qd: Array) -> Terms:
-        """Terms of a state, with what the drives' friction laws take by position alone.
+        """Return the terms of a state, with position-dependent friction of the drives.
 
         Errors as of :meth:`Equations.at`.
         """
@@ -241,22 +242,22 @@ class Resistance:
         return here._replace(bias=bias, potential=energy)
 
     def _remembered(self, q: Array) -> Memory:
-        """Memory after a straight way to a place."""
+        """Return the friction memory after a straight motion to a position."""
         before = self.memory = self.memory or Memory.begun(q)
         return before.after(q[None], np.sign(q - before.q), self._distance).last
 
     def passed(self, here: Terms) -> None:
-        """Remember the way to a part's end."""
+        """Store the friction memory at a part's end."""
         if self._level.any():
             self.memory = self._remembered(here.q)
 
     def _at_place(self, q: Array) -> Array:
-        """What the drives' friction takes whatever the rates, shape (n,)."""
+        """Return the drives' friction that does not depend on velocity, shape (n,)."""
         own = parts(self._laws, self._numbers, q, np.zeros_like(q))[0]
         return np.asarray(own + self._level * self._remembered(q).z, np.float64)
 
     def _bounds(self, here: Terms, given: Array) -> tuple[Array, Array]:
-        """Least and greatest dry friction of all rows at a state, shape (n + k,).
+        """Return the smallest and largest dry friction of all rows at a state, shape (n + k,).
 
         :param given: efforts of the drives, less their offset, shape (n,).
         """
@@ -269,7 +270,7 @@ class Resistance:
         return low, high
 
     def _pull(self, law: Law, here: Terms) -> Array:
-        """Dry friction of all rows at a state; of what is still as it is, shape (n + k,)."""
+        """Return the dry friction of all rows at a state, (n + k,); unchanged for still rows."""
         if not self._laws:
             return law.pull
         low, high = self._bounds(here, law.given)
@@ -280,26 +281,26 @@ class Resistance:
     # Rows.
 
     def rows(self, here: Terms) -> Array:
-        """Rates of all rows by joint rates, shape (n + k, n)."""
+        """Return the velocities of all rows by joint velocities, shape (n + k, n)."""
         return np.concatenate([self._drives, here.rows]) if self._passive else self._drives
 
     def rates(self, here: Terms) -> Array:
-        """Of all rows, shape (n + k,)."""
+        """Return the velocities of all rows, shape (n + k,)."""
         qd = here.qd
         return np.concatenate([qd, here.rows @ qd]) if self._passive else qd
 
     def seconds(self, here: Terms, a: Array) -> Array:
-        """Accelerations of all rows, shape (n + k,)."""
+        """Return the accelerations of all rows, shape (n + k,)."""
         return np.concatenate([a, here.rows @ a + here.drift]) if self._passive else a
 
     # States.
 
     def arrive(self, q: Array, qd: Array) -> Terms:
-        """Terms of a state that is new, after the impact that it may begin with."""
+        """Return the terms of a new state, after an impact if there is one."""
         return self._struck(self._anew(self.at(q, qd)))
 
     def _anew(self, here: Terms) -> Terms:
-        """Look which rows move, and which way."""
+        """Determine which rows move, and in which direction."""
         rates = self.rates(here)
         self._still = np.abs(rates) <= STILL * np.abs(self.rows(here) * here.qd).max(1)
         self._states = np.where(self._still, 0.0, np.sign(rates)).astype(np.int8)
@@ -307,7 +308,7 @@ class Resistance:
         return here
 
     def _struck(self, here: Terms) -> Terms:
-        """After the impact of the joints that go beyond their stops; the same where none does."""
+        """Return the state after the impact of joints at their stops; the same without one."""
         q, qd = here.q, here.qd
         up, down = q >= self._high, q <= self._low
         if not ((up & (qd > 0.0)) | (down & (qd < 0.0))).any():
@@ -326,7 +327,7 @@ class Resistance:
     # Laws.
 
     def law(self, here: Terms, effort: Array, wrench: Array | None) -> Law:
-        """What holds from here on, under efforts, shape (n,), and a wrench, (6,) and more."""
+        """Return which rows are held from now on, under efforts (n,) and a wrench (6,) and more."""
         law = self._law
         if law is not None:
             self._load(law, here, effort, wrench)
@@ -356,7 +357,7 @@ class Resistance:
         return law
 
     def _hold(self, law: Law, here: Terms, z: Indices, low: Array, high: Array) -> None:
-        """Say which of the rows z, which do not move, are held.
+        """Decide which of the still rows z are held.
 
         :param law: of all other rows.
         :param low: bounds of all rows' forces, shape (n + k,).
@@ -391,7 +392,7 @@ class Resistance:
         law.first, law.force = self.accelerate(law, here)
 
     def accelerate(self, law: Law, here: Terms) -> tuple[Array, Array]:
-        """Accelerations at a state, shape (n,), and the forces that hold, shape (h,)."""
+        """Return accelerations at a state, shape (n,), and the holding forces, shape (h,)."""
         n, h, pull = len(law.effort), len(law.held), self._pull(law, here)
         rest = (law.given - pull[:n] if self._laws else law.effort) - here.bias
         if law.wrench is not None:
@@ -419,7 +420,7 @@ class Resistance:
         return result[:n], result[n:]
 
     def stepper(self, here: Terms, law: Law, span: float) -> Stepper:
-        """The method of a part of a step, with the viscous friction at its start."""
+        """Return the integrator of a part of a step, with the viscous friction at its start."""
         if not self._damped:
             return undamped(span)
         damping = self._damping(here)
@@ -436,15 +437,15 @@ class Resistance:
         return damped(span, modes, modes.T @ here.mass, np.maximum(decays, 0.0))
 
     def _damping(self, here: Terms) -> Array:
-        """Viscous friction of all joints, by joint rates, shape (n, n)."""
+        """Return the viscous friction of all joints by joint velocities, shape (n, n)."""
         inner: Array = (here.rows.T * self._inner) @ here.rows
         return np.diag(self._viscous) + inner
 
     def crawl(self, here: Terms, law: Law, span: float) -> Terms:
-        """A part of a step by Moreau's implicit time stepping, of order one.
+        """Integrate a part of a step by Moreau's implicit time stepping, of order one.
 
-        For what changes faster than can be resolved: friction so stiff that its transients have
-        passed. It needs no law to last, always has a result, and takes energy away.
+        For changes faster than can be resolved: friction so stiff that its transients have decayed.
+        It needs no constant law, always has a result, and removes energy.
         """
         n = len(here.q)
         inverse = _inverse(here.mass + span * self._damping(here))
@@ -477,7 +478,7 @@ class Resistance:
     def change(
         self, here: Terms, end: Terms, law: Law, span: float, exact: float
     ) -> tuple[float, Mask | None]:
-        """When a law ends, s after its start, and by which signals; the span and None: it lasts.
+        """Return when a law ends, s after its start, and by which signals; None if it lasts.
 
         Signals fall to zero where it ends: distances of joints to their stops above and below,
         rates of rows that slide, and of forces that hold to their bounds.
@@ -520,12 +521,12 @@ class Resistance:
         for i in suspects[times[suspects] > span]:
             times[i] = span * first_fall(before[i], fall[i], after[i], last[i], size[i])
         first = min(span, float(times.min()))
-        # What ends as good as together ends together: joints that reach their stops at once.
+        # Events closer than the accuracy are simultaneous, as joints that reach their stops.
         hit = times <= first + exact * span
         return first, hit if hit.any() else None
 
     def _rounding(self, here: Terms, law: Law, force: Array, span: float) -> Array:
-        """What rounding makes of the signals of :meth:`change`."""
+        """Return the rounding errors of the signals of :meth:`change`."""
         rows = self.rows(here)[law.slides]
         own = np.einsum("ij,jk,ik->i", rows, _inverse(here.mass), rows)
         own = own * np.abs(self._pull(law, here)[law.slides])
@@ -535,7 +536,7 @@ class Resistance:
         return STILL * np.concatenate([q, q, rates, force, force])
 
     def settle(self, end: Terms, law: Law, hit: Mask | None, passed: bool) -> Terms:
-        """The state at a part's end: what came to rest rests, a joint at a stop stands there.
+        """Return the state at a part's end: stopped rows are still, joints at a stop rest there.
 
         :param hit: the signals that have ended the law.
         :param passed: whether time has passed under it: what it let go moves.

@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""A simulated machine: drives and sensors around a plant, as a controller meets them.
+"""Simulate a machine with drives and sensors around a plant, as a controller sees it.
 
 Times are integers in nanoseconds by the machine's own clock, which :meth:`Simulation.advance`
 alone moves. Pure: messages are read by their attributes.
@@ -31,20 +31,20 @@ from pkm_twin.streams.path import JointPath
 TimeoutAction = Literal["zeros", "hold"]
 
 SINGULAR: Final = 1e-3
-"""Singularity measure below which a machine has left what rigid bodies describe."""
+"""Singularity index below which rigid bodies no longer describe the machine."""
 POSES: Final = 64
-"""Random poses among which the one with the fastest position control is sought."""
+"""Random poses among which the one with the fastest position control is searched."""
 MARGIN: Final = 1.25
-"""Factor of all gains with which the position control has to be stable, too."""
+"""Factor of all gains with which the position control must still be stable."""
 DELAYS: Final = 20
-"""Periods of a delay that are followed one by one; a longer one is divided into as many."""
+"""Periods of a delay that are modelled one by one; a longer delay is divided into as many."""
 NO_GROWTH: Final = 1e-6
-"""Growth of an error in a period that is none: rounding's, where no gain moves a joint back."""
+"""Growth of an error per period that is rounding, for example where no gain acts on a joint."""
 
 
 @dataclass(frozen=True)
 class PayloadEvent:
-    """From ``time`` (s after the start) on the platform carries this."""
+    """Describe the payload of the platform from ``time`` (s after the start) on."""
 
     time: float
     mass: float
@@ -52,13 +52,13 @@ class PayloadEvent:
 
     @property
     def load(self) -> dict[str, Any]:
-        """The payload as a robot's file has it."""
+        """Payload as in a robot's file."""
         return {"mass": self.mass, "com": list(self.com)}
 
 
 @dataclass(frozen=True)
 class WrenchSignal:
-    """What the surroundings apply to the platform: constant + amplitude sin(2 pi frequency t).
+    """Describe an external wrench: constant + amplitude sin(2 pi frequency t).
 
     Shape (6,) each, N and N m, base axes, at the platform's reference point.
     """
@@ -68,7 +68,7 @@ class WrenchSignal:
     frequency: float = 0.0
 
     def at(self, time: float) -> Array:
-        """At a time after the start, s."""
+        """Return the wrench at a time after the start, s."""
         if not self.amplitude.any():
             return self.constant
         turn = 2.0 * np.pi * self.frequency * time
@@ -77,7 +77,7 @@ class WrenchSignal:
 
 @dataclass(frozen=True)
 class MachineSettings:
-    """Drives and sensors of a machine; arrays have shape (n,)."""
+    """Hold settings of drives and sensors of a machine; arrays have shape (n,)."""
 
     start: Array
     """Joint positions at the start, rad or m."""
@@ -114,7 +114,7 @@ class MachineSettings:
 
 
 def tuned(robot: Robot, bandwidth: float) -> tuple[Array, Array]:
-    """Stiffness and damping of a position control, by the masses at the home pose, (n,) each.
+    """Return stiffness and damping of a position control, by the masses at home, (n,) each.
 
     Drives that share the effort share the masses.
 
@@ -127,7 +127,7 @@ def tuned(robot: Robot, bandwidth: float) -> tuple[Array, Array]:
 
 
 def stable_share(robot: Robot, settings: MachineSettings) -> float:
-    """Share of the position control's bandwidth that is stable at its period, 1 at most.
+    """Return the stable fraction of the position control's bandwidth, at most 1.
 
     Stable: in the discrete loop of the sampled control and the machine's masses, linear about rest,
     no error grows, at the start and in the pose where the loop is fastest, with every payload, and
@@ -166,7 +166,7 @@ def error_growth(
     inertia: Array, settings: MachineSettings, stiffness: float = 1.0, damping: float = 1.0,
     follow: Array | None = None,
 ) -> float:  # fmt: skip
-    """Factor by which an error of the position control grows in a period, at most.
+    """Return the largest factor by which a position control error grows in a period.
 
     The spectral radius of the loop that :meth:`Simulation.advance` closes: positions, rates, the
     positions a period before (rates of an encoder with steps are differences) and the efforts on
@@ -193,7 +193,7 @@ def error_growth(
 
 @dataclass(frozen=True)
 class Measured:
-    """What the sensors measure, shape (n,) each: rad or m, their rates, N m or N."""
+    """Hold what the sensors measure, shape (n,) each: rad or m, their rates, N m or N."""
 
     stamp: int
     q: Array
@@ -204,9 +204,9 @@ class Measured:
 
 
 class Simulation(Core):
-    """One machine with brakes, which the first command opens.
+    """Simulate one machine with brakes, which the first command opens.
 
-    Effort commands and trajectories take turns: what came last is obeyed.
+    The latest effort command or trajectory takes effect.
 
     :param start: the machine's clock at its start, ns.
     """
@@ -220,10 +220,10 @@ class Simulation(Core):
                     raise ParameterError(f"start, {name}", float(q), f"{low:g} to {high:g}")
         self.robot, self.settings = robot, settings
         self.stream = counting()
-        """Effort commands, and what has stopped the machine."""
+        """Counts of effort commands, and the reason of a stop."""
         self.trajectories = counting()
         self.wrenches = counting()
-        """What is applied to the platform by a topic."""
+        """Counts of wrenches from a topic."""
         self.saturations = 0
         self.now = start
         self._reader = JointReader(robot, with_effort=True)
@@ -247,24 +247,24 @@ class Simulation(Core):
         self._seen_rate = np.zeros_like(self._seen)
 
     def restart(self) -> None:
-        """Stand at the start again, braked; the clock goes on."""
+        """Return to the start, braked; the clock continues."""
         self.stream.resume()
         self._begin()
 
     @property
     def time(self) -> float:
-        """Since the machine's start, s."""
+        """Time since the machine's start, s."""
         return (self.now - self._begun) / SECOND
 
     def skip(self, nanoseconds: int) -> None:
-        """The clock goes on and the machine does not: the process that runs it stood still."""
+        """Advance the clock without the machine, as after a suspension of the process."""
         self.now += nanoseconds
         self._begun += nanoseconds
 
     def commands(self, message: Any) -> None:
-        """Efforts as std_msgs/Float64MultiArray, the controller's, in the robot's order.
+        """Take efforts as std_msgs/Float64MultiArray, the controller's, in the robot's order.
 
-        :raises MessageError: rejected whole, and counted; what was commanded before stays.
+        :raises MessageError: rejected and counted; the previous command stays in effect.
         """
         with self.taking(self.stream):
             effort = self._reader.commands(message.data)
@@ -274,9 +274,9 @@ class Simulation(Core):
         self._send(effort)
 
     def trajectory(self, message: Any) -> None:
-        """Go a trajectory_msgs/JointTrajectory by position control, its effort as feedforward.
+        """Follow a trajectory_msgs/JointTrajectory by position control with its feedforward.
 
-        A zero stamp starts it now. Before its first point the way leads there from here.
+        A zero stamp starts it now. Before its first point the path leads there from here.
 
         :param message: the message or its TrajectoryFields.
         :raises MessageError: rejected whole, and counted; what was commanded before stays.
@@ -289,11 +289,11 @@ class Simulation(Core):
 
     @cached_property
     def stable_share(self) -> float:
-        """As :func:`stable_share` of this machine."""
+        """Stable fraction of this machine's bandwidth, as :func:`stable_share`."""
         return stable_share(self.robot, self.settings)
 
     def control_fault(self) -> str:
-        """Why no trajectory is followed where :attr:`stable_share` is below 1."""
+        """Explain why no trajectory is followed if :attr:`stable_share` is below 1."""
         s, share = self.settings, self.stable_share
         # Critically damped: stiffness m w^2 and damping 2 m w.
         damped = s.damping > 0.0
@@ -305,23 +305,23 @@ class Simulation(Core):
         )
 
     def push(self, message: Any, frame: str) -> None:
-        """A geometry_msgs/WrenchStamped in the base frame, which stays until the next.
+        """Apply a geometry_msgs/WrenchStamped in the base frame until the next one.
 
-        :raises MessageError: it is rejected, and counted.
+        :raises MessageError: the message is rejected, and counted.
         """
         rules = StampRules(accept_zero=True, future_tolerance=SECOND)
         with self.taking(self.wrenches):
             self._pushed = read_wrench(message, self.now, rules, frame, False).wrench
 
     def measured(self) -> Measured:
-        """What the sensors measure now."""
+        """Return the sensors' present measurements."""
         force = self._wrench()
         rotation = self.robot.platform(self.plant.q)[1]
         turned = np.concatenate([force[:3] @ rotation, force[3:] @ rotation])
         return Measured(self.now, self._seen, self._seen_rate, self._effort, turned)
 
     def advance(self) -> None:
-        """Go on by a period. A machine that has failed stands where it was.
+        """Simulate one period; a failed machine stays where it was.
 
         :raises MessageError: it fails now: a singularity, the edge of reach, or no finite result.
         """
@@ -363,14 +363,14 @@ class Simulation(Core):
             raise
 
     def _stops(self, k: int, low: float, high: float) -> None:
-        """Reject a drive that follows beyond its limits, where it has no stop."""
+        """Reject a redundant drive beyond its limits, where it has no simulated stop."""
         name, here = self.robot.joint_names[k], float(self.plant.q[k])
         if not low <= here <= high:
             how = f"is at {here:.4g}, allowed {low:g} to {high:g}, and has no simulated stop"
             raise UnreachableError("joint state", name, (), 0.0, how=how)
 
     def _tick(self) -> None:
-        """The period's end: the clock, and what the encoders see."""
+        """End the period: advance the clock, and sample the encoders."""
         s = self.settings
         self.now += round(s.period * SECOND)
         before, self._seen = self._seen, self._encoder()
@@ -388,7 +388,7 @@ class Simulation(Core):
         return np.where(step > 0.0, np.round(q / steps) * steps, q)
 
     def _control(self) -> Array | None:
-        """The position control's effort, shape (n,); None where no trajectory is gone."""
+        """Return the position control's effort, (n,); None if no trajectory is followed."""
         if self._path is None or self.now < self._path[0]:
             return None
         start, path = self._path
@@ -411,7 +411,7 @@ class Simulation(Core):
         return self.now - self._commanded > self.settings.deadline * SECOND
 
     def _load(self) -> None:
-        """Take what payload is due."""
+        """Apply payloads that are due."""
         while self._payloads and self._payloads[0].time <= self.time:
             load = self._payloads.popleft().load
             self.plant.change_robot(self.robot.changed(payload=load))

@@ -1,7 +1,7 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""Rigid bodies under efforts, with friction and stops, in the actuated joints' coordinates.
+"""Simulate rigid bodies under efforts, with friction and stops, in joint coordinates.
 
-So no loop can drift open.
+Loops cannot drift open, because actuated joints are the coordinates.
 """
 
 from __future__ import annotations
@@ -21,22 +21,23 @@ from pkm_twin.machine.inertia import loaded_joints
 from pkm_twin.robot.robot import Robot
 
 CHANGES: Final = 60
-"""Changes of what sticks or slides in a step that are followed one by one."""
+"""Changes between sticking and sliding in a step that are resolved one by one."""
 HALVINGS: Final = 12
-"""How often a part is halved that cannot be followed, or that gains energy."""
+"""Largest number of times that a part of a step is halved if it fails or gains energy."""
 RESOLVED: Final = 1e-8
-"""How exactly the time of a change is found, part of a step."""
+"""Accuracy of the time of a change, as a fraction of a step."""
 CRAWL: Final = 1e-6
-"""First part of a step that is taken implicitly where changes pile up; the next are longer."""
+"""First implicit part of a step where changes accumulate, as a fraction; later parts are longer."""
 GROWTH: Final = 1e-9
-"""Energy that the method may add in a part, which then is taken away; part of the kinetic one."""
+"""Energy that the method may add in a part, relative to the kinetic energy; it is removed
+afterwards."""
 ROUNDING: Final = 1e-14
-"""Of energies, part of the greatest summand."""
+"""Rounding error of energies, relative to the largest summand."""
 
 
 @dataclass
 class Plant:
-    """A robot's state and how it goes on.
+    """Hold a robot's state, and integrate its motion.
 
     Between changes a step is one of a Runge-Kutta method of order four that is exact in viscous
     friction, however stiff; efforts and wrench are constant in it. Dry friction of all joints and
@@ -56,9 +57,9 @@ class Plant:
         self.change_robot(self.robot)
 
     def change_robot(self, robot: Robot) -> None:
-        """Go on as a robot of the same joints, with another payload.
+        """Continue with a robot of the same joints and another payload.
 
-        Coordinates are the drives that lead; others push the joints where they stand.
+        The coordinates are the leading drives; the others act as forces on their joints.
         """
         self.robot, self._leading = robot, robot.graph.leading
         self.others = [k for k in range(robot.joints_count) if k not in self._leading]
@@ -70,7 +71,7 @@ class Plant:
         self._here: Terms | None = None
 
     def _all(self, here: Terms) -> tuple[Array, Array]:
-        """Positions and rates of all drives."""
+        """Return positions and velocities of all drives."""
         if not self.others:
             return here.q.copy(), here.qd.copy()
         q, qd = self.q.copy(), np.zeros_like(self.q)
@@ -80,11 +81,11 @@ class Plant:
         return q, qd
 
     def rest(self) -> None:
-        """Stand still."""
+        """Set all velocities to zero."""
         self.qd = np.zeros_like(self.q)
 
     def advance(self, effort: Array, wrench: Array, step: float) -> None:
-        """Go on by a step, s.
+        """Integrate one step, s.
 
         :param effort: of the actuators, shape (n,), N m or N.
         :param wrench: what the surroundings apply to the platform at its reference point, base
@@ -121,7 +122,7 @@ class Plant:
             at_once = 0 if taken else at_once + 1
 
     def _crawl(self, here: Terms, law: Law, span: float) -> tuple[Terms, float]:
-        """Go on implicitly, for no longer than loses energy; the time that this took."""
+        """Integrate implicitly over a span without energy gain; return the state and the span."""
         for _ in range(HALVINGS):
             end = self._resistance.crawl(here, law, span)
             growth = _growth(here, end, law, 0.0)
@@ -131,9 +132,9 @@ class Plant:
         return _lessened(here, end, law), span
 
     def _follow(self, here: Terms, law: Law, left: float, instant: float) -> tuple[Terms, float]:
-        """Integrate under a law until it changes, at most ``left`` s; also the time that passed.
+        """Integrate under a law until it changes, at most ``left`` s; return state and time.
 
-        :param instant: a time that is none.
+        :param instant: time that counts as zero, s.
         """
         resistance, span, least, tries = self._resistance, left, left * 0.5**HALVINGS, 0
         while True:
@@ -167,7 +168,7 @@ class Plant:
             return _lessened(here, settled, law, work), span
 
     def _flow(self, here: Terms, law: Law, span: float) -> tuple[Terms, float]:
-        """The state after a part, and the work of the wrench in it, J."""
+        """Return the state after a part, and the work of the wrench in it, J."""
         resistance, powers = self._resistance, []
 
         def accelerations(q: Array, qd: Array) -> Array:
@@ -185,7 +186,7 @@ class Plant:
 
 
 def _growth(here: Terms, end: Terms, law: Law, work: float) -> float:
-    """Energy that comes from nowhere, J.
+    """Return the energy that the integration has added, J.
 
     :param work: of the wrench, J.
     """
@@ -194,17 +195,17 @@ def _growth(here: Terms, end: Terms, law: Law, work: float) -> float:
 
 
 def _rounding(here: Terms, end: Terms, law: Law) -> float:
-    """What rounding makes of it, J. Positions too are rounded: the less they change, the more."""
+    """Bound the rounding error of the energy growth, J, including that of positions."""
     forces = np.abs(law.given) + np.abs(here.bias)
     size = here.kinetic + end.kinetic + abs(here.potential) + abs(end.potential)
     return ROUNDING * (size + float(forces @ np.abs(here.q)))
 
 
 def _lessened(here: Terms, end: Terms, law: Law, work: float = 0.0) -> Terms:
-    """The end without energy from nowhere."""
+    """Return the end state without the energy that the integration has added."""
     growth = _growth(here, end, law, work)
     if growth <= 0.0 or growth <= _rounding(here, end, law):
         return end
-    # So little that the other terms of the state stay.
+    # The change is so small that the other terms of the state are kept.
     left = max(0.0, 1.0 - growth / end.kinetic) if end.kinetic else 0.0
     return end._replace(qd=math.sqrt(left) * end.qd, kinetic=left * end.kinetic)
