@@ -163,7 +163,9 @@ def _solve_sample(scheme: Closures, limb: Limb, x: Numbers, q: Numbers) -> LimbP
         # What the limb has to find is not given.
         size = 2 if step.circle else 1
         given[step.position : step.position + size] = tree.home[step.position :][:size]
-    return LimbPose(motion, limb, given, q)
+    # A limb that has no closed form may have no real solution either: that is told by NaN.
+    with np.errstate(all="ignore"):
+        return LimbPose(motion, limb, given, q)
 
 
 def order_closed(scheme: Closures) -> tuple[str | Limb, ...]:
@@ -361,8 +363,7 @@ def _is_closed(scheme: Closures, limb: Limb) -> bool:
     if not _is_regular(scheme, limb):
         return False
     for x, q in scheme.samples:
-        with np.errstate(all="ignore"):
-            pose = _solve_sample(scheme, limb, x, q)
+        pose = _solve_sample(scheme, limb, x, q)
         difference = numbers(pose.x) - np.array(x, float)
         difference[[step.position for step in steps if not step.turns]] /= tree.size
         rest = [row.scale * float(row.value) for row in pose.rows]
