@@ -26,6 +26,9 @@ from pkm_twin.machine.tree import Link, Step, Tree
 MIN_LEVER: Final = 1e-2
 """Least lever of a limb's turns and least slope of its reach at home, of unit one: at a lever of 0
 the limb is singular, and nearby the closed form loses digits."""
+MIN_SLOPE: Final = 1e-4
+"""Least singular value, of unit one, of the equations that closed limbs leave to Newton's method:
+a limb about one point leaves a distance that nothing changes."""
 SAME_STATE: Final = 1e-9
 """Largest difference of a sampled state and its closed form: rounding, amplified near a
 singularity of the limb. Another solution differs by much more."""
@@ -212,7 +215,7 @@ def _is_regular_for_newton(scheme: Closures, order: Sequence[str | Limb]) -> boo
     rates = [rate for rate in scheme.varying if rate not in found]
     table = scheme.scaled(rows)[0][:, rates]
     sizes = np.linalg.svd(table, compute_uv=False)
-    return len(rows) == len(rates) and (not rates or bool(sizes[-1] > SAME_STATE))
+    return len(rows) == len(rates) and (not rates or bool(sizes[-1] > MIN_SLOPE))
 
 
 def _rates_of_newton(scheme: Closures, order: Sequence[str | Limb]) -> set[int]:

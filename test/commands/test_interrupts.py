@@ -82,7 +82,7 @@ def test_an_exception_that_was_lost_does_not_make_a_process_deaf():
     script = """
 import signal, time
 from pkm_twin.ros import signals as interrupts
-interrupts.PATIENCE = 0.2
+interrupts.IGNORE_TIME = 0.2
 with interrupts.first_signal(lambda: SystemExit(7)):
     try:
         signal.raise_signal(signal.SIGINT)
