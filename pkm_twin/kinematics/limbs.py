@@ -305,6 +305,7 @@ def _find_candidates(scheme: Closures, placed: Collection[str]) -> Iterator[Limb
             left = len(rows) - len(passive)
             if not bodies or not all(s.circle or (s.slide and not s.turns) for s in steps + tops):
                 continue
+            drives = any(step.actuated for link in links for step in link.steps)
             owner = {id(step): link.body for link in links for step in link.steps}
             for kind, reach, turns, spins in _split(steps, tops, rod=rod):
                 spins_alone = (
@@ -314,12 +315,16 @@ def _find_candidates(scheme: Closures, placed: Collection[str]) -> Iterator[Limb
                     continue
                 if spins and not spins_alone:
                     continue
+                ways = tuple(dict.fromkeys(owner[id(step)] for step in turns))
+                first = tuple(link.body for link in links[: len(ways)])
+                if drives and (kind != "turns" or first != ways):
+                    # Actuated joints may only follow the turns.
+                    continue
                 # A single turn leaves its plane; what has no reach leaves the distance.
                 if 0 <= left <= (len(turns) == 1) + (reach is None):
                     yield Limb(
                         kind, part, tip, beyond, bodies, owner[id(reach)] if reach else "",
-                        tuple(dict.fromkeys(owner[id(step)] for step in turns)), rows, left,
-                        owner[id(steps[-1])] if spins else "",
+                        ways, rows, left, owner[id(steps[-1])] if spins else "",
                     )  # fmt: skip
 
 

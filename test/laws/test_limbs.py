@@ -17,9 +17,9 @@ from test.machine.random_machines import variant
 from test.support.robots import load, partly_long
 
 NAMES = ("delta", "delta_cu", "five_bar", "linear_delta", "prru", "rps3", "stewart", "upr_rpu")
-TEMPLATES = ("agile_eye", "par4", "rrs3", "rss6", "tricept", "rrr3_planar")
+TEMPLATES = ("agile_eye", "exechon", "par4", "rrs3", "rss6", "tricept", "rrr3_planar")
 ROBOTS = [*NAMES, *(f"examples/machines/{name}.yaml" for name in TEMPLATES)]
-EVERY = partly_long(ROBOTS, "delta_cu", "five_bar", "rps3", "stewart", ROBOTS[-1])
+EVERY = partly_long(ROBOTS, "delta_cu", "five_bar", "rps3", "stewart", ROBOTS[9], ROBOTS[-1])
 
 
 def hexapod(seed):
