@@ -95,7 +95,7 @@ def make_report(path: Path, storage: Storage, checks: Sequence[Check]) -> BagRep
         warnings=(*warnings, *miscounts),
         miscounts=miscounts,
         out_of_order=sum(check.out_of_order for check in checks),
-        # rosbag2 writes its record anew when it closes a bag: the last one holds.
+        # rosbag2 writes its record again when it closes a bag: the last one is valid.
         metadata={title: entries for check in checks for title, entries, _ in check.metadata},
     )
 

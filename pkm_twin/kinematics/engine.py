@@ -231,8 +231,9 @@ class Engine(Scheme):
         :param write: writes it, of a :class:`Traced` and ``scheme``, :attr:`posed` or None.
         """
         scheme = self.posed
-        key = f"{self.inverse_pivots}"
-        if scheme is not None:
+        if scheme is None:
+            key = f"{self.inverse_pivots}"
+        else:
             key = f"{scheme.structure.text} {scheme.drive_pivots} {scheme.chain}"
         key += self._ahead_key
         return self.kernel(name, partial(write, scheme=scheme), key)

@@ -166,7 +166,7 @@ def _solve_sample(scheme: Closures, limb: Limb, x: Numbers, q: Numbers) -> LimbP
         # What the limb has to find is not given.
         size = 2 if step.circle else 1
         given[step.position : step.position + size] = tree.home[step.position :][:size]
-    # A limb that has no closed form may have no real solution either: that is told by NaN.
+    # Without a real solution the results are NaN, which no check accepts.
     with np.errstate(all="ignore"):
         return LimbPose(motion, limb, given, q)
 
@@ -203,11 +203,7 @@ def _is_regular_for_newton(scheme: Closures, order: Sequence[str | Limb]) -> boo
     """Return whether the equations of Newton's method determine its unknowns at home."""
     x, q = scheme.samples[0]
     limbs = [entry for entry in order if isinstance(entry, Limb)]
-    motion, poses = place_in_order(scheme.tree, order, np.array(x, dtype=object), q)
-    closures, solved = motion.closures(), {k for limb in limbs for k in limb.rows}
-    rows = [closures[k] for k in scheme.independent if k not in solved]
-    rows += [row for pose in poses for row in pose.rows]
-    links = scheme.tree.links
+    rows, links = _rows_of_newton(scheme, order, x, q), scheme.tree.links
     found = {
         step.rate for limb in limbs for body in limb.bodies for step in links[body].steps
         if not step.actuated
@@ -220,19 +216,25 @@ def _is_regular_for_newton(scheme: Closures, order: Sequence[str | Limb]) -> boo
 
 def _rates_of_newton(scheme: Closures, order: Sequence[str | Limb]) -> set[int]:
     """Return the unknown rates that the equations of Newton's method depend on near home."""
-    solved = {k for entry in order if isinstance(entry, Limb) for k in entry.rows}
     found: set[int] = set()
     for x, q in scheme.samples:
-        motion, poses = place_in_order(scheme.tree, order, np.array(x, dtype=object), q)
-        closures = motion.closures()
-        rows = [closures[k] for k in scheme.independent if k not in solved]
-        rows += [row for pose in poses for row in pose.rows]
-        for row in rows:
+        for row in _rows_of_newton(scheme, order, x, q):
             found |= {
                 rate for (kind, rate), value in row.columns.items()
                 if kind == "u" and abs(value) * row.scale > SAME_STATE * scheme.tree.scales[rate]
             }  # fmt: skip
     return found
+
+
+def _rows_of_newton(
+    scheme: Closures, order: Sequence[str | Limb], x: Numbers, q: Numbers
+) -> list[Row]:
+    """Return the closures that no limb solves, and those that limbs leave, in a state."""
+    solved = {k for entry in order if isinstance(entry, Limb) for k in entry.rows}
+    motion, poses = place_in_order(scheme.tree, order, np.array(x, dtype=object), q)
+    closures = motion.closures()
+    rows = [closures[k] for k in scheme.independent if k not in solved]
+    return rows + [row for pose in poses for row in pose.rows]
 
 
 def place_in_order(
