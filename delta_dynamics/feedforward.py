@@ -494,7 +494,7 @@ class Feedforward(Core):
         if doubt is not None:
             sure = moving_rates(sure, np.abs(sure) <= doubt, self._reach)
         if self.robot.redundant:
-            _, own, change = self.robot.agreeing(sample.q, sure, change)
+            _, own, change = self.robot.project_redundant(sample.q, sure, change)
             sure = own if sample.qd is None else sure
         return motion, sure, change
 

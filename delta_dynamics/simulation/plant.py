@@ -76,7 +76,7 @@ class Plant:
             return here.q.copy(), here.qd.copy()
         q, qd = self.q.copy(), np.zeros_like(self.q)
         q[self._leading], qd[self._leading] = here.q, here.qd
-        found = self.robot.agreeing(q, qd)
+        found = self.robot.project_redundant(q, qd)
         q[self.others], qd[self.others] = (rows[self.others] for rows in found[:2])
         return q, qd
 

@@ -106,7 +106,7 @@ def dynamics_terms(
     if robot.redundant:
         # Of dependent drives, the part of the accelerations that the mass matrix takes.
         onto = robot.inverse_jacobian(place) @ robot.jacobian(place)
-        bent = robot.agreeing(place, rate)[2]
+        bent = robot.project_redundant(place, rate)[2]
         bent = bent - np.einsum("...ij,...j->...i", onto, bent)
         linear = np.einsum("...ij,...j->...i", onto, change)
     velocity = efforts(weightless, rate, bent, none)

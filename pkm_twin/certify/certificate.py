@@ -268,7 +268,7 @@ def _expand_to_all_joints(robot: Any, *motion: Array) -> tuple[Array, ...]:
     whole = [np.zeros((*one.shape[:-1], robot.joints_count)) for one in motion]
     for one, leads in zip(whole, motion, strict=True):
         one[..., robot.graph.leading] = leads
-    made: tuple[Array, ...] = robot.agreeing(*whole)
+    made: tuple[Array, ...] = robot.project_redundant(*whole)
     return made
 
 

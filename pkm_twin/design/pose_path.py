@@ -131,7 +131,7 @@ class PathMotion:
         """Joint accelerations, shape (k, t, n)."""
         own = np.zeros_like(self.qd)
         if self.many.robot.redundant:
-            own = self.many.agreeing(self.q, self.qd, own)[2]
+            own = self.many.project_redundant(self.q, self.qd, own)[2]
         bent = self.many.pose_acceleration(self.q, self.qd, own)
         return own + self._solve_jacobian(self._for_machines(self.path.acceleration) - bent)
 

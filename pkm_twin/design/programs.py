@@ -90,7 +90,7 @@ forward: Final = asks(lambda robot: robot.engine.own_forward)
 """From q to pose, position and rotation."""
 anywhere: Final = asks(lambda robot: free_forward(robot.engine))
 """The same as :func:`forward`, one program for machines of every structure."""
-agreeing: Final = asks(lambda robot: robot.agreeing_kernel)
+project_redundant: Final = asks(lambda robot: robot.projection_kernel)
 """From q, qd, qdd of the leading drives to those of all drives."""
 inverse: Final = asks(lambda robot: robot.engine.followed_inverse)
 """From the pose to q of some assembly."""

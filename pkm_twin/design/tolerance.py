@@ -324,7 +324,7 @@ def drawn(
     else:
         each = np.broadcast_to(states, (count, *states.shape))
         if robot.redundant:
-            each = machines.agreeing(each, np.zeros_like(each), np.zeros_like(each))[0]
+            each = machines.project_redundant(each, np.zeros_like(each), np.zeros_like(each))[0]
         position, rotation = machines.platform(each)
         place, turn = robot.platform(states)
         turns = rotation_vector(rotation @ turn.swapaxes(-1, -2))

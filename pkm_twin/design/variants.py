@@ -112,7 +112,7 @@ class Variants:
         steps = np.linspace(-1.0, 1.0, len(home)) + 0.3
         away = HOME_NEIGHBOURHOOD * np.array([0.0 * steps, steps, -steps]) * reach
         rest = [np.zeros_like(home)] * 2 * self.robot.redundant
-        ask = programs.agreeing if self.robot.redundant else programs.forward
+        ask = programs.project_redundant if self.robot.redundant else programs.forward
         (poses, *_), good = self.run(ask, (home + away)[None], *rest)
         sound = good[..., 0] & np.isfinite(poses).all(-1)
         known = np.isfinite(self.geometry).all(1) & np.isfinite(self.masses).all(1)
@@ -173,9 +173,11 @@ class Variants:
         n = self.robot.joints_count
         return flat.reshape(*flat.shape[:-1], n, n)
 
-    def agreeing(self, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike) -> tuple[Array, Array, Array]:
-        """Return states of all drives, shape (k, ..., n) each, see :meth:`Robot.agreeing`."""
-        first, second, third = self.run(programs.agreeing, q, qd, qdd)[0]
+    def project_redundant(
+        self, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike
+    ) -> tuple[Array, Array, Array]:
+        """Return the motion of all drives, as :meth:`Robot.project_redundant`, (k, ..., n) each."""
+        first, second, third = self.run(programs.project_redundant, q, qd, qdd)[0]
         return first, second, third
 
     def forward(self, q: ArrayLike) -> Array:

@@ -219,9 +219,10 @@ class Package:
                 "row by row.", q, lambda: null_kernel(robot), n="efforts",
             )  # fmt: skip
             add(
-                "agreeing", "Positions, rates and accelerations of all joints, by those that lead: "
+                "project_redundant",
+                "Positions, rates and accelerations of all joints, by those that lead: "
                 f"{', '.join(robot.graph.leads)}.", rates | {"qdd": n},
-                lambda: robot.agreeing_kernel, positions="q", rates="qd", changes="qdd",
+                lambda: robot.projection_kernel, positions="q", rates="qd", changes="qdd",
             )  # fmt: skip
         if "terms" in self._names:
             add(
@@ -399,7 +400,7 @@ int @_parameters(double mass, const double *com, const double *inertia, double *
     def example(self) -> str:
         """Home, checked against the Python functions."""
         robot, home = self.robot, self.robot.graph.home
-        rates, changes = robot.agreeing(home, *np.full((2, self.n), 0.1))[1:]
+        rates, changes = robot.project_redundant(home, *np.full((2, self.n), 0.1))[1:]
         tests = {
             "pose": ("forward(q, pose)", robot.forward(home)),
             "joints": ("inverse(pose, joints)", home),

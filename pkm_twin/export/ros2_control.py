@@ -41,9 +41,9 @@ SHARED: Final = {
   }}
   return status;""",
     "independent": "  (void)q;\n  (void)qd;\n  (void)qdd;\n  return 0;",
-    "agreeing": """\
+    "project_redundant": """\
   const Vector x = model_positions(q), v = model_rates(qd), a = model_rates(qdd);
-  const int status = pkm_{}_agreeing(
+  const int status = pkm_{}_project_redundant(
     x.data(), v.data(), a.data(), q.data(), qd.data(), qdd.data());
   for (std::size_t i = 0; i < JOINTS; ++i) {{
     q[i] = DRIVES[i].offset + DRIVES[i].factor * q[i];
@@ -132,7 +132,7 @@ def _words(robot: Robot, package: str) -> dict[str, str]:
         "START": _row(controller.controller_positions(home)),
         "RANGE": _row(steps),
         "NULLEFFORTS": SHARED["idle" if robot.redundant else "none idle"].format(own),
-        "AGREEING": SHARED["agreeing" if robot.redundant else "independent"].format(own),
+        "PROJECTION": SHARED["project_redundant" if robot.redundant else "independent"].format(own),
     }
 
 

@@ -37,7 +37,7 @@ class Drives:
         self.leading = self.graph.leading
         self.others = [k for k in range(self.count) if k not in self.leading]
         self._given: dict[str, tuple[Objects, Objects]] = {}
-        self._agreeing: list[Any] = []
+        self._margins: list[Any] = []
 
     def given(self, name: str) -> Objects:
         """Inputs of all drives: those of the leading ones, shape (m,); the others' are judged."""
@@ -58,11 +58,11 @@ class Drives:
         if own is leads:
             for k in self.others:
                 apart = rest[self.t.tree.drives[k].rate] - values[k]
-                self._agreeing.append(self._tolerance(k) / time - absolute(apart))
+                self._margins.append(self._tolerance(k) / time - absolute(apart))
 
-    def agreeing(self) -> list[Any]:
+    def tolerance_margins(self) -> list[Any]:
         """Numbers above zero where no drive contradicts those that lead; positions too."""
-        q, found = self.t.tape.inputs("q", self.count), list(self._agreeing)
+        q, found = self.t.tape.inputs("q", self.count), list(self._margins)
         for k in self.others:
             x, step = self.t.x, self.t.tree.drives[k]
             away = q[k] - self.graph.joints[step.joint].home

@@ -126,7 +126,7 @@ def acceleration_program(t: Traced) -> Program:
     return Program(t.inputs("q", "qd", "qdd"), 0, {"acceleration": t.lift(second)}, t.equations())
 
 
-def agreeing_program(t: Traced) -> Program:
+def projection_program(t: Traced) -> Program:
     """Positions, rates and accelerations of all drives, by those of the drives that lead."""
     t.solve()
     q, qd, qdd = (

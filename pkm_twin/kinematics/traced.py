@@ -147,7 +147,7 @@ class Traced:
         """
         if self.drives.others and "goal" not in more:
             more["goal"] = self.lift(self.drives.given("q"))
-            more["branch"] = [*more.pop("branch", ()), *self.lift(self.drives.agreeing())]
+            more["branch"] = [*more.pop("branch", ()), *self.lift(self.drives.tolerance_margins())]
         scheme, tree = self.scheme, self.tree
         places, rates = scheme.solved
         step = -self.newton.solve([row.value for row in self.solved])

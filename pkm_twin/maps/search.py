@@ -262,7 +262,7 @@ def _poses_from_joints(robot: Robot) -> Array:
     corners = np.stack(np.meshgrid(*[[0.0, 0.5, 1.0]] * count, indexing="ij"), -1)
     inner = qmc.Halton(count, scramble=False).random(JOINT_STATES)
     share = np.concatenate([corners.reshape(-1, count), inner])
-    q = robot.try_agreeing(limits[:, 0] + share * np.ptp(limits, axis=1))
+    q = robot.try_project_redundant(limits[:, 0] + share * np.ptp(limits, axis=1))
     poses, good = try_forward(robot, q)
     good[good] = reachable(robot, poses[good], -math.inf)
     poses, q = poses[good], q[good]
@@ -287,7 +287,7 @@ def _climb(robot: Robot, limits: Array, q: Array, k: int, sign: float) -> Array:
     for step in np.repeat(0.5 ** np.arange(1, 9), 3):
         rates, known = robot.try_jacobian(q)
         uphill = np.where(known[:, None], sign * np.sign(rates[:, k]), 0.0)
-        tried = robot.try_agreeing(np.clip(q + step * (high - low) * uphill, low, high))
+        tried = robot.try_project_redundant(np.clip(q + step * (high - low) * uphill, low, high))
         poses, good = try_forward(robot, tried)
         good[good] = reachable(robot, poses[good], -math.inf)
         good &= sign * (poses[:, k] - best[:, k]) > 0.0

@@ -129,7 +129,7 @@ def _friction_rates(m: Recording) -> Array:
     rates = moving_rates(qd, m.still, friction_reach(m.robot))
     # Redundant drives follow those at rest.
     rests = (rates != qd).any(1)
-    rates[rests] = m.robot.agreeing(m.q[rests], rates[rests])[1]
+    rates[rests] = m.robot.project_redundant(m.q[rests], rates[rests])[1]
     return rates
 
 

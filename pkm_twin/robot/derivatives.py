@@ -45,7 +45,7 @@ def joint_changes(
 
     :param back: of :meth:`Robot.inverse_jacobian`, shape (k, n, m).
     """
-    bent = robot.agreeing(q, qd)[2]
+    bent = robot.project_redundant(q, qd)[2]
     own = change - robot.pose_acceleration(q, qd, bent)
     return np.asarray(bent + (back @ own[..., None])[..., 0], np.float64)
 
@@ -62,7 +62,7 @@ def nearest_motion(robot: Robot, q: Array, qd: Array, qdd: Array) -> tuple[Array
     weighted = (back / robot.joint_scales[:, None] ** 2).swapaxes(-1, -2)
     onto = back @ np.linalg.inv(weighted @ back) @ weighted
     rate = (onto @ qd[..., None])[..., 0]
-    bent = robot.agreeing(q, rate)[2]
+    bent = robot.project_redundant(q, rate)[2]
     return rate, np.asarray(bent + (onto @ (qdd - bent)[..., None])[..., 0])
 
 

@@ -23,7 +23,7 @@ from pkm_twin.kinematics.passive import (
     passive_program,
     passive_rates_program,
 )
-from pkm_twin.kinematics.programs import agreeing_program
+from pkm_twin.kinematics.programs import projection_program
 from pkm_twin.kinematics.scheme import Closed
 from pkm_twin.kinematics.singularity import singularity_kernel
 from pkm_twin.machine import schema
@@ -372,7 +372,7 @@ class Robot(Mechanism):
         """What efforts of drives that share are compared by, shape (n,)."""
         return np.asarray(self.graph.sharing[1 : 1 + self.joints_count])
 
-    def agreeing(
+    def project_redundant(
         self, q: ArrayLike, qd: ArrayLike | None = None, qdd: ArrayLike | None = None
     ) -> tuple[Array, Array, Array]:
         """Positions, rates and accelerations of all actuated joints, by the leading ones.
@@ -387,20 +387,20 @@ class Robot(Mechanism):
         if not self.redundant:
             arrays = np.broadcast_arrays(*(np.asarray(one, np.float64) for one in given))
             return arrays[0], arrays[1], arrays[2]
-        first, second, third = self.evaluate(self.agreeing_kernel, _NONE, *given)
+        first, second, third = self.evaluate(self.projection_kernel, _NONE, *given)
         return first, second, third
 
-    def try_agreeing(self, q: Array) -> Array:
+    def try_project_redundant(self, q: Array) -> Array:
         """The positions alone, NaN where there is no assembly."""
         if not self.redundant:
             return q
         still = np.zeros(self.joints_count)
-        return self.agreeing_kernel(_NONE, q, still, still)[0][0]
+        return self.projection_kernel(_NONE, q, still, still)[0][0]
 
     @property
-    def agreeing_kernel(self) -> Kernel:
-        """The program of :meth:`agreeing`."""
-        return self.engine.kernel("agreeing", agreeing_program)
+    def projection_kernel(self) -> Kernel:
+        """The program of :meth:`project_redundant`."""
+        return self.engine.kernel("project_redundant", projection_program)
 
     def pose_acceleration(self, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike) -> Array:
         """Second derivative of the pose in time, shape (..., m) (Delta-CU paper, equation 6)."""
@@ -506,7 +506,7 @@ class Robot(Mechanism):
             ("has a velocity of {:.4g} {}, ", "what {} make it", "/s"),
             ("has an acceleration of {:.4g} {}, ", "what {} make it", "/s2"),
         )
-        found = self.agreeing_kernel(_NONE, *state)[0]
+        found = self.projection_kernel(_NONE, *state)[0]
         for k, (own, follows, (has, whence, per)) in enumerate(
             zip(state, found, ways, strict=True)
         ):

@@ -363,7 +363,7 @@ def random_joints(robot: Robot, rng: np.random.Generator, count: int) -> Array:
     least = min(INSIDE, 0.5 * float(robot.singularity(home)))
     while len(kept) < count:
         drawn = rng.uniform(middle - share * reach, middle + share * reach, (2 * count, len(home)))
-        drawn = robot.try_agreeing(drawn)
+        drawn = robot.try_project_redundant(drawn)
         measure, good = robot.try_singularity(drawn)
         good = good & (measure > least) & ((low <= drawn) & (drawn <= high)).all(-1)
         kept = np.concatenate([kept, drawn[good]])

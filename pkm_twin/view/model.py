@@ -138,7 +138,7 @@ class Model:
         random = np.random.default_rng(0).random((SAMPLES, robot.joints_count))
         corners = np.array(list(itertools.product((0.0, 1.0), repeat=robot.joints_count)))
         parts = np.concatenate([corners, random])
-        states = robot.try_agreeing(lows + (highs - lows) * parts)
+        states = robot.try_project_redundant(lows + (highs - lows) * parts)
         poses, good = robot.try_forward(states)
         rows = states[good]
         kept = [
@@ -210,14 +210,14 @@ class Model:
                 turned = Rotation.from_matrix(rotation @ turn.T).as_rotvec()
                 missing = weights * np.concatenate([position - at, turned])
                 twists = weights[:, None] * robot.platform_jacobian(q)
-                q = robot.agreeing(q + np.linalg.lstsq(twists, missing, rcond=1e-9)[0])[0]
+                q = robot.project_redundant(q + np.linalg.lstsq(twists, missing, rcond=1e-9)[0])[0]
         except ValueError as error:
             return _refused(state, str(error))
         return self._moved(state, q, None)
 
     def _moved(self, state: State, q: Array, asked: Array | None) -> State:
         try:
-            q = self.robot.agreeing(q)[0]
+            q = self.robot.project_redundant(q)[0]
         except ValueError as error:
             return _refused(state, str(error))
         _, found = beyond_limits(self.robot, q)

@@ -550,7 +550,7 @@ def test_drives_that_share_are_judged_by_what_moves(inner, factors, cause):
     time = np.arange(0.0, 4.0, 0.004)
     q = robot.inverse(robot.home() + 0.02 * np.sin(np.outer(time, [5.0, 7.0, 9.0])))
     qd = np.gradient(q, time, axis=0)
-    q, qd, qdd = robot.agreeing(q, qd, np.gradient(qd, time, axis=0))
+    q, qd, qdd = robot.project_redundant(q, qd, np.gradient(qd, time, axis=0))
     efforts = inverse_dynamics(robot, q, qd, qdd)
     efforts += inner * np.sin(2.0 * time)[:, None] * null_efforts(robot, q)[:, 0]
     report = check(Recording(robot, time, q, qd, effort=factors * efforts), thorough=False)

@@ -414,7 +414,7 @@ def test_drives_share_the_effort_in_the_controller_s_numbers(tmp_path):
     square = np.concatenate([twist.reshape(40, 6, 4)[:, [0, 1, 5]], idle[:, None]], 1)
     back = np.linalg.inv(square)[..., :3] / factors[:, None]
     np.testing.assert_allclose(back, model.inverse_jacobian(q), atol=1e-9)
-    still = model.agreeing(q, qd)[2]
+    still = model.project_redundant(q, qd)[2]
     np.testing.assert_allclose(change / factors, still, atol=1e-9)
     # As the solver splits efforts: what is left of a motion without accelerations of the leads.
     split = dynamics_terms(model, q, qd, still).velocity

@@ -47,7 +47,7 @@ def reached(robot, rng, count, reach=0.3):
     """Poses of joint positions at random about home."""
     scales = robot.joint_scales
     q = robot.graph.home + rng.uniform(-reach, reach, (count, robot.joints_count)) * scales
-    return robot.try_forward(robot.try_agreeing(q))[0]
+    return robot.try_forward(robot.try_project_redundant(q))[0]
 
 
 @pytest.mark.parametrize("seed", [1, 2])

@@ -370,7 +370,7 @@ def test_contradictions_are_no_assembly(planar, joint, what, amount):
     # What encoders differ by counts as the leading drives say.
     state[what] = state[what] - 0.99 * amount * np.eye(4)[joint]
     np.testing.assert_allclose(inverse_dynamics(planar, *state), good, atol=0.1)
-    agreed = planar.agreeing(*state)
+    agreed = planar.project_redundant(*state)
     np.testing.assert_allclose(agreed[0][:, :3], state[0][:, :3])
     np.testing.assert_allclose(
         inverse_dynamics(planar, *agreed), inverse_dynamics(planar, *state), atol=1e-12
@@ -455,7 +455,7 @@ def test_a_stream_of_encoders_that_differ_is_answered(planar, noise, apart):
             answered += 1
             np.testing.assert_allclose(answer.effort, expected[k], atol=apart)
             _, rate, change = answer.motion
-            _, *follows = planar.agreeing(*answer.motion)
+            _, *follows = planar.project_redundant(*answer.motion)
             np.testing.assert_allclose([rate, change], follows, atol=1e-9)
     assert answered == len(q) - 61
     now += step
@@ -475,11 +475,11 @@ def test_exported_functions_share_alike(planar, tmp_path):
     wrench = rng.uniform(-9, 9, (20, 6))
     asked = functions(planar) | {
         "null_efforts": lambda q: null_efforts(planar, q).reshape(20, -1),
-        "agreeing": lambda *motion: np.hstack(planar.agreeing(*motion)),
+        "project_redundant": lambda *motion: np.hstack(planar.project_redundant(*motion)),
     }
     assert set(package.heads) == set(asked)
     given = inputs_of(planar, (q, qd, qdd, wrench))
-    given |= {"null_efforts": (q,), "agreeing": (q, qd, qdd)}
+    given |= {"null_efforts": (q,), "project_redundant": (q, qd, qdd)}
     for name, ask in asked.items():
         status, found = package.run(program, name, *given[name])
         right = ask(*given[name])
@@ -537,7 +537,7 @@ def test_a_number_of_the_file_is_off_with_the_leading_joints_held(planar):
     q = planar.inverse([[0.02, -0.01, 0.1], [-0.02, 0.0, -0.1]])
     path, step = "parameters.base_radius", 1e-5
     placed = [
-        made.platform(made.agreeing(q)[0])[0]
+        made.platform(made.project_redundant(q)[0])[0]
         for made in (planar.filed({path: 0.3 + side * step}) for side in (1, -1))
     ]
     slope = (placed[0] - placed[1]) / (2 * step)
@@ -605,7 +605,7 @@ def test_a_plant_under_computed_efforts_follows_the_path(planar):
         plant.qd = qd[0].copy()
         for k in range(1, 2 * steps, 2):
             plant.advance(efforts[k], load, step)
-        np.testing.assert_allclose(robot.agreeing(plant.q)[0], plant.q, atol=1e-12)
+        np.testing.assert_allclose(robot.project_redundant(plant.q)[0], plant.q, atol=1e-12)
         missed.append(np.abs(robot.forward(plant.q) - pose[-1]).max())
     assert missed[1] < 0.3 * missed[0] < 0.3 * 2e-3
     step, inner = 1e-4, null_efforts(robot, q[0])[0]

@@ -128,7 +128,7 @@ def test_a_rounded_file_needs_the_efforts_of_the_exact_one(case, digits, how, tm
     home = exact.inverse(exact.home())
     size = min(1.0, robot.graph.size)
     q = home + rng.uniform(-0.02, 0.02, (STATES, len(home))) * size
-    states = exact.agreeing(q, *rng.normal(size=(2, *q.shape)))
+    states = exact.project_redundant(q, *rng.normal(size=(2, *q.shape)))
     expected = efforts(exact, exact.joint_names, states)
     try:
         other = read(tmp_path, rounded(text, digits, how), ending)

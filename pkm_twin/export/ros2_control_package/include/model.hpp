@@ -130,7 +130,7 @@ inline int null_efforts(const Vector & q, std::array<double, (JOINTS - FREEDOMS)
 /// unless drives share the effort.
 inline int make_agree(Vector & q, Vector & qd, Vector & qdd)
 {
-@AGREEING@
+@PROJECTION@
 }
 
 /// Parameters of another payload: mass (kg), com (m) from the reference point, inertia (kg m2)
