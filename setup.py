@@ -109,7 +109,7 @@ setup(
             "xarray",
             "yourdfpy",
         ],
-        "atlas": ["h5netcdf", "h5py", "plotly", "threadpoolctl", "xarray"],
+        "maps": ["h5netcdf", "h5py", "plotly", "threadpoolctl", "xarray"],
         "cluster": ["dask[distributed]"],
         "bags": ["pin", "PyNiteFEA"],
         "certificate": ["mpmath", "mujoco", "pin", "pytest", "scipy"],

@@ -74,7 +74,7 @@ def platform_response(robot: Robot, q: ArrayLike, wrench: ArrayLike) -> Platform
     :raises SingularityError: a singularity on the way from home, or a frame that is a mechanism.
     :raises ValueError: a wrong last axis, or a value that is not finite.
     """
-    names = robot.made(Elastic).names
+    names = robot.cached(Elastic).names
     row = _evaluate(robot, q, wrench)
     row.setflags(write=False)
     n = len(names)
@@ -107,12 +107,12 @@ def _evaluate(robot: Robot, q: ArrayLike, wrench: ArrayLike) -> Array:
 
 
 def _response_kernel(robot: Robot) -> Kernel:
-    return robot.made(Elastic).response
+    return robot.cached(Elastic).response
 
 
 def _evaluate_checked(robot: Robot, q: ArrayLike, wrench: ArrayLike) -> Array:
     q, wrench = doubles(q, "joint positions"), vectors(wrench, 6, "the wrench")
-    (rows,), status = robot.made(Elastic).response(NO_PARAMETERS, q, wrench)
+    (rows,), status = robot.cached(Elastic).response(NO_PARAMETERS, q, wrench)
     check(robot, q, wrench, rows[..., -1], status)
     return rows
 
@@ -154,7 +154,7 @@ def compliance(robot: Robot, pose: ArrayLike) -> Array:
     :raises UnreachableError: a pose that is none of the mechanism's, by limb, sample and miss.
         Other errors as :func:`platform_response`.
     """
-    _ = robot.made(Elastic)
+    _ = robot.cached(Elastic)
     return platform_response(robot, robot.inverse(pose), _UNLOADED).compliance.copy()
 
 
@@ -170,7 +170,7 @@ def stiffness(robot: Robot, pose: ArrayLike) -> Array:
 
 def strain_energy(robot: Robot, pose: ArrayLike, wrench: ArrayLike) -> PlatformResponse:
     """Return :func:`platform_response` for poses (..., m); errors also as :func:`compliance`."""
-    _ = robot.made(Elastic)
+    _ = robot.cached(Elastic)
     return platform_response(robot, robot.inverse(pose), wrench)
 
 
@@ -183,7 +183,7 @@ def member_deflections(
     :returns: points, shape (..., 5, 3), from start to end, and displacements of the same shape, m;
         base axes.
     """
-    elastic = robot.made(Elastic)
+    elastic = robot.cached(Elastic)
     (rows, measure), status = elastic.deflections(NO_PARAMETERS, q, wrench)
     check(robot, q, wrench, measure[..., 0], status)
     names = [member.name for member in elastic.plan.members]
@@ -196,7 +196,7 @@ def kernels(robot: Robot) -> tuple[Kernel, ...]:
 
     :raises ParameterError: a robot without elastic members.
     """
-    return robot.engine.forward, robot.made(Elastic).response
+    return robot.engine.forward, robot.cached(Elastic).response
 
 
 @lru_cache(maxsize=8)

@@ -41,7 +41,7 @@ def compliance_derivatives(robot: Robot, pose: ArrayLike, by: Sequence[str] = ()
     by_q, by_numbers = _evaluate_gradients(robot, pose, _write_compliance)
     found: dict[str, Array] = {}
     if by:
-        slopes = robot.made(FileNumbers, tuple(by), elastic_numbers).slopes
+        slopes = robot.cached(FileNumbers, tuple(by), elastic_numbers).slopes
         table = _unravel_square(by_numbers @ slopes)
         found = {path: np.ascontiguousarray(table[..., k]) for k, path in enumerate(by)}
     back = robot.inverse_jacobian(robot.inverse(pose))
@@ -67,7 +67,7 @@ def energy_effects(robot: Robot, pose: ArrayLike, wrench: ArrayLike) -> Array:
 
 def _cause_effects(robot: Robot, pose: ArrayLike, write: Write, *loads: Array) -> Array:
     """Return the change of a program's outputs per standard deviation of each cause."""
-    causes = robot.made(CauseSlopes, elastic_numbers)
+    causes = robot.cached(CauseSlopes, elastic_numbers)
     table = _evaluate_gradients(robot, pose, write, causes.chosen, *loads)[1] @ causes.slopes
     return np.asarray(table, np.float64)
 
@@ -82,7 +82,7 @@ def _evaluate_gradients(
     """
     compliance(robot, pose)  # its errors
     q = robot.inverse(pose)
-    kernel = _gradient_kernel(robot.made(Elastic), write, chosen)
+    kernel = _gradient_kernel(robot.cached(Elastic), write, chosen)
     weights = np.eye(kernel.sizes[0][-1])
     (by_q, by_numbers), _ = kernel(NO_PARAMETERS, q[..., None, :], *loads, weights)
     if by_q.shape[-1]:

@@ -58,7 +58,7 @@ def limb_stiffness(robot: Robot, pose: ArrayLike) -> LimbStiffness:
     whole = compliance(robot, pose)
     columns, owner = elastic_columns(robot, robot.inverse(pose))
     count = wrenches.shape[-3]
-    limb = owner // (len(robot.made(Elastic).names) // count)
+    limb = owner // (len(robot.cached(Elastic).names) // count)
     back = np.linalg.pinv(wrenches)
     found = [_condense(columns[..., limb == number]) for number in range(count)]
     stiffness = back @ np.stack(found, -3) @ np.swapaxes(back, -1, -2)

@@ -106,7 +106,7 @@ def element_response(robot: Robot, pose: ArrayLike) -> ElementResponse:
     platform, elements = (np.linalg.solve(root, side) for side in (unit, own))
     turned = np.swapaxes(elements, -1, -2)
     return ElementResponse(
-        robot.made(Elastic).names, owner, whole, np.swapaxes(platform, -1, -2) @ elements,
+        robot.cached(Elastic).names, owner, whole, np.swapaxes(platform, -1, -2) @ elements,
         np.eye(len(owner)) - turned @ elements,
     )  # fmt: skip
 
@@ -118,7 +118,7 @@ def elastic_columns(robot: Robot, q: Array) -> tuple[Array, Indices]:
     :returns: columns, shape (..., size, r), the platform's six displacements first; and the element
         of each column by index, shape (r,).
     """
-    (entries, *places), _ = robot.made(Elastic).columns(NO_PARAMETERS, q)
+    (entries, *places), _ = robot.cached(Elastic).columns(NO_PARAMETERS, q)
     rows, columns, owner = (np.atleast_2d(p)[0].astype(int) for p in places)
     own = np.zeros((*q.shape[:-1], rows.max() + 1, len(owner)))
     own[..., rows, columns] = entries

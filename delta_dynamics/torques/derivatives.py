@@ -82,15 +82,15 @@ def torque_effects(
     robot: Robot, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, wrench: ArrayLike | None
 ) -> Array:
     """What one standard deviation of each of the file's causes changes, shape (..., n, causes)."""
-    causes = robot.made(CauseSlopes, geometry_and_masses)
-    kernel = robot.made(_effects)
+    causes = robot.cached(CauseSlopes, geometry_and_masses)
+    kernel = robot.cached(_effects)
     inputs = _inputs((q, qd, qdd), wrench, np.eye(robot.joints_count), rows=True)
     (table,) = robot.evaluate(kernel, robot.inertial, *inputs)
     return np.asarray(table @ causes.slopes, np.float64)
 
 
 def _effects(robot: Robot) -> Kernel:
-    chosen = robot.made(CauseSlopes, geometry_and_masses).chosen
+    chosen = robot.cached(CauseSlopes, geometry_and_masses).chosen
     return robot.massive().kernel(
         f"torque gradient by {chosen}", partial(_by_chosen, chosen), free=True
     )
@@ -116,7 +116,7 @@ def _by_paths(robot: Robot, inputs: Sequence[Array], by: Sequence[str]) -> dict[
 
 def numbers_slopes(robot: Robot, by: Sequence[str]) -> Array:
     """Derivatives of geometry and masses by numbers of the file, shape (numbers, paths)."""
-    return robot.made(FileNumbers, tuple(by), geometry_and_masses).slopes
+    return robot.cached(FileNumbers, tuple(by), geometry_and_masses).slopes
 
 
 def torques_by_numbers(

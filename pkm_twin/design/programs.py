@@ -106,7 +106,7 @@ loads: Final = asks(loads_kernel, of_masses)
 """From q, qd, qdd and wrench to the joints' loads and positions."""
 masses: Final = asks(masses_kernel, of_masses)
 """From q to the mass matrix."""
-compliance: Final = asks(lambda robot: robot.made(Elastic).compliance, of_elasticity)
+compliance: Final = asks(lambda robot: robot.cached(Elastic).compliance, of_elasticity)
 """From q to the compliance and its frame's pivot ratio."""
 torque_gradient: Final = asks(motion_gradient, of_masses)
 """Derivatives of the torques by q, qd and qdd."""
@@ -119,6 +119,6 @@ pose_motion: Final = asks(lambda robot: pose_motion_gradient(robot.engine))
 singularity_slopes: Final = asks(lambda robot: singularity_gradient(robot.engine))
 """Derivatives of the index by q and geometry."""
 compliance_slopes: Final = asks(
-    lambda robot: compliance_gradient(robot.made(Elastic)), of_elasticity
+    lambda robot: compliance_gradient(robot.cached(Elastic)), of_elasticity
 )
 """Derivatives of the compliance by q and all numbers."""

@@ -404,7 +404,7 @@ def design(
         best = _choose_middle(told, names)
     before = problem.point(problem.variables.start, constraints)
     return Design(
-        robot.filed(best.numbers), best, before, tuple(told) if len(aims) > 1 else (),
+        robot.with_file_values(best.numbers), best, before, tuple(told) if len(aims) > 1 else (),
         tuple(names), constraints, problem.count, rejected,
     )  # fmt: skip
 

@@ -76,7 +76,7 @@ class Variants:
             raise ParameterError("numbers", sizes, "as many of each, one per machine") from None
         self.values: Array = np.stack([np.atleast_1d(row) for row in rows], -1)
         """Values of the paths, shape (k, paths)."""
-        self.functions = robot.made(programs.NumberFunctions, self.paths)
+        self.functions = robot.cached(programs.NumberFunctions, self.paths)
         self._own: dict[int, Robot | PkmTwinError] = {}
         self._patterns: dict[int, str] = {}
         self._prepared: dict[int, tuple[Code, Array]] = {}
@@ -93,7 +93,7 @@ class Variants:
         if k not in self._own:
             try:
                 given = dict(zip(self.paths, self.values[k].tolist(), strict=True))
-                self._own[k] = self.robot.filed(given)
+                self._own[k] = self.robot.with_file_values(given)
             except PkmTwinError as error:
                 self._own[k] = error
         found = self._own[k]

@@ -88,7 +88,7 @@ class Package:
         self.elastic: Elastic | None = None
         if self._wants("compliance") or self._wants("strain_energy"):
             try:
-                made = robot.made(Elastic)
+                made = robot.cached(Elastic)
                 _ = made.response
                 self.elastic = made
             except RigidError:

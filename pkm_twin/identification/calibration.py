@@ -259,7 +259,7 @@ def geometric(robot: Robot, q: Array, only: Sequence[str] = ()) -> tuple[str, ..
         if not path.startswith(NOT_GEOMETRY if only else (*NOT_GEOMETRY, f"{PARAMETERS}."))
         and (not only or path.startswith(tuple(only)))
     ]
-    slopes = robot.made(FileNumbers, tuple(paths), geometry_numbers).slopes
+    slopes = robot.cached(FileNumbers, tuple(paths), geometry_numbers).slopes
     paths = [path for path, moves in zip(paths, np.abs(slopes).max(0) > 1e-9, strict=True) if moves]
     found: list[str] = []
     if paths:
@@ -459,7 +459,7 @@ def _calibrated(
         found = fit(robot, before, learnt, near, progress)
         steps += found.steps
     told = [replace(p, value=float(v)) for p, v in zip(told, found.values, strict=True)]
-    built = robot.filed(found.state.numbers)
+    built = robot.with_file_values(found.state.numbers)
     agreements, outliers = _compared(robot, built, learnt, apart, before, found, parameters)
     changes = [p for p in told if p.name not in (*FRAME, *TARGET, *learnt.own)]
     count = len({k for m in (learnt, apart) if m for one in m.readings for k in one.lines.tolist()})

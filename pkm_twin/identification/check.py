@@ -530,7 +530,7 @@ def _of_fit(found: Checked, bound: float) -> Explained:
     try:
         part = [recorded_of(r, found.left_out)]
         first = fit(r.robot, part, ("friction",), accept=True, causes=[None])
-        rubbing = r.robot.filed({one.name: one.after for one in first.numbers})
+        rubbing = r.robot.with_file_values({one.name: one.after for one in first.numbers})
         if not first.accepted and agrees(replace(r, robot=rubbing), found.left_out, bound):
             return (_fitted("friction other than the file's explains", first),), ()
         last, *_ = fit_recordings(r.robot, [r], accept=True)

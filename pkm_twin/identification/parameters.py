@@ -107,7 +107,7 @@ def file_parameters(robot: Robot, what: Sequence[Kind] = KINDS) -> FileParameter
 
     :raises ParameterError: the robot's file gives no masses.
     """
-    kept = [_scaled(g, robot) for g in robot.made(identifiable) if g.kind in what]
+    kept = [_scaled(g, robot) for g in robot.cached(identifiable) if g.kind in what]
     place = {name: k for k, name in enumerate(parameter_names(robot))}
     tree = robot.engine.tree
     mixing = np.zeros((len(place), sum(len(group.names) for group in kept)))

@@ -45,7 +45,7 @@ def write_page(data: Dataset, path: Path) -> Path:
 
     :raises MissingExtraError: plotly is not installed.
     """
-    require("plotly", "atlas")
+    require("plotly", "maps")
     kind = figures.kind_of(data)
     with reading(source(data)):
         first, *rest = figures.lines(data)
@@ -86,7 +86,7 @@ def _case_layout(data: Dataset, case: int, values: Array) -> tuple[float, str, d
 
 
 def _layers(data: Dataset) -> Any:
-    graph = require("plotly.graph_objects", "atlas")
+    graph = require("plotly.graph_objects", "maps")
     units = figures.units_of(data)
     dims = list(units)
     upwards = data.attrs["height"] or dims[2]
@@ -148,7 +148,7 @@ def _layers(data: Dataset) -> Any:
 
 
 def _planes(data: Dataset) -> Any:
-    graph = require("plotly.graph_objects", "atlas")
+    graph = require("plotly.graph_objects", "maps")
     figure, buttons = graph.Figure(), []
     every = [(k, p) for k in range(len(data.case)) for p in figures.full_planes(data, k)]
     for k, p in every:

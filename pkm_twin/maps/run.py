@@ -81,7 +81,7 @@ def run(
     :raises MissingExtraError: a package that is not installed.
     """
     # Check before hours of work.
-    require("h5netcdf", "atlas")
+    require("h5netcdf", "maps")
     if workers is not None and workers < 1:
         raise PkmTwinError(f"workers is {workers}; it has to be 1 or more")
     with writing(out):

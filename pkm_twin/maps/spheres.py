@@ -272,7 +272,7 @@ def _draw_rates(data: Dataset, ax: Any) -> None:
 
 def make_page(data: Dataset) -> Any:
     """Return the spheres as a plotly figure to turn; a menu chooses the index."""
-    graph = require("plotly.graph_objects", "atlas")
+    graph = require("plotly.graph_objects", "maps")
     from pkm_twin.maps.page import BAR, FLAT_LIGHT, MARGIN, MENU, button, round_digits
 
     ways, places = data.way.values, _sphere_centres(data)

@@ -316,7 +316,7 @@ def join(sweep: Map, parts: Parts, out: Path) -> None:
 
 
 def _write_file(sweep: Map, parts: Parts, sink: _Sink) -> None:
-    h5netcdf = require("h5netcdf", "atlas")
+    h5netcdf = require("h5netcdf", "maps")
     summaries = sweep.summaries(parts.grid())
     with h5netcdf.File(sink, "w") as file:
         file.dimensions = sweep.sizes | {
@@ -351,7 +351,7 @@ def _write_file(sweep: Map, parts: Parts, sink: _Sink) -> None:
 def _write_variable(file: Any, name: str, dims: tuple[str, ...], values: Any, attrs: Any) -> None:
     array = np.asarray(values)
     if array.dtype.kind == "U":
-        h5py = require("h5py", "atlas")
+        h5py = require("h5py", "maps")
         variable = file.create_variable(name, dims, h5py.string_dtype())
         for index in np.ndindex(array.shape):
             variable[index] = str(array[index])
@@ -401,8 +401,8 @@ def open_map(path: Path) -> Dataset:
 
     :raises MapError: no map, a damaged one, or one with impossible numbers.
     """
-    xarray = require("xarray", "atlas")
-    require("h5netcdf", "atlas")
+    xarray = require("xarray", "maps")
+    require("h5netcdf", "maps")
     with writing(path):
         if not path.exists():
             raise MapError(path, "no such file")

@@ -492,7 +492,7 @@ def map_of(
         raise ParameterError("least_clearance", least_clearance, what)
     if at is not None:
         robot.inverse(at)
-    bounds = robot.made(workspace_box)
+    bounds = robot.cached(workspace_box)
     count = len(bounds)
     stack = None
     if regular:

@@ -168,7 +168,9 @@ class Machine(TwinRobot):
         """
         parameters = sections.pop(PARAMETERS, {})
         if isinstance(parameters, Mapping) and parameters:
-            self = self.filed({f"{PARAMETERS}.{name}": v for name, v in parameters.items()})
+            self = self.with_file_values(
+                {f"{PARAMETERS}.{name}": v for name, v in parameters.items()}
+            )
         made = super().changed(**sections)
         if not sections or not set(sections) <= set(self.changeable):
             return made
@@ -235,13 +237,13 @@ class Machine(TwinRobot):
         described = shared_by(described, leads, sharing, own["limits"].effort)
         return made._with(described=described, specs=specs, sources=sources, book=book, **own)
 
-    def filed(self, values: Mapping[str, Any]) -> Any:
+    def with_file_values(self, values: Mapping[str, Any]) -> Any:
         """As of every robot; parameters and expressions stay, but where a copy's number is new."""
         data: Any = copy.deepcopy(self.book.data)
         values = self.resolved(values)
         kept = data and (self.book.values or self.book.formulas)
         if not kept or not all(has_entry(data, path) for path in values):
-            return super().filed(values)
+            return super().with_file_values(values)
         for path, value in values.items():
             *keys, last = keys_of(path)
             reduce(getitem, keys, data)[last] = value

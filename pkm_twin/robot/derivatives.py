@@ -128,7 +128,7 @@ def _by_numbers(robot: Robot, q: ArrayLike, rows: Array, by: Sequence[str]) -> d
     """Sums of rows over pose, position and rotation, by numbers of the file."""
     if not by:
         return {}
-    slopes = robot.made(FileNumbers, tuple(by), geometry_numbers).slopes
+    slopes = robot.cached(FileNumbers, tuple(by), geometry_numbers).slopes
     table = _by_geometry(robot, q, rows) @ slopes
     return {path: np.ascontiguousarray(table[..., k]) for k, path in enumerate(by)}
 
@@ -143,7 +143,7 @@ def position_effects(robot: Robot, q: ArrayLike) -> Array:
 
     :returns: translations of the reference point, shape (..., 3, causes), m.
     """
-    causes, m = robot.made(CauseSlopes, geometry_numbers), len(robot.pose_names)
+    causes, m = robot.cached(CauseSlopes, geometry_numbers), len(robot.pose_names)
     table = _by_geometry(robot, q, np.eye(3, m + 12, m))[..., list(causes.chosen)]
     return np.asarray(table @ causes.slopes, np.float64)
 

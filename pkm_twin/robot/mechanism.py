@@ -513,7 +513,7 @@ class Mechanism(Common):
             raise unknown_number(path, self.file_numbers())
         return number_in(schema.plain(getattr(self, str(keys[0]))), keys[1:], path)
 
-    def filed(self: R, values: Mapping[str, Any]) -> R:
+    def with_file_values(self: R, values: Mapping[str, Any]) -> R:
         """The robot of the same file with other numbers at dotted paths.
 
         :raises ParameterError: an unknown path, or a value that the file may not have.

@@ -91,14 +91,14 @@ class Robot(Mechanism):
         return {}
 
     @cached_property
-    def _made(self) -> dict[tuple[object, ...], Any]:
+    def _cached(self) -> dict[tuple[object, ...], Any]:
         return {}
 
-    def made(self, make: Callable[..., T], *options: Hashable) -> T:
+    def cached(self, make: Callable[..., T], *options: Hashable) -> T:
         """What a function makes of this robot and other arguments, made once."""
-        found: T | None = self._made.get((make, *options))
+        found: T | None = self._cached.get((make, *options))
         if found is None:
-            found = self._made[make, *options] = make(self, *options)
+            found = self._cached[make, *options] = make(self, *options)
         return found
 
     def bound(

@@ -364,7 +364,7 @@ class TwinNode(GuardedNode):
         super().__init__(name)
         self._tasks = Tasks(self.failed)
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", output_qos())
-        self._made = threading.Event()
+        self._cached = threading.Event()
         threading.Thread(target=self._report_start, daemon=True).start()
 
     def _report_start(self) -> None:
@@ -372,7 +372,7 @@ class TwinNode(GuardedNode):
         logger = self.get_logger()
         # If a constructor fails, the context ends meanwhile.
         with suppress(Exception):
-            while not self._made.wait(START_REPORT_PERIOD) and self.context.ok():
+            while not self._cached.wait(START_REPORT_PERIOD) and self.context.ok():
                 logger.info(COMPILING, once=True)
                 self._diagnostics.publish(self.health.array(WARN, COMPILING))
 
@@ -382,7 +382,7 @@ class TwinNode(GuardedNode):
         :param leap: forward step of the ROS clock that calls :meth:`time_jumped_forward`, s.
         """
         self.close_declarations()
-        self._made.set()
+        self._cached.set()
         self.create_guarded_timer(1.0, self._publish_diagnostics)
         self.create_service(Trigger, "~/reset", self._on_reset)
         for service in self.services:

@@ -288,7 +288,7 @@ class Model:
         """Joint positions of the softest pose, or of the one that a wrench (6,) moves most.
 
         The second part is the answer in words, with its units. The search is that of
-        ``pkm-twin atlas``; ``tell`` gets the part that is done, 0 to 1.
+        ``pkm-twin map``; ``tell`` gets the part that is done, 0 to 1.
 
         :raises PkmTwinError: no elasticity in the robot's file, or no pose that counts.
         """

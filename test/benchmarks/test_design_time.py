@@ -32,7 +32,7 @@ def test_an_optimiser_that_compiles_each_machine_finds_no_better_one(benchmark, 
         nonlocal counted
         counted += 1
         try:
-            machine = robot.filed(dict(zip(BOX, x.tolist(), strict=True)))
+            machine = robot.with_file_values(dict(zip(BOX, x.tolist(), strict=True)))
             q = machine.inverse(path.pose)
             miss = 0.1 - machine.singularity(q).min()
             qd = np.linalg.solve(machine.jacobian(q), path.rate[..., None])

@@ -103,7 +103,7 @@ def crooked(seed: int, only: list[str], count: int) -> tuple[Robot, Poses]:
     sizes, known = {"m": 1e-3, "": 3e-3}, robot.file_numbers()
     moved = {p: known[p] for p in geometric(robot, q, only) if not p.endswith(".home")}
     values = {p: v + sizes[unit] * rng.normal() for p, (v, unit) in moved.items()}
-    position, rotation = robot.filed(values).platform(q)
+    position, rotation = robot.with_file_values(values).platform(q)
     turn = Rotation.from_rotvec(1e-4 * rng.normal(size=position.shape)).as_matrix()
     noisy = position + NOISE * rng.normal(size=position.shape)
     return robot, Poses(q + 1e-3 * rng.normal(size=3), noisy, turn @ rotation)

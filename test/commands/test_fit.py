@@ -93,10 +93,10 @@ def test_refusals(twin, tmp_path, monkeypatch, arguments, text):
 def test_excite_writes_a_trajectory_within_the_limits_that_rests_at_both_ends(twin, tmp_path):
     out = tmp_path / "excite.mcap"
     data = twin.told(
-        "excite", "delta_cu", "--trials", "20", "--beside", DELTA, "--acceleration", "60",
+        "excite", "delta_cu", "--trials", "20", "--compare", DELTA, "--acceleration", "60",
         "--out", out,
     )  # fmt: skip
-    assert 1.0 < data["condition"] < data["condition_beside"]
+    assert 1.0 < data["condition"] < data["condition_compared"]
     (message,) = open_bag(out).messages()
     points = message.message.points
     robot = load("delta_cu")
@@ -150,7 +150,7 @@ def test_copies_of_a_limb_keep_elastic_parts_and_the_joint_map(tmp_path):
         assert len(identifiable(other)) > len(identifiable(robot))
         expected = compliance(robot, robot.home())
         assert compliance(other, other.home()) == pytest.approx(expected, rel=1e-9)
-    again = robot.filed({"origin[2]": robot.file_numbers()["origin[2]"][0]})
+    again = robot.with_file_values({"origin[2]": robot.file_numbers()["origin[2]"][0]})
     assert again.structure().compliances == robot.structure().compliances
     assert [beam.radius for beam in again.beams] == [beam.radius for beam in robot.beams]
 

@@ -202,7 +202,7 @@ def which_length(a: Asked) -> None:
     )
 
     def peak(value: float) -> float:
-        made = a.robot.filed({path: value})
+        made = a.robot.with_file_values({path: value})
         q = made.inverse(pose)
         efforts = inverse_dynamics(made, q, *joint_rates(made, q, rate, change))
         return float(np.abs(efforts).max())

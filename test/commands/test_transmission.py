@@ -89,7 +89,7 @@ def test_a_measured_hexapod_is_predicted_as_well_as_by_a_fit_of_each_leg(
     robot = load(EXAMPLES / "hexapod.yaml")
     nodes = [f"joints.{end}_{k}.at[{i}]"
              for end, k, i in product((FOOT, BALL), range(1, 7), range(3))]  # fmt: skip
-    real = robot.filed({n: robot.number(n) + 4e-3 * rng.normal() for n in nodes})
+    real = robot.with_file_values({n: robot.number(n) + 4e-3 * rng.normal() for n in nodes})
     box = np.array([0.12, 0.12, 0.09, 0.15, 0.15, 0.15])
     q = real.inverse(robot.home() + [0, 0, 0.1, 0, 0, 0] + box * rng.uniform(-1, 1, (count, 6)))
     factors = robot.controller.factors * rng.uniform(0.93, 0.99, 6)

@@ -172,7 +172,7 @@ def lengths(m: Drawn, rng: np.random.Generator) -> Recording:
         path = str(rng.choice(named or list(found)))
         step = 0.01 * (found[path] if abs(found[path]) > 0.1 * robot.size else robot.size)
         try:
-            other = robot.filed({path: found[path] + step})
+            other = robot.with_file_values({path: found[path] + step})
             effort = inverse_dynamics(other, m.q, m.qd, m.qdd)
         except (PkmTwinError, ValueError):
             continue

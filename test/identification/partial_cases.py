@@ -53,7 +53,7 @@ def case(drawn: Robot, kinds: Sequence[str], count: int, seed: int, flat: bool =
         turned = any(word in path for word in ("axis", "axes", "angle", "azimuth"))
         size = OFF / drawn.size if turned else OFF
         truth[path] = drawn.number(path) + float(rng.normal(scale=size))
-    real = drawn.filed(truth)
+    real = drawn.with_file_values(truth)
     scales = [OFF if unit == "m" else OFF / drawn.size for unit in drawn.joint_units]
     offsets = rng.normal(size=len(scales)) * scales
     names = zip(drawn.joint_names, drawn.controller.offsets + offsets, strict=True)

@@ -30,7 +30,7 @@ FAULTS = ("one_effort_negated", "effort_columns_swapped", "half_speed", "kilogra
 
 
 def fitted(result: Fit) -> Robot:
-    return result.robot.filed({number.name: number.after for number in result.numbers})
+    return result.robot.with_file_values({number.name: number.after for number in result.numbers})
 
 
 def agree(robot: Robot, recorded: Recording) -> str:
@@ -67,7 +67,7 @@ def test_an_encoder_s_noise_is_not_the_model_s_fault(name: str) -> None:
     result = fit(m.robot, [recorded], ("friction", "payload"))
     assert result.verdict.answer == "explains"
     friction = {n.name: n.after for n in result.numbers if n.name.startswith("friction")}
-    robot = m.truth.filed(friction)
+    robot = m.truth.with_file_values(friction)
     compared = compare(replace(recorded, robot=robot))
     assert compared is not None and compared.good.all()
     (end,) = result.problem.held_out

@@ -34,7 +34,7 @@ def sound(seed: int) -> tuple[Robot, tuple[str, ...], Poses]:
     paths = geometric(robot, q)
     known = {p: robot.file_numbers()[p] for p in paths}
     size = {"m": 3e-3, "rad": 0.03, "": 0.03}
-    truth = robot.filed({p: v + size[u] * rng.normal() for p, (v, u) in known.items()})
+    truth = robot.with_file_values({p: v + size[u] * rng.normal() for p, (v, u) in known.items()})
     position = truth.platform(q)[0] + NOISE * rng.normal(size=(60, 3))
     return robot, paths, Poses(q + 0.03 * rng.normal(size=3), position)
 
@@ -84,7 +84,7 @@ def test_an_offset_that_no_number_takes_up_is_a_frame_too() -> None:
 
 def test_changes_beyond_their_prior_are_rejected_or_marked(tmp_path: Path) -> None:
     robot, _, poses = sound(0)
-    far = robot.filed({"geometry.forearm_length": 0.1 + _forearm(robot)})
+    far = robot.with_file_values({"geometry.forearm_length": 0.1 + _forearm(robot)})
     there = Poses(poses.joints, far.platform(poses.joints)[0])
     only = ("geometry.arm_length", "geometry.forearm_length")
     with pytest.raises(PkmTwinError, match=r"geometry.forearm_length changes by 0.1 m"):

@@ -66,7 +66,7 @@ def test_columns_are_differences_of_the_efforts(name: str) -> None:
         sides = []
         try:
             for one in (heavy, none):
-                pair = [one.filed({path: one.number(path) + h}) for h in (-step, step)]
+                pair = [one.with_file_values({path: one.number(path) + h}) for h in (-step, step)]
                 low, high = (inverse_dynamics(other, *rows.signals.motion.joints) for other in pair)
                 sides.append((high - low) / (2.0 * step))
         except ValueError:

@@ -113,7 +113,7 @@ def test_distances_and_angles_of_new_poses_err_by_what_is_stated(
         found = calibrate(robot, one.measured, one.paths)
         own = robot.controller
         offsets = [one.truth[f"joint_map.{joint}.offset"] for joint in robot.joint_names]
-        real = robot.filed({path: one.truth[path] for path in one.paths})
+        real = robot.with_file_values({path: one.truth[path] for path in one.paths})
         rng, joints = np.random.default_rng([seed, 9]), one.measured.joints
         part, ends = rng.uniform(size=(40, 1)), joints[rng.integers(rows, size=(2, 40))]
         new = ends[0] + part * (ends[1] - ends[0])

@@ -148,7 +148,7 @@ def test_members_are_those_of_the_frame(name, sections, variant, rng):
 
 def box(robot, count=25):
     """Poses around all that a robot reaches, shape (..., m)."""
-    ticks = [np.linspace(low, high, count) for low, high in robot.made(workspace_box)]
+    ticks = [np.linspace(low, high, count) for low, high in robot.cached(workspace_box)]
     return np.stack(np.meshgrid(*ticks, indexing="ij"), -1)
 
 

@@ -94,7 +94,7 @@ def test_members_of_a_frame_are_fitted():
 
 def test_factors_stand_in_the_file_and_wrong_names_are_refused(tmp_path):
     robot = load("upr_rpu").changed(element_compliance={"3U": 3.0})
-    again = robot.filed({"element_compliance.3U": 2.0})
+    again = robot.with_file_values({"element_compliance.3U": 2.0})
     assert again.element_compliance == {"3U": 2.0}
     with pytest.raises(UnknownNameError, match="did you mean '3U'"):
         robot.changed(element_compliance={"3V": 3.0})

@@ -67,7 +67,7 @@ def test_numbers_are_those_of_the_robot_and_not_of_another_with_its_geometry(nam
     robot = load(name)
     keys = [path for path, (_, unit) in robot.file_numbers().items() if unit in ("kg", "kg/m3")]
     own = [path for path in keys if not path.startswith(("payload", "members", "limits"))]
-    heavier = robot.filed({path: 1.5 * robot.file_numbers()[path][0] for path in own})
+    heavier = robot.with_file_values({path: 1.5 * robot.file_numbers()[path][0] for path in own})
     before, after = (file_parameters(r, ("payload", "inertia")) for r in (robot, heavier))
     masses = [k for k, n in enumerate(after.names) if n.endswith((".mass", "density"))]
     np.testing.assert_allclose(after.values[masses], 1.5 * before.values[masses], rtol=1e-9)

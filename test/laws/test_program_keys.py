@@ -28,7 +28,7 @@ def kernels(robot):
         "loads": loads_kernel(robot),
     }
     if has(robot, "structure"):
-        elastic = robot.made(Elastic)
+        elastic = robot.cached(Elastic)
         found |= {"response": elastic.response, "gradient": compliance_gradient(elastic)}
     return found
 

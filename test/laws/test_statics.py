@@ -166,7 +166,7 @@ def test_other_numbers_take_the_same_program():
         for k, v in parameters_of("upr_rpu")["joints_compliance"].items()
     }
     other = robot.changed(members={"diameter": [0.07, 0.08, 0.09]}, joints_compliance=joints)
-    other = other.filed({"geometry.base_radius": 1.03 * robot.geometry.base_radius})
+    other = other.with_file_values({"geometry.base_radius": 1.03 * robot.geometry.base_radius})
     program = kernels(robot)[1].code
     assert kernels(other)[1].code is program
     joints["rpu_universal"][0] = 0.0

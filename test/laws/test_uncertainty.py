@@ -89,7 +89,7 @@ def test_effects_are_differences_of_machines_with_other_numbers() -> None:
 
     def effect(cause: dict[str, float], call: Callable[[Robot], Array]) -> Array:
         low, high = (
-            robot.filed({p: robot.number(p) + step * d for p, d in cause.items()})
+            robot.with_file_values({p: robot.number(p) + step * d for p, d in cause.items()})
             for step in (-0.01, 0.01)
         )
         return (call(high) - call(low)) / 0.02
@@ -152,7 +152,7 @@ def test_a_machine_keeps_what_its_file_says_beside_its_graph() -> None:
     joint = robot.joint_names[0]
     data = {**given(robot.parameter_sections()), "mechanism": "machine"}
     mapped = robot_of_data({**data, "joint_map": {joint: {"offset": 0.1}}}, "mine")
-    again = mapped.filed({"origin[2]": mapped.file_numbers()["origin[2]"][0]})
+    again = mapped.with_file_values({"origin[2]": mapped.file_numbers()["origin[2]"][0]})
     assert again.controller.offsets[0] == 0.1
     q = again.inverse(again.home())
     still = np.zeros_like(q)

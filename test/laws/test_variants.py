@@ -266,7 +266,7 @@ def test_what_was_changed_stays_when_another_number_changes(name, rng):
     friction = {key: rng.uniform(1.0, 2.0, n).tolist() for key in ("viscous", "coulomb")}
     changed = robot.changed(friction=friction, payload={"mass": 0.3}, limits={"velocity": 7.0})
     path = next(path for path, (_, unit) in changed.file_numbers().items() if unit == "kg")
-    again = changed.filed({path: changed.file_numbers()[path][0]})
+    again = changed.with_file_values({path: changed.file_numbers()[path][0]})
     state = motion(robot, rng, 3)
     expected = inverse_dynamics(changed, *state)
     np.testing.assert_allclose(inverse_dynamics(again, *state), expected, rtol=1e-12)
@@ -430,7 +430,7 @@ def test_a_frame_that_is_singular_at_home_has_programs_of_its_own(rng):
 
 def test_closures_that_are_left_out_follow_from_the_others():
     robot = soft("bolted", np.random.default_rng(7), 0.6)
-    elastic, engine = robot.made(Elastic), robot.engine
+    elastic, engine = robot.cached(Elastic), robot.engine
     chosen = elastic.followers
     assert chosen is not None
     for x, q in engine.samples:

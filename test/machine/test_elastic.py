@@ -172,7 +172,7 @@ def test_a_joint_beside_its_member_is_on_a_rigid_lever(joint):
 def test_factors_of_elements_stand_in_what_is_written_out(delta_in_the_graph_form):
     machine, _ = delta_in_the_graph_form
     softer = machine.changed(element_compliance={"arm I": 2.0})
-    again = softer.filed({"element_compliance.arm I": 3.0})
+    again = softer.with_file_values({"element_compliance.arm I": 3.0})
     assert again.element_compliance == {"arm I": 3.0}
     expected = machine.changed(element_compliance={"arm I": 3.0})
     size = np.abs(compliance(expected, POSES[0])).max()

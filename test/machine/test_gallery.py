@@ -42,7 +42,7 @@ def test_each_number_of_a_template_moves_a_machine_that_assembles(name):
     for parameter in robot.book.values.keys() - robot.book.own.keys():
         path = f"parameters.{parameter}"
         value = 1.01 * robot.number(path)
-        made = robot.filed({path: value})
+        made = robot.with_file_values({path: value})
         assert made.graph.key != robot.graph.key or (made.inertial != robot.inertial).any()
         state = made.project_redundant(q, q, 1.0 + q)
         expected = inverse_dynamics(made, *state)

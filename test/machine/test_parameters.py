@@ -114,7 +114,7 @@ def test_a_variant_that_a_file_may_not_be_is_not_valid_between_those_that_it_may
 def test_a_derivative_by_a_parameter_is_that_of_differences(name):
     robot, path, step = robot_with(), f"parameters.{name}", 1e-5
     slope = torque_derivatives(robot, Q, RATE, SECOND, by=[path]).by[path]
-    ends = [torques(robot.filed({path: robot.number(path) + s})) for s in (-step, step)]
+    ends = [torques(robot.with_file_values({path: robot.number(path) + s})) for s in (-step, step)]
     assert slope == pytest.approx((ends[1] - ends[0]) / (2 * step), rel=1e-7, abs=1e-8)
 
 
@@ -122,7 +122,7 @@ def test_a_parameter_of_tolerances_and_doubt():
     robot, path = robot_with(), "parameters.arm"
     moved = tolerances(robot, {path: 1e-4}, Q).sensitivity[path]
     step = 1e-6
-    places = [robot.filed({path: 0.2 + s}).platform(Q)[0] for s in (-step, step)]
+    places = [robot.with_file_values({path: 0.2 + s}).platform(Q)[0] for s in (-step, step)]
     assert moved[:3] == pytest.approx((places[1] - places[0]) / (2 * step), abs=1e-7)
     assert robot.causes[path] == {path: 1e-4}
 
@@ -246,7 +246,7 @@ def test_changed_parameters_stay_parameters():
 def test_what_is_changed_stays_when_a_parameter_moves(sections):
     robot, new = robot_with().changed(**sections), {"parameters.arm": 0.21}
     expected = torques(robot_with(arm=0.21).changed(**sections))
-    assert torques(robot.filed(new)) == pytest.approx(expected, abs=1e-13)
+    assert torques(robot.with_file_values(new)) == pytest.approx(expected, abs=1e-13)
     assert torques(robot.numbered(new)) == pytest.approx(expected, abs=1e-13)
 
 
@@ -255,7 +255,7 @@ def test_numbers_that_are_set_one_after_another_are_those_set_at_once():
     second = {"limbs.joints.motor.axis[2]": 0.01, "parameters.m": 0.2}
     expected = torques(robot_with().numbered(first | second))
     assert torques(robot_with().numbered(first).numbered(second)) == pytest.approx(expected)
-    assert torques(robot_with().numbered(first).filed({})) == pytest.approx(
+    assert torques(robot_with().numbered(first).with_file_values({})) == pytest.approx(
         torques(robot_with().numbered(first))
     )
 

@@ -538,7 +538,7 @@ def test_a_number_of_the_file_is_off_with_the_leading_joints_held(planar):
     path, step = "parameters.base_radius", 1e-5
     placed = [
         made.platform(made.project_redundant(q)[0])[0]
-        for made in (planar.filed({path: 0.3 + side * step}) for side in (1, -1))
+        for made in (planar.with_file_values({path: 0.3 + side * step}) for side in (1, -1))
     ]
     slope = (placed[0] - placed[1]) / (2 * step)
     found = tolerances(planar, {path: 1e-3}, q)
@@ -556,7 +556,7 @@ def test_a_design_has_less_effort_than_every_machine_of_a_grid(planar):
     name = "parameters.elbow_x"
 
     def peak(value):
-        made = planar.filed({name: value})
+        made = planar.with_file_values({name: value})
         q = made.inverse(pose)
         efforts = inverse_dynamics(made, q, *joint_rates(made, q, speed, change), path.wrench)
         return np.abs(efforts).max()

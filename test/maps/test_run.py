@@ -208,7 +208,7 @@ def test_typed_errors(tmp_path, strain, monkeypatch):
     with pytest.raises(MissingExtraError, match=r"\[cluster\]"):
         run(sweep, tmp_path / "b.nc", scheduler="tcp://127.0.0.1:9")
     monkeypatch.setitem(sys.modules, "h5netcdf", None)
-    with pytest.raises(MissingExtraError, match=r"\[atlas\]"):
+    with pytest.raises(MissingExtraError, match=r"\[maps\]"):
         run(sweep, tmp_path / "c.nc")
 
 

@@ -33,7 +33,7 @@ ERRORS = {
         "use the suggested name; `pkm-twin robots` lists the robots",
     ),
     errors.MissingExtraError: (
-        errors.MissingExtraError("h5netcdf", "atlas"),
+        errors.MissingExtraError("h5netcdf", "maps"),
         "install the extra that the line names",
     ),
     errors.MobilityError: (

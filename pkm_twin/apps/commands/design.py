@@ -352,8 +352,8 @@ def swept(given: Design, path: Path, kind: str) -> Report:
         )
     if out is None or out.suffix != ".nc":
         raise ParameterError("out", str(out), "a name that ends in .nc, for --sweep")
-    require("h5netcdf", "atlas")
-    require("xarray", "atlas")
+    require("h5netcdf", "maps")
+    require("xarray", "maps")
     robot, way = read_path(given, path)
     box = parse_vary(given.vary)
     grid = kind == "grid"

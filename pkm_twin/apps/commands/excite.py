@@ -46,7 +46,7 @@ class Excite(OfRobot, AwayFromSingular, Seeded, Writes):
         Path("excite.mcap"), "MCAP to write; the CSV has the same name with .csv", writes=True,
         endings=(".mcap",),
     )  # fmt: skip
-    beside: Path | None = setting(None, "also report the condition number of this bag")
+    compare: Path | None = setting(None, "also report the condition number of this bag")
     friction: bool = setting(
         False, "slow sweeps up and down, one joint at a time, for friction", name="sweeps",
         older=("--friction",),
@@ -79,7 +79,7 @@ def excite(given: Excite) -> Report:
 
     machine = given.machine()
     judge = Judge.of(machine, file_parameters(machine, kinds_of(given.what)))
-    other = None if given.beside is None else _condition_of(given.beside, judge)
+    other = None if given.compare is None else _condition_of(given.compare, judge)
     bounds = Bounds(given.share, given.acceleration, given.singularity, given.rate)
     best: Any
     if given.friction:
@@ -100,7 +100,7 @@ def excite(given: Excite) -> Report:
     notes = []
     if other is not None:
         told = f"{other:.4g}" if np.isfinite(other) else "infinite, it does not excite all of them"
-        notes.append(f"condition number of {given.beside}: {told}")
+        notes.append(f"condition number of {given.compare}: {told}")
     if not best.condition < LARGE and not given.friction:
         notes.append(
             f"a condition number above {LARGE:g}: a fit will know some parameters badly; try a "
@@ -121,7 +121,7 @@ def excite(given: Excite) -> Report:
         facts=[
             Fact("robot", machine.name), Fact("condition", best.condition),
             Fact("duration_s", best.duration, "s"), Fact("base_parameters", len(judge.columns)),
-            *shape, Fact("beside", given.beside), Fact("condition_beside", other),
+            *shape, Fact("compare", given.compare), Fact("condition_compared", other),
         ],
         notes=notes,
         files=given.files,

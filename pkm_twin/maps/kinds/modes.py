@@ -112,7 +112,7 @@ class Modes(Frequency):
     @classmethod
     def page(cls, data: Dataset) -> Any:
         """Return a figure of the frame at rest and in a mode, with menu and animation."""
-        graph = require("plotly.graph_objects", "atlas")
+        graph = require("plotly.graph_objects", "maps")
         from pkm_twin.maps.page import BAR, CAMERA, MARGIN, MENU, button
 
         rest, path = data.position.values, _join_edges(data.line.values)
