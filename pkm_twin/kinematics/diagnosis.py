@@ -9,29 +9,40 @@ Else what moves although the actuated joints are held is named, or which of them
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import MobilityError, ParameterError
-from pkm_twin.kinematics.conditions import Condition, Conditions
 from pkm_twin.kinematics.linkage import Linkage
-from pkm_twin.kinematics.rounding import repair
+from pkm_twin.kinematics.rounding import repair_few
 from pkm_twin.kinematics.spins import idle_bodies, null
-from pkm_twin.machine.graph import Graph
+from pkm_twin.machine.graph import Graph, Joint
 
-TOLERANCES: Final = (1e-8, 1e-7, 1e-6, 1e-5, 1e-4, 1e-3, 3e-3, 1e-2)
-"""Deviations up to which conditions are made to hold, rad and parts of the machine's size."""
+EXACT: Final = 1e-11
+"""Deviations below this are the computer's rounding, rad or parts of the machine's size."""
+EVERYWHERE: Final = "where all loops close in every position"
 MAX_CAUSES: Final = 5
 """Most causes that an error names."""
-_TRIED: Final = 40
-"""Most conditions that are tried one by one."""
 _NONE: Final = 1e-6
 """Motions that are less are none."""
 
 
-def mobility_error(linkage: Linkage, causes: Sequence[Condition] = ()) -> MobilityError:
+class Deviation(NamedTuple):
+    """A deviation of an axis or point that takes a freedom away.
+
+    ``text``: a sentence. ``parts``: the joint or rod, and the joint that it is compared with.
+    ``deviation``: rad or m; ``size``: rad or parts of the machine's size.
+    """
+
+    text: str
+    parts: tuple[str, ...]
+    deviation: float
+    size: float
+
+
+def mobility_error(linkage: Linkage, causes: Sequence[Deviation] = ()) -> MobilityError:
     """The error of a machine whose actuated joints do not determine it, with the causes.
 
     :param causes: what nearly holds; empty: looked for.
@@ -63,39 +74,49 @@ def singular_home(linkage: Linkage, rank: int, beside: int) -> ParameterError:
     )  # fmt: skip
 
 
-def near_conditions(graph: Graph, freedoms: int = 0) -> list[Condition]:
-    """Conditions that, were they exact, would give the mobility that the actuated joints need.
+def near_conditions(graph: Graph, freedoms: int = 0) -> list[Deviation]:
+    """Find deviations without which the machine has the mobility that the actuated joints need.
 
-    :param freedoms: that they would give at least, in place of one an actuated joint.
-    :returns: the least set that is found, the largest deviation first; empty where there is none.
+    :param freedoms: required degrees of freedom; 0: one for each actuated joint, which then
+        determine the machine.
+    :returns: the fewest that are found, the largest first; empty if there are none.
     """
-    tried = 0
-    for tolerance in TOLERANCES:
-        conditions = Conditions(graph, tolerance)
-        missed = sorted(conditions.missed, key=lambda c: c.size)
-        if len(missed) == tried:
-            continue
-        tried = len(missed)
-        if not is_right(conditions.idealized(), freedoms):
-            continue
-        dropped: list[Condition] = []
-        for condition in missed[:_TRIED]:
-            if is_right(conditions.idealized([*dropped, condition]), freedoms):
-                dropped.append(condition)
-        left = [c for c in missed if not any(c is d for d in dropped)]
-        return sorted(left, key=lambda c: -c.size)
-    for tolerance in TOLERANCES:
-        moved = repair(graph, tolerance)
-        if moved and moved.largest < tolerance and is_right(moved.graph, freedoms):
-            return [
-                Condition(
-                    f"{name} is {size:.2g} (rad, or parts of the machine's size) from where all "
-                    "loops close in every position", (name,), size, size,
-                )
-                for name, size in sorted(moved.moves.items(), key=lambda move: -move[1])
-                if size > 0.1 * moved.largest
-            ]  # fmt: skip
-    return []
+    repaired = repair_few(graph, freedoms or len(graph.leads))
+    if repaired is None or not is_right(repaired.graph, freedoms):
+        return []
+    found: list[Deviation] = []
+    new = repaired.graph
+    for name, joint in new.joints.items():
+        for k, axis in enumerate(joint.axes):
+            angle = float(np.linalg.norm(np.cross(axis, graph.joints[name].axes[k])))
+            which = f"{name}'s axis" + (f" {k + 1}" if len(joint.axes) > 1 else "")
+            other = _parallel_joint(new, joint, axis)
+            goal = f"parallel to {other}'s axis" if other else EVERYWHERE
+            parts = (name, other) if other else (name,)
+            found.append(Deviation(f"{which} is {angle:.2g} rad from {goal}", parts, angle, angle))
+    points = [(f"{n}", n, new.joints[n].at - j.at) for n, j in graph.joints.items()]
+    points += [
+        (f"the {side} of {n}", n, new.rods[n].ends[k] - rod.ends[k])
+        for n, rod in graph.rods.items() for k, side in enumerate(("start", "end"))
+    ]  # fmt: skip
+    for which, name, change in points:
+        gap = float(np.linalg.norm(change))
+        text = f"{which} is {1e3 * gap:.3g} mm from {EVERYWHERE}"
+        found.append(Deviation(text, (name,), gap, gap / graph.size))
+    found = [one for one in found if one.size > EXACT]
+    return sorted(found, key=lambda one: -one.size)
+
+
+def _parallel_joint(graph: Graph, joint: Joint, axis: Array) -> str:
+    """Return the first joint of one axis parallel to an axis of a joint, if it can be one's own."""
+    others = [
+        other for other in graph.joints.values() if other is not joint and len(other.axes) == 1
+    ]
+    others.sort(key=lambda other: not {joint.inner, joint.outer} & {other.inner, other.outer})
+    for other in others:
+        if float(np.linalg.norm(np.cross(axis, other.axes[0]))) < EXACT:
+            return other.name
+    return ""
 
 
 def is_right(graph: Graph | None, freedoms: int = 0) -> bool:

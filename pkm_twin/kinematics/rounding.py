@@ -14,7 +14,7 @@ are parts of the machine's size, angles are in rad.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Final, NamedTuple
 
@@ -48,6 +48,13 @@ EXACT: Final = 1e-10
 NOISE: Final = 100.0
 """Part of the largest effect of numbers on the loops below which one comes from rounding: this many
 times the largest singular value that should be zero."""
+MAX_NOISE: Final = 1e-2
+"""Most of that part: NOISE times MAX_ROUNDING."""
+MAX_DEVIATION: Final = 3e-2
+"""Largest deviation of an axis or point that is taken for an error and not for the design, rad or
+parts of the machine's size."""
+MOST_MOVED: Final = 6
+"""Most vectors that are chosen one by one."""
 
 Slot = tuple[str, str, int]
 """A vector of the graph: ``at`` or ``axis`` of a joint, or ``end`` of a rod, and which."""
@@ -127,6 +134,49 @@ def repair(graph: Graph, precision: float) -> Repair | None:
     return None
 
 
+def repair_few(graph: Graph, freedoms: int) -> Repair | None:
+    """Move as few axes and points as possible, so that a machine that lost freedoms has them.
+
+    Vectors are chosen one by one, each the one whose change leaves the loops least open: orthogonal
+    matching pursuit (Pati, Rezaiifar and Krishnaprasad 1993). Where MOST_MOVED do not close the
+    loops, all are moved as by :func:`repair`.
+
+    :param freedoms: degrees of freedom that the machine should have.
+    :returns: None if the machine has them, or if no change within MAX_DEVIATION gives them.
+    """
+    loops = _Loops(graph)
+    rank = 6 * loops.bodies - freedoms
+    sizes = np.linalg.svd(loops.equations(*loops.home(1))[1][0], compute_uv=False)
+    if not 0 < rank < len(sizes) or sizes[rank] > MAX_DEVIATION:
+        return None
+    positions = loops.walk(rank, POSITIONS[1], STEPS)
+    gap, effect, noise = loops.openings(rank, positions)
+    chosen: list[Slot] = []
+    basis = np.zeros((len(gap), 0))
+    for _ in range(MOST_MOVED):
+        best, least = None, float(np.linalg.norm(gap)) * (1.0 - 1e-6)
+        for slot, columns in effect.items():
+            apart = columns - basis @ (basis.T @ columns)
+            left, strength, _ = np.linalg.svd(apart, full_matrices=False)
+            own = left[:, strength > noise]
+            rest = gap - own @ (own.T @ gap)
+            # Of vectors that do the same the first is taken.
+            if float(np.linalg.norm(rest)) < least * (1.0 - 1e-6):
+                best, least, remaining, added = slot, float(np.linalg.norm(rest)), rest, own
+        if best is None:
+            break
+        chosen.append(best)
+        gap, basis = remaining, np.hstack([basis, added])
+        trial = _Loops(graph)
+        if trial.close(rank, positions, chosen) and trial.are_exact(
+            rank, trial.walk(rank, CHECKED, STEPS, seed=1)
+        ):
+            found = trial.repair()
+            return found if found.largest < MAX_DEVIATION else None
+    all_moved = repair(graph, 2.0 * float(sizes[rank]))
+    return all_moved if all_moved and all_moved.largest < MAX_DEVIATION else None
+
+
 def _least(table: Array, value: Array, rank: int) -> Array:
     """Solve table x = value in all positions with the largest ``rank`` singular values alone."""
     left, sizes, rows = np.linalg.svd(table, full_matrices=False)
@@ -204,8 +254,29 @@ class _Loops:
         miss = np.abs(self.equations(*positions)[0]).max(initial=0.0)
         return bool(miss < CLOSED and (self.sizes(positions)[:, rank:] < EXACT).all())
 
-    def close(self, rank: int, positions: tuple[Array, Array]) -> bool:
-        """Move the vectors by least changes until all loops close in all positions, if they can."""
+    def openings(
+        self, rank: int, positions: tuple[Array, Array]
+    ) -> tuple[Array, dict[Slot, Array], float]:
+        """Return how far loops stay open whatever the bodies do, and its change by the vectors.
+
+        :returns: openings, shape (k,); derivatives by each vector, (k, 3); the bound below which
+            a singular value of these is noise.
+        """
+        value, table, by_numbers = self.equations(*positions)
+        left, sizes, _ = np.linalg.svd(table)
+        left = left[:, :, rank:].transpose(0, 2, 1)
+        effect = (left @ by_numbers).reshape(-1, by_numbers.shape[2])
+        gap = np.einsum("kfi,ki->kf", left, value).ravel()
+        noise = min(MAX_NOISE, NOISE * max(EXACT, float(sizes[:, rank:].max(initial=0.0))))
+        return gap, {s: effect[:, 3 * k : 3 * k + 3] for k, s in enumerate(self._vectors)}, noise
+
+    def close(
+        self, rank: int, positions: tuple[Array, Array], slots: Sequence[Slot] | None = None
+    ) -> bool:
+        """Move vectors by least changes until all loops close in all positions, if they can.
+
+        :param slots: the vectors that may move; by default all.
+        """
         rotation, place = positions
         last = np.inf
         for _ in range(ROUNDS):
@@ -213,12 +284,10 @@ class _Loops:
             miss = float(np.abs(value).max(initial=0.0))
             if miss < 0.1 * CLOSED or miss > 0.5 * last:
                 break
-            left, sizes, _ = np.linalg.svd(table)
-            left = left[:, :, rank:].transpose(0, 2, 1)
-            noise = NOISE * max(EXACT, float(sizes[:, rank:].max(initial=0.0)))
-            effect = (left @ by_numbers).reshape(-1, by_numbers.shape[2])
-            gap = np.einsum("kfi,ki->kf", left, value).ravel()
-            change = -np.linalg.lstsq(effect, gap, rcond=noise)[0]
+            gap, effect, noise = self.openings(rank, (rotation, place))
+            allowed = [effect[s] * (slots is None or s in slots) for s in effect]
+            step = np.linalg.lstsq(np.hstack(allowed), gap, rcond=noise)[0]
+            change = np.asarray(-step, np.float64)
             self.change(change)
             closing = _least(table, value + by_numbers @ change, rank)
             rotation, place = _moved(rotation, place, -closing)

@@ -14,10 +14,9 @@ from typing import Final
 import numpy as np
 
 from pkm_twin.codegen.arrays import Array
-from pkm_twin.kinematics.conditions import merged
 from pkm_twin.kinematics.linkage import Linkage
 from pkm_twin.kinematics.motion import Motion
-from pkm_twin.machine.graph import BASE, Body, Graph, Joint, array
+from pkm_twin.machine.graph import BASE, Body, Graph, Joint, array, merged
 from pkm_twin.machine.joints import across, unit
 from pkm_twin.machine.tree import Tree
 

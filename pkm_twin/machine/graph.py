@@ -363,6 +363,12 @@ def groups(things: Iterable[T], pairs: Iterable[tuple[T, T]]) -> list[list[T]]:
     return [sorted(group, key=place.__getitem__) for group in found.values()]
 
 
+def merged(graph: Graph) -> dict[str, str]:
+    """Return for each body, the ground too, the first of those that fixed joints unite with it."""
+    fixed = ((j.inner, j.outer) for j in graph.joints.values() if j.kind == "fixed")
+    return {name: one[0] for one in groups([BASE, *graph.bodies], fixed) for name in one}
+
+
 def spanning(things: Iterable[T], pairs: Mapping[K, tuple[T, T]]) -> list[K]:
     """The pairs that make trees: each that joins what no earlier ones do."""
     own = {thing: [thing] for thing in things}

@@ -16,9 +16,8 @@ import numpy as np
 
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError, PkmTwinError
-from pkm_twin.kinematics.conditions import merged
 from pkm_twin.kinematics.singularity import singularity_at_home
-from pkm_twin.machine.graph import BASE, Graph, Joint
+from pkm_twin.machine.graph import BASE, Graph, Joint, merged
 from pkm_twin.robot.robot import Robot
 
 LARGEST: Final = 20.0
