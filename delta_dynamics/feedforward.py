@@ -31,6 +31,7 @@ from pkm_twin.robot.limits import first_beyond
 from pkm_twin.robot.robot import Robot
 from pkm_twin.robot.workspace import passing_singularity
 from pkm_twin.settings import COUNT, FUTURE, LATE, SECONDS, SHARE, ZERO_STAMP, setting
+from pkm_twin.streams.base_motion import BaseImu
 from pkm_twin.streams.continuity import Continuity
 from pkm_twin.streams.differentiator import Differentiator
 from pkm_twin.streams.matched import WrenchWindow
@@ -122,7 +123,7 @@ class Settings:
         )
 
 
-STOPPING: Final = (NON_FINITE, "singular", "jump", "no wrench")
+STOPPING: Final = (NON_FINITE, "singular", "jump", "no wrench", "no base motion")
 """Reasons for which one sample stops the stream: it is none that the model describes."""
 SLICE: Final = 256
 """Points of a trajectory that are answered in one go."""
@@ -159,13 +160,15 @@ class Torques(NamedTuple):
 class Feedforward(Core):
     """Answers trajectories and a stream of joint states with feedforward efforts.
 
-    ``wrenches``: those that the stream's efforts bear; None bears none. ``uncertain``: the doubt of
-    rates is computed for every robot, else it is known of those with dry friction alone.
+    ``wrenches``: those that the stream's efforts bear; None bears none. ``base``: measures the
+    motion of the base; None: it is at rest. ``uncertain``: the doubt of rates is computed for every
+    robot, else it is known of those with dry friction alone.
     """
 
     robot: Robot
     settings: Settings = field(default_factory=Settings)
     wrenches: WrenchWindow | None = None
+    base: BaseImu | None = None
     uncertain: bool = False
 
     def __post_init__(self) -> None:
@@ -183,6 +186,8 @@ class Feedforward(Core):
         self.limits = EffortLimits(self.robot)
         self.pose: MeasuredPose | None = None
         """Of the last accepted joint state."""
+        self._pull: Array | None = None
+        """Mean acceleration of the base less gravity there, shape (3,); None: at rest."""
         self._memory: Memory | None = None
         """Of the drives' friction; None before the stream's first answer."""
         self.differentiator = _differentiator(s, self.robot)
@@ -190,7 +195,7 @@ class Feedforward(Core):
         self._rest = VelocityErrorEstimator(_slope_gain(self.differentiator))
         self.rates = RateAgreement(self.robot)
         self._reach = friction_reach(self.robot)
-        self._rules = s.stamp_rules
+        self._take_rules(s)
         self._reader = JointReader(self.robot, extra_joints=s.extra_joints)
         self._continuity = Continuity(
             self.robot, s.singularity_warn, s.singularity_stop, self._reader.highest_velocity
@@ -209,7 +214,7 @@ class Feedforward(Core):
         before, self.settings = self.settings, settings
         self.stream.trip_count = settings.trip_count
         self.stream.recovery_count = settings.recovery_count
-        self._rules = settings.stamp_rules
+        self._take_rules(settings)
         if settings.extra_joints != before.extra_joints:
             self._reader = JointReader(self.robot, extra_joints=settings.extra_joints)
         self._continuity.warn = settings.singularity_warn
@@ -223,9 +228,16 @@ class Feedforward(Core):
             if self.wrenches is not None:
                 self.wrenches.change_fit(settings.order, settings.window)
 
+    def _take_rules(self, settings: Settings) -> None:
+        self._rules = settings.stamp_rules
+        if self.base is not None:
+            self.base.rules = self._rules
+
     def reset(self) -> None:
         """Forget the stream and the pose, as when the clock jumps: no torque across the seam."""
         self.pose = None
+        if self.base is not None:
+            self.base.clear()
         self._forget_stream()
 
     def stop(self, reason: str, text: str) -> None:
@@ -326,12 +338,18 @@ class Feedforward(Core):
         if self.settings.on_stop == "nothing":
             return None
         pose = self.pose if self.settings.on_stop == "gravity" else None
-        return find_holding_effort(self.limits, pose, steady, self.settings.stale_after)
+        return find_holding_effort(self.limits, pose, steady, self.settings.stale_after, self._pull)
 
     def _trajectory_steps(
         self, message: Any, now: int, holding: bool
     ) -> Generator[None, None, LimitedEfforts]:
         robot, settings, reader, limits = self.robot, self.settings, self._reader, self.limits
+        if self.base is not None:
+            raise MessageError(
+                "base motion",
+                "the motion of the base during a trajectory is unknown; with base_imu only joint "
+                "states are answered",
+            )
         t = reader.trajectory(message, now)
         yield
         qd, qdd = _derivatives(t, settings.differentiate)
@@ -427,6 +445,9 @@ class Feedforward(Core):
                 self.stream.stop("stale input", text)
             self._begin_anew()
         wrench = None if self.wrenches is None else self.wrenches.require(sample.stamp)
+        base = None
+        if self.base is not None:
+            base = self.base.require(sample.stamp, self.robot.gravity)
         try:
             near_singular = as_message_error(self._continuity.step, sample.stamp, sample.q)
         except MessageError:
@@ -445,7 +466,7 @@ class Feedforward(Core):
                     external, measured = self.wrenches.through()
                 motion, sure, change = as_message_error(self._moving, sample, rates, doubt)
                 solved = as_message_error(
-                    inverse_dynamics, self.robot, sample.q, sure, change, external
+                    inverse_dynamics, self.robot, sample.q, sure, change, external, base
                 )
                 memory, added = self._remembered(sample.q, sure)
                 controller, effort = self.robot.controller, solved + added
@@ -463,6 +484,7 @@ class Feedforward(Core):
             raise
         self._last_stamp = sample.stamp
         self.pose = MeasuredPose.from_sample(sample.q, sample.stamp, now, steady)
+        self._pull = None if self.base is None else self.base.mean
         if sample.qd is not None:
             self.rates.push(sample.stamp, sample.q, sample.qd)
         self.near_singular = near_singular
@@ -527,8 +549,10 @@ def _slope_gain(fit: Differentiator) -> float:
     return fit_gain(fit.order + 1, fit.window, fit.window - 1)
 
 
-def warm_up(robot: Robot) -> None:
+def warm_up(robot: Robot, *, base: bool = False) -> None:
     """Compile, or load, what live use calls: single samples and batches.
+
+    :param base: whether the base moves.
 
     :raises ParameterError: a robot without masses.
     """
@@ -538,7 +562,7 @@ def warm_up(robot: Robot) -> None:
         rest = np.zeros_like(here)
         robot.forward(here)
         robot.singularity(here)
-        inverse_dynamics(robot, here, rest, rest)
+        inverse_dynamics(robot, here, rest, rest, base=np.zeros(9) if base else None)
 
 
 def _of_points(first: int, call: Callable[..., Any], *arguments: Any) -> Any:

@@ -39,9 +39,15 @@ class MeasuredPose(NamedTuple):
 
 
 def find_holding_effort(
-    limits: EffortLimits, pose: MeasuredPose | None, steady: int, max_age: float
+    limits: EffortLimits,
+    pose: MeasuredPose | None,
+    steady: int,
+    max_age: float,
+    base: Array | None = None,
 ) -> LimitedEfforts:
     """Return the effort against gravity in the pose, shape (n,), or zeros.
+
+    ``base``: acceleration of the base less gravity, shape (3,), m/s2; None: at rest.
 
     Zeros without a pose, where the pose is older than ``max_age`` (s), where the model has no
     effort for it, and where the effort exceeds a limit: a machine that cannot be held must not be
@@ -53,7 +59,8 @@ def find_holding_effort(
         return zeros
     rest = np.zeros(robot.joints_count)
     try:
-        effort = inverse_dynamics(robot, pose.q, rest, rest)
+        moving = None if base is None else np.concatenate([np.zeros(6), base])
+        effort = inverse_dynamics(robot, pose.q, rest, rest, base=moving)
         return limits.apply(robot.controller.controller_efforts(effort), "zeros")[0]
     except (PkmTwinError, ValueError):
         return zeros

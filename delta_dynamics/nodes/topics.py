@@ -25,6 +25,8 @@ TWIN: Final = table(
           "a whole trajectory; a zero stamp means start on receipt", whole=True),
     Topic("in", "joint_states", JOINTS, "a stream, matched by name in any order"),
     Topic("in", "wrench", WRENCH, "the external wrench on the platform", "`use_wrench`"),
+    Topic("in", "base_imu", "sensor_msgs/Imu",
+          "angular velocity of the base, and its acceleration less gravity", "`base_imu`"),
     Topic("out", "~/joint_trajectory_ff", TRAJECTORY,
           "the input with `effort` added, for joint_trajectory_controller"),
     Topic("out", "~/joint_torques", JOINTS, "names and effort, with the stamp of the input"),

@@ -11,6 +11,7 @@ from typing import Any, Final
 
 import numpy as np
 from geometry_msgs.msg import WrenchStamped
+from sensor_msgs.msg import Imu
 
 from delta_dynamics.feedforward import Feedforward, Settings, Torques, warm_up
 from delta_dynamics.nodes.estimates import Estimates
@@ -28,6 +29,7 @@ from pkm_twin.ros.run import run
 from pkm_twin.ros.turns import Task
 from pkm_twin.ros.wrench import declare_mounts
 from pkm_twin.settings import SECONDS, changeable, with_parameters
+from pkm_twin.streams.base_motion import BaseImu, ImuSettings
 from pkm_twin.streams.matched import WrenchWindow
 from pkm_twin.streams.monitor import Pace
 from pkm_twin.streams.topics import topic_tokens
@@ -45,11 +47,12 @@ class DeltaDynamics(TwinNode):
     def __init__(self) -> None:
         super().__init__("delta_dynamics")
         robot = self.declare_robot()
+        base = self._create_base()
         # Before there is a topic to be found by: the first start compiles for many seconds.
-        warm_up(robot)
+        warm_up(robot, base=base is not None)
         robot = changed(robot, declare_changes(self, robot))
         settings = self.declare_settings(Settings)
-        self.core = Feedforward(robot, settings, self._create_wrenches(settings))
+        self.core = Feedforward(robot, settings, self._create_wrenches(settings), base)
         commands = self.declare("publish_commands", False, "publish ~/commands")
         if commands and "on_stop" not in self.given:
             # A controller of plain commands holds the last one for ever.
@@ -80,6 +83,9 @@ class DeltaDynamics(TwinNode):
             every=True,
         )
         self._action = self._create_action()
+        if base is not None:
+            self._check_base()
+            self.create_guarded_subscription("base_imu", self._on_imu, expected=True, every=True)
         self.follow(
             [*CHANGES, *changeable(Settings)],
             self._prepare,
@@ -158,8 +164,9 @@ class DeltaDynamics(TwinNode):
             return health.WARN, "an effort exceeded its limit"
         if estimates.touching and not estimates.idle:
             return health.WARN, "contact detected: an external effort is beyond its bound"
-        if core.wrenches is not None and core.wrenches.last_reject:
-            return health.WARN, f"last reject: {core.wrenches.last_reject}"
+        for one in (core.wrenches, core.base):
+            if one is not None and one.last_reject:
+                return health.WARN, f"last reject: {one.last_reject}"
         if estimates.idle:
             message = "the drives are off or braked: their efforts are ignored"
         return level, message
@@ -186,6 +193,8 @@ class DeltaDynamics(TwinNode):
         if core.wrenches is not None:
             values["joint states without a wrench"] = core.wrenches.without
             values |= core.wrenches.stream.counts("wrenches")
+        if core.base is not None:
+            values |= core.base.stream.counts("messages of base_imu")
         return values
 
     def _window_text(self) -> str:
@@ -287,6 +296,31 @@ class DeltaDynamics(TwinNode):
             settings.order,
             settings.window,
         )
+
+    def _create_base(self) -> BaseImu | None:
+        """Return what measures the motion of the base, where the parameter asks for it."""
+        wanted = self.declare(
+            "base_imu", False, "take the motion of the base from base_imu, else it is at rest; "
+            "only joint states are answered then"
+        )  # fmt: skip
+        settings = self.declare_settings(ImuSettings, fixed=True)
+        return BaseImu(settings) if wanted else None
+
+    def _check_base(self) -> None:
+        """Reject what takes the base as at rest.
+
+        :raises ParameterError: naming the parameter.
+        """
+        for name in ("publish_reactions", "estimate_payload", "observe_wrench"):
+            if self.get_parameter(name).value:
+                raise ParameterError(name, True, "false with base_imu: it is for a base at rest")
+        if self._action is not None:
+            given = self.get_parameter("controller_action").value
+            raise ParameterError("controller_action", given, "empty with base_imu")
+
+    def _on_imu(self, message: Imu) -> None:
+        if self.core.base is not None:
+            self.core.base.take(message, self.now())
 
     def _on_wrench(self, message: WrenchStamped) -> None:
         wrenches = self.core.wrenches

@@ -23,6 +23,7 @@ from pkm_twin.codegen.kernels import Kernel
 from pkm_twin.codegen.lu import SparseLU
 from pkm_twin.codegen.program import Program
 from pkm_twin.kinematics import pose as poses
+from pkm_twin.kinematics.motion import BaseMotion
 from pkm_twin.kinematics.posed import CarriedScheme
 from pkm_twin.kinematics.programs import certify_assembly, follow_pose, solve_pose
 from pkm_twin.kinematics.traced import Traced
@@ -108,7 +109,7 @@ def _pose_torques(t: Traced, scheme: CarriedScheme, *, certified: bool) -> Progr
     rods, gravity, passive = parts[1], parts[2], parts[-1]
     rate, acceleration = (t.tape.inputs(name, m) for name in ("rate", "acceleration"))
     posed.set_rates(rate)
-    posed.set_accelerations(acceleration, gravity)
+    posed.set_accelerations(acceleration, BaseMotion.at_rest(gravity))
 
     # J_M' Q_M + sum of J_H' Q_H, on the pose coordinates (3-PRRU paper).
     forces = Forces(posed.motion)

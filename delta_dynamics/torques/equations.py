@@ -15,6 +15,7 @@ from delta_dynamics.torques.virtual_work import Forces, begun, mass_entries, pot
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.codegen.kernels import Kernel
 from pkm_twin.codegen.program import Program
+from pkm_twin.kinematics.motion import BaseMotion
 from pkm_twin.kinematics.traced import Traced
 from pkm_twin.machine.inertia import loaded_joints
 from pkm_twin.robot.robot import Robot
@@ -87,7 +88,7 @@ def _motion(t: Traced) -> Program:
     n, graph, motion = t.joints, t.scheme.graph, t.motion
     qd = t.tape.inputs("qd", n)
     t.set_rates(qd)
-    t.set_accelerations(np.zeros(n), gravity)
+    t.set_accelerations(np.zeros(n), BaseMotion.at_rest(gravity))
     forces = Forces(motion)
     forces.inertia(bodies, rods)
     drift = []

@@ -20,7 +20,7 @@ from pkm_twin.codegen.expressions import PARAMETERS
 from pkm_twin.codegen.kernels import Kernel
 from pkm_twin.codegen.program import Program
 from pkm_twin.errors import SingularityError
-from pkm_twin.kinematics.motion import cross, reaction_directions
+from pkm_twin.kinematics.motion import BaseMotion, cross, reaction_directions
 from pkm_twin.kinematics.traced import Traced
 from pkm_twin.machine.graph import BASE, Graph, Joint, Rod
 from pkm_twin.machine.inertia import Layout
@@ -426,7 +426,7 @@ def _loads(t: Traced) -> Program:
     layout = Layout(t.tree)
     bodies, rods, gravity, *_, passive = layout.split(t.tape.inputs(PARAMETERS, layout.size))
     t.set_rates(t.drives.given("qd"))
-    t.set_accelerations(t.drives.given("qdd"), gravity)
+    t.set_accelerations(t.drives.given("qdd"), BaseMotion.at_rest(gravity))
     motion, graph = t.motion, t.graph
     forces = Forces(motion)
     # Rods stand for themselves here.

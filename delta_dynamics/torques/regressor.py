@@ -20,6 +20,7 @@ from delta_dynamics.torques.virtual_work import Forces
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.codegen.expressions import PARAMETERS
 from pkm_twin.codegen.program import Program
+from pkm_twin.kinematics.motion import BaseMotion
 from pkm_twin.kinematics.traced import Traced
 from pkm_twin.machine.friction import friction_values, linear_keys, taken
 from pkm_twin.machine.graph import Joint, Rod
@@ -223,7 +224,7 @@ def _regressor(t: Traced) -> Program:
         motion.set_rates(column, np.eye(n)[j])
         twists.append((motion.speed, motion.omega))
     t.set_rates(qd)
-    t.set_accelerations(qdd, gravity)
+    t.set_accelerations(qdd, BaseMotion.at_rest(gravity))
     bodies: list[Any] = []
     for body in t.tree.links:
         own = motion.turned(body).T

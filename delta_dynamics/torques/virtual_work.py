@@ -17,7 +17,7 @@ from pkm_twin.codegen.expressions import PARAMETERS, Numbers, Objects
 from pkm_twin.codegen.kernels import BoundCall, Kernel
 from pkm_twin.codegen.operations import absolute, maximum, minimum, sign
 from pkm_twin.codegen.program import Program
-from pkm_twin.kinematics.motion import Motion, cross
+from pkm_twin.kinematics.motion import BaseMotion, Motion, cross
 from pkm_twin.kinematics.stream import following
 from pkm_twin.kinematics.traced import Traced
 from pkm_twin.machine import friction
@@ -31,7 +31,12 @@ MASSLESS: Final = 1e-12
 
 
 def inverse_dynamics(
-    robot: Robot, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, wrench: ArrayLike | None = None
+    robot: Robot,
+    q: ArrayLike,
+    qd: ArrayLike,
+    qdd: ArrayLike,
+    wrench: ArrayLike | None = None,
+    base: ArrayLike | None = None,
 ) -> Array:
     """Actuator efforts for a motion, exact rigid-body dynamics.
 
@@ -46,12 +51,17 @@ def inverse_dynamics(
     :param qdd: joint accelerations, shape (..., n).
     :param wrench: external force and moment on the platform at its reference point, base axes,
         shape (..., 6), N and N m; None: no wrench.
+    :param base: motion of the base in base axes, shape (..., 9): angular velocity, rad/s, angular
+        acceleration, rad/s2, and linear acceleration of its origin less gravity, m/s2, as an
+        accelerometer there measures it. None: at rest, (0, 0, -gravity).
     :returns: efforts of the actuators, shape (..., n), N m or N.
     :raises UnreachableError: a joint state without an assembly, by limb, sample and miss.
     :raises SingularityError: a singularity on the way from home.
     :raises ValueError: a wrong last axis, or a value that is not finite.
     """
     load = _NO_WRENCH if wrench is None else wrench
+    if base is not None:
+        return robot.bound(moving_torques, robot.inertial)(q, qd, qdd, load, base)
     # Without a call where it is made: a stream's sample takes a microsecond or two.
     call = robot.calls.get(torques) or robot.bound(torques, robot.inertial)
     tau: Array = call(q, qd, qdd, load)
@@ -64,6 +74,14 @@ def torques(robot: Robot) -> Kernel:
     :raises ParameterError: a robot whose file gives no masses.
     """
     return robot.massive().kernel("torques", torque_program)
+
+
+def moving_torques(robot: Robot) -> Kernel:
+    """Return the program of :func:`inverse_dynamics` with the motion of the base as last input.
+
+    :raises ParameterError: a robot whose file gives no masses.
+    """
+    return robot.massive().kernel("moving torques", partial(_torques, base=9))
 
 
 def stream_torques(robot: Robot) -> Kernel:
@@ -329,13 +347,14 @@ def begun(t: Traced) -> tuple[Layout, list[Objects]]:
 
 
 def efforts_of_motion(
-    t: Traced, parts: list[Objects], qd: Objects, qdd: Objects
+    t: Traced, parts: list[Objects], qd: Objects, qdd: Objects, base: Objects | None = None
 ) -> tuple[list[Any], list[Any]]:
     """Efforts for a motion under the input ``wrench``, of the drives that lead alone.
 
+    :param base: its motion, shape (9,); None: at rest.
     :returns: them, and what friction and rotor of each drive take, shape (n,).
     """
-    loads = _loads(t, parts, qd, qdd)
+    loads = _loads(t, parts, qd, qdd, base)
     tree, q = t.tree, t.drives.variables("q")
     rates, changes = tree.of_drives(qd, t.u), tree.of_drives(qdd, t.du)
     return add_friction_and_rotors(t, parts, loads, q, rates, changes)
@@ -372,8 +391,12 @@ def _laws_of(t: Traced, parts: list[Objects]) -> list[dict[str, Any]]:
     return [{key: v[k] for key, v in laws.items()} for k in range(t.drives.count if laws else 0)]
 
 
-def _loads(t: Traced, parts: list[Objects], qd: Objects, qdd: Objects) -> list[Any]:
+def _loads(
+    t: Traced, parts: list[Objects], qd: Objects, qdd: Objects, base: Objects | None = None
+) -> list[Any]:
     """Return the efforts without the drives' friction and rotors.
+
+    :param base: its motion, shape (9,); None: at rest.
 
     F_d = -J^-T (J_M' Q_M + sum of J_Hij' Q_Hij) - Q_S (3-PRRU paper, equations 40 and 41), on joint
     rates: the closures' multipliers eliminate the unknown rates, which is the product with J^-T.
@@ -381,7 +404,8 @@ def _loads(t: Traced, parts: list[Objects], qd: Objects, qdd: Objects) -> list[A
     bodies, rods, gravity, *_, passive = parts
     wrench = t.tape.inputs("wrench", 6)
     t.set_rates(qd)
-    t.set_accelerations(qdd, gravity)
+    moving = BaseMotion.at_rest(gravity) if base is None else BaseMotion(*base.reshape(3, 3))
+    t.set_accelerations(qdd, moving)
     forces = Forces(t.motion)
     forces.inertia(bodies, rods)
     forces.passive(passive)
@@ -393,7 +417,7 @@ def _loads(t: Traced, parts: list[Objects], qd: Objects, qdd: Objects) -> list[A
 
 def torque_program(t: Traced) -> Program:
     """The program of :func:`torques`, to write others with."""
-    return _torques(t, on_bodies=False)
+    return _torques(t)
 
 
 def body_efforts(robot: Robot) -> Kernel:
@@ -401,13 +425,15 @@ def body_efforts(robot: Robot) -> Kernel:
     return robot.massive().kernel("body efforts", partial(_torques, on_bodies=True))
 
 
-def _torques(t: Traced, *, on_bodies: bool) -> Program:
+def _torques(t: Traced, *, on_bodies: bool = False, base: int = 0) -> Program:
+    """Write the program of torques; ``base``: size of the input with the motion of the base."""
     layout, parts = begun(t)
-    leads, own = efforts_of_motion(t, parts, t.drives.given("qd"), t.drives.given("qdd"))
+    moving = t.tape.inputs("base", base) if base else None
+    leads, own = efforts_of_motion(t, parts, t.drives.given("qd"), t.drives.given("qdd"), moving)
     efforts = t.drives.shared(leads, preload=True)
     if on_bodies:
         efforts = [effort - part for effort, part in zip(efforts, own, strict=True)]
-    sizes = t.inputs("q", "qd", "qdd", wrench=6)
+    sizes = t.inputs("q", "qd", "qdd", wrench=6, **({"base": base} if base else {}))
     return Program(sizes, layout.size, {"efforts": t.lift(efforts)}, t.equations())
 
 

@@ -17,6 +17,7 @@ from delta_dynamics.torques.virtual_work import (
     accelerations,
     inverse_dynamics,
     masses_kernel,
+    moving_torques,
     null_kernel,
     stream_torques,
     torques,
@@ -155,6 +156,13 @@ class Package:
             add(
                 "torques", "Actuator efforts tau (N m or N) for a motion.",
                 rates | {"qdd": n} | wrench, lambda: torques(robot), p, tau="efforts",
+            )  # fmt: skip
+            add(
+                "torques_moving",
+                "The efforts of _torques on a base that moves. base, in its own axes: angular "
+                "velocity, angular acceleration, and acceleration of its origin less gravity.",
+                rates | {"qdd": n} | wrench | {"base": 9},
+                lambda: moving_torques(robot), p, tau="efforts",
             )  # fmt: skip
             add(
                 "torques_and_singularity",

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +26,28 @@ Columns = dict[tuple[str, int], Any]
 """By rate ("u" or "q", index): a vector, or a number."""
 BodyPoint = tuple[str, Any]
 """A body, and where a point of it is."""
+
+
+class BaseMotion(NamedTuple):
+    """The motion of the base in its own axes, shape (3,) each.
+
+    ``omega``: angular velocity, rad/s. ``alpha``: angular acceleration, rad/s2. ``change``:
+    acceleration of its origin less gravity, m/s2. Nothing depends on a uniform velocity.
+    """
+
+    omega: Any
+    alpha: Any
+    change: Any
+
+    @classmethod
+    def at_rest(cls, gravity: Any) -> BaseMotion:
+        """Return the motion of a base at rest, which accelerates against gravity."""
+        return cls(_ZERO, _ZERO, -gravity)
+
+
+_ZERO: Final = np.zeros(3)
+FIXED: Final = BaseMotion(_ZERO, _ZERO, _ZERO)
+"""A base at rest, without gravity: the motion of all parts is relative to it."""
 
 
 def _none() -> Any:
@@ -313,15 +335,15 @@ class Motion:
 
     # Velocities and accelerations.
 
-    def set_rates(self, u: Numbers, qd: Numbers) -> None:
+    def set_rates(self, u: Numbers, qd: Numbers, base: BaseMotion = FIXED) -> None:
         """Compute the angular velocity, and the velocity of the origin, of every body.
 
-        With the pose's rates: 3-PRRU paper, equations 22 and 30. Of a Delta: Delta-CU paper,
-        equations 10 to 12.
+        Velocities are relative to the velocity of the base's origin. With the pose's rates: 3-PRRU
+        paper, equations 22 and 30. Of a Delta: Delta-CU paper, equations 10 to 12.
         """
-        zero = np.zeros(3)
-        self.omega: dict[str, Any] = {BASE: zero}
-        self.speed: dict[str, Any] = {BASE: zero}
+        self._base, self._u = base, u
+        self.omega: dict[str, Any] = {BASE: base.omega}
+        self.speed: dict[str, Any] = {BASE: _ZERO}
         self._before: dict[int, Any] = {}
         self._rate: dict[int, Any] = {}
         for link in self.tree.links.values():
@@ -330,9 +352,9 @@ class Motion:
             for step in link.steps:
                 k = step.rate
                 if step.ball or step.free:
-                    w = np.array(u[k : k + 3], dtype=object)
+                    w = base.omega + np.array(u[k : k + 3], dtype=object)
                     if step.free:
-                        v = np.array(u[k + 3 : k + 6], dtype=object)
+                        v = v + np.array(u[k + 3 : k + 6], dtype=object)
                     continue
                 rate = self._rate[id(step)] = step.sign * (qd[k] if step.actuated else u[k])
                 axis = self.axis[id(step)]
@@ -343,17 +365,16 @@ class Motion:
                     w = w + axis * rate
             self.omega[link.body], self.speed[link.body] = w, v
 
-    def set_accelerations(self, du: Numbers, qdd: Numbers, gravity: Any | None = None) -> None:
+    def set_accelerations(self, du: Numbers, qdd: Numbers) -> None:
         """Compute each body's angular acceleration, and its origin's acceleration less gravity.
 
-        Without the Hessians of the 3-PRRU paper's equations 23 and 31. Of a Delta: Delta-CU paper,
-        equations 13, 14 and 16, without their misprints.
+        The base moves as given with the rates. Without the Hessians of the 3-PRRU paper's equations
+        23 and 31. Of a Delta: Delta-CU paper, equations 13, 14 and 16, without their misprints.
         """
-        zero = np.zeros(3)
-        pull = zero if gravity is None else gravity
-        self.alpha: dict[str, Any] = {BASE: zero}
-        self.change: dict[str, Any] = {BASE: -pull if gravity is not None else zero}
-        self._spin: dict[str, Any] = {BASE: np.zeros((3, 3))}
+        base = self._base
+        self.alpha: dict[str, Any] = {BASE: base.alpha}
+        self.change: dict[str, Any] = {BASE: base.change}
+        self._spin: dict[str, Any] = {BASE: _spin(base.omega, base.alpha)}
         for link in self.tree.links.values():
             parent = link.parent
             w = self.omega[parent]
@@ -362,9 +383,12 @@ class Motion:
             for step in link.steps:
                 k = step.rate
                 if step.ball or step.free:
-                    al = np.array(du[k : k + 3], dtype=object)
+                    # Their rates and accelerations are relative to the base, in its axes.
+                    turning = np.array(du[k : k + 3], dtype=object)
+                    al = base.alpha + cross(base.omega, self.omega[link.body]) + turning
                     if step.free:
-                        acc = np.array(du[k + 3 : k + 6], dtype=object) - pull
+                        slip = cross(base.omega, self._u[k + 3 : k + 6])
+                        acc = acc + 2.0 * slip + np.array(du[k + 3 : k + 6], dtype=object)
                     continue
                 second = step.sign * (qdd[k] if step.actuated else du[k])
                 axis, rate = self.axis[id(step)], self._rate[id(step)]
@@ -381,7 +405,7 @@ class Motion:
         return self.speed[body] + cross(self.omega[body], self.arm(body, point))
 
     def acceleration(self, body: str, point: Array) -> Any:
-        """Its acceleration, less gravity where that was given (Delta-CU paper, equation 15)."""
+        """Its acceleration less gravity (Delta-CU paper, equation 15)."""
         return self.change[body] + self._spin[body] @ self.arm(body, point)
 
     def spin(self, body: str) -> Any:

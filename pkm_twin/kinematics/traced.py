@@ -25,7 +25,15 @@ from pkm_twin.codegen.operations import cos, sin
 from pkm_twin.codegen.program import AT, LEAST, STATE, UNKNOWNS, Equations, previous
 from pkm_twin.kinematics.drives import LEADS, TIME, Drives
 from pkm_twin.kinematics.limbs import LimbPose
-from pkm_twin.kinematics.motion import Columns, Motion, Row, cross, matrices
+from pkm_twin.kinematics.motion import (
+    FIXED,
+    BaseMotion,
+    Columns,
+    Motion,
+    Row,
+    cross,
+    matrices,
+)
 from pkm_twin.kinematics.scheme import Scheme
 from pkm_twin.machine.geometry import graph_on
 from pkm_twin.machine.graph import Graph
@@ -367,18 +375,23 @@ class Traced:
         """Rates of everything by qd; returns those of the unknowns."""
         kept = self.scheme.independent
         self.u = self._unknown(self.lu.solve(-(self.jq[kept] @ np.asarray(qd, dtype=object))))
+        self.qd = qd
         self.motion.set_rates(self.u, qd)
         self.drives.judge("qd", qd, self.u, TIME)
         return self.u
 
-    def set_accelerations(self, qdd: Numbers, gravity: Any | None = None) -> None:
-        """Accelerations of everything by qdd, after the rates."""
+    def set_accelerations(self, qdd: Numbers, base: BaseMotion = FIXED) -> None:
+        """Accelerations of everything by qdd, after the rates; then the base moves, too.
+
+        Closures hold relative to the base: unknown rates and accelerations do not depend on it.
+        """
         kept = self.scheme.independent
         self.motion.set_accelerations(np.zeros(self.tree.unknown_rates), qdd)
         bias = [self.rows[k].bias() for k in kept]
         self.du = self._unknown(-self.lu.solve(bias))
         self.drives.judge("qdd", qdd, self.du, TIME * TIME)
-        self.motion.set_accelerations(self.du, qdd, gravity)
+        self.motion.set_rates(self.u, self.qd, base)
+        self.motion.set_accelerations(self.du, qdd)
 
     def rate_columns(self) -> list[Objects]:
         """Rates of the unknowns per joint rate."""

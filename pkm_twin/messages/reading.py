@@ -508,6 +508,49 @@ def read_wrench(
     return WrenchSample(stamp, given or frame, np.array(values, np.float64))
 
 
+MAX_SENSED_ROTATION: Final = 1e3
+MAX_SENSED_ACCELERATION: Final = 1e4
+"""Largest components that an IMU may report, rad/s and m/s2: beyond all sensors."""
+NOT_MEASURED: Final = -1.0
+"""First entry of the covariance of a quantity that a sensor does not measure (sensor_msgs/Imu)."""
+
+
+class ImuSample(NamedTuple):
+    """Angular velocity, rad/s, and acceleration less gravity, m/s2, (3,) each, in sensor axes."""
+
+    stamp: int
+    angular_velocity: Array
+    acceleration: Array
+
+
+def read_imu(message: Any, now: int, rules: StampRules, frame: str) -> ImuSample:
+    """Read a sensor_msgs/Imu: angular velocity and acceleration, not the orientation.
+
+    A covariance of zeros means that it is unknown, and is accepted.
+
+    :raises MessageError: another frame, an invalid stamp, a value that is not finite or too large,
+        or a quantity that the sensor does not measure.
+    """
+    given = message.header.frame_id
+    if given != frame:
+        raise MessageError("frame", f"frame is {shown(given)}, expected {frame!r}")
+    stamp = rules.check(stamp_of(message.header), now)
+    parts = []
+    for name, bound in (
+        ("angular_velocity", MAX_SENSED_ROTATION),
+        ("linear_acceleration", MAX_SENSED_ACCELERATION),
+    ):
+        vector = getattr(message, name)
+        if float(getattr(message, f"{name}_covariance")[0]) == NOT_MEASURED:
+            raise MessageError(
+                "not measured", f"{name}_covariance[0] is -1: the sensor does not measure it"
+            )
+        values = [vector.x, vector.y, vector.z]
+        _check_numbers([f"{name}.{axis}" for axis in "xyz"], values, bound)
+        parts.append(np.array(values, np.float64))
+    return ImuSample(stamp, *parts)
+
+
 MAX_SHIFT: Final = 0.1
 MAX_TURN: Final = 0.1
 """Largest deflection, m and rad: larger ones are not small, or belong to another pose."""

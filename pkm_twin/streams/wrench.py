@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Final, Generic, TypeVar
 
@@ -48,6 +48,18 @@ class Mount:
         return cls(np.array(xyz), rotations.from_rpy(np.array(rpy)))
 
 
+def check_mount(entries: Mapping[str, Triple]) -> None:
+    """Reject a position, m, or angles, rad, of a sensor that are out of range.
+
+    :param entries: parameters by name, which ends in ``xyz`` or ``rpy``.
+    :raises ParameterError: naming the parameter and its bounds.
+    """
+    for name, values in entries.items():
+        bound = MAX_OFFSET if name.endswith("xyz") else 4.0 * math.pi
+        if len(values) != 3 or not all(abs(value) <= bound for value in values):
+            raise ParameterError(name, list(values), f"3 numbers from {-bound:g} to {bound:g}")
+
+
 Mounts = Callable[[str, int], Mount]
 """Function from a frame and a stamp, ns, to the mount; raises MessageError if it is unknown."""
 
@@ -86,11 +98,7 @@ class WrenchSettings:
         for name in ("wrench_frame", "base_frame"):
             if not getattr(self, name):
                 raise ParameterError(name, "", "a frame's name")
-        bounds = {"sensor.xyz": MAX_OFFSET, "sensor.rpy": 4.0 * math.pi}
-        for name, values in (("sensor.xyz", self.sensor_xyz), ("sensor.rpy", self.sensor_rpy)):
-            bound = bounds[name]
-            if len(values) != 3 or not all(abs(value) <= bound for value in values):
-                raise ParameterError(name, list(values), f"3 numbers from {-bound:g} to {bound:g}")
+        check_mount({"sensor.xyz": self.sensor_xyz, "sensor.rpy": self.sensor_rpy})
         if self.wrench_frame == self.base_frame and any(self.sensor_rpy):
             raise ParameterError(
                 "sensor.rpy",

@@ -69,6 +69,7 @@ def functions(robot: Robot) -> dict[str, Callable[..., Any]]:
     }
     if has(robot, "massive"):
         result["torques"] = lambda q, qd, qdd, w: inverse_dynamics(robot, q, qd, qdd, w)
+        result["torques_moving"] = lambda *given: inverse_dynamics(robot, *given)
         result["torques_and_singularity"] = lambda q, *rest: np.column_stack(
             [result["torques"](q, *rest), robot.singularity(q)]
         )
@@ -92,6 +93,8 @@ def inputs_of(robot: Robot, motion: tuple[Array, ...]) -> dict[str, tuple[Array,
         result["inverse"] = (robot.try_forward(q)[0],)
     if "torques" in result:
         result["torques"] = result["torques_and_singularity"] = motion
+        base = np.resize(np.sin(np.arange(101.0)) * 10.0, (len(q), 9))
+        result["torques_moving"] = (*motion, base)
         result["accelerations"] = (q, qd, 0.1 * qdd, wrench)
         m = len(robot.pose_names)
         result["torques_at_pose"] = (robot.try_forward(q)[0], qd[:, :m], qdd[:, :m], wrench)

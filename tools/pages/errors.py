@@ -71,6 +71,10 @@ ERRORS = {
 }
 """An example of each class, and what a user can do."""
 REASONS = {
+    "base motion": (
+        "a trajectory, but only the present motion of the base is known",
+        "send joint states",
+    ),
     "bounds": ("a value or a size is beyond the bounds of any real machine", "check the units"),
     "busy": ("too many requests are waiting", "send trajectories more slowly"),
     "cdr": ("the bytes are not a message of this type", "use the same message definitions"),
@@ -84,11 +88,16 @@ REASONS = {
     "length": ("an array has another length than the names", "send one value per joint"),
     "limit": ("a position or velocity is beyond the robot's limits", "check `limits`"),
     "missing joint": ("an actuated joint is missing", "check the names, or use `joint_map`"),
+    "no base motion": (
+        "no fresh message of `base_imu`, or none with gravity in it",
+        "check its stamps and driver",
+    ),
     "no pose": ("no joint state within `max_state_age` of the wrench", "check `joint_states`"),
     "no velocities": ("derivatives are missing", "set `acceleration` to `differentiate`"),
     "no wrench": ("no fresh wrench", "check the topic `wrench` and its stamps"),
     "non-finite result": ("the model gave NaN or infinity", "check the input and the robot file"),
     "not finite": ("NaN or infinity in the message", "check the sensor"),
+    "not measured": ("a covariance of the IMU begins with -1", "use a sensor that measures it"),
     "over": ("the trajectory has already ended", "use `use_sim_time` for a replayed bag"),
     "pose": ("joint positions of a deflection are not usable", "check `joint_states`"),
     "singular": ("too close to a singularity", "plan away from it, see `singularity_stop`"),
