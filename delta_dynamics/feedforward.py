@@ -39,7 +39,6 @@ from pkm_twin.streams.monitor import Core, StreamMonitor, counting, finished
 from pkm_twin.streams.rates import RateAgreement
 from pkm_twin.streams.rest import (
     VelocityErrorEstimator,
-    fit_gain,
     gradient_gain,
     velocity_error_bound,
 )
@@ -192,7 +191,7 @@ class Feedforward(Core):
         """Of the drives' friction; None before the stream's first answer."""
         self.differentiator = _differentiator(s, self.robot)
         self._window = s.window
-        self._rest = VelocityErrorEstimator(_slope_gain(self.differentiator))
+        self._rest = VelocityErrorEstimator(self.differentiator.slope_gain())
         self.rates = RateAgreement(self.robot)
         self._reach = friction_reach(self.robot)
         self._take_rules(s)
@@ -224,7 +223,7 @@ class Feedforward(Core):
         if (before.order, before.window) != (settings.order, settings.window):
             self.differentiator = _differentiator(settings, self.robot)
             self._window = settings.window
-            self._rest = VelocityErrorEstimator(_slope_gain(self.differentiator))
+            self._rest = VelocityErrorEstimator(self.differentiator.slope_gain())
             if self.wrenches is not None:
                 self.wrenches.change_fit(settings.order, settings.window)
 
@@ -525,7 +524,7 @@ class Feedforward(Core):
         rates = self.differentiator.push(sample.stamp, sample.q, sample.qd)
         if self.differentiator.window != self._window:
             self._window = self.differentiator.window
-            self._rest.gain = _slope_gain(self.differentiator)
+            self._rest.gain = self.differentiator.slope_gain()
             if self.wrenches is not None:
                 self.wrenches.window = self._window
         return rates
@@ -542,11 +541,6 @@ def _differentiator(s: Settings, robot: Robot) -> Differentiator:
     made = Differentiator(s.order, s.window, time=s.window_time)
     made.prepare(robot.joints_count)
     return made
-
-
-def _slope_gain(fit: Differentiator) -> float:
-    """Of the rates that a differentiator gives where the stream has none."""
-    return fit_gain(fit.order + 1, fit.window, fit.window - 1)
 
 
 def warm_up(robot: Robot, *, base: bool = False) -> None:

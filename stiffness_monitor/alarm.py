@@ -28,6 +28,7 @@ from pkm_twin.messages.stamps import SECOND, StampRules
 from pkm_twin.robot.robot import Robot
 from pkm_twin.settings import setting
 from pkm_twin.streams.monitor import Core, counting, finished
+from pkm_twin.streams.noise import estimate_deviation
 from pkm_twin.streams.wrench import TimeCache, check_order
 from stiffness_monitor.compliance import strain_energy
 from stiffness_monitor.derivatives import compliance_effects, energy_effects
@@ -392,7 +393,7 @@ def _estimate_noise(residual: Array, table: Array, least: Array) -> tuple[Array,
         scale = 1.0 / np.maximum(np.linalg.norm(rows, axis=0), 1e-300)
         found = scale * np.linalg.lstsq(rows * scale, (residual / size).ravel(), rcond=1e-12)[0]
         left = residual - table @ found
-        spread = 1.4826 * np.median(np.abs(left - np.median(left, 0)), 0)
+        spread = estimate_deviation(left - np.median(left, 0))
         size = np.maximum(np.maximum(spread, least), 1e-30)
     scaled = left / size
     whole = float(np.sum(scaled**2))

@@ -34,12 +34,12 @@ from pkm_twin.identification.fit import Fit, fit
 from pkm_twin.identification.friction_laws import fit_recordings
 from pkm_twin.identification.judge import LOUD
 from pkm_twin.identification.plausible import LATEST
-from pkm_twin.identification.samples import usual_size
 from pkm_twin.recordings import Recording
 from pkm_twin.report import Fact, Verdict, judged
 from pkm_twin.robot.limits import ranges
 from pkm_twin.robot.plausibility import why_no_torques
 from pkm_twin.streams.drives import CONSTANT_SAMPLES, MAX_RELATIVE_CHANGE
+from pkm_twin.streams.noise import estimate_deviation
 from pkm_twin.streams.rates import MAX_RATE, STANDSTILL_FRACTION, rate_faults, rms
 from pkm_twin.streams.steps import find_play
 
@@ -507,7 +507,7 @@ def _saturated(r: Recording, c: Compared) -> tuple[str, ...]:
         most = np.abs(measured[:, j]).max()
         full = np.abs(measured[:, j]) >= most * (1.0 - 1e-9)
         less = c.raw[~full, j]
-        usual = float(usual_size(less)) if len(less) else 0.0
+        usual = float(estimate_deviation(less)) if len(less) else 0.0
         slack = limit[j] + 4.0 * usual
         enough = (
             full.mean() > FULL

@@ -32,13 +32,13 @@ from pkm_twin.identification.samples import (
     passed_band,
     shaken_efforts,
     tracks,
-    usual_size,
 )
 from pkm_twin.machine.friction import Dahl
 from pkm_twin.recordings import Load, Recording, at_rest, by_load
 from pkm_twin.report import Fact, judged
 from pkm_twin.robot.robot import Robot
 from pkm_twin.streams.drives import idle_samples
+from pkm_twin.streams.noise import estimate_deviation
 from pkm_twin.streams.rates import rms
 from pkm_twin.streams.steps import Steps, sampling_of
 
@@ -157,7 +157,7 @@ class Compared:
         Before the filter, which spreads a step in time.
         """
         away = np.abs(self.raw)
-        usual, limit = usual_size(self.raw), self.limit
+        usual, limit = estimate_deviation(self.raw), self.limit
         far = away > MORE * limit + 4.0 * np.minimum(usual, limit)
         beyond: Mask = np.asarray(far.any(1), np.bool_)
         # Two in a row: one is noise's.

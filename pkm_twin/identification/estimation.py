@@ -19,7 +19,7 @@ import numpy as np
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import PkmTwinError, install
 from pkm_twin.identification.samples import huber
-from pkm_twin.streams.rest import MAD_TO_SIGMA
+from pkm_twin.streams.noise import estimate_deviation
 
 Cones = Sequence[tuple[slice, Array]]
 Bound = tuple[tuple[int, ...], ...]
@@ -145,8 +145,7 @@ def _robust(residual: Array, floor: float) -> float:
     """Deviation by the median absolute one."""
     if not len(residual):
         return floor
-    middle = float(np.median(np.abs(residual - np.median(residual))))
-    return max(MAD_TO_SIGMA * middle, floor)
+    return max(float(estimate_deviation(residual - np.median(residual))), floor)
 
 
 def _directions(gram: Array, side: Array, least: float) -> tuple[Array, Array, Array, Any]:

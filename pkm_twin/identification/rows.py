@@ -37,11 +37,11 @@ from pkm_twin.identification.samples import (
     resonances_of,
     shaken_efforts,
     tracks,
-    usual_size,
 )
 from pkm_twin.machine.friction import KNOWN_FRACTION, Dahl, Memory, all_keys, compiled, not_shared
 from pkm_twin.recordings.recording import Recording
 from pkm_twin.robot.robot import Robot
+from pkm_twin.streams.noise import estimate_deviation
 
 BLOCK: Final = 2048
 OUTLIER: Final = 8.0
@@ -266,7 +266,7 @@ def rows_of(
     # Where standing still is in the filter's reach, friction's sign is not known.
     moves, left = f["moves"] > 0.8, f["target"] - f["table"] @ first
     usual = [
-        float(usual_size(one[some])) if some.any() else 0.0
+        float(estimate_deviation(one[some])) if some.any() else 0.0
         for one, some in zip(left.T, moves.T, strict=True)
     ]
     # And what it may add is below what else is left.
@@ -406,7 +406,7 @@ def _drop_outliers(
     for part in parts:
         told = part.table @ first
         away = np.abs(part.target - told)
-        bound = OUTLIER * usual_size(part.target - told)
+        bound = OUTLIER * estimate_deviation(part.target - told)
         # Where friction turns over, an effort that is some samples late is no outlier.
         near = scipy.ndimage.maximum_filter1d(
             np.abs(np.diff(told, axis=0, prepend=told[:1])), 7, axis=0

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
 from itertools import pairwise
 from typing import Final
 
@@ -22,8 +21,7 @@ import scipy  # type: ignore[import-untyped]  # its parts come when they are ask
 
 from pkm_twin.codegen.arrays import Array, Mask
 from pkm_twin.recordings import Recording
-from pkm_twin.streams.rest import MAD_TO_SIGMA, SIGMAS
-from pkm_twin.streams.rest import noise as noise_of_samples
+from pkm_twin.streams.noise import SIGMAS, estimate_noise
 
 DEGREE: Final = 4
 """Of the local polynomial."""
@@ -105,7 +103,7 @@ class Filtering:
 
 def rate_noise(how: Filtering, period: float) -> Array:
     """Standard deviation that the positions' noise leaves in the differentiated rates, (n,)."""
-    weights = _weights(how.window, DEGREE, 1)[how.window // 2] / period
+    weights = scipy.signal.savgol_coeffs(how.window, DEGREE, 1, period)
     return np.asarray(np.array(how.position_noise) * np.linalg.norm(weights), np.float64)
 
 
@@ -115,7 +113,7 @@ def choose_window(pieces: list[Array], period: float, noise: Array) -> int:
     for window in WINDOWS:
         if window > min(len(q) for q in pieces) // 4:
             break
-        change = _weights(window, DEGREE, 2)[window // 2] / period**2
+        change = scipy.signal.savgol_coeffs(window, DEGREE, 2, period)
         error, size = np.zeros(noise.shape), np.zeros(noise.shape)
         for q in pieces:
             rough = local_fit(q, window, DEGREE, 2, period)
@@ -123,7 +121,7 @@ def choose_window(pieces: list[Array], period: float, noise: Array) -> int:
             if window > DEGREE + 3:
                 fine = local_fit(q, window, DEGREE + 2, 2, period)
                 inner = slice(window, -window)
-                extra = _weights(window, DEGREE + 2, 2)[window // 2] / period**2 - change
+                extra = scipy.signal.savgol_coeffs(window, DEGREE + 2, 2, period) - change
                 made = noise**2 * (extra @ extra)
                 error += np.maximum(np.mean((fine - rough)[inner] ** 2, 0) - made, 0.0)
         error += len(pieces) * noise**2 * (change @ change)
@@ -133,29 +131,13 @@ def choose_window(pieces: list[Array], period: float, noise: Array) -> int:
     return best
 
 
-@cache
-def _weights(window: int, degree: int, order: int) -> Array:
-    """Of a window's samples in the derivative of their polynomial at each of them, by the period.
-
-    Shape (window, window).
-    """
-    half, series = window // 2, np.polynomial.polynomial
-    places = np.arange(-half, half + 1) / half
-    changed = series.polyvander(places, degree - order) @ series.polyder(np.eye(degree + 1), order)
-    fitted = np.linalg.pinv(series.polyvander(places, degree))
-    return np.asarray(changed @ fitted / half**order, np.float64)
-
-
 def local_fit(values: Array, window: int, degree: int, order: int, period: float) -> Array:
-    """A derivative along the first axis, by a polynomial through the samples around each.
+    """Differentiate along the first axis by a polynomial through the samples around each.
 
-    Savitzky and Golay's filter; its ends are those of the first and the last polynomial.
+    The first and the last polynomial are differentiated at the ends, too.
     """
-    weights, half = _weights(window, degree, order) / period**order, window // 2
-    result = scipy.ndimage.correlate1d(values, weights[half], axis=0)
-    result[:half] = np.tensordot(weights[:half], values[:window], 1)
-    result[-half:] = np.tensordot(weights[-half:], values[-window:], 1)
-    return np.asarray(result, np.float64)
+    fitted = scipy.signal.savgol_filter(values, window, degree, order, period, axis=0)
+    return np.asarray(fitted, np.float64)
 
 
 def calm(values: Array, period: float, cutoff: float | None) -> list[Array]:
@@ -229,7 +211,7 @@ def tracks(
     positions = [own[0] for _, own in pieces]
     # Each piece by its length.
     noise = np.average(
-        [noise_of_samples(t, own[0]) for t, own in pieces], 0, [len(t) for t, _ in pieces]
+        [estimate_noise(t, own[0]) for t, own in pieces], 0, [len(t) for t, _ in pieces]
     )
     width = window or choose_window(positions, period, noise)
     result = []
@@ -331,11 +313,6 @@ def huber(away: Array, bound: float = HUBER) -> Array:
 def passed_band(how: Filtering, rate: float) -> float:
     """The part of white noise, sampled so many times a second, that the filter passes."""
     return 1.0 if how.cutoff is None else min(1.0, 2.0 * NOISE_BAND * how.cutoff / rate)
-
-
-def usual_size(residual: Array) -> Array:
-    """Standard deviation of normal residuals (k, n) by the median of their sizes, (n,)."""
-    return np.asarray(MAD_TO_SIGMA * np.median(np.abs(residual), axis=0), np.float64)
 
 
 def in_motion(values: Sequence[Array], moves: Sequence[Array | Mask]) -> list[Array]:

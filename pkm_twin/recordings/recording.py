@@ -21,8 +21,9 @@ from pkm_twin.recordings.topics import COLUMNS, Topics
 from pkm_twin.robot.derivatives import nearest_motion
 from pkm_twin.robot.robot import Robot
 from pkm_twin.streams.differentiator import Differentiator
+from pkm_twin.streams.noise import SIGMAS, estimate_noise
 from pkm_twin.streams.rates import MAX_RATE, rate_faults
-from pkm_twin.streams.rest import SIGMAS, fit_gain, gradient_gain, noise, velocity_error_bound
+from pkm_twin.streams.rest import gradient_gain, velocity_error_bound
 from pkm_twin.streams.steps import MAX_GAP_PERIODS, Steps, repeats_of, steps_of
 from pkm_twin.streams.wrench import WrenchSettings
 
@@ -171,8 +172,9 @@ class Recording:
 
     @property
     def held(self) -> Array | None:
-        """Which part of :attr:`carried` is on the platform, shape (samples,): 1, 0 where the robot
-        has its file's payload, and by the mass where there are several.
+        """Fraction of :attr:`carried` on the platform, shape (samples,), by the mass.
+
+        It is 0 while the robot has its file's payload.
         """
         if self.load is None:
             return None
@@ -220,7 +222,7 @@ class Recording:
         return self.q, self.qd, self.qdd, wrench
 
     def part(self, rows: Any) -> Recording:
-        """Some of the samples, by a slice, mask or indices; times stay as they are."""
+        """Return some of the samples, by a slice, mask or indices; times stay as they are."""
         values = {name: getattr(self, name) for name in BY_SAMPLE}
         return replace(self, **{k: v[rows] for k, v in values.items() if v is not None})
 
@@ -249,7 +251,7 @@ class Recording:
         return replace(self, effort=effort, late=self.late + late).part(known)
 
     def with_rates(self) -> Recording:
-        """The samples whose rates and accelerations are known, with these.
+        """Return the samples whose velocities and accelerations are known, with these.
 
         If the recording has both, they stay. In a table the missing ones are second-order
         differences; in a bag, a node's differentiator gives them in the middle of its window.
@@ -289,7 +291,7 @@ class Recording:
         return self._moving(qd, qdd, rest, slice(None))
 
     def _moving(self, qd: Array, qdd: Array, still: Mask | None, rows: Any) -> Recording:
-        """Some samples with these rates and accelerations: what is measured stays as it is.
+        """Return some samples with these velocities and accelerations; measured ones are kept.
 
         What is differentiated becomes a motion of all drives: noise contradicts nothing.
         """
@@ -308,10 +310,11 @@ def _differences(values: Array, time: Array) -> Array:
 def at_rest(r: Recording, qd: Array) -> Mask:
     """Which joints stand still, shape (samples, n), as far as their rates ``qd`` can tell."""
     if r.qd is not None:
-        return np.asarray(np.abs(qd) <= SIGMAS * noise(r.time, r.qd))
+        return np.asarray(np.abs(qd) <= SIGMAS * estimate_noise(r.time, r.qd))
     if len(r.time) < 3:
         return np.zeros(r.q.shape, np.bool_)
-    gain = fit_gain(_ORDER + 1, _WINDOW, _WINDOW // 2) / float(np.median(np.diff(r.time)))
+    fit = Differentiator(order=_ORDER, window=_WINDOW, middle=True)
+    gain = fit.slope_gain() / float(np.median(np.diff(r.time)))
     return np.asarray(np.abs(qd) <= velocity_error_bound(r.time, r.q, gain, _WINDOW // 2))
 
 

@@ -19,6 +19,7 @@ from functools import cache
 from typing import Any, Final
 
 import numpy as np
+from numpy.polynomial import polynomial
 
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.codegen.code import Code
@@ -39,6 +40,18 @@ MIN_SAMPLES: Final = 5
 FILLING_TOLERANCE: Final = 1.1
 """A filling window may exceed its time by this factor before the stream counts as slow."""
 _NO_PARAMETERS: Final = np.zeros(0)
+
+
+def fit_weights(times: Array, degree: int, derivative: int, at: float) -> Array:
+    """Return the weights of samples in a derivative of the polynomial fitted to them, (w,).
+
+    :param times: rising, shape (w,); ``at``: time at which the polynomial is differentiated.
+    """
+    half = 0.5 * float(times[-1] - times[0])
+    powers = np.vander((times - times[0]) / half - 1.0, degree + 1, increasing=True)
+    slopes = polynomial.polyder(np.eye(degree + 1), derivative)
+    here = polynomial.polyval((at - times[0]) / half - 1.0, slopes) / half**derivative
+    return np.asarray(powers @ np.linalg.solve(powers.T @ powers, here), np.float64)
 
 
 @dataclass
@@ -121,12 +134,16 @@ class Differentiator:
         derivative, _, weights = self._weights()
         return float(np.linalg.norm(weights)) / self.period**derivative
 
+    def slope_gain(self) -> float:
+        """Return the noise of velocities from positions, relative to theirs, times the period."""
+        at = self.window // 2 if self.middle else self.window - 1
+        return float(np.linalg.norm(fit_weights(np.arange(self.window), self.order + 1, 1, at)))
+
     def _weights(self) -> tuple[int, Array, Array]:
         """Return the order of derivative, the samples' times in periods, and their weights."""
         back: Array = np.arange(1.0 - self.window, 1.0)
-        powers = np.vander(back, self.degree + 1, increasing=True)
         derivative = 1 if self._carries_velocity else 2
-        return derivative, back, np.asarray(derivative * np.linalg.pinv(powers)[derivative])
+        return derivative, back, fit_weights(back, self.degree, derivative, 0.0)
 
     def _apart(self, stamp: int) -> bool:
         """Return whether the stream was silent for too long to fit a polynomial across."""

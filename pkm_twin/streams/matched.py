@@ -21,6 +21,7 @@ from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import MessageError
 from pkm_twin.messages.reading import JointSample, WrenchSample
 from pkm_twin.messages.stamps import SECOND
+from pkm_twin.streams.differentiator import fit_weights
 from pkm_twin.streams.monitor import Core, StreamMonitor, counting
 from pkm_twin.streams.wrench import Mount, TimeCache, WrenchReader
 
@@ -41,14 +42,7 @@ def window_weights(stamps: Array, order: int, carries_velocity: bool) -> Array:
     :returns: shape (w - 1,), sum 1.
     """
     t = (stamps - stamps[-1]) / SECOND
-    half = -0.5 * float(t[0])
-    x = t / half + 1.0
-    degree = order + (not carries_velocity)
-    powers = np.vander(x, degree + 1, increasing=True).T
-    k = np.arange(degree + 1)
-    # At x = 1 the powers' derivatives are k and k (k - 1).
-    slope = k / half if carries_velocity else k * (k - 1) / half**2
-    c = np.linalg.solve(powers @ powers.T, slope) @ powers
+    c = fit_weights(t, order + (not carries_velocity), 1 if carries_velocity else 2, 0.0)
     steps = np.diff(t)
     if carries_velocity:
         return np.asarray(steps * c[::-1].cumsum()[::-1][1:], np.float64)

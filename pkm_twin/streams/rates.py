@@ -16,7 +16,7 @@ import numpy as np
 from pkm_twin.codegen.arrays import Array, Mask
 from pkm_twin.messages.stamps import SECOND
 from pkm_twin.robot.robot import Robot
-from pkm_twin.streams.rest import SIGMAS, noise
+from pkm_twin.streams.noise import SIGMAS, estimate_noise
 from pkm_twin.streams.steps import MAX_GAP_PERIODS
 
 MIN_BLOCK_TIME: Final = 0.05
@@ -163,7 +163,7 @@ def rate_faults(
     units, most = np.array(robot.joint_units), np.maximum(rms(moved), rms(told))
     floor = np.array([STANDSTILL_FRACTION * most[units == unit].max() for unit in units])
     size, width = rms(told - moved), max(MIN_STEPS, MIN_BLOCK_TIME / period)
-    noisy = 2.0 * noise(time, q) + np.sqrt(width) * period * noise(time, qd)
+    noisy = 2.0 * estimate_noise(time, q) + np.sqrt(width) * period * estimate_noise(time, qd)
     part = size / np.maximum(np.maximum(most, floor), 1e-300)
     bad = (part > MAX_RATE) & (size > SIGMAS * noisy)
     return part, [

@@ -17,7 +17,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from pkm_twin.codegen.arrays import Array, Mask
-from pkm_twin.streams.rest import MAD_TO_SIGMA, SIGMAS, noise
+from pkm_twin.streams.noise import SIGMAS, estimate_deviation, estimate_noise, find_differences
 
 STAMP_ERROR: Final = 5e-3
 """Largest error of stamps, s; a joint may be off by this time at its largest velocity."""
@@ -41,9 +41,8 @@ UNEXPLAINED_QUANTILE: Final = 0.95
 """Without measured velocities this quantile of the unexplained moves belongs to the motion."""
 NOISE_QUANTILE: Final = 0.1
 """Quantile of the second differences, small enough to lie within one publisher without jumps,"""
-NOISE_QUANTILE_VALUE: Final = 0.1257 * 6.0**0.5
-"""and its value for noise of unit standard deviation: 0.1257 is this quantile of |N(0, 1)|; second
-differences have the weights 1, -2, 1."""
+NOISE_QUANTILE_VALUE: Final = 0.1257
+"""and its value for noise of unit standard deviation: this quantile of |N(0, 1)|."""
 ALTERNATING_BLOCK: Final = 16
 """Alternating publishers are looked for in blocks of this number of samples,"""
 ALTERNATING_PART: Final = 0.75
@@ -116,8 +115,8 @@ def steps_of(
     speed = np.quantile(_nearest_distances(q), MOTION_QUANTILE, axis=0) / period
     if qd is not None:
         speed = np.maximum(speed, np.quantile(np.abs(qd), MOTION_QUANTILE, axis=0))
-    floor = 2.0 * SIGMAS * _estimate_noise(q) + 2.0 * tick
-    off = SIGMAS * MAD_TO_SIGMA * float(np.median(np.abs(span - period)))
+    floor = 2.0 * SIGMAS * _estimate_tracks_noise(time, q) + 2.0 * tick
+    off = SIGMAS * float(estimate_deviation(span - period)[0])
     slack = max(min(STAMP_ERROR, period), off) * speed + floor
     near = span[:, 0] <= (MAX_GAP_PERIODS if qd is not None else 1.5) * period
     sizes = np.maximum(np.maximum(move - high * span, low * span - move), 0.0)
@@ -153,7 +152,9 @@ def repeats_of(time: Array, q: Array) -> Mask:
     apart = np.concatenate([np.ones_like(q[:1], np.bool_), move != 0.0])
     if apart.all():
         return found
-    own = [noise(time[new], one[new, None])[0] for one, new in zip(q.T, apart.T, strict=True)]
+    own = [
+        estimate_noise(time[new], one[new, None])[0] for one, new in zip(q.T, apart.T, strict=True)
+    ]
     floor = 2.0 * SIGMAS * np.array(own) + 2.0 * _find_resolution(np.abs(move))
     period = np.median(np.diff(time))
     for count in range(1, min(MAX_REPEATS, len(move) - 3) + 1):
@@ -183,7 +184,7 @@ def find_play(q: Array) -> tuple[Array, NDArray[np.int64]]:
     if len(q) < 6:
         return size, count
     bent = np.diff(q, 3, axis=0) / -2.0
-    floor = CROSSING_SIGMAS * MAD_TO_SIGMA * np.median(np.abs(bent), axis=0)
+    floor = CROSSING_SIGMAS * estimate_deviation(bent)
     floor = np.maximum(floor, CROSSING_TICKS * _find_resolution(np.abs(np.diff(q, axis=0))))
     middle, before, after = bent[1:-1], bent[:-2], bent[2:]
     against = np.maximum(np.sign(middle) * before, np.sign(middle) * after)
@@ -217,15 +218,14 @@ def _nearest_distances(q: Array) -> Array:
     return least
 
 
-def _estimate_noise(q: Array) -> Array:
+def _estimate_tracks_noise(time: Array, q: Array) -> Array:
     """Estimate the standard deviation of the positions' noise, (n,), also with two publishers."""
     found = np.full(q.shape[1], np.inf)
     for lag in (1, 2, 3):
         if len(q) > 2 * lag:
-            bent = np.abs(q[2 * lag :] - 2.0 * q[lag:-lag] + q[: -2 * lag])
-            found = np.minimum(
-                found, np.quantile(bent, NOISE_QUANTILE, axis=0) / NOISE_QUANTILE_VALUE
-            )
+            parts = [find_differences(time[k::lag], q[k::lag], 3) for k in range(lag)]
+            size = np.quantile(np.concatenate(parts), NOISE_QUANTILE, axis=0)
+            found = np.minimum(found, size / NOISE_QUANTILE_VALUE)
     return np.where(np.isfinite(found), found, 0.0)
 
 
@@ -254,7 +254,7 @@ def _find_alternating_tracks(time: Array, q: Array) -> Array:
     blocks = (len(q) - 2) // ALTERNATING_BLOCK
     if blocks < 1:
         return found
-    size = np.maximum(noise(time[::2], q[::2]), noise(time[1::2], q[1::2]))
+    size = np.max([estimate_noise(time[k::2], q[k::2]) for k in (0, 1)], 0)
     span = np.diff(time)[:, None]
     line = (q[:-2] * span[1:] + q[2:] * span[:-1]) / (span[1:] + span[:-1])
     signs = np.where(np.arange(len(line)) % 2, -1.0, 1.0)[:, None]

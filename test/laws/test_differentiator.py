@@ -3,6 +3,7 @@
 
 import numpy as np
 import pytest
+import scipy
 
 from pkm_twin.errors import MessageError
 from pkm_twin.streams.differentiator import Differentiator
@@ -260,3 +261,22 @@ def test_a_silence_longer_than_the_window_fills_it_anew(rate, window, longer):
 
     filling = sum(fill(0))
     assert sum(fill(39 + window - 1 + longer)) == filling * longer
+
+
+@pytest.mark.parametrize("order", [1, 2, 3])
+@pytest.mark.parametrize("window", [9, 25])
+@pytest.mark.parametrize("middle", [True, False])
+def test_a_stream_is_differentiated_as_savitzky_and_golay_do_offline(rng, order, window, middle):
+    q = rng.normal(size=(4 * window, 3)).cumsum(0)
+    differentiator = Differentiator(order, window, middle=middle)
+    results = [differentiator.push(STEP * i, row, None) for i, row in enumerate(q)]
+    found = np.array([result for result in results if result is not None])
+    for k in (1, 2):
+        if middle:
+            fitted = scipy.signal.savgol_filter(q, window, order + 1, k, STEP / SECOND, axis=0)
+            fitted = fitted[window // 2 : len(q) - window // 2]
+        else:
+            end = window - 1
+            weights = scipy.signal.savgol_coeffs(window, order + 1, k, STEP / SECOND, end, "dot")
+            fitted = np.array([weights @ q[i - end : i + 1] for i in range(end, len(q))])
+        np.testing.assert_allclose(found[:, k - 1], fitted, rtol=1e-7, atol=1e-7 * fitted.std())

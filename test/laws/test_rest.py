@@ -18,13 +18,8 @@ from pkm_twin.errors import PkmTwinError
 from pkm_twin.paths.along import torque_table
 from pkm_twin.recordings import ReadOptions, Recording, read
 from pkm_twin.streams.differentiator import Differentiator
-from pkm_twin.streams.rest import (
-    VelocityErrorEstimator,
-    fit_gain,
-    gradient_gain,
-    noise,
-    velocity_error_bound,
-)
+from pkm_twin.streams.noise import NoiseEstimator, estimate_noise
+from pkm_twin.streams.rest import VelocityErrorEstimator, gradient_gain, velocity_error_bound
 from test.laws.recordings import smooth_motion
 from test.nodes.harness import SECOND, Maker, Plain
 from test.support.robots import SHIPPED, joint_range, load, loaded_like, partly_long
@@ -63,11 +58,28 @@ def test_the_noise_is_that_which_was_added_whatever_the_motion(jitter: float) ->
     rng = np.random.default_rng(1)
     time = uneven(rng, 3000, 2e-3, jitter)
     q = np.stack([np.sin(7.0 * time), time**3, 0.0 * time], -1)
-    assert noise(time, q).max() < 1e-12
+    assert estimate_noise(time, q).max() < 1e-12
     size = np.array([1e-5, 1e-3, 0.1])
-    found = noise(time, q + size * rng.normal(size=q.shape))
+    found = estimate_noise(time, q + size * rng.normal(size=q.shape))
     np.testing.assert_allclose(found, size, rtol=0.1)
-    assert (noise(time[:6], q[:6]) == 0.0).all()
+    assert (estimate_noise(time[:6], q[:6]) == 0.0).all()
+
+
+@pytest.mark.parametrize("jitter", [0.0, 0.5])
+def test_a_stream_has_the_noise_of_its_last_samples(jitter: float) -> None:
+    rng = np.random.default_rng(7)
+    time = np.round(1e9 * uneven(rng, 60, 2e-3, jitter)).astype(int)
+    values = np.sin(np.arange(60.0) / 3.0)[:, None] + np.array([1.0, 1e-3, 0.0]) * rng.normal(
+        size=(60, 3)
+    )
+    stream = NoiseEstimator()
+    for k in range(60):
+        stream.push(int(time[k]) + 1, [1e6, 0.0, float(k)])
+        stream.retract()
+        found = stream.push(int(time[k]), values[k].tolist())
+        last = slice(max(0, k - 20), k + 1)
+        expected = estimate_noise(1e-9 * (time[last] - time[last][0]), values[last])
+        np.testing.assert_allclose(found or np.zeros(3), expected, rtol=1e-6, atol=1e-15)
 
 
 @pytest.mark.parametrize("jitter", [0.0, 0.3])
@@ -101,7 +113,7 @@ def test_a_streams_rate_beyond_its_doubt_has_the_true_sign(measured: bool, size:
     seen = q + size * rng.normal(size=q.shape)
     speeds = true + 100.0 * size * rng.normal(size=q.shape)
     differentiator = Differentiator(order, window)
-    watch = VelocityErrorEstimator(fit_gain(order + 1, window, window - 1))
+    watch = VelocityErrorEstimator(differentiator.slope_gain())
     wrong, known = [], []
     for k, t in enumerate((SECOND * time).round().astype(int).tolist()):
         qd = speeds[k] if measured else None
