@@ -19,7 +19,7 @@ from pkm_twin.files import STANDARD, parse_numbers, require_replaceable
 
 @contextmanager
 def progress(what: str, total: int | None) -> Iterator[Callable[[int], None]]:
-    """A progress bar on stderr, where that is a terminal, that a count moves.
+    """Draw a progress bar on stderr, if that is a terminal; yield a function that takes the count.
 
     It begins with the first count, so that the time left of work that is gone on with is that of
     the rest.
@@ -100,7 +100,7 @@ def refuse_existing(path: Path, overwrite: bool, source: Path | None = None) -> 
 
 @contextmanager
 def writing(path: Path | None) -> Iterator[None]:
-    """What the system refuses as one line with the file's name, ``path`` where it names none.
+    """Convert errors of the system to one line with the file's name.
 
     :raises PkmTwinError: in place of any ``OSError``.
     """
@@ -116,7 +116,7 @@ def tell(text: str) -> None:
 
 
 def system_error(error: OSError) -> str:
-    """What the system refused, as a line."""
+    """Return an error of the system as a line."""
     what = error.strerror or str(error)
     return f"{error.filename}: {what}" if error.filename else what
 

@@ -29,7 +29,7 @@ BY_AXIS: Final = "m_m_m_rad_rad_rad"
 
 
 def report_of(result: Result, marks: Sequence[str] = ()) -> tuple[Report, list[Table]]:
-    """A fit's report, and tables for its page alone.
+    """Return a fit's report, and tables for its page alone.
 
     :param marks: notes that come first.
     """
@@ -144,7 +144,7 @@ def _residual_table(held: Mapping[str, tuple[float, float, float, str]]) -> Tabl
 
 
 def _channels(result: Result, units: Sequence[str]) -> Table:
-    """What the verdict says of each channel."""
+    """Return what the verdict says of each channel."""
     columns = [
         Column("", text=text)
         for text in ("RMS residual in the band of the motion", "RMS noise there", "unit",
@@ -158,7 +158,7 @@ def _channels(result: Result, units: Sequence[str]) -> Table:
 
 
 def _delays(result: Fit) -> list[str]:
-    """What was done to the signals, by recording."""
+    """Describe how the signals of each recording were filtered."""
     lines = []
     for made, delay in zip(result.problem.whole, result.delays, strict=True):
         how, late = made.how, lateness(delay, made.period)
@@ -201,7 +201,7 @@ def _effort_facts(result: Fit) -> list[Fact]:
 
 
 def _elastic_facts(result: ElasticFit) -> list[Fact]:
-    """Groups, noise and what was held out; null for what was not measured."""
+    """Report groups, noise and held-out deflections; null for what was not measured."""
     groups = [
         {
             "elements": group.elements,
@@ -301,7 +301,7 @@ def _changes(shown: Mapping[str, Number]) -> Any:
 
 
 def _terms(law: Law) -> str:
-    """A drive's friction law with its values."""
+    """Write a drive's friction law with its values."""
     each = zip(law.terms, law.values, law.deviations, strict=True)
     return ", ".join(
         f"{term} {value:.3f} +- {deviation:.3f}" + (" A" if term != "load-dependent" else "")

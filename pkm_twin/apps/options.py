@@ -48,7 +48,7 @@ class OfRobot(OfPlatform):
     robot: str = setting(..., ROBOT_HELP, argument=True)
 
     def machine(self) -> Robot:
-        """The robot, with the payload where the command has one.
+        """Load the robot, with the payload if the command has one.
 
         :raises PkmTwinError: it cannot be read.
         """
@@ -83,7 +83,7 @@ class Carries(OfRobot):
             raise click.UsageError(str(error)) from None
 
     def machine(self) -> Robot:
-        """The robot with its payload."""
+        """Load the robot with its payload."""
         machine, carried = super().machine(), self.load
         return machine if carried is None else carried.on(machine)
 
@@ -99,7 +99,7 @@ class CarriesAtTimes(Carries):
     )
 
     def machine(self) -> Robot:
-        """The robot alone: what it carries and when is its recording's."""
+        """Load the robot alone: the recording knows what it carries and when."""
         return OfRobot.machine(self)
 
 
@@ -159,7 +159,7 @@ class ReadsRecordings(ReadsTables):
         self, path: Path, robot: Robot | str | None, progress: Callable[[int], None] | None = None,
         **more: Any,
     ) -> Recording:  # fmt: skip
-        """A recording; ``more``: other fields of ``ReadOptions``."""
+        """Read a recording; ``more``: other fields of ``ReadOptions``."""
         from pkm_twin.bags.storage import is_bag
         from pkm_twin.recordings import read
 
@@ -210,7 +210,7 @@ class BeyondLimitsToo:
     def admitted(
         self, machine: Robot, q: Array, qd: Array | None = None, where: str = ""
     ) -> list[Beyond]:
-        """What joint states (..., n) have beyond the joint limits.
+        """Describe what joint states (..., n) have beyond the joint limits.
 
         :param where: the recording, where there may be several.
         :raises ParameterError: something, and it is not allowed.
@@ -230,7 +230,7 @@ class AtPose(Carries, BeyondLimitsToo):
     at: str | None = setting(None, "the pose's coordinates, separated by commas; default: home")
 
     def pose(self, machine: Robot) -> list[float]:
-        """The pose, shape (m,).
+        """Return the pose, shape (m,).
 
         :raises ParameterError: beyond the joint limits, unless that is allowed.
         """
@@ -323,7 +323,7 @@ class Draws(Overwrites):
     no_picture: bool = setting(False, "draw nothing next to --out")
 
     def drawing(self, command: str) -> Path | None:
-        """The picture's file, None for none.
+        """Return the picture's file, None for none.
 
         :raises ParameterError: another ending.
         """
@@ -369,6 +369,6 @@ class AwayFromSingular:
 
 
 def payload_fact(carried: Load | None) -> Fact:
-    """The payload that a command used."""
+    """Report the payload that a command used."""
     data = None if carried is None else carried.as_json()
     return Fact("payload", data, text="payload", shown=str(carried or "as in the robot file"))

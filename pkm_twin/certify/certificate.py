@@ -119,9 +119,7 @@ class Certificate:
         """The certificate as numbers and names, for JSON; units of differences as in BOUNDS."""
         found = asdict(self)
         found["constraints"] = found.pop("rows")
-        found["items"] = [
-            asdict(item) | {"good": item.good} for item in self.items
-        ]  # fmt: skip
+        found["items"] = [asdict(item) | {"good": item.good} for item in self.items]
         return found | {"good": self.good}
 
 

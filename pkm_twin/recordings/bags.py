@@ -51,7 +51,7 @@ def read_bag(
     path: Path, robot: str | Robot | None, how: ReadOptions,
     progress: Callable[[int], None] | None = None,
 ) -> Recording:  # fmt: skip
-    """A bag's joint states and what was measured beside them; every message checked as by a node.
+    """Read a bag's joint states and its other measurements; messages are checked as by a node.
 
     Of a bag without joint states, where ``how`` takes it, the motion of its JointTrajectory.
 
@@ -67,9 +67,7 @@ def read_bag(
         if plan is not None:
             origin = Origin.of_bag(bag)
             computed = None if origin is None else plan.effort
-            return replace(
-                plan, load=held, source=str(path), origin=origin, computed=computed
-            )  # fmt: skip
+            return replace(plan, load=held, source=str(path), origin=origin, computed=computed)
     topics = choose_topics(bag, machine, how.topics, how.deflected)
     found = _messages(bag, machine, topics, how, progress)
     frame = found.wrenches[0].frame if found.wrenches else ""
@@ -112,7 +110,7 @@ def read_bag(
 
 
 def bags_of(folder: Path) -> list[Path]:
-    """Recordings in a folder and below: MCAP files and rosbag2 folders, by name."""
+    """List the recordings in a folder and below: MCAP files and rosbag2 folders, by name."""
     whole = {path.parent for path in folder.rglob(METADATA_FILE)}
     files = [p for p in folder.rglob("*.mcap") if not whole & set(p.parents)]
     return sorted([*whole, *files])
@@ -127,7 +125,7 @@ def is_collection(path: Path) -> bool:
 
 
 def _robot_of(bag: Bag, name: str | Robot | None) -> Robot:
-    """The robot, by name too, or the one that the bag's metadata names.
+    """Return the robot, which may be a name; without one, the robot of the bag's metadata.
 
     :raises BagError: neither is given, or the bag names one that is not in ``config/``.
     """
@@ -159,7 +157,7 @@ def _messages(
     bag: Bag, robot: Robot, topics: Topics, how: ReadOptions,
     progress: Callable[[int], None] | None,
 ) -> _Found:  # fmt: skip
-    """The accepted messages of the chosen topics, joint states in the order of their stamps.
+    """Yield the accepted messages of the chosen topics, joint states in the order of their stamps.
 
     :raises BagError: no joint state is accepted.
     """
@@ -204,7 +202,7 @@ def _messages(
 
 
 def _wrench_reader(how: ReadOptions, rules: StampRules) -> Callable[[Any, int], WrenchSample]:
-    """Reads a geometry_msgs/WrenchStamped and its log time, ns, of one frame, as a node does."""
+    """Return a reader of geometry_msgs/WrenchStamped (and log time, ns) of one frame."""
     accepted = how.wrench_frame
 
     def read(message: Any, now: int) -> WrenchSample:
@@ -246,7 +244,7 @@ def _nearest(stamps: Stamps, others: Stamps) -> NDArray[np.intp]:
 
 
 def _at_deflections(r: Recording, joints: Stamps, found: _Found, how: ReadOptions) -> Recording:
-    """The recording at the times of its deflections, linear between joint states and wrenches.
+    """Interpolate a recording linearly at the times of its deflections.
 
     :raises BagError: no deflection has both near it.
     """
@@ -362,7 +360,7 @@ def _columns(r: Recording) -> dict[str, Array]:
 
 
 def read_trajectory(bag: Bag, robot: Robot) -> Recording | None:
-    """The motion of a bag's only JointTrajectory, in the model's numbers.
+    """Read the motion of a bag's only JointTrajectory, in the model's numbers.
 
     None where the bag has no trajectory with velocities and accelerations.
 

@@ -86,7 +86,7 @@ class Load:
         return np.asarray(np.logical_or.reduce(near), np.bool_)
 
     def on(self, robot: Robot, mass: float | None = None) -> Robot:
-        """The robot with this payload.
+        """Return the robot with this payload.
 
         :param mass: one of ``masses``, by default the greatest.
         :raises ParameterError: the robot takes none, or not such a one; a mass that is many times
@@ -123,7 +123,7 @@ class Load:
 
 
 def payload_columns(robot: Robot, carried: Load | None, time: Array) -> dict[str, Array]:
-    """A table's columns of its payload, the robot's own between; none without a load."""
+    """Return a table's payload columns, with the robot's own in between; empty without a load."""
     if carried is None:
         return {}
     own, mass = robot.payload, carried.carried(time)
@@ -134,7 +134,7 @@ def payload_columns(robot: Robot, carried: Load | None, time: Array) -> dict[str
 
 
 def load_of_table(robot: Robot, table: Table, time: Array) -> Load | None:
-    """The payload of a table's columns; None where there is none beside the robot's own.
+    """Read the payload from a table's columns; None if it is the robot's own.
 
     :raises ParameterError: a negative mass, several centres, or a part of a centre.
     """
@@ -174,7 +174,7 @@ MASS, PICKED, RELEASED, CENTRE = (
 
 
 def load_facts(carried: Load | None) -> dict[str, Any]:
-    """What a bag's metadata tell of its payload; times as its stamps resolve them."""
+    """Return a payload as a bag's metadata; times are rounded as its stamps are."""
     if carried is None:
         return {}
     rows = list(zip(*carried.spans, strict=True))
@@ -188,7 +188,7 @@ def load_facts(carried: Load | None) -> dict[str, Any]:
 
 
 def told_load(bag: Bag) -> Load | None:
-    """The payload that the bag's metadata tell of.
+    """Read the payload from the bag's metadata.
 
     :raises BagError: a value is missing or no number.
     """
@@ -229,7 +229,7 @@ def _fact(bag: Bag, facts: Mapping[str, str], name: str) -> list[float]:
 
 
 def metadata_error(bag: Bag, name: str, value: str | None, expected: str) -> BagError:
-    """The refusal of a value of the bag's own metadata."""
+    """Return the error for a wrong value in the bag's own metadata."""
     return BagError(
         f"metadata 'pkm_twin': {name} is {value!r}; expected {expected}",
         path=bag.report.path,
@@ -263,7 +263,7 @@ def parse_times(text: str) -> tuple[tuple[float, float], ...]:
 def by_load(
     robot: Robot, carried: Load | None, time: Array, longest: int
 ) -> Iterator[tuple[Robot, slice]]:
-    """The robot as it is loaded, and the samples in a row (at most ``longest``) for which.
+    """Yield the loaded robot and the consecutive samples (at most ``longest``) that have its load.
 
     A payload that is sought is the robot's own.
     """

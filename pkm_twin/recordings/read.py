@@ -82,7 +82,7 @@ def read(
     path: str | Path, robot: str | Robot | None = None, how: ReadOptions = DEFAULT,
     progress: Callable[[int], None] | None = None,
 ) -> Recording:  # fmt: skip
-    """A recording of a robot, with a file's own robot where none is given.
+    """Read a recording of a robot; without one, of the robot that the file names.
 
     Columns of a table, in any order: ``time``; for every joint NAME ``NAME.position``, or in their
     place all coordinates of the pose (m, rad); optionally ``NAME.velocity`` and
@@ -115,7 +115,7 @@ def read(
 
 
 def _of_table(path: Path, name: str | Robot | None, how: ReadOptions) -> Recording:
-    """A recording as a table; see :func:`read`."""
+    """Read a table as a recording; see :func:`read`."""
     if name is None:
         _require_recording(path)
         raise ParameterError("--robot", None, "a robot, because a table does not name its robot")
@@ -210,7 +210,7 @@ def _require_recording(path: Path) -> None:
 
 
 def _side(robot: Robot, side: str) -> JointMap | None:
-    """What makes the joints' values of a table's; None where they are the joints' own.
+    """Return the map from a table's joint values to the joints'; None if they are the joints' own.
 
     :raises ParameterError: motors of a robot without drives.
     """
@@ -233,7 +233,7 @@ def _drives(robot: Robot) -> list[DriveSpec]:
 
 
 def _rated(robot: Robot, side: str) -> Array:
-    """The motors' rated torques, shape (n,), N m."""
+    """Return the motors' rated torques, shape (n,), N m."""
     if side != "motor":
         raise ParameterError("--units", "percent", "--side motor: it is the motor's rated torque")
     rated = [drive.rated_torque for drive in _drives(robot)]
@@ -294,7 +294,7 @@ def _of_pose(table: Table, robot: Robot, pose: Array) -> tuple[Array, Array | No
 
 
 def times_of(path: Path, values: Array) -> Array:
-    """A column of times from its first on, s.
+    """Return a column of times, s from its first.
 
     :raises ParameterError: they do not rise, or farther than a recording lasts.
     """
@@ -333,7 +333,7 @@ def check_pose(path: Path, robot: Robot, q: Array, pose: Array, how: str = "") -
                 f"{path}: {names}, sample {begin + worst}",
                 f"{1e3 * size[worst]:.4g} mm from the pose of the joint positions on {robot.name}",
                 f"a table of this machine{how}",
-            )  # fmt: skip
+            )
 
 
 def check_units(

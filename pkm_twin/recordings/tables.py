@@ -171,7 +171,7 @@ class Table(dict[str, Array]):
 
 
 def kinds_of(robot: Robot, side: str = "joint") -> dict[str, str]:
-    """What the columns of a robot's motion measure: angle, length, time, or another quantity.
+    """Return what the columns of a robot's motion measure: angle, length, time, or another.
 
     :param side: whose numbers the joints' are; a motor turns.
     """
@@ -314,7 +314,7 @@ def _parquet(
 
 
 def _lines(text: TextIO, path: Path) -> Iterator[str]:
-    """The lines of a file, none so long that a row takes all the memory."""
+    """Yield the lines of a file; a line that would take all memory is rejected."""
     while line := text.readline(MAX_LINE):
         if len(line) == MAX_LINE:
             raise ParameterError(
@@ -345,7 +345,7 @@ def _cells(path: Path, lines: Iterator[str], first: str, dialect: Dialect) -> It
 
 
 def _number(cell: str) -> float:
-    """A cell's number; NaN of an empty one.
+    """Return a cell's number, NaN for an empty cell.
 
     :raises ValueError: no finite number.
     """

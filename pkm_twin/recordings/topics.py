@@ -50,7 +50,7 @@ _FIELDS: Final = {
 
 
 def _definition(fields: Sequence[str], *held: str) -> str:
-    """The ros2msg text of a type with a header, these fields, and the types that they hold."""
+    """Return the ros2msg text of a type with a header, fields, and the types that they hold."""
     parts = ["\n".join(["std_msgs/Header header", *fields])]
     parts += ["\n".join([f"MSG: {name}", *_FIELDS[name]]) for name in ("std_msgs/Header", *held)]
     return f"\n{SEPARATOR}\n".join(parts) + "\n"
@@ -102,7 +102,7 @@ class Topics:
 def choose_topics(
     bag: Bag, robot: Robot, wanted: Sequence[str] = (), deflected: bool = False
 ) -> Topics:
-    """The joint-state topic that carries the robot's joints, and the wrench topic.
+    """Find the joint-state topic that carries the robot's joints, and the wrench topic.
 
     The twin's own outputs, and what no sensor publishes, are left out. Of several that fit,
     ``/joint_states``, ``/wrench`` and ``/measured_deflection`` are taken. ``wanted`` names them
@@ -200,7 +200,7 @@ def is_truth(topic: str) -> bool:
 
 
 def type_of(info: TopicInfo) -> str:
-    """A topic's type as ROS 2 writes it; libraries for other encodings leave the ``msg`` out."""
+    """Return a topic's type as ROS 2 writes it; some libraries leave the ``msg`` out."""
     package, _, name = info.type.partition("/")
     return info.type if "/" in name or not name else f"{package}/msg/{name}"
 
@@ -225,7 +225,7 @@ def _candidates(bag: Bag, kind: str, wanted: list[str], left_out: dict[str, str]
 
 
 def _only(bag: Bag, what: str, fit: list[str], usual: str, left_out: dict[str, str]) -> str | None:
-    """The topic of several that has the usual name, None of none."""
+    """Return the topic with the usual name among several, None without any."""
     if not fit:
         return None
     preferred = [name for name in fit if name.split("/")[-1] == usual]

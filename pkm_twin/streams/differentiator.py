@@ -137,7 +137,9 @@ class Differentiator:
     def slope_gain(self) -> float:
         """Return the noise of velocities from positions, relative to theirs, times the period."""
         at = self.window // 2 if self.middle else self.window - 1
-        return float(np.linalg.norm(fit_weights(np.arange(self.window), self.order + 1, 1, at)))
+        return float(
+            np.linalg.norm(fit_weights(np.arange(float(self.window)), self.order + 1, 1, at))
+        )
 
     def _weights(self) -> tuple[int, Array, Array]:
         """Return the order of derivative, the samples' times in periods, and their weights."""

@@ -55,11 +55,11 @@ class Camera:
         self.image = np.ones((len(y), len(x), 3))
 
     def see(self, points: Array) -> Array:
-        """Base coordinates, (..., 3), in those of the camera."""
+        """Transform base coordinates, (..., 3), to those of the camera."""
         return np.asarray(points @ self.turn.T, np.float64)
 
     def _window(self, points: Array, radius: float) -> tuple[Any, Array, Array]:
-        """The samples around some points, and their coordinates."""
+        """Return the pixels around some points, and their coordinates."""
         (left, low), (right, high) = points[:, :2].min(0) - radius, points[:, :2].max(0) + radius
         columns = slice(*np.searchsorted(self.x, [left, right]))
         rows = slice(*np.searchsorted(self.y, [low, high]))
@@ -77,7 +77,7 @@ class Camera:
         self.depth[window][nearer] = depth[nearer]
 
     def ball(self, at: Array, radius: float, colour: Any) -> None:
-        """A ball around a point (3,) in base coordinates."""
+        """Draw a ball around a point (3,) in base coordinates."""
         (middle,) = self.see(at[None])
         window, x, y = self._window(middle[None], radius)
         across = np.stack([x - middle[0], y - middle[1]], -1)
@@ -87,7 +87,7 @@ class Camera:
         self._paint(window, np.nan_to_num(middle[2] - towards, nan=np.inf), normal, colour)
 
     def cylinder(self, ends: Array, radius: float, colour: Any) -> None:
-        """A cylinder between two points (2, 3) in base coordinates, with its lids."""
+        """Draw a cylinder between two points (2, 3) in base coordinates, with its lids."""
         start, end = self.see(ends)
         length = float(np.linalg.norm(end - start))
         if not length > 0.0:
@@ -111,7 +111,7 @@ class Camera:
         self._paint(window, np.where(good, lid, np.inf), facing, colour)
 
     def plate(self, corners: Array, colour: Any, opacity: float = 1.0) -> None:
-        """A flat plate by its corners in base coordinates, shape (k, 3)."""
+        """Draw a flat plate by its corners in base coordinates, shape (k, 3)."""
         corners = self.see(corners)
         middle = corners.mean(0)
         normal = np.linalg.svd(corners - middle)[2][2]
@@ -125,7 +125,7 @@ class Camera:
         self._paint(window, depth, np.broadcast_to(normal, (*x.shape, 3)), colour, opacity)
 
     def pixels(self) -> Array:
-        """The picture, shape (HEIGHT, WIDTH, 3), the first row at the bottom."""
+        """Return the picture, shape (HEIGHT, WIDTH, 3), the first row at the bottom."""
         fine = self.image.reshape(HEIGHT, FINE, WIDTH, FINE, 3)
         return np.asarray(fine.mean((1, 3)), np.float64)
 
@@ -135,7 +135,7 @@ GROUND_BAR: Final = 0.015
 
 
 def draw(robot: Robot) -> Any:
-    """A matplotlib figure of the robot at home.
+    """Draw the robot at home as a matplotlib figure.
 
     Colours are those of ``pkm-twin view``: drives blue, rods light blue, the platform orange. The
     names of the drives are next to them, the base frame and a scale in the corners.

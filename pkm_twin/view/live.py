@@ -82,7 +82,7 @@ class Live:
         self._deflection: Array | None = None
 
     def take(self, name: str, message: Any) -> None:
-        """A message of a topic by its name in TOPICS; one that makes no sense is counted."""
+        """Take a message of a topic by its name in TOPICS; an invalid one is counted."""
         with self._lock:
             try:
                 self._take[name](message)

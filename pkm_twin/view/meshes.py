@@ -45,7 +45,7 @@ def body_meshes(robot: Robot) -> dict[str, tuple[Array, NDArray[np.int64]]]:
 
 
 def mesh_path(visual: Visual) -> Path:
-    """The file of a mesh: a path from the URDF's folder, ``file://`` or ``package://``.
+    """Return a mesh's file: a path from the URDF's folder, ``file://`` or ``package://``.
 
     A package is a folder of that name above the URDF or beside one of those, else an installed
     ROS package.

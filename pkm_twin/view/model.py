@@ -183,12 +183,12 @@ class Model:
         return Range("deflection enlarged", "times", 0.0, top, _step(top))
 
     def to_joints(self, state: State, q: ArrayLike) -> State:
-        """The state at joint positions, shape (n,), or the old one with the reason why not."""
+        """Return the state at joint positions, (n,), or the old one with the reason why not."""
         asked = np.asarray(q, np.float64)
         return self._moved(state, asked, None)
 
     def to_pose(self, state: State, pose: ArrayLike) -> State:
-        """The state at a pose, shape (m,), or the old one with the reason why not."""
+        """Return the state at a pose, shape (m,), or the old one with the reason why not."""
         asked = np.asarray(pose, np.float64)
         try:
             q = self.robot.inverse(asked)
@@ -197,7 +197,7 @@ class Model:
         return self._moved(state, q, asked)
 
     def to_platform(self, state: State, position: Array, rotation: Array) -> State:
-        """The state whose platform is nearest to a place (3,) m and a rotation (3, 3).
+        """Return the state whose platform is nearest to a position (3,), m, and a rotation (3, 3).
 
         What the machine cannot do is left out; angles count by the size of the platform. Errors as
         :meth:`to_pose`.
@@ -236,7 +236,7 @@ class Model:
         return _refused(state, beyond) if beyond else replace(state, q=q, pose=pose, refusal="")
 
     def _passive_beyond(self, q: Array, pose: Array) -> str:
-        """What passive joint is beyond its limits, in words; empty where none is."""
+        """Describe which passive joint is beyond its limits; empty if none is."""
         robot, graph = self.robot, self.robot.graph
         bound = getattr(robot.limits, "joint_angle", None)
         angles = robot.limit_angles(pose) if self._angles else None
@@ -254,21 +254,21 @@ class Model:
         return ""
 
     def loaded(self, state: State, wrench: ArrayLike) -> State:
-        """The state under another wrench, shape (6,), N and N m; the old one where that is none."""
+        """Return the state under a wrench, (6,), N and N m; the old one if it is not finite."""
         values = np.array(wrench, np.float64)
         if not np.isfinite(values).all():
             return _refused(state, "the wrench is not finite")
         return replace(state, wrench=values, refusal="")
 
     def link(self, state: State) -> str:
-        """The query of an address that carries robot, pose and load."""
+        """Return the query of an address that carries robot, pose and load."""
         parts = {"robot": self.robot.name, "pose": _listed(state.pose)}
         if state.wrench.any():
             parts["load"] = _listed(state.wrench)
         return f"?{urlencode(parts, safe=',')}"
 
     def linked(self, state: State, link: str) -> State:
-        """The state of an address with such a query, or the old one with the reason why not."""
+        """Return the state of such an address, or the old one with the reason why not."""
         parts = {name: given[-1] for name, given in parse_qs(link.rpartition("?")[2]).items()}
         if parts.get("robot") != self.robot.name:
             return _refused(state, f"the link is not of the robot {self.robot.name}")
@@ -332,7 +332,7 @@ class Model:
         )  # fmt: skip
 
     def deflected(self, state: State, deflection: Array) -> Deflection:
-        """The members' displacements where the platform's is (6,), m and rad, base axes."""
+        """Return the members' displacements for the platform's, (6,), m and rad, base axes."""
         robot, q = self.robot, state.q
         wrench = np.linalg.solve(platform_response(robot, q, np.zeros(6)).compliance, deflection)
         return Deflection(np.array(deflection), member_deflections(robot, q, wrench))
@@ -361,11 +361,11 @@ def _grade(value: float, bad: float, warn: float) -> Grade:
 
 
 def _step(span: float) -> float:
-    """A power of ten, 400 to 4000 of it in the span."""
+    """Return a power of ten of which 400 to 4000 are in the span."""
     return float(10.0 ** math.floor(math.log10(max(span, 1e-9) / 400)))
 
 
 def _round(value: float) -> float:
-    """The next of 1, 2, 5, 10, 20 ... from a value on."""
+    """Round up to the next of 1, 2, 5, 10, 20 ..."""
     decade = 10.0 ** math.floor(math.log10(max(value, 1e-9)))
     return float(next(k * decade for k in (1.0, 2.0, 5.0, 10.0) if k * decade >= 0.999 * value))

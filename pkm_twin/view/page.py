@@ -249,7 +249,7 @@ class Page:
                 self.stage.gizmo.wxyz = np.roll(turn, 1)
 
     def draw_deflected(self, deflection: Array, shares: dict[str, float], dominant: str) -> None:
-        """The state with a deflection (6,), m and rad, base axes, enlarged as the slider says."""
+        """Draw the state with a deflection (6,), m and rad, base axes, enlarged by the slider."""
         moved = self.model.deflected(self.state, deflection).times(self._enlarge.value)
         self.stage.draw(self.state.q, moved, shares, dominant)
 

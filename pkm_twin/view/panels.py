@@ -279,7 +279,7 @@ def _chart(
 
 
 def _mark(times: Array, values: Array, now: float) -> Array:
-    """A curve along the bottom with a spike at the time shown: charts draw no upright lines."""
+    """Return a curve along the bottom with a peak at the present time: charts have no lines."""
     result = np.full(len(times), float(values.min()))
     result[int(np.argmin(np.abs(times - now)))] = float(values.max())
     return result

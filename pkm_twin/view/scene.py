@@ -43,7 +43,7 @@ SCALE: Final = np.array([[198, 206, 214], [240, 228, 66], [213, 94, 0]], np.floa
 
 
 def share_colours(shares: Mapping[str, float]) -> dict[str, Colour]:
-    """A colour for each element by its share of the strain energy, the greatest at the scale's end.
+    """Return a colour for each element by its share of the strain energy.
 
     Empty where there is no energy.
     """
@@ -101,7 +101,7 @@ class Deflection:
     members: Mapping[str, tuple[Array, Array]]
 
     def times(self, factor: float) -> Deflection:
-        """The same, enlarged."""
+        """Return the deflection enlarged by a factor."""
         members = {name: (at, factor * moved) for name, (at, moved) in self.members.items()}
         return Deflection(factor * self.platform, members)
 
@@ -150,7 +150,7 @@ class Scene:
         return found
 
     def _member(self, place: Place) -> str:
-        """The member whose end a point is, else that it is on, else that ends there; or none."""
+        """Return the member that ends at a point, else that it lies on; empty without one."""
         key = place[0], place[1].tobytes()
         if key not in self._members:
             self._members[key] = self._find_member(*place)
@@ -289,7 +289,7 @@ class Scene:
         return ROD if bar.part in graph.rods else BODY
 
     def _motor(self, joint: Joint) -> Bar:
-        """The cylinder that stands for a drive, along its axis."""
+        """Return the cylinder that stands for a drive, along its axis."""
         axis, body, middle = joint.axes[0], joint.inner, joint.at
         radius = self._radius((joint.outer, joint.at))
         if telescope(joint):
@@ -345,7 +345,7 @@ ANCHORS: Final = {
 
 
 def anchors(spots: Array, sizes: Array, window: tuple[float, float]) -> list[str]:
-    """An anchor for each label, so that none covers another; empty where none is free.
+    """Return an anchor for each label, so that none covers another; empty if none is free.
 
     What finds no place is placed first in another attempt.
 

@@ -174,7 +174,7 @@ class Stage:
             draw.add_mesh_simple("/at_rest/plate", *still, color=(110, 110, 110), opacity=0.35)
 
     def _tool(self, away: float) -> None:
-        """A flange and its axis on the platform; ``away``: the base is below, 1, or above, -1."""
+        """Draw a flange and its axis on the platform; ``away``: 1 for a base below, -1 above."""
         (round_, faces), _ = round_mesh()
         size = self._scene.size
         for name, radius, length in (("flange", 0.05, 0.03), ("tool", 0.012, 0.2)):
@@ -223,7 +223,7 @@ class Stage:
         shares: Mapping[str, float] | None = None,
         dominant: str = "",
     ) -> None:
-        """The machine at q (n,), with a deflection as it is to be drawn, already enlarged.
+        """Draw the machine at q (n,), with a deflection that is already enlarged.
 
         At rest it is a shadow of the platform and lines along the bars. Elements have the colour of
         their share, ``dominant`` has a label.
@@ -293,7 +293,7 @@ class Stage:
         self._trail.visible, self._passed = shown, []
 
     def extend_trail(self, at: Array) -> None:
-        """The reference point is here now, (3,) m."""
+        """Extend the trail to the reference point's present position, (3,) m."""
         passed = self._passed
         if not self._trail.visible or (
             passed and np.linalg.norm(at - passed[-1]) < 1e-3 * self._scene.size

@@ -94,7 +94,7 @@ def buttons(name: str) -> str:
 
 
 def note(text: str) -> str:
-    """A line of plain text."""
+    """Return a line of plain text."""
     return f'<div id="note" style="{_STYLE}">{escape(text)}</div>'
 
 
@@ -186,7 +186,7 @@ def bars(shares: Mapping[str, float]) -> str:
 
 
 def instant(robot: Robot, timeline: Timeline, at: Instant) -> str:
-    """The bag at one time: measured effort, the twin's, and the residual of every joint."""
+    """Describe the bag at one time: each joint's measured effort, the twin's, and the residual."""
     rows = [_head("joint", "measured", "model", "residual")]
     columns = (("measured", at.measured), ("twin", at.twin), ("residual", at.residual))
     for k, name in enumerate(robot.joint_names):
@@ -202,7 +202,7 @@ def instant(robot: Robot, timeline: Timeline, at: Instant) -> str:
 
 
 def heard(robot: Robot, live: Heard, waiting: str) -> str:
-    """What running nodes say: the latest torque and residual, the dominant element, refusals."""
+    """Describe what running nodes say: efforts, residuals, dominant element, rejections."""
     rows = [_head("joint", "torque", "residual")]
     for k, name in enumerate(robot.joint_names):
         cells = []

@@ -57,7 +57,7 @@ class Timeline:
 
     @classmethod
     def of(cls, recording: Recording) -> Timeline:
-        """The time line of a recording.
+        """Return the time line of a recording.
 
         :raises UnreachableError: a joint state that the machine cannot be assembled in.
         :raises SingularityError: one in a singularity.
@@ -79,7 +79,7 @@ class Timeline:
         return float(self.time[-1])
 
     def at(self, time: float) -> Instant:
-        """The sample that is nearest to a time, s."""
+        """Return the sample that is nearest to a time, s."""
         right = int(np.clip(np.searchsorted(self.time, time), 0, len(self.time) - 1))
         left = max(0, right - 1)
         k = left if time - self.time[left] < self.time[right] - time else right
@@ -94,7 +94,7 @@ class Timeline:
         )
 
     def curves(self) -> tuple[Array, Array, Array | None]:
-        """Times (j,), the twin's and the measured efforts (j, n) where the twin has any.
+        """Return times (j,), the twin's and the measured efforts (j, n) where the twin has any.
 
         No more than POINTS of them, evenly taken.
         """

@@ -139,7 +139,7 @@ class Calibrate(OfRobot, ReadsTables, BeyondLimitsToo, Accepts, Overwrites):
 
 
 def calibrate(given: Calibrate) -> Report:
-    """The calibrated robot's numbers and errors, or a plan.
+    """Calibrate a robot's numbers, or plan the poses to measure.
 
     :raises ParameterError: poses of another machine, or too few; see
         :func:`pkm_twin.identification.calibration.calibrate`.
@@ -267,7 +267,7 @@ def report_of(
 
 
 def _open(result: Estimate) -> list[str]:
-    """What is not determined, in lines."""
+    """Describe what the measurements do not determine, a line each."""
     lines = [
         fill(line, WIDTH, initial_indent="  ", subsequent_indent="    ")
         for line in result.undetermined

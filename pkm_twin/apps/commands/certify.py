@@ -48,7 +48,7 @@ class Certify(OfRobot, Seeded):
 
 
 def certify(given: Certify) -> Report:
-    """The differences of each engine, against their bounds."""
+    """Compare the model with each independent engine, against the bounds."""
     from pkm_twin.certify.certificate import ENGINES, certify_variants
 
     unknown = [name for name in given.engine if name not in ENGINES]

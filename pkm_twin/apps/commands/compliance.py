@@ -39,7 +39,7 @@ class Compliance(OfRobot, BeyondLimitsToo):
 
 
 def compliance(given: Compliance) -> Report:
-    """The platform's compliance, deflection and shares of strain energy.
+    """Compute the platform's compliance, deflection and shares of strain energy.
 
     :raises PkmTwinError: a pose that is out of reach or of limits.
     """

@@ -54,7 +54,7 @@ class Convert(OfPlatform, Writes):
 
 
 def convert(given: Convert) -> Report:
-    """The YAML of a robot, or of a printer with its measurements.
+    """Write the YAML of a robot, or of a printer with its measurements.
 
     :raises PkmTwinError: a file that cannot be read.
     """

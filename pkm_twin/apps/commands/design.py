@@ -100,7 +100,7 @@ class Design(Carries, ReadsMotions, Writes, Draws, Seeded):
 
 
 def design(given: Design) -> Report:
-    """The best machine, a sweep of machines, or the budget of pose errors.
+    """Optimise a machine, sweep its numbers, or compute its budget of pose errors.
 
     :raises PkmTwinError: what cannot be asked, or cannot be computed.
     """
@@ -128,7 +128,7 @@ def design(given: Design) -> Report:
 
 
 def read_path(given: Design, path: Path, *, efforts: bool = True) -> tuple[Robot, PosePath]:
-    """The robot with the motion's payload, and the platform's path.
+    """Return the robot with the motion's payload, and the platform's path.
 
     :param efforts: whether they, and so the payload, matter.
     :raises ParameterError: a table that is no motion, or a payload that is held part of the time.
@@ -152,7 +152,7 @@ def read_path(given: Design, path: Path, *, efforts: bool = True) -> tuple[Robot
 
 
 def optimised(given: Design, path: Path) -> Report:
-    """The machine that is best for a path."""
+    """Find the machine that is best for a path."""
     from pkm_twin.design import QUANTITIES
     from pkm_twin.design import design as find
     from pkm_twin.design.search import searches
@@ -236,7 +236,7 @@ def optimised(given: Design, path: Path) -> Report:
 
 
 def against_limits(found: Found, path: PosePath) -> Iterator[Fact]:
-    """The effort and the singularity index of the best machine on the path, judged."""
+    """Judge the best machine's efforts and singularity index on the path by their limits."""
     from pkm_twin.design.pose_path import PathMotion
     from pkm_twin.design.tolerance import MIN_SINGULARITY_INDEX
     from pkm_twin.design.variants import Variants
@@ -295,7 +295,7 @@ def write_robot(robot: Robot, source: str, found: Found, path: Path, out: Path) 
 
 
 def draw(robot: Robot, found: Found, path: PosePath, answer: str) -> Any:
-    """The Pareto front, or the efforts before and after."""
+    """Draw the Pareto front, or the efforts before and after."""
     from pkm_twin.design import QUANTITIES
     from pkm_twin.design.pose_path import PathMotion
     from pkm_twin.design.variants import Variants

@@ -67,7 +67,7 @@ class Excite(OfRobot, AwayFromSingular, Seeded, Writes):
 
 
 def excite(given: Excite) -> Report:
-    """The trajectory's condition number, and that of a bag.
+    """Plan an exciting trajectory; compare its condition number with that of a bag.
 
     :raises PkmTwinError: no trajectory keeps to the limits.
     """

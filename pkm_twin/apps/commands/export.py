@@ -80,7 +80,7 @@ class Moveit(ToFolder):
 
 
 def moveit(given: Moveit) -> Report:
-    """A package for MoveIt."""
+    """Write a package for MoveIt."""
     from pkm_twin.export.moveit import moveit_package
 
     return given.write(moveit_package(given.machine(), given.kinematics_plugin))
@@ -97,7 +97,7 @@ class C(ToFolder):
 
 
 def c(given: C) -> Report:
-    """A package in C."""
+    """Write a package in C."""
     from pkm_twin.export.c_package import c_package
 
     return given.write(c_package(given.machine()))
@@ -118,7 +118,7 @@ class Ros2Control(ToFolder):
 
 
 def ros2_control(given: Ros2Control) -> Report:
-    """A package of controllers."""
+    """Write a package of controllers."""
     from pkm_twin.export.ros2_control import ros2_control_package
 
     return given.write(ros2_control_package(given.machine(), given.bandwidth))
@@ -140,7 +140,7 @@ class FunctionalMockupUnit(ToFile):
 
 
 def fmu(given: FunctionalMockupUnit) -> Report:
-    """An archive of sources, with a binary where a compiler is found."""
+    """Write an archive of sources, with a binary where a compiler is found."""
     from pkm_twin.export.fmu import Fmu, found_compiler
 
     compiler = found_compiler()
@@ -155,7 +155,7 @@ class Mjcf(ToFile):
 
 
 def mjcf(given: Mjcf) -> Report:
-    """A model whose keyframe holds its weight."""
+    """Write a model whose keyframe holds its weight."""
     from delta_dynamics import inverse_dynamics
     from pkm_twin.robot.robot_urdf import robot_mjcf
 
@@ -171,7 +171,7 @@ class Sdf(ToFile):
 
 
 def sdf(given: Sdf) -> Report:
-    """A model for Gazebo."""
+    """Write a model for Gazebo."""
     from pkm_twin.robot.robot_urdf import robot_sdf
 
     return given.write(robot_sdf(given.machine()))
@@ -197,7 +197,7 @@ class Urdf(Printed):
 
 
 def urdf(given: Urdf) -> Report:
-    """The text of a URDF.
+    """Write a URDF.
 
     :raises ParameterError: a prefix or a plugin that cannot be written.
     """
@@ -225,7 +225,7 @@ class ToPrinter(Printed):
 
 
 def printer(given: ToPrinter) -> Report:
-    """The text of a configuration."""
+    """Write a printer's configuration."""
     return given.write(written(printer_of(given.machine()), given.firmware))
 
 

@@ -133,7 +133,7 @@ class Fit(CarriesAtTimes, ReadsRecordings, BeyondLimitsToo, Accepts):
 
 
 def fit(given: Fit) -> Report:
-    """What the recordings say, with the files that are written.
+    """Identify the robot's parameters from recordings, and write the files.
 
     :raises PkmTwinError: recordings that show nothing, or that the machine cannot have made.
     """
@@ -210,7 +210,7 @@ def fit(given: Fit) -> Report:
 
 
 def _of_drive(given: Fit, path: Path) -> Report:
-    """A drive's torque constant and friction by weights."""
+    """Fit a drive's torque constant and friction to weights that it lifts."""
     from pkm_twin.apps.fit_report import drive_report
     from pkm_twin.identification.drives import drive_friction, runs_of
     from pkm_twin.recordings import read_table

@@ -49,7 +49,7 @@ class FrequencyResponse(AtPose, OfTool, Writes, Draws):
 
 
 def frf(given: FrequencyResponse) -> Report:
-    """The modes at the tool point, and where it responds most."""
+    """Compute the modes and the frequency response at the tool point."""
     from stiffness_monitor.modes import natural_frequencies
     from stiffness_monitor.vibration import tool_modes
 
@@ -100,7 +100,7 @@ def frf(given: FrequencyResponse) -> Report:
 def of_modes(
     machine: Robot, pose: list[float], frequencies: Array, damping: Array | None = None
 ) -> list[Fact]:
-    """The robot, the pose, and its lowest modes."""
+    """Return the robot, the pose, and its lowest modes."""
     found = [{"frequency_hz": f} for f in frequencies[:6].tolist()]
     texts = [f"{f:.4g} Hz" for f in frequencies[:6].tolist()]
     for k, ratio in enumerate([] if damping is None else damping[:6].tolist()):

@@ -147,7 +147,7 @@ def _picture(robot: Robot) -> Any:
 
 
 def overconstraint(robot: Robot) -> list[str]:
-    """What rigid-body statics cannot determine, by name; empty where it determines all."""
+    """Name what rigid-body statics cannot determine; empty if it determines all."""
     if not why_no_torques(robot):
         zero = np.zeros(len(robot.joint_names))
         return list(reactions(robot, robot.inverse(robot.home()), zero, zero).indeterminate)
@@ -200,7 +200,7 @@ def _some(names: list[str]) -> str:
 
 
 def _parameters(name: str, value: Any, unit: Any) -> Iterator[Fact]:
-    """A parameter, or a section's parameters under its name."""
+    """Yield a parameter, or a section's parameters under its name."""
     if isinstance(value, dict):
         for key, item in value.items():
             yield from _parameters(f"{name}: {key}", item, unit[key])

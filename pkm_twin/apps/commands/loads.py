@@ -59,7 +59,7 @@ class Loads(CarriesAtTimes, ReadsMotions, Writes, Draws):
 
 
 def loads(given: Loads) -> Report:
-    """The loads of all joints, the largest first in the answer."""
+    """Compute the loads of all joints; the answer names the largest."""
     from pkm_twin.paths.joint_loads import format_spectra, summarise_loads
 
     motion = given.read_motion(given.motion, given.machine())
@@ -96,7 +96,7 @@ def loads(given: Loads) -> Report:
 
 
 def of_joint(load: Summary, exponent: float, duration: float) -> dict[str, Any]:
-    """What is reported of one joint, units in the keys."""
+    """Return what is reported of one joint, units in the keys."""
     open_axes = [axis for axis, good in zip(WRENCH, load.determined, strict=True) if not good]
     entry: dict[str, Any] = {"undetermined": open_axes, "turned_rad": load.turned}
     entry |= {"travelled_m": load.travelled} if load.slides else {}
@@ -132,7 +132,7 @@ def _tables(joints: dict[str, Any]) -> list[Table]:
         Column("bearing_force_rms_N", "N", "RMS"),
         Column("bearing_moment_peak_N_m", "N m", "moment peak"),
         Column("bearing_moment_rms_N_m", "N m", "RMS"),
-    ]  # fmt: skip
+    ]
     rows: dict[str, list[Any]] = {}
     for name, entry in joints.items():
         forces = {a: v for a, v in entry["equivalent_range"].items() if a[0] == "f"}
@@ -157,7 +157,7 @@ def _tables(joints: dict[str, Any]) -> list[Table]:
 
 
 def draw(motion: Recording, loads: Sequence[Summary], title: str) -> Any:
-    """Forces of the joints with the largest ones over time, and their rainflow spectra."""
+    """Draw the largest joint forces over time, and their rainflow spectra."""
     told = [load for load in loads if load.determined[:3].any()]
     shown = sorted(told, key=lambda load: -load.peaks[2])
     figure, axes = plots.columns(2, 1)

@@ -51,7 +51,7 @@ class Lobes(OfMilling, AtPose, OfTool, Writes, Draws):
 
 
 def lobes(given: Lobes) -> Report:
-    """The limits of stability over the spindle's speed."""
+    """Compute the limits of stability over the spindle's speed."""
     from stiffness_monitor.chatter import SPEED_MARGIN, lobes_between
     from stiffness_monitor.vibration import tool_modes
 
@@ -97,7 +97,7 @@ def _place(speed: float, depth: float, is_open: bool) -> dict[str, Any]:
 
 
 def draw(found: Limits, milling: Milling, title: str) -> Any:
-    """The limit of the depth over the speed, with the best speed."""
+    """Draw the limit of the depth over the speed, with the best speed."""
     figure, axes = plots.columns(1, 1)
     ax = axes[0][0]
     depth = 1e3 * found.depths

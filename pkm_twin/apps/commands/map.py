@@ -78,14 +78,14 @@ class OfMap(Carries, Pages, Writes, Draws, Parallel):
         return self.out or Path(f"{Path(self.robot).stem}_{self.kind}.nc")
 
     def drawing(self, command: str) -> Path | None:
-        """The pictures' common name, next to the map's file."""
+        """Return the pictures' common name, next to the map's file."""
         if self.along is not None and self.out is None and self.picture is None:
             return None
         beside = dataclasses.replace(self, out=self.target)
         return super(OfMap, beside).drawing(command)
 
     def cases(self, kind: Kind, machine: Robot) -> list[Case]:
-        """The load cases, where the kind has any.
+        """Return the load cases, if the kind has any.
 
         :raises ParameterError: two of one name, or a wrench that is none.
         """
@@ -117,12 +117,12 @@ class Show(Pages, Overwrites):
     out: Path | None = setting(None, "stem of the PNGs; default: that of the file", writes=True)
 
     def drawing(self, _command: str) -> Path:
-        """The pictures' common name."""
+        """Return the pictures' common name."""
         return (self.out or self.file).with_suffix(".png")
 
 
 def show(given: Show) -> Report:
-    """What a stored map answers, with its pictures."""
+    """Show what a stored map answers, with its pictures."""
     return stored(given.file, given.drawing(""), given.html, given.overwrite)
 
 
@@ -202,10 +202,8 @@ def scalars(data: Dataset) -> dict[str, Any]:
     }
 
 
-def along_path(
-    given: OfMap, kind: Kind, machine: Robot, cases: list[Case], path: Path
-) -> Report:  # fmt: skip
-    """The worst of each case along a path."""
+def along_path(given: OfMap, kind: Kind, machine: Robot, cases: list[Case], path: Path) -> Report:
+    """Evaluate the kind along a path; report the worst of each case."""
     from pkm_twin.maps.along import along
     from pkm_twin.recordings import ReadOptions, read
 
@@ -247,7 +245,7 @@ def along_path(
 
 
 def kind_of(given: OfMap) -> Kind:
-    """The kind with its own options."""
+    """Return the kind with its own options."""
     if isinstance(given, OfMilling) and isinstance(given, OfTool):
         return CuttingDepth(given.milling, given.damping, given.tool)
     kind = KINDS[given.kind]
@@ -255,7 +253,7 @@ def kind_of(given: OfMap) -> Kind:
 
 
 def offered(kind: type[Kind]) -> Command:
-    """A kind as a command, with its own options and those of all maps."""
+    """Return a kind as a command, with its own options and those of all maps."""
     milling = kind is CuttingDepth
     own = [] if milling else [(f.name, get_type_hints(kind)[f.name], f)
                               for f in dataclasses.fields(kind)]  # fmt: skip
@@ -272,7 +270,7 @@ class AfterRobot(Group):
     """Kinds as commands after the robot; ``show`` stands in its place."""
 
     def order(self, words: list[str]) -> list[str]:
-        """The robot and the kind change places."""
+        """Exchange the robot and the kind, so that the kind is the command's name."""
         if not words or words[0] in self.commands:
             return words
         if len(words) == 1 or words[1].startswith("-"):
@@ -280,7 +278,7 @@ class AfterRobot(Group):
         return [words[1], words[0], *words[2:]]
 
     def show(self, name: str) -> str:
-        """The robot comes first."""
+        """Return the name with the robot before it."""
         return name if name == "show" else f"ROBOT {name}"
 
 

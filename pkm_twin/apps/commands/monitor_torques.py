@@ -54,7 +54,7 @@ class Offer:
 
 
 def judge(topic: str, arrivals: Arrivals, offer: Offer) -> Report:
-    """The report of what came, against what a controller needs."""
+    """Judge the messages that came by what a controller needs."""
     a, count = arrivals, arrivals.count
     most = f"at most {1e3 * a.deadline:g} ms"
     duration = (a.last - a.first) / SECOND
@@ -159,7 +159,7 @@ def _subscribe(node: Any, topic: str, take: Any) -> bool:
 
 
 def _offer(node: Any, topic: str) -> Offer | None:
-    """What the publishers of now promise; None where there are none."""
+    """Return the offered QoS of the present publishers; None without any."""
     profiles = [info.qos_profile for info in node.get_publishers_info_by_topic(topic)]
 
     def weakest(promises: tuple[Any, ...]) -> float:

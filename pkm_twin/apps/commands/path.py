@@ -85,9 +85,9 @@ class Motion(Carries, ReadsTables, AwayFromSingular, Writes, Draws):
         "default: home", count=0,
     )  # fmt: skip
     direction: float | None = setting(
-        None, "direction of the cycle in the xy plane, degrees from x towards y; default: x, "
-        "else y",
-    )  # fmt: skip
+        None,
+        "direction of the cycle in the xy plane, degrees from x towards y; default: x, else y",
+    )
     blend: float | None = setting(
         None, "distance from a corner at which rounding begins, m; 0 stops at every waypoint; "
         "default: a smooth curve", low=0.0,
@@ -148,7 +148,7 @@ class Motion(Carries, ReadsTables, AwayFromSingular, Writes, Draws):
 
 
 def path(given: Motion) -> Report:
-    """The motion, and which limits it uses."""
+    """Plan the motion along a path; report which limits it uses."""
     from pkm_twin.paths import ShapedPath, shaped, timed
     from pkm_twin.paths.along import SoftCut
     from pkm_twin.paths.joint_path import only_turns
@@ -236,7 +236,7 @@ def path(given: Motion) -> Report:
 
 
 def _way(given: Motion, machine: Robot) -> tuple[Way, Sequence[float | None] | None]:
-    """The path that a command line asks for, and the payload from each of its waypoints on."""
+    """Return the path, and the payload from each of its waypoints on."""
     from pkm_twin.paths.waypoints import parse_loads
 
     if given.carries and given.payload is not None:
@@ -250,7 +250,7 @@ def _way(given: Motion, machine: Robot) -> tuple[Way, Sequence[float | None] | N
 
 
 def _unloaded(given: Motion, machine: Robot) -> tuple[Way, list[float] | None]:
-    """The path, and the payload of a table's waypoints."""
+    """Return the path, and the payload of a table's waypoints."""
     from pkm_twin import paths
     from pkm_twin.paths.waypoints import read_waypoints
 
@@ -291,7 +291,7 @@ def _limit(name: str, values: tuple[float, ...] | None, machine: Robot) -> list[
 
 
 def _tables(motion: TimedPath, soft: bool) -> list[Table]:
-    """What the terminal shows of limits and peaks; ``soft``: the tolerance bounds the speed too."""
+    """Return tables of limits and peaks; with ``soft`` the tolerance bounds the speed, too."""
     rows: dict[str, list[Any]] = {}
     words_of = {"speed": "speed or tolerance"} if soft else {}
     for bound in motion.bounds:
@@ -355,7 +355,7 @@ def draw_limits(motion: TimedPath, title: str) -> Any:
 
 
 def _cut(cut: SoftCut, motion: TimedPath) -> tuple[list[Fact], Any]:
-    """What a cut is beside a motion, and its picture: feed and deflection with their bounds."""
+    """Report feed and deflection of a cut with their bounds, and draw them."""
     from pkm_twin.paths.joint_path import reference_velocity
 
     s, speed, tolerance = motion.fine, cut.feed, cut.tolerance

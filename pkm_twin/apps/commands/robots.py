@@ -15,7 +15,7 @@ class Robots:
 
 
 def robots(given: Robots) -> Report:
-    """The robots with a sentence on each."""
+    """List the robots with a sentence on each."""
     from pkm_twin import load, robot_names
 
     rows = {name: [load(name).description] for name in robot_names()}

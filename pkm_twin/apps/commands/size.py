@@ -98,7 +98,7 @@ class Size(CarriesAtTimes, ReadsMotions, AwayFromSingular, Draws):
 
 
 def size(given: Size) -> Report:
-    """What each drive must give, and which motors can."""
+    """Compute what each drive must give, and which motors can."""
     from pkm_twin.paths.along import EFFORT_TOLERANCE, compare_efforts
     from pkm_twin.paths.sizing import read_motors, size_drives
 
@@ -197,7 +197,7 @@ def gears(given: Size, robot: Robot) -> tuple[list[Gear], list[Gears]]:
 
 
 def smallest_motors(duties: Sequence[DriveDuty]) -> tuple[list[Fact], list[str]]:
-    """The smallest motor with a gear for all drives, and those for each, as facts and in words."""
+    """Find the smallest motor with a gear for all drives and for each; return facts and words."""
     from pkm_twin.paths.sizing import find_smallest
 
     none = f"none of {len(duties[0].fits)}"
@@ -246,9 +246,7 @@ def _tables(duties: Sequence[DriveDuty]) -> list[Table]:
             tables.append(Table("", columns, rows, head=side))
     for d in duties:
         fits = sorted(d.fits, key=lambda fit: (not fit.good, fit.motor.continuous_torque))
-        columns = [
-            Column("", "", name) for name in ("", "peak torque", "RMS torque", "speed")
-        ]  # fmt: skip
+        columns = [Column("", "", name) for name in ("", "peak torque", "RMS torque", "speed")]
         columns.append(Column("", "", "inertia ratio", form=".3g"))
         rows = {
             fit.name: [
@@ -276,7 +274,7 @@ def _percent(part: float) -> str:
 
 
 def over_workspace(given: Size) -> Report:
-    """The worst efforts and speeds over the workspace."""
+    """Compute the largest efforts and speeds over the workspace."""
     from pkm_twin.paths.joint_path import only_turns
     from pkm_twin.paths.worst import worst_over_workspace
 
@@ -334,7 +332,7 @@ def over_workspace(given: Size) -> Report:
 
 
 def near(duty: DriveDuty) -> list[Fit]:
-    """The motors to draw: the smallest that fits, or the largest, and the three below it."""
+    """Return the motors to draw: the smallest that fits, or the largest, and the three below it."""
     fits = sorted(duty.fits, key=lambda fit: fit.motor.continuous_torque)
     first = next((k for k, fit in enumerate(fits) if fit.good), len(fits) - 1)
     return fits[max(first - 3, 0) : first + 1]

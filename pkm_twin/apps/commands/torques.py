@@ -159,7 +159,7 @@ def torques(given: Torques) -> Report:
             *(f"beyond limits: {item}" for item in beyond if item not in over),
         ],
         files={"out": given.out},
-    )  # fmt: skip
+    )
 
 
 COMMAND = command(torques, "Torques, paths and drives")
