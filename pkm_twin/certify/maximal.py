@@ -107,7 +107,13 @@ class Maximal(Moving):
         )
         self._state = self._start
         self._assembled: dict[bytes, State] = {}
-        self.home: Final = self._analyse()
+        closures = self.closures()
+        sizes = np.linalg.svd(closures.columns, compute_uv=False)
+        rank = int((sizes > 1e-9 * sizes[0]).sum()) if sizes.size else 0
+        whole = np.vstack([closures.columns, self.drives().columns])
+        full = np.linalg.svd(whole, compute_uv=False)
+        condition = float(full[self.size - 1] / full[0]) if len(full) >= self.size else 0.0
+        self.home: Final = Home(self.size - rank, rank, len(closures.value), condition)
 
     def frame(self, body: str) -> Frame:
         """Return a body's frame at its centre of mass."""
@@ -116,15 +122,6 @@ class Maximal(Moving):
         return Frame(
             self._coms[k], state.com[k], state.rotation[k], columns, state.velocity[k], np.zeros(6)
         )
-
-    def _analyse(self) -> Home:
-        closures = self.closures()
-        sizes = np.linalg.svd(closures.columns, compute_uv=False)
-        rank = int((sizes > 1e-9 * sizes[0]).sum()) if sizes.size else 0
-        whole = np.vstack([closures.columns, self.drives().columns])
-        full = np.linalg.svd(whole, compute_uv=False)
-        condition = float(full[self.size - 1] / full[0]) if len(full) >= self.size else 0.0
-        return Home(self.size - rank, rank, len(closures.value), condition)
 
     # Positions
 

@@ -44,7 +44,21 @@ class MujocoTree(Tree):
         """Add a body to the tree; three rotations are a ball joint."""
         element = Xml.SubElement(self._elements[parent], "body", name=f"body {name}")
         self._elements[name] = element
-        self._weigh(element, body)
+        moments, axes = np.linalg.eigh(body.inertia)
+        # The eigenvectors may form a reflection instead of a rotation.
+        axes[:, 0] *= np.sign(np.linalg.det(axes))
+        turn = np.zeros(4)
+        mujoco.mju_mat2Quat(turn, axes.ravel())
+        moments = np.maximum(moments, 0.0)
+        self._weights.append((str(element.get("name")), body.mass, moments))
+        Xml.SubElement(
+            element,
+            "inertial",
+            pos=_format_numbers(body.com),
+            quat=_format_numbers(turn),
+            mass=repr(float(body.mass + COMPILER_INERTIA)),
+            diaginertia=_format_numbers(moments + COMPILER_INERTIA),
+        )
         kinds = [("hinge" if turns else "slide", axis) for turns, axis in steps or ()]
         if steps is None:
             Xml.SubElement(element, "freejoint")
@@ -107,23 +121,6 @@ class MujocoTree(Tree):
         # mj_inverse would factorise the mass matrix of the tree, which may be singular.
         mujoco.mj_rne(self._model, self._data, 1, result)
         return result
-
-    def _weigh(self, element: Xml.Element, body: Body) -> None:
-        moments, axes = np.linalg.eigh(body.inertia)
-        # The eigenvectors may form a reflection instead of a rotation.
-        axes[:, 0] *= np.sign(np.linalg.det(axes))
-        turn = np.zeros(4)
-        mujoco.mju_mat2Quat(turn, axes.ravel())
-        moments = np.maximum(moments, 0.0)
-        self._weights.append((str(element.get("name")), body.mass, moments))
-        Xml.SubElement(
-            element,
-            "inertial",
-            pos=_format_numbers(body.com),
-            quat=_format_numbers(turn),
-            mass=repr(float(body.mass + COMPILER_INERTIA)),
-            diaginertia=_format_numbers(moments + COMPILER_INERTIA),
-        )
 
 
 def _format_numbers(values: Any) -> str:

@@ -46,18 +46,7 @@ class Tree(Moving):
     def __init__(self, description: Description) -> None:
         self.machine = read(description)
         self._held: list[tuple[Joint, Sequence[str]]] = []
-        self._grow()
-        for rod in self.machine.rods:
-            unit = (rod.ends[1] - rod.ends[0]) / rod.length
-            turning = rod.mass * rod.length**2 / 12 * (np.eye(3) - np.outer(unit, unit))
-            body = Body(rod.mass, rod.ends.mean(0), turning)
-            hinges = [(True, axis) for axis in across(unit)]
-            self.hang(_rod_body_name(rod), rod.inner, rod.ends[0], hinges, body)
-        self.size = self.finish()
-        self._assembled: dict[bytes, Array] = {}
-
-    def _grow(self) -> None:
-        """Build a spanning tree from the base; the remaining joints become equations."""
+        # Build a spanning tree from the base; the remaining joints become equations.
         joints, bodies = list(self.machine.joints), self.machine.bodies
         hung = {BASE}
         while len(hung) <= len(bodies):
@@ -81,6 +70,14 @@ class Tree(Moving):
             if joint.type.threaded():
                 self._held.append((joint, ("thread",)))
         self._held += [(joint, joint.type.holds) for joint in joints]
+        for rod in self.machine.rods:
+            unit = (rod.ends[1] - rod.ends[0]) / rod.length
+            turning = rod.mass * rod.length**2 / 12 * (np.eye(3) - np.outer(unit, unit))
+            body = Body(rod.mass, rod.ends.mean(0), turning)
+            hinges = [(True, axis) for axis in across(unit)]
+            self.hang(_rod_body_name(rod), rod.inner, rod.ends[0], hinges, body)
+        self.size = self.finish()
+        self._assembled: dict[bytes, Array] = {}
 
     @abstractmethod
     def hang(self, name: str, parent: str, at: Array, steps: Steps | None, body: Body) -> None:

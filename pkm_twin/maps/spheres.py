@@ -219,22 +219,7 @@ def _draw(data: Dataset, index: str) -> Figure:
         circle = Circle((float(centre[0]), float(centre[1])), RADIUS, fill=False, zorder=3, **rim)
         ax.add_patch(circle)
         mesh.set_clip_path(circle)
-    _draw_polar_axes(data, ax)
-    _draw_rates(data, ax)
-    bar = figure.colorbar(mesh, ax=ax, aspect=32, pad=0.01, fraction=0.04, extend="max")
-    bar.set_label(label)
-    plots.head(figure, f"{data.attrs['robot']}, {_height(data)}: {question}", 10)
-    dashed = "; dashed rim: beyond the limits" if not inside.all() else ""
-    figure.supxlabel(
-        "a sphere is a pose: azimuth of the tilt around, tilt outwards; a point of it is a "
-        f"direction of motion{dashed}",
-        fontsize=8.5, color="0.3",
-    )  # fmt: skip
-    return figure
-
-
-def _draw_polar_axes(data: Dataset, ax: Any) -> None:
-    """Draw a circle for each tilt, with the names of tilts and azimuths."""
+    # Draw a circle for each tilt, with the names of tilts and azimuths.
     turn = np.linspace(0.0, 2 * np.pi, 181)
     far = float(data.tilt.values[-1]) + 1.4 * RADIUS
     for k, tilt in enumerate(data.tilt.values[1:].tolist()):
@@ -254,10 +239,7 @@ def _draw_polar_axes(data: Dataset, ax: Any) -> None:
     ax.set(xlim=(-1.06 * far, 1.06 * far), ylim=(-1.06 * far, 1.06 * far), xticks=[], yticks=[])
     ax.set_aspect("equal")
     ax.set_axis_off()
-
-
-def _draw_rates(data: Dataset, ax: Any) -> None:
-    """Draw in the lower left corner where the spheres' axes point."""
+    # Draw in the lower left corner where the spheres' axes point.
     inset = ax.inset_axes((0.0, 0.0, 0.17, 0.17))
     for k, name in enumerate(data.axis.values):
         tip = np.array([side[k] for side in _axes()])
@@ -268,6 +250,16 @@ def _draw_rates(data: Dataset, ax: Any) -> None:
     inset.set(xlim=(-1.9, 1.5), ylim=(-1.4, 1.8))
     inset.set_aspect("equal")
     inset.set_axis_off()
+    bar = figure.colorbar(mesh, ax=ax, aspect=32, pad=0.01, fraction=0.04, extend="max")
+    bar.set_label(label)
+    plots.head(figure, f"{data.attrs['robot']}, {_height(data)}: {question}", 10)
+    dashed = "; dashed rim: beyond the limits" if not inside.all() else ""
+    figure.supxlabel(
+        "a sphere is a pose: azimuth of the tilt around, tilt outwards; a point of it is a "
+        f"direction of motion{dashed}",
+        fontsize=8.5, color="0.3",
+    )  # fmt: skip
+    return figure
 
 
 def make_page(data: Dataset) -> Any:

@@ -128,7 +128,11 @@ class Parts:
             raise MapError(self.folder, "is not a folder; the chunks need a folder of this name")
         while self._lock < 0:
             self.folder.mkdir(parents=True, exist_ok=True)
-            self._reject_foreign()
+            foreign = [name for name in self._names() if not _OWN_NAMES.fullmatch(name)]
+            if foreign:
+                raise MapError(
+                    self.folder, f"holds {foreign[0]!r}, which no map wrote; move it elsewhere"
+                )
             self._lock = self._acquire_lock()
         mark = self.folder / _INFO_FILE
         try:
@@ -150,13 +154,6 @@ class Parts:
 
     def _names(self) -> list[str]:
         return [path.name for path in self.folder.iterdir()]
-
-    def _reject_foreign(self) -> None:
-        foreign = [name for name in self._names() if not _OWN_NAMES.fullmatch(name)]
-        if foreign:
-            raise MapError(
-                self.folder, f"holds {foreign[0]!r}, which no map wrote; move it elsewhere"
-            )
 
     def _acquire_lock(self) -> int:
         """Return the lock's file descriptor; below 0 if the folder was removed meanwhile.

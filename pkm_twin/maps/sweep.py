@@ -305,7 +305,13 @@ class Map(Space):
             values = {"counts": total, "starts": starts} | joined
         else:
             shape = (chunk.stop - chunk.start, self.sizes["column"])
-            self._store_worst(joined, states[1], chunk.case)
+            # Store the worst at its pose, which inverse kinematics may put outside by rounding.
+            numbers = range(len(self.cases)) if chunk.case is None else [chunk.case]
+            for column, number in enumerate(numbers):
+                worst = self.worst[number]
+                kept = (states[1] == worst.pose).all(-1)
+                _store(joined, column, kept, worst.found)
+                joined["reach"][kept, column] = 1
             values = {chunk.before + name: array for name, array in joined.items()}
         fields = self.fields
         return {
@@ -313,15 +319,6 @@ class Map(Space):
             for name, array in values.items()
             if name in fields or name in ("counts", "starts")
         }
-
-    def _store_worst(self, values: Values, poses: Array, case: int | None) -> None:
-        """Store the worst at its pose, which inverse kinematics may put outside by rounding."""
-        cases = range(len(self.cases)) if case is None else [case]
-        for column, k in enumerate(cases):
-            worst = self.worst[k]
-            kept = (poses == worst.pose).all(-1)
-            _store(values, column, kept, worst.found)
-            values["reach"][kept, column] = 1
 
     def _evaluate_batch(self, q: Array, pose: Array, known: Mask, cases: Sequence[Case]) -> Values:
         robot, count = self.robot, len(q)
@@ -497,7 +494,13 @@ def map_of(
     stack = None
     if regular:
         stack = find_circles(robot, bounds, least, least_clearance)
-        bounds = _bound_circles(robot, stack)
+        # Of the poses inside the circles.
+        kept = stack[:, np.isfinite(stack[1])]
+        wide = float(kept[1].max())
+        grid = robot.grid()
+        sides = {name: (-wide, wide) for name in grid.lateral}
+        sides[grid.height] = float(kept[0].min()), float(kept[0].max())
+        bounds = np.array([sides[name] for name in robot.pose_names])
     ticks: tuple[Array, ...] = ()
     if count <= MAX_GRID_DIMENSIONS:
         length = max(5, min(round(total ** (1 / count)), MAX_TICKS))
@@ -536,16 +539,6 @@ def find_circles(robot: Robot, bounds: Array, least: float, least_clearance: flo
     if not kept.any():
         raise ParameterError("regular", float(radius.max()), f"a circle of {smallest:.4g} or more")
     return np.stack([heights, np.where(kept, radius, np.nan)])
-
-
-def _bound_circles(robot: Robot, stack: Array) -> Array:
-    """Return the bounds of the poses inside circles, shape (m, 2)."""
-    kept = stack[:, np.isfinite(stack[1])]
-    wide = float(kept[1].max())
-    grid = robot.grid()
-    sides = {name: (-wide, wide) for name in grid.lateral}
-    sides[grid.height] = float(kept[0].min()), float(kept[0].max())
-    return np.array([sides[name] for name in robot.pose_names])
 
 
 def check(robot: Robot, kind: Kind, cases: Sequence[Case]) -> None:

@@ -117,7 +117,16 @@ def read(
 def _of_table(path: Path, name: str | Robot | None, how: ReadOptions) -> Recording:
     """Read a table as a recording; see :func:`read`."""
     if name is None:
-        _require_recording(path)
+        # A file that is no recording of any robot is rejected as such.
+        try:
+            columns = list(read_table(path))
+        except ParameterError as error:
+            expected = f"{RECORDING} ({error})"
+            raise ParameterError(str(path), "neither a bag nor a table", expected) from None
+        if "time" not in columns or not any(name.endswith(".position") for name in columns):
+            raise ParameterError(
+                str(path), f"columns {one_line(', '.join(columns), 80)}", RECORDING
+            )
         raise ParameterError("--robot", None, "a robot, because a table does not name its robot")
     robot = name if isinstance(name, Robot) else load(name)
     table, side = read_table(path, kinds_of(robot, how.side), how.dialect), _side(robot, how.side)
@@ -180,7 +189,15 @@ def _of_table(path: Path, name: str | Robot | None, how: ReadOptions) -> Recordi
                     str(path), f"no {what}", f"a column {axes[0]} or more of {', '.join(axes)}"
                 )
     efforts = (f"{joint}.{what}" for joint in joints for what in EFFORTS)
-    _check_sizes(table, SIZES | dict.fromkeys(efforts, MAX_EFFORT))
+    # As for messages: impossible numbers, and numbers below every measurement, are rejected.
+    for name, bound in (SIZES | dict.fromkeys(efforts, MAX_EFFORT)).items():
+        sizes = np.abs(table.get(name, np.zeros(1)))
+        bad = np.flatnonzero((sizes > bound) | ((sizes < TINY) & (sizes > 0.0)))
+        if len(bad):
+            raise ParameterError(
+                f"{table.line(bad[0])}: {name}", float(table[name][bad[0]]),
+                f"0, or {TINY:g} to {bound:g} in size",
+            )  # fmt: skip
     held = how.load or load_of_table(robot, table, time)
     return Recording(
         robot, time, q, qd, qdd, effort, wrench, deflection, pose, held,
@@ -193,20 +210,6 @@ def _of_table(path: Path, name: str | Robot | None, how: ReadOptions) -> Recordi
         ),
         start=round(1e9 * float(times[0])),
     )  # fmt: skip
-
-
-def _require_recording(path: Path) -> None:
-    """Refuse what is no recording of any robot.
-
-    :raises ParameterError: no table, or one without times and positions.
-    """
-    try:
-        columns = list(read_table(path))
-    except ParameterError as error:
-        expected = f"{RECORDING} ({error})"
-        raise ParameterError(str(path), "neither a bag nor a table", expected) from None
-    if "time" not in columns or not any(name.endswith(".position") for name in columns):
-        raise ParameterError(str(path), f"columns {one_line(', '.join(columns), 80)}", RECORDING)
 
 
 def _side(robot: Robot, side: str) -> JointMap | None:
@@ -382,15 +385,3 @@ def _in_degrees(robot: Robot, q: Array) -> bool:
     if np.mean(far & ~possible(some)) <= 0.5:
         return False
     return bool(possible(np.where(turns, some * UNITS["deg"][1], some)).all())
-
-
-def _check_sizes(table: Table, bounds: Mapping[str, float]) -> None:
-    """As of a message: no number that no machine has, and none below every measurement."""
-    for name, bound in bounds.items():
-        sizes = np.abs(table.get(name, np.zeros(1)))
-        bad = np.flatnonzero((sizes > bound) | ((sizes < TINY) & (sizes > 0.0)))
-        if len(bad):
-            raise ParameterError(
-                f"{table.line(bad[0])}: {name}", float(table[name][bad[0]]),
-                f"0, or {TINY:g} to {bound:g} in size",
-            )  # fmt: skip

@@ -62,7 +62,7 @@ def _layout_judged(facts: Sequence[Fact]) -> Iterator[str]:
     # A verdict stays on its row's first line, where it is coloured.
     words = [fact.verdict.words.replace(" ", BLANK) if fact.verdict else "" for fact in facts]
     rows = [
-        (f.text or f.name, f.words, _format_bound(f.bound), word)
+        (f.text or f.name, f.words, "" if f.bound is None else str(f.bound), word)
         for f, word in zip(facts, words, strict=True)
     ]
     lines = aligned([("", "value", "limit", "verdict"), *rows], "<<<<")
@@ -71,10 +71,6 @@ def _layout_judged(facts: Sequence[Fact]) -> Iterator[str]:
         first, *rest = line.split("\n")
         shown = click.style(word.replace(BLANK, " "), fg=COLOURS[fact.verdict or Verdict.UNKNOWN])
         yield "\n".join([first[: -len(word)] + shown, *rest])
-
-
-def _format_bound(bound: object) -> str:
-    return "" if bound is None else str(bound)
 
 
 def table_lines(table: Table) -> list[str]:

@@ -66,7 +66,10 @@ class Live:
         self._lock = threading.Lock()
         self._counts: Counter[str] = Counter()
         self._refused, self._reason = 0, ""
-        self._forget()
+        self._q: Array | None = None
+        self._traces: dict[str, deque[tuple[int, Array]]] = {name: deque() for name in TRACES}
+        self._dominant, self._shares = "", dict[str, float]()
+        self._deflection: Array | None = None
         self._take: dict[str, Callable[[Any], None]] = {
             "state": self._state,
             "torque": lambda message: self._effort("torque", message),
@@ -74,12 +77,6 @@ class Live:
             "energy": self._energy,
             "deflection": self._transform,
         }
-
-    def _forget(self) -> None:
-        self._q: Array | None = None
-        self._traces: dict[str, deque[tuple[int, Array]]] = {name: deque() for name in TRACES}
-        self._dominant, self._shares = "", dict[str, float]()
-        self._deflection: Array | None = None
 
     def take(self, name: str, message: Any) -> None:
         """Take a message of a topic by its name in TOPICS; an invalid one is counted."""

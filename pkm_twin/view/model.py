@@ -96,10 +96,7 @@ class Model:
         self._why: dict[str, str] = {}
         home = robot.home()
         self.start = State(robot.inverse(home), home)
-        self._learn_what_is_known()
-
-    def _learn_what_is_known(self) -> None:
-        robot, state = self.robot, self.start
+        state = self.start
         if not has_clearance(robot):
             self._why["clearance"] = "the robot's file tells no diameters of members"
         rest = np.zeros(robot.joints_count)

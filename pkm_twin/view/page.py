@@ -96,7 +96,40 @@ class Page:
         # On a narrow screen the browser shows it as a sheet at the bottom instead.
         server.gui.main_panel.dock_right()
         server.gui.set_panel_label(f"pkm-twin view {model.robot.name}")
-        self._build_panel(first)
+        gui = server.gui
+        gui.add_html(texts.SHEET)
+        self._status = gui.add_html("")
+        tabs = gui.add_tab_group()
+        if first:
+            self.first = tabs.add_tab(first)
+        with tabs.add_tab("Move"):
+            with gui.add_folder("Joints"):
+                self._joints = self._sliders(model.joint_ranges, "joint", self._move_joint)
+            with gui.add_folder("Pose of the platform"):
+                self._pose = self._sliders(model.pose_ranges, "pose", self._move_pose)
+            self.ask(gui.add_button("Home").on_click, "home", self._go_home)
+            self._check("names of drives", True, self.stage.name_drives)
+            self._check("drag platform", False, self.stage.show_gizmo)
+            self.ask(self.stage.gizmo.on_update, "drag", self._drag)
+            self._check("trail of the tool", False, self.stage.leave_trail)
+            if self.stage.has_meshes:
+                self._check("meshes of the URDF, which do not bend", True, self.stage.show_meshes)
+        self.load_tab = tabs.add_tab("Load")
+        with self.load_tab:
+            with gui.add_folder("Wrench on the platform, base axes"):
+                self._wrench = self._sliders(model.wrench_ranges, "wrench", self._load)
+                self.ask(gui.add_button("No wrench").on_click, "unload", self._unload)
+            r = model.enlargement
+            self._enlarge = gui.add_slider(
+                "deflection magnified, times", r.low, r.high, r.step, r.high / 2
+            )
+            self.ask(self._enlarge.on_update, "enlarge", self._show)
+            self._loads = gui.add_html("")
+            if "energy" not in model.numbers(self.state).why:
+                self.moving.append(Search(self))
+        self._link = gui.add_text("link", model.link(self.state))
+        self.ask(self._link.on_update, "link", self._follow)
+        gui.add_html(texts.buttons(model.robot.name))
         self._show()
 
     def ask(self, react: Any, what: str, call: Callable[[], None]) -> None:
@@ -144,42 +177,6 @@ class Page:
         """Show another state; one with a refusal leaves the sliders where they were put."""
         self.state = state
         self._show()
-
-    def _build_panel(self, first: str) -> None:
-        gui, model = self.server.gui, self.model
-        gui.add_html(texts.SHEET)
-        self._status = gui.add_html("")
-        tabs = gui.add_tab_group()
-        if first:
-            self.first = tabs.add_tab(first)
-        with tabs.add_tab("Move"):
-            with gui.add_folder("Joints"):
-                self._joints = self._sliders(model.joint_ranges, "joint", self._move_joint)
-            with gui.add_folder("Pose of the platform"):
-                self._pose = self._sliders(model.pose_ranges, "pose", self._move_pose)
-            self.ask(gui.add_button("Home").on_click, "home", self._go_home)
-            self._check("names of drives", True, self.stage.name_drives)
-            self._check("drag platform", False, self.stage.show_gizmo)
-            self.ask(self.stage.gizmo.on_update, "drag", self._drag)
-            self._check("trail of the tool", False, self.stage.leave_trail)
-            if self.stage.has_meshes:
-                self._check("meshes of the URDF, which do not bend", True, self.stage.show_meshes)
-        self.load_tab = tabs.add_tab("Load")
-        with self.load_tab:
-            with gui.add_folder("Wrench on the platform, base axes"):
-                self._wrench = self._sliders(model.wrench_ranges, "wrench", self._load)
-                self.ask(gui.add_button("No wrench").on_click, "unload", self._unload)
-            r = model.enlargement
-            self._enlarge = gui.add_slider(
-                "deflection magnified, times", r.low, r.high, r.step, r.high / 2
-            )
-            self.ask(self._enlarge.on_update, "enlarge", self._show)
-            self._loads = gui.add_html("")
-            if "energy" not in model.numbers(self.state).why:
-                self.moving.append(Search(self))
-        self._link = gui.add_text("link", model.link(self.state))
-        self.ask(self._link.on_update, "link", self._follow)
-        gui.add_html(texts.buttons(model.robot.name))
 
     def _check(self, label: str, value: bool, call: Callable[[bool], None]) -> None:
         box = self.server.gui.add_checkbox(label, value)

@@ -132,13 +132,8 @@ class Scene:
         self._elements = {bar.element for bar in self.bars if bar.element}
         self._joints = [j for j in graph.joints.values() if j.kind not in ("translation", "fixed")]
         self._drives = {j.name: self._motor(j) for j in self._joints if j.actuated}
-        self._balls = self._ball_places()
-        self._members: dict[tuple[str, bytes], str] = {}
-
-    def _ball_places(self) -> list[tuple[str, Place]]:
-        """Where balls stand: joints that turn, and the ends of rods, by the joint's label."""
-        graph = self.robot.graph
-        found = [
+        # Balls stand at joints that turn and at the ends of rods, by the joint's label.
+        self._balls: list[tuple[str, Place]] = [
             (j.label or j.name, (j.outer, j.at)) for j in self._joints if j.kind != "prismatic"
         ]
         for rod in graph.rods.values():
@@ -146,8 +141,8 @@ class Scene:
             for shift in shifts:
                 aside = np.zeros(3) if rod.pair is None else shift * rod.pair
                 ends = zip(rod.joint_names, (rod.inner, rod.outer), rod.ends, strict=True)
-                found += [(name, (body, end + aside)) for name, body, end in ends]
-        return found
+                self._balls += [(name, (body, end + aside)) for name, body, end in ends]
+        self._members: dict[tuple[str, bytes], str] = {}
 
     def _member(self, place: Place) -> str:
         """Return the member that ends at a point, else that it lies on; empty without one."""

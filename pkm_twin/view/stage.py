@@ -54,36 +54,7 @@ class Stage:
     def __init__(self, server: Any, scene: Scene, q: Array, lowest: float) -> None:
         """:param lowest: where the platform may go at least, z in m: the ground is below."""
         self._server, self._scene = server, scene
-        self._ground(lowest)
-        self._plates()
-        self._machine(q)
-        self._meshes = self._bodies()
-        self._passed: list[Array] = []
-        rotates = any(unit == "rad" for unit in scene.robot.pose_units)
-        self.gizmo = server.scene.add_transform_controls(
-            "/drag",
-            0.3 * scene.size,
-            disable_rotations=not rotates,
-            depth_test=False,
-            visible=False,
-        )
-        self._trail = server.scene.add_line_segments(
-            "/trail", np.zeros((1, 2, 3)), colors=FORCE, thickness=0.006 * scene.size, visible=False
-        )
-        size, draw = scene.size, server.scene
-        self._named, self._element = True, ""
-        self._places: dict[str, Array] = scene.shapes(q).drives
-        self._drives = tuple(self._places)
-        self._labels: dict[int, tuple[Any, dict[str, Any]]] = {}
-        server.on_client_disconnect(lambda client: self._labels.pop(client.client_id, None))
-        self._arrows = draw.add_arrows(
-            "/wrench", np.zeros((2, 2, 3)), _linear(np.array([FORCE, MOMENT])),
-            shaft_radius=0.008 * size, head_radius=0.02 * size, head_length=0.05 * size,
-            visible=False,
-        )  # fmt: skip
-
-    def _ground(self, lowest: float) -> None:
-        draw, size = self._server.scene, self._scene.size
+        draw, size, shapes = server.scene, scene.size, scene.shapes(q)
         draw.set_up_direction("+z")
         # Lights of its own: a lit face has just the colour that it was given.
         draw.configure_default_lights(False)
@@ -95,7 +66,7 @@ class Stage:
                 f"/lights/{name}", intensity=bright, position=tuple(place.tolist()),
                 cast_shadow=name == "key",
             )  # fmt: skip
-        low, high = self._scene.box()
+        low, high = scene.box()
         middle, reach = (low + high) / 2, float((high - low).max())
         cell = 10.0 ** np.floor(np.log10(reach))
         draw.add_grid(
@@ -110,6 +81,38 @@ class Stage:
         camera.look_at = tuple(middle.tolist())
         camera.up = (0.0, 0.0, 1.0)
         draw.add_frame("/base", **_axes(0.12 * size, size))
+        self._plates()
+        (cylinder, cylinder_faces), (ball, ball_faces) = round_mesh()
+        self._cylinders = draw.add_batched_meshes_simple(
+            "/machine/bars", cylinder, cylinder_faces, shapes.cylinder_turns, shapes.cylinder_at,
+            batched_scales=shapes.cylinder_sizes, batched_colors=_linear(shapes.cylinder_colours),
+            lod="off",
+        )  # fmt: skip
+        turns = np.tile([1.0, 0.0, 0.0, 0.0], (len(shapes.ball_at), 1))
+        self._balls = draw.add_batched_meshes_simple(
+            "/machine/balls", ball, ball_faces, turns, shapes.ball_at,
+            batched_scales=shapes.ball_sizes, batched_colors=_linear(shapes.ball_colours),
+            lod="off",
+        )  # fmt: skip
+        self._meshes = self._bodies()
+        self._passed: list[Array] = []
+        rotates = any(unit == "rad" for unit in scene.robot.pose_units)
+        self.gizmo = draw.add_transform_controls(
+            "/drag", 0.3 * size, disable_rotations=not rotates, depth_test=False, visible=False
+        )
+        self._trail = draw.add_line_segments(
+            "/trail", np.zeros((1, 2, 3)), colors=FORCE, thickness=0.006 * size, visible=False
+        )
+        self._named, self._element = True, ""
+        self._places: dict[str, Array] = shapes.drives
+        self._drives = tuple(self._places)
+        self._labels: dict[int, tuple[Any, dict[str, Any]]] = {}
+        server.on_client_disconnect(lambda client: self._labels.pop(client.client_id, None))
+        self._arrows = draw.add_arrows(
+            "/wrench", np.zeros((2, 2, 3)), _linear(np.array([FORCE, MOMENT])),
+            shaft_radius=0.008 * size, head_radius=0.02 * size, head_length=0.05 * size,
+            visible=False,
+        )  # fmt: skip
 
     async def _frame(self, client: Any) -> None:
         """Let the machine be seen whole in this window, and after its size has changed.
@@ -180,21 +183,6 @@ class Stage:
         for name, radius, length in (("flange", 0.05, 0.03), ("tool", 0.012, 0.2)):
             shape = size * (round_ * [radius, radius, length] + [0.0, 0.0, away * length / 2])
             self._server.scene.add_mesh_simple(f"/platform/{name}", shape, faces, color=BODY)
-
-    def _machine(self, q: Array) -> None:
-        draw, shapes = self._server.scene, self._scene.shapes(q)
-        (cylinder, cylinder_faces), (ball, ball_faces) = round_mesh()
-        self._cylinders = draw.add_batched_meshes_simple(
-            "/machine/bars", cylinder, cylinder_faces, shapes.cylinder_turns, shapes.cylinder_at,
-            batched_scales=shapes.cylinder_sizes, batched_colors=_linear(shapes.cylinder_colours),
-            lod="off",
-        )  # fmt: skip
-        turns = np.tile([1.0, 0.0, 0.0, 0.0], (len(shapes.ball_at), 1))
-        self._balls = draw.add_batched_meshes_simple(
-            "/machine/balls", ball, ball_faces, turns, shapes.ball_at,
-            batched_scales=shapes.ball_sizes, batched_colors=_linear(shapes.ball_colours),
-            lod="off",
-        )  # fmt: skip
 
     def _bodies(self) -> dict[str, Any]:
         """Frames of the bodies that have meshes in the robot's file; bars are seen through them."""

@@ -148,7 +148,13 @@ def fit(given: Fit) -> Report:
     from pkm_twin.streams.steps import sampling_of
 
     if given.drive is not None:
-        return _of_drive(given, given.drive)
+        # Fit a drive's torque constant and friction to weights that it lifts.
+        from pkm_twin.apps.fit_report import drive_report
+        from pkm_twin.identification.drives import drive_friction, runs_of
+        from pkm_twin.recordings import read_table
+
+        runs = runs_of(read_table(given.drive, dialect=given.dialect), given.lever)
+        return drive_report(drive_friction(*runs))
     if not given.robot or not given.recordings:
         raise click.UsageError("a robot and recordings are missing; give both, or --drive TABLE")
     (kinds, laws), options = given.words(), {"accept": given.accept}
@@ -207,16 +213,6 @@ def fit(given: Fit) -> Report:
             title = f"{result.robot.name}: fitted from {', '.join(names)}"
             replace_file(html, page(title, report, more).encode())
     return dataclasses.replace(report, facts=[*report.facts, *facts], files=given.files)
-
-
-def _of_drive(given: Fit, path: Path) -> Report:
-    """Fit a drive's torque constant and friction to weights that it lifts."""
-    from pkm_twin.apps.fit_report import drive_report
-    from pkm_twin.identification.drives import drive_friction, runs_of
-    from pkm_twin.recordings import read_table
-
-    runs = runs_of(read_table(path, dialect=given.dialect), given.lever)
-    return drive_report(drive_friction(*runs))
 
 
 COMMAND = command(fit, "Identification and calibration")
