@@ -36,9 +36,31 @@ ROBOT_HELP = "a robot's name (see `pkm-twin robots`), or its YAML, URDF, MJCF, S
 
 @dataclass(frozen=True, kw_only=True)
 class OfPlatform:
-    """The platform of a description that names none."""
+    """The platform of a description that names none, and what of a larger robot is the machine."""
 
     platform: str | None = setting(None, "for a URDF, MJCF or SDF: the link that carries the tool")
+    base: str | None = setting(
+        None, "for such a file: the link that is the ground; what is neither between base and "
+        "platform nor in a loop with that is left out; default: the root, nothing left out",
+    )  # fmt: skip
+    actuated: tuple[str, ...] = setting(
+        (), "for such a file: joints with motors, NAME,NAME,...; default: as the file marks them"
+    )
+    pose_names: tuple[str, ...] = setting(
+        (), "names of the pose coordinates, of x y z roll pitch yaw; default: see `pkm-twin info`",
+        name="pose", metavar="NAMES",
+    )  # fmt: skip
+    carry: bool = setting(
+        False, "with --base: what hangs on the platform is its payload, fixed as drawn"
+    )
+
+    @property
+    def part(self) -> dict[str, Any]:
+        """What of a file is the machine, as ``load`` takes it."""
+        lists = {"actuated": self.actuated, "pose": self.pose_names}
+        split = {key: [n for text in some for n in text.split(",")] for key, some in lists.items()}
+        chosen = {key: names or None for key, names in split.items()}
+        return {"platform": self.platform, "base": self.base, "carry": self.carry, **chosen}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,7 +76,7 @@ class OfRobot(OfPlatform):
         """
         from pkm_twin import load
 
-        return load(self.robot, platform=self.platform)
+        return load(self.robot, **self.part)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -308,7 +308,50 @@ def choose_leads(graph: Graph, wanted: Sequence[str] = (), pose: int = 0) -> tup
 
 
 def choose_coordinates(graph: Graph) -> tuple[str, ...]:
-    """Pose coordinates that determine the platform at home, the first ones that do.
+    """Pose coordinates that determine the platform at home, as people command it.
+
+    If rotations alone determine it, as of an ankle, these are those that move most; else the first
+    coordinates that do.
+
+    :raises ParameterError: something is free to move while the actuated joints are held.
+    """
+    rates = _pose_rates(graph)
+    for least in POSE_MOVES:
+        chosen = _pick_independent(rates, list(rates), least)
+        turns = sorted(
+            (name for name in rates if poses.COORDINATES[name].entries),
+            key=lambda name: -round(float(np.linalg.norm(rates[name])), 6),
+        )
+        turned = _pick_independent(rates, turns, least)
+        if len(turned) == len(graph.leads):
+            return tuple(name for name in rates if name in turned)
+        if len(chosen) == len(graph.leads):
+            break
+    return tuple(chosen)
+
+
+def list_coordinates(graph: Graph) -> list[tuple[str, ...]]:
+    """List all sets of pose coordinates that determine the platform at home."""
+    rates = _pose_rates(graph)
+    count = len(graph.leads)
+    return [
+        names for names in combinations(rates, count)
+        if len(_pick_independent(rates, names, POSE_MOVES[0])) == count
+    ]  # fmt: skip
+
+
+def _pick_independent(rates: Mapping[str, Array], names: Sequence[str], least: float) -> list[str]:
+    """Pick the first of some coordinates that are independent, at singular values above a least."""
+    chosen: list[str] = []
+    for name in names:
+        table = np.array([rates[own] for own in (*chosen, name)])
+        if np.linalg.matrix_rank(table, least) == len(table):
+            chosen.append(name)
+    return chosen
+
+
+def _pose_rates(graph: Graph) -> dict[str, Array]:
+    """Return the rate of each coordinate at home per rate of each leading drive, of unit one.
 
     :raises ParameterError: something is free to move while the actuated joints are held.
     """
@@ -318,17 +361,8 @@ def choose_coordinates(graph: Graph) -> tuple[str, ...]:
     independent = scheme.independent
     rates = np.vstack([-np.linalg.solve(ju[independent], jq[independent]), np.eye(scheme.joints)])
     rows = numbers(scheme.pose_rows(motion, [0.0] * len(scheme.coordinates)))
-    chosen: list[str] = []
-    for least in POSE_MOVES:
-        chosen, table = [], np.zeros((0, scheme.joints))
-        for name, scale, row in zip(poses.COORDINATES, scheme._pose_scales, rows, strict=True):
-            extended = np.vstack([table, scale * row @ rates])
-            if np.linalg.matrix_rank(extended, least) == len(extended):
-                chosen.append(name)
-                table = extended
-        if len(chosen) == scheme.joints:
-            break
-    return tuple(chosen)
+    scales = np.array(scheme._pose_scales)[:, None]
+    return dict(zip(poses.COORDINATES, scales * rows @ rates, strict=True))
 
 
 def check_masses(scheme: Scheme, graph: Graph) -> None:

@@ -140,13 +140,19 @@ class Capsule:
     radius: float
 
 
+Fault = tuple[tuple[str, ...], ParameterError]
+"""Joints, and the error of a machine that has one of them."""
+
+
 @dataclass(frozen=True, eq=False)
 class LoopTree:
     """A machine; ``root``: the link that is the ground; ``gravity``: m/s2, if the file tells.
 
     ``initial``: values that ``<ros2_control>`` begins with, of the joints for which it has them.
     ``rounding``: the largest rounding error of a file's places and directions, m or rad.
-    ``marked``: what of the file marks the actuated joints. What is
+    ``marked``: what of the file marks the actuated joints. ``faults``: joints that follow others,
+    by name, and the error of a machine that has one of them; without names that of a file that
+    marks no motors. What is
     written has ``capsules`` too, a ``platform``, the link, and its reference point ``origin``.
     """
 
@@ -160,6 +166,7 @@ class LoopTree:
     initial: Mapping[str, float] = field(default_factory=dict)
     rounding: float = 0.0
     marked: str = ""
+    faults: tuple[Fault, ...] = ()
     capsules: tuple[Capsule, ...] = ()
     platform: str = ""
     origin: Array = _zeros(3)

@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 import re
 import xml.etree.ElementTree as ET
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -19,9 +20,10 @@ import numpy as np
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError, install, warn
 from pkm_twin.machine import urdf_xml
-from pkm_twin.machine.loop_tree import Joint, Link, LoopTree
+from pkm_twin.machine.loop_tree import Fault, Joint, Link, LoopTree
 from pkm_twin.machine.precision import rounding_error
 from pkm_twin.machine.rotations import Pose, from_quaternion
+from pkm_twin.machine.urdf_control import CHOOSE, require_single
 
 _ENDLESS: Final = re.compile(
     r"(?:^|\s)[-+]?(?:nan(?:\(\S*\))?|inf|infinity)(?:\s|$)", re.IGNORECASE
@@ -49,9 +51,10 @@ MAX_PARTS: Final = 100_000
 """Most of anything that a file asks for by a number: elements, copies, pixels along a side."""
 
 
-def read(path: Path, top: ET.Element) -> LoopTree:
+def read(path: Path, top: ET.Element, actuated: Sequence[str] | None = None) -> LoopTree:
     """Read an MJCF file with its closures.
 
+    :param actuated: the joints that have motors; default: those of the file's actuators.
     :raises ParameterError: no mujoco package, a model that it does not compile, or a part of it
         that is refused, by name.
     """
@@ -72,7 +75,7 @@ def read(path: Path, top: ET.Element) -> LoopTree:
                 str(path), ValueError(text), "a model that MuJoCo compiles"
             ) from None
         warn(path, f"read without its meshes, as its bodies have inertias: {text}")
-    return _Reader(mujoco, model, path).tree(rounding_error(words))
+    return _Reader(mujoco, model, path).tree(rounding_error(words), actuated)
 
 
 def _without_meshes(mujoco: Any, path: Path) -> Any:
@@ -161,14 +164,18 @@ class _Reader:
             int(kinds.mjJNT_SLIDE): "prismatic",
             int(kinds.mjJNT_HINGE): "revolute",
         }
+        self.faults: list[Fault] = []
         self.locks = self._locks()
         self.data = mujoco.MjData(model)
         for joint, value in self.locks.items():
             self.data.qpos[model.jnt_qposadr[joint]] = value
         mujoco.mj_kinematics(model, self.data)
 
-    def tree(self, rounding: float) -> LoopTree:
-        """The machine; ``rounding``: the largest rounding error of the file's numbers."""
+    def tree(self, rounding: float, chosen: Sequence[str] | None) -> LoopTree:
+        """The machine; ``rounding``: the largest rounding error of the file's numbers.
+
+        :param chosen: actuated joints in place of those that the file's actuators drive.
+        """
         self._warn()
         for body in range(1, self.model.nbody):
             self._body(body)
@@ -179,7 +186,8 @@ class _Reader:
             label = urdf_xml.free_name(f"{name}_frame", self.joint_names)
             owner = self._name("BODY", self.model.site_bodyid[site])
             self.joints[label] = Joint(label, "fixed", owner, name, (place, place))
-        actuated = self._actuated()
+        types = {name: joint.kind for name, joint in self.joints.items()}
+        actuated = self._actuated() if chosen is None else require_single(chosen, types)
         return LoopTree(
             self.path.stem,
             WORLD,
@@ -190,7 +198,8 @@ class _Reader:
             [0.0, 0.0, 0.0] if self._disables("GRAVITY") else self.model.opt.gravity.tolist(),
             {name: self.joints[name].drawn for name in actuated},
             rounding,
-            "an actuator",
+            "an actuator" if chosen is None else "actuated",
+            tuple(self.faults),
         )
 
     def _named(self, **counts: int) -> set[str]:
@@ -382,9 +391,10 @@ class _Reader:
             if kind != int(self.mj.mjtEq.mjEQ_JOINT):
                 continue
             if other >= 0 or self.types[int(self.model.jnt_type[joint])] in ("free", "spherical"):
-                raise ParameterError(
-                    f"equality.{name}", self._name("JOINT", joint), "joints without coupling"
-                )
+                pair = [self._name("JOINT", k) for k in (joint, other) if k >= 0]
+                error = ParameterError(f"equality.{name}", pair[0], "joints without coupling")
+                self.faults.append((tuple(pair), error))
+                continue
             locks[joint] = self._start(joint) + float(data[0])
         return locks
 
@@ -419,7 +429,9 @@ class _Reader:
             name = self._name("ACTUATOR", i)
             joint = int(self.model.actuator_trnid[i][0])
             if i not in self._drives(joint):
-                raise ParameterError(f"actuator.{name}", name, "an actuator of a joint")
+                raise ParameterError(
+                    f"actuator.{name}", name, f"an actuator of a joint, or names with {CHOOSE}"
+                )
             own = self._name("JOINT", joint)
             if joint in self.locks or self.joints[own].kind not in ("revolute", "prismatic"):
                 raise ParameterError(
@@ -428,9 +440,8 @@ class _Reader:
             if own not in names:
                 names.append(own)
         if not names:
-            raise ParameterError(
-                str(self.path), "no actuator", "an <actuator> of each driven joint"
-            )
+            way = f"an <actuator> of each driven joint, or names with {CHOOSE}"
+            self.faults.append(((), ParameterError(str(self.path), "no actuator", way)))
         return tuple(names)
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import re
 import xml.etree.ElementTree as ET
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -24,7 +24,7 @@ from pkm_twin.machine import foreign, urdf_xml
 from pkm_twin.machine.foreign import gravity_of
 from pkm_twin.machine.graph import spanning
 from pkm_twin.machine.joints import TURN, TYPES
-from pkm_twin.machine.loop_tree import Joint, Link, LoopTree, hung, link_of
+from pkm_twin.machine.loop_tree import Fault, Joint, Link, LoopTree, hung, link_of
 from pkm_twin.machine.precision import rounding_error
 from pkm_twin.machine.rotations import Pose, from_rpy
 from pkm_twin.machine.urdf_control import actuated_joints, read_beside
@@ -47,10 +47,11 @@ WELDS: Final = {
 """Gazebo's plugins that hold two links together as they are drawn, and where they name them."""
 
 
-def read(path: Path, top: ET.Element) -> LoopTree:
+def read(path: Path, top: ET.Element, actuated: Sequence[str] | None = None) -> LoopTree:
     """Read an SDF file.
 
     :param top: the file's top element; the path is for what stands beside the file.
+    :param actuated: the actuated joints, in place of those that the file marks.
     :raises ParameterError: an element that is not supported, or is wrong, by name.
     """
     if any(str(part.tag).startswith("xacro:") for part in top.iter()):
@@ -92,10 +93,13 @@ def read(path: Path, top: ET.Element) -> LoopTree:
     types = {name: joint.kind for name, joint in joints.items()}
     # Where only some joints have an effort limit, these are motors.
     limited = [name for name, joint in joints.items() if "effort" in joint.limits]
-    actuated, marked = actuated_joints(path, top, read_beside(path), types, limited)
+    faults: list[Fault] = []
+    motors, marked = actuated_joints(
+        path, top, read_beside(path), types, faults, others=limited, chosen=actuated
+    )
 
     def rank(joint: Joint) -> tuple[bool, bool, int]:
-        return joint.kind != "fixed", joint.name not in actuated, joint.type.cost
+        return joint.kind != "fixed", joint.name not in motors, joint.type.cost
 
     pairs = {joint.name: (joint.inner, joint.outer) for joint in sorted(joints.values(), key=rank)}
     tree = set(spanning(links, pairs))
@@ -105,11 +109,11 @@ def read(path: Path, top: ET.Element) -> LoopTree:
         raise ParameterError(f"link.{name}", None, "a joint that connects it")
     return LoopTree(
         title, WORLD, links, spanned,
-        tuple(closing(joint) for name, joint in joints.items() if name not in tree), actuated,
+        tuple(closing(joint) for name, joint in joints.items() if name not in tree), motors,
         gravity_of(path, weight, links, WORLD, joints.values(), gravity), rounding=rounding_error(
             word for part in element.iter() if part.tag in ("pose", "xyz")
             for word in (part.text or "").split()
-        ), marked=marked,
+        ), marked=marked, faults=tuple(faults),
     )  # fmt: skip
 
 

@@ -19,6 +19,7 @@ from typing import Any, Final
 
 from pkm_twin.errors import ParameterError, UnknownNameError
 from pkm_twin.machine import urdf_xml
+from pkm_twin.machine.loop_tree import Fault
 from pkm_twin.machine.strict_yaml import read_yaml
 from pkm_twin.machine.urdf_xml import UNLIMITED
 
@@ -34,6 +35,10 @@ WHERE: Final = (
     "a joint marked by a <command_interface> in <ros2_control>, a <transmission>, "
     'independent="true", a Gazebo plugin that moves it, or name_mot in a YAML file next to it'
 )
+
+
+CHOOSE: Final = "`actuated=[...]` or --actuated"
+"""How a user names the actuated joints of a file that marks none."""
 
 
 def read_beside(path: Path) -> dict[str, Any]:
@@ -101,14 +106,21 @@ def actuated_joints(
     top: ET.Element,
     beside: Mapping[str, Any],
     types: Mapping[str, str],
+    faults: list[Fault],
+    *,
     others: Sequence[str] | None = None,
+    chosen: Sequence[str] | None = None,
 ) -> tuple[tuple[str, ...], str]:
     """The actuated joints in the order in which the file marks them, and what marks them.
 
     :param beside: the YAML file's entries. ``types``: of all joints, by name.
+    :param faults: takes the error of a file that marks none.
     :param others: joints of an SDF that have an effort limit: taken where nothing is marked.
-    :raises ParameterError: none is marked, or one that cannot be actuated.
+    :param chosen: the actuated joints, in place of those that the file marks.
+    :raises ParameterError: a joint that cannot be actuated.
     """
+    if chosen is not None:
+        return require_single(chosen, types), "actuated"
     names, source = [str(name) for name in beside.get("name_mot", [])], "name_mot"
     for key, marked in SOURCES.items():
         if not names:
@@ -117,15 +129,27 @@ def actuated_joints(
         names, source = list(others or ()), "limit.effort"
     if not names:
         way = WHERE if others is None else f"{WHERE}; or by an <effort> in its <limit>"
-        raise ParameterError(str(path), "no joint is marked as actuated", way)
-    if len(set(names)) != len(names):
-        raise ParameterError(source, names, "each joint once")
+        way += f"; or joints that {CHOOSE} names"
+        faults.append(((), ParameterError(str(path), "no joint is marked as actuated", way)))
+        return (), ""
+    return require_single(names, types, source), source
+
+
+def require_single(
+    names: Sequence[str], types: Mapping[str, str], source: str = "actuated"
+) -> tuple[str, ...]:
+    """Return names of joints that can be actuated: of one axis, each once.
+
+    :raises ParameterError: by the name.
+    """
+    if len(set(names)) != len(names) or not names:
+        raise ParameterError(source, list(names), "one joint or more, each once")
     for name in names:
         if name not in types:
             raise UnknownNameError(source, name, types)
         if types[name] not in ("revolute", "prismatic", "helical"):
             raise ParameterError(f"{source}.{name}", types[name], "a revolute or prismatic joint")
-    return tuple(names), source
+    return tuple(names)
 
 
 @dataclass(frozen=True)

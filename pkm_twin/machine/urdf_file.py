@@ -23,7 +23,7 @@ from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError, UnknownNameError, warn
 from pkm_twin.machine import foreign, sdf_file, urdf_xml
 from pkm_twin.machine.joints import TYPES
-from pkm_twin.machine.loop_tree import Joint, Link, LoopTree, hung, link_of
+from pkm_twin.machine.loop_tree import Fault, Joint, Link, LoopTree, hung, link_of
 from pkm_twin.machine.precision import rounding_error
 from pkm_twin.machine.rotations import Pose
 from pkm_twin.machine.urdf_control import actuated_joints, read_beside
@@ -74,10 +74,11 @@ class Visual:
     pose: Pose
 
 
-def read(path: Path, robot: ET.Element) -> LoopTree:
+def read(path: Path, robot: ET.Element, actuated: Sequence[str] | None = None) -> LoopTree:
     """The links, joints and closures of a URDF file.
 
     :param robot: the file's top element; the path is for what stands beside the file.
+    :param actuated: the actuated joints, in place of those that the file marks.
     :raises ParameterError: not readable, not a URDF, or an element that is refused, by name.
     """
     if robot.tag != "robot":
@@ -95,8 +96,12 @@ def read(path: Path, robot: ET.Element) -> LoopTree:
     for element in robot.findall("joint"):
         name = urdf_xml.name(element, joints)
         joints[name] = _joint(element, name, links)
+    faults: list[Fault] = []
     for element in robot.findall("joint[mimic]"):
-        _take_screw(element, joints, links)
+        try:
+            _take_screw(element, joints, links)
+        except ParameterError as error:
+            faults.append(((element.get("name", ""),), error))
     root = _root(links, joints)
     others = [element for element in robot if element.tag not in ("link", "joint")]
     foreign.check_elements(path, others)
@@ -117,11 +122,11 @@ def read(path: Path, robot: ET.Element) -> LoopTree:
     )
     closures |= _of_gazebo(path, robot, frames, {*joints, *closures})
     types = {n: joint.kind for n, joint in joints.items()}
-    actuated, marked = actuated_joints(path, robot, beside, types)
+    motors, marked = actuated_joints(path, robot, beside, types, faults, chosen=actuated)
     name = robot.get("name") or path.stem
-    initial = _parameters(robot, actuated, "initial_value")
-    rotors = _parameters(robot, actuated, "rotor_inertia")
-    offsets = _parameters(robot, actuated, "friction_offset")
+    initial = _parameters(robot, motors, "initial_value")
+    rotors = _parameters(robot, motors, "rotor_inertia")
+    offsets = _parameters(robot, motors, "friction_offset")
     for joint in [joints[key] for key in (*rotors, *offsets)]:
         joints[joint.name] = replace(
             joint,
@@ -136,11 +141,11 @@ def read(path: Path, robot: ET.Element) -> LoopTree:
             weight[link] = foreign.flag(element, "gravity", not off)
     gravity = foreign.gravity_of(path, weight, links, root, joints.values(), None)
     return LoopTree(
-        name, root, links, joints, tuple(closures.values()), actuated, gravity, initial=initial,
+        name, root, links, joints, tuple(closures.values()), motors, gravity, initial=initial,
         rounding=rounding_error(
             word for e in robot.iter() if e.tag in _PLACES or "origin" in e.tag
             for key in ("xyz", "rpy") for word in e.get(key, "").split()
-        ), marked=marked,
+        ), marked=marked, faults=tuple(faults),
     )  # fmt: skip
 
 

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import importlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
@@ -13,7 +13,7 @@ from pkm_twin.errors import ParameterError, UnknownNameError, one_line, warn
 from pkm_twin.machine.strict_yaml import read_yaml
 from pkm_twin.robot.plausibility import findings
 from pkm_twin.robot.robot import Robot
-from pkm_twin.robot.urdf_read import read_tree
+from pkm_twin.robot.urdf_read import Part, read_tree
 
 CATALOGUE: Final = {
     "delta": "pkm_twin.mechanisms.delta:Delta",
@@ -61,7 +61,10 @@ def robot_path(robot: str | Path) -> Path:
     raise UnknownNameError("robot", text, [*robot_names(), *files])
 
 
-def load(robot: str | Path, *, platform: str | None = None) -> Robot:
+def load(
+    robot: str | Path, *, platform: str | None = None, base: str | None = None,
+    actuated: Sequence[str] | None = None, pose: Sequence[str] | None = None, carry: bool = False,
+) -> Robot:  # fmt: skip
     """A robot by its name in ``config/``, from a parameter file, or from a URDF with its loops.
 
     Changes that the import made to a user's file, and implausible numbers in it, give warnings
@@ -69,12 +72,19 @@ def load(robot: str | Path, *, platform: str | None = None) -> Robot:
 
     :param robot: a name such as ``"delta_cu"``, or a path to a YAML, URDF, MJCF or SDF file.
     :param platform: link that carries the tool, of a URDF, MJCF or SDF; default: by usual names.
+    :param base: link that is the ground, of such a file; default: the root. With ``base`` or
+        ``actuated`` only what is between base and platform, or in a loop with that, is the robot.
+    :param actuated: names of the actuated joints, in the order of q; default: as the file marks.
+    :param pose: names of the pose coordinates, of x y z roll pitch yaw; default: rotations if they
+        determine the platform, else the first that do.
+    :param carry: whether what hangs on moving bodies is carried, fixed as drawn: on the platform as
+        payload; default: it is left out.
     :raises UnknownNameError: no such name; the closest one is named.
     :raises ParameterError: an invalid file, key, type or value, with its dotted name.
     """
-    path = robot_path(robot)
+    path, part = robot_path(robot), Part(platform, base, actuated, pose, carry)
     if path.suffix in TREES:
-        reading = read_tree(path, platform=platform)
+        reading = read_tree(path, part)
         robot_read = robot_of_data(reading.description, path.stem)
         graph = robot_read.graph
         if robot_read.redundant:
@@ -87,9 +97,13 @@ def load(robot: str | Path, *, platform: str | None = None) -> Robot:
         for note in reading.notes:
             warn(path, note)
         return _told(path, replace(robot_read, home_choice=reading.home, visuals=reading.visuals))
-    if platform is not None:
-        raise ParameterError("platform", platform, "none, because the file names its platform")
-    return _told(path, robot_of_data(read_yaml(path), path.stem))
+    for key in ("platform", "base", "actuated", "carry"):
+        if getattr(part, key):
+            raise ParameterError(key, getattr(part, key), f"none, because the file has its {key}")
+    data = read_yaml(path)
+    if pose is not None:
+        data = {**data, "pose": list(pose)}
+    return _told(path, robot_of_data(data, path.stem))
 
 
 def _told(path: Path, robot: Robot) -> Robot:

@@ -99,15 +99,14 @@ def write_edited(path: Path, head: Sequence[str], text: str, before: Robot) -> l
     return lost
 
 
-def robot_text(
-    name: str, *, platform: str | None = None, per_copy: bool = False
-) -> tuple[str, Robot]:
+def robot_text(name: str, *, per_copy: bool = False, **part: Any) -> tuple[str, Robot]:
     """A robot and the text of its file; of a URDF, or with ``per_copy``, as a machine's YAML.
 
+    :param part: what of a file is the robot, as :func:`load` takes it.
     :raises ParameterError: the file is refused; or it is to be written out, and would lose what it
         says of elasticity.
     """
-    robot = load(name, platform=platform)
+    robot = load(name, **part)
     if per_copy and not robot.elastic_entries() and _elastic(robot):
         raise ParameterError(
             "--per-copy",
@@ -117,7 +116,7 @@ def robot_text(
         )
     path = robot_path(name)
     if path.suffix in TREES:
-        data = read_urdf(path, platform=platform)
+        data = read_urdf(path, **part)
     elif per_copy:
         data = robot_description(robot)
     else:

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
@@ -16,9 +16,10 @@ from pkm_twin.kinematics.linkage import Linkage
 from pkm_twin.kinematics.rounding import repair_rounded
 from pkm_twin.machine import graph as graphs
 from pkm_twin.machine import mjcf_file, sdf_file, urdf_file, urdf_xml
-from pkm_twin.machine.graph import Graph, groups
+from pkm_twin.machine.cut_out import check_faults, cut_out, find_circles
+from pkm_twin.machine.graph import Graph
 from pkm_twin.machine.graph_description import graph_description
-from pkm_twin.machine.loop_tree import SINGLE, Joint, LoopTree
+from pkm_twin.machine.loop_tree import SINGLE, Joint, Link, LoopTree
 from pkm_twin.machine.rotations import Pose
 from pkm_twin.machine.urdf_control import take_drives
 from pkm_twin.machine.urdf_file import Visual, visuals
@@ -64,22 +65,45 @@ class UrdfReading:
     visuals: tuple[Visual, ...] = ()
 
 
-def read_urdf(
-    path: str | Path, *, platform: str | None = None, base: str | None = None
-) -> dict[str, Any]:
+@dataclass(frozen=True)
+class Part:
+    """What of a file with links and joints is the machine.
+
+    ``platform``: the link that carries the tool; default: the first of ``PLATFORMS``. ``base``: the
+    link that is the ground and gives the base axes; default: the root. ``actuated``: joints with
+    motors, in the order of q; default: those that the file marks. ``pose``: names of the pose
+    coordinates. ``carry``: what hangs on moving bodies is carried, fixed as drawn.
+
+    With ``base`` or ``actuated`` everything is left out that is neither between base and platform
+    nor in a loop with that.
+    """
+
+    platform: str | None = None
+    base: str | None = None
+    actuated: Sequence[str] | None = None
+    pose: Sequence[str] | None = None
+    carry: bool = False
+
+    @property
+    def cuts(self) -> bool:
+        """Whether other parts of the file are left out."""
+        return self.base is not None or self.actuated is not None or self.carry
+
+
+def read_urdf(path: str | Path, **part: Any) -> dict[str, Any]:
     """A URDF file as a description of ``mechanism: machine``, every vector in base axes at home.
 
     As :func:`read_tree`, whose notes are given as warnings.
+
+    :param part: fields of :class:`Part`.
     """
-    reading = read_tree(path, platform=platform, base=base)
+    reading = read_tree(path, Part(**part))
     for note in reading.notes:
         warn(path, note)
     return reading.description
 
 
-def read_tree(
-    path: str | Path, *, platform: str | None = None, base: str | None = None
-) -> UrdfReading:
+def read_tree(path: str | Path, part: Part = Part()) -> UrdfReading:
     """A URDF file as a description of ``mechanism: machine``, every vector in base axes at home.
 
     A file whose top element is ``<mujoco>`` is read as MJCF, with the mujoco package, and one of
@@ -90,19 +114,23 @@ def read_tree(
     spin about themselves are held, and axes that a rounded file leaves nearly parallel, or nearly
     meeting, are made so where the machine could not move otherwise.
 
-    :param platform: the link that carries the tool; default the first of ``PLATFORMS``.
-    :param base: the link that is the ground and gives the base axes; default the root.
     :raises ParameterError: a file, element or name that is refused, by its name.
     """
     path = Path(path)
     top = urdf_xml.elements(path)
     controller = take_drives(top)
     readers = {"mujoco": mjcf_file.read, "sdf": sdf_file.read}
-    tree = readers.get(top.tag, urdf_file.read)(path, top)
-    _require_closed(path, tree)
-    tool = _platform(tree, platform)
-    ground = tree.root if base is None else base
+    tree = readers.get(top.tag, urdf_file.read)(path, top, part.actuated)
+    tool = _platform(tree, part.platform)
+    ground = tree.root if part.base is None else part.base
     ground = urdf_xml.known_link("base", ground, tree.links)
+    notes, carried = list[str](), ()
+    if part.cuts:
+        cut = cut_out(tree, ground, tool, carry=part.carry)
+        _require_motors(part, tree, cut.tree, ground, tool)
+        tree, notes, carried = cut.tree, [*cut.notes], cut.carried
+    check_faults(tree)
+    _require_closed(path, tree)
     bodies = _bodies(tree, tool, ground)
     _require_open(tree, bodies, tool, ground)
     assembly = Assembly(tree)
@@ -111,7 +139,14 @@ def read_tree(
     assembly.place(home.values)
     graph = home.graph or _graph(assembly, bodies, tool, ground)
     data = _description(assembly, graph, ground)
-    notes = _left_out(tree)
+    if carried:
+        move = _seen(assembly, ground)[tool]
+        mass, com, inertia = _sum_masses([link.moved(move) for link in carried])
+        com = _snapped(com - graph.origin).tolist()
+        data["payload"] = {"mass": mass, "com": com, "inertia": inertia.tolist()}
+    if part.pose is not None:
+        data["pose"] = list(part.pose)
+    notes += _left_out(tree)
     if home.miss > EXACT:
         notes.append(f"the loops close within {home.miss:.1g} only (m or rad)")
     if home.repair and home.repair.moves:
@@ -148,6 +183,21 @@ def _require_closed(path: Path, tree: LoopTree) -> None:
         )
 
 
+def _require_motors(part: Part, whole: LoopTree, tree: LoopTree, base: str, tool: str) -> None:
+    """Reject a linkage without motors, and motors that are elsewhere.
+
+    :raises ParameterError: by name, with the joints that can be driven.
+    """
+    way = f"joints between base {base!r} and platform {tool!r}"
+    drivable = [n for n, j in tree.joints.items() if j.kind in ("revolute", "prismatic", "helical")]
+    away = [name for name in whole.actuated if name not in tree.joints]
+    if not tree.actuated or (part.actuated is not None and away):
+        raise ParameterError(
+            "actuated", ", ".join(away) or None, f"{way}, of which these can be driven: "
+            f"{', '.join(drivable)}",
+        )  # fmt: skip
+
+
 def _require_open(tree: LoopTree, bodies: dict[str, str], tool: str, ground: str) -> None:
     """Reject loops of which every joint is marked as actuated: the last one is a closure.
 
@@ -168,23 +218,13 @@ def _require_open(tree: LoopTree, bodies: dict[str, str], tool: str, ground: str
 def _require_moving(tree: LoopTree, bodies: dict[str, str], tool: str) -> None:
     """Reject actuated joints that do not move the platform, before a home is looked for.
 
-    A joint moves it where joints and closures make a circle through it, the platform and the
-    ground: then no body stands between them, whose absence would part them.
-
     :raises ParameterError: such joints, with the joints at which they can be cut out.
     """
     joints = [joint for joint in tree.joints.values() if joint.kind != "free"]
     joints += tree.closures
     pairs = {joint.name: (bodies[joint.inner], bodies[joint.outer]) for joint in joints}
     pairs = {name: pair for name, pair in pairs.items() if pair[0] != pair[1]}
-    target = {GROUND, bodies[tool]}
-    every = [*pairs.values(), (GROUND, bodies[tool])]
-    degree = Counter(body for pair in every for body in pair)
-    moving = set(pairs)
-    for gone in [body for body, count in degree.items() if count > 2]:
-        parts = groups([body for body in degree if body != gone], every)
-        own = next(part for part in parts if target - {gone} <= set(part))
-        moving = {name for name in moving if set(pairs[name]) - {gone} <= set(own)}
+    moving, target = find_circles(pairs, GROUND, bodies[tool]), {GROUND, bodies[tool]}
     apart = [name for name in tree.actuated if name not in moving]
     if not apart:
         return
@@ -192,7 +232,8 @@ def _require_moving(tree: LoopTree, bodies: dict[str, str], tool: str) -> None:
     cuts = [name for name, pair in pairs.items() if name not in moving and whole & set(pair)]
     raise ParameterError(
         "actuated", f"{', '.join(apart)}", f"joints that move the platform {tool!r}: close a "
-        f"missing loop, or cut out the other parts at {', '.join(cuts)}, with their motors"
+        f"missing loop, or leave out the other parts, at {', '.join(cuts)}, with their motors "
+        "(`base=LINK` or --base)"
     )  # fmt: skip
 
 
@@ -307,21 +348,26 @@ def _masses(
         links = [
             link.moved(moves[name]) for name, link in tree.links.items() if bodies[name] == body
         ]
-        mass = sum(link.mass for link in links)
-        com = links[0].com
-        if mass > 0.0:
-            com = sum((link.mass / mass * link.com for link in links), np.zeros(3))
-        inertia = np.zeros((3, 3))
-        for link in links:
-            arm = link.com - com
-            inertia += link.inertia
-            inertia += link.mass * (arm @ arm * np.eye(3) - np.outer(arm, arm))
-        # Rounding left over by rotations is dropped.
-        inertia = (inertia + inertia.T) / 2
-        clean = np.where(np.abs(inertia) > 1e-14 * float(np.abs(inertia).max()), inertia, 0.0)
-        short = np.array([[float(f"{x:.15g}") for x in row] for row in clean.tolist()])
-        result[body] = graphs.Body(body, mass, _snapped(com), short)
+        mass, com, inertia = _sum_masses(links)
+        result[body] = graphs.Body(body, mass, _snapped(com), inertia)
     return result
+
+
+def _sum_masses(links: Sequence[Link]) -> tuple[float, Array, Array]:
+    """Return the mass, kg, centre, m, and inertia about it, kg m2, of links together."""
+    mass = sum(link.mass for link in links)
+    com = links[0].com
+    if mass > 0.0:
+        com = sum((link.mass / mass * link.com for link in links), np.zeros(3))
+    inertia = np.zeros((3, 3))
+    for link in links:
+        arm = link.com - com
+        inertia += link.inertia
+        inertia += link.mass * (arm @ arm * np.eye(3) - np.outer(arm, arm))
+    # Rounding left over by rotations is dropped.
+    inertia = (inertia + inertia.T) / 2
+    clean = np.where(np.abs(inertia) > 1e-14 * float(np.abs(inertia).max()), inertia, 0.0)
+    return mass, com, np.array([[float(f"{x:.15g}") for x in row] for row in clean.tolist()])
 
 
 def _snapped(vector: Array) -> Array:

@@ -90,10 +90,10 @@ def check_one(given: Check, path: Path, update: Any = None, thorough: bool = Tru
     from pkm_twin.identification.check import check as checked
 
     robot: Any = given.robot
-    if given.platform is not None:
+    if any(given.part.values()):
         if robot is None:
-            raise ParameterError("--robot", None, "a file, for the platform that --platform names")
-        robot = load(robot, platform=given.platform)
+            raise ParameterError("--robot", None, "a file, for --platform, --base and the like")
+        robot = load(robot, **given.part)
     r = given.read(path, robot, update, limited=True, trajectory=True)
     found = checked(r, given.residual, thorough)
     good = found.answer == "good"

@@ -70,9 +70,9 @@ def convert(given: Convert) -> Report:
 
     told, notes = list[str](), list[str]()
     if ending in TREES:
-        described = read_urdf(Path(first), platform=given.platform)
+        described = read_urdf(Path(first), **given.part)
     else:
-        robot = load(first, platform=given.platform)
+        robot = load(first, **given.part)
         described, told = robot_description(robot), robot.book.told()
         carried = {*described.get("tolerances", ())} | {*copied_tolerances(robot)}
         lost = sorted({*robot.tolerances} - carried)

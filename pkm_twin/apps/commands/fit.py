@@ -158,7 +158,7 @@ def fit(given: Fit) -> Report:
     if not given.robot or not given.recordings:
         raise click.UsageError("a robot and recordings are missing; give both, or --drive TABLE")
     (kinds, laws), options = given.words(), {"accept": given.accept}
-    text, machine = robot_text(given.robot, platform=given.platform, per_copy=given.per_copy)
+    text, machine = robot_text(given.robot, per_copy=given.per_copy, **given.part)
     elastic, currents = kinds is None, given.torque_constant is not None
     if elastic:
         _ = machine.elastic

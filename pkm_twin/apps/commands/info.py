@@ -15,6 +15,7 @@ from pkm_twin.apps.frame import command
 from pkm_twin.apps.options import Draws, OfRobot
 from pkm_twin.codegen.code import slowness
 from pkm_twin.errors import ParameterError
+from pkm_twin.kinematics.scheme import list_coordinates
 from pkm_twin.machine.formulas import PARAMETERS
 from pkm_twin.report import Fact, Report, number
 from pkm_twin.robot.clearance import clearance, has_clearance
@@ -42,6 +43,17 @@ def _leading(robot: Robot) -> list[Fact]:
     """Of more actuated joints than degrees of freedom those that lead."""
     leads = list(robot.graph.leads)
     return [Fact("leads", leads, text="joints that lead")] if robot.redundant else []
+
+
+def _other_poses(robot: Robot) -> list[Fact]:
+    """Return other sets of pose coordinates that a file of bodies and joints may have."""
+    if robot.mechanism != "machine":
+        return []
+    found = [list(names) for names in list_coordinates(robot.graph) if names != robot.pose_names]
+    shown = "; ".join(", ".join(names) for names in found[:MOST_NAMES])
+    shown += f" and {len(found) - MOST_NAMES} more" if len(found) > MOST_NAMES else ""
+    text = "other pose coordinates" if found else None
+    return [Fact("other_poses", found, text=text, shown=f"{shown} (`pose`, --pose)")]
 
 
 def info(given: Info) -> Report:
@@ -80,6 +92,7 @@ def info(given: Info) -> Report:
         Fact("redundant_closures", engine.redundant),
         Fact("assumed_joints", assumed),
         Fact("pose", pose_units, text="pose", shown=_named(pose_units)),
+        *_other_poses(robot),
         Fact("joints", list(robot.joint_names), text="actuated joints", shown=_named(joint_units)),
         *_leading(robot),
         Fact("joint_unit", robot.joint_unit),

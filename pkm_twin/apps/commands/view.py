@@ -62,7 +62,7 @@ def view(given: View) -> Report:
     from stiffness_monitor.modes import has_modes
 
     with ExitStack() as stack:
-        machine = load(given.robot, platform=given.platform)
+        machine = load(given.robot, **given.part)
         timeline = None if bag is None else _timeline(bag, given)
         model = Model(machine)
         server = stack.enter_context(serving(given.port))
