@@ -39,6 +39,7 @@ from delta_dynamics.torques.regressor import (
     regressor,
 )
 from delta_dynamics.torques.torque_terms import Terms, dynamics_terms
+from delta_dynamics.torques.transmission import Transmission, TransmissionState
 from delta_dynamics.torques.uncertainty import torque_deviation
 from delta_dynamics.torques.virtual_work import (
     Energy,
@@ -64,6 +65,8 @@ __all__ = [
     "Reactions",
     "Terms",
     "TorqueDerivatives",
+    "Transmission",
+    "TransmissionState",
     "base_parameters",
     "dynamics_terms",
     "elastic_reactions",

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     __version__: str
+    from delta_dynamics.torques.transmission import transmission
     from pkm_twin.design.variants import variants
     from pkm_twin.mechanisms.catalogue import load, robot_names
     from pkm_twin.robot.derivatives import (
@@ -24,6 +25,7 @@ __all__ = [
     "load",
     "platform_derivatives",
     "robot_names",
+    "transmission",
     "variants",
 ]
 
@@ -34,6 +36,7 @@ _HOMES = {
     "platform_derivatives": "pkm_twin.robot.derivatives",
     "load": "pkm_twin.mechanisms.catalogue",
     "robot_names": "pkm_twin.mechanisms.catalogue",
+    "transmission": "delta_dynamics.torques.transmission",
     "variants": "pkm_twin.design.variants",
 }
 """Loaded when they are asked for: a command or a node answers signals before it loads numpy."""

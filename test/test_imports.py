@@ -27,7 +27,7 @@ RECORDINGS = STREAMS | {"pkm_twin.bags", "pkm_twin.mechanisms"}
 NODE = RECORDINGS | {"pkm_twin", "pkm_twin.ros"}
 TWINS = {"delta_dynamics", "stiffness_monitor"}
 MAY = {
-    "pkm_twin": {"pkm_twin.robot", "pkm_twin.mechanisms", "pkm_twin.design"},
+    "pkm_twin": {"pkm_twin.robot", "pkm_twin.mechanisms", "pkm_twin.design", "delta_dynamics"},
     "pkm_twin.errors": set(),
     "pkm_twin.extensions": set(),
     "pkm_twin.files": set(),

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, Final
@@ -22,10 +23,15 @@ from pkm_twin.codegen.expressions import PARAMETERS, Objects, snapped_all
 from pkm_twin.codegen.kernels import Kernel
 from pkm_twin.codegen.lu import SparseLU
 from pkm_twin.codegen.program import Program
-from pkm_twin.kinematics import pose as poses
 from pkm_twin.kinematics.motion import BaseMotion
 from pkm_twin.kinematics.posed import CarriedScheme
-from pkm_twin.kinematics.programs import certify_assembly, follow_pose, solve_pose
+from pkm_twin.kinematics.programs import (
+    certify_assembly,
+    follow_pose,
+    pose_accelerations,
+    pose_factors,
+    solve_pose,
+)
 from pkm_twin.kinematics.traced import Traced
 from pkm_twin.machine.inertia import Layout, change_of_frame, loaded_joints
 from pkm_twin.robot.robot import Robot
@@ -67,18 +73,36 @@ def inverse_dynamics_at_pose(
     """
     load = _NO_WRENCH if wrench is None else wrench
     given = pose, rate, acceleration, load
-    found, status = pose_torques(robot)(robot.inertial, *given)
+    found = evaluate_at_pose(robot, pose_torques, unjudged_pose_torques, robot.inertial, *given)
+    return PoseMotion(*found)
+
+
+def evaluate_at_pose(
+    robot: Robot,
+    certified: Callable[[Robot], Kernel],
+    accepted: Callable[[Robot], Kernel],
+    p: Array,
+    *given: ArrayLike,
+) -> list[Array]:
+    """Evaluate a program of poses and other inputs; which poses are reached is judged as always.
+
+    :param certified: gives the program that accepts poses that are certainly right, and
+        ``accepted`` that of poses which the inverse kinematics has accepted.
+    :param p: the programs' parameters. ``given``: poses, shape (..., m), and the other inputs.
+    :raises UnreachableError: as the inverse kinematics, and SingularityError.
+    :raises ValueError: an input that is not finite.
+    """
+    found, status = certified(robot)(p, *given)
     if status is not None:
-        # Poses that are not certainly right are judged as by the inverse kinematics.
         rows = [np.broadcast_to(a, (*status.shape[:-1], np.shape(a)[-1])) for a in given]
         robot.inverse(rows[0])
         left = status[..., 0] != GOOD
-        again, status = unjudged_pose_torques(robot)(robot.inertial, *(row[left] for row in rows))
+        again, status = accepted(robot)(p, *(row[left] for row in rows))
         if status is not None:
-            raise ValueError("a rate, an acceleration or a wrench is not finite, or too large")
+            raise ValueError("an input beside the pose is not finite, or too large")
         for values, new in zip(found, again, strict=True):
             values[left] = new
-    return PoseMotion(*found)
+    return found
 
 
 def pose_torques(robot: Robot) -> Kernel:
@@ -140,24 +164,16 @@ def _pose_torques(t: Traced, scheme: CarriedScheme, *, certified: bool) -> Progr
 def _followed_pose_torques(t: Traced, scheme: None) -> Program:
     """Write the program of a machine whose pose is followed with its own tree, as of a screw."""
     del scheme
-    m, coordinates = t.joints, t.scheme.coordinates
+    m = t.joints
     first, q = follow_pose(t)
     layout, parts = begun(t)
     equations = t.equations(goal=t.lift(q), stage=len(first))
     rate, acceleration = (t.tape.inputs(name, m) for name in ("rate", "acceleration"))
-    position, rotation = t.motion.platform()
-    twists = t.twists(t.graph.platform, position, t.rate_columns())
-    columns = [poses.rates(coordinates, rotation, v, w) for v, w in twists]
-    lu = SparseLU(np.array(columns, dtype=object).T, t.scheme.jacobian_pivots)
+    lu = pose_factors(t)
     qd = lu.solve(rate)
     t.set_rates(qd)
     t.set_accelerations(np.zeros(m))
-    motion, body = t.motion, t.graph.platform
-    bias = poses.accelerations(
-        coordinates, motion.turned(body), motion.omega[body],
-        motion.acceleration(body, t.graph.origin), motion.alpha[body],
-    )  # fmt: skip
-    qdd = lu.solve(acceleration - np.array(bias, dtype=object))
+    qdd = lu.solve(acceleration - np.array(pose_accelerations(t), dtype=object))
     efforts, _ = efforts_of_motion(t, parts, qd, qdd)
     outputs = {
         "q": t.lift(t.tree.values_of_drives(q, t.x)), "qd": t.lift(t.tree.of_drives(qd, t.u)),

@@ -117,12 +117,7 @@ def acceleration_program(t: Traced) -> Program:
     qd, qdd = t.drives.given("qd"), t.drives.given("qdd")
     t.set_rates(qd)
     t.set_accelerations(qdd)
-    motion, graph = t.motion, t.graph
-    body = graph.platform
-    second = poses.accelerations(
-        t.scheme.coordinates, motion.turned(body), motion.omega[body],
-        motion.acceleration(body, graph.origin), motion.alpha[body],
-    )  # fmt: skip
+    second = pose_accelerations(t)
     return Program(t.inputs("q", "qd", "qdd"), 0, {"acceleration": t.lift(second)}, t.equations())
 
 
@@ -194,6 +189,67 @@ def solve_pose(t: Traced, scheme: CarriedScheme) -> tuple[Traced, list[Any]]:
     posed = t.carried(scheme)
     posed.solve()
     return posed, posed.tree.values_of_joints(t.graph.actuated, posed.x)
+
+
+def transmission_program(
+    t: Traced, scheme: CarriedScheme | None, *, certified: bool, curved: bool
+) -> Program:
+    """Write the program from a pose to the drives' positions and their rates per pose rate.
+
+    :param certified: whether poses are accepted as by :func:`quick_inverse_program`; else all are.
+    :param curved: whether the pose's ``rate`` is an input, and the drives' second derivatives at a
+        constant rate an output.
+    """
+    m = len(t.scheme.coordinates)
+    rate = t.tape.inputs("rate", m) if curved else None
+    if scheme is None:
+        first, leads = follow_pose(t)
+        equations = (*first, *t.equations(goal=t.lift(leads), stage=len(first)))
+        q = t.tree.values_of_drives(leads, t.x)
+        lu = pose_factors(t)
+        follow = np.array(t.rate_columns(), dtype=object).T
+        leading = [lu.solve(unit) for unit in np.eye(m)]
+        by_pose = np.array([t.tree.of_drives(own, follow @ own) for own in leading], object).T
+        if rate is not None:
+            t.set_rates(lu.solve(rate))
+            t.set_accelerations(np.zeros(m))
+            change = lu.solve(-np.array(pose_accelerations(t), dtype=object))
+            t.set_accelerations(change)
+            changes = t.tree.of_drives(change, t.du)
+    else:
+        posed, q = solve_pose(t, scheme)
+        branch = certify_assembly(t, scheme, posed, q) if certified else []
+        equations = posed.equations(branch=t.lift(branch))
+        by_pose = posed.rates_of_joints(t.graph.actuated)
+        if rate is not None:
+            posed.set_rates(rate)
+            posed.set_accelerations(np.zeros(m))
+            changes = [posed.du[posed.tree.steps[name].rate] for name in t.graph.actuated]
+    outputs = {"q": t.lift(q), "ratio": t.lift(np.ravel(by_pose))}
+    if rate is not None:
+        outputs["change"] = t.lift(changes)
+    inputs = {"pose": m} | ({} if rate is None else {"rate": m})
+    return Program(inputs, 0, outputs, equations, single=certified and scheme is not None)
+
+
+def pose_factors(t: Traced) -> SparseLU:
+    """Return the factors of pose rates by rates of the leading drives, of the machine's own tree.
+
+    The closures' equations have been taken before.
+    """
+    position, rotation = t.motion.platform()
+    twists = t.twists(t.graph.platform, position, t.rate_columns())
+    columns = [poses.rates(t.scheme.coordinates, rotation, v, w) for v, w in twists]
+    return SparseLU(np.array(columns, dtype=object).T, t.scheme.jacobian_pivots)
+
+
+def pose_accelerations(t: Traced) -> list[Any]:
+    """Return the second derivatives of the pose in time, after rates and accelerations are set."""
+    motion, body = t.motion, t.graph.platform
+    return poses.accelerations(
+        t.scheme.coordinates, motion.turned(body), motion.omega[body],
+        motion.acceleration(body, t.graph.origin), motion.alpha[body],
+    )  # fmt: skip
 
 
 def certify_assembly(

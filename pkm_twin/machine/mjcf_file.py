@@ -23,7 +23,7 @@ from pkm_twin.machine import urdf_xml
 from pkm_twin.machine.loop_tree import Fault, Joint, Link, LoopTree
 from pkm_twin.machine.precision import rounding_error
 from pkm_twin.machine.rotations import Pose, from_quaternion
-from pkm_twin.machine.urdf_control import CHOOSE, require_single
+from pkm_twin.machine.urdf_control import CHOOSE, UNCOUPLED, require_single
 
 _ENDLESS: Final = re.compile(
     r"(?:^|\s)[-+]?(?:nan(?:\(\S*\))?|inf|infinity)(?:\s|$)", re.IGNORECASE
@@ -392,7 +392,7 @@ class _Reader:
                 continue
             if other >= 0 or self.types[int(self.model.jnt_type[joint])] in ("free", "spherical"):
                 pair = [self._name("JOINT", k) for k in (joint, other) if k >= 0]
-                error = ParameterError(f"equality.{name}", pair[0], "joints without coupling")
+                error = ParameterError(f"equality.{name}", pair[0], UNCOUPLED)
                 self.faults.append((tuple(pair), error))
                 continue
             locks[joint] = self._start(joint) + float(data[0])

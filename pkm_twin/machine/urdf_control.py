@@ -39,6 +39,8 @@ WHERE: Final = (
 
 CHOOSE: Final = "`actuated=[...]` or --actuated"
 """How a user names the actuated joints of a file that marks none."""
+UNCOUPLED: Final = "joints without coupling; a base and a platform (--base) can leave them out"
+"""What is expected in place of joints that follow others."""
 
 
 def read_beside(path: Path) -> dict[str, Any]:

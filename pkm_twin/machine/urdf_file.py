@@ -26,7 +26,7 @@ from pkm_twin.machine.joints import TYPES
 from pkm_twin.machine.loop_tree import Fault, Joint, Link, LoopTree, hung, link_of
 from pkm_twin.machine.precision import rounding_error
 from pkm_twin.machine.rotations import Pose
-from pkm_twin.machine.urdf_control import actuated_joints, read_beside
+from pkm_twin.machine.urdf_control import UNCOUPLED, actuated_joints, read_beside
 
 _PLACES: Final = ("axis", "parent_axis", "child_axis")
 LARGE: Final = 10.0
@@ -242,7 +242,7 @@ def _take_screw(element: ET.Element, joints: dict[str, Joint], links: dict[str, 
         or not (same(turn.axes, slide.axes) and same(pose.rotation, np.eye(3)))
         or not same(np.cross(pose.position, slide.axes[0]), 0.0)
     ):
-        raise ParameterError(where, "<mimic>", "joints without coupling")
+        raise ParameterError(where, "<mimic>", UNCOUPLED)
     along = Pose(position=pose.position + offset * slide.axes[0])
     joints[turn.name] = replace(
         turn, kind="helical", outer=slide.outer, frames=(turn.frames[0] @ along, Pose()),

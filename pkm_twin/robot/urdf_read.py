@@ -124,11 +124,12 @@ def read_tree(path: str | Path, part: Part = Part()) -> UrdfReading:
     tool = _platform(tree, part.platform)
     ground = tree.root if part.base is None else part.base
     ground = urdf_xml.known_link("base", ground, tree.links)
-    notes, carried = list[str](), ()
+    notes, carried = list[str](), tuple[Link, ...]()
     if part.cuts:
         cut = cut_out(tree, ground, tool, carry=part.carry)
         _require_motors(part, tree, cut.tree, ground, tool)
-        tree, notes, carried = cut.tree, [*cut.notes], cut.carried
+        tree, carried = cut.tree, cut.carried
+        notes += cut.notes
     check_faults(tree)
     _require_closed(path, tree)
     bodies = _bodies(tree, tool, ground)

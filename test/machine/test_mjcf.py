@@ -13,6 +13,7 @@ from delta_dynamics import inverse_dynamics
 from pkm_twin.errors import ParameterError
 from pkm_twin.mechanisms.machine import Machine
 from pkm_twin.robot.urdf_read import read_urdf
+from test.support.mujoco_judge import Judge
 
 mujoco = pytest.importorskip("mujoco")
 
@@ -209,61 +210,6 @@ def test_a_part_may_be_called_like_such_a_number(tmp_path):
     path = five_bar(tmp_path)
     path.write_text(path.read_text().replace('"m1"', '"nan"'))
     assert "nan" in read_urdf(path)["joints"]
-
-
-class Judge:
-    """MuJoCo's inverse dynamics of the open tree, projected by the Jacobian of its equalities."""
-
-    def __init__(self, path, names):
-        self.model = mujoco.MjModel.from_xml_path(str(path))
-        self.model.opt.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
-        self.data = mujoco.MjData(self.model)
-        self.names = names
-        self.own = [int(self.model.joint(name).dofadr[0]) for name in names]
-        self.rest = np.setdiff1d(np.arange(self.model.nv), self.own)
-
-    def rows(self):
-        """What the equalities miss, and its Jacobian; no other constraint is asked."""
-        mujoco.mj_forward(self.model, self.data)
-        count = int(self.data.ne)
-        table = np.reshape(self.data.efc_J, (-1, self.model.nv))[:count]
-        return self.data.efc_pos[:count].copy(), table.copy()
-
-    def close(self, q):
-        for name, value in zip(self.names, q, strict=True):
-            self.data.joint(name).qpos[0] = value
-        for _ in range(50):
-            miss, table = self.rows()
-            step = np.zeros(self.model.nv)
-            step[self.rest] = -np.linalg.lstsq(table[:, self.rest], miss, rcond=1e-9)[0]
-            mujoco.mj_integratePos(self.model, self.data.qpos, step, 1.0)
-        assert np.abs(self.rows()[0]).max() < 1e-10
-
-    def efforts(self, q, qd, qdd):
-        self.close(q)
-        place, (_, table) = self.data.qpos.copy(), self.rows()
-        motion = np.zeros((self.model.nv, len(q)))
-        motion[self.own] = np.eye(len(q))
-        passive = table[:, self.rest]
-        motion[self.rest] = -np.linalg.lstsq(passive, table[:, self.own], rcond=1e-9)[0]
-        speed, step = motion @ qd, 1e-6
-        tables = []
-        for way in (step, -step):
-            self.data.qpos[:] = place
-            mujoco.mj_integratePos(self.model, self.data.qpos, speed, way)
-            tables.append(self.rows()[1])
-        drift = (tables[0] - tables[1]) @ speed / (2 * step)
-        change = motion @ qdd
-        change[self.rest] -= np.linalg.lstsq(passive, drift, rcond=1e-9)[0]
-        self.data.qpos[:], self.data.qvel[:], self.data.qacc[:] = place, speed, change
-        flags = self.model.opt.disableflags
-        self.model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
-        mujoco.mj_inverse(self.model, self.data)
-        self.model.opt.disableflags = flags
-        self.data.qvel[:] = 0.0
-        # Dry friction is a constraint in MuJoCo.
-        dry = self.model.dof_frictionloss * np.sign(speed)
-        return motion.T @ (self.data.qfrc_inverse + dry)
 
 
 ROD = """<mujoco><compiler angle="radian"/><option gravity="0 -9.81 -2"/><worldbody>

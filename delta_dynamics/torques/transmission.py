@@ -1,0 +1,299 @@
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
+"""A linkage as a transmission between its actuators and the joint that it moves.
+
+The joint side has the m pose coordinates x, as roll and pitch of an ankle. The actuator side has
+the n actuated joints in the controller's numbers a (``joint_map``: names, signs, ratios, offsets).
+With the ratio B = da/dx, power is the same on both sides:
+
+    da/dt = B dx/dt        B' t = f        t: efforts of the actuators, f: those of the joint
+
+With more actuators than freedoms, P = (B' W B)^-1 B' W, W = diag(effort limit^2), has P B = 1: of
+all efforts t with B' t = f, t = P' f has the least sum of (effort / limit)^2. Otherwise P = B^-1.
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+from functools import partial
+from typing import Final
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from delta_dynamics.torques.at_pose import evaluate_at_pose
+from delta_dynamics.torques.virtual_work import mass_matrix
+from pkm_twin.codegen.arrays import Array
+from pkm_twin.codegen.kernels import Kernel
+from pkm_twin.errors import ParameterError
+from pkm_twin.kinematics.programs import transmission_program
+from pkm_twin.robot.robot import Robot
+
+_NO_PARAMETERS: Final = np.zeros(0)
+_ROUNDING: Final = 1e-9
+"""Part of the largest entry below which an effort or a velocity of a transmission is rounding."""
+
+
+@dataclass(frozen=True)
+class TransmissionState:
+    """Positions, velocities and efforts of one side, (..., m) or (..., n); None: not given."""
+
+    position: Array
+    velocity: Array | None = None
+    effort: Array | None = None
+
+
+def _program(robot: Robot, *, certified: bool, curved: bool) -> Kernel:
+    certified = certified and robot.engine.posed is not None
+    name = f"transmission{' curved' * curved}{' certified' * certified}"
+    write = partial(transmission_program, certified=certified, curved=curved)
+    return robot.engine.posed_kernel(name, write)
+
+
+_CERTIFIED, _ACCEPTED = (
+    {curved: partial(_program, certified=certified, curved=curved) for curved in (False, True)}
+    for certified in (True, False)
+)
+
+
+class Transmission:
+    """A robot's linkage as a transmission, see :func:`transmission`.
+
+    Inputs are single, shape (m,) or (n,), or batches with leading axes that broadcast. Efforts are
+    those of the linkage alone: friction, weight and inertia are not in them. All methods that take
+    a position raise UnreachableError or SingularityError as ``robot.inverse`` does.
+    """
+
+    def __init__(self, robot: Robot) -> None:
+        self.robot = robot
+
+    @property
+    def joints(self) -> tuple[str, ...]:
+        """Names of the joint side: the pose coordinates."""
+        return self.robot.pose_names
+
+    @property
+    def actuators(self) -> tuple[str, ...]:
+        """Names of the actuator side: the controller's joints."""
+        return self.robot.controller.names
+
+    def joint_to_actuator(
+        self, position: ArrayLike, velocity: ArrayLike | None = None,
+        effort: ArrayLike | None = None,
+    ) -> TransmissionState:  # fmt: skip
+        """Convert joint states to actuator states.
+
+        :param position: pose coordinates, shape (..., m), rad or m.
+        :param velocity: their rates, shape (..., m). ``effort``: their efforts, N m or N.
+        :returns: shape (..., n) each, in the controller's units.
+        """
+        q, ratio = self._solve(position)
+        moved = None if velocity is None else _apply(ratio, self._joint(velocity, "velocity"))
+        given = None
+        if effort is not None:
+            given = _apply(self._back(q, ratio).swapaxes(-1, -2), self._joint(effort, "effort"))
+        return TransmissionState(self.robot.controller.controller_positions(q), moved, given)
+
+    def actuator_to_joint(
+        self, position: ArrayLike, velocity: ArrayLike | None = None,
+        effort: ArrayLike | None = None,
+    ) -> TransmissionState:  # fmt: skip
+        """Convert actuator states to joint states, as ``robot.forward`` finds the assembly.
+
+        :param position: actuator positions, shape (..., n), in the controller's units.
+        :param velocity: their rates. ``effort``: their efforts; shape (..., n) each.
+        :returns: shape (..., m) each.
+        """
+        n = self.robot.joints_count
+        q = self.robot.controller.positions(_vector(position, n, "position"))
+        pose = self.robot.forward(q)
+        moved = given = None
+        if velocity is not None or effort is not None:
+            ratio = self.ratio(pose)
+            if velocity is not None:
+                moved = _apply(self._back(q, ratio), _vector(velocity, n, "velocity"))
+            if effort is not None:
+                given = _apply(ratio.swapaxes(-1, -2), _vector(effort, n, "effort"))
+        return TransmissionState(pose, moved, given)
+
+    def ratio(self, position: ArrayLike) -> Array:
+        """Return the actuators' rates per joint rate, B = d(actuator)/d(joint), (..., n, m)."""
+        return self._solve(position)[1]
+
+    def gains(
+        self, position: ArrayLike, stiffness: ArrayLike, damping: ArrayLike,
+        effort: ArrayLike | None = None,
+    ) -> tuple[Array, Array]:  # fmt: skip
+        """Return the actuators' gains that give the joint a stiffness K and a damping D.
+
+        Actuators with t = effort - Ka (a - a0) - Da da/dt give the joint, at a position a0(x), the
+        efforts f with df/dx = -K and df/dv = -D. As the ratio changes with x, an effort changes
+        the stiffness:
+
+            Ka = P' (K + sum_i effort_i d2a_i/dx2) P,        Da = P' D P
+
+        :param stiffness: K, and ``damping``: D, of the pose coordinates, shape (m, m) or with
+            leading axes; a vector (m,) or a number: a diagonal.
+        :param effort: efforts that the actuators carry at the position, (..., n); default: none.
+        :returns: Ka and Da, shape (..., n, n) each: their coupling is a part of the result.
+        """
+        back = self._back(*self._solve(position))
+        wanted = self._matrix(stiffness, "stiffness")
+        if effort is not None:
+            load = _vector(effort, self.robot.joints_count, "effort")
+            wanted = wanted + np.einsum("...i,...ijk->...jk", load, self.curvature(position))
+        forth = back.swapaxes(-1, -2)
+        return forth @ wanted @ back, forth @ self._matrix(damping, "damping") @ back
+
+    def curvature(self, position: ArrayLike) -> Array:
+        """Return the second derivatives d2(actuator)/d(joint)2, shape (..., n, m, m)."""
+        m, controller = len(self.joints), self.robot.controller
+        place = self._joint(position, "position")[..., None, :]
+        # The second derivative along a + b, less those along a and b, is twice that by a and b.
+        pairs = [(j, k) for j in range(m) for k in range(j)]
+        ways = np.array([*np.eye(m), *(np.eye(m)[j] + np.eye(m)[k] for j, k in pairs)])
+        q, flat, change = evaluate_at_pose(
+            self.robot, _CERTIFIED[True], _ACCEPTED[True], _NO_PARAMETERS, place, ways
+        )
+        found = np.empty((*change.shape[:-2], change.shape[-1], m, m))
+        for j in range(m):
+            found[..., j, j] = change[..., j, :]
+        for row, (j, k) in enumerate(pairs, m):
+            mixed = (change[..., row, :] - change[..., j, :] - change[..., k, :]) / 2.0
+            found[..., j, k] = found[..., k, j] = mixed
+        by_pose = flat.reshape(*q.shape, m)[..., 0, :, :]
+        q = q[..., 0, :]
+        found *= controller.slopes(q)[..., None, None]
+        bend = (controller.factors * controller.changes)[:, None, None]
+        return found + bend * by_pose[..., :, None] * by_pose[..., None, :]
+
+    def effort_limits(self, position: ArrayLike) -> Array:
+        """Return the least and largest effort of each joint alone, shape (..., m, 2), N m or N.
+
+        The other joints have no effort, and no actuator is beyond its limit; infinite if a joint
+        needs only actuators without a limit.
+
+        :raises ParameterError: the file has no effort limits.
+        """
+        q, ratio = self._solve(position)
+        # Efforts that the limits allow are bounded by planes c f <= sum_i limit_i |c B_i|, whose
+        # normals c are across m - 1 rows of the ratio each.
+        normals = self._normals(ratio)
+        reach = np.abs(normals @ ratio.swapaxes(-1, -2))
+        reach[reach < _ROUNDING * reach.max(-1, keepdims=True)] = 0.0
+        limits = self._limits("effort", q)[..., None, :]
+        with np.errstate(invalid="ignore", divide="ignore"):
+            bound = np.where(reach > 0.0, limits * reach, 0.0).sum(-1)
+            slope = np.abs(normals)
+            slope[slope < _ROUNDING * slope.max(-1, keepdims=True)] = 0.0
+            most = np.where(slope > 0.0, bound[..., None] / slope, np.inf).min(-2)
+        return np.stack([-most, most], -1)
+
+    def velocity_limits(self, position: ArrayLike) -> Array:
+        """Return the least and largest velocity of each joint alone, shape (..., m, 2).
+
+        The other joints are at rest, and no actuator is beyond its limit, in rad/s or m/s.
+
+        :raises ParameterError: the file has no velocity limits.
+        """
+        q, ratio = self._solve(position)
+        limits, rates = self._limits("velocity", q)[..., None], np.abs(ratio)
+        rates = np.where(rates < _ROUNDING * rates.max(-2, keepdims=True), 0.0, rates)
+        with np.errstate(divide="ignore"):
+            most = np.where(rates > 0.0, limits / rates, np.inf).min(-2)
+        return np.stack([-most, most], -1)
+
+    def effort_polytope(self, position: ArrayLike) -> Array:
+        """Return joint efforts of all actuators at a limit, shape (..., 2^n, m).
+
+        Their convex hull contains all joint efforts that the actuators can apply; each is a vertex
+        if there are as many actuators as freedoms.
+
+        :raises ParameterError: an actuator without an effort limit.
+        """
+        q, ratio = self._solve(position)
+        limits = self._limits("effort", q)
+        free = [n for n, own in zip(self.actuators, limits.T, strict=True) if np.isinf(own).any()]
+        if free:
+            raise ParameterError("limits.effort", np.inf, f"finite limits of {', '.join(free)}")
+        corners = np.array(list(itertools.product((-1.0, 1.0), repeat=self.robot.joints_count)))
+        return np.asarray((corners * limits[..., None, :]) @ ratio)
+
+    def inertia(self, position: ArrayLike) -> Array:
+        """Return the inertia that the joint feels, (..., m, m): bodies, payload and rotors.
+
+        Rotors count with the square of their ratio. kg m2, kg, or kg m between both.
+
+        :raises ParameterError: the robot's file gives no masses.
+        """
+        q, ratio = self._solve(position)
+        by_pose = ratio / self.robot.controller.slopes(q)[..., None]
+        found = by_pose.swapaxes(-1, -2) @ mass_matrix(self.robot, q) @ by_pose
+        return np.asarray(found)
+
+    def _solve(self, position: ArrayLike) -> tuple[Array, Array]:
+        """Return the model's q, shape (..., n), and the ratio, shape (..., n, m)."""
+        place = self._joint(position, "position")
+        q, flat = evaluate_at_pose(
+            self.robot, _CERTIFIED[False], _ACCEPTED[False], _NO_PARAMETERS, place
+        )
+        ratio = flat.reshape(*q.shape, len(self.joints))
+        return q, ratio * self.robot.controller.slopes(q)[..., None]
+
+    def _back(self, q: Array, ratio: Array) -> Array:
+        """Return P, joint rates per actuator rate, shape (..., m, n)."""
+        if not self.robot.redundant:
+            return np.asarray(np.linalg.inv(ratio))
+        weights = (self.robot.effort_scale / self.robot.controller.slopes(q)) ** 2
+        weighted = (ratio * weights[..., None]).swapaxes(-1, -2)
+        return np.asarray(np.linalg.inv(weighted @ ratio) @ weighted)
+
+    def _normals(self, ratio: Array) -> Array:
+        """Return vectors across each choice of m - 1 rows of the ratio, (..., choices, m)."""
+        n, m = ratio.shape[-2:]
+        if n == m:
+            return np.asarray(np.linalg.inv(ratio).swapaxes(-1, -2), np.float64)
+        chosen = [list(rows) for rows in itertools.combinations(range(n), m - 1)]
+        across = np.linalg.svd(ratio[..., chosen, :])[2][..., -1, :]
+        return np.asarray(across)
+
+    def _limits(self, name: str, q: Array) -> Array:
+        """Return the actuators' limits in the controller's numbers at positions q, (..., n)."""
+        limits = getattr(self.robot.limits, name)
+        if limits is None:
+            raise ParameterError(
+                f"limits.{name}", None, f"{name} limits of {', '.join(self.robot.joint_names)}"
+            )
+        slopes = np.abs(self.robot.controller.slopes(q))
+        return np.asarray(limits / slopes if name == "effort" else limits * slopes)
+
+    def _joint(self, values: ArrayLike, name: str) -> Array:
+        return _vector(values, len(self.joints), name)
+
+    def _matrix(self, values: ArrayLike, name: str) -> Array:
+        """Return matrices of the joint side, shape (..., m, m)."""
+        m, given = len(self.joints), np.asarray(values, np.float64)
+        if given.ndim < 2:
+            given = np.diag(np.broadcast_to(given, (m,))) if given.shape in ((), (m,)) else given
+        if given.shape[-2:] != (m, m) or not np.isfinite(given).all():
+            raise ParameterError(name, values, f"finite numbers, shape (..., {m}, {m}) or ({m},)")
+        return np.asarray(given, np.float64)
+
+
+def _vector(values: ArrayLike, size: int, name: str) -> Array:
+    given = np.asarray(values, np.float64)
+    if given.shape[-1:] != (size,) or not np.isfinite(given).all():
+        raise ParameterError(name, values, f"finite numbers, shape (..., {size})")
+    return given
+
+
+def _apply(matrix: Array, vector: Array) -> Array:
+    return np.asarray((matrix @ vector[..., None])[..., 0])
+
+
+def transmission(robot: Robot) -> Transmission:
+    """Return a robot as a transmission: pose coordinates to actuators and back, exactly.
+
+    Made once for a robot. Only :meth:`Transmission.inertia` needs masses.
+    """
+    return robot.made(Transmission)

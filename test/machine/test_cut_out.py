@@ -1,0 +1,138 @@
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
+"""A linkage that is cut out of a whole robot's file is MuJoCo's, of the whole file."""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from delta_dynamics import inverse_dynamics
+from pkm_twin import load, transmission
+from pkm_twin.errors import MobilityError, ParameterError, UnknownNameError
+from pkm_twin.machine.strict_yaml import read_yaml
+from pkm_twin.mechanisms.catalogue import robot_of_data
+from test.support.mujoco_judge import Judge, mujoco
+
+pytestmark = pytest.mark.usefixtures("quickly_compiled")
+HUMANOID = Path(__file__).resolve().parents[2] / "examples/humanoid.xml"
+LINKAGES = {
+    "ankle": {"base": "shank", "platform": "foot"},
+    "knee": {"base": "thigh", "platform": "shank"},
+    "leg": {"base": "pelvis", "platform": "foot"},
+}
+ANKLE = ("ankle_roll", "ankle_pitch")
+
+
+def linkage(name, path=HUMANOID, **more):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return load(path, **LINKAGES[name], **more)
+
+
+def judge(robot, given=None, path=HUMANOID):
+    """MuJoCo with all that is not in the robot held."""
+    model = mujoco.MjModel.from_xml_path(str(path))
+    every = [model.joint(k).name for k in range(model.njnt)]
+    held = [name for name in every if name and name not in robot.graph.joints]
+    made = Judge(path, given or robot.joint_names, held)
+    # The free joint of the pelvis has no name.
+    made.rest = np.setdiff1d(made.rest, np.arange(6))
+    return made
+
+
+@pytest.mark.parametrize("name", sorted(LINKAGES))
+def test_efforts_are_those_of_the_whole_robot_in_mujoco(name):
+    robot = linkage(name, carry=True)
+    right = judge(robot)
+    rng, n = np.random.default_rng(3), robot.joints_count
+    for _ in range(3):
+        q = robot.graph.home + rng.uniform(-0.15, 0.15, n)
+        qd, qdd = rng.normal(size=(2, n))
+        efforts = right.efforts(q, qd, qdd)
+        error = np.abs(inverse_dynamics(robot, q, qd, qdd) - efforts).max()
+        assert error < 1e-8 * np.abs(efforts).max()
+
+
+def test_an_ankle_s_transmission_is_mujoco_s():
+    robot = linkage("ankle")
+    assert robot.pose_names == ("roll", "pitch")
+    right, t = judge(robot, ANKLE), transmission(robot)
+    motors = [int(right.model.joint(name).dofadr[0]) for name in robot.joint_names]
+    rng = np.random.default_rng(1)
+    for _ in range(5):
+        x = rng.uniform(-0.35, 0.35, 2)
+        right.data.qpos[:] = right.model.qpos0
+        for part in np.linspace(0.2, 1.0, 5):
+            right.close(part * x)
+        found = [right.data.joint(name).qpos[0] for name in robot.joint_names]
+        np.testing.assert_allclose(t.joint_to_actuator(x).position, found, atol=1e-10)
+        np.testing.assert_allclose(t.ratio(x), right.motion()[motors], atol=1e-9)
+
+
+def test_what_is_left_out_is_told_with_its_mass():
+    with pytest.warns(match=r"left out, though it moves: toes, 0.15 kg, on foot") as told:
+        load(HUMANOID, base="shank", platform="foot")
+    texts = [str(one.message) for one in told]
+    model = mujoco.MjModel.from_xml_path(str(HUMANOID))
+    behind = ("pelvis", "trunk", "arm", "finger", "thumb", "thigh", "knee_crank", "knee_rod")
+    mass = sum(model.body(name).mass[0] for name in behind)
+    assert any(f"{mass:.4g} kg, on shank" in text for text in texts)
+    assert any("motors: waist, shoulder, hip, knee_motor" in text for text in texts)
+    bare, whole = linkage("ankle"), linkage("ankle", carry=True)
+    assert bare.payload.mass == 0.0
+    assert whole.payload.mass == pytest.approx(0.15)
+    np.testing.assert_allclose(whole.payload.com, [0.16, 0.0, -0.04], atol=1e-12)
+
+
+def test_options_of_the_command_line_are_those_of_load(twin, tmp_path):
+    out = tmp_path / "ankle.yaml"
+    given = ["--base", "shank", "--platform", "foot", "--actuated", "ankle_right,ankle_left"]
+    twin.good("convert", HUMANOID, *given, "--pose", "pitch,roll", "--carry", "--out", out)
+    robot = robot_of_data(read_yaml(out), "ankle")
+    assert robot.joint_names == ("ankle_right", "ankle_left")
+    assert robot.pose_names == ("pitch", "roll")
+    same = linkage("ankle", carry=True)
+    x = np.array([0.2, -0.1])
+    np.testing.assert_allclose(robot.inverse(x), same.inverse(x[::-1])[::-1], atol=1e-12)
+    told = twin.told("info", HUMANOID, *given, "--pose", "x,roll")
+    assert ["roll", "pitch"] in told["other_poses"] and list(told["pose"]) == ["x", "roll"]
+
+
+WRONG = {
+    "unknown base": ({"base": "shnk"}, UnknownNameError, "did you mean 'shank'"),
+    "same body": ({"base": "sole"}, ParameterError, "moves relative to base 'sole'"),
+    "free base": ({"base": "world"}, ParameterError, "joints connect to platform 'foot', as pelv"),
+    "unknown motor": ({"base": "shank", "actuated": ["ankle"]}, UnknownNameError, "ankle_"),
+    "ball": ({"base": "shank", "actuated": ["knee"]}, ParameterError, "ankle_left, ankle_right"),
+    "too few": (
+        {"base": "shank", "actuated": ["ankle_left"]}, MobilityError,
+        "1 actuated joint for 2 degrees of freedom.*ankle_",
+    ),
+    "coupled": ({"base": "arm", "platform": "thumb"}, ParameterError, "can be driven: thumb"),
+    "coupled motor": (
+        {"base": "arm", "platform": "thumb", "actuated": ["thumb"]}, ParameterError,
+        "equality.grip.*--base",
+    ),
+    "whole": ({}, ParameterError, "equality.grip.*--base"),
+    "pose": ({"base": "shank", "pose": ["x", "y"]}, ParameterError, "as roll, pitch"),
+}  # fmt: skip
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("case", sorted(WRONG))
+def test_what_cannot_be_cut_out_is_told_with_the_way_out(case):
+    options, kind, text = WRONG[case]
+    with pytest.raises(kind, match=text):
+        load(HUMANOID, **{"platform": "foot", **options})
+
+
+def test_a_yaml_has_its_own_base_and_motors():
+    for options in ({"base": "base"}, {"actuated": ["left"]}, {"carry": True}):
+        with pytest.raises(ParameterError, match=next(iter(options))):
+            load("five_bar", **options)
+    assert load(
+        HUMANOID.parent / "machines/rss6.yaml", pose=["z", "y", "x", "yaw", "roll", "pitch"]
+    )
