@@ -99,7 +99,7 @@ def evaluate_at_pose(
         left = status[..., 0] != GOOD
         again, status = accepted(robot)(p, *(row[left] for row in rows))
         if status is not None:
-            raise ValueError("an input beside the pose is not finite, or too large")
+            raise ValueError("an input in addition to the pose is not finite, or too large")
         for values, new in zip(found, again, strict=True):
             values[left] = new
     return found

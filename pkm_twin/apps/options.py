@@ -51,7 +51,7 @@ class OfPlatform:
         name="pose", metavar="NAMES",
     )  # fmt: skip
     carry: bool = setting(
-        False, "with --base: what hangs on the platform is its payload, fixed as drawn"
+        False, "with --base: parts beyond the platform are its payload, fixed as drawn"
     )
 
     @property

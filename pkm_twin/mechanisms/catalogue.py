@@ -77,8 +77,8 @@ def load(
     :param actuated: names of the actuated joints, in the order of q; default: as the file marks.
     :param pose: names of the pose coordinates, of x y z roll pitch yaw; default: rotations if they
         determine the platform, else the first that do.
-    :param carry: whether what hangs on moving bodies is carried, fixed as drawn: on the platform as
-        payload; default: it is left out.
+    :param carry: whether parts beyond the platform are its payload, fixed as drawn, and those at
+        other moving bodies parts of them; default: they are left out.
     :raises UnknownNameError: no such name; the closest one is named.
     :raises ParameterError: an invalid file, key, type or value, with its dotted name.
     """

@@ -96,7 +96,8 @@ def page() -> str:
     lines += [
         "",
         "Every command has `--json`, which prints JSON, and `--help`, which says more. Every",
-        "command that takes a robot has `--platform`, every one that writes a file `--overwrite`.",
+        "command that takes a robot has `--platform`, `--base`, `--actuated`, `--pose` and",
+        "`--carry`, every one that writes a file `--overwrite`.",
         "",
     ]
     lines += [f"## {SHARED}", ""]
