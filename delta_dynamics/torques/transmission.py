@@ -296,4 +296,4 @@ def transmission(robot: Robot) -> Transmission:
 
     Made once for a robot. Only :meth:`Transmission.inertia` needs masses.
     """
-    return robot.made(Transmission)
+    return robot.cached(Transmission)
