@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import importlib
 import inspect
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Final
 
@@ -17,8 +16,8 @@ MODULES: Final = (delta_cu, prru, upr_rpu)
 """Each has ``find_rows``, which computes the paper's values and returns a ``Paper``."""
 HEAD: Final = """# The three papers, compared
 
-`make papers` writes this page, with values of today's code. Differences are in units of the last
-printed digit. "Computed in" links to the source, in which the equation's number stands.
+`make papers` writes this page. Tables of numbers have the printed and the computed value in each
+cell; a unit is one of the last printed digit. "Computed in" links to the source with the equation's number.
 
 """
 
@@ -57,7 +56,7 @@ def _write_paper(paper: Paper) -> str:
         parts += map(_write_row, rows)
         for row in rows:
             parts += [_write_comparison(one) for one in row.comparisons]
-            parts += [f"\n![{row.content}](gallery/{file})\n" for file in row.pictures]
+            parts += [f"\n![{kind} {row.label}](gallery/{file})\n" for file in row.pictures]
     return "".join(parts)
 
 
@@ -88,25 +87,16 @@ def _link_test(name: str) -> str:
 
 def _link_comparison(one: Comparison) -> str:
     anchor = heading_anchor(one.title)
-    return f"[{one.title}](#{anchor}): at most {one.largest:.0f} units of the last digit"
+    return f"[{one.title.rpartition(', ')[2]}](#{anchor}): within {one.largest:.0f} units"
 
 
 def _write_comparison(one: Comparison) -> str:
-    """Write the printed numbers, this package's, and the differences in printed digits."""
-
-    def line(name: str, kind: str, texts: Iterator[str]) -> str:
-        return f"| {name} | {kind} | {' | '.join(texts)} |\n"
-
-    parts = [f"\n### {one.title}\n\n", line("", "", iter(one.columns))]
-    parts.append("|---" * (2 + len(one.columns)) + "|\n")
+    """Write the printed numbers and this package's as one table."""
+    parts = [f"\n### {one.title}\n\n", f"| | {' | '.join(one.columns)} |\n"]
+    parts.append("|---" * (1 + len(one.columns)) + "|\n")
     for name, numbers in one.lines.items():
-        parts.append(line(name, "printed", (p.text for p in numbers)))
-        parts.append(line("", "computed", map(_write_value, numbers)))
-        parts.append(
-            line(
-                "", "difference", (f"{round(p.difference):+d}".replace("+0", "0") for p in numbers)
-            )
-        )
+        cells = " | ".join(f"{number.text}, {_write_value(number)}" for number in numbers)
+        parts.append(f"| {name} | {cells} |\n")
     return "".join(parts)
 
 
