@@ -102,7 +102,7 @@ def test_the_blocks_of_the_simulators_page_run(tmp_path, twin, monkeypatch):
 
 def test_python_blocks_of_pages(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    for page in ("design.md", "fit.md", "api.md"):
+    for page in ("api.md", "design.md", "fit.md", "maps.md", "paths.md", "vibration.md"):
         space = {}
         for language, block, _ in blocks(page):
             if language == "python":

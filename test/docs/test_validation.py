@@ -57,7 +57,7 @@ class TestTablesOfTheUprRpuPaper:
             shares.append((np.array(solid) / found - 1)[np.abs(solid) > 10 * upr_rpu.UNIT])
         softer = 100 * np.concatenate(shares)
         pattern = r"finite elements are (\d+) to (\d+) % softer"
-        assert_printed(PAGE, pattern, softer.min(), softer.max())
+        assert_printed("docs/papers.md", pattern, softer.min(), softer.max())
 
 
 @pytest.mark.parametrize("machine", partly_long(range(6), 0))

@@ -20,6 +20,8 @@ GROUPS = {
     "--columns": "table", "--topic": "recording", "--picture": "picture", "--teeth": "milling",
 }  # fmt: skip
 """An option, and the name of those that the same commands have."""
+PLAIN = ("", "TEXT", "NUMBER", "NUMBERS", "COUNT")
+"""Kinds of values that an option's explanation makes clear."""
 USUAL = ("--platform", "--overwrite")
 """Options of every command that takes a robot, and of every command that writes a file."""
 
@@ -35,8 +37,8 @@ class Word:
     argument: bool
 
     def __str__(self) -> str:
-        value = f" {self.metavar}" if self.metavar and not self.argument else ""
-        default = f" [default: {self.default}]" if self.default else ""
+        value = "" if self.argument or self.metavar in PLAIN else f" {self.metavar}"
+        default = f" [{self.default.removesuffix('.0')}]" if self.default else ""
         return f"* `{self.name}{value}`: {self.text}{default}"
 
 
@@ -95,9 +97,9 @@ def page() -> str:
         lines += [f"* {task}: {links}"]
     lines += [
         "",
-        "Every command has `--json`, which prints JSON, and `--help`, which says more. Every",
-        "command that takes a robot has `--platform`, `--base`, `--actuated`, `--pose` and",
-        "`--carry`, every one that writes a file `--overwrite`.",
+        "Every command has `--json` and `--help`, every one that takes a robot `--platform`,",
+        "`--base`, `--actuated`, `--pose` and `--carry`, every one that writes a file",
+        "`--overwrite`. Ranges and defaults are in brackets.",
         "",
     ]
     lines += [f"## {SHARED}", ""]

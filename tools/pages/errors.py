@@ -13,8 +13,7 @@ from test.support.pages import write_section
 
 ROOT = Path(__file__).parents[2]
 HEAD = """All errors are subclasses of `PkmTwinError`, one line each: what is wrong, where, what is
-expected. Commands print it on stderr and end with exit code 1, or 2 for an unknown option,
-an unreadable value, or one outside the range in the help.
+expected. Commands print it on stderr and end with exit code 1, or 2 for a wrong option or value.
 Nodes reject the message and count it by its reason in `/diagnostics`. [Python](api.md#errors) has
 their attributes. Examples:
 
@@ -71,51 +70,42 @@ ERRORS = {
 }
 """An example of each class, and what a user can do."""
 REASONS = {
-    "base motion": (
-        "a trajectory, but only the present motion of the base is known",
-        "send joint states",
-    ),
-    "bounds": ("a value or a size is beyond the bounds of any real machine", "check the units"),
-    "busy": ("too many requests are waiting", "send trajectories more slowly"),
-    "cdr": ("the bytes are not a message of this type", "use the same message definitions"),
-    "duplicated joint": ("a joint occurs twice", "send each joint once"),
-    "effort limit": ("an effort is beyond `effort_limits`", "slow the motion, or `limit_policy`"),
-    "empty": ("no joints, points, positions or efforts", "fill the arrays"),
-    "frame": ("another frame than `wrench_frame`", "set `wrench_frame`, `accept_empty_frame`"),
-    "future stamp": ("the stamp is ahead of the clock", "synchronise the clocks"),
-    "jump": ("a joint or the platform moved faster than it can", "check encoders and stamps"),
-    "late answer": ("the computation took longer than `stale_after`", "reduce the load"),
-    "length": ("an array has another length than the names", "send one value per joint"),
-    "limit": ("a position or velocity is beyond the robot's limits", "check `limits`"),
-    "missing joint": ("an actuated joint is missing", "check the names, or use `joint_map`"),
-    "no base motion": (
-        "no fresh message of `base_imu`, or none with gravity in it",
-        "check its stamps and driver",
-    ),
-    "no pose": ("no joint state within `max_state_age` of the wrench", "check `joint_states`"),
-    "no velocities": ("derivatives are missing", "set `acceleration` to `differentiate`"),
-    "no wrench": ("no fresh wrench", "check the topic `wrench` and its stamps"),
-    "non-finite result": ("the model gave NaN or infinity", "check the input and the robot file"),
-    "not finite": ("NaN or infinity in the message", "check the sensor"),
-    "not measured": ("a covariance of the IMU begins with -1", "use a sensor that measures it"),
-    "over": ("the trajectory has already ended", "use `use_sim_time` for a replayed bag"),
-    "pose": ("joint positions of a deflection are not usable", "check `joint_states`"),
-    "singular": ("too close to a singularity", "plan away from it, see `singularity_stop`"),
-    "stale stamp": ("the stamp is too old", "use `use_sim_time` for a replayed bag"),
-    "stamp order": ("the stamp is not later than the last one", "send samples in order"),
-    "time": ("times do not increase, or are invalid", "correct `time_from_start` or the stamp"),
-    "too short": ("too few points to differentiate", "send at least 3 points"),
-    "transform": ("no transform for the sensor", "publish it, or use `sensor.xyz`, `sensor.rpy`"),
-    "uneven stamps": ("stamps are too uneven to differentiate", "check the sender's timing"),
-    "unstable control": (
-        "the position control of `machine_sim` is unstable at its period",
-        "set `bandwidth` as the message says, or a shorter `period`",
-    ),
-    "unknown joint": ("a trajectory has a joint that the robot lacks", "see `extra_joints`"),
-    "unreachable": ("the joint positions cannot be assembled", "check the robot file and offsets"),
-    "zero stamp": ("the stamp is zero", "stamp the message, or set `accept_zero_stamp`"),
+    "base motion": "only its present motion is known; send joint states in place of trajectories",
+    "bounds": "beyond the bounds of any real machine; check the units",
+    "busy": "too many requests are waiting; send trajectories more slowly",
+    "cdr": "the bytes are not a message of this type; use the same message definitions",
+    "duplicated joint": "send each joint once",
+    "effort limit": "slow the motion, or see `limit_policy`",
+    "empty": "no joints, points, positions or efforts; fill the arrays",
+    "frame": "set `wrench_frame`, or `accept_empty_frame`",
+    "future stamp": "the stamp is ahead of the clock; synchronise the clocks",
+    "jump": "a joint or the platform moved faster than it can; check encoders and stamps",
+    "late answer": "computed for longer than `stale_after`; reduce the load",
+    "length": "an array and the names differ; send one value per joint",
+    "limit": "beyond the robot's position or velocity limits; check `limits`",
+    "missing joint": "check the names, or use `joint_map`",
+    "no base motion": "no fresh `base_imu`, or none with gravity; check its stamps and driver",
+    "no pose": "no joint state within `max_state_age` of the wrench; check `joint_states`",
+    "no velocities": "nor accelerations; set `acceleration` to `differentiate`",
+    "no wrench": "none fresh; check the topic `wrench` and its stamps",
+    "non-finite result": "check the input and the robot file",
+    "not finite": "NaN or infinity in the message; check the sensor",
+    "not measured": "a covariance of the IMU begins with -1; use a sensor that measures it",
+    "over": "the trajectory has already ended; use `use_sim_time` for a replayed bag",
+    "pose": "joint positions of a deflection are not usable; check `joint_states`",
+    "singular": "too close to a singularity; plan away from it, see `singularity_stop`",
+    "stale stamp": "use `use_sim_time` for a replayed bag",
+    "stamp order": "send samples in order",
+    "time": "times do not increase, or are invalid; correct `time_from_start` or the stamp",
+    "too short": "send at least 3 points to differentiate",
+    "transform": "none for the sensor; publish it, or use `sensor.xyz`, `sensor.rpy`",
+    "uneven stamps": "too uneven to differentiate; check the sender's timing",
+    "unknown joint": "the robot lacks a joint of the trajectory; see `extra_joints`",
+    "unreachable": "the joint positions cannot be assembled; check the robot file and offsets",
+    "unstable control": "of `machine_sim`; see its message for `bandwidth`, or shorten `period`",
+    "zero stamp": "stamp the message, or set `accept_zero_stamp`",
 }
-"""Reason of a rejected message to its meaning and to what a user can do."""
+"""Reason of a rejected message to its meaning, where the reason does not say it, and the remedy."""
 
 
 def reasons() -> set[str]:
@@ -136,9 +126,9 @@ def section() -> str:
     lines = []
     for kind, (example, hint) in ERRORS.items():
         lines.append(f"* **`{kind.__name__}`**: `{example}`: {hint}.")
-    text = "\n\n## Reasons of rejected messages: stale, lost, invalid\n\n"
-    rows = [f"* {reason}: {what}; {hint}" for reason, (what, hint) in sorted(REASONS.items())]
-    return HEAD + "\n".join(lines) + text + "\n".join(rows)
+    heading = "\n\n## Reasons of rejected messages: stale, lost, invalid\n\n"
+    rows = [f"* {reason}: {text}" for reason, text in sorted(REASONS.items())]
+    return HEAD + "\n".join(lines) + heading + "\n".join(rows)
 
 
 if __name__ == "__main__":

@@ -442,10 +442,10 @@ def _find_figures(frequencies: str) -> tuple[Row, ...]:
         Row(
             "figure", (8,), "six natural modes (orange: the R-C-U forearm)",
             ("stiffness_monitor.modes.modes",), (TEST + "test_conclusion_2_mode_shapes",),
-            f"frequencies lost in the scan, here {frequencies} Hz. Modes 1 to 3: in print and here "
-            "in the platform, the forearms and the joints between them. Modes 4 to 6: in print "
-            "more deformation at the joints of arm and forearm; here the forearms bend, and these "
-            "joints, rigid in the file, hardly move: not confirmed",
+            f"frequencies lost in the scan, here {frequencies} Hz. Modes 1 to 3 agree: platform, "
+            "forearms and the joints between them. Modes 4 to 6: in print more deformation at the "
+            "joints of arm and forearm; here the forearms bend, and these joints, rigid in the "
+            "file, hardly move",
             pictures=("delta_cu_modes_1_3.png", "delta_cu_modes_4_6.png"),
             drawn_by={
                 "delta_cu_modes_1_3.png": partial(draw_modes, first=1),

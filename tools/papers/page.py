@@ -17,7 +17,8 @@ MODULES: Final = (delta_cu, prru, upr_rpu)
 HEAD: Final = """# The three papers, compared
 
 `make papers` writes this page. Tables of numbers have the printed and the computed value in each
-cell; a unit is one of the last printed digit. "Computed in" links to the source with the equation's number.
+cell; a unit is one of the last printed digit. Links lead to the source, in which the equation's
+number stands, and to the test.
 
 """
 
@@ -51,8 +52,8 @@ def _write_paper(paper: Paper) -> str:
         rows = [row for row in paper.rows if row.kind == kind]
         if not rows:
             continue
-        parts.append(f"\n| {kind} | content | computed in | test | compared with print |\n")
-        parts.append("|---|---|---|---|---|\n")
+        parts.append(f"\n| {kind} | content, compared with print | computed, tested in |\n")
+        parts.append("|---|---|---|\n")
         parts += map(_write_row, rows)
         for row in rows:
             parts += [_write_comparison(one) for one in row.comparisons]
@@ -63,10 +64,8 @@ def _write_paper(paper: Paper) -> str:
 def _write_row(row: Row) -> str:
     cells = (
         row.label,
-        row.content,
-        "<br>".join(_link_function(name) for name in row.functions),
-        "<br>".join(_link_test(name) for name in row.tests),
-        "; ".join(filter(None, (row.note, *map(_link_comparison, row.comparisons)))),
+        "; ".join(filter(None, (row.content, row.note, *map(_link_comparison, row.comparisons)))),
+        "<br>".join((*map(_link_function, row.functions), *map(_link_test, row.tests))),
     )
     return f"| {' | '.join(cells)} |\n"
 
