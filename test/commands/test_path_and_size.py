@@ -644,9 +644,13 @@ def test_a_closed_cycle_without_friction_takes_no_energy(twin, tmp_path, fast):
     file.write_text(yaml.safe_dump(without(parameters_of("delta"), "friction")))
     law = ["--fastest"] if fast else ["--duration", "0.5"]
     twin("path", file, "--cycle", "25,200,25", *law, "--out", tmp_path / "cycle.csv")
-    told = json.loads(twin("size", file, tmp_path / "cycle.csv", "--json").out)
+    line = ("size", file, tmp_path / "cycle.csv")
+    told = json.loads(twin(*line, "--json").out)
     assert told["regenerated_J"] > 1.0
     assert abs(told["energy_J"]) < 1e-5 * told["regenerated_J"]
+    # It goes there and back alike, so that no drive takes energy from another.
+    rows = [row.split() for row in twin(*line).out.splitlines() if row.startswith("arm_")]
+    assert [row[7] for row in rows] == ["0"] * 3
     assert sum(d["joint"]["energy_J"] for d in told["drives"].values()) == pytest.approx(
         told["energy_J"], abs=1e-9
     )
