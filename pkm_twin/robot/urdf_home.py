@@ -464,10 +464,12 @@ class HomeSearch:
         return bool(((values >= self.low - 1e-6) & (values <= self.high + 1e-6)).all())
 
     def _near(self) -> Home | None:
-        """The best conditioned of the assemblies within the least reach that has a good one."""
+        """Return the best conditioned assembly of the least reach that has one far from the edge of
+        the workspace: its index is at least half of the best that any reach has.
+        """
         rng = np.random.default_rng(1)
         tried: list[Home] = []
-        best: Home | None = None
+        best: list[Home] = []
         for reach in REACHES:
             for _ in range(TRIES):
                 start = self.wanted + rng.uniform(-reach, reach, len(self.wanted)) * self.units
@@ -475,13 +477,12 @@ class HomeSearch:
                 home = self._reached(start, "near")
                 tried += [] if home is None else [home]
             good = [h for h in tried if self._inside(np.where(self.held, h.values, self.low))]
-            best = max(good, key=lambda home: home.index, default=None)
-            if best is not None and best.index >= 5 * SMALL:
-                return best
-            if tried and (best is None or best.index < SINGULAR):
+            best += [max(good, key=lambda home: home.index)] if good else []
+            if tried and (not best or best[-1].index < SINGULAR):
                 # All that close are singular, and not for where they are.
                 break
-        return best if best is not None and best.index >= SINGULAR else None
+        most = best[-1].index if best else 0.0
+        return next((home for home in best if home.index >= max(0.5 * most, SINGULAR)), None)
 
     def _home(self, values: Array, miss: float, how: str) -> Home:
         self.assembly.place(values)
