@@ -5,8 +5,9 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.maps import figures
-from pkm_twin.maps.kind import Case, Found, Kind, evaluate_kind
+from pkm_twin.maps.kind import Case, Found, Kind, concatenate_found, evaluate_kind
 from pkm_twin.maps.sweep import check
 from pkm_twin.report import plots
 from pkm_twin.robot.robot import Robot
@@ -26,6 +27,7 @@ class Along:
     """Hold a kind's values along a path: ``time`` (k,), s; ``pose`` (k, m); ``found`` per case.
 
     ``counted``: which samples keep all limits and a singularity index of ``least``, shape (k,).
+    ``elements``: names that ``found`` indexes.
     """
 
     robot: Robot
@@ -36,12 +38,12 @@ class Along:
     least: float
     counted: NDArray[np.bool_]
     found: Sequence[Found]
+    elements: tuple[str, ...]
 
     @property
     def worst(self) -> list[dict[str, Any]]:
         """Worst sample of each case as plain data, as for a stored map, with its time."""
         answers, axes = [], self.kind.axes(self.robot)
-        elements = self.kind.elements(self.robot)
         for case, one in zip(self.cases, self.found, strict=True):
             k = int(np.nanargmax(one.value if case.largest else -one.value))
             answer: dict[str, Any] = {
@@ -52,8 +54,8 @@ class Along:
             }  # fmt: skip
             if one.direction is not None and axes:
                 answer |= {"direction": one.direction[k].tolist(), "axes": list(axes)}
-            if one.element is not None and elements:
-                answer["element"] = elements[int(one.element[k])]
+            if one.element is not None and self.elements:
+                answer["element"] = self.elements[int(one.element[k])]
             answers.append(answer)
         return answers
 
@@ -72,7 +74,6 @@ class Along:
         columns: list[list[Any]] = [
             self.time.tolist(), *self.pose.T.tolist(), self.counted.astype(int).tolist()
         ]  # fmt: skip
-        elements = self.kind.elements(self.robot)
         for case, one in zip(self.cases, self.found, strict=True):
             before = "" if len(self.cases) == 1 else f"{case.name}."
             header.append(f"{before}value")
@@ -80,17 +81,16 @@ class Along:
             if one.direction is not None and one.direction.shape[-1] == 3:
                 header += [f"{before}direction.{axis}" for axis in "xyz"]
                 columns += one.direction.T.tolist()
-            if one.element is not None and elements:
+            if one.element is not None and self.elements:
                 header.append(f"{before}element")
-                columns.append([elements[k] for k in one.element])
+                columns.append([self.elements[k] for k in one.element])
         text = io.StringIO()
         csv.writer(text).writerows([header, *zip(*columns, strict=True)])
         return text.getvalue()
 
     def draw(self) -> Any:
         """Draw the values of each case over time, coloured by the critical element."""
-        elements = self.kind.elements(self.robot)
-        indices = [one.element for one in self.found if one.element is not None and elements]
+        indices = [one.element for one in self.found if one.element is not None and self.elements]
         # An element has one colour in all panels.
         blamed = np.unique(np.concatenate(indices)).tolist() if indices else []
         figure, ((*axes,),) = plots.columns(1, len(self.found))
@@ -103,7 +103,7 @@ class Along:
                 if np.any(own):
                     colour = plots.COLOURS[n % len(plots.COLOURS)]
                     dots = ax.plot(self.time[own], values[own], ".", ms=4, color=colour)
-                    dots[0].set_label(elements[element])
+                    dots[0].set_label(self.elements[element])
             plots.label(ax, "time (s)", f"{case.what} ({unit})", text, 9)
             if blamed:
                 plots.legend(ax)
@@ -114,11 +114,14 @@ class Along:
 def along(
     kind: Kind, robot: Robot, time: Array, q: Array, *, cases: Sequence[Case] = (),
     least: float | None = None, least_clearance: float = 0.0,
+    parts: Iterable[tuple[Robot, slice]] = (), wrench: Array | None = None,
 ) -> Along:  # fmt: skip
     """Evaluate a kind at joint positions q (k, n) at times (k,), s.
 
     :param cases: load cases; by default the kind's own.
     :param least: singularity index below which a sample does not count; by default the kind's.
+    :param parts: the robot with its payload, and for which samples, in order.
+    :param wrench: on the platform instead of the cases', base axes, N and N m, shape (k, 6).
     :raises ParameterError: the robot's file lacks what the quantity needs.
     """
     chosen = tuple(cases) or kind.cases(robot)
@@ -127,6 +130,24 @@ def along(
     known = np.ones(len(pose), bool)
     least = kind.least if least is None else least
     counted = counts(robot, q, pose, known, least, least_clearance)
-    return Along(
-        robot, kind, chosen, time, pose, least, counted, evaluate_kind(kind, robot, q, chosen)
-    )
+    changes: list[int] = []
+    if wrench is not None:
+        changes = (1 + np.flatnonzero((wrench[1:] != wrench[:-1]).any(1))).tolist()
+    pieces, elements = [], dict[str, int]()
+    for loaded, rows in parts or [(robot, slice(0, len(q)))]:
+        # A payload is an element of its own where there is one.
+        names = [elements.setdefault(name, len(elements)) for name in kind.elements(loaded)]
+        index = np.array([*names, -1])
+        inside = [k for k in changes if rows.start < k < rows.stop]
+        for begin, end in pairwise([rows.start, *inside, rows.stop]):
+            under = chosen
+            if wrench is not None:
+                load = tuple(wrench[begin].tolist())
+                under = tuple(replace(case, wrench=load) for case in chosen)
+            values = evaluate_kind(kind, loaded, q[begin:end], under)
+            pieces.append([
+                one if one.element is None else one._replace(element=index[one.element])
+                for one in values
+            ])  # fmt: skip
+    found = [concatenate_found(each) for each in zip(*pieces, strict=True)]
+    return Along(robot, kind, chosen, time, pose, least, counted, found, tuple(elements))

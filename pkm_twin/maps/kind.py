@@ -309,14 +309,17 @@ def evaluate_kind(kind: Kind, robot: Robot, q: Array, cases: Sequence[Case]) -> 
         if len(q) == 1:
             return [without(1) for _ in cases]
         halves = [evaluate_kind(kind, robot, part, cases) for part in np.array_split(q, 2)]
-        return [_concatenate(*pair) for pair in zip(*halves, strict=True)]
+        return [concatenate_found(pair) for pair in zip(*halves, strict=True)]
 
 
-def _concatenate(one: Found, other: Found) -> Found:
-    def both(a: NDArray[Any] | None, b: NDArray[Any] | None) -> Any:
-        return None if a is None or b is None else np.concatenate([a, b])
+def concatenate_found(parts: Sequence[Found]) -> Found:
+    """Join a quantity's values of successive poses."""
 
-    return Found(*map(both, one, other))
+    def join(column: Sequence[NDArray[Any] | None]) -> Any:
+        arrays = [part for part in column if part is not None]
+        return np.concatenate(arrays) if len(arrays) == len(column) else None
+
+    return Found(*map(join, zip(*parts, strict=True)))
 
 
 def drive_limits(robot: Robot, name: str) -> Array:

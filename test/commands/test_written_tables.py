@@ -16,7 +16,10 @@ from test.support.robots import load, parameters_of
 from test.support.tables import of_joints, read_columns, write_columns
 
 ENDINGS = ("csv", *(["parquet"] if importlib.util.find_spec("pyarrow") else []))
-READERS = (("loads",), ("size",), ("size", "--efforts", "model"), ("torques", "--out", "-"))
+READERS = (
+    ("loads",), ("size",), ("size", "--efforts", "model"), ("map", "--along"),
+    ("torques", "--out", "-"),
+)  # fmt: skip
 NAMES = ("delta", "five_bar", "upr_rpu", "stewart")
 
 
@@ -24,7 +27,11 @@ def answers(twin, robot, path):
     """What each reader prints of a motion, without the name of its file."""
     told = []
     for command, *more in READERS:
-        out = twin.good(command, robot, path, *more, *(() if more[-1:] == ["-"] else ("--json",)))
+        words = [path, *more]
+        if command == "map":
+            driven = load(robot).limits.effort is not None
+            words = ["acceleration" if driven else "compliance", *more, path]
+        out = twin.good(command, robot, *words, *(() if more[-1:] == ["-"] else ("--json",)))
         told.append(out.out if more[-1:] == ["-"] else json.loads(out.out))
     return told
 

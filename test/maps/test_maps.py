@@ -3,7 +3,9 @@
 
 from __future__ import annotations
 
+import csv
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -276,6 +278,38 @@ def test_along_a_path_and_as_numbers(capsys, tmp_path, monkeypatch):
     again = json.loads(command(capsys, *map(str, (*words, *more))).out)
     assert again["worst"] == told["worst"]
     assert again["samples_that_do_not_count"] == np.sum(robot.singularity(q) < bound) > 0
+
+
+@pytest.mark.parametrize("kind", ["acceleration", "compliance", "strain-energy", "frequency"])
+def test_along_a_path_each_sample_has_its_payload_and_wrench(kind, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    robot, count = load("delta_cu"), 6
+    poses = robot.home() + np.linspace([0.0, 0.0, 0.0], [0.05, 0.02, 0.03], count)
+    wrench = np.zeros((count, 6))
+    wrench[2:, :3] = [30.0, -50.0, 20.0]
+    wrench[4:, 3:] = np.random.default_rng(0).normal(size=(2, 3))
+    masses = np.array([0.0, 1.5, 1.5, 1.5, 0.4, 0.4])
+    table = np.column_stack([0.01 * np.arange(count), poses, wrench, masses])
+    header = "time,x,y,z,fx,fy,fz,mx,my,mz,payload.mass"
+    np.savetxt("path.csv", table, "%.17g", ",", header=header, comments="")
+    words = ("map", "delta_cu", kind, "--along", "path.csv", "--out", "a.csv", "--no-picture")
+    told = command(capsys, *words)
+    assert told.code == 0, told
+    with open("a.csv") as file:
+        values = [float(row["value"]) for row in csv.DictReader(file)]
+    own = KINDS[kind]()
+    for value, pose, load_case, mass in zip(values, poses, wrench, masses, strict=True):
+        (case,) = own.cases(robot)
+        if own.takes_wrench:
+            case = replace(own.loaded(robot, "", [1.0] * 6), wrench=tuple(load_case))
+        loaded = robot.changed(payload={"mass": mass})
+        expected = evaluate_kind(own, loaded, robot.inverse(pose)[None], [case])[0].value[0]
+        assert value == pytest.approx(expected, rel=1e-9, abs=1e-15)
+    # A wrench of the command line takes the place of the path's.
+    if own.takes_wrench:
+        given = (*words[:-1], "--overwrite", "--wrench", "0,0,1,0,0,0", "--no-picture")
+        assert "of the path" not in command(capsys, *given).out
+        assert "of the path" in told.out
 
 
 def test_a_pose_in_a_sentence_is_as_commands_read_it():

@@ -10,7 +10,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, get_type_hints
 
 from pkm_twin.apps.frame import Command, Group, command
-from pkm_twin.apps.options import Carries, Draws, OfMilling, OfTool, Overwrites, Parallel, Writes
+from pkm_twin.apps.options import (
+    Carries,
+    Draws,
+    OfMilling,
+    OfTool,
+    Overwrites,
+    Parallel,
+    Writes,
+    payload_fact,
+)
 from pkm_twin.console import numbers, progress, refuse_existing
 from pkm_twin.errors import ParameterError
 from pkm_twin.extensions import Extensible
@@ -105,7 +114,8 @@ class Loads:
 
     wrench: tuple[str, ...] = setting(
         (),
-        f"force and moment on the platform, base axes: {SIX}; several times for several load cases",
+        f"force and moment on the platform, base axes: {SIX}; several times for several load "
+        "cases; default with --along: the path's, if it has one",
     )
 
 
@@ -205,13 +215,23 @@ def scalars(data: Dataset) -> dict[str, Any]:
 def along_path(given: OfMap, kind: Kind, machine: Robot, cases: list[Case], path: Path) -> Report:
     """Evaluate the kind along a path; report the worst of each case."""
     from pkm_twin.maps.along import along
+    from pkm_twin.paths.along import check_computed, settle_rests
     from pkm_twin.recordings import ReadOptions, read
+    from pkm_twin.recordings.payload import by_load
 
     if given.out is not None and given.out.suffix != ".csv":
         raise ParameterError("out", str(given.out), "a name that ends in .csv")
-    motion = read(path, machine, ReadOptions(planned=True))
+    motion = read(path, machine, ReadOptions(planned=True, load=given.load))
+    if motion.computed is not None and given.payload is None:
+        check_computed(settle_rests(motion.with_rates()))
+    wrench = None if cases or not kind.takes_wrench else motion.wrench
+    if wrench is not None and wrench.any():
+        cases = [kind.loaded(machine, "wrench of the path", wrench[wrench.any(1)][0].tolist())]
+    else:
+        wrench = None
     found = along(
-        kind, machine, motion.clock, motion.q, cases=cases,
+        kind, machine, motion.clock, motion.q, cases=cases, wrench=wrench,
+        parts=by_load(machine, motion.load, motion.time, len(motion.q)),
         least=given.singularity, least_clearance=given.least_clearance,
     )  # fmt: skip
     if given.out is not None:
@@ -219,7 +239,8 @@ def along_path(given: OfMap, kind: Kind, machine: Robot, cases: list[Case], path
     beyond, least = int((~found.counted).sum()), found.least
     first, *rest = found.sentences
     bound = f", singularity index {least:g} or more" if least > 0.0 else ""
-    notes = [*rest, f"{len(found.time)} samples of {path}{bound if not beyond else ''}"]
+    under = [] if wrench is None else ["under the wrench of the path"]
+    notes = [*rest, *under, f"{len(found.time)} samples of {path}{bound if not beyond else ''}"]
     if beyond:
         low = int((machine.try_singularity(motion.q)[0] < least).sum())
         alone = f"{low} have a singularity index below {least:g}"
@@ -235,6 +256,7 @@ def along_path(given: OfMap, kind: Kind, machine: Robot, cases: list[Case], path
             Fact("samples", len(found.time)),
             Fact("samples_that_do_not_count", beyond),
             Fact("singularity_bound", least if least > 0.0 else None),
+            payload_fact(motion.load),
             Fact("worst", found.worst),
             Fact("files", [str(path) for path in (given.out, given.drawing("")) if path]),
         ],
