@@ -43,7 +43,8 @@ class TransmissionState:
     effort: Array | None = None
 
 
-def _program(robot: Robot, *, certified: bool, curved: bool) -> Kernel:
+def transmission_kernel(robot: Robot, *, certified: bool, curved: bool) -> Kernel:
+    """Return the program from a pose to q and dq/dpose, see :func:`transmission_program`."""
     certified = certified and robot.engine.posed is not None
     name = f"transmission{' curved' * curved}{' certified' * certified}"
     write = partial(transmission_program, certified=certified, curved=curved)
@@ -51,7 +52,10 @@ def _program(robot: Robot, *, certified: bool, curved: bool) -> Kernel:
 
 
 _CERTIFIED, _ACCEPTED = (
-    {curved: partial(_program, certified=certified, curved=curved) for curved in (False, True)}
+    {
+        curved: partial(transmission_kernel, certified=certified, curved=curved)
+        for curved in (False, True)
+    }
     for certified in (True, False)
 )
 

@@ -507,6 +507,9 @@ static int @_{name}({more}const double *{q.target}, int steps, double *h, double
         work = "\n".join(
             [*solving, f"{call % 'r'};", f"status = @_judged(r, {len(routine.results)});"]
         )
+        # Results of functions in its place that it does not give.
+        left = {name: len(row) for o in routine.otherwise for name, row in o.outputs.items()}
+        left = {name: size for name, size in left.items() if name not in routine.outputs}
         lines = [f"    double {name}[{size}] = {{0.0}};" for name, size in rooms.items()]
         if any(q.home for q in routine.equations):
             lines.append("    int rung;")
@@ -521,6 +524,8 @@ static int @_{name}({more}const double *{q.target}, int steps, double *h, double
         lines += [f"    if ({' && '.join(finite)}) {{", indent(work, "        "), "    }"]
         if routine.otherwise:
             lines.append("    if (status == 1) {")
+            for name, size in left.items():
+                lines.append(f"        double {name}[{size}];")
             for k, other in enumerate(routine.otherwise):
                 names = ", ".join(["parameters", *other.inputs, *other.outputs])
                 call = f"status = @_{other.name}_with({names});"

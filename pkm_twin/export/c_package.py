@@ -13,6 +13,7 @@ import numpy as np
 
 from delta_dynamics.torques.at_pose import pose_torques, unjudged_pose_torques
 from delta_dynamics.torques.equations import motion_kernel
+from delta_dynamics.torques.transmission import transmission_kernel
 from delta_dynamics.torques.virtual_work import (
     accelerations,
     inverse_dynamics,
@@ -40,6 +41,8 @@ from pkm_twin.export.c_templates import (
     STATELESS,
     WORST,
 )
+from pkm_twin.export.c_transmission import TransmissionTerms, directions
+from pkm_twin.kinematics.programs import actuator_program
 from pkm_twin.machine.inertia import Layout
 from pkm_twin.machine.sections import MAX_LENGTH, MAX_MASS, payload_margins
 from pkm_twin.robot.mechanism import RigidError
@@ -113,11 +116,14 @@ class Package:
     # Programs.
 
     def _read(
-        self, kernel: Kernel, own: Sequence[Any] | Array = ()
+        self, kernel: Kernel, own: Sequence[Any] | Array = (), **more: Sequence[float]
     ) -> tuple[dict[str, list[Expression]], list[Equations]]:
-        """Outputs and equations of a kernel, with this machine's numbers in them."""
+        """Outputs and equations of a kernel, with this machine's numbers in them.
+
+        :param more: numbers of other inputs.
+        """
         program = kernel.program
-        given = {GEOMETRY: kernel.geometry.tolist(), PARAMETERS: list(own)}
+        given = {GEOMETRY: kernel.geometry.tolist(), PARAMETERS: list(own), **more}
         rows = {name: self.fold(row, given) for name, row in program.outputs.items()}
         return rows, [self.fold.equations(q, given) for q in program.equations]
 
@@ -255,6 +261,7 @@ class Package:
             "singularity", "Singularity index: 0 in a singularity, 1 at best.",
             q, robot.singularity_kernel, index="measure",
         )  # fmt: skip
+        self._add_transmission(result)
         if self.elastic is not None:
             self._add_elastic(self.elastic, result)
         return result
@@ -276,6 +283,57 @@ class Package:
 
     def _wants(self, name: str) -> bool:
         return not self._names or name in self._names
+
+    def _add_transmission(self, result: list[Routine]) -> None:
+        """Add the functions of the robot as a transmission between its pose and its joints."""
+        robot, n, m = self.robot, self.n, self.m
+        inverse = next((r for r in result if r.name == "inverse"), None)
+        for curved, name, summary, inputs in (
+            (
+                False, "joint_to_actuator", "The machine as a transmission: joint positions, rates "
+                "and efforts of a pose, its rate, and efforts on its coordinates.",
+                {"pose": m, "velocity": m, "effort": m},
+            ),
+            (
+                True, "gains", "Stiffness and damping of the actuated joints, row by row, which "
+                "give the pose coordinates a stiffness and damping while the joints have efforts "
+                "tau.", {"pose": m, "stiffness": m * m, "damping": m * m, "tau": n},
+            ),
+        ):  # fmt: skip
+            if not self._wants(name):
+                continue
+            made: list[Routine] = []
+            for certified in (False, True) if robot.engine.posed is not None else (True,):
+                kernel = transmission_kernel(robot, certified=certified, curved=curved)
+                ways = directions(m) if curved else [[]]
+                found = [self._read(kernel, rate=way) for way in ways]
+                rows, equations = found[0]
+                terms = TransmissionTerms(robot, self.fold, rows["ratio"])
+                if curved:
+                    changes = [rows["change"] for rows, _ in found]
+                    outputs = terms.gains(changes)
+                else:
+                    outputs = {"q": rows["q"], **terms.actuator_side()}
+                full = name if certified else f"{name}_accepted"
+                otherwise = (inverse, made[0]) if made and inverse is not None else ()
+                made.append(
+                    Routine(
+                        full, inputs, outputs, equations, summary, single=bool(otherwise),
+                        otherwise=otherwise,
+                    )
+                )  # fmt: skip
+            self.hidden += made[:-1]
+            result.append(made[-1])
+        if self._wants("actuator_to_joint"):
+            kernel = robot.engine.kernel("actuator to joint", actuator_program)
+            rows, equations = self._read(kernel)
+            result.append(
+                Routine(
+                    "actuator_to_joint", {"q": n, "qd": n, "tau": n}, rows, equations,
+                    "The machine as a transmission: pose, its rate, and efforts on its "
+                    "coordinates, of joint positions, rates and efforts.",
+                )
+            )  # fmt: skip
 
     def _add_elastic(self, elastic: Elastic, result: list[Routine]) -> None:
         rows, equations = self._read(elastic.response)

@@ -204,6 +204,7 @@ def transmission_program(
     rate = t.tape.inputs("rate", m) if curved else None
     if scheme is None:
         first, leads = follow_pose(t)
+        t.solve()
         equations = (*first, *t.equations(goal=t.lift(leads), stage=len(first)))
         q = t.tree.values_of_drives(leads, t.x)
         lu = pose_factors(t)
@@ -230,6 +231,22 @@ def transmission_program(
         outputs["change"] = t.lift(changes)
     inputs = {"pose": m} | ({} if rate is None else {"rate": m})
     return Program(inputs, 0, outputs, equations, single=certified and scheme is not None)
+
+
+def actuator_program(t: Traced) -> Program:
+    """Write the program from the drives' positions, rates and efforts to those of the pose."""
+    t.solve()
+    tau, qd = (t.tape.inputs(name, t.drives.count) for name in ("tau", "qd"))
+    position, rotation = t.motion.platform()
+    twists = t.twists(t.graph.platform, position, t.rate_columns())
+    rows = zip(*[poses.rates(t.scheme.coordinates, rotation, v, w) for v, w in twists], strict=True)
+    velocity = [np.array(t.drives.shared(row), dtype=object) @ qd for row in rows]
+    effort = pose_factors(t).solve_transposed(t.drives.on_leads([*tau]))
+    outputs = {
+        "pose": t.lift(poses.values(t.scheme.coordinates, position, rotation)),
+        "velocity": t.lift(velocity), "effort": t.lift(effort),
+    }  # fmt: skip
+    return Program(t.inputs("q", "qd", "tau"), 0, outputs, t.equations())
 
 
 def pose_factors(t: Traced) -> SparseLU:

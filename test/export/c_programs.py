@@ -22,7 +22,7 @@ from delta_dynamics import (
     inverse_dynamics_at_pose,
     mass_matrix,
 )
-from pkm_twin import Robot
+from pkm_twin import Robot, transmission
 from pkm_twin.codegen.arrays import Array
 from stiffness_monitor import platform_response
 from test.support.robots import has
@@ -67,6 +67,7 @@ def functions(robot: Robot) -> dict[str, Callable[..., Any]]:
         "platform_jacobian": lambda q: flat(robot.platform_jacobian(q)),
         "singularity": lambda q: robot.singularity(q)[:, None],
     }
+    result |= _transmission(robot)
     if has(robot, "massive"):
         result["torques"] = lambda q, qd, qdd, w: inverse_dynamics(robot, q, qd, qdd, w)
         result["torques_moving"] = lambda *given: inverse_dynamics(robot, *given)
@@ -85,19 +86,40 @@ def functions(robot: Robot) -> dict[str, Callable[..., Any]]:
     return result
 
 
+def _transmission(robot: Robot) -> dict[str, Callable[..., Any]]:
+    m = len(robot.pose_names)
+    t = transmission(robot.changed(joint_map={}))
+
+    def both(*parts: Array) -> Array:
+        return np.concatenate([part.reshape(len(parts[0]), -1) for part in parts], 1)
+
+    def gains(pose: Array, stiffness: Array, damping: Array, tau: Array) -> Array:
+        return both(*t.gains(pose, *(a.reshape(-1, m, m) for a in (stiffness, damping)), tau))
+
+    return {
+        "joint_to_actuator": lambda *given: both(*dataclasses.astuple(t.joint_to_actuator(*given))),
+        "actuator_to_joint": lambda *given: both(*dataclasses.astuple(t.actuator_to_joint(*given))),
+        "gains": gains,
+    }
+
+
 def inputs_of(robot: Robot, motion: tuple[Array, ...]) -> dict[str, tuple[Array, ...]]:
     """Arguments of all of these by a motion: q, qd, qdd and wrenches; efforts are those of qdd."""
     q, qd, qdd, wrench = motion
     result = dict.fromkeys(functions(robot), (q,))
     if "inverse" in result:
         result["inverse"] = (robot.try_forward(q)[0],)
+    m, pose = len(robot.pose_names), robot.try_forward(q)[0]
+    square = np.resize(np.cos(np.arange(997.0)), (len(q), m * m))
+    result["joint_to_actuator"] = pose, qd[:, :m], qdd[:, :m]
+    result["actuator_to_joint"] = q, qd, qdd
+    result["gains"] = pose, square, 0.1 * square, qdd
     if "torques" in result:
         result["torques"] = result["torques_and_singularity"] = motion
         base = np.resize(np.sin(np.arange(101.0)) * 10.0, (len(q), 9))
         result["torques_moving"] = (*motion, base)
         result["accelerations"] = (q, qd, 0.1 * qdd, wrench)
-        m = len(robot.pose_names)
-        result["torques_at_pose"] = (robot.try_forward(q)[0], qd[:, :m], qdd[:, :m], wrench)
+        result["torques_at_pose"] = (pose, qd[:, :m], qdd[:, :m], wrench)
     if "strain_energy" in result:
         result["strain_energy"] = (q, wrench)
     return result

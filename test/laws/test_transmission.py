@@ -18,11 +18,12 @@ from test.support.robots import parameters_of, partly_long, without
 
 GALLERY = Path(__file__).resolve().parents[2] / "examples/machines"
 OWN = ("five_bar", "rps3", "delta", "linear_delta", "stewart", "prru", "upr_rpu")
-RANDOM = ("four_bar", "slider_crank", "rrr3_spherical", "rsur", "platform_motor", "rcuu")
+RANDOM = ("gantry", "four_bar", "slider_crank", "rrr3_spherical", "rsur", "platform_motor", "rcuu")
 REDUNDANT = ("rrr4_planar", "dual_scara")
 NAMES = partly_long(
-    (*OWN, *RANDOM, *REDUNDANT), "five_bar", "rps3", "rrr3_spherical", "slider_crank", "rrr4_planar"
-)
+    (*OWN, *RANDOM, *REDUNDANT),
+    "five_bar", "rps3", "rrr3_spherical", "slider_crank", "rrr4_planar", "gantry",
+)  # fmt: skip
 some_machines = pytest.mark.parametrize("name", NAMES)
 SAMPLES, STEP = 6, 1e-3
 

@@ -1,0 +1,98 @@
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
+"""Write the functions of a transmission, see :mod:`delta_dynamics.torques.transmission`.
+
+The joint side has the pose coordinates, the actuator side q. With the ratio B = dq/dx and P B = 1:
+
+    qd = B v        tau = P' f        v = P qd        f = B' tau
+    Ka = P' (K + sum_i tau_i d2q_i/dx2) P             Da = P' D P
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from pkm_twin.codegen.cholesky import SparseCholesky
+from pkm_twin.codegen.expressions import Expression, Objects
+from pkm_twin.codegen.lu import SparseLU, pivot_order
+from pkm_twin.export.c99 import Folding
+from pkm_twin.robot.robot import Robot
+
+
+class TransmissionTerms:
+    """The ratio B of a transmission as expressions, and what follows from it.
+
+    :param fold: has the tape of the expressions. ``ratio``: B, row by row.
+    """
+
+    def __init__(self, robot: Robot, fold: Folding, ratio: Sequence[Expression]) -> None:
+        self.robot, self.tape = robot, fold.tape
+        self.m = len(robot.pose_names)
+        self.ratio: Objects = np.array(ratio, dtype=object).reshape(-1, self.m)
+        if robot.redundant:
+            # P = (B' W B)^-1 B' W: of all efforts, those with the least sum of (effort / limit)^2.
+            self._weighted = self.ratio * (robot.effort_scale**2)[:, None]
+            square = self.ratio.T @ self._weighted
+            lower = {(i, j): square[i, j] for i in range(self.m) for j in range(i + 1)}
+            self._root = SparseCholesky(lower, list(np.diag(square)))
+        else:
+            near = np.array([q for _, q in robot.engine.samples])
+            self._lu = SparseLU(self.ratio, pivot_order(robot.inverse_jacobian(near)))
+
+    def actuator_side(self) -> dict[str, list[Expression]]:
+        """Return rates and efforts of the actuators by the inputs ``velocity`` and ``effort``."""
+        velocity, effort = (self.tape.inputs(name, self.m) for name in ("velocity", "effort"))
+        return {"qd": self._lift(self.ratio @ velocity), "tau": self._lift(self._efforts(effort))}
+
+    def gains(self, changes: Sequence[Sequence[Expression]]) -> dict[str, list[Expression]]:
+        """Return Ka and Da by the inputs ``stiffness``, ``damping`` and ``tau``.
+
+        :param changes: second derivatives of q along each of :func:`directions`, shape (n,) each.
+        """
+        m = self.m
+        wanted, damping = (
+            self.tape.inputs(name, m * m).reshape(m, m) for name in ("stiffness", "damping")
+        )
+        bend = self._second_derivative(changes, self.tape.inputs("tau", len(self.ratio)))
+        return {
+            "ka": self._lift(self._congruent(wanted + bend)),
+            "da": self._lift(self._congruent(damping)),
+        }
+
+    def _lift(self, values: Any) -> list[Expression]:
+        return [self.tape.lift(value) for value in np.ravel(values)]
+
+    def _efforts(self, joint: Objects) -> Objects:
+        """Return P' f."""
+        if not self.robot.redundant:
+            return self._lu.solve_transposed(joint)
+        return np.asarray(self._weighted @ np.array(self._root.solve(list(joint)), dtype=object))
+
+    def _congruent(self, matrix: Objects) -> Objects:
+        """Return P' A P, shape (n, n)."""
+        half = np.array([self._efforts(column) for column in matrix.T], dtype=object)
+        return np.array([self._efforts(column) for column in half.T], dtype=object)
+
+    def _second_derivative(
+        self, changes: Sequence[Sequence[Expression]], weights: Objects
+    ) -> Objects:
+        """Return sum_i w_i d2q_i/dx2, shape (m, m)."""
+        along = [np.array(change, dtype=object) @ weights for change in changes]
+        result = np.empty((self.m, self.m), dtype=object)
+        for value, (j, k) in zip(along, _pairs(self.m), strict=True):
+            # The second derivative along a + b, less those along a and b, is twice that by both.
+            result[j, k] = result[k, j] = (
+                value if j == k else 0.5 * (value - result[j, j] - result[k, k])
+            )
+        return result
+
+
+def _pairs(m: int) -> list[tuple[int, int]]:
+    return [(j, j) for j in range(m)] + [(j, k) for j in range(m) for k in range(j)]
+
+
+def directions(m: int) -> list[list[float]]:
+    """Return the rates of the pose along which second derivatives are needed."""
+    return [np.maximum(*np.eye(m)[[j, k]]).tolist() for j, k in _pairs(m)]
