@@ -96,18 +96,20 @@ def load(
             )  # fmt: skip
         for note in reading.notes:
             warn(path, note)
-        return _told(path, replace(robot_read, home_choice=reading.home, visuals=reading.visuals))
+        return _with_warnings(
+            path, replace(robot_read, home_choice=reading.home, visuals=reading.visuals)
+        )
     for key in ("platform", "base", "actuated", "carry"):
         if getattr(part, key):
             raise ParameterError(key, getattr(part, key), f"none, because the file has its {key}")
     data = read_yaml(path)
     if pose is not None:
         data = {**data, "pose": list(pose)}
-    return _told(path, robot_of_data(data, path.stem))
+    return _with_warnings(path, robot_of_data(data, path.stem))
 
 
-def _told(path: Path, robot: Robot) -> Robot:
-    """The robot, after warnings of what is implausible in a user's file."""
+def _with_warnings(path: Path, robot: Robot) -> Robot:
+    """Return the robot, after a warning of each implausible number in a user's file."""
     if path.parent != config_folder():
         for finding in findings(robot):
             warn(path, finding.text)

@@ -51,8 +51,8 @@ class Continuity:
         self._largest = MAX_MOVE * robot.size
         self._scales = robot.pose_scales
         n, m = len(robot.joint_names), len(self._scales)
-        self._told = n + m + m * m
-        self._nothing = np.zeros(self._told + m + 1)
+        self._state_size = n + m + m * m
+        self._nothing = np.zeros(self._state_size + m + 1)
         self._call = robot.bound(_stream, self._scales)
         self.reset()
 
@@ -77,7 +77,7 @@ class Continuity:
         before = self._nothing if last is None else last.numbers
         result = self._call(q, before)
         state = _State(stamp, result)
-        *beyond, measure = result.tolist()[self._told :]
+        *beyond, measure = result.tolist()[self._state_size :]
         if last is not None:
             self._check_jump(last, state, beyond)
         if not measure >= self.stop:

@@ -148,7 +148,7 @@ class ModePanel:
         with page.load_tab:
             still = ("none", *map(str, range(1, MODES + 1)))
             self._choice = gui.add_dropdown("animated mode", still, initial_value=still[0])
-            self._told = gui.add_html("")
+            self._note = gui.add_html("")
         page.ask(self._choice.on_update, "mode", self._choose)
         page.moving.append(self)
 
@@ -160,7 +160,7 @@ class ModePanel:
     def _choose(self) -> None:
         self._state = None
         if not self.busy:
-            self._told.content = ""
+            self._note.content = ""
             self._page.become(self._page.state)
 
     def _solve(self, state: State) -> None:
@@ -169,14 +169,14 @@ class ModePanel:
         try:
             self._modes = modes(self._page.model.robot, state.pose, MODES)
         except (PkmTwinError, ValueError) as error:
-            self._told.content = texts.note(one_line(str(error)))
+            self._note.content = texts.note(one_line(str(error)))
             return
         shape, names = self._modes.shapes[k], self._modes.nodes
         sizes = np.linalg.norm(shape[:, :3], axis=1)
         told = f"{texts.number(float(self._modes.frequencies[k]))} Hz, drives locked"
         if sizes[0] < 0.1 * sizes.max():
             told += f"; {names[int(sizes.argmax())]} moves most, the platform hardly"
-        self._told.content = texts.note(told)
+        self._note.content = texts.note(told)
         part = VISIBLE / 3 * self._page.model.robot.graph.size / sizes.max()
         # A member's nodes have its name and their number.
         owners = [name.rpartition(" ")[0] for name in names[1:]]

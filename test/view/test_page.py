@@ -129,7 +129,7 @@ def test_a_mode_is_animated_at_the_pose_that_is_shown(page, monkeypatch):
     for _ in range(3):
         panel.step()
     found = modes(page.model.robot, page.state.pose, 6)
-    assert number(float(found.frequencies[1])) in panel._told.content
+    assert number(float(found.frequencies[1])) in panel._note.content
     shape = found.shapes[1, 0]
     for _, moved, shares, most in drawn:
         np.testing.assert_allclose(np.outer(moved.platform, shape), np.outer(shape, moved.platform))
