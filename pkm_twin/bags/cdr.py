@@ -51,7 +51,7 @@ class MessageCodec:
             text = f"fields of {type_name} cannot be attributes: {error}"
             raise BagError(text, reason="schema") from error
         self._readers = {
-            name: [self._reader(field) for field in fields]
+            name: [self._choose_decoder(field) for field in fields]
             for name, fields in self.definition.items()
         }
 
@@ -78,8 +78,8 @@ class MessageCodec:
             source.number("B")
         return self._classes[name](*[read(source) for read in readers])
 
-    def _reader(self, field: Field) -> Callable[[_Source], Any]:
-        """What reads a field: decided once a type, not once a message."""
+    def _choose_decoder(self, field: Field) -> Callable[[_Source], Any]:
+        """Return the function that decodes a field; it is chosen once per type."""
         code, base = CODES.get(field.base), field.base
         if field.size is not None:
             return partial(self._read_items, field, code)

@@ -134,8 +134,8 @@ def _short_name(type_name: str) -> str:
     return f"{parts[0]}/{parts[-1]}"
 
 
-def _checked_name(type_name: str) -> str:
-    """The short name of a type that a file names."""
+def _check_type_name(type_name: str) -> str:
+    """Return the short name of a type; raise if it is not a type name."""
     if not _HELD_NAME.fullmatch(type_name):
         text = f"{brief(type_name)} is not a type name; expected package/msg/Type"
         raise BagError(text, reason="schema")
@@ -170,7 +170,7 @@ def parse_definition(type_name: str, text: str) -> Definition:
     if len(text) > MAX_DEFINITION_CHARACTERS:
         error = f"the definition of {type_name} has {len(text)} characters"
         raise BagError(f"{error}; at most {MAX_DEFINITION_CHARACTERS}", reason="schema")
-    own = _checked_name(type_name)
+    own = _check_type_name(type_name)
     texts = dict(_BUILTIN)
     for index, part in enumerate(re.split(r"^={3,}[ \t]*$", text, flags=re.MULTILINE)):
         name = own
@@ -180,7 +180,7 @@ def parse_definition(type_name: str, text: str) -> Definition:
             if not heading.startswith("MSG:"):
                 error = f"definition of {type_name}: part {index} starts with {brief(heading)}"
                 raise BagError(f"{error}, not 'MSG:'", reason="schema")
-            name = _checked_name(heading[4:].strip())
+            name = _check_type_name(heading[4:].strip())
         texts[name] = fields
     definition: Definition = {}
     _resolve(own, texts, definition, ())
@@ -222,14 +222,14 @@ def _parse_fields(name: str, texts: Mapping[str, str]) -> list[Field]:
             continue
         base = _base_type(match["base"], name.split("/", 1)[0], texts)
         where = f"definition of {name}: field {match['name']}"
-        size = None if match["array"] is None else _bound(match["size"], where)
-        chars = _bound(match["chars"], where)
+        size = None if match["array"] is None else _read_bound(match["size"], where)
+        chars = _read_bound(match["chars"], where)
         fields.append(Field(match["name"], base, size, bool(match["upto"]), chars))
     return fields
 
 
-def _bound(digits: str | None, where: str) -> int:
-    """A size or bound as a definition writes it, 0 where it writes none."""
+def _read_bound(digits: str | None, where: str) -> int:
+    """Read a size or bound of a definition; 0 if there is none."""
     # Python refuses to convert thousands of digits.
     if digits and (len(digits) > 20 or int(digits) > MAX_BOUND):
         text = f"{where} has the bound {brief(digits)}; at most {MAX_BOUND}"
@@ -258,5 +258,5 @@ def live_type_name(message: object) -> str | None:
 
 
 def brief(value: object) -> str:
-    """A value from a file as an error shows it."""
+    """Shorten a value of a file for an error."""
     return short(value, 60)

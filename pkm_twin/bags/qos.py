@@ -57,7 +57,7 @@ def load_plain(text: str) -> object:
 
 
 def parse_qos(topic: str, text: str) -> OfferedQos:
-    """The recorded offer of a topic; reliable and volatile where there is none.
+    """Parse the recorded QoS offer of a topic; reliable and volatile if there is none.
 
     Of several publishers the first counts. Policies that are "system default" or unknown are those
     of the default.
@@ -91,7 +91,7 @@ def parse_qos(topic: str, text: str) -> OfferedQos:
 
 
 def require_topic(name: str) -> str:
-    """A full topic name that ROS takes.
+    """Return a topic's name if it is a full name that ROS accepts.
 
     :raises BagError: it is another text.
     """

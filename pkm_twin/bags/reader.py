@@ -241,8 +241,8 @@ class Bag:
 
 
 @lru_cache(maxsize=256)
-def _codec(name: str, text: bytes) -> MessageCodec:
-    """A type's codec, which may be long in the making."""
+def _make_codec(name: str, text: bytes) -> MessageCodec:
+    """Build the codec of a type; a long definition takes time."""
     try:
         return MessageCodec(name, text.decode())
     except UnicodeDecodeError:
@@ -260,6 +260,6 @@ def _decode(channel: Channel, schema: Schema | None, data: bytes) -> Any:
             found = repr(schema.encoding) if schema else "none"
             text = f"{kind} has the schema encoding {found}; expected 'ros2msg'"
             raise BagError(text, reason="encoding")
-        return _codec(schema.name, schema.data).decode(data)
+        return _make_codec(schema.name, schema.data).decode(data)
     except BagError as error:
         raise BagError(f"topic {channel.topic}: {error}", reason=error.reason) from error

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pkm_twin.bags.format import FormatError, RecordReader
-from pkm_twin.bags.storage import BagFile, files_by_name, find_storage
+from pkm_twin.bags.storage import BagFile, find_storage, list_files
 from pkm_twin.bags.strict import Check, check_files
 from pkm_twin.bags.writer import McapWriter, refuse_existing, write_error
 from pkm_twin.errors import BagError
@@ -55,7 +55,7 @@ def recover(source: str | Path, target: str | Path, *, overwrite: bool = False) 
     """
     source, target = Path(source), Path(target)
     refuse_existing(target, overwrite)
-    files, reason = _files(source)
+    files, reason = _find_files(source)
     results = check_files(files)
     losses = (part.left_out if isinstance(part, Check) else str(part) for part in results.values())
     reason = next(filter(None, (reason, *losses)), "")
@@ -97,14 +97,14 @@ def recover(source: str | Path, target: str | Path, *, overwrite: bool = False) 
     )
 
 
-def _files(source: Path) -> tuple[Sequence[BagFile], str]:
-    """The files to save, and what is wrong with the folder that should name them."""
+def _find_files(source: Path) -> tuple[Sequence[BagFile], str]:
+    """Return the files to save, and the fault of the folder's metadata; empty if it is sound."""
     try:
         return find_storage(source).files, ""
     except BagError as error:
         if error.reason not in ("metadata", "io", "folder") or not source.is_dir():
             raise
-        found = [BagFile(path) for path in files_by_name(source)]
+        found = [BagFile(path) for path in list_files(source)]
         if not found:
             raise
         return found, str(error)

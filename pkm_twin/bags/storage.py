@@ -45,7 +45,7 @@ class BagFile:
                 size = os.fstat(file.fileno()).st_size
                 head = os.pread(file.fileno(), len(SQLITE_MAGIC), 0)
                 if head == SQLITE_MAGIC:
-                    text = f"this is an SQLite bag, not MCAP; {conversion(self.path)} converts it"
+                    text = f"is an SQLite bag, not MCAP; {write_conversion(self.path)} converts it"
                     raise BagError(text, path=self.path, reason="not_mcap")
                 if not head.startswith(ZSTD_MAGIC):
                     yield RecordReader(file)
@@ -119,14 +119,14 @@ def find_storage(path: Path) -> Storage:
         return Storage((BagFile(path),))
     file = path / METADATA_FILE
     if not os.path.lexists(file):
-        inside = ", ".join(p.name for p in files_by_name(path)) or "no .mcap file"
+        inside = ", ".join(p.name for p in list_files(path)) or "no .mcap file"
         text = f"is a folder without {METADATA_FILE}: no rosbag2 bag; name a file in it: {inside}"
         raise BagError(text, path=path, reason="folder")
     return _described(path, _Field(file, "", _load(file)))
 
 
-def files_by_name(folder: Path) -> list[Path]:
-    """The MCAP files of a folder in the order that rosbag2 numbers them in."""
+def list_files(folder: Path) -> list[Path]:
+    """List the MCAP files of a folder in the order of their numbers."""
 
     def order(path: Path) -> tuple[str, int, str]:
         stem = path.name.split(".")[0]
@@ -136,8 +136,8 @@ def files_by_name(folder: Path) -> list[Path]:
     return sorted((*folder.glob("*.mcap"), *folder.glob("*.mcap.zstd")), key=order)
 
 
-def conversion(path: Path) -> str:
-    """The command line that makes an MCAP bag of an SQLite one."""
+def write_conversion(path: Path) -> str:
+    """Return the command line that converts an SQLite bag to MCAP."""
     target = path.with_name(f"{path.stem}_mcap")
     options = f"output_bags: [{{uri: {target}, storage_id: mcap, all_topics: true}}]"
     return (
@@ -189,7 +189,7 @@ def _described(folder: Path, root: _Field) -> Storage:
     facts = root.get("rosbag2_bagfile_information")
     storage = facts.get("storage_identifier")
     if storage.text() == "sqlite3":
-        text = f"is an SQLite bag, not MCAP; {conversion(folder)} converts it"
+        text = f"is an SQLite bag, not MCAP; {write_conversion(folder)} converts it"
         raise BagError(text, path=folder, reason="not_mcap")
     # `ros2 bag reindex` leaves it empty; what the files are is seen when they are opened.
     if storage.text() != "mcap" and storage.value != "":

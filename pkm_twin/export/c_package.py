@@ -58,7 +58,7 @@ def identifier(name: str) -> str:
 
 
 def c_package(robot: Robot) -> dict[str, str]:
-    """The files of the package, text by name.
+    """Write the files of a C package, text by name.
 
     A robot without masses has no functions of dynamics, one without elastic members none of
     elasticity.
@@ -118,7 +118,7 @@ class Package:
     def _read(
         self, kernel: Kernel, own: Sequence[Any] | Array = (), **more: Sequence[float]
     ) -> tuple[dict[str, list[Expression]], list[Equations]]:
-        """Outputs and equations of a kernel, with this machine's numbers in them.
+        """Return the outputs and equations of a kernel with this machine's numbers inserted.
 
         :param more: numbers of other inputs.
         """
@@ -421,7 +421,7 @@ int @_parameters(double mass, const double *com, const double *inertia, double *
         return f"{name}: written by pkm-twin export c, which overwrites changes."
 
     def header(self) -> str:
-        """Declarations, with what each function takes."""
+        """Write the header: the declarations, with the arguments of each function."""
         guard, size = f"{self.macro}_H", len(self.parameters)
         robot = self.robot
         joints = _listed(zip(robot.joint_names, robot.joint_units, strict=True))
@@ -442,17 +442,17 @@ int @_parameters(double mass, const double *com, const double *inertia, double *
             if routine.state:
                 what = f"{routine.summary}{BESIDE.format(size=len(routine.state))}{most}"
             parts.append(
-                _comment(what)
+                _write_comment(what)
                 + f"\n{self.unit.signature(routine, given=False)};\n"
                 + f"{self.unit.signature(routine, given=True)};\n"
             )
         if self.massive:
-            what = _comment(PARAMETERS_OF.format(size=size, mass=MAX_MASS, reach=MAX_LENGTH))
+            what = _write_comment(PARAMETERS_OF.format(size=size, mass=MAX_MASS, reach=MAX_LENGTH))
             parts.append(
                 f"{what}\nint @_parameters(double mass, const double *com, "
                 "const double *inertia, double *out);\n"
             )
-        about = _comment(ABOUT.format(joints=joints, pose=pose) + self._stateless)
+        about = _write_comment(ABOUT.format(joints=joints, pose=pose) + self._stateless)
         text = "\n".join([
             "/* SPDX-License-Identifier: Apache-2.0 */", f"/* {self._title} */", f"#ifndef {guard}",
             f"#define {guard}", "", about, "", *lines, "",
@@ -493,11 +493,11 @@ int @_parameters(double mass, const double *com, const double *inertia, double *
         )  # fmt: skip
 
     def cmake(self) -> str:
-        """A static library, and the example as a test."""
+        """Write the CMake file: a static library, and the example as a test."""
         return CMAKE.format(name=self.prefix)
 
     def readme(self) -> str:
-        """What the functions are, and what they cost at most."""
+        """Write the README: the functions, and their largest stack and number of corrections."""
         largest = (self.unit.rooms + max(self.unit.doubles.values())) * 8
         names = list(self.robot.joint_names)
         return README.format(
@@ -522,8 +522,8 @@ def _listed(pairs: Any) -> str:
     return ", ".join(f"{name} ({unit})" for name, unit in pairs)
 
 
-def _comment(text: str) -> str:
-    """A comment of lines of a readable length."""
+def _write_comment(text: str) -> str:
+    """Write a C comment in lines of at most 95 characters."""
     # What a name may hold must neither end the comment nor be a trigraph in it.
     safe = "".join(c if c.isprintable() else " " for c in text)
     for bad in ("*/", "/*", "??"):

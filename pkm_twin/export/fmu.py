@@ -19,7 +19,7 @@ from delta_dynamics.torques.virtual_work import MASSLESS
 from pkm_twin.errors import ParameterError
 from pkm_twin.export.c99 import table
 from pkm_twin.export.c_package import Package
-from pkm_twin.export.fmu_interface import interface, source
+from pkm_twin.export.fmu_interface import read_source, write_interface
 from pkm_twin.export.fmu_xml import Description, Variable, build_of, quoted, text_of
 from pkm_twin.machine.inertia import loaded_joints
 from pkm_twin.robot.robot import Robot
@@ -185,8 +185,8 @@ class Fmu:
 
     # Files.
 
-    def _model(self) -> str:
-        """The wrapper's text; in place of its token stands ``TOKEN``."""
+    def _write_model(self) -> str:
+        """Write the wrapper's source, with ``TOKEN`` in place of its token."""
         robot, size = self.robot, len(self.variables)
         defined = {
             "N": self.n, "COUNT": size, "DRY": len(self._rows), "PASSIVE": len(self._passive),
@@ -214,9 +214,9 @@ class Fmu:
             model = ["dynamics", *friction, "steps"]
         title = f"/* {self.identifier}: written by pkm-twin export fmu. */\n"
         parts = [
-            f"/* SPDX-License-Identifier: Apache-2.0 */\n{title}", source("head"),
+            f"/* SPDX-License-Identifier: Apache-2.0 */\n{title}", read_source("head"),
             "\n".join(lines) + "\n",
-            *constants, *map(source, ["model", *model]), interface(self.version),
+            *constants, *map(read_source, ["model", *model]), write_interface(self.version),
         ]  # fmt: skip
         return "\n".join(parts).replace("@", self.identifier)
 
@@ -225,7 +225,7 @@ class Fmu:
         sources = {
             f"{prefix}.h": self._package.header(),
             f"{prefix}.c": self._package.source(),
-            MODEL: self._model(),
+            MODEL: self._write_model(),
         }
         described = Description(
             self.robot.name or prefix, prefix, "", self._text, self.variables,
@@ -255,7 +255,7 @@ class Fmu:
         return f"Joint efforts that a motion of {name} needs"
 
     def archive(self, compiler: str | None = None) -> bytes:
-        """The FMU; with a binary for this machine where a compiler is given.
+        """Return the FMU as a zip archive; with a compiler also a binary for this machine.
 
         :raises ParameterError: the compiler does not accept the sources, with what it printed.
         """
@@ -293,6 +293,6 @@ class Fmu:
             return (Path(folder) / "model.so").read_bytes()
 
 
-def found_compiler() -> str | None:
-    """The first C compiler of this machine."""
+def find_compiler() -> str | None:
+    """Find the first C compiler on the PATH."""
     return next((path for name in COMPILERS if (path := shutil.which(name))), None)

@@ -228,19 +228,19 @@ _THIRD: Final[Functions] = {
 }  # fmt: skip
 
 
-def source(name: str) -> str:
-    """A part of the wrapper's sources, without its first line."""
+def read_source(name: str) -> str:
+    """Read a part of the wrapper's sources, without its first line."""
     text = (files(__package__) / "fmu_sources" / f"{name}.c").read_text(encoding="utf-8")
     return text.partition("\n")[2]
 
 
-def interface(version: int) -> str:
-    """The functions of a version of FMI, 2 or 3, behind the model's."""
+def write_interface(version: int) -> str:
+    """Write the functions of FMI 2 or 3, which follow the model's."""
     functions = dict(_MODES)
     state = "state" if version == 2 else "State"
     functions |= {name.format(state=state): entry for name, entry in _STATE.items()}
     functions |= _SECOND if version == 2 else _THIRD
-    shared = source("shared").replace("LOGGER\n", source(f"logger{version}") + "\n", 1)
+    shared = read_source("shared").replace("LOGGER\n", read_source(f"logger{version}") + "\n", 1)
     shared = shared.replace("CALL_LOGGER", _CALL[version])
     macro = f"""\
 /* Sources that are linked with others are compiled with FMI{version}_FUNCTION_PREFIX=@_; a library
@@ -252,7 +252,7 @@ def interface(version: int) -> str:
 #endif
 """
     written = [_function(name, *entry) for name, entry in functions.items()]
-    return "\n".join([shared, macro, source(f"fmi{version}"), *written])
+    return "\n".join([shared, macro, read_source(f"fmi{version}"), *written])
 
 
 def _function(name: str, arguments: str, body: str) -> str:

@@ -78,7 +78,7 @@ class Description:
         return [k for k, v in enumerate(self.variables) if v.kind == "s"]
 
     def unknowns(self, kinds: str) -> list[tuple[int, Variable]]:
-        """Outputs (``so``), derivatives (``d``)."""
+        """List the variables of kinds, outputs (``so``) or derivatives (``d``), with indices."""
         return [
             (k, v)
             for k, v in enumerate(self.variables)
@@ -87,7 +87,7 @@ class Description:
 
 
 def quoted(name: str) -> str:
-    """A name as a part of a structured one."""
+    """Quote a name for use in a structured one."""
     if PLAIN.fullmatch(name):
         return name
     safe = "".join(c if c.isascii() and c.isprintable() else "_" for c in name)
@@ -96,7 +96,7 @@ def quoted(name: str) -> str:
 
 
 def text_of(d: Description, version: int) -> str:
-    """The file of a version of FMI, 2 or 3."""
+    """Write modelDescription.xml of FMI 2 or 3."""
     top = _second(d) if version == 2 else _third(d)
     ET.indent(top)
     return '<?xml version="1.0" encoding="UTF-8"?>\n' + ET.tostring(top, encoding="unicode") + "\n"

@@ -23,7 +23,7 @@ import yaml
 from delta_dynamics import inverse_dynamics, mass_matrix
 from pkm_twin.errors import ParameterError
 from pkm_twin.export.c_package import c_package, identifier
-from pkm_twin.export.ros2_control import filled, literal, number, package_name, printable
+from pkm_twin.export.ros2_control import fill_templates, literal, number, package_name, printable
 from pkm_twin.kinematics.pose import Coordinate, Entry
 from pkm_twin.machine.loop_tree import LoopTree, Single
 from pkm_twin.machine.urdf_write import GROUND, PLATFORM, parts_of
@@ -49,7 +49,7 @@ CONTROLLER: Final = "delta_dynamics"
 
 
 def moveit_package(robot: Robot, kinematics: str = "") -> dict[str, str]:
-    """The files of a package ``ROBOT_moveit_config`` by their paths in it.
+    """Write the package ``ROBOT_moveit_config``: the text of each file by its path.
 
     :param kinematics: plugin of the planning group's inverse kinematics; empty: the package's own.
     :raises ParameterError: the robot has a ``joint_map``: plans are in the numbers of the URDF.
@@ -60,7 +60,7 @@ def moveit_package(robot: Robot, kinematics: str = "") -> dict[str, str]:
             "joint_map", list(robot.controller.names), "none: MoveIt plans in the URDF's numbers"
         )
     name = re.sub(r"\W", "_", robot.name or robot.mechanism)
-    groups = srdf(robot)
+    groups = write_srdf(robot)
     package = package_name(robot, "moveit_config")
     solver = kinematics or f"{package}/Kinematics"
     texts = {
@@ -73,11 +73,11 @@ def moveit_package(robot: Robot, kinematics: str = "") -> dict[str, str]:
         "launch/move_group.launch.py": LAUNCH.format(name=name, package=package),
     }
     texts |= {f"c/{path}": text for path, text in c_package(robot).items()}
-    return dict(sorted((texts | filled("moveit_package", _words(robot, package))).items()))
+    return dict(sorted((texts | fill_templates("moveit_package", _words(robot, package))).items()))
 
 
 def _words(robot: Robot, package: str) -> dict[str, str]:
-    """What stands for the words between two ``@``."""
+    """Return the texts that replace the words between two ``@`` in the templates."""
     own, shown = identifier(robot.name), printable(robot)
     limits = robot.limits.position
     ends = np.array([[-np.inf, np.inf]] * robot.joints_count) if limits is None else limits
@@ -90,7 +90,7 @@ def _words(robot: Robot, package: str) -> dict[str, str]:
         "MACRO": f"PKM_{own}".upper(),
         "JOINTNAMES": ", ".join(f"`{joint}`" for joint in robot.joint_names),
         "POSENAMES": ", ".join(robot.pose_names),
-        "POSE": ", ".join(map(_coordinate, robot.coordinates)),
+        "POSE": ", ".join(map(_write_coordinate, robot.coordinates)),
         "DRIVES": "\n".join(
             f"  {{{literal(joint)}, {number(low)}, {number(high)}}},"
             for joint, (low, high) in drives
@@ -101,8 +101,8 @@ def _words(robot: Robot, package: str) -> dict[str, str]:
     }
 
 
-def _coordinate(c: Coordinate) -> str:
-    """A pose coordinate in C++, of the position p and the rotation r, row by row."""
+def _write_coordinate(c: Coordinate) -> str:
+    """Write a pose coordinate in C++, from position p and rotation r (row-major)."""
 
     def entry(of: Entry) -> str:
         row, column, sign = of
@@ -118,7 +118,7 @@ def _coordinate(c: Coordinate) -> str:
 
 
 def accelerations(robot: Robot) -> list[float]:
-    """What each drive can do by itself at home beside the weight, shape (n,), rad/s2 or m/s2.
+    """Return the acceleration of each drive alone at home, with the weight, rad/s2 or m/s2, (n,).
 
     Infinite without effort limits.
     """
@@ -132,8 +132,8 @@ def accelerations(robot: Robot) -> list[float]:
         return list(SHARE * np.maximum(limits - weight, 0.0) / inertia)
 
 
-def srdf(robot: Robot) -> str:
-    """Groups, passive joints, the home state, and the links that always touch."""
+def write_srdf(robot: Robot) -> str:
+    """Write the SRDF: groups, passive joints, home state, and links that always touch."""
     tree = robot_tree(robot)
     parts = parts_of(tree)
     root = ET.Element("robot", name=tree.name)

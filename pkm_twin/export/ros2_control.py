@@ -66,7 +66,7 @@ def package_name(robot: Robot, kind: str = "ros2_control") -> str:
 
 
 def ros2_control_package(robot: Robot, bandwidth: float = 0.0) -> dict[str, str]:
-    """The files of the package, text by path.
+    """Write the package: the text of each file by its path.
 
     :param bandwidth: of the controller's gains by the masses at home, Hz; zero: no gains.
     :raises ParameterError: a robot whose file gives no masses, or a bandwidth that no machine has.
@@ -78,20 +78,20 @@ def ros2_control_package(robot: Robot, bandwidth: float = 0.0) -> dict[str, str]
     words = _words(robot, package)
     result = {f"c/{name}": text for name, text in c_package(robot).items()}
     result["config/controllers.yaml"] = _controllers(robot, package, bandwidth)
-    for path, text in filled("ros2_control_package", words).items():
+    for path, text in fill_templates("ros2_control_package", words).items():
         # Headers are included as PACKAGE/NAME.hpp.
         result[path.replace("include/", f"include/{package}/")] = text
     return dict(sorted(result.items()))
 
 
-def filled(folder: str, words: Mapping[str, str]) -> dict[str, str]:
-    """The files of a folder of sources, text by path; words between two ``@`` are replaced."""
+def fill_templates(folder: str, words: Mapping[str, str]) -> dict[str, str]:
+    """Return a folder's templates by path, with the words between two ``@`` replaced."""
     templates = _templates(files("pkm_twin.export") / folder)
     return {p: re.sub(r"@([A-Z]+)@", lambda word: words[word[1]], text) for p, text in templates}
 
 
 def printable(robot: Robot) -> str:
-    """The robot's name as a comment, a Markdown table and a string literal bear it."""
+    """Return the robot's name without characters that comments, tables or literals reject."""
     return re.sub(r"[^\w .:+-]", "_", robot.name or robot.mechanism)
 
 
@@ -105,7 +105,7 @@ def _templates(folder: Traversable, above: str = "") -> Iterable[tuple[str, str]
 
 
 def _words(robot: Robot, package: str) -> dict[str, str]:
-    """What stands for the words between two ``@``."""
+    """Return the texts that replace the words between two ``@`` in the templates."""
     own = identifier(robot.name)
     shown = printable(robot)
     load, controller = robot.payload, robot.controller
@@ -121,16 +121,16 @@ def _words(robot: Robot, package: str) -> dict[str, str]:
         "MACRO": f"PKM_{own}".upper(),
         "JOINTNAMES": ", ".join(f"`{name}`" for name in controller.names),
         "POSENAMES": ", ".join(POSE[k] for k in directions),
-        "POSE": _row(directions),
+        "POSE": _write_row(directions),
         "PAYLOAD": "{"
-        + ", ".join([number(load.mass), _row(load.com), _row(np.ravel(load.inertia))])
+        + ", ".join([number(load.mass), _write_row(load.com), _write_row(np.ravel(load.inertia))])
         + "}",
-        "DRIVES": _drives(robot),
+        "DRIVES": _write_drives(robot),
         "STOP": f"{STOP:g}",
         "MAXMASS": number(MAX_MASS),
         "MAXLENGTH": number(MAX_LENGTH),
-        "START": _row(controller.controller_positions(home)),
-        "RANGE": _row(steps),
+        "START": _write_row(controller.controller_positions(home)),
+        "RANGE": _write_row(steps),
         "NULLEFFORTS": SHARED["idle" if robot.redundant else "none idle"].format(own),
         "PROJECTION": SHARED["project_redundant" if robot.redundant else "independent"].format(own),
     }
@@ -156,8 +156,8 @@ def _directions(robot: Robot) -> list[int]:
     return list(choices[int(np.argmax(sizes))])
 
 
-def _drives(robot: Robot) -> str:
-    """The actuated joints, a line each; limits in the controller's numbers."""
+def _write_drives(robot: Robot) -> str:
+    """Write one line per actuated joint, with limits in the controller's values."""
     controller, limits, friction = robot.controller, robot.limits, robot.friction
     n = robot.joints_count
     position = np.array([[-np.inf, np.inf]] * n) if limits.position is None else limits.position
@@ -265,21 +265,21 @@ def _controllers(robot: Robot, package: str, bandwidth: float) -> str:
 
 
 def number(value: float) -> str:
-    """A double as C++ has it, exactly."""
+    """Write a double exactly, for C++."""
     value = float(value)
     if math.isinf(value):
         return "UNLIMITED" if value > 0.0 else "-UNLIMITED"
     return repr(value)
 
 
-def _row(values: Iterable[Any]) -> str:
-    """A std::array's numbers."""
+def _write_row(values: Iterable[Any]) -> str:
+    """Write the numbers of a std::array."""
     items = [str(v) if isinstance(v, int) else number(v) for v in values]
     return "{" + ", ".join(items) + "}"
 
 
 def literal(text: str) -> str:
-    """A string literal of C++; what is not plain is written in octal."""
+    """Write a C++ string literal; special characters are octal."""
     plain = re.compile(rb"[A-Za-z0-9 _./:+-]")
     return '"' + "".join(
         chr(byte) if plain.match(bytes([byte])) else f"\\{byte:03o}" for byte in text.encode()

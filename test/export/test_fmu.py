@@ -14,7 +14,7 @@ import pytest
 
 from delta_dynamics import inverse_dynamics
 from delta_dynamics.simulation.plant import Plant
-from pkm_twin.export.fmu import KINDS, VERSIONS, Fmu, found_compiler
+from pkm_twin.export.fmu import KINDS, VERSIONS, Fmu, find_compiler
 from pkm_twin.mechanisms.machine import Machine
 from test.machine.random_machines import variant
 from test.support.robots import loaded, partly_long, random_motion
@@ -23,7 +23,7 @@ fmpy = pytest.importorskip("fmpy")
 from fmpy.build import build_platform_binary  # noqa: E402
 from fmpy.validation import validate_fmu  # noqa: E402
 
-pytestmark = pytest.mark.skipif(found_compiler() is None, reason="there is no C compiler")
+pytestmark = pytest.mark.skipif(find_compiler() is None, reason="there is no C compiler")
 
 STRICT = (
     "-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Wshadow", "-Wvla", "-Wundef",
@@ -60,7 +60,7 @@ def unit(tmp_path_factory):
         key = id(robot), version, kind
         if key not in made:
             path = tmp_path_factory.mktemp("fmu") / "robot.fmu"
-            path.write_bytes(Fmu(robot, version, kind).archive(found_compiler()))
+            path.write_bytes(Fmu(robot, version, kind).archive(find_compiler()))
             made[key] = robot, str(path)
         return made[key][1]
 

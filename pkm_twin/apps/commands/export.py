@@ -141,9 +141,9 @@ class FunctionalMockupUnit(ToFile):
 
 def fmu(given: FunctionalMockupUnit) -> Report:
     """Write an archive of sources, with a binary where a compiler is found."""
-    from pkm_twin.export.fmu import Fmu, found_compiler
+    from pkm_twin.export.fmu import Fmu, find_compiler
 
-    compiler = found_compiler()
+    compiler = find_compiler()
     if compiler is None:
         tell("warning: no C compiler found: the FMU has sources and no binary")
     return given.write(Fmu(given.machine(), given.fmi, given.kind).archive(compiler))
