@@ -245,7 +245,7 @@ class Feedforward(Core):
             self._forget_stream()
 
     def time_jumped_forward(self) -> None:
-        """The clock jumped forward: what was fresh is stale, so a running stream stops."""
+        """Stop a running stream after the clock jumped forward, as its samples are stale."""
         if self._last_stamp:
             self.stream.stop("clock jump", "the clock jumped forward")
         self.reset()
@@ -263,7 +263,7 @@ class Feedforward(Core):
         return [n for n, one in zip(self.robot.joint_names, unknown, strict=True) if one]
 
     def trajectory(self, message: Any, now: int) -> LimitedEfforts:
-        """The controller's efforts for every point, (points, n), in the message's joint order.
+        """Compute the controller's efforts for every point, (points, n), in the message's order.
 
         :raises MessageError: the message is rejected, and counted.
         """
@@ -362,15 +362,15 @@ class Feedforward(Core):
             yield
             part = slice(first, first + SLICE)
             q = t.q[part]
-            beyond = _of_points(first, partial(first_beyond, actuated=False), robot, q)
+            beyond = _evaluate_points(first, partial(first_beyond, actuated=False), robot, q)
             if beyond is not None:
                 where = f"point {first + (beyond.index or 0)}: {beyond.joint}"
                 text = (
                     f"is {beyond.value:g} {beyond.unit}, allowed {beyond.low:g} to {beyond.high:g}"
                 )
                 raise MessageError("limit", f"{where} {text}")
-            self._check_singularity(_of_points(first, robot.singularity, q), first)
-            solved = _of_points(first, inverse_dynamics, robot, q, qd[part], qdd[part])
+            self._check_singularity(_evaluate_points(first, robot.singularity, q), first)
+            solved = _evaluate_points(first, inverse_dynamics, robot, q, qd[part], qdd[part])
             efforts[part], beyond = limits.apply(
                 robot.controller.controller_efforts(solved),
                 "zeros" if holding else settings.limit_policy,
@@ -415,16 +415,16 @@ class Feedforward(Core):
             self.wrenches.restart()
 
     def _take_time(self, now: int) -> None:
-        """A clock that went back makes the last stamp a future one: forget it.
+        """Reset the stream if the clock went back by more than ``future_tolerance``.
 
-        One that went back by less than what stamps may be ahead only drops what is older.
+        After a smaller step back the last stamp stays, and older samples are dropped.
         """
         if now < self._last_now - self._rules.future_tolerance:
             self.reset()
         self._last_now = now
 
     def _joint_state(self, message: Any, now: int, steady: int) -> Torques | None:
-        """A refused sample leaves nothing behind that the next one is judged by."""
+        """Compute the efforts of one sample; a rejected sample does not change the state."""
         self._take_time(now)
         sample = self._reader.joint_state(message, now, self._rules)
         silence = sample.stamp - self._last_stamp
@@ -463,7 +463,7 @@ class Feedforward(Core):
                 self._reader.check_derived(*rates)
                 if self.wrenches is not None:
                     external, measured = self.wrenches.through()
-                motion, sure, change = as_message_error(self._moving, sample, rates, doubt)
+                motion, sure, change = as_message_error(self._resolve_motion, sample, rates, doubt)
                 solved = as_message_error(
                     inverse_dynamics, self.robot, sample.q, sure, change, external, base
                 )
@@ -504,10 +504,13 @@ class Feedforward(Core):
         memory = before.after(q[None], np.sign(rates), friction.presliding).last
         return memory, Dahl.beyond(friction, memory.z, rates)
 
-    def _moving(
+    def _resolve_motion(
         self, sample: JointSample, rates: tuple[Array, Array], doubt: Array | None
     ) -> tuple[tuple[Array, Array, Array], Array, Array]:
-        """The motion, and the rates and accelerations that efforts are of: zero rates at rest."""
+        """Return the measured motion, and the rates and accelerations to compute efforts for.
+
+        Rates below their noise count as zero.
+        """
         # Noise that is differentiated contradicts nothing: what is measured is judged.
         rate, change = nearest_motion(self.robot, sample.q, *rates)
         motion = sample.q, rate, change
@@ -559,8 +562,8 @@ def warm_up(robot: Robot, *, base: bool = False) -> None:
         inverse_dynamics(robot, here, rest, rest, base=np.zeros(9) if base else None)
 
 
-def _of_points(first: int, call: Callable[..., Any], *arguments: Any) -> Any:
-    """What the model says of a trajectory's points from ``first`` on, counted from its beginning.
+def _evaluate_points(first: int, call: Callable[..., Any], *arguments: Any) -> Any:
+    """Evaluate the model at a trajectory's points from ``first`` on; errors name the point.
 
     :raises MessageError: the model refuses.
     """

@@ -81,13 +81,13 @@ class Gate(Core):
         self._limits = EffortLimits(robot)
 
     def reset(self) -> None:
-        """The clock jumped: stamps of before say nothing about those to come."""
+        """Close the gate after a jump of the clock, and forget the last stamp and pose."""
         self.stream.stop("clock jump", "the clock jumped")
         self._last_stamp = 0
         self._pose = None
 
     def torques(self, message: Any, now: int, steady: int) -> LimitedEfforts | None:
-        """The command for one message of stamped torques, shape (n,), or None while closed.
+        """Return the command for one message of stamped torques, shape (n,), or None while closed.
 
         The numbers are those of the message, bit by bit, in the robot's joint order.
 
@@ -121,7 +121,7 @@ class Gate(Core):
             self.stream.stop("stale torques", f"no torque for {silent:.3f} s")
 
     def stop_command(self, steady: int) -> LimitedEfforts:
-        """What is sent while the gate is closed, shape (n,): zeros, or what bears the weight.
+        """Return the command of the closed gate, shape (n,): zeros, or the effort against gravity.
 
         Gravity needs a pose measured within the deadline, an answer of the model for it, and an
         answer within the effort limits; without these it is zeros.

@@ -157,10 +157,7 @@ class EffortAction:
         return GoalResponse.ACCEPT
 
     def deactivated(self) -> None:
-        """The node answers nothing more: goals that wait for their efforts end here.
-
-        What the controller has already is the controller's.
-        """
+        """Abort the goals that wait for their efforts; the controller keeps those that it has."""
         for goal in list(self._goals.values()):
             if not goal.sent:
                 self._abort(goal, "the node was deactivated")
@@ -170,7 +167,7 @@ class EffortAction:
         self._settling = None
 
     def shutdown(self) -> None:
-        """The node ends, and with it every goal: the machine is stopped where it is."""
+        """Stop the machine where it is, and abort every goal."""
         moving = [goal for goal in self._goals.values() if goal.sent]
         if moving:
             self._stop(moving[-1])
@@ -199,7 +196,10 @@ class EffortAction:
         self._look_for_rest()
 
     def _look_for_life(self) -> None:
-        """A controller that was killed ends no goal, and the middleware keeps it for long."""
+        """Abort the goals of a controller that no longer answers.
+
+        A killed controller ends no goal, and the middleware lists it for seconds.
+        """
         sent = [goal for goal in self._goals.values() if goal.sent]
         self._silent = self._silent + 1 if sent else 0
         if self._silent >= GONE:
@@ -251,7 +251,7 @@ class EffortAction:
         self._send_filled()
 
     def _send_filled(self) -> None:
-        """What waits for the controller goes to it, in the order in which it came."""
+        """Send the goals that have their efforts to the controller, in the order of arrival."""
         waiting = [g for g in self._goals.values() if g.filled is not None and not g.sent]
         if waiting and self._client.server_is_ready():
             for goal in waiting:
@@ -380,9 +380,9 @@ class EffortAction:
         return True
 
     def _look_for_rest(self) -> None:
-        """A machine that comes to rest elsewhere gets the effort of that place.
+        """Send another hold point if the machine came to rest elsewhere.
 
-        One that speeds up again is moved by another client of the controller.
+        A machine that speeds up again is moved by another client of the controller.
         """
         settling, self._settling = self._settling, None
         measured, now = self._place(), time.monotonic()

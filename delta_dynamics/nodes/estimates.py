@@ -110,7 +110,7 @@ class Estimates:
         return ContactMonitor(robot, bandwidth, sigmas)
 
     def warning(self) -> str:
-        """What the user should know before the first sample; empty where there is nothing."""
+        """Return the warning to log before the first sample; empty if there is none."""
         if self._contact is None or self._contact.stated:
             return ""
         return (
@@ -120,7 +120,7 @@ class Estimates:
         )
 
     def reset(self) -> None:
-        """A stream begins again: the load stays, time does not."""
+        """Prepare for a new stream, whose stamps may be earlier; the estimated load stays."""
         self._last = 0
         self._pace.reset()
         if self._contact is not None:
@@ -136,7 +136,7 @@ class Estimates:
             self._contact.change_robot(robot)
 
     def take(self, torques: Torques) -> None:
-        """A sample whose torques were published; without measured efforts it gives nothing."""
+        """Update the estimates with a sample; without measured efforts nothing changes."""
         if torques.measured is None:
             return
         # The estimates' models have friction without memory.

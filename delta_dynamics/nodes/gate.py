@@ -75,12 +75,12 @@ class CommandGate(TwinNode):
         self.start(leap=settings.deadline + settings.future_tolerance)
 
     def details(self) -> str:
-        """What is sent without torques."""
+        """Return the diagnostics' text: what is sent without torques."""
         settings = self.core.settings
         return f", {settings.on_stop} after {settings.deadline:g} s without a torque"
 
     def time_jumped_backward(self) -> None:
-        """Closed until torques by the new clock come."""
+        """Close the gate until torques with stamps of the new clock come."""
         self.core.reset()
 
     def stream_broken(self, where: str) -> None:
@@ -92,7 +92,7 @@ class CommandGate(TwinNode):
         self._send(self.core.stop_command(time.monotonic_ns()))
 
     def deactivated(self) -> None:
-        """The last command, which the controller holds indefinitely, must not be a torque."""
+        """Send the closed gate's command last, because the controller holds it indefinitely."""
         self.core.stream.stop("inactive", "the node was deactivated")
         self._tell()
         self._send(self.core.stop_command(time.monotonic_ns()))

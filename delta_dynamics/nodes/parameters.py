@@ -58,7 +58,7 @@ def declare_changes(
 
 
 def changed(robot: Robot, values: dict[str, Any]) -> Robot:
-    """The robot with new values of :data:`CHANGES`."""
+    """Return the robot with new values of :data:`CHANGES`."""
     sections: dict[str, Any] = {}
     for name, value in values.items():
         section, key, *_ = CHANGES[name]

@@ -95,13 +95,13 @@ class MachineSim(TwinNode):
         self._publish_drawn()
 
     def details(self) -> str:
-        """What was drawn, and the clock."""
+        """Return the diagnostics' text: the number of drawn parameters, and the clock."""
         drawn = self._variation.drawn
         spread = f", {len(drawn)} parameters drawn" if drawn else ""
         return f"{spread}, clock {self._clock_kind}"
 
     def activated(self) -> None:
-        """The machine goes on; on the wall's clock, from now."""
+        """Resume the simulation; on the wall clock from the present time."""
         self._due = self._heard = time.monotonic()
         if not self._simulated:
             self.core.skip(max(0, self.now() - self.core.now))
@@ -178,27 +178,31 @@ class MachineSim(TwinNode):
         return self.declare_settings(
             MachineSettings,
             fixed=True,
-            start=self._row(
+            start=self._declare_array(
                 "start", home, "joint positions at the start, rad or m", usual="the robot's home"
             ),
-            effort_limits=self._row(
+            effort_limits=self._declare_array(
                 "effort_limits", effort_limits(robot), "largest effort of the drives, N m or N",
                 0.0, "the robot's"
             ),
-            stiffness=self._row(
+            stiffness=self._declare_array(
                 "stiffness", stiffness, "of the position control", 0.0, "from bandwidth"
             ),
-            damping=self._row("damping", damping, "of the position control", 0.0, "from bandwidth"),
-            resolution=self._row(
+            damping=self._declare_array(
+                "damping", damping, "of the position control", 0.0, "from bandwidth"
+            ),
+            resolution=self._declare_array(
                 "encoder_resolution", np.zeros(len(home)), "resolution of the encoders, rad or "
                 "m; velocities are then differences of steps; 0: exact", 0.0
             ),
             payloads=self._declare_payloads(robot),
             wrench=WrenchSignal(
-                self._row("wrench.constant", np.zeros(6), "wrench on the platform, N and N m, "
-                "base axes"),
-                self._row("wrench.amplitude", np.zeros(6), "amplitude of a sine added to "
-                "wrench.constant"),
+                self._declare_array(
+                    "wrench.constant", np.zeros(6), "wrench on the platform, N and N m, base axes"
+                ),
+                self._declare_array(
+                    "wrench.amplitude", np.zeros(6), "amplitude of a sine added to wrench.constant"
+                ),
                 self.declare(
                     "wrench.frequency", 1.0, "frequency of the "
                     "sine", unit="Hz", low=0.0, high=1e4
@@ -261,10 +265,10 @@ class MachineSim(TwinNode):
             robot.changed(payload=event.load)
         return events
 
-    def _row(
+    def _declare_array(
         self, name: str, default: Array, text: str, low: float | None = None, usual: str = ""
     ) -> Array:
-        """A parameter of one number a joint (or component); one stands for all."""
+        """Declare a parameter with one number per joint or component; one number stands for all."""
         given = self.declare(name, default.tolist(), text, usual=usual)
         values = np.asarray(given, np.float64)
         if len(values) not in (1, len(default)):
@@ -371,7 +375,7 @@ class MachineSim(TwinNode):
         )
 
     def _publish_drawn(self) -> None:
-        """What was drawn: into the log, and kept on a topic for who comes late."""
+        """Log the drawn parameters, and publish them on a transient local topic."""
         drawn = self._variation.drawn
         values = [KeyValue(key=name, value=short(value)) for name, value in drawn.items()]
         status = DiagnosticStatus(name=self.get_fully_qualified_name(), values=values)

@@ -106,7 +106,7 @@ class DeltaDynamics(TwinNode):
         self._reactions_pace.reset()
 
     def time_jumped_forward(self) -> None:
-        """What was fresh is stale now: a running stream stops."""
+        """Stop a running stream, whose samples are stale after a jump of the clock."""
         with self._telling_stop():
             self.core.time_jumped_forward()
         self._estimates.reset()
@@ -116,19 +116,19 @@ class DeltaDynamics(TwinNode):
         self._stop("exception", f"{where} raised an exception")
 
     def activated(self) -> None:
-        """A stream begins again."""
+        """Begin a new stream."""
         self.time_jumped_backward()
         self._accepted = None
 
     def deactivated(self) -> None:
-        """A stream that ran is stopped; goals that wait are ended."""
+        """Stop a running stream, and abort the goals that wait."""
         if self._action is not None:
             self._action.deactivated()
         if self._accepted is not None:
             self._stop("inactive", "the node was deactivated")
 
     def shutdown(self) -> None:
-        """What has to be the last: goals are ended, the machine held, a stop's torque sent."""
+        """End the goals, hold the machine and send the stop's torque, before all else ends."""
         if self._action is not None:
             self._action.shutdown()
         super().shutdown()
@@ -213,7 +213,7 @@ class DeltaDynamics(TwinNode):
         return text
 
     def _create_action(self) -> Any:
-        """The action ``~/follow_joint_trajectory``, where a controller is named."""
+        """Create the action ``~/follow_joint_trajectory`` if a controller is named."""
         controller = self.declare(
             "controller_action",
             "",
@@ -263,7 +263,7 @@ class DeltaDynamics(TwinNode):
         return (time.monotonic_ns() - self._accepted[0]) / SECOND
 
     def _create_wrenches(self, settings: Settings) -> WrenchWindow | None:
-        """The measured wrench, where the parameter asks for it."""
+        """Create the window of measured wrenches if ``use_wrench`` is set."""
         wanted = self.declare(
             "use_wrench",
             False,
@@ -328,7 +328,7 @@ class DeltaDynamics(TwinNode):
             wrenches.take(message, self.now())
 
     def _create_reaction_publishers(self, robot: Robot) -> dict[str, Any]:
-        """A publisher for each joint's reaction, where the parameter asks for them."""
+        """Create a publisher for each joint's reaction if ``publish_reactions`` is set."""
         wanted = self.declare("publish_reactions", False, "publish ~/reactions/*")
         rate = self.declare(
             "reactions_rate", 50.0, "rate of ~/reactions/*", unit="Hz", low=1e-3, high=1e4
@@ -441,7 +441,7 @@ class DeltaDynamics(TwinNode):
             self._torques.publish(stamp, effort)
 
     def _prepare(self, values: dict[str, Any]) -> tuple[Robot, Settings]:
-        """The robot and the settings with new values of parameters."""
+        """Return the robot and the settings with new values of parameters."""
         core, own = self.core, {k: v for k, v in values.items() if k in CHANGES}
         robot = changed(core.robot, own) if own else core.robot
         return robot, with_parameters(core.settings, values)

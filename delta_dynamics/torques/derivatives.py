@@ -43,7 +43,7 @@ def torque_derivatives(
     robot: Robot, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, wrench: ArrayLike | None = None,
     by: Sequence[str] = (),
 ) -> TorqueDerivatives:  # fmt: skip
-    """Derivatives of :func:`delta_dynamics.inverse_dynamics`, loops closed, wrench held.
+    """Compute the derivatives of :func:`delta_dynamics.inverse_dynamics`, wrench constant.
 
     Exact to rounding, by differentiation of the program and the implicit function theorem. Dry
     friction counts with its direction held: its jump at rest has no derivative.
@@ -60,7 +60,7 @@ def torque_gradient(
     robot: Robot, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, weights: ArrayLike,
     wrench: ArrayLike | None = None, by: Sequence[str] = (),
 ) -> TorqueDerivatives:  # fmt: skip
-    """Derivatives of the sum of weights times efforts; costs little more than the efforts.
+    """Compute the derivatives of the sum of weights times efforts, in reverse mode.
 
     :param weights: shape (..., n). Others and errors as of :func:`torque_derivatives`.
     :returns: ``q``, ``qd``, ``qdd`` of shape (..., n), and ``by`` of shape (...).
@@ -81,7 +81,7 @@ def _derivatives(
 def torque_effects(
     robot: Robot, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, wrench: ArrayLike | None
 ) -> Array:
-    """What one standard deviation of each of the file's causes changes, shape (..., n, causes)."""
+    """Return the change of efforts per standard deviation of each cause, (..., n, causes)."""
     causes = robot.cached(CauseSlopes, geometry_and_masses)
     kernel = robot.cached(_effects)
     inputs = _inputs((q, qd, qdd), wrench, np.eye(robot.joints_count), rows=True)
@@ -115,14 +115,14 @@ def _by_paths(robot: Robot, inputs: Sequence[Array], by: Sequence[str]) -> dict[
 
 
 def numbers_slopes(robot: Robot, by: Sequence[str]) -> Array:
-    """Derivatives of geometry and masses by numbers of the file, shape (numbers, paths)."""
+    """Return the derivatives of geometry and masses by numbers of the file, (numbers, paths)."""
     return robot.cached(FileNumbers, tuple(by), geometry_and_masses).slopes
 
 
 def torques_by_numbers(
     robot: Robot, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, wrench: ArrayLike, slopes: Array
 ) -> Array:
-    """Derivatives of the efforts by numbers of the file alone, shape (..., n, paths).
+    """Compute the derivatives of the efforts by numbers of the file, shape (..., n, paths).
 
     :param robot: also one of :meth:`Robot.numbered`; with ``slopes`` of :func:`numbers_slopes`.
         Others as of :func:`torque_derivatives`.

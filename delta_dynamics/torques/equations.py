@@ -78,7 +78,7 @@ class Equations:
 
 
 def motion_kernel(robot: Robot) -> Kernel:
-    """The program of :class:`Terms`: q and qd to all of them but these two, row by row."""
+    """Return the program of :class:`Terms`: q and qd to all terms but these two, row by row."""
     return robot.massive().kernel("motion", _motion)
 
 

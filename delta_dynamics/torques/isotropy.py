@@ -32,7 +32,7 @@ from pkm_twin.robot.robot import Robot
 
 
 def sphere_directions(count: int) -> Array:
-    """Unit vectors spread evenly over the sphere (Fibonacci lattice), shape (count, 3)."""
+    """Return unit vectors evenly over the sphere (Fibonacci lattice), shape (count, 3)."""
     count = operator.index(count)
     if count < 1:
         raise ValueError(f"count has to be at least 1, not {count}")
@@ -53,7 +53,7 @@ def largest(forms: Array, y: Array) -> Array:
 
 
 def minimax_direction(forms: Array) -> Array:
-    """Unit y, shape (m,), with the least max_a |y' G_a y| of symmetric forms G, shape (n, m, m).
+    """Find the unit y, (m,), with the least max_a |y' G_a y| of symmetric forms G, (n, m, m).
 
     For m up to 3. At a minimum one form is stationary, or two are equal but for their sign and one
     of them is stationary along the cone y' H y = 0 on which they are, or three are equal. All such
@@ -61,7 +61,7 @@ def minimax_direction(forms: Array) -> Array:
     cubic det(y, G y, H y) = 0; common points of two cones. The best of them all is the answer, to
     rounding.
     """
-    points = _candidates(forms)
+    points = _find_candidates(forms)
     return np.asarray(points[largest(forms, points).argmin()], np.float64)
 
 
@@ -69,8 +69,8 @@ def _units(vectors: Array) -> Array:
     return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True), np.float64)
 
 
-def _candidates(forms: Array) -> Array:
-    """Unit vectors, shape (k, m), among which the least one is."""
+def _find_candidates(forms: Array) -> Array:
+    """Find unit vectors, shape (k, m), among which the minimum is."""
     count, size = forms.shape[:2]
     pairs = list(itertools.combinations(range(count), 2))
     cones = [(a, forms[a] - sign * forms[b]) for a, b in pairs for sign in (1.0, -1.0)]

@@ -88,7 +88,7 @@ def _graph_joint(joint: Joint, vectors: Array) -> Transmitter:
     if pair:
         normal = vectors[..., 4, :]
         moments[joint.normal] = normal / np.linalg.norm(normal, axis=-1, keepdims=True)
-    return _joint(
+    return _make_transmitter(
         name, (joint.inner, joint.outer), vectors[..., 0, :], forces, moments, effort,
         threads=threads,
     )  # fmt: skip
@@ -114,12 +114,12 @@ def _rod_joints(rod: Rod, vectors: Array) -> list[Transmitter]:
         couple = {f"{rod.label or rod.name}: moment along e": e}
     inner, outer = rod.joint_names
     return [
-        _joint(inner, (rod.inner, rod.name), start, forces, {}, None, couple),
-        _joint(outer, (rod.name, rod.outer), end, forces, {}, None, couple),
+        _make_transmitter(inner, (rod.inner, rod.name), start, forces, {}, None, couple),
+        _make_transmitter(outer, (rod.name, rod.outer), end, forces, {}, None, couple),
     ]
 
 
-def _joint(
+def _make_transmitter(
     name: str,
     bodies: tuple[str, str],
     point: Array,
@@ -129,7 +129,7 @@ def _joint(
     passed: Mapping[str, Array] | None = None,
     threads: Mapping[str, Array] | None = None,
 ) -> Transmitter:
-    """A joint from unit directions, shape (..., 3).
+    """Build a joint's wrench basis from unit directions, shape (..., 3).
 
     ``passed``: couples shared with another; ``threads``: moments that come with a force.
     """
@@ -150,7 +150,7 @@ def _joint(
 def needs(
     graph: Graph, names: Sequence[str], bodies: Array, rods: Array
 ) -> tuple[dict[str, Array], dict[str, Array]]:
-    """A point of each body and rod, and the wrench about it that joints have to apply."""
+    """Return a point of each body and rod, and the wrench about it that its joints apply."""
     origin: dict[str, Array] = {}
     needed: dict[str, Array] = {}
     for k, name in enumerate(names):
@@ -164,8 +164,8 @@ def needs(
     return origin, needed
 
 
-def _columns(joint: Transmitter, names: tuple[str, ...], batch: tuple[int, ...]) -> Array:
-    """The joint's wrench basis over all unknowns, shape (..., 6, unknowns)."""
+def _place_columns(joint: Transmitter, names: tuple[str, ...], batch: tuple[int, ...]) -> Array:
+    """Place the joint's wrench basis in the columns of all unknowns, (..., 6, unknowns)."""
     result = np.zeros((*batch, 6, len(names)))
     result[..., [names.index(name) for name in joint.components]] = joint.basis
     return result
@@ -191,7 +191,7 @@ def transmission(
     result = np.zeros((*batch, len(origin), 6, len(names)))
     order = list(origin)
     for joint in joints:
-        columns = _columns(joint, names, batch)
+        columns = _place_columns(joint, names, batch)
         for body, sign in ((joint.inner, -1.0), (joint.outer, 1.0)):
             if body == BASE:
                 continue
@@ -287,7 +287,7 @@ def reactions(
 
 
 def known_alone(full: Reactions) -> Reactions:
-    """The same with NaN for what is indeterminate."""
+    """Return the reactions with NaN for indeterminate components."""
     return replace(
         full,
         wrenches=_read_only(np.where(full.determinate, full.wrenches, np.nan)),
@@ -351,19 +351,19 @@ def least_norm_reactions(
 def balance(
     robot: Robot, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, wrench: ArrayLike | None = None
 ) -> Balance:
-    """The balances of a motion, solved; arguments and errors as :func:`reactions`."""
+    """Solve the balances of a motion; arguments and errors as :func:`reactions`."""
     load = np.zeros(6) if wrench is None else wrench
     loads = robot.evaluate(loads_kernel(robot), robot.inertial, q, qd, qdd, load)
     found = balanced(robot, loads)
     if robot.redundant:
         efforts = robot.evaluate(body_efforts(robot), robot.inertial, q, qd, qdd, load)[0]
-        found = _with_efforts(found, efforts)
+        found = _set_efforts(found, efforts)
     finite(found.value, "the motion or the wrench")
     return found
 
 
-def _with_efforts(found: Balance, efforts: Array) -> Balance:
-    """The balances whose actuated components are these, which are chosen, shape (..., n)."""
+def _set_efforts(found: Balance, efforts: Array) -> Balance:
+    """Return the balances with given efforts, shape (..., n), of a redundant machine's drives."""
     names = [joint.actuated for joint in found.joints if joint.actuated is not None]
     rows = [found.components.index(name) for name in names]
     unit = found.unit[..., rows]
@@ -378,7 +378,7 @@ def _with_efforts(found: Balance, efforts: Array) -> Balance:
 
 
 def balanced(robot: Robot, loads: Sequence[Array], *, strict: bool = True) -> Balance:
-    """The balances of what :func:`loads_kernel` computes, also of variants of the robot.
+    """Solve the balances of the loads of :func:`loads_kernel`, also of variants of the robot.
 
     :param strict: raise where there is no equilibrium; else ``residual`` is not below
         ``BALANCE_BOUND`` there.
@@ -401,9 +401,17 @@ def balanced(robot: Robot, loads: Sequence[Array], *, strict: bool = True) -> Ba
     with np.errstate(over="ignore", invalid="ignore"):
         value, null, residual = _solve(a, b, moment, size, strict=strict)
 
-    spread = np.stack([_columns(joint, names, batch) for joint in joints], -3)
+    spread = np.stack([_place_columns(joint, names, batch) for joint in joints], -3)
     return Balance(
-        tuple(joints), names, points, spread, value, null, _unit(moment, size), size, residual
+        tuple(joints),
+        names,
+        points,
+        spread,
+        value,
+        null,
+        _scale_unknowns(moment, size),
+        size,
+        residual,
     )
 
 
@@ -465,8 +473,8 @@ def _loads(t: Traced) -> Program:
     return Program(t.inputs("q", "qd", "qdd", wrench=6), layout.size, outputs, t.equations())
 
 
-def _unit(moment: Mask, size: Array) -> Array:
-    """The size where the unknown is a moment, else one, shape (..., unknowns)."""
+def _scale_unknowns(moment: Mask, size: Array) -> Array:
+    """Return the machine's size for moments and one for forces, shape (..., unknowns)."""
     return np.where(moment, size[..., None], 1.0)
 
 
@@ -481,7 +489,7 @@ def _solve(
     equations, unknowns = a.shape[-2:]
     batch = b.shape[:-1]
     turning = np.tile(np.arange(6) >= 3, equations // 6)
-    unit = _unit(moment, size)
+    unit = _scale_unknowns(moment, size)
     rows = np.where(turning, 1.0 / size[..., None], 1.0)
     matrix = (a * rows[..., None] * unit[..., None, :]).reshape(-1, equations, unknowns)
     right = (b * rows).reshape(-1, equations)

@@ -65,7 +65,7 @@ def parameter_units(robot: Robot) -> tuple[str, ...]:
 
 
 def parameter_values(robot: Robot) -> Array:
-    """The robot's own values of the parameters, pi, shape (p,)."""
+    """Return the robot's own values of the parameters, pi, shape (p,)."""
     graph, tree = robot.graph, robot.massive().tree
     values: list[Any] = []
     for link in tree.links.values():
@@ -87,7 +87,7 @@ def parameter_values(robot: Robot) -> Array:
 def regressor(
     robot: Robot, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, wrench: ArrayLike | None = None
 ) -> Array:
-    """The regressor Y of the efforts of a motion: Y pi = inverse_dynamics, exactly.
+    """Compute the regressor Y of a motion's efforts: Y pi = inverse_dynamics, exactly.
 
     It depends only on the robot's geometry, gravity and the set of loaded passive joints, and on
     the robot's own values where its drives' friction laws are not linear: a Stribeck speed, a
@@ -214,7 +214,7 @@ def _columns(robot: Robot) -> list[tuple[str, str]]:
 
 
 def _regressor(t: Traced) -> Program:
-    """The bodies' motion in their own axes at home; and columns of rods, passive joints, wrench."""
+    """Write the bodies' motion in their axes at home, and columns of rods, joints and wrench."""
     t.solve()
     graph, motion, n = t.graph, t.motion, t.joints
     gravity = t.tape.inputs(PARAMETERS, 3)
@@ -291,7 +291,7 @@ class BaseParameters:
 
 
 def base_parameters(robot: Robot, *, seed: int = 0) -> BaseParameters:
-    """The identifiable combinations of the robot's parameters, without a wrench.
+    """Find the identifiable combinations of the robot's parameters, without a wrench.
 
     With the columns of ``columns`` alone, Y[..., columns] (matrix pi) = inverse_dynamics.
 
@@ -358,7 +358,7 @@ def independent(table: Array, preference: ArrayLike = 1.0) -> tuple[tuple[int, .
 
 
 def natural_units(robot: Robot) -> Array:
-    """What makes kilograms of the parameters by the machine's size and weight, shape (p,)."""
+    """Return the factors that convert parameters to kg by the machine's size, shape (p,)."""
     size = robot.engine.tree.size
     powers = {what: (0, 1, 1, 1, 2, 2, 2, 2, 2, 2)[k] for k, what in enumerate(TEN)}
     result = []
@@ -369,7 +369,7 @@ def natural_units(robot: Robot) -> Array:
 
 
 def combination_name(row: Sequence[float] | Array, leading: int, names: Sequence[str]) -> str:
-    """A combination in words, the leading parameter first."""
+    """Write a combination as text, the leading parameter first."""
     text = names[leading]
     for k, value in enumerate(row):
         if k == leading or value == 0.0:

@@ -36,15 +36,15 @@ def friction_reach(robot: Robot) -> Array:
     q, still = robot.inverse(robot.home()), np.zeros(n)
     size = np.abs(inverse_dynamics(robot, q, still, still)).max()
 
-    def odd(rate: float) -> Array:
-        """The part of each joint's own effort that turns over with its rate."""
+    def odd_part(rate: float) -> Array:
+        """Return the part of each joint's effort that changes its sign with the joint's rate."""
         rows = rate * np.eye(n)
         ahead = np.array([inverse_dynamics(robot, q, row, still) for row in rows])
         back = np.array([inverse_dynamics(robot, q, -row, still) for row in rows])
         return np.asarray(np.diag(ahead - back) / 2.0, np.float64)
 
     # Viscous friction doubles with the rates.
-    reach = 2.0 * odd(SLOW) - odd(2.0 * SLOW)
+    reach = 2.0 * odd_part(SLOW) - odd_part(2.0 * SLOW)
     return np.where(reach > SEEN * (1.0 + size), reach, 0.0)
 
 
@@ -85,6 +85,6 @@ def moving_rates(qd: Array, still: Mask, reach: Array) -> Array:
 
 
 def beyond_friction(residual: Array, still: Mask, reach: Array) -> Array:
-    """What friction of joints at rest does not explain of residuals (..., n), N m or N."""
+    """Return the part of residuals beyond friction of resting joints, (..., n), N m or N."""
     slack = np.where(still, reach, 0.0)
     return np.asarray(np.sign(residual) * np.maximum(np.abs(residual) - slack, 0.0), np.float64)

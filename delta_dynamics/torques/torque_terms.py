@@ -48,14 +48,14 @@ def frictionless(
     :param weight: False leaves gravity out, too.
     """
     layout = Layout(robot.massive().tree)
-    p = _without(robot.inertial, layout.friction)
+    p = _set_zero(robot.inertial, layout.friction)
     if not weight:
-        p = _without(p, layout.part(GRAVITY))
+        p = _set_zero(p, layout.part(GRAVITY))
     return robot.evaluate(torques(robot), p, q, qd, qdd, np.zeros(6))[0]
 
 
-def _without(p: Array, part: slice | Indices) -> Array:
-    """Inputs with some of them zero."""
+def _set_zero(p: Array, part: slice | Indices) -> Array:
+    """Return inputs with some of them set to zero."""
     result = p.copy()
     result[part] = 0.0
     return result
@@ -90,10 +90,10 @@ def dynamics_terms(
         return robot.evaluate(kernel, p, place, qd, qdd, wrench)[0]
 
     layout = Layout(robot.massive().tree)
-    held = _without(robot.inertial, layout.friction)
-    empty = _without(robot.own_inertial, layout.friction)
-    weightless = _without(empty, layout.part(GRAVITY))
-    rubbing = _without(robot.own_inertial, layout.part(GRAVITY))
+    held = _set_zero(robot.inertial, layout.friction)
+    empty = _set_zero(robot.own_inertial, layout.friction)
+    weightless = _set_zero(empty, layout.part(GRAVITY))
+    rubbing = _set_zero(robot.own_inertial, layout.part(GRAVITY))
     preload = np.zeros((*shape, n))
     if robot.redundant:
         # What is left at rest, without gravity, friction and wrench.

@@ -32,7 +32,7 @@ class EffortParts(NamedTuple):
     whole: Array
 
     def default_deviation(self, greatest: Array) -> Array:
-        """Standard deviation of the efforts of a robot whose file says nothing of it, shape (n,).
+        """Return the default standard deviation of efforts without ``uncertainty``, shape (n,).
 
         :param greatest: the greatest efforts that the robot's motion needs, shape (n,).
         """
@@ -44,7 +44,7 @@ class EffortParts(NamedTuple):
 def effort_parts(
     robot: Robot, q: Array, qd: Array, qdd: Array, wrench: Array | None, mass: Array
 ) -> EffortParts:
-    """The efforts of one motion sample by what needs them; arguments as ``inverse_dynamics``'.
+    """Split the efforts of one sample into rest, rates and accelerations, see ``EffortParts``.
 
     :param robot: without friction that grows with the load, so that efforts are linear in qdd.
     :param mass: its mass matrix at q, shape (n, n).
@@ -56,7 +56,7 @@ def effort_parts(
 
 
 def usual_effort(robot: Robot) -> Array:
-    """What each joint needs at home to bear the weight, or to move the platform by it, (n,)."""
+    """Return each joint's effort at home against the weight, or to accelerate by g, (n,)."""
     q, still = robot.inverse(robot.home()), np.zeros(robot.joints_count)
     lever = np.array([1.0, 1.0, 1.0, *(3 * [robot.size])])
     moves = np.linalg.norm(robot.platform_jacobian(q) * lever[:, None], axis=0)
@@ -77,7 +77,7 @@ def states_efforts(robot: Robot) -> bool:
 def torque_deviation(
     robot: Robot, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, wrench: ArrayLike | None = None
 ) -> Array:
-    """Standard deviation of :func:`inverse_dynamics`, propagated from the file's ``uncertainty``.
+    """Return the standard deviation of efforts, propagated from the file's ``uncertainty``.
 
     To first order in the standard deviations, independent causes. Zero for a file that names none.
 

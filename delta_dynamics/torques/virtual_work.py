@@ -69,7 +69,7 @@ def inverse_dynamics(
 
 
 def torques(robot: Robot) -> Kernel:
-    """The program of :func:`inverse_dynamics`: q, qd, qdd and wrench to efforts.
+    """Return the program of :func:`inverse_dynamics`: q, qd, qdd and wrench to efforts.
 
     :raises ParameterError: a robot whose file gives no masses.
     """
@@ -85,7 +85,7 @@ def moving_torques(robot: Robot) -> Kernel:
 
 
 def stream_torques(robot: Robot) -> Kernel:
-    """The same of a stream, see :func:`pkm_twin.kinematics.stream.following`."""
+    """Return the program of a stream's efforts, see :mod:`pkm_twin.kinematics.stream`."""
     return robot.massive().kernel("stream torques", _stream_torques)
 
 
@@ -96,7 +96,7 @@ def mass_matrix(robot: Robot, q: ArrayLike) -> Array:
 
 
 def masses_kernel(robot: Robot) -> Kernel:
-    """The program of :func:`mass_matrix`: q to its entries, row by row."""
+    """Return the program of :func:`mass_matrix`: q to its entries, row by row."""
     return robot.massive().kernel("mass matrix", _masses)
 
 
@@ -106,7 +106,7 @@ def _square(robot: Robot, flat: Array) -> Array:
 
 
 def body_mass_matrix(robot: Robot, q: ArrayLike, body: str) -> Array:
-    """The part of one body in the mass matrix, shape (..., n, n); the platform with payload."""
+    """Return one body's part of the mass matrix, (..., n, n); the platform's with payload."""
     layout = Layout(robot.massive().tree)
     p = np.zeros_like(robot.inertial)
     where = layout.body(body)
@@ -133,7 +133,7 @@ def forward_dynamics(
 
 
 def accelerations(robot: Robot) -> Kernel:
-    """The program of :func:`forward_dynamics`: q, qd, efforts and wrench to qdd."""
+    """Return the program of :func:`forward_dynamics`: q, qd, efforts and wrench to qdd."""
     return robot.massive().kernel("accelerations", _accelerations)
 
 
@@ -173,7 +173,7 @@ class Forces:
         self.moment: dict[str, Any] = {name: np.zeros(3) for name in names}
 
     def push(self, body: str, point: Array, force: Any) -> None:
-        """A needed force at a point of a body, given at home."""
+        """Add a needed force at a point of a body, given at home."""
         self.force[body] = self.force[body] + force
         self.moment[body] = self.moment[body] + cross(self.motion.arm(body, point), force)
 
@@ -192,7 +192,7 @@ class Forces:
             self.rod(rod, mass)
 
     def body(self, name: str, ten: Objects) -> None:
-        """What the acceleration of one body needs."""
+        """Add the force and moment that the acceleration of one body needs."""
         self._linear(name, ten)
         self._euler(name, _matrix(ten))
 
@@ -220,7 +220,7 @@ class Forces:
         return list(found.items())
 
     def rod(self, rod: Rod, mass: Any) -> None:
-        """What the acceleration of a thin even rod needs.
+        """Add the forces that the acceleration of a thin uniform rod needs.
 
         m (2 a + b) / 6 at its end of acceleration a and m (a + 2 b) / 6 at the other: its rotation
         is in it (Delta-CU paper, equations 15 and 16).
@@ -235,7 +235,7 @@ class Forces:
         self.push(rod.outer, rod.ends[1], sixth * (a + 2.0 * b))
 
     def momenta(self, bodies: Objects, rods: Objects) -> None:
-        """The same linear part alone: momenta of the velocities that the motion has."""
+        """Add the momenta of the motion's velocities in place of forces."""
         m = self.motion
         for name, ten in zip(m.tree.links, bodies, strict=True):
             first = m.rotation[name] @ ten[1:4]
@@ -250,12 +250,12 @@ class Forces:
             self._shared(rod, mass, m.velocity)
 
     def passive(self, values: Objects) -> None:
-        """What passive joints rub, and what their rotors resist: three numbers a joint."""
+        """Add friction and rotor inertia of passive joints, three numbers per joint."""
         for k, joint in enumerate(loaded_joints(self.motion.graph)):
             self.joint(joint, values[3 * k : 3 * k + 3])
 
     def joint(self, joint: Joint, three: Numbers) -> None:
-        """The same of one joint: viscous, Coulomb, rotor."""
+        """Add viscous friction, Coulomb friction and rotor inertia of one joint."""
         viscous, coulomb, rotor = three
         rate, second = self.relative(joint, accelerated=True)
         self.pair(joint, viscous * rate + coulomb * sign(rate) + rotor * second)
@@ -282,7 +282,7 @@ class Forces:
         return axis @ (m.velocity(b, joint.at) - m.speed[a] - cross(m.omega[a], lever)), second
 
     def pair(self, joint: Joint, amount: Any) -> None:
-        """An effort along a joint's freedom on its outer body, its opposite on the inner one."""
+        """Add an effort along a joint's freedom on its outer body, the reaction on the inner."""
         m, a, b = self.motion, joint.inner, joint.outer
         load = m.direction(a, joint.axes[0]) * amount
         if not joint.slides:
@@ -295,7 +295,7 @@ class Forces:
             self.moment[body] = self.moment[body] + cross(at - m.origin[body], force)
 
     def wrench(self, six: Objects) -> None:
-        """A wrench on the platform at its reference point: what it bears is not needed."""
+        """Subtract a wrench that acts on the platform at its reference point."""
         graph = self.motion.graph
         self.push(graph.platform, graph.origin, -six[:3])
         self.moment[graph.platform] = self.moment[graph.platform] - six[3:]
@@ -340,7 +340,7 @@ def _matrix(ten: Objects) -> Objects:
 
 
 def begun(t: Traced) -> tuple[Layout, list[Objects]]:
-    """The layout of the run-time inputs, and its parts; closures are solved."""
+    """Solve the closures; return the layout of the run-time inputs, and its parts."""
     t.solve()
     layout = Layout(t.tree)
     return layout, layout.split(t.tape.inputs(PARAMETERS, layout.size))
@@ -416,12 +416,12 @@ def _loads(
 
 
 def torque_program(t: Traced) -> Program:
-    """The program of :func:`torques`, to write others with."""
+    """Write the program of :func:`torques`."""
     return _torques(t)
 
 
 def body_efforts(robot: Robot) -> Kernel:
-    """The same less friction and rotors: what the drives do to the bodies."""
+    """Return the program of the efforts that act on the bodies, without friction and rotors."""
     return robot.massive().kernel("body efforts", partial(_torques, on_bodies=True))
 
 
@@ -549,7 +549,7 @@ def null_efforts(robot: Robot, q: ArrayLike) -> Array:
 
 
 def null_kernel(robot: Robot) -> Kernel:
-    """The program of :func:`null_efforts`: q to its entries, row by row."""
+    """Return the program of :func:`null_efforts`: q to its entries, row by row."""
     return robot.engine.kernel("null efforts", _null_efforts)
 
 
@@ -560,7 +560,7 @@ def _null_efforts(t: Traced) -> Program:
 
 
 def kernels(robot: Robot) -> tuple[Kernel, ...]:
-    """What a live node calls, to warm up before the first sample.
+    """Return the programs that a node calls, to compile them before the first sample.
 
     :raises ParameterError: a robot without masses.
     """
