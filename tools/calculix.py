@@ -25,7 +25,7 @@ STIFF = Section(1e14, 5e13, 0.04, 0.03, 1e-6, 1.0)
 
 
 def run(text: str, folder: Path) -> str:
-    """What CalculiX prints of a deck."""
+    """Run CalculiX on a deck, and return what it prints."""
     (folder / "deck.inp").write_text(text)
     result = folder / "deck.dat"
     result.unlink(missing_ok=True)
@@ -111,7 +111,7 @@ class Deck:
                 self.joint(support, place, node, along)
 
     def arm(self, node, start, end):
-        """A node at the end of a stiff, light lever from a node; the node itself for none."""
+        """Add a node at the end of a stiff, light lever; without a lever return the node itself."""
         span = end - start
         length = np.linalg.norm(span)
         if length < 1e-9:
@@ -168,7 +168,7 @@ class Deck:
         self.equations.append("\n".join(["*EQUATION", str(len(lines)), *lines]))
 
     def body(self, origin, body):
-        """A flat symmetric platform as four point masses, which have a disc's inertia."""
+        """Add a flat symmetric platform as four point masses with a disc's inertia."""
         radius = np.sqrt(4 * body.inertia[0, 0] / body.mass) / np.sqrt(2)
         assert np.allclose(body.inertia, body.inertia[0, 0] * np.diag([1, 1, 2]))
         assert np.allclose(body.at, origin, rtol=0.0, atol=1e-12)

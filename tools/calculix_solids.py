@@ -53,7 +53,7 @@ class Disc:
 
 
 def disc_mesh(square: int, rings: int) -> Disc:
-    """A square with bent sides in the middle, rings of quadrilaterals from there to the circle."""
+    """Mesh a disc: a square with curved sides, then rings of quadrilaterals to the circle."""
     places: list[tuple[float, float]] = []
     known: dict[tuple[float, float], int] = {}
 

@@ -37,7 +37,7 @@ KEPT: Final = Path("out/contact_table.jsonl")
 
 
 def departed(robot: Robot, rng: np.random.Generator, motion: Any, hit: Strike | None) -> Stream:
-    """The machine: each mass within 3 %, 3 % of the peak effort as friction, noise."""
+    """Measure a machine with masses within 3 %, friction of 3 % of the peak effort, and noise."""
     external = None if hit is None else hit.external
     return measured(robot, rng, motion, each=0.03, friction=0.03, external=external)
 
@@ -85,7 +85,7 @@ def contact(robot: Robot, seed: int) -> dict[str, Any]:
 
 
 def free(robot: Robot, seed: int) -> dict[str, Any]:
-    """A motion without a contact: how often there is one all the same."""
+    """Count the false contacts of a motion without a contact."""
     rng = np.random.default_rng([seed, *robot.name.encode(), 1])
     motion = moves(robot, rng, round(FREE / 0.4), 0.7, 0.5)
     touching = departed(robot, rng, motion, None).watched(robot)
@@ -133,7 +133,7 @@ def line(name: str, rows: list[dict[str, Any]]) -> str:
 
 
 def rate(rows: list[dict[str, Any]]) -> str:
-    """The rate of false alarms, with what its small number allows."""
+    """Write the rate of false alarms, with its 95 % bound."""
     hours = sum(row["seconds"] for row in rows) / 3600.0
     count = sum(row["false"] for row in rows)
     most = chi2.ppf(0.95, 2 * count + 2) / (2.0 * hours)
@@ -155,7 +155,7 @@ def places(rows: list[dict[str, Any]]) -> str:
 
 
 def section(rows: list[dict[str, Any]]) -> str:
-    """The part of docs/nodes.md."""
+    """Write the part of docs/nodes.md."""
     table = [line(name, [r for r in rows if r["robot"] == name]) for name in ROBOTS]
     return SECTION.format(
         contacts=sum(row["kind"] != "free" for row in rows),

@@ -69,7 +69,7 @@ def _python(*words: str, epoch: str, cwd: Path = ROOT) -> str:
 
 
 def _settled(path: Path, epoch: int) -> bytes:
-    """An archive in order, of one time and of nobody's account."""
+    """Rewrite an archive in order, with one time and without accounts."""
     data = io.BytesIO()
     with tarfile.open(path) as source, tarfile.open(fileobj=data, mode="w") as target:
         for member in sorted(source.getmembers(), key=lambda member: member.name):
@@ -81,7 +81,7 @@ def _settled(path: Path, epoch: int) -> bytes:
 
 
 def needed(name: str = NAME) -> dict[str, metadata.Distribution]:
-    """A package's installed dependencies and theirs, by normal name; extras are not followed."""
+    """Find a package's installed dependencies, and theirs, by normal name, without extras."""
     found: dict[str, metadata.Distribution] = {}
     todo = [name]
     while todo:
@@ -109,7 +109,7 @@ def licence(package: metadata.Distribution) -> str:
 
 
 def bill() -> dict[str, Any]:
-    """The bill of materials: CycloneDX 1.5."""
+    """Write the bill of materials, CycloneDX 1.5."""
 
     def component(name: str, package: metadata.Distribution) -> dict[str, Any]:
         reference = f"pkg:pypi/{name}@{package.version}"

@@ -43,7 +43,7 @@ PLAIN = (ast.Expr, ast.Assign, ast.AugAssign, ast.Raise)
 
 
 def mutants(node: ast.AST) -> Iterator[tuple[str, ast.AST]]:
-    """What a node itself may be changed to, by names."""
+    """Yield what a node may be changed to, with names."""
 
     def changed(**fields: object) -> ast.AST:
         own = dict(ast.iter_fields(node))

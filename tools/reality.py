@@ -91,13 +91,13 @@ def lengths(robot: Robot, found: Calibration, poses: Poses) -> Array:
 
 
 def recorded(robot: Robot) -> Poses:
-    """The grid, z from the base."""
+    """Read the grid of poses, z from the base."""
     poses = read_poses(DATA / "grid_180x180.csv", robot, Dialect(units={"length": "mm"}))
     return Poses(poses.joints, poses.position + np.array([0.0, 0.0, HOME]), poses.rotation)
 
 
 def section() -> str:
-    """The part of the page."""
+    """Write the part of the page."""
     robot = load(DATA / "hexapod.yaml")
     poses = recorded(robot)
     count = len(poses.joints)

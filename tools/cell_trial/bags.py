@@ -39,10 +39,10 @@ def folder() -> Path:
     return Path(__file__).resolve().parents[2] / "bags"
 
 
-def played(
+def play_bag(
     other: Peer, bag: Path, robot: str, name: str, rate: float, given: list[str]
 ) -> dict[str, str]:
-    """The values of a node's diagnostics after the whole bag."""
+    """Play a bag to a node, and return the values of its diagnostics."""
     told: dict[str, str] = {}
 
     def diagnosed(array: DiagnosticArray) -> None:
@@ -84,7 +84,7 @@ def main() -> None:
                 source, answered, _ = NODES[name]
                 if not inside[source]:
                     continue
-                told = played(other, bag, robot, name, given.rate, given.parameter)
+                told = play_bag(other, bag, robot, name, given.rate, given.parameter)
                 rejects = [
                     f"{value} {key.partition(': ')[2]}"
                     for key, value in told.items()

@@ -21,8 +21,8 @@ DEADLINE = 120.0
 """How long a condition is waited for, s."""
 
 
-def executable(name: str) -> str:
-    """The file of ``ros2 run pkm_twin NAME``; without a workspace, the environment's script."""
+def find_executable(name: str) -> str:
+    """Find the file of ``ros2 run pkm_twin NAME``; without a workspace, the script."""
     for prefix in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep):
         path = Path(prefix, "lib", "pkm_twin", name)
         if prefix and path.is_file():
@@ -46,7 +46,7 @@ class Process:
             stderr=subprocess.STDOUT,
             start_new_session=True,
             env=inherited | {"PYTHONUNBUFFERED": "1"} | (environment or {}),
-            preexec_fn=_hearing,
+            preexec_fn=_restore_signals,
         )
 
     @property
@@ -86,17 +86,19 @@ class Process:
         return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
 
 
-def _hearing() -> None:
-    """A background job of a shell ignores SIGINT, and so would what it starts."""
+def _restore_signals() -> None:
+    """Restore the default signals, because a background job of a shell ignores SIGINT."""
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_DFL)
 
 
 def node(*names: str, parameters: Iterable[str] = (), remap: Iterable[str] = ()) -> Process:
-    """A node of the suite, or several in one process, with NAME:=VALUE and FROM:=TO."""
+    """Start a node, or several in one process, with NAME:=VALUE and FROM:=TO."""
     words = [word for p in parameters for word in ("-p", p)]
     words += [word for r in remap for word in ("-r", r)]
-    program = [executable(names[0])] if len(names) == 1 else [executable("composed"), *names]
+    program = (
+        [find_executable(names[0])] if len(names) == 1 else [find_executable("composed"), *names]
+    )
     return Process(*program, *(["--ros-args", *words] if words else []))
 
 
@@ -110,7 +112,7 @@ class Peer:
         self._executor.add_node(self.node)
 
     def hear(self, kind: Any, topic: str, qos: Any = 1000) -> list[Any]:
-        """A list that every message of the topic is put into."""
+        """Subscribe to a topic, and return the list of its messages."""
         heard: list[Any] = []
         self.node.create_subscription(kind, topic, heard.append, qos)
         return heard
@@ -153,7 +155,7 @@ class Peer:
 
 @contextlib.contextmanager
 def peer(name: str = "trial") -> Iterator[Peer]:
-    """A peer for a block."""
+    """Yield a peer for the duration of a block."""
     made = Peer(name)
     try:
         yield made
@@ -163,7 +165,7 @@ def peer(name: str = "trial") -> Iterator[Peer]:
 
 @contextlib.contextmanager
 def closing(*processes: Process) -> Iterator[tuple[Process, ...]]:
-    """Processes that end with the block."""
+    """End processes at the end of the block."""
     try:
         yield processes
     finally:

@@ -157,21 +157,21 @@ class Cell:
         return goal
 
     def send(self, goal: Any) -> Any:
-        """The goal's handle, accepted by the twin, and its result to come."""
+        """Send a goal; return its accepted handle and the future of its result."""
         future = self.client.send_goal_async(goal)
         self.other.until(future.done, "the twin's answer to a goal")
         handle = future.result()
         return handle, handle.get_result_async()
 
     def until_moving(self) -> None:
-        """The controller follows the trajectory."""
+        """Wait until the controller follows the trajectory."""
         self.states.clear()
         self.other.until(
             lambda: self.states and any(self.states[-1].reference.velocities), "motion"
         )
 
     def least_share(self, since: float) -> float:
-        """The least share of the weight that an effort has had since then, moving or not."""
+        """Return the least share of the gravity effort since a stamp, moving or not."""
         stamps, share = self._shares()
         return float(share[stamps > since].min())
 
@@ -198,8 +198,10 @@ class Cell:
         return STATUS[answer.status], answer.result.error_string, time.monotonic() - began
 
     def weight_lost(self, since: float) -> tuple[float, float, float]:
-        """After a stop: the share of the weight that the last effort has, for how long the effort
-        was less than nine tenths of it, s, and the greatest miss of the last one, relative.
+        """Compare the efforts after a stop with the gravity effort.
+
+        :returns: the last effort's share of it; time below nine tenths of it, s; the largest
+            relative error of the last effort.
         """
         efforts = np.array([m.output.effort for m in self.states])
         moving = np.array([any(m.reference.velocities) for m in self.states])
@@ -235,7 +237,7 @@ def _say(cell: Cell, case: str, ended: tuple[str, str, float] | None, since: flo
 
 
 def cancelled(cell: Cell) -> None:
-    """A client cancels in the middle of the motion, as the first goal and after another one."""
+    """Cancel a goal in the middle of the motion, the first goal and a later one."""
     for case in ("cancel of the first goal", "cancel after a goal that succeeded"):
         if case.startswith("cancel after"):
             # Whose last effort is none that bears the weight.
@@ -250,21 +252,21 @@ def cancelled(cell: Cell) -> None:
 
 
 def aborted(cell: Cell) -> None:
-    """The controller aborts: mock hardware does not follow, and the path has a tolerance."""
+    """Let the controller abort: mock hardware does not follow, and the path has a tolerance."""
     _, result = cell.send(cell.goal(tolerance=0.005))
     since = _now(cell)
     _say(cell, "abort by path tolerance", cell.ended(result), since)
 
 
 def ended_in_acceleration(cell: Cell) -> None:
-    """The last point stands and has an acceleration."""
+    """End a goal with a last point at rest that has an acceleration."""
     _, result = cell.send(cell.goal(0.5, braking=-20.0))
     ended = cell.ended(result)
     _say(cell, "success whose last point accelerates", ended, _now(cell))
 
 
 def replaced(cell: Cell) -> None:
-    """A second goal replaces the first: nothing of the first may disturb it."""
+    """Replace a goal by a second one, which the first must not disturb."""
     _, first = cell.send(cell.goal())
     cell.until_moving()
     cell.other.spin(0.3)
@@ -295,7 +297,7 @@ def twin_ends(cell: Cell) -> None:
 
 
 def controller_killed(cell: Cell) -> None:
-    """The controller manager is killed by SIGKILL."""
+    """Kill the controller manager by SIGKILL."""
     _, result = cell.send(cell.goal())
     cell.until_moving()
     cell.other.spin(0.8)
@@ -307,7 +309,7 @@ def controller_killed(cell: Cell) -> None:
 
 
 def first_goal(cell: Cell) -> None:
-    """A goal at once after the twin's start."""
+    """Send a goal immediately after the start of delta_dynamics."""
     for _ in range(5):
         cell.twin.close()
         cell.start_twin()

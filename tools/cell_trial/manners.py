@@ -23,7 +23,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 import yaml
-from cell import DEADLINE, Peer, Process, closing, executable, node, peer
+from cell import DEADLINE, Peer, Process, closing, find_executable, node, peer
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import InertiaStamped, WrenchStamped
 from rclpy.qos import DurabilityPolicy, QoSProfile
@@ -104,7 +104,7 @@ class States:
 
 
 def diagnosed(other: Peer) -> dict[str, Any]:
-    """The newest diagnostic status of each node, by its name, from now on."""
+    """Collect the newest diagnostic status of each node, by its name."""
     found: dict[str, Any] = {}
 
     def take(array_of: DiagnosticArray) -> None:
@@ -116,7 +116,7 @@ def diagnosed(other: Peer) -> dict[str, Any]:
 
 def urdf(_: Peer, tell: Results) -> None:
     """Options of pkm-twin export urdf."""
-    program = executable("pkm-twin")
+    program = find_executable("pkm-twin")
     for words in (
         (),
         ("--hardware-plugin", "my_hardware/Drives"),
@@ -169,7 +169,7 @@ def description(other: Peer, tell: Results) -> None:
 
 
 def deadline(other: Peer, tell: Results) -> None:
-    """A stale_after that is greater than the gate's deadline."""
+    """Try a stale_after greater than the gate's deadline."""
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "parameters.yaml"
         slow = {"delta_dynamics": {"ros__parameters": {"stale_after": 0.5}}}
@@ -253,7 +253,7 @@ def off(other: Peer, tell: Results) -> None:
             states.stream(4.0)
             least = min((m.inertia.m for m in loads), default=0.0)
             tell(least >= 0.0, f"least payload {least:.3g} kg")
-        _, text = output(executable("pkm-twin"), "check", str(bag), "--robot", ROBOT, "--json")
+        _, text = output(find_executable("pkm-twin"), "check", str(bag), "--robot", ROBOT, "--json")
     items = [i for i in json.loads(text)["items"] if i["what"].startswith(("drives", "torque"))]
     for item in items:
         tell(item["verdict"] == "good", f"check, {item['what']}: {item['value']}")
@@ -261,7 +261,7 @@ def off(other: Peer, tell: Results) -> None:
 
 
 def launch(_: Peer, tell: Results) -> None:
-    """An unknown robot, and a configuration that a node rejects."""
+    """Launch an unknown robot, and a configuration that a node rejects."""
     code, text = output("ros2", "launch", "pkm_twin", "twin.launch.py", "robot:=nope")
     line = next((line for line in text.splitlines() if "nope" in line), "")
     tell(code and "process started" not in text, f"robot:=nope: exit code {code}, {line}")

@@ -16,7 +16,7 @@ import tempfile
 from pathlib import Path
 
 from ament_index_python.packages import get_package_prefix
-from cell import executable
+from cell import find_executable
 
 from pkm_twin import robot_names
 
@@ -25,7 +25,7 @@ def loaded(robot: str, folder: Path) -> bool:
     """Export a robot's configuration and load its URDF and SRDF."""
     package = folder / robot
     subprocess.run(
-        [executable("pkm-twin"), "export", "moveit", robot, "--out", str(package)],
+        [find_executable("pkm-twin"), "export", "moveit", robot, "--out", str(package)],
         check=True, stdout=subprocess.DEVNULL,
     )  # fmt: skip
     loader = Path(get_package_prefix("pkm_srdf_loader"), "lib", "pkm_srdf_loader", "load_srdf")

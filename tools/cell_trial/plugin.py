@@ -59,8 +59,8 @@ MORE = 0.5
 """Payload that is added at run time, kg."""
 
 
-def stamped(seconds: float) -> Duration:
-    """A duration."""
+def to_duration(seconds: float) -> Duration:
+    """Convert seconds to a Duration message."""
     sec, nanosec = divmod(round(seconds * 1e9), 10**9)
     return Duration(sec=sec, nanosec=nanosec)
 
@@ -72,7 +72,7 @@ def trajectory(names: list[str], times: Any, *columns: Any) -> JointTrajectory:
             positions=q.tolist(),
             velocities=qd.tolist(),
             accelerations=qdd.tolist(),
-            time_from_start=stamped(float(t)),
+            time_from_start=to_duration(float(t)),
         )
         for t, q, qd, qdd in zip(times, *columns, strict=True)
     ]
@@ -80,7 +80,7 @@ def trajectory(names: list[str], times: Any, *columns: Any) -> JointTrajectory:
 
 
 def there_and_back(robot: Robot, start: Any, seconds: float) -> JointTrajectory:
-    """A tenth of the range, in the controller's numbers; three times."""
+    """Return a motion over a tenth of the range, there and back, in the controller's values."""
     limits = robot.limits.position
     size = 0.1 * (1.0 if limits is None else float(np.ptp(limits, axis=1).min()))
     toward = np.ones(len(start)) if limits is None else np.sign(limits.mean(1) - start)
@@ -124,17 +124,14 @@ class Chain:
             JointTrajectory, f"/{target}/joint_trajectory", QoSProfile(depth=10)
         )
         simulated = HARDWARE[part] == TOPICS
-        settings = [f"controllers:={self._by_its_clock()}"] if simulated else []
+        settings = [f"controllers:={self._write_lockstep_settings()}"] if simulated else []
         self.process = Process(
             "ros2", "launch", "pkm_twin", "control.launch.py", f"robot:={given}", f"use:={use}",
             f"hardware_plugin:={HARDWARE[part]}", f"bandwidth:={bandwidth}", *settings,
         )  # fmt: skip
 
-    def _by_its_clock(self) -> Path:
-        """The package's settings with simulated time: a period of machine_sim a command.
-
-        Of 5 ms, as often as machine_sim sends /clock.
-        """
+    def _write_lockstep_settings(self) -> Path:
+        """Write the package's settings with simulated time, one command per 5 ms of /clock."""
         share = Path(get_package_share_directory(package_name(self.robot)))
         sections = yaml.safe_load((share / "config" / "controllers.yaml").read_text())
         sections["/**/joint_state_broadcaster"] = {"ros__parameters": {}}
@@ -177,7 +174,7 @@ class Chain:
         return [s for s in self.states if any(s.reference.velocities)]
 
     def through_the_twin(self) -> None:
-        """A motion there and back through delta_dynamics."""
+        """Send a motion there and back through delta_dynamics."""
         robot = self.robot
         motion = there_and_back(robot, self.start(), 4.0)
         self.go(motion)
@@ -257,7 +254,7 @@ class Chain:
         )
 
     def beyond(self) -> None:
-        """A trajectory through the position limit of the first joint, with another payload."""
+        """Send a trajectory through the position limit of the first joint, with another payload."""
         start, load = self.start(), self.robot.payload
         self.set_parameter(CONTROLLER, "payload.mass", load.mass + MORE)
         self.robot = robot = self.robot.changed(
@@ -290,7 +287,7 @@ class Chain:
         print(f"{self.part}: log: {said}")
 
     def lost(self) -> None:
-        """A velocity and then the position of the first joint become NaN, and good again."""
+        """Set the velocity, then the position of the first joint to NaN, and back."""
         self.start()
         self.other.spin(1.0)
         self.compare_control(self.states)
@@ -332,7 +329,7 @@ class Chain:
         print(f"killed: the launch ended with exit code {self.process.process.returncode}")
 
     def report(self) -> None:
-        """The last diagnostics of the controller, and of what is simulated."""
+        """Print the last diagnostics of the controller and of machine_sim."""
         for name in (": feedforward", "machine_sim"):
             mine = [s for m in self.counts for s in m.status if s.name.endswith(name)]
             if mine:
@@ -341,7 +338,7 @@ class Chain:
 
 
 def _output(*command: str) -> str:
-    """What a command prints."""
+    """Run a command, and return what it prints."""
     return subprocess.run(command, capture_output=True, text=True, check=False).stdout.strip()
 
 

@@ -67,7 +67,7 @@ class Watch:
         self.other.node.create_subscription(Float64MultiArray, topic, take, 5000)
 
     def faults(self) -> dict[str, Counter[str]]:
-        """What each node has counted that it should not, by its key."""
+        """Return the counts of each node that should be zero, by key."""
         found: dict[str, Counter[str]] = {}
         for name, values in self.values.items():
             found[name] = Counter(
@@ -81,7 +81,7 @@ class Watch:
 
 
 def robots(folder: Path, factor: float = 1.0) -> dict[str, Path]:
-    """A parameter file for each namespace, with so many times the friction."""
+    """Write a robot file for each namespace, with friction multiplied by a factor."""
     files = {}
     for space, (robot, viscous, dry) in MACHINES.items():
         files[space] = folder / f"{robot}_{factor:g}.yaml"
@@ -93,7 +93,7 @@ def robots(folder: Path, factor: float = 1.0) -> dict[str, Path]:
 def simulators(
     spaces: Iterable[str], folder: Path, period: float, priority: int = 0
 ) -> list[Process]:
-    """A machine for each namespace, moved by the efforts of its gate."""
+    """Start a machine_sim for each namespace, driven by the efforts of its gate."""
     files = robots(folder, SIMULATED)
     return [
         node(
@@ -135,7 +135,7 @@ PATIENT: dict[str, dict[str, float]] = {
 
 
 def parameters(spaces: Iterable[str], folder: Path, given: dict[str, dict[str, Any]]) -> str:
-    """An argument of a launch: parameters by a node's name, in each namespace."""
+    """Write a parameter file for all namespaces, and return the launch argument."""
     file = folder / "parameters.yaml"
     file.write_text(
         yaml.safe_dump(

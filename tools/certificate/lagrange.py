@@ -226,7 +226,7 @@ class Energies:
         return largest
 
     def assemble(self, q: Vector) -> Shape:
-        """The configuration at actuator positions near those settled at."""
+        """Solve the configuration at actuator positions near the settled ones."""
         u = list(self._base)
         for _ in range(8):
             if self._correct(q, u) < mpmath.mpf(10) ** -(DIGITS - 14):
@@ -250,7 +250,7 @@ class Energies:
         return self.kinetic(q, qd) + self.potential_of(self.assemble(q))
 
     def _momentum(self, q: Vector, qd: Vector) -> Vector:
-        """Derivative of the kinetic energy by the rates; exact for a quadratic form."""
+        """Differentiate the kinetic energy by the rates; exact for a quadratic form."""
         result = []
         for j in range(3):
             high = self.kinetic(q, plus(qd, unit(j)))

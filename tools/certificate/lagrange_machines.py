@@ -45,7 +45,7 @@ class DeltaEnergies(Energies):
             self.arm_inertia = about + exact(float(m.get("rotor_inertia", 0.0)))
 
     def middles(self, q: np.ndarray) -> list[float]:
-        """The mean angle and others where three forearms meet."""
+        """Return start values for Newton's method: angles at which three forearms meet."""
         size = {k: float(v) for k, v in self.lengths.items()}
         angles = [float(np.mean(q)) + shift for shift in (0.0, 0.2, 0.4, 0.7, 1.0)]
         reach = size["base_radius"] - size["platform_radius"]
@@ -62,7 +62,7 @@ class DeltaEnergies(Energies):
         return [0.0, 0.0, -size["arm_length"] * math.sin(middle) - drop]
 
     def _limb(self, i: int, q: Any, u: Sequence[Any], m: Any) -> tuple[Vector, Vector, Vector]:
-        """The arm's direction, the forearm's end at the elbow and at the platform."""
+        """Return the arm's direction, and the forearm's ends at elbow and platform."""
         size: Callable[[Any], Any] = float if m is math else mpmath.mpf
         r = [size(v) for v in self.out[i]]
         base, platform, arm = (
@@ -214,5 +214,5 @@ class PrruEnergies(Energies):
 
 
 def energies(params: Mapping[str, Any]) -> Energies:
-    """The energies of a parameter mapping."""
+    """Return the energies of a machine from its parameters."""
     return PrruEnergies(params) if params["mechanism"] == "prru" else DeltaEnergies(params)

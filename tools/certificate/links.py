@@ -40,7 +40,7 @@ FACTORS = np.linspace(0.5, 2.0, 301)
 
 
 def rigid_joints() -> dict[str, list[float]]:
-    """The shipped joint compliances with 0 for every number; free stays free."""
+    """Return the shipped joint compliances with 0 for every finite entry."""
     joints = parameters_of("upr_rpu")["joints_compliance"]
     return {
         name: [math.inf if value == math.inf else 0.0 for value in entries]
@@ -53,7 +53,7 @@ def with_rigid_joints() -> Robot:
 
 
 def round_bar(robot: Robot) -> float:
-    """A / A_shear of a round bar, Cowper 1966, for the robot's Poisson's ratio."""
+    """Return A / A_shear of a round bar (Cowper 1966) at the robot's Poisson's ratio."""
     members = robot.members
     poisson = members.youngs_modulus / members.shear_modulus / 2 - 1
     return (7 + 6 * poisson) / (6 + 6 * poisson)
@@ -112,7 +112,7 @@ def compare_links(name: str) -> Links:
 
 
 def deflections(bars: float = 1.0, joints: float = 1.0, base: Robot | None = None) -> np.ndarray:
-    """The twin's rows of table 1, um and urad, shape (2, 6); factors on the compliances."""
+    """Compute table 1 with factors on the compliances, um and urad, shape (2, 6)."""
     robot = base or load("upr_rpu")
     members = robot.members
     changes: Mapping[str, Any] = {

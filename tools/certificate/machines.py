@@ -40,7 +40,7 @@ class Case:
 
 
 def build(data: dict[str, Any]) -> Robot:
-    """The twin's robot of a parameter mapping."""
+    """Build the robot of a parameter mapping."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "machine.yaml"
         path.write_text(yaml.safe_dump(data))
@@ -56,7 +56,7 @@ def friction(data: dict[str, Any], qd: np.ndarray) -> np.ndarray:
 
 
 def random_case(name: str, rng: np.random.Generator, states: int) -> Case:
-    """A machine of the kind ``name`` and states that it can be assembled in."""
+    """Draw a machine of the kind ``name``, and states in which it can be assembled."""
     for _ in range(100):
         data = _prru(rng) if name == "prru" else _delta(rng, name == "delta_cu")
         robot = build(data)

@@ -64,7 +64,7 @@ class Judge:
         self.failures: list[str] = []
 
     def __call__(self, value: float, bound: float, what: str) -> str:
-        """The figure as text, bold and counted where it is above ``bound`` or not a number."""
+        """Write a figure; bold, and counted as a failure, if above ``bound`` or NaN."""
         if value <= bound:
             return f"{value:.1e}"
         self.failures.append(f"{what}: {value:.3g} is above {bound:.0e}")
@@ -78,7 +78,7 @@ def document(
     rows: PaperRows,
     seed: int,
 ) -> tuple[str, list[str]]:
-    """The cross-checks in Markdown, and one line for every bound that is exceeded."""
+    """Write the cross-checks in Markdown, and one line per exceeded bound."""
     judge = Judge()
     parts = [_head(seed)]
     parts.append(_torques(figures, judge))

@@ -73,7 +73,7 @@ class Swing:
 
 
 def starts() -> list[Start]:
-    """The machines of the parameter files; the PRRU hangs and has a long tool."""
+    """Return the machines of the parameter files; the PRRU hangs and has a long tool."""
     result = []
     rest = np.full(3, DELTA_REST)
     for name in ("delta", "delta_cu"):
@@ -114,7 +114,7 @@ def closure_error(
 
 
 def run(start: Start) -> list[Swing]:
-    """The three runs of one machine."""
+    """Run one machine in three ways."""
     robot = build(start.data)
     effort = inverse_dynamics(robot, start.rest, STILL, STILL)
     engine = engine_of(start.data)

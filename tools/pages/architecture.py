@@ -25,7 +25,7 @@ def is_folder(room):
 
 @cache
 def below():
-    """What each folder imports."""
+    """Return the folders that each folder imports."""
     pairs = [pair for pair in sources.arrows() if all(map(is_folder, pair))]
     names = sorted({name for pair in pairs for name in pair})
     return {n: frozenset(there for here, there in pairs if here == n) for n in names}
@@ -33,7 +33,7 @@ def below():
 
 @cache
 def reached(name):
-    """What a folder imports, and what that imports in turn."""
+    """Return the folders that a folder imports, directly or not."""
     return below()[name].union(*map(reached, below()[name]))
 
 

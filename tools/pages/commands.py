@@ -62,13 +62,13 @@ def words_of(command: Any) -> list[Word]:
 
 
 def leaves(name: str, command: Any) -> dict[str, Any]:
-    """The commands of a name, with their words."""
+    """Return the commands below a name, with their words."""
     inner = getattr(command, "commands", None)
     return {name: command} if inner is None else {f"{name} {k}": one for k, one in inner.items()}
 
 
 def page() -> str:
-    """The page, with the commands ordered by task."""
+    """Write the page, with the commands ordered by task."""
     every, tasks = app, group_by_task()
     found = {name: leaves(name, command) for name, command in every.commands.items()}
     users: dict[Word, list[str]] = defaultdict(list)
@@ -131,7 +131,7 @@ class Groups:
         return lines
 
     def named(self, there: Sequence[Word]) -> list[str]:
-        """The line of a command that has some of them."""
+        """Write the line that names a command's shared options."""
         names = []
         for word in [w for w in self.shared if w in there and w.name not in USUAL]:
             group = [name for name, words in self.groups.items() if word in words]
@@ -144,7 +144,7 @@ class Groups:
 def section(
     name: str, command: Any, inner: dict[str, Any], own: Sequence[Word], groups: Groups
 ) -> list[str]:
-    """A command, or the commands of a group after what they have in common."""
+    """Write a command, or the commands of a group after their common options."""
     lines, alone = [f"## `pkm-twin {name}`", ""], command in inner.values()
     if not alone:
         within = [word for one in inner.values() for word in words_of(one)]
@@ -163,7 +163,7 @@ def section(
 
 
 def first(text: str) -> str:
-    """What help says first, and what exit codes mean."""
+    """Return the first paragraph of a help text, and those on exit codes."""
     parts = text.split("\n\n")
     return "\n\n".join([parts[0], *(p for p in parts[1:] if p.startswith("Exit code"))])
 

@@ -109,7 +109,7 @@ REASONS = {
 
 
 def reasons() -> set[str]:
-    """The reasons that the sources give; "limit" is "bounds" of a robot with limits."""
+    """Collect the reasons in the sources; "limit" is "bounds" of a robot with limits."""
     found = {"limit"}
     for folder in ("pkm_twin", "delta_dynamics", "stiffness_monitor"):
         for path in (ROOT / folder).rglob("*.py"):
@@ -122,7 +122,7 @@ def reasons() -> set[str]:
 
 
 def section() -> str:
-    """The part of the page."""
+    """Write the part of the page."""
     lines = []
     for kind, (example, hint) in ERRORS.items():
         lines.append(f"* **`{kind.__name__}`**: `{example}`: {hint}.")

@@ -25,7 +25,7 @@ GROUPS: Final = {"in": "topics subscribe", "out": "topics publish", "service": "
 
 
 def class_of(node: str) -> Any:
-    """The class of a node."""
+    """Return the class of a node."""
     from pkm_twin.ros.node import TwinNode
 
     module = importlib.import_module(MODULES[node])
@@ -39,7 +39,7 @@ def class_of(node: str) -> Any:
 
 
 def rows_of(node: str) -> dict[str, tuple[Any, Setting]]:
-    """What a node declares: the default, and what it means; in this process, for a moment."""
+    """Return a node's declared parameters with their defaults, from a node in this process."""
     # Nobody else's node is meant.
     os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "OFF")
     import rclpy
@@ -57,13 +57,13 @@ def rows_of(node: str) -> dict[str, tuple[Any, Setting]]:
 
 
 def row(name: str, default: Any, setting: Setting) -> str:
-    """A parameter's line."""
+    """Write a parameter's line."""
     values = [setting.usual or _value(default), _values(setting), "" if setting.fixed else "live"]
     return f"* `{name}` ({'; '.join(filter(None, values))}): {setting.text}\n"
 
 
 def topic_row(row: Topic) -> str:
-    """A topic's line."""
+    """Write a topic's line."""
     when = f"only with {row.when}: " if row.when else ""
     kept = "; transient local" if row.latched else ""
     return f"* {row.way} `{row.name}` ({row.kind}): {when}{row.text}{kept}\n"
@@ -94,7 +94,7 @@ def _values(setting: Setting) -> str:
 
 
 def parts() -> dict[str, str]:
-    """What the page has between the marks of each node, and of all nodes."""
+    """Write the page's parts between the marks of each node, and of all nodes."""
     rows = {node: {k: row(k, *v) for k, v in rows_of(node).items()} for node in MODULES}
     times = Counter(line for own in rows.values() for line in own.values())
     shared = sorted(line for line, count in times.items() if count > 1)
@@ -112,7 +112,7 @@ def parts() -> dict[str, str]:
 
 
 def policy(text: str) -> str:
-    """The security policy with today's topics and services of the nodes."""
+    """Return the security policy with the nodes' present topics and services."""
     for node in MODULES:
         found = class_of(node).topics.values()
         allowed = "".join(

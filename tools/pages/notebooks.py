@@ -18,7 +18,7 @@ DPI = 70
 
 
 def run(cells: list[dict[str, Any]]) -> list[tuple[str, list[bytes]]]:
-    """What each code cell prints, the value of its last expression after it, and its pictures."""
+    """Run the code cells; return what each prints, its last expression, and its pictures."""
     matplotlib.use("Agg")
     from matplotlib import pyplot
 
@@ -46,12 +46,12 @@ def run(cells: list[dict[str, Any]]) -> list[tuple[str, list[bytes]]]:
 
 
 def text_of(cell: dict[str, Any]) -> str:
-    """The text that a cell's stored outputs have."""
+    """Return the text of a cell's stored outputs."""
     return "".join("".join(out["text"]) for out in cell["outputs"] if "text" in out)
 
 
 def stored(text: str, pictures: list[bytes]) -> list[dict[str, Any]]:
-    """A cell's outputs, as a notebook has them."""
+    """Write a cell's outputs in the notebook's format."""
     lines = text.splitlines(keepends=True)
     outputs: list[dict[str, Any]] = []
     if lines:

@@ -50,7 +50,7 @@ TITLES = {
 
 
 def default(field):
-    """A field's default as the file would write it."""
+    """Return a field's default as a file would have it."""
     value = field.default
     if field.default_factory is not dataclasses.MISSING:
         value = field.default_factory()
@@ -69,7 +69,7 @@ def default(field):
 
 
 def rows(kind, without=(), prefix=""):
-    """A line a key, nested sections behind the key that holds them."""
+    """Yield a line per key; nested sections follow the key that holds them."""
     fields = {field.name: field for field in dataclasses.fields(kind)}
     for name, (own, row) in settings_of(kind).items():
         if name in without:
@@ -91,13 +91,13 @@ def rows(kind, without=(), prefix=""):
 
 
 def table(kind, without=(), prefix=""):
-    """What a class says about its keys, and the keys."""
+    """Write a class's text on its keys, and the keys."""
     said = inspect.cleandoc(kind.__doc__).replace("``", "`")
     return f"{said}\n\n" + "\n".join(rows(kind, without, prefix))
 
 
 def page():
-    """The whole page."""
+    """Write the page."""
     common, shared = set(settings_of(Common)), set(settings_of(Mechanism))
     parts = [HEAD.rstrip(), "## Every file\n\n" + "\n".join(rows(Common))]
     listed = "\n".join(rows(Mechanism, common))

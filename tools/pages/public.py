@@ -65,12 +65,12 @@ def groups() -> Iterator[tuple[str, list[str]]]:
 
 
 def page(name: str) -> str:
-    """A page's text."""
+    """Read a page."""
     return (ROOT / "docs" / f"{name}.md").read_text(encoding="utf-8")
 
 
 def names() -> str:
-    """The file: a line per group, without empty groups."""
+    """Write the file: a line per group, without empty groups."""
     lines = (f"{group}: {' '.join(sorted(set(those)))}\n" for group, those in groups() if those)
     return "".join(lines)
 

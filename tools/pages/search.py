@@ -39,7 +39,7 @@ def paragraph(text: str) -> str:
 
 
 def entry_text(page: str, text: str) -> str:
-    """The indexed text of a section of a page (its file's stem), without markup.
+    """Return the indexed text of a section of a page (its file's stem), without markup.
 
     :param text: HTML of the search plugin.
     """
@@ -52,12 +52,12 @@ def entry_text(page: str, text: str) -> str:
 
 
 def on_page_content(html: str, **_: Any) -> str:
-    """A page's HTML with each reference as a name, the last part alone after ``~``."""
+    """Replace each reference in a page by its name, after ``~`` by the last part alone."""
     return ROLE.sub(lambda m: f"<code>{m[2].split('.')[-1] if m[1] else m[2]}</code>", html)
 
 
 def on_post_page(output: str, page: Any, **_: Any) -> str:
-    """A page that loads the shim from the site."""
+    """Let a page load the shim from the site."""
     return SHIM.sub("../" * page.url.count("/") + OWN_SHIM, output)
 
 

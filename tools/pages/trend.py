@@ -31,7 +31,7 @@ def printed(history, picture):
 
 
 def rewritten(text, picture):
-    """The page with today's output; the picture is drawn."""
+    """Return the page with today's output, and draw the picture."""
     with tempfile.TemporaryDirectory() as folder:
         history = Path(folder) / "nights.db"
         record(history)

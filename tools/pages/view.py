@@ -32,27 +32,27 @@ SETTLED = 10.0
 
 
 def loaded(page: Page) -> str:
-    """A Delta off its axis under a sideways force."""
+    """Show a Delta off its axis under a sideways force."""
     moved = page.model.to_pose(page.state, [0.08, -0.06, -0.37])
     page.become(page.model.loaded(moved, [60.0, 20.0, -80.0, 0.0, 0.0, 0.0]))
     return "Load"
 
 
 def recorded(page: Page) -> str:
-    """A recording, amid a stroke with the payload."""
+    """Show a recording in the middle of a stroke with payload."""
     panel = BagPanel(page, Timeline.of(read("bags/delta_cu_pick_and_place.mcap")))
     panel.show(9.05)
     return "Move"
 
 
 def leaning(page: Page) -> str:
-    """A hexapod that leans."""
+    """Show a tilted hexapod."""
     page.become(page.model.to_pose(page.state, [0.03, 0.02, 0.66, 0.12, -0.16, 0.2]))
     return "Move"
 
 
 def milling(page: Page) -> str:
-    """A head under a cutting force."""
+    """Show a head under a cutting force."""
     moved = page.model.to_pose(page.state, np.array([-0.6, 0.25, -0.2]))
     page.become(page.model.loaded(moved, [30.0, -50.0, -40.0, 10.0, -20.0, 50.0]))
     return "Load"
@@ -71,7 +71,7 @@ FRAMES = 10
 
 @contextlib.contextmanager
 def shown(browser: Browser, name: str) -> Iterator[Page]:
-    """A page in the browser, as it is drawn in the end."""
+    """Yield a page in the browser once it is drawn."""
     robot, prepare = PICTURES[name]
     with serving(0) as server:
         page = Page(server, Model(load(robot)), "Bag" if prepare is recorded else "")
@@ -89,7 +89,7 @@ def shown(browser: Browser, name: str) -> Iterator[Page]:
 
 
 def animate(browser: Browser, path: Path) -> None:
-    """The load of a page grows and falls."""
+    """Animate a load that grows and falls."""
     frames = []
     with shown(browser, "view_load") as page:
         full = np.array(page.state.wrench)
