@@ -170,6 +170,10 @@ class Kind:
         """Return the names of a direction's components."""
         return ("x", "y", "z")
 
+    def arrays(self, robot: Robot, poses: Array) -> dict[str, Array]:
+        """Return further arrays of poses (k, m) for an .npz file."""
+        return {}
+
     @property
     def options(self) -> dict[str, Any]:
         """The kind's own options, for a file."""

@@ -37,7 +37,9 @@ from pkm_twin.maps.kind import FORMAT_VERSION, Values
 if TYPE_CHECKING:
     from xarray import Dataset
 
+    from pkm_twin.maps.kind import Kind
     from pkm_twin.maps.sweep import Chunk, Map
+    from pkm_twin.robot.robot import Robot
 
 _INFO_FILE: Final = "sweep.json"
 _LOCK_FILE: Final = "lock"
@@ -494,3 +496,23 @@ def _slabs(variable: Any) -> Iterator[NDArray[Any]]:
     for k in range(first):
         for start in range(0, second, rows):
             yield np.asarray(variable[k, start : start + rows].values)
+
+
+def write_arrays(path: Path, file: Path, kind: Kind, robot: Robot) -> None:
+    """Write the poses of a stored map that count, and a kind's arrays of them, as an .npz file.
+
+    ``position``: shape (k, m), by ``names``. ``value``: shape (k, cases), by ``cases``.
+    """
+    with open_map(file) as data, reading(file):
+        cases = data["value"].values.reshape(-1, data.sizes["case"])
+        if "pose" in data:
+            poses = data["pose"].values
+        else:
+            grid = np.meshgrid(*(data[name].values for name in robot.pose_names), indexing="ij")
+            poses = np.stack(grid, -1).reshape(-1, len(grid))
+        named = {"names": np.array(robot.pose_names), "cases": data["case"].values.astype("U")}
+    counted = np.isfinite(cases).any(-1)
+    arrays: dict[str, Any] = named | {"position": poses[counted], "value": cases[counted]}
+    memory = io.BytesIO()
+    np.savez_compressed(memory, **(arrays | kind.arrays(robot, poses[counted])))
+    replace_file(path, memory.getvalue())

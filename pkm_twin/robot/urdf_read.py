@@ -267,6 +267,10 @@ def _description(assembly: Assembly, graph: Graph, ground: str) -> dict[str, Any
     if tree.gravity is not None:
         gravity = _seen(assembly, ground)[tree.root].rotation @ tree.gravity
         data["gravity"] = _snapped(gravity).tolist()
+    for name, entry in data["joints"].items():
+        ends = tree.joints[name].limits.get("position") if name in tree.joints else None
+        if ends is not None and np.isfinite(ends).any() and entry["type"] in SINGLE:
+            entry["limits"] = {"position": ends}
     for name in tree.actuated:
         joint, entry = tree.joints[name], data["joints"][name]
         if joint.limits:

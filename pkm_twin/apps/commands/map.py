@@ -78,7 +78,10 @@ class OfMap(Carries, Pages, Writes, Draws, Parallel):
         "count only poses inside the largest circles about the axis, of 10 degrees or more if they "
         "are tilts (2UPR-RPU paper, figure 5)",
     )
-    out: Path | None = setting(None, "file to write; default: ROBOT_KIND.nc", writes=True)
+    out: Path | None = setting(
+        None, "file to write; default: ROBOT_KIND.nc; .npz: also arrays of the poses that count",
+        writes=True,
+    )  # fmt: skip
     scheduler: str | None = setting(None, "address of a Dask scheduler: tcp://HOST:8786")
 
     @property
@@ -142,6 +145,7 @@ def compute(given: OfMap) -> Report:
     :raises PkmTwinError: what the kind or the file rejects.
     """
     from pkm_twin.maps.run import run
+    from pkm_twin.maps.store import write_arrays
     from pkm_twin.maps.sweep import map_of
 
     kind, machine = kind_of(given), given.machine()
@@ -155,7 +159,10 @@ def compute(given: OfMap) -> Report:
         least_singularity=given.singularity, least_clearance=given.least_clearance,
         regular=given.regular,
     )  # fmt: skip
-    target = given.target
+    arrays = given.target if given.target.suffix == ".npz" else None
+    if arrays is not None:
+        refuse_existing(arrays, given.overwrite)
+    target = given.target.with_suffix(".nc") if arrays else given.target
     with (
         first_signal(KeyboardInterrupt),
         progress(f"{kind.name} of {machine.name}", sweep.points) as update,
@@ -168,7 +175,11 @@ def compute(given: OfMap) -> Report:
         except KeyboardInterrupt:
             kept = f"stopped; finished parts are in {target}.parts, the same command continues"
             return Report(error=f"{kept} from there", code=INTERRUPTED)
-    return stored(target, given.drawing(""), given.html, given.overwrite)
+    report = stored(target, given.drawing(""), given.html, given.overwrite)
+    if arrays is not None:
+        write_arrays(arrays, target, kind, machine)
+        report = dataclasses.replace(report, files={**report.files, "arrays": arrays})
+    return report
 
 
 def stored(file: Path, drawing: Path | None, html: bool, overwrite: bool) -> Report:
