@@ -31,14 +31,16 @@ PICTURES = (".png", ".svg", ".pdf")
 """What a picture's name may end in."""
 BESIDE = "auto"
 """The picture's name where --picture has none."""
-ROBOT_HELP = "a robot's name (see `pkm-twin robots`), or its YAML, URDF, MJCF, SDF"
+ROBOT_HELP = "a robot's name (see `pkm-twin robots`), or its YAML, URDF, MJCF, SDF, USD"
 
 
 @dataclass(frozen=True, kw_only=True)
 class OfPlatform:
     """The platform of a description that names none, and what of a larger robot is the machine."""
 
-    platform: str | None = setting(None, "for a URDF, MJCF or SDF: the link that carries the tool")
+    platform: str | None = setting(
+        None, "for a URDF, MJCF, SDF or USD: the link that carries the tool"
+    )
     base: str | None = setting(
         None, "for such a file: the link that is the ground; what is neither between base and "
         "platform nor in a loop with that is left out; default: the root, nothing left out",

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from pkm_twin.errors import ParameterError, UnknownNameError, one_line, warn
+from pkm_twin.machine import usd_file
 from pkm_twin.machine.strict_yaml import read_yaml
 from pkm_twin.robot.plausibility import findings
 from pkm_twin.robot.robot import Robot
@@ -23,7 +24,7 @@ CATALOGUE: Final = {
     "upr_rpu": "pkm_twin.mechanisms.upr_rpu:UprRpu",
 }
 """Mechanism name to class: one line a mechanism."""
-TREES: Final = (".urdf", ".xml", ".mjcf", ".sdf", ".world")
+TREES: Final = (".urdf", ".xml", ".mjcf", ".sdf", ".world", *usd_file.SUFFIXES)
 """Endings of files that give a tree of links and its loop closures."""
 
 
@@ -70,8 +71,8 @@ def load(
     Changes that the import made to a user's file, and implausible numbers in it, give warnings
     (:class:`pkm_twin.errors.RobotWarning`), each once.
 
-    :param robot: a name such as ``"delta_cu"``, or a path to a YAML, URDF, MJCF or SDF file.
-    :param platform: link that carries the tool, of a URDF, MJCF or SDF; default: by usual names.
+    :param robot: a name such as ``"delta_cu"``, or a path to a YAML, URDF, MJCF, SDF or USD file.
+    :param platform: link that carries the tool, of a file of links; default: by usual names.
     :param base: link that is the ground, of such a file; default: the root. With ``base`` or
         ``actuated`` only what is between base and platform, or in a loop with that, is the robot.
     :param actuated: names of the actuated joints, in the order of q; default: as the file marks.

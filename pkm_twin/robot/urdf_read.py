@@ -15,7 +15,7 @@ from pkm_twin.errors import ParameterError, warn
 from pkm_twin.kinematics.linkage import Linkage
 from pkm_twin.kinematics.rounding import repair_rounded
 from pkm_twin.machine import graph as graphs
-from pkm_twin.machine import mjcf_file, sdf_file, urdf_file, urdf_xml
+from pkm_twin.machine import mjcf_file, sdf_file, urdf_file, urdf_xml, usd_file
 from pkm_twin.machine.cut_out import check_faults, cut_out, find_circles
 from pkm_twin.machine.graph import Graph
 from pkm_twin.machine.graph_description import graph_description
@@ -107,7 +107,7 @@ def read_tree(path: str | Path, part: Part = Part()) -> UrdfReading:
     """A URDF file as a description of ``mechanism: machine``, every vector in base axes at home.
 
     A file whose top element is ``<mujoco>`` is read as MJCF, with the mujoco package, and one of
-    ``<sdf>`` as SDF.
+    ``<sdf>`` as SDF; a file whose name ends in .usd, .usda or .usdc as USD, with usd-core.
 
     Links that fixed joints hold together are one body. Home: see :mod:`pkm_twin.robot.urdf_home`;
     ``home`` of a joint is its value there, so that joint values are the URDF's. Parts that only
@@ -117,10 +117,14 @@ def read_tree(path: str | Path, part: Part = Part()) -> UrdfReading:
     :raises ParameterError: a file, element or name that is refused, by its name.
     """
     path = Path(path)
-    top = urdf_xml.elements(path)
-    controller = take_drives(top)
-    readers = {"mujoco": mjcf_file.read, "sdf": sdf_file.read}
-    tree = readers.get(top.tag, urdf_file.read)(path, top, part.actuated)
+    controller, top = {}, None
+    if path.suffix in usd_file.SUFFIXES:
+        tree = usd_file.read(path, part.actuated)
+    else:
+        top = urdf_xml.elements(path)
+        controller = take_drives(top)
+        readers = {"mujoco": mjcf_file.read, "sdf": sdf_file.read}
+        tree = readers.get(top.tag, urdf_file.read)(path, top, part.actuated)
     tool = _platform(tree, part.platform)
     ground = tree.root if part.base is None else part.base
     ground = urdf_xml.known_link("base", ground, tree.links)
@@ -163,7 +167,9 @@ def read_tree(path: str | Path, part: Part = Part()) -> UrdfReading:
     if controller:
         data["joint_map"] = controller
     frames = {name: move @ tree.links[name].frame for name, move in _seen(assembly, ground).items()}
-    shown = () if top.tag in readers else visuals(path, top, frames, bodies)
+    shown: Sequence[Visual] = ()
+    if top is not None and top.tag == "robot":
+        shown = visuals(path, top, frames, bodies)
     return UrdfReading(data, home.text, tuple(notes), tree.marked, tuple(shown))
 
 

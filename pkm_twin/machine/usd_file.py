@@ -1,0 +1,345 @@
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
+"""A USD file as links, joints and loop closures: the prims of UsdPhysics.
+
+Rigid bodies are links. Joints that are excluded from the articulation, and those that a spanning
+tree leaves over, close loops. Actuated are joints with a drive that has a stiffness or a damping.
+Names are those of the prims, or their paths where prims share a name. Lengths and masses are in the
+stage's units; angles of limits are in degrees.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from pkm_twin.codegen.arrays import Array
+from pkm_twin.errors import ParameterError, install, warn
+from pkm_twin.machine.graph import spanning
+from pkm_twin.machine.loop_tree import Fault, Joint, Link, LoopTree, hung
+from pkm_twin.machine.rotations import Pose, about, from_quaternion
+from pkm_twin.machine.sdf_file import WORLD, closing
+from pkm_twin.machine.urdf_control import CHOOSE, UNCOUPLED, require_single
+from pkm_twin.machine.urdf_xml import free_name
+
+SUFFIXES: Final = (".usd", ".usda", ".usdc")
+ALIKE: Final = 1e-3
+"""Largest distance of a joint's frames on its two bodies, m or rad, that is rounding: USD's numbers
+have single precision, and exporters add up many."""
+SINGLE_PRECISION: Final = 6e-8
+"""Rounding error of a number of single precision, relative."""
+FREEDOMS: Final = ("transX", "transY", "transZ", "rotX", "rotY", "rotZ")
+MIMIC: Final = ("PhysxMimicJointAPI", "NewtonMimicAPI")
+"""Beginnings of the names of schemas that couple joints."""
+
+
+def read(path: Path, actuated: Sequence[str] | None = None) -> LoopTree:
+    """Read a USD file.
+
+    :param actuated: the actuated joints, in place of those with a drive.
+    :raises ParameterError: no usd-core package, a file that it does not open, or a prim that is
+        refused, by its path.
+    """
+    try:
+        from pxr import Tf, Usd
+    except ImportError:
+        raise ParameterError(
+            str(path), "a USD file without the usd-core package", install("usd")
+        ) from None
+    if not path.is_file():
+        raise ParameterError(str(path), "no regular file", "a USD file")
+    try:
+        stage = Usd.Stage.Open(str(path))
+    except Tf.ErrorException as error:
+        raise ParameterError(str(path), ValueError(str(error)), "a USD file") from None
+    return _Reader(stage, path).tree(actuated)
+
+
+class _Reader:
+    def __init__(self, stage: Any, path: Path) -> None:
+        from pxr import UsdGeom, UsdPhysics
+
+        self.physics, self.path = UsdPhysics, path
+        self.length = float(UsdGeom.GetStageMetersPerUnit(stage))
+        self.kilogram = float(UsdPhysics.GetStageKilogramsPerUnit(stage))
+        self.up = str(UsdGeom.GetStageUpAxis(stage))
+        self.cache = UsdGeom.XformCache()
+        self.prims = list(stage.Traverse())
+        self.bodies = [p for p in self.prims if p.HasAPI(UsdPhysics.RigidBodyAPI)]
+        self.bodies = [p for p in self.bodies if self._value(p, "physics:rigidBodyEnabled", True)]
+        self.names = self._named()
+        self.links = {WORLD: Link(WORLD)}
+        self.faults: list[Fault] = []
+
+    def tree(self, chosen: Sequence[str] | None) -> LoopTree:
+        """Return the machine; ``chosen``: actuated joints in place of those with a drive."""
+        for prim in self.bodies:
+            self.links[self.names[prim.GetPath()]] = self._link(prim)
+        if len(self.links) == 1:
+            raise ParameterError(str(self.path), "no rigid body", "prims with PhysicsRigidBodyAPI")
+        joints: dict[str, Joint] = {}
+        driven, excluded = list[str](), set[str]()
+        for prim in self.prims:
+            if not prim.IsA(self.physics.Joint):
+                continue
+            if not self._value(prim, "physics:jointEnabled", True):
+                warn(self.path, f"{prim.GetPath()} is switched off and left out")
+                continue
+            joint = self._joint(prim)
+            if joint.inner == joint.outer:
+                continue
+            joints[joint.name] = joint
+            if self._value(prim, "physics:excludeFromArticulation", False):
+                excluded.add(joint.name)
+            if self._drives(prim):
+                driven.append(joint.name)
+            if any(str(s).startswith(MIMIC) for s in prim.GetAppliedSchemas()):
+                error = ParameterError(str(prim.GetPath()), "a mimic joint", UNCOUPLED)
+                self.faults.append(((joint.name,), error))
+        if not any(WORLD in (joint.inner, joint.outer) for joint in joints.values()):
+            held = self.names[self.bodies[0].GetPath()]
+            warn(self.path, f"no joint holds a body in the world: {held} is taken for the ground")
+            label, frame = free_name("world_fixed", {*joints}), self.links[held].frame
+            joints[label] = Joint(label, "fixed", WORLD, held, (frame, frame))
+        types = {name: joint.kind for name, joint in joints.items()}
+        if chosen is None and not driven:
+            way = f"a drive with a stiffness or a damping, or joints that {CHOOSE} names"
+            self.faults.append(((), ParameterError(str(self.path), "no driven joint", way)))
+        motors = tuple(driven) if chosen is None else require_single(chosen, types)
+
+        def rank(joint: Joint) -> tuple[bool, bool, bool, int]:
+            passive = joint.name not in motors
+            return joint.name in excluded, joint.kind != "fixed", passive, joint.type.cost
+
+        pairs = {j.name: (j.inner, j.outer) for j in sorted(joints.values(), key=rank)}
+        tree = set(spanning(self.links, pairs))
+        placed = self._placed({name: joint for name, joint in joints.items() if name in tree})
+        closures = [self._closure(joint) for name, joint in joints.items() if name not in tree]
+        size = max(1.0, *(float(np.abs(link.frame.position).max()) for link in self.links.values()))
+        return LoopTree(
+            self.path.stem, WORLD, self.links, placed, tuple(closures), motors, self._gravity(),
+            rounding=SINGLE_PRECISION * size, marked="a drive" if chosen is None else "actuated",
+            faults=tuple(self.faults),
+        )  # fmt: skip
+
+    def _named(self) -> dict[Any, str]:
+        """Name bodies and joints by their prims: the prim's name, or its path if others have it."""
+        named: dict[Any, str] = {}
+        for prims in (self.bodies, [p for p in self.prims if p.IsA(self.physics.Joint)]):
+            own = [str(prim.GetName()) for prim in prims]
+            for prim, name in zip(prims, own, strict=True):
+                path = str(prim.GetPath())[1:].replace("/", "_")
+                named[prim.GetPath()] = path if own.count(name) > 1 or name == WORLD else name
+        return named
+
+    def _value(self, prim: Any, name: str, default: Any) -> Any:
+        value = prim.GetAttribute(name).Get() if prim.HasAttribute(name) else None
+        return default if value is None else value
+
+    def _world(self, prim: Any) -> tuple[Pose, Array]:
+        """Return a prim's frame, m, and the scales of its axes.
+
+        :raises ParameterError: a frame that is mirrored or not orthogonal.
+        """
+        table = np.array(self.cache.GetLocalToWorldTransform(prim), np.float64)
+        scales = np.linalg.norm(table[:3, :3], axis=1)
+        axes = (table[:3, :3] / scales[:, None]).T
+        if np.abs(axes.T @ axes - np.eye(3)).max() > ALIKE or np.linalg.det(axes) < 0.0:
+            raise ParameterError(str(prim.GetPath()), "a skew or mirrored frame", "a rotation")
+        u, _, vt = np.linalg.svd(axes)
+        return Pose(u @ vt, self.length * table[3, :3]), scales
+
+    def _link(self, prim: Any) -> Link:
+        """Return a body with its mass.
+
+        :raises ParameterError: a mass that would follow from shapes and densities.
+        """
+        where, (frame, scales) = str(prim.GetPath()), self._world(prim)
+        name = self.names[prim.GetPath()]
+        below = [p for p in self.prims if p.GetPath().HasPrefix(prim.GetPath()) and p != prim]
+        shapes = [p for p in below if p.HasAPI(self.physics.CollisionAPI)]
+        mass = self.kilogram * float(self._value(prim, "physics:mass", 0.0))
+        for part in below:
+            if part not in self.bodies and float(self._value(part, "physics:mass", 0.0)) > 0.0:
+                raise ParameterError(
+                    f"{part.GetPath()}.physics:mass", "a shape's", f"one of {where}"
+                )
+        if mass <= 0.0:
+            if shapes:
+                raise ParameterError(f"{where}.physics:mass", None, "kg, not only shapes")
+            return Link(name, frame)
+        moments = np.array(self._value(prim, "physics:diagonalInertia", (0.0, 0.0, 0.0)), float)
+        center = np.array(self._value(prim, "physics:centerOfMass", (-math.inf,) * 3), float)
+        if not moments.all() or (shapes and not np.isfinite(center).all()):
+            missing = "diagonalInertia" if not moments.all() else "centerOfMass"
+            raise ParameterError(f"{where}.physics:{missing}", None, "a value, not only shapes")
+        center = np.where(np.isfinite(center), center, 0.0)
+        turn = self._value(prim, "physics:principalAxes", None)
+        axes = np.eye(3) if turn is None or not turn.GetReal() else _rotation(turn)
+        inertia = axes @ np.diag(moments) @ axes.T * self.kilogram * self.length**2
+        own = Link(name, Pose(), mass, self.length * scales * center, inertia)
+        return own.moved(frame)
+
+    def _joint(self, prim: Any) -> Joint:
+        """Return a joint with its frames on both bodies, as drawn, its first axis in each."""
+        where, name = str(prim.GetPath()), self.names[prim.GetPath()]
+        ends, frames = [], []
+        for k in (0, 1):
+            targets = prim.GetRelationship(f"physics:body{k}").GetTargets()
+            owner = prim.GetStage().GetPrimAtPath(targets[0]) if targets else None
+            if targets and not owner:
+                raise ParameterError(f"{where}.physics:body{k}", str(targets[0]), "a prim's path")
+            frame, scales = (Pose(), np.ones(3)) if owner is None else self._world(owner)
+            while owner and owner not in self.bodies:
+                owner = owner.GetParent()
+            ends.append(self.names[owner.GetPath()] if owner else WORLD)
+            at = np.array(self._value(prim, f"physics:localPos{k}", (0.0, 0.0, 0.0)), float)
+            turn = self._value(prim, f"physics:localRot{k}", None)
+            local = np.eye(3) if turn is None else _rotation(turn)
+            frames.append(frame @ Pose(local, self.length * scales * at))
+        kind, axis = self._kind(prim, where)
+        more: dict[str, Any] = {}
+        if kind in ("revolute", "prismatic"):
+            local = np.eye(3)["XYZ".index(axis)]
+            first, second = (frame.rotation @ local for frame in frames)
+            more = {"axes": np.array([first, second]), **self._numbers(prim, kind)}
+            more["drawn"] = _value_between(kind, local, *frames)
+        return Joint(name, kind, ends[0], ends[1], (frames[0], frames[1]), **more)
+
+    def _kind(self, prim: Any, where: str) -> tuple[str, str]:
+        """Return a joint's type, and its axis if it has one.
+
+        :raises ParameterError: a type that is not read.
+        """
+        types = {"PhysicsRevoluteJoint": "revolute", "PhysicsPrismaticJoint": "prismatic",
+                 "PhysicsSphericalJoint": "spherical", "PhysicsFixedJoint": "fixed"}  # fmt: skip
+        kind = str(prim.GetTypeName())
+        if kind in types:
+            return types[kind], str(self._value(prim, "physics:axis", "X"))
+        free = [
+            freedom for freedom in FREEDOMS
+            if self._value(prim, f"limit:{freedom}:physics:low", -math.inf)
+            <= self._value(prim, f"limit:{freedom}:physics:high", math.inf)
+        ]  # fmt: skip
+        if kind == "PhysicsJoint":
+            if not free or free == ["rotX", "rotY", "rotZ"]:
+                return ("spherical" if free else "fixed"), ""
+            if len(free) == 1:
+                return ("revolute" if free[0][0] == "r" else "prismatic"), free[0][-1]
+            kind += f" free in {', '.join(free)}"
+        raise ParameterError(
+            where,
+            kind,
+            "a revolute, prismatic, spherical or fixed joint, or one that is free alike",
+        )
+
+    def _numbers(self, prim: Any, kind: str) -> dict[str, Any]:
+        """Return limits and the rotor of a joint of one axis."""
+        turns = kind == "revolute"
+        unit = math.radians(1.0) if turns else self.length
+        force = self.kilogram * self.length ** (2 if turns else 1)
+        limits: dict[str, Any] = {}
+        ends = [float(self._value(prim, f"physics:{end}Limit", sign * math.inf)) * unit
+                for end, sign in (("lower", -1), ("upper", 1))]  # fmt: skip
+        if np.isfinite(ends).any():
+            limits["position"] = ends
+        drive = f"drive:{'angular' if turns else 'linear'}:physics"
+        for key, name, scale in (
+            ("effort", f"{drive}:maxForce", force),
+            ("velocity", "physxJoint:maxJointVelocity", unit),
+        ):
+            most = float(self._value(prim, name, math.inf)) * scale
+            if 0.0 < most < 1e30:
+                limits[key] = most
+        if self._value(prim, "physxJoint:jointFriction", 0.0):
+            warn(self.path, f"physxJoint:jointFriction of {prim.GetPath()} is ignored")
+        rotor = float(self._value(prim, "physxJoint:armature", 0.0))
+        scale = self.kilogram * (self.length**2 if turns else 1.0)
+        return {"limits": limits, "rotor_inertia": rotor * scale}
+
+    def _drives(self, prim: Any) -> bool:
+        return any(
+            prim.HasAPI(self.physics.DriveAPI, name)
+            and any(self._value(prim, f"drive:{name}:physics:{gain}", 0.0) > 0.0
+                    for gain in ("stiffness", "damping"))
+            for name in ("angular", "linear")
+        )  # fmt: skip
+
+    def _placed(self, joints: dict[str, Joint]) -> dict[str, Joint]:
+        """Place all links from the world on, so that the joints of the tree meet exactly.
+
+        :raises ParameterError: a joint that is drawn open.
+        """
+        moves = {WORLD: Pose()}
+        placed: dict[str, Joint] = {}
+        order = hung(WORLD, joints.values())
+        for joint, parent, child in order:
+            first, second = joint.frames if parent == joint.inner else joint.frames[::-1]
+            meant = moves[parent] @ first
+            apart = first.inverse() @ second
+            if joint.kind == "spherical":
+                apart = Pose(apart.rotation)
+            elif joint.kind == "fixed":
+                apart = Pose()
+            else:
+                along = first.rotation.T @ joint.axes[0 if parent == joint.inner else 1]
+                value = _value_between(joint.kind, along, first, second)
+                turns = joint.kind == "revolute"
+                apart = Pose(about(along, value)) if turns else Pose(position=value * along)
+            target = first @ apart
+            miss = np.linalg.norm(target.position - second.position)
+            turned = np.abs(target.rotation - second.rotation).max()
+            if max(miss, turned) > ALIKE:
+                raise ParameterError(
+                    f"joint.{joint.name}", f"frames {miss:.3g} m and {turned:.3g} rad apart",
+                    f"frames on {parent} and {child} that meet",
+                )  # fmt: skip
+            moves[child] = meant @ apart @ second.inverse()
+            axes = moves[parent].rotation @ joint.axes[0 if parent == joint.inner else 1] if len(
+                joint.axes) else np.zeros((0, 3))  # fmt: skip
+            at = Pose(meant.rotation, (meant @ apart).position if joint.kind == "prismatic"
+                      else meant.position)  # fmt: skip
+            placed[joint.name] = replace(joint, frames=(at, at), axes=np.reshape(axes, (-1, 3)))
+        for name in [name for name in self.links if name not in moves]:
+            raise ParameterError(f"link.{name}", None, "a joint that connects it")
+        self.moves = moves
+        self.links = {name: link.moved(moves[name]) for name, link in self.links.items()}
+        return {name: placed[name] for name in joints}
+
+    def _closure(self, joint: Joint) -> Joint:
+        """Return a joint that closes a loop, where the placed links have it."""
+        first, second = (self.moves[end] for end in (joint.inner, joint.outer))
+        axes = [m.rotation @ a for m, a in zip((first, second), joint.axes, strict=False)]
+        frames = first @ joint.frames[0], second @ joint.frames[1]
+        return closing(replace(joint, frames=frames, axes=np.reshape(axes, (-1, 3))))
+
+    def _gravity(self) -> list[float]:
+        """Return the scene's gravity, by default 9.81 m/s2 downwards, as PhysX."""
+        down = -np.eye(3)["XYZ".index(self.up)]
+        size = 9.81
+        for prim in self.prims:
+            if prim.IsA(self.physics.Scene):
+                way = np.array(self._value(prim, "physics:gravityDirection", (0.0,) * 3), float)
+                down = way / np.linalg.norm(way) if way.any() else down
+                stated = float(self._value(prim, "physics:gravityMagnitude", -math.inf))
+                size = stated * self.length if stated >= 0.0 else size
+        return [float(x) for x in size * down]
+
+
+def _rotation(quaternion: Any) -> Array:
+    x, y, z = quaternion.GetImaginary()
+    return from_quaternion(x, y, z, quaternion.GetReal())
+
+
+def _value_between(kind: str, axis: Array, first: Pose, second: Pose) -> float:
+    """Return a joint's value as drawn: the motion of its second frame against the first."""
+    apart = first.inverse() @ second
+    if kind == "prismatic":
+        return float(axis @ apart.position)
+    across = np.cross(axis, np.eye(3)[int(np.abs(axis).argmin())])
+    turned = apart.rotation @ across
+    return math.atan2(float(np.cross(across, turned) @ axis), float(across @ turned))
