@@ -74,18 +74,24 @@ class Controller(Node):
         if self._first is None:
             self._first, self._start = stamp, q
         self._last = stamp
-        wanted = self.wanted((stamp - self._first) / SECOND)
+        try:
+            effort = self.effort((stamp - self._first) / SECOND, q, qd)
+            if effort is None:
+                self.done = True
+                return
+            self.send(effort)
+        except ValueError as refusal:
+            self.stop(str(refusal))
+
+    def effort(self, t, q, qd):
+        """Efforts at a time of the path and a joint state; None after its end."""
+        wanted = self.wanted(t)
         if wanted is None:
-            self.done = True
-            return
+            return None
         w = 2.0 * np.pi * self.options.bandwidth
         error, error_rate = wanted[0] - q, wanted[1] - qd
         self.errors.append(error)
-        qdd = wanted[2] + 2.0 * w * error_rate + w**2 * error
-        try:
-            self.send(inverse_dynamics(self.robot, q, qd, qdd))
-        except ValueError as refusal:
-            self.stop(str(refusal))
+        return inverse_dynamics(self.robot, q, qd, wanted[2] + 2.0 * w * error_rate + w**2 * error)
 
     def _trouble(self, message, stamp):
         """The fault of a joint state, or an empty text."""
@@ -140,10 +146,10 @@ class Controller(Node):
         self._publisher.wait_for_all_acked(Duration(seconds=0.5))
 
 
-def main():
+def main(kind=Controller, text=__doc__, robot="delta_cu"):
     """0 after the whole path, 1 if a check stopped it."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--robot", default="delta_cu")
+    parser = argparse.ArgumentParser(description=text)
+    parser.add_argument("--robot", default=robot)
     parser.add_argument("--commands", default="machine_sim/commands")
     parser.add_argument("--seconds", type=float, default=1.0, help="duration of the path")
     parser.add_argument("--reach", type=float, default=0.1, help="fraction of the joints' range")
@@ -155,7 +161,7 @@ def main():
     # Ctrl-C must leave the topics open for the zeros.
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     try:
-        controller = Controller(options)
+        controller = kind(options)
     except PkmTwinError as error:
         print(f"failed: {error}", file=sys.stderr)
         rclpy.try_shutdown()

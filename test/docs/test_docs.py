@@ -94,6 +94,14 @@ def test_a_printer_from_its_configuration_to_the_next(clone, twin):
 
 
 @pytest.mark.long
+@pytest.mark.filterwarnings("ignore")
+def test_the_blocks_of_the_linkages_page_run(clone, twin):
+    printed = [run(language, block, twin) for language, block, _ in blocks("linkages.md")]
+    assert len(printed) == 2 and all(printed)
+    assert (clone / "ankle_effort.npz").stat().st_size
+
+
+@pytest.mark.long
 def test_the_blocks_of_the_simulators_page_run(tmp_path, twin, monkeypatch):
     monkeypatch.chdir(tmp_path)
     printed = [run(language, block, twin) for language, block, _ in blocks("simulators.md")]

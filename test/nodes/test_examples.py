@@ -13,6 +13,8 @@ pytest.importorskip("rclpy", exc_type=ImportError)
 from std_msgs.msg import Float64MultiArray
 
 from delta_dynamics import inverse_dynamics
+from pkm_twin.machine.machine_yaml import describe_machine_yaml
+from pkm_twin.robot.urdf_read import read_urdf
 from test.nodes.harness import REPOSITORY
 from test.support.mapped import sides
 from test.support.robots import load, parameters_of
@@ -91,6 +93,25 @@ class TestComputedTorque:
         assert samples == 801
         assert worst < 1e-3
         peer.until(lambda: commands and list(commands[-1].data) == [0.0] * 3)
+        assert any(any(c.data) for c in commands)
+        assert sim.stop() == 0
+
+    def test_an_ankle_follows_in_roll_and_pitch(self, launch_alone, peer, commands, tmp_path):
+        path = tmp_path / "ankle.yaml"
+        part = {"base": "shank", "platform": "foot", "carry": True}
+        with pytest.warns(match="toes"):
+            data = read_urdf(EXAMPLES / "humanoid.xml", **part)
+        path.write_text(describe_machine_yaml(data))
+        controller = example(
+            launch_alone, "ankle.py", "--deadline", "60", "--robot", str(path),
+            parameters=(SIM_TIME,),
+        )  # fmt: skip
+        peer.until(lambda: peer.node.count_publishers("/machine_sim/commands"), PATIENCE)
+        sim = launch_alone(SIM, f"mechanism:={path}", "clock:=lockstep")
+        peer.until(lambda: not controller.alive(), PATIENCE)
+        assert controller.wait() == 0, controller.output
+        samples, worst = numbers(controller.output.splitlines()[-1])
+        assert samples == 1001 and worst < 5e-3
         assert any(any(c.data) for c in commands)
         assert sim.stop() == 0
 
