@@ -167,9 +167,9 @@ def read_tree(path: str | Path, part: Part = Part()) -> UrdfReading:
     if controller:
         data["joint_map"] = controller
     frames = {name: move @ tree.links[name].frame for name, move in _seen(assembly, ground).items()}
-    shown: Sequence[Visual] = ()
+    shown = list[Visual]()
     if top is not None and top.tag == "robot":
-        shown = visuals(path, top, frames, bodies)
+        shown += visuals(path, top, frames, bodies)
     return UrdfReading(data, home.text, tuple(notes), tree.marked, tuple(shown))
 
 
