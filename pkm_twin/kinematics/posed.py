@@ -22,7 +22,8 @@ from pkm_twin.codegen.expressions import SNAP
 from pkm_twin.codegen.lu import Order, independent_rows, pivot_order
 from pkm_twin.kinematics import pose as poses
 from pkm_twin.kinematics.diagnosis import mobility_error
-from pkm_twin.kinematics.limbs import Limb, chain_to_base, order_closed
+from pkm_twin.kinematics.limb_pose import Limb, chain_to_base
+from pkm_twin.kinematics.limbs import order_closed
 from pkm_twin.kinematics.linkage import REACH
 from pkm_twin.kinematics.motion import Motion, numbers
 from pkm_twin.kinematics.pose import Coordinate

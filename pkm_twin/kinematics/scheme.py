@@ -20,7 +20,8 @@ from pkm_twin.errors import ParameterError
 from pkm_twin.kinematics import pose as poses
 from pkm_twin.kinematics.diagnosis import mobility_error, near_conditions, singular_home
 from pkm_twin.kinematics.iterations import RANK
-from pkm_twin.kinematics.limbs import Limb, LimbPose, find_hanging_limbs, place_in_order
+from pkm_twin.kinematics.limb_pose import Limb, LimbPose, place_in_order
+from pkm_twin.kinematics.limbs import find_hanging_limbs
 from pkm_twin.kinematics.linkage import Linkage, rank_of
 from pkm_twin.kinematics.motion import Motion, Row, matrices, numbers
 from pkm_twin.kinematics.pose import Coordinate

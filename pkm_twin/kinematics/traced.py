@@ -24,7 +24,7 @@ from pkm_twin.codegen.lu import SparseLU
 from pkm_twin.codegen.operations import cos, sin
 from pkm_twin.codegen.program import AT, LEAST, STATE, UNKNOWNS, Equations, previous
 from pkm_twin.kinematics.drives import LEADS, TIME, Drives
-from pkm_twin.kinematics.limbs import LimbPose
+from pkm_twin.kinematics.limb_pose import LimbPose
 from pkm_twin.kinematics.motion import (
     FIXED,
     BaseMotion,

@@ -1,0 +1,355 @@
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
+"""Joint values of a limb in closed form, from the placed bodies at its ends.
+
+At most one joint of a limb, the reach, sets the distance of two points; then turns about one centre
+take one of these points to the other. Both are subproblems of Paden and Kahan (Murray, Li, Sastry
+1994, section 3.2). So are solved: drive and rod, R-R-R and R-P-R in a plane, R-P-S, R-S-U, U-P-S,
+and a universal joint whose limb is driven.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from pkm_twin.codegen.arrays import Array
+from pkm_twin.codegen.expressions import Numbers, Objects, snapped, snapped_all
+from pkm_twin.codegen.operations import absolute, sqrt
+from pkm_twin.kinematics.motion import Columns, Motion, Row, difference
+from pkm_twin.machine.graph import BASE
+from pkm_twin.machine.joints import UNITS
+from pkm_twin.machine.tree import Link, Step, Tree
+
+
+@dataclass(frozen=True)
+class Limb:
+    """A limb by the names of its parts.
+
+    ``kind``: "rod", "reach, turns", "across", "turns, reach" or "turns", see :class:`LimbPose`.
+    ``part``: the cut joint or rod that closes it, from ``tip`` to ``beyond``. ``bodies``: all that
+    the limb places, in the tree's order. ``reach``: the body whose step sets the distance, empty
+    where the limb has only turns. ``turns``: the bodies that turn about one centre. ``rows``: its
+    closures among the independent ones, by index. ``leaves``: how many of them are left to other
+    joints. ``spin``: a body that turns about the line from the centre to the closing joint, whose
+    axes set its angle; empty: none.
+    """
+
+    kind: str
+    part: str
+    tip: str
+    beyond: str
+    bodies: tuple[str, ...]
+    reach: str
+    turns: tuple[str, ...]
+    rows: tuple[int, ...]
+    leaves: int = 0
+    spin: str = ""
+
+
+def chain_to_base(tree: Tree, body: str) -> list[str]:
+    """Return a body and those between it and the ground."""
+    chain = []
+    while body != BASE:
+        chain.append(body)
+        body = tree.links[body].parent
+    return chain
+
+
+class LimbPose:
+    """A limb solved for bodies at its ends that are placed, on numbers and expressions alike.
+
+    The limb's unknowns are written into ``x``, and its bodies are placed. C is the centre of the
+    turns, J the point of the joint that closes the limb.
+
+    * "rod": the reach brings one end of a rod to its length from the other.
+    * "reach, turns": the reach brings C to its distance from J beyond; then the turns bring J.
+    * "across": the reach brings J to its distance from C beyond; then the turns there bring J.
+    * "turns, reach": the reach beyond the turns brings J to the distance that it has from C.
+    * "turns": joints between C and J are driven; their distance is left to other joints.
+
+    ``slopes``: factors of the limb in the determinant of the closures, above zero as at home, and
+    what makes them of unit one. ``levers``: of turns, in the same way. ``rows``: the closures that
+    are left to other joints.
+    """
+
+    def __init__(self, motion: Motion, limb: Limb, x: Objects, q: Numbers) -> None:
+        tree, graph = motion.tree, motion.graph
+        self.motion, self.tree, self.x = motion, tree, x
+        self.slopes: list[tuple[Any, Any]] = []
+        self.levers: list[tuple[Any, Any]] = []
+        self.rows: list[Row] = []
+        self.normal: Any = None
+        self.slope: Any = None
+        self.ends: tuple[tuple[str, Any], tuple[str, Any]] = (BASE, UNITS[0]), (BASE, UNITS[0])
+        if limb.kind == "rod":
+            rod = graph.rods[limb.part]
+            at, end = rod.ends if rod.inner == limb.tip else rod.ends[::-1]
+            target = motion.point(limb.beyond, end)
+            self._reach(tree.links[limb.reach], at, target, end, _square(end - at))
+            motion.place(limb.bodies, x, q)
+            self._keep_ends(limb, at, limb.beyond, target)
+            return
+        at = graph.joints[limb.part].at
+        top, last = tree.links[limb.turns[0]], tree.links[limb.turns[-1]]
+        every = [step for body in limb.turns for step in tree.links[body].steps]
+        steps = [step for step in every if step.turns]
+        beyond = [body for body in limb.bodies if top.body in chain_to_base(tree, body)]
+        before = [body for body in limb.bodies if body not in beyond]
+        after = beyond[len(limb.turns) :]
+        lever = home = snapped_all(last.axes.T @ (at - last.at))
+        if limb.kind == "reach, turns":
+            target = motion.point(limb.beyond, at)
+            square = self._square_between(limb, steps, lever, top.at, target)
+            self._reach(tree.links[limb.reach], top.at, target, at, square)
+            motion.place(before, x, q)
+            self._keep_ends(limb, top.at, limb.beyond, target)
+        elif limb.kind == "across":
+            centre = motion.point(top.parent, top.at)
+            square = self._square_between(limb, steps, lever, at, centre)
+            self._reach(tree.links[limb.reach], at, centre, top.at, square)
+            motion.place(before, x, q)
+            self._keep_ends(limb, at, top.parent, centre)
+            target = motion.point(limb.tip, at)
+        else:
+            target = motion.point(limb.beyond, at)
+        parent = motion.rotation[top.parent]
+        centre = motion.origin[top.parent] + parent @ top.arm
+        apart = target - centre
+        towards = steps[0].before.T @ (parent.T @ apart)
+        if limb.kind == "turns, reach":
+            link = tree.links[limb.reach]
+            between = Motion(tree, x, q, after[: after.index(link.body)], last.body)
+            turned = between.rotation[link.parent]
+            local = -(turned.T @ between.origin[link.parent]) - link.arm
+            square = _square(apart)
+            if len(steps) == 1:
+                square = _square([*towards[:2], lever[2]])
+            self._solve_reach(link, at, local, top.at, square)
+            self.ends = (limb.beyond, target), (top.parent, centre)
+        if limb.kind in ("turns", "turns, reach"):
+            lever = Motion(tree, x, q, after, last.body).point(limb.tip, at)
+        if len(steps) == 2:
+            self._turn_twice(steps, towards, lever, home)
+        else:
+            self._turn(steps[0], towards, lever)
+        if len(steps) == 1:
+            self.normal = parent @ steps[0].before[:, 2]
+        for slide in (step for step in every if not step.turns):
+            # Along the axis of the turn, so that nothing is left to other joints.
+            x[slide.position] = slide.sign * (towards[2] - lever[2]) / slide.slide
+        if limb.spin:
+            motion.place(beyond[:-1], x, q)
+            self._spin(limb)
+        motion.place(beyond[-1:] if limb.spin else beyond, x, q)
+        ends = (top.parent, limb.beyond), (apart, target)
+        if limb.leaves and limb.kind == "turns":
+            self.rows.append(
+                self._distance(limb, *ends, _square(lever[: 2 if len(steps) == 1 else 3]))
+            )
+        if limb.leaves > len(self.rows):
+            self.rows.append(self._plane(limb, *ends, lever[2]))
+
+    def _keep_ends(self, limb: Limb, moved: Array, body: str, target: Objects) -> None:
+        """Keep the ends of the distance that the reach sets: carried by its parent, and given."""
+        place = self.motion.point(limb.reach, moved)
+        self.ends = (body, target), (self.tree.links[limb.reach].parent, place)
+        # The vector between them goes from the target to the point that is moved.
+        self.slope = -self.slope
+
+    def reach_rates(self) -> Columns:
+        """Return the rate of the reach by the rates of the bodies at the limb's ends.
+
+        The distance is set by the reach: slope rate = distance vector . difference of velocities.
+        """
+        (body, target), (carrier, place) = self.ends
+        vector = target - place
+        if self.normal is not None:
+            vector = _across(vector, self.normal)
+        vector = vector / self.slope
+        moving = (
+            self.motion.linear_jacobian(body, target),
+            self.motion.linear_jacobian(carrier, place),
+        )
+        return {key: column @ vector for key, column in difference(*moving).items()}
+
+    def _square_between(
+        self, limb: Limb, steps: Sequence[Step], lever: Numbers, moved: Array, target: Numbers
+    ) -> Any:
+        """Return the square of the distance that the reach has to set.
+
+        A single turn keeps out of its plane what is there.
+        """
+        if len(steps) == 2:
+            return _square(lever)
+        tree, motion = self.tree, self.motion
+        link = tree.links[limb.reach]
+        turned = motion.rotation[link.parent]
+        own = tree.axes[link.parent].T @ (moved - tree.at[link.parent])
+        normal = turned @ snapped_all(tree.axes[link.parent].T @ steps[0].axis)
+        gap = normal @ (np.asarray(target) - motion.origin[link.parent] - turned @ own)
+        return _square([*lever[:2], gap])
+
+    def _reach(self, link: Link, point: Array, target: Numbers, goal: Array, square: Any) -> None:
+        """Bring a body's point to a distance from a target; ``goal`` is the target at home."""
+        turned, origin = self.motion.rotation[link.parent], self.motion.origin[link.parent]
+        local = turned.T @ (np.asarray(target) - origin) - link.arm
+        self._solve_reach(link, point, local, goal, square)
+
+    def _solve_reach(
+        self, link: Link, point: Array, local: Numbers, goal: Array, square: Any
+    ) -> None:
+        """Find the one step of a body by |point - target|^2 = square.
+
+        :param local: the target from the joint, in axes of the parent. ``goal``: it at home.
+        """
+        (step,), parent = link.steps, self.tree.axes[link.parent]
+        v = snapped_all(link.axes.T @ (point - link.at))
+        home = snapped_all(parent.T @ (goal - link.at))
+        if step.circle:
+            # a cos + c sin = d, of the turn from home.
+            w, w_home = step.before.T @ local, step.before.T @ home
+            a, c = v[0] * w[0] + v[1] * w[1], v[0] * w[1] - v[1] * w[0]
+            c_home = v[0] * w_home[1] - v[1] * w_home[0]
+            d = 0.5 * (_square(v[:2]) + _square(w[:2]) + (v[2] - w[2]) ** 2 - square)
+            n = a * a + c * c
+            root = sqrt(n - d * d)
+            side = -_sign(c_home) * root
+            self.x[step.position] = (a * d - c * side) / n
+            self.x[step.position + 1] = step.sign * ((c * d + a * side) / n)
+            scale = sqrt(_square(v[:2]) * _square(w_home[:2]))
+            self.slope = step.sign * side
+        else:
+            # |e t + d|^2 = square, of the slide t from home.
+            own = parent.T @ link.axes @ v
+            e = step.local * step.slide * step.sign
+            d, d_home = own - local, own - home
+            length, h = _square(e), e @ d
+            root = sqrt(h * h - (_square(d) - square) * length)
+            self.slope = _sign(e @ d_home) * root
+            self.x[step.position] = (self.slope - h) / length
+            scale = sqrt(_square(d_home) * length)
+        self.slopes.append((root, scale))
+
+    def _turn(self, step: Step, towards: Numbers, lever: Numbers) -> None:
+        """Turn a lever about an axis z into the direction of a vector."""
+        x, y, n = lever[0], lever[1], _square(lever[:2])
+        self.levers.append((sqrt(n), self.tree.size))
+        self.x[step.position] = (x * towards[0] + y * towards[1]) / n
+        self.x[step.position + 1] = step.sign * ((x * towards[1] - y * towards[0]) / n)
+
+    def _turn_twice(
+        self, steps: Sequence[Step], towards: Numbers, lever: Numbers, home: Numbers
+    ) -> None:
+        """Turn a lever about two axes that cross to a vector of its length.
+
+        :param towards: the vector in axes of the first turn. ``home``: the lever at home.
+        """
+        first, second = steps
+        x, y, z = lever
+        m = second.before[2]
+        a, b = m[0] * x + m[1] * y, m[1] * x - m[0] * y
+        c = towards[2] - m[2] * z
+        square = a * a + b * b
+        root = sqrt(square - c * c)
+        # At home the turn is none, and the root is the size of what stands here for b.
+        side = -_sign(m[1] * home[0] - m[0] * home[1]) * root
+        cosine, sine = (a * c - b * side) / square, (b * c + a * side) / square
+        self.x[second.position], self.x[second.position + 1] = cosine, second.sign * sine
+        turned = [cosine * x - sine * y, sine * x + cosine * y, z]
+        self._turn(first, towards, second.before @ np.array(turned, dtype=object))
+        self.slopes.append((root, sqrt(_square(lever))))
+
+    def _spin(self, limb: Limb) -> None:
+        """Turn a body about its line to the closing joint, whose axes keep their angle."""
+        link, joint = self.tree.links[limb.spin], self.motion.graph.joints[limb.part]
+        (step,), (held,) = link.steps, (c for c in joint.constraints if c.kind == "angle")
+        mine, other = held.inner, held.outer
+        if limb.tip == joint.outer:
+            mine, other = other, mine
+        # a cos + b sin = d, of the turn from home.
+        v = snapped_all(link.axes.T @ mine)
+        u = step.before.T @ (
+            self.motion.rotation[link.parent].T @ self.motion.direction(limb.beyond, other)
+        )
+        home = snapped_all(step.before.T @ (self.tree.axes[link.parent].T @ other))
+        a, b = v[0] * u[0] + v[1] * u[1], v[0] * u[1] - v[1] * u[0]
+        d = snapped(mine @ other) - v[2] * u[2]
+        n = a * a + b * b
+        root = sqrt(n - d * d)
+        side = -_sign(v[0] * home[1] - v[1] * home[0]) * root
+        self.x[step.position] = (a * d - b * side) / n
+        self.x[step.position + 1] = step.sign * ((b * d + a * side) / n)
+        self.slopes.append((root, 1.0))
+
+    def _distance(
+        self, limb: Limb, bodies: tuple[str, str], ends: tuple[Objects, Objects], square: Any
+    ) -> Row:
+        """Return the closure by which a point keeps its distance from the turns' centre.
+
+        Of a single turn, in its plane.
+
+        :param bodies: the turns' parent, and the point's. ``ends``: the point from the centre, and
+            from the origin. ``square``: of the distance.
+        """
+        apart = ends[0] if self.normal is None else _across(ends[0], self.normal)
+        scale = 1.0 / (self.tree.size * sqrt(square))
+        value = 0.5 * (apart @ apart - square)
+        return self._row(limb, bodies, ends[1], apart, value, scale)
+
+    def _plane(
+        self, limb: Limb, bodies: tuple[str, str], ends: tuple[Objects, Objects], height: Any
+    ) -> Row:
+        """Return the closure by which a point stays in the plane of a turn; see above.
+
+        :param height: of the plane above the centre.
+        """
+        value = self.normal @ ends[0] - height
+        return self._row(limb, bodies, ends[1], self.normal, value, 1.0 / self.tree.size)
+
+    def _row(
+        self, limb: Limb, bodies: tuple[str, str], place: Objects, along: Objects, value: Any,
+        scale: Any,
+    ) -> Row:  # fmt: skip
+        """Return a closure along a vector fixed in the turns' parent, at a point's place."""
+        inner, outer = bodies
+        moving = (self.motion.linear_jacobian(body, place) for body in (outer, inner))
+        columns = {k: column @ along for k, column in difference(*moving).items()}
+        return Row(
+            limb.part, value, columns, _no_bias, scale, inner, outer, place, along, np.zeros(3)
+        )
+
+
+def _no_bias() -> Any:
+    raise NotImplementedError("rates and accelerations come from the closures themselves")
+
+
+def _square(vector: Numbers) -> Any:
+    """Return the sum of the squares of three numbers or fewer."""
+    return sum((value * value for value in vector), 0.0)
+
+
+def _across(vector: Objects, normal: Objects) -> Objects:
+    """Return the part of a vector across a unit vector."""
+    part: Objects = vector - normal * (normal @ vector)
+    return part
+
+
+def _sign(value: Any) -> Any:
+    """Return 1 or -1 as the sign of a number that is not 0."""
+    return value / absolute(value)
+
+
+def place_in_order(
+    tree: Tree, order: Sequence[str | Limb], x: Objects, q: Numbers
+) -> tuple[Motion, list[LimbPose]]:
+    """Place all bodies; limbs in closed form write their unknowns into ``x``."""
+    motion, limbs = Motion(tree, x, q, ()), []
+    for entry in order:
+        if isinstance(entry, Limb):
+            limbs.append(LimbPose(motion, entry, x, q))
+        else:
+            motion.place((entry,), x, q)
+    return motion, limbs
